@@ -1,0 +1,60 @@
+"""The one exception for input that cannot be used, and the checks that raise it."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable
+
+
+class InputError(ValueError):
+    """Bad input: one sentence that names the field, its value and what is allowed."""
+
+
+def check_number(
+    name: str,
+    value: float,
+    *,
+    above: float = -math.inf,
+    at_least: float = -math.inf,
+    at_most: float = math.inf,
+    unit: str = "",
+) -> float:
+    """`value` as a float if it is a number within bounds; infinite only where `at_most` says so.
+
+    Raises:
+      InputError: it is NaN, not a number, or out of bounds.
+    """
+    bounds = []
+    if above > -math.inf:
+        bounds.append(f"above {above:g}")
+    if at_least > -math.inf:
+        bounds.append(f"at least {at_least:g}")
+    if at_most < math.inf:
+        bounds.append(f"at most {at_most:g}")
+    allowed = " and ".join(["a number", *bounds]) + (f" [{unit}]" if unit else "")
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if math.isnan(number) or not (above < number and at_least <= number <= at_most):
+        raise InputError(f"{name} = {value} is not allowed: it must be {allowed}.")
+    return number
+
+
+def check_finite(name: str, value: float, **bounds) -> float:
+    """`check_number`, and finite."""
+    number = check_number(name, value, **bounds)
+    if math.isinf(number):
+        raise InputError(f"{name} = {value} is not allowed: it must be finite.")
+    return number
+
+
+def check_name(kind: str, name: str, known: Iterable[str]) -> str:
+    """`name` if it is one of `known`; otherwise an InputError lists them and the nearest."""
+    known = list(known)
+    if name in known:
+        return name
+    near = difflib.get_close_matches(str(name), known, n=1)
+    hint = f" (did you mean '{near[0]}'?)" if near else ""
+    raise InputError(f"unknown {kind} '{name}': choose from {', '.join(known)}{hint}.")

@@ -1,0 +1,59 @@
+"""Planar geometry whose values and derivatives are finite everywhere.
+
+Every singularity of the project is guarded here and nowhere else: the norm at zero, the
+direction of a zero vector, the wrap at pi.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+
+def rotate(yaw: jax.Array, vector: jax.Array) -> jax.Array:
+    """Turn planar vectors (..., 2) by `yaw` (...) [rad], counter-clockwise."""
+    c, s = jnp.cos(yaw), jnp.sin(yaw)
+    x, y = vector[..., 0], vector[..., 1]
+    return jnp.stack([c * x - s * y, s * x + c * y], axis=-1)
+
+
+def norm(vector: jax.Array) -> jax.Array:
+    """Euclidean norm over the last axis: (..., n) -> (...).
+
+    Scaled by the largest component, so squares neither overflow nor vanish in float32; the
+    derivative at zero is zero, where `jnp.linalg.norm` gives NaN.
+    """
+    scale = jax.lax.stop_gradient(jnp.max(jnp.abs(vector), axis=-1))
+    is_zero = scale == 0
+    unit = jnp.where(is_zero[..., None], 1.0, vector / jnp.where(is_zero, 1.0, scale)[..., None])
+    return jnp.where(is_zero, 0.0, scale * jnp.sqrt(jnp.sum(unit * unit, axis=-1)))
+
+
+def direction(vector: jax.Array) -> jax.Array:
+    """Angle of planar vectors (..., 2) in (-pi, pi] [rad]; 0 with zero derivative at zero."""
+    scale = jax.lax.stop_gradient(jnp.max(jnp.abs(vector), axis=-1))
+    is_zero = scale == 0
+    # Scaling changes no angle and keeps x*x + y*y, which the derivative divides by, in range.
+    unit = vector / jnp.where(is_zero, 1.0, scale)[..., None]
+    x = jnp.where(is_zero, 1.0, unit[..., 0])
+    y = jnp.where(is_zero, 0.0, unit[..., 1])
+    return jnp.arctan2(y, x)
+
+
+def wrap(angle: jax.Array) -> jax.Array:
+    """The same angle in [-pi, pi) [rad], the paper's unit circle S."""
+    wrapped = jnp.mod(angle + jnp.pi, 2 * jnp.pi) - jnp.pi
+    # Rounding can return the excluded end.
+    return jnp.where(wrapped >= jnp.pi, wrapped - 2 * jnp.pi, wrapped)
+
+
+def safe_sqrt(x: jax.Array) -> jax.Array:
+    """Square root of max(x, 0), with zero derivative where x <= 0."""
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+
+
+def yaw_of_quaternion(quaternion: jax.Array) -> jax.Array:
+    """Heading (...) [rad] of unit quaternions (..., 4), scalar first."""
+    w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
+    return direction(jnp.stack([1 - 2 * (y * y + z * z), 2 * (w * z + x * y)], axis=-1))

@@ -1,0 +1,233 @@
+"""The Reactive Pushing Strategy (RPS): Eqs. 1-9 and Algorithm 1 of Ozdamar, Sirintuna, Arbaud
+and Ajoudani, "Pushing in the Dark" (IEEE RA-L 2024). Nothing here knows of MuJoCo.
+
+Frames: W is the world, R the robot (origin at the middle of the base, x forward, y left).
+`p_robot_contact` is the paper's p^R_C; `l` is its y component. Every function takes single
+worlds; `jax.vmap` batches any argument, parameters included.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rps_jax import errors, frames
+
+# Inputs are held within this distance [m] so that no finite float32 overflows on the way.
+_WORLD_SIZE = 1e9
+
+
+class RPSParams(NamedTuple):
+    """Parameters of the law, all floats, all leaves of a pytree (any may be batched).
+
+    The paper gives the first block; it leaves the second open, and the defaults are ours.
+    """
+
+    eta: float | jax.Array = 10.0  # [1] upper asymptote of the adaptive rate, Eq. 5
+    zeta: float | jax.Array = 0.0  # [1] lower asymptote, Eq. 5
+    beta: float | jax.Array = 0.12  # [m] inflection point of |l|, Eq. 5
+    k: float | jax.Array = 60.0  # [1/m] steepness, Eq. 5
+    K_h: float | jax.Array = 1.0  # [1] heading gain, Eq. 7
+    K_v: float | jax.Array = 0.1  # [1/s] velocity gain, Eq. 3
+    L: float | jax.Array = 0.2  # [m] turning length, Eqs. 6 and 8
+    l_cr: float | jax.Array = 0.24  # [m] the critical region starts here
+    d_th: float | jax.Array = 0.5  # [m] no lateral motion nearer than this, Eq. 5
+    v_max: float | jax.Array = 0.05  # [m/s] bound on the norm of (v_x, v_y)
+    omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
+    d_success: float | jax.Array = 0.05  # [m] target reached, Algorithm 1
+    v_approach: float | jax.Array = 0.01  # [m/s] forward speed without contact (Sec. IV-B)
+
+    l_mr: float | jax.Array = 0.15  # [m] the middle region ends here; Realignment stops
+    a_r_max: float | jax.Array = 10.0  # [1] adaptive rate in Realignment; eta's value
+    gamma_max: float | jax.Array = 1.56  # [rad] bound on |gamma|; inf is the tangent as printed
+    reactive: float | jax.Array = 1.0  # [1] 1: RPS; 0: NPS (a_r = 0 and no Realignment)
+
+    @classmethod
+    def paper(cls) -> RPSParams:
+        """The paper's values (Sec. IV-A), with our defaults for what it leaves open."""
+        return cls()
+
+    @classmethod
+    def nps(cls) -> RPSParams:
+        """The non-reactive baseline: a_r = 0 throughout and no Realignment State (Sec. IV-B)."""
+        return cls(reactive=0.0)
+
+
+class RPSState(NamedTuple):
+    """What the law remembers between two control steps."""
+
+    l_th: jax.Array  # () [m] dynamic threshold: l_cr normally, l_mr while realigning
+    p_robot_contact: jax.Array  # (2,) [m] the last contact, in the robot frame
+    touched: jax.Array  # () bool: the skin has felt the object at least once
+
+    @classmethod
+    def init(cls, params: RPSParams) -> RPSState:
+        """Algorithm 1's initialisation, l_th = l_cr, before any contact."""
+        l_th = jnp.asarray(params.l_cr, float)
+        return cls(l_th, jnp.zeros(2, l_th.dtype), jnp.zeros((), bool))
+
+
+class Observation(NamedTuple):
+    """What the law may know: odometry, touch and the target."""
+
+    p_world_robot: jax.Array  # (2,) [m]
+    yaw: jax.Array  # () [rad] heading of the robot in the world
+    p_robot_contact: jax.Array  # (2,) [m] contact location; ignored unless in_contact
+    in_contact: jax.Array  # () bool
+    p_world_target: jax.Array  # (2,) [m]
+
+
+class Twist(NamedTuple):
+    """Commanded velocity of the base, in the robot frame."""
+
+    v_x: float | jax.Array  # () [m/s] forward
+    v_y: float | jax.Array  # () [m/s] left
+    omega: float | jax.Array  # () [rad/s] counter-clockwise
+
+
+class Details(NamedTuple):
+    """The quantities behind one twist, for plots and tests."""
+
+    l: jax.Array  # noqa: E741  () [m] lateral contact location, the paper's symbol
+    distance: jax.Array  # () [m] ||d||, contact point to target
+    a_r: jax.Array  # () [1] adaptive rate
+    gamma: jax.Array  # () [rad] steering angle
+    realigning: jax.Array  # () bool: in the Realignment State
+
+
+def check(params: RPSParams) -> RPSParams:
+    """The same parameters, if scalars that mean something.
+
+    Raises:
+      InputError: a value is not a number, negative where it must not be, or infinite (only
+        gamma_max may be, for the tangent as printed).
+    """
+    for name in ("eta", "zeta", "beta", "k", "d_th", "a_r_max", "l_mr", "v_approach"):
+        errors.check_finite(name, getattr(params, name), at_least=0)
+    for name in ("K_h", "K_v", "L", "l_cr", "v_max", "omega_max", "d_success"):
+        errors.check_finite(name, getattr(params, name), above=0)
+    errors.check_number("gamma_max", params.gamma_max, above=0)
+    errors.check_finite("reactive", params.reactive, at_least=0, at_most=1)
+    return params
+
+
+def _sgn(x: jax.Array) -> jax.Array:
+    """sgn with sgn(0) = 0: a centred contact asks for no lateral motion."""
+    return jnp.sign(x)
+
+
+def _is_far(params: RPSParams, distance: jax.Array) -> jax.Array:
+    """Eq. 5's switch: lateral motion only beyond d_th."""
+    return distance > params.d_th
+
+
+def _must_realign(params: RPSParams, l: jax.Array, l_th: jax.Array) -> jax.Array:  # noqa: E741
+    """Algorithm 1's switch into, and out of, the Realignment State."""
+    return (jnp.abs(l) > l_th) & (jnp.asarray(params.reactive) > 0)
+
+
+def displacement(observation: Observation) -> jax.Array:
+    """Eq. 4: d = p^W_T - (p^W_R + R^W_R p^R_C), from contact to target, (2,) [m] in the world."""
+    p_world_contact = observation.p_world_robot + frames.rotate(
+        observation.yaw, observation.p_robot_contact
+    )
+    d = observation.p_world_target - p_world_contact
+    return jnp.clip(d, -_WORLD_SIZE, _WORLD_SIZE)
+
+
+def adaptive_rate(params: RPSParams, l: jax.Array, distance: jax.Array) -> jax.Array:  # noqa: E741
+    """Eq. 5: a_r (...) [1] from the lateral contact location l [m] and ||d|| [m]."""
+    logistic = jax.nn.sigmoid((jnp.abs(l) - params.beta) * params.k)
+    a_r = (params.zeta + (params.eta - params.zeta) * logistic) * _sgn(l)
+    return jnp.where(_is_far(params, distance), a_r, 0.0) * params.reactive
+
+
+def linear_velocity(v_star: jax.Array, a_r: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Eqs. 1-2: (v_x, v_y) [m/s] of norm v_star [m/s] and slope v_y / v_x = a_r [1]."""
+    a_r = jnp.asarray(a_r, float)
+    length = frames.norm(jnp.stack([jnp.ones_like(a_r), a_r], axis=-1))
+    return v_star / length, v_star * (a_r / length)
+
+
+def steering_angle(params: RPSParams, d: jax.Array, yaw: jax.Array) -> jax.Array:
+    """Eq. 7: gamma = K_h (theta* - theta) [rad], theta* the direction of d (..., 2) [m].
+
+    The heading error is wrapped to [-pi, pi). The paper's tangent changes sign beyond pi / 2,
+    where the robot would turn away from its target, so gamma is held within +-gamma_max.
+    """
+    gamma = params.K_h * frames.wrap(frames.direction(d) - yaw)
+    return jnp.clip(gamma, -jnp.asarray(params.gamma_max), params.gamma_max)
+
+
+def realignment_gain(params: RPSParams, l: jax.Array) -> jax.Array:  # noqa: E741
+    """Eq. 9: sigma = 1 - |l| / l_cr [1], zero in the critical region."""
+    return 1.0 - jnp.minimum(jnp.abs(l), params.l_cr) / params.l_cr
+
+
+def saturate(params: RPSParams, twist: Twist) -> Twist:
+    """Bound the commanded twist: (v_x, v_y) scaled as a vector to norm v_max, omega clipped."""
+    speed = frames.norm(jnp.stack([twist.v_x, twist.v_y], axis=-1))
+    scale = params.v_max / jnp.maximum(speed, params.v_max)
+    omega = jnp.clip(twist.omega, -jnp.asarray(params.omega_max), params.omega_max)
+    return Twist(twist.v_x * scale, twist.v_y * scale, omega)
+
+
+def _push(
+    params: RPSParams, l_th: jax.Array, observation: Observation
+) -> tuple[jax.Array, Twist, Details]:
+    """One pass of Algorithm 1's control loop, in contact."""
+    l = observation.p_robot_contact[..., 1]  # noqa: E741
+    d = displacement(observation)
+    distance = frames.norm(d)
+    v_star = params.K_v * distance  # Eq. 3
+    gamma = steering_angle(params, d, observation.yaw)
+
+    realigning = _must_realign(params, l, l_th)
+    a_r = jnp.where(realigning, params.a_r_max * _sgn(l), adaptive_rate(params, l, distance))
+    v_x, v_y = linear_velocity(v_star, a_r)  # Eqs. 1-2
+    turning_speed = jnp.where(realigning, realignment_gain(params, l) * v_star, v_x)
+    omega = turning_speed / params.L * jnp.tan(gamma)  # Eq. 8 or 6: before any saturation
+    twist = saturate(params, Twist(v_x, v_y, omega))
+
+    arrived = distance < params.d_success
+    twist = jax.tree.map(lambda v: jnp.where(arrived, 0.0, v), twist)
+    new_l_th = jnp.where(realigning, params.l_mr, params.l_cr)
+    return (
+        jnp.where(arrived, l_th, new_l_th),
+        twist,
+        Details(l, distance, a_r, gamma, realigning & ~arrived),
+    )
+
+
+def step_with_details(
+    params: RPSParams, state: RPSState, observation: Observation
+) -> tuple[RPSState, Twist, Details]:
+    """`step`, and the quantities behind its twist (those of the last contact without one)."""
+    in_contact = jnp.asarray(observation.in_contact)
+    # Without contact the location means nothing; the last one keeps every branch finite.
+    contact = jnp.where(in_contact, observation.p_robot_contact, state.p_robot_contact)
+    l_th, push, details = _push(params, state.l_th, observation._replace(p_robot_contact=contact))
+    approach = Twist(params.v_approach, 0.0, 0.0)
+    twist = jax.tree.map(lambda a, b: jnp.where(in_contact, a, b), push, approach)
+    state = RPSState(
+        l_th=jnp.where(in_contact, l_th, state.l_th),
+        p_robot_contact=contact,
+        touched=state.touched | in_contact,
+    )
+    return state, twist, details._replace(realigning=details.realigning & in_contact)
+
+
+@jax.jit
+def step(
+    params: RPSParams, state: RPSState, observation: Observation
+) -> tuple[RPSState, Twist]:
+    """Algorithm 1: one control step of RPS (or NPS, by `params.reactive`).
+
+    In contact: the saturated twist of Eqs. 1-9, or zero once ||d|| < d_success. Without contact,
+    before the first and after a loss alike: straight ahead at v_approach, l_th unchanged.
+    Algorithm 1's last line prints v_x twice; (v_x, v_y, omega) is meant.
+    """
+    state, twist, _ = step_with_details(params, state, observation)
+    return state, twist

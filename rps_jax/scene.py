@@ -1,0 +1,233 @@
+"""Scenes: `mjcf/` -> a MuJoCo model for looking at, and one stripped to the physics for stepping.
+
+The physics model holds the three geoms that touch and nothing else; it is what C MuJoCo and MJX
+both step. All objects of one shape family compile to the same MJX structure, so that they can
+be batched in one program: `stack` collects the fields in which they differ.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from rps_jax import errors, skin
+from rps_jax import footprint as fp
+from rps_jax.footprint import Footprint
+
+with contextlib.redirect_stdout(io.StringIO()):  # MJX reports on the console that warp is absent
+    from mujoco import mjx
+
+Side = Literal["near", "far"]
+# An inertial frame off by this [m] keeps MuJoCo from compiling centred bodies to a structure of
+# their own, which could not be batched with the others.
+_OFF_CENTRE = 1e-6
+
+
+class Friction(NamedTuple):
+    """Coulomb coefficients of the two contacts."""
+
+    ground: float  # [1] object-ground
+    robot: float  # [1] object-robot
+
+
+FRICTION = {"S1": Friction(0.3, 0.35), "S2": Friction(0.2, 0.5)}  # Table I
+FAMILIES = {
+    "box": "box",
+    "cylinder": "cylinder",
+    "nonuniform_box": "box",
+    "hardware_box": "box",
+    "hardware_cylinder": "cylinder",
+}  # object -> shape family
+OBJECTS = tuple(FAMILIES)
+PAPER_OBJECTS = ("box", "cylinder", "nonuniform_box")  # Fig. 4, in the order of Table II
+
+
+@dataclass(frozen=True)
+class Physics:
+    """How the world is stepped. Static: a change compiles another program."""
+
+    timestep: float = 0.01  # [s]
+    control_period: float = 0.02  # [s] between two decisions of the law; left open by the paper
+    cone: Literal["elliptic", "pyramidal"] = "elliptic"
+    impratio: float = 10.0  # [1] friction stiffness over normal stiffness
+    iterations: int = 8  # of the Newton solver
+    ls_iterations: int = 10  # of its line search
+    tolerance: float = 1e-8  # [1] of the solver
+
+    def __post_init__(self) -> None:
+        """Raises InputError for values that MuJoCo would accept and that mean nothing."""
+        errors.check_finite("timestep", self.timestep, above=0, at_most=0.1, unit="s")
+        errors.check_finite("control_period", self.control_period, above=0, at_most=1, unit="s")
+        errors.check_finite("impratio", self.impratio, above=0)
+        errors.check_finite("iterations", self.iterations, at_least=1)
+        errors.check_finite("ls_iterations", self.ls_iterations, at_least=1)
+        errors.check_finite("tolerance", self.tolerance, at_least=0)
+        errors.check_name("cone", self.cone, ("elliptic", "pyramidal"))
+        steps = self.control_period / self.timestep
+        if steps < 0.5 or not math.isclose(steps, round(steps), rel_tol=1e-6):
+            raise errors.InputError(
+                f"control_period = {self.control_period:g} s is not allowed: it must be a "
+                f"multiple of timestep = {self.timestep:g} s."
+            )
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps in one control period."""
+        return round(self.control_period / self.timestep)
+
+
+PHYSICS = {"default": Physics(), "pyramidal": Physics(cone="pyramidal")}
+
+
+class Scene(NamedTuple):
+    """One object before the robot."""
+
+    name: str
+    family: str
+    model: mujoco.MjModel  # everything, for pictures
+    physics: mujoco.MjModel  # the three geoms that touch, for stepping
+    footprint: Footprint
+
+
+class Joints(NamedTuple):
+    """Where the joints are in qpos and qvel; the same in every scene and in both models."""
+
+    base: slice = slice(0, 3)  # x, y [m], yaw [rad] in the world
+    object: slice = slice(3, 10)  # position [m] and quaternion, scalar first
+
+
+JOINTS = Joints()
+
+
+def mjcf_folder() -> Path:
+    """The folder of the scenes: inside an installed package, or beside it in a checkout."""
+    package = Path(__file__).resolve().parent
+    installed = package / "mjcf"
+    return installed if installed.is_dir() else package.parent / "mjcf"
+
+
+def load(
+    name: str,
+    physics: Physics = PHYSICS["default"],
+    friction: Friction = FRICTION["S1"],
+    *,
+    rear: Side = "near",
+) -> Scene:
+    """Compile a scene.
+
+    Args:
+      name: one of `OBJECTS`.
+      physics: how it will be stepped.
+      friction: coefficients of its two contacts.
+      rear: which side the nonuniform box's load stands on, nearest the robot or farthest; the
+        paper says "rear left corner".
+
+    Raises:
+      InputError: unknown name, or friction that is not a positive finite number.
+    """
+    errors.check_name("object", name, OBJECTS)
+    errors.check_name("rear", rear, ("near", "far"))
+    for side, value in friction._asdict().items():
+        errors.check_finite(f"friction.{side}", value, above=0, at_most=10)
+    spec = mujoco.MjSpec.from_file(str(mjcf_folder() / f"{name}.xml"))
+    for geom in spec.geoms:
+        if geom.name == "load" and rear == "far":
+            geom.pos[0] = -geom.pos[0]
+    for pair in spec.pairs:
+        pair.friction[:2] = friction.ground if pair.name == "ground_object" else friction.robot
+    _set_options(spec.option, physics)
+    model = spec.compile()
+    stripped = _strip(spec, model)
+    return Scene(name, FAMILIES[name], model, stripped, _footprint(stripped))
+
+
+def _set_options(option: mujoco.MjOption, physics: Physics) -> None:
+    option.timestep = physics.timestep
+    option.cone = {
+        "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC,
+        "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL,
+    }[physics.cone]
+    option.impratio = physics.impratio
+    option.iterations = physics.iterations
+    option.ls_iterations = physics.ls_iterations
+    option.tolerance = physics.tolerance
+
+
+def _strip(spec: mujoco.MjSpec, full: mujoco.MjModel) -> mujoco.MjModel:
+    """Only what touches: the geoms of the contact pairs, with each body's whole inertia."""
+    spec = spec.copy()
+    spec.modelname = "physics"
+    spec.delete(spec.body("target"))
+    touching = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
+    for geom in list(spec.geoms):
+        if geom.name not in touching:
+            spec.delete(geom)
+    for item in [*spec.lights, *spec.cameras]:
+        spec.delete(item)
+    for name in ("base", "object"):
+        body, compiled = spec.body(name), full.body(name)
+        body.explicitinertial = True
+        body.mass = compiled.mass[0]
+        body.ipos = compiled.ipos + _OFF_CENTRE
+        body.iquat = compiled.iquat
+        body.inertia = compiled.inertia
+    model = spec.compile()
+    model.body_sameframe[:] = 0  # likewise: always the general formula for the inertial frame
+    return model
+
+
+def _footprint(model: mujoco.MjModel) -> Footprint:
+    """The outline of the object's geom that stands on the ground."""
+    geom = model.geom("object")
+    half_x, half_y, _ = geom.size
+    if geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX:
+        return fp.rectangle(half_x, half_y)
+    return fp.circle(half_x)
+
+
+def initial_qpos(scene: Scene, gap: float = 0.02, yaw: float = 0.0) -> np.ndarray:
+    """Base at the origin, object `gap` [m] in front of the middle of its front face: (10,)."""
+    placed = fp.place(scene.footprint, jnp.zeros(2), jnp.asarray(yaw, float))
+    reach = float(fp.extent(placed, jnp.array([-1.0, 0.0])))
+    qpos = scene.physics.qpos0.copy()
+    qpos[JOINTS.base] = 0.0
+    height = qpos[JOINTS.object][2]
+    position = [skin.HALF_LENGTH + gap + reach, 0.0, height]
+    qpos[JOINTS.object] = [*position, math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
+    return qpos
+
+
+def stack(models: list[mujoco.MjModel]) -> tuple[mjx.Model, dict[str, jax.Array]]:
+    """One MJX model for all, and the fields in which they differ: name -> (len(models), ...).
+
+    Fields are found by comparing the compiled models leaf by leaf, so nothing derived from a
+    mass, a size or a friction is forgotten.
+    """
+    # A static copy of the bounding radii, which only height fields use, would bar stacking.
+    unused = {"_impl.geom_rbound_hfield": np.zeros(models[0].ngeom)}
+    trees = [mjx.put_model(m).tree_replace(unused) for m in models]
+    leaves, structures = zip(*map(jax.tree_util.tree_flatten_with_path, trees), strict=True)
+    if any(s != structures[0] for s in structures):
+        raise ValueError("models of different structure cannot be stacked")
+    fields = {}
+    for columns in zip(*leaves, strict=True):
+        values = [np.asarray(leaf) for _, leaf in columns]
+        if any(not np.array_equal(v, values[0]) for v in values):
+            fields[jax.tree_util.keystr(columns[0][0])] = jnp.stack(values)
+    return jax.tree.unflatten(structures[0], [leaf for _, leaf in leaves[0]]), fields
+
+
+def apply(model: mjx.Model, fields: dict[str, jax.Array]) -> mjx.Model:
+    """The model with one world's fields, as named by `stack`, put in place."""
+    return jax.tree_util.tree_map_with_path(
+        lambda path, leaf: fields.get(jax.tree_util.keystr(path), leaf), model
+    )

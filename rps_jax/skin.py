@@ -1,0 +1,189 @@
+"""The tactile skin: where does the object touch the base?
+
+Two sensors behind one interface, both purely geometric: they read the object's footprint, placed
+in the robot frame, and never the engine's contacts. The skin covers the front, left and right
+faces. Positions along it form one strip that starts at the rear of the left face, runs forward,
+across the front from left to right, and back along the right face; the two extreme positions of a
+contact are its first and last along this strip.
+
+    sensor.init(key) -> state
+    sensor.sense(state, footprint, period) -> (state, Reading)
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rps_jax import footprint as fp
+from rps_jax.footprint import Footprint
+
+HALF_LENGTH = 0.3625  # [m] of the base: 15 taxels of 48.3 mm make 0.725 m
+HALF_WIDTH = 0.29  # [m] of the base: l_cr + 5 cm, Sec. IV-A
+BOARDS = {"left": 5, "front": 4, "right": 5}  # 14 boards, Sec. II-B
+ELECTRODES = 3  # on each board
+
+NONE, POINT, LINE = 0, 1, 2  # contact types, Fig. 6c
+
+
+class Face(NamedTuple):
+    """One side of the base, in strip order."""
+
+    start: np.ndarray  # (2,) [m] in the robot frame
+    along: np.ndarray  # (2,) unit vector
+    length: float  # [m]
+
+
+FACES = {
+    "left": Face(np.array([-HALF_LENGTH, HALF_WIDTH]), np.array([1.0, 0.0]), 2 * HALF_LENGTH),
+    "front": Face(np.array([HALF_LENGTH, HALF_WIDTH]), np.array([0.0, -1.0]), 2 * HALF_WIDTH),
+    "right": Face(np.array([HALF_LENGTH, -HALF_WIDTH]), np.array([-1.0, 0.0]), 2 * HALF_LENGTH),
+}
+
+
+class Reading(NamedTuple):
+    """What the skin tells the law."""
+
+    contact_type: jax.Array  # () int32: NONE, POINT or LINE
+    p_robot_contact: jax.Array  # (2,) [m] contact location in the robot frame; 0 if NONE
+
+    @property
+    def in_contact(self) -> jax.Array:
+        """() bool."""
+        return self.contact_type != NONE
+
+
+class Skin(Protocol):
+    """A tactile sensor: a pytree of parameters with two pure functions."""
+
+    def init(self, key: jax.Array) -> SkinState:
+        """The sensor before it has felt anything; `key` draws its imperfections."""
+        ...
+
+    def sense(
+        self, state: SkinState, footprint: Footprint, period: float
+    ) -> tuple[SkinState, Reading]:
+        """One reading of a footprint placed in the robot frame, `period` [s] after the last."""
+        ...
+
+
+class SkinState(NamedTuple):
+    """What a sensor carries from one reading to the next (empty for the ideal one)."""
+
+    key: jax.Array  # noise of the readings to come
+    signal: jax.Array  # (T,) [1] filtered relative change of capacitance
+    gain: jax.Array  # (T,) [1] of each taxel
+    alive: jax.Array  # (T,) bool
+
+
+class IdealSkin(NamedTuple):
+    """The exact contact interval, as the position of the paper's Gazebo contact sensor.
+
+    A point of a face is in contact if it lies within `tolerance` of the object: foam gives a real
+    skin several millimetres of it, and without any, the corners of a box alternate and the law
+    chatters.
+    """
+
+    tolerance: float | jax.Array = 0.006  # [m]
+    point_length: float | jax.Array = 2 * HALF_WIDTH / 12  # [m] up to one taxel long: a point
+
+    def init(self, key: jax.Array) -> SkinState:
+        """No memory, no imperfections."""
+        return SkinState(key, *(jnp.zeros(0),) * 3)
+
+    def sense(
+        self, state: SkinState, footprint: Footprint, period: float
+    ) -> tuple[SkinState, Reading]:
+        """The middle between the two ends of the contact interval; the period is unused."""
+        del period
+        dtype = footprint.vertices.dtype
+        strip_start = 0.0
+        hits, ends = [], []  # of both ends of each face's interval, in strip order
+        for face in FACES.values():
+            start, along = jnp.asarray(face.start, dtype), jnp.asarray(face.along, dtype)
+            low, high = fp.crossing(footprint, start, along, self.tolerance)
+            hit = (low <= high) & (high >= 0) & (low <= face.length)
+            for s in (low, high):
+                s = jnp.clip(s, 0.0, face.length)
+                ends.append(jnp.concatenate([start + s * along, strip_start + s[None]]))
+                hits.append(hit)
+            strip_start += face.length
+        ends, hits = jnp.stack(ends), jnp.stack(hits)
+        first, last = _extremes(hits, ends)
+        kind = jnp.where(last[2] - first[2] > self.point_length, LINE, POINT)
+        return state, _reading(jnp.where(jnp.any(hits), kind, NONE), first[:2], last[:2])
+
+
+class CapacitiveSkin(NamedTuple):
+    """42 taxels under foam: compression -> capacitance -> low-pass -> threshold (Sec. II-B).
+
+    The foam stands proud of the rigid base by `foam`. An electrode's capacitance is the mean of
+    eps / gap over its length, the gap being what the object leaves of the foam.
+    """
+
+    foam: float | jax.Array = 0.010  # [m] thickness, uncompressed
+    max_compression: float | jax.Array = 0.9  # [1] share of the thickness that can give way
+    time_constant: float | jax.Array = 0.05  # [s] of the low-pass filter
+    threshold: float | jax.Array = 0.25  # [1] relative change of capacitance that counts as touch
+    noise: float | jax.Array = 0.0  # [1] standard deviation of each raw reading
+    gain_spread: float | jax.Array = 0.0  # [1] standard deviation of the taxels' gains about 1
+    dead_share: float | jax.Array = 0.0  # [1] probability that a taxel never answers
+
+    def init(self, key: jax.Array) -> SkinState:
+        """Draws each taxel's gain and whether it is dead."""
+        key, key_gain, key_dead = jax.random.split(key, 3)
+        n = len(TAXELS)
+        gain = 1 + self.gain_spread * jax.random.normal(key_gain, (n,))
+        alive = jax.random.uniform(key_dead, (n,)) >= self.dead_share
+        return SkinState(key, jnp.zeros(n), gain, alive)
+
+    def compression(self, footprint: Footprint) -> jax.Array:
+        """How far the object presses into the foam (T, S) [m] at each sample of each taxel."""
+        samples = jnp.asarray(TAXEL_SAMPLES, footprint.vertices.dtype)
+        depth = self.foam - fp.signed_distance(footprint, samples)
+        return jnp.clip(depth, 0.0, self.max_compression * self.foam)
+
+    def sense(
+        self, state: SkinState, footprint: Footprint, period: float
+    ) -> tuple[SkinState, Reading]:
+        """One scan of all taxels, filtered and compared to the threshold."""
+        gap = self.foam - self.compression(footprint)
+        change = jnp.mean(self.foam / gap, axis=-1) - 1.0
+        key, key_noise = jax.random.split(state.key)
+        noise = self.noise * jax.random.normal(key_noise, change.shape, change.dtype)
+        raw = state.gain * change + noise
+        signal = state.signal + (1 - jnp.exp(-period / self.time_constant)) * (raw - state.signal)
+        active = (signal > self.threshold) & state.alive
+        first, last = _extremes(active, jnp.asarray(TAXELS, change.dtype))
+        kind = jnp.minimum(jnp.sum(active), LINE)
+        return state._replace(key=key, signal=signal), _reading(kind, first, last)
+
+
+def _taxels(samples: int) -> np.ndarray:
+    """Sample points (42, samples, 2) [m] of the taxels, in strip order, in the robot frame."""
+    rows = []
+    for name, face in FACES.items():
+        count = BOARDS[name] * ELECTRODES * samples
+        s = (np.arange(count) + 0.5) / count * face.length
+        rows.append((face.start + s[:, None] * face.along).reshape(-1, samples, 2))
+    return np.concatenate(rows)
+
+
+TAXELS = _taxels(1)[:, 0]  # (42, 2) [m] middles of the taxels
+TAXEL_SAMPLES = _taxels(5)  # (42, 5, 2) [m] about 1 cm apart: no sharp corner slips between
+
+
+def _extremes(active: jax.Array, values: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The rows of `values` (n, m) at the first and the last True of `active` (n,)."""
+    first = jnp.argmax(active)
+    last = active.shape[0] - 1 - jnp.argmax(active[::-1])
+    return values[first], values[last]
+
+
+def _reading(kind: jax.Array, first: jax.Array, last: jax.Array) -> Reading:
+    """Sec. II-B: one position is the location itself, several give the mean of the extremes."""
+    location = jnp.where(kind == NONE, 0.0, 0.5 * (first + last))
+    return Reading(kind.astype(jnp.int32), location)

@@ -1,0 +1,297 @@
+"""One pushing trial: sense -> decide -> step, until the paper's success rule says stop.
+
+`control_step` is a pure function of one world. `advance` and `record` jit it over a batch of
+worlds of one shape family; a world that has ended is frozen, and a batch whose worlds have all
+ended stops.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rps_jax import errors, frames, law, scene
+from rps_jax import footprint as fp
+from rps_jax.footprint import Footprint
+from rps_jax.law import Details, Observation, RPSParams, RPSState, Twist
+from rps_jax.scene import JOINTS, Physics, mjx
+from rps_jax.skin import Reading, Skin, SkinState
+
+# A world is a runaway beyond these, far outside anything a base at 0.05 m/s can cause.
+_MAX_SPEED = 20.0  # [m/s], [rad/s]
+_MAX_DISTANCE = 100.0  # [m]
+
+
+class Strategy(NamedTuple):
+    """What decides: two pure functions. Static, so a change compiles another program."""
+
+    init: Callable[[RPSParams], Any]  # params -> state
+    step: Callable[[RPSParams, Any, Observation], tuple[Any, Twist, Details]]
+
+
+RPS = Strategy(RPSState.init, law.step_with_details)  # and NPS, by `params.reactive`
+
+
+@dataclass(frozen=True)
+class Rules:
+    """When a trial ends (Sec. IV-B). Static."""
+
+    horizon: float = 300.0  # [s]
+    max_lost: float = 150.0  # [s] without contact, in all, after the first touch
+
+    def __post_init__(self) -> None:
+        """Raises InputError for times that are not positive and finite."""
+        errors.check_finite("horizon", self.horizon, above=0, at_most=1e5, unit="s")
+        errors.check_finite("max_lost", self.max_lost, at_least=0, unit="s")
+
+
+class Stage(NamedTuple):
+    """What all worlds of a batch share."""
+
+    model: mjx.Model
+    data: mjx.Data  # a blank to be filled with each world's state
+
+
+class World(NamedTuple):
+    """What makes one world; every leaf is batched."""
+
+    fields: dict[str, jax.Array]  # of the model, as named by `scene.stack`
+    footprint: Footprint
+    skin: Skin
+    params: RPSParams
+    p_world_target: jax.Array  # (2,) [m]
+    qpos: jax.Array  # (10,) [m, rad] at the start
+    key: jax.Array  # of the skin's imperfections
+
+
+class Trial(NamedTuple):
+    """The running state of one world."""
+
+    qpos: jax.Array  # (10,) base x, y [m], yaw [rad]; object position [m], quaternion
+    qvel: jax.Array  # (9,) [m/s, rad/s]
+    warmstart: jax.Array  # (9,) [m/s^2, rad/s^2] last accelerations, for the solver
+    strategy: Any  # what the strategy remembers
+    skin: SkinState
+    steps: jax.Array  # () int32 control steps done
+    contact_steps: jax.Array  # () int32 of them in contact
+    lost_steps: jax.Array  # () int32 without contact after the first touch
+    sum_abs_l: jax.Array  # () [m] over the steps in contact
+    min_distance: jax.Array  # () [m] contact point to target; inf before the first touch
+    done: jax.Array  # () bool
+    success: jax.Array  # () bool
+    diverged: jax.Array  # () bool
+
+
+class Snapshot(NamedTuple):
+    """What one control step saw and did."""
+
+    time: jax.Array  # () [s]
+    qpos: jax.Array  # (10,)
+    reading: Reading
+    twist: Twist  # [m/s, m/s, rad/s] commanded, robot frame
+    details: Details
+    done: jax.Array  # () bool: the trial had ended
+
+
+class Outcome(NamedTuple):
+    """The result of one trial."""
+
+    success: jax.Array  # () bool
+    time: jax.Array  # () [s] at which it ended
+    min_distance: jax.Array  # () [m] contact point to target; inf if never touched
+    contact_lost_time: jax.Array  # () [s]
+    mean_abs_l: jax.Array  # () [m] the paper's D; NaN if never touched
+    diverged: jax.Array  # () bool
+    base_pose: jax.Array  # (3,) [m, m, rad] at the end
+    object_pose: jax.Array  # (3,) [m, m, rad] at the end
+
+
+def object_pose(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Planar position (2,) [m] and yaw () [rad] of the object in the world."""
+    free = qpos[JOINTS.object]
+    return free[:2], frames.yaw_of_quaternion(free[3:])
+
+
+def start(world: World, strategy: Strategy = RPS) -> Trial:
+    """The trial of a world before its first control step."""
+    zero, false = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+    return Trial(
+        qpos=world.qpos,
+        qvel=jnp.zeros_like(world.qpos[:9]),
+        warmstart=jnp.zeros_like(world.qpos[:9]),
+        strategy=strategy.init(world.params),
+        skin=world.skin.init(world.key),
+        steps=zero,
+        contact_steps=zero,
+        lost_steps=zero,
+        sum_abs_l=jnp.zeros_like(world.qpos[0]),
+        min_distance=jnp.full_like(world.qpos[0], jnp.inf),
+        done=false,
+        success=false,
+        diverged=false,
+    )
+
+
+def sense(world: World, trial: Trial, period: float) -> tuple[SkinState, Reading, Observation]:
+    """The skin's reading of the object where it stands now, and what the law is told."""
+    p_world_robot, yaw = trial.qpos[:2], trial.qpos[2]
+    p_world_object, object_yaw = object_pose(trial.qpos)
+    p_robot_object = frames.rotate(-yaw, p_world_object - p_world_robot)
+    placed = fp.place(world.footprint, p_robot_object, object_yaw - yaw)
+    state, reading = world.skin.sense(trial.skin, placed, period)
+    observation = Observation(
+        p_world_robot, yaw, reading.p_robot_contact, reading.in_contact, world.p_world_target
+    )
+    return state, reading, observation
+
+
+def drive(
+    stage: Stage, world: World, trial: Trial, twist: Twist, substeps: int
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Step the physics for one control period: (qpos, qvel, warmstart).
+
+    The base is a velocity source: before each step the commanded twist is written into its
+    joint velocities, turned into the world.
+    """
+    model = scene.apply(stage.model, world.fields)
+
+    def one(state, _):
+        qpos, qvel, warmstart = state
+        v_world = frames.rotate(qpos[2], jnp.stack([twist.v_x, twist.v_y]))
+        qvel = qvel.at[JOINTS.base].set(jnp.stack([*v_world, jnp.asarray(twist.omega)]))
+        data = stage.data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
+        data = mjx.step(model, data)
+        return (data.qpos, data.qvel, data.qacc_warmstart), None
+
+    state = (trial.qpos, trial.qvel, trial.warmstart)
+    return jax.lax.scan(one, state, length=substeps)[0]
+
+
+def control_step(
+    stage: Stage,
+    world: World,
+    trial: Trial,
+    *,
+    physics: Physics,
+    rules: Rules = Rules(),
+    strategy: Strategy = RPS,
+) -> tuple[Trial, Snapshot]:
+    """One pass of the loop of one world. A world that has ended comes back as it is."""
+    period = physics.control_period
+    time = trial.steps * period
+    skin, reading, observation = sense(world, trial, period)
+    state, twist, details = strategy.step(world.params, trial.strategy, observation)
+    snapshot = Snapshot(time, trial.qpos, reading, twist, details, trial.done)
+
+    touch = reading.in_contact
+    distance = frames.norm(law.displacement(observation))
+    lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
+    success = touch & (distance < world.params.d_success)
+    over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost)
+    told = trial._replace(
+        contact_steps=trial.contact_steps + touch,
+        lost_steps=lost_steps,
+        sum_abs_l=trial.sum_abs_l + jnp.where(touch, jnp.abs(reading.p_robot_contact[1]), 0.0),
+        min_distance=jnp.where(
+            touch, jnp.minimum(trial.min_distance, distance), trial.min_distance
+        ),
+        success=success & ~over,
+        done=success | over,
+    )
+
+    qpos, qvel, warmstart = drive(stage, world, trial, twist, physics.substeps)
+    sane = (
+        jnp.all(jnp.isfinite(qpos))
+        & jnp.all(jnp.abs(qvel) < _MAX_SPEED)
+        & jnp.all(jnp.abs(qpos) < _MAX_DISTANCE)
+    )
+    moved = told._replace(
+        qpos=qpos, qvel=qvel, warmstart=warmstart, strategy=state, skin=skin, steps=trial.steps + 1
+    )
+    stopped = told._replace(done=jnp.ones((), bool), diverged=~told.done & ~sane)
+    new = _select(told.done | ~sane, stopped, moved)
+    return _select(trial.done, trial, new), snapshot
+
+
+def _select(condition: jax.Array, yes: Any, no: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+
+
+def outcome(trial: Trial, period: float) -> Outcome:
+    """The result of a trial of control period `period` [s], batched or not."""
+    position, yaw = jax.vmap(object_pose)(trial.qpos.reshape(-1, 10))
+    pose = jnp.concatenate([position, yaw[:, None]], axis=-1)
+    return Outcome(
+        success=trial.success,
+        time=trial.steps * period,
+        min_distance=trial.min_distance,
+        contact_lost_time=trial.lost_steps * period,
+        mean_abs_l=jnp.where(
+            trial.contact_steps > 0, trial.sum_abs_l / jnp.maximum(trial.contact_steps, 1), jnp.nan
+        ),
+        diverged=trial.diverged,
+        base_pose=trial.qpos[..., JOINTS.base],
+        object_pose=pose.reshape(*trial.qpos.shape[:-1], 3),
+    )
+
+
+@partial(jax.jit, static_argnames=("strategy",))
+def start_all(worlds: World, live: jax.Array, strategy: Strategy = RPS) -> Trial:
+    """Trials of a batch of worlds; those not `live` (B,) are padding, ended from the start."""
+    trials = jax.vmap(partial(start, strategy=strategy))(worlds)
+    return trials._replace(done=~live)
+
+
+_STATIC = ("physics", "rules", "strategy", "steps")
+
+
+@partial(jax.jit, static_argnames=_STATIC, donate_argnames=("trials",))
+def advance(
+    stage: Stage,
+    worlds: World,
+    trials: Trial,
+    *,
+    physics: Physics,
+    rules: Rules = Rules(),
+    strategy: Strategy = RPS,
+    steps: int,
+) -> Trial:
+    """Up to `steps` control steps of a batch of worlds; fewer if all of them end before."""
+    one = partial(control_step, stage, physics=physics, rules=rules, strategy=strategy)
+
+    def some_run(carry):
+        count, trials = carry
+        return (count < steps) & ~jnp.all(trials.done)
+
+    def body(carry):
+        count, trials = carry
+        return count + 1, jax.vmap(one)(worlds, trials)[0]
+
+    return jax.lax.while_loop(some_run, body, (0, trials))[1]
+
+
+@partial(jax.jit, static_argnames=(*_STATIC, "every"), donate_argnames=("trials",))
+def record(
+    stage: Stage,
+    worlds: World,
+    trials: Trial,
+    *,
+    physics: Physics,
+    rules: Rules = Rules(),
+    strategy: Strategy = RPS,
+    steps: int,
+    every: int = 1,
+) -> tuple[Trial, Snapshot]:
+    """`steps` control steps of a batch, with every `every`-th snapshot: (steps // every, B, ...)."""
+    one = partial(control_step, stage, physics=physics, rules=rules, strategy=strategy)
+
+    def body(trials, _):
+        trials, snapshot = jax.vmap(one)(worlds, trials)
+        return jax.lax.fori_loop(1, every, lambda _, t: jax.vmap(one)(worlds, t)[0], trials), snapshot
+
+    return jax.lax.scan(body, trials, length=steps // every)
