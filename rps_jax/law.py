@@ -114,7 +114,7 @@ def check(params: RPSParams) -> RPSParams:
 
 
 def _sgn(x: jax.Array) -> jax.Array:
-    """sgn with sgn(0) = 0: a centred contact asks for no lateral motion."""
+    """Sgn with sgn(0) = 0: a centred contact asks for no lateral motion."""
     return jnp.sign(x)
 
 
@@ -220,9 +220,7 @@ def step_with_details(
 
 
 @jax.jit
-def step(
-    params: RPSParams, state: RPSState, observation: Observation
-) -> tuple[RPSState, Twist]:
+def step(params: RPSParams, state: RPSState, observation: Observation) -> tuple[RPSState, Twist]:
     """Algorithm 1: one control step of RPS (or NPS, by `params.reactive`).
 
     In contact: the saturated twist of Eqs. 1-9, or zero once ||d|| < d_success. Without contact,

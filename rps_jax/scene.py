@@ -121,6 +121,7 @@ def load(
     friction: Friction = FRICTION["S1"],
     *,
     rear: Side = "near",
+    mass: float | None = None,
 ) -> Scene:
     """Compile a scene.
 
@@ -130,24 +131,42 @@ def load(
       friction: coefficients of its two contacts.
       rear: which side the nonuniform box's load stands on, nearest the robot or farthest; the
         paper says "rear left corner".
+      mass: of the object [kg], its inertia scaled along; None: the object's own.
 
     Raises:
-      InputError: unknown name, or friction that is not a positive finite number.
+      InputError: unknown name, or friction or mass that is not a positive finite number.
     """
     errors.check_name("object", name, OBJECTS)
     errors.check_name("rear", rear, ("near", "far"))
-    for side, value in friction._asdict().items():
-        errors.check_finite(f"friction.{side}", value, above=0, at_most=10)
+    check(friction, mass)
     spec = mujoco.MjSpec.from_file(str(mjcf_folder() / f"{name}.xml"))
     for geom in spec.geoms:
         if geom.name == "load" and rear == "far":
             geom.pos[0] = -geom.pos[0]
     for pair in spec.pairs:
         pair.friction[:2] = friction.ground if pair.name == "ground_object" else friction.robot
+    if mass is not None:
+        _set_mass(spec, mass)
     _set_options(spec.option, physics)
     model = spec.compile()
     stripped = _strip(spec, model)
     return Scene(name, FAMILIES[name], model, stripped, _footprint(stripped))
+
+
+def check(friction: Friction, mass: float | None) -> None:
+    """Raises InputError unless friction and mass are positive and finite, as MuJoCo does not."""
+    for side, value in friction._asdict().items():
+        errors.check_finite(f"friction {side}", value, above=0, at_most=10)
+    if mass is not None:
+        errors.check_finite("mass", mass, above=0, at_most=1e4, unit="kg")
+
+
+def _set_mass(spec: mujoco.MjSpec, mass: float) -> None:
+    """Scale the object's geoms to this mass in all [kg]."""
+    geoms = [geom for geom in spec.body("object").geoms if geom.mass > 0]
+    total = sum(geom.mass for geom in geoms)
+    for geom in geoms:
+        geom.mass *= mass / total
 
 
 def _set_options(option: mujoco.MjOption, physics: Physics) -> None:

@@ -162,6 +162,9 @@ class CapacitiveSkin(NamedTuple):
         return state._replace(key=key, signal=signal), _reading(kind, first, last)
 
 
+SKINS = {"ideal": IdealSkin(), "capacitive": CapacitiveSkin()}
+
+
 def _taxels(samples: int) -> np.ndarray:
     """Sample points (42, samples, 2) [m] of the taxels, in strip order, in the robot frame."""
     rows = []

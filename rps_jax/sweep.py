@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
+import os
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -18,9 +18,9 @@ import numpy as np
 
 from rps_jax import errors, law, scene, skin, trial
 from rps_jax.law import RPSParams
-from rps_jax.scene import FRICTION, PHYSICS, Friction, Physics, Scene, Side, mjx
+from rps_jax.scene import PHYSICS, Friction, Physics, Scene, Side, mjx
 from rps_jax.skin import IdealSkin, Skin
-from rps_jax.trial import Outcome, Rules, Stage, Trial, World
+from rps_jax.trial import Outcome, Rules, Snapshot, Stage, Trial, World
 
 _SEGMENT = 10.0  # [s] simulated between two looks at which trials have ended
 
@@ -33,6 +33,7 @@ class Case:
     friction: Friction
     p_world_target: tuple[float, float]  # [m]
     params: RPSParams
+    mass: float | None = None  # [kg] of the object; None: its own
 
     def __post_init__(self) -> None:
         """Raises InputError for anything that names or means no trial."""
@@ -46,6 +47,7 @@ class Case:
                 f"covers |x| <= {skin.HALF_LENGTH:g} m and |y| <= {skin.HALF_WIDTH:g} m."
             )
         law.check(self.params)
+        scene.check(self.friction, self.mass)
 
 
 @dataclass(frozen=True)
@@ -84,34 +86,46 @@ class Timing:
     simulated: float  # [s] of trials
 
 
+@dataclass(frozen=True)
+class Trace:
+    """One trial, seen every `interval` [s]: arrays over time, (T, ...)."""
+
+    snapshots: Snapshot
+    outcome: Outcome  # without a leading axis
+    timing: Timing
+
+
+def scene_of(case: Case, setting: Setting) -> Scene:
+    """The scene that a case is run in."""
+    return scene.load(
+        case.object, setting.physics, case.friction, rear=setting.rear, mass=case.mass
+    )
+
+
 def build(cases: Sequence[Case], setting: Setting) -> tuple[Stage, World]:
     """Worlds of cases of one shape family, stacked on the host: leaves (len(cases), ...).
 
     World `i` draws its skin's imperfections from (setting.seed, i).
     """
-    scenes: dict[tuple[str, Friction], Scene] = {}
-    for case in cases:
-        if (case.object, case.friction) not in scenes:
-            scenes[case.object, case.friction] = scene.load(
-                case.object, setting.physics, case.friction, rear=setting.rear
-            )
-    order = {key: i for i, key in enumerate(scenes)}
-    which = np.array([order[case.object, case.friction] for case in cases])
-    model, fields = scene.stack([s.physics for s in scenes.values()])
+    kinds = list(dict.fromkeys((case.object, case.friction, case.mass) for case in cases))
+    which = np.array([kinds.index((case.object, case.friction, case.mass)) for case in cases])
+    first = [cases[int(np.argmax(which == i))] for i in range(len(kinds))]
+    scenes = [scene_of(case, setting) for case in first]
+    model, fields = scene.stack([s.physics for s in scenes])
     dtype = model.qpos0.dtype
     n = len(cases)
     world = World(
         fields={name: np.asarray(values)[which] for name, values in fields.items()},
-        footprint=_stack([s.footprint for s in scenes.values()], dtype, which),
+        footprint=_stack([s.footprint for s in scenes], dtype, which),
         skin=_stack([setting.skin], dtype, np.zeros(n, int)),
         params=_stack([case.params for case in cases], dtype),
         p_world_target=np.array([case.p_world_target for case in cases], dtype),
-        qpos=_stack([scene.initial_qpos(s, setting.gap) for s in scenes.values()], dtype, which),
+        qpos=_stack([scene.initial_qpos(s, setting.gap) for s in scenes], dtype, which),
         key=np.asarray(
             jax.vmap(partial(jax.random.fold_in, jax.random.PRNGKey(setting.seed)))(np.arange(n))
         ),
     )
-    return Stage(model, mjx.make_data(next(iter(scenes.values())).physics)), world
+    return Stage(model, mjx.make_data(scenes[0].physics)), world
 
 
 def _stack(trees: Sequence[Any], dtype: np.dtype, which: np.ndarray | None = None) -> Any:
@@ -137,7 +151,11 @@ class _Queue:
 
     def __init__(self, indices: list[int], cases: Sequence[Case], setting: Setting, slots: int):
         self.indices = indices
-        self.waiting = deque(range(len(indices)))
+        # Without reaction most trials lose the object and wait for their end: the longest go
+        # first, so that the last slots to run are not theirs.
+        self.waiting = deque(
+            sorted(range(len(indices)), key=lambda i: cases[indices[i]].params.reactive)
+        )
         self.slots = min(slots, len(indices))
         self.setting = setting
         self.stage, self.worlds = build([cases[i] for i in indices], setting)
@@ -161,14 +179,19 @@ class _Queue:
                 physics = self.setting.physics
                 steps = max(1, round(_SEGMENT / physics.control_period))
                 self._program = trial.advance.lower(
-                    self.stage, worlds, trials, physics=physics, rules=self.setting.rules, steps=steps
+                    self.stage,
+                    worlds,
+                    trials,
+                    physics=physics,
+                    rules=self.setting.rules,
+                    steps=steps,
                 ).compile()
             return self._program
 
 
 def default_slots() -> int:
-    """Worlds stepped at once: few on a processor, whose caches are small, many on an accelerator."""
-    return 32 if jax.default_backend() == "cpu" else 8192
+    """Worlds stepped at once: few on a processor (small caches), many on an accelerator."""
+    return 24 if jax.default_backend() == "cpu" else 8192
 
 
 def run(
@@ -186,7 +209,7 @@ def run(
       setting: what they share.
       slots: worlds stepped at once by one worker. Results are bit-identical for equal slots on
         one kind of device, whatever shares the batch.
-      workers: host threads that each drive a batch; by default one per two... see `_workers`.
+      workers: host threads that each drive a batch of their own; see `default_workers`.
       report: called after every segment, from worker threads, one at a time.
 
     Returns:
@@ -201,20 +224,24 @@ def run(
     queues = [_Queue(indices, cases, setting, slots) for indices in families.values()]
     results: list[Outcome | None] = [None] * len(cases)
     shared = _Shared(results, report)
-    count = workers or _workers()
+    count = workers or default_workers()
     with ThreadPoolExecutor(count) as pool:
-        jobs = [pool.submit(_work, queues[w % len(queues):] + queues, shared) for w in range(count)]
-        for job in jobs:
-            job.result()
+        jobs = [
+            pool.submit(_work, queues[w % len(queues) :] + queues, shared) for w in range(count)
+        ]
+        try:
+            for job in as_completed(jobs):
+                job.result()
+        except BaseException:
+            shared.stop = True
+            raise
     total = time.perf_counter() - began
     outcome = jax.tree.map(lambda *rows: np.stack(rows), *results)
     return outcome, Timing(shared.compile, total - shared.compile, shared.simulated)
 
 
-def _workers() -> int:
-    """Threads: XLA runs a batch this small on one core of a processor, so one for each core."""
-    import os
-
+def default_workers() -> int:
+    """One thread for each core of a processor, since XLA steps a small batch on one core."""
     return os.cpu_count() or 1 if jax.default_backend() == "cpu" else 1
 
 
@@ -225,11 +252,13 @@ class _Shared:
         self.results = results
         self.simulated = 0.0
         self.compile = 0.0
+        self.stop = False  # set when one worker fails or the user interrupts
         self._finished = 0
         self._report = report
         self._lock = threading.Lock()
 
     def add(self, rows: dict[int, Outcome], simulated: float) -> None:
+        """Trials that ended in a segment, and the time [s] all of the worker's trials advanced."""
         with self._lock:
             for index, outcome in rows.items():
                 self.results[index] = outcome
@@ -238,6 +267,7 @@ class _Shared:
             self._report(Progress(self._finished, self.simulated))
 
     def compiled(self, seconds: float) -> None:
+        """One worker waited this long for a program."""
         with self._lock:
             self.compile = max(self.compile, seconds)
 
@@ -260,7 +290,7 @@ def _drain(queue: _Queue, shared: _Shared) -> None:
     began = time.perf_counter()
     program = queue.program(worlds, trials)
     shared.compiled(time.perf_counter() - began)
-    while live.any():
+    while live.any() and not shared.stop:
         before = np.asarray(trials.steps)
         trials = program(queue.stage, worlds, trials)
         steps = np.asarray(trials.steps)
@@ -276,3 +306,34 @@ def _drain(queue: _Queue, shared: _Shared) -> None:
             live[fresh] = True
             worlds = jax.device_put(_rows(queue.worlds, held))
             trials = _refill(worlds, trials, np.isin(np.arange(queue.slots), fresh))
+
+
+def follow(
+    case: Case,
+    setting: Setting = Setting(),
+    *,
+    interval: float = 0.1,
+    report: Callable[[Progress], None] = lambda progress: None,
+) -> Trace:
+    """Run one trial to its end and keep what it looked like every `interval` [s]."""
+    period = setting.physics.control_period
+    every = max(1, round(interval / period))
+    steps = every * max(1, round(_SEGMENT / (every * period)))
+    stage, worlds = build([case], setting)
+    worlds = jax.device_put(worlds)
+    trials = trial.start_all(worlds, np.ones(1, bool))
+    options = {"physics": setting.physics, "rules": setting.rules}
+    began = time.perf_counter()
+    program = trial.record.lower(
+        stage, worlds, trials, **options, steps=steps, every=every
+    ).compile()
+    compiled = time.perf_counter()
+    parts = []
+    while not bool(trials.done.all()):
+        trials, snapshots = program(stage, worlds, trials)
+        parts.append(jax.device_get(snapshots))
+        report(Progress(int(trials.done.sum()), float(trials.steps[0]) * period))
+    whole = jax.tree.map(lambda *arrays: np.concatenate(arrays)[:, 0], *parts)
+    outcome = _rows(jax.device_get(trial.outcome(trials, period)), 0)
+    timing = Timing(compiled - began, time.perf_counter() - compiled, float(outcome.time))
+    return Trace(_rows(whole, ~whole.done), outcome, timing)

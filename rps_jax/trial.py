@@ -287,11 +287,13 @@ def record(
     steps: int,
     every: int = 1,
 ) -> tuple[Trial, Snapshot]:
-    """`steps` control steps of a batch, with every `every`-th snapshot: (steps // every, B, ...)."""
+    """`steps` control steps of a batch, and every `every`-th snapshot (steps // every, B, ...)."""
     one = partial(control_step, stage, physics=physics, rules=rules, strategy=strategy)
 
     def body(trials, _):
         trials, snapshot = jax.vmap(one)(worlds, trials)
-        return jax.lax.fori_loop(1, every, lambda _, t: jax.vmap(one)(worlds, t)[0], trials), snapshot
+        return jax.lax.fori_loop(
+            1, every, lambda _, t: jax.vmap(one)(worlds, t)[0], trials
+        ), snapshot
 
     return jax.lax.scan(body, trials, length=steps // every)

@@ -1,0 +1,65 @@
+"""The Reactive Pushing Strategy as a pure function, and thousands of MJX worlds to try it in.
+
+Importing this package sets no flags, writes no file, prints nothing and touches no device: its
+names are loaded when first used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rps_jax.errors import InputError
+    from rps_jax.footprint import Footprint
+    from rps_jax.law import Observation, RPSParams, RPSState, Twist, step
+    from rps_jax.scene import FRICTION, OBJECTS, PHYSICS, Friction, Physics
+    from rps_jax.skin import CapacitiveSkin, IdealSkin
+    from rps_jax.sweep import Case, Setting, follow, run
+    from rps_jax.trial import Outcome, Rules
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "FRICTION",
+    "OBJECTS",
+    "PHYSICS",
+    "CapacitiveSkin",
+    "Case",
+    "Footprint",
+    "Friction",
+    "IdealSkin",
+    "InputError",
+    "Observation",
+    "Outcome",
+    "Physics",
+    "RPSParams",
+    "RPSState",
+    "Rules",
+    "Setting",
+    "Twist",
+    "follow",
+    "run",
+    "step",
+]
+
+_MODULES = {
+    "errors": ("InputError",),
+    "footprint": ("Footprint",),
+    "law": ("Observation", "RPSParams", "RPSState", "Twist", "step"),
+    "scene": ("FRICTION", "OBJECTS", "PHYSICS", "Friction", "Physics"),
+    "skin": ("CapacitiveSkin", "IdealSkin"),
+    "sweep": ("Case", "Setting", "follow", "run"),
+    "trial": ("Outcome", "Rules"),
+}
+_HOME = {name: module for module, names in _MODULES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(importlib.import_module(f"rps_jax.{_HOME[name]}"), name)
+    raise AttributeError(f"module 'rps_jax' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME])

@@ -1,0 +1,38 @@
+"""What works on this machine, and how to mend what does not."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+from rps_jax import record, scene, video
+
+
+def report(cache: Path) -> str:
+    """Versions, devices, folders and the state of rendering, one line each."""
+    environment = record.environment()
+    device = environment["device"]
+    lines = [
+        f"python    {environment['python']} on {environment['platform']}",
+        *(f"{name:<12}{version or 'missing'}" for name, version in environment["packages"].items()),
+        f"device    {device['count']} x {device['kind']} ({device['platform']}), "
+        f"{environment['processors']} processors",
+        f"commit    {environment['commit'] or 'not in a checkout'}",
+        f"scenes    {scene.mjcf_folder()}",
+    ]
+    checks = [("cache", *_writable(cache)), *video.check()]
+    for what, works, mend in checks:
+        lines.append(f"{what:<12}{'ok' if works else 'FAILS: ' + mend}")
+    return "\n".join(lines)
+
+
+def _writable(folder: Path) -> tuple[bool, str]:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        reason = os.strerror(error.errno or 0)
+        return False, f"{folder} ({reason}): set RPS_CACHE to a writable folder"
+    return True, ""

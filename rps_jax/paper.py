@@ -1,0 +1,31 @@
+"""What the paper ran and what it reports, as data."""
+
+from __future__ import annotations
+
+TARGETS = tuple(
+    (float(x), float(y)) for x in (2, 1, 0, -1, -2) for y in (2, 1, 0, -1, -2) if (x, y) != (0, 0)
+)  # [m] Sec. IV-B: a grid of 1 m, without the robot's place
+
+STRATEGIES = ("rps", "nps", "aps")
+
+# Table II: successes of 24, keyed by strategy, object and friction set.
+TABLE_II = {
+    ("rps", "box", "S1"): 23,
+    ("rps", "box", "S2"): 24,
+    ("rps", "cylinder", "S1"): 19,
+    ("rps", "cylinder", "S2"): 19,
+    ("rps", "nonuniform_box", "S1"): 19,
+    ("rps", "nonuniform_box", "S2"): 23,
+    ("nps", "box", "S1"): 2,
+    ("nps", "box", "S2"): 5,
+    ("nps", "cylinder", "S1"): 2,
+    ("nps", "cylinder", "S2"): 2,
+    ("nps", "nonuniform_box", "S1"): 6,
+    ("nps", "nonuniform_box", "S2"): 6,
+    ("aps", "box", "S1"): 2,
+    ("aps", "box", "S2"): 2,
+    ("aps", "cylinder", "S1"): 2,
+    ("aps", "cylinder", "S2"): 2,
+    ("aps", "nonuniform_box", "S1"): 0,
+    ("aps", "nonuniform_box", "S2"): 0,
+}

@@ -1,0 +1,133 @@
+"""Run folders: what was asked, what it ran on, and labelled results. Nothing is ever pickled."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from rps_jax.errors import InputError
+
+_PACKAGES = ("rps_jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "scipy", "xarray")
+
+
+def prepare(folder: Path, *, overwrite: bool = False) -> Path:
+    """The folder, made if need be and tried for writing.
+
+    Raises:
+      InputError: it cannot be written, or holds a run already and `overwrite` is off.
+    """
+    if (folder / "config.json").exists() and not overwrite:
+        raise InputError(
+            f"out = {folder} already holds a run: choose another folder or pass --overwrite."
+        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(
+            f"out = {folder} cannot be written ({error.strerror}): choose a writable folder."
+        ) from error
+    return folder
+
+
+def atomic(path: Path, write: Callable[[Path], Any]) -> Path:
+    """Have `write` fill a file beside `path`, then put it in place whole."""
+    partial = path.with_name(f".{path.stem}.partial{path.suffix}")
+    try:
+        write(partial)
+        with open(partial, "rb") as file:
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return path
+
+
+def write_json(path: Path, content: Any) -> Path:
+    """Readable JSON, keys in the order given."""
+    text = json.dumps(content, indent=2, allow_nan=True) + "\n"
+    return atomic(path, lambda partial: partial.write_text(text))
+
+
+def write_results(path: Path, results: xr.Dataset) -> Path:
+    """NetCDF 4. The file depends on the results alone, not on when or where it is written."""
+    return atomic(path, lambda partial: results.to_netcdf(partial, engine="h5netcdf"))
+
+
+def read_results(folder: Path) -> xr.Dataset:
+    """The results of a run folder.
+
+    Raises:
+      InputError: the folder holds no results, or its file cannot be read.
+    """
+    path = Path(folder) / "results.nc"
+    if not path.exists():
+        raise InputError(f"run = {folder} holds no results.nc: give the folder of a finished run.")
+    try:
+        return xr.load_dataset(path, engine="h5netcdf")
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{path} is corrupt ({error}): run again, or restore it.") from error
+
+
+def environment() -> dict[str, Any]:
+    """Versions, device, commit and command of this process."""
+    import jax
+
+    device = jax.devices()[0]
+    return {
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "commit": commit(),
+        "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "processors": os.cpu_count(),
+        "device": {
+            "platform": device.platform,
+            "kind": device.device_kind,
+            "count": jax.device_count(),
+        },
+        "x64": bool(jax.config.jax_enable_x64),
+        "packages": {name: _version(name) for name in _PACKAGES},
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def commit() -> str | None:
+    """The git commit of the checkout this code runs from, marked if changed; None elsewhere."""
+    here = Path(__file__).resolve().parent
+
+    def git(*arguments: str) -> str:
+        return subprocess.run(
+            ["git", "-C", str(here), *arguments],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=10,
+        ).stdout.strip()
+
+    try:
+        if Path(git("rev-parse", "--show-toplevel")) != here.parent:
+            return None
+        return git("rev-parse", "HEAD") + (
+            "-changed" if git("status", "--porcelain", "-uno") else ""
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
