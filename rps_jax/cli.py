@@ -90,8 +90,8 @@ class Push(Common):
     """rps or nps."""
     video: bool = True
     """Film the push."""
-    speed: float = 8.0
-    """Playback speed of the film, times real time."""
+    film_length: float = 12.0
+    """Length of the film [s], whatever the trial's."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def cache_folder() -> Path:
     return Path(os.environ.get("RPS_CACHE") or Path(base) / "rps_jax")
 
 
-def _use_cache() -> None:
+def use_cache() -> None:
     """Keep compiled programs, if the folder can be written; a run needs no cache."""
     import jax
 
@@ -160,7 +160,7 @@ def _assignments(kind: str, texts: Sequence[str], known: Sequence[str]) -> dict[
         if not equals:
             raise InputError(f"{kind} '{text}' is not allowed: write name=value.")
         errors.check_name(kind, name, known)
-        values[name] = errors.check_number(f"{kind} {name}", value)  # pyright: ignore[reportArgumentType]
+        values[name] = errors.check_number(f"{kind} {name}", value)
     return values
 
 
@@ -184,7 +184,7 @@ def _friction(text: str) -> Friction:
     if len(parts) != 2:
         raise InputError(f"friction '{text}' is not allowed: write S1, S2 or ground,robot.")
     ground, robot = (
-        errors.check_finite(f"friction {name}", value, above=0, at_most=10)  # pyright: ignore[reportArgumentType]
+        errors.check_finite(f"friction {name}", value, above=0, at_most=10)
         for name, value in zip(("ground", "robot"), parts, strict=True)
     )
     return scene.Friction(ground, robot)
@@ -235,7 +235,7 @@ def _open(common: Common, command: str) -> Path:
 
     out = common.out or Path("runs") / f"{command}-{time.strftime('%Y%m%d-%H%M%S')}"
     record.prepare(out, overwrite=common.overwrite)
-    _use_cache()
+    use_cache()
     record.write_json(out / "environment.json", record.environment())
     return out
 
@@ -250,7 +250,7 @@ def _write_config(
         "params": {name: values._asdict() for name, values in params.items()},
         "physics": dataclasses.asdict(setting.physics),
         "rules": dataclasses.asdict(setting.rules),
-        "skin": {"kind": common.skin, **setting.skin._asdict()},  # pyright: ignore[reportAttributeAccessIssue]
+        "skin": {"kind": common.skin, **setting.skin._asdict()},
     }
     record.write_json(out / "config.json", config)
 
@@ -282,13 +282,12 @@ def _table(options: Table) -> int:
     out = _open(options, "table")
     _write_config(out, options, setting, {s: _params(options, s) for s in options.strategies})
 
-    with tqdm(total=len(cases), unit="trial", desc="compile") as bar:
+    with tqdm(total=len(cases), unit="trial", desc="compile", mininterval=0.5) as bar:
 
         def report(progress: sweep.Progress) -> None:
             bar.set_description("push", refresh=False)
             bar.set_postfix_str(f"{progress.simulated:.0f} s simulated", refresh=False)
             bar.update(progress.finished - bar.n)
-            bar.refresh()
 
         outcome, timing = sweep.run(
             cases, setting, slots=options.slots, workers=options.workers, report=report
@@ -296,7 +295,7 @@ def _table(options: Table) -> int:
     results = score.dataset(outcome, options.strategies, options.objects, options.friction, targets)
     record.write_results(out / "results.nc", results)
     text = f"{score.table(results)}\n\n{score.summary(results)}\n"
-    record.atomic(out / "table.txt", lambda partial: partial.write_text(text))
+    record.write_text(out / "table.txt", text)
     figures.min_distance(results, out / "min_distance.png")
     print(text)
     _tell(timing)
@@ -314,7 +313,7 @@ def _push(options: Push) -> int:
     case = sweep.Case(
         options.object, _friction(options.friction), options.target, params, options.mass
     )
-    errors.check_finite("speed", options.speed, above=0, at_most=1000)
+    errors.check_finite("film_length", options.film_length, above=0, at_most=600, unit="s")
     out = _open(options, "push")
     _write_config(out, options, setting, {options.strategy: params})
 
@@ -343,20 +342,22 @@ def _push(options: Push) -> int:
 
 def _film(options: Push, case: Case, setting: Setting, trace: Trace, path: Path) -> None:
     """The video; without the means for one, a line that says how to mend it."""
+    import numpy as np
     from tqdm import tqdm
 
-    from rps_jax import sweep, video
+    from rps_jax import sweep, trial, video
 
     fps = 25
-    wanted = max(2, round(float(trace.outcome.time) / options.speed * fps))
-    last = len(trace.snapshots.time) - 1
-    rows = [round(i * last / (wanted - 1)) for i in range(wanted)]
+    count = max(2, round(options.film_length * fps))
+    rows = np.linspace(0, len(trace.snapshots.time) - 1, count).round().astype(int)
+    contacts = np.asarray(trial.p_world_contact(trace.snapshots))
     try:
         video.render(
             sweep.scene_of(case, setting),
             tqdm(trace.snapshots.qpos[rows], unit="frame", desc="film"),
             path,
-            p_world_target=case.p_world_target,
+            p_world_target=np.array(case.p_world_target),
+            p_world_contacts=contacts[rows],
             fps=fps,
         )
     except video.VideoError as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterable
+from typing import Any
 
 
 class InputError(ValueError):
@@ -13,7 +14,7 @@ class InputError(ValueError):
 
 def check_number(
     name: str,
-    value: float,
+    value: Any,
     *,
     above: float = -math.inf,
     at_least: float = -math.inf,
@@ -42,7 +43,7 @@ def check_number(
     return number
 
 
-def check_finite(name: str, value: float, **bounds) -> float:
+def check_finite(name: str, value: Any, **bounds: Any) -> float:
     """`check_number`, and finite."""
     number = check_number(name, value, **bounds)
     if math.isinf(number):

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg", force=False)
-
+import jax
 import numpy as np
 import xarray as xr
 from matplotlib import patches
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rps_jax import record, skin
+from rps_jax import record, skin, trial
 from rps_jax.skin import NONE
 from rps_jax.sweep import Case, Trace
 
@@ -110,11 +107,11 @@ def one_trial(case: Case, trace: Trace, path: Path) -> Path:
 
     Blue shade: Realignment State. Yellow: no contact.
     """
-    seen = trace.snapshots
+    seen = jax.tree.map(np.asarray, trace.snapshots)
     touching = seen.reading.contact_type != NONE
     figure = Figure(figsize=(11, 6), layout="constrained")
     grid = figure.add_gridspec(3, 2, width_ratios=(1.1, 1))
-    _path(figure.add_subplot(grid[:, 0]), case, trace, touching)
+    _path(figure.add_subplot(grid[:, 0]), case, trace)
 
     velocity = figure.add_subplot(grid[0, 1])
     velocity.plot(seen.time, seen.twist.v_x, label="$v_x$ [m/s]", color="C0")
@@ -142,8 +139,9 @@ def one_trial(case: Case, trace: Trace, path: Path) -> Path:
         _shade(ax, seen.time, seen.details.realigning, _SHADES["realigning"])
         _shade(ax, seen.time, ~touching, _SHADES["lost"])
     result = "reached" if trace.outcome.success else "not reached"
+    x, y = case.p_world_target
     figure.suptitle(
-        f"{_TITLES[case.object]}, target ({case.p_world_target[0]:g}, {case.p_world_target[1]:g}) m, "
+        f"{_TITLES[case.object]}, target ({x:g}, {y:g}) m, "
         f"$\\mu$ ground {case.friction.ground:g}, robot {case.friction.robot:g}: "
         f"{result} at {float(trace.outcome.time):.1f} s"
     )
@@ -163,16 +161,17 @@ def _shade(ax: Axes, time: np.ndarray, active: np.ndarray, colour: str) -> None:
     )
 
 
-def _path(ax: Axes, case: Case, trace: Trace, touching: np.ndarray) -> None:
+def _path(ax: Axes, case: Case, trace: Trace) -> None:
     """Left column of Fig. 6: the way of the base and of the contact point."""
-    pose = trace.snapshots.qpos[:, :3]
-    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-    contact = trace.snapshots.reading.p_robot_contact
-    world = pose[:, :2] + np.stack(
-        [c * contact[:, 0] - s * contact[:, 1], s * contact[:, 0] + c * contact[:, 1]], axis=-1
-    )
+    pose = np.asarray(trace.snapshots.qpos[:, :3])
     ax.plot(*pose[:, :2].T, color="0.35", label="base")
-    ax.plot(*world[touching].T, ".", ms=1.5, color="C0", label="contact point")
+    ax.plot(
+        *np.asarray(trial.p_world_contact(trace.snapshots)).T,
+        ".",
+        ms=1.5,
+        color="C0",
+        label="contact point",
+    )
     for index in np.linspace(0, len(pose) - 1, 7).astype(int):
         ax.add_patch(_base_patch(pose[index], fill=False))
     ax.plot(*case.p_world_target, "*", ms=14, color="C3", label="target")

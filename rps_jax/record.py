@@ -58,6 +58,11 @@ def atomic(path: Path, write: Callable[[Path], Any]) -> Path:
 def write_json(path: Path, content: Any) -> Path:
     """Readable JSON, keys in the order given."""
     text = json.dumps(content, indent=2, allow_nan=True) + "\n"
+    return write_text(path, text)
+
+
+def write_text(path: Path, text: str) -> Path:
+    """A text file, whole or not at all."""
     return atomic(path, lambda partial: partial.write_text(text))
 
 

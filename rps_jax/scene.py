@@ -12,7 +12,7 @@ import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,13 @@ with contextlib.redirect_stdout(io.StringIO()):  # MJX reports on the console th
     from mujoco import mjx
 
 Side = Literal["near", "far"]
+# All that differs between objects of one shape family, as paths into an MJX model.
+FIELDS = (
+    *(f".stat.mean{name}" for name in ("inertia", "mass", "size")),
+    *(f".body_{name}" for name in ("pos", "ipos", "iquat", "mass", "subtreemass", "inertia")),
+    *(".body_invweight0", ".dof_invweight0", ".dof_M0", ".qpos0", ".qpos_spring"),
+    *(".geom_size", ".geom_aabb", ".geom_rbound", ".pair_friction"),
+)
 # An inertial frame off by this [m] keeps MuJoCo from compiling centred bodies to a structure of
 # their own, which could not be batched with the others.
 _OFF_CENTRE = 1e-6
@@ -226,23 +233,30 @@ def initial_qpos(scene: Scene, gap: float = 0.02, yaw: float = 0.0) -> np.ndarra
 
 
 def stack(models: list[mujoco.MjModel]) -> tuple[mjx.Model, dict[str, jax.Array]]:
-    """One MJX model for all, and the fields in which they differ: name -> (len(models), ...).
+    """One MJX model for all, and the fields that vary: name -> (len(models), ...).
 
-    Fields are found by comparing the compiled models leaf by leaf, so nothing derived from a
-    mass, a size or a friction is forgotten.
+    The fields are always the same ones, so that a world's numbers depend neither on what it is
+    batched with nor on a program of its own. They are copied from compiled models, so nothing
+    that MuJoCo derives from a mass, a size or a friction is forgotten.
+
+    Raises:
+      ValueError: the models differ in anything but `FIELDS`.
     """
     # A static copy of the bounding radii, which only height fields use, would bar stacking.
-    unused = {"_impl.geom_rbound_hfield": np.zeros(models[0].ngeom)}
+    unused: dict[str, Any] = {"_impl.geom_rbound_hfield": np.zeros(models[0].ngeom)}
     trees = [mjx.put_model(m).tree_replace(unused) for m in models]
     leaves, structures = zip(*map(jax.tree_util.tree_flatten_with_path, trees), strict=True)
     if any(s != structures[0] for s in structures):
         raise ValueError("models of different structure cannot be stacked")
     fields = {}
     for columns in zip(*leaves, strict=True):
+        name = jax.tree_util.keystr(columns[0][0])
         values = [np.asarray(leaf) for _, leaf in columns]
-        if any(not np.array_equal(v, values[0]) for v in values):
-            fields[jax.tree_util.keystr(columns[0][0])] = jnp.stack(values)
-    return jax.tree.unflatten(structures[0], [leaf for _, leaf in leaves[0]]), fields
+        if name in FIELDS:
+            fields[name] = jnp.stack(values)
+        elif any(not np.array_equal(v, values[0]) for v in values):
+            raise ValueError(f"models that differ in {name} cannot be stacked")
+    return trees[0], fields
 
 
 def apply(model: mjx.Model, fields: dict[str, jax.Array]) -> mjx.Model:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -67,7 +68,8 @@ def trace_dataset(trace: Trace) -> xr.Dataset:
     """One trial over time: variables (time, ...), its outcome as scalars."""
     seen = trace.snapshots
 
-    def over_time(values: np.ndarray, unit: str, *dims: str) -> xr.Variable:
+    def over_time(values: Any, unit: str, *dims: str) -> xr.Variable:
+        values = np.asarray(values)
         values = values.astype(np.int8) if values.dtype == bool else values
         return xr.Variable(("time", *dims), values, {"units": unit})
 

@@ -65,7 +65,7 @@ class Setting:
         """Raises InputError for a gap or a seed that means nothing."""
         errors.check_finite("gap", self.gap, at_least=0, at_most=1, unit="m")
         errors.check_finite("seed", self.seed, at_least=0, at_most=2**32 - 1)
-        for name, value in self.skin._asdict().items():  # pyright: ignore[reportAttributeAccessIssue]
+        for name, value in self.skin._asdict().items():
             errors.check_finite(f"skin.{name}", value, at_least=0)
 
 
@@ -102,10 +102,13 @@ def scene_of(case: Case, setting: Setting) -> Scene:
     )
 
 
-def build(cases: Sequence[Case], setting: Setting) -> tuple[Stage, World]:
+def build(
+    cases: Sequence[Case], setting: Setting, indices: Sequence[int] | None = None
+) -> tuple[Stage, World]:
     """Worlds of cases of one shape family, stacked on the host: leaves (len(cases), ...).
 
-    World `i` draws its skin's imperfections from (setting.seed, i).
+    Each world draws its skin's imperfections from (setting.seed, its index); by default the
+    indices count from 0.
     """
     kinds = list(dict.fromkeys((case.object, case.friction, case.mass) for case in cases))
     which = np.array([kinds.index((case.object, case.friction, case.mass)) for case in cases])
@@ -114,16 +117,16 @@ def build(cases: Sequence[Case], setting: Setting) -> tuple[Stage, World]:
     model, fields = scene.stack([s.physics for s in scenes])
     dtype = model.qpos0.dtype
     n = len(cases)
+    numbers = np.arange(n) if indices is None else np.asarray(indices)
+    root = jax.random.PRNGKey(setting.seed)
     world = World(
-        fields={name: np.asarray(values)[which] for name, values in fields.items()},
+        fields=_rows(jax.device_get(fields), which),
         footprint=_stack([s.footprint for s in scenes], dtype, which),
         skin=_stack([setting.skin], dtype, np.zeros(n, int)),
         params=_stack([case.params for case in cases], dtype),
-        p_world_target=np.array([case.p_world_target for case in cases], dtype),
+        p_world_target=_stack([np.array(case.p_world_target) for case in cases], dtype),
         qpos=_stack([scene.initial_qpos(s, setting.gap) for s in scenes], dtype, which),
-        key=np.asarray(
-            jax.vmap(partial(jax.random.fold_in, jax.random.PRNGKey(setting.seed)))(np.arange(n))
-        ),
+        key=jax.device_get(jax.vmap(partial(jax.random.fold_in, root))(numbers)),
     )
     return Stage(model, mjx.make_data(scenes[0].physics)), world
 
@@ -134,7 +137,8 @@ def _stack(trees: Sequence[Any], dtype: np.dtype, which: np.ndarray | None = Non
     return stacked if which is None else _rows(stacked, which)
 
 
-def _rows(tree: Any, rows: np.ndarray) -> Any:
+def _rows(tree: Any, rows: Any) -> Any:
+    """The same rows of every leaf."""
     return jax.tree.map(lambda leaf: leaf[rows], tree)
 
 
@@ -158,7 +162,7 @@ class _Queue:
         )
         self.slots = min(slots, len(indices))
         self.setting = setting
-        self.stage, self.worlds = build([cases[i] for i in indices], setting)
+        self.stage, self.worlds = build([cases[i] for i in indices], setting, indices)
         self._program = None
         self._lock = threading.Lock()
 

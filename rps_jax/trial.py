@@ -117,6 +117,12 @@ def object_pose(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
     return free[:2], frames.yaw_of_quaternion(free[3:])
 
 
+def p_world_contact(seen: Snapshot) -> jax.Array:
+    """Contact points of snapshots (T, ...) in the world, (T, 2) [m]; NaN without contact."""
+    point = seen.qpos[:, :2] + frames.rotate(seen.qpos[:, 2], seen.reading.p_robot_contact)
+    return jnp.where(seen.reading.in_contact[:, None], point, jnp.nan)
+
+
 def start(world: World, strategy: Strategy = RPS) -> Trial:
     """The trial of a world before its first control step."""
     zero, false = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
@@ -291,9 +297,10 @@ def record(
     one = partial(control_step, stage, physics=physics, rules=rules, strategy=strategy)
 
     def body(trials, _):
-        trials, snapshot = jax.vmap(one)(worlds, trials)
-        return jax.lax.fori_loop(
-            1, every, lambda _, t: jax.vmap(one)(worlds, t)[0], trials
-        ), snapshot
+        return jax.vmap(one)(worlds, trials)
 
-    return jax.lax.scan(body, trials, length=steps // every)
+    def interval(trials, _):
+        trials, snapshots = jax.lax.scan(body, trials, length=every)
+        return trials, jax.tree.map(lambda x: x[0], snapshots)
+
+    return jax.lax.scan(interval, trials, length=steps // every)

@@ -1,0 +1,384 @@
+"""Pictures of a trial: one image of a qpos, or a video of many.
+
+MuJoCo reads the environment variable MUJOCO_GL when it is imported, so nothing here imports it
+before something is drawn: a command line calls `choose_gl` first of all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import itertools
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from rps_jax import errors
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from rps_jax.scene import Scene
+
+SIZE = (960, 540)  # [px] width, height
+
+_TRAIL_STEP = 0.02  # [m] between the points of a trail
+_TRAIL_POINTS = 1500  # at most, so that memory stays flat: 30 m; the oldest go first
+_TRAIL_WIDTH = 0.007  # [1] of the image's height
+_BASE_RGBA = (0.08, 0.09, 0.11, 1.0)
+_CONTACT_RGBA = (0.62, 0.04, 0.46, 1.0)
+_CONTACT_HEIGHT = 0.36  # [m] just above the chassis, which would hide the marker from above
+_CONTACT_RADIUS = 0.04  # [m]
+_NO_CONTACT = np.full(2, np.nan)
+
+_MEND_GL = (
+    "MuJoCo cannot draw on this machine: install Mesa's EGL library (`apt install libegl1 "
+    "libgl1-mesa-dri`) and set MUJOCO_GL=egl, or set MUJOCO_GL=osmesa (`apt install libosmesa6`)."
+)
+_MEND_FFMPEG = "ffmpeg was not found: run `pip install imageio-ffmpeg`."
+
+
+class VideoError(RuntimeError):
+    """No picture or video could be made: one sentence that says how to mend it."""
+
+
+class Check(NamedTuple):
+    """One thing that a video needs."""
+
+    what: str
+    ok: bool
+    mend: str  # how to mend it, one sentence; empty if `ok`
+
+
+def choose_gl() -> None:
+    """Set MUJOCO_GL to egl on a Linux machine without a display; call before MuJoCo is imported.
+
+    A variable that is set, and a machine that lacks the EGL library, are left alone: with egl
+    asked for and absent, MuJoCo could not even be imported.
+    """
+    if sys.platform != "linux" or os.environ.get("MUJOCO_GL") or os.environ.get("DISPLAY"):
+        return
+    with contextlib.suppress(OSError):
+        ctypes.CDLL("libEGL.so.1")
+        os.environ["MUJOCO_GL"] = "egl"
+
+
+def check() -> list[Check]:
+    """Whether this machine can draw and can encode, tried out; never raises VideoError."""
+    return [_attempt("rendering", _try_drawing), _attempt("ffmpeg", _try_encoding)]
+
+
+def snapshot(
+    scene: Scene,
+    qpos: ArrayLike,
+    *,
+    p_world_target: ArrayLike,
+    size: tuple[int, int] = SIZE,
+    camera: str = "oblique",
+) -> np.ndarray:
+    """One RGB image (height, width, 3) uint8.
+
+    Args:
+      scene: as `scene.load` gives it.
+      qpos: (10,) base x, y [m], yaw [rad]; object position [m] and quaternion, in the world.
+      p_world_target: (2,) [m] where the flag stands.
+      size: width and height [px].
+      camera: name of a camera of the scene: oblique or above.
+
+    Raises:
+      InputError: a qpos, target, size or camera that cannot be used.
+      VideoError: this machine cannot draw.
+    """
+    with _studio(scene, p_world_target, size, camera) as studio:
+        return studio.draw(qpos, _NO_CONTACT)
+
+
+def render(
+    scene: Scene,
+    frames: Iterable[ArrayLike],
+    path: str | os.PathLike[str],
+    *,
+    p_world_target: ArrayLike,
+    fps: float = 30.0,
+    size: tuple[int, int] = SIZE,
+    camera: str = "oblique",
+    p_world_contacts: Iterable[ArrayLike] | None = None,
+) -> None:
+    """Write an MP4 (H.264, yuv420p) with the paths of the base and of the contact point.
+
+    Frames are drawn and encoded one by one as they come, so memory does not grow with them. The
+    file appears at `path` when it is complete, and a file already there stays until then.
+
+    Args:
+      scene: as `scene.load` gives it.
+      frames: qpos of each frame, (10,), as for `snapshot`; at least one.
+      path: the file to write.
+      p_world_target: (2,) [m] where the flag stands.
+      fps: frames per second of the video.
+      size: width and height [px], even numbers.
+      camera: name of a camera of the scene: oblique or above.
+      p_world_contacts: contact point of each frame, (2,) [m], NaN without contact.
+
+    Raises:
+      InputError: no frames, or a frame, target, rate, size or camera that cannot be used.
+      ValueError: not as many contacts as frames.
+      VideoError: this machine cannot draw or encode, or `path` cannot be written.
+    """
+    errors.check_finite("fps", fps, above=0, at_most=1000)
+    if any(n % 2 for n in size):
+        raise errors.InputError(f"size = {size} is not allowed: H.264 needs two even numbers.")
+    pairs = _paired(frames, p_world_contacts)
+    first = next(pairs, None)
+    if first is None:
+        raise errors.InputError("frames = [] is not allowed: a video needs at least one frame.")
+    with (
+        _studio(scene, p_world_target, size, camera) as studio,
+        _encoder(Path(path), size, fps) as sink,
+    ):
+        for qpos, p_world_contact in itertools.chain([first], pairs):
+            sink.write(studio.draw(qpos, p_world_contact).data)
+
+
+def _paired(
+    frames: Iterable[ArrayLike], p_world_contacts: Iterable[ArrayLike] | None
+) -> Iterator[tuple[ArrayLike, ArrayLike]]:
+    if p_world_contacts is None:
+        return zip(frames, itertools.repeat(_NO_CONTACT), strict=False)
+    return zip(frames, p_world_contacts, strict=True)
+
+
+class _Trail:
+    """A path on the ground, thinned to `_TRAIL_STEP`. NaN interrupts it."""
+
+    def __init__(self, rgba: tuple[float, ...], height: float) -> None:
+        self.rgba = rgba
+        self.height = height  # [m] above the ground, so that one trail lies over another
+        self.points: deque[np.ndarray] = deque(maxlen=_TRAIL_POINTS)
+
+    def add(self, point: np.ndarray) -> None:
+        """Note a point (2,) [m] unless it lies close to the last one."""
+        last = self.points[-1] if self.points else _NO_CONTACT
+        both = np.isnan([point[0], last[0]])
+        if not both.all() and (both.any() or math.dist(point, last) >= _TRAIL_STEP):
+            self.points.append(point)
+
+    def segments(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Pairs of neighbouring points without a gap between them."""
+        for a, b in itertools.pairwise(self.points):
+            if not (math.isnan(a[0]) or math.isnan(b[0])):
+                yield a, b
+
+
+class _Studio:
+    """A scene before a camera, with what has been drawn so far left as trails."""
+
+    def __init__(self, renderer: Any, scene: Scene, camera: str, target: np.ndarray) -> None:
+        self.mujoco = _import_mujoco()
+        self.renderer = renderer
+        self.model = scene.model
+        self.data = self.mujoco.MjData(scene.model)
+        self.data.mocap_pos[scene.model.body("target").mocapid[0], :2] = target
+        self.camera = camera
+        self.base_trail = _Trail(_BASE_RGBA, 0.006)
+        self.contact_trail = _Trail(_CONTACT_RGBA, 0.010)
+
+    def draw(self, qpos: ArrayLike, p_world_contact: ArrayLike) -> np.ndarray:
+        """One image (height, width, 3) uint8, and a step further along the trails."""
+        qpos = _checked("qpos", qpos, self.model.nq)
+        contact = np.asarray(p_world_contact, float)
+        self.data.qpos[:] = qpos
+        self.mujoco.mj_kinematics(self.model, self.data)  # where things are; no dynamics
+        self.mujoco.mj_camlight(self.model, self.data)
+        self.renderer.update_scene(self.data, camera=self.camera)
+        self.base_trail.add(qpos[:2])
+        self.contact_trail.add(contact)
+        for trail in (self.base_trail, self.contact_trail):
+            for a, b in trail.segments():
+                self._add_line(a, b, trail)
+        if not np.isnan(contact).any():
+            self._add_marker(contact)
+        return self.renderer.render()
+
+    def _add_line(self, a: np.ndarray, b: np.ndarray, trail: _Trail) -> None:
+        """A line on the ground from `a` to `b`: quicker to draw than any solid."""
+        geom = self._new_geom("mjGEOM_LINE", np.zeros(3), np.zeros(3), trail.rgba)
+        if geom is not None:
+            width = _TRAIL_WIDTH * self.renderer.height
+            ends = ([*point, trail.height] for point in (a, b))
+            self.mujoco.mjv_connector(geom, geom.type, width, *ends)
+
+    def _add_marker(self, point: np.ndarray) -> None:
+        position = np.array([*point, _CONTACT_HEIGHT])
+        size = np.full(3, _CONTACT_RADIUS)
+        geom = self._new_geom("mjGEOM_SPHERE", size, position, _CONTACT_RGBA)
+        if geom is not None:
+            geom.emission = 1.0  # seen in the shadow of the object too
+
+    def _new_geom(self, kind: str, size: np.ndarray, position: np.ndarray, rgba: Any) -> Any:
+        """Another geom of this frame; None if there is no room for it."""
+        view = self.renderer.scene
+        if view.ngeom == view.maxgeom:
+            return None
+        geom = view.geoms[view.ngeom]
+        kind = getattr(self.mujoco.mjtGeom, kind)
+        colour = np.array(rgba, np.float32)
+        self.mujoco.mjv_initGeom(geom, kind, size, position, np.eye(3).ravel(), colour)
+        view.ngeom += 1
+        return geom
+
+
+@contextlib.contextmanager
+def _studio(
+    scene: Scene, p_world_target: ArrayLike, size: tuple[int, int], camera: str
+) -> Iterator[_Studio]:
+    """A studio whose renderer is closed at the end; an open one complains when Python exits."""
+    model = scene.model
+    errors.check_name("camera", camera, [model.camera(i).name for i in range(model.ncam)])
+    target = _checked("p_world_target", p_world_target, 2)
+    limits = (model.vis.global_.offwidth, model.vis.global_.offheight)
+    for n, limit in zip(size, limits, strict=True):
+        errors.check_finite("size", n, at_least=2, at_most=limit, unit="px")
+    with _renderer(model, size) as renderer:
+        yield _Studio(renderer, scene, camera, target)
+
+
+def _checked(name: str, values: ArrayLike, length: int) -> np.ndarray:
+    """A copy (length,) of finite `values`, or an InputError."""
+    array = np.array(values, float)
+    if array.shape != (length,) or not np.isfinite(array).all():
+        raise errors.InputError(
+            f"{name} = {array} is not allowed: it must be {length} finite numbers."
+        )
+    return array
+
+
+def _import_mujoco() -> Any:
+    try:
+        import mujoco
+    except Exception as error:  # what a missing GL library raises depends on the library
+        raise VideoError(_MEND_GL) from error
+    return mujoco
+
+
+@contextlib.contextmanager
+def _renderer(model: Any, size: tuple[int, int]) -> Iterator[Any]:
+    mujoco = _import_mujoco()
+    width, height = size
+    try:
+        with warnings.catch_warnings():  # GLFW warns before it fails
+            warnings.simplefilter("ignore")
+            renderer = mujoco.Renderer(model, height=height, width=width)
+    except Exception as error:  # likewise
+        raise VideoError(_MEND_GL) from error
+    with contextlib.closing(renderer):
+        yield renderer
+
+
+def _ffmpeg() -> str:
+    """The path of the program."""
+    try:
+        import imageio_ffmpeg
+
+        return imageio_ffmpeg.get_ffmpeg_exe()
+    except (ImportError, RuntimeError) as error:
+        raise VideoError(_MEND_FFMPEG) from error
+
+
+@contextlib.contextmanager
+def _encoder(path: Path, size: tuple[int, int], fps: float) -> Iterator[IO[bytes]]:
+    """Takes raw RGB images; `path` appears if all goes well, and nothing is left behind if not."""
+    program = _ffmpeg()
+    if path.is_dir():  # "." has no name to build on
+        raise _unwritable(path, "it is a folder")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with _writing(path):
+            part.touch()
+        with _encoding(_command(program, size, fps, part), path) as sink:
+            yield sink
+        with _writing(path):
+            part.replace(path)
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink()
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise _unwritable(path, error.strerror) from error
+
+
+def _unwritable(path: Path, reason: str | None) -> VideoError:
+    return VideoError(
+        f"the video '{path}' could not be written ({reason}): choose a folder that exists, can be "
+        "written to and has space left."
+    )
+
+
+def _command(program: str, size: tuple[int, int], fps: float, part: Path) -> list[str]:
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", f"{fps:g}"]
+    h264 = ["-c:v", "libx264", "-preset", "veryfast", "-crf", "20", "-pix_fmt", "yuv420p"]
+    mp4 = ["-movflags", "+faststart", "-f", "mp4"]  # faststart: plays before it is all loaded
+    return [program, "-y", "-loglevel", "error", *raw, "-i", "-", *h264, *mp4, str(part)]
+
+
+@contextlib.contextmanager
+def _encoding(command: list[str], path: Path) -> Iterator[IO[bytes]]:
+    """The input of a running ffmpeg, which has ended well when the context ends without error."""
+    with tempfile.TemporaryFile() as log:
+        try:  # close_fds=False: started without a fork, of which JAX warns
+            process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log, close_fds=False)
+        except OSError as error:
+            raise VideoError(_MEND_FFMPEG) from error
+        try:
+            assert process.stdin is not None
+            with contextlib.suppress(BrokenPipeError), process.stdin:
+                yield process.stdin  # a broken pipe means that ffmpeg has given up: see its log
+            if process.wait() != 0:
+                log.seek(0)
+                words = log.read().decode(errors="replace").split("\n")
+                raise _unwritable(path, next((w for w in words if w), "ffmpeg failed"))
+        finally:
+            process.kill()  # does nothing to a process that has ended
+            process.wait()
+
+
+def _attempt(what: str, action: Callable[[], None]) -> Check:
+    try:
+        action()
+    except VideoError as error:
+        return Check(what, False, str(error))
+    return Check(what, True, "")
+
+
+def _try_drawing() -> None:
+    mujoco = _import_mujoco()
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>'
+    )
+    with _renderer(model, (16, 16)) as renderer:
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        renderer.update_scene(data)
+        if not renderer.render().any():
+            raise VideoError(_MEND_GL)
+
+
+def _try_encoding() -> None:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        _encoder(Path(folder) / "black.mp4", (16, 16), 1.0) as sink,
+    ):
+        sink.write(bytes(16 * 16 * 3))

@@ -1,0 +1,404 @@
+"""Footprints: distances, derivatives and line crossings against brute force."""
+
+from __future__ import annotations
+
+import math
+
+import hypothesis
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull, cKDTree
+
+from rps_jax import footprint as fp
+from rps_jax import frames
+from rps_jax.footprint import Footprint
+
+property_test = hypothesis.settings(max_examples=100, deadline=None)
+seeds = st.integers(0, 2**32 - 1)
+
+BATCH, POINTS = 8, 128
+# One program for each number of vertices: the shapes below are always (BATCH, ...).
+distances = jax.jit(jax.vmap(fp.signed_distance))  # (B, P) [m]
+slopes = jax.jit(jax.vmap(jax.vmap(jax.grad(fp.signed_distance, argnums=1), (None, 0))))
+shape_slopes = jax.jit(jax.vmap(jax.vmap(jax.grad(fp.signed_distance), (None, 0))))
+crossings = jax.jit(jax.vmap(fp.crossing))
+reaches = jax.jit(jax.vmap(fp.extent))
+
+
+def random_rectangles(rng) -> Footprint:
+    half = rng.uniform(0.05, 0.5, (BATCH, 2)).astype(np.float32)
+    return place_at_random(rng, jax.vmap(fp.rectangle)(*half.T))
+
+
+def random_circles(rng) -> Footprint:
+    radius = rng.uniform(0.05, 0.5, BATCH).astype(np.float32)
+    return place_at_random(rng, jax.vmap(fp.circle)(radius))
+
+
+def random_polygons(rng) -> Footprint:
+    """Heptagons inscribed in ellipses, their corners at least 0.2 rad apart."""
+    share = rng.dirichlet(np.ones(7), BATCH)
+    angle = np.cumsum(0.2 + (2 * np.pi - 1.4) * share, axis=1)
+    axes = rng.uniform(0.1, 0.5, (BATCH, 2))
+    points = np.stack([np.cos(angle), np.sin(angle)], -1) * axes[:, None]
+    return place_at_random(rng, jax.tree.map(lambda *v: jnp.stack(v), *map(fp.polygon, points)))
+
+
+def place_at_random(rng, footprints: Footprint) -> Footprint:
+    position = rng.uniform(-0.5, 0.5, (BATCH, 2)).astype(np.float32)
+    yaw = rng.uniform(-4, 4, BATCH).astype(np.float32)
+    return jax.vmap(fp.place)(footprints, position, yaw)
+
+
+KINDS = {"rectangle": random_rectangles, "circle": random_circles, "polygon": random_polygons}
+every_kind = pytest.mark.parametrize("kind", KINDS)
+
+
+def boundary(vertices: np.ndarray, per_edge: int = 4000) -> np.ndarray:
+    """Dense samples (N * per_edge, 2) of the outline of a polygon."""
+    t = np.linspace(0, 1, per_edge)[:, None]
+    ends = zip(vertices, np.roll(vertices, -1, axis=0), strict=True)
+    return np.concatenate([a + t * (b - a) for a, b in ends])
+
+
+def brute_force_distance(vertices: np.ndarray, radius: float, points: np.ndarray) -> np.ndarray:
+    """Signed distance of points by dense sampling (polygons) or by definition (circles)."""
+    vertices = np.float64(vertices)
+    if len(vertices) == 1:
+        return np.linalg.norm(points - vertices[0], axis=1) - radius
+    unsigned = cKDTree(boundary(vertices)).query(points)[0]
+    equations = ConvexHull(vertices).equations
+    inside = (points @ equations[:, :2].T + equations[:, 2] < 0).all(axis=1)
+    return np.where(inside, -unsigned, unsigned) - radius
+
+
+# Golden values
+
+
+@pytest.mark.parametrize(
+    ("point", "expected"),
+    [
+        ((0.0, 0.0), -0.2),  # the centre: the nearer side
+        ((0.25, 0.0), -0.05),
+        ((0.3, 0.1), 0.0),  # on a side
+        ((0.3, 0.2), 0.0),  # on a corner
+        ((0.5, 0.1), 0.2),
+        ((0.0, -0.9), 0.7),
+        ((0.6, 0.6), 0.5),  # off a corner: 3-4-5
+        ((-0.6, -0.6), 0.5),
+    ],
+)
+def test_the_distance_to_a_rectangle_by_hand(point, expected):
+    distance = fp.signed_distance(fp.rectangle(0.3, 0.2), jnp.array(point))
+    assert distance == pytest.approx(expected, abs=1e-7)
+
+
+def test_the_distance_to_a_circle_by_hand():
+    points = jnp.array([[0.0, 0.0], [0.1, 0.0], [0.0, -0.25], [0.3, 0.4]])
+    distance = fp.signed_distance(fp.circle(0.25), points)
+    np.testing.assert_allclose(distance, [-0.25, -0.15, 0.0, 0.25], atol=1e-7)
+
+
+def test_a_radius_rounds_a_polygon_from_outside():
+    rounded = fp.rectangle(0.3, 0.2)._replace(radius=jnp.float32(0.1))
+    points = jnp.array([[0.0, 0.0], [0.5, 0.0], [0.6, 0.6]])
+    np.testing.assert_allclose(fp.signed_distance(rounded, points), [-0.3, 0.1, 0.4], atol=1e-7)
+
+
+def test_two_vertices_and_a_radius_are_a_stadium():
+    stadium = Footprint(jnp.array([[-0.3, 0.0], [0.3, 0.0]]), jnp.float32(0.1))
+    points = jnp.array([[0.0, 0.0], [0.2, 0.3], [0.6, 0.4]])
+    np.testing.assert_allclose(fp.signed_distance(stadium, points), [-0.1, 0.2, 0.4], atol=1e-7)
+    low, high = fp.crossing(stadium, jnp.array([0.0, 0.06]), jnp.array([1.0, 0.0]), 0.0)
+    np.testing.assert_allclose([low, high], [-0.38, 0.38], atol=1e-6)  # 6-8-10 at each end
+
+
+def test_place_turns_and_then_moves():
+    placed = fp.place(fp.rectangle(0.3, 0.2), jnp.array([1.0, 2.0]), jnp.float32(math.pi / 2))
+    expected = [[0.8, 2.3], [0.8, 1.7], [1.2, 1.7], [1.2, 2.3]]
+    np.testing.assert_allclose(placed.vertices, expected, atol=1e-6)
+    assert fp.place(fp.circle(0.25), jnp.ones(2), 1.0).radius == 0.25
+
+
+# Signed distance
+
+
+@every_kind
+def test_the_signed_distance_agrees_with_brute_force(kind):
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        footprints = KINDS[kind](rng)
+        points = rng.uniform(-1.2, 1.2, (BATCH, POINTS, 2)).astype(np.float32)
+        got = distances(footprints, points)
+        for b in range(BATCH):
+            shape = jax.tree.map(lambda v, b=b: np.asarray(v)[b], footprints)
+            np.testing.assert_allclose(
+                got[b], brute_force_distance(*shape, points[b]), rtol=1e-5, atol=2e-4
+            )
+        assert (got < -1e-3).any()
+        assert (got > 1e-3).any()
+
+
+@every_kind
+@property_test
+@hypothesis.given(seeds)
+def test_the_signed_distance_does_not_depend_on_the_frame(kind, seed):
+    rng = np.random.default_rng(seed)
+    footprints = KINDS[kind](rng)
+    points = rng.uniform(-1, 1, (BATCH, POINTS, 2)).astype(np.float32)
+    position = rng.uniform(-2, 2, (BATCH, 2)).astype(np.float32)
+    yaw = rng.uniform(-4, 4, BATCH).astype(np.float32)
+    moved = frames.rotate(yaw[:, None], points) + position[:, None]
+    got = distances(jax.vmap(fp.place)(footprints, position, yaw), moved)
+    np.testing.assert_allclose(got, distances(footprints, points), atol=3e-6)
+
+
+@every_kind
+def test_the_derivative_of_the_distance_is_the_unit_normal(kind):
+    """It agrees with finite differences, except on the ridges inside, where there is none."""
+    rng = np.random.default_rng(1)
+    h = 1e-6
+    with jax.enable_x64(True):
+        footprints = jax.tree.map(lambda v: jnp.asarray(v, jnp.float64), KINDS[kind](rng))
+        points = rng.uniform(-1, 1, (BATCH, POINTS, 2))
+        gradient = np.asarray(slopes(footprints, points))
+        here = np.asarray(distances(footprints, points))[..., None]
+        steps = h * np.eye(2)
+        up, down = (
+            np.stack([np.asarray(distances(footprints, points + a * e)) for e in steps], -1)
+            for a in (1, -1)
+        )
+    smooth = (np.abs(up - 2 * here + down) < 1e-3 * h).all(axis=-1)
+    assert smooth.mean() > 0.98
+    np.testing.assert_allclose(gradient[smooth], ((up - down) / (2 * h))[smooth], atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(gradient, axis=-1), 1, rtol=1e-6)
+
+
+@every_kind
+def test_derivatives_are_finite_on_vertices_edges_and_the_centre(kind):
+    footprints = KINDS[kind](np.random.default_rng(2))
+    vertices = np.asarray(footprints.vertices)  # (B, N, 2)
+    middles = 0.5 * (vertices + np.roll(vertices, -1, axis=1))
+    centre = vertices.mean(axis=1, keepdims=True)
+    special = np.concatenate([vertices, middles, centre], axis=1)
+    points = np.resize(special.swapaxes(0, 1), (POINTS, BATCH, 2)).swapaxes(0, 1)
+    by_point = slopes(footprints, points)
+    for gradient in (by_point, *shape_slopes(footprints, points)):
+        assert np.isfinite(gradient).all()
+        assert np.abs(gradient).max() < 4
+
+
+def test_derivatives_are_finite_on_an_exact_corner_side_and_centre():
+    box = fp.rectangle(0.25, 0.125)
+    points = jnp.array([[0.25, 0.125], [0.25, 0.0], [0.0, 0.125], [0.0, 0.0], [-0.25, -0.125]])
+    gradient = jax.vmap(jax.grad(fp.signed_distance, argnums=1), (None, 0))(box, points)
+    assert np.isfinite(gradient).all()
+    assert np.linalg.norm(gradient, axis=1).max() <= 1 + 1e-6
+
+
+# Crossing
+
+PAST_THE_CORNER = (0.3 + 0.05 * math.sqrt(0.5), 0.2 + 0.05 * math.sqrt(0.5))
+DIAGONAL = (math.sqrt(0.5), -math.sqrt(0.5))
+
+
+@pytest.mark.parametrize(
+    ("origin", "along", "tolerance", "expected"),
+    [
+        # Through the middle of a box 0.6 by 0.4, along x.
+        ((-1.0, 0.0), (1.0, 0.0), 0.0, (0.7, 1.3)),
+        ((-1.0, 0.0), (1.0, 0.0), 0.05, (0.65, 1.35)),
+        ((1.0, 0.0), (-1.0, 0.0), 0.0, (0.7, 1.3)),
+        # Through the middle, along y, from inside.
+        ((0.1, 0.0), (0.0, 1.0), 0.0, (-0.2, 0.2)),
+        # Beside the upper side by 0.03: the tolerance 0.05 rounds the corners, 3-4-5.
+        ((0.0, 0.23), (1.0, 0.0), 0.05, (-0.34, 0.34)),
+        # The 3-4-5 direction through the centre leaves by the upper and lower sides.
+        ((0.0, 0.0), (0.6, 0.8), 0.0, (-0.25, 0.25)),
+        # Past the corner (0.3, 0.2) at 0.05: its arc, half a chord of sqrt(0.06^2 - 0.05^2).
+        (PAST_THE_CORNER, DIAGONAL, 0.06, (-0.0331662, 0.0331662)),
+        # The same at 0.13: the shifted sides, 0.13 sqrt(2) - 0.05 away.
+        (PAST_THE_CORNER, DIAGONAL, 0.13, (-0.1338478, 0.1338478)),
+    ],
+)
+def test_the_crossing_of_a_box_by_hand(origin, along, tolerance, expected):
+    got = fp.crossing(fp.rectangle(0.3, 0.2), jnp.array(origin), jnp.array(along), tolerance)
+    np.testing.assert_allclose(got, expected, atol=1e-6)
+
+
+def test_the_crossing_along_a_side_is_the_whole_side():
+    box = fp.rectangle(0.25, 0.125)
+    for y, along in [(0.125, 1.0), (0.125, -1.0), (-0.125, 1.0)]:
+        got = fp.crossing(box, jnp.array([0.0, y]), jnp.array([along, 0.0]), 0.0)
+        np.testing.assert_allclose(got, [-0.25, 0.25], atol=1e-7)
+
+
+def test_the_crossing_of_a_circle_is_a_chord():
+    # 0.2 off the centre of a circle of radius 0.25: half a chord is 0.15.
+    low, high = fp.crossing(fp.circle(0.25), jnp.array([-1.0, 0.2]), jnp.array([1.0, 0.0]), 0.0)
+    np.testing.assert_allclose([low, high], [0.85, 1.15], rtol=1e-6)
+
+
+def test_a_line_that_stays_clear_has_an_empty_interval():
+    for shape in (fp.rectangle(0.3, 0.2), fp.circle(0.2)):
+        origin, along = jnp.array([0.0, 0.26]), jnp.array([1.0, 0.0])
+        assert tuple(map(float, fp.crossing(shape, origin, along, 0.05))) == (math.inf, -math.inf)
+        low, high = fp.crossing(shape, origin, along, 0.07)
+        assert low < high
+
+
+def random_lines(rng, footprints: Footprint) -> tuple[np.ndarray, np.ndarray]:
+    """Lines (B, 2), (B, 2): at random, or along and beside an edge where there is one."""
+    angle = rng.uniform(-np.pi, np.pi, BATCH)
+    origin = rng.uniform(-0.8, 0.8, (BATCH, 2))
+    vertices = np.float64(footprints.vertices)
+    if vertices.shape[1] > 1:
+        edge = vertices[:, 1] - vertices[:, 0]
+        beside = rng.random(BATCH) < 0.3
+        angle = np.where(beside, np.arctan2(edge[:, 1], edge[:, 0]), angle)
+        outward = np.stack([np.sin(angle), -np.cos(angle)], -1)
+        shifted = vertices[:, 0] + outward * rng.uniform(-0.05, 0.15, (BATCH, 1))
+        origin = np.where(beside[:, None], shifted, origin)
+    along = np.stack([np.cos(angle), np.sin(angle)], -1)
+    return origin.astype(np.float32), along.astype(np.float32)
+
+
+@every_kind
+@property_test
+@hypothesis.given(seeds)
+def test_the_crossing_holds_exactly_the_points_of_the_line_within_the_tolerance(kind, seed):
+    rng = np.random.default_rng(seed)
+    footprints = KINDS[kind](rng)
+    origin, along = random_lines(rng, footprints)
+    tolerance = rng.choice([0.0, 0.006, 0.1], BATCH).astype(np.float32)
+    low, high = (np.asarray(v)[:, None] for v in crossings(footprints, origin, along, tolerance))
+    hit = low <= high
+    # Samples along the line, and its points just within and just beyond the ends.
+    s = np.linspace(-2.5, 2.5, POINTS - 4) * np.ones((BATCH, 1))
+    ends = np.where(hit, np.concatenate([low, high], axis=1), 0)
+    inward = np.array([2e-3, -2e-3])
+    s = np.concatenate([s, ends + inward, ends - inward], axis=1)
+    points = np.float32(origin[:, None] + s[..., None] * along[:, None])
+    margin = np.asarray(distances(footprints, points)) - tolerance[:, None]
+    within = (low <= s) & (s <= high)
+    assert (margin[within] < 2e-6).all()
+    assert (margin[~within] > -2e-6).all()
+
+
+@every_kind
+def test_the_ends_of_a_crossing_are_at_the_tolerance(kind):
+    rng = np.random.default_rng(3)
+    hits = []
+    for _ in range(50):
+        footprints = KINDS[kind](rng)
+        origin, along = random_lines(rng, footprints)
+        tolerance = rng.choice([0.0, 0.006, 0.1], BATCH).astype(np.float32)
+        low, high = map(np.asarray, crossings(footprints, origin, along, tolerance))
+        hit = low <= high
+        s = np.where(hit, [low, high], 0)
+        points = origin[:, None] + s.T[..., None] * along[:, None]
+        points = np.resize(points.swapaxes(0, 1), (POINTS, BATCH, 2)).swapaxes(0, 1)
+        distance = distances(footprints, np.float32(points))[hit, :2]
+        np.testing.assert_allclose(distance, np.tile(tolerance[hit][:, None], 2), atol=2e-6)
+        hits.append(hit.mean())
+    assert 0.2 < np.mean(hits) < 0.95
+
+
+def test_derivatives_of_a_crossing_are_finite_where_the_line_grazes_or_misses():
+    def chord(shape, y):
+        origin = jnp.stack([0.0 * y, y])
+        low, high = fp.crossing(shape, origin, jnp.array([1.0, 0.0]), 0.0)
+        return jnp.where(low <= high, high - low, 0.0)
+
+    for shape in (fp.circle(0.25), fp.rectangle(0.5, 0.25)):
+        y = jnp.array([0.0, 0.2, 0.25, -0.25, 0.3])
+        gradients = jax.jit(jax.vmap(jax.grad(chord, argnums=(0, 1)), (None, 0)))
+        by_shape, by_y = gradients(shape, y)
+        for gradient in (*by_shape, by_y):
+            assert np.isfinite(gradient).all()
+
+
+# Extent
+
+
+@pytest.mark.parametrize(
+    ("shape", "along", "expected"),
+    [
+        (fp.rectangle(0.3, 0.2), (1.0, 0.0), 0.3),
+        (fp.rectangle(0.3, 0.2), (0.0, -1.0), 0.2),
+        (fp.rectangle(0.3, 0.2), (-0.6, 0.8), 0.34),  # 0.6 * 0.3 + 0.8 * 0.2
+        (fp.circle(0.25), (0.6, 0.8), 0.25),
+        (fp.place(fp.circle(0.25), jnp.array([1.0, 2.0]), 0.3), (0.6, 0.8), 2.45),
+    ],
+)
+def test_the_extent_by_hand(shape, along, expected):
+    assert fp.extent(shape, jnp.array(along)) == pytest.approx(expected)
+
+
+@every_kind
+def test_the_extent_is_the_furthest_point_of_the_outline(kind):
+    rng = np.random.default_rng(4)
+    footprints = KINDS[kind](rng)
+    angle = rng.uniform(-4, 4, BATCH)
+    along = np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32)
+    got = reaches(footprints, along)
+    for b in range(BATCH):
+        vertices, radius = np.float64(footprints.vertices[b]), float(footprints.radius[b])
+        outline = boundary(vertices, 100)
+        if radius > 0:
+            turn = np.linspace(0, 2 * np.pi, 4000)
+            outline = outline + radius * np.stack([np.cos(turn), np.sin(turn)], -1)[:, None]
+        assert got[b] == pytest.approx((outline @ along[b]).max(), abs=2e-6)
+
+
+# Constructors
+
+
+def test_the_constructors_make_counter_clockwise_outlines_of_the_given_size():
+    box = fp.rectangle(0.3, 0.2)
+    x, y = np.asarray(box.vertices, float).T
+    area = 0.5 * (x * np.roll(y, -1) - np.roll(x, -1) * y).sum()
+    assert area == pytest.approx(0.6 * 0.4)
+    assert box.radius == 0
+    ball = fp.circle(0.25)
+    np.testing.assert_array_equal(ball.vertices, [[0, 0]])
+    assert ball.radius == 0.25
+
+
+def test_polygon_keeps_its_vertices():
+    triangle = [[0.0, 0.0], [1.0, 0.0], [0.25, 0.5]]
+    made = fp.polygon(triangle)
+    np.testing.assert_array_equal(made.vertices, triangle)
+    assert made.radius == 0
+
+
+SQUARE = [[0, 0], [1, 0], [1, 1], [0, 1]]
+STAR = [[math.sin(4 * math.pi * i / 5), -math.cos(4 * math.pi * i / 5)] for i in range(5)]
+
+
+@pytest.mark.parametrize(
+    ("fault", "vertices"),
+    [
+        ("clockwise", SQUARE[::-1]),
+        ("not convex", [[0, 0], [1, 0], [0.2, 0.2], [0, 1]]),
+        ("crossing itself", [[0, 0], [1, 1], [1, 0], [0, 1]]),
+        ("a star, always turning left but twice around", STAR),
+        ("a star the other way around", STAR[::-1]),
+        ("twice around a square", SQUARE + SQUARE),
+        ("three in a line", [[0, 0], [0.5, 0], [1, 0], [1, 1]]),
+        ("a repeated vertex", [[0, 0], [1, 0], [1, 0], [1, 1]]),
+        ("all in a line", [[0, 0], [1, 0], [2, 0]]),
+        ("NaN", [[0, 0], [1, 0], [math.nan, 1]]),
+        ("infinite", [[0, 0], [math.inf, 0], [1, 1]]),
+        ("two vertices", [[0, 0], [1, 0]]),
+        ("three coordinates", [[0, 0, 0], [1, 0, 0], [1, 1, 0]]),
+        ("flat", [0, 0, 1, 0, 1, 1]),
+        ("empty", []),
+    ],
+)
+def test_polygon_rejects_what_is_no_convex_counter_clockwise_outline(fault, vertices):
+    with pytest.raises(ValueError, match="vertices must"):
+        fp.polygon(vertices)

@@ -1,0 +1,250 @@
+"""Planar geometry: right values where others overflow, finite derivatives where others are NaN."""
+
+from __future__ import annotations
+
+import math
+
+import hypothesis
+import hypothesis.extra.numpy as hnp
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from rps_jax import frames
+
+PI = np.float32(np.pi)  # a little above pi
+
+property_test = hypothesis.settings(max_examples=100, deadline=None)
+finite32 = st.floats(allow_nan=False, allow_infinity=False, width=32)
+
+wrap = jax.jit(frames.wrap)
+yaw_of_quaternion = jax.jit(frames.yaw_of_quaternion)
+norm_and_gradient = jax.jit(jax.vmap(jax.value_and_grad(frames.norm)))
+direction_and_gradient = jax.jit(jax.vmap(jax.value_and_grad(frames.direction)))
+sqrt_and_gradient = jax.jit(jax.vmap(jax.value_and_grad(frames.safe_sqrt)))
+
+
+def ordinary(v: np.ndarray) -> np.ndarray:
+    """Without what XLA on the CPU flushes to zero: subnormal numbers, and subnormal reciprocals."""
+    return np.clip(np.where(np.abs(v) < 1e-37, 0, v), -8e37, 8e37)
+
+
+# rotate
+
+
+def test_a_rotation_by_a_quarter_turn_takes_x_to_y_and_y_to_minus_x():
+    got = frames.rotate(jnp.float32(math.pi / 2), jnp.array([[2.0, 0.0], [0.0, 3.0], [1.0, 1.0]]))
+    np.testing.assert_allclose(got, [[0, 2], [-3, 0], [-1, 1]], atol=1e-6)
+
+
+def test_rotations_compose_by_adding_their_angles_and_keep_lengths():
+    rng = np.random.default_rng(0)
+    a, b = rng.uniform(-4, 4, (2, 100)).astype(np.float32)
+    v = rng.normal(size=(100, 2)).astype(np.float32)
+    twice = frames.rotate(a, frames.rotate(b, v))
+    np.testing.assert_allclose(twice, frames.rotate(a + b, v), atol=3e-6)
+    np.testing.assert_allclose(np.hypot(*np.asarray(twice).T), np.hypot(*v.T), rtol=1e-6)
+
+
+# wrap
+
+
+@pytest.mark.parametrize(
+    ("angle", "expected"),
+    [
+        (0.0, 0.0),
+        (1.5, 1.5),
+        (-3.0, -3.0),
+        (3.5, 3.5 - 2 * math.pi),
+        (-3.5, 2 * math.pi - 3.5),
+        (7.0, 7.0 - 2 * math.pi),
+        (-20.0, -20.0 + 6 * math.pi),
+        (PI, -math.pi),  # the excluded end is the included one
+        (-PI, -math.pi),
+    ],
+)
+def test_wrap_gives_the_same_angle_within_half_a_turn(angle, expected):
+    assert frames.wrap(jnp.float32(angle)) == pytest.approx(expected, abs=2e-6)
+
+
+@property_test
+@hypothesis.given(hnp.arrays(np.float32, 256, elements=finite32))
+def test_wrap_stays_in_minus_pi_to_pi_exclusive_for_every_finite_angle(angle):
+    wrapped = np.asarray(wrap(angle))
+    assert (wrapped >= -PI).all()
+    assert (wrapped < PI).all()
+
+
+def test_wrap_excludes_pi_whatever_the_rounding_near_its_odd_multiples():
+    odd = np.arange(-41, 42, 2, dtype=np.float64) * np.pi
+    near = [odd.astype(np.float32)]
+    for end in (-np.inf, np.inf):
+        for _ in range(4):
+            near.append(np.nextafter(near[-1], np.float32(end)))
+        near.append(near[0])
+    tiny = np.float32([1e-8, -1e-8, 1e-38, -1e-38, 0.0, -0.0])
+    angle = np.resize(np.concatenate([*near, tiny, -PI + tiny, PI + tiny]), 512)
+    wrapped = np.asarray(wrap(angle))
+    assert (wrapped >= -PI).all()
+    assert (wrapped < PI).all()
+    np.testing.assert_allclose(np.cos(np.float64(wrapped)), np.cos(np.float64(angle)), atol=1e-4)
+
+
+@property_test
+@hypothesis.given(hnp.arrays(np.float32, 256, elements=st.floats(-1e4, 1e4, width=32)))
+def test_wrap_changes_no_angle_beyond_rounding(angle):
+    # float32's 2 pi is off by 1.7e-7 in every turn, and a large angle is itself that coarse.
+    difference = np.float64(wrap(angle)) - np.float64(angle)
+    off = np.abs(np.remainder(difference + np.pi, 2 * np.pi) - np.pi)
+    assert (off <= 1e-6 + 2e-7 * np.abs(angle)).all()
+
+
+def test_the_derivative_of_wrap_is_one_even_at_the_jump():
+    angle = jnp.array([0.0, 1.0, PI, -PI, 100.0, -3.0])
+    np.testing.assert_array_equal(jax.vmap(jax.grad(frames.wrap))(angle), np.ones(6))
+
+
+# norm
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-36, 1e-30, 1e-20, 1e20, 1e30, 1e37])
+def test_norm_and_its_derivative_are_right_where_squares_overflow_or_vanish(scale):
+    v = np.float32(scale) * np.float32([[3, 4], [-4, 3], [0, -5]])
+    value, gradient = norm_and_gradient(v)
+    np.testing.assert_allclose(value, np.full(3, 5 * np.float32(scale)), rtol=1e-6)
+    np.testing.assert_allclose(gradient, [[0.6, 0.8], [-0.8, 0.6], [0, -1]], rtol=1e-6)
+
+
+def test_norm_is_zero_with_zero_derivative_at_zero():
+    value, gradient = norm_and_gradient(jnp.zeros((3, 2)))
+    np.testing.assert_array_equal(value, np.zeros(3))
+    np.testing.assert_array_equal(gradient, np.zeros((3, 2)))
+
+
+@property_test
+@hypothesis.given(hnp.arrays(np.float32, (64, 2), elements=finite32))
+def test_norm_agrees_with_hypot_and_its_derivative_is_a_unit_vector(v):
+    v = ordinary(v)
+    value, gradient = norm_and_gradient(v)
+    np.testing.assert_allclose(value, np.hypot(*np.float64(v).T), rtol=1e-6)
+    lengths = np.hypot(*np.float64(gradient).T)
+    np.testing.assert_allclose(lengths, v.any(axis=1), atol=1e-6)
+
+
+def test_norm_and_its_derivative_are_right_up_to_the_largest_numbers():
+    # The reciprocal of anything above 2^126 = 8.5e37 is subnormal, which XLA flushes to zero.
+    value, gradient = norm_and_gradient(np.float32([[1.2e38, 1.6e38], [0, -3e38]]))
+    np.testing.assert_allclose(value, [2e38, 3e38], rtol=1e-6)
+    np.testing.assert_allclose(gradient, [[0.6, 0.8], [0, -1]], rtol=1e-6)
+
+
+def test_norm_is_over_the_last_axis():
+    v = np.random.default_rng(0).normal(size=(4, 3, 5))
+    np.testing.assert_allclose(frames.norm(jnp.asarray(v)), np.linalg.norm(v, axis=-1), rtol=1e-6)
+
+
+def test_norm_hides_no_nan():
+    assert np.isnan(frames.norm(jnp.array([jnp.nan, 1.0])))
+
+
+# direction
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-36, 1e-20, 1e20, 5e37])
+@pytest.mark.parametrize(
+    ("unit", "expected"),
+    [
+        ((1, 0), 0),
+        ((1, 1), math.pi / 4),
+        ((0, 1), math.pi / 2),
+        ((-1, 1), 3 * math.pi / 4),
+        ((-1, 0), math.pi),
+        ((-1, -1), -3 * math.pi / 4),
+        ((0, -1), -math.pi / 2),
+    ],
+)
+def test_direction_is_the_angle_from_x_to_y_at_any_length(unit, expected, scale):
+    assert frames.direction(jnp.float32(scale) * jnp.array(unit)) == pytest.approx(expected)
+
+
+def test_the_derivative_of_direction_is_across_and_inverse_to_the_length():
+    # d atan2(y, x) = (-y, x) / (x^2 + y^2)
+    for scale in (1.0, 1e-30, 1e-20, 1e20, 1e30):
+        v = np.float32(scale) * np.float32([[3, 4], [-4, 3], [-5, 0], [0, -5]])
+        gradient = np.float64(direction_and_gradient(v)[1]) * scale
+        np.testing.assert_allclose(
+            gradient, [[-0.16, 0.12], [-0.12, -0.16], [0, -0.2], [0.2, 0]], rtol=1e-5, atol=1e-9
+        )
+
+
+def test_direction_is_zero_with_zero_derivative_at_zero():
+    value, gradient = direction_and_gradient(jnp.zeros((4, 2)))
+    np.testing.assert_array_equal(value, np.zeros(4))
+    np.testing.assert_array_equal(gradient, np.zeros((4, 2)))
+
+
+@property_test
+@hypothesis.given(hnp.arrays(np.float32, (64, 2), elements=finite32))
+def test_direction_agrees_with_atan2_for_every_finite_vector(v):
+    v = ordinary(v)
+    value, gradient = direction_and_gradient(v)
+    expected = np.where(v.any(axis=1), np.arctan2(*np.float64(v).T[::-1]), 0)
+    # Beside the cut, float32 may round to its other end.
+    off = np.abs(np.remainder(np.float64(value) - expected + np.pi, 2 * np.pi) - np.pi)
+    assert off.max() < 1e-6
+    assert np.isfinite(gradient).all()
+
+
+def test_direction_is_right_up_to_the_largest_numbers():
+    value, gradient = direction_and_gradient(np.float32([[1e38, 1e38], [0, -3e38]]))
+    np.testing.assert_allclose(value, [math.pi / 4, -math.pi / 2], rtol=1e-6)
+    np.testing.assert_allclose(gradient, np.zeros((2, 2)), atol=1e-37)
+
+
+def test_the_direction_of_a_negative_x_is_pi_whatever_the_sign_of_its_zero():
+    got = frames.direction(jnp.array([[-1.0, 0.0], [-1.0, -0.0]]))
+    np.testing.assert_array_equal(got, [PI, PI])
+
+
+# safe_sqrt
+
+
+def test_safe_sqrt_is_the_root_where_positive_and_zero_with_zero_derivative_elsewhere():
+    value, gradient = sqrt_and_gradient(jnp.array([4.0, 0.25, 1e-30, 0.0, -1.0, -1e30]))
+    np.testing.assert_allclose(value, [2, 0.5, 1e-15, 0, 0, 0], rtol=1e-6)
+    np.testing.assert_allclose(gradient, [0.25, 1, 5e14, 0, 0, 0], rtol=1e-6)
+
+
+# yaw_of_quaternion
+
+
+def test_yaw_of_quaternion_by_hand():
+    half = math.sqrt(0.5)
+    quaternions = jnp.array([[1, 0, 0, 0], [half, 0, 0, half], [half, 0, 0, -half], [0, 1, 0, 0]])
+    got = frames.yaw_of_quaternion(quaternions)
+    np.testing.assert_allclose(got, [0, math.pi / 2, -math.pi / 2, 0], atol=1e-6)
+
+
+@property_test
+@hypothesis.given(st.integers(0, 2**32 - 1))
+def test_yaw_of_quaternion_is_where_the_tilted_body_heads(seed):
+    rng = np.random.default_rng(seed)
+    yaw = rng.uniform(-3.14, 3.14, 256)
+    tilt = rng.uniform(-1.4, 1.4, (256, 2))
+    rotation = Rotation.from_euler("ZYX", np.column_stack([yaw, tilt]))
+    quaternion = np.float32(rotation.as_quat(scalar_first=True))
+    heading = rotation.apply([1.0, 0.0, 0.0])
+    np.testing.assert_allclose(np.arctan2(heading[:, 1], heading[:, 0]), yaw, atol=1e-9)
+    for q in (quaternion, -quaternion):  # both are the same rotation
+        # The heading's shadow is cos(tilt) >= 0.17 long, which magnifies rounding.
+        np.testing.assert_allclose(yaw_of_quaternion(q), yaw, atol=3e-6)
+
+
+def test_the_yaw_of_a_body_on_its_nose_is_finite_with_finite_derivatives():
+    upright = jnp.array([1.0, 0.0, 1.0, 0.0]) * jnp.sqrt(0.5)
+    value, gradient = jax.value_and_grad(frames.yaw_of_quaternion)(upright)
+    assert abs(value) <= PI
+    assert np.isfinite(gradient).all()

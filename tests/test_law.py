@@ -1,0 +1,668 @@
+"""The law of the paper: Eqs. 1-9 and Algorithm 1, by golden values and by symmetries.
+
+Golden values are worked out by hand from the printed equations. The recurring displacements are
+Pythagorean, so that norms and tangents are rational: (0.384, 0.112) has norm 0.4 and tangent 7/24,
+(1.2, -0.5) norm 1.3 and tangent -5/12.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import chex
+import hypothesis
+import hypothesis.extra.numpy as hnp
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+from jax.flatten_util import ravel_pytree
+
+from rps_jax import errors, law
+from rps_jax.law import Observation, RPSParams, RPSState, Twist
+
+PAPER = RPSParams.paper()
+FRONT = 0.3625  # [m] x of a contact on the front face
+UNBOUNDED = PAPER._replace(v_max=1e6, omega_max=1e6)  # shows the equations before saturation
+
+property_test = hypothesis.settings(max_examples=100, deadline=None)
+details_of = jax.jit(law.step_with_details)
+batch_details = jax.jit(jax.vmap(law.step_with_details))
+
+
+def observe(d, l=0.0, robot=(0.0, 0.0), yaw=0.0, in_contact=True) -> Observation:  # noqa: E741
+    """A contact at lateral location `l` whose displacement to the target is `d`, by Eq. 4."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    contact = (robot[0] + c * FRONT - s * l, robot[1] + s * FRONT + c * l)
+    return Observation(
+        p_world_robot=jnp.asarray(robot, float),
+        yaw=jnp.asarray(yaw, float),
+        p_robot_contact=jnp.asarray((FRONT, l), float),
+        in_contact=jnp.asarray(in_contact),
+        p_world_target=jnp.asarray((contact[0] + d[0], contact[1] + d[1]), float),
+    )
+
+
+def state_with(l_th: float) -> RPSState:
+    return RPSState.init(PAPER)._replace(l_th=jnp.asarray(l_th, float))
+
+
+def twist_of(params, observation, l_th=0.24) -> list[float]:
+    return [float(v) for v in law.step(params, state_with(l_th), observation)[1]]
+
+
+def random_worlds(seed: int, n: int = 256, dtype=np.float32):
+    """Plausible situations in contact: (state, observation), every leaf batched."""
+    rng = np.random.default_rng(seed)
+    l_th = rng.choice([0.15, 0.24], n)
+    contact = np.stack([np.full(n, FRONT), rng.uniform(-0.29, 0.29, n)], -1)
+    state = RPSState(l_th.astype(dtype), np.zeros((n, 2), dtype), np.ones(n, bool))
+    observation = Observation(
+        rng.uniform(-3, 3, (n, 2)).astype(dtype),
+        rng.uniform(-math.pi, math.pi, n).astype(dtype),
+        contact.astype(dtype),
+        np.ones(n, bool),
+        rng.uniform(-3, 3, (n, 2)).astype(dtype),
+    )
+    return jax.tree.map(jnp.asarray, (state, observation))
+
+
+def random_params(seed: int, n: int, dtype=np.float32) -> RPSParams:
+    """Sensible parameters around the paper's, every leaf batched."""
+    rng = np.random.default_rng(seed)
+    factor = rng.uniform(0.7, 1.3, (len(PAPER), n))
+    params = RPSParams(*(np.asarray(value * f) for value, f in zip(PAPER, factor, strict=True)))
+    params = params._replace(
+        zeta=rng.uniform(0, 1, n),
+        gamma_max=rng.uniform(1.0, 1.56, n),
+        reactive=np.resize([1.0, 0.0, 1.0], n),
+    )
+    return jax.tree.map(lambda v: jnp.asarray(v, dtype), params)
+
+
+def repeat(params: RPSParams, n: int, dtype=np.float32) -> RPSParams:
+    return jax.tree.map(lambda v: jnp.full(n, v, dtype), params)
+
+
+# The parameters
+
+
+def test_the_defaults_are_the_papers_values_of_section_iv_a():
+    given = {"eta": 10, "zeta": 0, "beta": 0.12, "k": 60, "K_h": 1, "K_v": 0.1, "L": 0.2}
+    given |= {"l_cr": 0.24, "d_th": 0.5, "v_max": 0.05, "omega_max": 0.15, "d_success": 0.05}
+    given |= {"v_approach": 0.01, "reactive": 1}
+    assert {name: getattr(PAPER, name) for name in given} == given
+
+
+def test_what_the_paper_leaves_open_is_consistent_with_what_it_gives():
+    assert 0 < PAPER.l_mr < PAPER.l_cr
+    assert PAPER.a_r_max == PAPER.eta
+    assert 1.5 < PAPER.gamma_max < math.pi / 2
+
+
+def test_nps_differs_from_the_paper_only_in_not_being_reactive():
+    assert RPSParams.nps() == PAPER._replace(reactive=0.0)
+
+
+def test_the_initial_threshold_is_the_critical_one():
+    state = RPSState.init(PAPER._replace(l_cr=0.2))
+    assert state.l_th == jnp.float32(0.2)
+    assert not state.touched
+
+
+def test_check_returns_valid_parameters_unchanged():
+    assert law.check(PAPER) is PAPER
+    assert law.check(RPSParams.nps()) == RPSParams.nps()
+
+
+@pytest.mark.parametrize("name", RPSParams._fields)
+@pytest.mark.parametrize("value", [math.nan, -0.1, -math.inf, "much", None, (1.0, 2.0)])
+def test_check_names_the_parameter_that_is_not_a_number_or_is_negative(name, value):
+    with pytest.raises(errors.InputError, match=rf"\b{name} = "):
+        law.check(PAPER._replace(**{name: value}))
+
+
+MUST_BE_POSITIVE = ("K_h", "K_v", "L", "l_cr", "v_max", "omega_max", "d_success", "gamma_max")
+
+
+@pytest.mark.parametrize("name", MUST_BE_POSITIVE)
+def test_check_names_the_parameter_that_must_not_be_zero(name):
+    with pytest.raises(errors.InputError, match=rf"\b{name} = "):
+        law.check(PAPER._replace(**{name: 0.0}))
+
+
+@pytest.mark.parametrize("name", sorted(set(RPSParams._fields) - set(MUST_BE_POSITIVE)))
+def test_check_lets_the_other_parameters_be_zero(name):
+    law.check(PAPER._replace(**{name: 0.0}))
+
+
+@pytest.mark.parametrize("name", sorted(set(RPSParams._fields) - {"gamma_max"}))
+def test_check_names_the_parameter_that_is_infinite(name):
+    with pytest.raises(errors.InputError, match=rf"\b{name} = "):
+        law.check(PAPER._replace(**{name: math.inf}))
+
+
+def test_check_allows_an_infinite_gamma_max_the_tangent_as_printed():
+    law.check(PAPER._replace(gamma_max=math.inf))
+
+
+def test_check_holds_reactive_within_its_two_ends():
+    with pytest.raises(errors.InputError, match=r"\breactive = "):
+        law.check(PAPER._replace(reactive=1.5))
+
+
+# The equations, one by one
+
+
+@pytest.mark.parametrize(
+    ("l", "expected"),
+    [
+        (0.12, 5.0),  # the inflection: 10 / (1 + e^0)
+        (-0.12, -5.0),  # sgn(l)
+        (0.18, 9.734030),  # 10 / (1 + e^-3.6), e^-3.6 = 0.02732372
+        (0.06, 0.265970),  # 10 / (1 + e^3.6), e^3.6 = 36.59823
+        (0.24, 9.992540),  # 10 / (1 + e^-7.2), e^-7.2 = 7.465858e-4
+        (-0.01, -0.013585),  # -10 / (1 + e^6.6), e^6.6 = 735.0952
+        (1e-6, 0.007461),  # 10 / (1 + e^7.2): not zero beside the centre
+        (0.0, 0.0),  # sgn(0) = 0
+        (2.0, 10.0),  # eta, the upper asymptote
+    ],
+)
+def test_eq_5_gives_the_adaptive_rate_by_hand(l, expected):  # noqa: E741
+    # The slope of the curve, at most eta k / 4 = 150 per metre, amplifies float32's rounding of l.
+    a_r = law.adaptive_rate(PAPER, jnp.float32(l), jnp.float32(1.0))
+    assert a_r == pytest.approx(expected, rel=5e-5, abs=1e-6)
+
+
+def test_eq_5_has_the_lower_asymptote_zeta_and_the_upper_asymptote_eta():
+    params = PAPER._replace(zeta=2.0, beta=0.5, k=200.0)
+    a_r = law.adaptive_rate(params, jnp.array([0.01, 0.5, -0.99]), jnp.ones(3))
+    np.testing.assert_allclose(a_r, [2.0, 6.0, -10.0], rtol=1e-5)
+
+
+def test_eq_5_switches_off_at_d_th_and_below():
+    just_beyond = np.nextafter(np.float32(0.5), np.float32(1))
+    a_r = law.adaptive_rate(PAPER, jnp.full(3, 0.12), jnp.array([0.49, 0.5, just_beyond]))
+    np.testing.assert_allclose(a_r, [0.0, 0.0, 5.0], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("v_star", "a_r", "expected"),
+    [
+        (0.05, 0.0, (0.05, 0.0)),
+        (0.05, 0.75, (0.04, 0.03)),  # sqrt(1 + 9/16) = 5/4
+        (0.13, -2.4, (0.05, -0.12)),  # sqrt(1 + 144/25) = 13/5
+        (1.0, 10.0, (0.0995037, 0.995037)),  # 1 / sqrt(101)
+        (0.0, 10.0, (0.0, 0.0)),
+        (1.0, 1e30, (1e-30, 1.0)),  # a_r^2 is beyond float32
+    ],
+)
+def test_eqs_1_and_2_split_the_speed_by_the_slope(v_star, a_r, expected):
+    np.testing.assert_allclose(law.linear_velocity(v_star, a_r), expected, rtol=1e-6)
+
+
+def test_eq_3_makes_the_speed_proportional_to_the_distance():
+    for l, l_th in [(0.0, 0.24), (0.1, 0.24), (-0.2, 0.15)]:  # noqa: E741
+        v_x, v_y, _ = twist_of(UNBOUNDED._replace(K_v=0.3), observe((1.2, -0.5), l), l_th)
+        assert math.hypot(v_x, v_y) == pytest.approx(0.3 * 1.3, rel=1e-5)
+
+
+def test_eq_4_points_from_the_contact_to_the_target_in_the_world():
+    # At yaw 90 degrees the robot's x is the world's y, and its y the world's -x:
+    # the contact (0.3, 0.1) of a robot at (2, -1) is at (2 - 0.1, -1 + 0.3).
+    observation = Observation(
+        jnp.array([2.0, -1.0]),
+        jnp.array(math.pi / 2),
+        jnp.array([0.3, 0.1]),
+        jnp.array(True),
+        jnp.array([3.0, 3.0]),
+    )
+    np.testing.assert_allclose(law.displacement(observation), [1.1, 3.7], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("d", "yaw", "K_h", "expected"),
+    [
+        ((1.0, 1.0), 0.0, 1.0, math.pi / 4),
+        ((1.0, 1.0), math.pi / 2, 1.0, -math.pi / 4),
+        ((0.0, 2.0), 0.5, 0.5, 0.5 * (math.pi / 2 - 0.5)),
+        # 3 - (-3) = 6 rad wraps to 6 - 2 pi, and only then meets the gain.
+        ((math.cos(3), math.sin(3)), -3.0, 0.5, 0.5 * (6 - 2 * math.pi)),
+        ((0.0, 0.0), 0.25, 1.0, -0.25),  # no direction: 0
+    ],
+)
+def test_eq_7_is_the_gain_times_the_wrapped_heading_error(d, yaw, K_h, expected):
+    gamma = law.steering_angle(PAPER._replace(K_h=K_h), jnp.array(d), jnp.float32(yaw))
+    assert gamma == pytest.approx(expected, abs=2e-6)
+
+
+def test_gamma_is_held_within_gamma_max():
+    errors_ = jnp.array([1.5, 1.57, 3.0, -1.57, -3.0])
+    d = jnp.stack([jnp.cos(errors_), jnp.sin(errors_)], -1)
+    gamma = law.steering_angle(PAPER, d, jnp.zeros(5))
+    np.testing.assert_allclose(gamma, [1.5, 1.56, 1.56, -1.56, -1.56], rtol=1e-6)
+    as_printed = law.steering_angle(PAPER._replace(gamma_max=math.inf), d, jnp.zeros(5))
+    np.testing.assert_allclose(as_printed, errors_, rtol=1e-6)
+
+
+def test_eq_9_falls_linearly_from_one_at_the_centre_to_zero_in_the_critical_region():
+    sigma = law.realignment_gain(PAPER, jnp.array([0.0, 0.06, -0.12, 0.24, -0.24, 0.29, 9.0]))
+    np.testing.assert_allclose(sigma, [1.0, 0.75, 0.5, 0.0, 0.0, 0.0, 0.0], atol=1e-6)
+
+
+def test_eq_6_turns_with_the_forward_velocity():
+    # v* = 0.13, a_r = 5, v_x = 0.13 / sqrt(26); omega = v_x / 0.2 * (-5/12).
+    v_x, v_y, omega = twist_of(UNBOUNDED, observe((1.2, -0.5), l=0.12))
+    assert v_x == pytest.approx(0.13 / math.sqrt(26), rel=1e-4)
+    assert v_y == pytest.approx(0.65 / math.sqrt(26), rel=1e-4)
+    assert omega == pytest.approx(-0.65 / 2.4 / math.sqrt(26), rel=1e-4)
+
+
+def test_eq_8_turns_with_sigma_and_the_whole_speed_while_realigning():
+    # v* = 0.13, |l| = 0.18: sigma = 1/4; omega = 0.25 * 0.13 / 0.2 * (-5/12), without sqrt(101).
+    v_x, v_y, omega = twist_of(UNBOUNDED, observe((1.2, -0.5), l=-0.18), l_th=0.15)
+    assert v_x == pytest.approx(0.13 / math.sqrt(101), rel=1e-5)
+    assert v_y == pytest.approx(-1.3 / math.sqrt(101), rel=1e-5)
+    assert omega == pytest.approx(-0.0677083, rel=1e-4)
+
+
+# Whole steps by hand
+
+
+@pytest.mark.parametrize(
+    ("case", "observation", "l_th", "expected"),
+    [
+        # v* = 0.1 is scaled to 0.05.
+        ("straight ahead, far", observe((1.0, 0.0)), 0.24, (0.05, 0.0, 0.0)),
+        # ||d|| = 0.4 < d_th: a_r = 0. omega = 0.04 / 0.2 * 7/24.
+        ("near, to the left", observe((0.384, 0.112), l=0.1), 0.24, (0.04, 0.0, 0.0583333)),
+        # v* = 0.13, a_r = 5: (0.0255, 0.1275) scaled to norm 0.05 is (0.05, 0.25) / sqrt(26).
+        # omega keeps the unsaturated v_x: 0.0254951 / 0.2 * -5/12 (the saturated: -0.0204).
+        ("v saturates", observe((1.2, -0.5), l=0.12), 0.24, (0.00980581, 0.0490290, -0.0531148)),
+        # As above with tangent -12/5: -0.30594 is clipped (the saturated v_x: -0.1177).
+        ("both saturate", observe((0.5, -1.2), l=0.12), 0.24, (0.00980581, 0.0490290, -0.15)),
+        # |l| > l_cr: a_r = 10, sigma = 0. v* = 0.13 scaled to 0.05.
+        ("critical region", observe((1.2, -0.5), l=0.25), 0.24, (0.00497519, 0.0497519, 0.0)),
+        # v* = 0.04, a_r = -10 although ||d|| < d_th; omega = 1/4 * 0.04 / 0.2 * 7/24.
+        (
+            "realigning, near",
+            observe((0.384, 0.112), l=-0.18),
+            0.15,
+            (0.00398015, -0.0398015, 0.0145833),
+        ),
+        # The same l and d, not realigning: a_r = 0.
+        ("the same, normal", observe((0.384, 0.112), l=-0.18), 0.24, (0.04, 0.0, 0.0583333)),
+        # The same situation for a robot elsewhere, turned by 90 degrees: d = (-0.112, 0.384).
+        (
+            "realigning, elsewhere",
+            observe((-0.112, 0.384), l=-0.18, robot=(2.0, -1.0), yaw=math.pi / 2),
+            0.15,
+            (0.00398015, -0.0398015, 0.0145833),
+        ),
+        # Heading error 3 rad, gamma = 1.56, tan = 92.6: 0.1 / 0.2 * 92.6 is clipped.
+        ("behind", observe((math.cos(3), math.sin(3))), 0.24, (0.05, 0.0, 0.15)),
+    ],
+)
+def test_one_step_by_hand(case, observation, l_th, expected):
+    twist = twist_of(PAPER, observation, l_th)
+    assert twist == pytest.approx(expected, rel=1e-4, abs=2e-7), case
+
+
+def test_the_tangent_as_printed_turns_away_from_a_target_behind():
+    # v_x = 0.1, omega = 0.1 / 0.2 * tan(error): tan is positive at 1.5 and negative at 1.7.
+    as_printed = PAPER._replace(gamma_max=math.inf, omega_max=100.0)
+    for error in (1.5, 1.7, 3.0, -1.5, -1.7, -3.0):
+        observation = observe((math.cos(error), math.sin(error)))
+        omega = twist_of(as_printed, observation)[2]
+        assert omega == pytest.approx(0.5 * math.tan(error), rel=1e-3)
+        assert (omega * error > 0) == (abs(error) < math.pi / 2)
+        assert twist_of(PAPER, observation)[2] * error > 0
+
+
+def test_a_centred_contact_asks_for_no_lateral_motion_whatever_zeta():
+    v_x, v_y, _ = twist_of(PAPER._replace(zeta=3.0), observe((2.0, 0.0), l=0.0))
+    assert (v_x, v_y) == (pytest.approx(0.05), 0.0)
+
+
+# Algorithm 1
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_realignment_starts_above_l_cr_and_lasts_until_l_mr(side):
+    #      far   l_cr  above  on its way in    l_mr  as before
+    ls = [0.20, 0.24, 0.241, 0.23, 0.20, 0.151, 0.15, 0.20, 0.24]
+    realigns = [False, False, True, True, True, True, False, False, False]
+    state = RPSState.init(PAPER)
+    thresholds, states = [], []
+    for l in ls:  # noqa: E741
+        state, _, details = details_of(PAPER, state, observe((1.0, 0.3), side * l))
+        thresholds.append(float(state.l_th))
+        states.append(bool(details.realigning))
+        assert details.l == pytest.approx(side * l)
+        if details.realigning:
+            assert details.a_r == side * 10
+    assert states == realigns
+    assert thresholds == pytest.approx([0.15 if r else 0.24 for r in realigns])
+
+
+@pytest.mark.parametrize(("l", "l_th"), [(0.2, 0.15), (0.1, 0.15), (0.28, 0.24), (0.0, 0.24)])
+def test_at_the_target_the_robot_stops_and_the_threshold_stays(l, l_th):  # noqa: E741
+    state, twist, details = details_of(PAPER, state_with(l_th), observe((0.03, -0.039), l))
+    assert tuple(map(float, twist)) == (0.0, 0.0, 0.0)
+    assert state.l_th == jnp.float32(l_th)
+    assert not details.realigning
+
+
+def test_the_target_is_reached_strictly_within_d_success():
+    def at(distance):  # exactly representable: the contact is at the origin
+        zero = jnp.zeros(2)
+        return Observation(zero, zero[0], zero, jnp.array(True), jnp.array([distance, 0.0]))
+
+    d_success = np.float32(0.05)
+    assert twist_of(PAPER, at(d_success))[0] == pytest.approx(0.005)
+    assert twist_of(PAPER, at(np.nextafter(d_success, np.float32(0))))[0] == 0.0
+
+
+@pytest.mark.parametrize("l_th", [0.24, 0.15])
+def test_without_contact_the_robot_creeps_straight_ahead_and_the_threshold_stays(l_th):
+    for params in (PAPER, RPSParams.nps()):
+        observation = observe((1.0, 2.0), l=0.27, in_contact=False)
+        state, twist, details = details_of(params, state_with(l_th), observation)
+        assert tuple(map(float, twist)) == (pytest.approx(0.01), 0.0, 0.0)
+        assert state.l_th == jnp.float32(l_th)
+        assert not details.realigning
+
+
+def test_without_contact_a_target_within_d_success_does_not_stop_the_robot():
+    assert twist_of(PAPER, observe((0.0, 0.0), in_contact=False))[0] == pytest.approx(0.01)
+
+
+def test_without_contact_the_contact_location_may_be_nan():
+    observation = observe((1.0, 0.0), in_contact=False)
+    observation = observation._replace(p_robot_contact=jnp.full(2, jnp.nan))
+    state, twist, details = details_of(PAPER, state_with(0.24), observation)
+    assert tuple(map(float, twist)) == (pytest.approx(0.01), 0.0, 0.0)
+    chex.assert_tree_all_finite((state, details))
+
+
+def test_the_state_remembers_the_last_contact_and_that_there_was_one():
+    state = RPSState.init(PAPER)
+    state, _ = law.step(PAPER, state, observe((1.0, 0.0), l=0.27, in_contact=False))
+    assert not state.touched
+    state, _ = law.step(PAPER, state, observe((1.0, 0.0), l=0.1))
+    state, _ = law.step(PAPER, state, observe((1.0, 0.0), l=0.27, in_contact=False))
+    assert state.touched
+    np.testing.assert_allclose(state.p_robot_contact, [FRONT, 0.1], rtol=1e-6)
+
+
+# Laws
+
+
+@property_test
+@hypothesis.given(st.integers(0, 2**32 - 1))
+def test_nps_never_moves_laterally_and_never_realigns(seed):
+    state, observation = random_worlds(seed)
+    nps = random_params(seed, 256)._replace(reactive=jnp.zeros(256))
+    after, twist, details = batch_details(nps, state, observation)
+    assert (twist.v_y == 0).all()
+    assert not details.realigning.any()
+    arrived = details.distance < nps.d_success
+    np.testing.assert_array_equal(after.l_th, np.where(arrived, state.l_th, nps.l_cr))
+
+
+@property_test
+@hypothesis.given(st.integers(0, 2**32 - 1))
+def test_a_mirrored_world_gives_the_mirrored_twist(seed):
+    state, observation = random_worlds(seed)
+    params = random_params(seed, 256)
+    flip = jnp.array([1.0, -1.0])
+    mirrored = Observation(
+        observation.p_world_robot * flip,
+        -observation.yaw,
+        observation.p_robot_contact * flip,
+        observation.in_contact,
+        observation.p_world_target * flip,
+    )
+    after, twist, details = batch_details(params, state, observation)
+    after_m, twist_m, details_m = batch_details(params, state, mirrored)
+    d = jax.vmap(law.displacement)(observation)
+    error = np.arctan2(d[:, 1], d[:, 0]) - observation.yaw
+    regular = np.abs(np.cos(error / 2)) > 1e-4  # at +-pi the law must choose a side
+    assert regular.mean() > 0.9
+    np.testing.assert_allclose(twist_m.v_x, twist.v_x, rtol=1e-5)
+    np.testing.assert_allclose(twist_m.v_y, -twist.v_y, rtol=1e-5)
+    np.testing.assert_allclose(twist_m.omega[regular], -twist.omega[regular], atol=1e-4)
+    np.testing.assert_array_equal(details_m.realigning, details.realigning)
+    np.testing.assert_array_equal(after_m.l_th, after.l_th)
+
+
+@property_test
+@hypothesis.given(st.integers(0, 2**32 - 1), st.floats(-10, 10), st.floats(-50, 50))
+def test_the_twist_does_not_depend_on_where_the_world_has_its_origin_and_axes(seed, turn, shift):
+    c, s = math.cos(turn), math.sin(turn)
+    R = np.array([[c, -s], [s, c]])
+    with jax.enable_x64(True):
+        state, observation = random_worlds(seed, dtype=np.float64)
+        params = random_params(seed, 256, np.float64)
+        moved = observation._replace(
+            p_world_robot=observation.p_world_robot @ R.T + shift,
+            yaw=observation.yaw + turn,
+            p_world_target=observation.p_world_target @ R.T + shift,
+        )
+        expected = batch_details(params, state, observation)
+        got = batch_details(params, state, moved)
+        chex.assert_trees_all_close(got, expected, atol=1e-8)
+
+
+finite32 = st.floats(allow_nan=False, allow_infinity=False, width=32)
+
+
+@property_test
+@hypothesis.given(hnp.arrays(np.float32, (64, 9), elements=finite32), st.integers(0, 2**32 - 1))
+def test_whatever_the_finite_input_the_twist_is_finite_and_within_its_bounds(x, seed):
+    params = random_params(seed, 64)
+    rng = np.random.default_rng(seed)
+    params = params._replace(gamma_max=jnp.asarray(rng.choice([1.56, np.inf], 64), jnp.float32))
+    state = RPSState(jnp.asarray(rng.choice([0.15, 0.24], 64), jnp.float32), x[:, :2], x[:, 2] > 0)
+    observation = Observation(x[:, 2:4], x[:, 4], x[:, 5:7], rng.random(64) < 0.8, x[:, 7:9])
+    after, twist, details = batch_details(params, state, observation)
+    chex.assert_tree_all_finite((after, twist, details))
+    speed = np.hypot(np.float64(twist.v_x), np.float64(twist.v_y))
+    assert (speed <= np.maximum(params.v_max, params.v_approach) * (1 + 1e-6)).all()
+    assert (np.abs(twist.omega) <= params.omega_max).all()
+    assert (twist.v_x >= 0).all()
+
+
+@property_test
+@hypothesis.given(st.floats(-100, 100), st.floats(-100, 100), st.floats(-100, 100))
+def test_saturation_keeps_the_direction_of_the_velocity_and_what_is_within_bounds(v_x, v_y, omega):
+    v_x, v_y, omega = map(np.float32, (v_x, v_y, omega))
+    out = law.saturate(PAPER, Twist(v_x, v_y, omega))
+    speed = math.hypot(v_x, v_y)
+    scale = min(1.0, 0.05 / speed) if speed > 0 else 1.0
+    assert out.v_x == pytest.approx(v_x * scale, rel=1e-5, abs=1e-30)
+    assert out.v_y == pytest.approx(v_y * scale, rel=1e-5, abs=1e-30)
+    assert out.omega == pytest.approx(min(max(omega, -0.15), 0.15))
+
+
+# Derivatives, with respect to every parameter and every real number observed
+
+_, unravel = ravel_pytree((PAPER, observe((1.0, 0.0))[:3], jnp.zeros(2)))
+
+
+def twist_vector(x, l_th):
+    """The twist (3,) of the flattened parameters and observation x, in contact."""
+    params, (p_world_robot, yaw, contact), target = unravel(x)
+    observation = Observation(p_world_robot, yaw, contact, jnp.array(True), target)
+    state = RPSState(l_th, jnp.zeros(2, x.dtype), jnp.array(True))
+    return jnp.stack(law.step_with_details(params, state, observation)[1])
+
+
+def flatten(params: RPSParams, observation: Observation) -> np.ndarray:
+    """(n, 24): the inverse of `unravel`, batched."""
+    parts = [*params, *observation[:3], observation.p_world_target]
+    return np.concatenate([np.reshape(v, (len(v), -1)) for v in map(np.asarray, parts)], axis=1)
+
+
+batch_twist = jax.jit(jax.vmap(twist_vector))
+forward = jax.jit(jax.vmap(jax.jacfwd(twist_vector)))
+reverse = jax.jit(jax.vmap(jax.jacrev(twist_vector)))
+
+
+def singular_worlds() -> list[tuple[RPSParams, Observation]]:
+    """Where a careless derivative is 0/0 or infinite."""
+    as_printed = PAPER._replace(gamma_max=math.inf)
+    worlds = [
+        (as_printed, observe((math.cos(error), math.sin(error)), l))
+        for error in (0.0, 1.0, -1.5, 1.7, -3.0)
+        for l in (0.0, 0.1, -0.25)  # noqa: E741
+    ]
+    for params in (PAPER, RPSParams.nps(), PAPER._replace(zeta=1.0)):
+        for l in (0.0, 0.12, 0.15, -0.24, 0.29, 5.0, -1e6):  # noqa: E741
+            worlds += [
+                (params, observe((0.0, 0.0), l)),  # the target on the contact
+                (params, observe((-1.0, 0.0), l)),  # heading error exactly pi
+                (params, observe((-1.0, -0.0), l)),
+                (params, observe((1e-30, 1e-30), l)),
+                (params, observe((0.05, 0.0), l)),
+                (params, observe((0.5, 0.0), l)),
+                (params, observe((0.0, 1.0), l)),
+                (params, observe((1e6, -1e6), l, robot=(-1e6, 1e6), yaw=1e6)),
+            ]
+    zero = jnp.zeros(2)
+    for yaw in (0.0, math.pi, -math.pi):  # exactly, at the origin
+        at = Observation(zero, jnp.float32(yaw), zero, jnp.array(True), zero)
+        worlds += [(PAPER, at), (PAPER, at._replace(p_world_target=jnp.array([1.0, 0.0])))]
+    return worlds
+
+
+def test_derivatives_are_finite_at_every_singular_point():
+    worlds = singular_worlds()
+    params, observation = jax.tree.map(lambda *v: np.stack([np.float32(u) for u in v]), *worlds)
+    x = flatten(params, observation).astype(np.float32)
+    assert len(x) <= 256
+    x = np.resize(x, (256, x.shape[1]))  # the shape of the other tests
+    for l_th in (0.24, 0.15):
+        for jacobian in (forward, reverse):
+            chex.assert_tree_all_finite(jacobian(x, np.full(256, l_th, np.float32)))
+
+
+@property_test
+@hypothesis.given(
+    hnp.arrays(np.float32, (256, 7), elements=st.floats(-1e6, 1e6, width=32)),
+    st.integers(0, 2**32 - 1),
+)
+def test_derivatives_are_finite_for_any_sensible_input(x, seed):
+    params = np.stack(random_params(seed, 256), axis=1)
+    x = np.concatenate([params, x], axis=1)
+    l_th = np.resize(np.float32([0.24, 0.15]), 256)
+    ahead, back = forward(x, l_th), reverse(x, l_th)
+    chex.assert_tree_all_finite((ahead, back))
+
+
+def test_derivatives_agree_with_each_other_and_with_finite_differences():
+    n, h = 256, 1e-6
+    with jax.enable_x64(True):
+        state, observation = random_worlds(1, n, np.float64)
+        x = flatten(random_params(2, n, np.float64), observation)
+        l_th = np.asarray(state.l_th)
+        ahead, back = np.asarray(forward(x, l_th)), np.asarray(reverse(x, l_th))
+        differences, one_sided = [], []
+        for i in range(x.shape[1]):
+            e = np.zeros(x.shape[1])
+            e[i] = h
+            up, here, down = (np.asarray(batch_twist(x + a * e, l_th)) for a in (1, 0, -1))
+            differences.append((up - down) / (2 * h))
+            one_sided.append(np.abs(up - 2 * here + down) / h)
+    differences, kink = np.stack(differences, -1), np.stack(one_sided, -1) > 1e-2
+    assert kink.mean() < 0.1
+    np.testing.assert_allclose(ahead, back, rtol=1e-8, atol=1e-10)
+    scale = 1 + np.abs(differences)
+    assert (np.abs(differences - ahead) / scale)[~kink].max() < 1e-4
+
+
+def test_without_contact_a_nan_contact_location_does_no_harm_to_derivatives():
+    observation = observe((1.0, 0.0), in_contact=False)
+    observation = observation._replace(p_robot_contact=jnp.full(2, jnp.nan))
+
+    def forward_speed(params):
+        return sum(law.step(params, RPSState.init(PAPER), observation)[1])
+
+    gradient = jax.grad(forward_speed)(jax.tree.map(jnp.float32, PAPER))
+    expected = jax.tree.map(jnp.zeros_like, gradient)._replace(v_approach=jnp.float32(1.0))
+    chex.assert_trees_all_close(gradient, expected)
+
+
+# As a JAX program
+
+
+def test_a_batch_over_every_leaf_equals_a_loop_over_worlds():
+    n = 24
+    params = random_params(3, n)
+    state, observation = random_worlds(4, n)
+    observation = observation._replace(in_contact=jnp.arange(n) % 5 > 0)
+    batch = jax.jit(jax.vmap(law.step))(params, state, observation)
+    one_by_one = [
+        law.step(*jax.tree.map(lambda v, i=i: v[i], (params, state, observation))) for i in range(n)
+    ]
+    loop = jax.tree.map(lambda *v: jnp.stack(v), *one_by_one)
+    chex.assert_trees_all_close(batch, loop, rtol=1e-5, atol=1e-5)
+
+
+def test_a_batch_over_the_parameters_alone_shares_the_world():
+    params = random_params(5, 8)
+    world = state_with(0.24), observe((1.2, -0.5), l=0.1)
+    _, twist = jax.vmap(law.step, in_axes=(0, None, None))(params, *world)
+    shared = jax.tree.map(lambda v: jnp.broadcast_to(v, (8, *v.shape)), world)
+    expected = batch_details(params, *shared)[1]
+    chex.assert_trees_all_close(twist, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_float64_agrees_with_float32():
+    state, observation = random_worlds(6)
+    params = random_params(7, 256)
+    single = batch_details(params, state, observation)
+    with jax.enable_x64(True):
+        wide = jax.tree.map(
+            lambda v: v.astype(np.float64) if v.dtype == np.float32 else v,
+            jax.tree.map(np.asarray, (params, state, observation)),
+        )
+        double = batch_details(*wide)
+        assert {v.dtype for v in double[1]} == {np.dtype(np.float64)}
+    np.testing.assert_array_equal(single[2].realigning, double[2].realigning)
+    chex.assert_trees_all_close(
+        jax.tree.map(np.float64, single), jax.tree.map(np.float64, double), atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("x64", [False, True])
+@pytest.mark.parametrize("in_contact", [False, True])
+def test_a_step_preserves_the_dtypes_of_the_state(x64, in_contact):
+    with jax.enable_x64(x64):
+        before = RPSState.init(PAPER)
+        after, twist = law.step(PAPER, before, observe((1.0, 0.2), 0.1, in_contact=in_contact))
+        kinds = [jax.tree.map(lambda v: (v.dtype, v.weak_type), s) for s in (before, after)]
+        assert kinds[0] == kinds[1]
+        assert {v.dtype for v in twist} == {jnp.zeros(()).dtype}
+
+
+def test_float32_stays_float32_where_float64_is_enabled():
+    before, observation = (jax.tree.map(lambda v: v[0], w) for w in random_worlds(8, 1))
+    params = jax.tree.map(lambda v: v[0], random_params(8, 1))
+    with jax.enable_x64(True):
+        after, twist = law.step(params, before, observation)
+        assert after.l_th.dtype == after.p_robot_contact.dtype == jnp.float32
+        assert {v.dtype for v in twist} == {np.dtype(np.float32)}
+
+
+def test_the_state_can_be_the_carry_of_a_scan():
+    observations = jax.tree.map(lambda v: v[:16], random_worlds(9)[1])
+    start = RPSState.init(PAPER)
+    last, twists = jax.lax.scan(partial(law.step, PAPER), start, observations)
+    state = start
+    for i in range(16):
+        state, twist = law.step(PAPER, state, jax.tree.map(lambda v, i=i: v[i], observations))
+    chex.assert_trees_all_close(last, state)
+    chex.assert_trees_all_close(jax.tree.map(lambda v: v[-1], twists), twist, rtol=1e-5)

@@ -1,0 +1,206 @@
+"""The scenes are the paper's, and MJX steps them as C MuJoCo does."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from rps_jax import errors, scene, skin
+from rps_jax.scene import FRICTION, JOINTS, OBJECTS, Physics, mjx
+
+STEP = 0.01  # [s]
+TWIST = np.array([0.05, 0.01, 0.1])  # base x, y [m/s], yaw [rad/s] in the world
+
+
+def load(name, **options):
+    return scene.load(name, Physics(timestep=STEP), **options)
+
+
+def touching(loaded):
+    """A start with the object half a millimetre inside the skin, so that contact acts at once."""
+    return scene.initial_qpos(loaded, gap=-0.0005)
+
+
+def step_c(loaded, qpos, steps):
+    data = mujoco.MjData(loaded.physics)
+    data.qpos[:] = qpos
+    for _ in range(steps):
+        data.qvel[JOINTS.base] = TWIST
+        mujoco.mj_step(loaded.physics, data)
+    return data
+
+
+@partial(jax.jit, static_argnames="steps")
+def step_mjx(model, data, fields, qpos, steps):
+    def one_world(fields, qpos):
+        world = scene.apply(model, fields)
+
+        def body(_, data):
+            data = data.replace(qvel=data.qvel.at[JOINTS.base].set(jnp.asarray(TWIST, jnp.float32)))
+            return mjx.step(world, data)
+
+        done = jax.lax.fori_loop(0, steps, body, data.replace(qpos=qpos))
+        return done.qpos, done.qvel
+
+    return jax.vmap(one_world)(fields, qpos)
+
+
+FAMILY_OBJECTS = [
+    [name for name in OBJECTS if scene.FAMILIES[name] == family] for family in ("box", "cylinder")
+]
+
+
+@pytest.mark.parametrize("names", FAMILY_OBJECTS, ids=["box", "cylinder"])
+def test_mjx_agrees_with_c_mujoco_at_one_step_and_over_0_4_seconds(names):
+    scenes = [load(name, friction=f) for name in names for f in FRICTION.values()]
+    model, fields = scene.stack([s.physics for s in scenes])
+    data = mjx.make_data(scenes[0].physics)
+    # Where capsule and face are exactly parallel, MJX reports both ends of the line of contact
+    # and C MuJoCo one: the first step of a cylinder is compared before it touches.
+    apart = 0.005 if names[0] == "cylinder" else -0.0005
+    starts = np.array([scene.initial_qpos(s, gap=apart) for s in scenes])
+    qpos, qvel = step_mjx(model, data, fields, starts.astype(np.float32), 1)
+    for i, loaded in enumerate(scenes):
+        want = step_c(loaded, starts[i], 1)
+        np.testing.assert_allclose(qpos[i], want.qpos, atol=2e-6, err_msg=loaded.name)
+        np.testing.assert_allclose(qvel[i], want.qvel, atol=1e-3, err_msg=loaded.name)
+
+    # Over a push of 20 mm the way along is sharp; sideways it hangs on stick and slip at a corner.
+    starts = np.array([touching(s) for s in scenes])
+    qpos, _ = step_mjx(model, data, fields, starts.astype(np.float32), 40)
+    want = np.array([step_c(s, start, 40).qpos for s, start in zip(scenes, starts, strict=True)])
+    assert (want[:, 3] - starts[:, 3] > 0.02).all(), "the base must have pushed every object"
+    np.testing.assert_allclose(qpos[:, 3], want[:, 3], atol=1e-3)
+    np.testing.assert_allclose(qpos[:, 4], want[:, 4], atol=3e-3)
+    np.testing.assert_allclose(qpos[:, JOINTS.base], want[:, JOINTS.base], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_the_stripped_model_moves_as_the_whole_scene(name):
+    loaded = load(name)
+    whole, stripped = mujoco.MjData(loaded.model), mujoco.MjData(loaded.physics)
+    for data, model in ((whole, loaded.model), (stripped, loaded.physics)):
+        data.qpos[:] = touching(loaded)
+        for _ in range(20):
+            data.qvel[JOINTS.base] = TWIST
+            mujoco.mj_step(model, data)
+    np.testing.assert_allclose(stripped.qpos, whole.qpos, atol=5e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "mass", "half_extents"),
+    [
+        ("box", 20.0, (0.20, 0.20)),
+        ("nonuniform_box", 15.0, (0.225, 0.225)),
+        ("cylinder", 25.0, (0.25, 0.25)),
+        ("hardware_box", 25.0, (0.16, 0.13)),
+        ("hardware_cylinder", 12.0, (0.115, 0.115)),
+    ],
+)
+def test_objects_have_the_papers_mass_and_size_and_stand_on_the_ground(name, mass, half_extents):
+    loaded = load(name)
+    assert loaded.physics.body("object").mass[0] == pytest.approx(mass)
+    for axis, half in zip(np.eye(2), half_extents, strict=True):
+        assert float(scene.fp.extent(loaded.footprint, jnp.asarray(axis))) == pytest.approx(half)
+    geom = loaded.model.geom("object")
+    half_height = geom.size[2] if geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX else geom.size[1]
+    assert loaded.model.body("object").pos[2] == pytest.approx(half_height)
+
+
+def test_the_nonuniform_boxs_centre_of_mass_follows_from_its_two_parts():
+    # 10 of 15 kg stand 12.5 cm back and left and 45 cm above the middle of the box.
+    expected = np.array([-0.125, 0.125, 0.45]) * 10 / 15
+    near = load("nonuniform_box").physics.body("object").ipos
+    np.testing.assert_allclose(near, expected, atol=2e-6)
+    far = load("nonuniform_box", rear="far").physics.body("object").ipos
+    np.testing.assert_allclose(far, expected * [-1, 1, 1], atol=2e-6)
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_the_base_is_as_large_as_its_skin(name):
+    size = load(name).model.geom("base").size
+    assert size[:2] == pytest.approx([skin.HALF_LENGTH, skin.HALF_WIDTH])
+
+
+@pytest.mark.parametrize("label", FRICTION)
+def test_friction_reaches_both_contact_pairs(label):
+    pairs = load("cylinder", friction=FRICTION[label]).physics.pair_friction
+    expected = {"S1": (0.3, 0.35), "S2": (0.2, 0.5)}[label]  # Table I
+    assert pairs[:, :2] == pytest.approx(np.repeat(np.array(expected)[:, None], 2, axis=1))
+
+
+def test_a_given_mass_scales_the_inertia_and_keeps_the_centre():
+    own, heavy = load("nonuniform_box"), load("nonuniform_box", mass=30.0)
+    a, b = own.physics.body("object"), heavy.physics.body("object")
+    assert b.mass[0] == pytest.approx(30.0)
+    np.testing.assert_allclose(b.inertia, 2 * a.inertia, rtol=1e-6)
+    np.testing.assert_allclose(b.ipos, a.ipos, atol=1e-9)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.3, np.pi / 4])
+def test_the_object_starts_the_gap_in_front_of_the_face(yaw):
+    loaded = load("box")
+    qpos = scene.initial_qpos(loaded, gap=0.02, yaw=yaw)
+    placed = scene.fp.place(loaded.footprint, jnp.asarray(qpos[3:5]), jnp.asarray(yaw))
+    assert float(placed.vertices[:, 0].min()) == pytest.approx(skin.HALF_LENGTH + 0.02, abs=1e-6)
+
+
+def test_a_stack_holds_every_field_of_each_recompiled_model():
+    scenes = [
+        load(n, friction=f, mass=m)
+        for n, f, m in (
+            ("box", FRICTION["S1"], None),
+            ("nonuniform_box", FRICTION["S2"], None),
+            ("hardware_box", FRICTION["S2"], 7.0),
+        )
+    ]
+    model, fields = scene.stack([s.physics for s in scenes])
+    assert set(fields) == set(scene.FIELDS)
+    for i, loaded in enumerate(scenes):
+        applied = scene.apply(model, {name: values[i] for name, values in fields.items()})
+        alone, _ = scene.stack([loaded.physics])  # recompiled by itself
+        jax.tree.map(np.testing.assert_array_equal, applied, alone)
+
+
+def test_the_base_keeps_its_commanded_speed_against_the_heaviest_object():
+    loaded = load("cylinder")
+    data = step_c(loaded, touching(loaded), 100)
+    # 25 kg x 9.81 m/s^2 x 0.3 = 74 N against an armature of 1e6 kg.
+    np.testing.assert_allclose(data.qpos[:2], TWIST[:2] * 1.0, atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"timestep": 0.0},
+        {"timestep": -0.01},
+        {"timestep": float("nan")},
+        {"timestep": 0.005, "control_period": 0.012},
+        {"timestep": 0.02, "control_period": 0.01},
+        {"control_period": 0.0},
+        {"cone": "square"},
+        {"impratio": -1.0},
+        {"iterations": 0},
+    ],
+)
+def test_physics_that_means_nothing_is_refused(bad):
+    with pytest.raises(errors.InputError, match=next(iter(reversed(bad)))):
+        Physics(**bad)
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        ({"name": "sphere"}, "object"),
+        ({"name": "box", "friction": scene.Friction(-0.1, 0.3)}, "friction ground"),
+        ({"name": "box", "friction": scene.Friction(0.1, float("nan"))}, "friction robot"),
+        ({"name": "box", "mass": -1.0}, "mass"),
+        ({"name": "box", "rear": "left"}, "rear"),
+    ],
+)
+def test_a_scene_that_mujoco_would_accept_and_means_nothing_is_refused(options, field):
+    with pytest.raises(errors.InputError, match=field):
+        scene.load(**options)

@@ -1,0 +1,165 @@
+"""Trials end as the rules say, worlds do not touch each other, and a short push arrives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rps_jax import errors, sweep, trial
+from rps_jax.law import RPSParams
+from rps_jax.scene import FRICTION, PHYSICS
+from rps_jax.skin import CapacitiveSkin
+from rps_jax.sweep import Case, Setting
+from rps_jax.trial import Rules
+
+NEAR = (0.7, 0.0)  # [m] 0.32 m ahead of the front face
+AHEAD = (2.0, 0.0)
+SLOTS = 4
+SHORT = Setting(rules=Rules(horizon=24.0, max_lost=5.0))
+
+
+def case(target=NEAR, name="box", friction="S1", **changes):
+    params = RPSParams.paper()._replace(**changes)
+    return Case(name, FRICTION[friction], target, params)
+
+
+CASES = [
+    case(),
+    case(friction="S2"),
+    case(AHEAD),
+    case((0.7, 0.25), name="nonuniform_box"),
+    case((0.55, -0.2), d_th=0.1),
+    case(name="nonuniform_box", v_max=0.02),
+    case((1.5, 1.5), reactive=0.0),
+]
+
+
+@pytest.fixture(scope="module")
+def outcomes():
+    """Seven trials through four slots: three slots are refilled while their neighbours run."""
+    outcome, timing = sweep.run(CASES, SHORT, slots=SLOTS, workers=1)
+    assert timing.run > 0
+    return outcome
+
+
+def test_a_short_push_reaches_a_near_target(outcomes):
+    assert outcomes.success[:2].all()
+    assert (outcomes.min_distance[:2] < 0.05).all()
+    # 2 s of approach, then 0.32 m: at 0.05 m/s, slower below 0.5 m by K_v: some 10 ln(.32/.05) s.
+    assert (outcomes.time[:2] > 15).all()
+    assert (outcomes.time[:2] < 24).all()
+
+
+def test_a_far_target_is_not_reached_in_time(outcomes):
+    assert not outcomes.success[2]
+    assert outcomes.time[2] == pytest.approx(24.0)
+    assert 0.05 < outcomes.min_distance[2] < 1.62
+
+
+def test_a_trial_is_bit_identical_alone_or_among_others(outcomes):
+    for index in (1, 3, 5):
+        alone, _ = sweep.run([CASES[index]] * SLOTS, SHORT, slots=SLOTS, workers=1)
+        for slot in range(SLOTS):
+            for name in outcomes._fields:
+                np.testing.assert_array_equal(
+                    getattr(alone, name)[slot], getattr(outcomes, name)[index], err_msg=name
+                )
+
+
+def test_contact_lost_for_too_long_ends_a_trial(outcomes):
+    # Without reaction the box slides off the turning base, which creeps ahead without it.
+    lost = case((0.2, 2.0), reactive=0.0)
+    rules = Rules(horizon=60.0, max_lost=5.0)
+    outcome, _ = sweep.run([lost] * SLOTS, Setting(rules=rules), slots=SLOTS, workers=1)
+    assert not outcome.success.any()
+    assert outcome.contact_lost_time[0] == pytest.approx(5.0, abs=0.03)
+    assert outcome.time[0] < 60.0
+
+
+def world_batch(count):
+    stage, worlds = sweep.build([case()] * count, Setting())
+    return stage, jax.device_put(worlds)
+
+
+@pytest.fixture(scope="module")
+def advanced():
+    """Three healthy worlds beside one whose object starts as NaN, after 0.4 s."""
+    stage, worlds = world_batch(SLOTS)
+    broken = worlds._replace(qpos=worlds.qpos.at[1, 4].set(jnp.nan))
+    options = {"physics": PHYSICS["default"], "steps": 20}
+    live = jnp.ones(SLOTS, bool)
+    healthy = trial.advance(stage, worlds, trial.start_all(worlds, live), **options)
+    mixed = trial.advance(stage, broken, trial.start_all(broken, live), **options)
+    return healthy, mixed
+
+
+def test_a_diverged_world_freezes_and_leaves_the_others_bit_unchanged(advanced):
+    healthy, mixed = advanced
+    np.testing.assert_array_equal(mixed.diverged, [False, True, False, False])
+    assert mixed.steps[1] == 0
+    assert mixed.done[1]
+    for slot in (0, 2, 3):
+        np.testing.assert_array_equal(mixed.qpos[slot], healthy.qpos[slot])
+        np.testing.assert_array_equal(mixed.qvel[slot], healthy.qvel[slot])
+    assert (np.asarray(healthy.steps) == 20).all()
+
+
+def test_padding_never_moves_and_a_finished_batch_stops_at_once():
+    stage, worlds = world_batch(SLOTS)
+    trials = trial.start_all(worlds, jnp.zeros(SLOTS, bool))
+    after = trial.advance(stage, worlds, trials, physics=PHYSICS["default"], steps=20)
+    np.testing.assert_array_equal(after.qpos, worlds.qpos)
+    assert (np.asarray(after.steps) == 0).all()
+
+
+def test_before_the_first_touch_the_base_creeps_and_nothing_counts_as_lost(advanced):
+    healthy, _ = advanced
+    assert float(healthy.qpos[0, 0]) == pytest.approx(0.4 * 0.01, rel=1e-4)
+    assert int(healthy.lost_steps[0]) == 0
+    assert np.isinf(healthy.min_distance[0])
+
+
+def test_the_trace_of_a_trial_tells_the_same_story_as_its_outcome():
+    setting = Setting(skin=CapacitiveSkin(), rules=Rules(horizon=24.0))
+    trace = sweep.follow(case(), setting, interval=0.1)
+    seen, outcome = trace.snapshots, trace.outcome
+    assert outcome.success
+    assert np.allclose(np.diff(seen.time), 0.1, atol=1e-4)
+    assert outcome.time == pytest.approx(seen.time[-1], abs=0.1)
+    touching = seen.reading.contact_type > 0
+    assert seen.details.distance[touching].min() == pytest.approx(outcome.min_distance, abs=0.002)
+    speed = np.hypot(seen.twist.v_x, seen.twist.v_y)
+    assert speed.max() <= 0.05 * (1 + 1e-5)
+    # The base is where its commanded twist takes it.
+    travelled = np.trapezoid(seen.twist.v_x, seen.time)
+    assert seen.qpos[-1, 0] == pytest.approx(travelled, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"target": (float("nan"), 0.0)}, "target x"),
+        ({"target": (0.1, 0.1)}, "outside the robot"),
+        ({"name": "chair"}, "object"),
+        ({"k": float("inf")}, "k"),
+        ({"v_max": -0.05}, "v_max"),
+    ],
+)
+def test_a_case_that_means_nothing_is_refused(changes, field):
+    with pytest.raises(errors.InputError, match=field):
+        case(**changes)
+
+
+@pytest.mark.parametrize(
+    ("make", "field"),
+    [
+        (lambda: Rules(horizon=0.0), "horizon"),
+        (lambda: Rules(max_lost=float("nan")), "max_lost"),
+        (lambda: Setting(gap=-0.1), "gap"),
+        (lambda: Setting(seed=-1), "seed"),
+        (lambda: Setting(skin=CapacitiveSkin(noise=-1.0)), "noise"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(make, field):
+    with pytest.raises(errors.InputError, match=field):
+        make()

@@ -1,0 +1,207 @@
+"""Pictures and videos: small, drawn from qpos alone."""
+
+import itertools
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+
+from rps_jax import errors, video
+
+video.choose_gl()  # before anything imports MuJoCo
+
+from rps_jax import scene  # noqa: E402
+
+# imageio_ffmpeg's reader, used here alone, forks; JAX warns that its threads might then lock.
+pytestmark = pytest.mark.filterwarnings("ignore:os.fork")
+
+SMALL = (160, 120)  # [px]
+FAR = (50.0, 50.0)  # [m] a target out of sight
+
+
+@pytest.fixture(scope="module")
+def box() -> scene.Scene:
+    return scene.load("box")
+
+
+def drive(of: scene.Scene, count: int = 5) -> list[np.ndarray]:
+    """The base and the object before it, 0.2 m further forward in each frame."""
+    frames = np.tile(scene.initial_qpos(of), (count, 1))
+    frames[:, [0, 3]] += 0.2 * np.arange(count)[:, None]
+    return list(frames)
+
+
+def decode(path: Path) -> np.ndarray:
+    """All images of a video (count, height, width, 3)."""
+    reader = imageio_ffmpeg.read_frames(str(path))
+    width, height = next(reader)["size"]
+    return np.array([np.frombuffer(f, np.uint8).reshape(height, width, 3) for f in reader])
+
+
+def changed(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Rows and columns (n, 2) of the pixels in which two images differ plainly."""
+    return np.argwhere(np.abs(a.astype(int) - b).max(axis=-1) > 60)
+
+
+def red(image: np.ndarray) -> np.ndarray:
+    """Rows and columns (n, 2) of the pixels as red as the flag."""
+    r, g, _ = np.moveaxis(image.astype(int), -1, 0)
+    return np.argwhere(r - g > 100)
+
+
+def assert_one_sentence(error: Exception) -> None:
+    text = str(error)
+    assert text.endswith(".")
+    assert "\n" not in text
+    assert ". " not in text
+
+
+def test_a_video_holds_every_frame_of_a_moving_robot(box: scene.Scene, tmp_path: Path) -> None:
+    path = tmp_path / "push.mp4"
+    video.render(box, iter(drive(box)), path, p_world_target=(2.0, 1.0), size=SMALL)
+    images = decode(path)
+    assert images.shape == (5, 120, 160, 3)
+    assert all(image.std() > 10 for image in images)
+    assert all(len(changed(a, b)) > 20 for a, b in itertools.pairwise(images))
+    assert os.listdir(tmp_path) == ["push.mp4"]
+
+
+def test_the_contact_point_leaves_a_path_with_gaps(box: scene.Scene, tmp_path: Path) -> None:
+    def last_image(contacts: list[tuple[float, float]]) -> np.ndarray:
+        path = tmp_path / "push.mp4"
+        video.render(
+            box,
+            [scene.initial_qpos(box)] * len(contacts),
+            path,
+            p_world_target=FAR,
+            size=(480, 360),
+            camera="above",
+            p_world_contacts=contacts,
+        )
+        return decode(path)[-1]
+
+    nothing = (np.nan, np.nan)
+    blank = last_image([nothing] * 6)
+    ends = [(1.0, 1.0), (1.0, 0.5), (1.0, -0.5), (1.0, -1.0), nothing]
+    whole = last_image([*ends, nothing])
+    gap = last_image([*ends[:2], nothing, *ends[2:]])
+    middle = 240  # px: the column of y = 0
+    assert middle in changed(blank, whole)[:, 1]
+    assert middle not in changed(blank, gap)[:, 1]
+    assert 0 < len(changed(blank, gap)) < len(changed(blank, whole))
+
+
+def test_above_is_a_map_with_x_up_and_y_left(box: scene.Scene) -> None:
+    qpos = scene.initial_qpos(box)
+    image = video.snapshot(box, qpos, p_world_target=(1.5, 2.0), size=(320, 180), camera="above")
+    metre = 180 / 6  # px
+    row, column = np.median(red(image), axis=0)
+    assert row == pytest.approx(90 - 1.5 * metre, abs=3)
+    assert column == pytest.approx(160 - 2.0 * metre, abs=3)
+
+
+@pytest.mark.parametrize("camera", ["above", "oblique"])
+def test_both_cameras_see_targets_on_all_sides(box: scene.Scene, camera: str) -> None:
+    qpos = scene.initial_qpos(box)
+    for target in itertools.product((-2.5, 2.5), repeat=2):
+        image = video.snapshot(box, qpos, p_world_target=target, size=(320, 180), camera=camera)
+        rows, columns = red(image).T
+        assert len(rows) > 5
+        assert rows.min() > 0
+        assert rows.max() < 179
+        assert columns.min() > 0
+        assert columns.max() < 319
+
+
+def test_the_capsule_that_stands_in_for_a_drum_is_not_drawn() -> None:
+    drum = scene.load("cylinder")
+    qpos = scene.initial_qpos(drum)
+    before = video.snapshot(drum, qpos, p_world_target=FAR, size=SMALL)
+    drum.model.geom("object_side").size = [1.0, 1.0, 0.0]
+    assert np.array_equal(before, video.snapshot(drum, qpos, p_world_target=FAR, size=SMALL))
+
+
+def test_a_path_that_cannot_be_written_is_one_sentence(box: scene.Scene, tmp_path: Path) -> None:
+    for path in (tmp_path / "missing" / "push.mp4", tmp_path, Path()):
+        with pytest.raises(video.VideoError, match="could not be written") as caught:
+            video.render(box, drive(box), path, p_world_target=FAR, size=SMALL)
+        assert_one_sentence(caught.value)
+
+
+def test_an_unfinished_video_leaves_the_old_file_alone(box: scene.Scene, tmp_path: Path) -> None:
+    path = tmp_path / "push.mp4"
+    path.write_bytes(b"old")
+
+    def broken():
+        yield from drive(box)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        video.render(box, broken(), path, p_world_target=FAR, size=SMALL)
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["push.mp4"]
+
+
+def test_an_ffmpeg_that_fails_is_one_sentence(
+    box: scene.Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for program in ("/bin/false", "/no/such/program"):
+        monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", program)
+        with pytest.raises(video.VideoError) as caught:
+            video.render(box, drive(box), tmp_path / "push.mp4", p_world_target=FAR, size=SMALL)
+        assert_one_sentence(caught.value)
+        assert [c.ok for c in video.check()] == [True, False]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"frames": []},
+        {"frames": [np.full(10, np.nan)]},
+        {"frames": [np.zeros(3)]},
+        {"p_world_target": (np.nan, 0.0)},
+        {"size": (161, 120)},
+        {"size": (8000, 120)},
+        {"camera": "abov"},
+        {"fps": 0},
+    ],
+)
+def test_input_that_cannot_be_drawn_is_refused(
+    box: scene.Scene, tmp_path: Path, change: dict
+) -> None:
+    good = {"frames": drive(box), "p_world_target": FAR, "size": SMALL}
+    with pytest.raises(errors.InputError):
+        video.render(box, path=tmp_path / "push.mp4", **(good | change))
+    assert not os.listdir(tmp_path)
+
+
+def test_this_machine_can_draw_and_encode() -> None:
+    assert [(c.what, c.ok) for c in video.check()] == [("rendering", True), ("ffmpeg", True)]
+
+
+def test_a_machine_that_cannot_draw_is_told_how_to_mend_it() -> None:
+    code = "from rps_jax import video; print(video.check()[0])"
+    environment = os.environ | {"MUJOCO_GL": "disable"}
+    command = [sys.executable, "-c", code]
+    told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert "ok=False" in told.stdout
+    assert "apt install libegl1" in told.stdout
+    assert told.stderr == ""
+
+
+def test_importing_the_module_changes_nothing() -> None:
+    code = (
+        "import os, sys; before = dict(os.environ); import rps_jax.video; "
+        "assert 'mujoco' not in sys.modules and before == dict(os.environ)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_choice_of_gl_already_made_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    video.choose_gl()
+    assert os.environ["MUJOCO_GL"] == "osmesa"
