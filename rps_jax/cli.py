@@ -118,9 +118,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from rps_jax import video
 
     video.choose_gl()
-    act: dict[type, Callable[[Any], int]] = {Table: _table, Push: _push, Doctor: _doctor}
+    act: dict[type, Callable[[Any], None]] = {Table: _table, Push: _push, Doctor: _doctor}
+    return guarded(lambda: act[type(command)](command))
+
+
+def guarded(action: Callable[[], None]) -> int:
+    """Run a command: exit code 0, or one sentence on the error stream and 2 (130: interrupted)."""
     try:
-        return act[type(command)](command)
+        action()
     except InputError as error:
         print(f"rps: error: {error}", file=sys.stderr)
         return 2
@@ -130,6 +135,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("rps: interrupted.", file=sys.stderr)
         return 130
+    return 0
 
 
 def cache_folder() -> Path:
@@ -268,7 +274,7 @@ def _tell(timing: Timing) -> None:
 # --- the commands --------------------------------------------------------------------------
 
 
-def _table(options: Table) -> int:
+def _table(options: Table) -> None:
     from tqdm import tqdm
 
     from rps_jax import figures, paper, record, score, sweep
@@ -300,10 +306,9 @@ def _table(options: Table) -> int:
     print(text)
     _tell(timing)
     print(f"run folder: {out}")
-    return 0
 
 
-def _push(options: Push) -> int:
+def _push(options: Push) -> None:
     from tqdm import tqdm
 
     from rps_jax import figures, record, score, sweep
@@ -337,7 +342,6 @@ def _push(options: Push) -> int:
     if options.video:
         _film(options, case, setting, trace, out / "push.mp4")
     print(f"run folder: {out}")
-    return 0
 
 
 def _film(options: Push, case: Case, setting: Setting, trace: Trace, path: Path) -> None:
@@ -364,8 +368,7 @@ def _film(options: Push, case: Case, setting: Setting, trace: Trace, path: Path)
         print(f"no video: {error}")
 
 
-def _doctor(_: Doctor) -> int:
+def _doctor(_: Doctor) -> None:
     from rps_jax import doctor
 
     print(doctor.report(cache_folder()))
-    return 0

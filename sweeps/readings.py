@@ -17,7 +17,7 @@ import tyro
 from tqdm import tqdm
 
 from rps_jax import errors, paper, record, scene, score, sweep
-from rps_jax.cli import use_cache
+from rps_jax.cli import guarded, use_cache
 from rps_jax.law import RPSParams
 from rps_jax.scene import FRICTION, Physics
 from rps_jax.skin import CapacitiveSkin, IdealSkin
@@ -119,7 +119,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Options, description=__doc__))
-    except errors.InputError as error:
-        sys.exit(f"readings: error: {error}")
+    sys.exit(guarded(lambda: main(tyro.cli(Options, description=__doc__))))
