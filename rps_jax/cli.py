@@ -118,6 +118,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from rps_jax import video
 
     video.choose_gl()
+    _be_deterministic()
     act: dict[type, Callable[[Any], None]] = {Table: _table, Push: _push, Doctor: _doctor}
     return guarded(lambda: act[type(command)](command))
 
@@ -136,6 +137,14 @@ def guarded(action: Callable[[], None]) -> int:
         print("rps: interrupted.", file=sys.stderr)
         return 130
     return 0
+
+
+def _be_deterministic() -> None:
+    """Ask XLA for GPU sums in a fixed order: the same command must give the same results."""
+    flag = "--xla_gpu_deterministic_ops"
+    flags = os.environ.get("XLA_FLAGS", "")
+    if flag not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {flag}=true".strip()
 
 
 def cache_folder() -> Path:

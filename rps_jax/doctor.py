@@ -6,11 +6,12 @@ import os
 import tempfile
 from pathlib import Path
 
-from rps_jax import record, scene, video
+from rps_jax import record, video
 
 
 def report(cache: Path) -> str:
     """Versions, devices, folders and the state of rendering, one line each."""
+    checks = [("cache", *_writable(cache)), *video.check()]
     environment = record.environment()
     device = environment["device"]
     lines = [
@@ -19,9 +20,7 @@ def report(cache: Path) -> str:
         f"device    {device['count']} x {device['kind']} ({device['platform']}), "
         f"{environment['processors']} processors",
         f"commit    {environment['commit'] or 'not in a checkout'}",
-        f"scenes    {scene.mjcf_folder()}",
     ]
-    checks = [("cache", *_writable(cache)), *video.check()]
     for what, works, mend in checks:
         lines.append(f"{what:<12}{'ok' if works else 'FAILS: ' + mend}")
     return "\n".join(lines)

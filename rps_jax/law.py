@@ -37,7 +37,7 @@ class RPSParams(NamedTuple):
     v_max: float | jax.Array = 0.05  # [m/s] bound on the norm of (v_x, v_y)
     omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
     d_success: float | jax.Array = 0.05  # [m] target reached, Algorithm 1
-    v_approach: float | jax.Array = 0.01  # [m/s] forward speed without contact (Sec. IV-B)
+    v_approach: float | jax.Array = 0.01  # [m/s] forward speed without contact (Sec. III-B)
 
     l_mr: float | jax.Array = 0.15  # [m] the middle region ends here; Realignment stops
     a_r_max: float | jax.Array = 10.0  # [1] adaptive rate in Realignment; eta's value
@@ -46,12 +46,12 @@ class RPSParams(NamedTuple):
 
     @classmethod
     def paper(cls) -> RPSParams:
-        """The paper's values (Sec. IV-A), with our defaults for what it leaves open."""
+        """The paper's values (Sec. III-A), with our defaults for what it leaves open."""
         return cls()
 
     @classmethod
     def nps(cls) -> RPSParams:
-        """The non-reactive baseline: a_r = 0 throughout and no Realignment State (Sec. IV-B)."""
+        """The non-reactive baseline: a_r = 0 throughout and no Realignment State (Sec. III-B)."""
         return cls(reactive=0.0)
 
 

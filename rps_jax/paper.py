@@ -4,7 +4,7 @@ from __future__ import annotations
 
 TARGETS = tuple(
     (float(x), float(y)) for x in (2, 1, 0, -1, -2) for y in (2, 1, 0, -1, -2) if (x, y) != (0, 0)
-)  # [m] Sec. IV-B: a grid of 1 m, without the robot's place
+)  # [m] Sec. III-B: a grid of 1 m, without the robot's place
 
 STRATEGIES = ("rps", "nps", "aps")
 

@@ -22,7 +22,7 @@ from rps_jax import footprint as fp
 from rps_jax.footprint import Footprint
 
 HALF_LENGTH = 0.3625  # [m] of the base: 15 taxels of 48.3 mm make 0.725 m
-HALF_WIDTH = 0.29  # [m] of the base: l_cr + 5 cm, Sec. IV-A
+HALF_WIDTH = 0.29  # [m] of the base: l_cr + 5 cm, Sec. III-A
 BOARDS = {"left": 5, "front": 4, "right": 5}  # 14 boards, Sec. II-B
 ELECTRODES = 3  # on each board
 

@@ -39,7 +39,7 @@ RPS = Strategy(RPSState.init, law.step_with_details)  # and NPS, by `params.reac
 
 @dataclass(frozen=True)
 class Rules:
-    """When a trial ends (Sec. IV-B). Static."""
+    """When a trial ends (Sec. III-B). Static."""
 
     horizon: float = 300.0  # [s]
     max_lost: float = 150.0  # [s] without contact, in all, after the first touch
@@ -171,7 +171,8 @@ def drive(
         v_world = frames.rotate(qpos[2], jnp.stack([twist.v_x, twist.v_y]))
         qvel = qvel.at[JOINTS.base].set(jnp.stack([*v_world, jnp.asarray(twist.omega)]))
         data = stage.data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
-        data = mjx.step(model, data)
+        with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
+            data = mjx.step(model, data)
         return (data.qpos, data.qvel, data.qacc_warmstart), None
 
     state = (trial.qpos, trial.qvel, trial.warmstart)

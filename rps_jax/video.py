@@ -11,14 +11,13 @@ import ctypes
 import itertools
 import math
 import os
-import subprocess
 import sys
 import tempfile
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -44,7 +43,7 @@ _MEND_GL = (
     "MuJoCo cannot draw on this machine: install Mesa's EGL library (`apt install libegl1 "
     "libgl1-mesa-dri`) and set MUJOCO_GL=egl, or set MUJOCO_GL=osmesa (`apt install libosmesa6`)."
 )
-_MEND_FFMPEG = "ffmpeg was not found: run `pip install imageio-ffmpeg`."
+_MEND_FFMPEG = "ffmpeg was not found or does not run: run `pip install imageio-ffmpeg`."
 
 
 class VideoError(RuntimeError):
@@ -145,7 +144,7 @@ def render(
         _encoder(Path(path), size, fps) as sink,
     ):
         for qpos, p_world_contact in itertools.chain([first], pairs):
-            sink.write(studio.draw(qpos, p_world_contact).data)
+            sink(np.ascontiguousarray(studio.draw(qpos, p_world_contact)))
 
 
 def _paired(
@@ -194,7 +193,7 @@ class _Studio:
     def draw(self, qpos: ArrayLike, p_world_contact: ArrayLike) -> np.ndarray:
         """One image (height, width, 3) uint8, and a step further along the trails."""
         qpos = _checked("qpos", qpos, self.model.nq)
-        contact = np.asarray(p_world_contact, float)
+        contact = np.array(p_world_contact, float)  # a copy: the trail keeps it
         self.data.qpos[:] = qpos
         self.mujoco.mj_kinematics(self.model, self.data)  # where things are; no dynamics
         self.mujoco.mj_camlight(self.model, self.data)
@@ -283,76 +282,37 @@ def _renderer(model: Any, size: tuple[int, int]) -> Iterator[Any]:
         yield renderer
 
 
-def _ffmpeg() -> str:
-    """The path of the program."""
+@contextlib.contextmanager
+def _encoder(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable[[Any], None]]:
+    """Takes raw RGB images; `path` appears if all goes well, and nothing is left behind if not."""
     try:
         import imageio_ffmpeg
-
-        return imageio_ffmpeg.get_ffmpeg_exe()
-    except (ImportError, RuntimeError) as error:
+    except ImportError as error:
         raise VideoError(_MEND_FFMPEG) from error
-
-
-@contextlib.contextmanager
-def _encoder(path: Path, size: tuple[int, int], fps: float) -> Iterator[IO[bytes]]:
-    """Takes raw RGB images; `path` appears if all goes well, and nothing is left behind if not."""
-    program = _ffmpeg()
-    if path.is_dir():  # "." has no name to build on
-        raise _unwritable(path, "it is a folder")
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part = path.parent / f".{path.stem}.{os.getpid()}.part.mp4"
     try:
-        with _writing(path):
-            part.touch()
-        with _encoding(_command(program, size, fps, part), path) as sink:
-            yield sink
-        with _writing(path):
-            part.replace(path)
+        part.touch()
+        sink = imageio_ffmpeg.write_frames(
+            str(part), size, fps=fps, codec="libx264", quality=7, macro_block_size=2
+        )
+        with contextlib.closing(sink):
+            sink.send(None)  # starts ffmpeg
+            yield sink.send
+        if part.stat().st_size == 0:  # a silent death of ffmpeg goes unnoticed by its wrapper
+            raise VideoError(_MEND_FFMPEG)
+        os.replace(part, path)
+    except OSError as error:
+        # ffmpeg's own failure comes as an OSError too, with the end of its log as the message.
+        reason = error.strerror or str(error).strip().splitlines()[-1]
+        raise VideoError(
+            f"{path} could not be written ({reason}): choose a folder that exists, can be "
+            "written to and has space left."
+        ) from error
+    except RuntimeError as error:
+        raise error if isinstance(error, VideoError) else VideoError(_MEND_FFMPEG) from error
     finally:
         with contextlib.suppress(OSError):
             part.unlink()
-
-
-@contextlib.contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise _unwritable(path, error.strerror) from error
-
-
-def _unwritable(path: Path, reason: str | None) -> VideoError:
-    return VideoError(
-        f"the video '{path}' could not be written ({reason}): choose a folder that exists, can be "
-        "written to and has space left."
-    )
-
-
-def _command(program: str, size: tuple[int, int], fps: float, part: Path) -> list[str]:
-    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", f"{fps:g}"]
-    h264 = ["-c:v", "libx264", "-preset", "veryfast", "-crf", "20", "-pix_fmt", "yuv420p"]
-    mp4 = ["-movflags", "+faststart", "-f", "mp4"]  # faststart: plays before it is all loaded
-    return [program, "-y", "-loglevel", "error", *raw, "-i", "-", *h264, *mp4, str(part)]
-
-
-@contextlib.contextmanager
-def _encoding(command: list[str], path: Path) -> Iterator[IO[bytes]]:
-    """The input of a running ffmpeg, which has ended well when the context ends without error."""
-    with tempfile.TemporaryFile() as log:
-        try:  # close_fds=False: started without a fork, of which JAX warns
-            process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log, close_fds=False)
-        except OSError as error:
-            raise VideoError(_MEND_FFMPEG) from error
-        try:
-            assert process.stdin is not None
-            with contextlib.suppress(BrokenPipeError), process.stdin:
-                yield process.stdin  # a broken pipe means that ffmpeg has given up: see its log
-            if process.wait() != 0:
-                log.seek(0)
-                words = log.read().decode(errors="replace").split("\n")
-                raise _unwritable(path, next((w for w in words if w), "ffmpeg failed"))
-        finally:
-            process.kill()  # does nothing to a process that has ended
-            process.wait()
 
 
 def _attempt(what: str, action: Callable[[], None]) -> Check:
@@ -381,4 +341,4 @@ def _try_encoding() -> None:
         tempfile.TemporaryDirectory() as folder,
         _encoder(Path(folder) / "black.mp4", (16, 16), 1.0) as sink,
     ):
-        sink.write(bytes(16 * 16 * 3))
+        sink(bytes(16 * 16 * 3))
