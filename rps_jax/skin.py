@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rps_jax import errors
 from rps_jax import footprint as fp
 from rps_jax.footprint import Footprint
 
@@ -59,6 +60,10 @@ class Reading(NamedTuple):
 class Skin(Protocol):
     """A tactile sensor: a pytree of parameters with two pure functions."""
 
+    def check(self) -> None:
+        """Raises InputError for scalar parameters that mean nothing."""
+        ...
+
     def init(self, key: jax.Array) -> SkinState:
         """The sensor before it has felt anything; `key` draws its imperfections."""
         ...
@@ -89,6 +94,11 @@ class IdealSkin(NamedTuple):
 
     tolerance: float | jax.Array = 0.006  # [m]
     point_length: float | jax.Array = 2 * HALF_WIDTH / 12  # [m] up to one taxel long: a point
+
+    def check(self) -> None:
+        """Raises InputError unless tolerance and point_length are lengths."""
+        for name, value in self._asdict().items():
+            errors.check_finite(f"skin {name}", value, at_least=0, at_most=0.1, unit="m")
 
     def init(self, key: jax.Array) -> SkinState:
         """No memory, no imperfections."""
@@ -131,6 +141,15 @@ class CapacitiveSkin(NamedTuple):
     noise: float | jax.Array = 0.0  # [1] standard deviation of each raw reading
     gain_spread: float | jax.Array = 0.0  # [1] standard deviation of the taxels' gains about 1
     dead_share: float | jax.Array = 0.0  # [1] probability that a taxel never answers
+
+    def check(self) -> None:
+        """Raises InputError for foam, filter or imperfections that no skin can have."""
+        errors.check_finite("skin foam", self.foam, above=0, at_most=0.1, unit="m")
+        errors.check_finite("skin max_compression", self.max_compression, above=0, at_most=0.99)
+        errors.check_finite("skin time_constant", self.time_constant, above=0, unit="s")
+        for name in ("threshold", "noise", "gain_spread"):
+            errors.check_finite(f"skin {name}", getattr(self, name), at_least=0)
+        errors.check_finite("skin dead_share", self.dead_share, at_least=0, at_most=1)
 
     def init(self, key: jax.Array) -> SkinState:
         """Draws each taxel's gain and whether it is dead."""

@@ -65,8 +65,7 @@ class Setting:
         """Raises InputError for a gap or a seed that means nothing."""
         errors.check_finite("gap", self.gap, at_least=0, at_most=1, unit="m")
         errors.check_finite("seed", self.seed, at_least=0, at_most=2**32 - 1)
-        for name, value in self.skin._asdict().items():
-            errors.check_finite(f"skin.{name}", value, at_least=0)
+        self.skin.check()
 
 
 @dataclass(frozen=True)

@@ -296,7 +296,9 @@ def _encoder(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable
             str(part), size, fps=fps, codec="libx264", quality=7, macro_block_size=2
         )
         with contextlib.closing(sink):
-            sink.send(None)  # starts ffmpeg
+            with warnings.catch_warnings():  # JAX warns of forks; this one only starts ffmpeg
+                warnings.simplefilter("ignore", RuntimeWarning)
+                sink.send(None)
             yield sink.send
         if part.stat().st_size == 0:  # a silent death of ffmpeg goes unnoticed by its wrapper
             raise VideoError(_MEND_FFMPEG)
@@ -306,7 +308,7 @@ def _encoder(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable
         reason = error.strerror or str(error).strip().splitlines()[-1]
         raise VideoError(
             f"{path} could not be written ({reason}): choose a folder that exists, can be "
-            "written to and has space left."
+            "written to and has space left; if it does, run `pip install imageio-ffmpeg`."
         ) from error
     except RuntimeError as error:
         raise error if isinstance(error, VideoError) else VideoError(_MEND_FFMPEG) from error

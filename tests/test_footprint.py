@@ -242,6 +242,11 @@ def test_the_crossing_of_a_circle_is_a_chord():
     np.testing.assert_allclose([low, high], [0.85, 1.15], rtol=1e-6)
 
 
+def test_a_line_that_touches_a_circle_crosses_it_in_a_point():
+    low, high = fp.crossing(fp.circle(0.25), jnp.array([-1.0, 0.375]), jnp.array([1.0, 0.0]), 0.125)
+    assert (low, high) == (1.0, 1.0)
+
+
 def test_a_line_that_stays_clear_has_an_empty_interval():
     for shape in (fp.rectangle(0.3, 0.2), fp.circle(0.2)):
         origin, along = jnp.array([0.0, 0.26]), jnp.array([1.0, 0.0])

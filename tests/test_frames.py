@@ -93,6 +93,13 @@ def test_wrap_excludes_pi_whatever_the_rounding_near_its_odd_multiples():
     np.testing.assert_allclose(np.cos(np.float64(wrapped)), np.cos(np.float64(angle)), atol=1e-4)
 
 
+def test_wrap_excludes_pi_in_float64_where_the_modulus_rounds_up_to_a_turn():
+    # 2 pi - 4.4e-16 is halfway between two float64, of which 2 pi is the even one.
+    with jax.enable_x64(True):
+        below = np.nextafter(-np.pi, -np.inf)
+        assert -np.pi <= frames.wrap(jnp.asarray(below)) < np.pi
+
+
 @property_test
 @hypothesis.given(hnp.arrays(np.float32, 256, elements=st.floats(-1e4, 1e4, width=32)))
 def test_wrap_changes_no_angle_beyond_rounding(angle):

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
+from rps_jax import errors, skin
 from rps_jax import footprint as fp
-from rps_jax import skin
 from rps_jax.footprint import Footprint
 from rps_jax.skin import LINE, NONE, POINT, CapacitiveSkin, IdealSkin
 
@@ -203,6 +203,13 @@ def test_a_flush_box_beside_the_base_touches_its_side(x):
         assert abs(got_x - x) <= PITCH / 2
 
 
+def test_an_object_that_overhangs_the_rear_end_of_a_side_touches_only_the_side():
+    # Over x = -0.5625 ... -0.1625: from the end at -0.3625 to 6 mm beyond -0.1625.
+    for side in (1, -1):
+        expected = about(LINE, 0.5 * (-FRONT - 0.1565), side * SIDE)
+        assert read(IDEAL, box(-FRONT, side * (SIDE + 0.2))) == expected
+
+
 def test_there_is_no_skin_on_the_rear():
     for sensor in (IDEAL, CAPACITIVE):
         assert read(sensor, box(-FRONT - 0.2, 0.0)) == (NONE, 0.0, 0.0)
@@ -327,6 +334,24 @@ def test_a_sharp_corner_between_two_taxels_must_press_deeper_than_a_flush_box(ga
     # is 1/4 if this one is 5/4: 10 mm / 2.25 = 4.44 mm, a gap of 1.45 mm.
     shape = box(FRONT + 0.2 * math.sqrt(2) + gap, 0.0, yaw=math.pi / 4)
     assert read(CAPACITIVE, shape)[0] == kind
+
+
+@pytest.mark.parametrize("sensor", [IDEAL, CAPACITIVE], ids=["ideal", "capacitive"])
+@pytest.mark.parametrize("value", [math.nan, -0.01, math.inf])
+def test_check_names_the_parameter_that_no_skin_can_have(sensor, value):
+    sensor.check()
+    for name in sensor._fields:
+        with pytest.raises(errors.InputError, match=rf"\b{name} = "):
+            sensor._replace(**{name: value}).check()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("foam", 0.0), ("time_constant", 0.0), ("max_compression", 1.0), ("dead_share", 1.1)],
+)
+def test_check_rejects_what_would_divide_by_zero_or_is_no_share(name, value):
+    with pytest.raises(errors.InputError, match=rf"\b{name} = "):
+        CAPACITIVE._replace(**{name: value}).check()
 
 
 # The capacitive sensor

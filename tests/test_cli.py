@@ -1,0 +1,195 @@
+"""The command line as a user meets it: whole runs, repeatable files, and teaching errors."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from rps_jax import cli, paper, record, score
+
+SMALL = [
+    *("table", "--targets", "0.6", "0", "0.62", "0.03", "--horizon", "18", "--slots", "4"),
+    *("--objects", "box", "nonuniform_box", "--workers", "1"),
+]
+
+
+def rps(*arguments):
+    return cli.main([str(a) for a in arguments])
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """The same small table, run twice."""
+    folders = [tmp_path_factory.mktemp("table") / name for name in ("first", "second")]
+    for folder in folders:
+        assert rps(*SMALL, "--out", folder) == 0
+    return folders
+
+
+def test_a_table_run_leaves_a_labelled_run_folder(runs):
+    results = record.read_results(runs[0])
+    assert results.success.dims == score.DIMS
+    assert results.sizes == {"strategy": 2, "object": 2, "friction": 2, "target": 2, "pose": 3}
+    assert list(results.object.values) == ["box", "nonuniform_box"]
+    assert results.time.attrs["units"] == "s"
+    assert results.success.sel(strategy="rps", object="box").all()
+    assert (results.min_distance.where(results.success == 1).fillna(0) < 0.05).all()
+    config = json.loads((runs[0] / "config.json").read_text())
+    assert config["params"]["rps"]["eta"] == 10.0
+    assert config["params"]["nps"]["reactive"] == 0.0
+    environment = json.loads((runs[0] / "environment.json").read_text())
+    assert environment["packages"]["mujoco"] == "3.17.0"
+    assert (runs[0] / "min_distance.png").stat().st_size > 10_000
+    assert "RPS  ours" in (runs[0] / "table.txt").read_text()
+
+
+def test_the_same_command_gives_the_same_results_file_bit_for_bit(runs):
+    assert (runs[0] / "results.nc").read_bytes() == (runs[1] / "results.nc").read_bytes()
+
+
+def test_a_run_is_not_overwritten_unasked(runs, capsys):
+    before = (runs[0] / "results.nc").read_bytes()
+    assert rps(*SMALL, "--out", runs[0]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert (runs[0] / "results.nc").read_bytes() == before
+
+
+def test_a_push_draws_and_films_a_trial(tmp_path, capsys):
+    out = tmp_path / "push"
+    arguments = ("--target", 0.6, 0, "--horizon", 18, "--film-length", 0.4, "--out", out)
+    assert rps("push", *arguments) == 0
+    assert "reached at" in capsys.readouterr().out
+    trace = xr.load_dataset(out / "results.nc", engine="h5netcdf")
+    assert trace.sizes["time"] > 100
+    assert int(trace.outcome_success) == 1
+    assert (out / "trial.png").stat().st_size > 10_000
+    assert (out / "push.mp4").stat().st_size > 1_000
+
+
+def test_a_push_without_the_means_to_film_says_how_and_does_the_rest(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
+    out = tmp_path / "push"
+    assert rps("push", "--target", 0.6, 0, "--horizon", 18, "--out", out) == 0
+    printed = capsys.readouterr().out
+    assert "no video: " in printed
+    assert "pip install imageio-ffmpeg" in printed
+    assert (out / "trial.png").exists()
+    assert not (out / "push.mp4").exists()
+
+
+def test_the_doctor_names_versions_device_cache_rendering_and_ffmpeg(capsys):
+    assert rps("doctor") == 0
+    printed = capsys.readouterr().out
+    for word in ("python", "mujoco-mjx", "device", "cache", "rendering", "ffmpeg"):
+        assert word in printed
+
+
+BAD = [
+    (("table", "--objects", "bx"), "did you mean 'box'"),
+    (("table", "--objects", "box", "box"), "objects"),
+    (("table", "--strategies", "aps"), "aps"),
+    (("table", "--strategies", "mpc"), "strategy"),
+    (("table", "--friction", "S3"), "friction set"),
+    (("table", "--friction", "-0.3,0.35"), "friction ground"),
+    (("table", "--friction", "0.3,nan"), "friction robot"),
+    (("table", "--friction", "0.3,0.2,0.1"), "friction"),
+    (("table", "--targets", "nan", "0"), "target x"),
+    (("table", "--targets", "0.1", "0.1"), "outside the robot"),
+    (("table", "--params", "bta=1"), "did you mean 'beta'"),
+    (("table", "--params", "beta"), "name=value"),
+    (("table", "--params", "K_h=-1"), "K_h"),
+    (("table", "--params", "eta=inf"), "eta"),
+    (("table", "--params", "L=zero"), "L"),
+    (("table", "--slots", "0"), "slots"),
+    (("table", "--workers", "-1"), "workers"),
+    (("table", "--horizon", "0"), "horizon"),
+    (("push", "--object", "sphere"), "object"),
+    (("push", "--target", "inf", "0"), "target x"),
+    (("push", "--target", "0", "0"), "outside the robot"),
+    (("push", "--strategy", "RPS"), "strategy"),
+    (("push", "--mass", "-20"), "mass"),
+    (("push", "--mass", "0"), "mass"),
+    (("push", "--mass", "nan"), "mass"),
+    (("push", "--timestep", "0"), "timestep"),
+    (("push", "--timestep", "-0.01"), "timestep"),
+    (("push", "--timestep", "0.006"), "multiple of timestep"),
+    (("push", "--control-period", "0.025"), "multiple of timestep"),
+    (("push", "--physics", "bullet"), "physics"),
+    (("push", "--skin", "leather"), "skin"),
+    (("push", "--skin-params", "tolerance=-1"), "tolerance"),
+    (("push", "--skin-params", "foam=0.01"), "skin-params"),
+    (("push", "--skin", "capacitive", "--skin-params", "foam=0"), "foam"),
+    (("push", "--skin", "capacitive", "--skin-params", "dead_share=2"), "dead_share"),
+    (("push", "--gap", "-0.1"), "gap"),
+    (("push", "--rear", "left"), "rear"),
+    (("push", "--seed", "-1"), "seed"),
+    (("push", "--film-length", "0"), "film_length"),
+    (("push", "--out", "/proc/nowhere/run"), "out"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "word"), BAD, ids=[" ".join(a) for a, _ in BAD])
+def test_bad_input_is_one_sentence_and_exit_code_2_before_anything_compiles(
+    arguments, word, capsys, monkeypatch, tmp_path
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("jax.stages.Lowered.compile", lambda *_: pytest.fail("compiled"))
+    assert rps(*arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("rps: error: ")
+    assert error.count("\n") == 1
+    assert word in error
+
+
+def test_words_that_are_no_option_are_refused_with_exit_code_2(capsys):
+    with pytest.raises(SystemExit) as caught:
+        rps("push", "--colour", "red")
+    assert caught.value.code == 2
+
+
+def test_a_corrupt_results_file_is_named(tmp_path):
+    (tmp_path / "results.nc").write_bytes(b"not a file of results")
+    with pytest.raises(record.InputError, match=r"results\.nc is corrupt"):
+        record.read_results(tmp_path)
+
+
+IMPORT = """
+import os, sys
+before = dict(os.environ)
+import rps_jax
+import jax
+from jax._src import xla_bridge
+rps_jax.RPSParams.paper(), rps_jax.Case, rps_jax.CapacitiveSkin, rps_jax.OBJECTS
+assert not xla_bridge._backends, "a device was touched"
+assert dict(os.environ) == before, "flags were set"
+assert not jax.config.jax_compilation_cache_dir and not jax.config.jax_enable_x64
+"""
+
+
+def test_importing_sets_no_flags_prints_nothing_and_touches_no_device(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", IMPORT], capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wilsons_interval_by_hand():
+    # n = 24, all succeed: low = 1 / (1 + z^2 / n) with z = 1.959964.
+    low, high = score.wilson(24, 24)
+    assert low == pytest.approx(1 / (1 + 1.959964**2 / 24), abs=1e-6)
+    assert high == pytest.approx(1.0)
+    # p = 1/2 is symmetric about itself.
+    low, high = score.wilson(12, 24)
+    assert low + high == pytest.approx(1.0)
+
+
+def test_the_papers_totals_and_targets():
+    # 88.19, 15.97 and 5.56 % of 144 (Sec. III-B).
+    totals = [sum(n for (s, *_), n in paper.TABLE_II.items() if s == w) for w in paper.STRATEGIES]
+    assert totals == [127, 23, 8]
+    assert len(set(paper.TARGETS)) == 24
+    assert np.abs(paper.TARGETS).max() == 2
