@@ -349,32 +349,42 @@ def _push(options: Push) -> None:
     )
     _tell(trace.timing)
     if options.video:
-        _film(options, case, setting, trace, out / "push.mp4")
+        _film(options, case, setting, trace, out)
     print(f"run folder: {out}")
 
 
-def _film(options: Push, case: Case, setting: Setting, trace: Trace, path: Path) -> None:
-    """The video; without the means for one, a line that says how to mend it."""
+def _film(options: Push, case: Case, setting: Setting, trace: Trace, out: Path) -> None:
+    """Stills and video; without the means for them, a line that says how to mend it."""
     import numpy as np
     from tqdm import tqdm
 
-    from rps_jax import sweep, trial, video
+    from rps_jax import figures, sweep, trial, video
 
+    scene = sweep.scene_of(case, setting)
+    target = np.array(case.p_world_target)
+    seen = trace.snapshots
     fps = 25
-    count = max(2, round(options.film_length * fps))
-    rows = np.linspace(0, len(trace.snapshots.time) - 1, count).round().astype(int)
-    contacts = np.asarray(trial.p_world_contact(trace.snapshots))
+    rows = _evenly(len(seen.time), round(options.film_length * fps))
+    stills = _evenly(len(seen.time), 6)
     try:
+        images = [video.snapshot(scene, seen.qpos[i], p_world_target=target) for i in stills]
+        figures.stills(images, seen.time[stills], out / "stills.png")
         video.render(
-            sweep.scene_of(case, setting),
-            tqdm(trace.snapshots.qpos[rows], unit="frame", desc="film"),
-            path,
-            p_world_target=np.array(case.p_world_target),
-            p_world_contacts=contacts[rows],
+            scene,
+            tqdm(seen.qpos[rows], unit="frame", desc="film"),
+            out / "push.mp4",
+            p_world_target=target,
+            p_world_contacts=np.asarray(trial.p_world_contact(seen))[rows],
             fps=fps,
         )
     except video.VideoError as error:
         print(f"no video: {error}")
+
+
+def _evenly(length: int, count: int) -> list[int]:
+    """At least two indices into `length` items, from the first to the last."""
+    count = max(2, count)
+    return [round(i * (length - 1) / (count - 1)) for i in range(count)]
 
 
 def _doctor(_: Doctor) -> None:

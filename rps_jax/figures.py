@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -159,6 +160,19 @@ def _shade(ax: Axes, time: np.ndarray, active: np.ndarray, colour: str) -> None:
         lw=0,
         step="post",
     )
+
+
+def stills(images: Sequence[np.ndarray], times: Sequence[float], path: Path) -> Path:
+    """Fig. 1: pictures (height, width, 3) of a push, three in a row, with their times [s]."""
+    rows = -(-len(images) // 3)
+    figure = Figure(figsize=(12, 2.3 * rows), layout="constrained")
+    axes = figure.subplots(rows, 3, squeeze=False).ravel()
+    for ax in axes:
+        ax.axis("off")
+    for ax, image, time in zip(axes, images, times, strict=False):
+        ax.imshow(image)
+        ax.set_title(f"{time:.0f} s", fontsize=9)
+    return save(figure, path)
 
 
 def _path(ax: Axes, case: Case, trace: Trace) -> None:

@@ -17,21 +17,29 @@ def rotate(yaw: jax.Array, vector: jax.Array) -> jax.Array:
     return jnp.stack([c * x - s * y, s * x + c * y], axis=-1)
 
 
+def _scale(vector: jax.Array) -> jax.Array:
+    """Largest component (...) of vectors (..., n), to divide by; zero only for a zero vector.
+
+    Bounded, since the reciprocal of a larger float32 is subnormal, which XLA takes for zero.
+    """
+    return jax.lax.stop_gradient(jnp.minimum(jnp.max(jnp.abs(vector), axis=-1), 1e37))
+
+
 def norm(vector: jax.Array) -> jax.Array:
     """Euclidean norm over the last axis: (..., n) -> (...).
 
     Scaled by the largest component, so squares neither overflow nor vanish in float32; the
     derivative at zero is zero, where `jnp.linalg.norm` gives NaN.
     """
-    scale = jax.lax.stop_gradient(jnp.max(jnp.abs(vector), axis=-1))
+    scale = _scale(vector)
     is_zero = scale == 0
     unit = jnp.where(is_zero[..., None], 1.0, vector / jnp.where(is_zero, 1.0, scale)[..., None])
     return jnp.where(is_zero, 0.0, scale * jnp.sqrt(jnp.sum(unit * unit, axis=-1)))
 
 
 def direction(vector: jax.Array) -> jax.Array:
-    """Angle of planar vectors (..., 2) in (-pi, pi] [rad]; 0 with zero derivative at zero."""
-    scale = jax.lax.stop_gradient(jnp.max(jnp.abs(vector), axis=-1))
+    """Angle of planar vectors (..., 2) in [-pi, pi] [rad]; 0 with zero derivative at zero."""
+    scale = _scale(vector)
     is_zero = scale == 0
     # Scaling changes no angle and keeps x*x + y*y, which the derivative divides by, in range.
     unit = vector / jnp.where(is_zero, 1.0, scale)[..., None]

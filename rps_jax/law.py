@@ -108,6 +108,7 @@ def check(params: RPSParams) -> RPSParams:
         errors.check_finite(name, getattr(params, name), at_least=0)
     for name in ("K_h", "K_v", "L", "l_cr", "v_max", "omega_max", "d_success"):
         errors.check_finite(name, getattr(params, name), above=0)
+    errors.check_finite("l_mr", params.l_mr, at_most=params.l_cr)
     errors.check_number("gamma_max", params.gamma_max, above=0)
     errors.check_finite("reactive", params.reactive, at_least=0, at_most=1)
     return params
@@ -146,7 +147,7 @@ def adaptive_rate(params: RPSParams, l: jax.Array, distance: jax.Array) -> jax.A
 
 def linear_velocity(v_star: jax.Array, a_r: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Eqs. 1-2: (v_x, v_y) [m/s] of norm v_star [m/s] and slope v_y / v_x = a_r [1]."""
-    a_r = jnp.asarray(a_r, float)
+    a_r = jnp.asarray(a_r) * 1.0  # a float, of the width it came in
     length = frames.norm(jnp.stack([jnp.ones_like(a_r), a_r], axis=-1))
     return v_star / length, v_star * (a_r / length)
 

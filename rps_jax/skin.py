@@ -195,7 +195,7 @@ def _taxels(samples: int) -> np.ndarray:
 
 
 TAXELS = _taxels(1)[:, 0]  # (42, 2) [m] middles of the taxels
-TAXEL_SAMPLES = _taxels(5)  # (42, 5, 2) [m] about 1 cm apart: no sharp corner slips between
+TAXEL_SAMPLES = _taxels(5)  # (42, 5, 2) [m] about 1 cm apart: a corner pressed home is felt
 
 
 def _extremes(active: jax.Array, values: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -211,11 +211,6 @@ def test_direction_is_right_up_to_the_largest_numbers():
     np.testing.assert_allclose(gradient, np.zeros((2, 2)), atol=1e-37)
 
 
-def test_the_direction_of_a_negative_x_is_pi_whatever_the_sign_of_its_zero():
-    got = frames.direction(jnp.array([[-1.0, 0.0], [-1.0, -0.0]]))
-    np.testing.assert_array_equal(got, [PI, PI])
-
-
 # safe_sqrt
 
 
