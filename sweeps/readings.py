@@ -19,7 +19,7 @@ from tqdm import tqdm
 from rps_jax import errors, paper, record, scene, score, sweep
 from rps_jax.cli import guarded, use_cache
 from rps_jax.law import RPSParams
-from rps_jax.scene import FRICTION, Physics
+from rps_jax.scene import FRICTION, PHYSICS, Physics
 from rps_jax.skin import CapacitiveSkin, IdealSkin
 from rps_jax.sweep import Setting
 
@@ -41,12 +41,15 @@ READINGS = {
     "default": Reading("the defaults"),
     "timestep_5ms": Reading("physics step 5 ms instead of 10 ms", _physics(timestep=0.005)),
     "timestep_2ms": Reading("physics step 2 ms", _physics(timestep=0.002)),
-    "solver_20_20": Reading(
-        "20 solver and 20 line-search iterations instead of 8 and 10",
-        _physics(iterations=20, ls_iterations=20),
+    "solver_50_50": Reading(
+        "50 solver and 50 line-search iterations instead of 20 and 20",
+        _physics(iterations=50, ls_iterations=50),
     ),
+    "solver_8_10": Reading("8 and 10 iterations", _physics(iterations=8, ls_iterations=10)),
     "solver_4_6": Reading("4 and 6 iterations", _physics(iterations=4, ls_iterations=6)),
-    "pyramidal": Reading("friction pyramid instead of the cone", _physics(cone="pyramidal")),
+    "pyramidal": Reading(
+        "friction pyramid instead of the cone, 5 ms", Setting(physics=PHYSICS["pyramidal"])
+    ),
     "period_50ms": Reading("control period 50 ms instead of 20 ms", _physics(control_period=0.05)),
     "tangent_as_printed": Reading(
         "tangent as printed (gamma_max = inf)", params=RPSParams(gamma_max=np.inf)
