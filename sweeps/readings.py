@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+import xarray as xr
 from tqdm import tqdm
 
 from rps_jax import errors, paper, record, scene, score, sweep
@@ -42,7 +43,7 @@ READINGS = {
     "timestep_5ms": Reading("physics step 5 ms instead of 10 ms", _physics(timestep=0.005)),
     "timestep_2ms": Reading("physics step 2 ms", _physics(timestep=0.002)),
     "solver_50_50": Reading(
-        "50 solver and 50 line-search iterations instead of 20 and 20",
+        "50 solver and 50 line-search iterations instead of 10 and 14",
         _physics(iterations=50, ls_iterations=50),
     ),
     "solver_8_10": Reading("8 and 10 iterations", _physics(iterations=8, ls_iterations=10)),
@@ -73,12 +74,14 @@ class Options:
     out: Path = Path("runs/readings")
     """Run folder."""
     slots: int | None = None
-    """Worlds stepped at once; by default chosen by the device."""
+    """Worlds stepped at once by one worker; by default chosen by the device."""
+    workers: int | None = None
+    """Host threads; by default chosen by the device."""
     overwrite: bool = False
     """Allow a run folder that already holds a run."""
 
 
-def run(reading: Reading, slots: int | None) -> tuple[str, object]:
+def run(reading: Reading, options: Options) -> tuple[str, xr.Dataset]:
     """One row of text and the labelled results of a reading."""
     cases = [
         sweep.Case(name, friction, target, reading.params)
@@ -88,7 +91,11 @@ def run(reading: Reading, slots: int | None) -> tuple[str, object]:
     ]
     with tqdm(total=len(cases), unit="trial", desc=reading.what[:40], leave=False) as bar:
         outcome, _ = sweep.run(
-            cases, reading.setting, slots=slots, report=lambda p: bar.update(p.finished - bar.n)
+            cases,
+            reading.setting,
+            slots=options.slots,
+            workers=options.workers,
+            report=lambda progress: bar.update(progress.finished - bar.n),
         )
     results = score.dataset(outcome, ["rps"], scene.PAPER_OBJECTS, tuple(FRICTION), paper.TARGETS)
     won = results.success.sum(("strategy", "target")).values
@@ -114,7 +121,7 @@ def main(options: Options) -> None:
     lines = ["successes of 24, S1 S2: box, cylinder, nonuniform box; of 144 with Wilson 95 %; time"]
     print(lines[0])
     for name in options.readings:
-        row, results = run(READINGS[name], options.slots)
+        row, results = run(READINGS[name], options)
         record.write_results(out / f"{name}.nc", results)
         lines.append(row)
         record.write_text(out / "readings.txt", "\n".join(lines) + "\n")
