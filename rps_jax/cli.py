@@ -368,7 +368,7 @@ def _film(options: Push, case: Case, setting: Setting, trace: Trace, out: Path) 
     stills = _evenly(len(seen.time), 6)
     try:
         images = [video.snapshot(scene, seen.qpos[i], p_world_target=target) for i in stills]
-        figures.stills(images, seen.time[stills], out / "stills.png")
+        figures.stills(images, np.asarray(seen.time)[stills], out / "stills.png")
         video.render(
             scene,
             tqdm(seen.qpos[rows], unit="frame", desc="film"),

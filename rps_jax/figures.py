@@ -162,7 +162,7 @@ def _shade(ax: Axes, time: np.ndarray, active: np.ndarray, colour: str) -> None:
     )
 
 
-def stills(images: Sequence[np.ndarray], times: Sequence[float], path: Path) -> Path:
+def stills(images: Sequence[np.ndarray], times: np.ndarray, path: Path) -> Path:
     """Fig. 1: pictures (height, width, 3) of a push, three in a row, with their times [s]."""
     rows = -(-len(images) // 3)
     figure = Figure(figsize=(12, 2.3 * rows), layout="constrained")

@@ -248,7 +248,7 @@ def stack(models: list[mujoco.MjModel]) -> tuple[mjx.Model, dict[str, jax.Array]
     """
     # A static copy of the bounding radii, which only height fields use, would bar stacking.
     unused: dict[str, Any] = {"_impl.geom_rbound_hfield": np.zeros(models[0].ngeom)}
-    trees = [mjx.put_model(m).tree_replace(unused) for m in models]
+    trees: list[Any] = [mjx.put_model(m).tree_replace(unused) for m in models]
     leaves, structures = zip(*map(jax.tree_util.tree_flatten_with_path, trees), strict=True)
     if any(s != structures[0] for s in structures):
         raise ValueError("models of different structure cannot be stacked")

@@ -203,7 +203,7 @@ def run(
     *,
     slots: int | None = None,
     workers: int | None = None,
-    report: Callable[[Progress], None] = lambda progress: None,
+    report: Callable[[Progress], Any] = lambda progress: None,
 ) -> tuple[Outcome, Timing]:
     """Run every case to its end.
 
@@ -251,7 +251,7 @@ def default_workers() -> int:
 class _Shared:
     """What the workers report into."""
 
-    def __init__(self, results: list[Outcome | None], report: Callable[[Progress], None]):
+    def __init__(self, results: list[Outcome | None], report: Callable[[Progress], Any]):
         self.results = results
         self.simulated = 0.0
         self.compile = 0.0
@@ -316,7 +316,7 @@ def follow(
     setting: Setting = Setting(),
     *,
     interval: float = 0.1,
-    report: Callable[[Progress], None] = lambda progress: None,
+    report: Callable[[Progress], Any] = lambda progress: None,
 ) -> Trace:
     """Run one trial to its end and keep what it looked like every `interval` [s]."""
     period = setting.physics.control_period

@@ -107,7 +107,7 @@ def render(
     path: str | os.PathLike[str],
     *,
     p_world_target: ArrayLike,
-    fps: float = 30.0,
+    fps: int = 30,
     size: tuple[int, int] = SIZE,
     camera: str = "oblique",
     p_world_contacts: Iterable[ArrayLike] | None = None,
@@ -283,7 +283,7 @@ def _renderer(model: Any, size: tuple[int, int]) -> Iterator[Any]:
 
 
 @contextlib.contextmanager
-def _encoder(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable[[Any], None]]:
+def _encoder(path: Path, size: tuple[int, int], fps: int) -> Iterator[Callable[[Any], None]]:
     """Takes raw RGB images; `path` appears if all goes well, and nothing is left behind if not."""
     try:
         import imageio_ffmpeg
@@ -341,6 +341,6 @@ def _try_drawing() -> None:
 def _try_encoding() -> None:
     with (
         tempfile.TemporaryDirectory() as folder,
-        _encoder(Path(folder) / "black.mp4", (16, 16), 1.0) as sink,
+        _encoder(Path(folder) / "black.mp4", (16, 16), 1) as sink,
     ):
         sink(bytes(16 * 16 * 3))
