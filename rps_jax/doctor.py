@@ -14,16 +14,16 @@ def report(cache: Path) -> str:
     checks = [("cache", *_writable(cache)), *video.check()]
     environment = record.environment()
     device = environment["device"]
-    lines = [
-        f"python    {environment['python']} on {environment['platform']}",
-        *(f"{name:<12}{version or 'missing'}" for name, version in environment["packages"].items()),
-        f"device    {device['count']} x {device['kind']} ({device['platform']}), "
+    rows = {
+        "python": f"{environment['python']} on {environment['platform']}",
+        **{name: version or "missing" for name, version in environment["packages"].items()},
+        "device": f"{device['count']} x {device['kind']} ({device['platform']}), "
         f"{environment['processors']} processors",
-        f"commit    {environment['commit'] or 'not in a checkout'}",
-    ]
-    for what, works, mend in checks:
-        lines.append(f"{what:<12}{'ok' if works else 'FAILS: ' + mend}")
-    return "\n".join(lines)
+        "commit": environment["commit"] or "not in a checkout",
+        "cached in": str(cache),
+        **{what: "ok" if works else f"FAILS: {mend}" for what, works, mend in checks},
+    }
+    return "\n".join(f"{name:<12}{text}" for name, text in rows.items())
 
 
 def _writable(folder: Path) -> tuple[bool, str]:
