@@ -43,8 +43,7 @@ def dataset(
     shape = (len(strategies), len(objects), len(frictions), len(targets))
     variables = {}
     for name, values in outcome._asdict().items():
-        values = np.asarray(values)
-        values = values.astype(np.int8) if values.dtype == bool else values
+        values = _plain(values)
         dims = DIMS + ("pose",) * (values.ndim - 1)
         unit, meaning = _UNITS[name]
         attrs = {"units": unit, "long_name": meaning}
@@ -64,14 +63,18 @@ def dataset(
     )
 
 
+def _plain(values: Any) -> np.ndarray:
+    """As an array that NetCDF can hold, which has no booleans."""
+    values = np.asarray(values)
+    return values.astype(np.int8) if values.dtype == bool else values
+
+
 def trace_dataset(trace: Trace) -> xr.Dataset:
     """One trial over time: variables (time, ...), its outcome as scalars."""
     seen = trace.snapshots
 
     def over_time(values: Any, unit: str, *dims: str) -> xr.Variable:
-        values = np.asarray(values)
-        values = values.astype(np.int8) if values.dtype == bool else values
-        return xr.Variable(("time", *dims), values, {"units": unit})
+        return xr.Variable(("time", *dims), _plain(values), {"units": unit})
 
     variables = {
         "qpos": over_time(seen.qpos, "m, rad, 1", "joint"),
@@ -87,8 +90,7 @@ def trace_dataset(trace: Trace) -> xr.Dataset:
         "realigning": over_time(seen.details.realigning, "1"),
     }
     for name, value in trace.outcome._asdict().items():
-        value = np.asarray(value)
-        value = value.astype(np.int8) if value.dtype == bool else value
+        value = _plain(value)
         attrs = {"units": _UNITS[name][0], "long_name": _UNITS[name][1]}
         variables[f"outcome_{name}"] = xr.Variable(("pose",) * value.ndim, value, attrs)
     return xr.Dataset(variables, coords={"time": ("time", seen.time, {"units": "s"})})
