@@ -6,11 +6,12 @@ the commands, so that `rps --help` answers at once and MuJoCo finds its renderin
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,9 +22,9 @@ from rps_jax import errors
 from rps_jax.errors import InputError
 
 if TYPE_CHECKING:
-    from rps_jax.law import RPSParams
     from rps_jax.scene import Friction
-    from rps_jax.sweep import Case, Setting, Timing, Trace
+    from rps_jax.sweep import Case, Progress, Setting, Timing, Trace
+    from rps_jax.trial import Params
 
 
 @dataclass(frozen=True)
@@ -31,15 +32,20 @@ class Common:
     """Options that every run takes."""
 
     params: tuple[str, ...] = ()
-    """Parameters of the law to change from the paper's, as name=value."""
+    """Parameters to change from the paper's, as name=value; those of APS as aps.name=value."""
     physics: str = "default"
-    """default (elliptic friction cone) or pyramidal."""
+    """default (isotropic friction) or paper_gazebo (friction pyramid, thin skin)."""
+    fidelity: str = "standard"
+    """How finely the physics is solved: reference, standard or fast."""
+    engine: str = "mjx"
+    """mjx, or mujoco (the C reference, on all cores)."""
     timestep: float | None = None
     """Physics step [s]; by default that of the physics."""
     control_period: float | None = None
     """Time between two decisions of the law [s]; by default that of the physics."""
-    skin: str = "ideal"
-    """ideal (the paper's simulated contact sensor) or capacitive (42 taxels)."""
+    skin: str | None = None
+    """ideal (the paper's simulated contact sensor), thin (the same without foam) or capacitive
+    (42 taxels); by default that of the physics, ideal or thin."""
     skin_params: tuple[str, ...] = ()
     """Parameters of the skin to change from their defaults, as name=value."""
     mass: float | None = None
@@ -64,8 +70,8 @@ class Table(Common):
 
     objects: tuple[str, ...] = ("box", "cylinder", "nonuniform_box")
     """Objects to push."""
-    strategies: tuple[str, ...] = ("rps", "nps")
-    """Strategies to run: rps, nps."""
+    strategies: tuple[str, ...] = ("rps", "nps", "aps")
+    """Strategies to run: rps, nps, aps."""
     friction: tuple[str, ...] = ("S1", "S2")
     """Friction sets, each S1, S2 or ground,robot (as 0.25,0.4)."""
     targets: tuple[tuple[float, float], ...] = ()
@@ -87,11 +93,49 @@ class Push(Common):
     friction: str = "S1"
     """S1, S2 or ground,robot (as 0.25,0.4)."""
     strategy: str = "rps"
-    """rps or nps."""
+    """rps, nps or aps."""
     video: bool = True
     """Film the push."""
     film_length: float = 12.0
     """Length of the film [s], whatever the trial's."""
+
+
+@dataclass(frozen=True)
+class StudyOptions:
+    """What every study of the paper's trials takes; its run folder can be continued."""
+
+    out: Path = Path("runs/study")
+    """Run folder; a run that was killed is continued there."""
+    quick: bool = False
+    """Six of the paper's 24 targets."""
+    slots: int | None = None
+    """Worlds stepped at once by one worker; by default chosen by the device."""
+    workers: int | None = None
+    """Host threads; by default chosen by the device."""
+
+    def targets(self) -> tuple[tuple[float, float], ...]:
+        """The paper's targets, or a few of them."""
+        from rps_jax import paper, study
+
+        return study.FEW_TARGETS if self.quick else paper.TARGETS
+
+    def shape(self) -> dict[str, int | None]:
+        """How the trials are spread; see `sweep.run`."""
+        for name in ("slots", "workers"):
+            if getattr(self, name) is not None:
+                errors.check_finite(name, getattr(self, name), at_least=1)
+        return {"slots": self.slots, "workers": self.workers}
+
+    def open(self) -> Path:
+        """The run folder, new or to be continued; checks the options first."""
+        from rps_jax import record
+
+        self.shape()
+        be_deterministic()
+        record.writable(self.out)
+        use_cache()
+        record.write_json(self.out / "environment.json", record.environment())
+        return self.out
 
 
 @dataclass(frozen=True)
@@ -118,7 +162,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from rps_jax import video
 
     video.choose_gl()
-    _be_deterministic()
+    be_deterministic()
     act: dict[type, Callable[[Any], None]] = {Table: _table, Push: _push, Doctor: _doctor}
     return guarded(lambda: act[type(command)](command))
 
@@ -139,7 +183,7 @@ def guarded(action: Callable[[], None]) -> int:
     return 0
 
 
-def _be_deterministic() -> None:
+def be_deterministic() -> None:
     """Ask XLA for GPU sums in a fixed order: the same command must give the same results."""
     flag = "--xla_gpu_deterministic_ops"
     flags = os.environ.get("XLA_FLAGS", "")
@@ -179,15 +223,18 @@ def _assignments(kind: str, texts: Sequence[str], known: Sequence[str]) -> dict[
     return values
 
 
-def _params(common: Common, strategy: str) -> RPSParams:
-    from rps_jax import law
+def _params(common: Common, strategy: str) -> Params:
+    from rps_jax import paper
+    from rps_jax.baselines import APSParams
+    from rps_jax.law import RPSParams
 
-    if strategy == "aps":
-        raise InputError("strategy 'aps' is not available yet: choose from rps, nps.")
-    errors.check_name("strategy", strategy, ("rps", "nps"))
-    base = law.RPSParams.paper() if strategy == "rps" else law.RPSParams.nps()
-    names = [name for name in base._fields if name != "reactive"]
-    return base._replace(**_assignments("params", common.params, names))
+    errors.check_name("strategy", strategy, paper.STRATEGIES)
+    of_the_law = [name for name in RPSParams._fields if name != "reactive"]
+    of_aps = [f"aps.{name}" for name in APSParams._fields]
+    given = _assignments("params", common.params, [*of_the_law, *of_aps])
+    wanted = of_aps if strategy == "aps" else of_the_law
+    changes = {name.removeprefix("aps."): v for name, v in given.items() if name in wanted}
+    return paper.PARAMS[strategy]._replace(**changes)
 
 
 def _friction(text: str) -> Friction:
@@ -206,24 +253,35 @@ def _friction(text: str) -> Friction:
 
 
 def _setting(common: Common) -> Setting:
-    from rps_jax import scene, skin, sweep
+    from rps_jax import scene, sweep
     from rps_jax.trial import Rules
 
-    errors.check_name("physics", common.physics, scene.PHYSICS)
     steps = {"timestep": common.timestep, "control_period": common.control_period}
     physics = dataclasses.replace(
-        scene.PHYSICS[common.physics], **{k: v for k, v in steps.items() if v is not None}
+        scene.physics(common.physics, common.fidelity),
+        **{k: v for k, v in steps.items() if v is not None},
     )
-    sensor = skin.SKINS[errors.check_name("skin", common.skin, skin.SKINS)]
-    changes = _assignments("skin-params", common.skin_params, sensor._fields)
     return sweep.Setting(
         physics=physics,
         rules=Rules(horizon=common.horizon),
-        skin=sensor._replace(**changes),
-        gap=common.gap,
-        rear=errors.check_name("rear", common.rear, ("near", "far")),  # pyright: ignore[reportArgumentType]
         seed=common.seed,
+        engine=common.engine,  # pyright: ignore[reportArgumentType]
     )
+
+
+def _per_world(common: Common) -> dict[str, Any]:
+    """The options that become fields of every case."""
+    from rps_jax import paper, skin
+
+    name = common.skin or paper.SKIN[common.physics]
+    sensor = skin.SKINS[errors.check_name("skin", name, skin.SKINS)]
+    changes = _assignments("skin-params", common.skin_params, sensor._fields)
+    return {
+        "mass": common.mass,
+        "skin": sensor._replace(**changes),
+        "gap": common.gap,
+        "rear": common.rear,
+    }
 
 
 def _cases(options: Table, targets: Sequence[tuple[float, float]]) -> list[Case]:
@@ -236,7 +294,7 @@ def _cases(options: Table, targets: Sequence[tuple[float, float]]) -> list[Case]
             raise InputError(f"{name} = {values} is not allowed: name each once, at least one.")
     frictions = [_friction(text) for text in options.friction]
     return [
-        sweep.Case(name, friction, target, params, options.mass)
+        sweep.Case(name, friction, target, params, **_per_world(options))
         for params in [_params(options, s) for s in options.strategies]
         for name in options.objects
         for friction in frictions
@@ -255,9 +313,7 @@ def _open(common: Common, command: str) -> Path:
     return out
 
 
-def _write_config(
-    out: Path, common: Common, setting: Setting, params: dict[str, RPSParams]
-) -> None:
+def _write_config(out: Path, common: Common, setting: Setting, params: dict[str, Params]) -> None:
     from rps_jax import record
 
     config = {
@@ -265,9 +321,24 @@ def _write_config(
         "params": {name: values._asdict() for name, values in params.items()},
         "physics": dataclasses.asdict(setting.physics),
         "rules": dataclasses.asdict(setting.rules),
-        "skin": {"kind": common.skin, **setting.skin._asdict()},
+        "skin": _per_world(common)["skin"]._asdict(),
     }
     record.write_json(out / "config.json", config)
+
+
+@contextlib.contextmanager
+def progress_bar(trials: int, what: str = "push") -> Iterator[Callable[[Progress], None]]:
+    """A bar over trials, to be handed to `sweep.run` as its `report`."""
+    from tqdm import tqdm
+
+    with tqdm(total=trials, unit="trial", desc="compile", mininterval=0.5) as bar:
+
+        def report(progress: Progress) -> None:
+            bar.set_description(what, refresh=False)
+            bar.set_postfix_str(f"{progress.simulated:.0f} s simulated", refresh=False)
+            bar.update(progress.finished - bar.n)
+
+        yield report
 
 
 def _tell(timing: Timing) -> None:
@@ -284,8 +355,6 @@ def _tell(timing: Timing) -> None:
 
 
 def _table(options: Table) -> None:
-    from tqdm import tqdm
-
     from rps_jax import figures, paper, record, score, sweep
 
     setting = _setting(options)
@@ -296,14 +365,7 @@ def _table(options: Table) -> None:
             errors.check_finite(name, value, at_least=1)
     out = _open(options, "table")
     _write_config(out, options, setting, {s: _params(options, s) for s in options.strategies})
-
-    with tqdm(total=len(cases), unit="trial", desc="compile", mininterval=0.5) as bar:
-
-        def report(progress: sweep.Progress) -> None:
-            bar.set_description("push", refresh=False)
-            bar.set_postfix_str(f"{progress.simulated:.0f} s simulated", refresh=False)
-            bar.update(progress.finished - bar.n)
-
+    with progress_bar(len(cases)) as report:
         outcome, timing = sweep.run(
             cases, setting, slots=options.slots, workers=options.workers, report=report
         )
@@ -325,8 +387,14 @@ def _push(options: Push) -> None:
     setting = _setting(options)
     params = _params(options, options.strategy)
     case = sweep.Case(
-        options.object, _friction(options.friction), options.target, params, options.mass
+        options.object,
+        _friction(options.friction),
+        options.target,
+        params,
+        **_per_world(options),
     )
+    if options.engine != "mjx":
+        raise InputError(f"engine = {options.engine} is not allowed: a push is traced by mjx.")
     errors.check_finite("film_length", options.film_length, above=0, at_most=600, unit="s")
     out = _open(options, "push")
     _write_config(out, options, setting, {options.strategy: params})
@@ -337,7 +405,7 @@ def _push(options: Push) -> None:
             bar.set_description("push", refresh=False)
             bar.update(round(progress.simulated - bar.n, 3))
 
-        trace = sweep.follow(case, setting, report=report)
+        (trace,) = sweep.follow([case], setting, report=report)
     record.write_results(out / "results.nc", score.trace_dataset(trace))
     figures.one_trial(case, trace, out / "trial.png")
     result = trace.outcome
@@ -360,7 +428,7 @@ def _film(options: Push, case: Case, setting: Setting, trace: Trace, out: Path) 
 
     from rps_jax import figures, sweep, trial, video
 
-    scene = sweep.scene_of(case, setting)
+    scene = sweep.scene_of(case, setting.physics)
     target = np.array(case.p_world_target)
     seen = trace.snapshots
     fps = 25

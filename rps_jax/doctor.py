@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from pathlib import Path
 
 from rps_jax import record, video
+from rps_jax.errors import InputError
 
 
 def report(cache: Path) -> str:
@@ -28,10 +27,7 @@ def report(cache: Path) -> str:
 
 def _writable(folder: Path) -> tuple[bool, str]:
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        reason = os.strerror(error.errno or 0)
-        return False, f"{folder} ({reason}): set RPS_CACHE to a writable folder"
+        record.writable(folder)
+    except InputError:
+        return False, f"{folder} cannot be written: set RPS_CACHE to a writable folder"
     return True, ""

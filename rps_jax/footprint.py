@@ -62,6 +62,11 @@ def extent(footprint: Footprint, along: jax.Array) -> jax.Array:
     return jnp.max(footprint.vertices @ along) + footprint.radius
 
 
+def circumradius(footprint: Footprint) -> jax.Array:
+    """Greatest distance () [m] of the outline from the object's origin."""
+    return jnp.max(frames.norm(footprint.vertices)) + footprint.radius
+
+
 def _edges(footprint: Footprint) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Start points (N, 2), vectors (N, 2) and squared lengths (N,), never zero, of the edges."""
     start = footprint.vertices

@@ -42,7 +42,14 @@ class RPSParams(NamedTuple):
     l_mr: float | jax.Array = 0.15  # [m] the middle region ends here; Realignment stops
     a_r_max: float | jax.Array = 10.0  # [1] adaptive rate in Realignment; eta's value
     gamma_max: float | jax.Array = 1.56  # [rad] bound on |gamma|; inf is the tangent as printed
-    reactive: float | jax.Array = 1.0  # [1] 1: RPS; 0: NPS (a_r = 0 and no Realignment)
+    v_lost: float | jax.Array = 0.01  # [m/s] forward speed after contact is lost
+    sgn_0: float | jax.Array = 0.0  # [1] sgn(0), from 0 to 1
+
+    # Switches, each 0 or 1.
+    reactive: float | jax.Array = 1.0  # 1: RPS; 0: NPS (a_r = 0 and no Realignment)
+    keep_contact: float | jax.Array = 0.0  # 1: a loss is ignored, the last contact acted upon
+    saturate_first: float | jax.Array = 0.0  # 1: omega from the saturated linear velocity
+    clip_each: float | jax.Array = 0.0  # 1: v_x and v_y clipped one by one, not as a vector
 
     @classmethod
     def paper(cls) -> RPSParams:
@@ -104,19 +111,21 @@ def check(params: RPSParams) -> RPSParams:
       InputError: a value is not a number, negative where it must not be, or infinite (only
         gamma_max may be, for the tangent as printed).
     """
-    for name in ("eta", "zeta", "beta", "k", "d_th", "a_r_max", "l_mr", "v_approach"):
+    for name in ("eta", "zeta", "beta", "k", "d_th", "a_r_max", "l_mr", "v_approach", "v_lost"):
         errors.check_finite(name, getattr(params, name), at_least=0)
     for name in ("K_h", "K_v", "L", "l_cr", "v_max", "omega_max", "d_success"):
         errors.check_finite(name, getattr(params, name), above=0)
     errors.check_finite("l_mr", params.l_mr, at_most=params.l_cr)
     errors.check_number("gamma_max", params.gamma_max, above=0)
-    errors.check_finite("reactive", params.reactive, at_least=0, at_most=1)
+    errors.check_finite("sgn_0", params.sgn_0, at_least=0, at_most=1)
+    for name in ("reactive", "keep_contact", "saturate_first", "clip_each"):
+        errors.check_finite(name, getattr(params, name), at_least=0, at_most=1)
     return params
 
 
-def _sgn(x: jax.Array) -> jax.Array:
-    """Sgn with sgn(0) = 0: a centred contact asks for no lateral motion."""
-    return jnp.sign(x)
+def _sgn(params: RPSParams, x: jax.Array) -> jax.Array:
+    """Sgn, with the parameter sgn(0): by default a centred contact asks for no lateral motion."""
+    return jnp.where(x == 0, params.sgn_0, jnp.sign(x))
 
 
 def _is_far(params: RPSParams, distance: jax.Array) -> jax.Array:
@@ -141,7 +150,7 @@ def displacement(observation: Observation) -> jax.Array:
 def adaptive_rate(params: RPSParams, l: jax.Array, distance: jax.Array) -> jax.Array:  # noqa: E741
     """Eq. 5: a_r (...) [1] from the lateral contact location l [m] and ||d|| [m]."""
     logistic = jax.nn.sigmoid((jnp.abs(l) - params.beta) * params.k)
-    a_r = (params.zeta + (params.eta - params.zeta) * logistic) * _sgn(l)
+    a_r = (params.zeta + (params.eta - params.zeta) * logistic) * _sgn(params, l)
     return jnp.where(_is_far(params, distance), a_r, 0.0) * params.reactive
 
 
@@ -168,11 +177,17 @@ def realignment_gain(params: RPSParams, l: jax.Array) -> jax.Array:  # noqa: E74
 
 
 def saturate(params: RPSParams, twist: Twist) -> Twist:
-    """Bound the commanded twist: (v_x, v_y) scaled as a vector to norm v_max, omega clipped."""
-    speed = frames.norm(jnp.stack([twist.v_x, twist.v_y], axis=-1))
-    scale = params.v_max / jnp.maximum(speed, params.v_max)
+    """Bound the commanded twist: (v_x, v_y) scaled as a vector to norm v_max, omega clipped.
+
+    With `clip_each`, v_x and v_y are clipped to +-v_max one by one, which turns the vector.
+    """
+    v = jnp.stack([twist.v_x, twist.v_y], axis=-1)
+    v_max = jnp.asarray(params.v_max)
+    scaled = v * (v_max / jnp.maximum(frames.norm(v), v_max))[..., None]
+    clipped = jnp.clip(v, -v_max[..., None], v_max[..., None])
+    v = jnp.where(jnp.asarray(params.clip_each > 0)[..., None], clipped, scaled)
     omega = jnp.clip(twist.omega, -jnp.asarray(params.omega_max), params.omega_max)
-    return Twist(twist.v_x * scale, twist.v_y * scale, omega)
+    return Twist(v[..., 0], v[..., 1], omega)
 
 
 def _push(
@@ -186,10 +201,16 @@ def _push(
     gamma = steering_angle(params, d, observation.yaw)
 
     realigning = _must_realign(params, l, l_th)
-    a_r = jnp.where(realigning, params.a_r_max * _sgn(l), adaptive_rate(params, l, distance))
+    a_r = jnp.where(
+        realigning, params.a_r_max * _sgn(params, l), adaptive_rate(params, l, distance)
+    )
     v_x, v_y = linear_velocity(v_star, a_r)  # Eqs. 1-2
-    turning_speed = jnp.where(realigning, realignment_gain(params, l) * v_star, v_x)
-    omega = turning_speed / params.L * jnp.tan(gamma)  # Eq. 8 or 6: before any saturation
+    bounded = saturate(params, Twist(v_x, v_y, jnp.zeros_like(v_x)))
+    first = jnp.asarray(params.saturate_first) > 0
+    forward = jnp.where(first, bounded.v_x, v_x)
+    speed = jnp.where(first, jnp.minimum(v_star, params.v_max), v_star)
+    turning_speed = jnp.where(realigning, realignment_gain(params, l) * speed, forward)
+    omega = turning_speed / params.L * jnp.tan(gamma)  # Eq. 8 or 6
     twist = saturate(params, Twist(v_x, v_y, omega))
 
     arrived = distance < params.d_success
@@ -210,22 +231,26 @@ def step_with_details(
     # Without contact the location means nothing; the last one keeps every branch finite.
     contact = jnp.where(in_contact, observation.p_robot_contact, state.p_robot_contact)
     l_th, push, details = _push(params, state.l_th, observation._replace(p_robot_contact=contact))
-    approach = Twist(params.v_approach, 0.0, 0.0)
-    twist = jax.tree.map(lambda a, b: jnp.where(in_contact, a, b), push, approach)
+    kept = state.touched & (jnp.asarray(params.keep_contact) > 0)
+    # A remembered contact near the target must not stop the robot: only a felt one arrives.
+    pushing = in_contact | (kept & (details.distance >= params.d_success))
+    ahead = Twist(jnp.where(state.touched, params.v_lost, params.v_approach), 0.0, 0.0)
+    twist = jax.tree.map(lambda a, b: jnp.where(pushing, a, b), push, ahead)
     state = RPSState(
-        l_th=jnp.where(in_contact, l_th, state.l_th),
+        l_th=jnp.where(pushing, l_th, state.l_th),
         p_robot_contact=contact,
         touched=state.touched | in_contact,
     )
-    return state, twist, details._replace(realigning=details.realigning & in_contact)
+    return state, twist, details._replace(realigning=details.realigning & pushing)
 
 
 @jax.jit
 def step(params: RPSParams, state: RPSState, observation: Observation) -> tuple[RPSState, Twist]:
     """Algorithm 1: one control step of RPS (or NPS, by `params.reactive`).
 
-    In contact: the saturated twist of Eqs. 1-9, or zero once ||d|| < d_success. Without contact,
-    before the first and after a loss alike: straight ahead at v_approach, l_th unchanged.
+    In contact: the saturated twist of Eqs. 1-9, or zero once ||d|| < d_success. Without contact:
+    straight ahead, at v_approach before the first touch and at v_lost after a loss, l_th
+    unchanged; with `keep_contact`, a loss is ignored and the last contact acted upon.
     Algorithm 1's last line prints v_x twice; (v_x, v_y, omega) is meant.
     """
     state, twist, _ = step_with_details(params, state, observation)

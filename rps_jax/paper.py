@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from rps_jax.baselines import APSParams
+from rps_jax.law import RPSParams
+
 TARGETS = tuple(
     (float(x), float(y)) for x in (2, 1, 0, -1, -2) for y in (2, 1, 0, -1, -2) if (x, y) != (0, 0)
 )  # [m] Sec. III-B: a grid of 1 m, without the robot's place
 
-STRATEGIES = ("rps", "nps", "aps")
+PARAMS = {"rps": RPSParams.paper(), "nps": RPSParams.nps(), "aps": APSParams()}
+STRATEGIES = tuple(PARAMS)
+SKIN = {"default": "ideal", "paper_gazebo": "thin"}  # that goes with each physics
 
 # Table II: successes of 24, keyed by strategy, object and friction set.
 TABLE_II = {

@@ -22,7 +22,7 @@ _PACKAGES = ("rps_jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "scipy
 
 
 def prepare(folder: Path, *, overwrite: bool = False) -> Path:
-    """The folder, made if need be and tried for writing.
+    """The folder of a new run, made if need be and tried for writing.
 
     Raises:
       InputError: it cannot be written, or holds a run already and `overwrite` is off.
@@ -31,6 +31,15 @@ def prepare(folder: Path, *, overwrite: bool = False) -> Path:
         raise InputError(
             f"out = {folder} already holds a run: choose another folder or pass --overwrite."
         )
+    return writable(folder)
+
+
+def writable(folder: Path) -> Path:
+    """The folder, made if need be and tried for writing.
+
+    Raises:
+      InputError: it cannot be written.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -80,6 +89,15 @@ def read_results(folder: Path) -> xr.Dataset:
     path = Path(folder) / "results.nc"
     if not path.exists():
         raise InputError(f"run = {folder} holds no results.nc: give the folder of a finished run.")
+    return read(path)
+
+
+def read(path: Path) -> xr.Dataset:
+    """The labelled results of one file.
+
+    Raises:
+      InputError: it cannot be read.
+    """
     try:
         return xr.load_dataset(path, engine="h5netcdf")
     except (OSError, ValueError, KeyError) as error:

@@ -27,6 +27,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # MJX reports on the console th
     from mujoco import mjx
 
 Side = Literal["near", "far"]
+SIDES = ("near", "far")
 # All that differs between objects of one shape family, as paths into an MJX model.
 FIELDS = (
     *(f".stat.mean{name}" for name in ("inertia", "mass", "size")),
@@ -69,6 +70,7 @@ class Physics:
     iterations: int = 10  # of the Newton solver, at most; too few lose the object
     ls_iterations: int = 14  # of its line search, always done
     tolerance: float = 1e-8  # [1] of the solver
+    solref: tuple[float, float] = (0.02, 1.0)  # [s, 1] of the base's contact; MuJoCo's own
 
     def __post_init__(self) -> None:
         """Raises InputError for values that MuJoCo would accept and that mean nothing."""
@@ -78,6 +80,8 @@ class Physics:
         errors.check_finite("iterations", self.iterations, at_least=1)
         errors.check_finite("ls_iterations", self.ls_iterations, at_least=1)
         errors.check_finite("tolerance", self.tolerance, at_least=0)
+        for name, value in zip(("time constant", "damping ratio"), self.solref, strict=True):
+            errors.check_finite(f"solref {name}", value, above=0)
         errors.check_name("cone", self.cone, ("elliptic", "pyramidal"))
         steps = self.control_period / self.timestep
         if steps < 0.5 or not math.isclose(steps, round(steps), rel_tol=1e-6):
@@ -92,11 +96,37 @@ class Physics:
         return round(self.control_period / self.timestep)
 
 
+# How the friction is modelled, and how finely that is solved: see `physics`.
+_PYRAMID = {"cone": "pyramidal", "iterations": 20, "ls_iterations": 20}
+_EXACT = {"timestep": 0.001, "iterations": 100, "ls_iterations": 50, "tolerance": 1e-10}
 PHYSICS = {
-    "default": Physics(),
+    "default": {
+        "reference": Physics(**_EXACT),
+        "standard": Physics(),
+        "fast": Physics(iterations=8, ls_iterations=10),
+    },
     # The pyramid converges more slowly, and with fewer iterations it loses boxes.
-    "pyramidal": Physics(cone="pyramidal", timestep=0.005, iterations=20, ls_iterations=20),
+    "paper_gazebo": {
+        "reference": Physics(**(_EXACT | {"cone": "pyramidal"})),
+        "standard": Physics(timestep=0.005, **_PYRAMID),
+        "fast": Physics(timestep=0.005, **_PYRAMID),
+    },
 }
+
+
+def physics(name: str = "default", fidelity: str = "standard") -> Physics:
+    """Physics by name.
+
+    Args:
+      name: `default`, isotropic Coulomb friction; `paper_gazebo`, a friction pyramid along the
+        world's axes, as in the paper's engine.
+      fidelity: `reference`, converged, for the engine `mujoco`; `standard`, for tables; `fast`.
+
+    Raises:
+      InputError: unknown name or fidelity.
+    """
+    errors.check_name("physics", name, PHYSICS)
+    return PHYSICS[name][errors.check_name("fidelity", fidelity, PHYSICS[name])]
 
 
 class Scene(NamedTuple):
@@ -128,11 +158,12 @@ def mjcf_folder() -> Path:
 
 def load(
     name: str,
-    physics: Physics = PHYSICS["default"],
+    physics: Physics = PHYSICS["default"]["standard"],
     friction: Friction = FRICTION["S1"],
     *,
     rear: Side = "near",
     mass: float | None = None,
+    half_length: float = skin.HALF_LENGTH,
 ) -> Scene:
     """Compile a scene.
 
@@ -143,18 +174,22 @@ def load(
       rear: which side the nonuniform box's load stands on, nearest the robot or farthest; the
         paper says "rear left corner".
       mass: of the object [kg], its inertia scaled along; None: the object's own.
+      half_length: of the base [m].
 
     Raises:
       InputError: unknown name, or friction or mass that is not a positive finite number.
     """
     errors.check_name("object", name, OBJECTS)
-    errors.check_name("rear", rear, ("near", "far"))
+    errors.check_name("rear", rear, SIDES)
     check(friction, mass)
     spec = mujoco.MjSpec.from_file(str(mjcf_folder() / f"{name}.xml"))
     for geom in spec.geoms:
         if geom.name == "load" and rear == "far":
             geom.pos[0] = -geom.pos[0]
+    _set_length(spec, half_length)
     for pair in spec.pairs:
+        if pair.name == "base_object":
+            pair.solref[:] = physics.solref
         pair.friction[:2] = friction.ground if pair.name == "ground_object" else friction.robot
     if mass is not None:
         _set_mass(spec, mass)
@@ -170,6 +205,13 @@ def check(friction: Friction, mass: float | None) -> None:
         errors.check_finite(f"friction {side}", value, above=0, at_most=10)
     if mass is not None:
         errors.check_finite("mass", mass, above=0, at_most=1e4, unit="kg")
+
+
+def _set_length(spec: mujoco.MjSpec, half_length: float) -> None:
+    """Stretch the base and its skin to this half length [m]."""
+    spec.geom("skin_front").pos[0] = half_length
+    for name in ("base", "skin_left", "skin_right"):
+        spec.geom(name).size[0] = half_length
 
 
 def _set_mass(spec: mujoco.MjSpec, mass: float) -> None:
@@ -225,13 +267,17 @@ def _footprint(model: mujoco.MjModel) -> Footprint:
 
 
 def initial_qpos(scene: Scene, gap: float = 0.02, yaw: float = 0.0) -> np.ndarray:
-    """Base at the origin, object `gap` [m] in front of the middle of its front face: (10,)."""
+    """Base at the origin, object `gap` [m] in front of the middle of its front face: (10,).
+
+    `yaw` [rad] turns the object.
+    """
     placed = fp.place(scene.footprint, jnp.zeros(2), jnp.asarray(yaw, float))
     reach = float(fp.extent(placed, jnp.array([-1.0, 0.0])))
     qpos = scene.physics.qpos0.copy()
     qpos[JOINTS.base] = 0.0
     height = qpos[JOINTS.object][2]
-    position = [skin.HALF_LENGTH + gap + reach, 0.0, height]
+    front = scene.physics.geom("base").size[0]
+    position = [front + gap + reach, 0.0, height]
     qpos[JOINTS.object] = [*position, math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
     return qpos
 

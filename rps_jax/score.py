@@ -96,36 +96,37 @@ def trace_dataset(trace: Trace) -> xr.Dataset:
     return xr.Dataset(variables, coords={"time": ("time", seen.time, {"units": "s"})})
 
 
+def markdown(rows: Sequence[Sequence[str]]) -> str:
+    """A header and rows as a Markdown table whose columns line up."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = [
+        "| " + " | ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)) + " |"
+        for row in rows
+    ]
+    rule = "|" + "|".join("-" * (w + 2) for w in widths) + "|"
+    return "\n".join([lines[0], rule, *lines[1:]])
+
+
 def table(results: xr.Dataset) -> str:
-    """Table II as text: successes with Wilson 95 % intervals, and the paper's beside them."""
+    """Table II in Markdown: successes with Wilson 95 % intervals, and the paper's beside them."""
     trials = results.sizes["target"]
     whole = trials == len(paper.TARGETS)
     columns = [(str(o), str(f)) for o in results.object.values for f in results.friction.values]
-    names = ["", "", *(f"{o} {f}" for o, f in columns), "all"]
-    rows = []
+    rows = [["", "", *(f"{o} {f}" for o, f in columns), "all"]]
     for strategy in map(str, results.strategy.values):
         success = results.success.sel(strategy=strategy)
         counts = [int(success.sel(object=o, friction=f).sum()) for o, f in columns]
-        total = trials * len(columns)
-        cells = [f"{c}/{trials} {_percent(c, trials)}" for c in counts]
-        rows.append(
-            [
-                strategy.upper(),
-                "ours",
-                *cells,
-                f"{sum(counts)}/{total} {_percent(sum(counts), total)}",
-            ]
-        )
+        sizes = [trials] * len(columns)
+        pairs = [*zip(counts, sizes, strict=True), (sum(counts), sum(sizes))]
+        cells = [f"{n}/{of} {_percent(n, of)}" for n, of in pairs]
+        rows.append([strategy.upper(), "ours", *cells])
         theirs = [paper.TABLE_II.get((strategy, o, f)) for o, f in columns]
         if whole and None not in theirs:
-            cells = [f"{c}/24" for c in theirs]
-            rows.append(["", "paper", *cells, f"{sum(filter(None, theirs))}/{total}"])
-    widths = [max(len(row[i]) for row in [names, *rows]) for i in range(len(names))]
-    lines = [
-        "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip()
-        for row in [names, *rows]
-    ]
-    return "\n".join(["Successes, with Wilson 95 % intervals in percent", *lines])
+            theirs = [n for n in theirs if n is not None]
+            pairs = [*zip(theirs, sizes, strict=True), (sum(theirs), sum(sizes))]
+            rows.append(["", "paper", *(f"{n}/{of}" for n, of in pairs)])
+    title = "Successes, with Wilson 95 % intervals in percent"
+    return f"{title}\n\n{markdown(rows)}"
 
 
 def _percent(successes: int, trials: int) -> str:

@@ -12,7 +12,7 @@ contact are its first and last along this strip.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,7 @@ HALF_LENGTH = 0.3625  # [m] of the base: 15 taxels of 48.3 mm make 0.725 m
 HALF_WIDTH = 0.29  # [m] of the base: l_cr + 5 cm, Sec. III-A
 BOARDS = {"left": 5, "front": 4, "right": 5}  # 14 boards, Sec. II-B
 ELECTRODES = 3  # on each board
+_SAMPLES = 5  # of each taxel, about 1 cm apart: a corner pressed home is felt
 
 NONE, POINT, LINE = 0, 1, 2  # contact types, Fig. 6c
 
@@ -33,16 +34,19 @@ NONE, POINT, LINE = 0, 1, 2  # contact types, Fig. 6c
 class Face(NamedTuple):
     """One side of the base, in strip order."""
 
-    start: np.ndarray  # (2,) [m] in the robot frame
+    start: jax.Array  # (2,) [m] in the robot frame
     along: np.ndarray  # (2,) unit vector
-    length: float  # [m]
+    length: Any  # () [m]
 
 
-FACES = {
-    "left": Face(np.array([-HALF_LENGTH, HALF_WIDTH]), np.array([1.0, 0.0]), 2 * HALF_LENGTH),
-    "front": Face(np.array([HALF_LENGTH, HALF_WIDTH]), np.array([0.0, -1.0]), 2 * HALF_WIDTH),
-    "right": Face(np.array([HALF_LENGTH, -HALF_WIDTH]), np.array([-1.0, 0.0]), 2 * HALF_LENGTH),
-}
+def faces(half_length: Any = HALF_LENGTH) -> dict[str, Face]:
+    """The covered sides of a base of length 2 half_length [m], in strip order."""
+    x, y = half_length, HALF_WIDTH
+    return {
+        "left": Face(jnp.stack([-x, y]), np.array([1.0, 0.0]), 2 * x),
+        "front": Face(jnp.stack([x, y]), np.array([0.0, -1.0]), 2 * y),
+        "right": Face(jnp.stack([x, -y]), np.array([-1.0, 0.0]), 2 * x),
+    }
 
 
 class Reading(NamedTuple):
@@ -59,6 +63,8 @@ class Reading(NamedTuple):
 
 class Skin(Protocol):
     """A tactile sensor: a pytree of parameters with two pure functions."""
+
+    half_length: float | jax.Array  # [m] of the base that it covers
 
     def check(self) -> None:
         """Raises InputError for scalar parameters that mean nothing."""
@@ -94,11 +100,15 @@ class IdealSkin(NamedTuple):
 
     tolerance: float | jax.Array = 0.006  # [m]
     point_length: float | jax.Array = 2 * HALF_WIDTH / 12  # [m] up to one taxel long: a point
+    half_length: float | jax.Array = HALF_LENGTH  # [m] of the base
 
     def check(self) -> None:
-        """Raises InputError unless tolerance and point_length are lengths."""
-        for name, value in self._asdict().items():
-            errors.check_finite(f"skin {name}", value, at_least=0, at_most=0.1, unit="m")
+        """Raises InputError unless all are lengths."""
+        for name in ("tolerance", "point_length"):
+            errors.check_finite(
+                f"skin {name}", getattr(self, name), at_least=0, at_most=0.1, unit="m"
+            )
+        _check_half_length(self.half_length)
 
     def init(self, key: jax.Array) -> SkinState:
         """No memory, no imperfections."""
@@ -112,7 +122,7 @@ class IdealSkin(NamedTuple):
         dtype = footprint.vertices.dtype
         strip_start = 0.0
         hits, ends = [], []  # of both ends of each face's interval, in strip order
-        for face in FACES.values():
+        for face in faces(self.half_length).values():
             start, along = jnp.asarray(face.start, dtype), jnp.asarray(face.along, dtype)
             low, high = fp.crossing(footprint, start, along, self.tolerance)
             hit = (low <= high) & (high >= 0) & (low <= face.length)
@@ -141,6 +151,7 @@ class CapacitiveSkin(NamedTuple):
     noise: float | jax.Array = 0.0  # [1] standard deviation of each raw reading
     gain_spread: float | jax.Array = 0.0  # [1] standard deviation of the taxels' gains about 1
     dead_share: float | jax.Array = 0.0  # [1] probability that a taxel never answers
+    half_length: float | jax.Array = HALF_LENGTH  # [m] of the base
 
     def check(self) -> None:
         """Raises InputError for foam, filter or imperfections that no skin can have."""
@@ -150,18 +161,19 @@ class CapacitiveSkin(NamedTuple):
         for name in ("threshold", "noise", "gain_spread"):
             errors.check_finite(f"skin {name}", getattr(self, name), at_least=0)
         errors.check_finite("skin dead_share", self.dead_share, at_least=0, at_most=1)
+        _check_half_length(self.half_length)
 
     def init(self, key: jax.Array) -> SkinState:
         """Draws each taxel's gain and whether it is dead."""
         key, key_gain, key_dead = jax.random.split(key, 3)
-        n = len(TAXELS)
+        n = sum(BOARDS.values()) * ELECTRODES
         gain = 1 + self.gain_spread * jax.random.normal(key_gain, (n,))
         alive = jax.random.uniform(key_dead, (n,)) >= self.dead_share
         return SkinState(key, jnp.zeros(n), gain, alive)
 
     def compression(self, footprint: Footprint) -> jax.Array:
         """How far the object presses into the foam (T, S) [m] at each sample of each taxel."""
-        samples = jnp.asarray(TAXEL_SAMPLES, footprint.vertices.dtype)
+        samples = jnp.asarray(taxels(_SAMPLES, self.half_length), footprint.vertices.dtype)
         depth = self.foam - fp.signed_distance(footprint, samples)
         return jnp.clip(depth, 0.0, self.max_compression * self.foam)
 
@@ -176,26 +188,28 @@ class CapacitiveSkin(NamedTuple):
         raw = state.gain * change + noise
         signal = state.signal + (1 - jnp.exp(-period / self.time_constant)) * (raw - state.signal)
         active = (signal > self.threshold) & state.alive
-        first, last = _extremes(active, jnp.asarray(TAXELS, change.dtype))
+        middles = jnp.asarray(taxels(1, self.half_length)[:, 0], change.dtype)
+        first, last = _extremes(active, middles)
         kind = jnp.minimum(jnp.sum(active), LINE)
         return state._replace(key=key, signal=signal), _reading(kind, first, last)
 
 
-SKINS = {"ideal": IdealSkin(), "capacitive": CapacitiveSkin()}
+# "thin" chatters between the corners of a box, as a rigid contact sensor does.
+SKINS = {"ideal": IdealSkin(), "thin": IdealSkin(tolerance=0.001), "capacitive": CapacitiveSkin()}
 
 
-def _taxels(samples: int) -> np.ndarray:
+def _check_half_length(value: Any) -> None:
+    errors.check_finite("skin half_length", value, at_least=0.1, at_most=2, unit="m")
+
+
+def taxels(samples: int = 1, half_length: Any = HALF_LENGTH) -> jax.Array:
     """Sample points (42, samples, 2) [m] of the taxels, in strip order, in the robot frame."""
     rows = []
-    for name, face in FACES.items():
+    for name, face in faces(half_length).items():
         count = BOARDS[name] * ELECTRODES * samples
         s = (np.arange(count) + 0.5) / count * face.length
         rows.append((face.start + s[:, None] * face.along).reshape(-1, samples, 2))
-    return np.concatenate(rows)
-
-
-TAXELS = _taxels(1)[:, 0]  # (42, 2) [m] middles of the taxels
-TAXEL_SAMPLES = _taxels(5)  # (42, 5, 2) [m] about 1 cm apart: a corner pressed home is felt
+    return jnp.concatenate(rows)
 
 
 def _extremes(active: jax.Array, values: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -2,38 +2,45 @@
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import errors, law, scene, skin, trial
+from rps_jax import baselines, errors, law, reference, scene, skin, trial
 from rps_jax.law import RPSParams
-from rps_jax.scene import PHYSICS, Friction, Physics, Scene, Side, mjx
+from rps_jax.scene import JOINTS, PHYSICS, Friction, Physics, Scene, Side, mjx
 from rps_jax.skin import IdealSkin, Skin
-from rps_jax.trial import Outcome, Rules, Snapshot, Stage, Trial, World
+from rps_jax.trial import Outcome, Params, Rules, Shift, Snapshot, Stage, Strategy, Trial, World
 
+Engine = Literal["mjx", "mujoco"]
 _SEGMENT = 10.0  # [s] simulated between two looks at which trials have ended
 
 
 @dataclass(frozen=True)
 class Case:
-    """One trial to run."""
+    """One trial to run: all that may differ from world to world."""
 
     object: str
     friction: Friction
     p_world_target: tuple[float, float]  # [m]
-    params: RPSParams
+    params: Params = RPSParams.paper()  # and with them the strategy
     mass: float | None = None  # [kg] of the object; None: its own
+    skin: Skin = IdealSkin()
+    gap: float = 0.02  # [m] between base and object at the start; left open by the paper
+    rear: Side = "near"  # where the nonuniform box's load stands; left open by the paper
+    bearing: float = 0.0  # [rad] turns the whole trial, and so matters to a friction pyramid alone
+    shift: Shift = Shift()
 
     def __post_init__(self) -> None:
         """Raises InputError for anything that names or means no trial."""
@@ -46,26 +53,30 @@ class Case:
                 f"target = ({x:g}, {y:g}) m is not allowed: it must lie outside the robot, which "
                 f"covers |x| <= {skin.HALF_LENGTH:g} m and |y| <= {skin.HALF_WIDTH:g} m."
             )
-        law.check(self.params)
+        (law if isinstance(self.params, RPSParams) else baselines).check(self.params)
         scene.check(self.friction, self.mass)
+        self.skin.check()
+        errors.check_finite("gap", self.gap, at_least=0, at_most=1, unit="m")
+        errors.check_name("rear", self.rear, scene.SIDES)
+        errors.check_finite("bearing", self.bearing, at_least=-10, at_most=10, unit="rad")
+        errors.check_number("shift time", self.shift.time, at_least=0, unit="s")
+        for axis, value in zip("xy", self.shift.p_robot, strict=True):
+            errors.check_finite(f"shift {axis}", value, at_least=-5, at_most=5, unit="m")
 
 
 @dataclass(frozen=True)
 class Setting:
     """What all trials of a run share."""
 
-    physics: Physics = PHYSICS["default"]
+    physics: Physics = PHYSICS["default"]["standard"]
     rules: Rules = Rules()
-    skin: Skin = field(default_factory=IdealSkin)
-    gap: float = 0.02  # [m] between base and object at the start; left open by the paper
-    rear: Side = "near"  # where the nonuniform box's load stands; left open by the paper
-    seed: int = 0
+    seed: int = 0  # of the skins' imperfections
+    engine: Engine = "mjx"
 
     def __post_init__(self) -> None:
-        """Raises InputError for a gap or a seed that means nothing."""
-        errors.check_finite("gap", self.gap, at_least=0, at_most=1, unit="m")
+        """Raises InputError for a seed or an engine that means nothing."""
         errors.check_finite("seed", self.seed, at_least=0, at_most=2**32 - 1)
-        self.skin.check()
+        errors.check_name("engine", self.engine, get_args(Engine))
 
 
 @dataclass(frozen=True)
@@ -91,43 +102,87 @@ class Trace:
 
     snapshots: Snapshot
     outcome: Outcome  # without a leading axis
-    timing: Timing
+    timing: Timing  # of all trials followed together
 
 
-def scene_of(case: Case, setting: Setting) -> Scene:
+def _scene_key(case: Case) -> Hashable:
+    """What `scene_of` depends on."""
+    return case.object, case.friction, case.mass, case.rear, float(case.skin.half_length)
+
+
+def scene_of(case: Case, physics: Physics) -> Scene:
     """The scene that a case is run in."""
     return scene.load(
-        case.object, setting.physics, case.friction, rear=setting.rear, mass=case.mass
+        case.object,
+        physics,
+        case.friction,
+        rear=case.rear,
+        mass=case.mass,
+        half_length=float(case.skin.half_length),
     )
+
+
+def _distinct(keys: Sequence[Hashable]) -> tuple[list[int], np.ndarray]:
+    """Index of the first of each distinct key, and which of these every key is, (len(keys),)."""
+    order = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+    which = np.array([order[key] for key in keys])
+    return [int(np.argmax(which == i)) for i in range(len(order))], which
+
+
+def _start_of(case: Case, at: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """The start (10,) and the target (2,) of a case, the whole turned by its bearing."""
+    qpos = scene.initial_qpos(at, case.gap)
+    c, s = math.cos(case.bearing), math.sin(case.bearing)
+    turn = np.array([[c, -s], [s, c]])
+    x = JOINTS.object.start
+    qpos[:3] = [*(turn @ qpos[:2]), qpos[2] + case.bearing]
+    qpos[x : x + 2] = turn @ qpos[x : x + 2]
+    qpos[x + 3 : x + 7] = [math.cos(case.bearing / 2), 0.0, 0.0, math.sin(case.bearing / 2)]
+    return qpos, turn @ np.array(case.p_world_target)
 
 
 def build(
     cases: Sequence[Case], setting: Setting, indices: Sequence[int] | None = None
 ) -> tuple[Stage, World]:
-    """Worlds of cases of one shape family, stacked on the host: leaves (len(cases), ...).
+    """Worlds of cases of one kind (see `kind`), stacked on the host: leaves (len(cases), ...).
 
     Each world draws its skin's imperfections from (setting.seed, its index); by default the
     indices count from 0.
     """
-    kinds = list(dict.fromkeys((case.object, case.friction, case.mass) for case in cases))
-    which = np.array([kinds.index((case.object, case.friction, case.mass)) for case in cases])
-    first = [cases[int(np.argmax(which == i))] for i in range(len(kinds))]
-    scenes = [scene_of(case, setting) for case in first]
+    first, which = _distinct([_scene_key(case) for case in cases])
+    scenes = [scene_of(cases[i], setting.physics) for i in first]
     model, fields = scene.stack([s.physics for s in scenes])
+    starts = [_start_of(case, scenes[i]) for case, i in zip(cases, which, strict=True)]
     dtype = model.qpos0.dtype
-    n = len(cases)
-    numbers = np.arange(n) if indices is None else np.asarray(indices)
+    numbers = np.arange(len(cases)) if indices is None else np.asarray(indices)
     root = jax.random.PRNGKey(setting.seed)
     world = World(
         fields=_rows(jax.device_get(fields), which),
         footprint=_stack([s.footprint for s in scenes], dtype, which),
-        skin=_stack([setting.skin], dtype, np.zeros(n, int)),
+        skin=_stack([case.skin for case in cases], dtype),
         params=_stack([case.params for case in cases], dtype),
-        p_world_target=_stack([np.array(case.p_world_target) for case in cases], dtype),
-        qpos=_stack([scene.initial_qpos(s, setting.gap) for s in scenes], dtype, which),
+        p_world_target=_stack([target for _, target in starts], dtype),
+        shift=Shift(
+            _stack([case.shift.time for case in cases], dtype),
+            _stack([np.array(case.shift.p_robot) for case in cases], dtype),
+        ),
+        qpos=_stack([qpos for qpos, _ in starts], dtype),
         key=jax.device_get(jax.vmap(partial(jax.random.fold_in, root))(numbers)),
     )
     return Stage(model, mjx.make_data(scenes[0].physics)), world
+
+
+def kind(case: Case) -> tuple[str, type, type]:
+    """What decides which compiled program runs a case: family, strategy and sensor."""
+    return scene.FAMILIES[case.object], type(case.params), type(case.skin)
+
+
+def _by_kind(cases: Sequence[Case]) -> list[list[int]]:
+    """Indices of the cases of each kind."""
+    kinds: dict[Hashable, list[int]] = {}
+    for i, case in enumerate(cases):
+        kinds.setdefault(kind(case), []).append(i)
+    return list(kinds.values())
 
 
 def _stack(trees: Sequence[Any], dtype: np.dtype, which: np.ndarray | None = None) -> Any:
@@ -141,10 +196,10 @@ def _rows(tree: Any, rows: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[rows], tree)
 
 
-@partial(jax.jit, donate_argnames=("trials",))
-def _refill(worlds: World, trials: Trial, fresh: jax.Array) -> Trial:
+@partial(jax.jit, static_argnames=("strategy",), donate_argnames=("trials",))
+def _refill(worlds: World, trials: Trial, fresh: jax.Array, *, strategy: Strategy) -> Trial:
     """Start a new trial in the slots that are `fresh` (B,)."""
-    started = trial.start_all(worlds, jnp.ones_like(fresh))
+    started = trial.start_all(worlds, jnp.ones_like(fresh), strategy=strategy)
     pick = partial(jax.vmap(lambda f, a, b: jnp.where(f, a, b)), fresh)
     return jax.tree.map(pick, started, trials)
 
@@ -157,11 +212,13 @@ class _Queue:
         # Without reaction most trials lose the object and wait for their end: the longest go
         # first, so that the last slots to run are not theirs.
         self.waiting = deque(
-            sorted(range(len(indices)), key=lambda i: cases[indices[i]].params.reactive)
+            sorted(range(len(indices)), key=lambda i: _expected_success(cases[indices[i]]))
         )
         self.slots = min(slots, len(indices))
         self.setting = setting
-        self.stage, self.worlds = build([cases[i] for i in indices], setting, indices)
+        mine = [cases[i] for i in indices]
+        self.strategy = trial.STRATEGIES[type(mine[0].params)]
+        self.stage, self.worlds = build(mine, setting, indices)
         self._program = None
         self._lock = threading.Lock()
 
@@ -187,6 +244,7 @@ class _Queue:
                     trials,
                     physics=physics,
                     rules=self.setting.rules,
+                    strategy=self.strategy,
                     steps=steps,
                 ).compile()
             return self._program
@@ -212,22 +270,33 @@ def run(
       setting: what they share.
       slots: worlds stepped at once by one worker. Results are bit-identical for equal slots on
         one kind of device, whatever shares the batch.
-      workers: host threads that each drive a batch of their own; see `default_workers`.
+      workers: host threads that each drive a batch of their own, or, with the engine `mujoco`,
+        that step worlds; see `default_workers`.
       report: called after every segment, from worker threads, one at a time.
 
     Returns:
       Outcomes as numpy arrays (len(cases), ...), in the order of `cases`; and the timing.
     """
     slots = slots or default_slots()
+    workers = workers or default_workers()
     errors.check_finite("slots", slots, at_least=1)
-    families: dict[str, list[int]] = {}
-    for i, case in enumerate(cases):
-        families.setdefault(scene.FAMILIES[case.object], []).append(i)
-    began = time.perf_counter()
-    queues = [_Queue(indices, cases, setting, slots) for indices in families.values()]
+    errors.check_finite("workers", workers, at_least=1)
     results: list[Outcome | None] = [None] * len(cases)
     shared = _Shared(results, report)
-    count = workers or default_workers()
+    began = time.perf_counter()
+    if setting.engine == "mujoco":
+        _run_in_c(cases, setting, workers, shared)
+    else:
+        _run_in_mjx(cases, setting, slots, workers, shared)
+    total = time.perf_counter() - began
+    outcome = jax.tree.map(lambda *rows: np.stack(rows), *results)
+    return outcome, Timing(shared.compile, total - shared.compile, shared.simulated)
+
+
+def _run_in_mjx(
+    cases: Sequence[Case], setting: Setting, slots: int, count: int, shared: _Shared
+) -> None:
+    queues = [_Queue(indices, cases, setting, slots) for indices in _by_kind(cases)]
     with ThreadPoolExecutor(count) as pool:
         jobs = [
             pool.submit(_work, queues[w % len(queues) :] + queues, shared) for w in range(count)
@@ -238,9 +307,51 @@ def run(
         except BaseException:
             shared.stop = True
             raise
-    total = time.perf_counter() - began
-    outcome = jax.tree.map(lambda *rows: np.stack(rows), *results)
-    return outcome, Timing(shared.compile, total - shared.compile, shared.simulated)
+
+
+def _run_in_c(cases: Sequence[Case], setting: Setting, threads: int, shared: _Shared) -> None:
+    kinds = _by_kind(cases)
+    at_once = min(threads, len(kinds))
+    with ThreadPoolExecutor(at_once) as pool:
+        jobs = [
+            pool.submit(_run_kind_in_c, indices, cases, setting, threads // at_once, shared)
+            for indices in kinds
+        ]
+        try:
+            for job in as_completed(jobs):
+                job.result()
+        except BaseException:
+            shared.stop = True
+            raise
+
+
+def _run_kind_in_c(
+    indices: list[int], cases: Sequence[Case], setting: Setting, threads: int, shared: _Shared
+) -> None:
+    mine = [cases[i] for i in indices]
+    strategy = trial.STRATEGIES[type(mine[0].params)]
+    _, worlds = build(mine, setting, indices)
+    first, which = _distinct([_scene_key(case) for case in mine])
+    models = [scene_of(mine[i], setting.physics).physics for i in first]
+
+    def tell(ended: np.ndarray, trials: Trial, simulated: float) -> bool:
+        outcomes = jax.device_get(trial.outcome(trials, setting.physics.control_period))
+        shared.add({indices[i]: _rows(outcomes, i) for i in ended}, simulated)
+        return not shared.stop
+
+    reference.run(
+        [models[i] for i in which],
+        worlds,
+        physics=setting.physics,
+        rules=setting.rules,
+        strategy=strategy,
+        threads=threads,
+        report=tell,
+    )
+
+
+def _expected_success(case: Case) -> float:
+    return float(case.params.reactive) if isinstance(case.params, RPSParams) else 0.0
 
 
 def default_workers() -> int:
@@ -289,7 +400,7 @@ def _drain(queue: _Queue, shared: _Shared) -> None:
     held = np.array(taken + [0] * (queue.slots - len(taken)))  # the trial in each slot
     live = np.arange(queue.slots) < len(taken)
     worlds = jax.device_put(_rows(queue.worlds, held))
-    trials = trial.start_all(worlds, live)
+    trials = trial.start_all(worlds, live, strategy=queue.strategy)
     began = time.perf_counter()
     program = queue.program(worlds, trials)
     shared.compiled(time.perf_counter() - began)
@@ -308,24 +419,30 @@ def _drain(queue: _Queue, shared: _Shared) -> None:
             held[fresh] = taken
             live[fresh] = True
             worlds = jax.device_put(_rows(queue.worlds, held))
-            trials = _refill(worlds, trials, np.isin(np.arange(queue.slots), fresh))
+            trials = _refill(
+                worlds, trials, np.isin(np.arange(queue.slots), fresh), strategy=queue.strategy
+            )
 
 
 def follow(
-    case: Case,
+    cases: Sequence[Case],
     setting: Setting = Setting(),
     *,
     interval: float = 0.1,
     report: Callable[[Progress], Any] = lambda progress: None,
-) -> Trace:
-    """Run one trial to its end and keep what it looked like every `interval` [s]."""
+) -> list[Trace]:
+    """Run trials of one kind to their ends and keep what they looked like every `interval` [s].
+
+    The engine is MJX, whatever the setting says.
+    """
     period = setting.physics.control_period
     every = max(1, round(interval / period))
     steps = every * max(1, round(_SEGMENT / (every * period)))
-    stage, worlds = build([case], setting)
+    strategy = trial.STRATEGIES[type(cases[0].params)]
+    stage, worlds = build(cases, setting)
     worlds = jax.device_put(worlds)
-    trials = trial.start_all(worlds, np.ones(1, bool))
-    options = {"physics": setting.physics, "rules": setting.rules}
+    trials = trial.start_all(worlds, np.ones(len(cases), bool), strategy=strategy)
+    options = {"physics": setting.physics, "rules": setting.rules, "strategy": strategy}
     began = time.perf_counter()
     program = trial.record.lower(
         stage, worlds, trials, **options, steps=steps, every=every
@@ -335,8 +452,11 @@ def follow(
     while not bool(trials.done.all()):
         trials, snapshots = program(stage, worlds, trials)
         parts.append(jax.device_get(snapshots))
-        report(Progress(int(trials.done.sum()), float(trials.steps[0]) * period))
-    whole = jax.tree.map(lambda *arrays: np.concatenate(arrays)[:, 0], *parts)
-    outcome = _rows(jax.device_get(trial.outcome(trials, period)), 0)
-    timing = Timing(compiled - began, time.perf_counter() - compiled, float(outcome.time))
-    return Trace(_rows(whole, ~whole.done), outcome, timing)
+        report(Progress(int(trials.done.sum()), float(trials.steps.sum()) * period))
+    whole = jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
+    outcomes = jax.device_get(trial.outcome(trials, period))
+    timing = Timing(compiled - began, time.perf_counter() - compiled, float(np.sum(outcomes.time)))
+    return [
+        Trace(_rows(whole, (~whole.done[:, i], i)), _rows(outcomes, i), timing)
+        for i in range(len(cases))
+    ]

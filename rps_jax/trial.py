@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax import errors, frames, law, scene
+from rps_jax import baselines, errors, frames, law, scene
 from rps_jax import footprint as fp
+from rps_jax.baselines import APSParams, APSState, TrackedObservation
 from rps_jax.footprint import Footprint
 from rps_jax.law import Details, Observation, RPSParams, RPSState, Twist
 from rps_jax.scene import JOINTS, Physics, mjx
@@ -30,11 +31,15 @@ _MAX_DISTANCE = 100.0  # [m]
 class Strategy(NamedTuple):
     """What decides: two pure functions. Static, so a change compiles another program."""
 
-    init: Callable[[RPSParams], Any]  # params -> state
-    step: Callable[[RPSParams, Any, Observation], tuple[Any, Twist, Details]]
+    init: Callable[[Any], Any]  # params -> state
+    step: Callable[[Any, Any, Any], tuple[Any, Twist, Details]]  # params, state, observation
+    tracks: bool = False  # observes a TrackedObservation: the object's place as well
 
 
+Params = RPSParams | APSParams
 RPS = Strategy(RPSState.init, law.step_with_details)  # and NPS, by `params.reactive`
+APS = Strategy(APSState.init, baselines.aps_step, tracks=True)
+STRATEGIES: dict[type, Strategy] = {RPSParams: RPS, APSParams: APS}  # by their parameters
 
 
 @dataclass(frozen=True)
@@ -57,14 +62,22 @@ class Stage(NamedTuple):
     data: mjx.Data  # a blank to be filled with each world's state
 
 
+class Shift(NamedTuple):
+    """The object is moved by a hand during the push, as in the paper's video."""
+
+    time: float | jax.Array = jnp.inf  # () [s]
+    p_robot: tuple[float, float] | jax.Array = (0.0, 0.0)  # (2,) [m] how far, in the robot frame
+
+
 class World(NamedTuple):
     """What makes one world; every leaf is batched."""
 
     fields: dict[str, jax.Array]  # of the model, as named by `scene.stack`
     footprint: Footprint
     skin: Skin
-    params: RPSParams
+    params: Params
     p_world_target: jax.Array  # (2,) [m]
+    shift: Shift
     qpos: jax.Array  # (10,) [m, rad] at the start
     key: jax.Array  # of the skin's imperfections
 
@@ -143,6 +156,15 @@ def start(world: World, strategy: Strategy = RPS) -> Trial:
     )
 
 
+def _shifted(world: World, trial: Trial, period: float) -> Trial:
+    """The trial with its object moved, if this is the control step at which that happens."""
+    since = trial.steps * period - world.shift.time
+    now = (since >= 0) & (since < period)
+    by = frames.rotate(trial.qpos[2], jnp.asarray(world.shift.p_robot))
+    x = JOINTS.object.start
+    return trial._replace(qpos=trial.qpos.at[x : x + 2].add(jnp.where(now, by, 0.0)))
+
+
 def sense(world: World, trial: Trial, period: float) -> tuple[SkinState, Reading, Observation]:
     """The skin's reading of the object where it stands now, and what the law is told."""
     p_world_robot, yaw = trial.qpos[:2], trial.qpos[2]
@@ -179,6 +201,67 @@ def drive(
     return jax.lax.scan(one, state, length=substeps)[0]
 
 
+def decide(
+    world: World,
+    trial: Trial,
+    *,
+    physics: Physics,
+    rules: Rules = Rules(),
+    strategy: Strategy = RPS,
+) -> tuple[Trial, Twist, Snapshot]:
+    """What happens between two control periods of one world: sense, judge, decide.
+
+    Returns the trial as it will be driven on, or ended; the commanded twist; and what was seen.
+    """
+    period = physics.control_period
+    time = trial.steps * period
+    trial = _shifted(world, trial, period)
+    skin, reading, observation = sense(world, trial, period)
+    seen: Any = observation
+    if strategy.tracks:
+        seen = TrackedObservation(
+            observation, object_pose(trial.qpos)[0], fp.circumradius(world.footprint), period
+        )
+    state, twist, details = strategy.step(world.params, trial.strategy, seen)
+    snapshot = Snapshot(time, trial.qpos, reading, twist, details, trial.done)
+
+    touch = reading.in_contact
+    distance = frames.norm(law.displacement(observation))
+    lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
+    success = touch & (distance < world.params.d_success)
+    over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost)
+    told = trial._replace(
+        strategy=state,
+        skin=skin,
+        contact_steps=trial.contact_steps + touch,
+        lost_steps=lost_steps,
+        sum_abs_l=trial.sum_abs_l + jnp.where(touch, jnp.abs(reading.p_robot_contact[1]), 0.0),
+        min_distance=jnp.where(
+            touch, jnp.minimum(trial.min_distance, distance), trial.min_distance
+        ),
+        success=success & ~over,
+        done=success | over,
+    )
+    return told, twist, snapshot
+
+
+def settle(
+    before: Trial, told: Trial, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array
+) -> Trial:
+    """The trial after one control period: `told` driven to (qpos, qvel, warmstart), or ended.
+
+    A trial that had ended `before` comes back as it was.
+    """
+    sane = (
+        jnp.all(jnp.isfinite(qpos))
+        & jnp.all(jnp.abs(qvel) < _MAX_SPEED)
+        & jnp.all(jnp.abs(qpos) < _MAX_DISTANCE)
+    )
+    moved = told._replace(qpos=qpos, qvel=qvel, warmstart=warmstart, steps=told.steps + 1)
+    stopped = told._replace(done=jnp.ones((), bool), diverged=~told.done & ~sane)
+    return _select(before.done, before, _select(told.done | ~sane, stopped, moved))
+
+
 def control_step(
     stage: Stage,
     world: World,
@@ -189,40 +272,9 @@ def control_step(
     strategy: Strategy = RPS,
 ) -> tuple[Trial, Snapshot]:
     """One pass of the loop of one world. A world that has ended comes back as it is."""
-    period = physics.control_period
-    time = trial.steps * period
-    skin, reading, observation = sense(world, trial, period)
-    state, twist, details = strategy.step(world.params, trial.strategy, observation)
-    snapshot = Snapshot(time, trial.qpos, reading, twist, details, trial.done)
-
-    touch = reading.in_contact
-    distance = frames.norm(law.displacement(observation))
-    lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
-    success = touch & (distance < world.params.d_success)
-    over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost)
-    told = trial._replace(
-        contact_steps=trial.contact_steps + touch,
-        lost_steps=lost_steps,
-        sum_abs_l=trial.sum_abs_l + jnp.where(touch, jnp.abs(reading.p_robot_contact[1]), 0.0),
-        min_distance=jnp.where(
-            touch, jnp.minimum(trial.min_distance, distance), trial.min_distance
-        ),
-        success=success & ~over,
-        done=success | over,
-    )
-
-    qpos, qvel, warmstart = drive(stage, world, trial, twist, physics.substeps)
-    sane = (
-        jnp.all(jnp.isfinite(qpos))
-        & jnp.all(jnp.abs(qvel) < _MAX_SPEED)
-        & jnp.all(jnp.abs(qpos) < _MAX_DISTANCE)
-    )
-    moved = told._replace(
-        qpos=qpos, qvel=qvel, warmstart=warmstart, strategy=state, skin=skin, steps=trial.steps + 1
-    )
-    stopped = told._replace(done=jnp.ones((), bool), diverged=~told.done & ~sane)
-    new = _select(told.done | ~sane, stopped, moved)
-    return _select(trial.done, trial, new), snapshot
+    told, twist, snapshot = decide(world, trial, physics=physics, rules=rules, strategy=strategy)
+    driven = drive(stage, world, told, twist, physics.substeps)
+    return settle(trial, told, *driven), snapshot
 
 
 def _select(condition: jax.Array, yes: Any, no: Any) -> Any:

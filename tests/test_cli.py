@@ -14,7 +14,7 @@ from rps_jax import cli, paper, record, score
 
 SMALL = [
     *("table", "--targets", "0.6", "0", "0.62", "0.03", "--horizon", "18", "--slots", "4"),
-    *("--objects", "box", "nonuniform_box", "--workers", "1"),
+    *("--objects", "box", "nonuniform_box", "--workers", "1", "--strategies", "rps", "nps"),
 ]
 
 
@@ -45,7 +45,7 @@ def test_a_table_run_leaves_a_labelled_run_folder(runs):
     environment = json.loads((runs[0] / "environment.json").read_text())
     assert environment["packages"]["mujoco"] == "3.17.0"
     assert (runs[0] / "min_distance.png").stat().st_size > 10_000
-    assert "RPS  ours" in (runs[0] / "table.txt").read_text()
+    assert "| RPS | ours" in (runs[0] / "table.txt").read_text()
 
 
 def test_the_same_command_gives_the_same_results_file_bit_for_bit(runs):
@@ -56,7 +56,7 @@ def test_the_notebook_reads_a_run_folder(runs, monkeypatch, capsys):
     monkeypatch.setenv("RPS_RUN", str(runs[0]))
     monkeypatch.setenv("MPLBACKEND", "Agg")
     runpy.run_path(str(Path(__file__).parents[1] / "notebooks" / "03_paper.py"))
-    assert "RPS  ours" in capsys.readouterr().out
+    assert "| RPS | ours" in capsys.readouterr().out
 
 
 def test_a_run_is_not_overwritten_unasked(runs, capsys):
@@ -99,7 +99,10 @@ def test_the_doctor_names_versions_device_cache_rendering_and_ffmpeg(capsys):
 BAD = [
     (("table", "--objects", "bx"), "did you mean 'box'"),
     (("table", "--objects", "box", "box"), "objects"),
-    (("table", "--strategies", "aps"), "aps"),
+    (("table", "--params", "aps.vmax=1"), "did you mean 'aps.v_max'"),
+    (("table", "--params", "aps.v_max=0"), "aps.v_max"),
+    (("table", "--fidelity", "best"), "fidelity"),
+    (("table", "--engine", "ode"), "engine"),
     (("table", "--strategies", "mpc"), "strategy"),
     (("table", "--friction", "S3"), "friction set"),
     (("table", "--friction", "-0.3,0.35"), "friction ground"),

@@ -23,6 +23,9 @@ from rps_jax.skin import LINE, NONE, POINT, CapacitiveSkin, IdealSkin
 
 FRONT, SIDE = 0.3625, 0.29  # [m]
 PITCH = 0.58 / 12  # [m] from taxel to taxel
+FACES = skin.faces()
+TAXELS = np.asarray(skin.taxels()[:, 0])  # (42, 2) [m] their middles
+TAXEL_SAMPLES = np.asarray(skin.taxels(5))  # (42, 5, 2) [m]
 SETTLED = 1e3  # [s] a period after which the low-pass filter has forgotten its past
 
 property_test = hypothesis.settings(max_examples=100, deadline=None)
@@ -88,13 +91,13 @@ def random_placements(seed: int, n: int = 64, gap=(-0.004, 0.012)) -> dict[str, 
 
 
 def test_there_are_42_taxels_on_14_boards_of_three_electrodes():
-    assert skin.TAXELS.shape == (42, 2)
+    assert TAXELS.shape == (42, 2)
     assert sum(skin.BOARDS.values()) == 14
     assert skin.ELECTRODES == 3
 
 
 def test_15_taxels_lie_on_each_side_and_12_on_the_front():
-    left, front, right = np.split(skin.TAXELS, [15, 27])
+    left, front, right = np.split(TAXELS, [15, 27])
     np.testing.assert_allclose(left[:, 1], SIDE)
     np.testing.assert_allclose(front[:, 0], FRONT)
     np.testing.assert_allclose(right[:, 1], -SIDE)
@@ -107,37 +110,37 @@ def test_the_critical_region_ends_5_cm_beyond_l_cr_at_the_edge_of_the_front():
 
 
 def test_the_taxels_of_every_face_have_the_pitch_of_48_3_mm_and_fill_it():
-    for face in np.split(skin.TAXELS, [15, 27]):
+    for face in np.split(TAXELS, [15, 27]):
         steps = np.linalg.norm(np.diff(face, axis=0), axis=1)
         np.testing.assert_allclose(steps, 0.0483, atol=1e-4)
-    lengths = [face.length for face in skin.FACES.values()]
+    lengths = [face.length for face in FACES.values()]
     np.testing.assert_allclose(lengths, np.array([15, 12, 15]) * PITCH, atol=1e-12)
 
 
 def test_the_strip_runs_from_left_rear_across_the_front_to_right_rear():
-    left, front, right = np.split(skin.TAXELS, [15, 27])
+    left, front, right = np.split(TAXELS, [15, 27])
     assert (np.diff(left[:, 0]) > 0).all()
     assert (np.diff(front[:, 1]) < 0).all()
     assert (np.diff(right[:, 0]) < 0).all()
 
 
 def test_the_strip_is_continuous_around_the_corners():
-    faces = list(skin.FACES.values())
+    faces = list(FACES.values())
     for face, following in itertools.pairwise(faces):
         np.testing.assert_allclose(face.start + face.length * face.along, following.start)
     # Each taxel beside a corner is half a pitch from it.
     np.testing.assert_allclose(
-        skin.TAXELS[[14, 15]], [[FRONT - PITCH / 2, SIDE], [FRONT, SIDE - PITCH / 2]]
+        TAXELS[[14, 15]], [[FRONT - PITCH / 2, SIDE], [FRONT, SIDE - PITCH / 2]]
     )
     np.testing.assert_allclose(
-        skin.TAXELS[[26, 27]], [[FRONT, PITCH / 2 - SIDE], [FRONT - PITCH / 2, -SIDE]]
+        TAXELS[[26, 27]], [[FRONT, PITCH / 2 - SIDE], [FRONT - PITCH / 2, -SIDE]]
     )
 
 
 def test_the_samples_of_a_taxel_are_spread_evenly_about_its_middle():
-    np.testing.assert_allclose(skin.TAXEL_SAMPLES.mean(axis=1), skin.TAXELS)
-    steps = np.linalg.norm(np.diff(skin.TAXEL_SAMPLES, axis=1), axis=-1)
-    np.testing.assert_allclose(steps, PITCH / skin.TAXEL_SAMPLES.shape[1])
+    np.testing.assert_allclose(TAXEL_SAMPLES.mean(axis=1), TAXELS)
+    steps = np.linalg.norm(np.diff(TAXEL_SAMPLES, axis=1), axis=-1)
+    np.testing.assert_allclose(steps, PITCH / TAXEL_SAMPLES.shape[1])
 
 
 # The ideal sensor
@@ -368,7 +371,7 @@ def test_one_taxel_is_a_point_contact_at_its_position():
     for i in range(42):
         reading = active_taxels(np.arange(42) == i)
         assert reading.contact_type == POINT
-        np.testing.assert_allclose(reading.p_robot_contact, skin.TAXELS[i], rtol=1e-6)
+        np.testing.assert_allclose(reading.p_robot_contact, TAXELS[i], rtol=1e-6)
 
 
 @property_test
@@ -376,7 +379,7 @@ def test_one_taxel_is_a_point_contact_at_its_position():
 def test_several_taxels_are_a_line_contact_at_the_mean_of_the_two_extreme_ones(active):
     reading = active_taxels(np.isin(np.arange(42), list(active)))
     assert reading.contact_type == LINE
-    expected = (skin.TAXELS[min(active)] + skin.TAXELS[max(active)]) / 2
+    expected = (TAXELS[min(active)] + TAXELS[max(active)]) / 2
     np.testing.assert_allclose(reading.p_robot_contact, expected, atol=1e-6)
 
 
@@ -388,9 +391,9 @@ def test_no_taxel_is_no_contact():
 
 
 def test_a_small_object_pressed_onto_one_taxel_is_felt_there():
-    for i, (x, y) in enumerate(skin.TAXELS[15:27]):
+    for i, (x, y) in enumerate(TAXELS[15:27]):
         got = read(CAPACITIVE, ball(x + 0.01, y, radius=0.015))
-        assert got == about(POINT, *skin.TAXELS[15 + i])
+        assert got == about(POINT, *TAXELS[15 + i])
 
 
 FLUSH_TAXELS = slice(19, 23)  # the four about the middle of the front

@@ -7,10 +7,10 @@ import pytest
 
 from rps_jax import errors, sweep, trial
 from rps_jax.law import RPSParams
-from rps_jax.scene import FRICTION, PHYSICS
-from rps_jax.skin import CapacitiveSkin
+from rps_jax.scene import FRICTION, physics
+from rps_jax.skin import CapacitiveSkin, IdealSkin
 from rps_jax.sweep import Case, Setting
-from rps_jax.trial import Rules
+from rps_jax.trial import Rules, Shift
 
 NEAR = (0.7, 0.0)  # [m] 0.32 m ahead of the front face
 AHEAD = (2.0, 0.0)
@@ -19,8 +19,9 @@ SHORT = Setting(rules=Rules(horizon=24.0, max_lost=5.0))
 
 
 def case(target=NEAR, name="box", friction="S1", **changes):
+    world = {k: changes.pop(k) for k in list(changes) if k in Case.__dataclass_fields__}
     params = RPSParams.paper()._replace(**changes)
-    return Case(name, FRICTION[friction], target, params)
+    return Case(name, FRICTION[friction], target, params, **world)
 
 
 CASES = [
@@ -86,7 +87,7 @@ def advanced():
     """Three healthy worlds beside one whose object starts as NaN, after 0.4 s."""
     stage, worlds = world_batch(SLOTS)
     broken = worlds._replace(qpos=worlds.qpos.at[1, 4].set(jnp.nan))
-    options = {"physics": PHYSICS["default"], "steps": 20}
+    options = {"physics": physics(), "steps": 20}
     live = jnp.ones(SLOTS, bool)
     healthy = trial.advance(stage, worlds, trial.start_all(worlds, live), **options)
     mixed = trial.advance(stage, broken, trial.start_all(broken, live), **options)
@@ -107,7 +108,7 @@ def test_a_diverged_world_freezes_and_leaves_the_others_bit_unchanged(advanced):
 def test_padding_never_moves_and_a_finished_batch_stops_at_once():
     stage, worlds = world_batch(SLOTS)
     trials = trial.start_all(worlds, jnp.zeros(SLOTS, bool))
-    after = trial.advance(stage, worlds, trials, physics=PHYSICS["default"], steps=20)
+    after = trial.advance(stage, worlds, trials, physics=physics(), steps=20)
     np.testing.assert_array_equal(after.qpos, worlds.qpos)
     assert (np.asarray(after.steps) == 0).all()
 
@@ -120,8 +121,8 @@ def test_before_the_first_touch_the_base_creeps_and_nothing_counts_as_lost(advan
 
 
 def test_the_trace_of_a_trial_tells_the_same_story_as_its_outcome():
-    setting = Setting(skin=CapacitiveSkin(), rules=Rules(horizon=24.0))
-    trace = sweep.follow(case(), setting, interval=0.1)
+    setting = Setting(rules=Rules(horizon=24.0))
+    (trace,) = sweep.follow([case(skin=CapacitiveSkin())], setting, interval=0.1)
     seen, outcome = trace.snapshots, trace.outcome
     assert outcome.success
     assert np.allclose(np.diff(seen.time), 0.1, atol=1e-4)
@@ -143,6 +144,13 @@ def test_the_trace_of_a_trial_tells_the_same_story_as_its_outcome():
         ({"name": "chair"}, "object"),
         ({"k": float("inf")}, "k"),
         ({"v_max": -0.05}, "v_max"),
+        ({"gap": -0.1}, "gap"),
+        ({"rear": "left"}, "rear"),
+        ({"skin": CapacitiveSkin(noise=-1.0)}, "noise"),
+        ({"skin": IdealSkin(half_length=0.0)}, "half_length"),
+        ({"bearing": float("nan")}, "bearing"),
+        ({"shift": Shift(float("nan"))}, "shift time"),
+        ({"shift": Shift(3.0, (0.0, float("inf")))}, "shift y"),
     ],
 )
 def test_a_case_that_means_nothing_is_refused(changes, field):
@@ -155,9 +163,8 @@ def test_a_case_that_means_nothing_is_refused(changes, field):
     [
         (lambda: Rules(horizon=0.0), "horizon"),
         (lambda: Rules(max_lost=float("nan")), "max_lost"),
-        (lambda: Setting(gap=-0.1), "gap"),
+        (lambda: Setting(engine="ode"), "engine"),
         (lambda: Setting(seed=-1), "seed"),
-        (lambda: Setting(skin=CapacitiveSkin(noise=-1.0)), "noise"),
     ],
 )
 def test_settings_that_mean_nothing_are_refused(make, field):

@@ -1,0 +1,161 @@
+"""What the paper leaves open, one reading at a time; and whether its simulator lost its trials.
+
+All of it runs on C MuJoCo, converged at 5 ms, so that no difference comes from the solver.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from rps_jax import paper, score
+from rps_jax.scene import PHYSICS, Physics
+from rps_jax.skin import CapacitiveSkin, IdealSkin
+from rps_jax.study import Condition
+from rps_jax.sweep import Setting
+
+DEFAULT = "default"
+_CONVERGED = replace(PHYSICS["default"]["reference"], timestep=0.005)
+_PYRAMID = replace(_CONVERGED, cone="pyramidal")
+
+
+def _setting(physics: Physics = _CONVERGED, **changes: Any) -> Setting:
+    return Setting(physics=replace(physics, **changes), engine="mujoco")
+
+
+def _params(what: str, **params: float) -> Condition:
+    return Condition(what, _setting(), params=params)
+
+
+def _case(what: str, **case: Any) -> Condition:
+    return Condition(what, _setting(), case=case)
+
+
+READINGS = {
+    DEFAULT: Condition("the defaults", _setting()),
+    "tangent_as_printed": _params("tangent as printed (gamma_max = inf)", gamma_max=math.inf),
+    "gamma_max_1.4": _params("gamma_max 1.4 rad instead of 1.56", gamma_max=1.4),
+    "gamma_max_1": _params("gamma_max 1 rad", gamma_max=1.0),
+    "l_mr_5cm": _params("l_mr 0.05 m instead of 0.15", l_mr=0.05),
+    "l_mr_10cm": _params("l_mr 0.10 m", l_mr=0.10),
+    "l_mr_20cm": _params("l_mr 0.20 m", l_mr=0.20),
+    "a_r_max_5": _params("a_r_max 5 instead of 10", a_r_max=5.0),
+    "a_r_max_20": _params("a_r_max 20", a_r_max=20.0),
+    "saturate_first": _params("omega from the saturated velocity", saturate_first=1.0),
+    "clip_each": _params("v_x and v_y clipped one by one", clip_each=1.0),
+    "period_5ms": Condition("control period 5 ms instead of 20", _setting(control_period=0.005)),
+    "period_10ms": Condition("control period 10 ms", _setting(control_period=0.01)),
+    "period_50ms": Condition("control period 50 ms", _setting(control_period=0.05)),
+    "period_100ms": Condition("control period 100 ms", _setting(control_period=0.1)),
+    "drive_on_loss": _params("0.05 m/s instead of 0.01 after a loss", v_lost=0.05),
+    "keep_on_loss": _params("last contact acted upon after a loss", keep_contact=1.0),
+    "base_98cm": _case("base 0.978 m long instead of 0.725", skin=IdealSkin(half_length=0.489)),
+    "base_58cm": _case("base 0.58 m long (square)", skin=IdealSkin(half_length=0.29)),
+    "capacitive": _case("capacitive skin of 42 taxels", skin=CapacitiveSkin()),
+    "tolerance_10mm": _case("skin tolerance 10 mm instead of 6", skin=IdealSkin(0.010)),
+    "tolerance_3mm": _case("skin tolerance 3 mm", skin=IdealSkin(0.003)),
+    "tolerance_1mm": _case("skin tolerance 1 mm", skin=IdealSkin(0.001)),
+    "rear_far": _case("load on the far left corner", rear="far"),
+    "gap_0": _case("initial gap 0 instead of 2 cm", gap=0.0),
+    "gap_10cm": _case("initial gap 10 cm", gap=0.10),
+    "sgn_0": _params("sgn(0) = 1 instead of 0", sgn_0=1.0),
+}
+QUICK_READINGS = (DEFAULT, "tangent_as_printed", "drive_on_loss", "tolerance_1mm", "capacitive")
+
+_THIN = {"skin": IdealSkin(0.001)}
+# What Gazebo may have done to the paper's trials: all together, then each ingredient alone.
+GAZEBO = {
+    DEFAULT: READINGS[DEFAULT],
+    "paper_gazebo": Condition("`paper_gazebo`: pyramid, 1 mm", _setting(_PYRAMID), case=_THIN),
+    "pyramid": Condition("pyramid alone, 6 mm", _setting(_PYRAMID)),
+    "pyramid_turned": Condition(
+        "pyramid alone, turned by 45 degrees", _setting(_PYRAMID), case={"bearing": math.pi / 4}
+    ),
+    "thin": Condition("1 mm alone, isotropic", _setting(), case=_THIN),
+    "thin_half": Condition(
+        "pyramid, 0.5 mm", _setting(_PYRAMID), case={"skin": IdealSkin(0.0005)}
+    ),
+    "thin_2mm": Condition("pyramid, 2 mm", _setting(_PYRAMID), case={"skin": IdealSkin(0.002)}),
+    "thin_3mm": Condition("pyramid, 3 mm", _setting(_PYRAMID), case={"skin": IdealSkin(0.003)}),
+    "gazebo_turned": Condition(
+        "`paper_gazebo` turned by 45 degrees",
+        _setting(_PYRAMID),
+        case=_THIN | {"bearing": math.pi / 4},
+    ),
+    "gazebo_drive": Condition(
+        "`paper_gazebo`, 0.05 m/s after a loss",
+        _setting(_PYRAMID),
+        params={"v_lost": 0.05},
+        case=_THIN,
+    ),
+    "gazebo_1ms": Condition(
+        "`paper_gazebo` at 1 ms", _setting(_PYRAMID, timestep=0.001), case=_THIN
+    ),
+    "gazebo_10ms": Condition(
+        "`paper_gazebo` at 10 ms", _setting(_PYRAMID, timestep=0.01), case=_THIN
+    ),
+}
+QUICK_GAZEBO = (DEFAULT, "paper_gazebo", "pyramid", "thin")
+
+TOLERANCES = (0.5, 1, 2, 3, 4, 5, 6, 8, 10, 12, 15)  # [mm] of the skin
+QUICK_TOLERANCES = (1, 3, 6, 10)
+ON_LOSS = {
+    "creep": ("ahead at 0.01 m/s", {}),
+    "drive": ("ahead at 0.05 m/s", {"v_lost": 0.05}),
+    "keep": ("last contact kept", {"keep_contact": 1.0}),
+}
+
+
+def curve(tolerances: tuple[float, ...] = TOLERANCES) -> dict[str, Condition]:
+    """Conditions over skin tolerance [mm] and behaviour on loss."""
+    return {
+        f"{loss}_{mm:g}mm": Condition(
+            f"{mm:g} mm, {what}",
+            _setting(),
+            params=params,
+            case={"skin": IdealSkin(mm / 1000)},
+        )
+        for loss, (what, params) in ON_LOSS.items()
+        for mm in tolerances
+    }
+
+
+def by_tolerance(results: xr.Dataset, tolerances: tuple[float, ...]) -> xr.DataArray:
+    """Successes (loss, tolerance, object) of the RPS trials of `curve`."""
+    won = results.success.sel(strategy="rps").sum(("friction", "target"))
+    by_loss = [
+        won.sel(condition=[f"{loss}_{mm:g}mm" for mm in tolerances]).values for loss in ON_LOSS
+    ]
+    return xr.DataArray(
+        np.stack(by_loss),
+        dims=("loss", "tolerance", "object"),
+        coords={"loss": list(ON_LOSS), "tolerance": list(tolerances), "object": won.object},
+    )
+
+
+def cells(results: xr.Dataset, condition: str = "paper_gazebo") -> list[list[str]]:
+    """Header and the cells of Table II: ours with its Wilson interval, the paper's, in or out."""
+    one = results.sel(condition=condition).success
+    trials = one.sizes["target"]
+    rows = [["cell", "ours", "95 % of 24", "paper", "inside"]]
+    for strategy in map(str, one.strategy.values):
+        for name in map(str, one.object.values):
+            for friction in map(str, one.friction.values):
+                won = int(one.sel(strategy=strategy, object=name, friction=friction).sum())
+                low, high = (24 * x for x in score.wilson(won, trials))
+                theirs = paper.TABLE_II[strategy, name, friction]
+                inside = low <= theirs <= high
+                rows.append(
+                    [
+                        f"{strategy.upper()} {name} {friction}",
+                        f"{won} of {trials}",
+                        f"{low:.1f}-{high:.1f}",
+                        f"{theirs}",
+                        "yes" if inside else "no",
+                    ]
+                )
+    return rows

@@ -1,0 +1,53 @@
+"""How finely must the physics be solved? The paper's 432 trials against converged C MuJoCo.
+
+    python sweeps/fidelity.py --out runs/fidelity
+
+prints a table: successes, share of outcomes equal to the reference's, error of the object's place
+after 5 s, and cost. It can be killed; the same command continues.
+"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from tqdm import tqdm
+
+from rps_jax import errors, fidelity, paper, record, study
+from rps_jax.cli import StudyOptions, guarded, progress_bar
+
+
+@dataclass(frozen=True)
+class Options(StudyOptions):
+    """Which settings of the solver to compare."""
+
+    conditions: tuple[str, ...] = tuple(fidelity.CONDITIONS)
+    """Names of the settings; the reference is always among them."""
+    cost_worlds: int = 0
+    """Measure the cost of every MJX setting with a batch of so many worlds; 0: do not."""
+    out: Path = Path("runs/fidelity")
+    """Run folder; a run that was killed is continued there."""
+
+
+def main(options: Options) -> None:
+    """Run the conditions that are missing, then print and write the table."""
+    for name in options.conditions:
+        errors.check_name("condition", name, fidelity.CONDITIONS)
+    names = tuple(dict.fromkeys([fidelity.REFERENCE, *options.conditions]))
+    grid = study.Grid(strategies=paper.STRATEGIES, targets=options.targets())
+    out = options.open()
+    with progress_bar(fidelity.trials(names, grid)) as report:
+        results = fidelity.run(names, grid, out, **options.shape(), report=report)
+    costs = {}
+    if options.cost_worlds:
+        in_mjx = {n: c for n, c in fidelity.IN_MJX.items() if n in names}
+        for name, condition in tqdm(in_mjx.items(), unit="setting", desc="cost"):
+            by_family = fidelity.cost(condition.setting, options.cost_worlds)
+            costs[name] = sum(by_family.values()) / len(by_family)
+    record.write_results(out / "results.nc", results)
+    record.write_text(out / "fidelity.md", fidelity.markdown(results, costs) + "\n")
+    print((out / "fidelity.md").read_text())
+
+
+if __name__ == "__main__":
+    sys.exit(guarded(lambda: main(tyro.cli(Options, description=__doc__))))
