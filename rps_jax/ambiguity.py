@@ -66,6 +66,42 @@ READINGS = {
 }
 QUICK_READINGS = (DEFAULT, "tangent_as_printed", "drive_on_loss", "tolerance_1mm", "capacitive")
 
+# What is open, our reading, and why: physics or the text, not the score.
+CHOICES = (
+    (
+        "tangent beyond a quarter turn",
+        "gamma within +-1.56 rad",
+        "as printed the robot turns away from targets behind it, which the paper reaches",
+    ),
+    (
+        "l_mr",
+        "0.15 m",
+        "the paper's trial realigns well into the middle; from 0.05 to 0.20 m nothing changes",
+    ),
+    ("a_r_max", "10", "the text calls it the maximal rate, and eta is the most Eq. 5 gives"),
+    (
+        "saturation",
+        "omega from the unsaturated velocity, (v_x, v_y) scaled as a vector",
+        "the text saturates the computed velocities before they are commanded, and only scaling "
+        "keeps the direction that Eqs. 1-2 ask for",
+    ),
+    ("control period", "20 ms", "the skin's 50 ms filter cannot use more"),
+    (
+        "loss of contact",
+        "ahead at 0.01 m/s",
+        "the one behaviour without contact that the paper reports",
+    ),
+    ("length of the base", "0.725 m", "42 equal taxels over three sides of a front of 58 cm"),
+    (
+        "simulated skin",
+        "ideal, 6 mm",
+        "foam yields by millimetres; a rigid sensor is `thin`, the hardware's `capacitive`",
+    ),
+    ("rear left corner", "nearest the robot", "rear as seen along the push"),
+    ("initial gap", "2 cm", "Fig. 6 begins with a short approach at 0.01 m/s"),
+    ("sgn(0)", "0", "a centred contact asks for no lateral motion"),
+)
+
 _THIN = {"skin": IdealSkin(0.001)}
 # What Gazebo may have done to the paper's trials: all together, then each ingredient alone.
 GAZEBO = {
@@ -76,9 +112,7 @@ GAZEBO = {
         "pyramid alone, turned by 45 degrees", _setting(_PYRAMID), case={"bearing": math.pi / 4}
     ),
     "thin": Condition("1 mm alone, isotropic", _setting(), case=_THIN),
-    "thin_half": Condition(
-        "pyramid, 0.5 mm", _setting(_PYRAMID), case={"skin": IdealSkin(0.0005)}
-    ),
+    "thin_half": Condition("pyramid, 0.5 mm", _setting(_PYRAMID), case={"skin": IdealSkin(0.0005)}),
     "thin_2mm": Condition("pyramid, 2 mm", _setting(_PYRAMID), case={"skin": IdealSkin(0.002)}),
     "thin_3mm": Condition("pyramid, 3 mm", _setting(_PYRAMID), case={"skin": IdealSkin(0.003)}),
     "gazebo_turned": Condition(

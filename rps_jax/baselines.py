@@ -58,7 +58,7 @@ class APSState(NamedTuple):
     gamma_count: jax.Array  # () [1]
     mean: jax.Array  # () [rad] m, running mean of good alphas
     variance: jax.Array  # () [rad^2] s2, running variance of good alphas
-    count: jax.Array  # () [1]
+    weight: jax.Array  # () [1] how many alphas these two sum up
     yaw_error: jax.Array  # () [rad] of the last step
 
     @classmethod
@@ -97,8 +97,8 @@ def check(params: APSParams) -> APSParams:
 
 def predictive(params: APSParams, state: APSState) -> tuple[jax.Array, jax.Array]:
     """Mean [rad] and variance [rad^2] of the next good alpha: Gaussian with unknown mean."""
-    precision = 1 / params.alpha_variance + state.count / state.variance
-    mean = params.alpha_mean / params.alpha_variance + state.count * state.mean / state.variance
+    precision = 1 / params.alpha_variance + state.weight / state.variance
+    mean = params.alpha_mean / params.alpha_variance + state.weight * state.mean / state.variance
     return mean / precision, 1 / precision + state.variance
 
 
@@ -127,7 +127,7 @@ def _learn(
     gamma_count = state.gamma_count + 1
     good = moved & (jnp.abs(gamma) < jnp.abs(state.gamma) - params.gamma_drop)
     good &= state.gamma_count > 0
-    count = state.count + 1
+    count = state.weight + 1
     offset = state.alpha - state.mean
     mean = state.mean + offset / count
     variance = state.variance + (offset * (state.alpha - mean) - state.variance) / count
@@ -144,7 +144,7 @@ def _learn(
         gamma_count=jnp.where(moved, gamma_count, state.gamma_count),
         mean=jnp.where(good, mean, state.mean),
         variance=jnp.where(good, variance, state.variance),
-        count=jnp.where(good, count, state.count),
+        weight=jnp.where(good, count, state.weight),
         yaw_error=state.yaw_error,
     )
 

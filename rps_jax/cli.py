@@ -119,12 +119,9 @@ class StudyOptions:
 
         return study.FEW_TARGETS if self.quick else paper.TARGETS
 
-    def shape(self) -> dict[str, int | None]:
+    def shape(self) -> dict[str, Any]:
         """How the trials are spread; see `sweep.run`."""
-        for name in ("slots", "workers"):
-            if getattr(self, name) is not None:
-                errors.check_finite(name, getattr(self, name), at_least=1)
-        return {"slots": self.slots, "workers": self.workers}
+        return _shape(self)
 
     def open(self) -> Path:
         """The run folder, new or to be continued; checks the options first."""
@@ -139,6 +136,32 @@ class StudyOptions:
 
 
 @dataclass(frozen=True)
+class Hardware(Common):
+    """Run the paper's hardware experiments in simulation, over a range of friction; draw Fig. 7."""
+
+    skin: str | None = "capacitive"
+    """capacitive (42 taxels), ideal or thin."""
+    skin_params: tuple[str, ...] = ("noise=0.05", "gain_spread=0.1")
+    """Parameters of the skin to change from their defaults, as name=value."""
+    layout: str = "circle"
+    """The eight targets: circle (each 2.1 m from the start) or grid (2.1 m along x and y)."""
+    slots: int | None = None
+    """Worlds stepped at once by one worker; by default chosen by the device."""
+    workers: int | None = None
+    """Host threads; by default chosen by the device."""
+
+
+@dataclass(frozen=True)
+class Paper(StudyOptions):
+    """Reproduce all of the paper into one run folder, with report.md and report.html."""
+
+    out: Path = Path("runs/paper")
+    """Run folder; a run that was killed is continued there."""
+    quick: bool = False
+    """Table II in full, everything else with six of the 24 targets and fewer conditions."""
+
+
+@dataclass(frozen=True)
 class Doctor:
     """Print versions, devices and folders, and what does not work with its mend."""
 
@@ -146,6 +169,8 @@ class Doctor:
 Command = (
     Annotated[Table, tyro.conf.subcommand("table")]
     | Annotated[Push, tyro.conf.subcommand("push")]
+    | Annotated[Hardware, tyro.conf.subcommand("hardware")]
+    | Annotated[Paper, tyro.conf.subcommand("paper")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )
 
@@ -163,7 +188,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     video.choose_gl()
     be_deterministic()
-    act: dict[type, Callable[[Any], None]] = {Table: _table, Push: _push, Doctor: _doctor}
+    act: dict[type, Callable[[Any], None]] = {
+        Table: _table,
+        Push: _push,
+        Hardware: _hardware,
+        Paper: _paper,
+        Doctor: _doctor,
+    }
     return guarded(lambda: act[type(command)](command))
 
 
@@ -302,6 +333,15 @@ def _cases(options: Table, targets: Sequence[tuple[float, float]]) -> list[Case]
     ]
 
 
+def _shape(options: Table | Hardware | StudyOptions) -> dict[str, Any]:
+    """How the trials are spread; see `sweep.run`."""
+    shape = {"slots": options.slots, "workers": options.workers}
+    for name, value in shape.items():
+        if value is not None:
+            errors.check_finite(name, value, at_least=1)
+    return shape
+
+
 def _open(common: Common, command: str) -> Path:
     """The run folder, with what was asked and what it runs on already in it."""
     from rps_jax import record
@@ -360,18 +400,16 @@ def _table(options: Table) -> None:
     setting = _setting(options)
     targets = options.targets or paper.TARGETS
     cases = _cases(options, targets)
-    for name, value in (("slots", options.slots), ("workers", options.workers)):
-        if value is not None:
-            errors.check_finite(name, value, at_least=1)
+    shape = _shape(options)
     out = _open(options, "table")
     _write_config(out, options, setting, {s: _params(options, s) for s in options.strategies})
     with progress_bar(len(cases)) as report:
-        outcome, timing = sweep.run(
-            cases, setting, slots=options.slots, workers=options.workers, report=report
-        )
+        outcome, timing = sweep.run(cases, setting, **shape, report=report)
     results = score.dataset(outcome, options.strategies, options.objects, options.friction, targets)
     record.write_results(out / "results.nc", results)
-    text = f"{score.table(results)}\n\n{score.summary(results)}\n"
+    title = "Successes, with Wilson 95 % intervals in percent"
+    table = score.markdown(score.table(results))
+    text = f"{title}\n\n{table}\n\n{score.summary(results)}\n"
     record.write_text(out / "table.txt", text)
     figures.min_distance(results, out / "min_distance.png")
     print(text)
@@ -436,7 +474,8 @@ def _film(options: Push, case: Case, setting: Setting, trace: Trace, out: Path) 
     stills = _evenly(len(seen.time), 6)
     try:
         images = [video.snapshot(scene, seen.qpos[i], p_world_target=target) for i in stills]
-        figures.stills(images, np.asarray(seen.time)[stills], out / "stills.png")
+        titles = [f"{seen.time[i]:.0f} s" for i in stills]
+        figures.stills(images, titles, out / "stills.png")
         video.render(
             scene,
             tqdm(seen.qpos[rows], unit="frame", desc="film"),
@@ -453,6 +492,44 @@ def _evenly(length: int, count: int) -> list[int]:
     """At least two indices into `length` items, from the first to the last."""
     count = max(2, count)
     return [round(i * (length - 1) / (count - 1)) for i in range(count)]
+
+
+def _hardware(options: Hardware) -> None:
+    from rps_jax import figures, hardware, record, reproduce, sweep
+
+    setting = _setting(options)
+    params = _params(options, "rps")
+    layout = hardware.LAYOUTS[errors.check_name("layout", options.layout, hardware.LAYOUTS)]
+    case = sweep.Case(
+        hardware.OBJECTS[0], hardware.MIDDLE, layout[0], params, **_per_world(options)
+    )
+    if options.mass is not None:
+        raise InputError("mass is not an option here: each object has the paper's.")
+    shape = _shape(options)
+    out = _open(options, "hardware")
+    _write_config(out, options, setting, {"rps": params})
+    given = {"layout": options.layout}
+    with progress_bar(len(hardware.OBJECTS) * len(layout) * len(hardware.frictions())) as report:
+        results = hardware.run(case, setting, **given, **shape, report=report)
+    record.write_results(out / "results.nc", results)
+    with progress_bar(2 * len(hardware.OBJECTS) * len(layout) * len(hardware.SHIFTS)) as report:
+        shifted = hardware.disturb(case, setting, **given, **shape, report=report)
+    record.write_results(out / "shifted.nc", shifted)
+    figures.paths(hardware.paths(case, setting, **given), layout, out / "paths.png")
+    sections = reproduce.hardware_sections(out, results, shifted)
+    reproduce.report_to(out, sections)
+    print((out / "report.md").read_text())
+    print(f"run folder: {out}")
+
+
+def _paper(options: Paper) -> None:
+    from rps_jax import reproduce
+
+    plan = reproduce.Plan.quick() if options.quick else reproduce.Plan()
+    out = options.open()
+    with progress_bar(plan.trials()) as report:
+        path = reproduce.run(out, plan, report=report, **options.shape())
+    print(f"report: {path}")
 
 
 def _doctor(_: Doctor) -> None:

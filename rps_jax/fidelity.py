@@ -100,7 +100,7 @@ def run(
     reference: for RPS alone.
     """
     chosen = {name: CONDITIONS[name] for name in names}
-    options = {"slots": slots, "workers": workers}
+    options: dict[str, Any] = {"slots": slots, "workers": workers}
     results = study.run(chosen, grid, folder, **options, report=report)
     early_folder = folder / "early"
     early_folder.mkdir(exist_ok=True)
@@ -158,6 +158,22 @@ def table(results: xr.Dataset, costs: Mapping[str, float] | None = None) -> list
                 f"{1000 * cost:.3g} ms",
             ]
         )
+    return rows
+
+
+def by_strategy(results: xr.Dataset) -> list[list[str]]:
+    """Header and one row for each condition: share of equal outcomes for each strategy."""
+    base = results.success.sel(condition=REFERENCE)
+    strategies = [str(s) for s in results.strategy.values]
+    rows = [["setting", *(s.upper() for s in strategies)]]
+    for name in map(str, results.condition.values):
+        one = results.success.sel(condition=name)
+        shares = []
+        for s in strategies:
+            c = study.compare(base.sel(strategy=s), one.sel(strategy=s))
+            low, high = c.equal_interval
+            shares.append(f"{100 * c.equal:.1f} % ({100 * low:.0f}-{100 * high:.0f})")
+        rows.append([str(results.what.sel(condition=name).values), *shares])
     return rows
 
 

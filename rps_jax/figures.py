@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from matplotlib import patches
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rps_jax import record, skin, trial
+from rps_jax import ambiguity, hardware, law, record, score, skin, trial
+from rps_jax.law import RPSParams
 from rps_jax.skin import NONE
 from rps_jax.sweep import Case, Trace
 
@@ -26,6 +28,8 @@ _TITLES = {
     "hardware_box": "hardware box",
     "hardware_cylinder": "hardware cylinder",
 }
+_OBJECT_COLOURS = {"box": "C0", "cylinder": "C1", "nonuniform_box": "C2"}
+_OBJECT_COLOURS |= {"hardware_box": "C0", "hardware_cylinder": "C1"}
 _SHADES = {"realigning": "#bcd7f2", "lost": "#f8e3a1"}
 
 
@@ -162,16 +166,16 @@ def _shade(ax: Axes, time: np.ndarray, active: np.ndarray, colour: str) -> None:
     )
 
 
-def stills(images: Sequence[np.ndarray], times: np.ndarray, path: Path) -> Path:
-    """Fig. 1: pictures (height, width, 3) of a push, three in a row, with their times [s]."""
+def stills(images: Sequence[np.ndarray], titles: Sequence[str], path: Path) -> Path:
+    """Figs. 1 and 4: pictures (height, width, 3), three in a row, with their titles."""
     rows = -(-len(images) // 3)
     figure = Figure(figsize=(12, 2.3 * rows), layout="constrained")
     axes = figure.subplots(rows, 3, squeeze=False).ravel()
     for ax in axes:
         ax.axis("off")
-    for ax, image, time in zip(axes, images, times, strict=False):
+    for ax, image, title in zip(axes, images, titles, strict=False):
         ax.imshow(image)
-        ax.set_title(f"{time:.0f} s", fontsize=9)
+        ax.set_title(_TITLES.get(title, title), fontsize=9)
     return save(figure, path)
 
 
@@ -196,3 +200,113 @@ def _path(ax: Axes, case: Case, trace: Trace) -> None:
     ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     ax.grid(alpha=0.3)
     ax.legend(fontsize=8)
+
+
+def profile(params: RPSParams, path: Path) -> Path:
+    """The logistic profile of Eq. 5 (in the paper's Fig. 3): a_r over the contact location."""
+    l = jnp.linspace(-skin.HALF_WIDTH, skin.HALF_WIDTH, 401)  # noqa: E741
+    far = jnp.asarray(2 * params.d_th)
+    a_r = jax.vmap(lambda l: law.adaptive_rate(params, l, far))(l)  # noqa: E741
+    figure = Figure(figsize=(5.5, 3.2), layout="constrained")
+    ax = figure.subplots()
+    ax.plot(l, a_r, color="C0")
+    for side in (-1, 1):
+        ax.axvspan(
+            side * float(params.l_cr), side * skin.HALF_WIDTH, color=_SHADES["realigning"], lw=0
+        )
+        ax.axvline(side * float(params.beta), color="0.6", lw=0.7, ls="--")
+    ax.set(xlabel="contact location $l$ [m]", ylabel="adaptive rate $a_r$ [1]")
+    ax.set_title("Eq. 5; dashed: $\\pm\\beta$; shaded: critical region", fontsize=9)
+    return save(figure, path)
+
+
+def paths(traces: Mapping[str, Sequence[Trace]], targets: Sequence, path: Path) -> Path:
+    """Fig. 7: the ways of the base to every target, and the contact points at the end."""
+    figure = Figure(figsize=(5.2 * len(traces), 5), layout="constrained")
+    axes = figure.subplots(1, len(traces), squeeze=False, sharey=True)[0]
+    for ax, (name, rows) in zip(axes, traces.items(), strict=True):
+        ax.add_patch(_base_patch(np.zeros(3), fill=True))
+        for target, trace in zip(targets, rows, strict=True):
+            (line,) = ax.plot(*np.asarray(trace.snapshots.qpos[:, :2]).T, lw=1.2)
+            ax.plot(*target, "*", ms=12, color=line.get_color())
+            contacts = np.asarray(trial.p_world_contact(trace.snapshots))
+            touching = contacts[np.isfinite(contacts[:, 0])]
+            if len(touching):
+                ax.plot(*touching[-1], "o", ms=5, mfc="white", color=line.get_color())
+        won = sum(bool(trace.outcome.success) for trace in rows)
+        ax.set(xlabel="x [m]", aspect="equal")
+        ax.set_title(f"{_TITLES[name]}: {won} of {len(rows)}", fontsize=10)
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel("y [m]")
+    figure.suptitle("lines: base; stars: targets; circles: last contact point", fontsize=9)
+    return save(figure, path)
+
+
+def _rates(ax: Axes, x: np.ndarray, won: np.ndarray, of: np.ndarray, **style) -> None:
+    """Success rates in percent with their Wilson 95 % intervals."""
+    rate = 100 * won / np.maximum(of, 1)
+    ends = np.array([score.wilson(int(n), int(m)) for n, m in zip(won, of, strict=True)]) * 100
+    errors = np.abs(np.stack([rate - ends[:, 0], ends[:, 1] - rate]))
+    ax.errorbar(x, rate, errors, capsize=2, marker="o", ms=4, lw=1.2, **style)
+
+
+def tolerance_curve(won: xr.DataArray, trials: int, path: Path) -> Path:
+    """Success of RPS over skin tolerance, for each behaviour on loss of contact and object.
+
+    `won` counts the successes of `trials` each, as `ambiguity.by_tolerance` gives them.
+    """
+    figure = Figure(figsize=(4 * won.sizes["loss"], 3.4), layout="constrained")
+    axes = figure.subplots(1, won.sizes["loss"], squeeze=False, sharey=True)[0]
+    for ax, loss in zip(axes, map(str, won.loss.values), strict=True):
+        for name in map(str, won.object.values):
+            counts = won.sel(loss=loss, object=name).values
+            _rates(
+                ax,
+                won.tolerance.values,
+                counts,
+                np.full(len(counts), trials),
+                color=_OBJECT_COLOURS[name],
+                label=_TITLES[name],
+            )
+        ax.set_title(f"on loss: {ambiguity.ON_LOSS[loss][0]}", fontsize=9)
+        ax.set(xlabel="skin tolerance [mm]", ylim=(-3, 103))
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel("success [%]")
+    axes[-1].legend(fontsize=8)
+    return save(figure, path)
+
+
+def shift_curve(results: xr.Dataset, path: Path) -> Path:
+    """Success over the size of the shove, with Wilson 95 % intervals."""
+    figure = Figure(figsize=(5.5, 3.4), layout="constrained")
+    ax = figure.subplots()
+    sizes = results["shift"].values
+    for name in map(str, results.object.values):
+        pairs = np.array([hardware.recovered(results, name, float(size)) for size in sizes])
+        _rates(
+            ax,
+            100 * sizes,
+            pairs[:, 0],
+            pairs[:, 1],
+            color=_OBJECT_COLOURS[name],
+            label=_TITLES[name],
+        )
+    ax.set(xlabel="the object is moved sideways by [cm]", ylabel="success [%]", ylim=(-3, 103))
+    ax.grid(alpha=0.3)
+    ax.legend(fontsize=8)
+    return save(figure, path)
+
+
+def agreement(names: Sequence[str], equal: np.ndarray, ends: np.ndarray, path: Path) -> Path:
+    """Share of outcomes (N,) equal to the reference's, with the ends (N, 2) of its intervals."""
+    figure = Figure(figsize=(7.5, 0.6 + 0.24 * len(names)), layout="constrained")
+    ax = figure.subplots()
+    y = np.arange(len(names))[::-1]
+    errors = np.abs(np.stack([equal - ends[:, 0], ends[:, 1] - equal]))
+    ax.errorbar(100 * equal, y, xerr=100 * errors, fmt="o", ms=4, capsize=2)
+    for goal in (90, 95):
+        ax.axvline(goal, color="0.6", lw=0.7, ls="--")
+    ax.set_yticks(y, names, fontsize=8)
+    ax.set_xlabel("outcomes equal to the reference's [%]")
+    ax.grid(alpha=0.3, axis="x")
+    return save(figure, path)

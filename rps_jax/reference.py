@@ -64,9 +64,11 @@ class Batch:
         state[:, 1 + nq :][:, JOINTS.base] = np.stack(
             [c * v_x - s * v_y, s * v_x + c * v_y, omega], axis=1
         )
+        warmstart = self.warmstart[which]
         after, _ = self._pool.rollout(
-            models, self._data, state, nstep=substeps, initial_warmstart=self.warmstart[which]
+            models, self._data, state, nstep=substeps, initial_warmstart=warmstart
         )
+        after = np.asarray(after)
         before_last = after[:, -2] if substeps > 1 else state
         # Euler's rule gives back the acceleration, with which the next step starts.
         difference = after[:, -1, 1 + nq :] - before_last[:, 1 + nq :]

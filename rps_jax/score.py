@@ -107,8 +107,9 @@ def markdown(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([lines[0], rule, *lines[1:]])
 
 
-def table(results: xr.Dataset) -> str:
-    """Table II in Markdown: successes with Wilson 95 % intervals, and the paper's beside them."""
+def table(results: xr.Dataset) -> list[list[str]]:
+    """Header and rows of Table II: successes with Wilson 95 % intervals in percent, and the
+    paper's beside them."""
     trials = results.sizes["target"]
     whole = trials == len(paper.TARGETS)
     columns = [(str(o), str(f)) for o in results.object.values for f in results.friction.values]
@@ -125,8 +126,7 @@ def table(results: xr.Dataset) -> str:
             theirs = [n for n in theirs if n is not None]
             pairs = [*zip(theirs, sizes, strict=True), (sum(theirs), sum(sizes))]
             rows.append(["", "paper", *(f"{n}/{of}" for n, of in pairs)])
-    title = "Successes, with Wilson 95 % intervals in percent"
-    return f"{title}\n\n{markdown(rows)}"
+    return rows
 
 
 def _percent(successes: int, trials: int) -> str:

@@ -64,7 +64,10 @@ class Reading(NamedTuple):
 class Skin(Protocol):
     """A tactile sensor: a pytree of parameters with two pure functions."""
 
-    half_length: float | jax.Array  # [m] of the base that it covers
+    @property
+    def half_length(self) -> float | jax.Array:
+        """Of the base that it covers [m]."""
+        ...
 
     def check(self) -> None:
         """Raises InputError for scalar parameters that mean nothing."""

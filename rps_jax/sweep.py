@@ -53,7 +53,10 @@ class Case:
                 f"target = ({x:g}, {y:g}) m is not allowed: it must lie outside the robot, which "
                 f"covers |x| <= {skin.HALF_LENGTH:g} m and |y| <= {skin.HALF_WIDTH:g} m."
             )
-        (law if isinstance(self.params, RPSParams) else baselines).check(self.params)
+        if isinstance(self.params, RPSParams):
+            law.check(self.params)
+        else:
+            baselines.check(self.params)
         scene.check(self.friction, self.mass)
         self.skin.check()
         errors.check_finite("gap", self.gap, at_least=0, at_most=1, unit="m")

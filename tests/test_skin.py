@@ -102,7 +102,7 @@ def test_15_taxels_lie_on_each_side_and_12_on_the_front():
     np.testing.assert_allclose(front[:, 0], FRONT)
     np.testing.assert_allclose(right[:, 1], -SIDE)
     for face in (left, front, right):
-        assert (np.abs(face) <= [FRONT, SIDE]).all()
+        assert (np.abs(face) <= np.array([FRONT, SIDE]) + 1e-7).all()
 
 
 def test_the_critical_region_ends_5_cm_beyond_l_cr_at_the_edge_of_the_front():
@@ -138,9 +138,9 @@ def test_the_strip_is_continuous_around_the_corners():
 
 
 def test_the_samples_of_a_taxel_are_spread_evenly_about_its_middle():
-    np.testing.assert_allclose(TAXEL_SAMPLES.mean(axis=1), TAXELS)
+    np.testing.assert_allclose(TAXEL_SAMPLES.mean(axis=1), TAXELS, atol=1e-7)
     steps = np.linalg.norm(np.diff(TAXEL_SAMPLES, axis=1), axis=-1)
-    np.testing.assert_allclose(steps, PITCH / TAXEL_SAMPLES.shape[1])
+    np.testing.assert_allclose(steps, PITCH / TAXEL_SAMPLES.shape[1], rtol=1e-4)
 
 
 # The ideal sensor
