@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from scipy import stats
 
 from rps_jax import paper, score
 from rps_jax.scene import PHYSICS, Physics
@@ -172,24 +173,28 @@ def by_tolerance(results: xr.Dataset, tolerances: tuple[float, ...]) -> xr.DataA
 
 
 def cells(results: xr.Dataset, condition: str = "paper_gazebo") -> list[list[str]]:
-    """Header and the cells of Table II: ours with its Wilson interval, the paper's, in or out."""
+    """Header and the cells of Table II: ours, the paper's with its Wilson interval, in or out.
+
+    The last column is the p of Fisher's exact test that both have the same rate.
+    """
     one = results.sel(condition=condition).success
     trials = one.sizes["target"]
-    rows = [["cell", "ours", "95 % of 24", "paper", "inside"]]
+    rows = [["cell", "ours", "paper", "95 % of the paper's", "inside", "Fisher p"]]
     for strategy in map(str, one.strategy.values):
         for name in map(str, one.object.values):
             for friction in map(str, one.friction.values):
                 won = int(one.sel(strategy=strategy, object=name, friction=friction).sum())
-                low, high = (24 * x for x in score.wilson(won, trials))
-                theirs = paper.TABLE_II[strategy, name, friction]
-                inside = low <= theirs <= high
+                theirs, of = paper.TABLE_II[strategy, name, friction], len(paper.TARGETS)
+                low, high = score.wilson(theirs, of)
+                table = [[won, trials - won], [theirs, of - theirs]]
                 rows.append(
                     [
                         f"{strategy.upper()} {name} {friction}",
                         f"{won} of {trials}",
-                        f"{low:.1f}-{high:.1f}",
-                        f"{theirs}",
-                        "yes" if inside else "no",
+                        f"{theirs} of {of}",
+                        f"{of * low:.1f}-{of * high:.1f}",
+                        "yes" if low <= won / trials <= high else "no",
+                        f"{stats.fisher_exact(table).pvalue:.2g}",
                     ]
                 )
     return rows

@@ -107,7 +107,7 @@ class StudyOptions:
     out: Path = Path("runs/study")
     """Run folder; a run that was killed is continued there."""
     quick: bool = False
-    """Six of the paper's 24 targets."""
+    """Four of the paper's 24 targets."""
     slots: int | None = None
     """Worlds stepped at once by one worker; by default chosen by the device."""
     workers: int | None = None
@@ -158,7 +158,7 @@ class Paper(StudyOptions):
     out: Path = Path("runs/paper")
     """Run folder; a run that was killed is continued there."""
     quick: bool = False
-    """Table II in full, everything else with six of the 24 targets and fewer conditions."""
+    """Table II in full, everything else with four of the 24 targets and fewer conditions."""
 
 
 @dataclass(frozen=True)
@@ -360,7 +360,7 @@ def _write_config(out: Path, common: Common, setting: Setting, params: dict[str,
         "options": dataclasses.asdict(common) | {"out": str(out)},
         "params": {name: values._asdict() for name, values in params.items()},
         "physics": dataclasses.asdict(setting.physics),
-        "rules": dataclasses.asdict(setting.rules),
+        "rules": setting.rules._asdict(),
         "skin": _per_world(common)["skin"]._asdict(),
     }
     record.write_json(out / "config.json", config)
@@ -437,7 +437,7 @@ def _push(options: Push) -> None:
     out = _open(options, "push")
     _write_config(out, options, setting, {options.strategy: params})
 
-    with tqdm(total=setting.rules.horizon, unit="s", desc="compile", smoothing=0.05) as bar:
+    with tqdm(total=options.horizon, unit="s", desc="compile", smoothing=0.05) as bar:
 
         def report(progress: sweep.Progress) -> None:
             bar.set_description("push", refresh=False)

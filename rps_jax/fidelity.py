@@ -66,6 +66,7 @@ IN_MJX = {
     "standard": Condition("MJX `standard`", Setting(physics=_STANDARD)),
     "fast": Condition("MJX `fast`", Setting(physics=_FAST)),
     "mjx_5ms": _mjx("MJX, 5 ms, 10/14", timestep=0.005),
+    "mjx_5ms_8_10": _mjx("MJX, 5 ms, 8/10", timestep=0.005, iterations=8, ls_iterations=10),
     "mjx_5ms_20_20": _mjx("MJX, 5 ms, 20/20", timestep=0.005, iterations=20, ls_iterations=20),
     "mjx_20ms": _mjx("MJX, 20 ms, 10/14", timestep=0.02),
     "mjx_20ms_8_10": _mjx("MJX, 20 ms, 8/10", timestep=0.02, iterations=8, ls_iterations=10),

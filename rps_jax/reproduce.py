@@ -48,7 +48,7 @@ class Plan:
 
     @classmethod
     def quick(cls) -> Plan:
-        """Six of 24 targets and the most telling conditions, for a first look."""
+        """Four of 24 targets and the most telling conditions, for a first look."""
         return cls(
             targets=study.FEW_TARGETS,
             fidelity=fidelity.QUICK,
@@ -291,12 +291,12 @@ def _gazebo(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any]) -
         out, "gazebo", ambiguity.GAZEBO, plan.gazebo, plan.all_strategies, progress, shape
     )
     cells = ambiguity.cells(results)
-    inside = sum(row[-1] == "yes" for row in cells[1:])
-    rps = sum(row[-1] == "yes" for row in cells[1:] if row[0].startswith("RPS"))
+    inside = sum("yes" in row for row in cells[1:])
+    rps = sum("yes" in row for row in cells[1:] if row[0].startswith("RPS"))
     text = (
         "Hypothesis: the paper's 17 lost RPS trials come from its simulator (friction pyramid, "
         f"thin contact sensor), not from its law. With both, {inside} of {len(cells) - 1} cells "
-        f"have the paper's count within their Wilson 95 % interval, {rps} of 6 for RPS."
+        f"lie within the Wilson 95 % interval of the paper's count, {rps} of 6 for RPS."
     )
     ingredients = [
         Section(

@@ -77,7 +77,8 @@ class Setting:
     engine: Engine = "mjx"
 
     def __post_init__(self) -> None:
-        """Raises InputError for a seed or an engine that means nothing."""
+        """Raises InputError for rules, a seed or an engine that mean nothing."""
+        self.rules.check()
         errors.check_finite("seed", self.seed, at_least=0, at_most=2**32 - 1)
         errors.check_name("engine", self.engine, get_args(Engine))
 
@@ -409,7 +410,7 @@ def _drain(queue: _Queue, shared: _Shared) -> None:
     shared.compiled(time.perf_counter() - began)
     while live.any() and not shared.stop:
         before = np.asarray(trials.steps)
-        trials = program(queue.stage, worlds, trials)
+        trials = program(queue.stage, worlds, trials, rules=queue.setting.rules)
         steps = np.asarray(trials.steps)
         ended = np.asarray(trials.done) & live
         outcomes = jax.device_get(trial.outcome(trials, period)) if ended.any() else None
@@ -453,7 +454,7 @@ def follow(
     compiled = time.perf_counter()
     parts = []
     while not bool(trials.done.all()):
-        trials, snapshots = program(stage, worlds, trials)
+        trials, snapshots = program(stage, worlds, trials, rules=setting.rules)
         parts.append(jax.device_get(snapshots))
         report(Progress(int(trials.done.sum()), float(trials.steps.sum()) * period))
     whole = jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)

@@ -8,7 +8,6 @@ ended stops.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -42,14 +41,13 @@ APS = Strategy(APSState.init, baselines.aps_step, tracks=True)
 STRATEGIES: dict[type, Strategy] = {RPSParams: RPS, APSParams: APS}  # by their parameters
 
 
-@dataclass(frozen=True)
-class Rules:
-    """When a trial ends (Sec. III-B). Static."""
+class Rules(NamedTuple):
+    """When a trial ends (Sec. III-B)."""
 
-    horizon: float = 300.0  # [s]
-    max_lost: float = 150.0  # [s] without contact, in all, after the first touch
+    horizon: float | jax.Array = 300.0  # [s]
+    max_lost: float | jax.Array = 150.0  # [s] without contact, in all, after the first touch
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
         """Raises InputError for times that are not positive and finite."""
         errors.check_finite("horizon", self.horizon, above=0, at_most=1e5, unit="s")
         errors.check_finite("max_lost", self.max_lost, at_least=0, unit="s")
@@ -306,7 +304,7 @@ def start_all(worlds: World, live: jax.Array, strategy: Strategy = RPS) -> Trial
     return trials._replace(done=~live)
 
 
-_STATIC = ("physics", "rules", "strategy", "steps")
+_STATIC = ("physics", "strategy", "steps")
 
 
 @partial(jax.jit, static_argnames=_STATIC, donate_argnames=("trials",))

@@ -322,6 +322,51 @@ def test_the_tangent_as_printed_turns_away_from_a_target_behind():
         assert twist_of(PAPER, observation)[2] * error > 0
 
 
+def test_the_other_orders_of_saturation_by_hand():
+    # As "v saturates" above: v = (0.0254951, 0.1274755), omega = v_x / 0.2 * -5/12.
+    seen = observe((1.2, -0.5), l=0.12)
+    first = twist_of(PAPER._replace(saturate_first=1.0), seen)
+    assert first == pytest.approx((0.00980581, 0.0490290, -0.0204288), rel=1e-4)
+    each = twist_of(PAPER._replace(clip_each=1.0), seen)
+    assert each == pytest.approx((0.0254951, 0.05, -0.0531148), rel=1e-4)
+    # Realigning, sigma = 1/4: omega = 0.25 * 0.05 / 0.2 * -5/12, where 0.13 would give -0.0677.
+    seen = observe((1.2, -0.5), l=-0.18)
+    first = twist_of(PAPER._replace(saturate_first=1.0), seen, l_th=0.15)
+    assert first[2] == pytest.approx(-0.0260417, rel=1e-4)
+
+
+def test_sgn_0_decides_where_a_centred_contact_goes():
+    # zeta = 3: v_y / v_x = 3.
+    v_x, v_y, _ = twist_of(PAPER._replace(zeta=3.0, sgn_0=1.0), observe((2.0, 0.0), l=0.0))
+    assert v_y == pytest.approx(3 * v_x, rel=5e-3)
+
+
+def after_a_loss(params, d=(1.2, -0.5)):
+    """The state and twist one step after contact at l = 0.12, and the twist while it lasted."""
+    state, felt = law.step(params, RPSState.init(params), observe(d, l=0.12))
+    state, twist = law.step(params, state, observe(d, l=0.12, in_contact=False))
+    return state, np.stack(twist), np.stack(felt)
+
+
+def test_after_a_loss_the_robot_creeps_or_drives_or_acts_on_the_last_contact():
+    _, creep, felt = after_a_loss(PAPER)
+    np.testing.assert_allclose(creep, [0.01, 0.0, 0.0])
+    _, drive, _ = after_a_loss(PAPER._replace(v_lost=0.05))
+    np.testing.assert_allclose(drive, [0.05, 0.0, 0.0])
+    _, kept, _ = after_a_loss(PAPER._replace(keep_contact=1.0))
+    # The robot stands where it was, so the remembered contact asks for the same twist.
+    np.testing.assert_allclose(kept, felt, rtol=1e-6)
+    # Before the first touch nothing is remembered: v_approach, whatever happens after a loss.
+    changed = PAPER._replace(v_lost=0.05, keep_contact=1.0)
+    first = twist_of(changed, observe((1.0, 0.0), in_contact=False))
+    assert first == pytest.approx([0.01, 0.0, 0.0])
+
+
+def test_a_remembered_contact_on_the_target_does_not_stop_the_robot():
+    _, twist, _ = after_a_loss(PAPER._replace(keep_contact=1.0), d=(0.02, 0.0))
+    np.testing.assert_allclose(twist, [0.01, 0.0, 0.0])
+
+
 def test_a_centred_contact_asks_for_no_lateral_motion_whatever_zeta():
     v_x, v_y, _ = twist_of(PAPER._replace(zeta=3.0), observe((2.0, 0.0), l=0.0))
     assert (v_x, v_y) == (pytest.approx(0.05), 0.0)

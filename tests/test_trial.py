@@ -161,8 +161,8 @@ def test_a_case_that_means_nothing_is_refused(changes, field):
 @pytest.mark.parametrize(
     ("make", "field"),
     [
-        (lambda: Rules(horizon=0.0), "horizon"),
-        (lambda: Rules(max_lost=float("nan")), "max_lost"),
+        (lambda: Setting(rules=Rules(horizon=0.0)), "horizon"),
+        (lambda: Setting(rules=Rules(max_lost=float("nan"))), "max_lost"),
         (lambda: Setting(engine="ode"), "engine"),
         (lambda: Setting(seed=-1), "seed"),
     ],

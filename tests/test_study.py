@@ -1,0 +1,197 @@
+"""Studies, the C engine, hardware experiments and reports, at smoke size."""
+
+import mujoco
+import numpy as np
+import pytest
+import xarray as xr
+
+from rps_jax import (
+    ambiguity,
+    errors,
+    fidelity,
+    hardware,
+    paper,
+    record,
+    reference,
+    report,
+    scene,
+    score,
+    study,
+    sweep,
+)
+from rps_jax.law import RPSParams
+from rps_jax.report import Section
+from rps_jax.scene import FRICTION
+from rps_jax.skin import IdealSkin
+from rps_jax.study import Condition, Grid
+from rps_jax.sweep import Case, Setting
+from rps_jax.trial import Rules, Shift
+
+NEAR = ((0.6, 0.0), (0.62, 0.03))
+SHORT = Setting(engine="mujoco", rules=Rules(horizon=18.0))
+GRID = Grid(objects=("box",), friction={"S1": FRICTION["S1"]}, targets=NEAR)
+CONDITIONS = {
+    "default": Condition("the defaults", SHORT),
+    "slow": Condition("slow", SHORT, params={"v_max": 0.001}),
+    "thin": Condition("thin skin", SHORT, case={"skin": IdealSkin(0.001)}),
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("study")
+    study.run(CONDITIONS, GRID, path)
+    return path
+
+
+def test_a_study_labels_its_conditions_and_compares_them(folder):
+    results = study.run(CONDITIONS, GRID, folder)
+    assert results.success.dims == ("condition", *score.DIMS)
+    won = results.success.sum(score.DIMS).values
+    np.testing.assert_array_equal(won, [2, 0, 2])
+    rows = study.rows(results, "default")
+    assert [row[0] for row in rows] == ["reading", "the defaults", "slow", "thin skin"]
+    assert rows[1][1:3] == ["2", "2 of 2"]
+    assert rows[2][-1].startswith("+0 -2")
+
+
+def test_a_study_continues_where_it_stopped_and_redoes_alone_what_is_corrupt(folder, monkeypatch):
+    before = record.read(folder / "thin.nc")
+    (folder / "thin.nc").write_bytes(b"torn")
+    ran = []
+    run = sweep.run
+
+    def counted(cases, *args, **options):
+        ran.extend(cases)
+        return run(cases, *args, **options)
+
+    monkeypatch.setattr(sweep, "run", counted)
+    study.run(CONDITIONS, GRID, folder)
+    assert ran == CONDITIONS["thin"].cases(GRID)
+    xr.testing.assert_identical(record.read(folder / "thin.nc").drop_attrs(), before.drop_attrs())
+    assert (folder / "thin.nc.corrupt").exists()
+
+
+def test_a_study_refuses_a_folder_of_other_conditions(folder):
+    other = {"slow": Condition("slow", SHORT, params={"v_max": 0.002})}
+    with pytest.raises(errors.InputError, match=r"slow\.nc was run with other options"):
+        study.run(other, GRID, folder)
+
+
+def test_mcnemars_exact_test_by_hand():
+    a = xr.DataArray([1, 1, 1, 1, 1, 1, 0, 0])
+    b = xr.DataArray([0, 0, 0, 0, 0, 1, 0, 0])
+    c = study.compare(a, b)
+    # Five of five differences go one way: 2 / 2^5.
+    assert (c.gained, c.lost, c.p) == (0, 5, pytest.approx(0.0625))
+    assert c.equal == pytest.approx(3 / 8)
+    assert study.compare(a, a).p == 1.0
+
+
+def test_c_mujoco_driven_by_periods_matches_c_mujoco_driven_by_steps():
+    physics = scene.physics()
+    at = scene.load("box", physics)
+    qpos = scene.initial_qpos(at, gap=0.001)
+    twist = np.array([[0.05, 0.02, 0.1]])
+    batch = reference.Batch([at.physics], qpos[None], 1)
+    data = mujoco.MjData(at.physics)
+    data.qpos[:] = qpos
+    for _ in range(100):
+        batch.drive(np.array([0]), twist, physics.substeps)
+        for _ in range(physics.substeps):
+            v_x, v_y, omega = twist[0]
+            heading = data.qpos[2] + omega * physics.timestep / 2
+            c, s = np.cos(heading), np.sin(heading)
+            data.qvel[:3] = [c * v_x - s * v_y, s * v_x + c * v_y, omega]
+            mujoco.mj_step(at.physics, data)
+    batch.close()
+    np.testing.assert_allclose(batch.qpos[0, :3], data.qpos[:3], atol=1e-6)
+    np.testing.assert_allclose(batch.qpos[0, 3:], data.qpos[3:], atol=2e-4)
+    assert batch.qpos[0, 3] > qpos[3] + 0.08  # it was pushed
+
+
+def test_a_shove_moves_the_object_along_the_front_of_the_robot():
+    # Before any contact the box stands where it was put: 0.1 m to the robot's left.
+    cases = [
+        Case("box", FRICTION["S1"], (2.0, 0.0), shift=Shift(0.5, (0.0, y)), bearing=bearing)
+        for y, bearing in ((0.1, 0.0), (-0.1, 0.0), (0.1, np.pi / 2))
+    ]
+    setting = Setting(engine="mujoco", rules=Rules(horizon=1.0))
+    outcome, _ = sweep.run(cases, setting)
+    x = 0.3625 + 0.02 + 0.2
+    expected = [[x, 0.1], [x, -0.1], [-0.1, x]]
+    np.testing.assert_allclose(outcome.object_pose[:, :2], expected, atol=1e-3)
+
+
+def test_the_hardware_experiments_cover_friction_targets_and_shoves():
+    base = Case("hardware_box", hardware.MIDDLE, (2.1, 0.0), skin=hardware.SKIN)
+    setting = Setting(engine="mujoco", rules=Rules(horizon=3.0))
+    results = hardware.run(base, setting)
+    assert results.sizes["friction"] == len(hardware.GROUND) * len(hardware.ROBOT)
+    assert results.sizes["target"] == 8
+    assert (results.mean_abs_l < 0.29).any()  # it was touched
+    rows = hardware.table(results)
+    assert rows[1][1] == "0 of 96"
+    assert "8 of 8" in rows[1]
+    shifted = hardware.disturb(base, setting, shifts=(0.1,))
+    assert shifted.success.shape == (2, 1, 2, 8)
+    # All trials ended at 3 s, before the object was to be moved: none tells anything.
+    assert hardware.recovered(shifted, "hardware_box", 0.1) == (0, 0)
+
+
+def test_the_hardware_targets_are_2_1_m_from_the_start():
+    distance = np.linalg.norm(hardware.LAYOUTS["circle"], axis=1)
+    np.testing.assert_allclose(distance, 2.1)
+    assert len(set(hardware.LAYOUTS["grid"])) == 8
+
+
+def test_every_condition_is_a_study_that_could_run():
+    for conditions in (fidelity.CONDITIONS, ambiguity.READINGS, ambiguity.GAZEBO):
+        for condition in conditions.values():
+            assert len(condition.cases(Grid(targets=NEAR))) == 12
+    assert len(ambiguity.curve()) == 3 * len(ambiguity.TOLERANCES)
+    assert set(fidelity.QUICK) <= set(fidelity.CONDITIONS)
+    assert set(ambiguity.QUICK_READINGS) <= set(ambiguity.READINGS)
+    assert set(ambiguity.QUICK_GAZEBO) <= set(ambiguity.GAZEBO)
+
+
+def test_the_cells_of_table_ii_are_judged_by_their_intervals():
+    shape = (1, 3, 3, 2, 24)
+    success = np.ones(shape, np.int8)
+    success[:, 1:] = 0
+    results = xr.Dataset(
+        {"success": (("condition", *score.DIMS), success)},
+        coords={
+            "condition": ["paper_gazebo"],
+            "strategy": list(paper.STRATEGIES),
+            "object": list(scene.PAPER_OBJECTS),
+            "friction": ["S1", "S2"],
+        },
+    )
+    rows = {row[0]: row for row in ambiguity.cells(results)[1:]}
+    # Of 24: the paper's 24 gives 20.7-24, its 19 14.3-21.8, its 0 0-3.3, its 2 0.6-6.2.
+    assert rows["RPS box S2"][3:5] == ["20.7-24.0", "yes"]
+    assert rows["RPS cylinder S1"][3:5] == ["14.3-21.8", "no"]
+    assert rows["NPS box S1"][3:5] == ["0.6-6.2", "no"]
+    assert rows["APS nonuniform_box S1"][3:5] == ["0.0-3.3", "yes"]
+    # Equal counts cannot differ; 24 against 19 of 24: 2 C(43, 19) / C(48, 24) = 0.0496.
+    assert rows["RPS box S2"][5] == "1"
+    assert rows["RPS cylinder S1"][5] == "0.05"
+
+
+def test_a_report_is_one_html_file_that_needs_no_other(tmp_path):
+    picture = tmp_path / "dot.png"
+    picture.write_bytes(b"\x89PNG")
+    sections = [Section("Numbers", "in *words*", [["a", "b"], ["1", "2"]], picture)]
+    path = report.write_report(tmp_path, "A <title>", "intro", sections)
+    page = path.read_text()
+    assert "<td>1</td>" in page
+    assert 'src="data:image/png;base64,' in page
+    assert "dot.png" not in page
+    assert "A &lt;title&gt;" in page
+    assert "![Numbers](dot.png)" in (tmp_path / "report.md").read_text()
+
+
+def test_the_papers_parameters_are_named_by_strategy():
+    assert paper.PARAMS["nps"] == RPSParams.nps()
+    assert tuple(paper.PARAMS) == ("rps", "nps", "aps")
