@@ -159,16 +159,29 @@ def curve(tolerances: tuple[float, ...] = TOLERANCES) -> dict[str, Condition]:
     }
 
 
-def by_tolerance(results: xr.Dataset, tolerances: tuple[float, ...]) -> xr.DataArray:
-    """Successes (loss, tolerance, object) of the RPS trials of `curve`."""
-    won = results.success.sel(strategy="rps").sum(("friction", "target"))
-    by_loss = [
-        won.sel(condition=[f"{loss}_{mm:g}mm" for mm in tolerances]).values for loss in ON_LOSS
-    ]
-    return xr.DataArray(
-        np.stack(by_loss),
-        dims=("loss", "tolerance", "object"),
-        coords={"loss": list(ON_LOSS), "tolerance": list(tolerances), "object": won.object},
+def by_tolerance(results: xr.Dataset, tolerances: tuple[float, ...]) -> xr.Dataset:
+    """The RPS trials of `curve`, (loss, tolerance, object): how many were `won`, and the mean time
+    `lost` without contact [s].
+    """
+    one = results.sel(strategy="rps")
+    measures = {
+        "won": one.success.sum(("friction", "target")),
+        "lost": one.contact_lost_time.mean(("friction", "target")),
+    }
+    return xr.Dataset(
+        {
+            name: (
+                ("loss", "tolerance", "object"),
+                np.stack(
+                    [
+                        values.sel(condition=[f"{loss}_{mm:g}mm" for mm in tolerances]).values
+                        for loss in ON_LOSS
+                    ]
+                ),
+            )
+            for name, values in measures.items()
+        },
+        coords={"loss": list(ON_LOSS), "tolerance": list(tolerances), "object": one.object},
     )
 
 

@@ -50,8 +50,11 @@ IN_C = {
     "c_impratio_100": _c("C, 2 ms, impratio 100", impratio=100.0),
     "c_pyramidal": _c("C, 2 ms, pyramidal", cone="pyramidal"),
     "c_pyramidal_1ms": _c("C, 1 ms, pyramidal", cone="pyramidal", timestep=0.001),
-    "c_stiff": _c("C, 2 ms, skin contact 5 ms (solref)", solref=(0.005, 1.0)),
-    "c_soft": _c("C, 2 ms, skin contact 60 ms (solref)", solref=(0.06, 1.0)),
+    "c_mujocos_ground": _c(
+        "C, 2 ms, MuJoCo's own ground contact", ground_solref=(0.02, 1.0), ground_impedance=0.9
+    ),
+    "c_stiff": _c("C, 2 ms, skin contact 5 ms (solref)", base_solref=(0.005, 1.0)),
+    "c_soft": _c("C, 2 ms, skin contact 60 ms (solref)", base_solref=(0.06, 1.0)),
     "c_period_5ms": _c("C, 5 ms, control period 5 ms", timestep=0.005, control_period=0.005),
     "c_period_50ms": _c("C, 5 ms, control period 50 ms", timestep=0.005, control_period=0.05),
     "c_drive_on_loss": replace(
@@ -65,19 +68,19 @@ IN_C = {
 IN_MJX = {
     "standard": Condition("MJX `standard`", Setting(physics=_STANDARD)),
     "fast": Condition("MJX `fast`", Setting(physics=_FAST)),
-    "mjx_5ms": _mjx("MJX, 5 ms, 10/14", timestep=0.005),
-    "mjx_5ms_8_10": _mjx("MJX, 5 ms, 8/10", timestep=0.005, iterations=8, ls_iterations=10),
+    "mjx_5ms": _mjx("MJX, 5 ms, 8/10", timestep=0.005),
     "mjx_5ms_20_20": _mjx("MJX, 5 ms, 20/20", timestep=0.005, iterations=20, ls_iterations=20),
-    "mjx_20ms": _mjx("MJX, 20 ms, 10/14", timestep=0.02),
-    "mjx_20ms_8_10": _mjx("MJX, 20 ms, 8/10", timestep=0.02, iterations=8, ls_iterations=10),
-    "mjx_20ms_6_8": _mjx("MJX, 20 ms, 6/8", timestep=0.02, iterations=6, ls_iterations=8),
+    "mjx_20ms": _mjx("MJX, 20 ms, 8/10", timestep=0.02),
     "mjx_50_50": _mjx("MJX, 10 ms, 50/50", iterations=50, ls_iterations=50),
     "mjx_10_14": _mjx("MJX, 10 ms, 10/14", iterations=10, ls_iterations=14),
-    "mjx_8_10": _mjx("MJX, 10 ms, 8/10", iterations=8, ls_iterations=10),
-    "mjx_6_10": _mjx("MJX, 10 ms, 6/10", iterations=6, ls_iterations=10),
+    "mjx_6_8": _mjx("MJX, 10 ms, 6/8", iterations=6, ls_iterations=8),
     "mjx_4_14": _mjx("MJX, 10 ms, 4/14", iterations=4, ls_iterations=14),
+    "mjx_loose": _mjx("MJX, 10 ms, MuJoCo's own tolerance 1e-8", tolerance=1e-8),
+    "mjx_mujocos_ground": _mjx(
+        "MJX, 10 ms, MuJoCo's own ground contact", ground_solref=(0.02, 1.0), ground_impedance=0.9
+    ),
     "mjx_4_6": _mjx("MJX, 10 ms, 4/6", iterations=4, ls_iterations=6),
-    "mjx_impratio_1": _mjx("MJX, 10 ms, 10/14, impratio 1", impratio=1.0),
+    "mjx_impratio_1": _mjx("MJX, 10 ms, 8/10, impratio 1", impratio=1.0),
     "mjx_pyramidal": Condition(
         "MJX `paper_gazebo`, its pyramid", Setting(physics=physics("paper_gazebo"))
     ),

@@ -250,29 +250,30 @@ def _rates(ax: Axes, x: np.ndarray, won: np.ndarray, of: np.ndarray, **style) ->
     ax.errorbar(x, rate, errors, capsize=2, marker="o", ms=4, lw=1.2, **style)
 
 
-def tolerance_curve(won: xr.DataArray, trials: int, path: Path) -> Path:
-    """Success of RPS over skin tolerance, for each behaviour on loss of contact and object.
+def tolerance_curve(curve: xr.Dataset, trials: int, path: Path) -> Path:
+    """Success of RPS, and time without contact, over skin tolerance.
 
-    `won` counts the successes of `trials` each, as `ambiguity.by_tolerance` gives them.
+    A column for each behaviour on loss of contact; `curve` is what `ambiguity.by_tolerance` gives,
+    successes out of `trials`.
     """
-    figure = Figure(figsize=(4 * won.sizes["loss"], 3.4), layout="constrained")
-    axes = figure.subplots(1, won.sizes["loss"], squeeze=False, sharey=True)[0]
-    for ax, loss in zip(axes, map(str, won.loss.values), strict=True):
-        for name in map(str, won.object.values):
-            counts = won.sel(loss=loss, object=name).values
-            _rates(
-                ax,
-                won.tolerance.values,
-                counts,
-                np.full(len(counts), trials),
-                color=_OBJECT_COLOURS[name],
-                label=_TITLES[name],
-            )
-        ax.set_title(f"on loss: {ambiguity.ON_LOSS[loss][0]}", fontsize=9)
-        ax.set(xlabel="skin tolerance [mm]", ylim=(-3, 103))
-        ax.grid(alpha=0.3)
-    axes[0].set_ylabel("success [%]")
-    axes[-1].legend(fontsize=8)
+    columns = curve.sizes["loss"]
+    figure = Figure(figsize=(4 * columns, 5), layout="constrained")
+    axes = figure.subplots(2, columns, squeeze=False, sharex=True, sharey="row")
+    x = curve.tolerance.values
+    for (above, below), loss in zip(axes.T, map(str, curve.loss.values), strict=True):
+        for name in map(str, curve.object.values):
+            one = curve.sel(loss=loss, object=name)
+            style = {"color": _OBJECT_COLOURS[name], "label": _TITLES[name]}
+            _rates(above, x, one.won.values, np.full(len(x), trials), **style)
+            below.plot(x, one.lost.values, "o-", ms=4, lw=1.2, **style)
+        above.set_title(f"on loss: {ambiguity.ON_LOSS[loss][0]}", fontsize=9)
+        above.set_ylim(-3, 103)
+        below.set_xlabel("skin tolerance [mm]")
+        for ax in (above, below):
+            ax.grid(alpha=0.3)
+    axes[0, 0].set_ylabel("success [%]")
+    axes[1, 0].set_ylabel("mean time without contact [s]")
+    axes[0, -1].legend(fontsize=8)
     return save(figure, path)
 
 

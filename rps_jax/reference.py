@@ -35,11 +35,12 @@ class Batch:
     """Worlds stepped by C MuJoCo on a pool of threads: (time, qpos, qvel) of each, in double."""
 
     def __init__(self, models: Sequence[mujoco.MjModel], qpos: np.ndarray, threads: int):
-        """Start from positions (n, 10) at rest."""
+        """Start from positions (n, 10) at rest; the models are of one shape family."""
         self.models = list(models)
         nq, nv = models[0].nq, models[0].nv
         size = mujoco.mj_stateSize(models[0], _STATE)
         assert size == 1 + nq + nv, "the scenes have neither actuators nor plugins"
+        assert all((m.geom_type == models[0].geom_type).all() for m in models), "one family"
         self.state = np.zeros((len(models), size))
         self.qpos = self.state[:, 1 : 1 + nq]
         self.qvel = self.state[:, 1 + nq :]

@@ -349,8 +349,8 @@ def _readings(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any])
 def _curve(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any]) -> list[Section]:
     conditions = ambiguity.curve(plan.tolerances)
     results = _study(out, "curve", conditions, tuple(conditions), plan.rps_alone, progress, shape)
-    won = ambiguity.by_tolerance(results, plan.tolerances)
+    curve = ambiguity.by_tolerance(results, plan.tolerances)
     trials = plan.rps_alone.size // len(scene.PAPER_OBJECTS)
-    picture = figures.tolerance_curve(won, trials, out / "tolerance.png")
+    picture = figures.tolerance_curve(curve, trials, out / "tolerance.png")
     text = f"RPS, {trials} trials a point, isotropic friction."
     return [Section("Skin tolerance and behaviour on loss of contact", text, (), picture)]

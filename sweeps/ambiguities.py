@@ -55,9 +55,9 @@ def main(options: Options) -> None:
     if options.gazebo and "paper_gazebo" in names:
         tables.append(ambiguity.cells(results))
     if options.curve and not options.readings:
-        won = ambiguity.by_tolerance(results, ambiguity.TOLERANCES)
+        curve = ambiguity.by_tolerance(results, ambiguity.TOLERANCES)
         trials = grid.size // len(scene.PAPER_OBJECTS)
-        figures.tolerance_curve(won, trials, out / "tolerance.png")
+        figures.tolerance_curve(curve, trials, out / "tolerance.png")
     text = "\n\n".join(score.markdown(rows) for rows in tables)
     record.write_text(out / "table.md", text + "\n")
     print(text)

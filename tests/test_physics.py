@@ -1,45 +1,45 @@
 """Physics whose answer is known by hand: a base that pushes, and objects left to themselves.
 
-Every law is derived where it is tested. The engine `mujoco` is C MuJoCo with reference physics,
-`mjx` is MJX with the standard physics of the tables; both are seen every control period.
-
-Laws of steady sliding are tested where MuJoCo slides steadily. Its contact is a spring of
-stiffness k and damping b per unit of mass, and its cone couples the two directions: an object
-that slides at v floats mu v b / k higher than it stands, b / k = 38 ms. Standing, a box sinks
-0.1 mm, so beyond v = 0.1 mm / (mu b / k), 1 cm/s for mu = 0.3 and 5 cm/s for mu = 0.05, it
-leaves the ground and hops. What that costs at the paper's speed is in the two tests that fail.
+Each law is derived where it is tested. The engine `mujoco` is C MuJoCo with the reference physics,
+`mjx` is MJX with the standard physics, in float32; worlds are seen every control period.
 """
 
+import functools
 import math
-from functools import partial
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from rps_jax import scene, sweep, trial
+from rps_jax import frames, scene, sweep, trial
 from rps_jax.reference import Batch
-from rps_jax.scene import FRICTION, JOINTS, OBJECTS, Friction, mjx
+from rps_jax.scene import FRICTION, OBJECTS, Friction, Physics, mjx
 from rps_jax.sweep import Case, Setting
 from rps_jax.trial import Rules, Stage, Twist
 
 G = 9.81  # [m/s^2]
 MASS = {"box": 20.0, "cylinder": 25.0}  # [kg]
-HALF, RADIUS = 0.20, 0.25  # [m] of the box's sides, of the cylinder
-CORNERS = HALF * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])  # [m] where a MuJoCo box stands
+HALF, RADIUS = 0.20, 0.25  # [m] half a side of the box; of the cylinder
+INERTIA = {"box": 20 * 2 * 0.4**2 / 12, "cylinder": 25 * RADIUS**2 / 2}  # [kg m^2] vertical axis
+# c = m_max / f_max [m]: the largest torque of the ground's friction over its largest force. The
+# points on which MuJoCo stands an object are all this far from its middle.
+ARM = {"box": math.hypot(HALF, HALF), "cylinder": RADIUS}
+BASE = 1e6 + 130  # [kg] armature and mass
 STANDARD, REFERENCE = scene.physics(), scene.physics(fidelity="reference")
 SECONDS = 2.5
-SLOW = Friction(0.05, 1.0)  # little on the ground, so that a push does not tip what it pushes
 
 
 class World(NamedTuple):
-    """An object before the base: what moves them."""
+    """An object before the base, and what moves them."""
 
     friction: Friction = FRICTION["S1"]
-    push: tuple[float, float] = (0.0, 0.0)  # [m/s] velocity of the base
+    push: tuple[float, float] = (0.0, 0.0)  # [m/s] of the base
     thrown: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [m/s, m/s, rad/s] object at the start
     yaw: float = 0.0  # [rad] of the object at the start
     gap: float = 0.0  # [m] between them at the start
@@ -51,20 +51,27 @@ class Film(NamedTuple):
 
     qpos: np.ndarray  # (T, 10)
     qvel: np.ndarray  # (T, 9)
+    physics: Physics
 
     @property
-    def position(self):
-        return self.qpos[:, 3:5]
+    def pose(self):  # (T, 3) of the object
+        yaw = np.unwrap(2 * np.arctan2(self.qpos[:, 9], self.qpos[:, 6]))
+        return np.column_stack([self.qpos[:, 3:5], yaw])
 
     @property
-    def yaw(self):
-        return np.unwrap(2 * np.arctan2(self.qpos[:, 9], self.qpos[:, 6]))
-
     def moved(self):
-        return float(np.hypot(*(self.position[-1] - self.position[0])))
+        return self.pose[-1] - self.pose[0]
 
-    def turned(self):
-        return float(self.yaw[-1] - self.yaw[0])
+    @property
+    def way(self):
+        return float(np.hypot(*self.moved[:2]))
+
+    def twist(self):
+        """Mean velocity (3,) [m/s, m/s, rad/s] from 0.5 s on, and the yaw half way."""
+        period = self.physics.control_period
+        pose = self.pose[round(0.5 / period) :]
+        mean = (pose[-1] - pose[0]) / ((len(pose) - 1) * period)
+        return mean, (pose[0, 2] + pose[-1, 2]) / 2
 
 
 def starts(worlds, physics):
@@ -73,45 +80,346 @@ def starts(worlds, physics):
     qpos = np.array([scene.initial_qpos(s, w.gap, w.yaw) for s, w in pairs])
     qvel = np.zeros((len(worlds), 9))
     qvel[:, [3, 4, 8]] = [w.thrown for w in worlds]
-    return [s.physics for s in scenes], qpos, qvel
+    return [s.physics for s in scenes], qpos, qvel, np.array([(*w.push, 0.0) for w in worlds])
 
 
 def in_c(worlds, physics=REFERENCE, seconds=SECONDS):
-    models, qpos, qvel = starts(worlds, physics)
+    """Films of worlds of one shape family."""
+    models, qpos, qvel, twist = starts(worlds, physics)
     batch = Batch(models, qpos, threads=2)
     batch.qvel[:] = qvel
-    twist = np.array([(*w.push, 0.0) for w in worlds])
-    frames = [(qpos, qvel)]
+    states = [(qpos, qvel)]
     for _ in range(round(seconds / physics.control_period)):
         batch.drive(np.arange(len(worlds)), twist, physics.substeps)
-        frames.append((batch.qpos.copy(), batch.qvel.copy()))
+        states.append((batch.qpos.copy(), batch.qvel.copy()))
     batch.close()
-    return [Film(*film) for film in zip(*(np.stack(x, axis=1) for x in zip(*frames)))]
+    qpos, qvel = (np.stack(x, axis=1) for x in zip(*states, strict=True))
+    return [Film(*both, physics) for both in zip(qpos, qvel, strict=True)]
 
 
 def blank(kind, **given):
     return kind(**(dict.fromkeys(kind._fields) | given))
 
 
-def in_mjx(worlds, physics=STANDARD, seconds=SECONDS):
-    models, qpos, qvel = starts(worlds, physics)
+def in_mjx(worlds, physics=STANDARD):
+    models, *start, twist = starts(worlds, physics)
     model, fields = scene.stack(models)
     stage = Stage(model, mjx.make_data(models[0]))
-    state = tuple(jnp.asarray(x, model.qpos0.dtype) for x in (qpos, qvel, 0 * qvel))
-    twist = jnp.array([(*w.push, 0.0) for w in worlds])
+    qpos, qvel, twist = (jnp.asarray(x, model.qpos0.dtype) for x in (*start, twist))
 
     def drive(fields, twist, qpos, qvel, warmstart):
-        world = blank(trial.World, fields=fields)
         now = blank(trial.Trial, qpos=qpos, qvel=qvel, warmstart=warmstart)
+        world = blank(trial.World, fields=fields)
         return trial.drive(stage, world, now, Twist(*twist), physics.substeps)
 
     @jax.jit
-    def run(state):
+    def run(*state):
         def body(state, _):
-            state = jax.vmap(drive)(fields, twist, *state)
-            return state, state[:2]
+            return jax.vmap(drive)(fields, twist, *state), state[:2]
 
-        return jax.lax.scan(body, state, length=round(seconds / physics.control_period))[1]
+        return jax.lax.scan(body, state, length=round(SECONDS / physics.control_period) + 1)[1]
 
-    films = zip(*(np.concatenate([a[None], b]).swapaxes(0, 1) for a, b in zip(state, run(state))))
-    return [Film(*film) for film in films]
+    seen = (np.asarray(x, float).swapaxes(0, 1) for x in run(qpos, qvel, 0 * qvel))
+    return [Film(*both, physics) for both in zip(*seen, strict=True)]
+
+
+def polar(length, degrees):
+    return length * math.cos(math.radians(degrees)), length * math.sin(math.radians(degrees))
+
+
+ALL = {
+    "centre": World(push=(0.05, 0.0)),
+    "rolling": World(FRICTION["S2"], (0.05, 0.02), name="cylinder"),
+    "slipping": World(Friction(0.2, 0.02), (0.05, 0.02), name="cylinder"),
+    "diagonal box": World(thrown=(*polar(0.5, 45), 0.0), gap=1.0),
+}
+for name in MASS:
+    ALL[f"resting {name}"] = World(gap=1.0, name=name)
+    ALL[f"sliding {name}"] = World(thrown=(0.5, 0.0, 0.0), gap=1.0, name=name)
+    ALL[f"spinning {name}"] = World(Friction(0.1, 0.35), (0, 0), (0, 0, 2.0), gap=1.0, name=name)
+# Yaw of the box whose corner meets the face, direction of the base's velocity [degrees]: the box
+# then turns about a point about c away, or, pushed straight ahead, one that is farther away.
+NEAR, FAR = [(10, 50), (20, 50)], [(10, 0), (20, 0), (30, 0)]
+for yaw, direction in NEAR + FAR:
+    # So little friction on the ground that the push, 0.2 m above it, does not tip the box.
+    push = World(Friction(0.05, 1.0), polar(0.01, direction), yaw=math.radians(yaw))
+    ALL[f"corner {yaw} {direction}"] = push
+
+
+@functools.cache
+def films(engine):
+    names = [[n for n in ALL if ALL[n].name == name] for name in MASS]
+    with ThreadPoolExecutor(2) as pool:  # MJX compiles both families at once
+        run = {"mjx": in_mjx, "mujoco": in_c}[engine]
+        boxes, cylinders = pool.map(run, [[ALL[n] for n in some] for some in names])
+    return dict(zip(names[0] + names[1], boxes + cylinders, strict=True))
+
+
+@pytest.fixture
+def seen(request):
+    """Films of all worlds in one engine."""
+    return films(request.param)
+
+
+IN_BOTH = pytest.mark.parametrize("seen", ["mjx", "mujoco"], indirect=True)
+
+
+@IN_BOTH
+def test_a_box_pushed_through_its_centre_keeps_its_heading_and_goes_as_far_as_the_base(seen):
+    film = seen["centre"]
+    assert film.qpos[-1, 0] == pytest.approx(0.05 * SECONDS, abs=1e-4)
+    assert film.moved[:2] == pytest.approx([0.05 * SECONDS, 0.0], abs=1e-3)
+    assert abs(film.moved[2]) < math.radians(0.2)
+
+
+@pytest.mark.parametrize("physics", [STANDARD, REFERENCE], ids=["standard", "reference"])
+@pytest.mark.parametrize("robot", [0.02, 0.35])
+@pytest.mark.parametrize("ground", [0.3, 0.2, 0.05])
+def test_a_steady_push_takes_the_force_mu_m_g_and_the_work_of_friction(ground, robot, physics):
+    """The base loses the momentum that the push takes, and is set anew every period.
+
+    0.3 x 20 kg x 9.81 m/s^2 = 58.9 N. The face may bear mu_robot F of the weight, either way:
+    mu m g / (1 + mu mu_robot) < F < mu m g / (1 - mu mu_robot), 1 % or 12 % off. The work is that
+    of friction, and m v^2 at the start: half of it sets the box moving, half is lost, as always
+    when speed is given at once.
+    """
+    speed = 0.05
+    (film,) = in_c([World(Friction(ground, robot), (speed, 0.0))], physics)
+    force = BASE * (speed - film.qvel[1:, 0]) / physics.control_period
+    weight, borne = ground * MASS["box"] * G, ground * robot / (1 - ground * robot)
+    steady = force[len(force) // 2 :]
+    assert steady.mean() == pytest.approx(weight, rel=0.01 + borne)
+    assert steady.std() < 0.01 * weight
+    work = force.sum() * speed * physics.control_period
+    assert work == pytest.approx(weight * film.way + MASS["box"] * speed**2, rel=0.02 + borne)
+
+
+@pytest.mark.parametrize("friction", FRICTION)
+def test_a_box_pushed_at_the_papers_speed_stays_on_the_ground(friction):
+    """MuJoCo's cone lifts what slides; on its own, stiffer ground a box hops from 1 cm/s on."""
+    (film,) = in_c([World(FRICTION[friction], (0.05, 0.0))], STANDARD)
+    assert film.qvel[25:, 5].std() < 1e-3
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_an_object_left_alone_creeps_less_than_a_millimetre_in_a_minute(name):
+    calm = replace(STANDARD, control_period=1.0)
+    (film,) = in_c([World(gap=1.0, name=name)], calm, seconds=60.0)
+    assert film.way < 1e-3
+    assert abs(film.moved[2]) < math.radians(0.1)
+
+
+@IN_BOTH
+@pytest.mark.parametrize("name", MASS)
+def test_an_object_left_alone_creeps_less_than_half_a_millimetre_a_second(seen, name):
+    """In float32 noise moves it by up to 0.2 mm/s; C MuJoCo is held to the line above."""
+    assert seen[f"resting {name}"].way < 0.5e-3 * SECONDS
+
+
+def loses_energy(film, name):
+    """Never more than at the start, with the fall onto the ground; the planar part only falls.
+
+    But for what rocking lends it, below 1 %.
+    """
+    inertia = scene.load(name).physics.body("object").inertia
+    squares = np.hstack([MASS[name] * film.qvel[:, 3:6] ** 2, inertia * film.qvel[:, 6:] ** 2]) / 2
+    planar = squares[:, [0, 1, 5]].sum(axis=1)
+    total = squares.sum(axis=1) + MASS[name] * G * (film.qpos[:, 5] - film.qpos[0, 5])
+    return np.diff(planar).max() < 0.01 * planar[0] and total.max() < 1.001 * planar[0]
+
+
+@IN_BOTH
+@pytest.mark.parametrize("what", ["sliding box", "diagonal box", "sliding cylinder"])
+def test_an_object_thrown_at_v_slides_v2_over_2_mu_g_and_never_gains_energy(seen, what):
+    """0.5^2 / (2 x 0.3 x 9.81) = 42.5 mm.
+
+    Euler's rule, which moves it by the speed at the end of each step, takes off v dt / 2: 2.5 mm
+    in steps of 10 ms.
+    """
+    film = seen[what]
+    assert film.way == pytest.approx(0.5**2 / (2 * 0.3 * G), rel=0.05)
+    assert abs(film.moved[2]) < math.radians(0.2)
+    assert loses_energy(film, what.split()[1])
+
+
+def stops_by_the_torque_mu_m_g_c(film, name):
+    """Energy I w^2 / 2 over torque: this measures c, on which the laws of turning below stand."""
+    angle = INERTIA[name] * 2.0**2 / (2 * 0.1 * MASS[name] * G * ARM[name])
+    assert film.moved[2] == pytest.approx(angle, rel=0.05)
+    assert film.way < 1e-3
+    assert loses_energy(film, name)
+
+
+@IN_BOTH
+def test_a_spun_box_is_stopped_by_mu_m_g_times_half_its_diagonal(seen):
+    stops_by_the_torque_mu_m_g_c(seen["spinning box"], "box")
+
+
+@IN_BOTH
+def test_a_spun_cylinder_is_stopped_by_mu_m_g_times_its_radius(seen):
+    stops_by_the_torque_mu_m_g_c(seen["spinning cylinder"], "cylinder")
+
+
+@pytest.mark.parametrize(("name", "points"), [("box", 4), ("cylinder", 3)])
+def test_an_object_stands_on_equally_loaded_points_all_equally_far_from_its_middle(name, points):
+    model = scene.load(name, REFERENCE).physics
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 3000)
+    mujoco.mj_forward(model, data)
+    middle = data.body("object").xpos
+    load = np.zeros((data.ncon, 6))
+    for i in range(data.ncon):
+        mujoco.mj_contactForce(model, data, i, load[i])
+    assert data.ncon == points
+    assert load[:, 0] == pytest.approx(MASS[name] * G / points, rel=0.01)
+    assert np.hypot(*(data.contact.pos - middle)[:, :2].T) == pytest.approx(ARM[name], rel=1e-3)
+    assert data.contact.pos.mean(axis=0)[:2] == pytest.approx(middle[:2], abs=1e-3)
+
+
+def test_mjx_lets_a_nearly_upright_cylinder_touch_with_its_rim_alone():
+    """A rim of radius R, tilted, lies within R times the tilt of the plane of its middle."""
+    loaded = scene.load("cylinder")
+    model, data = mjx.put_model(loaded.physics), mjx.make_data(loaded.physics)
+    tilt = np.repeat([0.0, 1e-7, 1e-6, 1e-5, 1e-4], 40)
+    yaw, towards = np.random.default_rng(0).uniform(-3, 3, (2, tilt.size))
+    qpos = np.tile(scene.initial_qpos(loaded, gap=1.0), (tilt.size, 1))
+    (qpos[:, 6], qpos[:, 9]), leaning = (np.cos(yaw / 2), np.sin(yaw / 2)), np.sin(tilt / 2)
+    qpos[:, 7], qpos[:, 8] = leaning * np.cos(towards), leaning * np.sin(towards)
+
+    @jax.jit
+    @jax.vmap
+    def ground_contact(qpos):
+        contact = mjx.collision(model, mjx.kinematics(model, data.replace(qpos=qpos)))._impl.contact
+        return contact.dist[:3], contact.pos[:3] - qpos[3:6]
+
+    depth, arm = ground_contact(qpos.astype(np.float32))
+    assert (np.abs(depth) < RADIUS * tilt[:, None] + 1e-6).all()
+    assert np.hypot(arm[..., 0], arm[..., 1]) == pytest.approx(RADIUS, rel=1e-3)
+
+
+def slip(film, push):
+    """Share of the base's sideways speed that the cylinder's surface does not share.
+
+    And the share that it takes up by rolling.
+    """
+    (_, v_y, omega), _ = film.twist()
+    return 1 - (v_y - RADIUS * omega) / push[1], -RADIUS * omega / push[1]
+
+
+@IN_BOTH
+def test_a_cylinder_rolls_along_the_face_without_slipping(seen):
+    """The base moves at (v_n, v_t) = (5, 2) cm/s, with mu_robot 0.5.
+
+    The contact force f = (f_n, f_t) acts on the rim with the torque -R f_t, so by the limit
+    surface the twist goes as (f_n, f_t, -R f_t / c^2), and the rim moves sideways at
+    f_t (1 + R^2 / c^2) over f_n: it sticks up to v_t / v_n = mu (1 + R^2 / c^2). On three points
+    at radius R, c = R where the cylinder mostly turns. Where it mostly translates, along e, the
+    torque of an added w is mu m g w <(r.e)^2> / v, so that c^2 = R^2 / 2. It sticks up to 1 to
+    1.5, and rolling takes up R^2 / (R^2 + c^2) of v_t: between a half and two thirds.
+    """
+    slipping, rolling = slip(seen["rolling"], ALL["rolling"].push)
+    assert abs(slipping) < 0.02
+    assert 1 / 2 < rolling < 2 / 3
+
+
+@IN_BOTH
+def test_a_cylinder_slips_along_a_slippery_face(seen):
+    """With mu_robot 0.02 and c^2 = R^2 / 2 the rim moves sideways at 3 mu v_n: 85 % is slip."""
+    slipping, _ = slip(seen["slipping"], ALL["slipping"].push)
+    assert slipping == pytest.approx(1 - 3 * 0.02 / 0.4, abs=0.02)
+
+
+def on_an_ellipsoid(arm, point, v):
+    """Lynch's twist (3,) of an object stuck to `point`, which moves at v."""
+    (x, y), square = point, arm**2
+    v_x = ((square + x * x) * v[0] + x * y * v[1]) / (square + x * x + y * y)
+    v_y = (x * y * v[0] + (square + y * y) * v[1]) / (square + x * x + y * y)
+    return np.array([v_x, v_y, (x * v_y - y * v_x) / square])
+
+
+def on_points(feet, point, v):
+    """The exact twist on equally loaded feet: friction has no moment about the sticking point.
+
+    That is the condition of least power, the sum of the feet's speeds, over the rate of turning.
+    """
+
+    def twist(omega):
+        return np.array([v[0] + omega * point[1], v[1] - omega * point[0], omega])
+
+    def power(omega):
+        v_x, v_y, _ = twist(omega)
+        return np.hypot(v_x - omega * feet[:, 1], v_y + omega * feet[:, 0]).sum()
+
+    bound = 10 * math.hypot(*v) / HALF
+    return twist(minimize_scalar(power, bounds=(-bound, bound), options={"xatol": 1e-9}).x)
+
+
+def centre(twist):
+    """Where an object turns about, from its middle (2,) [m]."""
+    return np.array([-twist[1], twist[0]]) / twist[2]
+
+
+@IN_BOTH
+@pytest.mark.parametrize(("yaw", "direction"), NEAR + FAR)
+def test_a_box_pushed_at_a_corner_turns_about_the_centre_that_friction_says(seen, yaw, direction):
+    """A corner of the box sticks to the face, at 1 cm/s.
+
+    The ellipsoid through the measured f_max and m_max is right where the box turns about a point
+    some c away. The limit surface of four feet bulges out of it elsewhere: turning about a point
+    farther away, the box is as on c^2 / 2, as derived for the cylinder. There the ellipsoid puts
+    the centre a third too far, and only the exact solution holds.
+    """
+    twist, middle = seen[f"corner {yaw} {direction}"].twist()
+    feet = np.array([polar(ARM["box"], 45 + 90 * i + math.degrees(middle)) for i in range(4)])
+    corner, push = feet[1], np.array(polar(0.01, direction))
+    is_near = (yaw, direction) in NEAR
+    stuck = twist[:2] + twist[2] * np.array([-corner[1], corner[0]])
+    # In steps of 10 ms the contact creeps where friction carries most of the push.
+    assert math.hypot(*(stuck - push)) < (0.10 if is_near else 0.03) * 0.01
+    exact = centre(on_points(feet, corner, push))
+    assert math.hypot(*(centre(twist) - exact)) < 0.05 * math.hypot(*exact)
+    ellipsoid = centre(on_an_ellipsoid(ARM["box"], corner, push))
+    share = math.hypot(*centre(twist)) / math.hypot(*ellipsoid)
+    assert share == pytest.approx(1.0 if is_near else 0.74, rel=0.1)
+
+
+@pytest.mark.parametrize("friction", FRICTION)
+@pytest.mark.parametrize("yaw", [10, 20])
+def test_ten_centimetres_of_an_off_centre_push_end_alike_at_1_and_at_5_cm_a_second(yaw, friction):
+    """Quasi-static: at 5 cm/s the box slides v^2 / (2 mu g) = 0.4 mm by itself."""
+    slow = World(FRICTION[friction], (0.01, 0.0), yaw=math.radians(yaw))
+    (a,), (b,) = in_c([slow], seconds=10.0), in_c([slow._replace(push=(0.05, 0.0))], seconds=2.0)
+    assert abs(a.moved[2]) > math.radians(5)
+    assert np.hypot(*(a.moved - b.moved)[:2]) < 2e-3
+    assert abs(a.moved[2] - b.moved[2]) < math.radians(0.5)
+
+
+def ends(physics, *bearings):
+    """Where 6 s of the law leave the cylinder, for each bearing [degrees], turned back (3,)."""
+    bearings = np.radians(bearings)
+    cases = [Case("cylinder", Friction(0.05, 0.5), (0.4, 2.0), bearing=b) for b in bearings]
+    setting = Setting(physics, Rules(horizon=6.0), engine="mujoco")
+    poses = sweep.run(cases, setting, workers=1)[0].object_pose
+    yaw = frames.wrap(jnp.asarray(poses[:, 2] - bearings))
+    return np.column_stack([frames.rotate(jnp.asarray(-bearings), jnp.asarray(poses[:, :2])), yaw])
+
+
+def test_with_the_cone_a_trial_turned_by_45_degrees_ends_the_same_turned():
+    ahead, diagonal = ends(STANDARD, 0, 45)
+    assert np.hypot(*(diagonal - ahead)[:2]) < 5e-4
+    assert abs(diagonal - ahead)[2] < math.radians(0.1)
+
+
+def test_with_the_pyramid_a_trial_turned_by_45_degrees_ends_elsewhere_but_not_by_90():
+    ahead, diagonal, left = ends(scene.physics("paper_gazebo"), 0, 45, 90)
+    assert np.hypot(*(diagonal - ahead)[:2]) > 0.05
+    assert np.hypot(*(left - ahead)[:2]) < 0.01
+
+
+@pytest.mark.parametrize("name", MASS)
+def test_on_the_pyramid_an_object_slides_farther_along_the_diagonal_by_the_root_of_two(name):
+    """The pyramid's edges hold mu N along the axes, and between them only mu N / sqrt(2)."""
+    still = World(Friction(0.1, 0.35), gap=1.0, name=name)
+    thrown = [still._replace(thrown=(*polar(0.5, degrees), 0.0)) for degrees in (0, 45)]
+    ahead, diagonal = in_c(thrown, scene.physics("paper_gazebo"))
+    assert diagonal.way / ahead.way == pytest.approx(math.sqrt(2), rel=0.03)

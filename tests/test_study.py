@@ -179,6 +179,24 @@ def test_the_cells_of_table_ii_are_judged_by_their_intervals():
     assert rows["RPS cylinder S1"][5] == "0.05"
 
 
+def test_the_tolerance_curve_sums_each_behaviour_and_tolerance():
+    names = list(ambiguity.curve((1, 6)))
+    shape = (6, 1, 3, 2, 24)
+    success = np.zeros(shape, np.int8)
+    success[names.index("drive_6mm"), 0, 1] = 1
+    results = xr.Dataset(
+        {
+            "success": (("condition", *score.DIMS), success),
+            "contact_lost_time": (("condition", *score.DIMS), np.full(shape, 2.0)),
+        },
+        coords={"condition": names, "strategy": ["rps"], "object": list(scene.PAPER_OBJECTS)},
+    )
+    curve = ambiguity.by_tolerance(results, (1, 6))
+    assert curve.won.sum() == 48
+    assert curve.won.sel(loss="drive", tolerance=6, object="cylinder") == 48
+    assert (curve.lost == 2.0).all()
+
+
 def test_a_report_is_one_html_file_that_needs_no_other(tmp_path):
     picture = tmp_path / "dot.png"
     picture.write_bytes(b"\x89PNG")
