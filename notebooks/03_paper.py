@@ -22,7 +22,7 @@ from rps_jax import record, score
 
 run = Path(os.environ.get("RPS_RUN", "runs/table"))
 results = record.read_results(run)
-print(score.table(results))
+print(score.markdown(score.table(results)))
 print(score.summary(results))
 
 # %% [markdown]

@@ -193,7 +193,7 @@ def test_the_tolerance_curve_sums_each_behaviour_and_tolerance():
     )
     curve = ambiguity.by_tolerance(results, (1, 6))
     assert curve.won.sum() == 48
-    assert curve.won.sel(loss="drive", tolerance=6, object="cylinder") == 48
+    assert curve.won.sel({"loss": "drive", "tolerance": 6, "object": "cylinder"}) == 48
     assert (curve.lost == 2.0).all()
 
 
