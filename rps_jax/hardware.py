@@ -166,6 +166,8 @@ def table(results: xr.Dataset) -> list[list[str]]:
 
 def _spread(values: xr.DataArray, digits: int, unit: str) -> str:
     """Mean over targets of the successes: over all friction, then its least and greatest."""
+    if not values.notnull().any():
+        return "-"
     each = values.mean("target")
     low, high = float(each.min()), float(each.max())
     return (

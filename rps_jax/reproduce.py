@@ -276,14 +276,12 @@ def _fidelity(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any])
     )
     return [
         Section("Fidelity of the physics", text, fidelity.table(results), picture),
-        Section("Agreement by strategy", _BY_STRATEGY, fidelity.by_strategy(results)),
+        Section(
+            "Agreement by strategy",
+            "Share of outcomes equal to the reference's.",
+            fidelity.by_strategy(results),
+        ),
     ]
-
-
-_BY_STRATEGY = (
-    "Share of outcomes equal to the reference's. APS is chaotic: even C MuJoCo at another timestep "
-    "disagrees with itself."
-)
 
 
 def _gazebo(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any]) -> list[Section]:

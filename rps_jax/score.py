@@ -27,7 +27,9 @@ _UNITS = {
 
 
 def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Wilson score interval of a success rate, each end in [0, 1]."""
+    """Wilson score interval of a success rate, each end in [0, 1]; all of it without trials."""
+    if trials == 0:
+        return 0.0, 1.0
     interval = stats.binomtest(successes, trials).proportion_ci(confidence, method="wilson")
     return float(interval.low), float(interval.high)
 

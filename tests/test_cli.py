@@ -194,6 +194,7 @@ def test_wilsons_interval_by_hand():
     low, high = score.wilson(24, 24)
     assert low == pytest.approx(1 / (1 + 1.959964**2 / 24), abs=1e-6)
     assert high == pytest.approx(1.0)
+    assert score.wilson(0, 0) == (0.0, 1.0)
     # p = 1/2 is symmetric about itself.
     low, high = score.wilson(12, 24)
     assert low + high == pytest.approx(1.0)
