@@ -28,6 +28,24 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
+class Spread:
+    """How a run's trials are spread over the machine; see `sweep.run`."""
+
+    slots: int | None = None
+    """Worlds stepped at once by one worker; by default chosen by the device."""
+    workers: int | None = None
+    """Host threads; by default chosen by the device."""
+
+    def shape(self) -> dict[str, Any]:
+        """The options of `sweep.run`, checked."""
+        shape = {"slots": self.slots, "workers": self.workers}
+        for name, value in shape.items():
+            if value is not None:
+                errors.check_finite(name, value, at_least=1)
+        return shape
+
+
+@dataclass(frozen=True)
 class Common:
     """Options that every run takes."""
 
@@ -44,8 +62,9 @@ class Common:
     control_period: float | None = None
     """Time between two decisions of the law [s]; by default that of the physics."""
     skin: str | None = None
-    """ideal (the paper's simulated contact sensor), thin (the same without foam) or capacitive
-    (42 taxels); by default that of the physics, ideal or thin."""
+    """ideal (the paper's simulated contact sensor), thin (the same without foam), capacitive
+    (42 taxels) or hardware (these with noise and unequal gains); by default that of the physics,
+    ideal or thin."""
     skin_params: tuple[str, ...] = ()
     """Parameters of the skin to change from their defaults, as name=value."""
     mass: float | None = None
@@ -65,7 +84,7 @@ class Common:
 
 
 @dataclass(frozen=True)
-class Table(Common):
+class Table(Spread, Common):
     """Run the paper's trials and print Table II beside the paper's."""
 
     objects: tuple[str, ...] = ("box", "cylinder", "nonuniform_box")
@@ -76,10 +95,6 @@ class Table(Common):
     """Friction sets, each S1, S2 or ground,robot (as 0.25,0.4)."""
     targets: tuple[tuple[float, float], ...] = ()
     """Targets x y [m], one pair after the other; by default the paper's 24."""
-    slots: int | None = None
-    """Worlds stepped at once by one worker; by default chosen by the device."""
-    workers: int | None = None
-    """Host threads; by default chosen by the device."""
 
 
 @dataclass(frozen=True)
@@ -101,17 +116,13 @@ class Push(Common):
 
 
 @dataclass(frozen=True)
-class StudyOptions:
+class StudyOptions(Spread):
     """What every study of the paper's trials takes; its run folder can be continued."""
 
     out: Path = Path("runs/study")
     """Run folder; a run that was killed is continued there."""
     quick: bool = False
     """Four of the paper's 24 targets."""
-    slots: int | None = None
-    """Worlds stepped at once by one worker; by default chosen by the device."""
-    workers: int | None = None
-    """Host threads; by default chosen by the device."""
 
     def targets(self) -> tuple[tuple[float, float], ...]:
         """The paper's targets, or a few of them."""
@@ -119,16 +130,11 @@ class StudyOptions:
 
         return study.FEW_TARGETS if self.quick else paper.TARGETS
 
-    def shape(self) -> dict[str, Any]:
-        """How the trials are spread; see `sweep.run`."""
-        return _shape(self)
-
     def open(self) -> Path:
         """The run folder, new or to be continued; checks the options first."""
         from rps_jax import record
 
         self.shape()
-        be_deterministic()
         record.writable(self.out)
         use_cache()
         record.write_json(self.out / "environment.json", record.environment())
@@ -136,19 +142,13 @@ class StudyOptions:
 
 
 @dataclass(frozen=True)
-class Hardware(Common):
+class Hardware(Spread, Common):
     """Run the paper's hardware experiments in simulation, over a range of friction; draw Fig. 7."""
 
-    skin: str | None = "capacitive"
-    """capacitive (42 taxels), ideal or thin."""
-    skin_params: tuple[str, ...] = ("noise=0.05", "gain_spread=0.1")
-    """Parameters of the skin to change from their defaults, as name=value."""
+    skin: str | None = "hardware"
+    """hardware (42 taxels with noise and unequal gains), capacitive, ideal or thin."""
     layout: str = "circle"
     """The eight targets: circle (each 2.1 m from the start) or grid (2.1 m along x and y)."""
-    slots: int | None = None
-    """Worlds stepped at once by one worker; by default chosen by the device."""
-    workers: int | None = None
-    """Host threads; by default chosen by the device."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from rps_jax import video
 
     video.choose_gl()
-    be_deterministic()
     act: dict[type, Callable[[Any], None]] = {
         Table: _table,
         Push: _push,
@@ -200,6 +199,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def guarded(action: Callable[[], None]) -> int:
     """Run a command: exit code 0, or one sentence on the error stream and 2 (130: interrupted)."""
+    _be_deterministic()
     try:
         action()
     except InputError as error:
@@ -214,7 +214,7 @@ def guarded(action: Callable[[], None]) -> int:
     return 0
 
 
-def be_deterministic() -> None:
+def _be_deterministic() -> None:
     """Ask XLA for GPU sums in a fixed order: the same command must give the same results."""
     flag = "--xla_gpu_deterministic_ops"
     flags = os.environ.get("XLA_FLAGS", "")
@@ -333,15 +333,6 @@ def _cases(options: Table, targets: Sequence[tuple[float, float]]) -> list[Case]
     ]
 
 
-def _shape(options: Table | Hardware | StudyOptions) -> dict[str, Any]:
-    """How the trials are spread; see `sweep.run`."""
-    shape = {"slots": options.slots, "workers": options.workers}
-    for name, value in shape.items():
-        if value is not None:
-            errors.check_finite(name, value, at_least=1)
-    return shape
-
-
 def _open(common: Common, command: str) -> Path:
     """The run folder, with what was asked and what it runs on already in it."""
     from rps_jax import record
@@ -400,7 +391,7 @@ def _table(options: Table) -> None:
     setting = _setting(options)
     targets = options.targets or paper.TARGETS
     cases = _cases(options, targets)
-    shape = _shape(options)
+    shape = options.shape()
     out = _open(options, "table")
     _write_config(out, options, setting, {s: _params(options, s) for s in options.strategies})
     with progress_bar(len(cases)) as report:
@@ -505,7 +496,7 @@ def _hardware(options: Hardware) -> None:
     )
     if options.mass is not None:
         raise InputError("mass is not an option here: each object has the paper's.")
-    shape = _shape(options)
+    shape = options.shape()
     out = _open(options, "hardware")
     _write_config(out, options, setting, {"rps": params})
     given = {"layout": options.layout}

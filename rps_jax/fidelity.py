@@ -17,7 +17,7 @@ import jax
 import numpy as np
 import xarray as xr
 
-from rps_jax import paper, score, study, sweep, trial
+from rps_jax import paper, study, sweep, trial
 from rps_jax.scene import Physics, physics
 from rps_jax.study import Condition, Grid
 from rps_jax.sweep import Case, Progress, Setting
@@ -94,9 +94,8 @@ def run(
     grid: Grid,
     folder: Path,
     *,
-    slots: int | None = None,
-    workers: int | None = None,
     report: Callable[[Progress], Any] = lambda progress: None,
+    **shape: Any,
 ) -> xr.Dataset:
     """Outcomes under the named conditions, and `early_error` [m] (condition, object, ...).
 
@@ -104,26 +103,20 @@ def run(
     reference: for RPS alone.
     """
     chosen = {name: CONDITIONS[name] for name in names}
-    options: dict[str, Any] = {"slots": slots, "workers": workers}
-    results = study.run(chosen, grid, folder, **options, report=report)
+    results = study.run(chosen, grid, folder, **shape, report=report)
     early_folder = folder / "early"
     early_folder.mkdir(exist_ok=True)
     early = study.run(
         {name: _early(condition) for name, condition in chosen.items()},
         grid._replace(strategies=("rps",)),
         early_folder,
-        **options,
+        **shape,
     )
     place = early.object_pose.sel(strategy="rps", pose=["x", "y"])
     results["early_error"] = np.sqrt(
         ((place - place.sel(condition=REFERENCE)) ** 2).sum("pose")
     ).drop_vars("strategy")
     return results
-
-
-def trials(names: tuple[str, ...], grid: Grid) -> int:
-    """How many trials `run` reports on."""
-    return len(names) * grid.size
 
 
 def _early(condition: Condition) -> Condition:
@@ -206,8 +199,3 @@ def cost(setting: Setting, worlds: int, *, simulated: float = 2.0) -> dict[str, 
             best = min(best, time.perf_counter() - began)
         costs[name] = best / (worlds * simulated)
     return costs
-
-
-def markdown(results: xr.Dataset, costs: Mapping[str, float] | None = None) -> str:
-    """`table` as Markdown."""
-    return score.markdown(table(results, costs))

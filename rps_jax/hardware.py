@@ -14,7 +14,7 @@ import xarray as xr
 
 from rps_jax import score, sweep
 from rps_jax.scene import Friction
-from rps_jax.skin import CapacitiveSkin
+from rps_jax.skin import SKINS
 from rps_jax.sweep import Case, Progress, Setting, Trace
 from rps_jax.trial import Shift
 
@@ -31,7 +31,7 @@ LAYOUTS = {
 GROUND = (0.2, 0.35, 0.5, 0.65)  # [1] object-ground
 ROBOT = (0.3, 0.5, 0.7)  # [1] object-robot: polyurethane foam coated with ink
 MIDDLE = Friction(0.35, 0.5)  # of which the paths are drawn
-SKIN = CapacitiveSkin(noise=0.05, gain_spread=0.1)  # a fifth of the threshold; 10 % gains
+SKIN = SKINS["hardware"]
 SHIFT_TIME = 30.0  # [s] when the object is shifted
 SHIFTS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4)  # [m] to either side of the robot
 

@@ -198,7 +198,12 @@ class CapacitiveSkin(NamedTuple):
 
 
 # "thin" chatters between the corners of a box, as a rigid contact sensor does.
-SKINS = {"ideal": IdealSkin(), "thin": IdealSkin(tolerance=0.001), "capacitive": CapacitiveSkin()}
+SKINS = {
+    "ideal": IdealSkin(),
+    "thin": IdealSkin(tolerance=0.001),
+    "capacitive": CapacitiveSkin(),
+    "hardware": CapacitiveSkin(noise=0.05, gain_spread=0.1),  # noise a fifth of the threshold
+}
 
 
 def _check_half_length(value: Any) -> None:

@@ -109,11 +109,6 @@ class Trace:
     timing: Timing  # of all trials followed together
 
 
-def _scene_key(case: Case) -> Hashable:
-    """What `scene_of` depends on."""
-    return case.object, case.friction, case.mass, case.rear, float(case.skin.half_length)
-
-
 def scene_of(case: Case, physics: Physics) -> Scene:
     """The scene that a case is run in."""
     return scene.load(
@@ -126,11 +121,13 @@ def scene_of(case: Case, physics: Physics) -> Scene:
     )
 
 
-def _distinct(keys: Sequence[Hashable]) -> tuple[list[int], np.ndarray]:
-    """Index of the first of each distinct key, and which of these every key is, (len(keys),)."""
-    order = {key: i for i, key in enumerate(dict.fromkeys(keys))}
-    which = np.array([order[key] for key in keys])
-    return [int(np.argmax(which == i)) for i in range(len(order))], which
+def _scenes(cases: Sequence[Case], physics: Physics) -> tuple[list[Scene], np.ndarray]:
+    """The different scenes of cases, and which of them each case has, (len(cases),)."""
+    keys = [(c.object, c.friction, c.mass, c.rear, float(c.skin.half_length)) for c in cases]
+    different = dict(zip(keys, cases, strict=True))
+    order = {key: i for i, key in enumerate(different)}
+    scenes = [scene_of(case, physics) for case in different.values()]
+    return scenes, np.array([order[key] for key in keys])
 
 
 def _start_of(case: Case, at: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -153,8 +150,7 @@ def build(
     Each world draws its skin's imperfections from (setting.seed, its index); by default the
     indices count from 0.
     """
-    first, which = _distinct([_scene_key(case) for case in cases])
-    scenes = [scene_of(cases[i], setting.physics) for i in first]
+    scenes, which = _scenes(cases, setting.physics)
     model, fields = scene.stack([s.physics for s in scenes])
     starts = [_start_of(case, scenes[i]) for case, i in zip(cases, which, strict=True)]
     dtype = model.qpos0.dtype
@@ -301,26 +297,27 @@ def _run_in_mjx(
     cases: Sequence[Case], setting: Setting, slots: int, count: int, shared: _Shared
 ) -> None:
     queues = [_Queue(indices, cases, setting, slots) for indices in _by_kind(cases)]
-    with ThreadPoolExecutor(count) as pool:
-        jobs = [
-            pool.submit(_work, queues[w % len(queues) :] + queues, shared) for w in range(count)
-        ]
-        try:
-            for job in as_completed(jobs):
-                job.result()
-        except BaseException:
-            shared.stop = True
-            raise
+    orders = [queues[w % len(queues) :] + queues for w in range(count)]
+    _side_by_side([partial(_work, order, shared) for order in orders], count, shared)
 
 
 def _run_in_c(cases: Sequence[Case], setting: Setting, threads: int, shared: _Shared) -> None:
     kinds = _by_kind(cases)
-    at_once = min(threads, len(kinds))
-    with ThreadPoolExecutor(at_once) as pool:
-        jobs = [
-            pool.submit(_run_kind_in_c, indices, cases, setting, threads // at_once, shared)
+    count = min(threads, len(kinds))
+    _side_by_side(
+        [
+            partial(_run_kind_in_c, indices, cases, setting, threads // count, shared)
             for indices in kinds
-        ]
+        ],
+        count,
+        shared,
+    )
+
+
+def _side_by_side(tasks: Sequence[Callable[[], None]], count: int, shared: _Shared) -> None:
+    """Run tasks on `count` threads; the first that fails stops the others."""
+    with ThreadPoolExecutor(count) as pool:
+        jobs = [pool.submit(task) for task in tasks]
         try:
             for job in as_completed(jobs):
                 job.result()
@@ -335,8 +332,7 @@ def _run_kind_in_c(
     mine = [cases[i] for i in indices]
     strategy = trial.STRATEGIES[type(mine[0].params)]
     _, worlds = build(mine, setting, indices)
-    first, which = _distinct([_scene_key(case) for case in mine])
-    models = [scene_of(mine[i], setting.physics).physics for i in first]
+    scenes, which = _scenes(mine, setting.physics)
 
     def tell(ended: np.ndarray, trials: Trial, simulated: float) -> bool:
         outcomes = jax.device_get(trial.outcome(trials, setting.physics.control_period))
@@ -344,7 +340,7 @@ def _run_kind_in_c(
         return not shared.stop
 
     reference.run(
-        [models[i] for i in which],
+        [scenes[i].physics for i in which],
         worlds,
         physics=setting.physics,
         rules=setting.rules,

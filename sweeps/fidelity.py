@@ -13,7 +13,7 @@ from pathlib import Path
 import tyro
 from tqdm import tqdm
 
-from rps_jax import errors, fidelity, paper, record, study
+from rps_jax import errors, fidelity, paper, record, score, study
 from rps_jax.cli import StudyOptions, guarded, progress_bar
 
 
@@ -36,7 +36,7 @@ def main(options: Options) -> None:
     names = tuple(dict.fromkeys([fidelity.REFERENCE, *options.conditions]))
     grid = study.Grid(strategies=paper.STRATEGIES, targets=options.targets())
     out = options.open()
-    with progress_bar(fidelity.trials(names, grid)) as report:
+    with progress_bar(len(names) * grid.size) as report:
         results = fidelity.run(names, grid, out, **options.shape(), report=report)
     costs = {}
     if options.cost_worlds:
@@ -45,8 +45,9 @@ def main(options: Options) -> None:
             by_family = fidelity.cost(condition.setting, options.cost_worlds)
             costs[name] = sum(by_family.values()) / len(by_family)
     record.write_results(out / "results.nc", results)
-    record.write_text(out / "fidelity.md", fidelity.markdown(results, costs) + "\n")
-    print((out / "fidelity.md").read_text())
+    text = score.markdown(fidelity.table(results, costs))
+    record.write_text(out / "fidelity.md", text + "\n")
+    print(text)
 
 
 if __name__ == "__main__":
