@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import paper, study, sweep, trial
-from rps_jax.scene import physics
+from rps_jax.scene import Physics, physics
 from rps_jax.study import Condition, Grid
 from rps_jax.sweep import Case, Progress, Setting
 from rps_jax.trial import Rules
@@ -36,6 +36,10 @@ def _c(what: str, **changes: Any) -> Condition:
 
 def _mjx(what: str, **changes: Any) -> Condition:
     return Condition(what, Setting(physics=replace(_STANDARD, **changes)))
+
+
+def _fused(what: str, physics: Physics) -> Condition:
+    return Condition(what, Setting(physics=physics, engine="fused"))
 
 
 # C MuJoCo, converged: what the physics does to the outcome.
@@ -76,8 +80,17 @@ IN_MJX = {
         "MJX `paper_gazebo`, its pyramid", Setting(physics=physics("paper_gazebo"))
     ),
 }
-CONDITIONS = IN_C | IN_MJX
-QUICK = (REFERENCE, "c_10ms", "standard", "fast")
+# The same equations in `rps_jax.fused`, float32.
+IN_FUSED = {
+    "fused_standard": _fused("fused, `standard`", _STANDARD),
+    "fused_fast": _fused("fused, `fast`", physics(fidelity="fast")),
+    "fused_5ms": _fused("fused, 5 ms", replace(_STANDARD, timestep=0.005)),
+    "fused_pyramidal": _fused(
+        "fused, 5 ms, pyramidal", replace(_STANDARD, timestep=0.005, cone="pyramidal")
+    ),
+}
+CONDITIONS = IN_C | IN_MJX | IN_FUSED
+QUICK = (REFERENCE, "standard", "fused_standard", "fused_fast")
 
 
 def run(

@@ -30,7 +30,7 @@ from rps_jax import (
 from rps_jax.report import Section, write_report
 from rps_jax.scene import FRICTION
 from rps_jax.study import Condition, Grid
-from rps_jax.sweep import Case, Progress, Setting
+from rps_jax.sweep import Case, Engine, Progress, Setting
 
 _FIG_6 = Case("box", FRICTION["S1"], (-2.0, 0.0))
 
@@ -39,6 +39,7 @@ _FIG_6 = Case("box", FRICTION["S1"], (-2.0, 0.0))
 class Plan:
     """How much to run."""
 
+    engine: Engine = "mjx"  # of Table II, Fig. 6 and the hardware experiments
     targets: tuple[tuple[float, float], ...] = paper.TARGETS  # of the studies; Table II has all
     fidelity: tuple[str, ...] = tuple(fidelity.CONDITIONS)
     readings: tuple[str, ...] = tuple(ambiguity.READINGS)
@@ -50,6 +51,7 @@ class Plan:
     def quick(cls) -> Plan:
         """Four of 24 targets and the most telling conditions, for a first look."""
         return cls(
+            engine="fused",
             targets=study.FEW_TARGETS,
             fidelity=fidelity.QUICK,
             readings=ambiguity.QUICK_READINGS,
@@ -115,8 +117,8 @@ def run(
     progress = _Progress(report)
     sections = [
         *_setup(out),
-        *_table_ii(out, progress, shape),
-        *_one_trial(out),
+        *_table_ii(out, plan, progress, shape),
+        *_one_trial(out, plan),
         *_hardware(out, plan, progress, shape),
         *_fidelity(out, plan, progress, shape),
         *_gazebo(out, plan, progress, shape),
@@ -183,11 +185,12 @@ def _objects(out: Path) -> list[Section]:
     return [Section("Fig. 4: the objects", "", (), path)]
 
 
-def _table_ii(out: Path, progress: _Progress, shape: dict[str, Any]) -> list[Section]:
-    standard = {"standard": fidelity.CONDITIONS["standard"]}
+def _table_ii(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any]) -> list[Section]:
+    name = {"mjx": "standard", "fused": "fused_standard"}[plan.engine]
+    standard = {name: fidelity.CONDITIONS[name]}
     grid = Grid(strategies=paper.STRATEGIES)
     results = study.run(standard, grid, _folder(out, "trials"), **shape, report=progress.part())
-    results = results.sel(condition="standard")
+    results = results.sel(condition=name)
     picture = figures.min_distance(results, out / "min_distance.png")
     text = "  \n".join(score.summary(results).splitlines())
     return [
@@ -196,10 +199,10 @@ def _table_ii(out: Path, progress: _Progress, shape: dict[str, Any]) -> list[Sec
     ]
 
 
-def _one_trial(out: Path) -> list[Section]:
+def _one_trial(out: Path, plan: Plan) -> list[Section]:
     picture, file = out / "trial.png", out / "trial.nc"
     if not (picture.exists() and file.exists()):
-        (trace,) = sweep.follow([_FIG_6], Setting())
+        (trace,) = sweep.follow([_FIG_6], Setting(engine=plan.engine))
         figures.one_trial(_FIG_6, trace, picture)
         record.write_results(file, score.trace_dataset(trace))
     seen = record.read(file)
@@ -210,7 +213,7 @@ def _one_trial(out: Path) -> list[Section]:
 
 def _hardware(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any]) -> list[Section]:
     base = Case("hardware_box", hardware.MIDDLE, (2.1, 0.0), skin=hardware.SKIN)
-    setting = Setting()
+    setting = Setting(engine=plan.engine)
     each = len(hardware.OBJECTS) * len(hardware.LAYOUTS["circle"])
     results = _kept(
         out / "hardware.nc",

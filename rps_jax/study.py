@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 import xarray as xr
 from scipy import stats
@@ -21,7 +22,8 @@ from rps_jax.errors import InputError
 from rps_jax.scene import FRICTION, Friction
 from rps_jax.sweep import Case, Progress, Setting
 
-_TOGETHER = 600  # trials run at once: more keep the cores busier, fewer lose less when killed
+# Trials run at once: more keep the device busier, fewer lose less when killed.
+_TOGETHER = {"cpu": 600, "gpu": 100_000}
 
 
 class Grid(NamedTuple):
@@ -151,7 +153,7 @@ def _chunks(
     groups: dict[Setting, list[str]] = {}
     for name in names:
         groups.setdefault(conditions[name].setting, []).append(name)
-    at_once = max(1, _TOGETHER // grid.size)
+    at_once = max(1, _TOGETHER.get(jax.default_backend(), 600) // grid.size)
     return [
         group[i : i + at_once] for group in groups.values() for i in range(0, len(group), at_once)
     ]

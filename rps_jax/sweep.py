@@ -17,13 +17,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import baselines, errors, law, reference, scene, skin, trial
+from rps_jax import baselines, errors, fused, law, reference, scene, skin, trial
 from rps_jax.law import RPSParams
 from rps_jax.scene import JOINTS, PHYSICS, Friction, Physics, Scene, Side, mjx
 from rps_jax.skin import IdealSkin, Skin
-from rps_jax.trial import Outcome, Params, Rules, Shift, Snapshot, Stage, Strategy, Trial, World
+from rps_jax.trial import (
+    Fused,
+    Outcome,
+    Params,
+    Rules,
+    Shift,
+    Snapshot,
+    Stage,
+    Strategy,
+    Trial,
+    World,
+)
 
-Engine = Literal["mjx", "mujoco"]
+Engine = Literal["mjx", "fused", "mujoco"]
 _SEGMENT = 10.0  # [s] simulated between two looks at which trials have ended
 
 
@@ -144,20 +155,20 @@ def _start_of(case: Case, at: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 def build(
     cases: Sequence[Case], setting: Setting, indices: Sequence[int] | None = None
-) -> tuple[Stage, World]:
+) -> tuple[Stage | Fused, World]:
     """Worlds of cases of one kind (see `kind`), stacked on the host: leaves (len(cases), ...).
 
     Each world draws its skin's imperfections from (setting.seed, its index); by default the
     indices count from 0.
     """
     scenes, which = _scenes(cases, setting.physics)
-    model, fields = scene.stack([s.physics for s in scenes])
+    stage, fields = _stage(scenes, setting)
     starts = [_start_of(case, scenes[i]) for case, i in zip(cases, which, strict=True)]
-    dtype = model.qpos0.dtype
+    dtype = jnp.zeros(()).dtype
     numbers = np.arange(len(cases)) if indices is None else np.asarray(indices)
     root = jax.random.PRNGKey(setting.seed)
     world = World(
-        fields=_rows(jax.device_get(fields), which),
+        fields=_rows(fields, which),
         footprint=_stack([s.footprint for s in scenes], dtype, which),
         skin=_stack([case.skin for case in cases], dtype),
         params=_stack([case.params for case in cases], dtype),
@@ -169,7 +180,18 @@ def build(
         qpos=_stack([qpos for qpos, _ in starts], dtype),
         key=jax.device_get(jax.vmap(partial(jax.random.fold_in, root))(numbers)),
     )
-    return Stage(model, mjx.make_data(scenes[0].physics)), world
+    return stage, world
+
+
+def _stage(scenes: list[Scene], setting: Setting) -> tuple[Stage | Fused, Any]:
+    """What an engine steps: shared by all worlds, and the fields of each scene."""
+    if setting.engine == "mujoco":
+        return Fused(), {}
+    if setting.engine == "fused":
+        bodies = [fused.body(s.physics, np.asarray(s.footprint.vertices)) for s in scenes]
+        return Fused(), _stack(bodies, jnp.zeros(()).dtype)
+    model, fields = scene.stack([s.physics for s in scenes])
+    return Stage(model, mjx.make_data(scenes[0].physics)), jax.device_get(fields)
 
 
 def kind(case: Case) -> tuple[str, type, type]:
@@ -250,8 +272,10 @@ class _Queue:
             return self._program
 
 
-def default_slots() -> int:
+def default_slots(engine: Engine = "mjx") -> int:
     """Worlds stepped at once: few on a processor (small caches), many on an accelerator."""
+    if engine == "fused":
+        return 64 if jax.default_backend() == "cpu" else 65536
     return 24 if jax.default_backend() == "cpu" else 8192
 
 
@@ -277,7 +301,7 @@ def run(
     Returns:
       Outcomes as numpy arrays (len(cases), ...), in the order of `cases`; and the timing.
     """
-    slots = slots or default_slots()
+    slots = slots or default_slots(setting.engine)
     workers = workers or default_workers()
     errors.check_finite("slots", slots, at_least=1)
     errors.check_finite("workers", workers, at_least=1)
@@ -433,8 +457,11 @@ def follow(
 ) -> list[Trace]:
     """Run trials of one kind to their ends and keep what they looked like every `interval` [s].
 
-    The engine is MJX, whatever the setting says.
+    Raises:
+      InputError: the engine is `mujoco`, which is not followed.
     """
+    if setting.engine == "mujoco":
+        raise errors.InputError("engine = mujoco is not allowed: follow a trial with mjx or fused.")
     period = setting.physics.control_period
     every = max(1, round(interval / period))
     steps = every * max(1, round(_SEGMENT / (every * period)))

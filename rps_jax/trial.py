@@ -1,8 +1,8 @@
 """One pushing trial: sense -> decide -> step, until the paper's success rule says stop.
 
-`control_step` is a pure function of one world. `advance` and `record` jit it over a batch of
-worlds of one shape family; a world that has ended is frozen, and a batch whose worlds have all
-ended stops.
+`decide` and `settle` are pure functions of one world; between them an engine drives the batch.
+`advance` and `record` jit that for a batch of worlds of one shape family; a world that has ended
+is frozen, and a batch whose worlds have all ended stops.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax import baselines, errors, frames, law, scene
+from rps_jax import baselines, errors, frames, fused, law, scene
 from rps_jax import footprint as fp
 from rps_jax.baselines import APSParams, APSState, TrackedObservation
+from rps_jax.contacts import Body
 from rps_jax.footprint import Footprint
 from rps_jax.law import Details, Observation, RPSParams, RPSState, Twist
 from rps_jax.scene import JOINTS, Physics, mjx
@@ -54,10 +55,14 @@ class Rules(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """What all worlds of a batch share."""
+    """What all worlds of a batch that MJX steps share."""
 
     model: mjx.Model
     data: mjx.Data  # a blank to be filled with each world's state
+
+
+class Fused(NamedTuple):
+    """Worlds stepped by `rps_jax.fused` share nothing."""
 
 
 class Shift(NamedTuple):
@@ -70,7 +75,7 @@ class Shift(NamedTuple):
 class World(NamedTuple):
     """What makes one world; every leaf is batched."""
 
-    fields: dict[str, jax.Array]  # of the model, as named by `scene.stack`
+    fields: dict[str, jax.Array] | Body  # of the model, as named by `scene.stack`; or for `Fused`
     footprint: Footprint
     skin: Skin
     params: Params
@@ -177,14 +182,25 @@ def sense(world: World, trial: Trial, period: float) -> tuple[SkinState, Reading
 
 
 def drive(
-    stage: Stage, world: World, trial: Trial, twist: Twist, substeps: int
+    stage: Stage | Fused, worlds: World, trials: Trial, twists: Twist, physics: Physics
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Step the physics for one control period: (qpos, qvel, warmstart).
+    """Step the physics of a batch for one control period: (qpos, qvel, warmstart).
 
     The base is a velocity source: before each step the commanded twist is written into its
     joint velocities, turned into the world.
     """
-    model = scene.apply(stage.model, world.fields)
+    fields = worlds.fields
+    if isinstance(stage, Stage) and isinstance(fields, dict):
+        one = partial(_drive_in_mjx, stage, substeps=physics.substeps)
+        return jax.vmap(one)(fields, trials, twists)
+    assert isinstance(fields, Body)
+    return fused.drive(fields, trials.qpos, trials.qvel, trials.warmstart, twists, physics)
+
+
+def _drive_in_mjx(
+    stage: Stage, fields: dict[str, jax.Array], trial: Trial, twist: Twist, substeps: int
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    model = scene.apply(stage.model, fields)
 
     def one(state, _):
         qpos, qvel, warmstart = state
@@ -261,18 +277,19 @@ def settle(
 
 
 def control_step(
-    stage: Stage,
-    world: World,
-    trial: Trial,
+    stage: Stage | Fused,
+    worlds: World,
+    trials: Trial,
     *,
     physics: Physics,
     rules: Rules = Rules(),
     strategy: Strategy = RPS,
 ) -> tuple[Trial, Snapshot]:
-    """One pass of the loop of one world. A world that has ended comes back as it is."""
-    told, twist, snapshot = decide(world, trial, physics=physics, rules=rules, strategy=strategy)
-    driven = drive(stage, world, told, twist, physics.substeps)
-    return settle(trial, told, *driven), snapshot
+    """One pass of the loop of a batch of worlds. One that has ended comes back as it is."""
+    think = partial(decide, physics=physics, rules=rules, strategy=strategy)
+    told, twists, snapshots = jax.vmap(think)(worlds, trials)
+    driven = drive(stage, worlds, told, twists, physics)
+    return jax.vmap(settle)(trials, told, *driven), snapshots
 
 
 def _select(condition: jax.Array, yes: Any, no: Any) -> Any:
@@ -309,7 +326,7 @@ _STATIC = ("physics", "strategy", "steps")
 
 @partial(jax.jit, static_argnames=_STATIC, donate_argnames=("trials",))
 def advance(
-    stage: Stage,
+    stage: Stage | Fused,
     worlds: World,
     trials: Trial,
     *,
@@ -327,14 +344,14 @@ def advance(
 
     def body(carry):
         count, trials = carry
-        return count + 1, jax.vmap(one)(worlds, trials)[0]
+        return count + 1, one(worlds, trials)[0]
 
     return jax.lax.while_loop(some_run, body, (0, trials))[1]
 
 
 @partial(jax.jit, static_argnames=(*_STATIC, "every"), donate_argnames=("trials",))
 def record(
-    stage: Stage,
+    stage: Stage | Fused,
     worlds: World,
     trials: Trial,
     *,
@@ -348,7 +365,7 @@ def record(
     one = partial(control_step, stage, physics=physics, rules=rules, strategy=strategy)
 
     def body(trials, _):
-        return jax.vmap(one)(worlds, trials)
+        return one(worlds, trials)
 
     def interval(trials, _):
         trials, snapshots = jax.lax.scan(body, trials, length=every)

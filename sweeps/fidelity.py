@@ -24,7 +24,7 @@ class Options(StudyOptions):
     conditions: tuple[str, ...] = tuple(fidelity.CONDITIONS)
     """Names of the settings; the reference is always among them."""
     cost_worlds: int = 0
-    """Measure the cost of every MJX setting with a batch of so many worlds; 0: do not."""
+    """Measure the cost of every setting with a batch of so many worlds, but C's; 0: do not."""
     out: Path = Path("runs/fidelity")
     """Run folder; a run that was killed is continued there."""
 
@@ -40,8 +40,10 @@ def main(options: Options) -> None:
         results = fidelity.run(names, grid, out, **options.shape(), report=report)
     costs = {}
     if options.cost_worlds:
-        in_mjx = {n: c for n, c in fidelity.IN_MJX.items() if n in names}
-        for name, condition in tqdm(in_mjx.items(), unit="setting", desc="cost"):
+        batched = {n: c for n, c in fidelity.CONDITIONS.items() if n in names}
+        for name in fidelity.IN_C:
+            batched.pop(name, None)
+        for name, condition in tqdm(batched.items(), unit="setting", desc="cost"):
             by_family = fidelity.cost(condition.setting, options.cost_worlds)
             costs[name] = sum(by_family.values()) / len(by_family)
     record.write_results(out / "results.nc", results)

@@ -1,0 +1,196 @@
+"""MuJoCo's equations for these scenes alone: one free object, on the ground, before the base.
+
+MJX solves any scene. Here the scene is known: the base is a velocity source, so only the object's
+six accelerations are unknown; it touches the ground with the corners of its lower face and the
+base along two lines. What MuJoCo computes (its soft contacts, its two cones, its Newton solver and
+Euler's rule) is written out for that in scalars, so that a compiler can keep a whole world in
+registers: `contacts.py` finds the points, `newton.py` solves.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax.experimental import pallas
+from jax.experimental.pallas import triton
+
+from rps_jax import spatial as sp
+from rps_jax.contacts import Body, State, on_base, on_ground
+from rps_jax.newton import accelerations
+from rps_jax.scene import JOINTS, Physics
+from rps_jax.spatial import Vec
+
+_BLOCK = 64  # worlds of one program of the kernel; they go on until the last has converged
+_RANKS = Body(0, 1, 1, 1, 2, 0, 0, 1, 0, 0, 0, 0, 1, 1)  # of the leaves of one world
+
+
+def body(model: mujoco.MjModel, vertices: np.ndarray) -> Body:
+    """The constants of a physics model and the vertices (N, 2) [m] of its footprint."""
+    thing, base = model.body("object"), model.body("base")
+    geom, front = model.geom("object"), model.geom("base")
+    frame = sp.matrix(thing.iquat)
+    round_ = len(vertices) == 1
+    half = geom.size[1] if round_ else geom.size[2]
+    bottom = np.column_stack([vertices, np.full(len(vertices), -half)]) + geom.pos
+    pairs = {model.pair(i).name: model.pair(i) for i in range(model.npair)}
+    return Body(
+        mass=thing.mass[0],
+        inertia=thing.inertia.copy(),
+        p_object_com=thing.ipos.copy(),
+        q_object_body=thing.iquat.copy(),
+        vertices=np.array([sp.to_body(frame, v) for v in bottom - thing.ipos]),
+        radius=geom.size[0] if round_ else 0.0,
+        height=2 * half,
+        up=np.array(sp.to_body(frame, (0.0, 0.0, 1.0))),
+        friction_ground=pairs["ground_object"].friction[0],
+        friction_robot=pairs["base_object"].friction[0],
+        invweight=model.body_invweight0[thing.id, 0],
+        base_invweight=model.body_invweight0[base.id, 0],
+        base_half=front.size[:2].copy(),
+        base_z=front.pos[2] + front.size[2] * np.array([-1.0, 1.0]),
+    )
+
+
+def _split(array: jax.Array, at: slice = slice(None)) -> Any:
+    return tuple(array[..., i] for i in range(array.shape[-1]))[at]
+
+
+def enter(body: Body, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array) -> State:
+    """The state of worlds as MuJoCo holds them: qpos (..., 10), qvel and warmstart (..., 9)."""
+    free, spin = _split(qpos, JOINTS.object), _split(qvel, slice(6, 9))
+    com, axes = _split(body.p_object_com), _split(body.q_object_body)
+    m = sp.matrix(free[3:])
+    v = sp.add(_split(qvel, slice(3, 6)), sp.to_world(m, sp.cross(spin, com)))
+    return State(
+        base=_split(qpos, JOINTS.base),
+        p=sp.add(free[:3], sp.to_world(m, com)),
+        q=sp.times(free[3:], axes),
+        v=v,
+        w=sp.to_body(sp.matrix(axes), spin),
+        a=_split(warmstart, slice(3, 6)),
+        alpha=_split(warmstart, slice(6, 9)),
+    )
+
+
+def leave(body: Body, state: State, twist: Vec) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The opposite of `enter`, after a period at `twist`: (qpos, qvel, warmstart)."""
+    com, axes = _split(body.p_object_com), _split(body.q_object_body)
+    q = sp.times(state.q, (axes[0], -axes[1], -axes[2], -axes[3]))
+    m = sp.matrix(q)
+    spin = sp.to_world(sp.matrix(axes), state.w)
+    v = sp.sub(state.v, sp.to_world(m, sp.cross(spin, com)))
+    c, s = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+    base = (c * twist[0] - s * twist[1], s * twist[0] + c * twist[1], twist[2])
+    p = sp.sub(state.p, sp.to_world(m, com))
+    still = tuple(jnp.zeros_like(x) for x in state.base)
+    return (
+        jnp.stack([*state.base, *p, *q], axis=-1),
+        jnp.stack([*base, *v, *spin], axis=-1),
+        jnp.stack([*still, *state.a, *state.alpha], axis=-1),
+    )
+
+
+def step(body: Body, state: State, twist: Vec, physics: Physics) -> State:
+    """One step of MuJoCo's semi-implicit Euler rule with the base held at `twist`.
+
+    `twist` [m/s, m/s, rad/s] is in the base's frame.
+    """
+    m = sp.matrix(state.q)
+    contacts = on_ground(body, state, m, physics)
+    contacts += on_base(body, state, m, twist, physics)
+    a, alpha = accelerations(body, state, m, contacts, physics)
+    dt = physics.timestep
+    v = sp.add(state.v, sp.scale(dt, a))
+    w = sp.add(state.w, sp.scale(dt, sp.to_body(m, alpha)))
+    angle = sp.scale(dt, w)
+    half = 0.5 * sp.norm(angle)
+    # By their series: the angles of one step are small.
+    sinc = 0.5 * (1 - half * half / 6)
+    turn = (1 - half * half / 2 + half**4 / 24, *sp.scale(sinc, angle))
+    q = sp.times(state.q, turn)
+    length = jax.lax.rsqrt(sp.dot(q, q))
+    c, s = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+    base = (
+        state.base[0] + dt * (c * twist[0] - s * twist[1]),
+        state.base[1] + dt * (s * twist[0] + c * twist[1]),
+        state.base[2] + dt * twist[2],
+    )
+    p = sp.add(state.p, sp.scale(dt, v))
+    return State(base, p, tuple(x * length for x in q), v, w, a, alpha)  # type: ignore[arg-type]
+
+
+def drive(
+    body: Body,
+    qpos: jax.Array,
+    qvel: jax.Array,
+    warmstart: jax.Array,
+    twist: Vec,
+    physics: Physics,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """One control period of a batch of worlds (B, 10), (B, 9), (B, 9) at `twist` (B,).
+
+    On an NVIDIA GPU it is one kernel; elsewhere XLA compiles it.
+    """
+    scalars = Body(*(_scalars(x, n) for x, n in zip(body, _RANKS, strict=True)))
+    state = enter(body, qpos, qvel, warmstart)
+    state = jax.lax.platform_dependent(
+        scalars,
+        state,
+        twist,
+        cuda=partial(_kernel, physics=physics),
+        default=partial(_steps, physics=physics),
+    )
+    return leave(body, state, twist)
+
+
+def _steps(scalars: Body, state: State, twist: Vec, physics: Physics) -> State:
+    return jax.lax.fori_loop(
+        0, physics.substeps, lambda _, s: step(scalars, s, twist, physics), state
+    )
+
+
+def _kernel(
+    scalars: Body, state: State, twist: Vec, physics: Physics, interpret: bool = False
+) -> State:
+    """`_steps` as one kernel, a world to a thread, which keeps its world in registers."""
+    args = (scalars, state, twist)
+    leaves, tree = jax.tree.flatten(args)
+    count = leaves[0].shape[0]
+    padded = -(-count // _BLOCK) * _BLOCK
+    leaves = [jnp.pad(x, (0, padded - count), mode="edge") for x in leaves]
+    whole, shape = pallas.BlockSpec((_BLOCK,), lambda i: (i,)), state.p[0]
+
+    def kernel(*refs):
+        values = [ref[...] for ref in refs[: len(leaves)]]
+        body, state, twist = jax.tree.unflatten(tree, values)
+        after = _steps(body, state, twist, physics)
+        for ref, value in zip(refs[len(leaves) :], jax.tree.leaves(after), strict=True):
+            ref[...] = value
+
+    out = [jax.ShapeDtypeStruct((padded,), shape.dtype) for _ in jax.tree.leaves(state)]
+    after = pallas.pallas_call(
+        kernel,
+        grid=(padded // _BLOCK,),
+        in_specs=[whole] * len(leaves),
+        out_specs=[whole] * len(out),
+        out_shape=out,
+        interpret=interpret,
+        compiler_params=triton.CompilerParams(num_warps=_BLOCK // 32),
+    )(*leaves)
+    return jax.tree.unflatten(jax.tree.structure(state), [x[:count] for x in after])
+
+
+def _scalars(leaf: Any, rank: int) -> Any:
+    """A leaf (..., n, m) as nested tuples of (...)."""
+    if rank == 0:
+        return leaf
+    axis = leaf.ndim - rank
+    return tuple(
+        _scalars(jax.lax.index_in_dim(leaf, i, axis, keepdims=False), rank - 1)
+        for i in range(leaf.shape[axis])
+    )

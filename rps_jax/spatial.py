@@ -1,0 +1,105 @@
+"""Vectors of three and rotations as tuples of scalars, for programs written out entry by entry.
+
+An entry is a number or an array; all arrays have one shape. Literal zeros and ones are folded away,
+which halves a program that has axis-aligned directions in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any
+
+import jax.numpy as jnp
+
+Vec = tuple[Any, Any, Any]
+X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+
+
+def mul(a: Any, b: Any) -> Any:
+    """A b."""
+    for x, y in ((a, b), (b, a)):
+        if isinstance(x, float) and x in (0.0, 1.0):
+            return y if x else 0.0
+    return a * b
+
+
+def plus(a: Any, b: Any) -> Any:
+    """A + b."""
+    for x, y in ((a, b), (b, a)):
+        if isinstance(x, float) and x == 0.0:
+            return y
+    return a + b
+
+
+def minus(a: Any, b: Any) -> Any:
+    """A - b."""
+    return a if isinstance(b, float) and b == 0.0 else a - b
+
+
+def add(a: Vec, b: Vec) -> Vec:
+    """Sum of vectors."""
+    return plus(a[0], b[0]), plus(a[1], b[1]), plus(a[2], b[2])
+
+
+def sub(a: Vec, b: Vec) -> Vec:
+    """Difference of vectors."""
+    return minus(a[0], b[0]), minus(a[1], b[1]), minus(a[2], b[2])
+
+
+def scale(s: Any, a: Vec) -> Vec:
+    """Multiple of a vector."""
+    return mul(s, a[0]), mul(s, a[1]), mul(s, a[2])
+
+
+def dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
+    """Inner product of any number of entries."""
+    return reduce(plus, map(mul, a, b))
+
+
+def cross(a: Vec, b: Vec) -> Vec:
+    """Cross product."""
+    return (
+        minus(mul(a[1], b[2]), mul(a[2], b[1])),
+        minus(mul(a[2], b[0]), mul(a[0], b[2])),
+        minus(mul(a[0], b[1]), mul(a[1], b[0])),
+    )
+
+
+def combine(weights: Sequence[Any], vectors: Sequence[Vec]) -> Vec:
+    """Weighted sum of vectors."""
+    return reduce(add, map(scale, weights, vectors))
+
+
+def norm(a: Sequence[Any], least: float = 1e-12) -> Any:
+    """Length, at least `least`."""
+    return jnp.sqrt(jnp.maximum(dot(a, a), least * least))
+
+
+def to_world(m: Sequence[Vec], a: Vec) -> Vec:
+    """Rotate by the matrix of rows m."""
+    return dot(m[0], a), dot(m[1], a), dot(m[2], a)
+
+
+def to_body(m: Sequence[Vec], a: Vec) -> Vec:
+    """Rotate by its transpose."""
+    x, y, z = (dot([row[j] for row in m], a) for j in range(3))
+    return x, y, z
+
+
+def matrix(q: Sequence[Any]) -> tuple[Vec, Vec, Vec]:
+    """Rows of the rotation matrix of a unit quaternion."""
+    w, x, y, z = q
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+def times(p: Sequence[Any], q: Sequence[Any]) -> tuple[Any, Any, Any, Any]:
+    """Product of quaternions, scalar first."""
+    a, u = p[0], (p[1], p[2], p[3])
+    b, v = q[0], (q[1], q[2], q[3])
+    x, y, z = add(cross(u, v), add(scale(a, v), scale(b, u)))
+    return a * b - dot(u, v), x, y, z
