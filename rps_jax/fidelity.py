@@ -20,73 +20,57 @@ import xarray as xr
 from rps_jax import paper, study, sweep, trial
 from rps_jax.scene import Physics, physics
 from rps_jax.study import Condition, Grid
-from rps_jax.sweep import Case, Progress, Setting
+from rps_jax.sweep import Case, Engine, Progress, Setting
 from rps_jax.trial import Rules
 
 REFERENCE = "reference"
 _EARLY = 5.0  # [s] after which the object's place is compared
 
-_STANDARD = physics()
-_FINE = replace(physics(fidelity="reference"), timestep=0.005)
+
+def _condition(engine: Engine, base: Physics, what: str, **changes: Any) -> Condition:
+    return Condition(what, Setting(physics=replace(base, **changes), engine=engine))
 
 
-def _c(what: str, **changes: Any) -> Condition:
-    return Condition(what, Setting(physics=replace(_FINE, **changes), engine="mujoco"))
+_c = partial(_condition, "mujoco", physics(fidelity="reference"))
+_mjx = partial(_condition, "mjx", physics())
+_fused = partial(_condition, "fused", physics())
 
-
-def _mjx(what: str, **changes: Any) -> Condition:
-    return Condition(what, Setting(physics=replace(_STANDARD, **changes)))
-
-
-def _fused(what: str, physics: Physics) -> Condition:
-    return Condition(what, Setting(physics=physics, engine="fused"))
-
-
-# C MuJoCo, converged: what the physics does to the outcome.
+# C MuJoCo, converged, at several steps.
 IN_C = {
-    REFERENCE: _c("reference: C, 1 ms, elliptic", timestep=0.001),
+    REFERENCE: _c("reference: C, 1 ms, elliptic"),
     "c_2ms": _c("C, 2 ms", timestep=0.002),
-    "c_5ms": _c("C, 5 ms"),
+    "c_5ms": _c("C, 5 ms", timestep=0.005),
     "c_10ms": _c("C, 10 ms", timestep=0.01),
     "c_20ms": _c("C, 20 ms", timestep=0.02),
-    "c_impratio_1": _c("C, 5 ms, impratio 1", impratio=1.0),
-    "c_impratio_100": _c("C, 5 ms, impratio 100", impratio=100.0),
-    "c_pyramidal": _c("C, 5 ms, pyramidal", cone="pyramidal"),
-    "c_mujocos_ground": _c(
-        "C, 5 ms, MuJoCo's own ground contact", ground_solref=(0.02, 1.0), ground_impedance=0.9
+}
+# MJX in float32, whose cost grows with its iterations.
+IN_MJX = {
+    "standard": _mjx("MJX `standard`"),
+    "fast": Condition("MJX `fast`", Setting(physics=physics(fidelity="fast"))),
+    "mjx_6_8": _mjx("MJX, 10 ms, 6/8", iterations=6, ls_iterations=8),
+    "mjx_20ms_4_6": _mjx("MJX, 20 ms, 4/6", timestep=0.02, iterations=4, ls_iterations=6),
+}
+# The same equations in `rps_jax.fused`, float32: first as they are, then what the physics does.
+IN_FUSED = {
+    "fused_standard": _fused("fused, `standard`"),
+    "fused_fast": Condition(
+        "fused, `fast`", Setting(physics=physics(fidelity="fast"), engine="fused")
+    ),
+    "fused_5ms": _fused("fused, 5 ms", timestep=0.005),
+    "fused_20ms_4_6": _fused("fused, 20 ms, 4/6", timestep=0.02, iterations=4, ls_iterations=6),
+    "impratio_1": _fused("fused, impratio 1", impratio=1.0),
+    "impratio_100": _fused("fused, impratio 100", impratio=100.0),
+    "mujocos_ground": _fused(
+        "fused, MuJoCo's own ground contact", ground_solref=(0.02, 1.0), ground_impedance=0.9
     ),
     # MuJoCo keeps time constants above two timesteps.
-    "c_stiff": _c("C, 2 ms, skin contact 5 ms (solref)", timestep=0.002, base_solref=(0.005, 1.0)),
-    "c_soft": _c("C, 5 ms, skin contact 60 ms (solref)", base_solref=(0.06, 1.0)),
-    "c_period_5ms": _c("C, 5 ms, control period 5 ms", control_period=0.005),
-    "c_period_50ms": _c("C, 5 ms, control period 50 ms", control_period=0.05),
-    "c_drive_on_loss": replace(_c("C, 5 ms, 0.05 m/s after a loss"), params={"v_lost": 0.05}),
-    "c_keep_on_loss": replace(
-        _c("C, 5 ms, last contact kept on loss"), params={"keep_contact": 1.0}
-    ),
-}
-# MJX in float32: what is lost by fewer iterations and longer steps.
-IN_MJX = {
-    "standard": Condition("MJX `standard`", Setting(physics=_STANDARD)),
-    "fast": Condition("MJX `fast`", Setting(physics=physics(fidelity="fast"))),
-    "mjx_5ms": _mjx("MJX, 5 ms, 8/10", timestep=0.005),
-    "mjx_6_8": _mjx("MJX, 10 ms, 6/8", iterations=6, ls_iterations=8),
-    "mjx_4_6": _mjx("MJX, 10 ms, 4/6", iterations=4, ls_iterations=6),
-    "mjx_loose": _mjx("MJX, 10 ms, MuJoCo's own tolerance 1e-8", tolerance=1e-8),
-    "mjx_mujocos_ground": _mjx(
-        "MJX, 10 ms, MuJoCo's own ground contact", ground_solref=(0.02, 1.0), ground_impedance=0.9
-    ),
-    "mjx_pyramidal": Condition(
-        "MJX `paper_gazebo`, its pyramid", Setting(physics=physics("paper_gazebo"))
-    ),
-}
-# The same equations in `rps_jax.fused`, float32.
-IN_FUSED = {
-    "fused_standard": _fused("fused, `standard`", _STANDARD),
-    "fused_fast": _fused("fused, `fast`", physics(fidelity="fast")),
-    "fused_5ms": _fused("fused, 5 ms", replace(_STANDARD, timestep=0.005)),
-    "fused_pyramidal": _fused(
-        "fused, 5 ms, pyramidal", replace(_STANDARD, timestep=0.005, cone="pyramidal")
+    "stiff": _fused("fused, 5 ms, skin contact 10 ms", timestep=0.005, base_solref=(0.01, 1.0)),
+    "soft": _fused("fused, skin contact 60 ms (solref)", base_solref=(0.06, 1.0)),
+    "period_10ms": _fused("fused, control period 10 ms", control_period=0.01),
+    "period_50ms": _fused("fused, control period 50 ms", control_period=0.05),
+    "drive_on_loss": replace(_fused("fused, 0.05 m/s after a loss"), params={"v_lost": 0.05}),
+    "keep_on_loss": replace(
+        _fused("fused, last contact kept on loss"), params={"keep_contact": 1.0}
     ),
 }
 CONDITIONS = IN_C | IN_MJX | IN_FUSED

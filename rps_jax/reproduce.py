@@ -39,7 +39,7 @@ _FIG_6 = Case("box", FRICTION["S1"], (-2.0, 0.0))
 class Plan:
     """How much to run."""
 
-    engine: Engine = "mjx"  # of Table II, Fig. 6 and the hardware experiments
+    engine: Engine = "mjx"  # of Table II and Fig. 6
     targets: tuple[tuple[float, float], ...] = paper.TARGETS  # of the studies; Table II has all
     fidelity: tuple[str, ...] = tuple(fidelity.CONDITIONS)
     readings: tuple[str, ...] = tuple(ambiguity.READINGS)
@@ -213,7 +213,7 @@ def _one_trial(out: Path, plan: Plan) -> list[Section]:
 
 def _hardware(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any]) -> list[Section]:
     base = Case("hardware_box", hardware.MIDDLE, (2.1, 0.0), skin=hardware.SKIN)
-    setting = Setting(engine=plan.engine)
+    setting = Setting(engine="fused")
     each = len(hardware.OBJECTS) * len(hardware.LAYOUTS["circle"])
     results = _kept(
         out / "hardware.nc",

@@ -162,7 +162,7 @@ def build(
     indices count from 0.
     """
     scenes, which = _scenes(cases, setting.physics)
-    stage, fields = _stage(scenes, setting)
+    stage, fields = stage_of(scenes, setting)
     starts = [_start_of(case, scenes[i]) for case, i in zip(cases, which, strict=True)]
     dtype = jnp.zeros(()).dtype
     numbers = np.arange(len(cases)) if indices is None else np.asarray(indices)
@@ -183,7 +183,7 @@ def build(
     return stage, world
 
 
-def _stage(scenes: list[Scene], setting: Setting) -> tuple[Stage | Fused, Any]:
+def stage_of(scenes: list[Scene], setting: Setting) -> tuple[Stage | Fused, Any]:
     """What an engine steps: shared by all worlds, and the fields of each scene."""
     if setting.engine == "mujoco":
         return Fused(), {}

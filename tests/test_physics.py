@@ -1,7 +1,7 @@
 """Physics whose answer is known by hand: a base that pushes, and objects left to themselves.
 
 Each law is derived where it is tested. The engine `mujoco` is C MuJoCo with the reference physics,
-`mjx` is MJX with the standard physics, in float32; worlds are seen every control period.
+`mjx` and `fused` have the standard physics, in float32; worlds are seen every control period.
 """
 
 import functools
@@ -21,7 +21,7 @@ from rps_jax import frames, scene, sweep, trial
 from rps_jax.reference import Batch
 from rps_jax.scene import FRICTION, OBJECTS, Friction, Physics, mjx
 from rps_jax.sweep import Case, Setting
-from rps_jax.trial import Rules, Stage, Twist
+from rps_jax.trial import Rules, Twist
 
 G = 9.81  # [m/s^2]
 MASS = {"box": 20.0, "cylinder": 25.0}  # [kg]
@@ -80,13 +80,13 @@ def starts(worlds, physics):
     qpos = np.array([scene.initial_qpos(s, w.gap, w.yaw) for s, w in pairs])
     qvel = np.zeros((len(worlds), 9))
     qvel[:, [3, 4, 8]] = [w.thrown for w in worlds]
-    return [s.physics for s in scenes], qpos, qvel, np.array([(*w.push, 0.0) for w in worlds])
+    return scenes, qpos, qvel, np.array([(*w.push, 0.0) for w in worlds])
 
 
 def in_c(worlds, physics=REFERENCE, seconds=SECONDS):
     """Films of worlds of one shape family."""
-    models, qpos, qvel, twist = starts(worlds, physics)
-    batch = Batch(models, qpos, threads=2)
+    scenes, qpos, qvel, twist = starts(worlds, physics)
+    batch = Batch([s.physics for s in scenes], qpos, threads=2)
     batch.qvel[:] = qvel
     states = [(qpos, qvel)]
     for _ in range(round(seconds / physics.control_period)):
@@ -101,23 +101,19 @@ def blank(kind, **given):
     return kind(**(dict.fromkeys(kind._fields) | given))
 
 
-def in_mjx(worlds, physics=STANDARD):
-    models, *start, twist = starts(worlds, physics)
-    model, fields = scene.stack(models)
-    stage = Stage(model, mjx.make_data(models[0]))
-    qpos, qvel, twist = (jnp.asarray(x, model.qpos0.dtype) for x in (*start, twist))
-
-    def drive(fields, twist, qpos, qvel, warmstart):
-        now = blank(trial.Trial, qpos=qpos, qvel=qvel, warmstart=warmstart)
-        world = blank(trial.World, fields=fields)
-        return trial.drive(stage, world, now, Twist(*twist), physics.substeps)
+def in_jax(worlds, physics=STANDARD, engine="mjx", seconds=SECONDS):
+    scenes, *start, twist = starts(worlds, physics)
+    stage, fields = sweep.stage_of(scenes, Setting(physics, engine=engine))
+    qpos, qvel, twist = (jnp.asarray(x, float) for x in (*start, twist))
+    batch = blank(trial.World, fields=jax.tree.map(jnp.asarray, fields))
 
     @jax.jit
     def run(*state):
         def body(state, _):
-            return jax.vmap(drive)(fields, twist, *state), state[:2]
+            now = blank(trial.Trial, qpos=state[0], qvel=state[1], warmstart=state[2])
+            return trial.drive(stage, batch, now, Twist(*twist.T), physics), state[:2]
 
-        return jax.lax.scan(body, state, length=round(SECONDS / physics.control_period) + 1)[1]
+        return jax.lax.scan(body, state, length=round(seconds / physics.control_period) + 1)[1]
 
     seen = (np.asarray(x, float).swapaxes(0, 1) for x in run(qpos, qvel, 0 * qvel))
     return [Film(*both, physics) for both in zip(*seen, strict=True)]
@@ -150,7 +146,7 @@ for yaw, direction in NEAR + FAR:
 def films(engine):
     names = [[n for n in ALL if ALL[n].name == name] for name in MASS]
     with ThreadPoolExecutor(2) as pool:  # MJX compiles both families at once
-        run = {"mjx": in_mjx, "mujoco": in_c}[engine]
+        run = in_c if engine == "mujoco" else functools.partial(in_jax, engine=engine)
         boxes, cylinders = pool.map(run, [[ALL[n] for n in some] for some in names])
     return dict(zip(names[0] + names[1], boxes + cylinders, strict=True))
 
@@ -161,10 +157,10 @@ def seen(request):
     return films(request.param)
 
 
-IN_BOTH = pytest.mark.parametrize("seen", ["mjx", "mujoco"], indirect=True)
+IN_ALL = pytest.mark.parametrize("seen", ["mjx", "fused", "mujoco"], indirect=True)
 
 
-@IN_BOTH
+@IN_ALL
 def test_a_box_pushed_through_its_centre_keeps_its_heading_and_goes_as_far_as_the_base(seen):
     film = seen["centre"]
     assert film.qpos[-1, 0] == pytest.approx(0.05 * SECONDS, abs=1e-4)
@@ -209,7 +205,7 @@ def test_an_object_left_alone_creeps_less_than_a_millimetre_in_a_minute(name):
     assert abs(film.moved[2]) < math.radians(0.1)
 
 
-@IN_BOTH
+@IN_ALL
 @pytest.mark.parametrize("name", MASS)
 def test_an_object_left_alone_creeps_less_than_half_a_millimetre_a_second(seen, name):
     """In float32 noise moves it by up to 0.2 mm/s; C MuJoCo is held to the line above."""
@@ -228,7 +224,7 @@ def loses_energy(film, name):
     return np.diff(planar).max() < 0.01 * planar[0] and total.max() < 1.001 * planar[0]
 
 
-@IN_BOTH
+@IN_ALL
 @pytest.mark.parametrize("what", ["sliding box", "diagonal box", "sliding cylinder"])
 def test_an_object_thrown_at_v_slides_v2_over_2_mu_g_and_never_gains_energy(seen, what):
     """0.5^2 / (2 x 0.3 x 9.81) = 42.5 mm.
@@ -250,12 +246,12 @@ def stops_by_the_torque_mu_m_g_c(film, name):
     assert loses_energy(film, name)
 
 
-@IN_BOTH
+@IN_ALL
 def test_a_spun_box_is_stopped_by_mu_m_g_times_half_its_diagonal(seen):
     stops_by_the_torque_mu_m_g_c(seen["spinning box"], "box")
 
 
-@IN_BOTH
+@IN_ALL
 def test_a_spun_cylinder_is_stopped_by_mu_m_g_times_its_radius(seen):
     stops_by_the_torque_mu_m_g_c(seen["spinning cylinder"], "cylinder")
 
@@ -306,7 +302,7 @@ def slip(film, push):
     return 1 - (v_y - RADIUS * omega) / push[1], -RADIUS * omega / push[1]
 
 
-@IN_BOTH
+@IN_ALL
 def test_a_cylinder_rolls_along_the_face_without_slipping(seen):
     """The base moves at (v_n, v_t) = (5, 2) cm/s, with mu_robot 0.5.
 
@@ -322,7 +318,7 @@ def test_a_cylinder_rolls_along_the_face_without_slipping(seen):
     assert 1 / 2 < rolling < 2 / 3
 
 
-@IN_BOTH
+@IN_ALL
 def test_a_cylinder_slips_along_a_slippery_face(seen):
     """With mu_robot 0.02 and c^2 = R^2 / 2 the rim moves sideways at 3 mu v_n: 85 % is slip."""
     slipping, _ = slip(seen["slipping"], ALL["slipping"].push)
@@ -359,7 +355,7 @@ def centre(twist):
     return np.array([-twist[1], twist[0]]) / twist[2]
 
 
-@IN_BOTH
+@IN_ALL
 @pytest.mark.parametrize(("yaw", "direction"), NEAR + FAR)
 def test_a_box_pushed_at_a_corner_turns_about_the_centre_that_friction_says(seen, yaw, direction):
     """A corner of the box sticks to the face, at 1 cm/s.
