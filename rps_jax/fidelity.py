@@ -6,21 +6,19 @@ the outcome, trial by trial, and the object's place after the first 5 s.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import xarray as xr
 
-from rps_jax import paper, study, sweep, trial
+from rps_jax import study
 from rps_jax.scene import Physics, physics
 from rps_jax.study import Condition, Grid
-from rps_jax.sweep import Case, Engine, Progress, Setting
+from rps_jax.sweep import Engine, Progress, Setting
 from rps_jax.trial import Rules
 
 REFERENCE = "reference"
@@ -112,11 +110,10 @@ def _early(condition: Condition) -> Condition:
     return replace(condition, setting=setting)
 
 
-def table(results: xr.Dataset, costs: Mapping[str, float] | None = None) -> list[list[str]]:
+def table(results: xr.Dataset) -> list[list[str]]:
     """Header and one row for each condition.
 
-    `costs` [s] of wall clock for a simulated second of one world, by condition, on an idle
-    device; without it, the cost while the trials ran is given.
+    The cost is wall clock for a simulated second of one world while the trials ran.
     """
     base = results.success.sel(condition=REFERENCE)
     objects = [str(o) for o in results.object.values]
@@ -130,7 +127,7 @@ def table(results: xr.Dataset, costs: Mapping[str, float] | None = None) -> list
         c = study.compare(base, one.success)
         low, high = c.equal_interval
         median, worst = np.quantile(one.early_error.values, (0.5, 0.95))
-        cost = (costs or {}).get(name, float(one.run_time) / float(one.simulated))
+        cost = float(one.run_time) / float(one.simulated)
         rows.append(
             [
                 str(one.what.values),
@@ -160,30 +157,3 @@ def by_strategy(results: xr.Dataset) -> list[list[str]]:
             shares.append(f"{100 * c.equal:.1f} % ({100 * low:.0f}-{100 * high:.0f})")
         rows.append([str(results.what.sel(condition=name).values), *shares])
     return rows
-
-
-def cost(setting: Setting, worlds: int, *, simulated: float = 2.0) -> dict[str, float]:
-    """Wall clock [s] for a simulated second of one world, by family, on this device.
-
-    A full batch of worlds is stepped in MJX while the boxes and cylinders are being pushed; the
-    fastest of three goes.
-    """
-    costs = {}
-    for name in ("box", "cylinder"):
-        cases = [
-            Case(name, study.FRICTION["S1"], paper.TARGETS[i % len(paper.TARGETS)])
-            for i in range(worlds)
-        ]
-        stage, batch = sweep.build(cases, setting)
-        batch = jax.device_put(batch)
-        steps = round(simulated / setting.physics.control_period)
-        go = partial(trial.advance, stage, batch, physics=setting.physics, steps=steps)
-        state = go(trial.start_all(batch, np.ones(worlds, bool)))
-        best = np.inf
-        for _ in range(3):
-            jax.block_until_ready(state)
-            began = time.perf_counter()
-            state = jax.block_until_ready(go(state))
-            best = min(best, time.perf_counter() - began)
-        costs[name] = best / (worlds * simulated)
-    return costs

@@ -13,7 +13,8 @@ from matplotlib import patches
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rps_jax import ambiguity, hardware, law, record, score, skin, trial
+from rps_jax import ambiguity, benchmark, hardware, law, record, score, skin, trial
+from rps_jax.benchmark import Speed
 from rps_jax.law import RPSParams
 from rps_jax.skin import NONE
 from rps_jax.sweep import Case, Trace
@@ -310,4 +311,24 @@ def agreement(names: Sequence[str], equal: np.ndarray, ends: np.ndarray, path: P
     ax.set_yticks(y, names, fontsize=8)
     ax.set_xlabel("outcomes equal to the reference's [%]")
     ax.grid(alpha=0.3, axis="x")
+    return save(figure, path)
+
+
+def throughput(speeds: Sequence[Speed], path: Path) -> Path:
+    """Simulated seconds per second over the batch, a panel for each family; C as a line."""
+    families = list(dict.fromkeys(s.family for s in speeds))
+    figure = Figure(figsize=(4.5 * len(families), 3.6), layout="constrained")
+    axes = figure.subplots(1, len(families), squeeze=False, sharey=True)[0]
+    for ax, family in zip(axes, families, strict=True):
+        mine = [s for s in speeds if s.family == family]
+        for i, name in enumerate(dict.fromkeys(s.name for s in mine)):
+            points = [(s.worlds, s.rate) for s in mine if s.name == name]
+            if name in benchmark.IN_C:
+                ax.axhline(points[0][1], color=f"C{i}", ls="--", label=name)
+            else:
+                ax.plot(*zip(*points, strict=True), marker="o", color=f"C{i}", label=name)
+        ax.set(xscale="log", yscale="log", xlabel="worlds in the batch", title=_TITLES[family])
+        ax.grid(alpha=0.3, which="both")
+    axes[0].set_ylabel("simulated s per s")
+    axes[0].legend(fontsize=8)
     return save(figure, path)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
-from tqdm import tqdm
 
 from rps_jax import errors, fidelity, paper, record, score, study
 from rps_jax.cli import StudyOptions, guarded, progress_bar
@@ -23,8 +22,6 @@ class Options(StudyOptions):
 
     conditions: tuple[str, ...] = tuple(fidelity.CONDITIONS)
     """Names of the settings; the reference is always among them."""
-    cost_worlds: int = 0
-    """Measure the cost of every setting with a batch of so many worlds, but C's; 0: do not."""
     out: Path = Path("runs/fidelity")
     """Run folder; a run that was killed is continued there."""
 
@@ -38,16 +35,8 @@ def main(options: Options) -> None:
     out = options.open()
     with progress_bar(len(names) * grid.size) as report:
         results = fidelity.run(names, grid, out, **options.shape(), report=report)
-    costs = {}
-    if options.cost_worlds:
-        batched = {n: c for n, c in fidelity.CONDITIONS.items() if n in names}
-        for name in fidelity.IN_C:
-            batched.pop(name, None)
-        for name, condition in tqdm(batched.items(), unit="setting", desc="cost"):
-            by_family = fidelity.cost(condition.setting, options.cost_worlds)
-            costs[name] = sum(by_family.values()) / len(by_family)
     record.write_results(out / "results.nc", results)
-    text = score.markdown(fidelity.table(results, costs))
+    text = score.markdown(fidelity.table(results))
     record.write_text(out / "fidelity.md", text + "\n")
     print(text)
 

@@ -1,0 +1,136 @@
+"""How fast is it? Simulated seconds in a second of wall clock, by engine, shape family and batch.
+
+Every world is being pushed while it is timed: no trial has ended, so all seconds are of use.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+
+from rps_jax import paper, reference, scene, sweep, trial
+from rps_jax.reference import Batch
+from rps_jax.scene import FRICTION, Physics, physics
+from rps_jax.sweep import Case, Setting
+from rps_jax.trial import Rules
+
+FAMILIES = ("box", "cylinder")
+_MUJOCOS_OWN = Physics(
+    timestep=0.002,
+    cone="pyramidal",
+    impratio=1.0,
+    iterations=100,
+    ls_iterations=50,
+    tolerance=1e-8,
+    ground_solref=(0.02, 1.0),
+    ground_impedance=0.9,
+)
+# What is timed: batched on JAX's device, and C MuJoCo on the processor.
+BATCHED = {
+    "fused standard": Setting(engine="fused"),
+    "fused fast": Setting(engine="fused", physics=physics(fidelity="fast")),
+    "mjx standard": Setting(),
+    "mjx fast": Setting(physics=physics(fidelity="fast")),
+    "mjx, MuJoCo's defaults": Setting(physics=_MUJOCOS_OWN),
+}
+IN_C = {"C in closed loop": "closed", "C, mj_step alone": "open"}
+NAMES = (*BATCHED, *IN_C)
+
+
+@dataclass(frozen=True)
+class Speed:
+    """One measurement."""
+
+    name: str
+    family: str
+    worlds: int
+    compile: float  # [s]
+    rate: float  # simulated s per s of wall clock
+    memory: float  # [bytes] most in use on the device; NaN where JAX does not tell
+    physics: Physics
+
+
+def _cases(family: str, count: int) -> list[Case]:
+    targets = paper.TARGETS
+    return [Case(family, FRICTION["S1"], targets[i % len(targets)]) for i in range(count)]
+
+
+def _best(action: Callable[[], Any], goes: int = 3) -> float:
+    """Least wall clock [s] of some goes."""
+    times = []
+    for _ in range(goes):
+        began = time.perf_counter()
+        action()
+        times.append(time.perf_counter() - began)
+    return min(times)
+
+
+def batched(name: str, family: str, worlds: int, simulated: float = 2.0) -> Speed:
+    """Time a full batch on JAX's default device, `simulated` [s] of each world at a time."""
+    setting = BATCHED[name]
+    stage, few = sweep.build(_cases(family, len(paper.TARGETS)), setting)
+    rows = np.arange(worlds) % len(paper.TARGETS)
+    batch = jax.device_put(jax.tree.map(lambda leaf: leaf[rows], few))
+    start = trial.start_all(batch, np.ones(worlds, bool))
+    steps = round(simulated / setting.physics.control_period)
+    began = time.perf_counter()
+    go = trial.advance.lower(stage, batch, start, physics=setting.physics, steps=steps).compile()
+    compiled = time.perf_counter() - began
+    state = [start]
+
+    def once() -> None:
+        state[0] = jax.block_until_ready(go(stage, batch, state[0]))
+
+    once()
+    best = _best(once)
+    memory = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use", np.nan)
+    return Speed(name, family, worlds, compiled, worlds * simulated / best, memory, setting.physics)
+
+
+def in_c(name: str, family: str, worlds: int = 64, simulated: float = 2.0) -> Speed:
+    """Time C MuJoCo on all cores: in the closed loop of the law, or stepping alone."""
+    physics_ = physics()
+    threads = os.cpu_count() or 1
+    setting = Setting(engine="mujoco", physics=physics_)
+    cases = _cases(family, worlds)
+    _, batch = sweep.build(cases, setting)
+    models = [scene.load(family, physics_).physics] * worlds
+    if IN_C[name] == "closed":
+        options = {"strategy": trial.RPS, "threads": threads, "report": lambda *_: True}
+        rules = Rules(horizon=simulated)
+
+        def once() -> None:
+            reference.run(models, batch, physics=physics_, rules=rules, **options)
+
+        once()  # compiles the law
+    else:
+        stepper = Batch(models, np.asarray(batch.qpos, float), threads)
+        twist = np.tile([0.05, 0.0, 0.0], (worlds, 1))
+        once = partial(
+            stepper.drive, np.arange(worlds), twist, round(simulated / physics_.timestep)
+        )
+        once()
+    return Speed(name, family, worlds, 0.0, worlds * simulated / _best(once), np.nan, physics_)
+
+
+def table(speeds: list[Speed]) -> list[list[str]]:
+    """Header and one row for each measurement, compared with C MuJoCo in closed loop."""
+    base = {s.family: s.rate for s in speeds if s.name == "C in closed loop"}
+    rows = [["what", "family", "worlds", "dt", "iterations", "compile", "simulated s/s",
+             "against C in closed loop", "peak memory"]]  # fmt: skip
+    for s in speeds:
+        memory = "" if np.isnan(s.memory) else f"{s.memory / 2**30:.2f} GiB"
+        ratio = f"{s.rate / base[s.family]:.3g}" if s.family in base else ""
+        solver = f"{s.physics.iterations}/{s.physics.ls_iterations}"
+        rows.append(
+            [s.name, s.family, f"{s.worlds}", f"{1000 * s.physics.timestep:g} ms", solver,
+             f"{s.compile:.1f} s", f"{s.rate:,.0f}", ratio, memory]
+        )  # fmt: skip
+    return rows
