@@ -94,10 +94,11 @@ def batched(name: str, family: str, worlds: int, simulated: float = 2.0) -> Spee
     return Speed(name, family, worlds, compiled, worlds * simulated / best, memory, setting.physics)
 
 
-def in_c(name: str, family: str, worlds: int = 64, simulated: float = 2.0) -> Speed:
+def in_c(name: str, family: str, simulated: float = 2.0) -> Speed:
     """Time C MuJoCo on all cores: in the closed loop of the law, or stepping alone."""
     physics_ = physics()
     threads = os.cpu_count() or 1
+    worlds = 64 * threads
     setting = Setting(engine="mujoco", physics=physics_)
     cases = _cases(family, worlds)
     _, batch = sweep.build(cases, setting)
