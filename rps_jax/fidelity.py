@@ -37,6 +37,7 @@ _fused = partial(_condition, "fused", physics())
 IN_C = {
     REFERENCE: _c("reference: C, 1 ms, elliptic"),
     "c_2ms": _c("C, 2 ms", timestep=0.002),
+    "c_5ms": _c("C, 5 ms", timestep=0.005),
     "c_10ms": _c("C, 10 ms", timestep=0.01),
     "c_20ms": _c("C, 20 ms", timestep=0.02),
 }

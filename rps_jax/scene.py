@@ -116,8 +116,9 @@ _PYRAMID = Physics(timestep=0.001, cone="pyramidal", iterations=20, ls_iteration
 PHYSICS = {
     "default": {
         "reference": _EXACT,
-        "standard": Physics(),
-        "fast": Physics(timestep=0.02, iterations=6, ls_iterations=8),
+        # Share of the 432 outcomes equal to the reference's in C (`rps paper`):
+        "standard": Physics(),  # MJX 98.1 %, fused 100 %
+        "fast": Physics(timestep=0.02, iterations=6, ls_iterations=8),  # MJX 95.8 %, fused 100 %
     },
     "paper_gazebo": {
         "reference": replace(_EXACT, cone="pyramidal"),

@@ -216,7 +216,7 @@ def test_the_fused_engine_lets_nothing_creep_in_float32(name):
 @IN_ALL
 @pytest.mark.parametrize("name", MASS)
 def test_an_object_left_alone_creeps_less_than_half_a_millimetre_a_second(seen, name):
-    """In MJX noise of float32 moves it by up to 0.2 mm/s; the others are held to the lines above."""
+    """In MJX noise of float32 moves it by up to 0.2 mm/s; the others are held to more above."""
     assert seen[f"resting {name}"].way < 0.5e-3 * SECONDS
 
 
