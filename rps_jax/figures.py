@@ -262,11 +262,12 @@ def tolerance_curve(curve: xr.Dataset, trials: int, path: Path) -> Path:
     axes = figure.subplots(2, columns, squeeze=False, sharex=True, sharey="row")
     x = curve.tolerance.values
     for (above, below), loss in zip(axes.T, map(str, curve.loss.values), strict=True):
-        for name in map(str, curve.object.values):
+        for i, name in enumerate(map(str, curve.object.values)):
             one = curve.sel(loss=loss, object=name)
             style = {"color": _OBJECT_COLOURS[name], "label": _TITLES[name]}
-            _rates(above, x, one.won.values, np.full(len(x), trials), **style)
-            below.plot(x, one.lost.values, "o-", ms=4, lw=1.2, **style)
+            beside = x + 0.15 * (i - 1)  # where curves coincide
+            _rates(above, beside, one.won.values, np.full(len(x), trials), **style)
+            below.plot(beside, one.lost.values, "o-", ms=4, lw=1.2, **style)
         above.set_title(f"on loss: {ambiguity.ON_LOSS[loss][0]}", fontsize=9)
         above.set_ylim(-3, 103)
         below.set_xlabel("skin tolerance [mm]")

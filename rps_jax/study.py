@@ -105,7 +105,6 @@ def run(
             # Shared by all that ran together.
             share = grid.size / len(cases)
             results.attrs = {
-                "what": conditions[name].what,
                 "run_as": _fingerprint(conditions[name], grid),
                 "run_time": timing.run * share,
                 "simulated": timing.simulated * share,
@@ -117,10 +116,10 @@ def run(
         [results.drop_attrs(deep=False) for results in done.values()],
         xr.DataArray(list(done), dims="condition", name="condition"),
     )
-    for attribute in ("what", "run_time", "simulated"):
+    for attribute in ("run_time", "simulated"):
         values = [results.attrs[attribute] for results in done.values()]
         whole = whole.assign_coords({attribute: ("condition", values)})
-    return whole
+    return whole.assign_coords(what=("condition", [conditions[name].what for name in done]))
 
 
 def _fingerprint(condition: Condition, grid: Grid) -> str:
