@@ -11,7 +11,7 @@ Reference: MuJoCo documentation, "Computation: Constraint model" and "Solver".
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -117,9 +117,9 @@ def accelerations(
     Newton's method with an exact line search, from the last accelerations.
     """
     i_w = _spin(body, m)
-    spin = tuple(x * i for x, i in zip(state.w, body.inertia, strict=True))
-    torque = sp.cross(spin, state.w)  # - w x (I w)
-    free = sp.to_world(m, tuple(x / i for x, i in zip(torque, body.inertia, strict=True)))
+    i, w = body.inertia, state.w
+    torque = sp.cross((i[0] * w[0], i[1] * w[1], i[2] * w[2]), w)  # - w x (I w)
+    free = sp.to_world(m, (torque[0] / i[0], torque[1] / i[1], torque[2] / i[2]))
 
     def gauss(a: Vec, alpha: Vec) -> tuple[Vec, Vec]:
         """M (a - free accelerations)."""
@@ -129,16 +129,14 @@ def accelerations(
     def gradient(a: Vec, alpha: Vec):
         linear, angular = gauss(a, alpha)
         h: list[list[Any]] = [[0.0] * 6 for _ in range(6)]
-        for i in range(3):
-            h[i][i] = body.mass
-            for j in range(i + 1):
-                h[3 + i][3 + j] = i_w[i][j]
+        for row in range(3):
+            h[row][row] = body.mass
+            for column in range(row + 1):
+                h[3 + row][3 + column] = i_w[row][column]
         for c in contacts:
             x = sp.add(_rows(c, a, alpha), c.bias)
             force, k = _law(c, x, physics)
-            f = sp.add(
-                sp.add(sp.scale(force[0], c.n), sp.scale(force[1], c.t)), sp.scale(force[2], c.s)
-            )
+            f = sp.combine(force, (c.n, c.t, c.s))
             linear = sp.sub(linear, f)
             angular = sp.sub(angular, sp.cross(c.r, f))
             _stiffen(h, c, k)
@@ -148,18 +146,14 @@ def accelerations(
         count, a, alpha, _ = carry
         g, h = gradient(a, alpha)
         step = _solve(h, [-x for x in g])
-        d, delta = tuple(step[:3]), tuple(step[3:])
+        d, delta = (step[0], step[1], step[2]), (step[3], step[4], step[5])
         x = _line_search(contacts, a, alpha, d, delta, gauss, body.mass, i_w, physics)
         # An inner product of step and gradient: twice what a quadratic cost would gain.
         gain = -sp.dot(step, g)
         going = gain > 2 * body.mass * _ENOUGH**2
         move = jnp.where(going, x, jnp.minimum(x, 1.0))
-        return (
-            count + 1,
-            sp.add(a, sp.scale(move, d)),
-            sp.add(alpha, sp.scale(move, delta)),
-            _some(going),
-        )
+        a, alpha = sp.add(a, sp.scale(move, d)), sp.add(alpha, sp.scale(move, delta))
+        return count + 1, a, alpha, _some(going)
 
     start = (0, state.a, state.alpha, _some(body.mass > 0))
     _, a, alpha, _ = jax.lax.while_loop(
@@ -199,8 +193,18 @@ def _stiffen(h: list[list[Any]], c: Contact, k: tuple[Any, ...]) -> None:
             h[3 + i][3 + j] = sp.plus(h[3 + i][3 + j], row[j])
 
 
-def _line_search(contacts, a, alpha, d, delta, gauss, mass, i_w, physics: Physics) -> Any:
-    """How far along (d, delta) the cost is least."""
+def _line_search(
+    contacts: list[Contact],
+    a: Vec,
+    alpha: Vec,
+    d: Vec,
+    delta: Vec,
+    gauss: Callable[[Vec, Vec], tuple[Vec, Vec]],
+    mass: Any,
+    i_w: list[Vec],
+    physics: Physics,
+) -> Any:
+    """How far from (a, alpha) along (d, delta) the cost is least: Newton's method, bracketed."""
     linear, angular = gauss(a, alpha)
     slope = sp.dot(linear, d) + sp.dot(angular, delta)
     bend = mass * sp.dot(d, d) + sp.dot(delta, sp.to_world(i_w, delta))
