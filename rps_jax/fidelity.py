@@ -66,7 +66,7 @@ IN_FUSED = {
     ),
 }
 CONDITIONS = IN_C | IN_MJX | IN_FUSED
-QUICK = (REFERENCE, "standard", "fused_standard", "fused_fast")
+QUICK = (REFERENCE, "fused_standard", "fused_fast")
 
 
 def run(
