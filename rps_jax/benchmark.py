@@ -15,9 +15,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from rps_jax import paper, reference, scene, sweep, trial
+from rps_jax import paper, reference, sweep, trial
 from rps_jax.reference import Batch
-from rps_jax.scene import FRICTION, Physics, physics
+from rps_jax.scene import FRICTION, MUJOCOS_GROUND, Physics, physics
 from rps_jax.sweep import Case, Setting
 from rps_jax.trial import Rules
 
@@ -29,8 +29,7 @@ _MUJOCOS_OWN = Physics(
     iterations=100,
     ls_iterations=50,
     tolerance=1e-8,
-    ground_solref=(0.02, 1.0),
-    ground_impedance=0.9,
+    **MUJOCOS_GROUND,
 )
 # What is timed: batched on JAX's device, and C MuJoCo on the processor.
 BATCHED = {
@@ -101,23 +100,21 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Speed:
     worlds = 64 * threads
     setting = Setting(engine="mujoco", physics=physics_)
     cases = _cases(family, worlds)
-    _, batch = sweep.build(cases, setting)
-    models = [scene.load(family, physics_).physics] * worlds
+    stage, batch = sweep.build(cases, setting)
     if IN_C[name] == "closed":
         options = {"strategy": trial.RPS, "threads": threads, "report": lambda *_: True}
         rules = Rules(horizon=simulated)
 
         def once() -> None:
-            reference.run(models, batch, physics=physics_, rules=rules, **options)
+            reference.run(stage, batch, physics=physics_, rules=rules, **options)
 
-        once()  # compiles the law
     else:
-        stepper = Batch(models, np.asarray(batch.qpos, float), threads)
+        stepper = Batch(stage, np.asarray(batch.qpos, float), threads)
         twist = np.tile([0.05, 0.0, 0.0], (worlds, 1))
         once = partial(
             stepper.drive, np.arange(worlds), twist, round(simulated / physics_.timestep)
         )
-        once()
+    once()  # compiles the law
     return Speed(name, family, worlds, 0.0, worlds * simulated / _best(once), np.nan, physics_)
 
 

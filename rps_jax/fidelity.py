@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import study
-from rps_jax.scene import Physics, physics
+from rps_jax.scene import MUJOCOS_GROUND, Physics, physics
 from rps_jax.study import Condition, Grid
 from rps_jax.sweep import Engine, Progress, Setting
 from rps_jax.trial import Rules
@@ -55,9 +55,7 @@ IN_FUSED = {
     ),
     "fused_20ms_4_6": _fused("fused, 20 ms, 4/6", timestep=0.02, iterations=4, ls_iterations=6),
     "impratio_1": _fused("fused, impratio 1", impratio=1.0),
-    "mujocos_ground": _fused(
-        "fused, MuJoCo's own ground contact", ground_solref=(0.02, 1.0), ground_impedance=0.9
-    ),
+    "mujocos_ground": _fused("fused, MuJoCo's own ground contact", **MUJOCOS_GROUND),
     "soft": _fused("fused, skin contact 60 ms (solref)", base_solref=(0.06, 1.0)),
     "period_50ms": _fused("fused, control period 50 ms", control_period=0.05),
     "drive_on_loss": replace(_fused("fused, 0.05 m/s after a loss"), params={"v_lost": 0.05}),

@@ -109,6 +109,8 @@ class Physics:
         return round(self.control_period / self.timestep)
 
 
+# The ground contact that MuJoCo has if none is chosen.
+MUJOCOS_GROUND = {"ground_solref": (0.02, 1.0), "ground_impedance": 0.9}
 _EXACT = Physics(timestep=0.001, iterations=100, ls_iterations=50, tolerance=1e-15)
 # The pyramid needs Gazebo's own step of 1 ms: in steps of 5 ms it loses most boxes.
 _PYRAMID = Physics(timestep=0.001, cone="pyramidal", iterations=20, ls_iterations=20)

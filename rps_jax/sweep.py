@@ -155,7 +155,7 @@ def _start_of(case: Case, at: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 def build(
     cases: Sequence[Case], setting: Setting, indices: Sequence[int] | None = None
-) -> tuple[Stage | Fused, World]:
+) -> tuple[Any, World]:
     """Worlds of cases of one kind (see `kind`), stacked on the host: leaves (len(cases), ...).
 
     Each world draws its skin's imperfections from (setting.seed, its index); by default the
@@ -163,6 +163,8 @@ def build(
     """
     scenes, which = _scenes(cases, setting.physics)
     stage, fields = stage_of(scenes, setting)
+    if isinstance(stage, list):
+        stage = [stage[i] for i in which]
     starts = [_start_of(case, scenes[i]) for case, i in zip(cases, which, strict=True)]
     dtype = jnp.zeros(()).dtype
     numbers = np.arange(len(cases)) if indices is None else np.asarray(indices)
@@ -183,10 +185,13 @@ def build(
     return stage, world
 
 
-def stage_of(scenes: list[Scene], setting: Setting) -> tuple[Stage | Fused, Any]:
-    """What an engine steps: shared by all worlds, and the fields of each scene."""
+def stage_of(scenes: list[Scene], setting: Setting) -> tuple[Any, Any]:
+    """What an engine steps: shared by all worlds, and the fields of each scene.
+
+    C MuJoCo shares nothing: its models, one for each scene.
+    """
     if setting.engine == "mujoco":
-        return Fused(), {}
+        return [s.physics for s in scenes], {}
     if setting.engine == "fused":
         bodies = [fused.body(s.physics, np.asarray(s.footprint.vertices)) for s in scenes]
         return Fused(), _stack(bodies, jnp.zeros(()).dtype)
@@ -355,8 +360,7 @@ def _run_kind_in_c(
 ) -> None:
     mine = [cases[i] for i in indices]
     strategy = trial.STRATEGIES[type(mine[0].params)]
-    _, worlds = build(mine, setting, indices)
-    scenes, which = _scenes(mine, setting.physics)
+    models, worlds = build(mine, setting, indices)
 
     def tell(ended: np.ndarray, trials: Trial, simulated: float) -> bool:
         outcomes = jax.device_get(trial.outcome(trials, setting.physics.control_period))
@@ -364,7 +368,7 @@ def _run_kind_in_c(
         return not shared.stop
 
     reference.run(
-        [scenes[i].physics for i in which],
+        models,
         worlds,
         physics=setting.physics,
         rules=setting.rules,

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 from rps_jax import baselines, errors, frames, fused, law, scene
 from rps_jax import footprint as fp
 from rps_jax.baselines import APSParams, APSState, TrackedObservation
-from rps_jax.contacts import Body
 from rps_jax.footprint import Footprint
 from rps_jax.law import Details, Observation, RPSParams, RPSState, Twist
 from rps_jax.scene import JOINTS, Physics, mjx
@@ -54,17 +53,6 @@ class Rules(NamedTuple):
         errors.check_finite("max_lost", self.max_lost, at_least=0, unit="s")
 
 
-class Stage(NamedTuple):
-    """What all worlds of a batch that MJX steps share."""
-
-    model: mjx.Model
-    data: mjx.Data  # a blank to be filled with each world's state
-
-
-class Fused(NamedTuple):
-    """Worlds stepped by `rps_jax.fused` share nothing."""
-
-
 class Shift(NamedTuple):
     """The object is moved by a hand during the push, as in the paper's video."""
 
@@ -75,7 +63,7 @@ class Shift(NamedTuple):
 class World(NamedTuple):
     """What makes one world; every leaf is batched."""
 
-    fields: dict[str, jax.Array] | Body  # of the model, as named by `scene.stack`; or for `Fused`
+    fields: Any  # for its stage: of the model, as named by `scene.stack`; a `Body`
     footprint: Footprint
     skin: Skin
     params: Params
@@ -139,6 +127,9 @@ def p_world_contact(seen: Snapshot) -> jax.Array:
     return jnp.where(seen.reading.in_contact[:, None], point, jnp.nan)
 
 
+Driven = tuple[jax.Array, jax.Array, jax.Array]  # qpos, qvel, warmstart of a batch
+
+
 def start(world: World, strategy: Strategy = RPS) -> Trial:
     """The trial of a world before its first control step."""
     zero, false = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
@@ -181,38 +172,46 @@ def sense(world: World, trial: Trial, period: float) -> tuple[SkinState, Reading
     return state, reading, observation
 
 
-def drive(
-    stage: Stage | Fused, worlds: World, trials: Trial, twists: Twist, physics: Physics
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Step the physics of a batch for one control period: (qpos, qvel, warmstart).
+class Stage(NamedTuple):
+    """What all worlds of a batch that MJX steps share."""
 
-    The base is a velocity source: before each step the commanded twist is written into its
-    joint velocities, turned into the world.
-    """
-    fields = worlds.fields
-    if isinstance(stage, Stage) and isinstance(fields, dict):
-        one = partial(_drive_in_mjx, stage, substeps=physics.substeps)
-        return jax.vmap(one)(fields, trials, twists)
-    assert isinstance(fields, Body)
-    return fused.drive(fields, trials.qpos, trials.qvel, trials.warmstart, twists, physics)
+    model: mjx.Model
+    data: mjx.Data  # a blank to be filled with each world's state
+
+    def drive(self, worlds: World, trials: Trial, twists: Twist, physics: Physics) -> Driven:
+        """Step a batch for one control period.
+
+        The base is a velocity source: before each step the commanded twist is written into its
+        joint velocities, turned into the world.
+        """
+        one = partial(self._drive, substeps=physics.substeps)
+        return jax.vmap(one)(worlds.fields, trials, twists)
+
+    def _drive(
+        self, fields: dict[str, jax.Array], trial: Trial, twist: Twist, substeps: int
+    ) -> Driven:
+        model = scene.apply(self.model, fields)
+
+        def one(state, _):
+            qpos, qvel, warmstart = state
+            v_world = frames.rotate(qpos[2], jnp.stack([twist.v_x, twist.v_y]))
+            qvel = qvel.at[JOINTS.base].set(jnp.stack([*v_world, jnp.asarray(twist.omega)]))
+            data = self.data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
+            with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
+                data = mjx.step(model, data)
+            return (data.qpos, data.qvel, data.qacc_warmstart), None
+
+        state = (trial.qpos, trial.qvel, trial.warmstart)
+        return jax.lax.scan(one, state, length=substeps)[0]
 
 
-def _drive_in_mjx(
-    stage: Stage, fields: dict[str, jax.Array], trial: Trial, twist: Twist, substeps: int
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    model = scene.apply(stage.model, fields)
+class Fused(NamedTuple):
+    """Worlds stepped by `rps_jax.fused` share nothing."""
 
-    def one(state, _):
-        qpos, qvel, warmstart = state
-        v_world = frames.rotate(qpos[2], jnp.stack([twist.v_x, twist.v_y]))
-        qvel = qvel.at[JOINTS.base].set(jnp.stack([*v_world, jnp.asarray(twist.omega)]))
-        data = stage.data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
-        with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
-            data = mjx.step(model, data)
-        return (data.qpos, data.qvel, data.qacc_warmstart), None
-
-    state = (trial.qpos, trial.qvel, trial.warmstart)
-    return jax.lax.scan(one, state, length=substeps)[0]
+    def drive(self, worlds: World, trials: Trial, twists: Twist, physics: Physics) -> Driven:
+        """Step a batch for one control period."""
+        state = (trials.qpos, trials.qvel, trials.warmstart)
+        return fused.drive(worlds.fields, *state, twists, physics)
 
 
 def decide(
@@ -288,7 +287,7 @@ def control_step(
     """One pass of the loop of a batch of worlds. One that has ended comes back as it is."""
     think = partial(decide, physics=physics, rules=rules, strategy=strategy)
     told, twists, snapshots = jax.vmap(think)(worlds, trials)
-    driven = drive(stage, worlds, told, twists, physics)
+    driven = stage.drive(worlds, told, twists, physics)
     return jax.vmap(settle)(trials, told, *driven), snapshots
 
 
