@@ -158,7 +158,7 @@ class Paper(StudyOptions):
     out: Path = Path("runs/paper")
     """Run folder; a run that was killed is continued there."""
     quick: bool = False
-    """Table II in full, everything else with four of the 24 targets and fewer conditions."""
+    """Table II in full; of everything else a few conditions, RPS alone, four of 24 targets."""
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,8 @@ def accelerations(
 ) -> tuple[Vec, Vec]:
     """Linear and angular acceleration of the object: the minimum of MuJoCo's convex cost.
 
-    Newton's method with an exact line search, from the last accelerations.
+    Newton's method with an exact line search, from the last accelerations. It ends at an error of
+    `_ENOUGH`; the tolerance of `physics`, relative to the mass of the base too, is not used.
     """
     i_w = _spin(body, m)
     i, w = body.inertia, state.w
@@ -143,7 +144,7 @@ def accelerations(
         return (*linear, *angular), h
 
     def improve(carry):
-        count, a, alpha, _ = carry
+        count, a, alpha, active, _ = carry
         g, h = gradient(a, alpha)
         step = _solve(h, [-x for x in g])
         d, delta = (step[0], step[1], step[2]), (step[3], step[4], step[5])
@@ -151,20 +152,23 @@ def accelerations(
         # An inner product of step and gradient: twice what a quadratic cost would gain.
         gain = -sp.dot(step, g)
         going = gain > 2 * body.mass * _ENOUGH**2
-        move = jnp.where(going, x, jnp.minimum(x, 1.0))
+        # A world that is done stays as it is while others go on: its numbers are its own.
+        move = jnp.where(active > 0, jnp.where(going, x, jnp.minimum(x, 1.0)), 0.0)
         a, alpha = sp.add(a, sp.scale(move, d)), sp.add(alpha, sp.scale(move, delta))
-        return count + 1, a, alpha, _some(going)
+        active = jnp.where(going, active, 0.0)
+        return count + 1, a, alpha, active, _some(active)
 
-    start = (0, state.a, state.alpha, _some(body.mass > 0))
-    _, a, alpha, _ = jax.lax.while_loop(
-        lambda carry: (carry[0] < physics.iterations) & carry[3], improve, start
+    active = jnp.ones_like(body.mass)
+    start = (0, state.a, state.alpha, active, _some(active))
+    _, a, alpha, _, _ = jax.lax.while_loop(
+        lambda carry: (carry[0] < physics.iterations) & carry[4], improve, start
     )
     return a, alpha
 
 
-def _some(going: jax.Array) -> jax.Array:
-    """Whether any is true, in a form that Triton knows."""
-    return jnp.sum(going.astype(jnp.float32)) > 0
+def _some(active: jax.Array) -> jax.Array:
+    """Whether any is above zero, in a form that Triton knows."""
+    return jnp.sum(active) > 0
 
 
 def _spin(body: Body, m: Sequence[Vec]) -> list[Vec]:

@@ -40,37 +40,33 @@ class Plan:
     """How much to run."""
 
     engine: Engine = "mjx"  # of Table II and Fig. 6
-    targets: tuple[tuple[float, float], ...] = paper.TARGETS  # of the studies; Table II has all
+    # Of the studies; Table II has all.
+    targets: tuple[tuple[float, float], ...] = paper.TARGETS
+    strategies: tuple[str, ...] = paper.STRATEGIES
     fidelity: tuple[str, ...] = tuple(fidelity.CONDITIONS)
     readings: tuple[str, ...] = tuple(ambiguity.READINGS)
     gazebo: tuple[str, ...] = tuple(ambiguity.GAZEBO)
-    gazebo_strategies: tuple[str, ...] = paper.STRATEGIES
     tolerances: tuple[float, ...] = ambiguity.TOLERANCES
     shifts: tuple[float, ...] = hardware.SHIFTS
 
     @classmethod
     def quick(cls) -> Plan:
-        """Four of 24 targets and the most telling conditions, for a first look."""
+        """RPS to four of 24 targets under the most telling conditions, for a first look."""
         return cls(
             engine="fused",
             targets=study.FEW_TARGETS,
+            strategies=("rps",),
             fidelity=fidelity.QUICK,
             readings=ambiguity.QUICK_READINGS,
             gazebo=ambiguity.QUICK_GAZEBO,
-            gazebo_strategies=("rps",),  # a push at 1 ms is slow
             tolerances=ambiguity.QUICK_TOLERANCES,
             shifts=(0.1, 0.2, 0.3),
         )
 
     @property
     def all_strategies(self) -> Grid:
-        """The studies' trials of RPS, NPS and APS."""
-        return Grid(strategies=paper.STRATEGIES, targets=self.targets)
-
-    @property
-    def in_gazebo(self) -> Grid:
-        """The trials in the paper's simulator."""
-        return Grid(strategies=self.gazebo_strategies, targets=self.targets)
+        """The studies' trials of all strategies."""
+        return Grid(strategies=self.strategies, targets=self.targets)
 
     @property
     def rps_alone(self) -> Grid:
@@ -80,12 +76,11 @@ class Plan:
     def trials(self) -> int:
         """How many trials the whole plan counts."""
         table = Grid(strategies=paper.STRATEGIES).size
+        many = len(self.fidelity) + len(self.gazebo)
         few = len(self.readings) + len(ambiguity.ON_LOSS) * len(self.tolerances)
         targets = len(hardware.LAYOUTS["circle"])
         hard = len(hardware.OBJECTS) * targets * (len(hardware.frictions()) + 2 * len(self.shifts))
-        all_ = len(self.fidelity) * self.all_strategies.size
-        gazebo = len(self.gazebo) * self.in_gazebo.size
-        return table + all_ + gazebo + few * self.rps_alone.size + hard
+        return table + many * self.all_strategies.size + few * self.rps_alone.size + hard
 
 
 class _Progress:
@@ -296,7 +291,9 @@ def _fidelity(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any])
 
 
 def _gazebo(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any]) -> list[Section]:
-    results = _study(out, "gazebo", ambiguity.GAZEBO, plan.gazebo, plan.in_gazebo, progress, shape)
+    results = _study(
+        out, "gazebo", ambiguity.GAZEBO, plan.gazebo, plan.all_strategies, progress, shape
+    )
     cells = ambiguity.cells(results)
     inside = sum("yes" in row for row in cells[1:])
     rps = sum("yes" in row for row in cells[1:] if row[0].startswith("RPS"))
@@ -311,7 +308,7 @@ def _gazebo(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any]) -
             "",
             study.rows(results, ambiguity.DEFAULT, strategy),
         )
-        for strategy in plan.gazebo_strategies
+        for strategy in plan.strategies
     ]
     return [Section("Did the simulator lose the paper's trials?", text, cells), *ingredients]
 
