@@ -13,9 +13,11 @@ if TYPE_CHECKING:
     from rps_jax.errors import InputError
     from rps_jax.footprint import Footprint
     from rps_jax.law import Observation, RPSParams, RPSState, Twist, step
-    from rps_jax.scene import FRICTION, OBJECTS, PHYSICS, Friction, Physics
+    from rps_jax.physics import PHYSICS, Physics
+    from rps_jax.scene import FRICTION, OBJECTS, Friction
     from rps_jax.skin import CapacitiveSkin, IdealSkin
-    from rps_jax.sweep import Case, Setting, follow, run
+    from rps_jax.slots import Setting
+    from rps_jax.sweep import Case, follow, run
     from rps_jax.trial import Outcome, Rules
 
 __version__ = "0.1.0"
@@ -49,7 +51,8 @@ _MODULES = {
     "law": ("Observation", "RPSParams", "RPSState", "Twist", "step"),
     "scene": ("FRICTION", "OBJECTS", "PHYSICS", "Friction", "Physics"),
     "skin": ("CapacitiveSkin", "IdealSkin"),
-    "sweep": ("Case", "Setting", "follow", "run"),
+    "slots": ("Setting",),
+    "sweep": ("Case", "follow", "run"),
     "trial": ("Outcome", "Rules"),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}

@@ -15,10 +15,10 @@ import xarray as xr
 from scipy import stats
 
 from rps_jax import paper, score
-from rps_jax.scene import PHYSICS, Physics
+from rps_jax.physics import PHYSICS, Physics
 from rps_jax.skin import CapacitiveSkin, IdealSkin
+from rps_jax.slots import Setting
 from rps_jax.study import Condition
-from rps_jax.sweep import Setting
 
 DEFAULT = "default"
 _CONVERGED = replace(PHYSICS["default"]["standard"], timestep=0.005, iterations=30)

@@ -16,9 +16,11 @@ import jax
 import numpy as np
 
 from rps_jax import paper, reference, sweep, trial
+from rps_jax.physics import MUJOCOS_GROUND, Physics, preset
 from rps_jax.reference import Batch
-from rps_jax.scene import FRICTION, MUJOCOS_GROUND, Physics, physics
-from rps_jax.sweep import Case, Setting
+from rps_jax.scene import FRICTION
+from rps_jax.slots import Setting
+from rps_jax.sweep import Case
 from rps_jax.trial import Rules
 
 FAMILIES = ("box", "cylinder")
@@ -34,9 +36,9 @@ _MUJOCOS_OWN = Physics(
 # What is timed: batched on JAX's device, and C MuJoCo on the processor.
 BATCHED = {
     "fused standard": Setting(engine="fused"),
-    "fused fast": Setting(engine="fused", physics=physics(fidelity="fast")),
+    "fused fast": Setting(engine="fused", physics=preset(fidelity="fast")),
     "mjx standard": Setting(),
-    "mjx fast": Setting(physics=physics(fidelity="fast")),
+    "mjx fast": Setting(physics=preset(fidelity="fast")),
     "mjx, MuJoCo's defaults": Setting(physics=_MUJOCOS_OWN),
 }
 IN_C = {"C in closed loop": "closed", "C, mj_step alone": "open"}
@@ -95,10 +97,10 @@ def batched(name: str, family: str, worlds: int, simulated: float = 2.0) -> Spee
 
 def in_c(name: str, family: str, simulated: float = 2.0) -> Speed:
     """Time C MuJoCo on all cores: in the closed loop of the law, or stepping alone."""
-    physics_ = physics()
+    physics = preset()
     threads = os.cpu_count() or 1
     worlds = 64 * threads
-    setting = Setting(engine="mujoco", physics=physics_)
+    setting = Setting(engine="mujoco", physics=physics)
     cases = _cases(family, worlds)
     stage, batch = sweep.build(cases, setting)
     if IN_C[name] == "closed":
@@ -106,16 +108,14 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Speed:
         rules = Rules(horizon=simulated)
 
         def once() -> None:
-            reference.run(stage, batch, physics=physics_, rules=rules, **options)
+            reference.run(stage, batch, physics=physics, rules=rules, **options)
 
     else:
         stepper = Batch(stage, np.asarray(batch.qpos, float), threads)
         twist = np.tile([0.05, 0.0, 0.0], (worlds, 1))
-        once = partial(
-            stepper.drive, np.arange(worlds), twist, round(simulated / physics_.timestep)
-        )
+        once = partial(stepper.drive, np.arange(worlds), twist, round(simulated / physics.timestep))
     once()  # compiles the law
-    return Speed(name, family, worlds, 0.0, worlds * simulated / _best(once), np.nan, physics_)
+    return Speed(name, family, worlds, 0.0, worlds * simulated / _best(once), np.nan, physics)
 
 
 def table(speeds: list[Speed]) -> list[list[str]]:

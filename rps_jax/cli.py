@@ -23,7 +23,8 @@ from rps_jax.errors import InputError
 
 if TYPE_CHECKING:
     from rps_jax.scene import Friction
-    from rps_jax.sweep import Case, Progress, Setting, Timing, Trace
+    from rps_jax.slots import Progress, Setting, Timing
+    from rps_jax.sweep import Case, Trace
     from rps_jax.trial import Params
 
 
@@ -284,15 +285,16 @@ def _friction(text: str) -> Friction:
 
 
 def _setting(common: Common) -> Setting:
-    from rps_jax import scene, sweep
+    from rps_jax.physics import preset
+    from rps_jax.slots import Setting
     from rps_jax.trial import Rules
 
     steps = {"timestep": common.timestep, "control_period": common.control_period}
     physics = dataclasses.replace(
-        scene.physics(common.physics, common.fidelity),
+        preset(common.physics, common.fidelity),
         **{k: v for k, v in steps.items() if v is not None},
     )
-    return sweep.Setting(
+    return Setting(
         physics=physics,
         rules=Rules(horizon=common.horizon),
         seed=common.seed,
@@ -430,7 +432,7 @@ def _push(options: Push) -> None:
 
     with tqdm(total=options.horizon, unit="s", desc="compile", smoothing=0.05) as bar:
 
-        def report(progress: sweep.Progress) -> None:
+        def report(progress: Progress) -> None:
             bar.set_description("push", refresh=False)
             bar.update(round(progress.simulated - bar.n, 3))
 

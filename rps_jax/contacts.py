@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax import spatial as sp
-from rps_jax.scene import Physics
+from rps_jax.physics import Physics
 from rps_jax.spatial import Vec
 
 _FAR = 1e9  # [m] of what can never touch

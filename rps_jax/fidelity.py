@@ -16,9 +16,10 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import study
-from rps_jax.scene import MUJOCOS_GROUND, Physics, physics
+from rps_jax.engines import Engine
+from rps_jax.physics import MUJOCOS_GROUND, Physics, preset
+from rps_jax.slots import Progress, Setting
 from rps_jax.study import Condition, Grid
-from rps_jax.sweep import Engine, Progress, Setting
 from rps_jax.trial import Rules
 
 REFERENCE = "reference"
@@ -29,9 +30,9 @@ def _condition(engine: Engine, base: Physics, what: str, **changes: Any) -> Cond
     return Condition(what, Setting(physics=replace(base, **changes), engine=engine))
 
 
-_c = partial(_condition, "mujoco", physics(fidelity="reference"))
-_mjx = partial(_condition, "mjx", physics())
-_fused = partial(_condition, "fused", physics())
+_c = partial(_condition, "mujoco", preset(fidelity="reference"))
+_mjx = partial(_condition, "mjx", preset())
+_fused = partial(_condition, "fused", preset())
 
 # C MuJoCo, converged, at several steps.
 IN_C = {
@@ -44,14 +45,14 @@ IN_C = {
 # MJX in float32, whose cost grows with its iterations.
 IN_MJX = {
     "standard": _mjx("MJX `standard`"),
-    "fast": Condition("MJX `fast`", Setting(physics=physics(fidelity="fast"))),
+    "fast": Condition("MJX `fast`", Setting(physics=preset(fidelity="fast"))),
     "mjx_20ms_4_6": _mjx("MJX, 20 ms, 4/6", timestep=0.02, iterations=4, ls_iterations=6),
 }
 # The same equations in `rps_jax.fused`, float32: first as they are, then what the physics does.
 IN_FUSED = {
     "fused_standard": _fused("fused, `standard`"),
     "fused_fast": Condition(
-        "fused, `fast`", Setting(physics=physics(fidelity="fast"), engine="fused")
+        "fused, `fast`", Setting(physics=preset(fidelity="fast"), engine="fused")
     ),
     "fused_20ms_4_6": _fused("fused, 20 ms, 4/6", timestep=0.02, iterations=4, ls_iterations=6),
     "impratio_1": _fused("fused, impratio 1", impratio=1.0),

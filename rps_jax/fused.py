@@ -22,7 +22,8 @@ from jax.experimental.pallas import triton
 from rps_jax import spatial as sp
 from rps_jax.contacts import Body, State, on_base, on_ground
 from rps_jax.newton import accelerations
-from rps_jax.scene import JOINTS, Physics
+from rps_jax.physics import Physics
+from rps_jax.scene import JOINTS
 from rps_jax.spatial import Vec
 
 _BLOCK = 64  # worlds of one program of the kernel; they go on until the last has converged

@@ -15,7 +15,8 @@ import xarray as xr
 from rps_jax import score, sweep
 from rps_jax.scene import Friction
 from rps_jax.skin import SKINS
-from rps_jax.sweep import Case, Progress, Setting, Trace
+from rps_jax.slots import Progress, Setting
+from rps_jax.sweep import Case, Trace
 from rps_jax.trial import Shift
 
 OBJECTS = ("hardware_box", "hardware_cylinder")

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 
 from rps_jax import spatial as sp
 from rps_jax.contacts import Body, Contact, State
-from rps_jax.scene import Physics
+from rps_jax.physics import Physics
 from rps_jax.spatial import Vec
 
 GRAVITY = 9.81  # [m/s^2]

@@ -16,7 +16,8 @@ import numpy as np
 from mujoco import rollout
 
 from rps_jax import trial
-from rps_jax.scene import JOINTS, Physics
+from rps_jax.physics import Physics
+from rps_jax.scene import JOINTS
 from rps_jax.trial import Rules, Strategy, Trial, World
 
 _STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS

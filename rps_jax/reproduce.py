@@ -27,10 +27,12 @@ from rps_jax import (
     sweep,
     video,
 )
+from rps_jax.engines import Engine
 from rps_jax.report import Section, write_report
 from rps_jax.scene import FRICTION
+from rps_jax.slots import Progress, Setting
 from rps_jax.study import Condition, Grid
-from rps_jax.sweep import Case, Engine, Progress, Setting
+from rps_jax.sweep import Case
 
 _FIG_6 = Case("box", FRICTION["S1"], (-2.0, 0.0))
 

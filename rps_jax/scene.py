@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import io
 import math
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -22,6 +21,8 @@ import numpy as np
 from rps_jax import errors, skin
 from rps_jax import footprint as fp
 from rps_jax.footprint import Footprint
+from rps_jax.physics import PHYSICS, Physics
+from rps_jax.solid import Solid
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX reports on the console that warp is absent
     from mujoco import mjx
@@ -33,21 +34,21 @@ Side = Literal["near", "far"]
 SIDES = ("near", "far")
 # All that differs between objects of one shape family, as paths into an MJX model.
 FIELDS = (
-    *(f".stat.mean{name}" for name in ("inertia", "mass", "size")),
+    ".stat.meaninertia",
     *(f".body_{name}" for name in ("pos", "ipos", "iquat", "mass", "subtreemass", "inertia")),
     *(".body_invweight0", ".dof_invweight0", ".dof_M0", ".qpos0", ".qpos_spring"),
-    *(".geom_size", ".geom_aabb", ".geom_rbound", ".pair_friction"),
+    *(".geom_pos", ".geom_size", ".geom_aabb", ".geom_rbound", ".pair_friction"),
 )
 # An inertial frame off by this [m] keeps MuJoCo from compiling centred bodies to a structure of
 # their own, which could not be batched with the others.
-_OFF_CENTRE = 1e-6
+OFF_CENTRE = 1e-6
 
 
 class Friction(NamedTuple):
     """Coulomb coefficients of the two contacts."""
 
-    ground: float  # [1] object-ground
-    robot: float  # [1] object-robot
+    ground: Any  # [1] object-ground; a number, or (n,) of many worlds
+    robot: Any  # [1] object-robot
 
 
 FRICTION = {"S1": Friction(0.3, 0.35), "S2": Friction(0.2, 0.5)}  # Table I
@@ -58,91 +59,9 @@ FAMILIES = {
     "hardware_box": "box",
     "hardware_cylinder": "cylinder",
 }  # object -> shape family
+SHAPES = ("box", "cylinder", "prism")  # the families
 OBJECTS = tuple(FAMILIES)
 PAPER_OBJECTS = ("box", "cylinder", "nonuniform_box")  # Fig. 4, in the order of Table II
-
-
-@dataclass(frozen=True)
-class Physics:
-    """How the world is stepped. Static: a change compiles another program."""
-
-    timestep: float = 0.01  # [s]
-    control_period: float = 0.02  # [s] between two decisions of the law; left open by the paper
-    cone: Literal["elliptic", "pyramidal"] = "elliptic"
-    impratio: float = 10.0  # [1] friction stiffness over normal stiffness
-    iterations: int = 8  # of the Newton solver, at most; with 4 the object is lost
-    ls_iterations: int = 10  # of its line search, always done
-    # Of the solver, relative to the trace of the mass matrix: that is 3e6 by the base's armature,
-    # so MuJoCo's own 1e-8 would end the solver far from an object's solution.
-    tolerance: float = 1e-13  # [1]
-    # Time constant and damping ratio [s, 1] of the two contacts (MuJoCo's solref) and the ground's
-    # impedance [1] (its solimp). MuJoCo's cone lifts what slides; on its own ground, (0.02, 1) and
-    # 0.9, objects hop at 5 cm/s and the push force chatters by three quarters of its mean. This
-    # softer and less damped ground carries them steadily, 0.5 mm deep.
-    base_solref: tuple[float, float] = (0.02, 1.0)  # MuJoCo's own
-    ground_solref: tuple[float, float] = (0.1, 0.3)
-    ground_impedance: float = 0.7
-
-    def __post_init__(self) -> None:
-        """Raises InputError for values that MuJoCo would accept and that mean nothing."""
-        errors.check_finite("timestep", self.timestep, above=0, at_most=0.1, unit="s")
-        errors.check_finite("control_period", self.control_period, above=0, at_most=1, unit="s")
-        errors.check_finite("impratio", self.impratio, above=0)
-        errors.check_finite("iterations", self.iterations, at_least=1)
-        errors.check_finite("ls_iterations", self.ls_iterations, at_least=1)
-        errors.check_finite("tolerance", self.tolerance, at_least=0)
-        for name, solref in (("base", self.base_solref), ("ground", self.ground_solref)):
-            for what, value in zip(("time constant", "damping ratio"), solref, strict=True):
-                errors.check_finite(f"{name} contact's {what}", value, above=0)
-        errors.check_finite("ground_impedance", self.ground_impedance, above=0, at_most=0.9999)
-        errors.check_name("cone", self.cone, ("elliptic", "pyramidal"))
-        steps = self.control_period / self.timestep
-        if steps < 0.5 or not math.isclose(steps, round(steps), rel_tol=1e-6):
-            raise errors.InputError(
-                f"control_period = {self.control_period:g} s is not allowed: it must be a "
-                f"multiple of timestep = {self.timestep:g} s."
-            )
-
-    @property
-    def substeps(self) -> int:
-        """Physics steps in one control period."""
-        return round(self.control_period / self.timestep)
-
-
-# The ground contact that MuJoCo has if none is chosen.
-MUJOCOS_GROUND = {"ground_solref": (0.02, 1.0), "ground_impedance": 0.9}
-_EXACT = Physics(timestep=0.001, iterations=100, ls_iterations=50, tolerance=1e-15)
-# The pyramid needs Gazebo's own step of 1 ms: in steps of 5 ms it loses most boxes.
-_PYRAMID = Physics(timestep=0.001, cone="pyramidal", iterations=20, ls_iterations=20)
-# How the friction is modelled, and how finely that is solved: see `physics`.
-PHYSICS = {
-    "default": {
-        "reference": _EXACT,
-        # Share of the 432 outcomes equal to the reference's in C (`rps paper`):
-        "standard": Physics(),  # MJX 98.1 %, fused 100 %
-        "fast": Physics(timestep=0.02, iterations=6, ls_iterations=8),  # MJX 95.8 %, fused 100 %
-    },
-    "paper_gazebo": {
-        "reference": replace(_EXACT, cone="pyramidal"),
-        "standard": _PYRAMID,
-        "fast": _PYRAMID,
-    },
-}
-
-
-def physics(name: str = "default", fidelity: str = "standard") -> Physics:
-    """Physics by name.
-
-    Args:
-      name: `default`, isotropic Coulomb friction; `paper_gazebo`, a friction pyramid along the
-        world's axes, as in the paper's engine.
-      fidelity: `reference`, converged, for the engine `mujoco`; `standard`, for tables; `fast`.
-
-    Raises:
-      InputError: unknown name or fidelity.
-    """
-    errors.check_name("physics", name, PHYSICS)
-    return PHYSICS[name][errors.check_name("fidelity", fidelity, PHYSICS[name])]
 
 
 class Scene(NamedTuple):
@@ -202,6 +121,78 @@ def load(
     for geom in spec.geoms:
         if geom.name == "load" and rear == "far":
             geom.pos[0] = -geom.pos[0]
+    if mass is not None:
+        _set_mass(spec, mass)
+    model, stripped = _compile(spec, physics, friction, half_length)
+    return Scene(name, FAMILIES[name], model, stripped, _footprint(stripped))
+
+
+def shaped(
+    family: str,
+    one: Solid,
+    physics: Physics = PHYSICS["default"]["standard"],
+    friction: Friction = FRICTION["S1"],
+    *,
+    half_length: float = skin.HALF_LENGTH,
+) -> Scene:
+    """Compile a scene with one solid (its leaves without a leading axis) of a shape family.
+
+    Raises:
+      InputError: unknown family, or friction that is not a positive finite number.
+    """
+    errors.check_name("family", family, SHAPES)
+    check(friction, float(one.mass))
+    spec = mujoco.MjSpec.from_file(str(mjcf_folder() / f"{family}.xml"))
+    body = spec.body("object")
+    body.pos[2] = one.height / 2
+    for geom in list(body.geoms):
+        if not geom.name:
+            spec.delete(geom)  # the looks of the object that gave the family its file
+    for name, size in geom_sizes(family, one).items():
+        spec.geom(name).size[: size.size] = size
+    if family == "prism":
+        _set_corners(spec, one)
+    body.explicitinertial = True
+    body.mass, body.ipos = one.mass, one.p_object_com
+    body.iquat, body.inertia = one.q_object_body, one.inertia
+    outline = Footprint(jnp.asarray(one.vertices, float), jnp.asarray(one.radius, float))
+    return Scene(family, family, *_compile(spec, physics, friction, half_length), outline)
+
+
+def geom_sizes(family: str, solids: Solid) -> dict[str, np.ndarray]:
+    """Sizes (..., 3) [m], as MuJoCo means them, of the geoms of solids (...)."""
+    half = solids.height / 2
+    if family == "box":
+        corner = solids.vertices[..., 0, :]
+        return {"object": np.stack([corner[..., 0], corner[..., 1], half], axis=-1)}
+    if family == "cylinder":
+        size = np.stack([solids.radius, half, np.zeros_like(half)], axis=-1)
+        return {"object": size, "object_side": size}
+    return {}  # of a mesh and points
+
+
+def _set_corners(spec: mujoco.MjSpec, one: Solid) -> None:
+    """Give the mesh and the feet of a prism their places."""
+    real = np.any(one.vertices != np.roll(one.vertices, 1, axis=0), axis=1)
+    half = one.height / 2
+    spec.mesh("prism").uservert = np.concatenate(
+        [np.column_stack([one.vertices[real], np.full(real.sum(), z)]) for z in (-half, half)]
+    ).ravel()
+    for i, foot in enumerate(feet(one)):
+        spec.geom(f"foot_{i}").pos = foot
+
+
+def feet(solids: Solid) -> np.ndarray:
+    """Where prisms (...) stand, (..., N, 3) [m]; a repeated corner's foot is at the top, unused."""
+    repeated = np.all(solids.vertices == np.roll(solids.vertices, 1, axis=-2), axis=-1)
+    half = np.expand_dims(solids.height / 2, -1)
+    return np.concatenate([solids.vertices, np.where(repeated, half, -half)[..., None]], axis=-1)
+
+
+def _compile(
+    spec: mujoco.MjSpec, physics: Physics, friction: Friction, half_length: float
+) -> tuple[mujoco.MjModel, mujoco.MjModel]:
+    """The model for looking at, and the one stripped to the physics."""
     _set_length(spec, half_length)
     for pair in spec.pairs:
         if pair.name == "base_object":
@@ -209,13 +200,10 @@ def load(
         else:
             pair.solref[:] = physics.ground_solref
             pair.solimp[:2] = physics.ground_impedance
-        pair.friction[:2] = friction.ground if pair.name == "ground_object" else friction.robot
-    if mass is not None:
-        _set_mass(spec, mass)
+        pair.friction[:2] = friction.robot if pair.name == "base_object" else friction.ground
     _set_options(spec.option, physics)
     model = spec.compile()
-    stripped = _strip(spec, model)
-    return Scene(name, FAMILIES[name], model, stripped, _footprint(stripped))
+    return model, _strip(spec, model)
 
 
 def check(friction: Friction, mass: float | None) -> None:
@@ -257,6 +245,7 @@ def _strip(spec: mujoco.MjSpec, full: mujoco.MjModel) -> mujoco.MjModel:
     """Only what touches: the geoms of the contact pairs, with each body's whole inertia."""
     spec = spec.copy()
     spec.modelname = "physics"
+    spec.stat.meanmass, spec.stat.meansize = 1.0, 1.0  # unused, and so the same for all
     spec.delete(spec.body("target"))
     touching = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
     for geom in list(spec.geoms):
@@ -268,7 +257,7 @@ def _strip(spec: mujoco.MjSpec, full: mujoco.MjModel) -> mujoco.MjModel:
         body, compiled = spec.body(name), full.body(name)
         body.explicitinertial = True
         body.mass = compiled.mass[0]
-        body.ipos = compiled.ipos + _OFF_CENTRE
+        body.ipos = compiled.ipos + OFF_CENTRE
         body.iquat = compiled.iquat
         body.inertia = compiled.inertia
     model = spec.compile()
@@ -283,6 +272,21 @@ def _footprint(model: mujoco.MjModel) -> Footprint:
     if geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX:
         return fp.rectangle(half_x, half_y)
     return fp.circle(half_x)
+
+
+def solid_of(scene: Scene) -> Solid:
+    """The object of a scene as solids, one of them."""
+    thing, geom = scene.physics.body("object"), scene.physics.geom("object")
+    round_ = geom.type[0] == mujoco.mjtGeom.mjGEOM_CYLINDER
+    return Solid(
+        vertices=np.asarray(scene.footprint.vertices, float)[None],
+        radius=np.array([geom.size[0] if round_ else 0.0]),
+        height=2 * geom.size[1:2] if round_ else 2 * geom.size[2:],
+        mass=thing.mass.copy(),
+        p_object_com=thing.ipos[None].copy(),
+        inertia=thing.inertia[None].copy(),
+        q_object_body=thing.iquat[None].copy(),
+    )
 
 
 def initial_qpos(scene: Scene, gap: float = 0.02, yaw: float = 0.0) -> np.ndarray:

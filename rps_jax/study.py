@@ -20,7 +20,8 @@ from scipy import stats
 from rps_jax import paper, record, scene, score, sweep
 from rps_jax.errors import InputError
 from rps_jax.scene import FRICTION, Friction
-from rps_jax.sweep import Case, Progress, Setting
+from rps_jax.slots import Progress, Setting
+from rps_jax.sweep import Case
 
 # Trials run at once: more keep the device busier, fewer lose less when killed.
 _TOGETHER = {"cpu": 600, "gpu": 100_000}

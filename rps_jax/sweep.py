@@ -1,41 +1,26 @@
-"""Many trials: cases -> worlds -> slots on a device, each refilled as soon as its trial ends."""
+"""The trials that are asked for one by one: cases -> worlds -> outcomes, or traces over time."""
 
 from __future__ import annotations
 
 import math
-import os
-import threading
 import time
-from collections import deque
 from collections.abc import Callable, Hashable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import baselines, errors, fused, law, reference, scene, skin, trial
+from rps_jax import baselines, engines, errors, law, scene, skin, trial
 from rps_jax.law import RPSParams
-from rps_jax.scene import JOINTS, PHYSICS, Friction, Physics, Scene, Side, mjx
+from rps_jax.physics import Physics
+from rps_jax.scene import JOINTS, Friction, Scene, Side
 from rps_jax.skin import IdealSkin, Skin
-from rps_jax.trial import (
-    Fused,
-    Outcome,
-    Params,
-    Rules,
-    Shift,
-    Snapshot,
-    Stage,
-    Strategy,
-    Trial,
-    World,
-)
-
-Engine = Literal["mjx", "fused", "mujoco"]
-_SEGMENT = 10.0  # [s] simulated between two looks at which trials have ended
+from rps_jax.slots import SEGMENT, Job, Part, Progress, Setting, Timing, rows
+from rps_jax.slots import run as _run
+from rps_jax.trial import Odometry, Outcome, Params, Shift, Snapshot, World
 
 
 @dataclass(frozen=True)
@@ -76,39 +61,6 @@ class Case:
         errors.check_number("shift time", self.shift.time, at_least=0, unit="s")
         for axis, value in zip("xy", self.shift.p_robot, strict=True):
             errors.check_finite(f"shift {axis}", value, at_least=-5, at_most=5, unit="m")
-
-
-@dataclass(frozen=True)
-class Setting:
-    """What all trials of a run share."""
-
-    physics: Physics = PHYSICS["default"]["standard"]
-    rules: Rules = Rules()
-    seed: int = 0  # of the skins' imperfections
-    engine: Engine = "mjx"
-
-    def __post_init__(self) -> None:
-        """Raises InputError for rules, a seed or an engine that mean nothing."""
-        self.rules.check()
-        errors.check_finite("seed", self.seed, at_least=0, at_most=2**32 - 1)
-        errors.check_name("engine", self.engine, get_args(Engine))
-
-
-@dataclass(frozen=True)
-class Progress:
-    """A look at a running sweep."""
-
-    finished: int  # trials
-    simulated: float  # [s] summed over trials, ended or running
-
-
-@dataclass(frozen=True)
-class Timing:
-    """Where the time of a sweep went."""
-
-    compile: float  # [s] on the critical path of the first worker
-    run: float  # [s] wall clock after that
-    simulated: float  # [s] of trials
 
 
 @dataclass(frozen=True)
@@ -156,13 +108,13 @@ def _start_of(case: Case, at: Scene) -> tuple[np.ndarray, np.ndarray]:
 def build(
     cases: Sequence[Case], setting: Setting, indices: Sequence[int] | None = None
 ) -> tuple[Any, World]:
-    """Worlds of cases of one kind (see `kind`), stacked on the host: leaves (len(cases), ...).
+    """Stage and worlds of cases of one kind (see `kind`), on the host: leaves (len(cases), ...).
 
     Each world draws its skin's imperfections from (setting.seed, its index); by default the
     indices count from 0.
     """
     scenes, which = _scenes(cases, setting.physics)
-    stage, fields = stage_of(scenes, setting)
+    stage, fields = engines.stage_of_scenes(scenes, setting.engine)
     if isinstance(stage, list):
         stage = [stage[i] for i in which]
     starts = [_start_of(case, scenes[i]) for case, i in zip(cases, which, strict=True)]
@@ -170,7 +122,7 @@ def build(
     numbers = np.arange(len(cases)) if indices is None else np.asarray(indices)
     root = jax.random.PRNGKey(setting.seed)
     world = World(
-        fields=_rows(fields, which),
+        fields=rows(jax.tree.map(lambda leaf: np.asarray(leaf, dtype), fields), which),
         footprint=_stack([s.footprint for s in scenes], dtype, which),
         skin=_stack([case.skin for case in cases], dtype),
         params=_stack([case.params for case in cases], dtype),
@@ -181,22 +133,9 @@ def build(
         ),
         qpos=_stack([qpos for qpos, _ in starts], dtype),
         key=jax.device_get(jax.vmap(partial(jax.random.fold_in, root))(numbers)),
+        odometry=_stack([Odometry()] * len(cases), dtype),
     )
     return stage, world
-
-
-def stage_of(scenes: list[Scene], setting: Setting) -> tuple[Any, Any]:
-    """What an engine steps: shared by all worlds, and the fields of each scene.
-
-    C MuJoCo shares nothing: its models, one for each scene.
-    """
-    if setting.engine == "mujoco":
-        return [s.physics for s in scenes], {}
-    if setting.engine == "fused":
-        bodies = [fused.body(s.physics, np.asarray(s.footprint.vertices)) for s in scenes]
-        return Fused(), _stack(bodies, jnp.zeros(()).dtype)
-    model, fields = scene.stack([s.physics for s in scenes])
-    return Stage(model, mjx.make_data(scenes[0].physics)), jax.device_get(fields)
 
 
 def kind(case: Case) -> tuple[str, type, type]:
@@ -205,83 +144,25 @@ def kind(case: Case) -> tuple[str, type, type]:
 
 
 def _by_kind(cases: Sequence[Case]) -> list[list[int]]:
-    """Indices of the cases of each kind."""
+    """Indices of the cases of each kind.
+
+    Without reaction most trials lose the object and wait for their end: the longest go first, so
+    that the last slots to run are not theirs.
+    """
     kinds: dict[Hashable, list[int]] = {}
-    for i, case in enumerate(cases):
-        kinds.setdefault(kind(case), []).append(i)
+    for i in sorted(range(len(cases)), key=lambda i: _expected_success(cases[i])):
+        kinds.setdefault(kind(cases[i]), []).append(i)
     return list(kinds.values())
+
+
+def _expected_success(case: Case) -> float:
+    return float(case.params.reactive) if isinstance(case.params, RPSParams) else 0.0
 
 
 def _stack(trees: Sequence[Any], dtype: np.dtype, which: np.ndarray | None = None) -> Any:
     """Pytrees of floats stacked leaf by leaf, then rows taken in the order `which`."""
     stacked = jax.tree.map(lambda *leaves: np.array([np.asarray(x) for x in leaves], dtype), *trees)
-    return stacked if which is None else _rows(stacked, which)
-
-
-def _rows(tree: Any, rows: Any) -> Any:
-    """The same rows of every leaf."""
-    return jax.tree.map(lambda leaf: leaf[rows], tree)
-
-
-@partial(jax.jit, static_argnames=("strategy",), donate_argnames=("trials",))
-def _refill(worlds: World, trials: Trial, fresh: jax.Array, *, strategy: Strategy) -> Trial:
-    """Start a new trial in the slots that are `fresh` (B,)."""
-    started = trial.start_all(worlds, jnp.ones_like(fresh), strategy=strategy)
-    pick = partial(jax.vmap(lambda f, a, b: jnp.where(f, a, b)), fresh)
-    return jax.tree.map(pick, started, trials)
-
-
-class _Queue:
-    """The waiting trials of one shape family, its worlds, and its program once compiled."""
-
-    def __init__(self, indices: list[int], cases: Sequence[Case], setting: Setting, slots: int):
-        self.indices = indices
-        # Without reaction most trials lose the object and wait for their end: the longest go
-        # first, so that the last slots to run are not theirs.
-        self.waiting = deque(
-            sorted(range(len(indices)), key=lambda i: _expected_success(cases[indices[i]]))
-        )
-        self.slots = min(slots, len(indices))
-        self.setting = setting
-        mine = [cases[i] for i in indices]
-        self.strategy = trial.STRATEGIES[type(mine[0].params)]
-        self.stage, self.worlds = build(mine, setting, indices)
-        self._program = None
-        self._lock = threading.Lock()
-
-    def take(self, count: int) -> list[int]:
-        """Up to `count` waiting trials."""
-        taken = []
-        while len(taken) < count:
-            try:
-                taken.append(self.waiting.popleft())
-            except IndexError:
-                break
-        return taken
-
-    def program(self, worlds: World, trials: Trial) -> Any:
-        """The compiled `trial.advance`; the first worker to come compiles, others wait."""
-        with self._lock:
-            if self._program is None:
-                physics = self.setting.physics
-                steps = max(1, round(_SEGMENT / physics.control_period))
-                self._program = trial.advance.lower(
-                    self.stage,
-                    worlds,
-                    trials,
-                    physics=physics,
-                    rules=self.setting.rules,
-                    strategy=self.strategy,
-                    steps=steps,
-                ).compile()
-            return self._program
-
-
-def default_slots(engine: Engine = "mjx") -> int:
-    """Worlds stepped at once: few on a processor (small caches), many on an accelerator."""
-    if engine == "fused":
-        return 64 if jax.default_backend() == "cpu" else 65536
-    return 24 if jax.default_backend() == "cpu" else 8192
+    return stacked if which is None else rows(stacked, which)
 
 
 def run(
@@ -300,156 +181,27 @@ def run(
       slots: worlds stepped at once by one worker. Results are bit-identical for equal slots on
         one kind of device, whatever shares the batch.
       workers: host threads that each drive a batch of their own, or, with the engine `mujoco`,
-        that step worlds; see `default_workers`.
+        that step worlds; see `slots.default_workers`.
       report: called after every segment, from worker threads, one at a time.
 
     Returns:
       Outcomes as numpy arrays (len(cases), ...), in the order of `cases`; and the timing.
     """
-    slots = slots or default_slots(setting.engine)
-    workers = workers or default_workers()
-    errors.check_finite("slots", slots, at_least=1)
-    errors.check_finite("workers", workers, at_least=1)
-    results: list[Outcome | None] = [None] * len(cases)
-    shared = _Shared(results, report)
-    began = time.perf_counter()
-    if setting.engine == "mujoco":
-        _run_in_c(cases, setting, workers, shared)
-    else:
-        _run_in_mjx(cases, setting, slots, workers, shared)
-    total = time.perf_counter() - began
-    outcome = jax.tree.map(lambda *rows: np.stack(rows), *results)
-    return outcome, Timing(shared.compile, total - shared.compile, shared.simulated)
+    jobs = []
+    for indices in _by_kind(cases):
+        mine = [cases[i] for i in indices]
+        stage, worlds = build(mine, setting, indices)
+        part = Part(np.array(indices), worlds, stage)
+        jobs.append(Job(trial.STRATEGIES[type(mine[0].params)], len(mine), [part]))
+    order, found = [], []
 
+    def collect(numbers: np.ndarray, outcomes: Outcome) -> None:
+        order.append(numbers)
+        found.append(outcomes)
 
-def _run_in_mjx(
-    cases: Sequence[Case], setting: Setting, slots: int, count: int, shared: _Shared
-) -> None:
-    queues = [_Queue(indices, cases, setting, slots) for indices in _by_kind(cases)]
-    orders = [queues[w % len(queues) :] + queues for w in range(count)]
-    _side_by_side([partial(_work, order, shared) for order in orders], count, shared)
-
-
-def _run_in_c(cases: Sequence[Case], setting: Setting, threads: int, shared: _Shared) -> None:
-    kinds = _by_kind(cases)
-    count = min(threads, len(kinds))
-    _side_by_side(
-        [
-            partial(_run_kind_in_c, indices, cases, setting, threads // count, shared)
-            for indices in kinds
-        ],
-        count,
-        shared,
-    )
-
-
-def _side_by_side(tasks: Sequence[Callable[[], None]], count: int, shared: _Shared) -> None:
-    """Run tasks on `count` threads; the first that fails stops the others."""
-    with ThreadPoolExecutor(count) as pool:
-        jobs = [pool.submit(task) for task in tasks]
-        try:
-            for job in as_completed(jobs):
-                job.result()
-        except BaseException:
-            shared.stop = True
-            raise
-
-
-def _run_kind_in_c(
-    indices: list[int], cases: Sequence[Case], setting: Setting, threads: int, shared: _Shared
-) -> None:
-    mine = [cases[i] for i in indices]
-    strategy = trial.STRATEGIES[type(mine[0].params)]
-    models, worlds = build(mine, setting, indices)
-
-    def tell(ended: np.ndarray, trials: Trial, simulated: float) -> bool:
-        outcomes = jax.device_get(trial.outcome(trials, setting.physics.control_period))
-        shared.add({indices[i]: _rows(outcomes, i) for i in ended}, simulated)
-        return not shared.stop
-
-    reference.run(
-        models,
-        worlds,
-        physics=setting.physics,
-        rules=setting.rules,
-        strategy=strategy,
-        threads=threads,
-        report=tell,
-    )
-
-
-def _expected_success(case: Case) -> float:
-    return float(case.params.reactive) if isinstance(case.params, RPSParams) else 0.0
-
-
-def default_workers() -> int:
-    """One thread for each core of a processor, since XLA steps a small batch on one core."""
-    return os.cpu_count() or 1 if jax.default_backend() == "cpu" else 1
-
-
-class _Shared:
-    """What the workers report into."""
-
-    def __init__(self, results: list[Outcome | None], report: Callable[[Progress], Any]):
-        self.results = results
-        self.simulated = 0.0
-        self.compile = 0.0
-        self.stop = False  # set when one worker fails or the user interrupts
-        self._finished = 0
-        self._report = report
-        self._lock = threading.Lock()
-
-    def add(self, rows: dict[int, Outcome], simulated: float) -> None:
-        """Trials that ended in a segment, and the time [s] all of the worker's trials advanced."""
-        with self._lock:
-            for index, outcome in rows.items():
-                self.results[index] = outcome
-            self._finished += len(rows)
-            self.simulated += simulated
-            self._report(Progress(self._finished, self.simulated))
-
-    def compiled(self, seconds: float) -> None:
-        """One worker waited this long for a program."""
-        with self._lock:
-            self.compile = max(self.compile, seconds)
-
-
-def _work(queues: list[_Queue], shared: _Shared) -> None:
-    for queue in queues:
-        _drain(queue, shared)
-
-
-def _drain(queue: _Queue, shared: _Shared) -> None:
-    """Run the queue's trials until none waits and none of this worker's runs."""
-    taken = queue.take(queue.slots)
-    if not taken:
-        return
-    period = queue.setting.physics.control_period
-    held = np.array(taken + [0] * (queue.slots - len(taken)))  # the trial in each slot
-    live = np.arange(queue.slots) < len(taken)
-    worlds = jax.device_put(_rows(queue.worlds, held))
-    trials = trial.start_all(worlds, live, strategy=queue.strategy)
-    began = time.perf_counter()
-    program = queue.program(worlds, trials)
-    shared.compiled(time.perf_counter() - began)
-    while live.any() and not shared.stop:
-        before = np.asarray(trials.steps)
-        trials = program(queue.stage, worlds, trials, rules=queue.setting.rules)
-        steps = np.asarray(trials.steps)
-        ended = np.asarray(trials.done) & live
-        outcomes = jax.device_get(trial.outcome(trials, period)) if ended.any() else None
-        rows = {queue.indices[held[s]]: _rows(outcomes, s) for s in np.flatnonzero(ended)}
-        shared.add(rows, float((steps - before)[live].sum()) * period)
-        live &= ~ended
-        taken = queue.take(int(ended.sum()))
-        if taken:
-            fresh = np.flatnonzero(ended)[: len(taken)]
-            held[fresh] = taken
-            live[fresh] = True
-            worlds = jax.device_put(_rows(queue.worlds, held))
-            trials = _refill(
-                worlds, trials, np.isin(np.arange(queue.slots), fresh), strategy=queue.strategy
-            )
+    timing = _run(jobs, setting, slots=slots, workers=workers, collect=collect, report=report)
+    whole = jax.tree.map(lambda *parts: np.concatenate(parts), *found)
+    return rows(whole, np.argsort(np.concatenate(order))), timing
 
 
 def follow(
@@ -468,7 +220,7 @@ def follow(
         raise errors.InputError("engine = mujoco is not allowed: follow a trial with mjx or fused.")
     period = setting.physics.control_period
     every = max(1, round(interval / period))
-    steps = every * max(1, round(_SEGMENT / (every * period)))
+    steps = every * max(1, round(SEGMENT / (every * period)))
     strategy = trial.STRATEGIES[type(cases[0].params)]
     stage, worlds = build(cases, setting)
     worlds = jax.device_put(worlds)
@@ -488,6 +240,6 @@ def follow(
     outcomes = jax.device_get(trial.outcome(trials, period))
     timing = Timing(compiled - began, time.perf_counter() - compiled, float(np.sum(outcomes.time)))
     return [
-        Trace(_rows(whole, (~whole.done[:, i], i)), _rows(outcomes, i), timing)
+        Trace(rows(whole, (~whole.done[:, i], i)), rows(outcomes, i), timing)
         for i in range(len(cases))
     ]

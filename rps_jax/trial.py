@@ -13,18 +13,21 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from rps_jax import baselines, errors, frames, fused, law, scene
 from rps_jax import footprint as fp
 from rps_jax.baselines import APSParams, APSState, TrackedObservation
 from rps_jax.footprint import Footprint
 from rps_jax.law import Details, Observation, RPSParams, RPSState, Twist
-from rps_jax.scene import JOINTS, Physics, mjx
+from rps_jax.physics import Physics
+from rps_jax.scene import JOINTS, mjx
 from rps_jax.skin import Reading, Skin, SkinState
 
 # A world is a runaway beyond these, far outside anything a base at 0.05 m/s can cause.
 _MAX_SPEED = 20.0  # [m/s], [rad/s]
 _MAX_DISTANCE = 100.0  # [m]
+_ODOMETRY = 7  # of a world's key; the skin splits it into fewer
 
 
 class Strategy(NamedTuple):
@@ -60,6 +63,21 @@ class Shift(NamedTuple):
     p_robot: tuple[float, float] | jax.Array = (0.0, 0.0)  # (2,) [m] how far, in the robot frame
 
 
+class Odometry(NamedTuple):
+    """What a base gets wrong: where it believes it is, and how it does what it is told.
+
+    Ages are rounded to control steps. `past` only gives, by its shape, how many steps are
+    remembered, at least one more than the greatest age; without any the base is perfect.
+    """
+
+    pose_noise: float | jax.Array = 0.0  # () [m] standard deviation of each position reading
+    yaw_noise: float | jax.Array = 0.0  # () [rad] and of each heading reading
+    pose_latency: float | jax.Array = 0.0  # () [s] age of the pose that the law is told
+    command_delay: float | jax.Array = 0.0  # () [s] until a twist is acted upon
+    velocity_error: float | jax.Array = 0.0  # (3,) [1] of each component of the twist
+    past: Any = np.zeros(0)  # (K,)
+
+
 class World(NamedTuple):
     """What makes one world; every leaf is batched."""
 
@@ -70,7 +88,8 @@ class World(NamedTuple):
     p_world_target: jax.Array  # (2,) [m]
     shift: Shift
     qpos: jax.Array  # (10,) [m, rad] at the start
-    key: jax.Array  # of the skin's imperfections
+    key: jax.Array  # of the imperfections of skin and odometry
+    odometry: Odometry = Odometry()
 
 
 class Trial(NamedTuple):
@@ -81,6 +100,8 @@ class Trial(NamedTuple):
     warmstart: jax.Array  # (9,) [m/s^2, rad/s^2] last accelerations, for the solver
     strategy: Any  # what the strategy remembers
     skin: SkinState
+    poses: jax.Array  # (K, 3) [m, m, rad] of the base in the last steps, the latest first
+    twists: jax.Array  # (K, 3) [m/s, m/s, rad/s] commanded, likewise
     steps: jax.Array  # () int32 control steps done
     contact_steps: jax.Array  # () int32 of them in contact
     lost_steps: jax.Array  # () int32 without contact after the first touch
@@ -139,6 +160,8 @@ def start(world: World, strategy: Strategy = RPS) -> Trial:
         warmstart=jnp.zeros_like(world.qpos[:9]),
         strategy=strategy.init(world.params),
         skin=world.skin.init(world.key),
+        poses=jnp.tile(world.qpos[JOINTS.base], (*world.odometry.past.shape, 1)),
+        twists=jnp.zeros((*world.odometry.past.shape, 3), world.qpos.dtype),
         steps=zero,
         contact_steps=zero,
         lost_steps=zero,
@@ -214,6 +237,31 @@ class Fused(NamedTuple):
         return fused.drive(worlds.fields, *state, twists, physics)
 
 
+def _believed(world: World, trial: Trial, period: float) -> tuple[jax.Array, jax.Array]:
+    """The last poses (K, 3), and the pose (3,) of the base as the law is told it."""
+    now = trial.qpos[JOINTS.base]
+    if not trial.poses.shape[0]:
+        return trial.poses, now
+    poses = jnp.concatenate([now[None], trial.poses[:-1]])
+    told = poses[_age(world.odometry.pose_latency, period)]
+    key = jax.random.fold_in(jax.random.fold_in(world.key, _ODOMETRY), trial.steps)
+    sigma = jnp.stack([world.odometry.pose_noise] * 2 + [world.odometry.yaw_noise])
+    return poses, told + sigma * jax.random.normal(key, (3,), now.dtype)
+
+
+def _executed(world: World, trial: Trial, twist: Twist, period: float) -> tuple[jax.Array, Twist]:
+    """The last twists (K, 3), and the twist that the base carries out."""
+    if not trial.twists.shape[0]:
+        return trial.twists, twist
+    twists = jnp.concatenate([jnp.stack(twist)[None], trial.twists[:-1]])
+    done = twists[_age(world.odometry.command_delay, period)]
+    return twists, Twist(*(done * (1 + world.odometry.velocity_error)))
+
+
+def _age(time: Any, period: float) -> jax.Array:
+    return jnp.round(time / period).astype(jnp.int32)
+
+
 def decide(
     world: World,
     trial: Trial,
@@ -224,28 +272,33 @@ def decide(
 ) -> tuple[Trial, Twist, Snapshot]:
     """What happens between two control periods of one world: sense, judge, decide.
 
-    Returns the trial as it will be driven on, or ended; the commanded twist; and what was seen.
+    Returns the trial as it will be driven on, or ended; the twist that the base carries out; and
+    what was seen. The rules judge by where the base is, the law by where it believes to be.
     """
     period = physics.control_period
     time = trial.steps * period
     trial = _shifted(world, trial, period)
     skin, reading, observation = sense(world, trial, period)
-    seen: Any = observation
+    distance = frames.norm(law.displacement(observation))
+    poses, believed = _believed(world, trial, period)
+    seen: Any = observation._replace(p_world_robot=believed[:2], yaw=believed[2])
     if strategy.tracks:
         seen = TrackedObservation(
-            observation, object_pose(trial.qpos)[0], fp.circumradius(world.footprint), period
+            seen, object_pose(trial.qpos)[0], fp.circumradius(world.footprint), period
         )
     state, twist, details = strategy.step(world.params, trial.strategy, seen)
     snapshot = Snapshot(time, trial.qpos, reading, twist, details, trial.done)
+    twists, twist = _executed(world, trial, twist, period)
 
     touch = reading.in_contact
-    distance = frames.norm(law.displacement(observation))
     lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
     success = touch & (distance < world.params.d_success)
     over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost)
     told = trial._replace(
         strategy=state,
         skin=skin,
+        poses=poses,
+        twists=twists,
         contact_steps=trial.contact_steps + touch,
         lost_steps=lost_steps,
         sum_abs_l=trial.sum_abs_l + jnp.where(touch, jnp.abs(reading.p_robot_contact[1]), 0.0),

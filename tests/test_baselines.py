@@ -9,7 +9,8 @@ from rps_jax import baselines, errors, sweep
 from rps_jax.baselines import APSParams, APSState, TrackedObservation
 from rps_jax.law import Observation
 from rps_jax.scene import FRICTION
-from rps_jax.sweep import Case, Setting
+from rps_jax.slots import Setting
+from rps_jax.sweep import Case
 from rps_jax.trial import Rules
 
 APS = APSParams()

@@ -1,5 +1,6 @@
 """The fused engine computes what C MuJoCo computes, in one kernel as outside it."""
 
+import contextlib
 import functools
 from dataclasses import replace
 from functools import partial
@@ -11,10 +12,11 @@ import numpy as np
 import pytest
 
 from rps_jax import contacts, fused, newton, scene, spatial
+from rps_jax.physics import Physics
 from rps_jax.scene import Friction
 
 TWIST = (0.05, 0.01, 0.05)  # [m/s, m/s, rad/s]
-FINE = scene.Physics(control_period=0.01, iterations=30, ls_iterations=20)
+FINE = Physics(control_period=0.01, iterations=30, ls_iterations=20)
 # Object, yaw [rad] and lateral offset [m]: flat on the face, corner first, the base's corner first.
 STARTS = (
     ("box", 0.0, 0.0),
@@ -108,28 +110,39 @@ def some_worlds(name, physics, count=5):
 @pytest.mark.parametrize("name", ["box", "cylinder"])
 def test_the_kernel_computes_what_xla_computes(name):
     """In Pallas's interpreter; five worlds, padded to a block of 64."""
-    physics = scene.Physics(timestep=0.02, iterations=4, ls_iterations=3)
+    physics = Physics(timestep=0.02)
     scalars, state = some_worlds(name, physics)
     twist = tuple(jnp.full(5, x) for x in TWIST)
     expected = jax.jit(partial(fused._steps, physics=physics))(scalars, state, twist)
     kernel = partial(fused._kernel, physics=physics, interpret=True)
     for a, b in zip(jax.tree.leaves(jax.jit(kernel)(scalars, state, twist)),
                     jax.tree.leaves(expected), strict=True):  # fmt: skip
-        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", ["box", "cylinder"])
 def test_the_kernel_compiles_for_an_nvidia_gpu(name):
-    scalars, state = some_worlds(name, scene.Physics())
+    scalars, state = some_worlds(name, Physics())
     twist = tuple(jnp.full(5, x) for x in TWIST)
-    traced = jax.jit(partial(fused._kernel, physics=scene.Physics())).trace(scalars, state, twist)
-    assert "triton" in traced.lower(lowering_platforms=("cuda",)).as_text()
+    with as_if_there_were_a_gpu():
+        traced = jax.jit(partial(fused._kernel, physics=Physics())).trace(scalars, state, twist)
+        assert "triton" in traced.lower(lowering_platforms=("cuda",)).as_text()
+
+
+def as_if_there_were_a_gpu():
+    """Later versions of JAX ask which one; earlier ones have no name for it."""
+    if not hasattr(jax.sharding, "AbstractDevice"):
+        return contextlib.nullcontext()
+    device = jax.sharding.AbstractDevice("NVIDIA H200", None, "gpu")
+    return jax.sharding.use_abstract_mesh(
+        jax.sharding.AbstractMesh((1,), ("worlds",), abstract_device=device)
+    )
 
 
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 def test_a_contacts_force_and_stiffness_are_derivatives_of_its_cost(cone):
     """Force = - d s / d x and stiffness = d^2 s / d x^2, with MuJoCo's s in its three zones."""
-    physics = scene.Physics(cone=cone)
+    physics = Physics(cone=cone)
     d, f = 20.0, 0.4
     point = contacts.Contact(spatial.X, spatial.X, spatial.Y, spatial.Z, spatial.X, d, f)
 

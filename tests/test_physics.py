@@ -17,10 +17,12 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from rps_jax import frames, scene, sweep, trial
+from rps_jax import engines, frames, scene, sweep, trial
+from rps_jax.physics import Physics, preset
 from rps_jax.reference import Batch
-from rps_jax.scene import FRICTION, OBJECTS, Friction, Physics, mjx
-from rps_jax.sweep import Case, Setting
+from rps_jax.scene import FRICTION, OBJECTS, Friction, mjx
+from rps_jax.slots import Setting
+from rps_jax.sweep import Case
 from rps_jax.trial import Rules, Twist
 
 G = 9.81  # [m/s^2]
@@ -31,7 +33,7 @@ INERTIA = {"box": 20 * 2 * 0.4**2 / 12, "cylinder": 25 * RADIUS**2 / 2}  # [kg m
 # points on which MuJoCo stands an object are all this far from its middle.
 ARM = {"box": math.hypot(HALF, HALF), "cylinder": RADIUS}
 BASE = 1e6 + 130  # [kg] armature and mass
-STANDARD, REFERENCE = scene.physics(), scene.physics(fidelity="reference")
+STANDARD, REFERENCE = preset(), preset(fidelity="reference")
 SECONDS = 2.5
 
 
@@ -103,7 +105,7 @@ def blank(kind, **given):
 
 def in_jax(worlds, physics=STANDARD, engine="mjx", seconds=SECONDS):
     scenes, *start, twist = starts(worlds, physics)
-    stage, fields = sweep.stage_of(scenes, Setting(physics, engine=engine))
+    stage, fields = engines.stage_of_scenes(scenes, engine)
     qpos, qvel, twist = (jnp.asarray(x, float) for x in (*start, twist))
     batch = blank(trial.World, fields=jax.tree.map(jnp.asarray, fields))
 
@@ -415,7 +417,7 @@ def test_with_the_cone_a_trial_turned_by_45_degrees_ends_the_same_turned():
 
 
 def test_with_the_pyramid_a_trial_turned_by_45_degrees_ends_elsewhere_but_not_by_90():
-    ahead, diagonal, left = ends(scene.physics("paper_gazebo"), 0, 45, 90)
+    ahead, diagonal, left = ends(preset("paper_gazebo"), 0, 45, 90)
     assert np.hypot(*(diagonal - ahead)[:2]) > 0.05
     assert np.hypot(*(left - ahead)[:2]) < 0.01
 
@@ -425,5 +427,5 @@ def test_on_the_pyramid_an_object_slides_farther_along_the_diagonal_by_the_root_
     """The pyramid's edges hold mu N along the axes, and between them only mu N / sqrt(2)."""
     still = World(Friction(0.1, 0.35), gap=1.0, name=name)
     thrown = [still._replace(thrown=(*polar(0.5, degrees), 0.0)) for degrees in (0, 45)]
-    ahead, diagonal = in_c(thrown, scene.physics("paper_gazebo"))
+    ahead, diagonal = in_c(thrown, preset("paper_gazebo"))
     assert diagonal.way / ahead.way == pytest.approx(math.sqrt(2), rel=0.03)

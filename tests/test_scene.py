@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from rps_jax import errors, scene, skin
-from rps_jax.scene import FRICTION, JOINTS, OBJECTS, Physics, mjx
+from rps_jax.physics import Physics
+from rps_jax.scene import FRICTION, JOINTS, OBJECTS, mjx
 
 STEP = 0.01  # [s]
 TWIST = np.array([0.05, 0.01, 0.1])  # base x, y [m/s], yaw [rad/s] in the world

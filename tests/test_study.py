@@ -20,11 +20,13 @@ from rps_jax import (
     sweep,
 )
 from rps_jax.law import RPSParams
+from rps_jax.physics import preset
 from rps_jax.report import Section
 from rps_jax.scene import FRICTION
 from rps_jax.skin import IdealSkin
+from rps_jax.slots import Setting
 from rps_jax.study import Condition, Grid
-from rps_jax.sweep import Case, Setting
+from rps_jax.sweep import Case
 from rps_jax.trial import Rules, Shift
 
 NEAR = ((0.6, 0.0), (0.62, 0.03))
@@ -89,7 +91,7 @@ def test_mcnemars_exact_test_by_hand():
 
 
 def test_c_mujoco_driven_by_periods_matches_c_mujoco_driven_by_steps():
-    physics = scene.physics()
+    physics = preset()
     at = scene.load("box", physics)
     qpos = scene.initial_qpos(at, gap=0.001)
     twist = np.array([[0.05, 0.02, 0.1]])

@@ -7,9 +7,11 @@ import pytest
 
 from rps_jax import errors, sweep, trial
 from rps_jax.law import RPSParams
-from rps_jax.scene import FRICTION, physics
+from rps_jax.physics import preset
+from rps_jax.scene import FRICTION
 from rps_jax.skin import CapacitiveSkin, IdealSkin
-from rps_jax.sweep import Case, Setting
+from rps_jax.slots import Setting
+from rps_jax.sweep import Case
 from rps_jax.trial import Rules, Shift
 
 NEAR = (0.7, 0.0)  # [m] 0.32 m ahead of the front face
@@ -87,7 +89,7 @@ def advanced():
     """Three healthy worlds beside one whose object starts as NaN, after 0.4 s."""
     stage, worlds = world_batch(SLOTS)
     broken = worlds._replace(qpos=worlds.qpos.at[1, 4].set(jnp.nan))
-    options = {"physics": physics(), "steps": 20}
+    options = {"physics": preset(), "steps": 20}
     live = jnp.ones(SLOTS, bool)
     healthy = trial.advance(stage, worlds, trial.start_all(worlds, live), **options)
     mixed = trial.advance(stage, broken, trial.start_all(broken, live), **options)
@@ -108,7 +110,7 @@ def test_a_diverged_world_freezes_and_leaves_the_others_bit_unchanged(advanced):
 def test_padding_never_moves_and_a_finished_batch_stops_at_once():
     stage, worlds = world_batch(SLOTS)
     trials = trial.start_all(worlds, jnp.zeros(SLOTS, bool))
-    after = trial.advance(stage, worlds, trials, physics=physics(), steps=20)
+    after = trial.advance(stage, worlds, trials, physics=preset(), steps=20)
     np.testing.assert_array_equal(after.qpos, worlds.qpos)
     assert (np.asarray(after.steps) == 0).all()
 

@@ -1,0 +1,176 @@
+"""What a sweep over random worlds says: rates with intervals, differences, failures, hard worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from rps_jax import score, study
+
+# Of a sweep's results, what was drawn, and its name in words.
+DRAWN = {
+    "mass": "mass of the object",
+    "size": "half width of the object",
+    "height": "height of the object",
+    "corners": "corners of the object",
+    "com_offset": "centre of mass off the middle",
+    "friction_ground": "friction object-ground",
+    "friction_robot": "friction object-robot",
+    "distance": "distance of the target",
+    "bearing": "bearing of the target",
+    "lateral": "lateral offset",
+    "yaw": "yaw of the object",
+    "gap": "gap at the start",
+    "noise": "noise of the skin",
+    "gain_spread": "spread of the taxels' gains",
+    "dead_share": "dead taxels",
+    "pose_noise": "noise of the position",
+    "yaw_noise": "noise of the heading",
+    "pose_latency": "latency of the pose",
+    "command_delay": "delay of the command",
+    "v_x_error": "error of v_x",
+    "v_y_error": "error of v_y",
+    "omega_error": "error of omega",
+}
+FAILURES = ("never touched", "lost contact", "timeout", "diverged")
+_TAIL = 0.05  # of the worlds are the worst
+
+
+class Bins(NamedTuple):
+    """Success of one arm against one quantity."""
+
+    middle: np.ndarray  # (n,) of each bin: the median of its worlds
+    won: np.ndarray  # (n,)
+    of: np.ndarray  # (n,)
+
+
+def worlds_by_object(results: xr.Dataset) -> dict[str, np.ndarray]:
+    """Which worlds, a mask, have each object."""
+    which = results.which_object.values
+    return {str(name): which == i for i, name in enumerate(results.object.values)}
+
+
+def cvar(values: np.ndarray, tail: float = _TAIL) -> float:
+    """Mean of the worst, greatest `tail` of the values: their conditional value at risk."""
+    worst = max(1, round(tail * values.size))
+    return float(np.sort(values)[-worst:].mean())
+
+
+def left_over(one: xr.Dataset) -> np.ndarray:
+    """Least distance (worlds,) [m] of the contact to the target; never touched: the whole way."""
+    distance = one.min_distance.values.astype(float)
+    return np.where(np.isfinite(distance), distance, one.distance.values)
+
+
+def failure(one: xr.Dataset, max_lost: float) -> np.ndarray:
+    """Index into `FAILURES` (worlds,), -1 for a success."""
+    kinds = np.select(
+        [
+            one.success.values > 0,
+            one.diverged.values > 0,
+            ~np.isfinite(one.min_distance.values),
+            one.contact_lost_time.values > max_lost,
+        ],
+        [-1, FAILURES.index("diverged"), 0, FAILURES.index("lost contact")],
+        FAILURES.index("timeout"),
+    )
+    return kinds
+
+
+def rates(results: xr.Dataset, max_lost: float) -> list[list[str]]:
+    """Header and one row for each arm: success by object, distance left, time, failures."""
+    groups = worlds_by_object(results)
+    header = ["", *groups, "all", "CVaR 5 % of distance", "median time", *FAILURES]
+    rows = [header]
+    for arm in map(str, results.arm.values):
+        one = results.sel(arm=arm)
+        won = one.success.values > 0
+        kinds = failure(one, max_lost)
+        rows.append(
+            [
+                arm,
+                *(_rate(won[mask]) for mask in groups.values()),
+                _rate(won),
+                f"{cvar(left_over(one)):.2f} m",
+                f"{np.median(one.time.values[won]):.1f} s" if won.any() else "-",
+                *(str(int((kinds == i).sum())) for i in range(len(FAILURES))),
+            ]
+        )
+    return rows
+
+
+def _rate(won: np.ndarray) -> str:
+    low, high = score.wilson(int(won.sum()), won.size)
+    share = 100 * won.mean() if won.size else np.nan
+    return f"{share:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+
+
+def differences(results: xr.Dataset) -> list[list[str]]:
+    """Header and one row for each pair of arms, world by world, with McNemar's exact test."""
+    rows = [["second against first", "gained", "lost", "difference", "McNemar p"]]
+    for first, second in combinations(map(str, results.arm.values), 2):
+        a, b = results.success.sel(arm=first), results.success.sel(arm=second)
+        c = study.compare(a, b)
+        share = 100 * (c.gained - c.lost) / a.size
+        rows.append(
+            [f"{second} against {first}", str(c.gained), str(c.lost), f"{share:+.2f} %", f"{c.p:.2g}"]
+        )
+    return rows
+
+
+def hardest(results: xr.Dataset, count: int = 10) -> np.ndarray:
+    """Worlds (count,) in which most arms fail, and among these the most distance is left."""
+    arms = [results.sel(arm=arm) for arm in results.arm.values]
+    failed = sum((one.success.values == 0).astype(float) for one in arms)
+    left = np.mean([left_over(one) for one in arms], axis=0)
+    order = np.lexsort((-left, -np.asarray(failed)))
+    return order[: min(count, int((np.asarray(failed) > 0).sum()))]
+
+
+def hardest_table(results: xr.Dataset, run: str, count: int = 10) -> list[list[str]]:
+    """Header and one row for each of the hardest worlds, with the command that replays it."""
+    names = [str(name) for name in results.object.values]
+    arms = [str(arm) for arm in results.arm.values]
+    rows = [["world", "object", *arms, "mass", "friction", "target", "replay"]]
+    for world in hardest(results, count):
+        one = results.isel(world=world)
+        x = float(one.distance), float(np.degrees(one.bearing))
+        rows.append(
+            [
+                str(int(world)),
+                names[int(one.which_object)],
+                *(_told(one.sel(arm=arm)) for arm in arms),
+                f"{float(one.mass):.1f} kg",
+                f"{float(one.friction_ground):.2f}, {float(one.friction_robot):.2f}",
+                f"{x[0]:.1f} m at {x[1]:.0f} deg",
+                f"`rps replay {run} {int(world)} --arm {arms[0]!r} --video`",
+            ]
+        )
+    return rows
+
+
+def _told(trial: xr.Dataset) -> str:
+    if int(trial.success):
+        return f"{float(trial.time):.0f} s"
+    distance = float(trial.min_distance)
+    return f"fails, {100 * distance:.0f} cm off" if np.isfinite(distance) else "never touches"
+
+
+def bins(values: np.ndarray, won: np.ndarray, count: int = 8) -> Bins:
+    """Success against a quantity, in bins of equal numbers of worlds, or one for each value."""
+    known = np.isfinite(values)
+    values, won = values[known], won[known]
+    different = np.unique(values)
+    if different.size <= count:
+        groups: Sequence[np.ndarray] = [np.flatnonzero(values == v) for v in different]
+    else:
+        groups = [g for g in np.array_split(np.argsort(values, kind="stable"), count) if g.size]
+    return Bins(
+        np.array([np.median(values[g]) for g in groups]),
+        np.array([int(won[g].sum()) for g in groups]),
+        np.array([g.size for g in groups]),
+    )

@@ -1,0 +1,394 @@
+"""Many random worlds in a run folder that can be killed and continued, split and merged.
+
+The design is paired: every arm (a strategy with its parameters) meets the same worlds. Trials are
+kept in parts: a part is one file, written whole as soon as its last trial has ended, named by the
+hash of its content. A part that is there is not run again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import fcntl
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5netcdf
+import h5py
+import numpy as np
+import xarray as xr
+
+from rps_jax import domain, errors, record, slots, trial
+from rps_jax.domain import Domain
+from rps_jax.errors import InputError
+from rps_jax.physics import Physics
+from rps_jax.slots import Job, Part, Progress, Setting, Timing
+from rps_jax.trial import Outcome, Params, Rules
+
+MANIFEST = "manifest.json"
+_SHAPES = {"base_pose": (3,), "object_pose": (3,)}  # of an outcome's leaves; the others are scalars
+_TYPES = {"success": np.int8, "diverged": np.int8}  # likewise; the others are float32
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is run: every arm in the worlds 0 to `worlds` - 1 of a domain."""
+
+    domain: Domain
+    worlds: int
+    arms: Mapping[str, Params]
+    setting: Setting = Setting()  # its seed draws the worlds, too
+    part: int = 1024  # trials of a part, at most
+
+    def __post_init__(self) -> None:
+        """Raises InputError for no worlds or no arms."""
+        errors.check_finite("worlds", self.worlds, at_least=1, at_most=1e9)
+        errors.check_finite("part", self.part, at_least=1, at_most=1e6)
+        if not self.arms:
+            raise InputError("arms = {} is not allowed: name at least one strategy.")
+
+    @property
+    def trials(self) -> int:
+        """How many: trial a * worlds + i is of arm a in world i."""
+        return len(self.arms) * self.worlds
+
+    @property
+    def blocks(self) -> int:
+        """Parts of one arm and one object, at most."""
+        return math.ceil(self.worlds_of(0).size / self.part)
+
+    def worlds_of(self, which: int) -> np.ndarray:
+        """Indices of the worlds with the object `which` of the domain, in order."""
+        every = np.arange(self.worlds)
+        return every[self.domain.object_of(every) == which]
+
+    def parts(self) -> dict[int, np.ndarray]:
+        """Numbers of the trials of every part, by the part's number."""
+        found = {}
+        for which in range(len(self.domain.objects)):
+            of_object = self.worlds_of(which)
+            for arm in range(len(self.arms)):
+                for block in range(math.ceil(of_object.size / self.part)):
+                    some = of_object[block * self.part : (block + 1) * self.part]
+                    number = (arm * len(self.domain.objects) + which) * self.blocks + block
+                    found[number] = arm * self.worlds + some
+        return found
+
+    def configuration(self) -> dict[str, Any]:
+        """All that the results depend on, as JSON."""
+        whole = {
+            "domain": dataclasses.asdict(self.domain),
+            "worlds": self.worlds,
+            "arms": {
+                name: {"strategy": type(params).__name__} | _numbers(params)
+                for name, params in self.arms.items()
+            },
+            "physics": dataclasses.asdict(self.setting.physics),
+            "rules": _numbers(self.setting.rules),
+            "seed": self.setting.seed,
+            "engine": self.setting.engine,
+            "part": self.part,
+        }
+        return json.loads(json.dumps(whole))
+
+
+def _numbers(fields: Any) -> dict[str, float]:
+    return {name: float(value) for name, value in fields._asdict().items()}
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One of several shares of a run, to be merged: parts number, number + of, ..."""
+
+    number: int = 1
+    of: int = 1
+
+    def __post_init__(self) -> None:
+        """Raises InputError unless 1 <= number <= of."""
+        errors.check_finite("shard", self.of, at_least=1, at_most=1e6)
+        errors.check_finite("shard", self.number, at_least=1, at_most=self.of)
+
+
+# --- the run folder ------------------------------------------------------------------------
+
+
+def open_run(folder: Path, plan: Plan) -> Path:
+    """The run folder with the plan in it; a folder that has one must have the same.
+
+    Raises:
+      InputError: it cannot be written, or holds a run of another configuration.
+    """
+    record.writable(folder)
+    wanted = plan.configuration()
+    if (folder / MANIFEST).exists():
+        found = _manifest(folder)
+        if found != wanted:
+            raise InputError(
+                f"out = {folder} holds another run ({_difference(found, wanted)}): choose another "
+                "folder, or ask for the same."
+            )
+    else:
+        record.write_json(folder / MANIFEST, wanted)
+    (folder / "parts").mkdir(exist_ok=True)
+    return folder
+
+
+def _manifest(folder: Path) -> dict[str, Any]:
+    path = folder / MANIFEST
+    try:
+        return json.loads(path.read_text())
+    except FileNotFoundError as error:
+        raise InputError(
+            f"run = {folder} holds no {MANIFEST}: give the folder of a run."
+        ) from error
+    except ValueError as error:
+        raise InputError(
+            f"{path} is corrupt ({error}): restore it, or choose another folder."
+        ) from error
+
+
+def _difference(found: Any, wanted: Any, path: str = "") -> str:
+    """The first few differences of two JSON values, in words."""
+    differences = list(_differences(found, wanted, path))
+    more = f" and {len(differences) - 3} more" if len(differences) > 3 else ""
+    return "; ".join(differences[:3]) + more
+
+
+def _differences(found: Any, wanted: Any, path: str) -> Iterator[str]:
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        for key in [*found, *(k for k in wanted if k not in found)]:
+            yield from _differences(
+                found.get(key), wanted.get(key), f"{path}.{key}" if path else key
+            )
+    elif found != wanted:
+        yield f"{path} = {found} there, {wanted} asked for"
+
+
+def load_plan(folder: Path) -> Plan:
+    """The plan of a run folder.
+
+    Raises:
+      InputError: it holds none, or a corrupt one.
+    """
+    found = _manifest(folder)
+    try:
+        physics = {k: tuple(v) if isinstance(v, list) else v for k, v in found["physics"].items()}
+        return Plan(
+            domain.from_json(found["domain"]),
+            found["worlds"],
+            {name: _params(dict(arm)) for name, arm in found["arms"].items()},
+            Setting(Physics(**physics), Rules(**found["rules"]), found["seed"], found["engine"]),
+            found["part"],
+        )
+    except (KeyError, TypeError) as error:
+        raise InputError(
+            f"{folder / MANIFEST} is corrupt ({error}): restore it, or choose another folder."
+        ) from error
+
+
+def _params(arm: dict[str, Any]) -> Params:
+    name = arm.pop("strategy")
+    (kind,) = [kind for kind in trial.STRATEGIES if kind.__name__ == name]
+    return kind(**arm)
+
+
+@contextlib.contextmanager
+def lock(folder: Path, shard: Shard = Shard()) -> Iterator[None]:
+    """Hold a run folder, or one shard of it, against other processes.
+
+    Raises:
+      InputError: another process holds it.
+    """
+    with open(folder / f".lock-{shard.number}-{shard.of}", "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InputError(
+                f"out = {folder} is in use by another process: wait for its end, or choose "
+                "another folder."
+            ) from error
+        yield
+
+
+def finished(folder: Path) -> dict[int, Path]:
+    """Files of the parts that are done; one whose content is not what was written is set aside."""
+    found = {}
+    for path in sorted((folder / "parts").glob("[0-9]*-*.nc")):
+        number, _, digest = path.stem.partition("-")
+        if _digest(path) == digest:
+            found[int(number)] = path
+        else:
+            path.rename(path.with_suffix(".nc.corrupt"))
+    return found
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+@dataclass
+class _Parts:
+    """Trials on their way into the files of their parts."""
+
+    folder: Path
+    parts: dict[int, np.ndarray]  # numbers of the trials of each part still to be done
+    _part_of: dict[int, int] = field(default_factory=dict)
+    _open: dict[int, dict[int, Outcome]] = field(default_factory=dict)
+
+    def start(self, number: int) -> np.ndarray:
+        """Numbers of the trials of a part that is now begun."""
+        trials = self.parts[number]
+        self._part_of.update(dict.fromkeys(map(int, trials), number))
+        return trials
+
+    def collect(self, numbers: np.ndarray, outcomes: Outcome) -> None:
+        """Outcomes of trials that ended; writes the parts that are complete with them."""
+        for i, trial_number in enumerate(map(int, numbers)):
+            part = self._part_of.pop(trial_number)
+            rows = self._open.setdefault(part, {})
+            rows[trial_number] = Outcome(*(leaf[i] for leaf in outcomes))
+            if len(rows) == self.parts[part].size:
+                self._write(part, self._open.pop(part))
+
+    def _write(self, part: int, rows: dict[int, Outcome]) -> None:
+        numbers = self.parts[part]
+        leaves = zip(*(rows[int(n)] for n in numbers), strict=True)
+        content = {"trial": ("row", numbers)}
+        for name, values in zip(Outcome._fields, leaves, strict=True):
+            stacked = np.stack(values).astype(_TYPES.get(name, np.float32))
+            content[name] = (("row", "pose")[: stacked.ndim], stacked)
+        place = self.folder / "parts"
+        path = record.write_results(place / f"{part:07d}.nc.new", xr.Dataset(content))
+        path.rename(place / f"{part:07d}-{_digest(path)}.nc")
+
+
+# --- running -------------------------------------------------------------------------------
+
+
+def run(
+    folder: Path,
+    plan: Plan,
+    *,
+    shard: Shard = Shard(),
+    report: Callable[[Progress], Any] = lambda progress: None,
+    **shape: Any,
+) -> Timing:
+    """Run what is missing of a plan, or of one shard of it, in a folder that `open_run` opened."""
+    every = plan.parts()
+    mine = [n for i, n in enumerate(every) if i % shard.of == shard.number - 1]
+    done = finished(folder)
+    before = sum(every[n].size for n in mine if n in done)
+    report(Progress(before, 0.0))
+    parts = _Parts(folder, {n: every[n] for n in mine if n not in done})
+    jobs: dict[Any, list[int]] = {}
+    for number in parts.parts:
+        arm, which = _arm_and_object(plan, number)
+        jobs.setdefault((which, type(list(plan.arms.values())[arm])), []).append(number)
+
+    def tell(progress: Progress) -> None:
+        report(Progress(before + progress.finished, progress.simulated))
+
+    return slots.run(
+        [
+            Job(
+                trial.STRATEGIES[kind],
+                sum(parts.parts[n].size for n in numbers),
+                _made(plan, parts, numbers),
+            )
+            for (_, kind), numbers in jobs.items()
+        ],
+        plan.setting,
+        collect=parts.collect,
+        report=tell,
+        **shape,
+    )
+
+
+def _arm_and_object(plan: Plan, part: int) -> tuple[int, int]:
+    return divmod(part // plan.blocks, len(plan.domain.objects))
+
+
+def _made(plan: Plan, parts: _Parts, numbers: list[int]) -> Iterator[Part]:
+    """The worlds of parts, made one part at a time."""
+    for number in numbers:
+        trials = parts.start(number)
+        arm, _ = _arm_and_object(plan, number)
+        yield world_part(plan, arm, trials % plan.worlds)._replace(numbers=trials)
+
+
+def world_part(plan: Plan, arm: int, index: np.ndarray) -> Part:
+    """Worlds of one object, with the parameters of an arm."""
+    drawn = domain.draw(plan.domain, plan.setting.seed, index)
+    return domain.worlds(plan.domain, drawn, list(plan.arms.values())[arm], plan.setting)
+
+
+# --- results -------------------------------------------------------------------------------
+
+
+def merge(folders: list[Path], out: Path) -> Path:
+    """One `results.nc` of all parts in run folders of one plan: (arm, world), and (world) drawn.
+
+    It is written part by part, so that memory does not grow with the number of worlds.
+
+    Raises:
+      InputError: the folders differ in their plan, or parts are missing.
+    """
+    manifest = _manifest(folders[0])
+    for other in folders[1:]:
+        if (theirs := _manifest(other)) != manifest:
+            raise InputError(
+                f"run = {other} is of another plan than {folders[0]} "
+                f"({_difference(manifest, theirs)}): merge shards of one run."
+            )
+    plan = load_plan(folders[0])
+    found = {n: path for folder in folders for n, path in finished(folder).items()}
+    missing = [n for n in plan.parts() if n not in found]
+    if missing:
+        raise InputError(
+            f"run = {', '.join(map(str, folders))} lacks {len(missing)} of {len(plan.parts())} "
+            "parts: run the same command again, or give the folders of all shards."
+        )
+    return record.atomic(out / "results.nc", lambda path: _write_results(path, plan, found))
+
+
+def _write_results(path: Path, plan: Plan, found: dict[int, Path]) -> None:
+    with h5netcdf.File(path, "w") as file:
+        sizes = {"arm": len(plan.arms), "world": plan.worlds, "pose": 3}
+        file.dimensions = sizes | {"object": len(plan.domain.objects)}
+        names = {"arm": list(plan.arms), "object": list(plan.domain.objects)}
+        for name, values in names.items():
+            file.create_variable(name, (name,), h5py.string_dtype(), data=np.array(values, object))
+        every = np.arange(plan.worlds)
+        file.create_variable("world", ("world",), data=every)
+        which = plan.domain.object_of(every).astype(np.int16)
+        file.create_variable("which_object", ("world",), data=which)
+        for name in Outcome._fields:
+            dims = ("arm", "world", "pose") if name in _SHAPES else ("arm", "world")
+            file.create_variable(name, dims, dtype=_TYPES.get(name, np.float32))
+        for number, source in found.items():
+            arm, _ = _arm_and_object(plan, number)
+            with xr.open_dataset(source, engine="h5netcdf") as part:
+                world = part.trial.values % plan.worlds
+                for name in Outcome._fields:
+                    values = file[name][arm]
+                    values[world] = part[name].values
+                    file[name][arm] = values
+            if arm == 0:
+                drawn = domain.draw(plan.domain, plan.setting.seed, world)
+                _write_drawn(file, domain.table(drawn), world)
+
+
+def _write_drawn(file: h5netcdf.File, columns: Mapping[str, Any], world: np.ndarray) -> None:
+    """What was drawn for some worlds, one variable a quantity."""
+    for name, (values, unit) in columns.items():
+        if name not in file.variables:
+            new = file.create_variable(name, ("world",), dtype=np.float32, fillvalue=np.nan)
+            new.attrs["units"] = unit
+        whole = file[name][...]
+        whole[world] = values
+        file[name][...] = whole

@@ -1,0 +1,311 @@
+"""Trials on a device: slots of a batch, each refilled as soon as its trial ends.
+
+A job is all that one compiled program runs; its trials come in parts, which are made only when a
+slot waits for one of their trials, so that memory does not grow with the number of trials.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rps_jax import engines, errors, reference, trial
+from rps_jax.engines import Engine
+from rps_jax.physics import PHYSICS, Physics
+from rps_jax.trial import Outcome, Rules, Strategy, Trial, World
+
+SEGMENT = 10.0  # [s] simulated between two looks at which trials have ended
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What all trials of a run share."""
+
+    physics: Physics = PHYSICS["default"]["standard"]
+    rules: Rules = Rules()
+    seed: int = 0  # of the skins' imperfections
+    engine: Engine = "mjx"
+
+    def __post_init__(self) -> None:
+        """Raises InputError for rules, a seed or an engine that mean nothing."""
+        self.rules.check()
+        errors.check_finite("seed", self.seed, at_least=0, at_most=2**32 - 1)
+        errors.check_name("engine", self.engine, engines.ENGINES)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """A look at a running sweep."""
+
+    finished: int  # trials
+    simulated: float  # [s] summed over trials, ended or running
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Where the time of a sweep went."""
+
+    compile: float  # [s] on the critical path of the first worker
+    run: float  # [s] wall clock after that
+    simulated: float  # [s] of trials
+
+
+class Part(NamedTuple):
+    """Some trials of a job."""
+
+    numbers: np.ndarray  # (n,) of the trials
+    worlds: World  # leaves (n, ...), on the host
+    stage: Any
+
+
+class Job(NamedTuple):
+    """Trials of one kind: one compiled program runs them all."""
+
+    strategy: Strategy
+    trials: int
+    parts: Iterable[Part]  # of one stage, but for the engine `mujoco`
+
+
+Collect = Callable[[np.ndarray, Outcome], Any]  # numbers (m,) of trials and their outcomes
+
+
+def default_slots(engine: Engine = "mjx") -> int:
+    """Worlds stepped at once: few on a processor (small caches), many on an accelerator."""
+    if engine == "fused":
+        return 64 if jax.default_backend() == "cpu" else 65536
+    return 24 if jax.default_backend() == "cpu" else 8192
+
+
+def default_workers() -> int:
+    """One thread for each core of a processor, since XLA steps a small batch on one core."""
+    return os.cpu_count() or 1 if jax.default_backend() == "cpu" else 1
+
+
+def run(
+    jobs: Sequence[Job],
+    setting: Setting,
+    *,
+    slots: int | None = None,
+    workers: int | None = None,
+    collect: Collect,
+    report: Callable[[Progress], Any] = lambda progress: None,
+) -> Timing:
+    """Run every trial of every job to its end.
+
+    Args:
+      jobs: what to run.
+      setting: what they share.
+      slots: worlds stepped at once by one worker.
+      workers: host threads that each drive a batch of their own, or, with the engine `mujoco`,
+        that step worlds.
+      collect: called with the outcomes of trials that ended, in any order, one call at a time.
+      report: called after every segment, likewise.
+    """
+    slots = slots or default_slots(setting.engine)
+    workers = workers or default_workers()
+    errors.check_finite("slots", slots, at_least=1)
+    errors.check_finite("workers", workers, at_least=1)
+    shared = _Shared(collect, report)
+    began = time.perf_counter()
+    if setting.engine == "mujoco":
+        count = max(1, min(workers, len(jobs)))
+        tasks = [partial(_run_in_c, job, setting, workers // count, shared) for job in jobs]
+    else:
+        count = workers
+        queues = [_Queue(job, setting, slots) for job in jobs]
+        orders = [queues[w % len(queues) :] + queues for w in range(count if queues else 0)]
+        tasks = [partial(_work, order, shared) for order in orders]
+    _side_by_side(tasks, count, shared)
+    total = time.perf_counter() - began
+    return Timing(shared.compile, total - shared.compile, shared.simulated)
+
+
+def _side_by_side(tasks: Sequence[Callable[[], None]], count: int, shared: _Shared) -> None:
+    """Run tasks on `count` threads; the first that fails stops the others."""
+    with ThreadPoolExecutor(count) as pool:
+        jobs = [pool.submit(task) for task in tasks]
+        try:
+            for job in as_completed(jobs):
+                job.result()
+        except BaseException:
+            shared.stop = True
+            raise
+
+
+class _Shared:
+    """What the workers report into."""
+
+    def __init__(self, collect: Collect, report: Callable[[Progress], Any]):
+        self.simulated = 0.0
+        self.compile = 0.0
+        self.stop = False  # set when one worker fails or the user interrupts
+        self._finished = 0
+        self._collect, self._report = collect, report
+        self._lock = threading.Lock()
+
+    def add(self, numbers: np.ndarray, trials: Outcome, simulated: float) -> None:
+        """Trials that ended in a segment, and the time [s] all of the worker's trials advanced."""
+        with self._lock:
+            if numbers.size:
+                self._collect(numbers, trials)
+            self._finished += numbers.size
+            self.simulated += simulated
+            self._report(Progress(self._finished, self.simulated))
+
+    def compiled(self, seconds: float) -> None:
+        """One worker waited this long for a program."""
+        with self._lock:
+            self.compile = max(self.compile, seconds)
+
+
+# --- C MuJoCo ------------------------------------------------------------------------------
+
+
+def _run_in_c(job: Job, setting: Setting, threads: int, shared: _Shared) -> None:
+    for part in job.parts:
+
+        def tell(ended: np.ndarray, trials: Trial, simulated: float, part: Part = part) -> bool:
+            outcomes = jax.device_get(trial.outcome(trials, setting.physics.control_period))
+            shared.add(part.numbers[ended], rows(outcomes, ended), simulated)
+            return not shared.stop
+
+        if shared.stop:
+            return
+        reference.run(
+            part.stage,
+            part.worlds,
+            physics=setting.physics,
+            rules=setting.rules,
+            strategy=job.strategy,
+            threads=max(1, threads),
+            report=tell,
+        )
+
+
+# --- JAX -----------------------------------------------------------------------------------
+
+
+class _Queue:
+    """The waiting trials of one job, and its program once compiled."""
+
+    def __init__(self, job: Job, setting: Setting, slots: int):
+        self.strategy = job.strategy
+        self.setting = setting
+        self.slots = min(slots, job.trials)
+        self._parts = iter(job.parts)
+        self._waiting: deque[tuple[Part, int]] = deque()
+        self._program = None
+        self._lock = threading.Lock()
+
+    def take(self, count: int) -> list[tuple[Part, int]]:
+        """Up to `count` waiting trials, each a row of a part."""
+        with self._lock:
+            while len(self._waiting) < count and (part := next(self._parts, None)) is not None:
+                self._waiting.extend((part, row) for row in range(part.numbers.size))
+            return [self._waiting.popleft() for _ in range(min(count, len(self._waiting)))]
+
+    def program(self, stage: Any, worlds: World, trials: Trial) -> Any:
+        """The compiled `trial.advance`; the first worker to come compiles, others wait."""
+        with self._lock:
+            if self._program is None:
+                physics = self.setting.physics
+                steps = max(1, round(SEGMENT / physics.control_period))
+                self._program = trial.advance.lower(
+                    stage,
+                    worlds,
+                    trials,
+                    physics=physics,
+                    rules=self.setting.rules,
+                    strategy=self.strategy,
+                    steps=steps,
+                ).compile()
+            return self._program
+
+
+def rows(tree: Any, which: Any) -> Any:
+    """The same rows of every leaf."""
+    return jax.tree.map(lambda leaf: leaf[which], tree)
+
+
+@partial(jax.jit, static_argnames=("strategy",), donate_argnames=("trials",))
+def _refill(worlds: World, trials: Trial, fresh: jax.Array, *, strategy: Strategy) -> Trial:
+    """Start a new trial in the slots that are `fresh` (B,)."""
+    started = trial.start_all(worlds, jnp.ones_like(fresh), strategy=strategy)
+    pick = partial(jax.vmap(lambda f, a, b: jnp.where(f, a, b)), fresh)
+    return jax.tree.map(pick, started, trials)
+
+
+def _work(queues: list[_Queue], shared: _Shared) -> None:
+    for queue in queues:
+        _drain(queue, shared)
+
+
+class _Held:
+    """The worlds in the slots of one worker, on the host."""
+
+    def __init__(self, first: list[tuple[Part, int]], slots: int):
+        part, row = first[0]
+        self.numbers = np.zeros(slots, np.int64)
+        self._worlds = jax.tree.map(
+            lambda leaf: np.repeat(leaf[row][None], slots, axis=0), part.worlds
+        )
+
+    def put(self, at: np.ndarray, taken: list[tuple[Part, int]]) -> World:
+        """Put trials into the slots `at`; returns the worlds, on the device."""
+        by_part: dict[int, tuple[Part, list[int], list[int]]] = {}
+        for slot, (part, row) in zip(at, taken, strict=True):
+            _, slots, of = by_part.setdefault(id(part), (part, [], []))
+            slots.append(int(slot))
+            of.append(row)
+        for part, slots, of in by_part.values():
+            self.numbers[slots] = part.numbers[of]
+            for mine, theirs in zip(
+                jax.tree.leaves(self._worlds), jax.tree.leaves(part.worlds), strict=True
+            ):
+                mine[slots] = theirs[of]
+        # A copy: the device may otherwise share the host's memory, which the next call changes.
+        return jax.device_put(jax.tree.map(np.copy, self._worlds))
+
+
+def _drain(queue: _Queue, shared: _Shared) -> None:
+    """Run the queue's trials until none waits and none of this worker's runs."""
+    taken = queue.take(queue.slots)
+    if not taken:
+        return
+    stage, period = taken[0][0].stage, queue.setting.physics.control_period
+    held = _Held(taken, queue.slots)
+    live = np.arange(queue.slots) < len(taken)
+    worlds = held.put(np.arange(len(taken)), taken)
+    trials = trial.start_all(worlds, live, strategy=queue.strategy)
+    began = time.perf_counter()
+    program = queue.program(stage, worlds, trials)
+    shared.compiled(time.perf_counter() - began)
+    while live.any() and not shared.stop:
+        before = np.asarray(trials.steps)
+        trials = program(stage, worlds, trials, rules=queue.setting.rules)
+        steps = np.asarray(trials.steps)
+        ended = np.asarray(trials.done) & live
+        at = np.flatnonzero(ended)
+        outcomes = jax.device_get(trial.outcome(trials, period))
+        shared.add(
+            held.numbers[at], rows(outcomes, at), float((steps - before)[live].sum()) * period
+        )
+        live &= ~ended
+        taken = queue.take(at.size)
+        if taken:
+            fresh = at[: len(taken)]
+            live[fresh] = True
+            worlds = held.put(fresh, taken)
+            now = np.isin(np.arange(queue.slots), fresh)
+            trials = _refill(worlds, trials, now, strategy=queue.strategy)
