@@ -1,4 +1,4 @@
-"""What a sweep over random worlds says: rates with intervals, differences, failures, hard worlds."""
+"""What a sweep over random worlds says: rates, differences, kinds of failure, hard worlds."""
 
 from __future__ import annotations
 
@@ -117,7 +117,13 @@ def differences(results: xr.Dataset) -> list[list[str]]:
         c = study.compare(a, b)
         share = 100 * (c.gained - c.lost) / a.size
         rows.append(
-            [f"{second} against {first}", str(c.gained), str(c.lost), f"{share:+.2f} %", f"{c.p:.2g}"]
+            [
+                f"{second} against {first}",
+                str(c.gained),
+                str(c.lost),
+                f"{share:+.2f} %",
+                f"{c.p:.2g}",
+            ]
         )
     return rows
 

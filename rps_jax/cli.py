@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import os
 import sys
 import time
@@ -22,7 +23,9 @@ from rps_jax import errors
 from rps_jax.errors import InputError
 
 if TYPE_CHECKING:
-    from rps_jax.scene import Friction
+    from rps_jax.domain import Domain
+    from rps_jax.robustness import Plan, Shard
+    from rps_jax.scene import Friction, Scene
     from rps_jax.slots import Progress, Setting, Timing
     from rps_jax.sweep import Case, Trace
     from rps_jax.trial import Params
@@ -163,6 +166,68 @@ class Paper(StudyOptions):
 
 
 @dataclass(frozen=True)
+class Sweep(Spread):
+    """Push in many random worlds, every strategy in the same ones; the run can be continued."""
+
+    domain: str = "wide"
+    """paper, hardware, wide or hostile, or a JSON file with ranges (see `rps sweep --domain`)."""
+    change: tuple[str, ...] = ()
+    """Ranges to change, each as quantity=low,high (as mass=3,10)."""
+    strategies: tuple[str, ...] = ("rps", "nps", "aps")
+    """Strategies to run: rps, nps, aps."""
+    params: tuple[str, ...] = ("paper",)
+    """Parameters of rps and nps: paper, or JSON files (as {"L": 0.3}); each is run."""
+    worlds: int | None = None
+    """How many; by default 1000, or the domain's whole grid."""
+    physics: str = "default"
+    """default (isotropic friction) or paper_gazebo (friction pyramid)."""
+    fidelity: str = "standard"
+    """How finely the physics is solved: reference, standard or fast."""
+    engine: str = "mjx"
+    """mjx, fused (the same equations, specialised: much faster), or mujoco (C, on all cores)."""
+    horizon: float = 300.0
+    """Longest trial [s]."""
+    seed: int = 0
+    """Seed of the worlds."""
+    part: int = 1024
+    """Trials of a part: the most that is lost for each strategy and object when killed."""
+    device: str = "auto"
+    """auto, cpu or gpu."""
+    shard: str = "1/1"
+    """k/n: run share k of n, to be merged with `rps merge`."""
+    out: Path = Path("runs/sweep")
+    """Run folder; a run that was killed is continued there."""
+
+
+@dataclass(frozen=True)
+class Merge:
+    """Merge the shards of a sweep into one run folder, with results.nc and the report."""
+
+    folders: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folders of the shards; one, if they share it."""
+    out: Path
+    """Run folder of the whole."""
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Run one world of a sweep again; draw it as in the paper's Fig. 6 and film it."""
+
+    run: tyro.conf.Positional[Path]
+    """Run folder of the sweep."""
+    index: tyro.conf.Positional[int]
+    """Index of the world."""
+    arm: str | None = None
+    """Which of the sweep's strategies with parameters; by default the first."""
+    video: bool = False
+    """Film the push."""
+    film_length: float = 12.0
+    """Length of the film [s], whatever the trial's."""
+    out: Path | None = None
+    """Folder; by default RUN/replay-INDEX."""
+
+
+@dataclass(frozen=True)
 class Doctor:
     """Print versions, devices and folders, and what does not work with its mend."""
 
@@ -172,6 +237,9 @@ Command = (
     | Annotated[Push, tyro.conf.subcommand("push")]
     | Annotated[Hardware, tyro.conf.subcommand("hardware")]
     | Annotated[Paper, tyro.conf.subcommand("paper")]
+    | Annotated[Sweep, tyro.conf.subcommand("sweep")]
+    | Annotated[Merge, tyro.conf.subcommand("merge")]
+    | Annotated[Replay, tyro.conf.subcommand("replay")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )
 
@@ -193,6 +261,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Push: _push,
         Hardware: _hardware,
         Paper: _paper,
+        Sweep: _sweep,
+        Merge: _merge,
+        Replay: _replay,
         Doctor: _doctor,
     }
     return guarded(lambda: act[type(command)](command))
@@ -208,6 +279,14 @@ def guarded(action: Callable[[], None]) -> int:
         return 2
     except OSError as error:
         print(f"rps: error: {error.filename or 'output'}: {error.strerror}.", file=sys.stderr)
+        return 2
+    except RuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        print(
+            "rps: error: the device is out of memory: ask for fewer worlds at once with --slots.",
+            file=sys.stderr,
+        )
         return 2
     except KeyboardInterrupt:
         print("rps: interrupted.", file=sys.stderr)
@@ -413,7 +492,7 @@ def _table(options: Table) -> None:
 def _push(options: Push) -> None:
     from tqdm import tqdm
 
-    from rps_jax import figures, record, score, sweep
+    from rps_jax import figures, sweep
 
     setting = _setting(options)
     params = _params(options, options.strategy)
@@ -424,8 +503,7 @@ def _push(options: Push) -> None:
         params,
         **_per_world(options),
     )
-    if options.engine == "mujoco":
-        raise InputError("engine = mujoco is not allowed: follow a push with mjx or fused.")
+    sweep.check_followed(options.engine)
     errors.check_finite("film_length", options.film_length, above=0, at_most=600, unit="s")
     out = _open(options, "push")
     _write_config(out, options, setting, {options.strategy: params})
@@ -437,33 +515,40 @@ def _push(options: Push) -> None:
             bar.update(round(progress.simulated - bar.n, 3))
 
         (trace,) = sweep.follow([case], setting, report=report)
+    _show(trace, options.object, figures.title_of(case), out)
+    if options.video:
+        _film(sweep.scene_of(case, setting.physics), trace, options.film_length, out)
+    print(f"run folder: {out}")
+
+
+def _show(trace: Trace, name: str, title: str, out: Path) -> None:
+    """Results, figure and a line on the screen for one trial."""
+    from rps_jax import figures, record, score
+
     record.write_results(out / "results.nc", score.trace_dataset(trace))
-    figures.one_trial(case, trace, out / "trial.png")
+    figures.one_trial(trace, title, out / "trial.png")
     result = trace.outcome
+    x, y = trace.p_world_target
     print(
-        f"{options.object}, target ({case.p_world_target[0]:g}, {case.p_world_target[1]:g}) m: "
+        f"{name}, target ({x:g}, {y:g}) m: "
         f"{'reached' if result.success else 'not reached'} at {float(result.time):.1f} s, "
         f"least distance {float(result.min_distance):.3f} m, "
         f"contact lost for {float(result.contact_lost_time):.1f} s"
     )
     _tell(trace.timing)
-    if options.video:
-        _film(options, case, setting, trace, out)
-    print(f"run folder: {out}")
 
 
-def _film(options: Push, case: Case, setting: Setting, trace: Trace, out: Path) -> None:
+def _film(scene: Scene, trace: Trace, length: float, out: Path) -> None:
     """Stills and video; without the means for them, a line that says how to mend it."""
     import numpy as np
     from tqdm import tqdm
 
-    from rps_jax import figures, sweep, trial, video
+    from rps_jax import figures, trial, video
 
-    scene = sweep.scene_of(case, setting.physics)
-    target = np.array(case.p_world_target)
+    target = np.array(trace.p_world_target)
     seen = trace.snapshots
     fps = 25
-    rows = _evenly(len(seen.time), round(options.film_length * fps))
+    rows = _evenly(len(seen.time), round(length * fps))
     stills = _evenly(len(seen.time), 6)
     try:
         images = [video.snapshot(scene, seen.qpos[i], p_world_target=target) for i in stills]
@@ -523,6 +608,171 @@ def _paper(options: Paper) -> None:
     with progress_bar(plan.trials()) as report:
         path = reproduce.run(out, plan, report=report, **options.shape())
     print(f"report: {path}")
+
+
+def _domain(options: Sweep) -> Domain:
+    from rps_jax import domain
+
+    if options.domain.endswith(".json"):
+        chosen = domain.from_json(_json(Path(options.domain)))
+    else:
+        chosen = domain.DOMAINS[errors.check_name("domain", options.domain, domain.DOMAINS)]
+    changes = {}
+    for text in options.change:
+        name, _, values = text.partition("=")
+        errors.check_name("domain quantity", name, domain.RANGES)
+        ends = [errors.check_number(f"domain {name}", v) for v in values.split(",")]
+        if len(ends) != 2:
+            raise InputError(f"change '{text}' is not allowed: write quantity=low,high.")
+        changes[name] = getattr(chosen, name)._replace(low=ends[0], high=ends[1])
+    return dataclasses.replace(chosen, **changes)
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        values = json.loads(path.read_text())
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}): give a JSON file.") from error
+    except ValueError as error:
+        raise InputError(f"{path} is not JSON ({error}).") from error
+    if not isinstance(values, dict):
+        raise InputError(f'{path} holds no names with values: write {{"name": value}}.')
+    return values
+
+
+def _arms(options: Sweep) -> dict[str, Params]:
+    """Every strategy with every set of parameters; APS has but one."""
+    from rps_jax import law, paper
+    from rps_jax.law import RPSParams
+
+    arms: dict[str, Params] = {}
+    for name in options.params:
+        values = {} if name == "paper" else _json(Path(name))
+        for key, value in values.items():
+            errors.check_name(f"parameter of {name}", key, RPSParams._fields)
+            values[key] = errors.check_number(f"{name} {key}", value)
+        for strategy in options.strategies:
+            params = paper.PARAMS[errors.check_name("strategy", strategy, paper.PARAMS)]
+            label = strategy
+            if isinstance(params, RPSParams):
+                changed = {k: v for k, v in values.items() if k != "reactive"}
+                params = params._replace(**changed)
+                law.check(params)
+                label = strategy if len(options.params) == 1 else f"{strategy} {Path(name).stem}"
+            arms[label] = params
+    return arms
+
+
+def _plan(options: Sweep) -> Plan:
+    from rps_jax.physics import preset
+    from rps_jax.robustness import Plan
+    from rps_jax.slots import Setting
+    from rps_jax.trial import Rules
+
+    domain = _domain(options)
+    every = domain.combinations if domain.targets else 1000
+    setting = Setting(
+        preset(options.physics, options.fidelity),
+        Rules(horizon=options.horizon),
+        options.seed,
+        options.engine,  # pyright: ignore[reportArgumentType]
+    )
+    return Plan(domain, options.worlds or every, _arms(options), setting, options.part)
+
+
+def _shard(text: str) -> Shard:
+    from rps_jax.robustness import Shard
+
+    number, _, of = text.partition("/")
+    if not (number.isdigit() and of.isdigit()):
+        raise InputError(f"shard '{text}' is not allowed: write k/n, as 3/8.")
+    return Shard(int(number), int(of))
+
+
+def choose_device(name: str) -> None:
+    """Have JAX use this kind of device.
+
+    Raises:
+      InputError: unknown name, or no such device.
+    """
+    import jax
+
+    errors.check_name("device", name, ("auto", "cpu", "gpu"))
+    if name == "auto":
+        return
+    jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[name])
+    try:
+        jax.devices()
+    except RuntimeError as error:
+        raise InputError(
+            f"device = {name} is not there: install jax[cuda12] on a machine with an NVIDIA GPU, "
+            "or choose cpu."
+        ) from error
+
+
+def _sweep(options: Sweep) -> None:
+    from rps_jax import record, robustness
+
+    plan, shard, shape = _plan(options), _shard(options.shard), options.shape()
+    choose_device(options.device)
+    out = robustness.open_run(options.out, plan)
+    use_cache()
+    with robustness.lock(out, shard):
+        record.write_json(out / "environment.json", record.environment())
+        trials = sum(numbers.size for numbers in robustness.share(plan, shard).values())
+        with progress_bar(trials, "sweep") as report:
+            timing = robustness.run(out, plan, shard=shard, report=report, **shape)
+        _tell(timing)
+        if shard.of == 1:
+            robustness.merge([out], out)
+            _report_sweep(out)
+        else:
+            print(f"run folder: {out}; when all shards are done: rps merge {out} --out {out}")
+
+
+def _merge(options: Merge) -> None:
+    from rps_jax import record, robustness
+
+    if not options.folders:
+        raise InputError("folders = () is not allowed: give the run folders of the shards.")
+    record.writable(options.out)
+    robustness.merge(list(options.folders), options.out)
+    _report_sweep(options.out)
+
+
+def _report_sweep(out: Path) -> None:
+    from rps_jax import robustness
+
+    print(robustness.write_report(out).read_text())
+    print(f"run folder: {out}")
+
+
+def _replay(options: Replay) -> None:
+    from tqdm import tqdm
+
+    from rps_jax import record, robustness, sweep, trial
+
+    plan = robustness.load_plan(options.run)
+    arms = list(plan.arms)
+    name = errors.check_name("arm", options.arm or arms[0], arms)
+    errors.check_finite("index", options.index, at_least=0, at_most=plan.worlds - 1)
+    errors.check_finite("film_length", options.film_length, above=0, at_most=600, unit="s")
+    sweep.check_followed(plan.setting.engine)
+    out = record.writable(options.out or options.run / f"replay-{options.index}")
+    use_cache()
+    part = robustness.world_part(plan, arms.index(name), [options.index])
+    strategy = trial.STRATEGIES[type(plan.arms[name])]
+    with tqdm(total=float(plan.setting.rules.horizon), unit="s", desc="compile") as bar:
+
+        def report(progress: Progress) -> None:
+            bar.set_description("push", refresh=False)
+            bar.update(round(progress.simulated - bar.n, 3))
+
+        (trace,) = sweep.follow_part(part, strategy, plan.setting, report=report)
+    _show(trace, f"world {options.index}, {name}", robustness.title_of(plan, options.index), out)
+    if options.video:
+        _film(robustness.scene_of(plan, options.index), trace, options.film_length, out)
+    print(f"run folder: {out}")
 
 
 def _doctor(_: Doctor) -> None:

@@ -131,7 +131,7 @@ def on_base(
     c, s = jnp.cos(state.base[2]), jnp.sin(state.base[2])
     w = sp.to_world(m, state.w)
     contacts = []
-    for z, normal, q, distance in _meetings(body, state, m, (c, s)):
+    for z, normal, q, distance in meetings(body, state, m, (c, s)):
         n = (c * normal[0] - s * normal[1], s * normal[0] + c * normal[1], 0.0)
         t = (-n[1], n[0], 0.0)
         arm = (c * q[0] - s * q[1], s * q[0] + c * q[1])  # from the base's origin
@@ -155,7 +155,7 @@ def on_base(
 Point = tuple[Any, Any]
 
 
-def _meetings(
+def meetings(
     body: Body, state: State, m: Sequence[Vec], turn: Point
 ) -> list[tuple[Any, Point, Point, Any]]:
     """Height, normal, point and distance [m] of each contact, in the base's frame."""

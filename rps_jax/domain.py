@@ -7,17 +7,19 @@ a counter-based generator, and everything after them is computed on the host in 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rps_jax import engines, errors, hardware, paper, scene, skin, solid
 from rps_jax.errors import InputError
 from rps_jax.footprint import Footprint
-from rps_jax.scene import FRICTION, JOINTS, Friction
+from rps_jax.physics import Physics
+from rps_jax.scene import FRICTION, JOINTS, Friction, mjx
 from rps_jax.skin import CapacitiveSkin, IdealSkin, Skin
 from rps_jax.slots import Part, Setting
 from rps_jax.solid import Solid
@@ -142,6 +144,7 @@ _ALLOWED = {
     "command_delay": (0, 1, "s"),
     "velocity_error": (-0.9, 0.9, "1"),
 }
+RANGES = tuple(_ALLOWED)
 _UNITS = {
     **dict.fromkeys(("lateral", "gap", "pose_noise"), "m"),
     **dict.fromkeys(("yaw", "yaw_noise"), "rad"),
@@ -154,6 +157,7 @@ _PERFECT: dict[str, Any] = {
     ),
     **dict.fromkeys(("command_delay", "velocity_error", "lateral", "yaw"), _only(0)),
 }
+_HARDWARE: dict[str, Any] = _PERFECT | {"noise": _only(0.05), "gain_spread": _only(0.1)}
 DOMAINS = {
     "paper": Domain(
         objects=scene.PAPER_OBJECTS,
@@ -169,7 +173,7 @@ DOMAINS = {
         friction_robot=Range(hardware.ROBOT[0], hardware.ROBOT[-1]),
         gap=_only(0.02),
         distance=_only(2.1),
-        **_PERFECT | {"noise": _only(0.05), "gain_spread": _only(0.1)},
+        **_HARDWARE,
     ),
     "wide": Domain(),
     "hostile": Domain(
@@ -227,7 +231,7 @@ _USES = (
 )
 
 
-def draw(domain: Domain, seed: int, index: np.ndarray) -> Draw:
+def draw(domain: Domain, seed: int, index: ArrayLike) -> Draw:
     """The worlds `index` (n,), all of one object of the domain.
 
     Raises:
@@ -237,7 +241,13 @@ def draw(domain: Domain, seed: int, index: np.ndarray) -> Draw:
     which = domain.object_of(index)
     if (which != which[0]).any():
         raise ValueError("worlds of several objects cannot be batched")
-    u = dict(zip(_USES, _uniform(seed, index).T, strict=False))
+    return _drawn(domain, index, _uniform(seed, index))
+
+
+def _drawn(domain: Domain, index: np.ndarray, numbers: np.ndarray) -> Draw:
+    """Worlds of the same object, from their random numbers (n, _COLUMNS)."""
+    u = dict(zip(_USES, numbers.T, strict=False))
+    name = domain.objects[int(domain.object_of(index[0]))]
     at = {name: getattr(domain, name).at(u[name]) for name in _ALLOWED if name in u}
     error = [
         domain.velocity_error.at(u[name]) for name in ("v_x_error", "v_y_error", "omega_error")
@@ -245,7 +255,7 @@ def draw(domain: Domain, seed: int, index: np.ndarray) -> Draw:
     key = [np.floor(u[name] * 2**32).astype(np.uint32) for name in ("key_0", "key_1")]
     return Draw(
         number=index,
-        solid=_solid(domain.objects[which[0]], at, u),
+        solid=_solid(name, at, u),
         friction=_friction(domain, index, at),
         p_world_target=_targets(domain, index, at),
         velocity_error=np.stack(error, axis=-1),
@@ -312,6 +322,37 @@ def _targets(domain: Domain, index: np.ndarray, at: dict[str, np.ndarray]) -> np
     return at["distance"][:, None] * along
 
 
+def domain_randomize(
+    model: mjx.Model, rng: jax.Array, domain: Domain = DOMAINS["wide"]
+) -> tuple[mjx.Model, mjx.Model]:
+    """Models of random objects for a loop of one's own, as mujoco_playground has them.
+
+    Args:
+      model: of a random object's scene, as `mjx.put_model(scene.shaped(...).physics)` gives it.
+      rng: keys (n, 2), one a world.
+      domain: ranges of the object's mass, size, centre of mass and friction.
+
+    Returns:
+      The model with its fields batched, (n, ...), and which of them are: 0, the others None, for
+      `jax.vmap(..., in_axes=(in_axes, ...))`. Not to be traced: it works on the host.
+    """
+    family = scene.family_of(model)
+    (name,) = [name for name, of in RANDOM.items() if of == family]
+    keys = np.asarray(rng, np.uint32).astype(object)
+    numbers = np.stack([_uniform(int(a) << 32 | int(b), np.zeros(1, int))[0] for a, b in keys])
+    alone = replace(domain, objects=(name,), frictions=(), targets=())
+    drawn = _drawn(alone, np.zeros(len(keys), int), numbers)
+    template = engines.scene_of_solid(family, drawn.solid, drawn.friction, Physics(), 0)
+    _, of_one = engines.stage_of_scenes([template], "mjx")
+    own = engines.mjx_fields(family, drawn.solid, drawn.friction, template, of_one)
+    dtype = model.body_mass.dtype
+    batched = scene.apply(model, {k: jnp.asarray(v, dtype) for k, v in own.items()})
+    in_axes = jax.tree_util.tree_map_with_path(
+        lambda path, _: 0 if jax.tree_util.keystr(path) in own else None, model
+    )
+    return batched, in_axes
+
+
 def worlds(domain: Domain, drawn: Draw, params: Params, setting: Setting) -> Part:
     """The worlds of a draw as a part of a job, all with the same parameters."""
     family = domain.family_of(drawn.number[0])
@@ -319,19 +360,24 @@ def worlds(domain: Domain, drawn: Draw, params: Params, setting: Setting) -> Par
     stage, own = engines.stage_of_solids(
         family, drawn.solid, drawn.friction, setting.engine, setting.physics
     )
-    world = World(
-        fields=own,
-        footprint=Footprint(drawn.solid.vertices, drawn.solid.radius),  # type: ignore[arg-type]
-        skin=_skin(domain, drawn),
-        params=jax.tree.map(lambda value: np.full(count, value), params),
-        p_world_target=drawn.p_world_target,
-        shift=Shift(np.full(count, np.inf), np.zeros((count, 2))),
-        qpos=_starts(drawn),
-        key=drawn.key,
-        odometry=_odometry(domain, drawn, setting.physics.control_period),
-    )
+    world: Any = {
+        "fields": own,
+        "footprint": Footprint(*_any(drawn.solid.vertices, drawn.solid.radius)),
+        "skin": _skin(domain, drawn),
+        "params": jax.tree.map(lambda value: np.full(count, value), params),
+        "p_world_target": drawn.p_world_target,
+        "shift": Shift(*_any(np.full(count, np.inf), np.zeros((count, 2)))),
+        "qpos": _starts(drawn),
+        "key": drawn.key,
+        "odometry": _odometry(domain, drawn, setting.physics.control_period),
+    }
     narrow = jax.tree.map(lambda x: x if x.dtype == np.uint32 else x.astype(dtype), world)
-    return Part(drawn.number, narrow, stage)
+    return Part(drawn.number, World(**narrow), stage)
+
+
+def _any(*arrays: Any) -> tuple[Any, ...]:
+    """Host arrays where a type asks for those of the device."""
+    return arrays
 
 
 def _skin(domain: Domain, drawn: Draw) -> Skin:
@@ -361,14 +407,8 @@ def _odometry(domain: Domain, drawn: Draw, period: float) -> Odometry:
     perfect = all(getattr(domain, name) == _PERFECT[name] for name in _OF_THE_BASE)
     oldest = max(domain.pose_latency.high, domain.command_delay.high)
     past = 0 if perfect else 1 + round(oldest / period)
-    return Odometry(
-        drawn.pose_noise,
-        drawn.yaw_noise,
-        drawn.pose_latency,
-        drawn.command_delay,
-        drawn.velocity_error,
-        np.zeros((count, past)),
-    )
+    errors_ = (getattr(drawn, name) for name in _OF_THE_BASE)
+    return Odometry(*_any(*errors_, np.zeros((count, past))))
 
 
 def table(drawn: Draw) -> dict[str, tuple[np.ndarray, str]]:

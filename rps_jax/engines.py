@@ -73,16 +73,16 @@ def bodies(solids: Solid, friction: Friction, template: Body) -> Body:
         ],
         axis=-1,
     )
-    count = solids.mass.size
+    count, axes = solids.mass.size, solid.axes(solids)
     own = Body(
         mass=solids.mass,
         inertia=solids.inertia,
         p_object_com=com,
         q_object_body=solids.q_object_body,
-        vertices=(corners - com[:, None, :]) @ solid.axes(solids),
+        vertices=(corners - com[:, None, :]) @ axes,
         radius=solids.radius,
         height=solids.height,
-        up=np.tile([0.0, 0.0, 1.0], (count, 1)),
+        up=axes[:, 2],
         friction_ground=friction.ground,
         friction_robot=friction.robot,
         invweight=1 / solids.mass,

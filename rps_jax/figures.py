@@ -13,7 +13,7 @@ from matplotlib import patches
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rps_jax import ambiguity, benchmark, hardware, law, record, score, skin, trial
+from rps_jax import ambiguity, analysis, benchmark, hardware, law, record, score, skin, trial
 from rps_jax.benchmark import Speed
 from rps_jax.law import RPSParams
 from rps_jax.skin import NONE
@@ -108,7 +108,15 @@ def _base_patch(pose: np.ndarray, *, fill: bool) -> patches.Polygon:
     )
 
 
-def one_trial(case: Case, trace: Trace, path: Path) -> Path:
+def title_of(case: Case) -> str:
+    """What a case is, in words."""
+    return (
+        f"{_TITLES[case.object]}, $\\mu$ ground {case.friction.ground:g}, "
+        f"robot {case.friction.robot:g}"
+    )
+
+
+def one_trial(trace: Trace, title: str, path: Path) -> Path:
     """Fig. 6: the path with contact points; velocities; l and a_r; contact type.
 
     Blue shade: Realignment State. Yellow: no contact.
@@ -117,7 +125,7 @@ def one_trial(case: Case, trace: Trace, path: Path) -> Path:
     touching = seen.reading.contact_type != NONE
     figure = Figure(figsize=(11, 6), layout="constrained")
     grid = figure.add_gridspec(3, 2, width_ratios=(1.1, 1))
-    _path(figure.add_subplot(grid[:, 0]), case, trace)
+    _path(figure.add_subplot(grid[:, 0]), trace)
 
     velocity = figure.add_subplot(grid[0, 1])
     velocity.plot(seen.time, seen.twist.v_x, label="$v_x$ [m/s]", color="C0")
@@ -130,8 +138,8 @@ def one_trial(case: Case, trace: Trace, path: Path) -> Path:
     place.plot(seen.time, np.where(touching, seen.details.l, np.nan), color="C0")
     place.set_ylabel("b) $l$ [m]", color="C0")
     place.set_ylim(-skin.HALF_WIDTH, skin.HALF_WIDTH)
-    for sign in (-1, 1):
-        place.axhline(sign * float(case.params.l_cr), color="0.6", lw=0.7, ls="--")
+    for sign in (-1, 1) if isinstance(trace.params, RPSParams) else ():
+        place.axhline(sign * float(trace.params.l_cr), color="0.6", lw=0.7, ls="--")
     rate = place.twinx()
     rate.plot(seen.time, np.where(touching, seen.details.a_r, np.nan), color="C3", lw=0.9)
     rate.set_ylabel("$a_r$ [1]", color="C3")
@@ -145,11 +153,9 @@ def one_trial(case: Case, trace: Trace, path: Path) -> Path:
         _shade(ax, seen.time, seen.details.realigning, _SHADES["realigning"])
         _shade(ax, seen.time, ~touching, _SHADES["lost"])
     result = "reached" if trace.outcome.success else "not reached"
-    x, y = case.p_world_target
+    x, y = trace.p_world_target
     figure.suptitle(
-        f"{_TITLES[case.object]}, target ({x:g}, {y:g}) m, "
-        f"$\\mu$ ground {case.friction.ground:g}, robot {case.friction.robot:g}: "
-        f"{result} at {float(trace.outcome.time):.1f} s"
+        f"{title}, target ({x:.3g}, {y:.3g}) m: {result} at {float(trace.outcome.time):.1f} s"
     )
     return save(figure, path)
 
@@ -180,7 +186,7 @@ def stills(images: Sequence[np.ndarray], titles: Sequence[str], path: Path) -> P
     return save(figure, path)
 
 
-def _path(ax: Axes, case: Case, trace: Trace) -> None:
+def _path(ax: Axes, trace: Trace) -> None:
     """Left column of Fig. 6: the way of the base and of the contact point."""
     pose = np.asarray(trace.snapshots.qpos[:, :3])
     ax.plot(*pose[:, :2].T, color="0.35", label="base")
@@ -193,9 +199,9 @@ def _path(ax: Axes, case: Case, trace: Trace) -> None:
     )
     for index in np.linspace(0, len(pose) - 1, 7).astype(int):
         ax.add_patch(_base_patch(pose[index], fill=False))
-    ax.plot(*case.p_world_target, "*", ms=14, color="C3", label="target")
+    ax.plot(*trace.p_world_target, "*", ms=14, color="C3", label="target")
     circle = patches.Circle(
-        case.p_world_target, float(case.params.d_success), fill=False, color="C3"
+        trace.p_world_target, float(trace.params.d_success), fill=False, color="C3"
     )
     ax.add_patch(circle)
     ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
@@ -332,4 +338,26 @@ def throughput(speeds: Sequence[Speed], path: Path) -> Path:
         ax.grid(alpha=0.3, which="both")
     axes[0].set_ylabel("simulated s per s")
     axes[0].legend(fontsize=8)
+    return save(figure, path)
+
+
+def success_curves(results: xr.Dataset, path: Path) -> Path:
+    """Success against every quantity that was drawn, one line an arm, Wilson 95 % intervals."""
+    drawn = [name for name in analysis.DRAWN if np.nanstd(results[name].values) > 0]
+    rows = -(-len(drawn) // 4)
+    figure = Figure(figsize=(13, 2.6 * rows), layout="constrained")
+    axes = figure.subplots(rows, 4, squeeze=False, sharey=True)
+    for ax in axes.ravel()[len(drawn) :]:
+        ax.axis("off")
+    for ax, name in zip(axes.ravel(), drawn, strict=False):
+        for i, arm in enumerate(map(str, results.arm.values)):
+            won = results.success.sel(arm=arm).values > 0
+            found = analysis.bins(results[name].values, won)
+            _rates(ax, found.middle, found.won, found.of, color=f"C{i}", label=arm)
+        ax.set_xlabel(f"{analysis.DRAWN[name]} [{results[name].attrs['units']}]", fontsize=8)
+        ax.set_ylim(-3, 103)
+        ax.grid(alpha=0.3)
+    for ax in axes[:, 0]:
+        ax.set_ylabel("success [%]")
+    axes[0, 0].legend(fontsize=8)
     return save(figure, path)

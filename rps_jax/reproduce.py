@@ -208,7 +208,7 @@ def _one_trial(out: Path, plan: Plan) -> list[Section]:
     picture, file = out / "trial.png", out / "trial.nc"
     if not (picture.exists() and file.exists()):
         (trace,) = sweep.follow([_FIG_6], Setting(engine=plan.engine))
-        figures.one_trial(_FIG_6, trace, picture)
+        figures.one_trial(trace, figures.title_of(_FIG_6), picture)
         record.write_results(file, score.trace_dataset(trace))
     seen = record.read(file)
     reached = "reached" if int(seen.outcome_success) else "not reached"

@@ -23,16 +23,18 @@ import h5py
 import numpy as np
 import xarray as xr
 
-from rps_jax import domain, errors, record, slots, trial
+from rps_jax import analysis, domain, engines, errors, figures, record, score, slots, trial
 from rps_jax.domain import Domain
 from rps_jax.errors import InputError
 from rps_jax.physics import Physics
+from rps_jax.report import Section
+from rps_jax.report import write_report as _write
+from rps_jax.scene import Scene
 from rps_jax.slots import Job, Part, Progress, Setting, Timing
 from rps_jax.trial import Outcome, Params, Rules
 
 MANIFEST = "manifest.json"
-_SHAPES = {"base_pose": (3,), "object_pose": (3,)}  # of an outcome's leaves; the others are scalars
-_TYPES = {"success": np.int8, "diverged": np.int8}  # likewise; the others are float32
+_TYPES = {"success": np.int8, "diverged": np.int8}  # of an outcome; the others are float32
 
 
 @dataclass(frozen=True)
@@ -177,7 +179,9 @@ def load_plan(folder: Path) -> Plan:
     """
     found = _manifest(folder)
     try:
-        physics = {k: tuple(v) if isinstance(v, list) else v for k, v in found["physics"].items()}
+        physics: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in found["physics"].items()
+        }
         return Plan(
             domain.from_json(found["domain"]),
             found["worlds"],
@@ -258,7 +262,7 @@ class _Parts:
     def _write(self, part: int, rows: dict[int, Outcome]) -> None:
         numbers = self.parts[part]
         leaves = zip(*(rows[int(n)] for n in numbers), strict=True)
-        content = {"trial": ("row", numbers)}
+        content: dict[str, Any] = {"trial": ("row", numbers)}
         for name, values in zip(Outcome._fields, leaves, strict=True):
             stacked = np.stack(values).astype(_TYPES.get(name, np.float32))
             content[name] = (("row", "pose")[: stacked.ndim], stacked)
@@ -279,12 +283,10 @@ def run(
     **shape: Any,
 ) -> Timing:
     """Run what is missing of a plan, or of one shard of it, in a folder that `open_run` opened."""
-    every = plan.parts()
-    mine = [n for i, n in enumerate(every) if i % shard.of == shard.number - 1]
-    done = finished(folder)
-    before = sum(every[n].size for n in mine if n in done)
+    mine, done = share(plan, shard), finished(folder)
+    before = sum(trials.size for n, trials in mine.items() if n in done)
     report(Progress(before, 0.0))
-    parts = _Parts(folder, {n: every[n] for n in mine if n not in done})
+    parts = _Parts(folder, {n: trials for n, trials in mine.items() if n not in done})
     jobs: dict[Any, list[int]] = {}
     for number in parts.parts:
         arm, which = _arm_and_object(plan, number)
@@ -309,6 +311,12 @@ def run(
     )
 
 
+def share(plan: Plan, shard: Shard) -> dict[int, np.ndarray]:
+    """The parts of one shard: numbers of their trials, by the part's number."""
+    every = plan.parts().items()
+    return {n: trials for i, (n, trials) in enumerate(every) if i % shard.of == shard.number - 1}
+
+
 def _arm_and_object(plan: Plan, part: int) -> tuple[int, int]:
     return divmod(part // plan.blocks, len(plan.domain.objects))
 
@@ -321,8 +329,26 @@ def _made(plan: Plan, parts: _Parts, numbers: list[int]) -> Iterator[Part]:
         yield world_part(plan, arm, trials % plan.worlds)._replace(numbers=trials)
 
 
-def world_part(plan: Plan, arm: int, index: np.ndarray) -> Part:
-    """Worlds of one object, with the parameters of an arm."""
+def scene_of(plan: Plan, index: int) -> Scene:
+    """The compiled scene of one world, for pictures."""
+    drawn = domain.draw(plan.domain, plan.setting.seed, [index])
+    family = plan.domain.family_of(index)
+    return engines.scene_of_solid(family, drawn.solid, drawn.friction, plan.setting.physics, 0)
+
+
+def title_of(plan: Plan, index: int) -> str:
+    """What one world is, in words."""
+    drawn = domain.table(domain.draw(plan.domain, plan.setting.seed, [index]))
+    name = plan.domain.objects[int(plan.domain.object_of(np.asarray(index)))].replace("_", " ")
+    value = {key: float(values[0]) for key, (values, _) in drawn.items()}
+    return (
+        f"world {index}: {name}, {value['mass']:.1f} kg, $\\mu$ ground "
+        f"{value['friction_ground']:.2f}, robot {value['friction_robot']:.2f}"
+    )
+
+
+def world_part(plan: Plan, arm: int, index: Any) -> Part:
+    """Worlds of one object, by their indices, with the parameters of an arm."""
     drawn = domain.draw(plan.domain, plan.setting.seed, index)
     return domain.worlds(plan.domain, drawn, list(plan.arms.values())[arm], plan.setting)
 
@@ -367,28 +393,59 @@ def _write_results(path: Path, plan: Plan, found: dict[int, Path]) -> None:
         file.create_variable("world", ("world",), data=every)
         which = plan.domain.object_of(every).astype(np.int16)
         file.create_variable("which_object", ("world",), data=which)
-        for name in Outcome._fields:
-            dims = ("arm", "world", "pose") if name in _SHAPES else ("arm", "world")
-            file.create_variable(name, dims, dtype=_TYPES.get(name, np.float32))
+        outcomes, drawn = {}, {}
+        for name, (unit, meaning) in score.UNITS.items():
+            dims = ("arm", "world", "pose") if name.endswith("pose") else ("arm", "world")
+            outcomes[name] = file.create_variable(name, dims, _TYPES.get(name, np.float32))
+            outcomes[name].attrs.update(units=unit, long_name=meaning)
         for number, source in found.items():
             arm, _ = _arm_and_object(plan, number)
-            with xr.open_dataset(source, engine="h5netcdf") as part:
-                world = part.trial.values % plan.worlds
-                for name in Outcome._fields:
-                    values = file[name][arm]
-                    values[world] = part[name].values
-                    file[name][arm] = values
+            part = record.read(source)
+            world = part.trial.values % plan.worlds
+            for name, variable in outcomes.items():
+                _put(variable, (arm,), world, part[name].values)
             if arm == 0:
-                drawn = domain.draw(plan.domain, plan.setting.seed, world)
-                _write_drawn(file, domain.table(drawn), world)
+                columns = domain.table(domain.draw(plan.domain, plan.setting.seed, world))
+                for name, (values, unit) in columns.items():
+                    if name not in drawn:
+                        drawn[name] = file.create_variable(name, ("world",), np.float32)
+                        drawn[name].attrs["units"] = unit
+                    _put(drawn[name], (), world, values)
 
 
-def _write_drawn(file: h5netcdf.File, columns: Mapping[str, Any], world: np.ndarray) -> None:
-    """What was drawn for some worlds, one variable a quantity."""
-    for name, (values, unit) in columns.items():
-        if name not in file.variables:
-            new = file.create_variable(name, ("world",), dtype=np.float32, fillvalue=np.nan)
-            new.attrs["units"] = unit
-        whole = file[name][...]
-        whole[world] = values
-        file[name][...] = whole
+def _put(variable: h5netcdf.Variable, at: tuple[int, ...], world: np.ndarray, values: Any) -> None:
+    """Write the rows of some worlds, which are in order but seldom adjacent."""
+    span = slice(int(world[0]), int(world[-1]) + 1)
+    rows = variable[(*at, span)]
+    rows[world - world[0]] = values
+    variable[(*at, span)] = rows
+
+
+def write_report(folder: Path) -> Path:
+    """`report.md`, `report.html` and the figure of a run folder with results; returns the first."""
+    plan, results = load_plan(folder), record.read_results(folder)
+    environment = json.loads((folder / "environment.json").read_text())
+    picture = figures.success_curves(results, folder / "success.png")
+    intro = (
+        f"{plan.worlds} worlds, seed {plan.setting.seed}, engine {plan.setting.engine}, "
+        f"{1000 * plan.setting.physics.timestep:g} ms steps; every arm meets the same worlds. "
+        "Intervals: Wilson 95 %.\n\n"
+        f"Made by `{' '.join(environment['command'])}`, commit {environment['commit']}, "
+        f"{environment['time']}, on {environment['device']['kind']} with "
+        f"{environment['processors']} processors."
+    )
+    failures = (
+        "CVaR: mean over the worst 5 % of worlds of the least distance between contact point and "
+        "target; of an object that was never touched, the whole way."
+    )
+    hard = "Worlds in which most arms fail, and most distance is left."
+    sections = [
+        Section("Success", failures, analysis.rates(results, float(plan.setting.rules.max_lost))),
+        Section("Success against what was drawn", "", (), picture),
+        Section("The hardest worlds", hard, analysis.hardest_table(results, str(folder))),
+    ]
+    if len(plan.arms) > 1:
+        paired = Section("Differences, world by world", "", analysis.differences(results))
+        sections.insert(1, paired)
+    _write(folder, "Sweep over random worlds", intro, sections)
+    return folder / "report.md"

@@ -283,7 +283,7 @@ def solid_of(scene: Scene) -> Solid:
         radius=np.array([geom.size[0] if round_ else 0.0]),
         height=2 * geom.size[1:2] if round_ else 2 * geom.size[2:],
         mass=thing.mass.copy(),
-        p_object_com=thing.ipos[None].copy(),
+        p_object_com=thing.ipos[None] - OFF_CENTRE,
         inertia=thing.inertia[None].copy(),
         q_object_body=thing.iquat[None].copy(),
     )
@@ -330,6 +330,14 @@ def stack(models: list[mujoco.MjModel]) -> tuple[mjx.Model, dict[str, jax.Array]
         elif any(not np.array_equal(v, values[0]) for v in values):
             raise ValueError(f"models that differ in {name} cannot be stacked")
     return trees[0], fields
+
+
+def family_of(model: mjx.Model) -> str:
+    """The shape family of an MJX model's object."""
+    kinds = {int(kind) for kind in model.geom_type}
+    if int(mujoco.mjtGeom.mjGEOM_MESH) in kinds:
+        return "prism"
+    return "cylinder" if int(mujoco.mjtGeom.mjGEOM_CYLINDER) in kinds else "box"
 
 
 def apply(model: mjx.Model, fields: dict[str, jax.Array]) -> mjx.Model:

@@ -14,7 +14,7 @@ from rps_jax.sweep import Trace
 from rps_jax.trial import Outcome
 
 DIMS = ("strategy", "object", "friction", "target")
-_UNITS = {
+UNITS = {
     "success": ("1", "target reached within the rules"),
     "time": ("s", "simulated time at which the trial ended"),
     "min_distance": ("m", "least distance of the contact point to the target"),
@@ -47,7 +47,7 @@ def dataset(
     for name, values in outcome._asdict().items():
         values = _plain(values)
         dims = DIMS + ("pose",) * (values.ndim - 1)
-        unit, meaning = _UNITS[name]
+        unit, meaning = UNITS[name]
         attrs = {"units": unit, "long_name": meaning}
         variables[name] = xr.Variable(dims, values.reshape(shape + values.shape[1:]), attrs)
     position = np.asarray(targets, float)
@@ -93,7 +93,7 @@ def trace_dataset(trace: Trace) -> xr.Dataset:
     }
     for name, value in trace.outcome._asdict().items():
         value = _plain(value)
-        attrs = {"units": _UNITS[name][0], "long_name": _UNITS[name][1]}
+        attrs = {"units": UNITS[name][0], "long_name": UNITS[name][1]}
         variables[f"outcome_{name}"] = xr.Variable(("pose",) * value.ndim, value, attrs)
     return xr.Dataset(variables, coords={"time": ("time", seen.time, {"units": "s"})})
 

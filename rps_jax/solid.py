@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rps_jax import spatial
+
 _LOAD_AT = 0.8  # of the way from the middle to the outline stands the load
 
 
@@ -118,10 +120,9 @@ def extent(solid: Solid, yaw: np.ndarray) -> np.ndarray:
 
 def axes(solid: Solid) -> np.ndarray:
     """Rotation matrices (n, 3, 3) from principal axes to the object's frame."""
-    w, z = solid.q_object_body[:, 0], solid.q_object_body[:, 3]  # all of them about z
-    c, s = w * w - z * z, 2 * w * z
-    zero, one = np.zeros_like(c), np.ones_like(c)
-    return np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(-1, 3, 3)
+    w, x, y, z = solid.q_object_body.T
+    rows = spatial.matrix((w, x, y, z))
+    return np.stack([entry for row in rows for entry in row], axis=-1).reshape(-1, 3, 3)
 
 
 def _triangles(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

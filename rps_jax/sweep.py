@@ -20,7 +20,7 @@ from rps_jax.scene import JOINTS, Friction, Scene, Side
 from rps_jax.skin import IdealSkin, Skin
 from rps_jax.slots import SEGMENT, Job, Part, Progress, Setting, Timing, rows
 from rps_jax.slots import run as _run
-from rps_jax.trial import Odometry, Outcome, Params, Shift, Snapshot, World
+from rps_jax.trial import Odometry, Outcome, Params, Shift, Snapshot, Strategy, World
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,8 @@ class Trace:
     snapshots: Snapshot
     outcome: Outcome  # without a leading axis
     timing: Timing  # of all trials followed together
+    p_world_target: tuple[float, float]  # [m]
+    params: Params
 
 
 def scene_of(case: Case, physics: Physics) -> Scene:
@@ -216,30 +218,54 @@ def follow(
     Raises:
       InputError: the engine is `mujoco`, which is not followed.
     """
-    if setting.engine == "mujoco":
+    check_followed(setting.engine)
+    stage, worlds = build(cases, setting)
+    part = Part(np.arange(len(cases)), worlds, stage)
+    strategy = trial.STRATEGIES[type(cases[0].params)]
+    return follow_part(part, strategy, setting, interval=interval, report=report)
+
+
+def check_followed(engine: str) -> None:
+    """Raises InputError unless trials of this engine can be followed."""
+    if engine == "mujoco":
         raise errors.InputError("engine = mujoco is not allowed: follow a trial with mjx or fused.")
+
+
+def follow_part(
+    part: Part,
+    strategy: Strategy,
+    setting: Setting,
+    *,
+    interval: float = 0.1,
+    report: Callable[[Progress], Any] = lambda progress: None,
+) -> list[Trace]:
+    """`follow`, for worlds that are built."""
     period = setting.physics.control_period
     every = max(1, round(interval / period))
     steps = every * max(1, round(SEGMENT / (every * period)))
-    strategy = trial.STRATEGIES[type(cases[0].params)]
-    stage, worlds = build(cases, setting)
-    worlds = jax.device_put(worlds)
-    trials = trial.start_all(worlds, np.ones(len(cases), bool), strategy=strategy)
+    worlds = jax.device_put(part.worlds)
+    trials = trial.start_all(worlds, np.ones(part.numbers.size, bool), strategy=strategy)
     options = {"physics": setting.physics, "rules": setting.rules, "strategy": strategy}
     began = time.perf_counter()
     program = trial.record.lower(
-        stage, worlds, trials, **options, steps=steps, every=every
+        part.stage, worlds, trials, **options, steps=steps, every=every
     ).compile()
     compiled = time.perf_counter()
     parts = []
     while not bool(trials.done.all()):
-        trials, snapshots = program(stage, worlds, trials, rules=setting.rules)
+        trials, snapshots = program(part.stage, worlds, trials, rules=setting.rules)
         parts.append(jax.device_get(snapshots))
         report(Progress(int(trials.done.sum()), float(trials.steps.sum()) * period))
     whole = jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
     outcomes = jax.device_get(trial.outcome(trials, period))
     timing = Timing(compiled - began, time.perf_counter() - compiled, float(np.sum(outcomes.time)))
     return [
-        Trace(rows(whole, (~whole.done[:, i], i)), rows(outcomes, i), timing)
-        for i in range(len(cases))
+        Trace(
+            rows(whole, (~whole.done[:, i], i)),
+            rows(outcomes, i),
+            timing,
+            (float(part.worlds.p_world_target[i][0]), float(part.worlds.p_world_target[i][1])),
+            rows(part.worlds.params, i),
+        )
+        for i in range(part.numbers.size)
     ]

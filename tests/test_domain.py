@@ -1,0 +1,256 @@
+"""Random worlds: each is what its address says, and what MuJoCo would compile."""
+
+import dataclasses
+import json
+import math
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from rps_jax import domain, engines, fused, paper, scene, solid, sweep
+from rps_jax.domain import DOMAINS, RANDOM, Domain, Range
+from rps_jax.errors import InputError
+from rps_jax.physics import preset
+from rps_jax.scene import FRICTION, mjx
+from rps_jax.slots import Setting
+from rps_jax.sweep import Case
+
+WIDE = DOMAINS["wide"]
+COUNT = 12
+
+
+def drawn(name, count=COUNT, seed=3, **changes):
+    return domain.draw(replace(WIDE, objects=(name,), **changes), seed, np.arange(count))
+
+
+def same(a, b):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_a_world_is_the_same_alone_as_among_others_however_they_are_asked_for():
+    many = domain.draw(WIDE, 7, np.arange(1, 3000, 3))
+    for i in (0, 17, 999):
+        alone = domain.draw(WIDE, 7, [1 + 3 * i])
+        same(alone, jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], many))
+    backwards = domain.draw(WIDE, 7, np.arange(1, 3000, 3)[::-1])
+    same(jax.tree.map(lambda leaf: leaf[::-1], backwards), many)
+
+
+def test_other_indices_and_other_seeds_give_other_worlds():
+    masses = np.concatenate([drawn("random_box", seed=seed).solid.mass for seed in range(4)])
+    assert np.unique(masses).size == 4 * COUNT
+
+
+def test_a_change_of_one_range_leaves_all_else_as_it_was():
+    a, b = drawn("random_box"), drawn("random_box", friction_ground=Range(0.9, 1.0))
+    assert (b.friction.ground >= 0.9).all()
+    same(a.solid, b.solid)
+    same(a.p_world_target, b.p_world_target)
+
+
+@pytest.mark.parametrize("name", ["wide", "hostile", "hardware"])
+def test_everything_lies_in_its_range_and_fills_it(name):
+    chosen = DOMAINS[name]
+    index = np.arange(0, 600 * len(chosen.objects), len(chosen.objects))
+    columns = domain.table(domain.draw(chosen, 0, index))
+    for quantity in set(columns) & set(domain.RANGES):
+        values = columns[quantity][0]
+        low, high, log = getattr(chosen, quantity)
+        if name == "hardware" and quantity in ("mass", "size", "height", "com_offset"):
+            continue  # these are the objects' own
+        assert low - 1e-9 <= values.min() <= values.max() <= high + 1e-9, quantity
+        if high > low:
+            at = np.log(values / low) / np.log(high / low) if log else (values - low) / (high - low)
+            assert abs(at.mean() - 0.5) < 5 * 0.29 / math.sqrt(values.size), quantity
+
+
+def test_objects_take_turns():
+    objects = WIDE.object_of(np.arange(9))
+    assert objects.tolist() == [0, 1, 2] * 3
+    assert [WIDE.family_of(i) for i in range(3)] == ["box", "cylinder", "prism"]
+    with pytest.raises(ValueError, match="several objects"):
+        domain.draw(WIDE, 0, [0, 1])
+
+
+@pytest.mark.parametrize("engine", ["fused", "mjx"])
+def test_the_paper_domain_is_the_papers_grid(engine):
+    chosen, setting = DOMAINS["paper"], Setting(engine=engine)
+    assert chosen.combinations == 144
+    for which, name in enumerate(scene.PAPER_OBJECTS):
+        index = np.flatnonzero(chosen.object_of(np.arange(144)) == which)
+        part = domain.worlds(chosen, domain.draw(chosen, 0, index), paper.PARAMS["rps"], setting)
+        cases = [Case(name, f, t) for f in FRICTION.values() for t in paper.TARGETS]
+        _, worlds = sweep.build(cases, setting)
+        mine, theirs = (w._replace(key=0, odometry=0) for w in (part.worlds, worlds))
+        for world in (mine, theirs) if engine == "mjx" else ():
+            for field in (".body_pos", ".qpos0", ".qpos_spring"):  # of a body that is free
+                world.fields.pop(field)
+        for a, b in zip(jax.tree.leaves(mine), jax.tree.leaves(theirs), strict=True):
+            np.testing.assert_allclose(a, b, rtol=3e-6, atol=3e-6)
+
+
+@pytest.mark.parametrize("name", ["random_box", "random_cylinder"])
+def test_fused_bodies_equal_those_of_recompiled_models(name):
+    worlds, family = drawn(name), RANDOM[name]
+    _, bodies = engines.stage_of_solids(family, worlds.solid, worlds.friction, "fused", preset())
+    for i in range(COUNT):
+        one = engines.scene_of_solid(family, worlds.solid, worlds.friction, preset(), i)
+        compiled = fused.body(one.physics, np.asarray(one.footprint.vertices, float))
+        for field, a, b in zip(compiled._fields, bodies, compiled, strict=True):
+            np.testing.assert_allclose(a[i], b, rtol=1e-6, atol=1e-7, err_msg=field)
+
+
+@pytest.mark.parametrize("name", list(RANDOM))
+def test_applied_domain_equals_the_recompiled_model_in_every_field(name):
+    worlds, family = drawn(name), RANDOM[name]
+    _, fields = engines.stage_of_solids(family, worlds.solid, worlds.friction, "mjx", preset())
+    assert set(fields) <= set(scene.FIELDS)
+    for i in range(COUNT):
+        one = engines.scene_of_solid(family, worlds.solid, worlds.friction, preset(), i)
+        compiled = mjx.put_model(one.physics)
+        # The mesh of a prism stands for it in C MuJoCo alone: MJX reads its corners off its feet.
+        real = one.physics.geom_type != mujoco.mjtGeom.mjGEOM_MESH
+        leaves = jax.tree_util.tree_flatten_with_path(compiled)[0]
+        values = {jax.tree_util.keystr(path): np.asarray(leaf, float) for path, leaf in leaves}
+        for field in scene.FIELDS:
+            mine, theirs = fields[field][i], values[field]
+            if field.startswith(".geom"):
+                mine, theirs = mine[real], theirs[real]
+            scale = np.abs(theirs).max() + 1e-12
+            np.testing.assert_allclose(mine / scale, theirs / scale, atol=1e-6, err_msg=field)
+
+
+def test_models_of_a_family_differ_in_nothing_but_these_fields():
+    for name, family in RANDOM.items():
+        worlds = drawn(name, 2)
+        models = [
+            engines.scene_of_solid(family, worlds.solid, worlds.friction, preset(), i).physics
+            for i in range(2)
+        ]
+        if family != "prism":  # whose meshes differ, and are not read
+            scene.stack(models)
+
+
+@pytest.mark.parametrize("name", list(RANDOM))
+def test_mass_properties_are_those_mujoco_finds_for_an_even_solid_and_a_small_load(name):
+    worlds = drawn(name, 6, seed=1)
+    for i in range(6):
+        one = jax.tree.map(lambda leaf, i=i: leaf[i], worlds.solid)
+        share = np.linalg.norm(one.p_object_com) / (
+            0.8 * _reach(one, np.arctan2(*one.p_object_com[1::-1]))
+        )
+        load = one.p_object_com / share
+        spec = mujoco.MjSpec()
+        body = spec.worldbody.add_body()
+        body.add_geom(**_even(spec, one), mass=(1 - share) * one.mass)
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-4] * 3, pos=load, mass=share * one.mass
+        )
+        model = spec.compile()
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, model.body_iquat[1])
+        theirs = turn.reshape(3, 3) @ np.diag(model.body_inertia[1]) @ turn.reshape(3, 3).T
+        axes = solid.axes(jax.tree.map(lambda leaf: leaf[None], one))[0]
+        np.testing.assert_allclose(one.p_object_com, model.body_ipos[1], atol=1e-6)
+        np.testing.assert_allclose(axes @ np.diag(one.inertia) @ axes.T, theirs, rtol=1e-4,
+                                   atol=1e-4 * one.inertia.max())  # fmt: skip
+
+
+def _reach(one, bearing):
+    direction = np.array([[np.cos(bearing), np.sin(bearing)]])
+    return solid.reach(one.vertices[None], one.radius[None], direction)[0]
+
+
+def _even(spec, one):
+    """The geom of a solid of even density."""
+    half = one.height / 2
+    if len(one.vertices) == 1:
+        return {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": [one.radius, half, 0]}
+    corners = np.unique(one.vertices, axis=0)
+    points = [[*corner, z] for z in (-half, half) for corner in corners]
+    spec.add_mesh(name="solid", uservert=np.ravel(points))
+    return {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": "solid"}
+
+
+def test_prisms_are_convex_of_three_to_eight_sides_and_centred():
+    solids = drawn("random_prism", 300).solid
+    sides = solid.corners(solids)
+    assert set(sides) == set(range(3, 9))
+    centre = solid.centred(solids.vertices)
+    np.testing.assert_allclose(centre, solids.vertices, atol=1e-12)
+    for vertices, count in zip(solids.vertices, sides, strict=True):
+        corners = vertices[: int(count)]
+        edge = np.roll(corners, -1, axis=0) - corners
+        following = np.roll(edge, -1, axis=0)
+        assert (edge[:, 0] * following[:, 1] - edge[:, 1] * following[:, 0] > 0).all()
+    assert (solid.area(solids) > 0).all()
+
+
+def test_a_square_prism_has_a_boxs_mass_properties():
+    square = solid.rectangles(np.array([0.2]), np.array([0.3]))
+    (height, mass, offset) = (np.array([x]) for x in (0.6, 12.0, 0.0))
+    one = solid.build(square, np.zeros(1), height, mass, offset, offset)
+    ixx, iyy, izz = 12 / 3 * (0.3**2 + 0.3**2), 12 / 3 * (0.2**2 + 0.3**2), 12 / 3 * 0.13
+    axes = solid.axes(one)[0]
+    found = np.diag(axes @ np.diag(one.inertia[0]) @ axes.T)
+    np.testing.assert_allclose(found, [ixx, iyy, izz])
+    padded = np.concatenate([square, np.repeat(square[:, -1:], 4, axis=1)], axis=1)
+    assert solid.build(padded, np.zeros(1), height, mass, offset, offset).inertia == pytest.approx(
+        one.inertia
+    )
+
+
+def test_a_load_moves_the_centre_of_mass_by_the_share_that_is_asked_for():
+    worlds = drawn("random_prism", 50, com_offset=Range(0.3, 0.3))
+    np.testing.assert_allclose(domain.table(worlds)["com_offset"][0], 0.3)
+
+
+def test_domain_randomize_gives_models_for_a_loop_of_ones_own():
+    for name, family in RANDOM.items():
+        worlds = drawn(name, 1)
+        one = engines.scene_of_solid(family, worlds.solid, worlds.friction, preset(), 0)
+        model = mjx.put_model(one.physics)
+        keys = jax.random.split(jax.random.PRNGKey(0), 5)
+        batched, in_axes = domain.domain_randomize(model, keys)
+        mass = jax.vmap(lambda m: m.body_mass[-1], in_axes=(in_axes,))(batched)
+        assert mass.shape == (5,)
+        assert jnp.unique(mass).size == 5
+        again, _ = domain.domain_randomize(model, keys[2:3])
+        np.testing.assert_array_equal(again.body_inertia[0], batched.body_inertia[2])
+        assert in_axes.opt.timestep is None
+        assert in_axes.pair_friction == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mass": Range(-1, 3)}, "domain mass .low. = -1"),
+        ({"mass": Range(5, 3)}, "mass = 5 to 3"),
+        ({"mass": Range(math.nan, 3)}, "domain mass"),
+        ({"friction_ground": Range(0, 1)}, "friction_ground"),
+        ({"com_offset": Range(0, 0.9)}, "com_offset"),
+        ({"distance": Range(0.1, 1)}, "distance"),
+        ({"pose_latency": Range(0, 5)}, "pose_latency"),
+        ({"objects": ("ball",)}, "unknown domain object 'ball'"),
+        ({"objects": ()}, "name at least one"),
+        ({"skin": "fur"}, "unknown domain skin"),
+    ],
+)
+def test_ranges_that_mean_nothing_are_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        Domain(**changes)
+
+
+def test_a_domain_survives_json():
+    for chosen in DOMAINS.values():
+        text = json.dumps(dataclasses.asdict(chosen))
+        assert domain.from_json(json.loads(text)) == chosen
+    with pytest.raises(InputError, match=r"unknown domain quantity 'masss'.*did you mean 'mass'"):
+        domain.from_json({"masss": [1, 2]})
+    with pytest.raises(InputError, match="write low and high"):
+        domain.from_json({"mass": 3})
