@@ -11,6 +11,7 @@ that it stands on, and so may differ from world to world.
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -21,7 +22,7 @@ from mujoco.mjx._src.collision_types import Collision, GeomInfo
 from mujoco.mjx._src.types import Data, GeomType, Model
 
 from rps_jax import spatial
-from rps_jax.contacts import Body, State, meetings
+from rps_jax.contacts import meetings
 
 _UPRIGHT = 1e-6  # [rad] below this tilt every point of the rim is the lowest
 
@@ -65,22 +66,16 @@ def box_prism(model: Model, data: Data, key: Any, geom: jax.Array) -> Collision:
     lower = -jnp.abs(corners[:, 2])
     turn = data.geom_xmat[base][:2, 0]
     middle = data.geom_xpos[base]
-    blank = dict.fromkeys((*Body._fields, *State._fields))
-    thing = {
-        "vertices": list(zip(corners[:, 0], corners[:, 1], lower, strict=True)),
-        "height": -2 * lower[0],
-        "up": spatial.Z,
-        "base_half": half[:2],
-        "base_z": middle[2] + jnp.array([-1.0, 1.0]) * half[2],
-    }
-    held = {"base": middle, "p": data.xpos[body]}
-    m = data.xmat[body]
-    found = meetings(
-        Body(**{k: thing.get(k, blank[k]) for k in Body._fields}),
-        State(**{k: held.get(k, blank[k]) for k in State._fields}),
-        [tuple(row) for row in m],  # type: ignore[misc]
-        (turn[0], turn[1]),
+    thing: Any = SimpleNamespace(
+        vertices=list(zip(corners[:, 0], corners[:, 1], lower, strict=True)),
+        height=-2 * lower[0],
+        up=spatial.Z,
+        base_half=half[:2],
+        base_z=middle[2] + jnp.array([-1.0, 1.0]) * half[2],
     )
+    state: Any = SimpleNamespace(base=middle, p=data.xpos[body])
+    m: Any = [tuple(row) for row in data.xmat[body]]
+    found = meetings(thing, state, m, (turn[0], turn[1]))
     back = jnp.array([[turn[0], turn[1]], [-turn[1], turn[0]]])
     distance, points, frames = [], [], []
     for z, normal, point, apart in found:

@@ -119,7 +119,7 @@ class Domain:
 
 
 RANDOM = {"random_box": "box", "random_cylinder": "cylinder", "random_prism": "prism"}
-_OF_THE_BASE = ("pose_noise", "yaw_noise", "pose_latency", "command_delay", "velocity_error")
+OF_THE_BASE = ("pose_noise", "yaw_noise", "pose_latency", "command_delay", "velocity_error")
 _POSITIVE = 1e-3
 # What a range must not leave.
 _ALLOWED = {
@@ -404,10 +404,10 @@ def _starts(drawn: Draw) -> np.ndarray:
 
 def _odometry(domain: Domain, drawn: Draw, period: float) -> Odometry:
     count = drawn.number.size
-    perfect = all(getattr(domain, name) == _PERFECT[name] for name in _OF_THE_BASE)
+    perfect = all(getattr(domain, name) == _PERFECT[name] for name in OF_THE_BASE)
     oldest = max(domain.pose_latency.high, domain.command_delay.high)
     past = 0 if perfect else 1 + round(oldest / period)
-    errors_ = (getattr(drawn, name) for name in _OF_THE_BASE)
+    errors_ = (getattr(drawn, name) for name in OF_THE_BASE)
     return Odometry(*_any(*errors_, np.zeros((count, past))))
 
 

@@ -1,0 +1,337 @@
+"""Sweeps over random worlds: a world's result is its own, and nothing that is done is lost."""
+
+import json
+import multiprocessing
+import os
+import random
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+
+from rps_jax import analysis, cli, domain, paper, record, robustness, slots, trial
+from rps_jax.domain import DOMAINS, Range
+from rps_jax.errors import InputError
+from rps_jax.physics import preset
+from rps_jax.robustness import Plan, Shard
+from rps_jax.slots import Job, Setting
+from rps_jax.trial import Rules
+
+SLOTS = 8
+SHORT = Setting(preset(fidelity="fast"), Rules(horizon=20.0), engine="fused")
+BOXES = replace(
+    DOMAINS["wide"],
+    objects=("random_box",),
+    distance=Range(0.7, 0.8),
+    bearing=Range(-0.5, 0.5),
+    gap=Range(0, 0.01),
+)
+ROUND = replace(BOXES, objects=("random_cylinder",))
+PLAN = Plan(BOXES, 20, {"rps": paper.PARAMS["rps"], "nps": paper.PARAMS["nps"]}, SHORT, part=7)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def cache(tmp_path_factory):
+    """The programs of this file are compiled once, also those of other processes."""
+    folder = os.environ.get("RPS_CACHE") or str(tmp_path_factory.mktemp("cache"))
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", folder)
+    yield folder
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+def outcomes(parts, setting=SHORT):
+    found = {}
+
+    def collect(numbers, rows):
+        for i, number in enumerate(numbers):
+            found[int(number)] = [leaf[i] for leaf in rows]
+
+    job = Job(trial.RPS, sum(p.numbers.size for p in parts), parts)
+    slots.run([job], setting, slots=SLOTS, workers=1, collect=collect)
+    return found
+
+
+def made(index):
+    return domain.worlds(BOXES, domain.draw(BOXES, 0, index), paper.PARAMS["rps"], SHORT)
+
+
+def swept(folder, plan=PLAN, **options):
+    robustness.open_run(folder, plan)
+    robustness.run(folder, plan, slots=SLOTS, **options)
+    return folder
+
+
+def payload(folder):
+    return {path.name: path.read_bytes() for path in (folder / "parts").iterdir()}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, cache):
+    """A run that nothing disturbed."""
+    return swept(tmp_path_factory.mktemp("whole"))
+
+
+def test_a_world_in_a_refilled_slot_ends_as_it_does_alone():
+    """Bit by bit, for one number of slots: whatever shares the batch, whenever it began."""
+    together = outcomes([made(np.arange(13)), made(np.arange(13, 20))])
+    assert len(together) == 20
+    assert len({float(row[1]) for row in together.values()}) > 3  # they end at different times
+    for index in (0, 9, 19):
+        padded = made(np.full(SLOTS, index))  # a batch of one program, of this world alone
+        alone = outcomes([padded._replace(numbers=np.arange(SLOTS))])
+        for a, b in zip(alone[0], together[index], strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("error", ["pose_latency", "command_delay"])
+def test_late_poses_and_late_commands_are_late_by_as_much(error):
+    """Of a base that is told to turn: what is believed, and done, is what was n steps before."""
+    steps, period = 3, SHORT.physics.control_period
+    still = replace(BOXES, **{name: Range(0, 0) for name in domain.OF_THE_BASE})
+    late = replace(still, **{error: Range(steps * period, steps * period)})
+    part = domain.worlds(late, domain.draw(late, 0, [0]), paper.PARAMS["rps"], SHORT)
+    world = jax.tree.map(lambda leaf: leaf[0], part.worlds)
+    now = jax.tree.map(jnp.asarray, trial.start(world))
+    told, done = [], []
+    for step in range(8):
+        now = now._replace(qpos=now.qpos.at[2].set(0.01 * step))  # turned by hand
+        now, twist, seen = trial.decide(world, now, physics=SHORT.physics)
+        now = now._replace(steps=now.steps + 1)
+        told.append([float(x) for x in seen.twist])
+        done.append([float(x) for x in twist])
+    if error == "command_delay":
+        np.testing.assert_allclose(done[steps:], told[:-steps], rtol=1e-6)
+        np.testing.assert_array_equal(done[:steps], 0.0)
+    else:
+        np.testing.assert_allclose(done, told)
+        assert np.abs(np.array(told[: steps + 1]) - told[0]).max() == 0  # nothing seen yet
+        assert np.abs(np.array(told[steps + 1]) - told[0]).max() > 0
+
+
+def test_a_base_that_errs_by_nothing_is_perfect():
+    nothing = {name: Range(0, 0) for name in domain.OF_THE_BASE}
+    perfect = replace(ROUND, **nothing)
+    assert made(np.arange(2)).worlds.odometry.past.shape[1] > 1
+    drawn = domain.draw(perfect, 0, np.arange(6))
+    part = domain.worlds(perfect, drawn, paper.PARAMS["rps"], SHORT)
+    assert part.worlds.odometry.past.shape == (6, 0)
+    remembered = part.worlds._replace(
+        odometry=part.worlds.odometry._replace(past=np.zeros((6, 4), np.float32))
+    )
+    brief = replace(SHORT, rules=Rules(horizon=1.0))
+    a, b = (outcomes([p], brief) for p in (part, part._replace(worlds=remembered)))
+    for i in range(6):
+        for mine, theirs in zip(a[i], b[i], strict=True):
+            np.testing.assert_allclose(mine, theirs, atol=1e-4)
+
+
+def test_a_faster_base_arrives_earlier():
+    quick = replace(ROUND, **{n: Range(0, 0) for n in domain.OF_THE_BASE}, gap=Range(0.05, 0.05))
+    times = []
+    for error in (-0.5, 0.0):
+        chosen = replace(quick, velocity_error=Range(error, error))
+        part = domain.worlds(chosen, domain.draw(chosen, 0, [1]), paper.PARAMS["rps"], SHORT)
+        times.append(outcomes([part])[1][-2][0])  # x of the base at the end
+    assert times[0] < 0.7 * times[1]
+
+
+def test_results_hold_every_world_with_what_was_drawn(whole, tmp_path):
+    robustness.merge([whole], tmp_path)
+    results = record.read_results(tmp_path)
+    assert dict(results.sizes) == {"arm": 2, "world": 20, "pose": 3, "object": 1}
+    columns = domain.table(domain.draw(BOXES, 0, np.arange(20)))
+    for name, (values, unit) in columns.items():
+        np.testing.assert_allclose(results[name], values, rtol=1e-6)
+        assert results[name].attrs["units"] == unit
+    assert set(analysis.DRAWN) == set(columns)
+    again = outcomes([made(np.arange(20))])
+    for i, row in again.items():
+        assert float(results.time.sel(arm="rps")[i]) == row[1]
+        assert int(results.success.sel(arm="rps")[i]) == int(row[0])
+    json.dumps(robustness.load_plan(whole).configuration())
+    assert robustness.load_plan(whole) == PLAN
+
+
+# C MuJoCo compiles little, so that a process is soon at work.
+KILLED = replace(
+    PLAN,
+    domain=replace(ROUND, skin="ideal"),
+    worlds=60,
+    setting=replace(SHORT, engine="mujoco", rules=Rules(horizon=6.0)),
+    part=5,
+)
+
+
+def sweep_in_a_process(folder, cache):
+    jax.config.update("jax_compilation_cache_dir", cache)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    swept(folder, KILLED)
+
+
+def test_a_run_killed_twenty_times_ends_as_one_that_was_not(tmp_path, cache):
+    """SIGKILL at random moments; then one process may come to the end."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["rps_jax.robustness"])
+    folder, dice, interrupted = tmp_path / "run", random.Random(0), 0
+    for kill in range(21):
+        process = context.Process(target=sweep_in_a_process, args=(folder, cache))
+        process.start()
+        if kill < 20:
+            process.join(dice.uniform(0.5, 4.0))
+            process.kill()
+        process.join()
+        interrupted += 0 < len(list(folder.glob("parts/*.nc"))) < len(KILLED.parts())
+    assert process.exitcode == 0
+    assert interrupted > 2
+    assert payload(folder) == payload(swept(tmp_path / "whole", KILLED))
+
+
+def test_a_corrupt_part_is_set_aside_and_done_again_alone(whole, tmp_path):
+    folder = shutil.copytree(whole, tmp_path / "run")
+    victim = sorted(folder.glob("parts/*.nc"))[2]
+    others = {path: path.stat().st_mtime_ns for path in folder.glob("parts/*.nc") if path != victim}
+    content = bytearray(victim.read_bytes())
+    content[len(content) // 2] ^= 1
+    victim.write_bytes(content)
+    finished = []
+    swept(folder, report=lambda progress: finished.append(progress.finished))
+    assert finished[0] == PLAN.trials - PLAN.parts()[2].size
+    assert {path: path.stat().st_mtime_ns for path in others} == others
+    aside = victim.with_suffix(".nc.corrupt")
+    assert aside.read_bytes() == bytes(content)
+    aside.unlink()
+    assert payload(folder) == payload(whole)
+
+
+def test_shards_merge_to_the_whole(whole, tmp_path):
+    folders = [swept(tmp_path / f"{k}", shard=Shard(k, 3)) for k in (1, 2, 3)]
+    with pytest.raises(InputError, match="lacks 2 of 6 parts"):
+        robustness.merge(folders[:2], tmp_path)
+    robustness.merge(folders, tmp_path)
+    (tmp_path / "direct").mkdir()
+    robustness.merge([whole], tmp_path / "direct")
+    together = [record.read_results(f) for f in (tmp_path, tmp_path / "direct")]
+    xr.testing.assert_identical(*together)
+    other = replace(PLAN, setting=replace(SHORT, seed=5))
+    robustness.open_run(tmp_path / "other", other)
+    with pytest.raises(InputError, match="seed = 0 there, 5 asked for"):
+        robustness.merge([folders[0], tmp_path / "other"], tmp_path)
+
+
+def test_another_configuration_is_refused_with_what_differs(whole):
+    other = replace(PLAN, worlds=30, domain=replace(BOXES, mass=Range(1, 2)))
+    with pytest.raises(InputError, match=r"domain.mass = .*there, .* asked for; worlds = 20 there"):
+        robustness.open_run(whole, other)
+
+
+def test_two_processes_may_not_share_a_run_but_may_share_its_shards(tmp_path):
+    with robustness.lock(tmp_path), pytest.raises(InputError, match="in use by another process"):  # noqa: SIM117
+        with robustness.lock(tmp_path):
+            pass
+    with robustness.lock(tmp_path, Shard(1, 2)), robustness.lock(tmp_path, Shard(2, 2)):
+        pass
+
+
+def test_what_a_sweep_says_is_what_happened():
+    """Worked out by hand on four worlds."""
+    inf = np.inf
+    results = xr.Dataset(
+        {
+            "success": (("arm", "world"), np.array([[1, 0, 0, 0], [1, 1, 0, 0]], np.int8)),
+            "diverged": (("arm", "world"), np.array([[0, 0, 0, 1], [0, 0, 0, 0]], np.int8)),
+            "time": (("arm", "world"), np.array([[50.0, 300, 200, 9], [70, 80, 300, 300]])),
+            "min_distance": (("arm", "world"), np.array([[0.04, 0.5, inf, 1], [0.04, 0.04, 1, 2]])),
+            "contact_lost_time": (("arm", "world"), np.array([[0.0, 0, 0, 0], [0, 0, 151, 0]])),
+            "which_object": ("world", [0, 0, 1, 1]),
+            "distance": ("world", [1.0, 2.0, 3.0, 1.0]),
+        },
+        coords={"arm": ["a", "b"], "object": ["box", "drum"], "world": range(4)},
+    )
+    first, second = (results.sel(arm=arm) for arm in "ab")
+    assert [analysis.FAILURES[k] if k >= 0 else "" for k in analysis.failure(first, 150)] == [
+        "", "timeout", "never touched", "diverged"]  # fmt: skip
+    assert analysis.FAILURES[analysis.failure(second, 150)[2]] == "lost contact"
+    assert analysis.left_over(first).tolist() == [0.04, 0.5, 3.0, 1.0]
+    assert analysis.cvar(np.arange(100.0)) == pytest.approx(97.0)  # mean of 95 .. 99
+    assert analysis.cvar(np.array([1.0, 3.0])) == 3.0
+    assert analysis.differences(results)[1][1:4] == ["1", "0", "+25.00 %"]
+    assert analysis.hardest(results).tolist() == [2, 3, 1]
+    rates = analysis.rates(results, 150)
+    assert rates[1][1].startswith("50.0 %")  # of a with the box
+    assert rates[2][3].startswith("50.0 %")  # of b in all
+    bins = analysis.bins(np.arange(16.0), np.arange(16) < 4, count=4)
+    assert bins.won.tolist() == [4, 0, 0, 0]
+    assert bins.of.tolist() == [4] * 4
+    assert analysis.bins(np.array([1.0, 1, 2]), np.array([True, False, True])).of.tolist() == [2, 1]
+
+
+BAD = {
+    "domain": (["--domain", "narrow"], "unknown domain 'narrow'"),
+    "file": (["--domain", "none.json"], "none.json cannot be read"),
+    "change": (["--change", "mass=3"], "write quantity=low,high"),
+    "quantity": (["--change", "masses=3,4"], "unknown domain quantity 'masses'"),
+    "range": (["--change", "mass=nan,4"], "domain mass = nan"),
+    "worlds": (["--worlds", "-1"], "worlds = -1"),
+    "strategy": (["--strategies", "npss"], "unknown strategy 'npss'"),
+    "params": (["--params", "none.json"], "none.json cannot be read"),
+    "engine": (["--engine", "bullet"], "unknown engine 'bullet'"),
+    "device": (["--device", "tpu"], "unknown device 'tpu'"),
+    "shard": (["--shard", "3"], "write k/n"),
+    "shard number": (["--shard", "3/2"], "shard = 3"),
+    "part": (["--part", "0"], "part = 0"),
+    "slots": (["--slots", "0"], "slots = 0"),
+    "horizon": (["--horizon", "0"], "horizon = 0"),
+    "out": (["--out", "/dev/null/x"], "cannot be written"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_sweeps_end_in_one_sentence_before_anything_compiles(
+    name, capsys, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    arguments, message = BAD[name]
+    assert cli.main(["sweep", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.glob("runs/*/parts/*"))
+
+
+def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cli, "use_cache", lambda: None)
+    tuned = tmp_path / "tuned.json"
+    tuned.write_text(json.dumps({"L": 0.3}))
+    run = str(tmp_path / "run")
+    drums = tmp_path / "drums.json"
+    drums.write_text(json.dumps({"objects": ["random_cylinder"], "distance": [1, 2]}))
+    command = ["sweep", "--domain", str(drums), "--engine", "fused", "--fidelity", "fast",
+               "--worlds", "12", "--strategies", "rps", "--params", "paper", str(tuned),
+               "--horizon", "6", "--part", "5", "--slots", str(SLOTS), "--out", run]  # fmt: skip
+    assert cli.main([*command, "--shard", "1/2"]) == 0
+    assert cli.main([*command, "--shard", "2/2"]) == 0
+    assert cli.main(["merge", run, "--out", run]) == 0
+    text = capsys.readouterr().out
+    assert "rps tuned against rps paper" in text
+    results = record.read_results(Path(run))
+    assert results.arm.values.tolist() == ["rps paper", "rps tuned"]
+    for name in ("report.html", "report.md", "success.png"):
+        assert (tmp_path / "run" / name).exists()
+    assert cli.main(["replay", run, "4", "--arm", "rps tuned"]) == 0
+    seen = record.read(Path(run) / "replay-4" / "results.nc")
+    # Followed alone, in another batch than in the sweep.
+    assert float(seen.outcome_time) == pytest.approx(float(results.time[1, 4]), abs=0.5)
+    for bad in (
+        ["replay", run, "12"],
+        ["replay", run, "0", "--arm", "x"],
+        ["replay", str(tmp_path), "0"],
+        ["merge", str(tmp_path), "--out", run],
+        ["sweep", "--worlds", "13", "--out", run],
+    ):
+        assert cli.main(bad) == 2
