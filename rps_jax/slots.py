@@ -56,7 +56,7 @@ class Progress:
 class Timing:
     """Where the time of a sweep went."""
 
-    compile: float  # [s] on the critical path of the first worker
+    compile: float  # [s] that the worker waited who waited longest
     run: float  # [s] wall clock after that
     simulated: float  # [s] of trials
 
@@ -123,9 +123,12 @@ def run(
         tasks = [partial(_run_in_c, job, setting, workers // count, shared) for job in jobs]
     else:
         count = workers
-        queues = [_Queue(job, setting, slots) for job in jobs]
+        queues = [_Queue(job, setting, slots) for job in jobs if job.trials]
         orders = [queues[w % len(queues) :] + queues for w in range(count if queues else 0)]
         tasks = [partial(_work, order, shared) for order in orders]
+        if jax.default_backend() != "cpu":  # the processor is idle: compile all at once
+            tasks += [queue.program for queue in queues]
+            count += len(queues)
     _side_by_side(tasks, count, shared)
     total = time.perf_counter() - began
     return Timing(shared.compile, total - shared.compile, shared.simulated)
@@ -164,7 +167,7 @@ class _Shared:
             self._report(Progress(self._finished, self.simulated))
 
     def compiled(self, seconds: float) -> None:
-        """One worker waited this long for a program."""
+        """One worker has waited this long for programs."""
         with self._lock:
             self.compile = max(self.compile, seconds)
 
@@ -204,33 +207,48 @@ class _Queue:
         self.setting = setting
         self.slots = min(slots, job.trials)
         self._parts = iter(job.parts)
+        first = next(self._parts)
+        self.stage = first.stage
+        self._worlds = jax.tree.map(self._batched, first.worlds)
         self._waiting: deque[tuple[Part, int]] = deque()
+        self._add(first)
+        self._lock, self._compiling = threading.Lock(), threading.Lock()
         self._program = None
-        self._lock = threading.Lock()
+
+    def _add(self, part: Part) -> None:
+        self._waiting.extend((part, row) for row in range(part.numbers.size))
 
     def take(self, count: int) -> list[tuple[Part, int]]:
         """Up to `count` waiting trials, each a row of a part."""
         with self._lock:
             while len(self._waiting) < count and (part := next(self._parts, None)) is not None:
-                self._waiting.extend((part, row) for row in range(part.numbers.size))
+                self._add(part)
             return [self._waiting.popleft() for _ in range(min(count, len(self._waiting)))]
 
-    def program(self, stage: Any, worlds: World, trials: Trial) -> Any:
-        """The compiled `trial.advance`; the first worker to come compiles, others wait."""
-        with self._lock:
+    def program(self) -> Any:
+        """The compiled `trial.advance`; the first to come compiles, others wait."""
+        with self._compiling:
             if self._program is None:
-                physics = self.setting.physics
-                steps = max(1, round(SEGMENT / physics.control_period))
-                self._program = trial.advance.lower(
-                    stage,
-                    worlds,
-                    trials,
-                    physics=physics,
-                    rules=self.setting.rules,
-                    strategy=self.strategy,
-                    steps=steps,
-                ).compile()
+                self._program = self._compile()
             return self._program
+
+    def _batched(self, leaf: Any) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((self.slots, *leaf.shape[1:]), leaf.dtype)
+
+    def _compile(self) -> Any:
+        physics = self.setting.physics
+        live = jax.ShapeDtypeStruct((self.slots,), bool)
+        start = partial(trial.start_all, strategy=self.strategy)
+        lowered = trial.advance.lower(
+            self.stage,
+            self._worlds,
+            jax.eval_shape(start, self._worlds, live),
+            physics=physics,
+            rules=self.setting.rules,
+            strategy=self.strategy,
+            steps=max(1, round(SEGMENT / physics.control_period)),
+        )
+        return lowered.compile()
 
 
 def rows(tree: Any, which: Any) -> Any:
@@ -247,8 +265,15 @@ def _refill(worlds: World, trials: Trial, fresh: jax.Array, *, strategy: Strateg
 
 
 def _work(queues: list[_Queue], shared: _Shared) -> None:
+    waited = 0.0
     for queue in queues:
-        _drain(queue, shared)
+        taken = queue.take(queue.slots)
+        if taken:
+            began = time.perf_counter()
+            program = queue.program()
+            waited += time.perf_counter() - began
+            shared.compiled(waited)
+            _drain(queue, program, taken, shared)
 
 
 class _Held:
@@ -278,19 +303,13 @@ class _Held:
         return jax.device_put(jax.tree.map(np.copy, self._worlds))
 
 
-def _drain(queue: _Queue, shared: _Shared) -> None:
-    """Run the queue's trials until none waits and none of this worker's runs."""
-    taken = queue.take(queue.slots)
-    if not taken:
-        return
-    stage, period = taken[0][0].stage, queue.setting.physics.control_period
+def _drain(queue: _Queue, program: Any, taken: list[tuple[Part, int]], shared: _Shared) -> None:
+    """Run trials, the `taken` first, until none waits and none of this worker's runs."""
+    stage, period = queue.stage, queue.setting.physics.control_period
     held = _Held(taken, queue.slots)
     live = np.arange(queue.slots) < len(taken)
     worlds = held.put(np.arange(len(taken)), taken)
     trials = trial.start_all(worlds, live, strategy=queue.strategy)
-    began = time.perf_counter()
-    program = queue.program(stage, worlds, trials)
-    shared.compiled(time.perf_counter() - began)
     while live.any() and not shared.stop:
         before = np.asarray(trials.steps)
         trials = program(stage, worlds, trials, rules=queue.setting.rules)
