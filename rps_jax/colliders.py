@@ -22,7 +22,7 @@ from mujoco.mjx._src.collision_types import Collision, GeomInfo
 from mujoco.mjx._src.types import Data, GeomType, Model
 
 from rps_jax import spatial
-from rps_jax.contacts import meetings
+from rps_jax.contacts import Corners, meetings
 
 _UPRIGHT = 1e-6  # [rad] below this tilt every point of the rim is the lowest
 
@@ -67,7 +67,7 @@ def box_prism(model: Model, data: Data, key: Any, geom: jax.Array) -> Collision:
     turn = data.geom_xmat[base][:2, 0]
     middle = data.geom_xpos[base]
     thing: Any = SimpleNamespace(
-        vertices=list(zip(corners[:, 0], corners[:, 1], lower, strict=True)),
+        vertices=Corners.of((corners[:, 0], corners[:, 1], lower)),
         height=-2 * lower[0],
         up=spatial.Z,
         base_half=half[:2],
@@ -75,16 +75,13 @@ def box_prism(model: Model, data: Data, key: Any, geom: jax.Array) -> Collision:
     )
     state: Any = SimpleNamespace(base=middle, p=data.xpos[body])
     m: Any = [tuple(row) for row in data.xmat[body]]
-    found = meetings(thing, state, m, (turn[0], turn[1]))
+    ((z, normal, point, distance),) = meetings(thing, state, m, (turn[0], turn[1]))
     back = jnp.array([[turn[0], turn[1]], [-turn[1], turn[0]]])
-    distance, points, frames = [], [], []
-    for z, normal, point, apart in found:
-        n = jnp.stack(normal) @ back
-        points.append(jnp.append(middle[:2] + jnp.stack(point) @ back, z))
-        zero = jnp.zeros_like(z)
-        frames.append(jnp.stack([n[0], n[1], zero, -n[1], n[0], zero, zero, zero, zero + 1]))
-        distance.append(apart)
-    return jnp.stack(distance), jnp.stack(points), jnp.stack(frames).reshape(-1, 3, 3)
+    n = jnp.stack(normal) @ back
+    place = middle[:2] + jnp.stack(point, axis=-1) @ back
+    zero, one = jnp.zeros_like(n[0]), jnp.ones_like(n[0])
+    frame = jnp.stack([n[0], n[1], zero, -n[1], n[0], zero, zero, zero, one]).reshape(3, 3)
+    return distance, jnp.concatenate([place, z[:, None]], axis=-1), jnp.stack([frame] * 4)
 
 
 box_prism.ncon = 4  # pyright: ignore[reportFunctionMemberAccess]

@@ -2,13 +2,14 @@
 along two upright lines; and MuJoCo's soft constraint at each point. For `rps_jax.fused`.
 
 Vectors are in the world's axes, points about the object's centre of mass unless said otherwise.
+The leading axis of an array numbers corners or contacts, the others are of the batch; contacts
+that are wanted `apart` are one by one in a list, without that axis, as a GPU's registers like it.
 Reference: MuJoCo documentation, "Computation: Constraint model".
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -25,6 +26,9 @@ _UPRIGHT = 1e-6  # [rad] tilt below which every point of a cylinder's rim is the
 _D_MIN, _D_MAX, _WIDTH = 0.9, 0.95, 0.001
 
 
+Point = tuple[Any, Any]
+
+
 class Body(NamedTuple):
     """What one world is made of, as MuJoCo compiled it. Frame: principal axes at the centre of
     mass."""
@@ -33,7 +37,7 @@ class Body(NamedTuple):
     inertia: Any  # (3,) [kg m^2] principal moments
     p_object_com: Any  # (3,) [m] centre of mass in the object's frame
     q_object_body: Any  # (4,) principal axes in the object's frame
-    vertices: Any  # (N, 3) [m] of the lower face; of a cylinder its centre
+    vertices: Any  # (N, 3) [m] of the lower face, of a cylinder its centre; spread: `Corners`
     radius: Any  # () [m] of a cylinder; 0 of a prism
     height: Any  # () [m]
     up: Any  # (3,) unit vector along the height
@@ -43,6 +47,24 @@ class Body(NamedTuple):
     base_invweight: Any  # () [1/kg] and of the base
     base_half: Any  # (2,) [m] half length and width of the base
     base_z: Any  # (2,) [m] its lower and upper edge
+
+
+class Corners(NamedTuple):
+    """The lower face of a prism."""
+
+    at: Vec  # (N, ...) [m]
+    ahead: Vec  # (N, ...) [m] the following corner
+    real: Any  # (N, ...) 0 of a corner that repeats the one before, else 1
+    apart: tuple[tuple[Vec, Any], ...]  # `at` and `real` one by one
+
+    @classmethod
+    def of(cls, at: Vec, apart: bool = False) -> Corners:
+        """Corners (N, ...), counter-clockwise seen from above."""
+        back = [x - jnp.roll(x, 1, axis=0) for x in at]
+        ahead: Any = tuple(jnp.roll(x, -1, axis=0) for x in at)
+        real = jnp.where(sp.dot(back, back) > 1e-12, 1.0, 0.0)
+        each = range(real.shape[0] if apart else 0)
+        return cls(at, ahead, real, tuple(((at[0][i], at[1][i], at[2][i]), real[i]) for i in each))
 
 
 class State(NamedTuple):
@@ -58,7 +80,7 @@ class State(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """One point of contact. Its rows are J a - a_ref along n, t and s."""
+    """Points of contact (C, ...). The rows of each are J a - a_ref along n, t and s."""
 
     r: Vec  # [m] from the centre of mass
     n: Vec  # unit normal, towards the object
@@ -85,12 +107,19 @@ def _stiffness(solref: tuple[float, float], d_max: float, timestep: float) -> tu
     return 1 / (d_max * time * ratio) ** 2, 2 / (d_max * time)
 
 
-def on_ground(body: Body, state: State, m: Sequence[Vec], physics: Physics) -> list[Contact]:
+def _index(count: int, like: Any) -> Any:
+    """0, 1, ... along a new leading axis of the batch."""
+    return jax.lax.broadcasted_iota(jnp.int32, (count, *like.shape), 0)
+
+
+def on_ground(
+    body: Body, state: State, m: Sequence[Vec], physics: Physics, apart: bool
+) -> list[Contact]:
     """Contacts of the lower face with the ground."""
     k, b = _stiffness(physics.ground_solref, physics.ground_impedance, physics.timestep)
     w = sp.to_world(m, state.w)
     contacts = []
-    for r, there in _lower_face(body, m):
+    for r, there in _lower_face(body, m, apart):
         distance = state.p[2] + r[2]
         at = (r[0], r[1], r[2] - 0.5 * distance)
         u = sp.add(state.v, sp.cross(w, at))
@@ -100,91 +129,108 @@ def on_ground(body: Body, state: State, m: Sequence[Vec], physics: Physics) -> l
     return contacts
 
 
-def _lower_face(body: Body, m: Sequence[Vec]) -> list[tuple[Vec, Any]]:
+def _lower_face(body: Body, m: Sequence[Vec], apart: bool) -> list[tuple[Vec, Any]]:
     """Points that may touch the ground, from the centre of mass, and whether they exist."""
-    corners = [sp.to_world(m, v) for v in body.vertices]
-    if len(corners) == 1:  # of a cylinder three points of the rim, the first the lowest
-        up = sp.to_world(m, body.up)
-        tilt = jnp.sqrt(up[0] * up[0] + up[1] * up[1])
-        standing = tilt < _UPRIGHT
-        least = jnp.maximum(tilt, _UPRIGHT)
-        # Horizontal direction in which it leans; of a standing one, fixed to the object.
-        lean = [jnp.where(standing, m[i][0], up[i] / least) for i in range(2)]
-        across = (-lean[1], lean[0], 0.0)
-        low = sp.cross(across, up)
-        low = sp.scale(body.radius / sp.norm(low), low)
-        side = sp.scale(body.radius * 0.75**0.5, across)
-        rim = [low, sp.sub(side, sp.scale(0.5, low)), sp.sub(sp.scale(-0.5, low), side)]
-        return [(sp.add(corners[0], point), True) for point in rim]
-    points = []
-    for i, corner in enumerate(corners):
-        edge = sp.sub(corners[i - 1], corner)
-        points.append((corner, sp.dot(edge, edge) > 1e-12))  # polygons are padded by repetition
-    return points
+    corners = body.vertices
+    if isinstance(corners, Corners):
+        points = corners.apart if apart else ((corners.at, corners.real),)
+        return [(sp.to_world(m, at), real > 0) for at, real in points]
+    # Of a cylinder three points of the rim, the first the lowest.
+    up = sp.to_world(m, body.up)
+    tilt = jnp.sqrt(up[0] * up[0] + up[1] * up[1])
+    standing = tilt < _UPRIGHT
+    least = jnp.maximum(tilt, _UPRIGHT)
+    # Horizontal direction in which it leans; of a standing one, fixed to the object.
+    lean = [jnp.where(standing, m[i][0], up[i] / least) for i in range(2)]
+    across = (-lean[1], lean[0], 0.0)
+    low = sp.cross(across, up)
+    low = sp.scale(body.radius / sp.norm(low), low)
+    side = sp.scale(body.radius * 0.75**0.5, across)
+    shares: list[Any] = [((1.0, 0.0), True), ((-0.5, 1.0), True), ((-0.5, -1.0), True)]
+    if not apart:
+        i = _index(4, tilt)  # the fourth only fills up
+        of_side = jnp.where(i == 0, 0.0, jnp.where(i == 1, 1.0, -1.0))
+        shares = [((jnp.where(i == 0, 1.0, -0.5), of_side), i < 3)]
+    centre = sp.to_world(m, corners)
+    return [(sp.add(centre, sp.combine(share, (low, side))), there) for share, there in shares]
 
 
 def on_base(
-    body: Body, state: State, m: Sequence[Vec], twist: Vec, physics: Physics
+    body: Body, state: State, m: Sequence[Vec], twist: Vec, physics: Physics, apart: bool
 ) -> list[Contact]:
     """Contacts of the object's side with the base, at the upper and lower edge of both."""
+    turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+    found = meetings(body, state, m, turn, apart)
+    return [_on_base(body, state, m, twist, physics, turn, *one) for one in found]
+
+
+def _on_base(
+    body: Body,
+    state: State,
+    m: Sequence[Vec],
+    twist: Vec,
+    physics: Physics,
+    turn: Point,
+    z: Any,
+    normal: Point,
+    q: Point,
+    distance: Any,
+) -> Contact:
     k, b = _stiffness(physics.base_solref, _D_MAX, physics.timestep)
-    c, s = jnp.cos(state.base[2]), jnp.sin(state.base[2])
-    w = sp.to_world(m, state.w)
-    contacts = []
-    for z, normal, q, distance in meetings(body, state, m, (c, s)):
-        n = (c * normal[0] - s * normal[1], s * normal[0] + c * normal[1], 0.0)
-        t = (-n[1], n[0], 0.0)
-        arm = (c * q[0] - s * q[1], s * q[0] + c * q[1])  # from the base's origin
-        lever = (state.base[0] + arm[0] - state.p[0], state.base[1] + arm[1] - state.p[1])
-        r = (*lever, z - state.p[2])
-        of_base = (
-            c * twist[0] - s * twist[1] - twist[2] * arm[1],
-            s * twist[0] + c * twist[1] + twist[2] * arm[0],
-            0.0,
-        )
-        u = sp.sub(sp.add(state.v, sp.cross(w, r)), of_base)
-        x = jnp.minimum(jnp.abs(distance) / _WIDTH, 1.0)
-        x = jnp.where(x < 0.5, 2 * x * x, 1 - 2 * (1 - x) * (1 - x))
-        impedance = _D_MIN + x * (_D_MAX - _D_MIN)
-        d = _stiff(distance, True, impedance, body.invweight + body.base_invweight)
-        bias = _bias(k, b, impedance, distance, (sp.dot(n, u), sp.dot(t, u), u[2]))
-        contacts.append(Contact(r, n, t, sp.Z, bias, d, body.friction_robot))
-    return contacts
-
-
-Point = tuple[Any, Any]
+    c, s = turn
+    n = (c * normal[0] - s * normal[1], s * normal[0] + c * normal[1], 0.0)
+    t = (-n[1], n[0], 0.0)
+    arm = (c * q[0] - s * q[1], s * q[0] + c * q[1])  # from the base's origin
+    lever = (state.base[0] + arm[0] - state.p[0], state.base[1] + arm[1] - state.p[1])
+    r = (*lever, z - state.p[2])
+    of_base = (
+        c * twist[0] - s * twist[1] - twist[2] * arm[1],
+        s * twist[0] + c * twist[1] + twist[2] * arm[0],
+        0.0,
+    )
+    u = sp.sub(sp.add(state.v, sp.cross(sp.to_world(m, state.w), r)), of_base)
+    x = jnp.minimum(jnp.abs(distance) / _WIDTH, 1.0)
+    x = jnp.where(x < 0.5, 2 * x * x, 1 - 2 * (1 - x) * (1 - x))
+    impedance = _D_MIN + x * (_D_MAX - _D_MIN)
+    d = _stiff(distance, True, impedance, body.invweight + body.base_invweight)
+    bias = _bias(k, b, impedance, distance, (sp.dot(n, u), sp.dot(t, u), u[2]))
+    return Contact(r, n, t, sp.Z, bias, d, body.friction_robot)
 
 
 def meetings(
-    body: Body, state: State, m: Sequence[Vec], turn: Point
+    body: Body, state: State, m: Sequence[Vec], turn: Point, apart: bool = False
 ) -> list[tuple[Any, Point, Point, Any]]:
-    """Height, normal, point and distance [m] of each contact, in the base's frame."""
+    """Heights, normals, points and distances [m] of the contacts, in the base's frame."""
     c, s = turn
     up = sp.to_world(m, body.up)
     slope = (up[0] / up[2], up[1] / up[2])
     slope = (c * slope[0] + s * slope[1], -s * slope[0] + c * slope[1])
     low, high = body.base_z[0], jnp.minimum(body.base_z[1], 0.98 * body.height)
-    foot = []  # vertices of the lower face, with z
-    for vertex in body.vertices:
-        x, y, z = sp.sub(sp.add(sp.to_world(m, vertex), state.p), (*state.base[:2], 0.0))
-        foot.append((c * x + s * y, -s * x + c * y, z))
 
-    def outline(z: Any) -> list[Point]:
-        return [(x + slope[0] * (z - h), y + slope[1] * (z - h)) for x, y, h in foot]
+    def outline(foot: Vec, z: Any) -> Point:
+        """Points of the lower face, moved up along the edges to the height z."""
+        x, y, h = sp.sub(sp.add(sp.to_world(m, foot), state.p), (*state.base[:2], 0.0))
+        rise = z - h
+        return c * x + s * y + slope[0] * rise, -s * x + c * y + slope[1] * rise
 
-    if len(foot) == 1:
-        return [
-            (z, *_circle_and_rectangle(outline(z)[0], body.radius, body.base_half))
-            for z in (low, high)
-        ]
+    if not isinstance(body.vertices, Corners):
+        heights = (low, high)
+        if not apart:
+            heights = (jnp.where(_index(2, body.radius) == 0, low, high),)
+        centres = [outline(body.vertices, z) for z in heights]
+        meet = [_circle_and_rectangle(at, body.radius, body.base_half) for at in centres]
+        return [(z, *one) for z, one in zip(heights, meet, strict=True)]
     middle = 0.5 * (low + high)
-    normal, found = _polygon_and_rectangle(outline(middle), body.base_half)
+    here, ahead = (outline(foot, middle) for foot in (body.vertices.at, body.vertices.ahead))
+    normal, points, distances = _polygon_and_rectangle(here, ahead, body.base_half)
     lean = sp.dot(slope, normal)
-    return [
-        (z, normal, point, distance + lean * (z - middle))
-        for z in (low, high)
-        for point, distance in found
-    ]
+    found = [(z, *one) for z in (low, high) for one in zip(points, distances, strict=True)]
+    if not apart:
+        i = _index(4, lean)
+        first = i % 2 == 0
+        point: Any = tuple(jnp.where(first, a, b) for a, b in zip(*points, strict=True))
+        found = [(jnp.where(i < 2, low, high), point, jnp.where(first, *distances))]
+    return [(z, normal, p, distance + lean * (z - middle)) for z, p, distance in found]
 
 
 def _circle_and_rectangle(
@@ -202,67 +248,73 @@ def _circle_and_rectangle(
 
 
 def _polygon_and_rectangle(
-    outline: list[Point], half: Sequence[Any]
-) -> tuple[Point, list[tuple[Point, Any]]]:
+    here: Point, ahead: Point, half: Sequence[Any]
+) -> tuple[Point, list[Point], list[Any]]:
     """Normal from a centred rectangle to a convex polygon, and two points with distances [m].
 
-    The face that separates them best is the reference; the face of the other that looks most
-    against it is clipped to its width (as in MuJoCo's box-box collider).
+    The polygon is given by its corners (N, ...) and the corners that follow them. The face that
+    separates the two best is the reference; the face of the other that looks most against it is
+    clipped to its width (as in MuJoCo's box-box collider).
     """
     a, b = half
-    count = len(outline)
-    xs, ys = [p[0] for p in outline], [p[1] for p in outline]
-    least, most = (lambda v: reduce(jnp.minimum, v)), (lambda v: reduce(jnp.maximum, v))
-    one, nil = jnp.ones_like(xs[0]), jnp.zeros_like(xs[0])
-    # Reference faces: separation, normal out of its owner, a point on it, along it, its length.
-    faces = [
-        (least(xs) - a, (one, nil), (a, -b), (nil, one), 2 * b),
-        (-most(xs) - a, (-one, nil), (-a, b), (nil, -one), 2 * b),
-        (least(ys) - b, (nil, one), (a, b), (-one, nil), 2 * a),
-        (-most(ys) - b, (nil, -one), (-a, -b), (one, nil), 2 * a),
-    ]
-    own = []
-    for i in range(count):
-        (x, y), (x2, y2) = outline[i], outline[(i + 1) % count]
-        length = sp.norm((x2 - x, y2 - y))
-        along = ((x2 - x) / length, (y2 - y) / length)
-        n = (along[1], -along[0])
-        apart = -(x * n[0] + y * n[1]) - (a * jnp.abs(n[0]) + b * jnp.abs(n[1]))
-        real = length > 1e-6
-        own.append((jnp.where(real, apart, -_FAR), n, (x, y), along, length, real))
+    x, y = here
+    along = (ahead[0] - x, ahead[1] - y)
+    length = sp.norm(along)
+    along = (along[0] / length, along[1] / length)
+    n = (along[1], -along[0])
+    real = length > 1e-6
+    apart = -(x * n[0] + y * n[1]) - (a * jnp.abs(n[0]) + b * jnp.abs(n[1]))
+    faces = (n, here, along, length)
+    separation, chosen = _best(jnp.where(real, apart, -_FAR), faces)
 
-    def best(rows: list[Any], score: list[Any]) -> Any:
-        top, chosen = score[0], rows[0]
-        for row, value in zip(rows[1:], score[1:], strict=True):
+    one, nil = jnp.ones_like(separation), jnp.zeros_like(separation)
+    # Reference faces: separation, normal out of its owner, a point on it, along it, its length.
+    sides = [
+        (jnp.min(x, axis=0) - a, (one, nil), (a, -b), (nil, one), 2 * b),
+        (-jnp.max(x, axis=0) - a, (-one, nil), (-a, b), (nil, -one), 2 * b),
+        (jnp.min(y, axis=0) - b, (nil, one), (a, b), (-one, nil), 2 * a),
+        (-jnp.max(y, axis=0) - b, (nil, -one), (-a, -b), (one, nil), 2 * a),
+    ]
+
+    def side(score: list[Any]) -> Any:
+        top, picked = score[0], sides[0]
+        for row, value in zip(sides[1:], score[1:], strict=True):
             better = value > top
             top = jnp.where(better, value, top)
-            chosen = jax.tree.map(lambda new, old, w=better: jnp.where(w, new, old), row, chosen)
-        return chosen
+            picked = jax.tree.map(lambda new, old, w=better: jnp.where(w, new, old), row, picked)
+        return picked
 
-    of_base, of_object = best(faces, [f[0] for f in faces]), best(own, [f[0] for f in own])[:5]
-    by_base = of_base[0] + _PARALLEL > of_object[0]
-    _, n, start, along, length = jax.tree.map(
-        lambda x, y: jnp.where(by_base, x, y), of_base, of_object
+    of_base = side([s[0] for s in sides])
+    by_base = of_base[0] + _PARALLEL > separation
+    ref, start, direction, width = jax.tree.map(
+        lambda u, v: jnp.where(by_base, u, v), of_base[1:], chosen
     )
-    against = [-sp.dot(f[1], n) for f in faces]
-    base_edge = best(faces, against)
-    against = [jnp.where(f[5], -sp.dot(f[1], n), -_FAR) for f in own]
-    object_edge = best(own, against)[:5]
-    _, _, p, edge, extent = jax.tree.map(
-        lambda x, y: jnp.where(by_base, x, y), object_edge, base_edge
+    base_edge = side([-sp.dot(s[1], ref) for s in sides])[2:]
+    _, object_edge = _best(jnp.where(real, -sp.dot(n, ref), -_FAR), faces)
+    p, edge, extent = jax.tree.map(
+        lambda u, v: jnp.where(by_base, u, v), object_edge[1:], base_edge
     )
-    # Clip the incident edge p + x edge, x in [0, extent], to [0, length] of the reference face.
-    offset = (p[0] - start[0]) * along[0] + (p[1] - start[1]) * along[1]
-    pace = sp.dot(edge, along)  # near -1
+    # Clip the incident edge p + t edge, t in [0, extent], to [0, width] of the reference face.
+    offset = (p[0] - start[0]) * direction[0] + (p[1] - start[1]) * direction[1]
+    pace = sp.dot(edge, direction)  # near -1
     pace = jnp.where(jnp.abs(pace) < 1e-3, -1e-3, pace)
-    ends = [-offset / pace, (length - offset) / pace]
+    ends = [-offset / pace, (width - offset) / pace]
     low = jnp.clip(jnp.minimum(*ends), 0.0, extent)
     high = jnp.clip(jnp.maximum(*ends), 0.0, extent)
-    normal = (jnp.where(by_base, n[0], -n[0]), jnp.where(by_base, n[1], -n[1]))
-    found = []
-    for x in (low, high):
-        q = (p[0] + x * edge[0], p[1] + x * edge[1])
-        distance = (q[0] - start[0]) * n[0] + (q[1] - start[1]) * n[1]
-        middle = (q[0] - 0.5 * distance * n[0], q[1] - 0.5 * distance * n[1])
-        found.append((middle, distance))
-    return normal, found
+    normal = (jnp.where(by_base, ref[0], -ref[0]), jnp.where(by_base, ref[1], -ref[1]))
+    points, distances = [], []
+    for t in (low, high):
+        q = (p[0] + t * edge[0], p[1] + t * edge[1])
+        distance = (q[0] - start[0]) * ref[0] + (q[1] - start[1]) * ref[1]
+        points.append((q[0] - 0.5 * distance * ref[0], q[1] - 0.5 * distance * ref[1]))
+        distances.append(distance)
+    return normal, points, distances
+
+
+def _best(score: Any, values: Any) -> tuple[Any, Any]:
+    """The greatest score along the leading axis, and what stands there; the first of equals."""
+    top = jnp.max(score, axis=0)
+    i = jax.lax.broadcasted_iota(jnp.int32, score.shape, 0)
+    first = jnp.min(jnp.where(score == top, i, score.shape[0]), axis=0)
+    there = i == first
+    return top, jax.tree.map(lambda x: jnp.sum(jnp.where(there, x, 0.0), axis=0), values)

@@ -20,14 +20,13 @@ from jax.experimental import pallas
 from jax.experimental.pallas import triton
 
 from rps_jax import spatial as sp
-from rps_jax.contacts import Body, State, on_base, on_ground
+from rps_jax.contacts import Body, Corners, State, on_base, on_ground
 from rps_jax.newton import accelerations
 from rps_jax.physics import Physics
 from rps_jax.scene import JOINTS
 from rps_jax.spatial import Vec
 
 _BLOCK = 64  # worlds of one program of the kernel; they go on until the last has converged
-_RANKS = Body(0, 1, 1, 1, 2, 0, 0, 1, 0, 0, 0, 0, 1, 1)  # of the leaves of one world
 
 
 def body(model: mujoco.MjModel, vertices: np.ndarray) -> Body:
@@ -96,14 +95,14 @@ def leave(body: Body, state: State, twist: Vec) -> tuple[jax.Array, jax.Array, j
     )
 
 
-def step(body: Body, state: State, twist: Vec, physics: Physics) -> State:
+def step(body: Body, state: State, twist: Vec, physics: Physics, apart: bool = False) -> State:
     """One step of MuJoCo's semi-implicit Euler rule with the base held at `twist`.
 
-    `twist` [m/s, m/s, rad/s] is in the base's frame.
+    `twist` [m/s, m/s, rad/s] is in the base's frame; `apart` writes the contacts out one by one.
     """
     m = sp.matrix(state.q)
-    contacts = on_ground(body, state, m, physics)
-    contacts += on_base(body, state, m, twist, physics)
+    contacts = on_ground(body, state, m, physics, apart)
+    contacts += on_base(body, state, m, twist, physics, apart)
     a, alpha = accelerations(body, state, m, contacts, physics)
     dt = physics.timestep
     v = sp.add(state.v, sp.scale(dt, a))
@@ -137,10 +136,9 @@ def drive(
 
     On an NVIDIA GPU it is one kernel; elsewhere XLA compiles it.
     """
-    scalars = Body(*(_scalars(x, n) for x, n in zip(body, _RANKS, strict=True)))
     state = enter(body, qpos, qvel, warmstart)
     state = jax.lax.platform_dependent(
-        scalars,
+        body,
         state,
         twist,
         cuda=partial(_kernel, physics=physics),
@@ -149,27 +147,37 @@ def drive(
     return leave(body, state, twist)
 
 
-def _steps(scalars: Body, state: State, twist: Vec, physics: Physics) -> State:
+def _steps(body: Body, state: State, twist: Vec, physics: Physics) -> State:
+    return _period(spread(body), state, twist, physics, apart=False)
+
+
+def _period(body: Body, state: State, twist: Vec, physics: Physics, apart: bool) -> State:
     return jax.lax.fori_loop(
-        0, physics.substeps, lambda _, s: step(scalars, s, twist, physics), state
+        0, physics.substeps, lambda _, s: step(body, s, twist, physics, apart), state
     )
 
 
 def _kernel(
-    scalars: Body, state: State, twist: Vec, physics: Physics, interpret: bool = False
+    body: Body, state: State, twist: Vec, physics: Physics, interpret: bool = False
 ) -> State:
     """`_steps` as one kernel, a world to a thread, which keeps its world in registers."""
-    args = (scalars, state, twist)
+    args = (spread(body, apart=True), state, twist)
     leaves, tree = jax.tree.flatten(args)
-    count = leaves[0].shape[0]
+    count = state.p[0].size
     padded = -(-count // _BLOCK) * _BLOCK
-    leaves = [jnp.pad(x, (0, padded - count), mode="edge") for x in leaves]
-    whole, shape = pallas.BlockSpec((_BLOCK,), lambda i: (i,)), state.p[0]
+    leaves = [
+        jnp.pad(x, (*((0, 0),) * (x.ndim - 1), (0, padded - count)), mode="edge") for x in leaves
+    ]
+    shape = state.p[0]
+
+    def block(leaf: Any) -> pallas.BlockSpec:
+        corners = leaf.shape[:-1]
+        return pallas.BlockSpec((*corners, _BLOCK), lambda i: (*(0,) * len(corners), i))
 
     def kernel(*refs):
         values = [ref[...] for ref in refs[: len(leaves)]]
         body, state, twist = jax.tree.unflatten(tree, values)
-        after = _steps(body, state, twist, physics)
+        after = _period(body, state, twist, physics, apart=True)
         for ref, value in zip(refs[len(leaves) :], jax.tree.leaves(after), strict=True):
             ref[...] = value
 
@@ -177,8 +185,8 @@ def _kernel(
     after = pallas.pallas_call(
         kernel,
         grid=(padded // _BLOCK,),
-        in_specs=[whole] * len(leaves),
-        out_specs=[whole] * len(out),
+        in_specs=[block(x) for x in leaves],
+        out_specs=[block(x) for x in out],
         out_shape=out,
         interpret=interpret,
         compiler_params=triton.CompilerParams(num_warps=_BLOCK // 32),
@@ -186,12 +194,15 @@ def _kernel(
     return jax.tree.unflatten(jax.tree.structure(state), [x[:count] for x in after])
 
 
-def _scalars(leaf: Any, rank: int) -> Any:
-    """A leaf (..., n, m) as nested tuples of (...)."""
-    if rank == 0:
-        return leaf
-    axis = leaf.ndim - rank
-    return tuple(
-        _scalars(jax.lax.index_in_dim(leaf, i, axis, keepdims=False), rank - 1)
-        for i in range(leaf.shape[axis])
-    )
+def spread(body: Body, apart: bool = False) -> Body:
+    """Bodies (...) with every entry an array of its own, as `step` has them."""
+    leaves = body._replace(vertices=None)
+    entries = {
+        name: _split(leaf) if jnp.ndim(leaf) > jnp.ndim(body.mass) else leaf
+        for name, leaf in leaves._asdict().items()
+        if leaf is not None
+    }
+    corners = _split(jnp.moveaxis(body.vertices, -2, 0))
+    if body.vertices.shape[-2] == 1:
+        return Body(vertices=tuple(x[0] for x in corners), **entries)
+    return Body(vertices=Corners.of(corners, apart), **entries)

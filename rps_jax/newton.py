@@ -138,8 +138,8 @@ def accelerations(
             x = sp.add(_rows(c, a, alpha), c.bias)
             force, k = _law(c, x, physics)
             f = sp.combine(force, (c.n, c.t, c.s))
-            linear = sp.sub(linear, f)
-            angular = sp.sub(angular, sp.cross(c.r, f))
+            linear = sp.sub(linear, _sums(f, c))
+            angular = sp.sub(angular, _sums(sp.cross(c.r, f), c))
             _stiffen(h, c, k)
         return (*linear, *angular), h
 
@@ -166,6 +166,16 @@ def accelerations(
     return a, alpha
 
 
+def _sum(entry: Any, contact: Contact) -> Any:
+    """Over the points of a contact, of what each adds to an entry."""
+    many = jnp.ndim(contact.d) > jnp.ndim(contact.friction)
+    return jnp.sum(entry, axis=0) if many and not isinstance(entry, float) else entry
+
+
+def _sums(vector: Vec, contact: Contact) -> Vec:
+    return _sum(vector[0], contact), _sum(vector[1], contact), _sum(vector[2], contact)
+
+
 def _some(active: jax.Array) -> jax.Array:
     """Whether any is above zero, in a form that Triton knows."""
     return jnp.sum(active) > 0
@@ -180,7 +190,7 @@ def _spin(body: Body, m: Sequence[Vec]) -> list[Vec]:
 
 
 def _stiffen(h: list[list[Any]], c: Contact, k: tuple[Any, ...]) -> None:
-    """Add a contact's J^T K J to the lower triangle of h."""
+    """Add the contacts' J^T K J to the lower triangle of h."""
     nn, nt, ns, tt, ts, ss = k
     # K in the world's axes: columns of Q K Q^T with Q = (n, t, s).
     axes = (c.n, c.t, c.s)
@@ -189,12 +199,12 @@ def _stiffen(h: list[list[Any]], c: Contact, k: tuple[Any, ...]) -> None:
     turned = [sp.cross(c.r, column) for column in columns]  # columns of [r] K
     for i in range(3):
         for j in range(i + 1):
-            h[i][j] = sp.plus(h[i][j], columns[j][i])
+            h[i][j] = sp.plus(h[i][j], _sum(columns[j][i], c))
         for j in range(3):
-            h[3 + i][j] = sp.plus(h[3 + i][j], turned[j][i])
+            h[3 + i][j] = sp.plus(h[3 + i][j], _sum(turned[j][i], c))
         row = sp.cross(c.r, (turned[0][i], turned[1][i], turned[2][i]))
         for j in range(i + 1):
-            h[3 + i][3 + j] = sp.plus(h[3 + i][3 + j], row[j])
+            h[3 + i][3 + j] = sp.plus(h[3 + i][3 + j], _sum(row[j], c))
 
 
 def _line_search(
@@ -219,11 +229,11 @@ def _line_search(
         first, second = slope + x * bend, bend
         for c, start, pace in lines:
             force, k = _law(c, sp.add(start, sp.scale(x, pace)), physics)
-            first = first - sp.dot(force, pace)
+            first = first - _sum(sp.dot(force, pace), c)
             nn, nt, ns, tt, ts, ss = k
             p, q, r = pace
-            second = second + nn * p * p + tt * q * q + ss * r * r
-            second = second + 2 * (nt * p * q + ns * p * r + ts * q * r)
+            curve = nn * p * p + tt * q * q + ss * r * r
+            second = second + _sum(curve + 2 * (nt * p * q + ns * p * r + ts * q * r), c)
         low, high = jnp.where(first < 0, x, low), jnp.where(first < 0, high, x)
         new = x - first / second
         halved = jnp.where(high < _FAR, 0.5 * (low + high), 2 * x)
