@@ -75,7 +75,7 @@ def box_prism(model: Model, data: Data, key: Any, geom: jax.Array) -> Collision:
     )
     state: Any = SimpleNamespace(base=middle, p=data.xpos[body])
     m: Any = [tuple(row) for row in data.xmat[body]]
-    ((z, normal, point, distance),) = meetings(thing, state, m, (turn[0], turn[1]))
+    z, normal, point, distance = meetings(thing, state, m, (turn[0], turn[1]))
     back = jnp.array([[turn[0], turn[1]], [-turn[1], turn[0]]])
     n = jnp.stack(normal) @ back
     place = middle[:2] + jnp.stack(point, axis=-1) @ back

@@ -2,8 +2,7 @@
 along two upright lines; and MuJoCo's soft constraint at each point. For `rps_jax.fused`.
 
 Vectors are in the world's axes, points about the object's centre of mass unless said otherwise.
-The leading axis of an array numbers corners or contacts, the others are of the batch; contacts
-that are wanted `apart` are one by one in a list, without that axis, as a GPU's registers like it.
+The leading axis of an array numbers corners or contacts, the others are of the batch.
 Reference: MuJoCo documentation, "Computation: Constraint model".
 """
 
@@ -24,9 +23,6 @@ _PARALLEL = 1e-4  # [m] by which a face of the base is preferred to one of the o
 _UPRIGHT = 1e-6  # [rad] tilt below which every point of a cylinder's rim is the lowest
 # MuJoCo's own impedance of the skin contact: least, greatest, and the depth [m] between them.
 _D_MIN, _D_MAX, _WIDTH = 0.9, 0.95, 0.001
-
-
-Point = tuple[Any, Any]
 
 
 class Body(NamedTuple):
@@ -54,17 +50,14 @@ class Corners(NamedTuple):
 
     at: Vec  # (N, ...) [m]
     ahead: Vec  # (N, ...) [m] the following corner
-    real: Any  # (N, ...) 0 of a corner that repeats the one before, else 1
-    apart: tuple[tuple[Vec, Any], ...]  # `at` and `real` one by one
+    real: Any  # (N, ...) bool, not of a corner that repeats the one before
 
     @classmethod
-    def of(cls, at: Vec, apart: bool = False) -> Corners:
+    def of(cls, at: Vec) -> Corners:
         """Corners (N, ...), counter-clockwise seen from above."""
-        back = [x - jnp.roll(x, 1, axis=0) for x in at]
-        ahead: Any = tuple(jnp.roll(x, -1, axis=0) for x in at)
-        real = jnp.where(sp.dot(back, back) > 1e-12, 1.0, 0.0)
-        each = range(real.shape[0] if apart else 0)
-        return cls(at, ahead, real, tuple(((at[0][i], at[1][i], at[2][i]), real[i]) for i in each))
+        back = tuple(x - jnp.roll(x, 1, axis=0) for x in at)
+        ahead = tuple(jnp.roll(x, -1, axis=0) for x in at)
+        return cls(at, ahead, sp.dot(back, back) > 1e-12)  # type: ignore[arg-type]
 
 
 class State(NamedTuple):
@@ -112,30 +105,23 @@ def _index(count: int, like: Any) -> Any:
     return jax.lax.broadcasted_iota(jnp.int32, (count, *like.shape), 0)
 
 
-def on_ground(
-    body: Body, state: State, m: Sequence[Vec], physics: Physics, apart: bool
-) -> list[Contact]:
+def on_ground(body: Body, state: State, m: Sequence[Vec], physics: Physics) -> Contact:
     """Contacts of the lower face with the ground."""
     k, b = _stiffness(physics.ground_solref, physics.ground_impedance, physics.timestep)
-    w = sp.to_world(m, state.w)
-    contacts = []
-    for r, there in _lower_face(body, m, apart):
-        distance = state.p[2] + r[2]
-        at = (r[0], r[1], r[2] - 0.5 * distance)
-        u = sp.add(state.v, sp.cross(w, at))
-        d = _stiff(distance, there, physics.ground_impedance, body.invweight)
-        bias = _bias(k, b, physics.ground_impedance, distance, (u[2], u[0], u[1]))
-        contacts.append(Contact(at, sp.Z, sp.X, sp.Y, bias, d, body.friction_ground))
-    return contacts
+    r, there = _lower_face(body, m)
+    distance = state.p[2] + r[2]
+    at = (r[0], r[1], r[2] - 0.5 * distance)
+    u = sp.add(state.v, sp.cross(sp.to_world(m, state.w), at))
+    d = _stiff(distance, there, physics.ground_impedance, body.invweight)
+    bias = _bias(k, b, physics.ground_impedance, distance, (u[2], u[0], u[1]))
+    return Contact(at, sp.Z, sp.X, sp.Y, bias, d, body.friction_ground)
 
 
-def _lower_face(body: Body, m: Sequence[Vec], apart: bool) -> list[tuple[Vec, Any]]:
+def _lower_face(body: Body, m: Sequence[Vec]) -> tuple[Vec, Any]:
     """Points that may touch the ground, from the centre of mass, and whether they exist."""
-    corners = body.vertices
-    if isinstance(corners, Corners):
-        points = corners.apart if apart else ((corners.at, corners.real),)
-        return [(sp.to_world(m, at), real > 0) for at, real in points]
-    # Of a cylinder three points of the rim, the first the lowest.
+    if isinstance(body.vertices, Corners):
+        return sp.to_world(m, body.vertices.at), body.vertices.real
+    # Of a cylinder three points of the rim, the first the lowest; the fourth only fills up.
     up = sp.to_world(m, body.up)
     tilt = jnp.sqrt(up[0] * up[0] + up[1] * up[1])
     standing = tilt < _UPRIGHT
@@ -146,38 +132,19 @@ def _lower_face(body: Body, m: Sequence[Vec], apart: bool) -> list[tuple[Vec, An
     low = sp.cross(across, up)
     low = sp.scale(body.radius / sp.norm(low), low)
     side = sp.scale(body.radius * 0.75**0.5, across)
-    shares: list[Any] = [((1.0, 0.0), True), ((-0.5, 1.0), True), ((-0.5, -1.0), True)]
-    if not apart:
-        i = _index(4, tilt)  # the fourth only fills up
-        of_side = jnp.where(i == 0, 0.0, jnp.where(i == 1, 1.0, -1.0))
-        shares = [((jnp.where(i == 0, 1.0, -0.5), of_side), i < 3)]
-    centre = sp.to_world(m, corners)
-    return [(sp.add(centre, sp.combine(share, (low, side))), there) for share, there in shares]
+    i = _index(4, tilt)
+    rim = sp.combine(
+        (jnp.where(i == 0, 1.0, -0.5), jnp.where(i == 0, 0.0, jnp.where(i == 1, 1.0, -1.0))),
+        (low, side),
+    )
+    return sp.add(sp.to_world(m, body.vertices), rim), i < 3
 
 
-def on_base(
-    body: Body, state: State, m: Sequence[Vec], twist: Vec, physics: Physics, apart: bool
-) -> list[Contact]:
+def on_base(body: Body, state: State, m: Sequence[Vec], twist: Vec, physics: Physics) -> Contact:
     """Contacts of the object's side with the base, at the upper and lower edge of both."""
-    turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
-    found = meetings(body, state, m, turn, apart)
-    return [_on_base(body, state, m, twist, physics, turn, *one) for one in found]
-
-
-def _on_base(
-    body: Body,
-    state: State,
-    m: Sequence[Vec],
-    twist: Vec,
-    physics: Physics,
-    turn: Point,
-    z: Any,
-    normal: Point,
-    q: Point,
-    distance: Any,
-) -> Contact:
     k, b = _stiffness(physics.base_solref, _D_MAX, physics.timestep)
-    c, s = turn
+    c, s = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+    z, normal, q, distance = meetings(body, state, m, (c, s))
     n = (c * normal[0] - s * normal[1], s * normal[0] + c * normal[1], 0.0)
     t = (-n[1], n[0], 0.0)
     arm = (c * q[0] - s * q[1], s * q[0] + c * q[1])  # from the base's origin
@@ -197,10 +164,13 @@ def _on_base(
     return Contact(r, n, t, sp.Z, bias, d, body.friction_robot)
 
 
+Point = tuple[Any, Any]
+
+
 def meetings(
-    body: Body, state: State, m: Sequence[Vec], turn: Point, apart: bool = False
-) -> list[tuple[Any, Point, Point, Any]]:
-    """Heights, normals, points and distances [m] of the contacts, in the base's frame."""
+    body: Body, state: State, m: Sequence[Vec], turn: Point
+) -> tuple[Any, Point, Point, Any]:
+    """Heights, normals, points and distances [m] of the contacts (C, ...), in the base's frame."""
     c, s = turn
     up = sp.to_world(m, body.up)
     slope = (up[0] / up[2], up[1] / up[2])
@@ -214,23 +184,18 @@ def meetings(
         return c * x + s * y + slope[0] * rise, -s * x + c * y + slope[1] * rise
 
     if not isinstance(body.vertices, Corners):
-        heights = (low, high)
-        if not apart:
-            heights = (jnp.where(_index(2, body.radius) == 0, low, high),)
-        centres = [outline(body.vertices, z) for z in heights]
-        meet = [_circle_and_rectangle(at, body.radius, body.base_half) for at in centres]
-        return [(z, *one) for z, one in zip(heights, meet, strict=True)]
+        z = jnp.where(_index(2, body.radius) == 0, low, high)
+        centre = outline(body.vertices, z)
+        return z, *_circle_and_rectangle(centre, body.radius, body.base_half)
     middle = 0.5 * (low + high)
     here, ahead = (outline(foot, middle) for foot in (body.vertices.at, body.vertices.ahead))
     normal, points, distances = _polygon_and_rectangle(here, ahead, body.base_half)
-    lean = sp.dot(slope, normal)
-    found = [(z, *one) for z in (low, high) for one in zip(points, distances, strict=True)]
-    if not apart:
-        i = _index(4, lean)
-        first = i % 2 == 0
-        point: Any = tuple(jnp.where(first, a, b) for a, b in zip(*points, strict=True))
-        found = [(jnp.where(i < 2, low, high), point, jnp.where(first, *distances))]
-    return [(z, normal, p, distance + lean * (z - middle)) for z, p, distance in found]
+    i = _index(4, middle + 0 * normal[0])
+    first = i % 2 == 0
+    z = jnp.where(i < 2, low, high)
+    point = tuple(jnp.where(first, a, b) for a, b in zip(*points, strict=True))
+    distance = jnp.where(first, *distances) + sp.dot(slope, normal) * (z - middle)
+    return z, normal, point, distance  # type: ignore[return-value]
 
 
 def _circle_and_rectangle(

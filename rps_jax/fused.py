@@ -95,14 +95,13 @@ def leave(body: Body, state: State, twist: Vec) -> tuple[jax.Array, jax.Array, j
     )
 
 
-def step(body: Body, state: State, twist: Vec, physics: Physics, apart: bool = False) -> State:
+def step(body: Body, state: State, twist: Vec, physics: Physics) -> State:
     """One step of MuJoCo's semi-implicit Euler rule with the base held at `twist`.
 
-    `twist` [m/s, m/s, rad/s] is in the base's frame; `apart` writes the contacts out one by one.
+    `twist` [m/s, m/s, rad/s] is in the base's frame.
     """
     m = sp.matrix(state.q)
-    contacts = on_ground(body, state, m, physics, apart)
-    contacts += on_base(body, state, m, twist, physics, apart)
+    contacts = [on_ground(body, state, m, physics), on_base(body, state, m, twist, physics)]
     a, alpha = accelerations(body, state, m, contacts, physics)
     dt = physics.timestep
     v = sp.add(state.v, sp.scale(dt, a))
@@ -138,7 +137,7 @@ def drive(
     """
     state = enter(body, qpos, qvel, warmstart)
     state = jax.lax.platform_dependent(
-        body,
+        spread(body),
         state,
         twist,
         cuda=partial(_kernel, physics=physics),
@@ -147,21 +146,17 @@ def drive(
     return leave(body, state, twist)
 
 
-def _steps(body: Body, state: State, twist: Vec, physics: Physics) -> State:
-    return _period(spread(body), state, twist, physics, apart=False)
-
-
-def _period(body: Body, state: State, twist: Vec, physics: Physics, apart: bool) -> State:
+def _steps(scalars: Body, state: State, twist: Vec, physics: Physics) -> State:
     return jax.lax.fori_loop(
-        0, physics.substeps, lambda _, s: step(body, s, twist, physics, apart), state
+        0, physics.substeps, lambda _, s: step(scalars, s, twist, physics), state
     )
 
 
 def _kernel(
-    body: Body, state: State, twist: Vec, physics: Physics, interpret: bool = False
+    scalars: Body, state: State, twist: Vec, physics: Physics, interpret: bool = False
 ) -> State:
     """`_steps` as one kernel, a world to a thread, which keeps its world in registers."""
-    args = (spread(body, apart=True), state, twist)
+    args = (scalars, state, twist)
     leaves, tree = jax.tree.flatten(args)
     count = state.p[0].size
     padded = -(-count // _BLOCK) * _BLOCK
@@ -177,7 +172,7 @@ def _kernel(
     def kernel(*refs):
         values = [ref[...] for ref in refs[: len(leaves)]]
         body, state, twist = jax.tree.unflatten(tree, values)
-        after = _period(body, state, twist, physics, apart=True)
+        after = _steps(body, state, twist, physics)
         for ref, value in zip(refs[len(leaves) :], jax.tree.leaves(after), strict=True):
             ref[...] = value
 
@@ -194,7 +189,7 @@ def _kernel(
     return jax.tree.unflatten(jax.tree.structure(state), [x[:count] for x in after])
 
 
-def spread(body: Body, apart: bool = False) -> Body:
+def spread(body: Body) -> Body:
     """Bodies (...) with every entry an array of its own, as `step` has them."""
     leaves = body._replace(vertices=None)
     entries = {
@@ -205,4 +200,4 @@ def spread(body: Body, apart: bool = False) -> Body:
     corners = _split(jnp.moveaxis(body.vertices, -2, 0))
     if body.vertices.shape[-2] == 1:
         return Body(vertices=tuple(x[0] for x in corners), **entries)
-    return Body(vertices=Corners.of(corners, apart), **entries)
+    return Body(vertices=Corners.of(corners), **entries)

@@ -138,8 +138,8 @@ def accelerations(
             x = sp.add(_rows(c, a, alpha), c.bias)
             force, k = _law(c, x, physics)
             f = sp.combine(force, (c.n, c.t, c.s))
-            linear = sp.sub(linear, _sums(f, c))
-            angular = sp.sub(angular, _sums(sp.cross(c.r, f), c))
+            linear = sp.sub(linear, _sums(f))
+            angular = sp.sub(angular, _sums(sp.cross(c.r, f)))
             _stiffen(h, c, k)
         return (*linear, *angular), h
 
@@ -166,14 +166,13 @@ def accelerations(
     return a, alpha
 
 
-def _sum(entry: Any, contact: Contact) -> Any:
-    """Over the points of a contact, of what each adds to an entry."""
-    many = jnp.ndim(contact.d) > jnp.ndim(contact.friction)
-    return jnp.sum(entry, axis=0) if many and not isinstance(entry, float) else entry
+def _sum(entry: Any) -> Any:
+    """Over the contacts, of what each adds to an entry."""
+    return entry if isinstance(entry, float) else jnp.sum(entry, axis=0)
 
 
-def _sums(vector: Vec, contact: Contact) -> Vec:
-    return _sum(vector[0], contact), _sum(vector[1], contact), _sum(vector[2], contact)
+def _sums(vector: Vec) -> Vec:
+    return _sum(vector[0]), _sum(vector[1]), _sum(vector[2])
 
 
 def _some(active: jax.Array) -> jax.Array:
@@ -199,12 +198,12 @@ def _stiffen(h: list[list[Any]], c: Contact, k: tuple[Any, ...]) -> None:
     turned = [sp.cross(c.r, column) for column in columns]  # columns of [r] K
     for i in range(3):
         for j in range(i + 1):
-            h[i][j] = sp.plus(h[i][j], _sum(columns[j][i], c))
+            h[i][j] = sp.plus(h[i][j], _sum(columns[j][i]))
         for j in range(3):
-            h[3 + i][j] = sp.plus(h[3 + i][j], _sum(turned[j][i], c))
+            h[3 + i][j] = sp.plus(h[3 + i][j], _sum(turned[j][i]))
         row = sp.cross(c.r, (turned[0][i], turned[1][i], turned[2][i]))
         for j in range(i + 1):
-            h[3 + i][3 + j] = sp.plus(h[3 + i][3 + j], _sum(row[j], c))
+            h[3 + i][3 + j] = sp.plus(h[3 + i][3 + j], _sum(row[j]))
 
 
 def _line_search(
@@ -229,11 +228,11 @@ def _line_search(
         first, second = slope + x * bend, bend
         for c, start, pace in lines:
             force, k = _law(c, sp.add(start, sp.scale(x, pace)), physics)
-            first = first - _sum(sp.dot(force, pace), c)
+            first = first - _sum(sp.dot(force, pace))
             nn, nt, ns, tt, ts, ss = k
             p, q, r = pace
             curve = nn * p * p + tt * q * q + ss * r * r
-            second = second + _sum(curve + 2 * (nt * p * q + ns * p * r + ts * q * r), c)
+            second = second + _sum(curve + 2 * (nt * p * q + ns * p * r + ts * q * r))
         low, high = jnp.where(first < 0, x, low), jnp.where(first < 0, high, x)
         new = x - first / second
         halved = jnp.where(high < _FAR, 0.5 * (low + high), 2 * x)

@@ -103,28 +103,29 @@ def some_worlds(name, physics, count=5):
         states.append(jnp.asarray(qpos, float)[None])
     body, qpos = jax.tree.map(lambda *x: jnp.concatenate(x), *bodies), jnp.concatenate(states)
     still = jnp.zeros((count, 9))
-    return body, fused.enter(body, qpos, still, still)
+    scalars = fused.spread(body)
+    return scalars, fused.enter(body, qpos, still, still)
 
 
 @pytest.mark.parametrize("name", ["box", "cylinder"])
 def test_the_kernel_computes_what_xla_computes(name):
     """In Pallas's interpreter; five worlds, padded to a block of 64."""
     physics = Physics(timestep=0.02)
-    body, state = some_worlds(name, physics)
+    scalars, state = some_worlds(name, physics)
     twist = tuple(jnp.full(5, x) for x in TWIST)
-    expected = jax.jit(partial(fused._steps, physics=physics))(body, state, twist)
+    expected = jax.jit(partial(fused._steps, physics=physics))(scalars, state, twist)
     kernel = partial(fused._kernel, physics=physics, interpret=True)
-    for a, b in zip(jax.tree.leaves(jax.jit(kernel)(body, state, twist)),
+    for a, b in zip(jax.tree.leaves(jax.jit(kernel)(scalars, state, twist)),
                     jax.tree.leaves(expected), strict=True):  # fmt: skip
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", ["box", "cylinder"])
 def test_the_kernel_compiles_for_an_nvidia_gpu(name):
-    body, state = some_worlds(name, Physics())
+    scalars, state = some_worlds(name, Physics())
     twist = tuple(jnp.full(5, x) for x in TWIST)
     with as_if_there_were_a_gpu():
-        traced = jax.jit(partial(fused._kernel, physics=Physics())).trace(body, state, twist)
+        traced = jax.jit(partial(fused._kernel, physics=Physics())).trace(scalars, state, twist)
         assert "triton" in traced.lower(lowering_platforms=("cuda",)).as_text()
 
 
