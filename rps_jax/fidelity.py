@@ -55,9 +55,12 @@ IN_FUSED = {
         "fused, `fast`", Setting(physics=preset(fidelity="fast"), engine="fused")
     ),
     "fused_20ms_4_6": _fused("fused, 20 ms, 4/6", timestep=0.02, iterations=4, ls_iterations=6),
+    "fused_5ms": _fused("fused, 5 ms", timestep=0.005),
     "impratio_1": _fused("fused, impratio 1", impratio=1.0),
+    "impratio_100": _fused("fused, impratio 100", impratio=100.0),
     "mujocos_ground": _fused("fused, MuJoCo's own ground contact", **MUJOCOS_GROUND),
     "soft": _fused("fused, skin contact 60 ms (solref)", base_solref=(0.06, 1.0)),
+    "period_10ms": _fused("fused, control period 10 ms", control_period=0.01),
     "period_50ms": _fused("fused, control period 50 ms", control_period=0.05),
     "drive_on_loss": replace(_fused("fused, 0.05 m/s after a loss"), params={"v_lost": 0.05}),
     "keep_on_loss": replace(

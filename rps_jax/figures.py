@@ -349,15 +349,16 @@ def success_curves(results: xr.Dataset, path: Path) -> Path:
     axes = figure.subplots(rows, 4, squeeze=False, sharey=True)
     for ax in axes.ravel()[len(drawn) :]:
         ax.axis("off")
+    least = 1.0
     for ax, name in zip(axes.ravel(), drawn, strict=False):
         for i, arm in enumerate(map(str, results.arm.values)):
             won = results.success.sel(arm=arm).values > 0
             found = analysis.bins(results[name].values, won)
             _rates(ax, found.middle, found.won, found.of, color=f"C{i}", label=arm)
+            least = min(least, (found.won / found.of).min())
         ax.set_xlabel(f"{analysis.DRAWN[name]} [{results[name].attrs['units']}]", fontsize=8)
-        ax.set_ylim(-3, 103)
         ax.grid(alpha=0.3)
     for ax in axes[:, 0]:
-        ax.set_ylabel("success [%]")
+        ax.set(ylabel="success [%]", ylim=(max(-3.0, 100 * least - 10), 103))
     axes[0, 0].legend(fontsize=8)
     return save(figure, path)
