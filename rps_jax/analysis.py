@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -180,3 +180,29 @@ def bins(values: np.ndarray, won: np.ndarray, count: int = 8) -> Bins:
         np.array([int(won[g].sum()) for g in groups]),
         np.array([g.size for g in groups]),
     )
+
+
+def agreement(found: Mapping[str, xr.Dataset]) -> list[list[str]]:
+    """Header and one row for each engine: success, and outcomes equal to the first's, by object.
+
+    The results are those of one arm in the same worlds.
+    """
+    base = next(iter(found.values()))
+    groups = worlds_by_object(base)
+    rows = [["engine", *groups, "equal outcomes", "95 %", *(f"equal, {g}" for g in groups), "+/-"]]
+    for name, one in found.items():
+        won = one.success.values > 0
+        same = won == (base.success.values > 0)
+        c = study.compare(base.success, one.success)
+        low, high = c.equal_interval
+        rows.append(
+            [
+                name,
+                *(f"{won[mask].sum()} of {mask.sum()}" for mask in groups.values()),
+                f"{100 * c.equal:.1f} %",
+                f"{100 * low:.0f}-{100 * high:.0f} %",
+                *(f"{same[mask].sum()} of {mask.sum()}" for mask in groups.values()),
+                f"+{c.gained} -{c.lost}",
+            ]
+        )
+    return rows

@@ -1,0 +1,70 @@
+"""Do the engines agree in random worlds?
+
+    python sweeps/robustness.py --worlds 90 --out runs/engines
+
+runs the same worlds in every engine and prints a table: success, and the share of outcomes equal to
+those of converged C MuJoCo. It can be killed; the same command continues. `rps sweep` runs one.
+"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from rps_jax import analysis, errors, paper, record, robustness, score
+from rps_jax.cli import Spread, guarded, progress_bar, use_cache
+from rps_jax.domain import DOMAINS
+from rps_jax.physics import preset
+from rps_jax.robustness import Plan
+from rps_jax.slots import Setting
+
+# The first is what the others are compared with.
+ENGINES = {
+    "C, reference": Setting(preset(fidelity="reference"), engine="mujoco"),
+    "C, standard": Setting(preset(), engine="mujoco"),
+    "fused, standard": Setting(preset(), engine="fused"),
+    "fused, fast": Setting(preset(fidelity="fast"), engine="fused"),
+    "MJX, standard": Setting(preset(), engine="mjx"),
+}
+
+
+@dataclass(frozen=True)
+class Options(Spread):
+    """Which worlds."""
+
+    domain: str = "wide"
+    """paper, hardware, wide or hostile."""
+    strategy: str = "rps"
+    """rps, nps or aps."""
+    worlds: int = 90
+    """How many."""
+    out: Path = Path("runs/engines")
+    """Run folder; a run that was killed is continued there."""
+
+
+def main(options: Options) -> None:
+    """Run what is missing, then print and write the table."""
+    domain = DOMAINS[errors.check_name("domain", options.domain, DOMAINS)]
+    errors.check_name("strategy", options.strategy, paper.PARAMS)
+    arms = {options.strategy: paper.PARAMS[options.strategy]}
+    plans = {
+        name: Plan(domain, options.worlds, arms, setting, part=64)
+        for name, setting in ENGINES.items()
+    }
+    shape = options.shape()
+    use_cache()
+    found = {}
+    for name, plan in plans.items():
+        folder = robustness.open_run(options.out / name.replace(", ", "_"), plan)
+        with robustness.lock(folder), progress_bar(plan.trials, name) as report:
+            robustness.run(folder, plan, report=report, **shape)
+        robustness.merge([folder], folder)
+        found[name] = record.read_results(folder).isel(arm=0)
+    text = score.markdown(analysis.agreement(found))
+    record.write_text(options.out / "engines.md", text + "\n")
+    print(text)
+
+
+if __name__ == "__main__":
+    sys.exit(guarded(lambda: main(tyro.cli(Options, description=__doc__))))
