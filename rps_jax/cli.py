@@ -1,4 +1,4 @@
-"""The command line: `rps table`, `rps push`, `rps doctor`.
+"""The command line: `rps table`, `rps push`, `rps sweep` and the others.
 
 Input is checked, and folders are tried, before anything compiles. Heavy modules are imported by
 the commands, so that `rps --help` answers at once and MuJoCo finds its rendering backend chosen.
@@ -170,7 +170,7 @@ class Sweep(Spread):
     """Push in many random worlds, every strategy in the same ones; the run can be continued."""
 
     domain: str = "wide"
-    """paper, hardware, wide or hostile, or a JSON file with ranges (see `rps sweep --domain`)."""
+    """paper, hardware, wide or hostile, or a JSON file of ranges, as {"mass": [3, 60]}."""
     change: tuple[str, ...] = ()
     """Ranges to change, each as quantity=low,high (as mass=3,10)."""
     strategies: tuple[str, ...] = ("rps", "nps", "aps")
