@@ -705,7 +705,7 @@ def choose_device(name: str) -> None:
         jax.devices()
     except RuntimeError as error:
         raise InputError(
-            f"device = {name} is not there: install jax[cuda12] on a machine with an NVIDIA GPU, "
+            f"device = {name} is not there: install rps_jax[cuda] on a machine with an NVIDIA GPU, "
             "or choose cpu."
         ) from error
 
