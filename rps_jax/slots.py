@@ -19,6 +19,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import AxisType, NamedSharding
+from jax.sharding import PartitionSpec as P
 
 from rps_jax import engines, errors, reference, trial
 from rps_jax.engines import Engine
@@ -106,7 +108,7 @@ def run(
     Args:
       jobs: what to run.
       setting: what they share.
-      slots: worlds stepped at once by one worker.
+      slots: worlds stepped at once by one worker on each of the host's devices.
       workers: host threads that each drive a batch of their own, or, with the engine `mujoco`,
         that step worlds.
       collect: called with the outcomes of trials that ended, in any order, one call at a time.
@@ -205,7 +207,12 @@ class _Queue:
     def __init__(self, job: Job, setting: Setting, slots: int):
         self.strategy = job.strategy
         self.setting = setting
-        self.slots = min(slots, job.trials)
+        devices = jax.device_count()
+        self.slots = devices * min(slots, -(-job.trials // devices))
+        self.sharding = None
+        if devices > 1:
+            mesh = jax.make_mesh((devices,), ("worlds",), (AxisType.Auto,))
+            self.sharding = NamedSharding(mesh, P("worlds"))
         self._parts = iter(job.parts)
         first = next(self._parts)
         self.stage = first.stage
@@ -232,23 +239,49 @@ class _Queue:
                 self._program = self._compile()
             return self._program
 
+    def put(self, tree: Any) -> Any:
+        """Leaves (slots, ...) on the device, or split over all devices of the host."""
+        return jax.device_put(tree, self.sharding)
+
+    def start(self, worlds: World, live: np.ndarray) -> Trial:
+        """New trials in all slots."""
+        return self.put(trial.start_all(worlds, live, strategy=self.strategy))
+
+    def refill(self, worlds: World, trials: Trial, fresh: np.ndarray) -> Trial:
+        """New trials in the slots that are `fresh` (slots,)."""
+        return self.put(_refill(worlds, trials, fresh, strategy=self.strategy))
+
     def _batched(self, leaf: Any) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct((self.slots, *leaf.shape[1:]), leaf.dtype)
+        shape = (self.slots, *leaf.shape[1:])
+        return jax.ShapeDtypeStruct(shape, leaf.dtype, sharding=self.sharding)
 
     def _compile(self) -> Any:
         physics = self.setting.physics
-        live = jax.ShapeDtypeStruct((self.slots,), bool)
         start = partial(trial.start_all, strategy=self.strategy)
-        lowered = trial.advance.lower(
-            self.stage,
-            self._worlds,
-            jax.eval_shape(start, self._worlds, live),
-            physics=physics,
-            rules=self.setting.rules,
-            strategy=self.strategy,
-            steps=max(1, round(SEGMENT / physics.control_period)),
-        )
-        return lowered.compile()
+        live = jax.ShapeDtypeStruct((self.slots,), bool)
+        trials = jax.tree.map(self._batched, jax.eval_shape(start, self._worlds, live))
+
+        def advance(stage: Any, worlds: World, trials: Trial, rules: Rules) -> Trial:
+            return trial.advance(
+                stage,
+                worlds,
+                trials,
+                physics=physics,
+                rules=rules,
+                strategy=self.strategy,
+                steps=max(1, round(SEGMENT / physics.control_period)),
+            )
+
+        if self.sharding is not None:  # each device runs its own worlds and waits for no other
+            advance = jax.shard_map(
+                advance,
+                mesh=self.sharding.mesh,
+                in_specs=(P(), P("worlds"), P("worlds"), P()),
+                out_specs=P("worlds"),
+                check_vma=False,
+            )
+        program = jax.jit(advance, donate_argnums=2)
+        return program.lower(self.stage, self._worlds, trials, self.setting.rules).compile()
 
 
 def rows(tree: Any, which: Any) -> Any:
@@ -287,7 +320,7 @@ class _Held:
         )
 
     def put(self, at: np.ndarray, taken: list[tuple[Part, int]]) -> World:
-        """Put trials into the slots `at`; returns the worlds, on the device."""
+        """Put trials into the slots `at`; returns the worlds."""
         by_part: dict[int, tuple[Part, list[int], list[int]]] = {}
         for slot, (part, row) in zip(at, taken, strict=True):
             _, slots, of = by_part.setdefault(id(part), (part, [], []))
@@ -300,7 +333,7 @@ class _Held:
             ):
                 mine[slots] = theirs[of]
         # A copy: the device may otherwise share the host's memory, which the next call changes.
-        return jax.device_put(jax.tree.map(np.copy, self._worlds))
+        return jax.tree.map(np.copy, self._worlds)
 
 
 def _drain(queue: _Queue, program: Any, taken: list[tuple[Part, int]], shared: _Shared) -> None:
@@ -308,11 +341,11 @@ def _drain(queue: _Queue, program: Any, taken: list[tuple[Part, int]], shared: _
     stage, period = queue.stage, queue.setting.physics.control_period
     held = _Held(taken, queue.slots)
     live = np.arange(queue.slots) < len(taken)
-    worlds = held.put(np.arange(len(taken)), taken)
-    trials = trial.start_all(worlds, live, strategy=queue.strategy)
+    worlds = queue.put(held.put(np.arange(len(taken)), taken))
+    trials = queue.start(worlds, live)
     while live.any() and not shared.stop:
         before = np.asarray(trials.steps)
-        trials = program(stage, worlds, trials, rules=queue.setting.rules)
+        trials = program(stage, worlds, trials, queue.setting.rules)
         steps = np.asarray(trials.steps)
         ended = np.asarray(trials.done) & live
         at = np.flatnonzero(ended)
@@ -325,6 +358,5 @@ def _drain(queue: _Queue, program: Any, taken: list[tuple[Part, int]], shared: _
         if taken:
             fresh = at[: len(taken)]
             live[fresh] = True
-            worlds = held.put(fresh, taken)
-            now = np.isin(np.arange(queue.slots), fresh)
-            trials = _refill(worlds, trials, now, strategy=queue.strategy)
+            worlds = queue.put(held.put(fresh, taken))
+            trials = queue.refill(worlds, trials, np.isin(np.arange(queue.slots), fresh))

@@ -5,6 +5,8 @@ import multiprocessing
 import os
 import random
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -139,6 +141,40 @@ def test_a_faster_base_arrives_earlier():
         part = domain.worlds(chosen, domain.draw(chosen, 0, [1]), paper.PARAMS["rps"], SHORT)
         times.append(outcomes([part])[1][-2][0])  # x of the base at the end
     assert times[0] < 0.7 * times[1]
+
+
+_ON_TWO_DEVICES = """
+import sys, jax, tests.test_sweep as t
+from pathlib import Path
+jax.config.update("jax_compilation_cache_dir", sys.argv[2])
+assert jax.device_count() == 2
+t.swept(Path(sys.argv[1]), workers=1)
+queue = t.slots._Queue(t.Job(t.trial.RPS, 20, [t.made(range(20))]), t.SHORT, t.SLOTS)
+text = queue.program().as_text()
+print(queue.slots, *(w for w in ("all-reduce", "all-gather", "all-to-all", "permute") if w in text))
+"""
+
+
+def test_two_devices_find_what_one_finds_and_never_talk(whole, tmp_path, cache):
+    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    done = subprocess.run(
+        [sys.executable, "-c", _ON_TWO_DEVICES, str(tmp_path / "run"), cache],
+        cwd=Path(__file__).parent.parent,
+        env=os.environ | flags,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.split() == ["16"]  # slots, and no collective
+    results = []
+    for folder in (tmp_path / "run", whole):
+        robustness.merge([folder], tmp_path)
+        results.append(record.read_results(tmp_path))
+    # Another program rounds otherwise, and contact amplifies it.
+    two, one = results
+    np.testing.assert_array_equal(two.success, one.success)
+    np.testing.assert_allclose(two.min_distance, one.min_distance, atol=0.02)
+    assert np.median(np.abs(two.time - one.time)) < 0.1
 
 
 def test_results_hold_every_world_with_what_was_drawn(whole, tmp_path):
