@@ -297,11 +297,8 @@ def run(
 
     return slots.run(
         [
-            Job(
-                trial.STRATEGIES[kind],
-                sum(parts.parts[n].size for n in numbers),
-                _made(plan, parts, numbers),
-            )
+            # As many slots as for the whole run, whatever is left of it: the same bits.
+            Job(trial.STRATEGIES[kind], plan.trials, _made(plan, parts, numbers))
             for (_, kind), numbers in jobs.items()
         ],
         plan.setting,

@@ -75,7 +75,7 @@ class Job(NamedTuple):
     """Trials of one kind: one compiled program runs them all."""
 
     strategy: Strategy
-    trials: int
+    trials: int  # at most; there are no more slots than that
     parts: Iterable[Part]  # of one stage, but for the engine `mujoco`
 
 

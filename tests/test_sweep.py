@@ -7,6 +7,7 @@ import random
 import shutil
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -211,18 +212,25 @@ def sweep_in_a_process(folder, cache):
 
 
 def test_a_run_killed_twenty_times_ends_as_one_that_was_not(tmp_path, cache):
-    """SIGKILL at random moments; then one process may come to the end."""
+    """SIGKILL at random moments, in turn of a start and of the work; then one may end."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["rps_jax.robustness"])
     folder, dice, interrupted = tmp_path / "run", random.Random(0), 0
+
+    def done():
+        return len(list(folder.glob("parts/*.nc")))
+
     for kill in range(21):
+        before = done()
         process = context.Process(target=sweep_in_a_process, args=(folder, cache))
         process.start()
         if kill < 20:
-            process.join(dice.uniform(0.5, 4.0))
+            while kill % 2 and process.is_alive() and done() == before:
+                time.sleep(0.01)  # until it is at work, however slow the machine
+            process.join(dice.uniform(0.0, 0.5 if kill % 2 else 3.0))
             process.kill()
         process.join()
-        interrupted += 0 < len(list(folder.glob("parts/*.nc"))) < len(KILLED.parts())
+        interrupted += 0 < done() < len(KILLED.parts())
     assert process.exitcode == 0
     assert interrupted > 2
     assert payload(folder) == payload(swept(tmp_path / "whole", KILLED))
