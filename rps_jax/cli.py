@@ -453,6 +453,20 @@ def progress_bar(trials: int, what: str = "push") -> Iterator[Callable[[Progress
         yield report
 
 
+@contextlib.contextmanager
+def _clock(horizon: float) -> Iterator[Callable[[Progress], None]]:
+    """A bar over the simulated seconds of one trial, to be handed to `sweep.follow`."""
+    from tqdm import tqdm
+
+    with tqdm(total=horizon, unit="s", desc="compile", smoothing=0.05) as bar:
+
+        def report(progress: Progress) -> None:
+            bar.set_description("push", refresh=False)
+            bar.update(round(progress.simulated - bar.n, 3))
+
+        yield report
+
+
 def _tell(timing: Timing) -> None:
     import jax
 
@@ -490,8 +504,6 @@ def _table(options: Table) -> None:
 
 
 def _push(options: Push) -> None:
-    from tqdm import tqdm
-
     from rps_jax import figures, sweep
 
     setting = _setting(options)
@@ -508,12 +520,7 @@ def _push(options: Push) -> None:
     out = _open(options, "push")
     _write_config(out, options, setting, {options.strategy: params})
 
-    with tqdm(total=options.horizon, unit="s", desc="compile", smoothing=0.05) as bar:
-
-        def report(progress: Progress) -> None:
-            bar.set_description("push", refresh=False)
-            bar.update(round(progress.simulated - bar.n, 3))
-
+    with _clock(options.horizon) as report:
         (trace,) = sweep.follow([case], setting, report=report)
     _show(trace, options.object, figures.title_of(case), out)
     if options.video:
@@ -748,8 +755,6 @@ def _report_sweep(out: Path) -> None:
 
 
 def _replay(options: Replay) -> None:
-    from tqdm import tqdm
-
     from rps_jax import record, robustness, sweep, trial
 
     plan = robustness.load_plan(options.run)
@@ -762,12 +767,7 @@ def _replay(options: Replay) -> None:
     use_cache()
     part = robustness.world_part(plan, arms.index(name), [options.index])
     strategy = trial.STRATEGIES[type(plan.arms[name])]
-    with tqdm(total=float(plan.setting.rules.horizon), unit="s", desc="compile") as bar:
-
-        def report(progress: Progress) -> None:
-            bar.set_description("push", refresh=False)
-            bar.update(round(progress.simulated - bar.n, 3))
-
+    with _clock(float(plan.setting.rules.horizon)) as report:
         (trace,) = sweep.follow_part(part, strategy, plan.setting, report=report)
     _show(trace, f"world {options.index}, {name}", robustness.title_of(plan, options.index), out)
     if options.video:

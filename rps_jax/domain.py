@@ -342,9 +342,7 @@ def domain_randomize(
     numbers = np.stack([_uniform(int(a) << 32 | int(b), np.zeros(1, int))[0] for a, b in keys])
     alone = replace(domain, objects=(name,), frictions=(), targets=())
     drawn = _drawn(alone, np.zeros(len(keys), int), numbers)
-    template = engines.scene_of_solid(family, drawn.solid, drawn.friction, Physics(), 0)
-    _, of_one = engines.stage_of_scenes([template], "mjx")
-    own = engines.mjx_fields(family, drawn.solid, drawn.friction, template, of_one)
+    _, own = engines.stage_of_solids(family, drawn.solid, drawn.friction, "mjx", Physics())
     dtype = model.body_mass.dtype
     batched = scene.apply(model, {k: jnp.asarray(v, dtype) for k, v in own.items()})
     in_axes = jax.tree_util.tree_map_with_path(

@@ -10,9 +10,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import fcntl
+import functools
 import hashlib
 import json
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -59,7 +61,7 @@ class Plan:
         """How many: trial a * worlds + i is of arm a in world i."""
         return len(self.arms) * self.worlds
 
-    @property
+    @functools.cached_property
     def blocks(self) -> int:
         """Parts of one arm and one object, at most."""
         return math.ceil(self.worlds_of(0).size / self.part)
@@ -69,6 +71,7 @@ class Plan:
         every = np.arange(self.worlds)
         return every[self.domain.object_of(every) == which]
 
+    @functools.cached_property
     def parts(self) -> dict[int, np.ndarray]:
         """Numbers of the trials of every part, by the part's number."""
         found = {}
@@ -287,19 +290,24 @@ def run(
     before = sum(trials.size for n, trials in mine.items() if n in done)
     report(Progress(before, 0.0))
     parts = _Parts(folder, {n: trials for n, trials in mine.items() if n not in done})
+    # Of each kind the parts to do, and the trials of the whole plan: whatever is left of a run, it
+    # has the slots of the whole, and so its bits.
     jobs: dict[Any, list[int]] = {}
-    for number in parts.parts:
+    sizes: Counter[Any] = Counter()
+    for number, trials in plan.parts.items():
         arm, which = _arm_and_object(plan, number)
-        jobs.setdefault((which, type(list(plan.arms.values())[arm])), []).append(number)
+        kind = (which, type(list(plan.arms.values())[arm]))
+        sizes[kind] += trials.size
+        if number in parts.parts:
+            jobs.setdefault(kind, []).append(number)
 
     def tell(progress: Progress) -> None:
         report(Progress(before + progress.finished, progress.simulated))
 
     return slots.run(
         [
-            # As many slots as for the whole run, whatever is left of it: the same bits.
-            Job(trial.STRATEGIES[kind], plan.trials, _made(plan, parts, numbers))
-            for (_, kind), numbers in jobs.items()
+            Job(trial.STRATEGIES[kind[1]], sizes[kind], _made(plan, parts, numbers))
+            for kind, numbers in jobs.items()
         ],
         plan.setting,
         collect=parts.collect,
@@ -310,7 +318,7 @@ def run(
 
 def share(plan: Plan, shard: Shard) -> dict[int, np.ndarray]:
     """The parts of one shard: numbers of their trials, by the part's number."""
-    every = plan.parts().items()
+    every = plan.parts.items()
     return {n: trials for i, (n, trials) in enumerate(every) if i % shard.of == shard.number - 1}
 
 
@@ -370,10 +378,10 @@ def merge(folders: list[Path], out: Path) -> Path:
             )
     plan = load_plan(folders[0])
     found = {n: path for folder in folders for n, path in finished(folder).items()}
-    missing = [n for n in plan.parts() if n not in found]
+    missing = [n for n in plan.parts if n not in found]
     if missing:
         raise InputError(
-            f"run = {', '.join(map(str, folders))} lacks {len(missing)} of {len(plan.parts())} "
+            f"run = {', '.join(map(str, folders))} lacks {len(missing)} of {len(plan.parts)} "
             "parts: run the same command again, or give the folders of all shards."
         )
     return record.atomic(out / "results.nc", lambda path: _write_results(path, plan, found))

@@ -132,8 +132,6 @@ def shaped(
     one: Solid,
     physics: Physics = PHYSICS["default"]["standard"],
     friction: Friction = FRICTION["S1"],
-    *,
-    half_length: float = skin.HALF_LENGTH,
 ) -> Scene:
     """Compile a scene with one solid (its leaves without a leading axis) of a shape family.
 
@@ -156,7 +154,8 @@ def shaped(
     body.mass, body.ipos = one.mass, one.p_object_com
     body.iquat, body.inertia = one.q_object_body, one.inertia
     outline = Footprint(jnp.asarray(one.vertices, float), jnp.asarray(one.radius, float))
-    return Scene(family, family, *_compile(spec, physics, friction, half_length), outline)
+    models = _compile(spec, physics, friction, skin.HALF_LENGTH)
+    return Scene(family, family, *models, outline)
 
 
 def geom_sizes(family: str, solids: Solid) -> dict[str, np.ndarray]:

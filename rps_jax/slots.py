@@ -36,7 +36,7 @@ class Setting:
 
     physics: Physics = PHYSICS["default"]["standard"]
     rules: Rules = Rules()
-    seed: int = 0  # of the skins' imperfections
+    seed: int = 0  # of the skins' imperfections, and of random worlds
     engine: Engine = "mjx"
 
     def __post_init__(self) -> None:
@@ -125,7 +125,7 @@ def run(
         tasks = [partial(_run_in_c, job, setting, workers // count, shared) for job in jobs]
     else:
         count = workers
-        queues = [_Queue(job, setting, slots) for job in jobs if job.trials]
+        queues = [_Queue(job, setting, slots) for job in jobs]
         orders = [queues[w % len(queues) :] + queues for w in range(count if queues else 0)]
         tasks = [partial(_work, order, shared) for order in orders]
         if jax.default_backend() != "cpu":  # the processor is idle: compile all at once

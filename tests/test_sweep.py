@@ -230,7 +230,7 @@ def test_a_run_killed_twenty_times_ends_as_one_that_was_not(tmp_path, cache):
             process.join(dice.uniform(0.0, 0.5 if kill % 2 else 3.0))
             process.kill()
         process.join()
-        interrupted += 0 < done() < len(KILLED.parts())
+        interrupted += 0 < done() < len(KILLED.parts)
     assert process.exitcode == 0
     assert interrupted > 2
     assert payload(folder) == payload(swept(tmp_path / "whole", KILLED))
@@ -245,7 +245,7 @@ def test_a_corrupt_part_is_set_aside_and_done_again_alone(whole, tmp_path):
     victim.write_bytes(content)
     finished = []
     swept(folder, report=lambda progress: finished.append(progress.finished))
-    assert finished[0] == PLAN.trials - PLAN.parts()[2].size
+    assert finished[0] == PLAN.trials - PLAN.parts[2].size
     assert {path: path.stat().st_mtime_ns for path in others} == others
     aside = victim.with_suffix(".nc.corrupt")
     assert aside.read_bytes() == bytes(content)
