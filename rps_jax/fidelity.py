@@ -60,6 +60,8 @@ IN_FUSED = {
     "impratio_100": _fused("fused, impratio 100", impratio=100.0),
     "mujocos_ground": _fused("fused, MuJoCo's own ground contact", **MUJOCOS_GROUND),
     "soft": _fused("fused, skin contact 60 ms (solref)", base_solref=(0.06, 1.0)),
+    "pyramid": _condition("fused", preset("paper_gazebo"), "fused, friction pyramid, 1 ms"),
+    "period_5ms": _fused("fused, control period 5 ms", control_period=0.005, timestep=0.005),
     "period_10ms": _fused("fused, control period 10 ms", control_period=0.01),
     "period_50ms": _fused("fused, control period 50 ms", control_period=0.05),
     "drive_on_loss": replace(_fused("fused, 0.05 m/s after a loss"), params={"v_lost": 0.05}),
