@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from rps_jax.slots import Progress, Setting, Timing
     from rps_jax.sweep import Case, Trace
     from rps_jax.trial import Params
+    from rps_jax.tune import Course
 
 
 @dataclass(frozen=True)
@@ -228,6 +229,92 @@ class Replay:
 
 
 @dataclass(frozen=True)
+class TuneOptions(Spread):
+    """What every tuner takes."""
+
+    domain: tuple[str, ...] = ("wide",)
+    """Domains to tune in: paper, hardware, wide, hostile, or JSON files of ranges."""
+    objects: tuple[str, ...] = ("random_box", "random_cylinder")
+    """Objects of these domains; random_prism is held out by default."""
+    tuned: tuple[str, ...] = ("full",)
+    """Parameters to tune, by name, or logistic (eta, zeta, beta, k), or full (all of the law's)."""
+    start: str = "paper"
+    """Parameters to begin with: paper, tuned, or a JSON file (as {"L": 0.3})."""
+    worlds: int = 512
+    """Worlds that each candidate meets, in each domain; others in the next generation."""
+    validation: int = 512
+    """Worlds for validation, in each domain."""
+    risk: str = "mean"
+    """mean over the worlds, or cvar: the mean over the worst tenth."""
+    fidelity: str = "standard"
+    """How finely the physics is solved: reference, standard or fast."""
+    engine: str = "fused"
+    """fused, mjx, mujoco or quasistatic."""
+    horizon: float = 300.0
+    """Longest trial [s]."""
+    seed: int = 0
+    """Of proposals and worlds."""
+    device: str = "auto"
+    """auto, cpu or gpu."""
+    quick: bool = False
+    """A small run: minutes on two cores."""
+    out: Path = Path("runs/tune")
+    """Run folder; a run that was killed is continued there."""
+
+
+@dataclass(frozen=True)
+class TuneES(TuneOptions):
+    """Tune by evolution."""
+
+    strategy: str = "CMA_ES"
+    """A distribution-based strategy of evosax, by name."""
+    population: int = 64
+    """Candidates of a generation."""
+    generations: int = 50
+    """In all."""
+    spread: float = 0.5
+    """Standard deviation of the first generation, in units of the bounded map."""
+    patience: int = 0
+    """Generations without a better validation before a restart elsewhere; 0: never."""
+
+
+@dataclass(frozen=True)
+class TuneCompare(Spread):
+    """Compare sets of parameters in worlds kept for testing, which no tuner has seen."""
+
+    params: tuple[str, ...] = ("paper", "tuned")
+    """Sets of parameters: paper, tuned, or JSON files (as {"L": 0.3})."""
+    domain: tuple[str, ...] = ("paper", "wide", "hostile", "prisms")
+    """Domains, each a run of its own: paper, hardware, wide, hostile, prisms (those of wide), or
+    JSON files of ranges."""
+    worlds: int = 10000
+    """Of each domain; of the paper's its grid of 144."""
+    physics: str = "default"
+    """default (isotropic friction) or paper_gazebo (friction pyramid)."""
+    fidelity: str = "standard"
+    """How finely the physics is solved: reference, standard or fast."""
+    engine: str = "fused"
+    """fused, mjx, mujoco or quasistatic."""
+    seed: int = 0
+    """The worlds are those for testing of this seed."""
+    device: str = "auto"
+    """auto, cpu or gpu."""
+    out: Path = Path("runs/compare")
+    """Run folder; a run that was killed is continued there."""
+
+
+@dataclass(frozen=True)
+class Tune:
+    """Tune the law's parameters in many worlds."""
+
+    how: Annotated[
+        Annotated[TuneES, tyro.conf.subcommand("es")]
+        | Annotated[TuneCompare, tyro.conf.subcommand("compare")],
+        tyro.conf.arg(name=""),
+    ]
+
+
+@dataclass(frozen=True)
 class Doctor:
     """Print versions, devices and folders, and what does not work with its mend."""
 
@@ -240,6 +327,7 @@ Command = (
     | Annotated[Sweep, tyro.conf.subcommand("sweep")]
     | Annotated[Merge, tyro.conf.subcommand("merge")]
     | Annotated[Replay, tyro.conf.subcommand("replay")]
+    | Annotated[Tune, tyro.conf.subcommand("tune")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )
 
@@ -264,6 +352,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Sweep: _sweep,
         Merge: _merge,
         Replay: _replay,
+        Tune: _tune,
         Doctor: _doctor,
     }
     return guarded(lambda: act[type(command)](command))
@@ -617,13 +706,19 @@ def _paper(options: Paper) -> None:
     print(f"report: {path}")
 
 
+def _domain_of(text: str) -> Domain:
+    """A domain by name or from a JSON file."""
+    from rps_jax import domain
+
+    if text.endswith(".json"):
+        return domain.from_json(_json(Path(text)))
+    return domain.DOMAINS[errors.check_name("domain", text, domain.DOMAINS)]
+
+
 def _domain(options: Sweep) -> Domain:
     from rps_jax import domain
 
-    if options.domain.endswith(".json"):
-        chosen = domain.from_json(_json(Path(options.domain)))
-    else:
-        chosen = domain.DOMAINS[errors.check_name("domain", options.domain, domain.DOMAINS)]
+    chosen = _domain_of(options.domain)
     changes = {}
     for text in options.change:
         name, _, values = text.partition("=")
@@ -654,20 +749,27 @@ def _arms(options: Sweep) -> dict[str, Params]:
 
     arms: dict[str, Params] = {}
     for name in options.params:
-        values = {} if name == "paper" else _json(Path(name))
-        for key, value in values.items():
-            errors.check_name(f"parameter of {name}", key, RPSParams._fields)
-            values[key] = errors.check_number(f"{name} {key}", value)
+        changed = _changes(name)
         for strategy in options.strategies:
             params = paper.PARAMS[errors.check_name("strategy", strategy, paper.PARAMS)]
             label = strategy
             if isinstance(params, RPSParams):
-                changed = {k: v for k, v in values.items() if k != "reactive"}
-                params = params._replace(**changed)
-                law.check(params)
+                params = law.check(params._replace(**changed))
                 label = strategy if len(options.params) == 1 else f"{strategy} {Path(name).stem}"
             arms[label] = params
     return arms
+
+
+def _changes(name: str) -> dict[str, float]:
+    """What a set of parameters, by name or from a JSON file, changes of the paper's."""
+    from rps_jax.law import RPSParams
+
+    known = [field for field in RPSParams._fields if field != "reactive"]
+    values = {} if name == "paper" else _json(Path(name))
+    for key, value in values.items():
+        errors.check_name(f"parameter of {name}", key, known)
+        values[key] = errors.check_number(f"{name} {key}", value)
+    return values
 
 
 def _plan(options: Sweep) -> Plan:
@@ -752,6 +854,122 @@ def _report_sweep(out: Path) -> None:
 
     print(robustness.write_report(out).read_text())
     print(f"run folder: {out}")
+
+
+def _tune(options: Tune) -> None:
+    act = {TuneES: _tune_es, TuneCompare: _tune_compare}
+    act[type(options.how)](options.how)
+
+
+def _tune_compare(options: TuneCompare) -> None:
+    from rps_jax import law, record, robustness, tune
+    from rps_jax.law import RPSParams
+    from rps_jax.physics import preset
+    from rps_jax.robustness import Plan
+    from rps_jax.slots import Setting
+
+    setting = Setting(
+        preset(options.physics, options.fidelity),
+        seed=tune.seed_of(options.seed, "test"),
+        engine=options.engine,  # pyright: ignore[reportArgumentType]
+    )
+    arms = {
+        Path(name).stem: law.check(RPSParams.paper()._replace(**_changes(name)))
+        for name in options.params
+    }
+    plans = {}
+    for text in options.domain:
+        one = _domain_of(text)
+        count = one.combinations if one.targets else options.worlds
+        plans[Path(text).stem] = Plan(one, count, arms, setting, part=4096)
+    shape = options.shape()
+    choose_device(options.device)
+    use_cache()
+    for name, plan in plans.items():
+        out = robustness.open_run(options.out / name, plan)
+        with robustness.lock(out), progress_bar(plan.trials, name) as report:
+            record.write_json(out / "environment.json", record.environment())
+            robustness.run(out, plan, report=report, **shape)
+        robustness.merge([out], out)
+        print(f"## {name}\n")
+        _report_sweep(out)
+
+
+def _tune_es(options: TuneES) -> None:
+    from rps_jax import figures, law, record, tune
+    from rps_jax.law import RPSParams
+
+    how = _quick(options) if options.quick else options
+    base = law.check(RPSParams.paper()._replace(**_changes(how.start)))
+    names = [name for text in how.tuned for name in tune.SUBSETS.get(text, (text,))]
+    space, course = tune.Space(tuple(names), base), _course(how)
+    evolution = tune.Evolution(
+        how.strategy, how.population, how.generations, how.spread, how.patience, how.seed
+    )
+    shape = how.shape()
+    choose_device(how.device)
+    out = tune.open_run(how.out, space, course, evolution)
+    use_cache()
+    record.write_json(out / "environment.json", record.environment())
+    with _generations(evolution.generations) as report:
+        tune.evolve(out, space, course, evolution, report=report, **shape)
+    log = tune.read_log(out)
+    figures.tuning(log, space.names, out / "tuning.png")
+    first, last = log[0], min(log, key=lambda line: line["validation"])
+    print(
+        f"validation: {first['validation']:.4f} before, {last['validation']:.4f} after "
+        f"{last['generation']} generations; success {100 * first['validation_success']:.1f} % and "
+        f"{100 * last['validation_success']:.1f} %"
+    )
+    print(
+        f"compile {sum(line['compile'] for line in log):.1f} s, "
+        f"run {sum(line['run'] for line in log):.1f} s, "
+        f"{sum(line['simulated'] for line in log):.3g} s simulated"
+    )
+    print(f"parameters: {out / 'tuned.json'}, for --params of rps sweep")
+
+
+def _quick(options: TuneES) -> TuneES:
+    """The same, small."""
+    return dataclasses.replace(
+        options, worlds=24, validation=32, population=12, generations=10, horizon=150.0
+    )
+
+
+def _course(options: TuneOptions) -> Course:
+    from rps_jax.physics import preset
+    from rps_jax.slots import Setting
+    from rps_jax.trial import Rules
+    from rps_jax.tune import Course, Objective
+
+    domains = [_domain_of(text) for text in options.domain]
+    setting = Setting(
+        preset(fidelity=options.fidelity),
+        Rules(horizon=options.horizon),
+        engine=options.engine,  # pyright: ignore[reportArgumentType]
+    )
+    return Course(
+        tuple(dataclasses.replace(one, objects=options.objects) for one in domains),
+        options.worlds,
+        options.validation,
+        setting,
+        Objective(options.risk),
+    )
+
+
+@contextlib.contextmanager
+def _generations(count: int) -> Iterator[Callable[[int, Progress], None]]:
+    """A bar over generations, to be handed to `tune.evolve` as its `report`."""
+    from tqdm import tqdm
+
+    with tqdm(total=count, unit="generation", desc="compile") as bar:
+
+        def report(generation: int, progress: Progress) -> None:
+            bar.set_description("tune", refresh=False)
+            bar.set_postfix_str(f"{progress.finished} trials, {progress.simulated:.0f} s simulated")
+            bar.update(generation - bar.n)
+
+        yield report
 
 
 def _replay(options: Replay) -> None:

@@ -362,3 +362,38 @@ def success_curves(results: xr.Dataset, path: Path) -> Path:
         ax.set(ylabel="success [%]", ylim=(max(-3.0, 100 * least - 10), 103))
     axes[0, 0].legend(fontsize=8)
     return save(figure, path)
+
+
+def tuning(log: Sequence[Mapping], names: Sequence[str], path: Path) -> Path:
+    """Evolution, generation by generation: values, validation, and the mean's parameters."""
+    generation = [line["generation"] for line in log]
+
+    def of(key: str) -> np.ndarray:
+        return np.array([np.nan if line[key] is None else line[key] for line in log], float)
+
+    columns = 4
+    rows = 1 + -(-len(names) // columns)
+    figure = Figure(figsize=(11, 2.6 + 1.7 * (rows - 1)), layout="constrained")
+    grid = figure.add_gridspec(rows, columns, height_ratios=[1.6] + [1] * (rows - 1))
+    ax = figure.add_subplot(grid[0, :2])
+    mean, spread = of("mean"), of("spread")
+    ax.fill_between(generation, mean - spread, mean + spread, alpha=0.2, lw=0)
+    ax.plot(generation, mean, label="candidates: mean, and their spread")
+    ax.plot(generation, of("best"), label="best candidate")
+    ax.plot(generation, of("base"), "k--", lw=1, label="parameters at the start, same worlds")
+    ax.set(xlabel="generation", ylabel="objective [1]")
+    ax.legend(fontsize=8)
+    ax = figure.add_subplot(grid[0, 2:])
+    ax.plot(generation, of("validation"), "C2", label="objective")
+    ax.set(xlabel="generation", ylabel="mean on validation worlds [1]")
+    ax.legend(loc="upper left", fontsize=8)
+    twin = ax.twinx()
+    twin.plot(generation, 100 * of("validation_success"), "C3", label="success")
+    twin.set_ylabel("success [%]")
+    twin.legend(loc="upper right", fontsize=8)
+    for i, name in enumerate(names):
+        ax = figure.add_subplot(grid[1 + i // columns, i % columns])
+        ax.plot(generation, [line["params"][name] for line in log])
+        ax.set_title(name, fontsize=9)
+        ax.tick_params(labelsize=7)
+    return save(figure, path)

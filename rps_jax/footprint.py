@@ -78,13 +78,16 @@ def _edges(footprint: Footprint) -> tuple[jax.Array, jax.Array, jax.Array]:
 def signed_distance(footprint: Footprint, point: jax.Array) -> jax.Array:
     """Distance (...) [m] of `point` (..., 2) [m] to the outline, negative inside."""
     start, along, length2 = _edges(footprint)
-    offset = point[..., None, :] - start  # (..., N, 2)
-    t = jnp.clip(jnp.sum(offset * along, axis=-1) / length2, 0.0, 1.0)
-    nearest = jnp.min(frames.norm(offset - t[..., None] * along), axis=-1)
+    nearest, inside = jnp.inf, jnp.ones((), bool)
+    # Edge by edge and coordinate by coordinate: GPUs are slow at reducing axes this short.
+    for i in range(footprint.vertices.shape[0]):
+        x, y = point[..., 0] - start[i, 0], point[..., 1] - start[i, 1]
+        t = jnp.clip((x * along[i, 0] + y * along[i, 1]) / length2[i], 0.0, 1.0)
+        away = jnp.stack([x - t * along[i, 0], y - t * along[i, 1]], axis=-1)
+        nearest = jnp.minimum(nearest, frames.norm(away))
+        inside &= along[i, 0] * y - along[i, 1] * x > 0
     if footprint.vertices.shape[0] < 3:  # a point or a segment encloses nothing
         return nearest - footprint.radius
-    left_of = along[:, 0] * offset[..., 1] - along[:, 1] * offset[..., 0]
-    inside = jnp.all(left_of > 0, axis=-1)
     return jnp.where(inside, -nearest, nearest) - footprint.radius
 
 

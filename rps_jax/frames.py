@@ -6,6 +6,8 @@ direction of a zero vector, the wrap at pi.
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 
@@ -17,12 +19,18 @@ def rotate(yaw: jax.Array, vector: jax.Array) -> jax.Array:
     return jnp.stack([c * x - s * y, s * x + c * y], axis=-1)
 
 
+def _components(vector: jax.Array) -> list[jax.Array]:
+    """The components (...) of vectors (..., n), n small, one by one: see `footprint`."""
+    return [vector[..., i] for i in range(vector.shape[-1])]
+
+
 def _scale(vector: jax.Array) -> jax.Array:
     """Largest component (...) of vectors (..., n), to divide by; zero only for a zero vector.
 
     Bounded, since the reciprocal of a larger float32 is subnormal, which XLA takes for zero.
     """
-    return jax.lax.stop_gradient(jnp.minimum(jnp.max(jnp.abs(vector), axis=-1), 1e37))
+    largest = functools.reduce(jnp.maximum, (jnp.abs(x) for x in _components(vector)))
+    return jax.lax.stop_gradient(jnp.minimum(largest, 1e37))
 
 
 def norm(vector: jax.Array) -> jax.Array:
@@ -33,8 +41,9 @@ def norm(vector: jax.Array) -> jax.Array:
     """
     scale = _scale(vector)
     is_zero = scale == 0
-    unit = jnp.where(is_zero[..., None], 1.0, vector / jnp.where(is_zero, 1.0, scale)[..., None])
-    return jnp.where(is_zero, 0.0, scale * jnp.sqrt(jnp.sum(unit * unit, axis=-1)))
+    safe = jnp.where(is_zero, 1.0, scale)
+    squares = [jnp.where(is_zero, 1.0, x / safe) ** 2 for x in _components(vector)]
+    return jnp.where(is_zero, 0.0, scale * jnp.sqrt(functools.reduce(jnp.add, squares)))
 
 
 def direction(vector: jax.Array) -> jax.Array:

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import xarray as xr
 
 from rps_jax.errors import InputError
 
+MANIFEST = "manifest.json"
 _PACKAGES = ("rps_jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "scipy", "xarray")
 
 
@@ -49,6 +50,62 @@ def writable(folder: Path) -> Path:
             f"out = {folder} cannot be written ({error.strerror}): choose a writable folder."
         ) from error
     return folder
+
+
+def claim(folder: Path, wanted: dict[str, Any]) -> Path:
+    """The folder of a run that can be continued, with its configuration as `manifest.json`.
+
+    Raises:
+      InputError: it cannot be written, or holds a run of another configuration.
+    """
+    writable(folder)
+    wanted = json.loads(json.dumps(wanted))
+    if (folder / MANIFEST).exists():
+        found = manifest(folder)
+        if found != wanted:
+            raise InputError(
+                f"out = {folder} holds another run ({difference(found, wanted)}): choose another "
+                "folder, or ask for the same."
+            )
+    else:
+        write_json(folder / MANIFEST, wanted)
+    return folder
+
+
+def manifest(folder: Path) -> dict[str, Any]:
+    """The configuration of the run in a folder.
+
+    Raises:
+      InputError: there is none, or it is corrupt.
+    """
+    path = folder / MANIFEST
+    try:
+        return json.loads(path.read_text())
+    except FileNotFoundError as error:
+        raise InputError(
+            f"run = {folder} holds no {MANIFEST}: give the folder of a run."
+        ) from error
+    except ValueError as error:
+        raise InputError(
+            f"{path} is corrupt ({error}): restore it, or choose another folder."
+        ) from error
+
+
+def difference(found: Any, wanted: Any) -> str:
+    """The first few differences of two JSON values, in words."""
+    differences = list(_differences(found, wanted, ""))
+    more = f" and {len(differences) - 3} more" if len(differences) > 3 else ""
+    return "; ".join(differences[:3]) + more
+
+
+def _differences(found: Any, wanted: Any, path: str) -> Iterator[str]:
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        for key in [*found, *(k for k in wanted if k not in found)]:
+            yield from _differences(
+                found.get(key), wanted.get(key), f"{path}.{key}" if path else key
+            )
+    elif found != wanted:
+        yield f"{path} = {found} there, {wanted} asked for"
 
 
 def atomic(path: Path, write: Callable[[Path], Any]) -> Path:

@@ -6,6 +6,7 @@ slot waits for one of their trials, so that memory does not grow with the number
 
 from __future__ import annotations
 
+import functools
 import os
 import threading
 import time
@@ -256,32 +257,45 @@ class _Queue:
         return jax.ShapeDtypeStruct(shape, leaf.dtype, sharding=self.sharding)
 
     def _compile(self) -> Any:
-        physics = self.setting.physics
         start = partial(trial.start_all, strategy=self.strategy)
         live = jax.ShapeDtypeStruct((self.slots,), bool)
         trials = jax.tree.map(self._batched, jax.eval_shape(start, self._worlds, live))
+        stage, rules = jax.eval_shape(lambda: (self.stage, self.setting.rules))
+        leaves, tree = jax.tree.flatten((stage, self._worlds, trials, rules))
+        return _compiled(self.setting.physics, self.strategy, self.sharding, tree, tuple(leaves))
 
-        def advance(stage: Any, worlds: World, trials: Trial, rules: Rules) -> Trial:
-            return trial.advance(
-                stage,
-                worlds,
-                trials,
-                physics=physics,
-                rules=rules,
-                strategy=self.strategy,
-                steps=max(1, round(SEGMENT / physics.control_period)),
-            )
 
-        if self.sharding is not None:  # each device runs its own worlds and waits for no other
-            advance = jax.shard_map(
-                advance,
-                mesh=self.sharding.mesh,
-                in_specs=(P(), P("worlds"), P("worlds"), P()),
-                out_specs=P("worlds"),
-                check_vma=False,
-            )
-        program = jax.jit(advance, donate_argnums=2)
-        return program.lower(self.stage, self._worlds, trials, self.setting.rules).compile()
+@functools.lru_cache(maxsize=32)
+def _compiled(
+    physics: Physics,
+    strategy: Strategy,
+    sharding: NamedSharding | None,
+    tree: Any,
+    leaves: tuple[jax.ShapeDtypeStruct, ...],
+) -> Any:
+    """`trial.advance` compiled for arguments of these shapes; later runs of the kind reuse it."""
+
+    def advance(stage: Any, worlds: World, trials: Trial, rules: Rules) -> Trial:
+        return trial.advance(
+            stage,
+            worlds,
+            trials,
+            physics=physics,
+            rules=rules,
+            strategy=strategy,
+            steps=max(1, round(SEGMENT / physics.control_period)),
+        )
+
+    if sharding is not None:  # each device runs its own worlds and waits for no other
+        advance = jax.shard_map(
+            advance,
+            mesh=sharding.mesh,
+            in_specs=(P(), P("worlds"), P("worlds"), P()),
+            out_specs=P("worlds"),
+            check_vma=False,
+        )
+    program = jax.jit(advance, donate_argnums=2)
+    return program.lower(*jax.tree.unflatten(tree, leaves)).compile()
 
 
 def rows(tree: Any, which: Any) -> Any:
