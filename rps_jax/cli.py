@@ -274,6 +274,8 @@ class TuneES(TuneOptions):
     """In all."""
     spread: float = 0.5
     """Standard deviation of the first generation, in units of the bounded map."""
+    prior: float = 0.002
+    """Price of a mean square of 1 between a candidate's coordinates and the start's."""
     patience: int = 0
     """Generations without a better validation before a restart elsewhere; 0: never."""
 
@@ -904,7 +906,13 @@ def _tune_es(options: TuneES) -> None:
     names = [name for text in how.tuned for name in tune.SUBSETS.get(text, (text,))]
     space, course = tune.Space(tuple(names), base), _course(how)
     evolution = tune.Evolution(
-        how.strategy, how.population, how.generations, how.spread, how.patience, how.seed
+        how.strategy,
+        how.population,
+        how.generations,
+        how.spread,
+        how.prior,
+        how.patience,
+        how.seed,
     )
     shape = how.shape()
     choose_device(how.device)

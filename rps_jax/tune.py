@@ -221,7 +221,7 @@ def try_out(
     sizes = [len(ask.params.L) * width for ask, width in zip(asks, widths, strict=True)]
     firsts = [sum(sizes[:i]) for i in range(len(sizes))]
     found = Answer(*np.full((3, sum(sizes)), np.nan))
-    way = np.empty(sum(sizes))
+    lost, way = np.empty((2, sum(sizes)))  # [s], [m] missed: all the way until it ends nearer
     longest = max(domain.remembered(one, setting.physics.control_period) for one in domains)
     jobs: dict[Any, list[_Group]] = {}
     for ask, width, first, size in zip(asks, widths, firsts, sizes, strict=True):
@@ -234,11 +234,10 @@ def try_out(
             jobs.setdefault(kind, []).append(_Group(params, part, first, width, column))
 
     def collect(numbers: np.ndarray, outcome: Outcome) -> None:
-        missed = np.where(np.isfinite(outcome.min_distance), outcome.min_distance, way[numbers])
-        found.score[numbers] = objective.score(
-            outcome.success, outcome.time, outcome.contact_lost_time, missed, setting.rules
-        )
         found.success[numbers], found.time[numbers] = outcome.success, outcome.time
+        lost[numbers] = outcome.contact_lost_time
+        near = outcome.min_distance
+        way[numbers] = np.where(np.isfinite(near), near, way[numbers])
 
     count = [sum(len(g.params.L) * g.column.size for g in groups) for groups in jobs.values()]
     timing = slots.run(
@@ -248,6 +247,8 @@ def try_out(
         report=report,
         **shape,
     )
+    rules = setting.rules
+    found.score[:] = objective.score(found.success, found.time, lost, way, rules)
     return [
         Answer(*(row[first : first + size].reshape(-1, width) for row in found))
         for width, first, size in zip(widths, firsts, sizes, strict=True)
@@ -305,6 +306,9 @@ class Evolution:
     """In all, over restarts."""
     spread: float = 0.5
     """[1] Standard deviation of the first generation, about the base parameters."""
+    prior: float = 0.002
+    """[1] Price of a mean square of 1 between a candidate's coordinates and the base's: keeps the
+    search where the bounded map is not flat."""
     patience: int = 0
     """Generations without a better validation before a restart elsewhere; 0: never."""
     seed: int = 0
@@ -316,6 +320,7 @@ class Evolution:
         errors.check_finite("population", self.population, at_least=4, at_most=1e5)
         errors.check_finite("generations", self.generations, at_least=1, at_most=1e6)
         errors.check_finite("spread", self.spread, above=0, at_most=10)
+        errors.check_finite("prior", self.prior, at_least=0)
         errors.check_finite("patience", self.patience, at_least=0)
         errors.check_finite("seed", self.seed, at_least=0, at_most=2**30)
 
@@ -478,9 +483,10 @@ def evolve(
             report=lambda progress, g=generation: report(g, progress),
             **shape,
         )
+        away = jnp.mean((candidates - space.vector(space.base)) ** 2, axis=-1)
         values = course.objective.value(tried.score)
         value = float(course.objective.value(check.score)[0])
-        search = learn(evolution, search, asked, candidates, values)
+        search = learn(evolution, search, asked, candidates, values + evolution.prior * away)
         search = validated(evolution, search, mean, value)
         log.append(
             {
