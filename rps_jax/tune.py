@@ -131,7 +131,7 @@ class Objective:
     """mean, or cvar: the mean over the worst `tail` of the worlds."""
     tail: float = 0.1
     """[1] Share of the worlds that cvar looks at."""
-    time: float = 0.3
+    time: float = 0.1
     """[1] Of a success that takes the whole horizon."""
     lost: float = 0.1
     """[1] Of as much time without contact as the rules allow."""
@@ -505,8 +505,8 @@ def evolve(
                 "params": _named(space, mean),
             }
         )
+        record.write_json(folder / "tuned.json", _named(space, search.best))
         _save(folder, search, log)
-    record.write_json(folder / "tuned.json", _named(space, search.best))
     return space.params(search.best)
 
 
