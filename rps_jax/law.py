@@ -111,7 +111,8 @@ def check(params: RPSParams) -> RPSParams:
       InputError: a value is not a number, negative where it must not be, or infinite (only
         gamma_max may be, for the tangent as printed).
     """
-    for name in ("eta", "zeta", "beta", "k", "d_th", "a_r_max", "l_mr", "v_approach", "v_lost"):
+    errors.check_finite("zeta", params.zeta)
+    for name in ("eta", "beta", "k", "d_th", "a_r_max", "l_mr", "v_approach", "v_lost"):
         errors.check_finite(name, getattr(params, name), at_least=0)
     for name in ("K_h", "K_v", "L", "l_cr", "v_max", "omega_max", "d_success"):
         errors.check_finite(name, getattr(params, name), above=0)
