@@ -15,8 +15,8 @@ import hashlib
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -238,38 +238,51 @@ def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
-@dataclass
+class _Rows:
+    """Outcomes of the trials of a part that is begun."""
+
+    def __init__(self, size: int, like: Outcome):
+        self.outcomes = Outcome(
+            *(
+                np.empty((size, *leaf.shape[1:]), _TYPES.get(name, np.float32))
+                for name, leaf in like._asdict().items()
+            )
+        )
+        self.missing = size
+
+
 class _Parts:
     """Trials on their way into the files of their parts."""
 
-    folder: Path
-    parts: dict[int, np.ndarray]  # numbers of the trials of each part still to be done
-    _part_of: dict[int, int] = field(default_factory=dict)
-    _open: dict[int, dict[int, Outcome]] = field(default_factory=dict)
-
-    def start(self, number: int) -> np.ndarray:
-        """Numbers of the trials of a part that is now begun."""
-        trials = self.parts[number]
-        self._part_of.update(dict.fromkeys(map(int, trials), number))
-        return trials
+    def __init__(self, folder: Path, parts: Mapping[int, np.ndarray], trials: int):
+        self._folder = folder
+        self._parts = parts  # numbers of the trials of each part, rising
+        self._part_of = np.empty(trials, np.int32)
+        for number, of_part in parts.items():
+            self._part_of[of_part] = number
+        self._open: dict[int, _Rows] = {}
 
     def collect(self, numbers: np.ndarray, outcomes: Outcome) -> None:
         """Outcomes of trials that ended; writes the parts that are complete with them."""
-        for i, trial_number in enumerate(map(int, numbers)):
-            part = self._part_of.pop(trial_number)
-            rows = self._open.setdefault(part, {})
-            rows[trial_number] = Outcome(*(leaf[i] for leaf in outcomes))
-            if len(rows) == self.parts[part].size:
-                self._write(part, self._open.pop(part))
+        part_of = self._part_of[numbers]
+        for part in map(int, np.unique(part_of)):
+            ended = part_of == part
+            trials = self._parts[part]
+            if part not in self._open:
+                self._open[part] = _Rows(trials.size, outcomes)
+            rows = self._open[part]
+            at = np.searchsorted(trials, numbers[ended])
+            for mine, theirs in zip(rows.outcomes, outcomes, strict=True):
+                mine[at] = theirs[ended]
+            rows.missing -= at.size
+            if not rows.missing:
+                self._write(part, self._open.pop(part).outcomes)
 
-    def _write(self, part: int, rows: dict[int, Outcome]) -> None:
-        numbers = self.parts[part]
-        leaves = zip(*(rows[int(n)] for n in numbers), strict=True)
-        content: dict[str, Any] = {"trial": ("row", numbers)}
-        for name, values in zip(Outcome._fields, leaves, strict=True):
-            stacked = np.stack(values).astype(_TYPES.get(name, np.float32))
-            content[name] = (("row", "pose")[: stacked.ndim], stacked)
-        place = self.folder / "parts"
+    def _write(self, part: int, outcomes: Outcome) -> None:
+        content: dict[str, Any] = {"trial": ("row", self._parts[part])}
+        for name, leaf in outcomes._asdict().items():
+            content[name] = (("row", "pose")[: leaf.ndim], leaf)
+        place = self._folder / "parts"
         path = record.write_results(place / f"{part:07d}.nc.new", xr.Dataset(content))
         path.rename(place / f"{part:07d}-{_digest(path)}.nc")
 
@@ -289,7 +302,7 @@ def run(
     mine, done = share(plan, shard), finished(folder)
     before = sum(trials.size for n, trials in mine.items() if n in done)
     report(Progress(before, 0.0))
-    parts = _Parts(folder, {n: trials for n, trials in mine.items() if n not in done})
+    parts = _Parts(folder, plan.parts, plan.trials)
     # Of each kind the parts to do, and the trials of the whole plan: whatever is left of a run, it
     # has the slots of the whole, and so its bits.
     jobs: dict[Any, list[int]] = {}
@@ -298,7 +311,7 @@ def run(
         arm, which = _arm_and_object(plan, number)
         kind = (which, type(list(plan.arms.values())[arm]))
         sizes[kind] += trials.size
-        if number in parts.parts:
+        if number in mine and number not in done:
             jobs.setdefault(kind, []).append(number)
 
     def tell(progress: Progress) -> None:
@@ -306,7 +319,7 @@ def run(
 
     return slots.run(
         [
-            Job(trial.STRATEGIES[kind[1]], sizes[kind], _made(plan, parts, numbers))
+            Job(trial.STRATEGIES[kind[1]], sizes[kind], _made(plan, numbers))
             for kind, numbers in jobs.items()
         ],
         plan.setting,
@@ -326,10 +339,10 @@ def _arm_and_object(plan: Plan, part: int) -> tuple[int, int]:
     return divmod(part // plan.blocks, len(plan.domain.objects))
 
 
-def _made(plan: Plan, parts: _Parts, numbers: list[int]) -> Iterator[Part]:
+def _made(plan: Plan, numbers: Iterable[int]) -> Iterator[Part]:
     """The worlds of parts, made one part at a time."""
     for number in numbers:
-        trials = parts.start(number)
+        trials = plan.parts[number]
         arm, _ = _arm_and_object(plan, number)
         yield world_part(plan, arm, trials % plan.worlds)._replace(numbers=trials)
 
