@@ -12,6 +12,7 @@ import dataclasses
 import fcntl
 import functools
 import hashlib
+import io
 import json
 import math
 from collections import Counter
@@ -35,6 +36,8 @@ from rps_jax.scene import Scene
 from rps_jax.slots import Job, Part, Progress, Setting, Timing
 from rps_jax.trial import Outcome, Params, Rules
 
+Kind = tuple[int, type]  # of a part: the object's number and the type of the arm's parameters
+Keep = Callable[[int, bytes], Any]  # called with the number and the content of a part
 MANIFEST = "manifest.json"
 _TYPES = {"success": np.int8, "diverged": np.int8}  # of an outcome; the others are float32
 
@@ -83,6 +86,23 @@ class Plan:
                     number = (arm * len(self.domain.objects) + which) * self.blocks + block
                     found[number] = arm * self.worlds + some
         return found
+
+    def arm_and_object(self, part: int) -> tuple[int, int]:
+        """Which arm a part is of, and which object."""
+        return divmod(part // self.blocks, len(self.domain.objects))
+
+    def kind(self, part: int) -> Kind:
+        """Parts of a kind are run by one compiled program."""
+        arm, which = self.arm_and_object(part)
+        return which, type(list(self.arms.values())[arm])
+
+    @functools.cached_property
+    def sizes(self) -> Counter[Kind]:
+        """How many trials of each kind there are."""
+        counts: Counter[Kind] = Counter()
+        for number, trials in self.parts.items():
+            counts[self.kind(number)] += trials.size
+        return counts
 
     def configuration(self) -> dict[str, Any]:
         """All that the results depend on, as JSON."""
@@ -134,7 +154,7 @@ def open_run(folder: Path, plan: Plan) -> Path:
         found = _manifest(folder)
         if found != wanted:
             raise InputError(
-                f"out = {folder} holds another run ({_difference(found, wanted)}): choose another "
+                f"out = {folder} holds another run ({difference(found, wanted)}): choose another "
                 "folder, or ask for the same."
             )
     else:
@@ -157,14 +177,14 @@ def _manifest(folder: Path) -> dict[str, Any]:
         ) from error
 
 
-def _difference(found: Any, wanted: Any, path: str = "") -> str:
+def difference(found: Any, wanted: Any) -> str:
     """The first few differences of two JSON values, in words."""
-    differences = list(_differences(found, wanted, path))
+    differences = list(_differences(found, wanted))
     more = f" and {len(differences) - 3} more" if len(differences) > 3 else ""
     return "; ".join(differences[:3]) + more
 
 
-def _differences(found: Any, wanted: Any, path: str) -> Iterator[str]:
+def _differences(found: Any, wanted: Any, path: str = "") -> Iterator[str]:
     if isinstance(found, dict) and isinstance(wanted, dict):
         for key in [*found, *(k for k in wanted if k not in found)]:
             yield from _differences(
@@ -227,15 +247,20 @@ def finished(folder: Path) -> dict[int, Path]:
     found = {}
     for path in sorted((folder / "parts").glob("[0-9]*-*.nc")):
         number, _, digest = path.stem.partition("-")
-        if _digest(path) == digest:
+        if _digest(path.read_bytes()) == digest:
             found[int(number)] = path
         else:
             path.rename(path.with_suffix(".nc.corrupt"))
     return found
 
 
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+def store(folder: Path, number: int, content: bytes) -> Path:
+    """Write the file of a part into a run folder, whole or not at all."""
+    return record.write_bytes(folder / "parts" / f"{number:07d}-{_digest(content)}.nc", content)
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
 
 
 class _Rows:
@@ -254,16 +279,16 @@ class _Rows:
 class _Parts:
     """Trials on their way into the files of their parts."""
 
-    def __init__(self, folder: Path, parts: Mapping[int, np.ndarray], trials: int):
-        self._folder = folder
-        self._parts = parts  # numbers of the trials of each part, rising
-        self._part_of = np.empty(trials, np.int32)
-        for number, of_part in parts.items():
-            self._part_of[of_part] = number
+    def __init__(self, plan: Plan, keep: Keep):
+        self._keep = keep
+        self._parts = plan.parts
+        self._part_of = np.empty(plan.trials, np.int32)
+        for number, trials in plan.parts.items():
+            self._part_of[trials] = number
         self._open: dict[int, _Rows] = {}
 
     def collect(self, numbers: np.ndarray, outcomes: Outcome) -> None:
-        """Outcomes of trials that ended; writes the parts that are complete with them."""
+        """Outcomes of trials that ended; the parts that are complete with them are kept."""
         part_of = self._part_of[numbers]
         for part in map(int, np.unique(part_of)):
             ended = part_of == part
@@ -276,15 +301,15 @@ class _Parts:
                 mine[at] = theirs[ended]
             rows.missing -= at.size
             if not rows.missing:
-                self._write(part, self._open.pop(part).outcomes)
+                self._keep(part, _content(trials, self._open.pop(part).outcomes))
 
-    def _write(self, part: int, outcomes: Outcome) -> None:
-        content: dict[str, Any] = {"trial": ("row", self._parts[part])}
-        for name, leaf in outcomes._asdict().items():
-            content[name] = (("row", "pose")[: leaf.ndim], leaf)
-        place = self._folder / "parts"
-        path = record.write_results(place / f"{part:07d}.nc.new", xr.Dataset(content))
-        path.rename(place / f"{part:07d}-{_digest(path)}.nc")
+
+def _content(trials: np.ndarray, outcomes: Outcome) -> bytes:
+    """The file of a part."""
+    rows: dict[str, Any] = {"trial": ("row", trials)}
+    for name, leaf in outcomes._asdict().items():
+        rows[name] = (("row", "pose")[: leaf.ndim], leaf)
+    return record.encoded(xr.Dataset(rows))
 
 
 # --- running -------------------------------------------------------------------------------
@@ -299,34 +324,47 @@ def run(
     **shape: Any,
 ) -> Timing:
     """Run what is missing of a plan, or of one shard of it, in a folder that `open_run` opened."""
-    mine, done = share(plan, shard), finished(folder)
-    before = sum(trials.size for n, trials in mine.items() if n in done)
+    missing, before = remaining(folder, plan, shard)
     report(Progress(before, 0.0))
-    parts = _Parts(folder, plan.parts, plan.trials)
-    # Of each kind the parts to do, and the trials of the whole plan: whatever is left of a run, it
-    # has the slots of the whole, and so its bits.
-    jobs: dict[Any, list[int]] = {}
-    sizes: Counter[Any] = Counter()
-    for number, trials in plan.parts.items():
-        arm, which = _arm_and_object(plan, number)
-        kind = (which, type(list(plan.arms.values())[arm]))
-        sizes[kind] += trials.size
-        if number in mine and number not in done:
-            jobs.setdefault(kind, []).append(number)
 
     def tell(progress: Progress) -> None:
         report(Progress(before + progress.finished, progress.simulated))
 
-    return slots.run(
-        [
-            Job(trial.STRATEGIES[kind[1]], sizes[kind], _made(plan, numbers))
-            for kind, numbers in jobs.items()
-        ],
-        plan.setting,
-        collect=parts.collect,
-        report=tell,
-        **shape,
-    )
+    return work(plan, missing, functools.partial(store, folder), report=tell, **shape)
+
+
+def work(
+    plan: Plan,
+    numbers: Mapping[Kind, Iterable[int]],
+    keep: Keep,
+    *,
+    report: Callable[[Progress], Any],
+    **shape: Any,
+) -> Timing:
+    """Run some parts of a plan: of each kind those with these numbers, asked for one by one.
+
+    There are as many slots as the whole plan has use for, whatever parts are run, so that a part
+    has the same bits whoever runs it, and with whatever other parts.
+    """
+    jobs = [
+        Job(trial.STRATEGIES[kind[1]], plan.sizes[kind], _made(plan, some))
+        for kind, some in numbers.items()
+    ]
+    collect = _Parts(plan, keep).collect
+    return slots.run(jobs, plan.setting, collect=collect, report=report, **shape)
+
+
+def remaining(folder: Path, plan: Plan, shard: Shard) -> tuple[dict[Kind, list[int]], int]:
+    """Parts of a shard that a run folder lacks, by kind, and how many trials it has."""
+    done = finished(folder)
+    missing: dict[Kind, list[int]] = {}
+    before = 0
+    for number, trials in share(plan, shard).items():
+        if number in done:
+            before += trials.size
+        else:
+            missing.setdefault(plan.kind(number), []).append(number)
+    return missing, before
 
 
 def share(plan: Plan, shard: Shard) -> dict[int, np.ndarray]:
@@ -335,15 +373,11 @@ def share(plan: Plan, shard: Shard) -> dict[int, np.ndarray]:
     return {n: trials for i, (n, trials) in enumerate(every) if i % shard.of == shard.number - 1}
 
 
-def _arm_and_object(plan: Plan, part: int) -> tuple[int, int]:
-    return divmod(part // plan.blocks, len(plan.domain.objects))
-
-
 def _made(plan: Plan, numbers: Iterable[int]) -> Iterator[Part]:
     """The worlds of parts, made one part at a time."""
     for number in numbers:
         trials = plan.parts[number]
-        arm, _ = _arm_and_object(plan, number)
+        arm, _ = plan.arm_and_object(number)
         yield world_part(plan, arm, trials % plan.worlds)._replace(numbers=trials)
 
 
@@ -377,8 +411,6 @@ def world_part(plan: Plan, arm: int, index: Any) -> Part:
 def merge(folders: list[Path], out: Path) -> Path:
     """One `results.nc` of all parts in run folders of one plan: (arm, world), and (world) drawn.
 
-    It is written part by part, so that memory does not grow with the number of worlds.
-
     Raises:
       InputError: the folders differ in their plan, or parts are missing.
     """
@@ -387,7 +419,7 @@ def merge(folders: list[Path], out: Path) -> Path:
         if (theirs := _manifest(other)) != manifest:
             raise InputError(
                 f"run = {other} is of another plan than {folders[0]} "
-                f"({_difference(manifest, theirs)}): merge shards of one run."
+                f"({difference(manifest, theirs)}): merge shards of one run."
             )
     plan = load_plan(folders[0])
     found = {n: path for folder in folders for n, path in finished(folder).items()}
@@ -397,11 +429,13 @@ def merge(folders: list[Path], out: Path) -> Path:
             f"run = {', '.join(map(str, folders))} lacks {len(missing)} of {len(plan.parts)} "
             "parts: run the same command again, or give the folders of all shards."
         )
-    return record.atomic(out / "results.nc", lambda path: _write_results(path, plan, found))
+    return record.write_bytes(out / "results.nc", _merged(plan, found))
 
 
-def _write_results(path: Path, plan: Plan, found: dict[int, Path]) -> None:
-    with h5netcdf.File(path, "w") as file:
+def _merged(plan: Plan, found: dict[int, Path]) -> bytes:
+    """The file of all results, made in memory as `record.encoded` says."""
+    content = io.BytesIO()
+    with h5netcdf.File(content, "w") as file:
         sizes = {"arm": len(plan.arms), "world": plan.worlds, "pose": 3}
         file.dimensions = sizes | {"object": len(plan.domain.objects)}
         names = {"arm": list(plan.arms), "object": list(plan.domain.objects)}
@@ -417,7 +451,7 @@ def _write_results(path: Path, plan: Plan, found: dict[int, Path]) -> None:
             outcomes[name] = file.create_variable(name, dims, _TYPES.get(name, np.float32))
             outcomes[name].attrs.update(units=unit, long_name=meaning)
         for number, source in found.items():
-            arm, _ = _arm_and_object(plan, number)
+            arm, _ = plan.arm_and_object(number)
             part = record.read(source)
             world = part.trial.values % plan.worlds
             for name, variable in outcomes.items():
@@ -429,6 +463,7 @@ def _write_results(path: Path, plan: Plan, found: dict[int, Path]) -> None:
                         drawn[name] = file.create_variable(name, ("world",), np.float32)
                         drawn[name].attrs["units"] = unit
                     _put(drawn[name], (), world, values)
+    return content.getvalue()
 
 
 def _put(variable: h5netcdf.Variable, at: tuple[int, ...], world: np.ndarray, values: Any) -> None:
