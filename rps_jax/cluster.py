@@ -18,92 +18,24 @@ import contextlib
 import dataclasses
 import functools
 import itertools
-import math
 import os
 import socket
 import time
-from collections import deque
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 from rps_jax import record, robustness
+from rps_jax.board import Board, News
 from rps_jax.errors import InputError
-from rps_jax.robustness import Kind, Plan, Shard
+from rps_jax.robustness import Plan, Shard
 from rps_jax.slots import Progress, Timing
 
 POLL = 0.5  # [s] between two looks at what the workers have done
 PATIENCE = 10.0  # [s] to reach a cluster
 RETRIES = 16  # how often the task of one worker is begun again
-
-
-class News(NamedTuple):
-    """What has happened on the workers."""
-
-    parts: list[tuple[int, bytes]]  # those that came back since the last time
-    progress: Progress  # all trials that ended on workers and were not lost with them
-    workers: dict[int, dict[str, Any]]  # environment of each that has begun
-
-
-class Board:
-    """Which parts wait, which worker has begun which, and what came back."""
-
-    def __init__(self, waiting: Mapping[Kind, Sequence[int]], workers: int):
-        """At first the parts `waiting`, of each kind, for so many workers."""
-        self._waiting = {kind: deque(numbers) for kind, numbers in waiting.items()}
-        # What fits into one worker's slots may be all there is: no one begins more than a share.
-        self._share = math.ceil(sum(map(len, waiting.values())) / workers)
-        self._begun: dict[int, dict[int, Kind]] = {}  # by worker: its parts, until they came back
-        self._ended: dict[int, int] = {}  # by worker: its trials
-        self._kept: dict[int, int] = {}  # by worker: those of them in parts that came back
-        self._simulated = 0.0
-        self._parts: list[tuple[int, bytes]] = []
-        self._workers: dict[int, dict[str, Any]] = {}
-
-    def enter(self, worker: int, environment: dict[str, Any]) -> None:
-        """A worker begins, perhaps again after its death: parts that it had begun wait again."""
-        for number, kind in self._begun.pop(worker, {}).items():
-            self._waiting[kind].append(number)
-        self._begun[worker] = {}
-        self._ended[worker] = self._kept.setdefault(worker, 0)
-        self._workers[worker] = environment
-
-    def first(self, worker: int) -> tuple[Kind, int] | None:
-        """A kind for a worker that has nothing to do, and a part of it; None: nothing waits."""
-        kinds = [kind for kind, numbers in self._waiting.items() if numbers]
-        if not kinds:
-            return None
-        kind = kinds[worker % len(kinds)]
-        return kind, self._begin(worker, kind)
-
-    def next(self, worker: int, kind: Kind) -> int | None:
-        """One more part of a kind for a worker with free slots, if it may have one."""
-        if not self._waiting[kind] or len(self._begun[worker]) >= self._share:
-            return None
-        return self._begin(worker, kind)
-
-    def _begin(self, worker: int, kind: Kind) -> int:
-        number = self._waiting[kind].popleft()
-        self._begun[worker][number] = kind
-        return number
-
-    def deliver(self, worker: int, number: int, trials: int, content: bytes) -> None:
-        """A part came back."""
-        del self._begun[worker][number]
-        self._kept[worker] += trials
-        self._parts.append((number, content))
-
-    def tell(self, worker: int, ended: int, simulated: float) -> None:
-        """More trials of a worker ended, and more seconds were simulated."""
-        self._ended[worker] += ended
-        self._simulated += simulated
-
-    def news(self) -> News:
-        """What is new since the last time, and the state of the whole."""
-        parts, self._parts = self._parts, []
-        progress = Progress(sum(self._ended.values()), self._simulated)
-        return News(parts, progress, self._workers)
 
 
 # --- a worker ------------------------------------------------------------------------------
@@ -139,7 +71,7 @@ def _work(
 
 def _run(
     plan: Plan,
-    kind: Kind,
+    kind: int,
     first: int,
     ask: Callable[..., Any],
     tell: Callable[[int, float], Any],
@@ -157,7 +89,7 @@ def _run(
         tell(progress.finished - before.finished, progress.simulated - before.simulated)
         before = progress
 
-    robustness.work(plan, {kind: numbers}, keep, report=report, **shape)
+    robustness.work(plan, {plan.kind(first): numbers}, keep, report=report, **shape)
 
 
 # --- the process that the user started -----------------------------------------------------
@@ -187,7 +119,9 @@ def connected(address: str, **options: Any) -> Iterator[ModuleType]:
         options = {"include_dashboard": False} | options
     try:
         _reach(address)
-        ray.init(address, log_to_driver=False, logging_level="ERROR", **options)
+        with warnings.catch_warnings():  # Ray starts its processes by fork and exec
+            warnings.filterwarnings("ignore", r"os\.fork", RuntimeWarning)
+            ray.init(address, log_to_driver=False, logging_level="ERROR", **options)
     except (OSError, RuntimeError, ValueError, SystemExit) as error:  # SystemExit: Ray gave up
         raise InputError(
             f"ray = {address} is no cluster that can be reached ({_line(error)}): run `ray start` "
@@ -251,12 +185,13 @@ def run(
     report(Progress(before, 0.0))
     if not missing:
         return Timing(0.0, 0.0, 0.0)
-    lacking = {number for numbers in missing.values() for number in numbers}
+    waiting = list(missing.values())
+    lacking = set(itertools.chain.from_iterable(waiting))
     claim = {"num_cpus": workers or 1, "num_gpus": int(gpus)}
     own, known = record.environment(), {}
     began, stepped, simulated = time.perf_counter(), None, 0.0
     given = (_same(own), prepare, slots)
-    with connected(address) as ray, _started(ray, plan, missing, claim, given) as (board, tasks):
+    with connected(address) as ray, _started(ray, plan, waiting, claim, given) as (board, tasks):
         for news in _news(ray, board, tasks):
             for number, content in news.parts:
                 robustness.store(folder, number, content)
@@ -264,9 +199,9 @@ def run(
             if news.workers != known:
                 known = news.workers
                 record.write_json(folder / "environment.json", own | _environment(known))
-            simulated = news.progress.simulated
+            simulated = news.simulated
             stepped = stepped or (time.perf_counter() if simulated else None)
-            report(Progress(before + news.progress.finished, simulated))
+            report(Progress(before + news.ended, simulated))
             if not lacking:
                 break
     if lacking:
@@ -280,18 +215,18 @@ def run(
 def _started(
     ray: ModuleType,
     plan: Plan,
-    missing: Mapping[Kind, Sequence[int]],
+    waiting: Sequence[Sequence[int]],
     claim: dict[str, int],
     given: tuple[Any, ...],
 ) -> Iterator[tuple[Any, list[Any]]]:
     """The board, on this host, and the tasks of as many workers as the cluster has room for."""
     if not ray.cluster_resources().get("GPU"):
         claim = claim | {"num_gpus": 0}
-    count = min(_room(ray.nodes(), **claim), sum(map(len, missing.values())))
+    count = min(_room(ray.nodes(), **claim), sum(map(len, waiting)))
     here = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
         ray.get_runtime_context().get_node_id(), soft=False
     )
-    board = ray.remote(num_cpus=0, scheduling_strategy=here)(Board).remote(missing, count)
+    board = ray.remote(num_cpus=0, scheduling_strategy=here)(Board).remote(waiting, count)
     task = ray.remote(**claim, max_retries=RETRIES, scheduling_strategy="SPREAD")(_work)
     bare = ray.put(dataclasses.replace(plan))  # without what it has worked out
     try:
@@ -323,9 +258,10 @@ def _news(ray: ModuleType, board: Any, tasks: list[Any]) -> Iterator[News]:
             ended, tasks = ray.wait(tasks, num_returns=len(tasks), timeout=POLL)
             yield ray.get(board.news.remote())
             ray.get(ended)  # raises what ended a worker
-    except ray.exceptions.RayTaskError as error:
-        raise error.cause from error
     except ray.exceptions.RayError as error:
+        cause = getattr(error, "cause", None)
+        if cause is not None and not isinstance(cause, ray.exceptions.RayError):
+            raise cause from error  # what went wrong in a worker
         raise InputError(
             f"ray has failed ({_line(error)}): what came back is kept; run the same command again."
         ) from error
