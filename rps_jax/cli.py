@@ -286,7 +286,7 @@ def guarded(action: Callable[[], None]) -> int:
         print(f"rps: error: {error}", file=sys.stderr)
         return 2
     except OSError as error:
-        mend = "make room and run it again; what is done is kept"
+        mend = "make room, then run the same command again; what is done is kept"
         hint = f": {mend}" if error.errno == errno.ENOSPC else ""
         where = error.filename or "output"
         print(f"rps: error: {where}: {error.strerror}{hint}.", file=sys.stderr)
@@ -729,7 +729,7 @@ def choose_device(name: str) -> None:
         ) from error
 
 
-def _on_cluster(options: Sweep) -> Callable[..., Timing]:
+def _on_cluster(address: str, options: Sweep) -> Callable[..., Timing]:
     """`robustness.run`, by the workers of a cluster."""
     import jax
 
@@ -739,7 +739,7 @@ def _on_cluster(options: Sweep) -> Callable[..., Timing]:
     choose_device("cpu")  # for this process: the workers here need the GPUs
     return partial(
         cluster.run,
-        address=options.ray,
+        address=address,
         prepare=partial(_prepare, options.device, bool(jax.config.jax_enable_x64)),
         gpus=options.device != "cpu" and options.engine != "mujoco",
     )
@@ -761,7 +761,7 @@ def _sweep(options: Sweep) -> None:
     plan, shard, shape = _plan(options), _shard(options.shard), options.shape()
     run = robustness.run
     if options.ray:
-        run = _on_cluster(options)
+        run = _on_cluster(options.ray, options)
     else:
         choose_device(options.device)
     out = robustness.open_run(options.out, plan)

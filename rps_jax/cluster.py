@@ -18,6 +18,7 @@ import contextlib
 import dataclasses
 import functools
 import itertools
+import logging
 import os
 import socket
 import time
@@ -65,8 +66,10 @@ def _work(
         )
     ask("enter", environment)
     shape = {"slots": slots, "workers": threads}
+    tell = functools.partial(board.tell.remote, worker)
     while (found := ask("first")) is not None:
-        _run(plan, *found, ask, functools.partial(board.tell.remote, worker), shape)
+        kind, first = found
+        _run(plan, kind, first, ask, tell, shape)
 
 
 def _run(
@@ -121,7 +124,7 @@ def connected(address: str, **options: Any) -> Iterator[ModuleType]:
         _reach(address)
         with warnings.catch_warnings():  # Ray starts its processes by fork and exec
             warnings.filterwarnings("ignore", r"os\.fork", RuntimeWarning)
-            ray.init(address, log_to_driver=False, logging_level="ERROR", **options)
+            ray.init(address, log_to_driver=False, logging_level=logging.ERROR, **options)
     except (OSError, RuntimeError, ValueError, SystemExit) as error:  # SystemExit: Ray gave up
         raise InputError(
             f"ray = {address} is no cluster that can be reached ({_line(error)}): run `ray start` "

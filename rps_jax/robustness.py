@@ -264,16 +264,14 @@ def _digest(content: bytes) -> str:
 
 
 class _Rows:
-    """Outcomes of the trials of a part that is begun."""
+    """Outcomes of the trials of a part that is begun, by name."""
 
     def __init__(self, size: int, like: Outcome):
-        self.outcomes = Outcome(
-            *(
-                np.empty((size, *leaf.shape[1:]), _TYPES.get(name, np.float32))
-                for name, leaf in like._asdict().items()
-            )
-        )
         self.missing = size
+        self.leaves = {
+            name: np.empty((size, *leaf.shape[1:]), _TYPES.get(name, np.float32))
+            for name, leaf in like._asdict().items()
+        }
 
 
 class _Parts:
@@ -297,19 +295,19 @@ class _Parts:
                 self._open[part] = _Rows(trials.size, outcomes)
             rows = self._open[part]
             at = np.searchsorted(trials, numbers[ended])
-            for mine, theirs in zip(rows.outcomes, outcomes, strict=True):
-                mine[at] = theirs[ended]
+            for name, leaf in outcomes._asdict().items():
+                rows.leaves[name][at] = leaf[ended]
             rows.missing -= at.size
             if not rows.missing:
-                self._keep(part, _content(trials, self._open.pop(part).outcomes))
+                self._keep(part, _content(trials, self._open.pop(part).leaves))
 
 
-def _content(trials: np.ndarray, outcomes: Outcome) -> bytes:
+def _content(trials: np.ndarray, leaves: dict[str, np.ndarray]) -> bytes:
     """The file of a part."""
-    rows: dict[str, Any] = {"trial": ("row", trials)}
-    for name, leaf in outcomes._asdict().items():
-        rows[name] = (("row", "pose")[: leaf.ndim], leaf)
-    return record.encoded(xr.Dataset(rows))
+    columns: dict[str, Any] = {"trial": ("row", trials)}
+    for name, leaf in leaves.items():
+        columns[name] = (("row", "pose")[: leaf.ndim], leaf)
+    return record.encoded(xr.Dataset(columns))
 
 
 # --- running -------------------------------------------------------------------------------

@@ -263,7 +263,7 @@ def test_a_full_disk_loses_nothing(whole, tmp_path, capsys, monkeypatch):
         fsync(file)
 
     monkeypatch.setattr(os, "fsync", full)
-    words = (str(tmp_path), "No space left on device", "run it again", "is kept")
+    words = (str(tmp_path), "No space left on device", "same command again", "is kept")
     ends_in_one_sentence_and_is_continued(tmp_path, whole, capsys, monkeypatch, *words)
 
 
