@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import errno
 import json
 import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -30,6 +32,9 @@ if TYPE_CHECKING:
     from rps_jax.sweep import Case, Trace
     from rps_jax.trial import Params
     from rps_jax.tune import Course
+
+
+DEVICES = ("auto", "cpu", "gpu")
 
 
 @dataclass(frozen=True)
@@ -196,6 +201,9 @@ class Sweep(Spread):
     """auto, cpu or gpu."""
     shard: str = "1/1"
     """k/n: run share k of n, to be merged with `rps merge`."""
+    ray: str | None = None
+    """Run on the workers of a Ray cluster: auto, its host:port, or local (all of this host). Each
+    claims a GPU, or else as many processors as --workers, one by default."""
     out: Path = Path("runs/sweep")
     """Run folder; a run that was killed is continued there."""
 
@@ -369,13 +377,17 @@ def guarded(action: Callable[[], None]) -> int:
         print(f"rps: error: {error}", file=sys.stderr)
         return 2
     except OSError as error:
-        print(f"rps: error: {error.filename or 'output'}: {error.strerror}.", file=sys.stderr)
+        mend = "make room, then run the same command again; what is done is kept"
+        hint = f": {mend}" if error.errno == errno.ENOSPC else ""
+        where = error.filename or "output"
+        print(f"rps: error: {where}: {error.strerror}{hint}.", file=sys.stderr)
         return 2
     except RuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
         print(
-            "rps: error: the device is out of memory: ask for fewer worlds at once with --slots.",
+            "rps: error: the device is out of memory: ask for fewer worlds at once with --slots; "
+            "what is done is kept.",
             file=sys.stderr,
         )
         return 2
@@ -558,13 +570,13 @@ def _clock(horizon: float) -> Iterator[Callable[[Progress], None]]:
         yield report
 
 
-def _tell(timing: Timing) -> None:
+def _tell(timing: Timing, device: str | None = None) -> None:
     import jax
 
     print(
         f"compile {timing.compile:.1f} s, run {timing.run:.1f} s "
         f"({timing.simulated / max(timing.run, 1e-9):.0f} simulated s per s) on "
-        f"{jax.devices()[0].device_kind}"
+        f"{device or jax.devices()[0].device_kind}"
     )
 
 
@@ -808,7 +820,7 @@ def choose_device(name: str) -> None:
     """
     import jax
 
-    errors.check_name("device", name, ("auto", "cpu", "gpu"))
+    errors.check_name("device", name, DEVICES)
     if name == "auto":
         return
     jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[name])
@@ -821,19 +833,49 @@ def choose_device(name: str) -> None:
         ) from error
 
 
+def _on_cluster(address: str, options: Sweep) -> Callable[..., Timing]:
+    """`robustness.run`, by the workers of a cluster."""
+    import jax
+
+    from rps_jax import cluster
+
+    errors.check_name("device", options.device, DEVICES)
+    choose_device("cpu")  # for this process: the workers here need the GPUs
+    return partial(
+        cluster.run,
+        address=address,
+        prepare=partial(_prepare, options.device, bool(jax.config.jax_enable_x64)),
+        gpus=options.device != "cpu" and options.engine != "mujoco",
+    )
+
+
+def _prepare(device: str, x64: bool) -> None:
+    """Make a worker's process compute as this one would."""
+    import jax
+
+    _be_deterministic()
+    jax.config.update("jax_enable_x64", x64)
+    choose_device(device)
+    use_cache()
+
+
 def _sweep(options: Sweep) -> None:
     from rps_jax import record, robustness
 
     plan, shard, shape = _plan(options), _shard(options.shard), options.shape()
-    choose_device(options.device)
+    run = robustness.run
+    if options.ray:
+        run = _on_cluster(options.ray, options)
+    else:
+        choose_device(options.device)
     out = robustness.open_run(options.out, plan)
     use_cache()
     with robustness.lock(out, shard):
         record.write_json(out / "environment.json", record.environment())
         trials = sum(numbers.size for numbers in robustness.share(plan, shard).values())
         with progress_bar(trials, "sweep") as report:
-            timing = robustness.run(out, plan, shard=shard, report=report, **shape)
-        _tell(timing)
+            timing = run(out, plan, shard=shard, report=report, **shape)
+        _tell(timing, _json(out / "environment.json")["device"]["kind"])
         if shard.of == 1:
             robustness.merge([out], out)
             _report_sweep(out)

@@ -109,13 +109,19 @@ def _differences(found: Any, wanted: Any, path: str) -> Iterator[str]:
 
 
 def atomic(path: Path, write: Callable[[Path], Any]) -> Path:
-    """Have `write` fill a file beside `path`, then put it in place whole."""
+    """Have `write` fill a file beside `path`, then put it in place whole.
+
+    Raises:
+      OSError: it cannot be written; the error names `path`, and nothing is left behind.
+    """
     partial = path.with_name(f".{path.stem}.partial{path.suffix}")
     try:
         write(partial)
         with open(partial, "rb") as file:
             os.fsync(file.fileno())
         os.replace(partial, path)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         partial.unlink(missing_ok=True)
     return path
@@ -132,9 +138,22 @@ def write_text(path: Path, text: str) -> Path:
     return atomic(path, lambda partial: partial.write_text(text))
 
 
+def write_bytes(path: Path, content: bytes) -> Path:
+    """A file of this content, whole or not at all."""
+    return atomic(path, lambda partial: partial.write_bytes(content))
+
+
 def write_results(path: Path, results: xr.Dataset) -> Path:
-    """NetCDF 4. The file depends on the results alone, not on when or where it is written."""
-    return atomic(path, lambda partial: results.to_netcdf(partial, engine="h5netcdf"))
+    """A NetCDF 4 file of labelled results."""
+    return write_bytes(path, encoded(results))
+
+
+def encoded(results: xr.Dataset) -> bytes:
+    """NetCDF 4, which depends on the results alone, not on when or where it is made.
+
+    It is made in memory, since HDF5 crashes the process when its disk is full.
+    """
+    return bytes(results.to_netcdf(engine="h5netcdf"))
 
 
 def read_results(folder: Path) -> xr.Dataset:

@@ -12,11 +12,12 @@ import dataclasses
 import fcntl
 import functools
 import hashlib
+import io
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,8 @@ from rps_jax.scene import Scene
 from rps_jax.slots import Job, Part, Progress, Setting, Timing
 from rps_jax.trial import Outcome, Params, Rules
 
+Kind = tuple[int, type]  # of a part: the object's number and the type of the arm's parameters
+Keep = Callable[[int, bytes], Any]  # called with the number and the content of a part
 MANIFEST = "manifest.json"
 _TYPES = {"success": np.int8, "diverged": np.int8}  # of an outcome; the others are float32
 
@@ -83,6 +86,23 @@ class Plan:
                     number = (arm * len(self.domain.objects) + which) * self.blocks + block
                     found[number] = arm * self.worlds + some
         return found
+
+    def arm_and_object(self, part: int) -> tuple[int, int]:
+        """Which arm a part is of, and which object."""
+        return divmod(part // self.blocks, len(self.domain.objects))
+
+    def kind(self, part: int) -> Kind:
+        """Parts of a kind are run by one compiled program."""
+        arm, which = self.arm_and_object(part)
+        return which, type(list(self.arms.values())[arm])
+
+    @functools.cached_property
+    def sizes(self) -> Counter[Kind]:
+        """How many trials of each kind there are."""
+        counts: Counter[Kind] = Counter()
+        for number, trials in self.parts.items():
+            counts[self.kind(number)] += trials.size
+        return counts
 
     def configuration(self) -> dict[str, Any]:
         """All that the results depend on, as JSON."""
@@ -134,7 +154,7 @@ def open_run(folder: Path, plan: Plan) -> Path:
         found = _manifest(folder)
         if found != wanted:
             raise InputError(
-                f"out = {folder} holds another run ({_difference(found, wanted)}): choose another "
+                f"out = {folder} holds another run ({difference(found, wanted)}): choose another "
                 "folder, or ask for the same."
             )
     else:
@@ -157,14 +177,14 @@ def _manifest(folder: Path) -> dict[str, Any]:
         ) from error
 
 
-def _difference(found: Any, wanted: Any, path: str = "") -> str:
+def difference(found: Any, wanted: Any) -> str:
     """The first few differences of two JSON values, in words."""
-    differences = list(_differences(found, wanted, path))
+    differences = list(_differences(found, wanted))
     more = f" and {len(differences) - 3} more" if len(differences) > 3 else ""
     return "; ".join(differences[:3]) + more
 
 
-def _differences(found: Any, wanted: Any, path: str) -> Iterator[str]:
+def _differences(found: Any, wanted: Any, path: str = "") -> Iterator[str]:
     if isinstance(found, dict) and isinstance(wanted, dict):
         for key in [*found, *(k for k in wanted if k not in found)]:
             yield from _differences(
@@ -227,51 +247,67 @@ def finished(folder: Path) -> dict[int, Path]:
     found = {}
     for path in sorted((folder / "parts").glob("[0-9]*-*.nc")):
         number, _, digest = path.stem.partition("-")
-        if _digest(path) == digest:
+        if _digest(path.read_bytes()) == digest:
             found[int(number)] = path
         else:
             path.rename(path.with_suffix(".nc.corrupt"))
     return found
 
 
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+def store(folder: Path, number: int, content: bytes) -> Path:
+    """Write the file of a part into a run folder, whole or not at all."""
+    return record.write_bytes(folder / "parts" / f"{number:07d}-{_digest(content)}.nc", content)
 
 
-@dataclass
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+class _Rows:
+    """Outcomes of the trials of a part that is begun, by name."""
+
+    def __init__(self, size: int, like: Outcome):
+        self.missing = size
+        self.leaves = {
+            name: np.empty((size, *leaf.shape[1:]), _TYPES.get(name, np.float32))
+            for name, leaf in like._asdict().items()
+        }
+
+
 class _Parts:
     """Trials on their way into the files of their parts."""
 
-    folder: Path
-    parts: dict[int, np.ndarray]  # numbers of the trials of each part still to be done
-    _part_of: dict[int, int] = field(default_factory=dict)
-    _open: dict[int, dict[int, Outcome]] = field(default_factory=dict)
-
-    def start(self, number: int) -> np.ndarray:
-        """Numbers of the trials of a part that is now begun."""
-        trials = self.parts[number]
-        self._part_of.update(dict.fromkeys(map(int, trials), number))
-        return trials
+    def __init__(self, plan: Plan, keep: Keep):
+        self._keep = keep
+        self._parts = plan.parts
+        self._part_of = np.empty(plan.trials, np.int32)
+        for number, trials in plan.parts.items():
+            self._part_of[trials] = number
+        self._open: dict[int, _Rows] = {}
 
     def collect(self, numbers: np.ndarray, outcomes: Outcome) -> None:
-        """Outcomes of trials that ended; writes the parts that are complete with them."""
-        for i, trial_number in enumerate(map(int, numbers)):
-            part = self._part_of.pop(trial_number)
-            rows = self._open.setdefault(part, {})
-            rows[trial_number] = Outcome(*(leaf[i] for leaf in outcomes))
-            if len(rows) == self.parts[part].size:
-                self._write(part, self._open.pop(part))
+        """Outcomes of trials that ended; the parts that are complete with them are kept."""
+        part_of = self._part_of[numbers]
+        for part in map(int, np.unique(part_of)):
+            ended = part_of == part
+            trials = self._parts[part]
+            if part not in self._open:
+                self._open[part] = _Rows(trials.size, outcomes)
+            rows = self._open[part]
+            at = np.searchsorted(trials, numbers[ended])
+            for name, leaf in outcomes._asdict().items():
+                rows.leaves[name][at] = leaf[ended]
+            rows.missing -= at.size
+            if not rows.missing:
+                self._keep(part, _content(trials, self._open.pop(part).leaves))
 
-    def _write(self, part: int, rows: dict[int, Outcome]) -> None:
-        numbers = self.parts[part]
-        leaves = zip(*(rows[int(n)] for n in numbers), strict=True)
-        content: dict[str, Any] = {"trial": ("row", numbers)}
-        for name, values in zip(Outcome._fields, leaves, strict=True):
-            stacked = np.stack(values).astype(_TYPES.get(name, np.float32))
-            content[name] = (("row", "pose")[: stacked.ndim], stacked)
-        place = self.folder / "parts"
-        path = record.write_results(place / f"{part:07d}.nc.new", xr.Dataset(content))
-        path.rename(place / f"{part:07d}-{_digest(path)}.nc")
+
+def _content(trials: np.ndarray, leaves: dict[str, np.ndarray]) -> bytes:
+    """The file of a part."""
+    columns: dict[str, Any] = {"trial": ("row", trials)}
+    for name, leaf in leaves.items():
+        columns[name] = (("row", "pose")[: leaf.ndim], leaf)
+    return record.encoded(xr.Dataset(columns))
 
 
 # --- running -------------------------------------------------------------------------------
@@ -286,34 +322,47 @@ def run(
     **shape: Any,
 ) -> Timing:
     """Run what is missing of a plan, or of one shard of it, in a folder that `open_run` opened."""
-    mine, done = share(plan, shard), finished(folder)
-    before = sum(trials.size for n, trials in mine.items() if n in done)
+    missing, before = remaining(folder, plan, shard)
     report(Progress(before, 0.0))
-    parts = _Parts(folder, {n: trials for n, trials in mine.items() if n not in done})
-    # Of each kind the parts to do, and the trials of the whole plan: whatever is left of a run, it
-    # has the slots of the whole, and so its bits.
-    jobs: dict[Any, list[int]] = {}
-    sizes: Counter[Any] = Counter()
-    for number, trials in plan.parts.items():
-        arm, which = _arm_and_object(plan, number)
-        kind = (which, type(list(plan.arms.values())[arm]))
-        sizes[kind] += trials.size
-        if number in parts.parts:
-            jobs.setdefault(kind, []).append(number)
 
     def tell(progress: Progress) -> None:
         report(Progress(before + progress.finished, progress.simulated))
 
-    return slots.run(
-        [
-            Job(trial.STRATEGIES[kind[1]], sizes[kind], _made(plan, parts, numbers))
-            for kind, numbers in jobs.items()
-        ],
-        plan.setting,
-        collect=parts.collect,
-        report=tell,
-        **shape,
-    )
+    return work(plan, missing, functools.partial(store, folder), report=tell, **shape)
+
+
+def work(
+    plan: Plan,
+    numbers: Mapping[Kind, Iterable[int]],
+    keep: Keep,
+    *,
+    report: Callable[[Progress], Any],
+    **shape: Any,
+) -> Timing:
+    """Run some parts of a plan: of each kind those with these numbers, asked for one by one.
+
+    There are as many slots as the whole plan has use for, whatever parts are run, so that a part
+    has the same bits whoever runs it, and with whatever other parts.
+    """
+    jobs = [
+        Job(trial.STRATEGIES[kind[1]], plan.sizes[kind], _made(plan, some))
+        for kind, some in numbers.items()
+    ]
+    collect = _Parts(plan, keep).collect
+    return slots.run(jobs, plan.setting, collect=collect, report=report, **shape)
+
+
+def remaining(folder: Path, plan: Plan, shard: Shard) -> tuple[dict[Kind, list[int]], int]:
+    """Parts of a shard that a run folder lacks, by kind, and how many trials it has."""
+    done = finished(folder)
+    missing: dict[Kind, list[int]] = {}
+    before = 0
+    for number, trials in share(plan, shard).items():
+        if number in done:
+            before += trials.size
+        else:
+            missing.setdefault(plan.kind(number), []).append(number)
+    return missing, before
 
 
 def share(plan: Plan, shard: Shard) -> dict[int, np.ndarray]:
@@ -322,15 +371,11 @@ def share(plan: Plan, shard: Shard) -> dict[int, np.ndarray]:
     return {n: trials for i, (n, trials) in enumerate(every) if i % shard.of == shard.number - 1}
 
 
-def _arm_and_object(plan: Plan, part: int) -> tuple[int, int]:
-    return divmod(part // plan.blocks, len(plan.domain.objects))
-
-
-def _made(plan: Plan, parts: _Parts, numbers: list[int]) -> Iterator[Part]:
+def _made(plan: Plan, numbers: Iterable[int]) -> Iterator[Part]:
     """The worlds of parts, made one part at a time."""
     for number in numbers:
-        trials = parts.start(number)
-        arm, _ = _arm_and_object(plan, number)
+        trials = plan.parts[number]
+        arm, _ = plan.arm_and_object(number)
         yield world_part(plan, arm, trials % plan.worlds)._replace(numbers=trials)
 
 
@@ -364,8 +409,6 @@ def world_part(plan: Plan, arm: int, index: Any) -> Part:
 def merge(folders: list[Path], out: Path) -> Path:
     """One `results.nc` of all parts in run folders of one plan: (arm, world), and (world) drawn.
 
-    It is written part by part, so that memory does not grow with the number of worlds.
-
     Raises:
       InputError: the folders differ in their plan, or parts are missing.
     """
@@ -374,7 +417,7 @@ def merge(folders: list[Path], out: Path) -> Path:
         if (theirs := _manifest(other)) != manifest:
             raise InputError(
                 f"run = {other} is of another plan than {folders[0]} "
-                f"({_difference(manifest, theirs)}): merge shards of one run."
+                f"({difference(manifest, theirs)}): merge shards of one run."
             )
     plan = load_plan(folders[0])
     found = {n: path for folder in folders for n, path in finished(folder).items()}
@@ -384,11 +427,13 @@ def merge(folders: list[Path], out: Path) -> Path:
             f"run = {', '.join(map(str, folders))} lacks {len(missing)} of {len(plan.parts)} "
             "parts: run the same command again, or give the folders of all shards."
         )
-    return record.atomic(out / "results.nc", lambda path: _write_results(path, plan, found))
+    return record.write_bytes(out / "results.nc", _merged(plan, found))
 
 
-def _write_results(path: Path, plan: Plan, found: dict[int, Path]) -> None:
-    with h5netcdf.File(path, "w") as file:
+def _merged(plan: Plan, found: dict[int, Path]) -> bytes:
+    """The file of all results, made in memory as `record.encoded` says."""
+    content = io.BytesIO()
+    with h5netcdf.File(content, "w") as file:
         sizes = {"arm": len(plan.arms), "world": plan.worlds, "pose": 3}
         file.dimensions = sizes | {"object": len(plan.domain.objects)}
         names = {"arm": list(plan.arms), "object": list(plan.domain.objects)}
@@ -404,7 +449,7 @@ def _write_results(path: Path, plan: Plan, found: dict[int, Path]) -> None:
             outcomes[name] = file.create_variable(name, dims, _TYPES.get(name, np.float32))
             outcomes[name].attrs.update(units=unit, long_name=meaning)
         for number, source in found.items():
-            arm, _ = _arm_and_object(plan, number)
+            arm, _ = plan.arm_and_object(number)
             part = record.read(source)
             world = part.trial.values % plan.worlds
             for name, variable in outcomes.items():
@@ -416,6 +461,7 @@ def _write_results(path: Path, plan: Plan, found: dict[int, Path]) -> None:
                         drawn[name] = file.create_variable(name, ("world",), np.float32)
                         drawn[name].attrs["units"] = unit
                     _put(drawn[name], (), world, values)
+    return content.getvalue()
 
 
 def _put(variable: h5netcdf.Variable, at: tuple[int, ...], world: np.ndarray, values: Any) -> None:

@@ -146,6 +146,7 @@ def _side_by_side(tasks: Sequence[Callable[[], None]], count: int, shared: _Shar
                 job.result()
         except BaseException:
             shared.stop = True
+            pool.shutdown(wait=False, cancel_futures=True)
             raise
 
 
@@ -314,7 +315,7 @@ def _refill(worlds: World, trials: Trial, fresh: jax.Array, *, strategy: Strateg
 def _work(queues: list[_Queue], shared: _Shared) -> None:
     waited = 0.0
     for queue in queues:
-        taken = queue.take(queue.slots)
+        taken = [] if shared.stop else queue.take(queue.slots)
         if taken:
             began = time.perf_counter()
             program = queue.program()

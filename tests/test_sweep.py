@@ -1,5 +1,6 @@
 """Sweeps over random worlds: a world's result is its own, and nothing that is done is lost."""
 
+import errno
 import json
 import multiprocessing
 import os
@@ -234,6 +235,52 @@ def test_a_run_killed_twenty_times_ends_as_one_that_was_not(tmp_path, cache):
     assert process.exitcode == 0
     assert interrupted > 2
     assert payload(folder) == payload(swept(tmp_path / "whole", KILLED))
+
+
+def ends_in_one_sentence_and_is_continued(folder, whole, capsys, monkeypatch, *words):
+    """What was done stays, alone, and is not run again; then all is as if nothing had happened."""
+    assert cli.guarded(lambda: swept(folder)) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("rps: error: ")
+    assert error.count("\n") == 1
+    assert all(word in error for word in words)
+    monkeypatch.undo()
+    kept = payload(folder)
+    assert 0 < len(kept) < len(PLAN.parts)
+    assert kept.items() <= payload(whole).items()
+    finished = []
+    swept(folder, report=lambda progress: finished.append(progress.finished))
+    assert finished[0] == sum(PLAN.parts[int(name[:7])].size for name in kept)
+    assert payload(folder) == payload(whole)
+
+
+def test_a_full_disk_loses_nothing(whole, tmp_path, capsys, monkeypatch):
+    fsync = os.fsync
+
+    def full(file):
+        if len(list(tmp_path.glob("parts/[0-9]*"))) == 2:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        fsync(file)
+
+    monkeypatch.setattr(os, "fsync", full)
+    words = (str(tmp_path), "No space left on device", "same command again", "is kept")
+    ends_in_one_sentence_and_is_continued(tmp_path, whole, capsys, monkeypatch, *words)
+
+
+def test_a_device_out_of_memory_loses_nothing(whole, tmp_path, capsys, monkeypatch):
+    compiled = slots._Queue.program
+
+    def starved(queue):
+        def program(*arguments):
+            if list(tmp_path.glob("parts/[0-9]*")):
+                raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory.")
+            return compiled(queue)(*arguments)
+
+        return program
+
+    monkeypatch.setattr(slots._Queue, "program", starved)
+    words = ("out of memory", "--slots", "is kept")
+    ends_in_one_sentence_and_is_continued(tmp_path, whole, capsys, monkeypatch, *words)
 
 
 def test_a_corrupt_part_is_set_aside_and_done_again_alone(whole, tmp_path):

@@ -1,0 +1,220 @@
+"""Sweeps through Ray: whoever runs a part and whoever dies, results are those of one process."""
+
+import contextlib
+import json
+import os
+import random
+import signal
+import socket
+import sys
+
+import jax
+import pytest
+
+from rps_jax import cli, cluster, paper, record, robustness
+from rps_jax.board import Board
+from rps_jax.domain import from_json
+from rps_jax.errors import InputError
+from rps_jax.physics import preset
+from rps_jax.robustness import Plan
+from rps_jax.slots import Setting
+from rps_jax.trial import Rules
+
+SWEEP = [
+    *("sweep", "--engine", "fused", "--fidelity", "fast", "--horizon", "20", "--worlds", "20"),
+    *("--strategies", "rps", "nps", "--part", "7", "--slots", "8"),
+]
+NEAR = {"objects": ["random_cylinder"], "distance": [0.7, 0.8], "bearing": [-0.5, 0.5]}
+
+
+# --- the board -----------------------------------------------------------------------------
+
+
+def test_every_part_comes_back_once_whoever_dies():
+    """Workers ask, deliver and die in random order; the last two live."""
+    dice = random.Random(0)
+    kinds = [list(range(0, 20)), list(range(20, 27))]
+    board, held, returned = Board(kinds, 3), {}, []
+    for worker in range(3):
+        board.enter(worker, {})
+        held[worker] = []
+    for turn in range(2000):
+        worker = dice.randrange(3)
+        mine = held[worker]
+        act = dice.random()
+        if act < 0.02 and turn < 1000:
+            board.enter(worker, {})
+            mine.clear()
+        elif mine and act < 0.5:
+            _, number = mine.pop(dice.randrange(len(mine)))
+            board.tell(worker, 10, 1.0)
+            board.deliver(worker, number, 10, b"")
+        elif mine:
+            number = board.next(worker, mine[0][0])
+            mine += [] if number is None else [(mine[0][0], number)]
+        elif (found := board.first(worker)) is not None:
+            mine.append(found)
+        assert len(mine) <= 9  # a third
+        assert all(number in kinds[kind] for kind, number in mine)
+        begun = [number for others in held.values() for _, number in others]
+        assert len(set(begun)) == len(begun)
+        news = board.news()
+        returned += [number for number, _ in news.parts]
+        assert news.ended == 10 * len(returned)
+    assert sorted(returned) == list(range(27))
+
+
+def test_trials_that_are_lost_with_a_worker_do_not_count():
+    board = Board([[3, 4]], 1)
+    board.enter(0, {"pid": 1})
+    assert board.first(0) == (0, 3)
+    assert board.next(0, 0) == 4
+    board.tell(0, 8, 80.0)
+    board.deliver(0, 3, 7, b"three")
+    assert board.news()[:3] == ([(3, b"three")], 8, 80.0)
+    board.enter(0, {"pid": 2})
+    assert board.news() == ([], 7, 80.0, {0: {"pid": 2}})
+    assert board.first(0) == (0, 4)
+    assert board.first(0) is None
+
+
+def test_workers_begin_with_different_kinds():
+    board = Board([[1, 2], [3, 4], [5, 6]], 3)
+    for worker in range(3):
+        board.enter(worker, {})
+    assert [board.first(worker) for worker in range(3)] == [(0, 1), (1, 3), (2, 5)]
+
+
+def test_room_for_workers_by_hand():
+    hosts = [
+        {"Alive": True, "Resources": {"CPU": 8.0}},
+        {"Alive": True, "Resources": {"CPU": 3.0, "GPU": 4.0}},
+        {"Alive": False, "Resources": {"CPU": 8.0, "GPU": 8.0}},
+    ]
+    assert cluster._room(hosts, 1, 0) == 11
+    assert cluster._room(hosts, 3, 0) == 3
+    assert cluster._room(hosts, 1, 1) == 3
+    with pytest.raises(InputError, match=r"workers = 9 .* so many processors"):
+        cluster._room(hosts, 9, 0)
+
+
+# --- without a cluster ---------------------------------------------------------------------
+
+
+@pytest.fixture
+def domain(tmp_path):
+    (tmp_path / "near.json").write_text(json.dumps(NEAR))
+    return str(tmp_path / "near.json")
+
+
+def closed_port():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
+
+
+@pytest.mark.parametrize("wrong", ["closed", "auto", "what", "missing"])
+def test_without_ray_or_its_cluster_a_sweep_ends_in_one_sentence(
+    wrong, domain, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(cli, "use_cache", lambda: None)
+    nobody = f"127.0.0.1:{closed_port()}"
+    address = {"closed": nobody, "missing": "local"}.get(wrong, wrong)
+    monkeypatch.setenv("RAY_ADDRESS", nobody)
+    if wrong == "missing":
+        monkeypatch.setitem(sys.modules, "ray", None)
+    out = str(tmp_path / "run")
+    assert cli.main([*SWEEP, "--domain", domain, "--ray", address, "--out", out]) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    message = "pip install 'rps_jax[cluster]'" if wrong == "missing" else f"ray = {address}"
+    assert error.startswith("rps: error: ")
+    assert message in error
+
+
+# --- a cluster of two workers --------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def programs(tmp_path_factory):
+    """The cache of compiled programs, also of workers."""
+    before = jax.config.jax_compilation_cache_dir
+    with pytest.MonkeyPatch.context() as patch:
+        if "RPS_CACHE" not in os.environ:
+            patch.setenv("RPS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+@pytest.fixture(scope="module")
+def two_workers(programs):
+    """Ray, until the end of the module."""
+    with cluster.connected("local", num_cpus=2, object_store_memory=100 * 2**20) as ray:
+        yield ray
+    assert not ray.is_initialized()
+
+
+def payload(folder):
+    return {path.name: path.read_bytes() for path in (folder / "parts").iterdir()}
+
+
+def opened(folder):
+    """A run folder with the plan of `SWEEP` in it, and the plan."""
+    plan = Plan(
+        from_json(NEAR),
+        20,
+        {name: paper.PARAMS[name] for name in ("rps", "nps")},
+        Setting(preset(fidelity="fast"), Rules(horizon=20.0), engine="fused"),
+        part=7,
+    )
+    return robustness.open_run(folder, plan), plan
+
+
+def test_a_worker_killed_at_work_changes_nothing(domain, tmp_path, two_workers, monkeypatch):
+    """SIGKILL after some of its trials; the parts are those of one process without Ray."""
+    out, plan = opened(tmp_path / "run")
+    plain, _ = opened(tmp_path / "plain")
+    cli.use_cache()
+    robustness.run(plain, plan, slots=8)
+    seen, killed = set(), []
+
+    @contextlib.contextmanager
+    def killing(trials, what):
+        assert trials == plan.trials
+
+        def report(progress):
+            environment = json.loads((out / "environment.json").read_text())
+            pids = [worker["pid"] for worker in environment.get("workers", ())]
+            seen.update(pids)
+            if 0 < progress.finished < trials and not killed:
+                killed.append(pids[0])
+                os.kill(pids[0], signal.SIGKILL)
+
+        yield report
+
+    monkeypatch.setattr(cli, "progress_bar", killing)
+    assert cli.main([*SWEEP, "--domain", domain, "--out", str(out), "--ray", "local"]) == 0
+    assert killed
+    assert len(seen) > len(json.loads((out / "environment.json").read_text())["workers"])
+    assert len(payload(plain)) == 6
+    assert payload(out) == payload(plain)
+    assert record.read_results(out).success.shape == (2, 20)
+
+
+def test_what_ends_a_worker_ends_the_run_as_itself(tmp_path, two_workers):
+    def prepare():
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
+
+    with pytest.raises(RuntimeError, match="RESOURCE_EXHAUSTED: Out of memory"):
+        cluster.run(*opened(tmp_path), address="local", prepare=prepare)
+
+
+def test_a_worker_with_other_software_is_refused(tmp_path, two_workers, monkeypatch):
+    here = record.environment()
+    monkeypatch.setattr(record, "environment", lambda: here | {"commit": "another"})
+    with pytest.raises(InputError, match=r"other software \(commit = .* there, another asked for"):
+        cluster.run(*opened(tmp_path), address="local", prepare=int)
+
+
+def test_a_cluster_without_room_for_a_worker_is_refused(tmp_path, two_workers):
+    with pytest.raises(InputError, match=r"workers = 3 .* so many processors"):
+        cluster.run(*opened(tmp_path), address="local", prepare=int, workers=3)
