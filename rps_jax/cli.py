@@ -182,7 +182,7 @@ class Sweep(Spread):
     strategies: tuple[str, ...] = ("rps", "nps", "aps")
     """Strategies to run: rps, nps, aps."""
     params: tuple[str, ...] = ("paper",)
-    """Parameters of rps and nps: paper, or JSON files (as {"L": 0.3}); each is run."""
+    """Parameters of rps and nps: paper, tuned, or JSON files (as {"L": 0.3}); each is run."""
     worlds: int | None = None
     """How many; by default 1000, or the domain's whole grid."""
     physics: str = "default"
@@ -254,6 +254,8 @@ class TuneOptions(Spread):
     """Worlds for validation, in each domain."""
     risk: str = "mean"
     """mean over the worlds, or cvar: the mean over the worst tenth."""
+    time_weight: float = 0.1
+    """What a success that takes the whole horizon scores, where a failure scores 1 and more."""
     fidelity: str = "standard"
     """How finely the physics is solved: reference, standard or fast."""
     engine: str = "fused"
@@ -779,6 +781,8 @@ def _changes(name: str) -> dict[str, float]:
     from rps_jax.law import RPSParams
 
     known = [field for field in RPSParams._fields if field != "reactive"]
+    if name == "tuned":
+        return {key: float(getattr(RPSParams.tuned(), key)) for key in known}
     values = {} if name == "paper" else _json(Path(name))
     for key, value in values.items():
         errors.check_name(f"parameter of {name}", key, known)
@@ -1003,7 +1007,7 @@ def _course(options: TuneOptions) -> Course:
         options.worlds,
         options.validation,
         setting,
-        Objective(options.risk),
+        Objective(options.risk, time=options.time_weight),
     )
 
 

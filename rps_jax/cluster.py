@@ -62,7 +62,7 @@ def _work(
     if _same(environment) != same:
         raise InputError(
             f"ray: host {environment['host']} has other software "
-            f"({robustness.difference(_same(environment), same)}): install the same on all hosts."
+            f"({record.difference(_same(environment), same)}): install the same on all hosts."
         )
     ask("enter", environment)
     shape = {"slots": slots, "workers": threads}

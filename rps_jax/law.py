@@ -57,6 +57,28 @@ class RPSParams(NamedTuple):
         return cls()
 
     @classmethod
+    def tuned(cls) -> RPSParams:
+        """Tuned by evolution in random worlds of boxes and cylinders; the README says how.
+
+        Full speed until the target, and almost always realigning: Eq. 5 acts only beyond d_th.
+        """
+        return cls(
+            eta=6.537844,
+            zeta=-1.251917,
+            beta=0.1163395,
+            k=17.22659,
+            K_h=0.2083339,
+            K_v=1.297107,
+            L=0.2713795,
+            l_cr=0.1687817,
+            l_mr=0.1217143,
+            a_r_max=64.85278,
+            d_th=1.561165,
+            gamma_max=1.54169,
+            v_lost=0.03373589,
+        )
+
+    @classmethod
     def nps(cls) -> RPSParams:
         """The non-reactive baseline: a_r = 0 throughout and no Realignment State (Sec. III-B)."""
         return cls(reactive=0.0)

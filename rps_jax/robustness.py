@@ -38,7 +38,6 @@ from rps_jax.trial import Outcome, Params, Rules
 
 Kind = tuple[int, type]  # of a part: the object's number and the type of the arm's parameters
 Keep = Callable[[int, bytes], Any]  # called with the number and the content of a part
-MANIFEST = "manifest.json"
 _TYPES = {"success": np.int8, "diverged": np.int8}  # of an outcome; the others are float32
 
 
@@ -119,7 +118,7 @@ class Plan:
             "engine": self.setting.engine,
             "part": self.part,
         }
-        return json.loads(json.dumps(whole))
+        return whole
 
 
 def _numbers(fields: Any) -> dict[str, float]:
@@ -148,50 +147,9 @@ def open_run(folder: Path, plan: Plan) -> Path:
     Raises:
       InputError: it cannot be written, or holds a run of another configuration.
     """
-    record.writable(folder)
-    wanted = plan.configuration()
-    if (folder / MANIFEST).exists():
-        found = _manifest(folder)
-        if found != wanted:
-            raise InputError(
-                f"out = {folder} holds another run ({difference(found, wanted)}): choose another "
-                "folder, or ask for the same."
-            )
-    else:
-        record.write_json(folder / MANIFEST, wanted)
+    record.claim(folder, plan.configuration())
     (folder / "parts").mkdir(exist_ok=True)
     return folder
-
-
-def _manifest(folder: Path) -> dict[str, Any]:
-    path = folder / MANIFEST
-    try:
-        return json.loads(path.read_text())
-    except FileNotFoundError as error:
-        raise InputError(
-            f"run = {folder} holds no {MANIFEST}: give the folder of a run."
-        ) from error
-    except ValueError as error:
-        raise InputError(
-            f"{path} is corrupt ({error}): restore it, or choose another folder."
-        ) from error
-
-
-def difference(found: Any, wanted: Any) -> str:
-    """The first few differences of two JSON values, in words."""
-    differences = list(_differences(found, wanted))
-    more = f" and {len(differences) - 3} more" if len(differences) > 3 else ""
-    return "; ".join(differences[:3]) + more
-
-
-def _differences(found: Any, wanted: Any, path: str = "") -> Iterator[str]:
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        for key in [*found, *(k for k in wanted if k not in found)]:
-            yield from _differences(
-                found.get(key), wanted.get(key), f"{path}.{key}" if path else key
-            )
-    elif found != wanted:
-        yield f"{path} = {found} there, {wanted} asked for"
 
 
 def load_plan(folder: Path) -> Plan:
@@ -200,7 +158,7 @@ def load_plan(folder: Path) -> Plan:
     Raises:
       InputError: it holds none, or a corrupt one.
     """
-    found = _manifest(folder)
+    found = record.manifest(folder)
     try:
         physics: dict[str, Any] = {
             k: tuple(v) if isinstance(v, list) else v for k, v in found["physics"].items()
@@ -214,7 +172,8 @@ def load_plan(folder: Path) -> Plan:
         )
     except (KeyError, TypeError) as error:
         raise InputError(
-            f"{folder / MANIFEST} is corrupt ({error}): restore it, or choose another folder."
+            f"{folder / record.MANIFEST} is corrupt ({error}): restore it, or choose another "
+            "folder."
         ) from error
 
 
@@ -412,12 +371,12 @@ def merge(folders: list[Path], out: Path) -> Path:
     Raises:
       InputError: the folders differ in their plan, or parts are missing.
     """
-    manifest = _manifest(folders[0])
+    manifest = record.manifest(folders[0])
     for other in folders[1:]:
-        if (theirs := _manifest(other)) != manifest:
+        if (theirs := record.manifest(other)) != manifest:
             raise InputError(
                 f"run = {other} is of another plan than {folders[0]} "
-                f"({difference(manifest, theirs)}): merge shards of one run."
+                f"({record.difference(manifest, theirs)}): merge shards of one run."
             )
     plan = load_plan(folders[0])
     found = {n: path for folder in folders for n, path in finished(folder).items()}
