@@ -148,7 +148,7 @@ def check(params: RPSParams) -> RPSParams:
     return params
 
 
-_HARD: Any = Temperatures(*(None,) * len(Temperatures._fields))
+_HARD: Any = Temperatures._make([None] * len(Temperatures._fields))
 
 # A switch is a bool, or in the smooth law a weight from 0 to 1.
 
