@@ -150,7 +150,7 @@ def one_trial(trace: Trace, title: str, path: Path) -> Path:
     kind.set_ylim(-0.2, 2.2)
     kind.set(ylabel="c) contact", xlabel="time [s]")
     for ax in (velocity, place, kind):
-        _shade(ax, seen.time, seen.details.realigning, _SHADES["realigning"])
+        _shade(ax, seen.time, seen.details.realigning > 0.5, _SHADES["realigning"])
         _shade(ax, seen.time, ~touching, _SHADES["lost"])
     result = "reached" if trace.outcome.success else "not reached"
     x, y = trace.p_world_target

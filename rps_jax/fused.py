@@ -133,17 +133,27 @@ def drive(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """One control period of a batch of worlds (B, 10), (B, 9), (B, 9) at `twist` (B,).
 
-    On an NVIDIA GPU it is one kernel; elsewhere XLA compiles it.
+    On an NVIDIA GPU it is one kernel; elsewhere, and where it is differentiated, XLA compiles it.
     """
-    state = enter(body, qpos, qvel, warmstart)
-    state = jax.lax.platform_dependent(
-        spread(body),
+    state = _period(physics, spread(body), enter(body, qpos, qvel, warmstart), twist)
+    return leave(body, state, twist)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _period(physics: Physics, scalars: Body, state: State, twist: Vec) -> State:
+    return jax.lax.platform_dependent(
+        scalars,
         state,
         twist,
         cuda=partial(_kernel, physics=physics),
         default=partial(_steps, physics=physics),
     )
-    return leave(body, state, twist)
+
+
+@_period.defjvp
+def _period_jvp(physics: Physics, primals: Any, tangents: Any) -> tuple[State, State]:
+    """Forward mode: a kernel has none, and the solver's loop no other."""
+    return jax.jvp(partial(_steps, physics=physics), primals, tangents)
 
 
 def _steps(scalars: Body, state: State, twist: Vec, physics: Physics) -> State:

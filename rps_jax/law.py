@@ -4,11 +4,16 @@ and Ajoudani, "Pushing in the Dark" (IEEE RA-L 2024). Nothing here knows of MuJo
 Frames: W is the world, R the robot (origin at the middle of the base, x forward, y left).
 `p_robot_contact` is the paper's p^R_C; `l` is its y component. Every function takes single
 worlds; `jax.vmap` batches any argument, parameters included.
+
+The law switches. With `Temperatures` each of its switches is a weight from 0 to 1 instead, what it
+chose between is mixed by that weight, and the law is smooth; without them it is the paper's.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import operator
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -84,18 +89,38 @@ class RPSParams(NamedTuple):
         return cls(reactive=0.0)
 
 
+class Temperatures(NamedTuple):
+    """How far each switch of the smooth law reaches to either side, all [m].
+
+    As they go to zero the law tends to the paper's, but for l = 0 exactly, where a smooth sgn is
+    zero whatever `sgn_0`. They are small against what they soften: a Realignment State with a
+    memory needs realign < (l_cr - l_mr) / 4, beyond which l_th has one equilibrium for each l.
+    """
+
+    realign: float | jax.Array = 0.01  # Algorithm 1's |l| > l_th
+    d_th: float | jax.Array = 0.02  # Eq. 5's ||d|| > d_th
+    sgn: float | jax.Array = 0.01  # sgn(l)
+    arrive: float | jax.Array = 0.002  # ||d|| < d_success
+
+    def check(self) -> None:
+        """Raises InputError for a temperature that is not a positive length."""
+        for name, value in self._asdict().items():
+            errors.check_finite(f"temperature {name}", value, above=0, at_most=1, unit="m")
+
+
 class RPSState(NamedTuple):
     """What the law remembers between two control steps."""
 
     l_th: jax.Array  # () [m] dynamic threshold: l_cr normally, l_mr while realigning
     p_robot_contact: jax.Array  # (2,) [m] the last contact, in the robot frame
-    touched: jax.Array  # () bool: the skin has felt the object at least once
+    touched: jax.Array  # () bool: the skin has felt the object at least once; smooth: a weight
 
     @classmethod
-    def init(cls, params: RPSParams) -> RPSState:
+    def init(cls, params: RPSParams, temperatures: Temperatures | None = None) -> RPSState:
         """Algorithm 1's initialisation, l_th = l_cr, before any contact."""
         l_th = jnp.asarray(params.l_cr, float)
-        return cls(l_th, jnp.zeros(2, l_th.dtype), jnp.zeros((), bool))
+        touched = jnp.zeros((), bool if temperatures is None else l_th.dtype)
+        return cls(l_th, jnp.zeros(2, l_th.dtype), touched)
 
 
 class Observation(NamedTuple):
@@ -104,7 +129,7 @@ class Observation(NamedTuple):
     p_world_robot: jax.Array  # (2,) [m]
     yaw: jax.Array  # () [rad] heading of the robot in the world
     p_robot_contact: jax.Array  # (2,) [m] contact location; ignored unless in_contact
-    in_contact: jax.Array  # () bool
+    in_contact: jax.Array  # () bool; for the smooth law also a weight from 0 to 1
     p_world_target: jax.Array  # (2,) [m]
 
 
@@ -123,7 +148,7 @@ class Details(NamedTuple):
     distance: jax.Array  # () [m] ||d||, contact point to target
     a_r: jax.Array  # () [1] adaptive rate
     gamma: jax.Array  # () [rad] steering angle
-    realigning: jax.Array  # () bool: in the Realignment State
+    realigning: jax.Array  # () bool: in the Realignment State; smooth: a weight
 
 
 def check(params: RPSParams) -> RPSParams:
@@ -146,19 +171,54 @@ def check(params: RPSParams) -> RPSParams:
     return params
 
 
-def _sgn(params: RPSParams, x: jax.Array) -> jax.Array:
+_HARD: Any = Temperatures._make([None] * len(Temperatures._fields))
+
+# A switch is a bool, or in the smooth law a weight from 0 to 1.
+
+
+def _above(
+    x: jax.Array,
+    threshold: Any,
+    temperature: Any,
+    compare: Callable[[Any, Any], jax.Array] = operator.gt,
+) -> jax.Array:
+    """The switch `compare(x, threshold)`; smooth if there is a temperature."""
+    if temperature is None:
+        return compare(x, threshold)
+    return jax.nn.sigmoid((x - threshold) / temperature)
+
+
+def _below(x: jax.Array, threshold: Any, temperature: Any) -> jax.Array:
+    """The switch x < threshold; smooth if there is a temperature."""
+    if temperature is None:
+        return x < threshold
+    return jax.nn.sigmoid((threshold - x) / temperature)
+
+
+def _not(switch: jax.Array) -> jax.Array:
+    return ~switch if switch.dtype == bool else 1 - switch
+
+
+def _both(a: jax.Array, b: jax.Array) -> jax.Array:
+    return a & b if a.dtype == b.dtype == bool else a * b
+
+
+def _either(a: jax.Array, b: jax.Array) -> jax.Array:
+    return a | b if a.dtype == b.dtype == bool else jnp.maximum(a, b)
+
+
+def _choose(switch: jax.Array, yes: Any, no: Any) -> jax.Array:
+    """`yes` or `no`; of a weight, the mixture."""
+    if switch.dtype == bool:
+        return jnp.where(switch, yes, no)
+    return switch * yes + (1 - switch) * no
+
+
+def _sgn(params: RPSParams, x: jax.Array, temperature: Any = None) -> jax.Array:
     """Sgn, with the parameter sgn(0): by default a centred contact asks for no lateral motion."""
-    return jnp.where(x == 0, params.sgn_0, jnp.sign(x))
-
-
-def _is_far(params: RPSParams, distance: jax.Array) -> jax.Array:
-    """Eq. 5's switch: lateral motion only beyond d_th."""
-    return distance > params.d_th
-
-
-def _must_realign(params: RPSParams, l: jax.Array, l_th: jax.Array) -> jax.Array:  # noqa: E741
-    """Algorithm 1's switch into, and out of, the Realignment State."""
-    return (jnp.abs(l) > l_th) & (jnp.asarray(params.reactive) > 0)
+    if temperature is None:
+        return jnp.where(x == 0, params.sgn_0, jnp.sign(x))
+    return jnp.tanh(x / temperature)
 
 
 def displacement(observation: Observation) -> jax.Array:
@@ -170,11 +230,18 @@ def displacement(observation: Observation) -> jax.Array:
     return jnp.clip(d, -_WORLD_SIZE, _WORLD_SIZE)
 
 
-def adaptive_rate(params: RPSParams, l: jax.Array, distance: jax.Array) -> jax.Array:  # noqa: E741
+def adaptive_rate(
+    params: RPSParams,
+    l: jax.Array,  # noqa: E741
+    distance: jax.Array,
+    temperatures: Temperatures | None = None,
+) -> jax.Array:
     """Eq. 5: a_r (...) [1] from the lateral contact location l [m] and ||d|| [m]."""
+    soft = temperatures or _HARD
     logistic = jax.nn.sigmoid((jnp.abs(l) - params.beta) * params.k)
-    a_r = (params.zeta + (params.eta - params.zeta) * logistic) * _sgn(params, l)
-    return jnp.where(_is_far(params, distance), a_r, 0.0) * params.reactive
+    a_r = (params.zeta + (params.eta - params.zeta) * logistic) * _sgn(params, l, soft.sgn)
+    far = _above(distance, params.d_th, soft.d_th)
+    return _choose(far, a_r, 0.0) * params.reactive
 
 
 def linear_velocity(v_star: jax.Array, a_r: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -214,7 +281,7 @@ def saturate(params: RPSParams, twist: Twist) -> Twist:
 
 
 def _push(
-    params: RPSParams, l_th: jax.Array, observation: Observation
+    params: RPSParams, l_th: jax.Array, observation: Observation, temperatures: Temperatures | None
 ) -> tuple[jax.Array, Twist, Details]:
     """One pass of Algorithm 1's control loop, in contact."""
     l = observation.p_robot_contact[..., 1]  # noqa: E741
@@ -223,58 +290,84 @@ def _push(
     v_star = params.K_v * distance  # Eq. 3
     gamma = steering_angle(params, d, observation.yaw)
 
-    realigning = _must_realign(params, l, l_th)
-    a_r = jnp.where(
-        realigning, params.a_r_max * _sgn(params, l), adaptive_rate(params, l, distance)
+    soft = temperatures or _HARD
+    realigning = _both(
+        _above(jnp.abs(l), l_th, soft.realign), jnp.asarray(params.reactive) > 0
+    )  # Algorithm 1's switch into, and out of, the Realignment State
+    a_r = _choose(
+        realigning,
+        params.a_r_max * _sgn(params, l, soft.sgn),
+        adaptive_rate(params, l, distance, temperatures),
     )
     v_x, v_y = linear_velocity(v_star, a_r)  # Eqs. 1-2
     bounded = saturate(params, Twist(v_x, v_y, jnp.zeros_like(v_x)))
     first = jnp.asarray(params.saturate_first) > 0
     forward = jnp.where(first, bounded.v_x, v_x)
     speed = jnp.where(first, jnp.minimum(v_star, params.v_max), v_star)
-    turning_speed = jnp.where(realigning, realignment_gain(params, l) * speed, forward)
+    turning_speed = _choose(realigning, realignment_gain(params, l) * speed, forward)
     omega = turning_speed / params.L * jnp.tan(gamma)  # Eq. 8 or 6
     twist = saturate(params, Twist(v_x, v_y, omega))
 
-    arrived = distance < params.d_success
-    twist = jax.tree.map(lambda v: jnp.where(arrived, 0.0, v), twist)
-    new_l_th = jnp.where(realigning, params.l_mr, params.l_cr)
+    arrived = _below(distance, params.d_success, soft.arrive)
+    twist = jax.tree.map(lambda v: _choose(arrived, 0.0, v), twist)
+    new_l_th = _choose(realigning, params.l_mr, params.l_cr)
     return (
-        jnp.where(arrived, l_th, new_l_th),
+        _choose(arrived, l_th, new_l_th),
         twist,
-        Details(l, distance, a_r, gamma, realigning & ~arrived),
+        Details(l, distance, a_r, gamma, _both(realigning, _not(arrived))),
     )
 
 
 def step_with_details(
-    params: RPSParams, state: RPSState, observation: Observation
+    params: RPSParams,
+    state: RPSState,
+    observation: Observation,
+    temperatures: Temperatures | None = None,
 ) -> tuple[RPSState, Twist, Details]:
     """`step`, and the quantities behind its twist (those of the last contact without one)."""
     in_contact = jnp.asarray(observation.in_contact)
+    if temperatures is not None:
+        in_contact = in_contact.astype(state.l_th.dtype)
+    soft = temperatures or _HARD
     # Without contact the location means nothing; the last one keeps every branch finite.
-    contact = jnp.where(in_contact, observation.p_robot_contact, state.p_robot_contact)
-    l_th, push, details = _push(params, state.l_th, observation._replace(p_robot_contact=contact))
-    kept = state.touched & (jnp.asarray(params.keep_contact) > 0)
+    contact = _choose(in_contact, observation.p_robot_contact, state.p_robot_contact)
+    told = observation._replace(p_robot_contact=contact)
+    l_th, push, details = _push(params, state.l_th, told, temperatures)
+    kept = _both(state.touched, jnp.asarray(params.keep_contact) > 0)
     # A remembered contact near the target must not stop the robot: only a felt one arrives.
-    pushing = in_contact | (kept & (details.distance >= params.d_success))
-    ahead = Twist(jnp.where(state.touched, params.v_lost, params.v_approach), 0.0, 0.0)
-    twist = jax.tree.map(lambda a, b: jnp.where(pushing, a, b), push, ahead)
+    away = _above(details.distance, params.d_success, soft.arrive, operator.ge)
+    pushing = _either(in_contact, _both(kept, away))
+    ahead = Twist(_choose(state.touched, params.v_lost, params.v_approach), 0.0, 0.0)
+    twist = jax.tree.map(lambda a, b: _choose(pushing, a, b), push, ahead)
     state = RPSState(
-        l_th=jnp.where(pushing, l_th, state.l_th),
+        l_th=_choose(pushing, l_th, state.l_th),
         p_robot_contact=contact,
-        touched=state.touched | in_contact,
+        touched=_either(state.touched, in_contact),
     )
-    return state, twist, details._replace(realigning=details.realigning & pushing)
+    return state, twist, details._replace(realigning=_both(details.realigning, pushing))
 
 
 @jax.jit
-def step(params: RPSParams, state: RPSState, observation: Observation) -> tuple[RPSState, Twist]:
+def step(
+    params: RPSParams,
+    state: RPSState,
+    observation: Observation,
+    temperatures: Temperatures | None = None,
+) -> tuple[RPSState, Twist]:
     """Algorithm 1: one control step of RPS (or NPS, by `params.reactive`).
 
     In contact: the saturated twist of Eqs. 1-9, or zero once ||d|| < d_success. Without contact:
     straight ahead, at v_approach before the first touch and at v_lost after a loss, l_th
     unchanged; with `keep_contact`, a loss is ignored and the last contact acted upon.
     Algorithm 1's last line prints v_x twice; (v_x, v_y, omega) is meant.
+
+    With `temperatures` the smooth law: l_th moves continuously between l_mr and l_cr, a_r and the
+    turning speed between their values in and out of the Realignment State, and the contact's
+    weight mixes pushing with going straight ahead, and the contact felt with the last one (so
+    `p_robot_contact` must be finite, and the state from `RPSState.init(params, temperatures)`).
+    The speed stays v* split by the slope a_r. The 0-or-1 parameters switch as ever, and bounds
+    (saturation, gamma_max, sigma) stay as they are: they have kinks, but no jumps. One jump is
+    left: at a heading error of exactly pi the robot chooses a side.
     """
-    state, twist, _ = step_with_details(params, state, observation)
+    state, twist, _ = step_with_details(params, state, observation, temperatures)
     return state, twist

@@ -8,6 +8,8 @@ contact are its first and last along this strip.
 
     sensor.init(key) -> state
     sensor.sense(state, footprint, period) -> (state, Reading)
+
+`SmoothSkin` makes either sensor smooth: a reading tells how much contact there is, from 0 to 1.
 """
 
 from __future__ import annotations
@@ -27,6 +29,10 @@ HALF_WIDTH = 0.29  # [m] of the base: l_cr + 5 cm, Sec. III-A
 BOARDS = {"left": 5, "front": 4, "right": 5}  # 14 boards, Sec. II-B
 ELECTRODES = 3  # on each board
 _SAMPLES = 5  # of each taxel, about 1 cm apart: a corner pressed home is felt
+
+_NODES = 16  # points on each face of the smooth ideal sensor
+_REACH = 8.0  # [1] temperatures beyond its tolerance at which they end, with 3e-4 of the weight
+_NEVER = -1e9  # of a dead taxel: its excess over the threshold, in temperatures
 
 NONE, POINT, LINE = 0, 1, 2  # contact types, Fig. 6c
 
@@ -61,6 +67,14 @@ class Reading(NamedTuple):
         return self.contact_type != NONE
 
 
+class SmoothReading(NamedTuple):
+    """What a smooth skin tells: a `Reading` whose contact is a weight."""
+
+    contact_type: jax.Array  # () int32: NONE up to a weight of 1/2, beyond it POINT or LINE
+    p_robot_contact: jax.Array  # (2,) [m] contact location in the robot frame, at any weight
+    in_contact: jax.Array  # () [1] weight of the contact, from 0 to 1
+
+
 class Skin(Protocol):
     """A tactile sensor: a pytree of parameters with two pure functions."""
 
@@ -79,7 +93,7 @@ class Skin(Protocol):
 
     def sense(
         self, state: SkinState, footprint: Footprint, period: float
-    ) -> tuple[SkinState, Reading]:
+    ) -> tuple[SkinState, Reading | SmoothReading]:
         """One reading of a footprint placed in the robot frame, `period` [s] after the last."""
         ...
 
@@ -139,6 +153,48 @@ class IdealSkin(NamedTuple):
         kind = jnp.where(last[2] - first[2] > self.point_length, LINE, POINT)
         return state, _reading(jnp.where(jnp.any(hits), kind, NONE), first[:2], last[:2])
 
+    def sense_smoothly(
+        self, state: SkinState, footprint: Footprint, period: float, temperature: Any
+    ) -> tuple[SkinState, SmoothReading]:
+        """The reading if a point at signed distance x is active by its excess, tolerance - x.
+
+        Active is sigmoid(excess / temperature [m]). The contact is one run along the strip, so
+        its mean is the middle of its two ends and its total activity their distance, also around
+        a corner. The points lie where `footprint.crossing` finds a face near enough, and so move
+        with the object: a few suffice, and as the temperature falls their reading tends to that
+        of `sense`.
+        """
+        del period
+        s, share = self._nodes(footprint, self.tolerance + _REACH * temperature)
+        distance = fp.signed_distance(footprint, on_strip(s, self.half_length))
+        excess = (self.tolerance - distance) / temperature
+        # A softmax: defined where nothing is near too, by whatever is nearest.
+        middle = jnp.sum(s * jax.nn.softmax(jax.nn.log_sigmoid(excess) + jnp.log(share)))
+        length = jnp.sum(share * jax.nn.sigmoid(excess))
+        first, last = on_strip(middle + length * jnp.array([-0.5, 0.5], s.dtype), self.half_length)
+        kind = jnp.where(length > self.point_length, LINE, POINT)
+        return state, _smooth_reading(jnp.max(excess), kind, first, last)
+
+    def _nodes(self, footprint: Footprint, tolerance: Any) -> tuple[jax.Array, jax.Array]:
+        """Points (N,) [m] of the strip within `tolerance` of a footprint, the length of each.
+
+        Of a face that lies beyond it, points all along.
+        """
+        middles = (np.arange(_NODES) + 0.5) / _NODES
+        nodes, shares, strip_start = [], [], 0.0
+        for face in faces(self.half_length).values():
+            dtype = footprint.vertices.dtype
+            start, along = jnp.asarray(face.start, dtype), jnp.asarray(face.along, dtype)
+            low, high = fp.crossing(footprint, start, along, tolerance)
+            near = (low <= high) & (high >= 0) & (low <= face.length)
+            low = jnp.where(near, jnp.clip(low, 0.0, face.length), 0.0)
+            high = jnp.where(near, jnp.clip(high, 0.0, face.length), face.length)
+            nodes.append(strip_start + low + (high - low) * middles)
+            share = jnp.maximum(high - low, 1e-6) / _NODES  # not zero: its logarithm is taken
+            shares.append(jnp.broadcast_to(share, _NODES))
+            strip_start += face.length
+        return jnp.concatenate(nodes), jnp.concatenate(shares)
+
 
 class CapacitiveSkin(NamedTuple):
     """42 taxels under foam: compression -> capacitance -> low-pass -> threshold (Sec. II-B).
@@ -180,21 +236,74 @@ class CapacitiveSkin(NamedTuple):
         depth = self.foam - fp.signed_distance(footprint, samples)
         return jnp.clip(depth, 0.0, self.max_compression * self.foam)
 
-    def sense(
-        self, state: SkinState, footprint: Footprint, period: float
-    ) -> tuple[SkinState, Reading]:
-        """One scan of all taxels, filtered and compared to the threshold."""
+    def scan(self, state: SkinState, footprint: Footprint, period: float) -> SkinState:
+        """The signals of all taxels after one more scan, filtered."""
         gap = self.foam - self.compression(footprint)
         change = jnp.mean(self.foam / gap, axis=-1) - 1.0
         key, key_noise = jax.random.split(state.key)
         noise = self.noise * jax.random.normal(key_noise, change.shape, change.dtype)
         raw = state.gain * change + noise
         signal = state.signal + (1 - jnp.exp(-period / self.time_constant)) * (raw - state.signal)
-        active = (signal > self.threshold) & state.alive
-        middles = jnp.asarray(taxels(1, self.half_length)[:, 0], change.dtype)
+        return state._replace(key=key, signal=signal)
+
+    def sense(
+        self, state: SkinState, footprint: Footprint, period: float
+    ) -> tuple[SkinState, Reading]:
+        """One scan of all taxels, filtered and compared to the threshold."""
+        state = self.scan(state, footprint, period)
+        active = (state.signal > self.threshold) & state.alive
+        middles = jnp.asarray(taxels(1, self.half_length)[:, 0], state.signal.dtype)
         first, last = _extremes(active, middles)
         kind = jnp.minimum(jnp.sum(active), LINE)
-        return state._replace(key=key, signal=signal), _reading(kind, first, last)
+        return state, _reading(kind, first, last)
+
+    def sense_smoothly(
+        self, state: SkinState, footprint: Footprint, period: float, temperature: Any
+    ) -> tuple[SkinState, SmoothReading]:
+        """The reading if a taxel is active by its excess, signal - threshold.
+
+        Active is sigmoid(excess / temperature [1]). As if each were so with that probability, the
+        two ends are the means of the first and of the last active taxel. As the temperature falls
+        they tend to those of `sense`, also where dead taxels interrupt a contact.
+        """
+        state = self.scan(state, footprint, period)
+        excess = jnp.where(state.alive, (state.signal - self.threshold) / temperature, _NEVER)
+        middles = jnp.asarray(taxels(1, self.half_length)[:, 0], excess.dtype)
+        first, last = _first(excess) @ middles, _first(excess[::-1]) @ middles[::-1]
+        kind = jnp.clip(jnp.sum(excess > 0), POINT, LINE)
+        return state, _smooth_reading(jnp.max(excess), kind, first, last)
+
+
+class SmoothSkin(NamedTuple):
+    """A sensor whose threshold is soft. As the temperature goes to zero it tends to the sensor.
+
+    The temperature is of the threshold's unit: [m] of an ideal sensor; [1], a relative change of
+    capacitance, of a capacitive one, where 0.03 is a good value. It must be well below the
+    threshold itself, or the skin feels what is not there.
+    """
+
+    sensor: IdealSkin | CapacitiveSkin = IdealSkin()
+    temperature: float | jax.Array = 0.001
+
+    @property
+    def half_length(self) -> float | jax.Array:
+        """Of the base that it covers [m]."""
+        return self.sensor.half_length
+
+    def check(self) -> None:
+        """Raises InputError for a sensor or a temperature that means nothing."""
+        self.sensor.check()
+        errors.check_finite("skin temperature", self.temperature, above=0, at_most=1)
+
+    def init(self, key: jax.Array) -> SkinState:
+        """As of the sensor."""
+        return self.sensor.init(key)
+
+    def sense(
+        self, state: SkinState, footprint: Footprint, period: float
+    ) -> tuple[SkinState, SmoothReading]:
+        """A smooth reading, by the rule of the sensor."""
+        return self.sensor.sense_smoothly(state, footprint, period, self.temperature)
 
 
 # "thin" chatters between the corners of a box, as a rigid contact sensor does.
@@ -220,6 +329,26 @@ def taxels(samples: int = 1, half_length: Any = HALF_LENGTH) -> jax.Array:
     return jnp.concatenate(rows)
 
 
+def on_strip(s: jax.Array, half_length: Any = HALF_LENGTH) -> jax.Array:
+    """Points (..., 2) [m] of the strip in the robot frame, `s` (...) [m] from its start."""
+    x = jnp.asarray(half_length, s.dtype)
+    corners = jnp.cumsum(jnp.stack([0 * x, 2 * x, jnp.full_like(x, 2 * HALF_WIDTH), 2 * x]))
+    at_x = jnp.interp(s, corners, jnp.stack([-x, x, x, -x]))
+    y = HALF_WIDTH * np.array([1.0, 1.0, -1.0, -1.0])
+    return jnp.stack([at_x, jnp.interp(s, corners, jnp.asarray(y, s.dtype))], axis=-1)
+
+
+def _first(excess: jax.Array) -> jax.Array:
+    """Probability (n,) of each to be the first active one, given that there is one.
+
+    Each is active with the probability sigmoid(excess), independently.
+    """
+    none_before = -jnp.cumsum(jax.nn.softplus(excess))[:-1]
+    return jax.nn.softmax(
+        jax.nn.log_sigmoid(excess) + jnp.concatenate([jnp.zeros_like(excess[:1]), none_before])
+    )
+
+
 def _extremes(active: jax.Array, values: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The rows of `values` (n, m) at the first and the last True of `active` (n,)."""
     first = jnp.argmax(active)
@@ -231,3 +360,12 @@ def _reading(kind: jax.Array, first: jax.Array, last: jax.Array) -> Reading:
     """Sec. II-B: one position is the location itself, several give the mean of the extremes."""
     location = jnp.where(kind == NONE, 0.0, 0.5 * (first + last))
     return Reading(kind.astype(jnp.int32), location)
+
+
+def _smooth_reading(
+    excess: jax.Array, kind: jax.Array, first: jax.Array, last: jax.Array
+) -> SmoothReading:
+    """As much contact as where there is most: so it is 1/2 at the threshold at any temperature."""
+    in_contact = jax.nn.sigmoid(excess)
+    kind = jnp.where(excess > 0, kind, NONE)
+    return SmoothReading(kind.astype(jnp.int32), 0.5 * (first + last), in_contact)

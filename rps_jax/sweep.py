@@ -140,9 +140,9 @@ def build(
     return stage, world
 
 
-def kind(case: Case) -> tuple[str, type, type]:
+def kind(case: Case) -> Hashable:
     """What decides which compiled program runs a case: family, strategy and sensor."""
-    return scene.FAMILIES[case.object], type(case.params), type(case.skin)
+    return scene.FAMILIES[case.object], type(case.params), jax.tree.structure(case.skin)
 
 
 def _by_kind(cases: Sequence[Case]) -> list[list[int]]:

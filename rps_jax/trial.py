@@ -7,6 +7,7 @@ is frozen, and a batch whose worlds have all ended stops.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -19,10 +20,10 @@ from rps_jax import baselines, errors, frames, fused, law, scene
 from rps_jax import footprint as fp
 from rps_jax.baselines import APSParams, APSState, TrackedObservation
 from rps_jax.footprint import Footprint
-from rps_jax.law import Details, Observation, RPSParams, RPSState, Twist
+from rps_jax.law import Details, Observation, RPSParams, RPSState, Temperatures, Twist
 from rps_jax.physics import Physics
 from rps_jax.scene import JOINTS, mjx
-from rps_jax.skin import Reading, Skin, SkinState
+from rps_jax.skin import NONE, Reading, Skin, SkinState, SmoothReading
 
 # A world is a runaway beyond these, far outside anything a base at 0.05 m/s can cause.
 _MAX_SPEED = 20.0  # [m/s], [rad/s]
@@ -36,12 +37,31 @@ class Strategy(NamedTuple):
     init: Callable[[Any], Any]  # params -> state
     step: Callable[[Any, Any, Any], tuple[Any, Twist, Details]]  # params, state, observation
     tracks: bool = False  # observes a TrackedObservation: the object's place as well
+    smooth: bool = False  # is told the weight of a contact; others whether there is one
 
 
 Params = RPSParams | APSParams
 RPS = Strategy(RPSState.init, law.step_with_details)  # and NPS, by `params.reactive`
 APS = Strategy(APSState.init, baselines.aps_step, tracks=True)
 STRATEGIES: dict[type, Strategy] = {RPSParams: RPS, APSParams: APS}  # by their parameters
+
+
+@functools.cache  # equal temperatures are one strategy, and so one compiled program
+def smooth_rps(temperatures: Temperatures = Temperatures()) -> Strategy:
+    """RPS by the smooth law, for the derivatives of what it does.
+
+    Outcomes are judged as ever. With a `SmoothSkin` all that leads from the parameters to a
+    snapshot's twist is smooth, and what it saw of the contact, in `reading` and `details`.
+
+    Raises:
+      InputError: a temperature is not a positive length.
+    """
+    temperatures.check()
+    return Strategy(
+        partial(RPSState.init, temperatures=temperatures),
+        partial(law.step_with_details, temperatures=temperatures),
+        smooth=True,
+    )
 
 
 class Rules(NamedTuple):
@@ -117,7 +137,7 @@ class Snapshot(NamedTuple):
 
     time: jax.Array  # () [s]
     qpos: jax.Array  # (10,)
-    reading: Reading
+    reading: Reading | SmoothReading
     twist: Twist  # [m/s, m/s, rad/s] commanded, robot frame
     details: Details
     done: jax.Array  # () bool: the trial had ended
@@ -145,7 +165,7 @@ def object_pose(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
 def p_world_contact(seen: Snapshot) -> jax.Array:
     """Contact points of snapshots (T, ...) in the world, (T, 2) [m]; NaN without contact."""
     point = seen.qpos[:, :2] + frames.rotate(seen.qpos[:, 2], seen.reading.p_robot_contact)
-    return jnp.where(seen.reading.in_contact[:, None], point, jnp.nan)
+    return jnp.where((seen.reading.contact_type != NONE)[:, None], point, jnp.nan)
 
 
 Driven = tuple[jax.Array, jax.Array, jax.Array]  # qpos, qvel, warmstart of a batch
@@ -182,7 +202,9 @@ def _shifted(world: World, trial: Trial, period: float) -> Trial:
     return trial._replace(qpos=trial.qpos.at[x : x + 2].add(jnp.where(now, by, 0.0)))
 
 
-def sense(world: World, trial: Trial, period: float) -> tuple[SkinState, Reading, Observation]:
+def sense(
+    world: World, trial: Trial, period: float
+) -> tuple[SkinState, Reading | SmoothReading, Observation]:
     """The skin's reading of the object where it stands now, and what the law is told."""
     p_world_robot, yaw = trial.qpos[:2], trial.qpos[2]
     p_world_object, object_yaw = object_pose(trial.qpos)
@@ -279,6 +301,9 @@ def decide(
     time = trial.steps * period
     trial = _shifted(world, trial, period)
     skin, reading, observation = sense(world, trial, period)
+    touch = reading.contact_type != NONE
+    if not strategy.smooth:
+        observation = observation._replace(in_contact=touch)
     distance = frames.norm(law.displacement(observation))
     poses, believed = _believed(world, trial, period)
     seen: Any = observation._replace(p_world_robot=believed[:2], yaw=believed[2])
@@ -290,7 +315,6 @@ def decide(
     snapshot = Snapshot(time, trial.qpos, reading, twist, details, trial.done)
     twists, twist = _executed(world, trial, twist, period)
 
-    touch = reading.in_contact
     lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
     success = touch & (distance < world.params.d_success)
     over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost)

@@ -1,0 +1,587 @@
+"""The smooth law and the smooth skin: what they keep of the hard ones, and what they tend to."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import chex
+import hypothesis
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+from jax.flatten_util import ravel_pytree
+
+from rps_jax import errors, law, reference, sweep, trial
+from rps_jax import footprint as fp
+from rps_jax.footprint import Footprint
+from rps_jax.law import Observation, RPSParams, RPSState, Temperatures
+from rps_jax.scene import FRICTION
+from rps_jax.skin import HALF_LENGTH, HALF_WIDTH, NONE, CapacitiveSkin, IdealSkin, SmoothSkin
+from rps_jax.slots import Setting
+from rps_jax.sweep import Case
+from rps_jax.trial import Rules
+
+PAPER = RPSParams.paper()
+WARM = Temperatures()
+COLD = Temperatures(1e-6, 1e-6, 1e-6, 1e-6)
+FRONT, SIDE = HALF_LENGTH, HALF_WIDTH  # [m] the front face is x = FRONT, the sides y = +-SIDE
+WORLDS = 256
+
+property_test = hypothesis.settings(max_examples=30, deadline=None)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def times(factor: float, temperatures: Temperatures = WARM) -> Temperatures:
+    return Temperatures(*(factor * value for value in temperatures))
+
+
+# The law
+
+
+def observe(d, l=0.0, in_contact=1.0) -> Observation:  # noqa: E741
+    """A robot at the origin, its contact at lateral location `l` and `d` from the target."""
+    target = jnp.asarray((FRONT + d[0], l + d[1]), float)
+    contact = jnp.asarray((FRONT, l), float)
+    return Observation(jnp.zeros(2), jnp.zeros(()), contact, jnp.asarray(in_contact, float), target)
+
+
+def state_with(l_th: float = 0.24, touched: float = 1.0) -> RPSState:
+    first = RPSState.init(PAPER, WARM)
+    return first._replace(l_th=first.l_th * 0 + l_th, touched=first.touched + touched)
+
+
+@jax.jit
+def one_step(state, observation):
+    return law.step_with_details(PAPER, state, observation, WARM)
+
+
+def random_worlds(seed: int, dtype=np.float32):
+    """Plausible (params, state, observation), batched; contacts are 0 or 1, or in between."""
+    rng = np.random.default_rng(seed)
+    n = WORLDS
+    factor = rng.uniform(0.7, 1.3, (len(PAPER), n))
+    params = RPSParams(*(value * f for value, f in zip(PAPER, factor, strict=True)))
+    params = params._replace(
+        zeta=rng.uniform(0, 1, n),
+        gamma_max=rng.uniform(1.0, 1.56, n),
+        reactive=np.resize([1.0, 0.0, 1.0], n),
+        keep_contact=rng.choice([0.0, 1.0], n),
+        sgn_0=np.zeros(n),
+    )
+    contact = np.stack([np.full(n, FRONT), rng.uniform(-SIDE, SIDE, n)], -1)
+    last = np.stack([np.full(n, FRONT), rng.uniform(-SIDE, SIDE, n)], -1)
+    state = RPSState(rng.uniform(0.15, 0.24, n), last, rng.choice([0.0, 1.0], n))
+    observation = Observation(
+        rng.uniform(-2, 2, (n, 2)),
+        rng.uniform(-math.pi, math.pi, n),
+        contact,
+        rng.choice([0.0, 1.0], n, p=[0.2, 0.8]),
+        rng.uniform(-2, 2, (n, 2)),
+    )
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype), (params, state, observation))
+
+
+@jax.jit
+def hard(params, state, observation):
+    state = state._replace(touched=state.touched > 0.5)
+    observation = observation._replace(in_contact=observation.in_contact > 0.5)
+    return jax.vmap(law.step_with_details)(params, state, observation)
+
+
+@jax.jit
+def smooth(params, state, observation, temperatures):
+    one = jax.vmap(law.step_with_details, in_axes=(0, 0, 0, None))
+    return one(params, state, observation, temperatures)
+
+
+def clear(params, state, observation, details, margin: float) -> np.ndarray:
+    """Where (n,) no switch is nearer to its surface than `margin` [m]."""
+    l, distance = np.abs(details.l), details.distance  # noqa: E741
+    near = [l - state.l_th, l, distance - params.d_th, distance - params.d_success]
+    return np.min(np.abs(near), axis=0) > margin
+
+
+def numbers(results) -> np.ndarray:
+    """(n, ...) of all that a step returns, bools as 0 and 1."""
+    leaves = [np.asarray(x, float).reshape(WORLDS, -1) for x in jax.tree.leaves(results)]
+    return np.concatenate(leaves, axis=1)
+
+
+@property_test
+@hypothesis.given(seeds)
+def test_without_heat_the_smooth_law_is_the_law_away_from_its_switches(seed):
+    worlds = random_worlds(seed)
+    exact, cold = hard(*worlds), smooth(*worlds, COLD)
+    sure = clear(*worlds, exact[2], 1e-4)
+    assert sure.mean() > 0.9
+    np.testing.assert_allclose(numbers(cold)[sure], numbers(exact)[sure], rtol=1e-4, atol=1e-5)
+
+
+@property_test
+@hypothesis.given(seeds)
+def test_each_switch_comes_the_nearer_to_the_laws_the_colder_it_is(seed):
+    params, state, observation = random_worlds(seed)
+    params = params._replace(zeta=0 * params.zeta, k=0 * params.k)  # a_r is eta / 2, but for them
+    observation = observation._replace(in_contact=jnp.ones(WORLDS))
+    worlds = (params, state, observation)
+    exact = hard(*worlds)[2]
+    for name, value in WARM._asdict().items():
+        gaps = []
+        for factor in (1.0, 0.3, 0.1):
+            warmer = smooth(*worlds, COLD._replace(**{name: factor * value}))[2]
+            gaps.append(
+                np.abs(warmer.a_r - exact.a_r) + np.abs(warmer.realigning - exact.realigning)
+            )
+        assert (gaps[1] <= gaps[0] + 1e-4).all(), name
+        assert (gaps[2] <= gaps[1] + 1e-4).all(), name
+
+
+@property_test
+@hypothesis.given(seeds)
+def test_the_whole_law_comes_nearer_as_all_temperatures_fall(seed):
+    worlds = random_worlds(seed)
+    exact = numbers(hard(*worlds)[:2])
+    gaps = [
+        np.abs(numbers(smooth(*worlds, times(factor))[:2]) - exact).mean()
+        for factor in (4.0, 1.0, 0.25, 0.06, 0.015)
+    ]
+    assert (np.diff(gaps) < 0).all()
+    assert gaps[-1] < 0.1 * gaps[0]
+
+
+def test_on_its_surface_a_switch_is_half_on():
+    at_d_th, beyond = (
+        law.adaptive_rate(PAPER, jnp.float32(0.12), jnp.float32(d), WARM) for d in (0.5, 9.0)
+    )
+    assert at_d_th == pytest.approx(2.5, rel=1e-4)  # eta / 2 / 2
+    assert beyond == pytest.approx(5.0, rel=1e-4)
+    assert one_step(state_with(0.2), observe((1.0, 0.0), l=0.2))[2].realigning == pytest.approx(0.5)
+    # At d_success, half of K_v d_success.
+    _, twist, _ = one_step(state_with(), observe((0.05, 0.0)))
+    assert twist.v_x == pytest.approx(0.0025, rel=1e-4)
+
+
+def test_the_dynamic_threshold_lies_between_its_two_values_by_the_weight_of_the_realignment():
+    # |l| is one temperature beyond l_th: 1 / (1 + 1/e) = 0.7310586 of l_mr, the rest of l_cr.
+    state, _, details = one_step(state_with(0.2), observe((1.0, 0.0), l=-0.21))
+    assert details.realigning == pytest.approx(0.7310586, rel=1e-4)
+    assert state.l_th == pytest.approx(0.7310586 * 0.15 + 0.2689414 * 0.24, rel=1e-4)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_the_realignment_state_keeps_its_memory(side):
+    """Between l_mr and l_cr the law realigns only on the way in, as the hard law does."""
+    out, into = np.linspace(0.0, 0.29, 300), np.linspace(0.29, 0.0, 300)
+
+    def one(state, l):  # noqa: E741
+        contact = jnp.stack([jnp.float32(FRONT), side * l])
+        seen = observe((1.0, 0.3))._replace(p_robot_contact=contact)
+        state, _, details = law.step_with_details(PAPER, state, seen, WARM)
+        return state, details.realigning
+
+    _, weight = jax.jit(lambda ls: jax.lax.scan(one, state_with(), ls))(
+        jnp.asarray(np.concatenate([out, into]), jnp.float32)
+    )
+    going, coming = np.asarray(weight[:300]), np.asarray(weight[300:])[::-1]
+    middle = out.searchsorted(0.195)
+    assert going[middle] < 0.1
+    assert coming[middle] > 0.9
+    for way in (going, coming):
+        assert (np.diff(way) > -1e-6).all()
+        assert way[0] < 1e-3
+        assert way[-1] > 0.99
+
+
+def test_sgn_has_the_derivative_of_a_hyperbolic_tangent_where_the_law_has_none():
+    # Beside l = 0, a_r = 10 / (1 + e^7.2) tanh(l / 0.01) and e^7.2 = 1339.43: 0.746 per metre.
+    slope = jax.jit(jax.grad(law.adaptive_rate, argnums=1))
+    assert slope(PAPER, 0.0, 1.0, WARM) == pytest.approx(0.746027, rel=1e-3)
+    # v* = 0.1 is scaled to 0.05, and v_y = 0.05 a_r for a small a_r.
+    x, _ = ravel_pytree((PAPER, state_with(), observe((1.0, 0.0)), WARM))
+    of_v_y = unravel(reverse(np.tile(x, (WORLDS, 1)))[0, 1])
+    assert of_v_y[2].p_robot_contact[1] == pytest.approx(0.05 * 0.746027, rel=1e-3)
+
+
+@property_test
+@hypothesis.given(seeds)
+def test_the_smooth_speed_is_still_v_star_split_by_the_slope(seed):
+    params, state, observation = random_worlds(seed)
+    params = params._replace(v_max=0 * params.v_max + 1e3, clip_each=0 * params.clip_each)
+    observation = observation._replace(in_contact=jnp.ones(WORLDS))
+    _, twist, details = smooth(params, state, observation, WARM)
+    away = details.distance > 0.12
+    speed = np.hypot(twist.v_x, twist.v_y)
+    np.testing.assert_allclose(speed[away], (params.K_v * details.distance)[away], rtol=1e-4)
+    np.testing.assert_allclose(
+        twist.v_y[away], (details.a_r * twist.v_x)[away], rtol=1e-3, atol=1e-6
+    )
+
+
+def test_the_weight_of_a_contact_mixes_pushing_with_going_ahead_and_the_contact_with_the_last():
+    before = state_with()._replace(p_robot_contact=jnp.array([FRONT, -0.10]))
+    seen = observe((2.0, 0.0), l=0.10, in_contact=0.25)
+    state, twist, details = one_step(before, seen)
+    assert details.l == pytest.approx(0.25 * 0.10 - 0.75 * 0.10)
+    felt = seen._replace(p_robot_contact=jnp.array([FRONT, -0.05]), in_contact=jnp.ones(()))
+    pushed, push, _ = one_step(before, felt)
+    expected = 0.25 * np.stack(push) + 0.75 * np.array([0.01, 0.0, 0.0])
+    np.testing.assert_allclose(np.stack(twist), expected, rtol=1e-5)
+    np.testing.assert_allclose(state.l_th, 0.25 * pushed.l_th + 0.75 * before.l_th, rtol=1e-5)
+    assert state.touched == 1.0
+
+
+def test_what_was_touched_most_is_remembered():
+    state = RPSState.init(PAPER, WARM)
+    for weight in (0.2, 0.7, 0.1):
+        state, _, _ = one_step(state, observe((1.0, 0.0), in_contact=weight))
+    assert state.touched == pytest.approx(0.7)
+
+
+@property_test
+@hypothesis.given(seeds)
+def test_a_mirrored_world_gives_the_mirrored_smooth_twist(seed):
+    params, state, observation = random_worlds(seed)
+    flip = jnp.array([1.0, -1.0])
+    mirrored = observation._replace(
+        p_world_robot=observation.p_world_robot * flip,
+        yaw=-observation.yaw,
+        p_robot_contact=observation.p_robot_contact * flip,
+        p_world_target=observation.p_world_target * flip,
+    )
+    there = state._replace(p_robot_contact=state.p_robot_contact * flip)
+    after, twist, details = smooth(params, state, observation, WARM)
+    after_m, twist_m, details_m = smooth(params, there, mirrored, WARM)
+    behind = np.abs(np.abs(details.gamma) - params.gamma_max) < 1e-6  # at +-pi it chooses a side
+    np.testing.assert_allclose(after_m.l_th, after.l_th, rtol=1e-5)
+    np.testing.assert_allclose(details_m.a_r, -details.a_r, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(twist_m.v_x, twist.v_x, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(twist_m.v_y, -twist.v_y, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(
+        np.asarray(twist_m.omega)[~behind], -np.asarray(twist.omega)[~behind], atol=2e-4
+    )
+
+
+_, unravel = ravel_pytree((PAPER, state_with(), observe((1.0, 0.0)), WARM))
+
+
+def after_one_step(x):
+    """The twist and the state (7,) of flattened parameters, state, observation, temperatures."""
+    state, twist, _ = law.step_with_details(*unravel(x))
+    return jnp.concatenate([jnp.stack(twist), ravel_pytree(state)[0]])
+
+
+batch_step = jax.jit(jax.vmap(after_one_step))
+forward = jax.jit(jax.vmap(jax.jacfwd(after_one_step)))
+reverse = jax.jit(jax.vmap(jax.jacrev(after_one_step)))
+
+
+def flatten(params, state, observation, temperatures) -> np.ndarray:
+    parts = [*params, *state, *observation, *(np.full(WORLDS, value) for value in temperatures)]
+    return np.concatenate([np.reshape(x, (WORLDS, -1)) for x in map(np.asarray, parts)], axis=1)
+
+
+def test_derivatives_are_finite_on_every_surface_and_at_every_singular_point():
+    points = [
+        (d, l)
+        for d in ((0.0, 0.0), (1e-30, 0.0), (0.05, 0.0), (0.5, 0.0), (-1.0, 0.0), (0.0, 1.0))
+        for l in (0.0, 0.12, 0.15, -0.24, 0.29, -1e6)  # noqa: E741
+    ]
+    rows = []
+    for weight in (0.0, 0.5, 1.0):
+        for d, l in points:  # noqa: E741
+            seen = observe(d, l, weight)
+            rows += [ravel_pytree((PAPER, state_with(0.15), seen, WARM))[0]]
+            rows += [ravel_pytree((PAPER, RPSState.init(PAPER, COLD), seen, COLD))[0]]
+    assert len(rows) <= WORLDS
+    x = np.resize(np.stack(rows), (WORLDS, rows[0].size)).astype(np.float32)
+    chex.assert_tree_all_finite(reverse(x))
+
+
+@property_test
+@hypothesis.given(seeds)
+def test_derivatives_are_finite_in_float32_whatever_the_temperature(seed):
+    worlds = random_worlds(seed)
+    for temperatures in (WARM, COLD):
+        chex.assert_tree_all_finite(reverse(flatten(*worlds, temperatures).astype(np.float32)))
+
+
+def test_derivatives_agree_with_finite_differences():
+    h = 1e-7
+    with jax.enable_x64(True):
+        params, state, observation = random_worlds(1, np.float64)
+        touched, weight = np.random.default_rng(2).uniform(0.05, 0.95, (2, WORLDS))
+        state = state._replace(touched=touched)
+        x = flatten(params, state, observation._replace(in_contact=weight), WARM)
+        derivatives = np.asarray(forward(x))
+        differences, bend = [], []
+        for e in h * np.eye(x.shape[1]):
+            up, here, down = (np.asarray(batch_step(x + a * e)) for a in (1, 0, -1))
+            differences.append((up - down) / (2 * h))
+            bend.append(np.abs(up - 2 * here + down) / h)
+    differences = np.stack(differences, -1)
+    scale = 1 + np.abs(differences)
+    kink = np.stack(bend, -1) > 1e-4 * scale
+    assert kink.mean() < 0.02  # of the bounds, and of the 0-or-1 parameters
+    assert (np.abs(differences - derivatives) / scale)[~kink].max() < 1e-4
+
+
+@pytest.mark.parametrize("x64", [False, True])
+def test_a_smooth_step_preserves_the_dtypes_of_the_state(x64):
+    with jax.enable_x64(x64):
+        before = RPSState.init(PAPER, WARM)
+        after, twist = law.step(PAPER, before, observe((1.0, 0.2), 0.1), WARM)
+        assert jax.tree.map(lambda x: x.dtype, after) == jax.tree.map(lambda x: x.dtype, before)
+        assert {x.dtype for x in twist} == {jnp.zeros(()).dtype}
+
+
+@pytest.mark.parametrize("name", Temperatures._fields)
+@pytest.mark.parametrize("value", [0.0, -0.01, math.nan, math.inf, "warm"])
+def test_a_temperature_that_is_no_positive_length_is_refused(name, value):
+    with pytest.raises(errors.InputError, match=f"temperature {name} = "):
+        trial.smooth_rps(WARM._replace(**{name: value}))
+
+
+# The skin
+
+SETTLED = 1e3  # [s] a period after which the low-pass filter has forgotten its past
+SHAPES = 128  # read at once
+IMPERFECT = CapacitiveSkin(gain_spread=0.2, dead_share=0.2)
+SENSORS = {"ideal": SmoothSkin(IdealSkin(), 1e-3), "capacitive": SmoothSkin(CapacitiveSkin(), 0.03)}
+both_sensors = pytest.mark.parametrize("skin", SENSORS.values(), ids=SENSORS)
+
+
+@jax.jit
+def sense_all(sensor, shapes: Footprint, key):
+    """Settled readings of a batch of footprints, each by a sensor of its own."""
+    keys = jax.random.split(key, SHAPES)
+    return jax.vmap(lambda k, shape: sensor.sense(sensor.init(k), shape, SETTLED)[1])(keys, shapes)
+
+
+def box(pose) -> Footprint:
+    """A box of half width 0.2 m at (x, y, yaw)."""
+    return fp.place(fp.rectangle(0.2, 0.2), pose[:2], pose[2])
+
+
+def read(skin, poses):
+    """Readings of boxes at up to 128 poses (n, 3)."""
+    n = len(poses)
+    shapes = jax.vmap(box)(jnp.asarray(np.resize(poses, (SHAPES, 3)), jnp.float32))
+    return jax.tree.map(lambda x: np.asarray(x)[:n], sense_all(skin, shapes, jax.random.key(0)))
+
+
+def flush(gap=0.0, y=0.0, yaw=0.0) -> tuple[float, float, float]:
+    return (FRONT + 0.2 + gap, y, yaw)
+
+
+@jax.jit
+@jax.vmap
+def place_before_the_front(shape: Footprint, yaw, y, gap) -> Footprint:
+    turned = fp.place(shape, jnp.zeros(2), yaw)
+    x = FRONT + gap + fp.extent(turned, jnp.array([-1.0, 0.0]))
+    return fp.place(turned, jnp.stack([x, y]), 0.0)
+
+
+def random_shapes(seed: int) -> Footprint:
+    """Boxes and circles near the front, any yaw, some flush, some around its corners."""
+    rng = np.random.default_rng(seed)
+    yaw = rng.choice([0.0, 1.0], SHAPES, p=[0.3, 0.7]) * rng.uniform(-4, 4, SHAPES)
+    where = (yaw, rng.uniform(-0.35, 0.35, SHAPES), rng.uniform(-0.001, 0.02, SHAPES))
+    half = rng.uniform(0.1, 0.35, (SHAPES, 1, 2))
+    corners = half * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+    round_ = rng.random(SHAPES) < 0.5  # of four corners that are one
+    shape = Footprint(
+        np.where(round_[:, None, None], 0.0, corners), np.where(round_, half[:, 0, 0], 0.0)
+    )
+    return place_before_the_front(*jax.tree.map(lambda x: x.astype(np.float32), (shape, *where)))
+
+
+LIMITS = [
+    # Sensor, a slightly duller and a slightly keener one: where these agree nothing is at an edge.
+    (IdealSkin(), *(IdealSkin(tolerance=0.006 + x) for x in (-5e-5, 5e-5))),
+    (IMPERFECT, *(IMPERFECT._replace(threshold=0.25 + x) for x in (1e-3, -1e-3))),
+]
+
+
+@pytest.mark.parametrize(("sensor", "dull", "keen"), LIMITS, ids=["ideal", "capacitive"])
+@property_test
+@hypothesis.given(seeds)
+def test_without_heat_the_smooth_skin_is_the_skin(sensor, dull, keen, seed):
+    """Also around corners, and with dead taxels within a contact."""
+    shapes, key = random_shapes(seed), jax.random.key(seed % 2**31)
+    exact, less, more = (sense_all(s, shapes, key) for s in (sensor, dull, keen))
+    cold = sense_all(SmoothSkin(sensor, 1e-6), shapes, key)
+    sure = np.asarray(less.in_contact == more.in_contact)
+    assert sure.mean() > 0.7
+    np.testing.assert_allclose(cold.in_contact[sure], exact.in_contact[sure], atol=1e-6)
+    assert ((cold.contact_type == NONE) == (exact.contact_type == NONE))[sure].all()
+    # Of a slanted edge the end moves by many times the change of tolerance.
+    moved = np.abs(less.p_robot_contact - more.p_robot_contact).max(axis=1)
+    felt = sure & np.asarray(exact.in_contact) & (moved < 1e-3)
+    assert felt.sum() > 8
+    np.testing.assert_allclose(cold.p_robot_contact[felt], exact.p_robot_contact[felt], atol=2e-4)
+
+
+@pytest.mark.parametrize("sensor", [IdealSkin(), IMPERFECT], ids=["ideal", "capacitive"])
+@property_test
+@hypothesis.given(seeds)
+def test_the_skin_comes_nearer_as_its_temperature_falls(sensor, seed):
+    warm = 0.03 if isinstance(sensor, CapacitiveSkin) else 1e-3
+    shapes, key = random_shapes(seed), jax.random.key(seed % 2**31)
+    exact = sense_all(sensor, shapes, key)
+    felt = np.asarray(exact.in_contact)
+    far, weight = [], []
+    for factor in (2.0, 0.5, 0.125):
+        got = sense_all(SmoothSkin(sensor, factor * warm), shapes, key)
+        far.append(np.abs(got.p_robot_contact - exact.p_robot_contact)[felt].mean())
+        weight.append(np.abs(got.in_contact - exact.in_contact).mean())
+    assert (np.diff(weight) < 0).all()
+    assert far[1] < far[0]
+    assert far[2] < 0.5 * far[0]
+
+
+@both_sensors
+def test_a_contact_grows_as_the_object_comes_nearer_and_is_half_at_the_threshold(skin):
+    # The ideal threshold is 6 mm; foam of 10 mm has 1.25 times its capacitance at 8 mm.
+    threshold = 0.006 if isinstance(skin.sensor, IdealSkin) else 0.008
+    gaps = np.append(np.linspace(0.03, -0.001, 63), threshold)
+    reading = read(skin, [flush(gap, 0.05) for gap in gaps])
+    weight = reading.in_contact[:-1]
+    assert (np.diff(weight) >= -1e-6).all()
+    assert weight[0] < 1e-3
+    assert weight[-1] > 0.99
+    assert reading.in_contact[-1] == pytest.approx(0.5, abs=0.01)
+    np.testing.assert_array_equal(reading.contact_type != NONE, reading.in_contact > 0.5)
+
+
+def differences(skin, poses, step, h: float) -> np.ndarray:
+    """Derivatives (n, 2) of contact locations as poses (n, 3) move along `step` (3,)."""
+    up, down = (np.asarray(poses) + side * h * np.asarray(step) for side in (1, -1))
+    places = read(skin, np.concatenate([up, down])).p_robot_contact
+    return (places[: len(up)] - places[len(up) :]) / (2 * h)
+
+
+def test_an_ideal_contact_moves_with_the_object():
+    """By as much as a flush box moves aside."""
+    poses = [flush(0.001, y) for y in np.linspace(-0.07, 0.07, 40)]
+    slopes = differences(SENSORS["ideal"], poses, (0, 1, 0), 1e-3)
+    np.testing.assert_allclose(slopes, np.tile([0.0, 1.0], (40, 1)), atol=5e-3)
+
+
+def test_a_flush_box_that_turns_moves_its_contact_at_once():
+    """Of a flush box the plain skin feels both corners, until one is beyond its tolerance."""
+    pose, step = [flush(0.004)], (0, 0, 1)
+    assert differences(IdealSkin(), pose, step, 1e-3)[0, 1] == pytest.approx(0.0, abs=0.05)
+    # Turned to the left its left end is the nearer one.
+    assert differences(SENSORS["ideal"], pose, step, 1e-3)[0, 1] > 0.5
+
+
+@both_sensors
+@property_test
+@hypothesis.given(seeds)
+def test_a_mirrored_object_gives_the_mirrored_smooth_reading(skin, seed):
+    shapes, key = random_shapes(seed), jax.random.key(0)
+    mirrored = shapes._replace(vertices=(shapes.vertices * jnp.array([1.0, -1.0]))[:, ::-1])
+    here, there = sense_all(skin, shapes, key), sense_all(skin, mirrored, key)
+    np.testing.assert_allclose(there.in_contact, here.in_contact, atol=1e-3)
+    flip = np.array([1, -1])
+    np.testing.assert_allclose(there.p_robot_contact, here.p_robot_contact * flip, atol=2e-3)
+
+
+POSES = [
+    *(flush(gap, 0.05) for gap in (-0.05, -0.001, 0.0, 0.006, 0.02, 0.3)),
+    (FRONT + 0.2 * math.sqrt(2), 0.0, math.pi / 4),
+    flush(0.0, SIDE + 0.2),  # corner to corner
+    (0.0, SIDE + 0.2, 0.0),
+    (-FRONT - 0.2, 0.0, 0.0),
+    (0.0, 0.0, 0.0),
+    (9.0, -9.0, 1.0),
+    flush(0.0016, 0.05, 0.003),
+    flush(0.04, -0.1, 0.2),
+]
+
+
+def numbers_read(pose, skin):
+    reading = skin.sense(skin.init(jax.random.key(0)), box(pose), SETTLED)[1]
+    return jnp.append(reading.p_robot_contact, reading.in_contact)
+
+
+read_and_slope = jax.jit(
+    jax.vmap(
+        lambda pose, skin: (numbers_read(pose, skin), jax.jacfwd(numbers_read)(pose, skin)),
+        in_axes=(0, None),
+    )
+)
+
+
+@both_sensors
+def test_the_derivatives_of_a_smooth_reading_are_finite_everywhere(skin):
+    for colder in (skin, skin._replace(temperature=1e-6)):
+        chex.assert_tree_all_finite(read_and_slope(np.array(POSES, np.float32), colder))
+
+
+@both_sensors
+def test_the_derivatives_of_a_smooth_reading_agree_with_finite_differences(skin):
+    poses = np.resize(np.array(POSES[-2:], np.float32), (len(POSES), 3))
+    slopes = np.asarray(read_and_slope(poses, skin)[1])[:2]
+    assert np.abs(slopes).max() > 0.1
+    for axis, step in enumerate(np.eye(3)):
+        found = differences(skin, poses[:2], step, 1e-4)
+        np.testing.assert_allclose(slopes[:, :2, axis], found, rtol=0.02, atol=0.02)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+def test_a_skin_that_is_not_warm_is_refused(value):
+    with pytest.raises(errors.InputError, match="temperature"):
+        SmoothSkin(temperature=value).check()
+    with pytest.raises(errors.InputError, match="tolerance"):
+        SmoothSkin(IdealSkin(tolerance=-1.0)).check()
+
+
+# Whole trials, stepped by C MuJoCo, which needs no compiling
+
+
+def push(case: Case, strategy, horizon: float):
+    """The trial of a case after `horizon` [s], or at its end."""
+    setting = Setting(engine="mujoco", rules=Rules(horizon=horizon))
+    models, worlds = sweep.build([case], setting)
+    seen = []
+
+    def report(ended, trials, simulated):
+        seen.append(trials)
+        return True
+
+    options = {"physics": setting.physics, "rules": setting.rules, "threads": 1}
+    reference.run(models, worlds, strategy=strategy, report=report, **options)
+    return jax.tree.map(lambda x: np.asarray(x)[0], seen[-1])
+
+
+@pytest.mark.parametrize("name", ["box", "cylinder"])
+def test_without_heat_a_smooth_trial_is_the_hard_one(name):
+    """From before the first touch, through a turn towards a target at the side."""
+    case = Case(name, FRICTION["S1"], (1.0, -1.5), gap=0.005)
+    cold = replace(case, skin=SmoothSkin(IdealSkin(), 1e-6))
+    exact = push(case, trial.RPS, 10.0)
+    got = push(cold, trial.smooth_rps(COLD), 10.0)
+    assert abs(exact.qpos[2]) > 0.2  # it turned
+    np.testing.assert_allclose(got.qpos, exact.qpos, atol=2e-3)
+    assert got.contact_steps == pytest.approx(exact.contact_steps, abs=1)
+    assert got.sum_abs_l == pytest.approx(exact.sum_abs_l, rel=0.02)
+    assert got.min_distance == pytest.approx(exact.min_distance, abs=2e-3)
+
+
+@pytest.mark.parametrize("strategy", [trial.RPS, trial.smooth_rps()], ids=["hard", "smooth"])
+def test_with_a_warm_skin_a_push_arrives(strategy):
+    """By either law: a hard one is told whether there is contact."""
+    case = Case("box", FRICTION["S1"], (0.7, 0.05), skin=SmoothSkin())
+    ended = push(case, strategy, 30.0)
+    assert ended.success
+    assert ended.min_distance < 0.05
+    assert ended.lost_steps == 0
+
+
+def test_equal_temperatures_are_one_strategy():
+    assert trial.smooth_rps(Temperatures()) is trial.smooth_rps(Temperatures(realign=0.01))
+    assert trial.smooth_rps(COLD) is not trial.smooth_rps()
