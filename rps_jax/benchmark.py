@@ -37,6 +37,7 @@ _MUJOCOS_OWN = Physics(
 BATCHED = {
     "fused standard": Setting(engine="fused"),
     "fused fast": Setting(engine="fused", physics=preset(fidelity="fast")),
+    "quasistatic": Setting(engine="quasistatic"),
     "mjx standard": Setting(),
     "mjx fast": Setting(physics=preset(fidelity="fast")),
     "mjx, MuJoCo's defaults": Setting(physics=_MUJOCOS_OWN),

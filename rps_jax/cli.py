@@ -66,7 +66,8 @@ class Common:
     fidelity: str = "standard"
     """How finely the physics is solved: reference, standard or fast."""
     engine: str = "mjx"
-    """mjx, fused (the same equations, specialised: much faster), or mujoco (C, on all cores)."""
+    """mjx, fused (the same equations, specialised: much faster), mujoco (C, on all cores), or
+    quasistatic (planar, no inertia: fastest, and differentiable)."""
     timestep: float | None = None
     """Physics step [s]; by default that of the physics."""
     control_period: float | None = None
@@ -190,7 +191,8 @@ class Sweep(Spread):
     fidelity: str = "standard"
     """How finely the physics is solved: reference, standard or fast."""
     engine: str = "mjx"
-    """mjx, fused (the same equations, specialised: much faster), or mujoco (C, on all cores)."""
+    """mjx, fused (the same equations, specialised: much faster), mujoco (C, on all cores), or
+    quasistatic (planar, no inertia: fastest, and differentiable)."""
     horizon: float = 300.0
     """Longest trial [s]."""
     seed: int = 0

@@ -186,10 +186,10 @@ def meetings(
     if not isinstance(body.vertices, Corners):
         z = jnp.where(_index(2, body.radius) == 0, low, high)
         centre = outline(body.vertices, z)
-        return z, *_circle_and_rectangle(centre, body.radius, body.base_half)
+        return z, *circle_and_rectangle(centre, body.radius, body.base_half)
     middle = 0.5 * (low + high)
     here, ahead = (outline(foot, middle) for foot in (body.vertices.at, body.vertices.ahead))
-    normal, points, distances = _polygon_and_rectangle(here, ahead, body.base_half)
+    normal, points, distances = polygon_and_rectangle(here, ahead, body.base_half)
     i = _index(4, middle + 0 * normal[0])
     first = i % 2 == 0
     z = jnp.where(i < 2, low, high)
@@ -198,7 +198,7 @@ def meetings(
     return z, normal, point, distance  # type: ignore[return-value]
 
 
-def _circle_and_rectangle(
+def circle_and_rectangle(
     centre: Point, radius: Any, half: Sequence[Any]
 ) -> tuple[Point, Point, Any]:
     """Normal, point and distance [m] of a circle outside a centred rectangle."""
@@ -212,7 +212,7 @@ def _circle_and_rectangle(
     return normal, point, distance
 
 
-def _polygon_and_rectangle(
+def polygon_and_rectangle(
     here: Point, ahead: Point, half: Sequence[Any]
 ) -> tuple[Point, list[Point], list[Any]]:
     """Normal from a centred rectangle to a convex polygon, and two points with distances [m].

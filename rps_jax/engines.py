@@ -12,14 +12,15 @@ from typing import Any, Literal, get_args
 import jax
 import numpy as np
 
-from rps_jax import fused, scene, solid
+from rps_jax import fused, quasistatic, scene, solid
 from rps_jax.contacts import Body
 from rps_jax.physics import Physics
+from rps_jax.quasistatic import Quasistatic
 from rps_jax.scene import JOINTS, OFF_CENTRE, Friction, Scene, mjx
 from rps_jax.solid import Solid
 from rps_jax.trial import Fused, Stage
 
-Engine = Literal["mjx", "fused", "mujoco"]
+Engine = Literal["mjx", "fused", "mujoco", "quasistatic"]
 ENGINES = get_args(Engine)
 
 
@@ -30,6 +31,11 @@ def stage_of_scenes(scenes: Sequence[Scene], engine: Engine) -> tuple[Any, Any]:
     if engine == "fused":
         bodies = [fused.body(s.physics, np.asarray(s.footprint.vertices)) for s in scenes]
         return Fused(), jax.tree.map(lambda *leaves: np.stack(leaves), *bodies)
+    if engine == "quasistatic":
+        solids = jax.tree.map(lambda *x: np.concatenate(x), *map(scene.solid_of, scenes))
+        friction = np.array([s.physics.pair("base_object").friction[0] for s in scenes])
+        half = np.array([s.physics.geom("base").size[:2] for s in scenes])
+        return Quasistatic(), quasistatic.sliders(solids, friction, half)
     model, fields = scene.stack([s.physics for s in scenes])
     return Stage(model, mjx.make_data(scenes[0].physics)), jax.device_get(fields)
 
@@ -51,6 +57,9 @@ def stage_of_solids(
         one = fused.body(known.physics, np.asarray(known.footprint.vertices))
         return Fused(), bodies(solids, friction, one)
     template = scene_of_solid(family, solids, friction, physics, 0)
+    if engine == "quasistatic":
+        half = template.physics.geom("base").size[:2]
+        return Quasistatic(), quasistatic.sliders(solids, friction.robot, half)
     stage, fields = stage_of_scenes([template], engine)
     return stage, mjx_fields(family, solids, friction, template, fields)
 

@@ -69,7 +69,12 @@ IN_FUSED = {
         _fused("fused, last contact kept on loss"), params={"keep_contact": 1.0}
     ),
 }
-CONDITIONS = IN_C | IN_MJX | IN_FUSED
+# Without inertia, in the plane.
+QUASISTATIC = {
+    "quasistatic": _condition("quasistatic", preset(), "quasi-static, 10 ms"),
+    "quasistatic_20ms": _condition("quasistatic", preset(), "quasi-static, 20 ms", timestep=0.02),
+}
+CONDITIONS = IN_C | IN_MJX | IN_FUSED | QUASISTATIC
 QUICK = (REFERENCE, "fused_standard", "fused_fast")
 
 

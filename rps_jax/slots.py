@@ -41,10 +41,15 @@ class Setting:
     engine: Engine = "mjx"
 
     def __post_init__(self) -> None:
-        """Raises InputError for rules, a seed or an engine that mean nothing."""
+        """Raises InputError for rules, a seed or an engine that mean nothing, or do together."""
         self.rules.check()
         errors.check_finite("seed", self.seed, at_least=0, at_most=2**32 - 1)
         errors.check_name("engine", self.engine, engines.ENGINES)
+        if self.engine == "quasistatic" and self.physics.cone != "elliptic":
+            raise errors.InputError(
+                f"cone = {self.physics.cone} is not allowed with the engine quasistatic: its "
+                "friction is the same in all directions, elliptic."
+            )
 
 
 @dataclass(frozen=True)
@@ -85,7 +90,7 @@ Collect = Callable[[np.ndarray, Outcome], Any]  # numbers (m,) of trials and the
 
 def default_slots(engine: Engine = "mjx") -> int:
     """Worlds stepped at once: few on a processor (small caches), many on an accelerator."""
-    if engine == "fused":
+    if engine in ("fused", "quasistatic"):
         return 64 if jax.default_backend() == "cpu" else 65536
     return 24 if jax.default_backend() == "cpu" else 8192
 

@@ -7,13 +7,15 @@ NumPy in double precision and lead with the number of solids, n.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from rps_jax import spatial
+from rps_jax import errors, spatial
 
+Support = Literal["feet", "even"]  # what bears a solid on the ground
 _LOAD_AT = 0.8  # of the way from the middle to the outline stands the load
+_CELLS = 8  # into which the evenly borne parts of an outline are split, along and across
 
 
 class Solid(NamedTuple):
@@ -123,6 +125,63 @@ def axes(solid: Solid) -> np.ndarray:
     w, x, y, z = solid.q_object_body.T
     rows = spatial.matrix((w, x, y, z))
     return np.stack([entry for row in rows for entry in row], axis=-1).reshape(-1, 3, 3)
+
+
+def friction_arm(solid: Solid, support: Support = "feet") -> np.ndarray:
+    """Arms m_max / f_max (n,) [m] of the ground's friction about the centres of mass.
+
+    That is the mean distance of the load from its centre. The load is what springs under `support`
+    bear that give way alike and only push: `feet`, points as engines stand solids on (the corners
+    of a prism, three points of a cylinder's rim, one where it leans to); `even`, all of the ground
+    that is covered.
+
+    Raises:
+      InputError: unknown support.
+    """
+    errors.check_name("support", support, get_args(Support))
+    at, share = _feet(solid) if support == "feet" else _bed(solid)
+    com = solid.p_object_com[:, :2]
+    rows = np.concatenate([np.ones((*share.shape, 1)), at - com[:, None]], axis=-1)
+    bears = np.ones(share.shape, bool)
+    load = share
+    for _ in range(at.shape[1]):
+        some = rows * (bears * share)[..., None]
+        # Pressure is linear in place; its sum is 1, its centre the centre of mass.
+        pressure = np.linalg.pinv(some.swapaxes(1, 2) @ rows)[..., :1]
+        load = (some @ pressure)[..., 0]
+        if not np.any(load < 0):
+            break
+        bears &= load >= 0
+    return np.sum(load * np.linalg.norm(rows[..., 1:], axis=-1), axis=1)
+
+
+def _feet(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, N, 2) [m] on which engines stand solids, and whether (n, N) each counts."""
+    at = solid.vertices
+    if at.shape[1] > 1:
+        return at, np.any(at != np.roll(at, 1, axis=1), axis=2).astype(float)
+    x, y, _ = solid.p_object_com.T
+    lean = np.arctan2(y, x)[:, None] + np.array([0, 2, 4]) * np.pi / 3
+    return _on_circle(solid.radius, lean), np.ones(lean.shape)
+
+
+def _bed(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, M, 2) [m] all over the outlines, and the area (n, M) [m^2] of each."""
+    vertices = solid.vertices
+    if vertices.shape[1] == 1:
+        angles = np.arange(8 * _CELLS) * np.pi / (4 * _CELLS)
+        vertices = _on_circle(solid.radius, np.tile(angles, (len(vertices), 1)))
+    cross, ahead = _triangles(vertices)
+    along, out = np.meshgrid(*[(np.arange(_CELLS) + 0.5) / _CELLS] * 2)
+    edge = vertices[:, :, None] + along.ravel()[:, None] * (ahead - vertices)[:, :, None]
+    at = out.ravel()[:, None] * edge
+    area = cross[:, :, None] * out.ravel() / _CELLS**2
+    return at.reshape(len(at), -1, 2), area.reshape(len(at), -1)
+
+
+def _on_circle(radius: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Points (n, M, 2) [m] at angles (n, M) [rad]."""
+    return radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def _triangles(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

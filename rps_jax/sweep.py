@@ -228,7 +228,9 @@ def follow(
 def check_followed(engine: str) -> None:
     """Raises InputError unless trials of this engine can be followed."""
     if engine == "mujoco":
-        raise errors.InputError("engine = mujoco is not allowed: follow a trial with mjx or fused.")
+        raise errors.InputError(
+            "engine = mujoco is not allowed: follow a trial with mjx, fused or quasistatic."
+        )
 
 
 def follow_part(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -169,6 +169,14 @@ def p_world_contact(seen: Snapshot) -> jax.Array:
 
 
 Driven = tuple[jax.Array, jax.Array, jax.Array]  # qpos, qvel, warmstart of a batch
+
+
+class Drives(Protocol):
+    """What all worlds of a batch share, and how their engine steps them."""
+
+    def drive(self, worlds: World, trials: Trial, twists: Twist, physics: Physics) -> Driven:
+        """Step a batch for one control period."""
+        ...
 
 
 def start(world: World, strategy: Strategy = RPS) -> Trial:
@@ -353,7 +361,7 @@ def settle(
 
 
 def control_step(
-    stage: Stage | Fused,
+    stage: Drives,
     worlds: World,
     trials: Trial,
     *,
@@ -402,7 +410,7 @@ _STATIC = ("physics", "strategy", "steps")
 
 @partial(jax.jit, static_argnames=_STATIC, donate_argnames=("trials",))
 def advance(
-    stage: Stage | Fused,
+    stage: Drives,
     worlds: World,
     trials: Trial,
     *,
@@ -427,7 +435,7 @@ def advance(
 
 @partial(jax.jit, static_argnames=(*_STATIC, "every"), donate_argnames=("trials",))
 def record(
-    stage: Stage | Fused,
+    stage: Drives,
     worlds: World,
     trials: Trial,
     *,

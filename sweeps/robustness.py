@@ -25,6 +25,7 @@ ENGINES = {
     "C, standard": Setting(preset(), engine="mujoco"),
     "fused, standard": Setting(preset(), engine="fused"),
     "fused, fast": Setting(preset(fidelity="fast"), engine="fused"),
+    "quasistatic": Setting(preset(), engine="quasistatic"),
     "MJX, standard": Setting(preset(), engine="mjx"),
 }
 

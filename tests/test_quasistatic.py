@@ -1,0 +1,571 @@
+"""The quasi-static model against motions and derivatives that are known by other means.
+
+The motions are those of a point that pushes a slider with an ellipsoidal limit surface (Lynch,
+Maekawa and Tanie 1992): what sticks moves with the base, what slides pushes along an edge of the
+friction cone. Unless said otherwise, in double precision.
+"""
+
+import functools
+import math
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import nnls
+
+from rps_jax import engines, frames, paper, scene, solid, sweep, trial
+from rps_jax import footprint as fp
+from rps_jax.errors import InputError
+from rps_jax.footprint import Footprint
+from rps_jax.law import RPSParams
+from rps_jax.physics import Physics, preset
+from rps_jax.quasistatic import Contact, Problem, Quasistatic, Slider, _divide, rollout
+from rps_jax.scene import FRICTION, OBJECTS
+from rps_jax.slots import Setting
+from rps_jax.solid import Solid
+from rps_jax.sweep import Case
+from rps_jax.trial import Twist
+
+FRONT, SIDE = 0.3625, 0.29  # [m] half length and width of the base
+HALF, RADIUS = 0.20, 0.25  # [m] half a side of the box; of the cylinder
+ARM = {"box": HALF * math.sqrt(2), "cylinder": RADIUS}  # [m] c of the paper's objects
+STEPS, PERIOD = 100, 0.02  # control steps of every film, and their length [s]
+
+
+class Push(NamedTuple):
+    """An object before the base, which moves at a constant twist."""
+
+    twist: tuple[float, float, float] = (0.05, 0.0, 0.0)  # [m/s, m/s, rad/s]
+    pose: tuple[float, float, float] = (FRONT + HALF, 0.0, 0.0)  # [m, m, rad] of the object
+    base: tuple[float, float, float] = (0.0, 0.0, 0.0)  # likewise
+    arm: float = ARM["box"]  # [m]
+    friction: float = 0.5  # [1] with the base
+    com: tuple[float, float] = (0.0, 0.0)  # [m] in the object's frame
+    outline: Footprint = fp.rectangle(HALF, HALF)
+    scale: float = 1.0  # of time: so many times faster, and so much shorter
+
+
+class Film(NamedTuple):
+    """Poses (T, 3) [m, m, rad] of the base and of the object."""
+
+    base: np.ndarray
+    thing: np.ndarray
+
+    @property
+    def moved(self):
+        return self.thing[-1] - self.thing[0]
+
+    def velocity(self):
+        """Of the object in the last step (3,)."""
+        return (self.thing[-1] - self.thing[-2]) / PERIOD
+
+
+@partial(jax.jit, static_argnames=("stage", "physics"))
+def drive(stage, worlds, start, twists, physics):
+    """Positions (T + 1, B, 10) of worlds that start at (B, 10), driven by twists (T, B, 3)."""
+
+    def step(qpos, twist):
+        now = blank(trial.Trial, qpos=qpos)
+        after, _, _ = stage.drive(worlds, now, Twist(*twist.T), physics)
+        return after, after
+
+    return jnp.concatenate([start[None], jax.lax.scan(step, start, twists)[1]])
+
+
+def blank(kind, **given):
+    return kind(**(dict.fromkeys(kind._fields) | given))
+
+
+def film(pushes, stage=Quasistatic()):
+    """Films of pushes whose outlines have one number of corners."""
+    with jax.enable_x64(True):
+        rows = lambda name: np.array([getattr(p, name) for p in pushes], float)  # noqa: E731
+        base = np.tile([FRONT, SIDE], (len(pushes), 1))
+        slider = Slider(rows("com"), rows("arm"), rows("friction"), base)
+        outline = jax.tree.map(lambda *x: np.array(x, float), *[p.outline for p in pushes])
+        worlds = blank(trial.World, fields=slider, footprint=outline)
+        pose, half = rows("pose"), rows("pose")[:, 2] / 2
+        nil = np.zeros(len(pushes))
+        quaternion = np.stack([np.cos(half), nil, nil, np.sin(half)], axis=1)
+        start = np.column_stack([rows("base"), pose[:, :2], nil, quaternion])
+        scale = rows("scale")
+        going = np.arange(STEPS)[:, None] * scale < STEPS
+        twists = (going * scale)[..., None] * rows("twist")
+        physics = Physics(timestep=PERIOD, control_period=PERIOD)
+        worlds, start = jax.tree.map(lambda x: jnp.asarray(x, float), (worlds, start))
+        qpos = np.asarray(drive(stage, worlds, start, jnp.asarray(twists), physics))
+    yaw = np.unwrap(2 * np.arctan2(qpos[..., 9], qpos[..., 6]), axis=0)
+    thing = np.concatenate([qpos[..., 3:5], yaw[..., None]], axis=-1)
+    return [Film(qpos[:, i, :3], thing[:, i]) for i in range(len(pushes))]
+
+
+def at_corner(yaw, **given):
+    """The box turned by `yaw` > 0, its nearest corner, (-HALF, HALF) of its own, at the face."""
+    x, y = turn(yaw, (-HALF, HALF))
+    return Push(pose=(FRONT - x, 0.02 - y, yaw), **given)
+
+
+def turn(angle, point):
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([c * point[0] - s * point[1], s * point[0] + c * point[1]])
+
+
+def on_disc(push, **given):
+    return push._replace(
+        outline=fp.circle(RADIUS), arm=ARM["cylinder"], pose=(FRONT + RADIUS, 0.0, 0.0), **given
+    )
+
+
+# --- the motions that are known -------------------------------------------------------------
+
+
+def twist_of(force, r, arm):
+    """Twist (3,), but for its size, of an object pushed with a force (2,) at r (2,)."""
+    return np.array([*force, (r[0] * force[1] - r[1] * force[0]) / arm**2])
+
+
+def stuck(r, v, arm):
+    """Twist (3,) of an object whose point r from its centre moves at v (2,)."""
+    (x, y), square = r, arm**2
+    v_x = ((square + x * x) * v[0] + x * y * v[1]) / (square + x * x + y * y)
+    v_y = (x * y * v[0] + (square + y * y) * v[1]) / (square + x * x + y * y)
+    return np.array([v_x, v_y, (x * v_y - y * v_x) / square])
+
+
+def pushed(r, n, v, arm, friction):
+    """Twist (3,) of an object pushed at r by a point of velocity v, and whether it slides.
+
+    The normal n points to the object. If sticking takes a force outside the friction cone, the
+    force is along the cone's edge and the object keeps up with the pusher along n alone.
+    """
+    t = np.array([-n[1], n[0]])
+    still = stuck(r, v, arm)
+    force = still[:2]  # the force goes as the velocity of the centre
+    if abs(force @ t) <= friction * (force @ n):
+        return still, False
+    edge = twist_of(n + friction * np.sign(force @ t) * t, r, arm)
+    point = edge[:2] + edge[2] * np.array([-r[1], r[0]])
+    return edge * (v @ n) / (point @ n), True
+
+
+def expected(push):
+    """Pose (3,) of the box at the end, its corner at the face, by small steps of `pushed`."""
+    fine = 20
+    pose, twist = np.array(push.pose), np.array(push.twist)
+    slid = set()
+    for _ in range(STEPS * fine):
+        r = turn(pose[2], (-HALF, HALF))
+        v, slides = pushed(r, np.array([1.0, 0.0]), twist[:2], push.arm, push.friction)
+        pose = pose + v * PERIOD / fine
+        slid.add(slides)
+    return pose, slid
+
+
+STICKING = [at_corner(y, twist=(0.04, s, 0.0), friction=1.0, arm=c)
+            for y, s, c in [(0.1, 0.0, 0.2828), (0.3, 0.02, 0.2828), (0.2, -0.02, 0.15)]]  # fmt: skip
+SLIDING = [at_corner(y, twist=(0.04, s, 0.0), friction=mu, arm=c)
+           for y, s, mu, c in [(0.3, 0.03, 0.1, 0.2828), (0.2, -0.03, 0.2, 0.2828),
+                               (0.1, 0.03, 0.1, 0.15)]]  # fmt: skip
+CASES = {
+    "centre": Push(),
+    "apart": Push(pose=(FRONT + HALF + 0.2, 0.0, 0.3)),
+    "mirror": at_corner(0.3, twist=(0.05, 0.02, 0.05)),
+    "mirrored": Push((0.05, -0.02, -0.05), (*(np.array([1, -1, -1]) * at_corner(0.3).pose),)),
+    "once": at_corner(0.2, twist=(0.02, 0.01, -0.04), com=(0.05, -0.03)),
+    "twice": at_corner(0.2, twist=(0.02, 0.01, -0.04), com=(0.05, -0.03), scale=2.0),
+    "here": at_corner(0.2, twist=(0.05, 0.01, 0.1), com=(0.05, -0.03)),
+    **{f"sticking {i}": push for i, push in enumerate(STICKING)},
+    **{f"sliding {i}": push for i, push in enumerate(SLIDING)},
+}
+MOVE = (2.0, -1.0, 2.5)  # [m, m, rad]
+_here = CASES["here"]
+CASES["there"] = _here._replace(
+    base=MOVE, pose=(*(turn(MOVE[2], _here.pose[:2]) + MOVE[:2]), _here.pose[2] + MOVE[2])
+)
+_rng = np.random.default_rng(1)
+for _i in range(24):  # flat on the face
+    _s, _mu, _y = _rng.uniform([-0.03, 0.1, -0.1], [0.03, 0.8, 0.1])
+    CASES[f"flat {_i}"] = Push((0.03, _s, _rng.uniform(-0.15, 0.15)), (FRONT + HALF, _y, 0.0),
+                               friction=_mu)  # fmt: skip
+
+
+@functools.cache
+def boxes():
+    return dict(zip(CASES, film(list(CASES.values())), strict=True))
+
+
+def test_a_box_pushed_through_its_centre_keeps_its_heading_and_goes_as_far_as_the_base():
+    np.testing.assert_allclose(boxes()["centre"].moved, [0.05 * STEPS * PERIOD, 0, 0], atol=2e-4)
+
+
+def test_the_base_moves_as_it_is_told():
+    twist = CASES["here"].twist
+    base = boxes()["here"].base
+    assert base[-1, 2] == pytest.approx(twist[2] * STEPS * PERIOD)
+    way = np.diff(base[:, :2], axis=0)
+    back = np.array([turn(-yaw, d) for yaw, d in zip(base[:-1, 2], way, strict=True)])
+    np.testing.assert_allclose(back, np.tile(twist[:2], (STEPS, 1)) * PERIOD, atol=1e-12)
+
+
+def test_an_object_that_nothing_touches_does_not_move_at_all():
+    assert np.abs(boxes()["apart"].moved).max() < 1e-12
+
+
+@pytest.mark.parametrize("i", range(len(STICKING)))
+def test_a_corner_that_sticks_is_carried_along_as_lynch_has_it(i):
+    pose, slid = expected(STICKING[i])
+    assert slid == {False}
+    seen = boxes()[f"sticking {i}"]
+    assert abs(pose - seen.thing[0])[2] > 0.03
+    np.testing.assert_allclose(seen.moved, pose - seen.thing[0], rtol=0.02, atol=1e-3)
+
+
+@pytest.mark.parametrize("i", range(len(SLIDING)))
+def test_a_corner_that_slides_is_pushed_along_the_edge_of_the_cone(i):
+    pose, slid = expected(SLIDING[i])
+    assert slid == {True}
+    seen = boxes()[f"sliding {i}"]
+    assert abs(pose - seen.thing[0])[2] > 0.03
+    np.testing.assert_allclose(seen.moved, pose - seen.thing[0], rtol=0.02, atol=1e-3)
+
+
+def can_be_carried(push):
+    """Whether forces within the cones at both ends of the flat contact can hold the box, and by
+    what margin [1] of the twist's force.
+
+    The wrench that carries it with the base is L V; nnls finds the nearest that the four edges of
+    the cones make.
+    """
+    p = np.array(push.pose[:2])
+    v_x, v_y, omega = push.twist
+    wanted = np.array([v_x - omega * p[1], v_y + omega * p[0], push.arm**2 * omega])
+    ends = np.clip(p[1] + np.array([-HALF, HALF]), -SIDE, SIDE)
+    edges = []
+    for y in ends:
+        r = np.array([FRONT, y]) - p
+        for side in (-1, 1):
+            force = np.array([1.0, side * push.friction])
+            edges.append([*force, r[0] * force[1] - r[1] * force[0]])
+    return nnls(np.array(edges).T, wanted)[1] / np.linalg.norm(wanted)
+
+
+def test_a_flat_contact_holds_if_and_only_if_forces_within_its_cones_can():
+    """Lynch and Mason's stable pushes: the box then stays where it is on the base."""
+    held = []
+    for i in range(24):
+        name = f"flat {i}"
+        short = can_be_carried(CASES[name])
+        seen = boxes()[name]
+        relative = [turn(-b[2], t[:2] - b[:2]) for b, t in zip(seen.base, seen.thing, strict=True)]
+        crept = np.hypot(*(relative[25] - relative[0])) / (25 * PERIOD)
+        turned = abs((seen.thing - seen.base)[25, 2]) / (25 * PERIOD)
+        slipped = (crept + HALF * turned) / math.hypot(*CASES[name].twist[:2])
+        if short == 0:
+            held.append(True)
+            assert slipped < 0.05
+        elif short > 0.05:
+            held.append(False)
+            assert slipped > 0.05
+    assert held.count(True) > 4
+    assert held.count(False) > 4
+
+
+def test_left_and_right_are_alike():
+    a, b = boxes()["mirror"], boxes()["mirrored"]
+    np.testing.assert_allclose(a.moved, b.moved * [1, -1, -1], atol=1e-9)
+
+
+def test_twice_the_speed_is_the_same_path_in_half_the_time():
+    """But for the length of a step, which is twice as long."""
+    a, b = boxes()["once"], boxes()["twice"]
+    assert np.hypot(*a.moved[:2]) > 0.03
+    np.testing.assert_allclose(a.thing[::2], b.thing[: STEPS // 2 + 1], atol=5e-4)
+
+
+def test_where_it_happens_does_not_matter():
+    a, b = boxes()["here"], boxes()["there"]
+    moved = [*turn(MOVE[2], a.moved[:2]), a.moved[2]]
+    np.testing.assert_allclose(b.moved, moved, atol=1e-9)
+
+
+# --- round objects --------------------------------------------------------------------------
+
+ROLLING = on_disc(Push((0.04, 0.03, 0.0), friction=0.8))
+SLIPPING = ROLLING._replace(friction=0.1)
+
+
+@functools.cache
+def discs():
+    return film([ROLLING, SLIPPING])
+
+
+def rim(seen, push):
+    """Sideways velocity of the rim at the face, relative to the base's [1], and of rolling [1]."""
+    _, v_y, omega = seen.velocity() / push.twist[1]
+    return v_y - RADIUS * omega - 1, -RADIUS * omega
+
+
+def test_a_cylinder_rolls_along_the_face_without_slipping():
+    """The force f goes with the twist (f_n, f_t, -R f_t / c^2): with c = R, half is rolled."""
+    slip, rolled = rim(discs()[0], ROLLING)
+    assert abs(slip) < 0.01
+    assert rolled == pytest.approx(0.5, rel=0.01)
+
+
+def test_a_cylinder_slips_along_a_slippery_face():
+    """Then f_t = mu f_n, and its rim moves sideways at mu (1 + R^2 / c^2) v_n."""
+    slip, _ = rim(discs()[1], SLIPPING)
+    assert slip == pytest.approx(2 * 0.1 * 0.04 / 0.03 - 1, rel=0.01)
+
+
+def test_a_tiny_box_with_a_round_edge_is_a_cylinder():
+    tiny = fp.rectangle(1e-4, 1e-4)._replace(radius=jnp.asarray(RADIUS - 1e-4))
+    seen = film([ROLLING._replace(outline=tiny), SLIPPING._replace(outline=tiny)])
+    for a, b in zip(seen, discs(), strict=True):
+        np.testing.assert_allclose(a.moved, b.moved, atol=1e-3)
+
+
+# --- the problem that is solved -------------------------------------------------------------
+
+
+def some_problems(count=500):
+    """One or two contacts at the front face, near, deep or far, and any twist of the base."""
+    rng = np.random.default_rng(0)
+    speed, angle = np.exp(rng.uniform(-7, -3, count)), rng.uniform(-1.5, 1.5, count)
+    v_x, v_y, omega = speed * np.cos(angle), speed * np.sin(angle), rng.uniform(-0.15, 0.15, count)
+    p = np.stack([FRONT + rng.uniform(0.1, 0.3, count), rng.uniform(-0.4, 0.4, count)])
+    contacts = []
+    for far in (0.0, 0.02):
+        y = rng.uniform(-SIDE, SIDE, count)
+        tilt = rng.choice([0.0, 0.5, -0.5], count)
+        gap = rng.normal(0, 1e-4, count) + rng.choice([0.0, far], count)
+        contacts.append(
+            Contact(
+                (np.cos(tilt), np.sin(tilt)),
+                (FRONT - p[0], y - p[1]),
+                (v_x - omega * y, v_y + omega * FRONT),
+                gap,
+            )
+        )
+    reach = FRONT**2 + SIDE**2
+    size = np.sqrt(v_x**2 + v_y**2 + reach * omega**2)
+    problem = Problem(contacts, size, rng.uniform(0.1, 0.3, count), rng.uniform(0.05, 1.0, count))
+    return problem, (v_x - omega * p[1], v_y + omega * p[0], omega)
+
+
+def cost(stage, problem, v, dt):
+    """What the twist of one object minimises, written out."""
+    c, speed, depth = problem.arm, problem.speed, stage.depth
+    total = (v[0] ** 2 + v[1] ** 2 + c**2 * v[2] ** 2) / (2 * speed)
+    for contact in problem.contacts:
+        n, r = contact.normal, contact.r
+        u = jnp.stack([v[0] - v[2] * r[1], v[1] + v[2] * r[0]]) - jnp.stack(contact.v)
+        v_n, v_t = u[0] * n[0] + u[1] * n[1], u[1] * n[0] - u[0] * n[1]
+        tiny = stage.slip * speed
+        slide = jnp.sqrt(v_t**2 + tiny**2) - tiny
+        inside = -(contact.gap + dt * (v_n - problem.friction * slide))
+        x = jnp.maximum(inside / depth, -1.0)
+        soft = (1 + x) ** 3 / 12
+        total += depth / dt * jnp.where(x < 1, soft, x * x / 2 + 1 / 6)
+    return total
+
+
+def test_newtons_method_has_the_derivatives_of_what_it_minimises_and_finds_its_minimum():
+    stage, dt = Quasistatic(), 0.01
+    with jax.enable_x64(True):
+        problem, v = jax.tree.map(lambda x: jnp.asarray(x, float), some_problems())
+        of = partial(cost, stage)
+        gradient = jax.vmap(jax.grad(of, argnums=1), (0, 0, None))
+        hessian = jax.vmap(jax.hessian(of, argnums=1), (0, 0, None))
+
+        @jax.jit
+        def both(v):
+            return stage._derivatives(problem, v, stage.slip, dt), (
+                gradient(problem, v, dt),
+                hessian(problem, v, dt),
+            )
+
+        (g, h), (g_true, h_true) = both(v)
+        np.testing.assert_allclose(g, g_true, atol=1e-9)
+        upper = [h_true[i][j] for i in range(3) for j in range(i, 3)]
+        np.testing.assert_allclose(np.stack(h), upper, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(
+            np.einsum("ij...,j...->i...", np.array(h_true), np.stack(_divide(g, h))), g_true,
+            atol=1e-6,
+        )  # fmt: skip
+        found = jax.jit(partial(stage._solve, dt=dt))(problem, v)
+        (step, matrix), _ = both(found)
+        short = np.abs(np.stack(_divide(step, matrix)))[:2].max(axis=0) / problem.speed
+    assert np.mean(short > 1e-3) < 0.03
+    assert np.median(short) < 1e-9
+
+
+# --- derivatives ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "outline", [fp.rectangle(HALF, HALF), fp.circle(RADIUS)], ids=["box", "disc"]
+)
+def test_derivatives_of_a_push_are_those_of_finite_differences(outline):
+    """Of the end of an open-loop push, along directions in all that goes in."""
+    round_ = outline.vertices.shape[0] == 1
+    push = on_disc(Push()) if round_ else at_corner(0.3)
+    stage, physics = Quasistatic(), Physics(timestep=PERIOD, control_period=PERIOD)
+    time = np.arange(50)[:, None, None] * PERIOD
+    with jax.enable_x64(True):
+        wave = 0.05 + 0.01 * np.sin(2 * time), 0.02 * np.cos(3 * time), 0.1 * np.sin(4 * time)
+        twists = jnp.asarray(np.concatenate(wave, axis=-1))
+        start = np.array([[0, 0, 0, *push.pose[:2], 0, *_quaternion(push.pose[2])]])
+        slider = Slider(*(np.array([x], float) for x in (push.com, push.arm, 0.3, (FRONT, SIDE))))
+        shape = jax.tree.map(lambda x: np.asarray(x, float)[None], outline)
+        given = jax.tree.map(jnp.asarray, (slider, shape, start, twists))
+
+        def where(given):
+            slider, shape, start, twists = given
+            worlds = blank(trial.World, fields=slider, footprint=shape)
+            end = drive(stage, worlds, start, twists, physics)[-1, 0]
+            return end[3] + 2 * end[4] + 3 * jnp.arctan2(end[9], end[6])
+
+        gradient = jax.jit(jax.grad(where))(given)
+        rng, value = np.random.default_rng(0), jax.jit(where)
+        for part in range(4):
+            chosen = [jnp.zeros_like] * 4
+            chosen[part] = lambda x: jnp.asarray(rng.normal(size=x.shape))
+            way = tuple(jax.tree.map(f, x) for f, x in zip(chosen, given, strict=True))
+            sides = [value(jax.tree.map(lambda x, d, e=e: x + e * d, given, way))
+                     for e in (1e-6, -1e-6)]  # fmt: skip
+            slope = sum(jnp.vdot(a, b) for a, b in
+                        zip(jax.tree.leaves(gradient), jax.tree.leaves(way), strict=True))  # fmt: skip
+            assert abs(slope) > 1e-3
+            assert slope == pytest.approx((sides[0] - sides[1]) / 2e-6, rel=1e-3)
+
+
+def _quaternion(yaw):
+    return math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)
+
+
+TUNED = ("K_h", "K_v", "L", "beta", "k", "eta", "v_max", "omega_max")
+
+
+@functools.cache
+def closed_loop():
+    """Three seconds of RPS, and their derivatives: the nominal world, then each parameter moved up
+    and down."""
+    with jax.enable_x64(True):
+        nudges = [RPSParams()]
+        for name in TUNED:
+            nudges += [RPSParams()._replace(**{name: getattr(RPSParams(), name) * (1 + e)})
+                       for e in (1e-5, -1e-5)]  # fmt: skip
+        cases = [Case("cylinder", FRICTION["S1"], (2.0, 1.0), p, gap=0.0) for p in nudges]
+        stage, worlds = sweep.build(cases, Setting(engine="quasistatic"))
+        worlds = jax.device_put(worlds)
+
+        @jax.jit
+        @partial(jax.value_and_grad, has_aux=True)
+        def run(params):
+            seen = rollout(stage, worlds._replace(params=params), physics=preset(), steps=150)
+            return jnp.sum(seen.mean_distance), seen
+
+        (_, seen), gradient = run(worlds.params)
+        return jax.device_get(seen), jax.device_get(gradient)
+
+
+@pytest.mark.parametrize("name", TUNED)
+def test_derivatives_of_the_closed_loop_are_those_of_finite_differences(name):
+    seen, gradient = closed_loop()
+    i = 1 + 2 * TUNED.index(name)
+    step = 2e-5 * getattr(RPSParams(), name)
+    slope = (seen.mean_distance[i] - seen.mean_distance[i + 1]) / step
+    assert getattr(gradient, name)[0] == pytest.approx(slope, rel=1e-3, abs=1e-9)
+
+
+def test_a_rollout_tells_how_near_and_how_long():
+    seen, _ = closed_loop()
+    distance = seen.snapshots.details.distance
+    np.testing.assert_allclose(seen.mean_distance, distance.mean(axis=0))
+    np.testing.assert_allclose(seen.end_distance, distance[-1])
+    np.testing.assert_allclose(seen.min_distance, distance.min(axis=0))
+    touch = seen.snapshots.reading.contact_type != 0
+    np.testing.assert_allclose(seen.lost_time, 0.02 * (~touch).sum(axis=0))
+    assert (np.diff(distance, axis=0) < 0).all()
+
+
+# --- the stage ------------------------------------------------------------------------------
+
+
+def test_an_evenly_borne_square_has_0383_of_its_side_as_arm_and_a_disc_two_thirds_of_its_radius():
+    """Mean distances from the middle: (sqrt(2) + asinh(1)) / 6 of the side, and 2 R / 3."""
+    box, disc = (scene.solid_of(scene.load(name)) for name in ("box", "cylinder"))
+    side = (math.sqrt(2) + math.asinh(1)) / 6
+    assert solid.friction_arm(box, "even") == pytest.approx([side * 2 * HALF], rel=0.01)
+    assert solid.friction_arm(disc, "even") == pytest.approx([2 * RADIUS / 3], rel=0.01)
+    assert solid.friction_arm(box) == pytest.approx([ARM["box"]])
+    assert solid.friction_arm(disc) == pytest.approx([ARM["cylinder"]])
+
+
+def test_feet_bear_what_holds_the_centre_of_mass_and_none_pulls():
+    """On four corners, half way to an edge: 3/8 and 1/8 each; at an edge: half and nothing."""
+
+    def arm(x):
+        com = np.array([[x, 0.0, 0.0]])
+        one = Solid(solid.rectangles(np.array([0.2]), np.array([0.1])), np.zeros(1), np.ones(1),
+                    np.ones(1), com, np.ones((1, 3)), np.array([[1.0, 0, 0, 0]]))  # fmt: skip
+        return solid.friction_arm(one)[0]
+
+    assert arm(0.1) == pytest.approx(0.75 * math.hypot(0.1, 0.1) + 0.25 * math.hypot(0.3, 0.1))
+    assert arm(0.2) == pytest.approx(0.1)
+
+
+def test_a_repeated_corner_changes_nothing():
+    square = fp.rectangle(HALF, HALF)
+    padded = Footprint(jnp.concatenate([square.vertices, square.vertices[-1:]]), square.radius)
+    names = ("here", "flat 0")
+    pushes = [CASES[name]._replace(outline=padded) for name in names]
+    for name, seen in zip(names, film(pushes), strict=True):
+        np.testing.assert_allclose(seen.moved, boxes()[name].moved, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_every_scene_has_a_slider(name):
+    loaded = scene.load(name, friction=scene.Friction(0.3, 0.4), half_length=0.3)
+    stage, slider = engines.stage_of_scenes([loaded], "quasistatic")
+    assert isinstance(stage, Quasistatic)
+    np.testing.assert_allclose(slider.friction_robot, [0.4])
+    np.testing.assert_allclose(slider.base_half, [[0.3, SIDE]])
+    com = loaded.physics.body("object").ipos[:2]
+    np.testing.assert_allclose(slider.p_object_com[0], com, atol=1e-5)
+
+
+def test_the_papers_grid_ends_as_in_the_other_engines():
+    """RPS 144 of 144; NPS 25, as on converged C MuJoCo and on the fused engine."""
+    cases = [
+        Case(name, FRICTION[friction], target, paper.PARAMS[strategy])
+        for strategy in ("rps", "nps")
+        for name in scene.PAPER_OBJECTS
+        for friction in FRICTION
+        for target in paper.TARGETS
+    ]
+    outcome, _ = sweep.run(cases, Setting(engine="quasistatic"))
+    rps, nps = outcome.success.reshape(2, -1, len(paper.TARGETS)).sum(axis=-1)
+    assert rps.tolist() == [24] * 6
+    assert nps.tolist() == [4, 4, 4, 4, 3, 6]
+    assert np.median(outcome.time[:144]) == pytest.approx(87, rel=0.08)
+
+
+@pytest.mark.parametrize(
+    ("make", "field"),
+    [
+        (lambda: Setting(preset("paper_gazebo"), engine="quasistatic"), "cone"),
+        (lambda: Quasistatic(depth=0.0), "depth"),
+        (lambda: Quasistatic(slip=2.0), "slip"),
+        (lambda: Quasistatic(iterations=2), "iterations"),
+        (lambda: solid.friction_arm(scene.solid_of(scene.load("box")), "toes"), "support"),
+    ],
+)
+def test_bad_input_gets_one_sentence(make, field):
+    with pytest.raises(InputError, match=field):
+        make()
