@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rps_jax.slots import Progress, Setting, Timing
     from rps_jax.sweep import Case, Trace
     from rps_jax.trial import Params
-    from rps_jax.tune import Course
+    from rps_jax.tune import Course, Space
 
 
 DEVICES = ("auto", "cpu", "gpu")
@@ -293,6 +293,37 @@ class TuneES(TuneOptions):
 
 
 @dataclass(frozen=True)
+class TuneGrad(TuneOptions):
+    """Tune by gradients."""
+
+    worlds: int = 64
+    """Worlds of a step, in each domain; others in the next step."""
+    validation: int = 128
+    """Worlds for validation, in each domain."""
+    estimator: str = "combined"
+    """reverse (through the quasi-static model), forward (through the fused engine), evolution
+    (antithetic steps in the engine), or combined (reverse and evolution by their variances)."""
+    optimiser: str = "adam"
+    """An optimiser of optax, by name."""
+    learning_rate: float = 0.1
+    """At first, in units of the bounded map; it falls to zero along a cosine."""
+    clip: float = 1.0
+    """Bound on the norm of a gradient."""
+    steps: int = 40
+    """In all."""
+    starts: int = 4
+    """Descents side by side, the first from the start itself."""
+    spread: float = 0.5
+    """Standard deviation of the other starts."""
+    window: float = 30.0
+    """Length of a softened trial, for reverse and forward [s]."""
+    sigma: float = 0.15
+    """Standard deviation of the antithetic steps."""
+    pairs: int = 8
+    """Antithetic pairs of a start."""
+
+
+@dataclass(frozen=True)
 class TuneCompare(Spread):
     """Compare sets of parameters in worlds kept for testing, which no tuner has seen."""
 
@@ -323,6 +354,7 @@ class Tune:
 
     how: Annotated[
         Annotated[TuneES, tyro.conf.subcommand("es")]
+        | Annotated[TuneGrad, tyro.conf.subcommand("grad")]
         | Annotated[TuneCompare, tyro.conf.subcommand("compare")],
         tyro.conf.arg(name=""),
     ]
@@ -907,7 +939,11 @@ def _report_sweep(out: Path) -> None:
 
 
 def _tune(options: Tune) -> None:
-    act = {TuneES: _tune_es, TuneCompare: _tune_compare}
+    act: dict[type, Callable[[Any], None]] = {
+        TuneES: _tune_es,
+        TuneGrad: _tune_grad,
+        TuneCompare: _tune_compare,
+    }
     act[type(options.how)](options.how)
 
 
@@ -946,13 +982,14 @@ def _tune_compare(options: TuneCompare) -> None:
 
 
 def _tune_es(options: TuneES) -> None:
-    from rps_jax import figures, law, record, tune
-    from rps_jax.law import RPSParams
+    from rps_jax import tune
 
-    how = _quick(options) if options.quick else options
-    base = law.check(RPSParams.paper()._replace(**_changes(how.start)))
-    names = [name for text in how.tuned for name in tune.SUBSETS.get(text, (text,))]
-    space, course = tune.Space(tuple(names), base), _course(how)
+    how = options
+    if how.quick:
+        how = dataclasses.replace(
+            how, worlds=24, validation=32, population=12, generations=10, horizon=150.0
+        )
+    space, course = _space(how), _course(how)
     evolution = tune.Evolution(
         how.strategy,
         how.population,
@@ -965,30 +1002,77 @@ def _tune_es(options: TuneES) -> None:
     shape = how.shape()
     choose_device(how.device)
     out = tune.open_run(how.out, space, course, evolution)
-    use_cache()
-    record.write_json(out / "environment.json", record.environment())
-    with _generations(evolution.generations) as report:
+    with _tuning(out, evolution.generations) as report:
         tune.evolve(out, space, course, evolution, report=report, **shape)
+    _tell_tuned(out, space.names)
+
+
+def _tune_grad(options: TuneGrad) -> None:
+    from rps_jax import descent
+
+    how = options
+    if how.quick:
+        how = dataclasses.replace(
+            how, worlds=16, validation=32, steps=10, starts=2, pairs=4, horizon=150.0
+        )
+    space, course = _space(how), _course(how)
+    same = {f.name for f in dataclasses.fields(descent.Descent)} & set(how.__dict__)
+    chosen = descent.Descent(**{name: getattr(how, name) for name in same})
+    shape = how.shape()
+    choose_device(how.device)
+    out = descent.open_run(how.out, space, course, chosen)
+    with _tuning(out, chosen.steps + 1) as report:
+        descent.descend(out, space, course, chosen, report=report, **shape)
+    _tell_tuned(out, space.names)
+
+
+def _space(options: TuneOptions) -> Space:
+    from rps_jax import law, tune
+    from rps_jax.law import RPSParams
+
+    base = law.check(RPSParams.paper()._replace(**_changes(options.start)))
+    names = [name for text in options.tuned for name in tune.SUBSETS.get(text, (text,))]
+    return tune.Space(tuple(names), base)
+
+
+@contextlib.contextmanager
+def _tuning(out: Path, count: int) -> Iterator[Callable[[int, Progress], None]]:
+    """The run folder in use, and a bar over generations or steps, for tuners to report to."""
+    from tqdm import tqdm
+
+    from rps_jax import record, robustness
+
+    use_cache()
+    with robustness.lock(out), tqdm(total=count, unit="generation", desc="compile") as bar:
+        record.write_json(out / "environment.json", record.environment())
+
+        def report(generation: int, progress: Progress) -> None:
+            bar.set_description("tune", refresh=False)
+            bar.set_postfix_str(
+                f"{progress.finished} trials, {progress.simulated:.0f} s simulated", refresh=False
+            )
+            bar.update(generation - bar.n)
+
+        yield report
+        bar.update(count - bar.n)
+
+
+def _tell_tuned(out: Path, names: Sequence[str]) -> None:
+    """The figure of a tuner's run, and a few lines on the screen."""
+    from rps_jax import figures, tune
+
     log = tune.read_log(out)
-    figures.tuning(log, space.names, out / "tuning.png")
+    figures.tuning(log, names, out / "tuning.png")
     first, last = log[0], min(log, key=lambda line: line["validation"])
+    total = {key: sum(line[key] for line in log) for key in ("compile", "run", "simulated")}
     print(
-        f"validation: {first['validation']:.4f} before, {last['validation']:.4f} after "
-        f"{last['generation']} generations; success {100 * first['validation_success']:.1f} % and "
-        f"{100 * last['validation_success']:.1f} %"
-    )
-    print(
-        f"compile {sum(line['compile'] for line in log):.1f} s, "
-        f"run {sum(line['run'] for line in log):.1f} s, "
-        f"{sum(line['simulated'] for line in log):.3g} s simulated"
-    )
-    print(f"parameters: {out / 'tuned.json'}, for --params of rps sweep")
-
-
-def _quick(options: TuneES) -> TuneES:
-    """The same, small."""
-    return dataclasses.replace(
-        options, worlds=24, validation=32, population=12, generations=10, horizon=150.0
+        f"validation: {first['validation']:.4f} at the start, {last['validation']:.4f} after "
+        f"{last['generation']} of {len(log)}; success {100 * first['validation_success']:.1f} % "
+        f"and {100 * last['validation_success']:.1f} %\n"
+        f"compile {total['compile']:.1f} s, run {total['run']:.1f} s, "
+        f"{total['simulated']:.3g} s simulated\n"
+        f"parameters: {out / 'tuned.json'}, for --params of rps sweep\n"
+        f"run folder: {out}"
     )
 
 
@@ -1011,21 +1095,6 @@ def _course(options: TuneOptions) -> Course:
         setting,
         Objective(options.risk, time=options.time_weight),
     )
-
-
-@contextlib.contextmanager
-def _generations(count: int) -> Iterator[Callable[[int, Progress], None]]:
-    """A bar over generations, to be handed to `tune.evolve` as its `report`."""
-    from tqdm import tqdm
-
-    with tqdm(total=count, unit="generation", desc="compile") as bar:
-
-        def report(generation: int, progress: Progress) -> None:
-            bar.set_description("tune", refresh=False)
-            bar.set_postfix_str(f"{progress.finished} trials, {progress.simulated:.0f} s simulated")
-            bar.update(generation - bar.n)
-
-        yield report
 
 
 def _replay(options: Replay) -> None:

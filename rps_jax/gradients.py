@@ -16,6 +16,7 @@ needs no derivative.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -145,7 +146,7 @@ def window(
     """Scores of trials driven on for some control steps from where they are.
 
     Args:
-      stage: of MJX, or `Fused`.
+      stage: of MJX, `Fused`, or `Quasistatic`.
       params_of: parameters from theta (p,), differentiable.
       cost: () of the snapshots (steps, ...) of one trial, such as its mean distance.
       physics: with MJX of a pyramidal cone.
@@ -168,6 +169,7 @@ def window(
         worlds, trials = starts
         worlds = worlds._replace(params=jax.vmap(params_of)(thetas))
 
+        @partial(jax.checkpoint, prevent_cse=False)  # in reverse, memory of one state a step
         def one(trials: Trial, _: None) -> tuple[Trial, Snapshot]:
             return trial.control_step(stage, worlds, trials, physics=physics, strategy=strategy)
 

@@ -76,7 +76,7 @@ class Space:
         for name in self.names:
             bound = BOUNDS[errors.check_name("tuned parameter", name, BOUNDS)]
             share = _share(bound, self.base, name)
-            errors.check_finite(f"{name}, to be tuned", share, above=bound.low)
+            errors.checkfinite(f"{name}, to be tuned", share, above=bound.low)
             if share >= bound.high:
                 raise errors.InputError(
                     f"{name}, to be tuned = {share:g} is not allowed: it must be below "
@@ -141,9 +141,9 @@ class Objective:
     def __post_init__(self) -> None:
         """Raises InputError for weights or a risk that mean nothing."""
         errors.check_name("risk", self.risk, ("mean", "cvar"))
-        errors.check_finite("tail", self.tail, above=0, at_most=1)
+        errors.checkfinite("tail", self.tail, above=0, at_most=1)
         for name in ("time", "lost", "miss"):
-            errors.check_finite(name, getattr(self, name), at_least=0)
+            errors.checkfinite(name, getattr(self, name), at_least=0)
 
     def score(self, success: Any, time: Any, lost: Any, missed: Any, rules: Rules) -> Any:
         """Scores (...) [1] of trials, less is better, about 0 to 2.
@@ -226,7 +226,7 @@ def try_out(
     jobs: dict[Any, list[_Group]] = {}
     for ask, width, first, size in zip(asks, widths, firsts, sizes, strict=True):
         params, of_ask = jax.device_get(ask.params), way[first : first + size].reshape(-1, width)
-        for part, column, distance in _parts(ask, domains, setting):
+        for part, column, distance in parts(ask, domains, setting):
             of_ask[:, column] = distance
             part = _remembering(part, longest)
             alike = jax.tree.map(lambda leaf: leaf.shape[1:], part.worlds)
@@ -255,7 +255,7 @@ def try_out(
     ], timing
 
 
-def _parts(
+def parts(
     ask: Ask, domains: Sequence[Domain], setting: Setting
 ) -> Iterator[tuple[Part, np.ndarray, np.ndarray]]:
     """Worlds of an ask by domain and object, their columns, and the targets' distances [m]."""
@@ -317,12 +317,12 @@ class Evolution:
     def __post_init__(self) -> None:
         """Raises InputError for an unknown strategy or counts that mean nothing."""
         errors.check_name("strategy", self.strategy, STRATEGIES)
-        errors.check_finite("population", self.population, at_least=4, at_most=1e5)
-        errors.check_finite("generations", self.generations, at_least=1, at_most=1e6)
-        errors.check_finite("spread", self.spread, above=0, at_most=10)
-        errors.check_finite("prior", self.prior, at_least=0)
-        errors.check_finite("patience", self.patience, at_least=0)
-        errors.check_finite("seed", self.seed, at_least=0, at_most=2**30)
+        errors.checkfinite("population", self.population, at_least=4, at_most=1e5)
+        errors.checkfinite("generations", self.generations, at_least=1, at_most=1e6)
+        errors.checkfinite("spread", self.spread, above=0, at_most=10)
+        errors.checkfinite("prior", self.prior, at_least=0)
+        errors.checkfinite("patience", self.patience, at_least=0)
+        errors.checkfinite("seed", self.seed, at_least=0, at_most=2**30)
 
     def algorithm(self, size: int) -> Any:
         """The strategy of evosax for vectors (size,)."""
@@ -419,8 +419,8 @@ class Course:
         """Raises InputError for no domain or no worlds."""
         if not self.domains:
             raise errors.InputError("domains = () is not allowed: name at least one.")
-        errors.check_finite("worlds", self.worlds, at_least=1, at_most=1e7)
-        errors.check_finite("validation", self.validation, at_least=1, at_most=1e7)
+        errors.checkfinite("worlds", self.worlds, at_least=1, at_most=1e7)
+        errors.checkfinite("validation", self.validation, at_least=1, at_most=1e7)
 
     def ask(self, params: RPSParams, seed: int, generation: int) -> Ask:
         """Candidates with leaves (P,) in the worlds of a generation."""
@@ -438,14 +438,18 @@ def open_run(folder: Path, space: Space, course: Course, evolution: Evolution) -
     Raises:
       InputError: it cannot be written, or holds another run.
     """
+    own = {"evolution": asdict(replace(evolution, generations=1))}
+    return record.claim(folder, configuration(space, course) | own)
+
+
+def configuration(space: Space, course: Course) -> dict[str, Any]:
+    """What is tuned, and in which worlds, as JSON."""
     setting = asdict(course.setting) | {"rules": course.setting.rules._asdict()}
-    configuration = {
+    return {
         "tuned": space.names,
         "base": {name: float(value) for name, value in space.base._asdict().items()},
         "course": asdict(course) | {"setting": setting},
-        "evolution": asdict(replace(evolution, generations=1)),
     }
-    return record.claim(folder, configuration)
 
 
 def evolve(
@@ -465,7 +469,7 @@ def evolve(
     as `tuned.json` holds it.
     """
     search = begin(evolution, space, space.vector(space.base))
-    search, log = _resume(folder, search)
+    search, log = resume(folder, search, "generation")
     while int(search.generation) < evolution.generations:
         generation = int(search.generation)
         candidates, asked = propose(evolution, search)
@@ -491,35 +495,38 @@ def evolve(
         log.append(
             {
                 "generation": generation,
-                "best": _finite(np.nanmin(values)),
-                "mean": _finite(np.nanmean(values)),
-                "spread": _finite(np.nanstd(values)),
+                "best": finite(np.nanmin(values)),
+                "mean": finite(np.nanmean(values)),
+                "spread": finite(np.nanstd(values)),
                 "not_finite": int(np.isnan(values).sum()),
-                "base": _finite(course.objective.value(base.score)[0]),
-                "validation": _finite(value),
+                "base": finite(course.objective.value(base.score)[0]),
+                "validation": finite(value),
                 "validation_success": float(check.success.mean()),
                 "restarts": int(search.restarts),
                 "simulated": timing.simulated,
                 "compile": timing.compile,
                 "run": timing.run,
-                "params": _named(space, mean),
+                "params": named(space, mean),
             }
         )
-        record.write_json(folder / "tuned.json", _named(space, search.best))
-        _save(folder, search, log)
+        record.write_json(folder / "tuned.json", named(space, search.best))
+        save(folder, search, log)
     return space.params(search.best)
 
 
-def _finite(value: Any) -> float | None:
+def finite(value: Any) -> float | None:
+    """As JSON has it: None for what is not finite."""
     return float(value) if np.isfinite(value) else None
 
 
-def _named(space: Space, vector: jax.Array) -> dict[str, float]:
+def named(space: Space, vector: jax.Array) -> dict[str, float]:
+    """The tuned parameters of a vector (p,), by name."""
     params = space.params(vector)
     return {name: float(f"{float(getattr(params, name)):.7g}") for name in space.names}
 
 
-def _save(folder: Path, search: Search, log: list[dict[str, Any]]) -> None:
+def save(folder: Path, search: Any, log: list[dict[str, Any]]) -> None:
+    """Write the state of a search, a pytree of arrays, and its log."""
     record.write_text(folder / "log.jsonl", "".join(json.dumps(line) + "\n" for line in log))
     leaves: dict[str, Any] = {f"{i:03d}": x for i, x in enumerate(jax.tree.leaves(search))}
     record.atomic(folder / "state.npz", lambda path: np.savez(path, **leaves))
@@ -530,15 +537,24 @@ def read_log(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
 
 
-def _resume(folder: Path, search: Search) -> tuple[Search, list[dict[str, Any]]]:
-    """The state and the log of a run folder; `search` and none in a new one."""
+def resume(folder: Path, search: Any, done: str) -> tuple[Any, list[dict[str, Any]]]:
+    """The state and the log of a run folder; `search` and none in a new one.
+
+    Args:
+      folder: where `save` wrote.
+      search: a state of the same structure.
+      done: its field that counts the lines of the log.
+
+    Raises:
+      InputError: the run is corrupt.
+    """
     if not (folder / "state.npz").exists():
         return search, []
     try:
         with np.load(folder / "state.npz", allow_pickle=False) as file:
             leaves = [jnp.asarray(file[name]) for name in sorted(file.files)]
         search = jax.tree.unflatten(jax.tree.structure(search), leaves)
-        return search, read_log(folder)[: int(search.generation)]
+        return search, read_log(folder)[: int(getattr(search, done))]
     except (OSError, ValueError, KeyError) as error:
         raise errors.InputError(
             f"{folder} holds a corrupt run ({error}): restore it, or choose another folder."

@@ -1,0 +1,299 @@
+"""Tuning the law by gradients: of a softened trial, of randomised smoothing, or of both.
+
+The objective is that of `tune`. What is differentiated is a softened trial of fixed length: smooth
+law and skin, and a base that has arrived by a weight instead of by a switch. What is validated, in
+the course's engine, is the hard law under the paper's rules.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from rps_jax import errors, gradients, record, tune
+from rps_jax.gradients import Estimate
+from rps_jax.law import RPSParams
+from rps_jax.physics import preset
+from rps_jax.skin import CapacitiveSkin, SmoothSkin
+from rps_jax.slots import Progress, Setting
+from rps_jax.trial import Snapshot, World, smooth_rps, start_all
+from rps_jax.tune import Course, Objective, Space
+
+ESTIMATORS = ("reverse", "forward", "evolution", "combined")
+_ENGINE = {"reverse": "quasistatic", "forward": "fused", "combined": "quasistatic"}
+
+
+@dataclass(frozen=True)
+class Descent:
+    """How gradients are followed."""
+
+    estimator: str = "combined"
+    """reverse, through the quasi-static model; forward, through the fused engine; evolution,
+    antithetic steps in the course's engine; combined, reverse and evolution by their variances."""
+    optimiser: str = "adam"
+    """An optimiser of optax, by name."""
+    learning_rate: float = 0.1
+    """[1] At first, falling to zero along a cosine."""
+    clip: float = 1.0
+    """[1] Bound on the norm of a gradient."""
+    steps: int = 40
+    """In all."""
+    starts: int = 4
+    """Descents side by side: one from the base parameters, others from random places near it."""
+    spread: float = 0.5
+    """[1] Standard deviation of these places, in units of the bounded map."""
+    window: float = 30.0
+    """[s] Length of a softened trial."""
+    arrive: float = 0.005
+    """[m] Temperature at which a softened trial arrives."""
+    sigma: float = 0.15
+    """[1] Standard deviation of the steps of the evolution gradient."""
+    pairs: int = 8
+    """Antithetic pairs of these steps."""
+    seed: int = 0
+    """Of the starts, the steps and the worlds."""
+
+    def __post_init__(self) -> None:
+        """Raises InputError for unknown names or numbers that mean nothing."""
+        errors.check_name("estimator", self.estimator, ESTIMATORS)
+        if not callable(getattr(optax, self.optimiser, None)):
+            raise errors.InputError(
+                f"optimiser = {self.optimiser} is not allowed: name one of optax, as adam or sgd."
+            )
+        for name in ("learning_rate", "clip", "window", "arrive", "sigma"):
+            errors.check_finite(name, getattr(self, name), above=0)
+        for name in ("steps", "starts", "pairs"):
+            errors.check_finite(name, getattr(self, name), at_least=1, at_most=1e6)
+        errors.check_finite("spread", self.spread, at_least=0, at_most=10)
+        errors.check_finite("seed", self.seed, at_least=0, at_most=2**30)
+
+    def rule(self) -> optax.GradientTransformation:
+        """The rule of optax by which parameters follow their gradients."""
+        rate = optax.cosine_decay_schedule(self.learning_rate, self.steps)
+        return optax.chain(
+            optax.clip_by_global_norm(self.clip), getattr(optax, self.optimiser)(rate)
+        )
+
+
+def soft_score(
+    seen: Snapshot, params: RPSParams, setting: Setting, objective: Objective, arrive: float
+) -> jax.Array:
+    """The objective's score () of a softened trial's snapshots (T, ...), differentiable.
+
+    At each step the base arrives by a weight, in contact and nearer than d_success within the
+    temperature `arrive` [m]; what comes after counts only as far as it has not arrived before.
+    """
+    period = setting.physics.control_period
+    contact, distance = seen.reading.in_contact, seen.details.distance
+    arriving = contact * jax.nn.sigmoid((params.d_success - distance) / arrive)
+    under_way = jnp.cumprod(1 - arriving)
+    touched = jax.lax.cummax(contact)
+    return objective.score(
+        1 - under_way[-1],
+        period * jnp.sum(under_way),
+        period * jnp.sum(under_way * touched * (1 - contact)),
+        jnp.min(distance),
+        setting.rules,
+    )
+
+
+class Batch(NamedTuple):
+    """Softened worlds of one shape family."""
+
+    stage: Any
+    worlds: World  # (n, ...), with smooth skins
+
+
+def softened(course: Course, engine: Any, seed: int, step: int) -> list[Batch]:
+    """The worlds of one step of a course as smooth ones, by domain and object."""
+    setting = replace(course.setting, engine=engine)
+    ask = course.ask(jax.tree.map(lambda x: np.array([x]), RPSParams()), seed, step)
+    batches = []
+    for part, _, _ in tune.parts(ask, course.domains, setting):
+        sensor: Any = part.worlds.skin
+        warm = 0.03 if isinstance(sensor, CapacitiveSkin) else 0.001
+        skin = SmoothSkin(sensor, jnp.full(part.numbers.size, warm))
+        batches.append(Batch(part.stage, part.worlds._replace(skin=skin)))
+    return batches
+
+
+def scores_of(space: Space, course: Course, descent: Descent, stage: Any) -> gradients.Scores:
+    """Scores of softened trials from their start, as `gradients` takes them."""
+    setting = course.setting
+
+    def cost(seen: Snapshot) -> jax.Array:
+        return soft_score(seen, space.base, setting, course.objective, descent.arrive)
+
+    strategy = smooth_rps()
+    score = gradients.window(
+        stage,
+        space.params,
+        cost,
+        physics=preset(fidelity="fast"),
+        strategy=strategy,
+        steps=max(1, round(descent.window / setting.physics.control_period)),
+    )
+
+    def scores(thetas: jax.Array, worlds: World) -> jax.Array:
+        live = jnp.ones(len(thetas), bool)
+        return score(thetas, (worlds, start_all(worlds, live, strategy=strategy)))
+
+    return scores
+
+
+@functools.partial(jax.jit, static_argnames=("space", "course", "descent"))
+def _differentiated(
+    thetas: jax.Array, batch: Batch, *, space: Space, course: Course, descent: Descent
+) -> Estimate:
+    """Estimates (S, p) at thetas (S, p), each from all the worlds of a batch."""
+    scores = scores_of(space, course, descent, batch.stage)
+    mode = gradients.forward if descent.estimator == "forward" else gradients.reverse
+    return jax.vmap(lambda theta: mode(scores, theta, batch.worlds))(thetas)
+
+
+def differentiated(
+    thetas: jax.Array, space: Space, course: Course, descent: Descent, step: int
+) -> Estimate:
+    """Estimates (S, p) through the softened trials of one step's worlds."""
+    batches = softened(course, _ENGINE[descent.estimator], descent.seed, step)
+    found = [
+        (_differentiated(thetas, b, space=space, course=course, descent=descent), len(b.worlds.key))
+        for b in batches
+    ]
+    total = sum(n for _, n in found)
+    return Estimate(
+        sum(e.gradient * (n / total) for e, n in found),  # type: ignore[arg-type]
+        sum(e.variance * (n / total) ** 2 for e, n in found),  # type: ignore[arg-type]
+        sum(e.finite * (n / total) for e, n in found),  # type: ignore[arg-type]
+    )
+
+
+def smoothed(
+    thetas: jax.Array, space: Space, course: Course, descent: Descent, step: int, **shape: Any
+) -> Estimate:
+    """Evolution gradients (S, p): antithetic candidates, all in the same worlds, hard law."""
+    key = jax.random.fold_in(jax.random.key(descent.seed), step)
+    count, p = thetas.shape
+    steps = jax.random.normal(key, (count, descent.pairs, p), thetas.dtype)
+    both = jnp.concatenate([steps, -steps], axis=1) * descent.sigma
+    params = space.params((thetas[:, None] + both).reshape(-1, p))
+    ask = course.ask(params, descent.seed, step)
+    (answer,), _ = tune.try_out([ask], course.domains, course.setting, course.objective, **shape)
+    values = course.objective.value(answer.score).reshape(count, 2, descent.pairs)
+    slopes = (values[:, 0] - values[:, 1])[..., None] * steps / (2 * descent.sigma)
+    return jax.vmap(gradients.estimate)(slopes)
+
+
+def estimated(
+    thetas: jax.Array, space: Space, course: Course, descent: Descent, step: int, **shape: Any
+) -> Estimate:
+    """Estimates (S, p) by the estimator that the descent names."""
+    if descent.estimator == "evolution":
+        return smoothed(thetas, space, course, descent, step, **shape)
+    one = differentiated(thetas, space, course, descent, step)
+    if descent.estimator != "combined":
+        return one
+    return jax.vmap(gradients.combine)(one, smoothed(thetas, space, course, descent, step, **shape))
+
+
+# --- runs that can be continued ------------------------------------------------------------
+
+
+class Search(NamedTuple):
+    """The state of all descents."""
+
+    thetas: jax.Array  # (S, p)
+    rule: Any  # state of the optimiser, (S, ...)
+    step: jax.Array  # () int32: how many are done
+    best: jax.Array  # (p,) that validated best
+    best_value: jax.Array  # ()
+
+
+def begin(space: Space, descent: Descent) -> Search:
+    """The state before the first step."""
+    base = space.vector(space.base)
+    key = jax.random.key(descent.seed)
+    away = jax.random.normal(key, (descent.starts, base.size), base.dtype).at[0].set(0.0)
+    thetas = base + descent.spread * away
+    rule = jax.vmap(descent.rule().init)(thetas)
+    return Search(thetas, rule, jnp.zeros((), jnp.int32), base, jnp.asarray(jnp.inf))
+
+
+def open_run(folder: Path, space: Space, course: Course, descent: Descent) -> Path:
+    """The run folder; one that holds a run must hold this one.
+
+    Raises:
+      InputError: it cannot be written, or holds another run.
+    """
+    return record.claim(folder, tune.configuration(space, course) | {"descent": asdict(descent)})
+
+
+def descend(
+    folder: Path,
+    space: Space,
+    course: Course,
+    descent: Descent,
+    *,
+    report: Callable[[int, Progress], Any] = lambda step, progress: None,
+    **shape: Any,
+) -> RPSParams:
+    """Tune by gradients, in a run folder; one that was killed goes on where it was.
+
+    Before every step all descents are tried on the worlds for validation. Every step is a line of
+    `log.jsonl`. Returns what validated best, as `tuned.json` holds it.
+    """
+    search, log = tune.resume(folder, begin(space, descent), "step")
+    rule = descent.rule()
+    while int(search.step) <= descent.steps:
+        step = int(search.step)
+        check = course.validate(space.params(search.thetas), descent.seed)
+        (tried,), timing = tune.try_out(
+            [check],
+            course.domains,
+            course.setting,
+            course.objective,
+            report=lambda progress, step=step: report(step, progress),
+            **shape,
+        )
+        values = course.objective.value(tried.score)
+        first = int(jnp.nanargmin(values))
+        if float(values[first]) < float(search.best_value):
+            search = search._replace(best=search.thetas[first], best_value=values[first])
+        line = {
+            "generation": step,
+            "validation": tune.finite(values[first]),
+            "validation_success": float(tried.success[first].mean()),
+            "mean": tune.finite(jnp.nanmean(values)),
+            "spread": tune.finite(jnp.nanstd(values)),
+            "best": tune.finite(values[first]),
+            "base": log[0]["base"] if log else tune.finite(values[0]),
+            "simulated": timing.simulated,
+            "compile": timing.compile,
+            "run": timing.run,
+            "params": tune.named(space, search.thetas[first]),
+        }
+        if step < descent.steps:
+            found = estimated(search.thetas, space, course, descent, step, **shape)
+            changes, state = jax.vmap(rule.update)(found.gradient, search.rule, search.thetas)
+            thetas = optax.apply_updates(search.thetas, changes)
+            search = search._replace(thetas=thetas, rule=state)
+            norm = jnp.linalg.norm(found.gradient, axis=1)
+            error = jnp.sqrt(jnp.sum(found.variance, axis=1))
+            line |= {
+                "gradient": tune.finite(norm.mean()),
+                "gradient_error": tune.finite(error.mean()),
+                "finite": float(found.finite.mean()),
+            }
+        search = search._replace(step=search.step + 1)
+        log.append(line)
+        record.write_json(folder / "tuned.json", tune.named(space, search.best))
+        tune.save(folder, search, log)
+    return space.params(search.best)
