@@ -76,7 +76,7 @@ class Space:
         for name in self.names:
             bound = BOUNDS[errors.check_name("tuned parameter", name, BOUNDS)]
             share = _share(bound, self.base, name)
-            errors.checkfinite(f"{name}, to be tuned", share, above=bound.low)
+            errors.check_finite(f"{name}, to be tuned", share, above=bound.low)
             if share >= bound.high:
                 raise errors.InputError(
                     f"{name}, to be tuned = {share:g} is not allowed: it must be below "
@@ -141,9 +141,9 @@ class Objective:
     def __post_init__(self) -> None:
         """Raises InputError for weights or a risk that mean nothing."""
         errors.check_name("risk", self.risk, ("mean", "cvar"))
-        errors.checkfinite("tail", self.tail, above=0, at_most=1)
+        errors.check_finite("tail", self.tail, above=0, at_most=1)
         for name in ("time", "lost", "miss"):
-            errors.checkfinite(name, getattr(self, name), at_least=0)
+            errors.check_finite(name, getattr(self, name), at_least=0)
 
     def score(self, success: Any, time: Any, lost: Any, missed: Any, rules: Rules) -> Any:
         """Scores (...) [1] of trials, less is better, about 0 to 2.
@@ -317,12 +317,12 @@ class Evolution:
     def __post_init__(self) -> None:
         """Raises InputError for an unknown strategy or counts that mean nothing."""
         errors.check_name("strategy", self.strategy, STRATEGIES)
-        errors.checkfinite("population", self.population, at_least=4, at_most=1e5)
-        errors.checkfinite("generations", self.generations, at_least=1, at_most=1e6)
-        errors.checkfinite("spread", self.spread, above=0, at_most=10)
-        errors.checkfinite("prior", self.prior, at_least=0)
-        errors.checkfinite("patience", self.patience, at_least=0)
-        errors.checkfinite("seed", self.seed, at_least=0, at_most=2**30)
+        errors.check_finite("population", self.population, at_least=4, at_most=1e5)
+        errors.check_finite("generations", self.generations, at_least=1, at_most=1e6)
+        errors.check_finite("spread", self.spread, above=0, at_most=10)
+        errors.check_finite("prior", self.prior, at_least=0)
+        errors.check_finite("patience", self.patience, at_least=0)
+        errors.check_finite("seed", self.seed, at_least=0, at_most=2**30)
 
     def algorithm(self, size: int) -> Any:
         """The strategy of evosax for vectors (size,)."""
@@ -419,8 +419,8 @@ class Course:
         """Raises InputError for no domain or no worlds."""
         if not self.domains:
             raise errors.InputError("domains = () is not allowed: name at least one.")
-        errors.checkfinite("worlds", self.worlds, at_least=1, at_most=1e7)
-        errors.checkfinite("validation", self.validation, at_least=1, at_most=1e7)
+        errors.check_finite("worlds", self.worlds, at_least=1, at_most=1e7)
+        errors.check_finite("validation", self.validation, at_least=1, at_most=1e7)
 
     def ask(self, params: RPSParams, seed: int, generation: int) -> Ask:
         """Candidates with leaves (P,) in the worlds of a generation."""

@@ -1,0 +1,132 @@
+"""Tuning by gradients: the softened score, its limit, and runs that can be continued."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rps_jax import cli, descent, domain, tune
+from rps_jax.descent import Descent
+from rps_jax.errors import InputError
+from rps_jax.law import RPSParams
+from rps_jax.physics import preset
+from rps_jax.slots import Setting
+from rps_jax.trial import Rules
+from rps_jax.tune import Course, Objective, Space
+
+SETTING = Setting(preset(), Rules(horizon=20.0, max_lost=10.0), engine="quasistatic")
+OBJECTIVE = Objective(time=0.3, lost=0.1, miss=0.5)
+
+
+def seen(distance, contact):
+    """Snapshots of which the score reads no more than this."""
+    return SimpleNamespace(
+        details=SimpleNamespace(distance=jnp.asarray(distance)),
+        reading=SimpleNamespace(in_contact=jnp.asarray(contact)),
+    )
+
+
+def score(distance, contact, arrive=1e-5):
+    return float(
+        descent.soft_score(seen(distance, contact), RPSParams(), SETTING, OBJECTIVE, arrive)
+    )
+
+
+class TestSoftScore:
+    def test_cold_it_is_the_hard_score_of_a_success(self):
+        # 1 m at 0.1 m/s in steps of 20 ms: nearer than d_success = 5 cm after 9.5 s = 475 steps.
+        distance = 1.0 - 0.1 * 0.02 * np.arange(600)
+        expected = OBJECTIVE.score(1.0, 9.5, 0.0, 0.05, SETTING.rules)
+        assert score(distance, np.ones(600)) == pytest.approx(float(expected), abs=1e-3)
+
+    def test_cold_it_is_the_hard_score_of_a_failure(self):
+        # 5 s in contact, then 5 s without; never nearer than 30 cm.
+        contact = np.repeat([1.0, 0.0], 250)
+        expected = OBJECTIVE.score(0.0, 10.0, 5.0, 0.3, SETTING.rules)
+        assert score(np.full(500, 0.3), contact) == pytest.approx(float(expected), rel=1e-5)
+
+    def test_time_before_the_first_touch_is_not_lost(self):
+        contact = np.repeat([0.0, 1.0], 250)
+        expected = OBJECTIVE.score(0.0, 10.0, 0.0, 0.3, SETTING.rules)
+        assert score(np.full(500, 0.3), contact) == pytest.approx(float(expected), rel=1e-5)
+
+    def test_it_has_a_slope_where_the_hard_one_jumps(self):
+        def at(d):
+            one = seen(d * jnp.ones(5), jnp.ones(5))
+            return descent.soft_score(one, RPSParams(), SETTING, OBJECTIVE, 0.005)
+
+        assert float(jax.grad(at)(0.05)) > 1.0
+
+
+class TestDescent:
+    def test_bad_options_are_refused(self):
+        for bad in ({"estimator": "backprop"}, {"optimiser": "sgdd"}, {"clip": 0.0}, {"pairs": 0}):
+            with pytest.raises(InputError):
+                Descent(**bad)
+
+    def test_the_first_start_is_the_base(self):
+        space = Space(tune.SUBSETS["full"])
+        thetas = descent.begin(space, Descent(starts=3)).thetas
+        np.testing.assert_array_equal(thetas[0], space.vector(space.base))
+        assert (np.abs(thetas[1:] - thetas[0]).max(axis=1) > 0.1).all()
+
+    def test_steps_go_downhill_and_stay_within_the_clip(self):
+        one = Descent(optimiser="sgd", learning_rate=0.5, clip=1.0, steps=10)
+        rule = one.rule()
+        change, _ = rule.update(jnp.array([30.0, 40.0]), rule.init(jnp.zeros(2)), jnp.zeros(2))
+        np.testing.assert_allclose(change, [-0.3, -0.4], rtol=1e-6)
+
+
+def test_antithetic_steps_find_the_slope_of_the_objective(monkeypatch):
+    # value = 2 z_0 - z_1 in the coordinates of the map, the same in all worlds.
+    space = Space(("L", "K_h"))
+
+    def pretend(asks, *_, **__):
+        z = space.vector(asks[0].params)
+        values = np.asarray(2 * z[:, 0] - z[:, 1])[:, None] + np.zeros(3)
+        return [tune.Answer(values, values, values)], None
+
+    monkeypatch.setattr(tune, "try_out", pretend)
+    course = Course((domain.DOMAINS["wide"],), 3, 3, SETTING)
+    found = descent.smoothed(jnp.zeros((2, 2)), space, course, Descent(pairs=4000), 0)
+    np.testing.assert_allclose(found.gradient, [[2, -1], [2, -1]], atol=0.2)
+    errors = np.abs(found.gradient - jnp.array([2.0, -1.0])) / jnp.sqrt(found.variance)
+    assert (errors < 4).all()
+
+
+class TestRuns:
+    """Cylinders on the quasi-static model, to compile few programs."""
+
+    def arguments(self, folder, steps):
+        return [
+            *("tune", "grad", "--engine", "quasistatic", "--estimator", "reverse"),
+            *("--objects", "random_cylinder", "--worlds", "2", "--validation", "2"),
+            *("--starts", "2", "--steps", str(steps), "--window", "1", "--horizon", "5"),
+            *("--tuned", "L", "K_h", "v_lost", "--slots", "4", "--out", str(folder)),
+        ]
+
+    def test_the_command_line_and_a_run_of_another_kind(self, tmp_path, capsys):
+        assert cli.main(self.arguments(tmp_path, 2)) == 0
+        log = tune.read_log(tmp_path)
+        assert len(log) == 3
+        assert all(line["finite"] == 1.0 for line in log[:2])
+        assert log[1]["params"] != log[0]["params"] or log[0]["gradient"] == 0
+        assert set(json.loads((tmp_path / "tuned.json").read_text())) == {"L", "K_h", "v_lost"}
+        capsys.readouterr()
+        assert cli.main(self.arguments(tmp_path, 3)) == 2
+        assert "steps = 2 there, 3 asked for" in capsys.readouterr().err
+
+    def test_gradients_of_worlds_are_finite_and_know_their_error(self):
+        space = Space(("K_h", "L"))
+        one = replace(domain.DOMAINS["wide"], objects=("random_cylinder",))
+        course = Course((one,), 2, 2, SETTING)
+        thetas = space.vector(space.base)[None].repeat(2, axis=0)
+        how = Descent(estimator="reverse", window=1.0)
+        found = descent.estimated(thetas, space, course, how, 0)
+        assert np.isfinite(found.gradient).all()
+        assert (found.finite == 1).all()
+        np.testing.assert_allclose(found.gradient[0], found.gradient[1], rtol=1e-4, atol=1e-8)
