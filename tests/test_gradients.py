@@ -1,0 +1,240 @@
+"""Estimates of gradients: right on average, as sure as they say, and deaf to what is not finite."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import hypothesis
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+
+from rps_jax import errors, gradients, sweep, trial
+from rps_jax.gradients import Estimate
+from rps_jax.law import RPSParams
+from rps_jax.physics import Physics
+from rps_jax.scene import FRICTION
+from rps_jax.skin import SmoothSkin
+from rps_jax.slots import Setting
+from rps_jax.sweep import Case
+from rps_jax.trial import Stage
+
+THETA = jnp.array([0.5, -1.0, 2.0])
+STIFF = jnp.array([1.0, 2.0, 0.5])
+SPREAD = 0.3
+REPEATS = 400
+
+
+def bowls(thetas, worlds):
+    """Of mean gradient STIFF THETA: a quadratic with its bottom somewhere else in each world."""
+    return 0.5 * jnp.sum(STIFF * (thetas - worlds) ** 2, axis=-1)
+
+
+def some_worlds(key, n=32):
+    return SPREAD * jax.random.normal(key, (n, 3))
+
+
+ESTIMATORS = {
+    "forward": lambda scores, key, worlds: gradients.forward(scores, THETA, worlds),
+    "reverse": lambda scores, key, worlds: gradients.reverse(scores, THETA, worlds),
+    "evolution": lambda scores, key, worlds: gradients.evolution(
+        scores, THETA, worlds, key, sigma=0.2, pairs=2
+    ),
+}
+every_estimator = pytest.mark.parametrize("name", ESTIMATORS)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def found_by(name, scores, key, worlds) -> Estimate:
+    return ESTIMATORS[name](scores, key, worlds)
+
+
+@functools.cache
+def repeat(name, n, seed=1) -> Estimate:
+    """Independent estimates, (REPEATS, ...), each in n fresh worlds."""
+
+    def one(key):
+        key_worlds, key = jax.random.split(key)
+        return ESTIMATORS[name](bowls, key, some_worlds(key_worlds, n))
+
+    keys = jax.random.split(jax.random.key(seed), REPEATS)
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(keys))
+
+
+@every_estimator
+def test_the_gradient_of_a_quadratic_is_found_without_bias_and_within_its_interval(name):
+    for n in (32, 512):
+        found = repeat(name, n)
+        error = found.gradient - STIFF * THETA
+        of_the_mean = error.std(axis=0) / math.sqrt(REPEATS)
+        assert (np.abs(error.mean(axis=0)) < 3.5 * of_the_mean).all()
+        assert (found.finite == 1).all()
+    within = np.abs(error) < 1.96 * np.sqrt(found.variance)
+    assert (np.abs(within.mean(axis=0) - 0.95) < 0.04).all()
+
+
+@every_estimator
+def test_the_variance_is_that_of_repeated_estimates_and_falls_as_one_over_n(name):
+    few, many = repeat(name, 32), repeat(name, 512)
+    for found in (few, many):
+        np.testing.assert_allclose(found.variance.mean(0), found.gradient.var(0), rtol=0.3)
+    np.testing.assert_allclose(few.variance.mean(0) / many.variance.mean(0), 16, rtol=0.15)
+
+
+def test_forward_and_reverse_are_the_derivatives_in_each_world():
+    worlds = some_worlds(jax.random.key(2))
+    slopes = STIFF * (THETA - worlds)  # (32, 3)
+    for name in ("forward", "reverse"):
+        found = found_by(name, bowls, None, worlds)
+        np.testing.assert_allclose(found.gradient, slopes.mean(axis=0), rtol=1e-5)
+        np.testing.assert_allclose(found.variance, slopes.var(axis=0, ddof=1) / 32, rtol=1e-4)
+
+
+def test_evolution_has_the_gradient_of_the_smoothed_score():
+    # E[(theta + sigma e)^3] = theta^3 + 3 sigma^2 theta.
+    def cubes(thetas, worlds):
+        return jnp.sum(thetas**3, axis=-1) + worlds
+
+    sigma = jnp.array([0.5, 0.1, 0.3])
+    found = gradients.evolution(
+        cubes, THETA, jnp.zeros(200_000), jax.random.key(3), sigma=sigma, pairs=1
+    )
+    expected = 3 * THETA**2 + 3 * sigma**2
+    assert (np.abs(found.gradient - expected) < 4 * np.sqrt(found.variance)).all()
+    assert (found.variance < 0.05**2 * 9).all()
+
+
+def test_only_evolution_sees_what_jumps():
+    """A world is won if the first parameter, 0.5, passes a hurdle uniform on [-1, 2]."""
+
+    def wins(thetas, hurdles):
+        return (thetas[:, 0] > hurdles).astype(thetas.dtype)
+
+    hurdles = jax.random.uniform(jax.random.key(4), (20_000,), minval=-1, maxval=2)
+    for name in ("forward", "reverse"):
+        np.testing.assert_array_equal(found_by(name, wins, None, hurdles).gradient, np.zeros(3))
+    found = found_by("evolution", wins, jax.random.key(5), hurdles)
+    assert found.gradient[0] > 0.2
+    assert (np.abs(found.gradient - np.array([1 / 3, 0, 0])) < 4 * np.sqrt(found.variance)).all()
+
+
+def test_common_worlds_cancel_what_does_not_depend_on_the_parameters():
+    def shifted(thetas, worlds):
+        return bowls(thetas, worlds) + 1e3 * worlds[:, 0]
+
+    worlds, key = some_worlds(jax.random.key(6)), jax.random.key(7)
+    plain, noisy = (found_by("evolution", scores, key, worlds) for scores in (bowls, shifted))
+    np.testing.assert_allclose(noisy.gradient, plain.gradient, atol=2e-3)
+
+
+@every_estimator
+def test_worlds_that_are_not_finite_are_dropped_and_counted(name):
+    worlds = some_worlds(jax.random.key(8))
+    broken = worlds.at[::8].set(jnp.nan).at[4::8].set(jnp.inf)
+    rest = jnp.delete(worlds, np.arange(0, 32, 4), axis=0)
+    found = found_by(name, bowls, jax.random.key(9), broken)
+    np.testing.assert_allclose(found.finite, 0.75)
+    assert np.isfinite(found.gradient).all()
+    if name != "evolution":  # which tries other directions in another number of worlds
+        expected = found_by(name, bowls, None, rest)
+        np.testing.assert_allclose(found.gradient, expected.gradient, rtol=1e-5)
+        np.testing.assert_allclose(found.variance, expected.variance, rtol=1e-5)
+
+
+def test_entries_are_dropped_one_by_one():
+    found = gradients.estimate(jnp.array([[1.0, jnp.nan], [3.0, 2.0], [jnp.inf, 4.0], [5.0, 6.0]]))
+    np.testing.assert_allclose(found.gradient, [3.0, 4.0])
+    np.testing.assert_allclose(found.variance, [4 / 3, 4 / 3])  # of 1 3 5 and 2 4 6: 4 in 3
+    np.testing.assert_allclose(found.finite, [0.75, 0.75])
+
+
+def test_an_estimate_of_nothing_is_zero_with_infinite_variance():
+    found = gradients.estimate(jnp.array([[jnp.nan, 1.0], [jnp.nan, jnp.nan]]))
+    np.testing.assert_array_equal(found.gradient, [0.0, 1.0])
+    np.testing.assert_array_equal(found.variance, [np.inf, np.inf])
+    np.testing.assert_array_equal(found.finite, [0.0, 0.5])
+
+
+def known(gradient, variance) -> Estimate:
+    return Estimate(*(jnp.asarray(x, float) for x in (gradient, variance, np.ones_like(gradient))))
+
+
+def test_a_combination_weighs_by_inverse_variance_by_hand():
+    # Weights 1/1 and 1/3: (1 * 0 + 1/3 * 4) / (4/3) = 1, variance 1 / (4/3).
+    both = gradients.combine(known([0.0, 2.0], [1.0, 0.0]), known([4.0, 9.0], [3.0, 1.0]))
+    np.testing.assert_allclose(both.gradient, [1.0, 2.0])
+    np.testing.assert_allclose(both.variance, [0.75, 0.0])
+
+
+@pytest.mark.parametrize(("sure", "lost"), [(1.0, np.inf), (0.0, np.inf), (0.0, 0.0)])
+def test_what_knows_nothing_has_no_weight(sure, lost):
+    one, other = known([2.0], [sure]), known([2.0 if lost == 0 else 7.0], [lost])
+    for both in (gradients.combine(one, other), gradients.combine(other, one)):
+        assert both.gradient == 2.0
+        assert both.variance == sure
+    nothing = gradients.combine(known([0.0], [np.inf]), known([0.0], [np.inf]))
+    assert nothing.variance == np.inf
+    assert nothing.gradient == 0
+
+
+@hypothesis.settings(max_examples=30, deadline=None)
+@hypothesis.given(st.lists(st.floats(0, 1e6), min_size=4, max_size=4))
+def test_a_combination_claims_to_be_no_worse_than_either_and_is_symmetric(variances):
+    one, other = known([1.0, -1.0], variances[:2]), known([3.0, 5.0], variances[2:])
+    both, again = gradients.combine(one, other), gradients.combine(other, one)
+    least = np.minimum(one.variance, other.variance)
+    assert (both.variance <= least * (1 + 1e-6)).all()
+    np.testing.assert_allclose(both.gradient, again.gradient, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(both.variance, again.variance, rtol=1e-5, atol=1e-30)
+
+
+def test_a_combination_is_nearer_to_the_truth_than_either():
+    """The derivative and the smoothed differences of the same score, in worlds of their own."""
+    one, other = repeat("forward", 32), repeat("evolution", 512, seed=2)
+    both = jax.vmap(gradients.combine)(one, other)
+    error = [np.mean((found.gradient - STIFF * THETA) ** 2) for found in (both, one, other)]
+    assert error[0] < 0.95 * min(error[1:])
+    np.testing.assert_allclose(both.variance.mean(), error[0], rtol=0.3)
+
+
+# Windows of trials
+
+
+def params_of(theta) -> RPSParams:
+    return RPSParams.paper()._replace(L=theta[0], K_h=theta[1], beta=theta[2], K_v=theta[3])
+
+
+def final_distance(seen):
+    return seen.details.distance[-1]
+
+
+def test_mjx_must_have_a_pyramidal_cone():
+    stage: Stage = Stage(None, None)  # type: ignore[arg-type]
+    with pytest.raises(errors.InputError, match="cone = elliptic"):
+        gradients.window(stage, params_of, final_distance, physics=Physics(), steps=10)
+
+
+def test_the_derivative_of_a_window_of_fused_trials_is_its_finite_difference():
+    """A cylinder rolls along the base, in float32; one program gives scores and derivatives."""
+    targets = ((1.0, -1.5), (2.0, 0.5), (-1.5, 1.0))
+    skin, setting = SmoothSkin(), Setting(engine="fused")
+    cases = [Case("cylinder", FRICTION["S1"], t, skin=skin, gap=0.004) for t in targets]
+    stage, worlds = sweep.build(cases, setting)
+    strategy = trial.smooth_rps()
+    starts = (worlds, trial.start_all(worlds, np.ones(3, bool), strategy=strategy))
+    scores = gradients.window(stage, params_of, final_distance, physics=setting.physics, steps=50)
+    along = jax.jit(lambda thetas, way: jax.jvp(lambda x: scores(x, starts), (thetas,), (way,)))
+    theta, h = np.array([0.2, 1.0, 0.12, 0.04], np.float32), 0.01
+    slopes, differences = [], []
+    for direction in np.diag(theta):
+        thetas, way = np.tile(theta, (3, 1)), np.tile(direction, (3, 1))
+        slopes.append(along(thetas, way)[1])
+        up, down = (along(thetas + side * h * way, way)[0] for side in (1, -1))
+        differences.append((up - down) / (2 * h))
+    slopes, differences = np.array(slopes), np.array(differences)
+    assert np.isfinite(slopes).all()
+    assert (np.abs(slopes).max(axis=1) > 1e-3).all()  # each parameter matters somewhere
+    np.testing.assert_allclose(slopes, differences, rtol=0.02, atol=2e-4)
