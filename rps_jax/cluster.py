@@ -146,8 +146,8 @@ def _reach(address: str) -> None:
 
 
 def _line(error: BaseException) -> str:
-    """The first line of a message, without its full stop."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
+    """The last line of a message, which says what is wrong, without its full stop."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[-1].rstrip(".")
 
 
 def run(
