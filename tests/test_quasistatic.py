@@ -7,7 +7,6 @@ friction cone. Unless said otherwise, in double precision.
 
 import functools
 import math
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -17,7 +16,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from rps_jax import engines, frames, paper, scene, solid, sweep, trial
+from rps_jax import engines, paper, scene, solid, sweep, trial
 from rps_jax import footprint as fp
 from rps_jax.errors import InputError
 from rps_jax.footprint import Footprint
@@ -36,6 +35,13 @@ ARM = {"box": HALF * math.sqrt(2), "cylinder": RADIUS}  # [m] c of the paper's o
 STEPS, PERIOD = 100, 0.02  # control steps of every film, and their length [s]
 
 
+def box(half, radius=0.0):
+    """A square with a corner given twice, as objects of few corners have it beside others."""
+    plain = fp.rectangle(half, half)
+    twice = jnp.concatenate([plain.vertices, plain.vertices[-1:]])
+    return Footprint(twice, jnp.asarray(radius))
+
+
 class Push(NamedTuple):
     """An object before the base, which moves at a constant twist."""
 
@@ -45,7 +51,7 @@ class Push(NamedTuple):
     arm: float = ARM["box"]  # [m]
     friction: float = 0.5  # [1] with the base
     com: tuple[float, float] = (0.0, 0.0)  # [m] in the object's frame
-    outline: Footprint = fp.rectangle(HALF, HALF)
+    outline: Footprint = box(HALF)
     scale: float = 1.0  # of time: so many times faster, and so much shorter
 
 
@@ -80,7 +86,7 @@ def blank(kind, **given):
     return kind(**(dict.fromkeys(kind._fields) | given))
 
 
-def film(pushes, stage=Quasistatic()):
+def film(pushes):
     """Films of pushes whose outlines have one number of corners."""
     with jax.enable_x64(True):
         rows = lambda name: np.array([getattr(p, name) for p in pushes], float)  # noqa: E731
@@ -97,7 +103,7 @@ def film(pushes, stage=Quasistatic()):
         twists = (going * scale)[..., None] * rows("twist")
         physics = Physics(timestep=PERIOD, control_period=PERIOD)
         worlds, start = jax.tree.map(lambda x: jnp.asarray(x, float), (worlds, start))
-        qpos = np.asarray(drive(stage, worlds, start, jnp.asarray(twists), physics))
+        qpos = np.asarray(drive(Quasistatic(), worlds, start, jnp.asarray(twists), physics))
     yaw = np.unwrap(2 * np.arctan2(qpos[..., 9], qpos[..., 6]), axis=0)
     thing = np.concatenate([qpos[..., 3:5], yaw[..., None]], axis=-1)
     return [Film(qpos[:, i, :3], thing[:, i]) for i in range(len(pushes))]
@@ -165,11 +171,21 @@ def expected(push):
     return pose, slid
 
 
-STICKING = [at_corner(y, twist=(0.04, s, 0.0), friction=1.0, arm=c)
-            for y, s, c in [(0.1, 0.0, 0.2828), (0.3, 0.02, 0.2828), (0.2, -0.02, 0.15)]]  # fmt: skip
-SLIDING = [at_corner(y, twist=(0.04, s, 0.0), friction=mu, arm=c)
-           for y, s, mu, c in [(0.3, 0.03, 0.1, 0.2828), (0.2, -0.03, 0.2, 0.2828),
-                               (0.1, 0.03, 0.1, 0.15)]]  # fmt: skip
+STICKING = [
+    at_corner(yaw, twist=(0.04, v_y, 0.0), friction=1.0, arm=arm)
+    for yaw, v_y, arm in [(0.1, 0.0, 0.28), (0.3, 0.02, 0.28), (0.2, 0.0, 0.15)]
+]
+SLIDING = [
+    at_corner(yaw, twist=(0.04, v_y, 0.0), friction=mu, arm=arm)
+    for yaw, v_y, mu, arm in [
+        (0.3, 0.03, 0.1, 0.28),
+        (0.2, -0.03, 0.2, 0.28),
+        (0.3, 0.0, 0.05, 0.2),
+    ]
+]
+ROLLING = on_disc(Push((0.04, 0.03, 0.0), friction=0.8))
+SLIPPING = ROLLING._replace(friction=0.1)
+_ROUND = {"outline": box(1e-4, RADIUS - 1e-4)}
 CASES = {
     "centre": Push(),
     "apart": Push(pose=(FRONT + HALF + 0.2, 0.0, 0.3)),
@@ -177,6 +193,8 @@ CASES = {
     "mirrored": Push((0.05, -0.02, -0.05), (*(np.array([1, -1, -1]) * at_corner(0.3).pose),)),
     "once": at_corner(0.2, twist=(0.02, 0.01, -0.04), com=(0.05, -0.03)),
     "twice": at_corner(0.2, twist=(0.02, 0.01, -0.04), com=(0.05, -0.03), scale=2.0),
+    "rolling": ROLLING._replace(**_ROUND),
+    "slipping": SLIPPING._replace(**_ROUND),
     "here": at_corner(0.2, twist=(0.05, 0.01, 0.1), com=(0.05, -0.03)),
     **{f"sticking {i}": push for i, push in enumerate(STICKING)},
     **{f"sliding {i}": push for i, push in enumerate(SLIDING)},
@@ -189,7 +207,7 @@ CASES["there"] = _here._replace(
 _rng = np.random.default_rng(1)
 for _i in range(24):  # flat on the face
     _s, _mu, _y = _rng.uniform([-0.03, 0.1, -0.1], [0.03, 0.8, 0.1])
-    CASES[f"flat {_i}"] = Push((0.03, _s, _rng.uniform(-0.15, 0.15)), (FRONT + HALF, _y, 0.0),
+    CASES[f"flat {_i}"] = Push((0.03, _s, _rng.uniform(-0.08, 0.08)), (FRONT + HALF, _y, 0.0),
                                friction=_mu)  # fmt: skip
 
 
@@ -264,7 +282,7 @@ def test_a_flat_contact_holds_if_and_only_if_forces_within_its_cones_can():
         crept = np.hypot(*(relative[25] - relative[0])) / (25 * PERIOD)
         turned = abs((seen.thing - seen.base)[25, 2]) / (25 * PERIOD)
         slipped = (crept + HALF * turned) / math.hypot(*CASES[name].twist[:2])
-        if short == 0:
+        if short < 1e-9:
             held.append(True)
             assert slipped < 0.05
         elif short > 0.05:
@@ -294,9 +312,6 @@ def test_where_it_happens_does_not_matter():
 
 # --- round objects --------------------------------------------------------------------------
 
-ROLLING = on_disc(Push((0.04, 0.03, 0.0), friction=0.8))
-SLIPPING = ROLLING._replace(friction=0.1)
-
 
 @functools.cache
 def discs():
@@ -323,10 +338,8 @@ def test_a_cylinder_slips_along_a_slippery_face():
 
 
 def test_a_tiny_box_with_a_round_edge_is_a_cylinder():
-    tiny = fp.rectangle(1e-4, 1e-4)._replace(radius=jnp.asarray(RADIUS - 1e-4))
-    seen = film([ROLLING._replace(outline=tiny), SLIPPING._replace(outline=tiny)])
-    for a, b in zip(seen, discs(), strict=True):
-        np.testing.assert_allclose(a.moved, b.moved, atol=1e-3)
+    for name, disc in zip(("rolling", "slipping"), discs(), strict=True):
+        np.testing.assert_allclose(boxes()[name].moved, disc.moved, atol=1e-3)
 
 
 # --- the problem that is solved -------------------------------------------------------------
@@ -383,7 +396,7 @@ def test_newtons_method_has_the_derivatives_of_what_it_minimises_and_finds_its_m
         hessian = jax.vmap(jax.hessian(of, argnums=1), (0, 0, None))
 
         @jax.jit
-        def both(v):
+        def both(v):  # as it is written, and by differentiation
             return stage._derivatives(problem, v, stage.slip, dt), (
                 gradient(problem, v, dt),
                 hessian(problem, v, dt),
@@ -407,45 +420,46 @@ def test_newtons_method_has_the_derivatives_of_what_it_minimises_and_finds_its_m
 # --- derivatives ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "outline", [fp.rectangle(HALF, HALF), fp.circle(RADIUS)], ids=["box", "disc"]
-)
-def test_derivatives_of_a_push_are_those_of_finite_differences(outline):
-    """Of the end of an open-loop push, along directions in all that goes in."""
-    round_ = outline.vertices.shape[0] == 1
-    push = on_disc(Push()) if round_ else at_corner(0.3)
-    stage, physics = Quasistatic(), Physics(timestep=PERIOD, control_period=PERIOD)
-    time = np.arange(50)[:, None, None] * PERIOD
+def moved_both_ways(given, seed):
+    """Trees (7, ...) of `given` moved along a random direction in each of its three parts."""
+    rng = np.random.default_rng(seed)
+    ways = [jax.tree.map(lambda x: rng.normal(size=x.shape), part) for part in given]
+    rows = [(0.0, 0)] + [(e, part) for part in range(3) for e in (1e-6, -1e-6)]
+    stacked = []
+    for part, (nominal, way) in enumerate(zip(given, ways, strict=True)):
+        steps = np.array([e if part == of else 0.0 for e, of in rows])
+        move = lambda x, d, s=steps: x + s.reshape(-1, *(1,) * x.ndim) * d  # noqa: E731
+        stacked.append(jax.tree.map(move, nominal, way))
+    return stacked, ways
+
+
+def test_derivatives_of_a_push_are_those_of_finite_differences():
+    """Of where a cylinder, pushed in curves, ends: by what it is, where it starts and the push."""
+    time = np.arange(50)[:, None] * PERIOD
+    waves = 0.05 + 0.01 * np.sin(2 * time), 0.02 * np.cos(3 * time), 0.1 * np.sin(4 * time)
+    object_ = Slider(*(np.array(x) for x in ((0.01, 0.02), 0.2, 0.3, (FRONT, SIDE))))
+    pose = np.array([0, 0, 0, FRONT + RADIUS, 0, 0.2, 1, 0, 0, 0])
+    given = (object_, np.array(RADIUS)), pose, np.concatenate(waves, axis=1)
     with jax.enable_x64(True):
-        wave = 0.05 + 0.01 * np.sin(2 * time), 0.02 * np.cos(3 * time), 0.1 * np.sin(4 * time)
-        twists = jnp.asarray(np.concatenate(wave, axis=-1))
-        start = np.array([[0, 0, 0, *push.pose[:2], 0, *_quaternion(push.pose[2])]])
-        slider = Slider(*(np.array([x], float) for x in (push.com, push.arm, 0.3, (FRONT, SIDE))))
-        shape = jax.tree.map(lambda x: np.asarray(x, float)[None], outline)
-        given = jax.tree.map(jnp.asarray, (slider, shape, start, twists))
+        moved, ways = moved_both_ways(given, 0)
+        physics = Physics(timestep=PERIOD, control_period=PERIOD)
 
-        def where(given):
-            slider, shape, start, twists = given
-            worlds = blank(trial.World, fields=slider, footprint=shape)
-            end = drive(stage, worlds, start, twists, physics)[-1, 0]
-            return end[3] + 2 * end[4] + 3 * jnp.arctan2(end[9], end[6])
+        @jax.jit
+        @partial(jax.value_and_grad, has_aux=True)
+        def end(given):
+            (slider, radius), start, twists = given
+            outline = Footprint(jnp.zeros((7, 1, 2)), radius)
+            worlds = blank(trial.World, fields=slider, footprint=outline)
+            qpos = drive(Quasistatic(), worlds, start, twists.swapaxes(0, 1), physics)[-1]
+            where = qpos[:, 3] + 2 * qpos[:, 4] + 3 * qpos[:, 9]
+            return where[0], where
 
-        gradient = jax.jit(jax.grad(where))(given)
-        rng, value = np.random.default_rng(0), jax.jit(where)
-        for part in range(4):
-            chosen = [jnp.zeros_like] * 4
-            chosen[part] = lambda x: jnp.asarray(rng.normal(size=x.shape))
-            way = tuple(jax.tree.map(f, x) for f, x in zip(chosen, given, strict=True))
-            sides = [value(jax.tree.map(lambda x, d, e=e: x + e * d, given, way))
-                     for e in (1e-6, -1e-6)]  # fmt: skip
-            slope = sum(jnp.vdot(a, b) for a, b in
-                        zip(jax.tree.leaves(gradient), jax.tree.leaves(way), strict=True))  # fmt: skip
-            assert abs(slope) > 1e-3
-            assert slope == pytest.approx((sides[0] - sides[1]) / 2e-6, rel=1e-3)
-
-
-def _quaternion(yaw):
-    return math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)
+        (_, where), gradient = jax.device_get(end(jax.tree.map(jnp.asarray, moved)))
+    for part in range(3):
+        pairs = zip(jax.tree.leaves(gradient[part]), jax.tree.leaves(ways[part]), strict=True)
+        slope = sum(np.vdot(a[0], b) for a, b in pairs)
+        assert abs(slope) > 1e-3
+        assert slope == pytest.approx((where[1 + 2 * part] - where[2 + 2 * part]) / 2e-6, rel=1e-3)
 
 
 TUNED = ("K_h", "K_v", "L", "beta", "k", "eta", "v_max", "omega_max")
@@ -460,7 +474,7 @@ def closed_loop():
         for name in TUNED:
             nudges += [RPSParams()._replace(**{name: getattr(RPSParams(), name) * (1 + e)})
                        for e in (1e-5, -1e-5)]  # fmt: skip
-        cases = [Case("cylinder", FRICTION["S1"], (2.0, 1.0), p, gap=0.0) for p in nudges]
+        cases = [Case("box", FRICTION["S1"], (1.0, 2.0), p, gap=0.0) for p in nudges]
         stage, worlds = sweep.build(cases, Setting(engine="quasistatic"))
         worlds = jax.device_put(worlds)
 
@@ -518,15 +532,6 @@ def test_feet_bear_what_holds_the_centre_of_mass_and_none_pulls():
 
     assert arm(0.1) == pytest.approx(0.75 * math.hypot(0.1, 0.1) + 0.25 * math.hypot(0.3, 0.1))
     assert arm(0.2) == pytest.approx(0.1)
-
-
-def test_a_repeated_corner_changes_nothing():
-    square = fp.rectangle(HALF, HALF)
-    padded = Footprint(jnp.concatenate([square.vertices, square.vertices[-1:]]), square.radius)
-    names = ("here", "flat 0")
-    pushes = [CASES[name]._replace(outline=padded) for name in names]
-    for name, seen in zip(names, film(pushes), strict=True):
-        np.testing.assert_allclose(seen.moved, boxes()[name].moved, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", OBJECTS)
