@@ -14,6 +14,7 @@ import functools
 import hashlib
 import json
 import math
+import reprlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -25,7 +26,16 @@ import h5py
 import numpy as np
 import xarray as xr
 
-from rps_jax import analysis, domain, engines, errors, figures, record, score, slots, trial
+from rps_jax import (
+    analysis,
+    domain,
+    errors,
+    figures,
+    record,
+    score,
+    slots,
+    strategies,
+)
 from rps_jax.domain import Domain
 from rps_jax.errors import InputError
 from rps_jax.physics import Physics
@@ -33,7 +43,8 @@ from rps_jax.report import Section
 from rps_jax.report import write_report as _write
 from rps_jax.scene import Scene
 from rps_jax.slots import Job, Part, Progress, Setting, Timing
-from rps_jax.trial import Outcome, Params, Rules
+from rps_jax.strategies import Params
+from rps_jax.trial import Outcome, Rules
 
 MANIFEST = "manifest.json"
 _TYPES = {"success": np.int8, "diverged": np.int8}  # of an outcome; the others are float32
@@ -50,11 +61,13 @@ class Plan:
     part: int = 1024  # trials of a part, at most
 
     def __post_init__(self) -> None:
-        """Raises InputError for no worlds or no arms."""
-        errors.check_finite("worlds", self.worlds, at_least=1, at_most=1e9)
-        errors.check_finite("part", self.part, at_least=1, at_most=1e6)
+        """Raises InputError for no worlds, no arms, or parameters that mean nothing."""
+        errors.check_count("worlds", self.worlds, at_most=1_000_000_000)
+        errors.check_count("part", self.part, at_most=1_000_000)
         if not self.arms:
             raise InputError("arms = {} is not allowed: name at least one strategy.")
+        for params in self.arms.values():
+            strategies.of(params).check(params)
 
     @property
     def trials(self) -> int:
@@ -115,8 +128,8 @@ class Shard:
 
     def __post_init__(self) -> None:
         """Raises InputError unless 1 <= number <= of."""
-        errors.check_finite("shard", self.of, at_least=1, at_most=1e6)
-        errors.check_finite("shard", self.number, at_least=1, at_most=self.of)
+        errors.check_count("shard", self.of, at_most=1_000_000)
+        errors.check_count("shard", self.number, at_most=self.of)
 
 
 # --- the run folder ------------------------------------------------------------------------
@@ -146,15 +159,21 @@ def open_run(folder: Path, plan: Plan) -> Path:
 def _manifest(folder: Path) -> dict[str, Any]:
     path = folder / MANIFEST
     try:
-        return json.loads(path.read_text())
-    except FileNotFoundError as error:
+        found = json.loads(path.read_text())
+    except (FileNotFoundError, NotADirectoryError) as error:
         raise InputError(
             f"run = {folder} holds no {MANIFEST}: give the folder of a run."
         ) from error
     except ValueError as error:
-        raise InputError(
-            f"{path} is corrupt ({error}): restore it, or choose another folder."
-        ) from error
+        raise _corrupt(path, error) from error
+    if not isinstance(found, dict):
+        raise _corrupt(path, "it holds no names with values")
+    return found
+
+
+def _corrupt(path: Path, why: Any) -> InputError:
+    reason = str(why).rstrip(".")
+    return InputError(f"{path} is corrupt ({reason}): restore it, or choose another folder.")
 
 
 def _difference(found: Any, wanted: Any, path: str = "") -> str:
@@ -167,11 +186,10 @@ def _difference(found: Any, wanted: Any, path: str = "") -> str:
 def _differences(found: Any, wanted: Any, path: str) -> Iterator[str]:
     if isinstance(found, dict) and isinstance(wanted, dict):
         for key in [*found, *(k for k in wanted if k not in found)]:
-            yield from _differences(
-                found.get(key), wanted.get(key), f"{path}.{key}" if path else key
-            )
+            there, asked = (side.get(key, "nothing") for side in (found, wanted))
+            yield from _differences(there, asked, f"{path}.{key}" if path else key)
     elif found != wanted:
-        yield f"{path} = {found} there, {wanted} asked for"
+        yield f"{path} = {reprlib.repr(found)} there, {reprlib.repr(wanted)} asked for"
 
 
 def load_plan(folder: Path) -> Plan:
@@ -192,16 +210,14 @@ def load_plan(folder: Path) -> Plan:
             Setting(Physics(**physics), Rules(**found["rules"]), found["seed"], found["engine"]),
             found["part"],
         )
-    except (KeyError, TypeError) as error:
-        raise InputError(
-            f"{folder / MANIFEST} is corrupt ({error}): restore it, or choose another folder."
-        ) from error
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise _corrupt(folder / MANIFEST, error) from error
 
 
 def _params(arm: dict[str, Any]) -> Params:
     name = arm.pop("strategy")
-    (kind,) = [kind for kind in trial.STRATEGIES if kind.__name__ == name]
-    return kind(**arm)
+    kinds = {kind.__name__: kind for kind in strategies.STRATEGIES}
+    return kinds[errors.check_name("class of parameters", name, kinds)](**arm)
 
 
 @contextlib.contextmanager
@@ -306,7 +322,7 @@ def run(
 
     return slots.run(
         [
-            Job(trial.STRATEGIES[kind[1]], sizes[kind], _made(plan, parts, numbers))
+            Job(strategies.STRATEGIES[kind[1]], sizes[kind], _made(plan, parts, numbers))
             for kind, numbers in jobs.items()
         ],
         plan.setting,
@@ -337,8 +353,7 @@ def _made(plan: Plan, parts: _Parts, numbers: list[int]) -> Iterator[Part]:
 def scene_of(plan: Plan, index: int) -> Scene:
     """The compiled scene of one world, for pictures."""
     drawn = domain.draw(plan.domain, plan.setting.seed, [index])
-    family = plan.domain.family_of(index)
-    return engines.scene_of_solid(family, drawn.solid, drawn.friction, plan.setting.physics, 0)
+    return domain.scene_of(plan.domain, drawn, plan.setting.physics, 0)
 
 
 def title_of(plan: Plan, index: int) -> str:

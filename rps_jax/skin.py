@@ -183,18 +183,25 @@ class CapacitiveSkin(NamedTuple):
     def sense(
         self, state: SkinState, footprint: Footprint, period: float
     ) -> tuple[SkinState, Reading]:
-        """One scan of all taxels, filtered and compared to the threshold."""
+        """One scan of all taxels as the foam, its gains and its noise would have it, read."""
         gap = self.foam - self.compression(footprint)
         change = jnp.mean(self.foam / gap, axis=-1) - 1.0
         key, key_noise = jax.random.split(state.key)
         noise = self.noise * jax.random.normal(key_noise, change.shape, change.dtype)
-        raw = state.gain * change + noise
+        return self.read(state._replace(key=key), state.gain * change + noise, period)
+
+    def read(self, state: SkinState, raw: jax.Array, period: float) -> tuple[SkinState, Reading]:
+        """One scan of a real skin, or of a simulated one, filtered and compared to the threshold.
+
+        `raw` (42,) [1] is each taxel's relative change of capacitance, in strip order (that of
+        `taxels`), `period` [s] after the last scan.
+        """
         signal = state.signal + (1 - jnp.exp(-period / self.time_constant)) * (raw - state.signal)
         active = (signal > self.threshold) & state.alive
-        middles = jnp.asarray(taxels(1, self.half_length)[:, 0], change.dtype)
+        middles = jnp.asarray(taxels(1, self.half_length)[:, 0], raw.dtype)
         first, last = _extremes(active, middles)
         kind = jnp.minimum(jnp.sum(active), LINE)
-        return state._replace(key=key, signal=signal), _reading(kind, first, last)
+        return state._replace(signal=signal), _reading(kind, first, last)
 
 
 # "thin" chatters between the corners of a box, as a rigid contact sensor does.

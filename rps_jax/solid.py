@@ -13,6 +13,7 @@ import numpy as np
 
 from rps_jax import spatial
 
+SIDES = 8  # vertices of a prism at most; those of fewer sides repeat some
 _LOAD_AT = 0.8  # of the way from the middle to the outline stands the load
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from rps_jax import analysis, cli, domain, paper, record, robustness, slots, trial
+from rps_jax import analysis, cli, domain, paper, record, robustness, slots, strategies, trial
 from rps_jax.domain import DOMAINS, Range
 from rps_jax.errors import InputError
 from rps_jax.physics import preset
@@ -55,7 +55,7 @@ def outcomes(parts, setting=SHORT):
         for i, number in enumerate(numbers):
             found[int(number)] = [leaf[i] for leaf in rows]
 
-    job = Job(trial.RPS, sum(p.numbers.size for p in parts), parts)
+    job = Job(strategies.RPS, sum(p.numbers.size for p in parts), parts)
     slots.run([job], setting, slots=SLOTS, workers=1, collect=collect)
     return found
 
@@ -150,7 +150,7 @@ from pathlib import Path
 jax.config.update("jax_compilation_cache_dir", sys.argv[2])
 assert jax.device_count() == 2
 t.swept(Path(sys.argv[1]), workers=1)
-queue = t.slots._Queue(t.Job(t.trial.RPS, 20, [t.made(range(20))]), t.SHORT, t.SLOTS)
+queue = t.slots._Queue(t.Job(t.strategies.RPS, 20, [t.made(range(20))]), t.SHORT, t.SLOTS)
 text = queue.program().as_text()
 print(queue.slots, *(w for w in ("all-reduce", "all-gather", "all-to-all", "permute") if w in text))
 """
