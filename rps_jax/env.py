@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from rps_jax import domain, errors, frames, law, objects, trial, video
+from rps_jax import domain, errors, frames, law, objects, strategies, trial, video
 from rps_jax.domain import DOMAINS, Domain, Draw
 from rps_jax.law import RPSParams, Twist
 from rps_jax.scene import Scene, mjx
@@ -95,6 +95,7 @@ class PushEnv:
         errors.check_name("skin of an environment", self.domain.skin, ("capacitive",))
         errors.check_count("worlds", self.worlds, at_most=1_000_000)
         law.check(self.params)
+        strategies.check_finite(self.weights)
         self._drive  # noqa: B018
 
     # --- the loop ---

@@ -29,13 +29,13 @@ def step(params, memory, seen):
     return memory, twist, Details.of(seen)
 
 
-def main(horizon: float = 300.0):
+def main(horizon: float = 300.0, engine="fused"):
     """Success of the law and of this strategy at three targets, (2, 3)."""
     rps_jax.register_strategy("p_control", Strategy(lambda params: (), step), PParams())
     both = rps_jax.RPSParams.paper(), PParams()
     targets = (1.5, 0.0), (1.0, 1.0), (-1.0, 1.0)
     cases = [rps_jax.Case("box", rps_jax.FRICTION["S1"], t, p) for p in both for t in targets]
-    setting = rps_jax.Setting(rules=rps_jax.Rules(horizon=horizon), engine="fused")
+    setting = rps_jax.Setting(rules=rps_jax.Rules(horizon=horizon), engine=engine)
     outcome, _ = rps_jax.run(cases, setting)
     print(outcome.success.reshape(2, 3))
     return outcome
