@@ -10,24 +10,31 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rps_jax.domain import DOMAINS, Domain
+    from rps_jax.env import PushEnv
     from rps_jax.errors import InputError
     from rps_jax.footprint import Footprint
-    from rps_jax.law import Observation, RPSParams, RPSState, Twist, step
+    from rps_jax.law import Details, Observation, RPSParams, RPSState, Twist, step
+    from rps_jax.objects import OBJECTS, register_object
     from rps_jax.physics import PHYSICS, Physics
-    from rps_jax.scene import FRICTION, OBJECTS, Friction
+    from rps_jax.scene import FRICTION, Friction
     from rps_jax.skin import CapacitiveSkin, IdealSkin
     from rps_jax.slots import Setting
+    from rps_jax.strategies import Strategy, register_strategy
     from rps_jax.sweep import Case, follow, run
     from rps_jax.trial import Outcome, Rules
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "DOMAINS",
     "FRICTION",
     "OBJECTS",
     "PHYSICS",
     "CapacitiveSkin",
     "Case",
+    "Details",
+    "Domain",
     "Footprint",
     "Friction",
     "IdealSkin",
@@ -35,24 +42,32 @@ __all__ = [
     "Observation",
     "Outcome",
     "Physics",
+    "PushEnv",
     "RPSParams",
     "RPSState",
     "Rules",
     "Setting",
+    "Strategy",
     "Twist",
     "follow",
+    "register_object",
+    "register_strategy",
     "run",
     "step",
 ]
 
 _MODULES = {
+    "domain": ("DOMAINS", "Domain"),
+    "env": ("PushEnv",),
     "errors": ("InputError",),
     "footprint": ("Footprint",),
-    "law": ("Observation", "RPSParams", "RPSState", "Twist", "step"),
+    "law": ("Details", "Observation", "RPSParams", "RPSState", "Twist", "step"),
+    "objects": ("OBJECTS", "register_object"),
     "physics": ("PHYSICS", "Physics"),
-    "scene": ("FRICTION", "OBJECTS", "Friction"),
+    "scene": ("FRICTION", "Friction"),
     "skin": ("CapacitiveSkin", "IdealSkin"),
     "slots": ("Setting",),
+    "strategies": ("Strategy", "register_strategy"),
     "sweep": ("Case", "follow", "run"),
     "trial": ("Outcome", "Rules"),
 }

@@ -196,11 +196,5 @@ def aps_step(
         speed * jnp.sin(heading),
         jnp.clip(omega, -params.omega_max, params.omega_max),
     )
-    details = Details(
-        l=seen.p_robot_contact[..., 1],
-        distance=frames.norm(law.displacement(seen)),
-        a_r=jnp.zeros_like(speed),
-        gamma=state.gamma,
-        realigning=jnp.zeros_like(first),
-    )
+    details = Details.of(seen)._replace(gamma=state.gamma)
     return state._replace(alpha=alpha, yaw_error=yaw_error), twist, details

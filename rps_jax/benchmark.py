@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from rps_jax import paper, reference, sweep, trial
+from rps_jax import paper, reference, strategies, sweep, trial
 from rps_jax.physics import MUJOCOS_GROUND, Physics, preset
 from rps_jax.reference import Batch
 from rps_jax.scene import FRICTION
@@ -105,7 +105,7 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Speed:
     cases = _cases(family, worlds)
     stage, batch = sweep.build(cases, setting)
     if IN_C[name] == "closed":
-        options = {"strategy": trial.RPS, "threads": threads, "report": lambda *_: True}
+        options = {"strategy": strategies.RPS, "threads": threads, "report": lambda *_: True}
         rules = Rules(horizon=simulated)
 
         def once() -> None:

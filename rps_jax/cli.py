@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from rps_jax.robustness import Plan, Shard
     from rps_jax.scene import Friction, Scene
     from rps_jax.slots import Progress, Setting, Timing
+    from rps_jax.strategies import Params
     from rps_jax.sweep import Case, Trace
-    from rps_jax.trial import Params
     from rps_jax.tune import Course, Space
 
 
@@ -48,11 +48,10 @@ class Spread:
 
     def shape(self) -> dict[str, Any]:
         """The options of `sweep.run`, checked."""
-        shape = {"slots": self.slots, "workers": self.workers}
-        for name, value in shape.items():
-            if value is not None:
-                errors.check_finite(name, value, at_least=1)
-        return shape
+        from rps_jax import slots
+
+        slots.check_shape(self.slots, self.workers)
+        return {"slots": self.slots, "workers": self.workers}
 
 
 @dataclass(frozen=True)
@@ -473,18 +472,33 @@ def _assignments(kind: str, texts: Sequence[str], known: Sequence[str]) -> dict[
     return values
 
 
-def _params(common: Common, strategy: str) -> Params:
-    from rps_jax import paper
-    from rps_jax.baselines import APSParams
+def _params(common: Common, names: Sequence[str]) -> dict[str, Params]:
+    """The parameters of these strategies, with the changes that are asked for."""
+    from rps_jax import strategies
+
+    known = strategies.PARAMS
+    fields = {name: _fields(name, known[_known_strategy(name)]) for name in names}
+    options = dict.fromkeys(option for of in fields.values() for option in of)
+    given = _assignments("params", common.params, list(options))
+    return {
+        name: known[name]._replace(**{of[option]: v for option, v in given.items() if option in of})
+        for name, of in fields.items()
+    }
+
+
+def _known_strategy(name: str) -> str:
+    from rps_jax import strategies
+
+    return errors.check_name("strategy", name, strategies.PARAMS)
+
+
+def _fields(strategy: str, params: Params) -> dict[str, str]:
+    """How the options name the parameters of a strategy: option -> field."""
     from rps_jax.law import RPSParams
 
-    errors.check_name("strategy", strategy, paper.STRATEGIES)
-    of_the_law = [name for name in RPSParams._fields if name != "reactive"]
-    of_aps = [f"aps.{name}" for name in APSParams._fields]
-    given = _assignments("params", common.params, [*of_the_law, *of_aps])
-    wanted = of_aps if strategy == "aps" else of_the_law
-    changes = {name.removeprefix("aps."): v for name, v in given.items() if name in wanted}
-    return paper.PARAMS[strategy]._replace(**changes)
+    if isinstance(params, RPSParams):
+        return {name: name for name in params._fields if name != "reactive"}
+    return {f"{strategy}.{name}": name for name in params._fields}
 
 
 def _friction(text: str) -> Friction:
@@ -546,7 +560,7 @@ def _cases(options: Table, targets: Sequence[tuple[float, float]]) -> list[Case]
     frictions = [_friction(text) for text in options.friction]
     return [
         sweep.Case(name, friction, target, params, **_per_world(options))
-        for params in [_params(options, s) for s in options.strategies]
+        for params in _params(options, options.strategies).values()
         for name in options.objects
         for friction in frictions
         for target in targets
@@ -627,7 +641,7 @@ def _table(options: Table) -> None:
     cases = _cases(options, targets)
     shape = options.shape()
     out = _open(options, "table")
-    _write_config(out, options, setting, {s: _params(options, s) for s in options.strategies})
+    _write_config(out, options, setting, _params(options, options.strategies))
     with progress_bar(len(cases)) as report:
         outcome, timing = sweep.run(cases, setting, **shape, report=report)
     results = score.dataset(outcome, options.strategies, options.objects, options.friction, targets)
@@ -646,18 +660,18 @@ def _push(options: Push) -> None:
     from rps_jax import figures, sweep
 
     setting = _setting(options)
-    params = _params(options, options.strategy)
+    params = _params(options, [options.strategy])
     case = sweep.Case(
         options.object,
         _friction(options.friction),
         options.target,
-        params,
+        params[options.strategy],
         **_per_world(options),
     )
     sweep.check_followed(options.engine)
     errors.check_finite("film_length", options.film_length, above=0, at_most=600, unit="s")
     out = _open(options, "push")
-    _write_config(out, options, setting, {options.strategy: params})
+    _write_config(out, options, setting, params)
 
     with _clock(options.horizon) as report:
         (trace,) = sweep.follow([case], setting, report=report)
@@ -722,16 +736,19 @@ def _hardware(options: Hardware) -> None:
     from rps_jax import figures, hardware, record, reproduce, sweep
 
     setting = _setting(options)
-    params = _params(options, "rps")
+    params = _params(options, ["rps"])
     layout = hardware.LAYOUTS[errors.check_name("layout", options.layout, hardware.LAYOUTS)]
     case = sweep.Case(
-        hardware.OBJECTS[0], hardware.MIDDLE, layout[0], params, **_per_world(options)
+        hardware.OBJECTS[0], hardware.MIDDLE, layout[0], params["rps"], **_per_world(options)
     )
+    sweep.check_followed(options.engine)  # by Fig. 7
     if options.mass is not None:
-        raise InputError("mass is not an option here: each object has the paper's.")
+        raise InputError(
+            f"mass = {options.mass:g} is not allowed: each object of the hardware has the paper's."
+        )
     shape = options.shape()
     out = _open(options, "hardware")
-    _write_config(out, options, setting, {"rps": params})
+    _write_config(out, options, setting, params)
     given = {"layout": options.layout}
     with progress_bar(len(hardware.OBJECTS) * len(layout) * len(hardware.frictions())) as report:
         results = hardware.run(case, setting, **given, **shape, report=report)
@@ -773,10 +790,10 @@ def _domain(options: Sweep) -> Domain:
     for text in options.change:
         name, _, values = text.partition("=")
         errors.check_name("domain quantity", name, domain.RANGES)
-        ends = [errors.check_number(f"domain {name}", v) for v in values.split(",")]
-        if len(ends) != 2:
+        if values.count(",") != 1:
             raise InputError(f"change '{text}' is not allowed: write quantity=low,high.")
-        changes[name] = getattr(chosen, name)._replace(low=ends[0], high=ends[1])
+        low, high = (errors.check_number(f"domain {name}", end) for end in values.split(","))
+        changes[name] = getattr(chosen, name)._replace(low=low, high=high)
     return dataclasses.replace(chosen, **changes)
 
 
@@ -793,35 +810,40 @@ def _json(path: Path) -> dict[str, Any]:
 
 
 def _arms(options: Sweep) -> dict[str, Params]:
-    """Every strategy with every set of parameters; APS has but one."""
-    from rps_jax import law, paper
+    """Every strategy with every set of parameters; one that is not the law has but one."""
+    from rps_jax import strategies
     from rps_jax.law import RPSParams
 
+    sets = {Path(name).stem: _of_the_law(name) for name in options.params}
+    for field, given, distinct in (
+        ("strategies", options.strategies, set(options.strategies)),
+        ("params", options.params, sets),
+    ):
+        if not given or len(distinct) < len(given):
+            raise InputError(f"{field} = {given} is not allowed: name each once, at least one.")
     arms: dict[str, Params] = {}
-    for name in options.params:
-        changed = _changes(name)
+    for name, changes in sets.items():
         for strategy in options.strategies:
-            params = paper.PARAMS[errors.check_name("strategy", strategy, paper.PARAMS)]
+            params = strategies.PARAMS[_known_strategy(strategy)]
             label = strategy
             if isinstance(params, RPSParams):
-                params = law.check(params._replace(**changed))
-                label = strategy if len(options.params) == 1 else f"{strategy} {Path(name).stem}"
+                params = params._replace(**changes)
+                label = strategy if len(sets) == 1 else f"{strategy} {name}"
             arms[label] = params
     return arms
 
 
-def _changes(name: str) -> dict[str, float]:
-    """What a set of parameters, by name or from a JSON file, changes of the paper's."""
+def _of_the_law(name: str) -> dict[str, float]:
+    """Changes of the paper's parameters: of `paper`, of `tuned`, or those of a JSON file."""
     from rps_jax.law import RPSParams
 
-    known = [field for field in RPSParams._fields if field != "reactive"]
+    known = _fields("rps", RPSParams.paper())
     if name == "tuned":
         return {key: float(getattr(RPSParams.tuned(), key)) for key in known}
     values = {} if name == "paper" else _json(Path(name))
-    for key, value in values.items():
+    for key in values:
         errors.check_name(f"parameter of {name}", key, known)
-        values[key] = errors.check_number(f"{name} {key}", value)
-    return values
+    return {key: errors.check_number(f"{name} {key}", value) for key, value in values.items()}
 
 
 def _plan(options: Sweep) -> Plan:
@@ -838,7 +860,8 @@ def _plan(options: Sweep) -> Plan:
         options.seed,
         options.engine,  # pyright: ignore[reportArgumentType]
     )
-    return Plan(domain, options.worlds or every, _arms(options), setting, options.part)
+    worlds = every if options.worlds is None else options.worlds
+    return Plan(domain, worlds, _arms(options), setting, options.part)
 
 
 def _shard(text: str) -> Shard:
@@ -861,14 +884,16 @@ def choose_device(name: str) -> None:
     errors.check_name("device", name, DEVICES)
     if name == "auto":
         return
+    before = jax.config.jax_platforms
     jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[name])
-    try:
-        jax.devices()
-    except RuntimeError as error:
-        raise InputError(
-            f"device = {name} is not there: install rps_jax[cuda] on a machine with an NVIDIA GPU, "
-            "or choose cpu."
-        ) from error
+    with contextlib.suppress(RuntimeError, AssertionError):  # whichever JAX raises
+        if jax.default_backend() == name:
+            return
+    jax.config.update("jax_platforms", before)
+    raise InputError(
+        f"device = {name} is not there: install rps_jax[cuda] on a machine with an NVIDIA GPU, or "
+        "choose cpu."
+    )
 
 
 def _on_cluster(address: str, options: Sweep) -> Callable[..., Timing]:
@@ -960,7 +985,7 @@ def _tune_compare(options: TuneCompare) -> None:
         engine=options.engine,  # pyright: ignore[reportArgumentType]
     )
     arms = {
-        Path(name).stem: law.check(RPSParams.paper()._replace(**_changes(name)))
+        Path(name).stem: law.check(RPSParams.paper()._replace(**_of_the_law(name)))
         for name in options.params
     }
     plans = {}
@@ -1030,7 +1055,7 @@ def _space(options: TuneOptions) -> Space:
     from rps_jax import law, tune
     from rps_jax.law import RPSParams
 
-    base = law.check(RPSParams.paper()._replace(**_changes(options.start)))
+    base = law.check(RPSParams.paper()._replace(**_of_the_law(options.start)))
     names = [name for text in options.tuned for name in tune.SUBSETS.get(text, (text,))]
     return tune.Space(tuple(names), base)
 
@@ -1098,18 +1123,18 @@ def _course(options: TuneOptions) -> Course:
 
 
 def _replay(options: Replay) -> None:
-    from rps_jax import record, robustness, sweep, trial
+    from rps_jax import record, robustness, strategies, sweep
 
     plan = robustness.load_plan(options.run)
     arms = list(plan.arms)
     name = errors.check_name("arm", options.arm or arms[0], arms)
-    errors.check_finite("index", options.index, at_least=0, at_most=plan.worlds - 1)
+    errors.check_count("index", options.index, at_least=0, at_most=plan.worlds - 1)
     errors.check_finite("film_length", options.film_length, above=0, at_most=600, unit="s")
     sweep.check_followed(plan.setting.engine)
     out = record.writable(options.out or options.run / f"replay-{options.index}")
     use_cache()
     part = robustness.world_part(plan, arms.index(name), [options.index])
-    strategy = trial.STRATEGIES[type(plan.arms[name])]
+    strategy = strategies.of(plan.arms[name])
     with _clock(float(plan.setting.rules.horizon)) as report:
         (trace,) = sweep.follow_part(part, strategy, plan.setting, report=report)
     _show(trace, f"world {options.index}, {name}", robustness.title_of(plan, options.index), out)

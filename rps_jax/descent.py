@@ -24,7 +24,8 @@ from rps_jax.law import RPSParams
 from rps_jax.physics import preset
 from rps_jax.skin import CapacitiveSkin, SmoothSkin
 from rps_jax.slots import Progress, Setting
-from rps_jax.trial import Snapshot, World, smooth_rps, start_all
+from rps_jax.strategies import smooth_rps
+from rps_jax.trial import Snapshot, World, start_all
 from rps_jax.tune import Course, Objective, Space
 
 ESTIMATORS = ("reverse", "forward", "evolution", "combined")

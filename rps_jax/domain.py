@@ -7,6 +7,7 @@ a counter-based generator, and everything after them is computed on the host in 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
@@ -18,14 +19,15 @@ from numpy.typing import ArrayLike
 from rps_jax import engines, errors, hardware, paper, scene, skin, solid
 from rps_jax.errors import InputError
 from rps_jax.footprint import Footprint
+from rps_jax.objects import FAMILIES, OBJECTS, PAPER_OBJECTS
 from rps_jax.physics import Physics
-from rps_jax.scene import FRICTION, JOINTS, Friction, mjx
+from rps_jax.scene import FRICTION, JOINTS, Friction, Scene, mjx
 from rps_jax.skin import CapacitiveSkin, IdealSkin, Skin
 from rps_jax.slots import Part, Setting
-from rps_jax.solid import Solid
-from rps_jax.trial import Odometry, Params, Shift, World
+from rps_jax.solid import SIDES, Solid
+from rps_jax.strategies import Params
+from rps_jax.trial import Odometry, Shift, World
 
-SIDES = 8  # vertices of a prism at most; those of fewer sides repeat some
 _COLUMNS = 64  # random numbers of a world, more than are used, so that new ones change no old ones
 
 
@@ -89,7 +91,11 @@ class Domain:
         if not self.objects:
             raise InputError("domain objects = () is not allowed: name at least one.")
         for name in self.objects:
-            errors.check_name("domain object", name, (*RANDOM, *scene.OBJECTS))
+            errors.check_name("domain object", name, (*RANDOM, *OBJECTS))
+        for friction in self.frictions:
+            scene.check(friction, None)
+        for target in self.targets:
+            scene.check_target(target)
         errors.check_name("domain skin", self.skin, ("ideal", "capacitive"))
         for name, (least, most, unit) in _ALLOWED.items():
             low, high, log = getattr(self, name)
@@ -115,7 +121,7 @@ class Domain:
     def family_of(self, index: int) -> str:
         """The shape family of one world's object."""
         name = self.objects[int(self.object_of(np.asarray(index)))]
-        return RANDOM.get(name) or scene.FAMILIES[name]
+        return RANDOM.get(name) or FAMILIES[name]
 
 
 RANDOM = {"random_box": "box", "random_cylinder": "cylinder", "random_prism": "prism"}
@@ -160,7 +166,7 @@ _PERFECT: dict[str, Any] = {
 _HARDWARE: dict[str, Any] = _PERFECT | {"noise": _only(0.05), "gain_spread": _only(0.1)}
 DOMAINS = {
     "paper": Domain(
-        objects=scene.PAPER_OBJECTS,
+        objects=PAPER_OBJECTS,
         frictions=tuple(FRICTION.values()),
         targets=paper.TARGETS,
         gap=_only(0.02),
@@ -413,6 +419,18 @@ def _odometry(domain: Domain, drawn: Draw, period: float) -> Odometry:
     return Odometry(*_any(*(getattr(drawn, name) for name in OF_THE_BASE), past))
 
 
+def scene_of(domain: Domain, drawn: Draw, physics: Physics, i: int) -> Scene:
+    """The compiled scene of the i-th world of a draw, for pictures: with its looks, if it has."""
+    index = int(drawn.number[i])
+    name = domain.objects[int(domain.object_of(drawn.number[i]))]
+    if name in RANDOM:
+        return engines.scene_of_solid(
+            domain.family_of(index), drawn.solid, drawn.friction, physics, i
+        )
+    ground, robot = (float(leaf[i]) for leaf in drawn.friction)
+    return scene.load(name, physics, Friction(ground, robot))
+
+
 def table(drawn: Draw) -> dict[str, tuple[np.ndarray, str]]:
     """What was drawn, one column (n,) and its unit a quantity."""
     shape = drawn.solid
@@ -435,6 +453,27 @@ def table(drawn: Draw) -> dict[str, tuple[np.ndarray, str]]:
     }
 
 
+def _names(values: list[str]) -> tuple[str, ...]:
+    if isinstance(values, str):
+        raise TypeError("one name, not a list")
+    return tuple(values)
+
+
+# How JSON has what is not a range.
+_FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "objects": (_names, 'names, as ["random_box"]'),
+    "frictions": (
+        lambda pairs: tuple(Friction(*map(float, pair)) for pair in pairs),
+        "pairs of ground and robot, as [[0.3, 0.35]]",
+    ),
+    "targets": (
+        lambda pairs: tuple((float(x), float(y)) for x, y in pairs),
+        "pairs of x and y [m], as [[2, 0]]",
+    ),
+    "skin": (str, "its name"),
+}
+
+
 def from_json(values: dict[str, Any]) -> Domain:
     """The domain that was written as JSON by `dataclasses.asdict`.
 
@@ -445,19 +484,9 @@ def from_json(values: dict[str, Any]) -> Domain:
     known = {f.name: f for f in fields(Domain)}
     for name, value in values.items():
         errors.check_name("domain quantity", name, known)
-        default = getattr(Domain, name)
+        read, form = _FORMS.get(name, (lambda pair: Range(*pair), "low and high, as [0.1, 0.5]"))
         try:
-            if isinstance(default, Range):
-                value = Range(*value)
-            elif name == "frictions":
-                value = tuple(Friction(*pair) for pair in value)
-            elif name == "targets":
-                value = tuple((float(x), float(y)) for x, y in value)
-            elif name == "objects":
-                value = tuple(value)
-        except TypeError as error:
-            raise InputError(
-                f"domain {name} = {value} is not allowed: write low and high, as [0.1, 0.5]."
-            ) from error
-        given[name] = value
+            given[name] = read(value)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"domain {name} = {value} is not allowed: write {form}.") from error
     return Domain(**given)

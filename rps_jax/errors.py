@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import numbers
 from collections.abc import Iterable
 from typing import Any
 
@@ -49,6 +50,20 @@ def check_finite(name: str, value: Any, **bounds: Any) -> float:
     if math.isinf(number):
         raise InputError(f"{name} = {value} is not allowed: it must be finite.")
     return number
+
+
+def check_count(name: str, value: Any, *, at_least: int = 1, at_most: int) -> int:
+    """`value` if it is a whole number within bounds.
+
+    Raises:
+      InputError: it is not.
+    """
+    if not (isinstance(value, numbers.Integral) and at_least <= int(value) <= at_most):
+        raise InputError(
+            f"{name} = {value} is not allowed: it must be a whole number from {at_least} to "
+            f"{at_most}."
+        )
+    return int(value)
 
 
 def check_name(kind: str, name: str, known: Iterable[str]) -> str:

@@ -19,19 +19,14 @@ from rps_jax.law import RPSParams
 from rps_jax.skin import NONE
 from rps_jax.sweep import Case, Trace
 
-_TITLES = {
-    "rps": "RPS",
-    "nps": "NPS",
-    "aps": "APS",
-    "box": "box",
-    "cylinder": "cylinder",
-    "nonuniform_box": "nonuniform box",
-    "hardware_box": "hardware box",
-    "hardware_cylinder": "hardware cylinder",
-}
 _OBJECT_COLOURS = {"box": "C0", "cylinder": "C1", "nonuniform_box": "C2"}
 _OBJECT_COLOURS |= {"hardware_box": "C0", "hardware_cylinder": "C1"}
 _SHADES = {"realigning": "#bcd7f2", "lost": "#f8e3a1"}
+
+
+def _title(name: str) -> str:
+    """An object's name as words."""
+    return name.replace("_", " ")
 
 
 def save(figure: Figure, path: Path) -> Path:
@@ -61,8 +56,8 @@ def min_distance(results: xr.Dataset, path: Path) -> Path:
             part = part if column == "all" else part.sel(object=[column])
             image = _map(ax, part)
             won, of = int(part.success.sum()), part.success.size
-            name = "all objects" if column == "all" else _TITLES.get(column, column)
-            ax.set_title(f"{_TITLES[strategy]}, {name}: {won}/{of}", fontsize=9)
+            name = "all objects" if column == "all" else _title(column)
+            ax.set_title(f"{strategy.upper()}, {name}: {won}/{of}", fontsize=9)
     for ax in axes[-1]:
         ax.set_xlabel("x [m]")
     for ax in axes[:, 0]:
@@ -111,7 +106,7 @@ def _base_patch(pose: np.ndarray, *, fill: bool) -> patches.Polygon:
 def title_of(case: Case) -> str:
     """What a case is, in words."""
     return (
-        f"{_TITLES[case.object]}, $\\mu$ ground {case.friction.ground:g}, "
+        f"{_title(case.object)}, $\\mu$ ground {case.friction.ground:g}, "
         f"robot {case.friction.robot:g}"
     )
 
@@ -182,7 +177,7 @@ def stills(images: Sequence[np.ndarray], titles: Sequence[str], path: Path) -> P
         ax.axis("off")
     for ax, image, title in zip(axes, images, titles, strict=False):
         ax.imshow(image)
-        ax.set_title(_TITLES.get(title, title), fontsize=9)
+        ax.set_title(_title(title), fontsize=9)
     return save(figure, path)
 
 
@@ -242,7 +237,7 @@ def paths(traces: Mapping[str, Sequence[Trace]], targets: Sequence, path: Path) 
                 ax.plot(*touching[-1], "o", ms=5, mfc="white", color=line.get_color())
         won = sum(bool(trace.outcome.success) for trace in rows)
         ax.set(xlabel="x [m]", aspect="equal")
-        ax.set_title(f"{_TITLES[name]}: {won} of {len(rows)}", fontsize=10)
+        ax.set_title(f"{_title(name)}: {won} of {len(rows)}", fontsize=10)
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("y [m]")
     figure.suptitle("lines: base; stars: targets; circles: last contact point", fontsize=9)
@@ -270,7 +265,7 @@ def tolerance_curve(curve: xr.Dataset, trials: int, path: Path) -> Path:
     for (above, below), loss in zip(axes.T, map(str, curve.loss.values), strict=True):
         for i, name in enumerate(map(str, curve.object.values)):
             one = curve.sel(loss=loss, object=name)
-            style = {"color": _OBJECT_COLOURS[name], "label": _TITLES[name]}
+            style = {"color": _OBJECT_COLOURS[name], "label": _title(name)}
             beside = x + 0.15 * (i - 1)  # where curves coincide
             _rates(above, beside, one.won.values, np.full(len(x), trials), **style)
             below.plot(beside, one.lost.values, "o-", ms=4, lw=1.2, **style)
@@ -298,7 +293,7 @@ def shift_curve(results: xr.Dataset, path: Path) -> Path:
             pairs[:, 0],
             pairs[:, 1],
             color=_OBJECT_COLOURS[name],
-            label=_TITLES[name],
+            label=_title(name),
         )
     ax.set(xlabel="the object is moved sideways by [cm]", ylabel="success [%]", ylim=(-3, 103))
     ax.grid(alpha=0.3)
@@ -334,7 +329,7 @@ def throughput(speeds: Sequence[Speed], path: Path) -> Path:
                 ax.axhline(points[0][1], color=f"C{i}", ls="--", label=name)
             else:
                 ax.plot(*zip(*points, strict=True), marker="o", color=f"C{i}", label=name)
-        ax.set(xscale="log", yscale="log", xlabel="worlds in the batch", title=_TITLES[family])
+        ax.set(xscale="log", yscale="log", xlabel="worlds in the batch", title=_title(family))
         ax.grid(alpha=0.3, which="both")
     axes[0].set_ylabel("simulated s per s")
     axes[0].legend(fontsize=8)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import frames
+from rps_jax.errors import InputError
 
 
 class Footprint(NamedTuple):
@@ -36,19 +37,19 @@ def circle(radius: jax.Array | float) -> Footprint:
 def polygon(vertices: np.ndarray | list) -> Footprint:
     """Convex polygon of vertices (N >= 3, 2) [m], counter-clockwise.
 
-    Raises ValueError if they are not finite, not convex or not counter-clockwise.
+    Raises InputError if they are not finite, not convex or not counter-clockwise.
     """
     points = np.asarray(vertices, float)
     if points.ndim != 2 or points.shape[0] < 3 or points.shape[1] != 2:
-        raise ValueError(f"vertices must have shape (N >= 3, 2), not {points.shape}")
+        raise InputError(f"vertices must have shape (N >= 3, 2), not {points.shape}")
     if not np.isfinite(points).all():
-        raise ValueError("vertices must be finite")
+        raise InputError("vertices must be finite")
     edges = np.roll(points, -1, axis=0) - points
     following = np.roll(edges, -1, axis=0)
     turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
     turning = np.arctan2(turns, np.sum(edges * following, axis=1)).sum()
     if not (turns > 0).all() or not np.isclose(turning, 2 * np.pi):
-        raise ValueError("vertices must be strictly convex and counter-clockwise")
+        raise InputError("vertices must be strictly convex and counter-clockwise")
     return Footprint(jnp.asarray(points, float), jnp.zeros(()))
 
 

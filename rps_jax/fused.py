@@ -35,9 +35,10 @@ def body(model: mujoco.MjModel, vertices: np.ndarray) -> Body:
     geom, front = model.geom("object"), model.geom("base")
     frame = sp.matrix(thing.iquat)
     round_ = len(vertices) == 1
-    half = geom.size[1] if round_ else geom.size[2]
-    bottom = np.column_stack([vertices, np.full(len(vertices), -half)]) + geom.pos
-    pairs = {model.pair(i).name: model.pair(i) for i in range(model.npair)}
+    half = thing.pos[2]  # a scene starts with its object on the ground
+    bottom = np.column_stack([vertices, np.full(len(vertices), -half)])
+    pairs = [model.pair(i) for i in range(model.npair)]
+    friction = {pair.name.partition("_")[0]: pair.friction[0] for pair in pairs}
     return Body(
         mass=thing.mass[0],
         inertia=thing.inertia.copy(),
@@ -47,8 +48,8 @@ def body(model: mujoco.MjModel, vertices: np.ndarray) -> Body:
         radius=geom.size[0] if round_ else 0.0,
         height=2 * half,
         up=np.array(sp.to_body(frame, (0.0, 0.0, 1.0))),
-        friction_ground=pairs["ground_object"].friction[0],
-        friction_robot=pairs["base_object"].friction[0],
+        friction_ground=friction["ground"],
+        friction_robot=friction["base"],
         invweight=model.body_invweight0[thing.id, 0],
         base_invweight=model.body_invweight0[base.id, 0],
         base_half=front.size[:2].copy(),

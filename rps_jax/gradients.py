@@ -9,7 +9,7 @@ which two can be compared or combined. A score of one world becomes such a funct
 Derivatives of chaotic worlds may be finite and yet say nothing: their variance shows it.
 
 `forward` and `reverse` differentiate every world. What they differentiate must be smooth:
-`trial.smooth_rps` with a `skin.SmoothSkin`; and it misses what jumps all the same. `evolution`
+`strategies.smooth_rps` with a `skin.SmoothSkin`; and it misses what jumps all the same. `evolution`
 needs no derivative.
 """
 
@@ -22,11 +22,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax import trial
+from rps_jax import strategies, trial
 from rps_jax.errors import InputError
 from rps_jax.law import RPSParams
 from rps_jax.physics import Physics
-from rps_jax.trial import Snapshot, Stage, Strategy, Trial
+from rps_jax.strategies import Strategy
+from rps_jax.trial import Snapshot, Stage, Trial
 
 Scores = Callable[[jax.Array, Any], jax.Array]
 
@@ -140,7 +141,7 @@ def window(
     cost: Callable[[Snapshot], jax.Array],
     *,
     physics: Physics,
-    strategy: Strategy = trial.smooth_rps(),
+    strategy: Strategy = strategies.smooth_rps(),
     steps: int,
 ) -> Scores:
     """Scores of trials driven on for some control steps from where they are.

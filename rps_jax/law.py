@@ -150,6 +150,14 @@ class Details(NamedTuple):
     gamma: jax.Array  # () [rad] steering angle
     realigning: jax.Array  # () bool: in the Realignment State; smooth: a weight
 
+    @classmethod
+    def of(cls, observation: Observation) -> Details:
+        """Of a strategy that has neither an adaptive rate nor a steering angle: both are 0."""
+        distance = frames.norm(displacement(observation))
+        zero = jnp.zeros_like(distance)
+        l = observation.p_robot_contact[..., 1]  # noqa: E741
+        return cls(l, distance, zero, zero, zero > 0)
+
 
 def check(params: RPSParams) -> RPSParams:
     """The same parameters, if scalars that mean something.

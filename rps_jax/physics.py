@@ -32,11 +32,11 @@ class Physics:
 
     def __post_init__(self) -> None:
         """Raises InputError for values that MuJoCo would accept and that mean nothing."""
-        errors.check_finite("timestep", self.timestep, above=0, at_most=0.1, unit="s")
+        errors.check_finite("timestep", self.timestep, at_least=1e-5, at_most=0.1, unit="s")
         errors.check_finite("control_period", self.control_period, above=0, at_most=1, unit="s")
         errors.check_finite("impratio", self.impratio, above=0)
-        errors.check_finite("iterations", self.iterations, at_least=1)
-        errors.check_finite("ls_iterations", self.ls_iterations, at_least=1)
+        errors.check_count("iterations", self.iterations, at_most=10_000)
+        errors.check_count("ls_iterations", self.ls_iterations, at_most=10_000)
         errors.check_finite("tolerance", self.tolerance, at_least=0)
         for name, solref in (("base", self.base_solref), ("ground", self.ground_solref)):
             for what, value in zip(("time constant", "damping ratio"), solref, strict=True):

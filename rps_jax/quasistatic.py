@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import errors, frames, solid, trial
+from rps_jax import errors, frames, solid, strategies, trial
 from rps_jax import spatial as sp
 from rps_jax.contacts import Point, circle_and_rectangle, polygon_and_rectangle
 from rps_jax.law import Twist
@@ -35,7 +35,8 @@ from rps_jax.physics import Physics
 from rps_jax.scene import JOINTS
 from rps_jax.solid import Solid, Support
 from rps_jax.spatial import Vec
-from rps_jax.trial import Driven, Rules, Snapshot, Strategy, Trial, World
+from rps_jax.strategies import Strategy
+from rps_jax.trial import Driven, Rules, Snapshot, Trial, World
 
 _LEAST_SPEED = 1e-5  # [m/s] taken for that of a base at rest
 _SHARP = 3  # last steps of Newton's method, on the problem itself; those before widen its slip
@@ -273,7 +274,7 @@ def rollout(
     physics: Physics,
     steps: int,
     rules: Rules = Rules(),
-    strategy: Strategy = trial.RPS,
+    strategy: Strategy = strategies.RPS,
 ) -> Rollout:
     """`steps` control periods of a batch, from its start: pure, and differentiable in reverse.
 

@@ -6,6 +6,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import reprlib
 import subprocess
 import sys
 import tempfile
@@ -80,15 +81,22 @@ def manifest(folder: Path) -> dict[str, Any]:
     """
     path = folder / MANIFEST
     try:
-        return json.loads(path.read_text())
-    except FileNotFoundError as error:
+        found = json.loads(path.read_text())
+    except (FileNotFoundError, NotADirectoryError) as error:
         raise InputError(
             f"run = {folder} holds no {MANIFEST}: give the folder of a run."
         ) from error
     except ValueError as error:
-        raise InputError(
-            f"{path} is corrupt ({error}): restore it, or choose another folder."
-        ) from error
+        raise corrupt(path, error) from error
+    if not isinstance(found, dict):
+        raise corrupt(path, "it holds no names with values")
+    return found
+
+
+def corrupt(path: Path, why: Any) -> InputError:
+    """The error for a file that cannot be understood."""
+    reason = str(why).rstrip(".")
+    return InputError(f"{path} is corrupt ({reason}): restore it, or choose another folder.")
 
 
 def difference(found: Any, wanted: Any) -> str:
@@ -101,11 +109,10 @@ def difference(found: Any, wanted: Any) -> str:
 def _differences(found: Any, wanted: Any, path: str) -> Iterator[str]:
     if isinstance(found, dict) and isinstance(wanted, dict):
         for key in [*found, *(k for k in wanted if k not in found)]:
-            yield from _differences(
-                found.get(key), wanted.get(key), f"{path}.{key}" if path else key
-            )
+            there, asked = (side.get(key, "nothing") for side in (found, wanted))
+            yield from _differences(there, asked, f"{path}.{key}" if path else key)
     elif found != wanted:
-        yield f"{path} = {found} there, {wanted} asked for"
+        yield f"{path} = {reprlib.repr(found)} there, {reprlib.repr(wanted)} asked for"
 
 
 def atomic(path: Path, write: Callable[[Path], Any]) -> Path:

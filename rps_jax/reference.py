@@ -18,7 +18,8 @@ from mujoco import rollout
 from rps_jax import trial
 from rps_jax.physics import Physics
 from rps_jax.scene import JOINTS
-from rps_jax.trial import Rules, Strategy, Trial, World
+from rps_jax.strategies import Strategy
+from rps_jax.trial import Rules, Trial, World
 
 _STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _LOOK = 500  # control steps between two reports

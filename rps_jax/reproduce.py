@@ -28,6 +28,7 @@ from rps_jax import (
     video,
 )
 from rps_jax.engines import Engine
+from rps_jax.objects import PAPER_OBJECTS
 from rps_jax.report import Section, write_report
 from rps_jax.scene import FRICTION
 from rps_jax.slots import Progress, Setting
@@ -179,12 +180,12 @@ def _objects(out: Path) -> list[Section]:
     path = out / "objects.png"
     try:
         images = []
-        for name in scene.PAPER_OBJECTS:
+        for name in PAPER_OBJECTS:
             shown = scene.load(name)
             images.append(
                 video.snapshot(shown, scene.initial_qpos(shown), p_world_target=np.array([2, 0]))
             )
-        figures.stills(images, scene.PAPER_OBJECTS, path)
+        figures.stills(images, PAPER_OBJECTS, path)
     except video.VideoError as error:
         return [Section("Fig. 4: the objects", f"Not drawn: {error}")]
     return [Section("Fig. 4: the objects", "", (), path)]
@@ -356,7 +357,7 @@ def _curve(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any]) ->
     conditions = ambiguity.curve(plan.tolerances)
     results = _study(out, "curve", conditions, tuple(conditions), plan.rps_alone, progress, shape)
     curve = ambiguity.by_tolerance(results, plan.tolerances)
-    trials = plan.rps_alone.size // len(scene.PAPER_OBJECTS)
+    trials = plan.rps_alone.size // len(PAPER_OBJECTS)
     picture = figures.tolerance_curve(curve, trials, out / "tolerance.png")
     text = f"RPS, {trials} trials a point, isotropic friction."
     return [Section("Skin tolerance and behaviour on loss of contact", text, (), picture)]

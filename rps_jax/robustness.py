@@ -26,7 +26,16 @@ import h5py
 import numpy as np
 import xarray as xr
 
-from rps_jax import analysis, domain, engines, errors, figures, record, score, slots, trial
+from rps_jax import (
+    analysis,
+    domain,
+    errors,
+    figures,
+    record,
+    score,
+    slots,
+    strategies,
+)
 from rps_jax.domain import Domain
 from rps_jax.errors import InputError
 from rps_jax.physics import Physics
@@ -34,7 +43,8 @@ from rps_jax.report import Section
 from rps_jax.report import write_report as _write
 from rps_jax.scene import Scene
 from rps_jax.slots import Job, Part, Progress, Setting, Timing
-from rps_jax.trial import Outcome, Params, Rules
+from rps_jax.strategies import Params
+from rps_jax.trial import Outcome, Rules
 
 Kind = tuple[int, type]  # of a part: the object's number and the type of the arm's parameters
 Keep = Callable[[int, bytes], Any]  # called with the number and the content of a part
@@ -52,11 +62,13 @@ class Plan:
     part: int = 1024  # trials of a part, at most
 
     def __post_init__(self) -> None:
-        """Raises InputError for no worlds or no arms."""
-        errors.check_finite("worlds", self.worlds, at_least=1, at_most=1e9)
-        errors.check_finite("part", self.part, at_least=1, at_most=1e6)
+        """Raises InputError for no worlds, no arms, or parameters that mean nothing."""
+        errors.check_count("worlds", self.worlds, at_most=1_000_000_000)
+        errors.check_count("part", self.part, at_most=1_000_000)
         if not self.arms:
             raise InputError("arms = {} is not allowed: name at least one strategy.")
+        for params in self.arms.values():
+            strategies.of(params).check(params)
 
     @property
     def trials(self) -> int:
@@ -134,8 +146,8 @@ class Shard:
 
     def __post_init__(self) -> None:
         """Raises InputError unless 1 <= number <= of."""
-        errors.check_finite("shard", self.of, at_least=1, at_most=1e6)
-        errors.check_finite("shard", self.number, at_least=1, at_most=self.of)
+        errors.check_count("shard", self.of, at_most=1_000_000)
+        errors.check_count("shard", self.number, at_most=self.of)
 
 
 # --- the run folder ------------------------------------------------------------------------
@@ -170,17 +182,14 @@ def load_plan(folder: Path) -> Plan:
             Setting(Physics(**physics), Rules(**found["rules"]), found["seed"], found["engine"]),
             found["part"],
         )
-    except (KeyError, TypeError) as error:
-        raise InputError(
-            f"{folder / record.MANIFEST} is corrupt ({error}): restore it, or choose another "
-            "folder."
-        ) from error
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise record.corrupt(folder / record.MANIFEST, error) from error
 
 
 def _params(arm: dict[str, Any]) -> Params:
     name = arm.pop("strategy")
-    (kind,) = [kind for kind in trial.STRATEGIES if kind.__name__ == name]
-    return kind(**arm)
+    kinds = {kind.__name__: kind for kind in strategies.STRATEGIES}
+    return kinds[errors.check_name("class of parameters", name, kinds)](**arm)
 
 
 @contextlib.contextmanager
@@ -304,7 +313,7 @@ def work(
     has the same bits whoever runs it, and with whatever other parts.
     """
     jobs = [
-        Job(trial.STRATEGIES[kind[1]], plan.sizes[kind], _made(plan, some))
+        Job(strategies.STRATEGIES[kind[1]], plan.sizes[kind], _made(plan, some))
         for kind, some in numbers.items()
     ]
     collect = _Parts(plan, keep).collect
@@ -341,8 +350,7 @@ def _made(plan: Plan, numbers: Iterable[int]) -> Iterator[Part]:
 def scene_of(plan: Plan, index: int) -> Scene:
     """The compiled scene of one world, for pictures."""
     drawn = domain.draw(plan.domain, plan.setting.seed, [index])
-    family = plan.domain.family_of(index)
-    return engines.scene_of_solid(family, drawn.solid, drawn.friction, plan.setting.physics, 0)
+    return domain.scene_of(plan.domain, drawn, plan.setting.physics, 0)
 
 
 def title_of(plan: Plan, index: int) -> str:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import io
 import math
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -18,9 +17,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from rps_jax import errors, skin
+from rps_jax import errors, objects, skin
 from rps_jax import footprint as fp
 from rps_jax.footprint import Footprint
+from rps_jax.objects import FAMILIES, OBJECTS, SHAPES, path_of
 from rps_jax.physics import PHYSICS, Physics
 from rps_jax.solid import Solid
 
@@ -52,16 +52,6 @@ class Friction(NamedTuple):
 
 
 FRICTION = {"S1": Friction(0.3, 0.35), "S2": Friction(0.2, 0.5)}  # Table I
-FAMILIES = {
-    "box": "box",
-    "cylinder": "cylinder",
-    "nonuniform_box": "box",
-    "hardware_box": "box",
-    "hardware_cylinder": "cylinder",
-}  # object -> shape family
-SHAPES = ("box", "cylinder", "prism")  # the families
-OBJECTS = tuple(FAMILIES)
-PAPER_OBJECTS = ("box", "cylinder", "nonuniform_box")  # Fig. 4, in the order of Table II
 
 
 class Scene(NamedTuple):
@@ -82,13 +72,6 @@ class Joints(NamedTuple):
 
 
 JOINTS = Joints()
-
-
-def mjcf_folder() -> Path:
-    """The folder of the scenes: inside an installed package, or beside it in a checkout."""
-    package = Path(__file__).resolve().parent
-    installed = package / "mjcf"
-    return installed if installed.is_dir() else package.parent / "mjcf"
 
 
 def load(
@@ -117,7 +100,9 @@ def load(
     errors.check_name("object", name, OBJECTS)
     errors.check_name("rear", rear, SIDES)
     check(friction, mass)
-    spec = mujoco.MjSpec.from_file(str(mjcf_folder() / f"{name}.xml"))
+    if name in objects.REGISTERED:
+        return _load_registered(name, physics, friction, mass, half_length)
+    spec = objects.read(path_of(name))
     for geom in spec.geoms:
         if geom.name == "load" and rear == "far":
             geom.pos[0] = -geom.pos[0]
@@ -127,11 +112,26 @@ def load(
     return Scene(name, FAMILIES[name], model, stripped, _footprint(stripped))
 
 
+def _load_registered(
+    name: str, physics: Physics, friction: Friction, mass: float | None, half_length: float
+) -> Scene:
+    """The looks of a registered object, and the solid that stands for it in the physics."""
+    one = objects.REGISTERED[name].solid
+    if mass is not None:
+        one = one._replace(mass=np.asarray(mass), inertia=one.inertia * mass / one.mass)
+    spec = objects.read(path_of(name))
+    _set_length(spec, half_length)
+    upright = shaped(FAMILIES[name], one, physics, friction, half_length=half_length)
+    return upright._replace(name=name, model=spec.compile())
+
+
 def shaped(
     family: str,
     one: Solid,
     physics: Physics = PHYSICS["default"]["standard"],
     friction: Friction = FRICTION["S1"],
+    *,
+    half_length: float = skin.HALF_LENGTH,
 ) -> Scene:
     """Compile a scene with one solid (its leaves without a leading axis) of a shape family.
 
@@ -140,7 +140,7 @@ def shaped(
     """
     errors.check_name("family", family, SHAPES)
     check(friction, float(one.mass))
-    spec = mujoco.MjSpec.from_file(str(mjcf_folder() / f"{family}.xml"))
+    spec = objects.read(path_of(family))
     body = spec.body("object")
     body.pos[2] = one.height / 2
     for geom in list(body.geoms):
@@ -154,7 +154,7 @@ def shaped(
     body.mass, body.ipos = one.mass, one.p_object_com
     body.iquat, body.inertia = one.q_object_body, one.inertia
     outline = Footprint(jnp.asarray(one.vertices, float), jnp.asarray(one.radius, float))
-    models = _compile(spec, physics, friction, skin.HALF_LENGTH)
+    models = _compile(spec, physics, friction, half_length)
     return Scene(family, family, *models, outline)
 
 
@@ -211,6 +211,19 @@ def check(friction: Friction, mass: float | None) -> None:
         errors.check_finite(f"friction {side}", value, above=0, at_most=10)
     if mass is not None:
         errors.check_finite("mass", mass, above=0, at_most=1e4, unit="kg")
+
+
+def check_target(p_world_target: tuple[float, float]) -> None:
+    """Raises InputError for a target [m] that is under the robot, or out of the world."""
+    x, y = (
+        errors.check_finite(f"target {axis}", value, at_least=-50, at_most=50, unit="m")
+        for axis, value in zip("xy", p_world_target, strict=True)
+    )
+    if abs(x) <= skin.HALF_LENGTH and abs(y) <= skin.HALF_WIDTH:
+        raise errors.InputError(
+            f"target = ({x:g}, {y:g}) m is not allowed: it must lie outside the robot, which "
+            f"covers |x| <= {skin.HALF_LENGTH:g} m and |y| <= {skin.HALF_WIDTH:g} m."
+        )
 
 
 def _set_length(spec: mujoco.MjSpec, half_length: float) -> None:
@@ -276,11 +289,10 @@ def _footprint(model: mujoco.MjModel) -> Footprint:
 def solid_of(scene: Scene) -> Solid:
     """The object of a scene as solids, one of them."""
     thing, geom = scene.physics.body("object"), scene.physics.geom("object")
-    round_ = geom.type[0] == mujoco.mjtGeom.mjGEOM_CYLINDER
     return Solid(
         vertices=np.asarray(scene.footprint.vertices, float)[None],
-        radius=np.array([geom.size[0] if round_ else 0.0]),
-        height=2 * geom.size[1:2] if round_ else 2 * geom.size[2:],
+        radius=geom.size[:1] * (scene.family == "cylinder"),
+        height=2 * thing.pos[2:],
         mass=thing.mass.copy(),
         p_object_com=thing.ipos[None] - OFF_CENTRE,
         inertia=thing.inertia[None].copy(),

@@ -236,26 +236,36 @@ class CapacitiveSkin(NamedTuple):
         depth = self.foam - fp.signed_distance(footprint, samples)
         return jnp.clip(depth, 0.0, self.max_compression * self.foam)
 
-    def scan(self, state: SkinState, footprint: Footprint, period: float) -> SkinState:
-        """The signals of all taxels after one more scan, filtered."""
+    def _scan(self, state: SkinState, footprint: Footprint) -> tuple[SkinState, jax.Array]:
+        """What all taxels answer (T,) [1], as foam, gains and noise have it."""
         gap = self.foam - self.compression(footprint)
         change = jnp.mean(self.foam / gap, axis=-1) - 1.0
         key, key_noise = jax.random.split(state.key)
         noise = self.noise * jax.random.normal(key_noise, change.shape, change.dtype)
-        raw = state.gain * change + noise
+        return state._replace(key=key), state.gain * change + noise
+
+    def _filtered(self, state: SkinState, raw: jax.Array, period: float) -> SkinState:
         signal = state.signal + (1 - jnp.exp(-period / self.time_constant)) * (raw - state.signal)
-        return state._replace(key=key, signal=signal)
+        return state._replace(signal=signal)
+
+    def read(self, state: SkinState, raw: jax.Array, period: float) -> tuple[SkinState, Reading]:
+        """One scan of a real skin, or of a simulated one, filtered and compared to the threshold.
+
+        `raw` (42,) [1] is each taxel's relative change of capacitance, in strip order (that of
+        `taxels`), `period` [s] after the last scan.
+        """
+        state = self._filtered(state, raw, period)
+        active = (state.signal > self.threshold) & state.alive
+        middles = jnp.asarray(taxels(1, self.half_length)[:, 0], raw.dtype)
+        first, last = _extremes(active, middles)
+        kind = jnp.minimum(jnp.sum(active), LINE)
+        return state, _reading(kind, first, last)
 
     def sense(
         self, state: SkinState, footprint: Footprint, period: float
     ) -> tuple[SkinState, Reading]:
-        """One scan of all taxels, filtered and compared to the threshold."""
-        state = self.scan(state, footprint, period)
-        active = (state.signal > self.threshold) & state.alive
-        middles = jnp.asarray(taxels(1, self.half_length)[:, 0], state.signal.dtype)
-        first, last = _extremes(active, middles)
-        kind = jnp.minimum(jnp.sum(active), LINE)
-        return state, _reading(kind, first, last)
+        """One scan of all taxels, read."""
+        return self.read(*self._scan(state, footprint), period)
 
     def sense_smoothly(
         self, state: SkinState, footprint: Footprint, period: float, temperature: Any
@@ -266,7 +276,7 @@ class CapacitiveSkin(NamedTuple):
         two ends are the means of the first and of the last active taxel. As the temperature falls
         they tend to those of `sense`, also where dead taxels interrupt a contact.
         """
-        state = self.scan(state, footprint, period)
+        state = self._filtered(*self._scan(state, footprint), period)
         excess = jnp.where(state.alive, (state.signal - self.threshold) / temperature, _NEVER)
         middles = jnp.asarray(taxels(1, self.half_length)[:, 0], excess.dtype)
         first, last = _first(excess) @ middles, _first(excess[::-1]) @ middles[::-1]

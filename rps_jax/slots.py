@@ -26,7 +26,8 @@ from jax.sharding import PartitionSpec as P
 from rps_jax import engines, errors, reference, trial
 from rps_jax.engines import Engine
 from rps_jax.physics import PHYSICS, Physics
-from rps_jax.trial import Outcome, Rules, Strategy, Trial, World
+from rps_jax.strategies import Strategy
+from rps_jax.trial import Outcome, Rules, Trial, World
 
 SEGMENT = 10.0  # [s] simulated between two looks at which trials have ended
 
@@ -43,7 +44,7 @@ class Setting:
     def __post_init__(self) -> None:
         """Raises InputError for rules, a seed or an engine that mean nothing, or do together."""
         self.rules.check()
-        errors.check_finite("seed", self.seed, at_least=0, at_most=2**32 - 1)
+        errors.check_count("seed", self.seed, at_least=0, at_most=2**32 - 1)
         errors.check_name("engine", self.engine, engines.ENGINES)
         if self.engine == "quasistatic" and self.physics.cone != "elliptic":
             raise errors.InputError(
@@ -100,6 +101,14 @@ def default_workers() -> int:
     return os.cpu_count() or 1 if jax.default_backend() == "cpu" else 1
 
 
+def check_shape(slots: int | None, workers: int | None) -> None:
+    """Raises InputError unless each is left open or a sensible number."""
+    if slots is not None:
+        errors.check_count("slots", slots, at_most=10_000_000)
+    if workers is not None:
+        errors.check_count("workers", workers, at_most=1024)
+
+
 def run(
     jobs: Sequence[Job],
     setting: Setting,
@@ -120,10 +129,9 @@ def run(
       collect: called with the outcomes of trials that ended, in any order, one call at a time.
       report: called after every segment, likewise.
     """
+    check_shape(slots, workers)
     slots = slots or default_slots(setting.engine)
     workers = workers or default_workers()
-    errors.check_finite("slots", slots, at_least=1)
-    errors.check_finite("workers", workers, at_least=1)
     shared = _Shared(collect, report)
     began = time.perf_counter()
     if setting.engine == "mujoco":

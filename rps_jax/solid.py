@@ -14,6 +14,7 @@ import numpy as np
 from rps_jax import errors, spatial
 
 Support = Literal["feet", "even"]  # what bears a solid on the ground
+SIDES = 8  # vertices of a prism at most; those of fewer sides repeat some
 _LOAD_AT = 0.8  # of the way from the middle to the outline stands the load
 _CELLS = 8  # into which the evenly borne parts of an outline are split, along and across
 

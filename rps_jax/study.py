@@ -17,8 +17,9 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from rps_jax import paper, record, scene, score, sweep
+from rps_jax import paper, record, score, sweep
 from rps_jax.errors import InputError
+from rps_jax.objects import PAPER_OBJECTS
 from rps_jax.scene import FRICTION, Friction
 from rps_jax.slots import Progress, Setting
 from rps_jax.sweep import Case
@@ -31,7 +32,7 @@ class Grid(NamedTuple):
     """Which trials, in the nesting order of `score.dataset`."""
 
     strategies: tuple[str, ...] = ("rps",)
-    objects: tuple[str, ...] = scene.PAPER_OBJECTS
+    objects: tuple[str, ...] = PAPER_OBJECTS
     friction: Mapping[str, Friction] = FRICTION
     targets: tuple[tuple[float, float], ...] = paper.TARGETS
 

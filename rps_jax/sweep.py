@@ -13,14 +13,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import baselines, engines, errors, law, scene, skin, trial
+from rps_jax import engines, errors, scene, strategies, trial
 from rps_jax.law import RPSParams
+from rps_jax.objects import FAMILIES, OBJECTS
 from rps_jax.physics import Physics
 from rps_jax.scene import JOINTS, Friction, Scene, Side
 from rps_jax.skin import IdealSkin, Skin
 from rps_jax.slots import SEGMENT, Job, Part, Progress, Setting, Timing, rows
 from rps_jax.slots import run as _run
-from rps_jax.trial import Odometry, Outcome, Params, Shift, Snapshot, Strategy, World
+from rps_jax.strategies import Params, Strategy
+from rps_jax.trial import Odometry, Outcome, Shift, Snapshot, World
 
 
 @dataclass(frozen=True)
@@ -40,19 +42,9 @@ class Case:
 
     def __post_init__(self) -> None:
         """Raises InputError for anything that names or means no trial."""
-        errors.check_name("object", self.object, scene.OBJECTS)
-        for axis, value in zip("xy", self.p_world_target, strict=True):
-            errors.check_finite(f"target {axis}", value, at_least=-50, at_most=50, unit="m")
-        x, y = self.p_world_target
-        if abs(x) <= skin.HALF_LENGTH and abs(y) <= skin.HALF_WIDTH:
-            raise errors.InputError(
-                f"target = ({x:g}, {y:g}) m is not allowed: it must lie outside the robot, which "
-                f"covers |x| <= {skin.HALF_LENGTH:g} m and |y| <= {skin.HALF_WIDTH:g} m."
-            )
-        if isinstance(self.params, RPSParams):
-            law.check(self.params)
-        else:
-            baselines.check(self.params)
+        errors.check_name("object", self.object, OBJECTS)
+        scene.check_target(self.p_world_target)
+        strategies.of(self.params).check(self.params)
         scene.check(self.friction, self.mass)
         self.skin.check()
         errors.check_finite("gap", self.gap, at_least=0, at_most=1, unit="m")
@@ -142,7 +134,7 @@ def build(
 
 def kind(case: Case) -> Hashable:
     """What decides which compiled program runs a case: family, strategy and sensor."""
-    return scene.FAMILIES[case.object], type(case.params), jax.tree.structure(case.skin)
+    return FAMILIES[case.object], type(case.params), jax.tree.structure(case.skin)
 
 
 def _by_kind(cases: Sequence[Case]) -> list[list[int]]:
@@ -194,7 +186,7 @@ def run(
         mine = [cases[i] for i in indices]
         stage, worlds = build(mine, setting, indices)
         part = Part(np.array(indices), worlds, stage)
-        jobs.append(Job(trial.STRATEGIES[type(mine[0].params)], len(mine), [part]))
+        jobs.append(Job(strategies.of(mine[0].params), len(mine), [part]))
     order, found = [], []
 
     def collect(numbers: np.ndarray, outcomes: Outcome) -> None:
@@ -221,7 +213,7 @@ def follow(
     check_followed(setting.engine)
     stage, worlds = build(cases, setting)
     part = Part(np.arange(len(cases)), worlds, stage)
-    strategy = trial.STRATEGIES[type(cases[0].params)]
+    strategy = strategies.of(cases[0].params)
     return follow_part(part, strategy, setting, interval=interval, report=report)
 
 

@@ -7,8 +7,6 @@ is frozen, and a batch whose worlds have all ended stops.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -16,52 +14,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import baselines, errors, frames, fused, law, scene
+from rps_jax import errors, frames, fused, law, scene
 from rps_jax import footprint as fp
-from rps_jax.baselines import APSParams, APSState, TrackedObservation
+from rps_jax.baselines import TrackedObservation
 from rps_jax.footprint import Footprint
-from rps_jax.law import Details, Observation, RPSParams, RPSState, Temperatures, Twist
+from rps_jax.law import Details, Observation, Twist
 from rps_jax.physics import Physics
 from rps_jax.scene import JOINTS, mjx
 from rps_jax.skin import NONE, Reading, Skin, SkinState, SmoothReading
+from rps_jax.strategies import RPS, Params, Strategy
 
 # A world is a runaway beyond these, far outside anything a base at 0.05 m/s can cause.
 _MAX_SPEED = 20.0  # [m/s], [rad/s]
 _MAX_DISTANCE = 100.0  # [m]
 _ODOMETRY = 7  # of a world's key; the skin splits it into fewer
-
-
-class Strategy(NamedTuple):
-    """What decides: two pure functions. Static, so a change compiles another program."""
-
-    init: Callable[[Any], Any]  # params -> state
-    step: Callable[[Any, Any, Any], tuple[Any, Twist, Details]]  # params, state, observation
-    tracks: bool = False  # observes a TrackedObservation: the object's place as well
-    smooth: bool = False  # is told the weight of a contact; others whether there is one
-
-
-Params = RPSParams | APSParams
-RPS = Strategy(RPSState.init, law.step_with_details)  # and NPS, by `params.reactive`
-APS = Strategy(APSState.init, baselines.aps_step, tracks=True)
-STRATEGIES: dict[type, Strategy] = {RPSParams: RPS, APSParams: APS}  # by their parameters
-
-
-@functools.cache  # equal temperatures are one strategy, and so one compiled program
-def smooth_rps(temperatures: Temperatures = Temperatures()) -> Strategy:
-    """RPS by the smooth law, for the derivatives of what it does.
-
-    Outcomes are judged as ever. With a `SmoothSkin` all that leads from the parameters to a
-    snapshot's twist is smooth, and what it saw of the contact, in `reading` and `details`.
-
-    Raises:
-      InputError: a temperature is not a positive length.
-    """
-    temperatures.check()
-    return Strategy(
-        partial(RPSState.init, temperatures=temperatures),
-        partial(law.step_with_details, temperatures=temperatures),
-        smooth=True,
-    )
 
 
 class Rules(NamedTuple):
@@ -279,17 +245,59 @@ def _believed(world: World, trial: Trial, period: float) -> tuple[jax.Array, jax
     return poses, told + sigma * jax.random.normal(key, (3,), now.dtype)
 
 
-def _executed(world: World, trial: Trial, twist: Twist, period: float) -> tuple[jax.Array, Twist]:
-    """The last twists (K, 3), and the twist that the base carries out."""
-    if not trial.twists.shape[0]:
-        return trial.twists, twist
-    twists = jnp.concatenate([jnp.stack(twist)[None], trial.twists[:-1]])
-    done = twists[_age(world.odometry.command_delay, period)]
-    return twists, Twist(*(done * (1 + world.odometry.velocity_error)))
-
-
 def _age(time: Any, period: float) -> jax.Array:
     return jnp.round(time / period).astype(jnp.int32)
+
+
+class Seen(NamedTuple):
+    """What skin and odometry tell at one moment."""
+
+    reading: Reading | SmoothReading
+    observation: Observation  # by where the base believes to be
+    distance: jax.Array  # () [m] contact point to target, by where it is; without contact, base's
+
+
+def observe(
+    world: World, trial: Trial, *, physics: Physics, rules: Rules = Rules()
+) -> tuple[Trial, Seen]:
+    """The first half of `decide`: sense and judge.
+
+    The rules judge by where the base is, the law by where it believes to be.
+    """
+    period = physics.control_period
+    time = trial.steps * period
+    trial = _shifted(world, trial, period)
+    skin, reading, observation = sense(world, trial, period)
+    distance = frames.norm(law.displacement(observation))
+    poses, believed = _believed(world, trial, period)
+    seen = observation._replace(p_world_robot=believed[:2], yaw=believed[2])
+
+    touch = reading.contact_type != NONE
+    lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
+    success = touch & (distance < world.params.d_success)
+    over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost)
+    told = trial._replace(
+        skin=skin,
+        poses=poses,
+        contact_steps=trial.contact_steps + touch,
+        lost_steps=lost_steps,
+        sum_abs_l=trial.sum_abs_l + jnp.where(touch, jnp.abs(reading.p_robot_contact[1]), 0.0),
+        min_distance=jnp.where(
+            touch, jnp.minimum(trial.min_distance, distance), trial.min_distance
+        ),
+        success=success & ~over,
+        done=success | over,
+    )
+    return told, Seen(reading, seen, distance)
+
+
+def execute(world: World, trial: Trial, twist: Twist, period: float) -> tuple[Trial, Twist]:
+    """The trial that remembers a commanded twist, and the twist that the base carries out."""
+    if not trial.twists.shape[0]:
+        return trial, twist
+    twists = jnp.concatenate([jnp.stack(twist)[None], trial.twists[:-1]])
+    done = twists[_age(world.odometry.command_delay, period)]
+    return trial._replace(twists=twists), Twist(*(done * (1 + world.odometry.velocity_error)))
 
 
 def decide(
@@ -303,43 +311,20 @@ def decide(
     """What happens between two control periods of one world: sense, judge, decide.
 
     Returns the trial as it will be driven on, or ended; the twist that the base carries out; and
-    what was seen. The rules judge by where the base is, the law by where it believes to be.
+    what was seen.
     """
     period = physics.control_period
-    time = trial.steps * period
-    trial = _shifted(world, trial, period)
-    skin, reading, observation = sense(world, trial, period)
-    touch = reading.contact_type != NONE
+    told, seen = observe(world, trial, physics=physics, rules=rules)
+    observation: Any = seen.observation
     if not strategy.smooth:
-        observation = observation._replace(in_contact=touch)
-    distance = frames.norm(law.displacement(observation))
-    poses, believed = _believed(world, trial, period)
-    seen: Any = observation._replace(p_world_robot=believed[:2], yaw=believed[2])
+        observation = observation._replace(in_contact=seen.reading.contact_type != NONE)
     if strategy.tracks:
-        seen = TrackedObservation(
-            seen, object_pose(trial.qpos)[0], fp.circumradius(world.footprint), period
+        observation = TrackedObservation(
+            observation, object_pose(told.qpos)[0], fp.circumradius(world.footprint), period
         )
-    state, twist, details = strategy.step(world.params, trial.strategy, seen)
-    snapshot = Snapshot(time, trial.qpos, reading, twist, details, trial.done)
-    twists, twist = _executed(world, trial, twist, period)
-
-    lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
-    success = touch & (distance < world.params.d_success)
-    over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost)
-    told = trial._replace(
-        strategy=state,
-        skin=skin,
-        poses=poses,
-        twists=twists,
-        contact_steps=trial.contact_steps + touch,
-        lost_steps=lost_steps,
-        sum_abs_l=trial.sum_abs_l + jnp.where(touch, jnp.abs(reading.p_robot_contact[1]), 0.0),
-        min_distance=jnp.where(
-            touch, jnp.minimum(trial.min_distance, distance), trial.min_distance
-        ),
-        success=success & ~over,
-        done=success | over,
-    )
+    state, twist, details = strategy.step(world.params, trial.strategy, observation)
+    snapshot = Snapshot(trial.steps * period, told.qpos, seen.reading, twist, details, trial.done)
+    told, twist = execute(world, told._replace(strategy=state), twist, period)
     return told, twist, snapshot
 
 

@@ -20,7 +20,7 @@ from evosax import algorithms
 from evosax.algorithms.distribution_based.base import DistributionBasedAlgorithm
 from numpy.typing import ArrayLike
 
-from rps_jax import domain, errors, record, slots, trial
+from rps_jax import domain, errors, record, slots, strategies
 from rps_jax.domain import Domain
 from rps_jax.law import RPSParams
 from rps_jax.slots import Job, Part, Progress, Setting, Timing
@@ -241,7 +241,7 @@ def try_out(
 
     count = [sum(len(g.params.L) * g.column.size for g in groups) for groups in jobs.values()]
     timing = slots.run(
-        [Job(trial.RPS, n, _filled(g)) for n, g in zip(count, jobs.values(), strict=True)],
+        [Job(strategies.RPS, n, _filled(g)) for n, g in zip(count, jobs.values(), strict=True)],
         setting,
         collect=collect,
         report=report,

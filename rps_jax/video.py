@@ -97,8 +97,21 @@ def snapshot(
       InputError: a qpos, target, size or camera that cannot be used.
       VideoError: this machine cannot draw.
     """
+    options = {"p_world_target": p_world_target, "size": size, "camera": camera}
+    return images(scene, [qpos], **options)[0]
+
+
+def images(
+    scene: Scene,
+    frames: Iterable[ArrayLike],
+    *,
+    p_world_target: ArrayLike,
+    size: tuple[int, int] = SIZE,
+    camera: str = "oblique",
+) -> list[np.ndarray]:
+    """Pictures as of `snapshot`, each with the path of the base up to there."""
     with _studio(scene, p_world_target, size, camera) as studio:
-        return studio.draw(qpos, _NO_CONTACT)
+        return [studio.draw(qpos, _NO_CONTACT) for qpos in frames]
 
 
 def render(

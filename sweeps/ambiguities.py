@@ -13,8 +13,9 @@ from pathlib import Path
 
 import tyro
 
-from rps_jax import ambiguity, errors, figures, paper, record, scene, score, study
+from rps_jax import ambiguity, errors, figures, paper, record, score, study
 from rps_jax.cli import StudyOptions, guarded, progress_bar
+from rps_jax.objects import PAPER_OBJECTS
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ def main(options: Options) -> None:
         tables.append(ambiguity.cells(results))
     if options.curve and not options.readings:
         curve = ambiguity.by_tolerance(results, ambiguity.TOLERANCES)
-        trials = grid.size // len(scene.PAPER_OBJECTS)
+        trials = grid.size // len(PAPER_OBJECTS)
         figures.tolerance_curve(curve, trials, out / "tolerance.png")
     text = "\n\n".join(score.markdown(rows) for rows in tables)
     record.write_text(out / "table.md", text + "\n")

@@ -2,6 +2,8 @@
 
 import os
 
+import pytest
+
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 
@@ -13,3 +15,19 @@ def pytest_configure(config):
     video.choose_gl()
     jax.config.update("jax_compilation_cache_dir", str(config.rootpath / ".jax_cache"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+@pytest.fixture
+def compiled():
+    """How long [s] each compilation of this test took; the list grows as the test goes on."""
+    from jax import monitoring
+
+    took = []
+
+    def note(event, duration, **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            took.append(duration)
+
+    monitoring.register_event_duration_secs_listener(note)
+    yield took
+    monitoring.unregister_event_duration_listener(note)

@@ -14,6 +14,7 @@ import pytest
 from rps_jax import domain, engines, fused, paper, scene, solid, sweep
 from rps_jax.domain import DOMAINS, RANDOM, Domain, Range
 from rps_jax.errors import InputError
+from rps_jax.objects import PAPER_OBJECTS
 from rps_jax.physics import preset
 from rps_jax.scene import FRICTION, mjx
 from rps_jax.slots import Setting
@@ -81,7 +82,7 @@ def test_objects_take_turns():
 def test_the_paper_domain_is_the_papers_grid(engine):
     chosen, setting = DOMAINS["paper"], Setting(engine=engine)
     assert chosen.combinations == 144
-    for which, name in enumerate(scene.PAPER_OBJECTS):
+    for which, name in enumerate(PAPER_OBJECTS):
         index = np.flatnonzero(chosen.object_of(np.arange(144)) == which)
         part = domain.worlds(chosen, domain.draw(chosen, 0, index), paper.PARAMS["rps"], setting)
         cases = [Case(name, f, t) for f in FRICTION.values() for t in paper.TARGETS]

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from rps_jax import contacts, fused, newton, scene, spatial
+from rps_jax.objects import FAMILIES
 from rps_jax.physics import Physics
 from rps_jax.scene import Friction
 
@@ -67,7 +68,7 @@ def program(family, physics):
 
 def drive(name, body, physics, qpos, steps):
     state = jnp.asarray(qpos, float)[None], jnp.zeros((1, 9)), jnp.zeros((1, 9))
-    after = program(scene.FAMILIES[name], physics)(body, state, steps)
+    after = program(FAMILIES[name], physics)(body, state, steps)
     return [np.asarray(x[0], float) for x in after]
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from rps_jax import errors, gradients, sweep, trial
+from rps_jax import errors, gradients, strategies, sweep, trial
 from rps_jax.gradients import Estimate
 from rps_jax.law import RPSParams
 from rps_jax.physics import Physics
@@ -223,7 +223,7 @@ def test_the_derivative_of_a_window_of_fused_trials_is_its_finite_difference():
     skin, setting = SmoothSkin(), Setting(engine="fused")
     cases = [Case("cylinder", FRICTION["S1"], t, skin=skin, gap=0.004) for t in targets]
     stage, worlds = sweep.build(cases, setting)
-    strategy = trial.smooth_rps()
+    strategy = strategies.smooth_rps()
     starts = (worlds, trial.start_all(worlds, np.ones(3, bool), strategy=strategy))
     scores = gradients.window(stage, params_of, final_distance, physics=setting.physics, steps=50)
     along = jax.jit(lambda thetas, way: jax.jvp(lambda x: scores(x, starts), (thetas,), (way,)))

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from rps_jax import errors, scene, skin
+from rps_jax.objects import FAMILIES, OBJECTS
 from rps_jax.physics import Physics
-from rps_jax.scene import FRICTION, JOINTS, OBJECTS, mjx
+from rps_jax.scene import FRICTION, JOINTS, mjx
 
 STEP = 0.01  # [s]
 TWIST = np.array([0.05, 0.01, 0.1])  # base x, y [m/s], yaw [rad/s] in the world
@@ -50,7 +51,7 @@ def step_mjx(model, data, fields, qpos, steps):
 
 
 FAMILY_OBJECTS = [
-    [name for name in OBJECTS if scene.FAMILIES[name] == family] for family in ("box", "cylinder")
+    [name for name in OBJECTS if FAMILIES[name] == family] for family in ("box", "cylinder")
 ]
 
 

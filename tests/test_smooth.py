@@ -14,7 +14,7 @@ import pytest
 from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 
-from rps_jax import errors, law, reference, sweep, trial
+from rps_jax import errors, law, reference, strategies, sweep
 from rps_jax import footprint as fp
 from rps_jax.footprint import Footprint
 from rps_jax.law import Observation, RPSParams, RPSState, Temperatures
@@ -341,7 +341,7 @@ def test_a_smooth_step_preserves_the_dtypes_of_the_state(x64):
 @pytest.mark.parametrize("value", [0.0, -0.01, math.nan, math.inf, "warm"])
 def test_a_temperature_that_is_no_positive_length_is_refused(name, value):
     with pytest.raises(errors.InputError, match=f"temperature {name} = "):
-        trial.smooth_rps(WARM._replace(**{name: value}))
+        strategies.smooth_rps(WARM._replace(**{name: value}))
 
 
 # The skin
@@ -563,8 +563,8 @@ def test_without_heat_a_smooth_trial_is_the_hard_one(name):
     """From before the first touch, through a turn towards a target at the side."""
     case = Case(name, FRICTION["S1"], (1.0, -1.5), gap=0.005)
     cold = replace(case, skin=SmoothSkin(IdealSkin(), 1e-6))
-    exact = push(case, trial.RPS, 10.0)
-    got = push(cold, trial.smooth_rps(COLD), 10.0)
+    exact = push(case, strategies.RPS, 10.0)
+    got = push(cold, strategies.smooth_rps(COLD), 10.0)
     assert abs(exact.qpos[2]) > 0.2  # it turned
     np.testing.assert_allclose(got.qpos, exact.qpos, atol=2e-3)
     assert got.contact_steps == pytest.approx(exact.contact_steps, abs=1)
@@ -572,7 +572,9 @@ def test_without_heat_a_smooth_trial_is_the_hard_one(name):
     assert got.min_distance == pytest.approx(exact.min_distance, abs=2e-3)
 
 
-@pytest.mark.parametrize("strategy", [trial.RPS, trial.smooth_rps()], ids=["hard", "smooth"])
+@pytest.mark.parametrize(
+    "strategy", [strategies.RPS, strategies.smooth_rps()], ids=["hard", "smooth"]
+)
 def test_with_a_warm_skin_a_push_arrives(strategy):
     """By either law: a hard one is told whether there is contact."""
     case = Case("box", FRICTION["S1"], (0.7, 0.05), skin=SmoothSkin())
@@ -583,5 +585,7 @@ def test_with_a_warm_skin_a_push_arrives(strategy):
 
 
 def test_equal_temperatures_are_one_strategy():
-    assert trial.smooth_rps(Temperatures()) is trial.smooth_rps(Temperatures(realign=0.01))
-    assert trial.smooth_rps(COLD) is not trial.smooth_rps()
+    assert strategies.smooth_rps(Temperatures()) is strategies.smooth_rps(
+        Temperatures(realign=0.01)
+    )
+    assert strategies.smooth_rps(COLD) is not strategies.smooth_rps()

@@ -20,6 +20,7 @@ from rps_jax import (
     sweep,
 )
 from rps_jax.law import RPSParams
+from rps_jax.objects import PAPER_OBJECTS
 from rps_jax.physics import preset
 from rps_jax.report import Section
 from rps_jax.scene import FRICTION
@@ -166,7 +167,7 @@ def test_the_cells_of_table_ii_are_judged_by_their_intervals():
         coords={
             "condition": ["paper_gazebo"],
             "strategy": list(paper.STRATEGIES),
-            "object": list(scene.PAPER_OBJECTS),
+            "object": list(PAPER_OBJECTS),
             "friction": ["S1", "S2"],
         },
     )
@@ -191,7 +192,7 @@ def test_the_tolerance_curve_sums_each_behaviour_and_tolerance():
             "success": (("condition", *score.DIMS), success),
             "contact_lost_time": (("condition", *score.DIMS), np.full(shape, 2.0)),
         },
-        coords={"condition": names, "strategy": ["rps"], "object": list(scene.PAPER_OBJECTS)},
+        coords={"condition": names, "strategy": ["rps"], "object": list(PAPER_OBJECTS)},
     )
     curve = ambiguity.by_tolerance(results, (1, 6))
     assert curve.won.sum() == 48

@@ -1,0 +1,296 @@
+"""Bad input on the command line: exit code 2 and a sentence that names field, value and what is
+allowed, before anything compiles."""
+
+import json
+import re
+import time
+
+import pytest
+
+from rps_jax import cli, paper, record, robustness
+from rps_jax.domain import DOMAINS
+from rps_jax.errors import InputError
+from rps_jax.robustness import Plan
+from rps_jax.slots import Setting
+
+# What is asked for, and what the answer says of it.
+TABLE = {
+    "--objects bx": "unknown object 'bx': choose from box, cylinder, .*did you mean 'box'",
+    "--objects": r"objects = \(\) is not allowed: name each once, at least one",
+    "--objects box box": r"objects = .* is not allowed: name each once",
+    "--strategies": r"strategies = \(\) is not allowed",
+    "--strategies rps rps": "strategies = .* is not allowed: name each once",
+    "--strategies mpc": "unknown strategy 'mpc': choose from rps, nps, aps",
+    "--friction": r"friction = \(\) is not allowed",
+    "--friction S1 S1": "friction = .* is not allowed: name each once",
+    "--friction S3": "unknown friction set 'S3': choose from S1, S2",
+    "--friction 0.3,": "friction robot =  is not allowed: it must be a number",
+    "--friction a,b": "friction ground = a is not allowed: it must be a number",
+    "--friction -0.3,0.35": "friction ground = -0.3 is not allowed: .* above 0",
+    "--friction 0.3,nan": "friction robot = nan is not allowed",
+    "--friction 1e99,0.3": "friction ground = 1e99 is not allowed: .* at most 10",
+    "--friction 0.3,0.2,0.1": "write S1, S2 or ground,robot",
+    "--targets 1": "targets",
+    "--targets x y": "targets",
+    "--targets nan 0": "target x = nan is not allowed: .* at least -50 and at most 50",
+    "--targets 1e9 0": "target x = 1000000000.0 is not allowed",
+    "--targets 0.1 0.1": r"target = \(0.1, 0.1\) m is not allowed: .* outside the robot",
+    "--params beta": "params 'beta' is not allowed: write name=value",
+    "--params bta=1": "unknown params 'bta': choose from eta, .*did you mean 'beta'",
+    "--params aps.vmax=1": "did you mean 'aps.v_max'",
+    "--params aps.v_max=0": "aps.v_max = 0.0 is not allowed: it must be a number and above 0",
+    "--strategies rps --params aps.v_max=1": "unknown params 'aps.v_max'",
+    "--params reactive=0": "unknown params 'reactive'",
+    "--params L=": "params L =  is not allowed: it must be a number",
+    "--params L=zero": "params L = zero is not allowed: it must be a number",
+    "--params L=0": "L = 0.0 is not allowed: it must be a number and above 0",
+    "--params L=1e400": "L = inf is not allowed: it must be finite",
+    "--params K_h=-1": "K_h = -1.0 is not allowed",
+    "--params eta=inf": "eta = inf is not allowed: it must be finite",
+    "--params l_mr=0.3": "l_mr = 0.3 is not allowed: .* at most 0.24",
+    "--params sgn_0=2": "sgn_0 = 2.0 is not allowed: .* at most 1",
+    "--params gamma_max=nan": "gamma_max = nan is not allowed",
+    "--horizon 0": r"horizon = 0.0 is not allowed: .* above 0 and at most 100000 \[s\]",
+    "--horizon nan": "horizon = nan is not allowed",
+    "--horizon 1e9": "horizon = 1000000000.0 is not allowed",
+    "--slots 0": "slots = 0 is not allowed: it must be a whole number from 1 to",
+    "--slots 1.5": "1.5",
+    "--slots 99999999999999": "slots = 99999999999999 is not allowed",
+    "--workers -1": "workers = -1 is not allowed: it must be a whole number from 1 to",
+    "--workers 99999999": "workers = 99999999 is not allowed",
+    "--seed 4294967296": "seed = 4294967296 is not allowed: .* from 0 to 4294967295",
+    "--fidelity best": "unknown fidelity 'best': choose from reference, standard, fast",
+    "--engine ode": "unknown engine 'ode': choose from mjx, fused, mujoco",
+    "--out file": "out = file cannot be written .* choose a writable folder",
+    "--out done": "out = done already holds a run: .* --overwrite",
+}
+PUSH = {
+    "--object sphere": "unknown object 'sphere': choose from box",
+    "--target inf 0": "target x = inf is not allowed",
+    "--target 0 0": "target = .* outside the robot",
+    "--target 1": "target",
+    "--strategy RPS": "unknown strategy 'RPS': choose from rps",
+    "--engine mujoco": "engine = mujoco is not allowed: follow a trial with mjx or fused",
+    "--mass -20": r"mass = -20.0 is not allowed: .* above 0 and at most 10000 \[kg\]",
+    "--mass 0": "mass = 0.0 is not allowed",
+    "--mass nan": "mass = nan is not allowed",
+    "--mass heavy": "heavy",
+    "--timestep 0": r"timestep = 0.0 is not allowed: .* at least 1e-05 and at most 0.1 \[s\]",
+    "--timestep -0.01": "timestep = -0.01 is not allowed",
+    "--timestep 1e-9": "timestep = 1e-09 is not allowed",
+    "--timestep 0.006": "control_period = 0.02 s is not allowed: .* a multiple of timestep",
+    "--control-period 0.025": "control_period = 0.025 s .* a multiple of timestep",
+    "--control-period 5": "control_period = 5.0 is not allowed: .* at most 1",
+    "--physics bullet": "unknown physics 'bullet': choose from default, paper_gazebo",
+    "--skin leather": "unknown skin 'leather': choose from ideal, thin, capacitive, hardware",
+    "--skin-params tolerance": "skin-params 'tolerance' is not allowed: write name=value",
+    "--skin-params tolerance=-1": "skin tolerance = -1.0 is not allowed: .* at least 0",
+    "--skin-params foam=0.01": "unknown skin-params 'foam': choose from tolerance",
+    "--skin-params half_length=9": "skin half_length = 9.0 is not allowed: .* at most 2",
+    "--skin capacitive --skin-params foam=0": "skin foam = 0.0 is not allowed: .* above 0",
+    "--skin capacitive --skin-params dead_share=2": "skin dead_share = 2.0 .* at most 1",
+    "--skin capacitive --skin-params time_constant=0": "skin time_constant = 0.0 is not allowed",
+    "--gap -0.1": "gap = -0.1 is not allowed: .* at least 0 and at most 1",
+    "--rear left": "unknown rear 'left': choose from near, far",
+    "--seed -1": "seed = -1 is not allowed",
+    "--film-length 0": r"film_length = 0.0 is not allowed: .* above 0 and at most 600 \[s\]",
+    "--video maybe": "maybe",
+    "--colour red": "--colour",
+    "--out /proc/nowhere/run": "out = /proc/nowhere/run cannot be written",
+    "--out done": "out = done already holds a run",
+}
+HARDWARE = {
+    "--layout ring": "unknown layout 'ring': choose from circle, grid",
+    "--mass 3": "mass = 3 is not allowed: each object of the hardware has the paper's",
+    "--skin fur": "unknown skin 'fur'",
+    "--engine mujoco": "engine = mujoco is not allowed",
+    "--params aps.v_max=1": "unknown params 'aps.v_max'",
+    "--slots -1": "slots = -1 is not allowed",
+    "--out file": "out = file cannot be written",
+}
+PAPER = {
+    "--slots 0": "slots = 0 is not allowed",
+    "--workers 0": "workers = 0 is not allowed",
+    "--quick maybe": "maybe",
+    "--out file": "out = file cannot be written",
+}
+SWEEP = {
+    "--domain narrow": "unknown domain 'narrow': choose from paper, hardware, wide, hostile",
+    "--domain none.json": "none.json cannot be read .* give a JSON file",
+    "--domain folder.json": "folder.json cannot be read",
+    "--domain text.json": "text.json is not JSON",
+    "--domain binary.json": "binary.json is not JSON",
+    "--domain list.json": "list.json holds no names with values",
+    "--domain quantity.json": "unknown domain quantity 'masss': .*did you mean 'mass'",
+    "--domain word.json": r"domain mass = heavy is not allowed: write low and high, as \[0.1",
+    "--domain one.json": r"domain mass = \[1\] is not allowed: write low and high",
+    "--domain object.json": "domain objects = random_box is not allowed: write names",
+    "--domain frictions.json": r"domain frictions = \[\[0.1\]\] is not allowed: write pairs",
+    "--domain slippery.json": "friction ground = -1.0 is not allowed: .* above 0",
+    "--domain targets.json": r"domain targets = \[\[1\]\] is not allowed: write pairs",
+    "--domain nan.json": "target x = nan is not allowed",
+    "--domain under.json": r"target = \(0, 0\) m is not allowed: .* outside the robot",
+    "--domain fur.json": "unknown domain skin 'fur': choose from ideal, capacitive",
+    "--change mass": "change 'mass' is not allowed: write quantity=low,high",
+    "--change mass=3": "change 'mass=3' is not allowed: write quantity=low,high",
+    "--change mass=3,4,5": "change 'mass=3,4,5' is not allowed: write quantity=low,high",
+    "--change mass=a,b": "domain mass = a is not allowed: it must be a number",
+    "--change mass=nan,4": "domain mass = nan is not allowed",
+    "--change mass=4,3": "domain mass = 4 to 3 is not allowed: low must not exceed high",
+    "--change masses=3,4": "unknown domain quantity 'masses': .*did you mean 'mass'",
+    "--change com_offset=0,0.9": r"domain com_offset \(high\) = 0.9 is not allowed: .* at most",
+    "--strategies": r"strategies = \(\) is not allowed",
+    "--strategies npss": "unknown strategy 'npss': .*did you mean 'nps'",
+    "--strategies rps rps": "strategies = .* is not allowed: name each once",
+    "--params": r"params = \(\) is not allowed",
+    "--params none.json": "none.json cannot be read",
+    "--params L.json": "L = -1.0 is not allowed",
+    "--params L_word.json": "L_word.json L = x is not allowed: it must be a number",
+    "--params reactive.json": "unknown parameter of reactive.json 'reactive'",
+    "--params list.json": "list.json holds no names with values",
+    "--params good.json other/good.json": "params = .* is not allowed: name each once",
+    "--worlds 0": "worlds = 0 is not allowed: it must be a whole number from 1 to",
+    "--worlds -1": "worlds = -1 is not allowed",
+    "--worlds 99999999999": "worlds = 99999999999 is not allowed",
+    "--part 0": "part = 0 is not allowed: it must be a whole number from 1 to",
+    "--horizon 0": "horizon = 0.0 is not allowed",
+    "--seed -1": "seed = -1 is not allowed",
+    "--engine bullet": "unknown engine 'bullet'",
+    "--device tpu": "unknown device 'tpu': choose from auto, cpu, gpu",
+    "--device gpu": "device = gpu is not there: install .*, or choose cpu",
+    "--shard 3": "shard '3' is not allowed: write k/n, as 3/8",
+    "--shard 1/2/3": "shard '1/2/3' is not allowed: write k/n",
+    "--shard 3/2": "shard = 3 is not allowed: it must be a whole number from 1 to 2",
+    "--shard 1/0": "shard = 0 is not allowed",
+    "--slots 0": "slots = 0 is not allowed",
+    "--out file": "out = file cannot be written",
+    "--out /dev/null/x": "out = /dev/null/x cannot be written",
+    "--out run": "out = run holds another run .domain.objects = .* choose another folder",
+    "--out cut": "cut/manifest.json is corrupt .*: restore it, or choose another folder",
+    "--out bytes": "bytes/manifest.json is corrupt",
+    "--out empty": "empty/manifest.json is corrupt .it holds no names",
+}
+MERGE = {
+    "--out x": r"folders = \(\) is not allowed: give the run folders",
+    "run": "--out",
+    "nowhere --out x": "run = nowhere holds no manifest.json: give the folder of a run",
+    "file --out x": "run = file holds no manifest.json",
+    "cut --out x": "cut/manifest.json is corrupt",
+    "lacking --out x": "lacking/manifest.json is corrupt",
+    "run --out x": "run = run lacks 1 of 1 parts: run the same command again",
+    "run in_c --out x": "run = in_c is of another plan than run .engine = 'mjx' there",
+    "run --out file": "out = file cannot be written",
+}
+REPLAY = {
+    "run": "Index of the world",
+    "run x": "Index of the world",
+    "run 3": "index = 3 is not allowed: it must be a whole number from 0 to 2",
+    "run -1": "index = -1 is not allowed",
+    "run 0 --arm nps": "unknown arm 'nps': choose from rps",
+    "run 0 --film-length nan": "film_length = nan is not allowed",
+    "run 0 --out file": "out = file cannot be written",
+    "in_c 0": "engine = mujoco is not allowed: follow a trial with mjx or fused",
+    "nowhere 0": "run = nowhere holds no manifest.json",
+    "bytes 0": "bytes/manifest.json is corrupt",
+    "worlds 0": "worlds/manifest.json is corrupt .worlds = 2.5 is not allowed: .* whole number",
+    "class 0": "class/manifest.json is corrupt .unknown class of parameters 'Lost': choose from",
+    "params 0": "params/manifest.json is corrupt .L = x is not allowed",
+    "arms 0": "arms/manifest.json is corrupt",
+    "physics 0": "physics/manifest.json is corrupt .timestep = -1 is not allowed",
+}
+COMMANDS = {
+    "table": TABLE,
+    "push": PUSH,
+    "hardware": HARDWARE,
+    "paper": PAPER,
+    "sweep": SWEEP,
+    "merge": MERGE,
+    "replay": REPLAY,
+    "doctor": {"--loudly": "--loudly"},
+    "puhs": {"": "puhs"},
+}
+CASES = {f"{name} {more}": says for name, cases in COMMANDS.items() for more, says in cases.items()}
+
+DOMAIN_FILES = {
+    "list": [1],
+    "quantity": {"masss": [1, 2]},
+    "word": {"mass": "heavy"},
+    "one": {"mass": [1]},
+    "object": {"objects": "random_box"},
+    "frictions": {"frictions": [[0.1]]},
+    "slippery": {"frictions": [[-1, 0.3]]},
+    "targets": {"targets": [[1]]},
+    "nan": {"targets": [[float("nan"), 0]]},
+    "under": {"targets": [[0, 0]]},
+    "fur": {"skin": "fur"},
+}
+PARAMS_FILES = {
+    "L": {"L": -1},
+    "L_word": {"L": "x"},
+    "reactive": {"reactive": 0.5},
+    "good": {"L": 0.3},
+    "other/good": {"L": 0.25},
+}
+CHANGED_MANIFESTS = {
+    "worlds": {"worlds": 2.5},
+    "class": {"arms": {"rps": {"strategy": "Lost"}}},
+    "params": {"arms": {"rps": {"strategy": "RPSParams", "L": "x"}}},
+    "arms": {"arms": []},
+    "physics": {"physics": {"timestep": -1}},
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """What the cases speak of: files of every kind of badness, and one run of three worlds."""
+    root = tmp_path_factory.mktemp("bad")
+    (root / "file").touch()
+    (root / "text.json").write_text("mass = 3")
+    (root / "binary.json").write_bytes(b"\xff\xfe\x00")
+    for name in ("other", "folder.json", "done", "bytes", "cut", "empty", "lacking"):
+        (root / name).mkdir()
+    (root / "done" / "config.json").write_text("{}")
+    (root / "bytes" / "manifest.json").write_bytes(b"\xff\xfe\x00")
+    for name, text in (("cut", '{"worlds": 3'), ("empty", "[]"), ("lacking", "{}")):
+        (root / name / "manifest.json").write_text(text)
+    for name, values in (DOMAIN_FILES | PARAMS_FILES).items():
+        (root / f"{name}.json").write_text(json.dumps(values))
+    arms = {"rps": paper.PARAMS["rps"]}
+    for name, engine in (("run", "mjx"), ("in_c", "mujoco")):
+        robustness.open_run(root / name, Plan(DOMAINS["paper"], 3, arms, Setting(engine=engine)))
+    good = json.loads((root / "run" / "manifest.json").read_text())
+    for name, changes in CHANGED_MANIFESTS.items():
+        (root / name).mkdir()
+        (root / name / "manifest.json").write_text(json.dumps(good | changes))
+    return root
+
+
+def exit_code(arguments):
+    """Of the command; tyro ends the process for what it cannot read."""
+    try:
+        return cli.main(arguments)
+    except SystemExit as end:
+        return end.code
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_bad_input_is_one_sentence_and_exit_code_2_before_anything_compiles(
+    case, folder, compiled, capsys, monkeypatch
+):
+    monkeypatch.chdir(folder)
+    began = time.process_time()
+    assert exit_code(case.split()) == 2
+    assert time.process_time() - began < 2.0
+    assert not compiled
+    error = capsys.readouterr().err
+    assert re.search(CASES[case], error)
+    if error.startswith("rps: error: "):  # else tyro's own, in a frame
+        assert error.count("\n") == 1
+        assert error.endswith(".\n")
+    assert not list(folder.rglob("*.nc"))
+
+
+def test_a_corrupt_results_file_is_named(tmp_path):
+    (tmp_path / "results.nc").write_bytes(b"not a file of results")
+    with pytest.raises(InputError, match=r"results\.nc is corrupt"):
+        record.read_results(tmp_path)

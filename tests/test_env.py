@@ -1,0 +1,256 @@
+"""An environment is the same trial, with somebody else deciding."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rps_jax import domain, env, skin, trial
+from rps_jax.domain import DOMAINS, Range
+from rps_jax.env import PushEnv, Reward
+from rps_jax.errors import InputError
+from rps_jax.law import Details, RPSParams
+from rps_jax.physics import preset
+from rps_jax.slots import Setting
+from rps_jax.strategies import Strategy
+from rps_jax.trial import Rules
+
+FAST = preset(fidelity="fast")
+# Targets ahead, so near that a push of a few seconds arrives; a perfect base.
+NEAR = replace(
+    DOMAINS["wide"],
+    distance=Range(0.7, 0.72),
+    bearing=Range(-0.1, 0.1),
+    lateral=Range(-0.03, 0.03),
+    com_offset=Range(0, 0),
+    gap=Range(0.02, 0.02),
+    **{name: Range(0, 0) for name in domain.OF_THE_BASE},
+)
+COUNT, STEPS = 4, 50
+AHEAD, BACK = jnp.array([1.0, 0.0, 0.0]), jnp.array([-1.0, 0.0, 0.0])
+PERIOD = FAST.control_period
+
+
+def made(engine="fused", **options):
+    setting = Setting(FAST, Rules(horizon=20.0), engine=engine)
+    return PushEnv("random_cylinder", NEAR, setting=setting, worlds=6, **options)
+
+
+def programs(push):
+    """`reset` of many keys, and STEPS steps of many worlds, (STEPS, n, ...), compiled."""
+
+    def one(state, actions):
+        state = jax.vmap(push.step)(state, actions)
+        return state, state
+
+    steps = jax.jit(lambda state, actions: jax.lax.scan(one, state, length=STEPS, xs=actions)[1])
+    return jax.jit(jax.vmap(push.reset)), steps
+
+
+class Pushing:
+    """An environment, a batch at its start, and how it goes on."""
+
+    def __init__(self):
+        self.env = made()
+        self.reset, self._steps = programs(self.env)
+        self.start = self.reset(jax.random.split(jax.random.key(0), COUNT))
+
+    def go(self, state, actions, times=1):
+        """States (times * STEPS, COUNT, ...) under actions (COUNT, 3), or (3,) for all."""
+        actions = jnp.broadcast_to(actions, (STEPS, COUNT, 3))
+        parts = []
+        for _ in range(times):
+            parts.append(self._steps(state, actions))
+            state = last(parts[-1])
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+def last(states):
+    return jax.tree.map(lambda leaf: leaf[-1], states)
+
+
+@pytest.fixture(scope="module")
+def pushing():
+    return Pushing()
+
+
+def test_the_spaces_are_those_of_the_skin_the_target_and_the_twist(pushing):
+    push, state = pushing.env, pushing.start
+    assert (push.observation_size, push.action_size) == (skin.taxels().shape[0] + 2, 3)
+    assert state.obs.shape == (COUNT, 44)
+    assert (push.dt, push.sim_dt, push.n_substeps) == (0.02, 0.02, 1)
+    assert push.xml_path.endswith("cylinder.xml")
+    assert push.mj_model.nq == push.mjx_model.nq == 10
+    assert push.unwrapped is push
+
+
+def test_step_gives_back_what_reset_gave_so_that_a_loop_can_scan(pushing):
+    push, state = pushing.env, pushing.start
+    one = jax.tree.map(lambda leaf: leaf[0], state)
+    after = jax.eval_shape(push.step, one, AHEAD)
+    assert jax.tree.structure(after) == jax.tree.structure(one)
+    for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(one), strict=True):
+        assert (a.shape, a.dtype) == (b.shape, b.dtype)
+    # What a wrapper notes is kept.
+    noted = one.replace(info=one.info | {"steps": jnp.zeros(())}, metrics=one.metrics | {"x": 0.0})
+    kept = jax.eval_shape(push.step, noted, AHEAD)
+    assert "steps" in kept.info
+    assert "x" in kept.metrics
+
+
+def test_a_key_decides_on_world_and_noise(pushing):
+    twice = pushing.reset(jax.vmap(jax.random.key)(jnp.array([1, 1, 2, 3])))
+    np.testing.assert_array_equal(twice.obs[0], twice.obs[1])
+    assert len({bytes(np.asarray(row)) for row in twice.obs}) == 3
+    batches = jax.random.split(jax.random.key(4), (15, COUNT))
+    found = [pushing.reset(keys).info["index"] for keys in batches]
+    assert set(np.ravel(found)) == set(range(6))
+
+
+def test_worlds_are_those_of_the_domain(pushing):
+    state = pushing.start
+    index = np.asarray(state.info["index"])
+    drawn = domain.draw(replace(NEAR, objects=("random_cylinder",)), 0, index)
+    np.testing.assert_allclose(state.info["world"].footprint.radius, drawn.solid.radius, rtol=1e-6)
+    np.testing.assert_allclose(state.obs[:, 42:], drawn.p_world_target, rtol=1e-6)
+    np.testing.assert_allclose(state.data.qpos[:, 4], drawn.lateral, rtol=1e-6)
+
+
+def test_an_action_is_a_share_of_the_greatest_twist():
+    push = made(params=RPSParams(v_max=0.04, omega_max=0.2))
+    np.testing.assert_allclose(push.twist(jnp.array([0.5, -0.5, 0.25])), [0.02, -0.02, 0.05])
+    np.testing.assert_allclose(push.twist(jnp.array([3.0, 4.0, -9.0])), [0.024, 0.032, -0.2])
+
+
+def test_a_push_earns_what_it_brings_nearer_less_the_time_without_contact(pushing):
+    start, seen = pushing.start, pushing.go(pushing.start, AHEAD, times=14)
+    won = np.flatnonzero(seen.data.success[-1])
+    assert won.size >= 2, "targets are ahead: most arrive"
+    touch = seen.metrics["in_contact"] > 0
+    for i in won:
+        end = int(np.argmax(seen.done[:, i]))
+        felt = seen.data.strategy[:, i]
+        gained = felt[np.argmax(touch[:, i])] - felt[end]
+        without = PERIOD * (~touch[: end + 1, i]).sum()
+        assert seen.reward[:, i].sum() == pytest.approx(gained - 0.05 * without + 1, abs=1e-4)
+        assert felt[end] < pushing.env.params.d_success
+        # From then on nothing moves and nothing is earned.
+        assert (seen.done[end:, i] == 1).all()
+        assert (seen.reward[end + 1 :, i] == 0).all()
+        np.testing.assert_array_equal(seen.data.qpos[-1, i], seen.data.qpos[end, i])
+        # The base went straight on at v_max, and this is what it was told and felt.
+        x = seen.data.qpos[:, i, 0]
+        assert x[end] == pytest.approx(0.05 * PERIOD * (end + 1), rel=1e-3)
+        np.testing.assert_allclose(seen.obs[:, i, 42], start.obs[i, 42] - x, atol=1e-5)
+        assert seen.obs[end, i, 15:27].max() > 0.25  # taxels of the front, by the skin's threshold
+
+
+def test_contact_that_is_lost_costs_and_found_again_counts_from_where_it_was_lost(pushing):
+    there = last(pushing.go(pushing.start, AHEAD, times=2))
+    assert (there.metrics["in_contact"] == 1).all()
+    away = pushing.go(there, BACK)
+    gone = away.metrics["in_contact"] == 0
+    assert gone[-1].all()
+    np.testing.assert_allclose(away.reward[gone], -0.05 * PERIOD, rtol=1e-5)
+    again = pushing.go(last(away), AHEAD, times=2)
+    progress = np.concatenate([away.metrics["progress"], again.metrics["progress"]]).sum(axis=0)
+    lasting = there.data.strategy - last(again).data.strategy
+    np.testing.assert_allclose(progress, lasting, atol=1e-5)
+
+
+def test_the_rules_end_a_trial_and_its_start_can_be_put_back(pushing):
+    """As mujoco_playground's wrapper does: data and observation of the start where it is done."""
+    start = pushing.start
+    late = start.replace(data=start.data._replace(steps=start.data.steps + 999))
+    over = last(pushing.go(late, AHEAD))
+    assert (over.done == 1).all()
+    assert not over.data.success.any()
+    assert (over.data.steps == 1000).all()
+    back = over.replace(data=start.data, obs=start.obs, done=0 * over.done)
+    fresh, usual = (pushing.go(state, AHEAD) for state in (back, start))
+    np.testing.assert_array_equal(fresh.data.qpos, usual.data.qpos)
+    np.testing.assert_array_equal(fresh.reward, usual.reward)
+    assert (fresh.done == 0).all()
+
+
+def test_an_action_that_is_no_number_ends_a_world_and_no_other(pushing):
+    spoilt = jnp.tile(AHEAD, (COUNT, 1)).at[1].set(jnp.nan)
+    after = pushing.go(pushing.start, spoilt)
+    for states in (jax.tree.map(lambda leaf: leaf[0], after), last(after)):
+        assert states.done.tolist() == [0, 1, 0, 0]
+        assert states.metrics["diverged"].tolist() == [0, 1, 0, 0]
+    assert (after.reward[:, 1] == 0).all()
+    assert np.isfinite(after.obs).all()
+
+
+@pytest.mark.parametrize("engine", ["fused", "mjx"])
+def test_it_moves_as_a_trial_that_is_driven_by_the_same_twist(engine, pushing):
+    """A strategy that always says the same, in the loop of all other trials."""
+    push, action = pushing.env, jnp.array([0.8, 0.2, 0.3])
+    if engine == "fused":
+        state = pushing.start
+        mine = last(pushing.go(state, action))
+    else:
+        push = made("mjx")
+        reset, steps = programs(push)
+        state = reset(jax.random.split(jax.random.key(1), 1))
+        mine = last(steps(state, jnp.tile(action, (STEPS, 1, 1))))
+    constant = push.twist(action)
+    dull = Strategy(
+        lambda params: (), lambda params, memory, seen: (memory, constant, Details.of(seen))
+    )
+    worlds = state.info["world"]
+    trials = trial.start_all(worlds, np.ones(mine.done.size, bool), strategy=dull)
+    options = {"physics": FAST, "rules": push.setting.rules, "strategy": dull}
+    theirs = trial.advance(push._part.stage, worlds, trials, **options, steps=STEPS)
+    np.testing.assert_array_equal(mine.data.steps, STEPS)
+    np.testing.assert_allclose(mine.data.qpos, theirs.qpos, atol=2e-5)
+    assert (theirs.contact_steps > 0).all()
+    # An environment has sensed once more: what follows the last step.
+    sensed_more = mine.data.contact_steps - theirs.contact_steps
+    np.testing.assert_array_equal(sensed_more, mine.metrics["in_contact"])
+
+
+def test_a_batch_is_driven_as_one_and_not_world_by_world():
+    """On a GPU that is one kernel for all."""
+    sizes = []
+
+    class Stage:
+        def drive(self, worlds, trials, twists, physics):
+            sizes.append(jnp.shape(worlds)[0])
+            return worlds + 0 * twists, trials, twists
+
+    drive = env._one_of_many(Stage(), Setting())  # type: ignore[arg-type]
+    batch = jnp.arange(5.0)
+    together = jax.vmap(drive, (0, 0, None))(batch, batch, jnp.array(2.0))
+    np.testing.assert_array_equal(together[0], batch)
+    np.testing.assert_array_equal(together[2], np.full(5, 2.0))
+    assert sizes == [5] or sizes == [1, 5]  # the first when it is traced
+
+
+def test_states_are_drawn_each_in_its_own_world(pushing):
+    push, state = pushing.env, pushing.start
+    states = [jax.tree.map(lambda leaf, i=i: leaf[i], state) for i in range(2)]
+    images = push.render(states, 60, 80)
+    assert [image.shape for image in images] == [(60, 80, 3)] * 2
+    assert (abs(images[0].astype(int) - images[1]) > 20).any()
+    again = push.render(states[1], 60, 80)  # rendering itself may differ by a shade
+    np.testing.assert_allclose(again.astype(int), images[1].astype(int), atol=2)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"object": "ball"}, "unknown domain object 'ball'"),
+        ({"worlds": 0}, "worlds = 0"),
+        ({"setting": Setting(engine="mujoco")}, "unknown engine 'mujoco': choose from mjx, fused"),
+        ({"domain": DOMAINS["paper"]}, "skin of an environment 'ideal': choose from capacitive"),
+        ({"params": RPSParams(v_max=-1.0)}, "v_max = -1.0"),
+        ({"weights": Reward(success=float("nan"))}, "success = nan"),
+    ],
+)
+def test_environments_that_mean_nothing_are_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        PushEnv(**options)

@@ -1,0 +1,330 @@
+"""The examples run, and what they register is known everywhere."""
+
+import runpy
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rps_jax import (
+    cli,
+    domain,
+    engines,
+    figures,
+    objects,
+    record,
+    robustness,
+    scene,
+    strategies,
+    sweep,
+)
+from rps_jax.domain import Domain, Range
+from rps_jax.errors import InputError
+from rps_jax.footprint import Footprint, circle, polygon, rectangle
+from rps_jax.law import Details, Observation, RPSParams, RPSState, step
+from rps_jax.robustness import Plan
+from rps_jax.scene import FRICTION, Friction
+from rps_jax.skin import POINT, CapacitiveSkin
+from rps_jax.slots import Setting
+from rps_jax.strategies import Strategy
+from rps_jax.sweep import Case
+
+EXAMPLES = Path(__file__).parents[1] / "notebooks" / "examples"
+BOX, CYLINDER = (objects.mjcf_folder() / f"{name}.xml" for name in ("box", "cylinder"))
+
+
+def example(name):
+    """What one example defines."""
+    return runpy.run_path(str(EXAMPLES / f"{name}.py"))
+
+
+@pytest.fixture(autouse=True)
+def names():
+    """What a test registers is forgotten after it."""
+    tables = (objects.FAMILIES, objects.REGISTERED, strategies.PARAMS, strategies.STRATEGIES)
+    before = [dict(table) for table in tables]
+    yield
+    for table, content in zip(tables, before, strict=True):
+        table.clear()
+        table.update(content)
+
+
+@pytest.mark.parametrize("name", ["new_object", "new_strategy"])
+def test_the_short_examples_are_short(name):
+    source = (EXAMPLES / f"{name}.py").read_text()
+    code = source.split('"""\n', 2)[1]
+    assert len([line for line in code.splitlines() if line.strip()]) < 40
+
+
+# --- objects of one's own ------------------------------------------------------------------
+
+
+def test_a_hexagon_of_ones_own_is_pushed(capsys):
+    # C MuJoCo, which compiles least; what the other engines step is compared below.
+    outcome = example("new_object")["main"](horizon=8.0, engine="mujoco")
+    assert "reached: False" in capsys.readouterr().out
+    # The base touches within 2 s, at 1 cm/s, and then pushes at 5 cm/s.
+    assert outcome.min_distance[0] < 1.3
+    assert outcome.object_pose[0, 0] > 0.3625 + 0.02 + 0.1732 + 0.1
+
+
+@pytest.fixture
+def hexagon():
+    objects.register_object(
+        "hexagon", EXAMPLES / "hexagon.xml", polygon(example("new_object")["OUTLINE"])
+    )
+    return scene.load("hexagon")
+
+
+def test_a_hexagon_has_the_mass_of_its_geoms_and_the_outline_it_was_given(hexagon):
+    thing = hexagon.physics.body("object")
+    assert thing.mass[0] == pytest.approx(12.0)
+    # Three boxes of 4 kg about one axis.
+    assert thing.inertia[2] == pytest.approx(12 * (0.3464**2 + 0.2**2) / 12, rel=1e-4)
+    assert hexagon.family == "prism"
+    assert float(jnp.linalg.norm(hexagon.footprint.vertices, axis=1).max()) == pytest.approx(0.2)
+    assert 2 * thing.pos[2] == pytest.approx(0.5)
+    assert hexagon.model.ngeom > hexagon.physics.ngeom  # its looks are its own
+    heavy = scene.load("hexagon", mass=24.0).physics.body("object")
+    np.testing.assert_allclose(heavy.inertia, 2 * thing.inertia, rtol=1e-6)
+
+
+def test_every_engine_has_the_same_hexagon(hexagon):
+    solids, friction = scene.solid_of(hexagon), Friction(np.array([0.3]), np.array([0.35]))
+    physics = Setting().physics
+    for engine in ("fused", "mjx"):
+        _, alone = engines.stage_of_scenes([hexagon], engine)
+        _, drawn = engines.stage_of_solids("prism", solids, friction, engine, physics)
+        if engine == "mjx":
+            assert set(alone) == set(drawn)
+        for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(drawn), strict=True):
+            np.testing.assert_allclose(a, b, rtol=3e-6, atol=3e-6)
+
+
+@pytest.mark.parametrize(("name", "path"), [("box", BOX), ("cylinder", CYLINDER)])
+def test_an_object_of_the_paper_that_is_registered_anew_is_the_same_world(name, path):
+    """And so may share its batch."""
+    objects.register_object("mine", path)
+    cases = [Case(n, FRICTION["S2"], (2.0, 1.0), mass=m) for n in (name, "mine") for m in (None, 9)]
+    for engine in ("fused", "mjx"):
+        _, worlds = sweep.build(cases, Setting(engine=engine))
+        for leaf in jax.tree.leaves(worlds._replace(key=None, shift=None)):
+            leaf = np.asarray(leaf)
+            np.testing.assert_allclose(leaf[:2], leaf[2:], rtol=1e-6, atol=1e-6)
+
+
+def test_an_object_of_ones_own_may_be_of_a_domain_and_has_its_looks_in_a_replay(hexagon):
+    assert figures.title_of(Case("hexagon", FRICTION["S1"], (2.0, 0.0))).startswith("hexagon, ")
+    own = Domain(objects=("hexagon",), friction_robot=Range(0.4, 0.5))
+    drawn = domain.draw(own, 0, np.arange(5))
+    assert (drawn.solid.mass == 12.0).all()
+    part = domain.worlds(own, drawn, RPSParams.paper(), Setting(engine="fused"))
+    assert part.worlds.footprint.vertices.shape == (5, 8, 2)
+    plan = Plan(own, 5, {"rps": RPSParams.paper()})
+    assert robustness.scene_of(plan, 3).model.ngeom == hexagon.model.ngeom
+
+
+def changed(tmp_path, change):
+    """The box's file with a change made to its tree."""
+    tree = ET.parse(BOX)
+    change(tree.getroot())
+    path = tmp_path / "mine.xml"
+    tree.write(path)
+    return path
+
+
+def _body(root):
+    return root.find("worldbody/body")
+
+
+def _without_base(root):
+    root.remove(root.find("include"))
+    for tag in ("worldbody/body/geom", "contact/pair"):
+        for item in root.findall(tag):
+            item.attrib.pop("class")
+    root.remove(root.find("contact"))
+
+
+def _with_a_hinge(root):
+    inner = ET.SubElement(_body(root), "body")
+    ET.SubElement(inner, "joint")
+    ET.SubElement(inner, "geom", size="0.1", mass="1")
+
+
+def _with_a_lid(root):
+    ET.SubElement(ET.SubElement(_body(root), "body"), "geom", size="0.1", mass="1")
+
+
+BAD_FILES = {
+    "MuJoCo cannot compile .*mine.xml": lambda root: _body(root).append(ET.Element("wheel")),
+    "lacks the body 'base': include base.xml": _without_base,
+    "lacks the joint 'object'": lambda root: _body(root).find("freejoint").attrib.pop("name"),
+    "lacks the geom 'object'": lambda root: (
+        root.remove(root.find("contact")),
+        _body(root).find("geom").attrib.pop("name"),
+    ),
+    "joints of .* nothing else a joint": _with_a_hinge,
+    "bodies within the body object": _with_a_lid,
+    "from 0 to 0.8 m .* in the middle of its height": lambda root: (
+        _body(root).find("geom").set("pos", "0 0 0.4")
+    ),
+    "height = 0.02": lambda root: _body(root).find("geom").set("size", "0.2 0.2 0.01"),
+    "footprint = None is not allowed": lambda root: _body(root).find("geom").set("euler", "0 0 1"),
+}
+
+
+@pytest.mark.parametrize("message", BAD_FILES)
+def test_a_file_that_lacks_something_is_refused_with_what_it_lacks(message, tmp_path):
+    path = changed(tmp_path, BAD_FILES[message])
+    with pytest.raises(InputError, match=f"object 'mine': .*{message}"):
+        objects.register_object("mine", path)
+    assert "mine" not in objects.OBJECTS
+
+
+SQUARE = [[0.1, 0.1], [-0.1, 0.1], [-0.1, -0.1], [0.1, -0.1]]
+
+
+@pytest.mark.parametrize(
+    ("footprint", "message"),
+    [
+        (circle(-0.1), "radius of the footprint = -0.1"),
+        (Footprint(jnp.array([[0.1, 0.0]]), jnp.array(0.2)), "a circle about the origin"),
+        (Footprint(jnp.array(SQUARE), jnp.array(0.05)), "with radius 0.05 m is not allowed"),
+        (Footprint(jnp.array(SQUARE[::-1]), jnp.array(0.0)), "counter-clockwise"),
+        (polygon(np.array(SQUARE) + 0.2), "the origin must be inside"),
+        (polygon(0.2 * np.array([[np.cos(a), np.sin(a)] for a in np.arange(9) * 0.69])), "3 to 8"),
+        (rectangle(5.0, 5.0), "reach of the footprint"),
+    ],
+)
+def test_a_footprint_that_cannot_be_pushed_is_refused(footprint, message):
+    with pytest.raises(InputError, match=message):
+        objects.register_object("mine", BOX, footprint)
+
+
+def test_the_papers_names_are_taken():
+    for name in ("box", "prism"):
+        with pytest.raises(InputError, match=f"object name '{name}' is not allowed"):
+            objects.register_object(name, BOX)
+    with pytest.raises(InputError, match="strategy name 'rps' is not allowed"):
+        strategies.register_strategy("rps", strategies.RPS, RPSParams())
+    with pytest.raises(InputError, match=r"MuJoCo cannot compile .*nowhere.xml"):
+        objects.register_object("mine", "nowhere.xml")
+
+
+# --- strategies of one's own ---------------------------------------------------------------
+
+
+def test_a_strategy_of_ones_own_runs_beside_the_law(capsys):
+    outcome = example("new_strategy")["main"](horizon=6.0, engine="mujoco")
+    assert capsys.readouterr().out.strip()
+    moved = outcome.base_pose[:, 0]
+    # Nobody has arrived. The law turns to the targets beside it, the other one turns as well.
+    assert not outcome.success.any()
+    assert (moved > 0.03).all()
+    assert (outcome.base_pose[[1, 4], 2] > 0.05).all()
+
+
+def test_registered_names_work_on_the_command_line(tmp_path, capsys, hexagon):
+    made = example("new_strategy")
+    own = Strategy(lambda params: (), made["step"])
+    strategies.register_strategy("p_control", own, made["PParams"]())
+    out = tmp_path / "table"
+    command = ["table", "--objects", "hexagon", "--strategies", "p_control", "--friction", "S1"]
+    command += ["--targets", "2", "0", "--horizon", "4", "--engine", "mujoco", "--out", str(out)]
+    assert cli.main([*command, "--params", "p_control.v=0.02"]) == 0
+    assert "P_CONTROL" in capsys.readouterr().out
+    results = record.read_results(out)
+    assert results.object.values.tolist() == ["hexagon"]
+    assert float(results.base_pose[0, 0, 0, 0, 0]) == pytest.approx(0.08, abs=0.002)
+    assert cli.main([*command, "--params", "p_control.w=1"]) == 2
+    assert "choose from p_control.v, p_control.K_l" in capsys.readouterr().err
+
+
+def test_a_sweep_finds_a_registered_strategy_again(tmp_path):
+    made = example("new_strategy")
+    own = Strategy(lambda params: (), made["step"])
+    strategies.register_strategy("p_control", own, made["PParams"]())
+    plan = Plan(Domain(), 3, {"p": made["PParams"](v=0.03)})
+    robustness.open_run(tmp_path, plan)
+    assert robustness.load_plan(tmp_path) == plan
+    strategies.STRATEGIES.pop(made["PParams"])
+    with pytest.raises(InputError, match="unknown class of parameters 'PParams'"):
+        robustness.load_plan(tmp_path)
+
+
+def test_a_strategy_registered_again_replaces_the_old_one():
+    """As when a cell of a notebook is run twice, and its class of parameters is made anew."""
+    kinds = [example("new_strategy")["PParams"] for _ in range(2)]
+    for kind in kinds:
+        strategies.register_strategy("p", Strategy(lambda params: (), lambda *_: None), kind())
+    assert kinds[0] not in strategies.STRATEGIES
+    assert type(strategies.PARAMS["p"]) is kinds[1]
+    strategies.register_strategy("slow", strategies.RPS, RPSParams(v_max=0.01))
+    assert strategies.of(strategies.PARAMS["slow"]) is strategies.RPS
+
+
+def test_params_that_mean_nothing_are_refused():
+    kind = example("new_strategy")["PParams"]
+    own = Strategy(lambda params: (), lambda *_: None)
+    with pytest.raises(InputError, match="K_l = nan is not allowed"):
+        strategies.register_strategy("p", own, kind(K_l=float("nan")))
+    with pytest.raises(InputError, match=r"one of them d_success"):
+        strategies.register_strategy("p", own, (1.0, 2.0))
+    with pytest.raises(InputError, match="their class RPSParams is that of 'rps'"):
+        strategies.register_strategy("p", own, RPSParams())
+    with pytest.raises(InputError, match="params of class PParams belong to no strategy"):
+        Case("box", FRICTION["S1"], (2.0, 0.0), kind())
+    details = Details.of(Observation(jnp.zeros(2), 0.0, jnp.array([0.3, 0.1]), True, jnp.ones(2)))
+    assert float(details.l) == pytest.approx(0.1)
+    assert float(details.distance) == pytest.approx(np.hypot(0.7, 0.9))
+
+
+# --- a policy, and a robot -----------------------------------------------------------------
+
+
+def test_a_policy_is_trained():
+    made = example("train_policy")
+    few = made["Options"](iterations=3, pairs=2, seconds=0.2)
+    returns = made["main"](few)
+    assert len(returns) == 3
+    assert np.isfinite(returns).all()
+    assert len(set(returns)) > 1
+
+
+def test_the_law_runs_on_a_robot_and_compiles_nothing_on_the_way(compiled, capsys):
+    made = example("on_a_robot")
+    tick, memory = made["controller"](RPSParams.paper(), CapacitiveSkin(), 0.001)
+    robot, target = made["Robot"](), np.array([-2.0, 0.0], np.float32)
+    memory, twist = tick(memory, *robot.read(), target)
+    assert compiled
+    before = len(compiled)
+    for _ in range(200):
+        memory, twist = tick(memory, *robot.read(), target)
+        robot.command(np.asarray(twist))
+    assert len(compiled) == before
+    # Four taxels left of the middle, the 17th to 20th, are felt after the filter's delay.
+    place = 0.29 - 0.58 * (1.5 + 4.5) / 2 / 12
+    seen = Observation(
+        jnp.zeros(2), jnp.zeros(()), jnp.array([0.3625, place]), jnp.array(True), jnp.array(target)
+    )
+    _, wanted = step(RPSParams.paper(), RPSState.init(RPSParams.paper()), seen)
+    np.testing.assert_allclose(memory[1].p_robot_contact, [0.3625, place], atol=1e-6)
+    assert float(wanted.v_y) > 0.01
+    np.testing.assert_allclose(np.asarray(twist)[:2], [wanted.v_x, wanted.v_y], atol=2e-3)
+    latency = made["main"](made["Options"](seconds=0.3))
+    assert latency.shape == (300,)
+    assert "99.9th percentile" in capsys.readouterr().out
+
+
+def test_a_skin_reads_real_taxels_as_it_reads_its_own():
+    skin = CapacitiveSkin(time_constant=1e-6)
+    state = skin.init(jax.random.PRNGKey(0))
+    for taxel, point in ((0, (-0.3625 + 0.725 / 30, 0.29)), (41, (-0.3625 + 0.725 / 30, -0.29))):
+        _, reading = skin.read(state, jnp.zeros(42).at[taxel].set(0.3), 0.01)
+        assert int(reading.contact_type) == POINT
+        np.testing.assert_allclose(reading.p_robot_contact, point, atol=1e-6)
+    _, nothing = skin.read(state, jnp.full(42, 0.2), 0.01)
+    assert not bool(nothing.in_contact)
