@@ -995,6 +995,7 @@ def _tune_compare(options: TuneCompare) -> None:
         plans[Path(text).stem] = Plan(one, count, arms, setting, part=4096)
     shape = options.shape()
     choose_device(options.device)
+    record.writable(options.out)
     use_cache()
     for name, plan in plans.items():
         out = robustness.open_run(options.out / name, plan)

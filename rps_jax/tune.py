@@ -6,6 +6,7 @@ meets the same worlds; the next generation meets others.
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -16,8 +17,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from evosax import algorithms
-from evosax.algorithms.distribution_based.base import DistributionBasedAlgorithm
 from numpy.typing import ArrayLike
 
 from rps_jax import domain, errors, record, slots, strategies
@@ -286,12 +285,8 @@ def _filled(groups: Sequence[_Group]) -> Iterator[Part]:
 
 # --- evolution -----------------------------------------------------------------------------
 
-STRATEGIES = tuple(
-    name
-    for name in dir(algorithms)
-    if isinstance(kind := getattr(algorithms, name), type)
-    and issubclass(kind, DistributionBasedAlgorithm)
-)
+# Of evosax, those that keep a distribution over candidates.
+STRATEGIES = ("CMA_ES", "Sep_CMA_ES", "MA_ES", "Rm_ES", "SNES", "PGPE")
 
 
 @dataclass(frozen=True)
@@ -326,7 +321,14 @@ class Evolution:
 
     def algorithm(self, size: int) -> Any:
         """The strategy of evosax for vectors (size,)."""
-        return getattr(algorithms, self.strategy)(self.population, jnp.zeros(size))
+        return _algorithm(self.strategy, self.population, size)
+
+
+@functools.cache  # evosax compiles for each instance
+def _algorithm(strategy: str, population: int, size: int) -> Any:
+    from evosax import algorithms  # which runs programs when it is imported
+
+    return getattr(algorithms, strategy)(population, jnp.zeros(size))
 
 
 class Search(NamedTuple):
