@@ -60,7 +60,8 @@ class Common:
     fidelity: str = "standard"
     """How finely the physics is solved: reference, standard or fast."""
     engine: str = "mjx"
-    """mjx, fused (the same equations, specialised: much faster), or mujoco (C, on all cores)."""
+    """mjx, fused (the same equations, specialised: much faster), warp (MJX-Warp: an NVIDIA GPU), or
+    mujoco (C, on all cores)."""
     timestep: float | None = None
     """Physics step [s]; by default that of the physics."""
     control_period: float | None = None
@@ -184,7 +185,8 @@ class Sweep(Spread):
     fidelity: str = "standard"
     """How finely the physics is solved: reference, standard or fast."""
     engine: str = "mjx"
-    """mjx, fused (the same equations, specialised: much faster), or mujoco (C, on all cores)."""
+    """mjx, fused (the same equations, specialised: much faster), warp (MJX-Warp: an NVIDIA GPU), or
+    mujoco (C, on all cores)."""
     horizon: float = 300.0
     """Longest trial [s]."""
     seed: int = 0
@@ -317,6 +319,7 @@ def use_cache() -> None:
     except OSError:
         return
     jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
+    os.environ.setdefault("WARP_CACHE_PATH", str(cache_folder() / "warp"))
 
 
 # --- what the options mean -----------------------------------------------------------------
@@ -364,10 +367,12 @@ def _friction(text: str) -> Friction:
 
 
 def _setting(common: Common) -> Setting:
+    from rps_jax import engines
     from rps_jax.physics import preset
     from rps_jax.slots import Setting
     from rps_jax.trial import Rules
 
+    engines.check(common.engine)
     steps = {"timestep": common.timestep, "control_period": common.control_period}
     physics = dataclasses.replace(
         preset(common.physics, common.fidelity),
@@ -467,7 +472,7 @@ def _clock(horizon: float) -> Iterator[Callable[[Progress], None]]:
         yield report
 
 
-def _tell(timing: Timing) -> None:
+def _tell(timing: Timing, engine: str) -> None:
     import jax
 
     print(
@@ -475,6 +480,8 @@ def _tell(timing: Timing) -> None:
         f"({timing.simulated / max(timing.run, 1e-9):.0f} simulated s per s) on "
         f"{jax.devices()[0].device_kind}"
     )
+    if engine == "warp":
+        print(f"contacts lost for want of room: in {timing.overflowed} trials")
 
 
 # --- the commands --------------------------------------------------------------------------
@@ -499,7 +506,7 @@ def _table(options: Table) -> None:
     record.write_text(out / "table.txt", text)
     figures.min_distance(results, out / "min_distance.png")
     print(text)
-    _tell(timing)
+    _tell(timing, setting.engine)
     print(f"run folder: {out}")
 
 
@@ -522,13 +529,13 @@ def _push(options: Push) -> None:
 
     with _clock(options.horizon) as report:
         (trace,) = sweep.follow([case], setting, report=report)
-    _show(trace, options.object, figures.title_of(case), out)
+    _show(trace, options.engine, options.object, figures.title_of(case), out)
     if options.video:
         _film(sweep.scene_of(case, setting.physics), trace, options.film_length, out)
     print(f"run folder: {out}")
 
 
-def _show(trace: Trace, name: str, title: str, out: Path) -> None:
+def _show(trace: Trace, engine: str, name: str, title: str, out: Path) -> None:
     """Results, figure and a line on the screen for one trial."""
     from rps_jax import figures, record, score
 
@@ -542,7 +549,7 @@ def _show(trace: Trace, name: str, title: str, out: Path) -> None:
         f"least distance {float(result.min_distance):.3f} m, "
         f"contact lost for {float(result.contact_lost_time):.1f} s"
     )
-    _tell(trace.timing)
+    _tell(trace.timing, engine)
 
 
 def _film(scene: Scene, trace: Trace, length: float, out: Path) -> None:
@@ -729,7 +736,7 @@ def _sweep(options: Sweep) -> None:
         trials = sum(numbers.size for numbers in robustness.share(plan, shard).values())
         with progress_bar(trials, "sweep") as report:
             timing = robustness.run(out, plan, shard=shard, report=report, **shape)
-        _tell(timing)
+        _tell(timing, plan.setting.engine)
         if shard.of == 1:
             robustness.merge([out], out)
             _report_sweep(out)
@@ -769,7 +776,8 @@ def _replay(options: Replay) -> None:
     strategy = trial.STRATEGIES[type(plan.arms[name])]
     with _clock(float(plan.setting.rules.horizon)) as report:
         (trace,) = sweep.follow_part(part, strategy, plan.setting, report=report)
-    _show(trace, f"world {options.index}, {name}", robustness.title_of(plan, options.index), out)
+    title = robustness.title_of(plan, options.index)
+    _show(trace, plan.setting.engine, f"world {options.index}, {name}", title, out)
     if options.video:
         _film(robustness.scene_of(plan, options.index), trace, options.film_length, out)
     print(f"run folder: {out}")

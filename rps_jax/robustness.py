@@ -126,8 +126,10 @@ def open_run(folder: Path, plan: Plan) -> Path:
     """The run folder with the plan in it; a folder that has one must have the same.
 
     Raises:
-      InputError: it cannot be written, or holds a run of another configuration.
+      InputError: it cannot be written, or holds a run of another configuration; or the plan's
+        engine cannot run it on this machine.
     """
+    engines.check(plan.setting.engine, plan.domain.families)
     record.writable(folder)
     wanted = plan.configuration()
     if (folder / MANIFEST).exists():

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import threading
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -61,6 +62,7 @@ class Timing:
     compile: float  # [s] that the worker waited who waited longest
     run: float  # [s] wall clock after that
     simulated: float  # [s] of trials
+    overflowed: int = 0  # trials in which the engine lost contacts for want of room
 
 
 class Part(NamedTuple):
@@ -84,7 +86,7 @@ Collect = Callable[[np.ndarray, Outcome], Any]  # numbers (m,) of trials and the
 
 def default_slots(engine: Engine = "mjx") -> int:
     """Worlds stepped at once: few on a processor (small caches), many on an accelerator."""
-    if engine == "fused":
+    if engine in ("fused", "warp"):
         return 64 if jax.default_backend() == "cpu" else 65536
     return 24 if jax.default_backend() == "cpu" else 8192
 
@@ -133,7 +135,13 @@ def run(
             count += len(queues)
     _side_by_side(tasks, count, shared)
     total = time.perf_counter() - began
-    return Timing(shared.compile, total - shared.compile, shared.simulated)
+    if shared.overflowed:
+        warnings.warn(
+            f"the engine lost contacts for want of room in {shared.overflowed} trials, which are "
+            "not to be trusted",
+            stacklevel=2,
+        )
+    return Timing(shared.compile, total - shared.compile, shared.simulated, shared.overflowed)
 
 
 def _side_by_side(tasks: Sequence[Callable[[], None]], count: int, shared: _Shared) -> None:
@@ -154,14 +162,18 @@ class _Shared:
     def __init__(self, collect: Collect, report: Callable[[Progress], Any]):
         self.simulated = 0.0
         self.compile = 0.0
+        self.overflowed = 0
         self.stop = False  # set when one worker fails or the user interrupts
         self._finished = 0
         self._collect, self._report = collect, report
         self._lock = threading.Lock()
 
-    def add(self, numbers: np.ndarray, trials: Outcome, simulated: float) -> None:
+    def add(
+        self, numbers: np.ndarray, trials: Outcome, simulated: float, overflowed: int = 0
+    ) -> None:
         """Trials that ended in a segment, and the time [s] all of the worker's trials advanced."""
         with self._lock:
+            self.overflowed += overflowed
             if numbers.size:
                 self._collect(numbers, trials)
             self._finished += numbers.size
@@ -351,7 +363,10 @@ def _drain(queue: _Queue, program: Any, taken: list[tuple[Part, int]], shared: _
         at = np.flatnonzero(ended)
         outcomes = jax.device_get(trial.outcome(trials, period))
         shared.add(
-            held.numbers[at], rows(outcomes, at), float((steps - before)[live].sum()) * period
+            held.numbers[at],
+            rows(outcomes, at),
+            float((steps - before)[live].sum()) * period,
+            int(np.count_nonzero(np.asarray(trials.overflows)[at])),
         )
         live &= ~ended
         taken = queue.take(at.size)

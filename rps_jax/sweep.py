@@ -226,7 +226,8 @@ def follow(
 
 
 def check_followed(engine: str) -> None:
-    """Raises InputError unless trials of this engine can be followed."""
+    """Raises InputError unless trials of this engine can be followed on this machine."""
+    engines.check(engine)
     if engine == "mujoco":
         raise errors.InputError("engine = mujoco is not allowed: follow a trial with mjx or fused.")
 
@@ -258,7 +259,12 @@ def follow_part(
         report(Progress(int(trials.done.sum()), float(trials.steps.sum()) * period))
     whole = jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
     outcomes = jax.device_get(trial.outcome(trials, period))
-    timing = Timing(compiled - began, time.perf_counter() - compiled, float(np.sum(outcomes.time)))
+    timing = Timing(
+        compiled - began,
+        time.perf_counter() - compiled,
+        float(np.sum(outcomes.time)),
+        overflowed=int(np.count_nonzero(trials.overflows)),
+    )
     return [
         Trace(
             rows(whole, (~whole.done[:, i], i)),

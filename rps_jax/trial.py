@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import baselines, errors, frames, fused, law, scene
+from rps_jax import baselines, errors, frames, fused, law, mjwarp, scene
 from rps_jax import footprint as fp
 from rps_jax.baselines import APSParams, APSState, TrackedObservation
 from rps_jax.footprint import Footprint
@@ -110,6 +110,7 @@ class Trial(NamedTuple):
     done: jax.Array  # () bool
     success: jax.Array  # () bool
     diverged: jax.Array  # () bool
+    overflows: jax.Array  # () int32 control steps in which contacts were lost for want of room
 
 
 class Snapshot(NamedTuple):
@@ -148,7 +149,13 @@ def p_world_contact(seen: Snapshot) -> jax.Array:
     return jnp.where(seen.reading.in_contact[:, None], point, jnp.nan)
 
 
-Driven = tuple[jax.Array, jax.Array, jax.Array]  # qpos, qvel, warmstart of a batch
+class Driven(NamedTuple):
+    """A batch after a control period."""
+
+    qpos: Any  # (B, 10)
+    qvel: Any  # (B, 9)
+    warmstart: Any  # (B, 9)
+    overflowed: Any = None  # (B,) bool: contacts were lost; None: this engine loses none
 
 
 def start(world: World, strategy: Strategy = RPS) -> Trial:
@@ -170,6 +177,7 @@ def start(world: World, strategy: Strategy = RPS) -> Trial:
         done=false,
         success=false,
         diverged=false,
+        overflows=zero,
     )
 
 
@@ -217,15 +225,27 @@ class Stage(NamedTuple):
 
         def one(state, _):
             qpos, qvel, warmstart = state
-            v_world = frames.rotate(qpos[2], jnp.stack([twist.v_x, twist.v_y]))
-            qvel = qvel.at[JOINTS.base].set(jnp.stack([*v_world, jnp.asarray(twist.omega)]))
+            qvel = qvel.at[JOINTS.base].set(twist.in_world(qpos[2]))
             data = self.data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
             with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
                 data = mjx.step(model, data)
             return (data.qpos, data.qvel, data.qacc_warmstart), None
 
         state = (trial.qpos, trial.qvel, trial.warmstart)
-        return jax.lax.scan(one, state, length=substeps)[0]
+        return Driven(*jax.lax.scan(one, state, length=substeps)[0])
+
+
+class Warp(NamedTuple):
+    """What all worlds of a batch that MJX-Warp steps share."""
+
+    model: mjx.Model
+    data: mjx.Data  # a blank, with room for the contacts of one world
+
+    def drive(self, worlds: World, trials: Trial, twists: Twist, physics: Physics) -> Driven:
+        """Step a batch for one control period."""
+        state = (trials.qpos, trials.qvel, trials.warmstart)
+        shared = (self.model, self.data, worlds.fields)
+        return Driven(*mjwarp.drive(*shared, *state, twists, physics.substeps))
 
 
 class Fused(NamedTuple):
@@ -234,7 +254,7 @@ class Fused(NamedTuple):
     def drive(self, worlds: World, trials: Trial, twists: Twist, physics: Physics) -> Driven:
         """Step a batch for one control period."""
         state = (trials.qpos, trials.qvel, trials.warmstart)
-        return fused.drive(worlds.fields, *state, twists, physics)
+        return Driven(*fused.drive(worlds.fields, *state, twists, physics))
 
 
 def _believed(world: World, trial: Trial, period: float) -> tuple[jax.Array, jax.Array]:
@@ -311,25 +331,26 @@ def decide(
     return told, twist, snapshot
 
 
-def settle(
-    before: Trial, told: Trial, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array
-) -> Trial:
-    """The trial after one control period: `told` driven to (qpos, qvel, warmstart), or ended.
+def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
+    """The trial after one control period: `told` as it was `driven`, or ended.
 
     A trial that had ended `before` comes back as it was.
     """
+    qpos, qvel, warmstart, overflowed = driven
     sane = (
         jnp.all(jnp.isfinite(qpos))
         & jnp.all(jnp.abs(qvel) < _MAX_SPEED)
         & jnp.all(jnp.abs(qpos) < _MAX_DISTANCE)
     )
+    if overflowed is not None:
+        told = told._replace(overflows=told.overflows + (overflowed & ~told.done))
     moved = told._replace(qpos=qpos, qvel=qvel, warmstart=warmstart, steps=told.steps + 1)
     stopped = told._replace(done=jnp.ones((), bool), diverged=~told.done & ~sane)
     return _select(before.done, before, _select(told.done | ~sane, stopped, moved))
 
 
 def control_step(
-    stage: Stage | Fused,
+    stage: Stage | Warp | Fused,
     worlds: World,
     trials: Trial,
     *,
@@ -341,7 +362,7 @@ def control_step(
     think = partial(decide, physics=physics, rules=rules, strategy=strategy)
     told, twists, snapshots = jax.vmap(think)(worlds, trials)
     driven = stage.drive(worlds, told, twists, physics)
-    return jax.vmap(settle)(trials, told, *driven), snapshots
+    return jax.vmap(settle)(trials, told, driven), snapshots
 
 
 def _select(condition: jax.Array, yes: Any, no: Any) -> Any:
@@ -378,7 +399,7 @@ _STATIC = ("physics", "strategy", "steps")
 
 @partial(jax.jit, static_argnames=_STATIC, donate_argnames=("trials",))
 def advance(
-    stage: Stage | Fused,
+    stage: Stage | Warp | Fused,
     worlds: World,
     trials: Trial,
     *,
@@ -403,7 +424,7 @@ def advance(
 
 @partial(jax.jit, static_argnames=(*_STATIC, "every"), donate_argnames=("trials",))
 def record(
-    stage: Stage | Fused,
+    stage: Stage | Warp | Fused,
     worlds: World,
     trials: Trial,
     *,
