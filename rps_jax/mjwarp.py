@@ -85,7 +85,8 @@ def blank(model: mujoco.MjModel, contacts: int | None = None) -> mjx.Data:
     `contacts` is how many; by default as many as there can be.
     """
     room = _CONTACTS * model.npair if contacts is None else contacts
-    return mjx.make_data(model, impl="warp", naconmax=room, njmax=_ROWS * room)
+    pairs = model.npair  # each of which is looked into once
+    return mjx.make_data(model, impl="warp", naconmax=room, naccdmax=pairs, njmax=_ROWS * room)
 
 
 def _for_worlds(data: mjx.Data, count: int) -> mjx.Data:
