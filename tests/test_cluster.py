@@ -211,7 +211,9 @@ def test_what_ends_a_worker_ends_the_run_as_itself(tmp_path, two_workers):
 def test_a_worker_with_other_software_is_refused(tmp_path, two_workers, monkeypatch):
     here = record.environment()
     monkeypatch.setattr(record, "environment", lambda: here | {"commit": "another"})
-    with pytest.raises(InputError, match=r"other software \(commit = .* there, another asked for"):
+    with pytest.raises(
+        InputError, match=r"other software \(commit = .* there, .another. asked for"
+    ):
         cluster.run(*opened(tmp_path), address="local", prepare=int)
 
 
