@@ -232,7 +232,10 @@ def test_a_batch_is_driven_as_one_and_not_world_by_world():
 
 def test_states_are_drawn_each_in_its_own_world(pushing):
     push, state = pushing.env, pushing.start
-    states = [jax.tree.map(lambda leaf, i=i: leaf[i], state) for i in range(2)]
+    index = np.asarray(state.info["index"])
+    different = [0, int(np.argmax(index != index[0]))]
+    assert index[different[0]] != index[different[1]]
+    states = [jax.tree.map(lambda leaf, i=i: leaf[i], state) for i in different]
     images = push.render(states, 60, 80)
     assert [image.shape for image in images] == [(60, 80, 3)] * 2
     assert (abs(images[0].astype(int) - images[1]) > 20).any()
