@@ -93,6 +93,7 @@ class Trial(NamedTuple):
     lost_steps: jax.Array  # () int32 without contact after the first touch
     sum_abs_l: jax.Array  # () [m] over the steps in contact
     min_distance: jax.Array  # () [m] contact point to target; inf before the first touch
+    path_length: jax.Array  # () [m] of the base's way
     done: jax.Array  # () bool
     success: jax.Array  # () bool
     diverged: jax.Array  # () bool
@@ -116,6 +117,7 @@ class Outcome(NamedTuple):
     time: jax.Array  # () [s] at which it ended
     min_distance: jax.Array  # () [m] contact point to target; inf if never touched
     contact_lost_time: jax.Array  # () [s]
+    path_length: jax.Array  # () [m] of the base's way
     mean_abs_l: jax.Array  # () [m] the paper's D; NaN if never touched
     diverged: jax.Array  # () bool
     base_pose: jax.Array  # (3,) [m, m, rad] at the end
@@ -161,6 +163,7 @@ def start(world: World, strategy: Strategy = RPS) -> Trial:
         lost_steps=zero,
         sum_abs_l=jnp.zeros_like(world.qpos[0]),
         min_distance=jnp.full_like(world.qpos[0], jnp.inf),
+        path_length=jnp.zeros_like(world.qpos[0]),
         done=false,
         success=false,
         diverged=false,
@@ -340,7 +343,13 @@ def settle(
         & jnp.all(jnp.abs(qvel) < _MAX_SPEED)
         & jnp.all(jnp.abs(qpos) < _MAX_DISTANCE)
     )
-    moved = told._replace(qpos=qpos, qvel=qvel, warmstart=warmstart, steps=told.steps + 1)
+    moved = told._replace(
+        qpos=qpos,
+        qvel=qvel,
+        warmstart=warmstart,
+        path_length=told.path_length + frames.norm(qpos[:2] - told.qpos[:2]),
+        steps=told.steps + 1,
+    )
     stopped = told._replace(done=jnp.ones((), bool), diverged=~told.done & ~sane)
     return _select(before.done, before, _select(told.done | ~sane, stopped, moved))
 
@@ -374,6 +383,7 @@ def outcome(trial: Trial, period: float) -> Outcome:
         time=trial.steps * period,
         min_distance=trial.min_distance,
         contact_lost_time=trial.lost_steps * period,
+        path_length=trial.path_length,
         mean_abs_l=jnp.where(
             trial.contact_steps > 0, trial.sum_abs_l / jnp.maximum(trial.contact_steps, 1), jnp.nan
         ),
