@@ -21,6 +21,7 @@ UNITS = {
     "contact_lost_time": ("s", "time without contact after the first touch"),
     "path_length": ("m", "length of the base's way"),
     "mean_abs_l": ("m", "mean |l| while in contact, the paper's D"),
+    "tipped": ("1", "the object fell over"),
     "diverged": ("1", "physics became NaN or ran away"),
     "base_pose": ("m, m, rad", "x, y, yaw of the base in the world at the end"),
     "object_pose": ("m, m, rad", "x, y, yaw of the object in the world at the end"),

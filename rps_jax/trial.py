@@ -7,6 +7,7 @@ is frozen, and a batch whose worlds have all ended stops.
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -31,15 +32,17 @@ _ODOMETRY = 7  # of a world's key; the skin splits it into fewer
 
 
 class Rules(NamedTuple):
-    """When a trial ends (Sec. III-B)."""
+    """When a trial ends (Sec. III-B); of objects that fall over the paper says nothing."""
 
     horizon: float | jax.Array = 300.0  # [s]
     max_lost: float | jax.Array = 150.0  # [s] without contact, in all, after the first touch
+    max_tilt: float | jax.Array = math.pi / 4  # [rad] of an object that has not fallen over
 
     def check(self) -> None:
-        """Raises InputError for times that are not positive and finite."""
+        """Raises InputError for times that are not positive and finite, or no tilt."""
         errors.check_finite("horizon", self.horizon, above=0, at_most=1e5, unit="s")
         errors.check_finite("max_lost", self.max_lost, at_least=0, unit="s")
+        errors.check_finite("max_tilt", self.max_tilt, above=0, at_most=math.pi, unit="rad")
 
 
 class Shift(NamedTuple):
@@ -96,6 +99,7 @@ class Trial(NamedTuple):
     path_length: jax.Array  # () [m] of the base's way
     done: jax.Array  # () bool
     success: jax.Array  # () bool
+    tipped: jax.Array  # () bool: the object has fallen over
     diverged: jax.Array  # () bool
 
 
@@ -119,6 +123,7 @@ class Outcome(NamedTuple):
     contact_lost_time: jax.Array  # () [s]
     path_length: jax.Array  # () [m] of the base's way
     mean_abs_l: jax.Array  # () [m] the paper's D; NaN if never touched
+    tipped: jax.Array  # () bool: the object has fallen over
     diverged: jax.Array  # () bool
     base_pose: jax.Array  # (3,) [m, m, rad] at the end
     object_pose: jax.Array  # (3,) [m, m, rad] at the end
@@ -128,6 +133,12 @@ def object_pose(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Planar position (2,) [m] and yaw () [rad] of the object in the world."""
     free = qpos[JOINTS.object]
     return free[:2], frames.yaw_of_quaternion(free[3:])
+
+
+def _upright(qpos: jax.Array) -> jax.Array:
+    """Cosine () of the object's tilt."""
+    _, x, y, _ = qpos[JOINTS.object][3:]
+    return 1 - 2 * (x * x + y * y)
 
 
 def p_world_contact(seen: Snapshot) -> jax.Array:
@@ -166,6 +177,7 @@ def start(world: World, strategy: Strategy = RPS) -> Trial:
         path_length=jnp.zeros_like(world.qpos[0]),
         done=false,
         success=false,
+        tipped=false,
         diverged=false,
     )
 
@@ -278,7 +290,8 @@ def observe(
     touch = reading.contact_type != NONE
     lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
     success = touch & (distance < world.params.d_success)
-    over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost)
+    tipped = _upright(trial.qpos) < jnp.cos(rules.max_tilt)
+    over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost) | tipped
     told = trial._replace(
         skin=skin,
         poses=poses,
@@ -289,6 +302,7 @@ def observe(
             touch, jnp.minimum(trial.min_distance, distance), trial.min_distance
         ),
         success=success & ~over,
+        tipped=tipped,
         done=success | over,
     )
     return told, Seen(reading, seen, distance)
@@ -387,6 +401,7 @@ def outcome(trial: Trial, period: float) -> Outcome:
         mean_abs_l=jnp.where(
             trial.contact_steps > 0, trial.sum_abs_l / jnp.maximum(trial.contact_steps, 1), jnp.nan
         ),
+        tipped=trial.tipped,
         diverged=trial.diverged,
         base_pose=trial.qpos[..., JOINTS.base],
         object_pose=pose.reshape(*trial.qpos.shape[:-1], 3),
