@@ -20,7 +20,7 @@ import xarray as xr
 
 from rps_jax import domain, errors, gradients, record, strategies, trial, tune
 from rps_jax.descent import soften
-from rps_jax.domain import DOMAINS, RANDOM, Domain
+from rps_jax.domain import DOMAINS, RANDOM, Domain, Range
 from rps_jax.engines import Engine
 from rps_jax.gradients import Estimate
 from rps_jax.law import RPSParams
@@ -36,7 +36,8 @@ ESTIMATORS = ("reverse", "forward", "evolution", "combined")
 class Study:
     """Which gradient, and of what size its estimates are."""
 
-    domain: Domain = DOMAINS["wide"]
+    domain: Domain = replace(DOMAINS["wide"], gap=Range(0, 0))
+    """By default without a gap, in which no parameter matters."""
     object: str = "random_box"
     """One of the random objects."""
     space: Space = Space(("beta", "K_h", "K_v", "L"))
