@@ -190,11 +190,13 @@ WANTED = [
     ("table",),
     ("push",),
     ("hardware",),
-    ("sweep", "--change", "mass=3,10", "--domain", "paper"),
+    ("sweep", "--domain", "paper"),
+    ("tune", "es"),
+    ("tune", "compare", "--domain", "paper"),
 ]
 
 
-@pytest.mark.parametrize("command", WANTED, ids=[words[0] for words in WANTED])
+@pytest.mark.parametrize("command", WANTED, ids=" ".join)
 def test_without_an_nvidia_gpu_it_is_refused_in_one_sentence_before_anything_compiles(
     command, capsys, monkeypatch, tmp_path
 ):
