@@ -26,6 +26,7 @@ from rps_jax.errors import InputError
 
 if TYPE_CHECKING:
     from rps_jax.domain import Domain
+    from rps_jax.law import RPSParams
     from rps_jax.robustness import Plan, Shard
     from rps_jax.scene import Friction, Scene
     from rps_jax.slots import Progress, Setting, Timing
@@ -776,7 +777,7 @@ def _paper(options: Paper) -> None:
     print(f"report: {path}")
 
 
-def _domain_of(text: str) -> Domain:
+def domain_of(text: str) -> Domain:
     """A domain by name or from a JSON file."""
     from rps_jax import domain
 
@@ -788,7 +789,7 @@ def _domain_of(text: str) -> Domain:
 def _domain(options: Sweep) -> Domain:
     from rps_jax import domain
 
-    chosen = _domain_of(options.domain)
+    chosen = domain_of(options.domain)
     changes = {}
     for text in options.change:
         name, _, values = text.partition("=")
@@ -847,6 +848,14 @@ def _of_the_law(name: str) -> dict[str, float]:
     for key in values:
         errors.check_name(f"parameter of {name}", key, known)
     return {key: errors.check_number(f"{name} {key}", value) for key, value in values.items()}
+
+
+def params_of(name: str) -> RPSParams:
+    """The law's parameters: `paper`, `tuned`, or the paper's with the changes of a JSON file."""
+    from rps_jax import law
+    from rps_jax.law import RPSParams
+
+    return law.check(RPSParams.paper()._replace(**_of_the_law(name)))
 
 
 def _plan(options: Sweep) -> Plan:
@@ -984,8 +993,7 @@ def _tune(options: Tune) -> None:
 
 
 def _tune_compare(options: TuneCompare) -> None:
-    from rps_jax import law, record, robustness, tune
-    from rps_jax.law import RPSParams
+    from rps_jax import record, robustness, tune
     from rps_jax.physics import preset
     from rps_jax.robustness import Plan
     from rps_jax.slots import Setting
@@ -995,13 +1003,10 @@ def _tune_compare(options: TuneCompare) -> None:
         seed=tune.seed_of(options.seed, "test"),
         engine=options.engine,  # pyright: ignore[reportArgumentType]
     )
-    arms = {
-        Path(name).stem: law.check(RPSParams.paper()._replace(**_of_the_law(name)))
-        for name in options.params
-    }
+    arms = {Path(name).stem: params_of(name) for name in options.params}
     plans = {}
     for text in options.domain:
-        one = _domain_of(text)
+        one = domain_of(text)
         count = one.combinations if one.targets else options.worlds
         plans[Path(text).stem] = Plan(one, count, arms, setting, part=4096)
     shape = options.shape()
@@ -1064,12 +1069,10 @@ def _tune_grad(options: TuneGrad) -> None:
 
 
 def _space(options: TuneOptions) -> Space:
-    from rps_jax import law, tune
-    from rps_jax.law import RPSParams
+    from rps_jax import tune
 
-    base = law.check(RPSParams.paper()._replace(**_of_the_law(options.start)))
     names = [name for text in options.tuned for name in tune.SUBSETS.get(text, (text,))]
-    return tune.Space(tuple(names), base)
+    return tune.Space(tuple(names), params_of(options.start))
 
 
 @contextlib.contextmanager
@@ -1119,7 +1122,7 @@ def _course(options: TuneOptions) -> Course:
     from rps_jax.trial import Rules
     from rps_jax.tune import Course, Objective
 
-    domains = [_domain_of(text) for text in options.domain]
+    domains = [domain_of(text) for text in options.domain]
     setting = Setting(
         preset(fidelity=options.fidelity),
         Rules(horizon=options.horizon),

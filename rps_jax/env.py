@@ -72,8 +72,9 @@ class PushEnv:
     Reward: see `Reward`. Without contact nothing is gained; a contact that is found again counts
     from where it was lost, so a sum of rewards tells by how much a push came nearer.
 
-    Done: by the rules of `setting` (the paper's: arrived, 300 s, or 150 s without contact), or if
-    the physics diverged. A state that is done stays as it is, and earns nothing.
+    Done: by the rules of `setting` (the paper's: arrived, 300 s, or 150 s without contact; or
+    the object fell over), or if the physics diverged. A state that is done stays as it is, and
+    earns nothing.
 
     Every reset takes one of `worlds` random worlds of the domain, drawn in advance on the host,
     and noise of its own; no other randomisation is needed. Shape family and engine are static.

@@ -7,6 +7,7 @@ is frozen, and a batch whose worlds have all ended stops.
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -31,15 +32,17 @@ _ODOMETRY = 7  # of a world's key; the skin splits it into fewer
 
 
 class Rules(NamedTuple):
-    """When a trial ends (Sec. III-B)."""
+    """When a trial ends (Sec. III-B); of objects that fall over the paper says nothing."""
 
     horizon: float | jax.Array = 300.0  # [s]
     max_lost: float | jax.Array = 150.0  # [s] without contact, in all, after the first touch
+    max_tilt: float | jax.Array = math.pi / 4  # [rad] of an object that has not fallen over
 
     def check(self) -> None:
-        """Raises InputError for times that are not positive and finite."""
+        """Raises InputError for times that are not positive and finite, or no tilt."""
         errors.check_finite("horizon", self.horizon, above=0, at_most=1e5, unit="s")
         errors.check_finite("max_lost", self.max_lost, at_least=0, unit="s")
+        errors.check_finite("max_tilt", self.max_tilt, above=0, at_most=math.pi, unit="rad")
 
 
 class Shift(NamedTuple):
@@ -93,8 +96,10 @@ class Trial(NamedTuple):
     lost_steps: jax.Array  # () int32 without contact after the first touch
     sum_abs_l: jax.Array  # () [m] over the steps in contact
     min_distance: jax.Array  # () [m] contact point to target; inf before the first touch
+    path_length: jax.Array  # () [m] of the base's way
     done: jax.Array  # () bool
     success: jax.Array  # () bool
+    tipped: jax.Array  # () bool: the object has fallen over
     diverged: jax.Array  # () bool
     overflows: jax.Array  # () int32 control steps in which contacts were lost for want of room
 
@@ -117,7 +122,9 @@ class Outcome(NamedTuple):
     time: jax.Array  # () [s] at which it ended
     min_distance: jax.Array  # () [m] contact point to target; inf if never touched
     contact_lost_time: jax.Array  # () [s]
+    path_length: jax.Array  # () [m] of the base's way
     mean_abs_l: jax.Array  # () [m] the paper's D; NaN if never touched
+    tipped: jax.Array  # () bool: the object has fallen over
     diverged: jax.Array  # () bool
     overflows: jax.Array  # () int32 control steps in which contacts were lost for want of room
     base_pose: jax.Array  # (3,) [m, m, rad] at the end
@@ -128,6 +135,12 @@ def object_pose(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Planar position (2,) [m] and yaw () [rad] of the object in the world."""
     free = qpos[JOINTS.object]
     return free[:2], frames.yaw_of_quaternion(free[3:])
+
+
+def _upright(qpos: jax.Array) -> jax.Array:
+    """Cosine () of the object's tilt."""
+    _, x, y, _ = qpos[JOINTS.object][3:]
+    return 1 - 2 * (x * x + y * y)
 
 
 def p_world_contact(seen: Snapshot) -> jax.Array:
@@ -169,8 +182,10 @@ def start(world: World, strategy: Strategy = RPS) -> Trial:
         lost_steps=zero,
         sum_abs_l=jnp.zeros_like(world.qpos[0]),
         min_distance=jnp.full_like(world.qpos[0], jnp.inf),
+        path_length=jnp.zeros_like(world.qpos[0]),
         done=false,
         success=false,
+        tipped=false,
         diverged=false,
         overflows=zero,
     )
@@ -283,7 +298,8 @@ def observe(
     touch = reading.contact_type != NONE
     lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
     success = touch & (distance < world.params.d_success)
-    over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost)
+    tipped = _upright(trial.qpos) < jnp.cos(rules.max_tilt)
+    over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost) | tipped
     told = trial._replace(
         skin=skin,
         poses=poses,
@@ -294,6 +310,7 @@ def observe(
             touch, jnp.minimum(trial.min_distance, distance), trial.min_distance
         ),
         success=success & ~over,
+        tipped=tipped,
         done=success | over,
     )
     return told, Seen(reading, seen, distance)
@@ -349,7 +366,13 @@ def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
     )
     if overflowed is not None:
         told = told._replace(overflows=told.overflows + (overflowed & ~told.done))
-    moved = told._replace(qpos=qpos, qvel=qvel, warmstart=warmstart, steps=told.steps + 1)
+    moved = told._replace(
+        qpos=qpos,
+        qvel=qvel,
+        warmstart=warmstart,
+        path_length=told.path_length + frames.norm(qpos[:2] - told.qpos[:2]),
+        steps=told.steps + 1,
+    )
     stopped = told._replace(done=jnp.ones((), bool), diverged=~told.done & ~sane)
     return _select(before.done, before, _select(told.done | ~sane, stopped, moved))
 
@@ -383,9 +406,11 @@ def outcome(trial: Trial, period: float) -> Outcome:
         time=trial.steps * period,
         min_distance=trial.min_distance,
         contact_lost_time=trial.lost_steps * period,
+        path_length=trial.path_length,
         mean_abs_l=jnp.where(
             trial.contact_steps > 0, trial.sum_abs_l / jnp.maximum(trial.contact_steps, 1), jnp.nan
         ),
+        tipped=trial.tipped,
         diverged=trial.diverged,
         overflows=trial.overflows,
         base_pose=trial.qpos[..., JOINTS.base],

@@ -336,6 +336,7 @@ def test_what_a_sweep_says_is_what_happened():
         {
             "success": (("arm", "world"), np.array([[1, 0, 0, 0], [1, 1, 0, 0]], np.int8)),
             "diverged": (("arm", "world"), np.array([[0, 0, 0, 1], [0, 0, 0, 0]], np.int8)),
+            "tipped": (("arm", "world"), np.array([[0, 0, 0, 0], [0, 0, 0, 1]], np.int8)),
             "time": (("arm", "world"), np.array([[50.0, 300, 200, 9], [70, 80, 300, 300]])),
             "min_distance": (("arm", "world"), np.array([[0.04, 0.5, inf, 1], [0.04, 0.04, 1, 2]])),
             "contact_lost_time": (("arm", "world"), np.array([[0.0, 0, 0, 0], [0, 0, 151, 0]])),
@@ -347,7 +348,8 @@ def test_what_a_sweep_says_is_what_happened():
     first, second = (results.sel(arm=arm) for arm in "ab")
     assert [analysis.FAILURES[k] if k >= 0 else "" for k in analysis.failure(first, 150)] == [
         "", "timeout", "never touched", "diverged"]  # fmt: skip
-    assert analysis.FAILURES[analysis.failure(second, 150)[2]] == "lost contact"
+    assert [analysis.FAILURES[k] for k in analysis.failure(second, 150)[2:]] == [
+        "lost contact", "fell over"]  # fmt: skip
     assert analysis.left_over(first).tolist() == [0.04, 0.5, 3.0, 1.0]
     assert analysis.cvar(np.arange(100.0)) == pytest.approx(97.0)  # mean of 95 .. 99
     assert analysis.cvar(np.array([1.0, 3.0])) == 3.0
