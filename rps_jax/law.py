@@ -140,6 +140,11 @@ class Twist(NamedTuple):
     v_y: float | jax.Array  # () [m/s] left
     omega: float | jax.Array  # () [rad/s] counter-clockwise
 
+    def in_world(self, yaw: jax.Array) -> jax.Array:
+        """Velocities (3,) [m/s, m/s, rad/s] in the world, of a base with the heading `yaw`."""
+        v_world = frames.rotate(yaw, jnp.stack([self.v_x, self.v_y]))
+        return jnp.stack([*v_world, jnp.asarray(self.omega)])
+
 
 class Details(NamedTuple):
     """The quantities behind one twist, for plots and tests."""

@@ -49,7 +49,7 @@ from rps_jax.trial import Outcome, Rules
 Kind = tuple[int, type]  # of a part: the object's number and the type of the arm's parameters
 Keep = Callable[[int, bytes], Any]  # called with the number and the content of a part
 # Of an outcome; the others are float32.
-_TYPES = dict.fromkeys(("success", "tipped", "diverged"), np.int8)
+_TYPES = dict.fromkeys(("success", "tipped", "diverged"), np.int8) | {"overflows": np.int32}
 
 
 @dataclass(frozen=True)

@@ -101,6 +101,7 @@ class Trial(NamedTuple):
     success: jax.Array  # () bool
     tipped: jax.Array  # () bool: the object has fallen over
     diverged: jax.Array  # () bool
+    overflows: jax.Array  # () int32 control steps in which contacts were lost for want of room
 
 
 class Snapshot(NamedTuple):
@@ -125,6 +126,7 @@ class Outcome(NamedTuple):
     mean_abs_l: jax.Array  # () [m] the paper's D; NaN if never touched
     tipped: jax.Array  # () bool: the object has fallen over
     diverged: jax.Array  # () bool
+    overflows: jax.Array  # () int32 control steps in which contacts were lost for want of room
     base_pose: jax.Array  # (3,) [m, m, rad] at the end
     object_pose: jax.Array  # (3,) [m, m, rad] at the end
 
@@ -147,7 +149,13 @@ def p_world_contact(seen: Snapshot) -> jax.Array:
     return jnp.where((seen.reading.contact_type != NONE)[:, None], point, jnp.nan)
 
 
-Driven = tuple[jax.Array, jax.Array, jax.Array]  # qpos, qvel, warmstart of a batch
+class Driven(NamedTuple):
+    """A batch after one control period."""
+
+    qpos: Any  # (B, 10) as in `Trial`
+    qvel: Any  # (B, 9)
+    warmstart: Any  # (B, 9)
+    overflowed: Any = None  # (B,) bool: contacts were lost; None: this engine loses none
 
 
 class Drives(Protocol):
@@ -179,6 +187,7 @@ def start(world: World, strategy: Strategy = RPS) -> Trial:
         success=false,
         tipped=false,
         diverged=false,
+        overflows=zero,
     )
 
 
@@ -228,15 +237,14 @@ class Stage(NamedTuple):
 
         def one(state, _):
             qpos, qvel, warmstart = state
-            v_world = frames.rotate(qpos[2], jnp.stack([twist.v_x, twist.v_y]))
-            qvel = qvel.at[JOINTS.base].set(jnp.stack([*v_world, jnp.asarray(twist.omega)]))
+            qvel = qvel.at[JOINTS.base].set(twist.in_world(qpos[2]))
             data = self.data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
             with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
                 data = mjx.step(model, data)
             return (data.qpos, data.qvel, data.qacc_warmstart), None
 
         state = (trial.qpos, trial.qvel, trial.warmstart)
-        return jax.lax.scan(one, state, length=substeps)[0]
+        return Driven(*jax.lax.scan(one, state, length=substeps)[0])
 
 
 class Fused(NamedTuple):
@@ -245,7 +253,7 @@ class Fused(NamedTuple):
     def drive(self, worlds: World, trials: Trial, twists: Twist, physics: Physics) -> Driven:
         """Step a batch for one control period."""
         state = (trials.qpos, trials.qvel, trials.warmstart)
-        return fused.drive(worlds.fields, *state, twists, physics)
+        return Driven(*fused.drive(worlds.fields, *state, twists, physics))
 
 
 def _believed(world: World, trial: Trial, period: float) -> tuple[jax.Array, jax.Array]:
@@ -345,18 +353,19 @@ def decide(
     return told, twist, snapshot
 
 
-def settle(
-    before: Trial, told: Trial, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array
-) -> Trial:
-    """The trial after one control period: `told` driven to (qpos, qvel, warmstart), or ended.
+def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
+    """The trial after one control period: `told` as it was `driven`, or ended.
 
     A trial that had ended `before` comes back as it was.
     """
+    qpos, qvel, warmstart, overflowed = driven
     sane = (
         jnp.all(jnp.isfinite(qpos))
         & jnp.all(jnp.abs(qvel) < _MAX_SPEED)
         & jnp.all(jnp.abs(qpos) < _MAX_DISTANCE)
     )
+    if overflowed is not None:
+        told = told._replace(overflows=told.overflows + (overflowed & ~told.done))
     moved = told._replace(
         qpos=qpos,
         qvel=qvel,
@@ -381,7 +390,7 @@ def control_step(
     think = partial(decide, physics=physics, rules=rules, strategy=strategy)
     told, twists, snapshots = jax.vmap(think)(worlds, trials)
     driven = stage.drive(worlds, told, twists, physics)
-    return jax.vmap(settle)(trials, told, *driven), snapshots
+    return jax.vmap(settle)(trials, told, driven), snapshots
 
 
 def _select(condition: jax.Array, yes: Any, no: Any) -> Any:
@@ -403,6 +412,7 @@ def outcome(trial: Trial, period: float) -> Outcome:
         ),
         tipped=trial.tipped,
         diverged=trial.diverged,
+        overflows=trial.overflows,
         base_pose=trial.qpos[..., JOINTS.base],
         object_pose=pose.reshape(*trial.qpos.shape[:-1], 3),
     )
