@@ -100,7 +100,8 @@ def cloud(
     """Candidates (len(sets) + count,): the sets, and others on the lines between them, and beside.
 
     Each of these lies evenly somewhere between two of the sets, plus a normal step of standard
-    deviation `spread` in the coordinates of the bounded map.
+    deviation `spread` in the coordinates of the bounded map. What is not among `names`, such as
+    switches, it has from the nearer of the two.
     """
     space = Space(tuple(names))
     corners = jnp.stack([space.vector(params) for params in sets])
@@ -109,7 +110,12 @@ def cloud(
     share = jax.random.uniform(keys[2], (count, 1))
     middle = corners[one] + share * (corners[other] - corners[one])
     steps = spread * jax.random.normal(keys[3], middle.shape, middle.dtype)
-    return space.params(jnp.concatenate([corners, middle + steps]))
+    varied = space.params(jnp.concatenate([corners, middle + steps]))
+    nearer = jnp.where(share[:, 0] < 0.5, one, other)
+    whose = jnp.concatenate([jnp.arange(len(sets)), nearer])
+    taken = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x, float) for x in leaves]), *sets)
+    own = {name: getattr(taken, name)[whose] for name in taken._fields if name not in names}
+    return varied._replace(**own)
 
 
 def undominated(found: Aims) -> np.ndarray:

@@ -65,7 +65,8 @@ class RPSParams(NamedTuple):
     def tuned(cls) -> RPSParams:
         """Tuned by evolution in random worlds of boxes and cylinders; the README says how.
 
-        Full speed until the target, and almost always realigning: Eq. 5 acts only beyond d_th.
+        Full speed until the target, and almost always realigning: Eq. 5 acts only beyond d_th. A
+        contact that is lost is acted upon as if it were still felt.
         """
         return cls(
             eta=6.537844,
@@ -81,6 +82,7 @@ class RPSParams(NamedTuple):
             d_th=1.561165,
             gamma_max=1.54169,
             v_lost=0.03373589,
+            keep_contact=1.0,
         )
 
     @classmethod

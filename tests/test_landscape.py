@@ -65,6 +65,8 @@ def test_candidates_begin_with_the_sets_and_without_spread_lie_between_two_of_th
     assert (share > -1e-3).all()
     assert (share < 1 + 1e-3).all()
     np.testing.assert_allclose(z[2:], z[0] + share[:, None] * way, rtol=1e-3, atol=1e-3)
+    # The switch that differs between the sets, from the nearer one.
+    np.testing.assert_array_equal(found.keep_contact[2:], share > 0.5)
 
 
 @pytest.fixture
