@@ -8,22 +8,27 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
 
-from rps_jax import engines, paper, reference, strategies, sweep, trial
+from rps_jax import domain, engines, paper, reference, strategies, sweep, trial
+from rps_jax.domain import DOMAINS, Range
+from rps_jax.law import RPSParams
 from rps_jax.physics import MUJOCOS_GROUND, Physics, preset
 from rps_jax.reference import Batch
 from rps_jax.scene import FRICTION
-from rps_jax.slots import Setting
+from rps_jax.slots import Job, Setting, default_workers, run
 from rps_jax.sweep import Case
-from rps_jax.trial import Rules
+from rps_jax.trial import Rules, World
 
-FAMILIES = ("box", "cylinder")
+FAMILIES = ("box", "cylinder", "prism")
+_PRISMS = replace(
+    DOMAINS["paper"], objects=("random_prism",), frictions=(FRICTION["S1"],), gap=Range(0.0, 0.02)
+)
 _MUJOCOS_OWN = Physics(
     timestep=0.002,
     cone="pyramidal",
@@ -66,9 +71,20 @@ class Speed:
     physics: Physics
 
 
-def _cases(family: str, count: int) -> list[Case]:
+def _worlds(family: str, count: int, setting: Setting) -> tuple[Any, World]:
+    """Stage and worlds (count, ...): the paper's targets under S1, a box, a cylinder or prisms."""
+    if family == "prism":
+        drawn = domain.draw(_PRISMS, 0, np.arange(count))
+        part = domain.worlds(_PRISMS, drawn, RPSParams.paper(), setting)
+        return part.stage, part.worlds
     targets = paper.TARGETS
-    return [Case(family, FRICTION["S1"], targets[i % len(targets)]) for i in range(count)]
+    cases = [Case(family, FRICTION["S1"], targets[i % len(targets)]) for i in range(count)]
+    return sweep.build(cases, setting)
+
+
+def can(name: str, family: str) -> bool:
+    """Whether an engine steps a family: MJX-Warp knows no prisms of different shapes."""
+    return family != "prism" or name in IN_C or BATCHED[name].engine != "warp"
 
 
 def _best(action: Callable[[], Any], goes: int = 3) -> float:
@@ -84,7 +100,7 @@ def _best(action: Callable[[], Any], goes: int = 3) -> float:
 def batched(name: str, family: str, worlds: int, simulated: float = 2.0) -> Speed:
     """Time a full batch on JAX's default device, `simulated` [s] of each world at a time."""
     setting = BATCHED[name]
-    stage, few = sweep.build(_cases(family, len(paper.TARGETS)), setting)
+    stage, few = _worlds(family, len(paper.TARGETS), setting)
     rows = np.arange(worlds) % len(paper.TARGETS)
     batch = jax.device_put(jax.tree.map(lambda leaf: leaf[rows], few))
     start = trial.start_all(batch, np.ones(worlds, bool))
@@ -110,8 +126,7 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Speed:
     threads = os.cpu_count() or 1
     worlds = 64 * threads
     setting = Setting(engine="mujoco", physics=physics)
-    cases = _cases(family, worlds)
-    stage, batch = sweep.build(cases, setting)
+    stage, batch = _worlds(family, worlds, setting)
     if IN_C[name] == "closed":
         options = {"strategy": strategies.RPS, "threads": threads, "report": lambda *_: True}
         rules = Rules(horizon=simulated)
@@ -125,6 +140,29 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Speed:
         once = partial(stepper.drive, np.arange(worlds), twist, round(simulated / physics.timestep))
     once()  # compiles the law
     return Speed(name, family, worlds, 0.0, worlds * simulated / _best(once), np.nan, physics)
+
+
+def refilling(slots: int, times: int = 4) -> tuple[float, float]:
+    """Simulated seconds a second, with refilled slots and in batches that wait for their slowest.
+
+    Both run the same random boxes of the domain `wide`, `times` as many as there are slots.
+    """
+    setting = BATCHED["fused standard"]
+    boxes = replace(DOMAINS["wide"], objects=("random_box",))
+    count = slots * default_workers() * len(jax.local_devices())
+
+    def rate(groups: np.ndarray) -> float:
+        timings = []
+        for group in groups:
+            drawn = domain.draw(boxes, 0, group)
+            part = domain.worlds(boxes, drawn, RPSParams.paper(), setting)
+            job = Job(strategies.RPS, group.size, [part])
+            timings.append(run([job], setting, slots=slots, collect=lambda *_: None))
+        return sum(t.simulated for t in timings) / sum(t.run for t in timings)
+
+    numbers = np.arange(times * count)
+    rate(numbers[None, :count])  # compiles
+    return rate(numbers[None]), rate(numbers.reshape(times, count))
 
 
 def table(speeds: list[Speed]) -> list[list[str]]:

@@ -30,9 +30,11 @@ class Options:
     names: tuple[str, ...] = ()
     """Engines and fidelities; by default all that this machine can run."""
     families: tuple[str, ...] = benchmark.FAMILIES
-    """box, cylinder."""
+    """box, cylinder, prism."""
     worlds: tuple[int, ...] = (64, 512)
     """Batches."""
+    refill: int = 64
+    """Slots of each worker for the gain of refilling them; 0: not measured."""
     out: Path = Path("runs/benchmark")
     """Run folder."""
 
@@ -46,6 +48,7 @@ def main(options: Options) -> None:
             engines.check(benchmark.BATCHED[name].engine)
     for family in options.families:
         errors.check_name("family", family, benchmark.FAMILIES)
+    errors.check_finite("refill", options.refill, at_least=0, at_most=1e6)
     for worlds in options.worlds:
         errors.check_finite("worlds", worlds, at_least=1)
     record.writable(options.out)
@@ -55,13 +58,20 @@ def main(options: Options) -> None:
         where = f"{jax.devices()[0].device_kind}, {os.cpu_count()} processors"
         text = f"On {where}.\n\n{score.markdown(benchmark.table(speeds))}"
         record.write_text(options.out / "benchmark.md", text + "\n")
+    if options.refill:
+        with_it, without = benchmark.refilling(options.refill)
+        text += (
+            f"\n\nRefilled slots, {options.refill} a worker: {with_it:,.0f} simulated s/s; batches "
+            f"that wait for their slowest: {without:,.0f}; gain {with_it / without:.2f}."
+        )
+        record.write_text(options.out / "benchmark.md", text + "\n")
     figures.throughput(speeds, options.out / "throughput.png")
     print(text)
 
 
 def _measurements(options: Options) -> list[Callable[[], Speed]]:
     """C first, since the others are compared with it."""
-    named = list(product(options.names, options.families))
+    named = [pair for pair in product(options.names, options.families) if benchmark.can(*pair)]
     in_c = [partial(benchmark.in_c, n, f) for n, f in named if n in benchmark.IN_C]
     batched = [
         partial(benchmark.batched, n, f, worlds)
