@@ -25,6 +25,7 @@ from rps_jax import errors
 from rps_jax.errors import InputError
 
 if TYPE_CHECKING:
+    from rps_jax import view
     from rps_jax.domain import Domain
     from rps_jax.robustness import Plan, Shard
     from rps_jax.scene import Friction, Scene
@@ -55,8 +56,8 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class Common:
-    """Options that every run takes."""
+class Conditions:
+    """What the trials that are asked for one by one have in common."""
 
     params: tuple[str, ...] = ()
     """Parameters to change from the paper's, as name=value; those of APS as aps.name=value."""
@@ -87,6 +88,12 @@ class Common:
     """Longest trial [s]."""
     seed: int = 0
     """Seed of the skin's imperfections."""
+
+
+@dataclass(frozen=True)
+class Common(Conditions):
+    """Options that every run of such trials takes."""
+
     out: Path | None = None
     """Run folder; by default runs/<command>-<time>."""
     overwrite: bool = False
@@ -238,6 +245,32 @@ class Replay:
 
 
 @dataclass(frozen=True)
+class View(Conditions):
+    """Push in the browser: watch, drag the target, shove the object, push again."""
+
+    run: tyro.conf.Positional[Path | None] = None
+    """Run folder of a sweep, to begin with one of its worlds; by default the options' push."""
+    index: tyro.conf.Positional[int] = 0
+    """Index of the world in the sweep."""
+    arm: str | None = None
+    """Which of the sweep's strategies with parameters; by default the first."""
+    object: str = "box"
+    """Object to push."""
+    target: tuple[float, float] = (-2.0, 0.0)
+    """Target x y [m]."""
+    friction: str = "S1"
+    """S1, S2 or ground,robot (as 0.25,0.4)."""
+    strategy: str = "rps"
+    """rps, nps or aps."""
+    engine: str = "fused"
+    """fused, mjx or quasistatic."""
+    host: str = "127.0.0.1"
+    """Address to serve the page on; by default to this machine alone."""
+    port: int = 8080
+    """Port to serve the page on; 0 takes any that is free."""
+
+
+@dataclass(frozen=True)
 class TuneOptions(Spread):
     """What every tuner takes."""
 
@@ -372,6 +405,7 @@ Command = (
     | Annotated[Sweep, tyro.conf.subcommand("sweep")]
     | Annotated[Merge, tyro.conf.subcommand("merge")]
     | Annotated[Replay, tyro.conf.subcommand("replay")]
+    | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Tune, tyro.conf.subcommand("tune")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )
@@ -397,6 +431,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Sweep: _sweep,
         Merge: _merge,
         Replay: _replay,
+        View: _view,
         Tune: _tune,
         Doctor: _doctor,
     }
@@ -472,7 +507,7 @@ def _assignments(kind: str, texts: Sequence[str], known: Sequence[str]) -> dict[
     return values
 
 
-def _params(common: Common, names: Sequence[str]) -> dict[str, Params]:
+def _params(common: Conditions, names: Sequence[str]) -> dict[str, Params]:
     """The parameters of these strategies, with the changes that are asked for."""
     from rps_jax import strategies
 
@@ -516,7 +551,7 @@ def _friction(text: str) -> Friction:
     return scene.Friction(ground, robot)
 
 
-def _setting(common: Common) -> Setting:
+def _setting(common: Conditions) -> Setting:
     from rps_jax.physics import preset
     from rps_jax.slots import Setting
     from rps_jax.trial import Rules
@@ -534,7 +569,7 @@ def _setting(common: Common) -> Setting:
     )
 
 
-def _per_world(common: Common) -> dict[str, Any]:
+def _per_world(common: Conditions) -> dict[str, Any]:
     """The options that become fields of every case."""
     from rps_jax import paper, skin
 
@@ -547,6 +582,20 @@ def _per_world(common: Common) -> dict[str, Any]:
         "gap": common.gap,
         "rear": common.rear,
     }
+
+
+def _case(
+    common: Conditions,
+    name: str,
+    friction: str,
+    strategy: str,
+    p_world_target: tuple[float, float],
+) -> Case:
+    """One trial, of an object by its name."""
+    from rps_jax import sweep
+
+    params = _params(common, [strategy])[strategy]
+    return sweep.Case(name, _friction(friction), p_world_target, params, **_per_world(common))
 
 
 def _cases(options: Table, targets: Sequence[tuple[float, float]]) -> list[Case]:
@@ -661,13 +710,7 @@ def _push(options: Push) -> None:
 
     setting = _setting(options)
     params = _params(options, [options.strategy])
-    case = sweep.Case(
-        options.object,
-        _friction(options.friction),
-        options.target,
-        params[options.strategy],
-        **_per_world(options),
-    )
+    case = _case(options, options.object, options.friction, options.strategy, options.target)
     sweep.check_followed(options.engine)
     errors.check_finite("film_length", options.film_length, above=0, at_most=600, unit="s")
     out = _open(options, "push")
@@ -1123,18 +1166,26 @@ def _course(options: TuneOptions) -> Course:
     )
 
 
+def _one_world(run: Path, index: int, arm: str | None) -> tuple[Plan, str]:
+    """The plan of a sweep, one of whose worlds can be followed, and the arm that is meant."""
+    from rps_jax import robustness, sweep
+
+    plan = robustness.load_plan(run)
+    arms = list(plan.arms)
+    name = errors.check_name("arm", arm or arms[0], arms)
+    errors.check_count("index", index, at_least=0, at_most=plan.worlds - 1)
+    sweep.check_followed(plan.setting.engine)
+    return plan, name
+
+
 def _replay(options: Replay) -> None:
     from rps_jax import record, robustness, strategies, sweep
 
-    plan = robustness.load_plan(options.run)
-    arms = list(plan.arms)
-    name = errors.check_name("arm", options.arm or arms[0], arms)
-    errors.check_count("index", options.index, at_least=0, at_most=plan.worlds - 1)
+    plan, name = _one_world(options.run, options.index, options.arm)
     errors.check_finite("film_length", options.film_length, above=0, at_most=600, unit="s")
-    sweep.check_followed(plan.setting.engine)
     out = record.writable(options.out or options.run / f"replay-{options.index}")
     use_cache()
-    part = robustness.world_part(plan, arms.index(name), [options.index])
+    part = robustness.world_part(plan, list(plan.arms).index(name), [options.index])
     strategy = strategies.of(plan.arms[name])
     with _clock(float(plan.setting.rules.horizon)) as report:
         (trace,) = sweep.follow_part(part, strategy, plan.setting, report=report)
@@ -1142,6 +1193,53 @@ def _replay(options: Replay) -> None:
     if options.video:
         _film(robustness.scene_of(plan, options.index), trace, options.film_length, out)
     print(f"run folder: {out}")
+
+
+def _view(options: View) -> None:
+    from rps_jax import sweep, view
+
+    asked = view.Asked(options.object, options.friction, options.strategy, options.target)
+    make = partial(_push_of, options, _setting(options))
+    _case(options, *asked)
+    sweep.check_followed(options.engine)
+    first = partial(make, asked)
+    if options.run is not None:
+        plan, name = _one_world(options.run, options.index, options.arm)
+        first = partial(_push_in_world, plan, name, options.index)
+    page = view.open_page(options.host, options.port, asked, make)
+    use_cache()
+    print(f"page: {page.url} (Ctrl-C ends it)", flush=True)
+    try:
+        page.begin(first)
+        page.run()
+    except KeyboardInterrupt:
+        print("page closed.")
+    finally:
+        page.close()
+
+
+def _push_of(options: View, setting: Setting, asked: view.Asked) -> view.Push:
+    """The push that the page asks for."""
+    from rps_jax import sweep, view
+    from rps_jax.live import Live
+
+    case = _case(options, *asked)
+    title = (
+        f"{case.object.replace('_', ' ')}, friction ground {case.friction.ground:g}, robot "
+        f"{case.friction.robot:g}, {asked.strategy}"
+    )
+    return view.Push(Live.of_case(case, setting), sweep.scene_of(case, setting.physics), title)
+
+
+def _push_in_world(plan: Plan, arm: str, index: int) -> view.Push:
+    """A world of a sweep."""
+    from rps_jax import robustness, strategies, view
+    from rps_jax.live import Live
+
+    part = robustness.world_part(plan, list(plan.arms).index(arm), [index])
+    live = Live(part, strategies.of(plan.arms[arm]), plan.setting)
+    title = robustness.title_of(plan, index).replace("$\\mu$", "friction")
+    return view.Push(live, robustness.scene_of(plan, index), f"{title}, {arm}")
 
 
 def _doctor(_: Doctor) -> None:

@@ -33,10 +33,10 @@ SIZE = (960, 540)  # [px] width, height
 _TRAIL_STEP = 0.02  # [m] between the points of a trail
 _TRAIL_POINTS = 1500  # at most, so that memory stays flat: 30 m; the oldest go first
 _TRAIL_WIDTH = 0.007  # [1] of the image's height
-_BASE_RGBA = (0.08, 0.09, 0.11, 1.0)
-_CONTACT_RGBA = (0.62, 0.04, 0.46, 1.0)
-_CONTACT_HEIGHT = 0.36  # [m] just above the chassis, which would hide the marker from above
-_CONTACT_RADIUS = 0.04  # [m]
+BASE_RGBA = (0.08, 0.09, 0.11, 1.0)
+CONTACT_RGBA = (0.62, 0.04, 0.46, 1.0)
+CONTACT_HEIGHT = 0.36  # [m] just above the chassis, which would hide the marker from above
+CONTACT_RADIUS = 0.04  # [m]
 _NO_CONTACT = np.full(2, np.nan)
 
 _MEND_GL = (
@@ -200,8 +200,8 @@ class _Studio:
         self.data = self.mujoco.MjData(scene.model)
         self.data.mocap_pos[scene.model.body("target").mocapid[0], :2] = target
         self.camera = camera
-        self.base_trail = _Trail(_BASE_RGBA, 0.006)
-        self.contact_trail = _Trail(_CONTACT_RGBA, 0.010)
+        self.base_trail = _Trail(BASE_RGBA, 0.006)
+        self.contact_trail = _Trail(CONTACT_RGBA, 0.010)
 
     def draw(self, qpos: ArrayLike, p_world_contact: ArrayLike) -> np.ndarray:
         """One image (height, width, 3) uint8, and a step further along the trails."""
@@ -229,9 +229,9 @@ class _Studio:
             self.mujoco.mjv_connector(geom, geom.type, width, *ends)
 
     def _add_marker(self, point: np.ndarray) -> None:
-        position = np.array([*point, _CONTACT_HEIGHT])
-        size = np.full(3, _CONTACT_RADIUS)
-        geom = self._new_geom("mjGEOM_SPHERE", size, position, _CONTACT_RGBA)
+        position = np.array([*point, CONTACT_HEIGHT])
+        size = np.full(3, CONTACT_RADIUS)
+        geom = self._new_geom("mjGEOM_SPHERE", size, position, CONTACT_RGBA)
         if geom is not None:
             geom.emission = 1.0  # seen in the shadow of the object too
 

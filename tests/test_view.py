@@ -1,0 +1,229 @@
+"""A push in the browser: the trial that can be disturbed, and the page as Chromium shows it."""
+
+import io
+import math
+import shutil
+import socket
+import sys
+import threading
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+from selenium import webdriver
+from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.common.by import By
+from selenium.webdriver.support.ui import WebDriverWait
+
+from rps_jax import cli, scene, sweep, view
+from rps_jax.errors import InputError
+from rps_jax.live import Live
+from rps_jax.physics import preset
+from rps_jax.slots import Setting
+from rps_jax.sweep import Case
+from rps_jax.trial import Rules
+
+SETTING = Setting(preset(fidelity="fast"), Rules(horizon=12.0), engine="fused")
+CASE = Case("cylinder", scene.FRICTION["S1"], (0.6, 0.0))
+PERIOD = SETTING.physics.control_period
+
+
+@pytest.fixture(scope="module")
+def one():
+    return Live.of_case(CASE, SETTING)
+
+
+@pytest.fixture
+def live(one):
+    one.reset()
+    return one
+
+
+def go(live, steps):
+    for _ in range(steps):
+        live.step()
+
+
+def p_world_contact(live):
+    """Where the object was last felt (2,) [m]."""
+    return view.p_world_contact(live.past[-1].seen)
+
+
+def p_robot_object(seen):
+    """Where the object is (2,) [m], in the robot's frame."""
+    c, s = math.cos(seen.qpos[2]), math.sin(seen.qpos[2])
+    return np.array([[c, s], [-s, c]]) @ (seen.qpos[3:5] - seen.qpos[:2])
+
+
+# --- the trial -----------------------------------------------------------------------------
+
+
+def test_a_push_that_is_left_alone_ends_as_any_other_trial(live):
+    found, _ = sweep.run([CASE], SETTING, slots=1, workers=1)
+    go(live, 2 * round(SETTING.rules.horizon / PERIOD))
+    assert live.done
+    for name, value in live.outcome._asdict().items():
+        np.testing.assert_allclose(value, getattr(found, name)[0], atol=1e-5, err_msg=name)
+    assert live.past[-1].seen.time == pytest.approx(float(found.time[0]), abs=1e-4)
+
+
+def test_a_target_dragged_to_the_contact_is_reached_and_one_dragged_away_is_pushed_to(live):
+    live.set_target((0.0, 3.0))
+    go(live, 150)
+    assert not live.done
+    live.set_target(tuple(p_world_contact(live)))
+    go(live, 1)
+    assert live.done
+    assert live.outcome.success
+    ended = len(live.past)
+    go(live, 5)
+    assert len(live.past) == ended
+    live.set_target((0.0, 3.0))
+    go(live, 25)
+    assert not live.done
+    assert len(live.past) == ended + 25
+    assert live.outcome.min_distance > 1.0  # of the target that it has now
+
+
+def test_a_shove_moves_the_object_once_by_what_is_asked_in_the_frame_of_the_robot(live):
+    live.set_target((0.0, 3.0))
+    go(live, 250)
+    before = p_robot_object(live.past[-1].seen)
+    assert abs(live.past[-1].seen.qpos[2]) > 0.05  # turned, so that the frames differ
+    live.shove((0.3, -0.2))
+    go(live, 1)
+    np.testing.assert_allclose(p_robot_object(live.past[-1].seen) - before, (0.3, -0.2), atol=3e-3)
+    shoved = live.past[-1].seen.qpos[3:5]
+    go(live, 2)
+    assert math.dist(live.past[-1].seen.qpos[3:5], shoved) < 3e-3
+
+
+def test_going_back_forgets_what_came_after_and_the_same_then_comes_again(live):
+    go(live, 60)
+    last = live.past[-1]
+    live.rewind(20)
+    assert len(live.past) == 21
+    live.shove((0.1, 0.1))
+    go(live, 5)
+    live.rewind(20)
+    go(live, 39)
+    np.testing.assert_array_equal(last.seen.qpos, live.past[-1].seen.qpos)
+
+
+def test_the_foam_gives_way_where_the_object_is_felt_and_nowhere_else(live):
+    go(live, 1)
+    assert not live.past[0].compression.any()  # 2 cm before the robot
+    go(live, 150)
+    pressed = live.past[-1].compression
+    assert pressed.max() > 0.3
+    front = slice(15, 27)
+    assert not np.delete(pressed, np.arange(42)[front]).any()
+    assert np.argmax(pressed) in (20, 21)  # the middle of the front
+
+
+@pytest.mark.parametrize("wrong", [(math.nan, 0.0), (0.0, 99.0)])
+def test_a_disturbance_that_means_nothing_is_refused(live, wrong):
+    with pytest.raises(InputError, match="target"):
+        live.set_target(wrong)
+    with pytest.raises(InputError, match="shove"):
+        live.shove(wrong)
+
+
+# --- the page ------------------------------------------------------------------------------
+
+FLAGS = (
+    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--window-size=900,700"),
+)
+ASKED = view.Asked("cylinder", "S1", "rps", (0.0, 2.0))
+
+
+def make(asked):
+    friction = scene.FRICTION.get(asked.friction)
+    if friction is None:
+        raise InputError(f"unknown friction set '{asked.friction}': choose from S1, S2.")
+    case = Case(asked.object, friction, asked.p_world_target)
+    return view.Push(Live.of_case(case, SETTING), sweep.scene_of(case, SETTING.physics), "A drum")
+
+
+@pytest.fixture
+def page():
+    page = view.open_page("127.0.0.1", 0, ASKED, make)
+    page.begin(lambda: make(ASKED))
+    thread = threading.Thread(target=page.run)
+    thread.start()
+    yield page
+    page.close()
+    thread.join()
+
+
+@pytest.fixture
+def browser(tmp_path):
+    binary, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if not (binary and driver):
+        pytest.fail("There is no Chromium: run `apt-get install -y chromium chromium-driver`.")
+    options = webdriver.ChromeOptions()
+    options.binary_location = binary
+    for flag in (*FLAGS, f"--user-data-dir={tmp_path / 'profile'}"):
+        options.add_argument(flag)
+    with webdriver.Chrome(options=options, service=Service(driver)) as browser:
+        yield browser
+
+
+def picture(browser):
+    """What the browser shows, (height, width, 3) uint8."""
+    return imageio.imread(io.BytesIO(browser.get_screenshot_as_png()))[..., :3]
+
+
+def button(browser, name):
+    return browser.find_element(By.XPATH, f"//button[normalize-space()='{name}']")
+
+
+def test_the_page_plays_a_push_and_says_what_is_wrong(page, browser):
+    browser.get(page.url)
+    wait = WebDriverWait(browser, 60)
+
+    def text():
+        return browser.find_element(By.TAG_NAME, "body").text
+
+    wait.until(lambda _: "A drum" in text() and "point contact" in text())
+    first = picture(browser)
+    at = text()
+    wait.until(lambda _: text() != at)
+    second = picture(browser)
+    for image in (first, second):
+        assert len(np.unique(image.reshape(-1, 3), axis=0)) > 300
+    ground = (slice(100, 600), slice(0, 500))  # left of the panel
+    assert np.any(np.abs(first[ground].astype(int) - second[ground]) > 60)
+
+    button(browser, "Pause").click()
+    wait.until(lambda _: button(browser, "Play"))
+    button(browser, "Shove").click()
+    wait.until(lambda _: "no contact" in text())
+
+    field = browser.find_element(By.CSS_SELECTOR, "input[value='S1']")
+    field.clear()
+    field.send_keys("S3")
+    wait.until(lambda _: page.asked.friction == "S3")
+    button(browser, "Push").click()
+    wait.until(lambda _: "unknown friction set 'S3': choose from S1, S2." in text())
+
+
+def rps(*arguments):
+    return cli.main([str(a) for a in arguments])
+
+
+def test_a_port_that_is_taken_is_one_sentence(capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert rps("view", "--port", port) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert f"port = {port} cannot be served on (Address already in use)" in error
+
+
+def test_without_viser_the_command_says_how_to_install_it(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert rps("view") == 2
+    assert "viser is not installed: run pip install '.[viz]'." in capsys.readouterr().err
