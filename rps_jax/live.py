@@ -24,11 +24,13 @@ from rps_jax.strategies import Strategy
 from rps_jax.sweep import Case
 from rps_jax.trial import Outcome, Rules, Shift, Snapshot, Trial, World
 
+CHUNK = 25  # steps, at most, that one call of the compiled program takes
+
 
 class Moment(NamedTuple):
     """One control step, on the host: where everything was, and what was seen and done."""
 
-    world: World  # of this moment: its target and its shove
+    worlds: World  # of this moment, (1, ...): its target and its shove
     before: Trial  # as the step found it
     seen: Snapshot
     compression: np.ndarray  # (42,) [1] of the foam under each taxel, in strip order
@@ -89,28 +91,31 @@ class Live:
         self._now: Trial = jax.device_get(started)
         self.past.clear()
 
-    def step(self) -> None:
-        """One control period; nothing, once the trial has ended."""
-        if self.done:
-            return
-        after, seen, compression = jax.device_get(
-            _step(
-                self._stage,
-                self._worlds,
-                self._now,
-                physics=self._setting.physics,
-                rules=self._setting.rules,
-                strategy=self._strategy,
+    def step(self, count: int = 1) -> None:
+        """Some control periods, fewer if the trial ends before."""
+        while count > 0 and not self.done:
+            some = min(count, CHUNK)
+            self._now, kept = jax.device_get(
+                _steps(
+                    self._stage,
+                    self._worlds,
+                    self._now,
+                    some,
+                    physics=self._setting.physics,
+                    rules=self._setting.rules,
+                    strategy=self._strategy,
+                )
             )
-        )
-        self.past.append(Moment(self._worlds, self._now, rows(seen, 0), compression[0]))
-        self._now = after
+            some -= int(kept[0].done[:some].sum())  # it ended before these
+            self.past += [Moment(self._worlds, *rows(kept, i)) for i in range(some)]
+            count -= CHUNK
 
     def rewind(self, index: int) -> None:
         """Forget what came after the moment `index`, and go on from there."""
         after = index + 1
         if after < len(self.past):
-            self._worlds, self._now = self.past[index].world, self.past[after].before
+            self._worlds = self.past[index].worlds
+            self._now = rows(self.past[after].before, None)
             del self.past[after:]
 
     def set_target(self, p_world_target: tuple[float, float]) -> None:
@@ -152,21 +157,33 @@ class Live:
 
 
 @partial(jax.jit, static_argnames=("physics", "strategy"))
-def _step(
+def _steps(
     stage: Any,
     worlds: World,
     trials: Trial,
+    count: int,
     *,
     physics: Physics,
     rules: Rules,
     strategy: Strategy,
-) -> tuple[Trial, Snapshot, jax.Array]:
-    """One control step of a batch, and how far the foam gives way at the outset, (B, 42) [1]."""
-    after, seen = trial.control_step(
-        stage, worlds, trials, physics=physics, rules=rules, strategy=strategy
-    )
-    placed = jax.vmap(trial.outline)(worlds, seen.qpos)
-    return after, seen, jax.vmap(_compression)(worlds.skin, placed)
+) -> tuple[Trial, tuple[Trial, Snapshot, jax.Array]]:
+    """Up to CHUNK control steps of a world (1, ...), and what each was: rows (CHUNK, ...)."""
+
+    def one(trials: Trial) -> tuple[Trial, Any]:
+        after, seen = trial.control_step(
+            stage, worlds, trials, physics=physics, rules=rules, strategy=strategy
+        )
+        placed = jax.vmap(trial.outline)(worlds, seen.qpos)
+        compression = jax.vmap(_compression)(worlds.skin, placed)
+        return after, rows((trials, seen, compression), 0)
+
+    def body(i: jax.Array, carry: tuple[Trial, Any]) -> tuple[Trial, Any]:
+        after, moment = one(carry[0])
+        return after, jax.tree.map(lambda every, x: every.at[i].set(x), carry[1], moment)
+
+    like = jax.eval_shape(one, trials)[1]
+    blank = jax.tree.map(lambda x: jnp.zeros((CHUNK, *x.shape), x.dtype), like)
+    return jax.lax.fori_loop(0, count, body, (trials, blank))
 
 
 def _compression(sensor: Any, placed: Footprint) -> jax.Array:

@@ -23,7 +23,7 @@ import numpy as np
 
 from rps_jax import errors, objects, skin, strategies, video
 from rps_jax.errors import InputError
-from rps_jax.live import Live, Moment
+from rps_jax.live import CHUNK, Live, Moment
 from rps_jax.scene import Scene
 from rps_jax.skin import NONE
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from viser import ViserServer
 
 _TICK = 0.04  # [s] between two pictures
+_WORDS = 0.25  # [s] between two looks at the panel, which browsers are slow to lay out
 _BUDGET = 0.15  # [s] of simulation before the page is looked after again
 _PATH_STEP = 10  # moments between two points of a path
 _ROOT = "/push"
@@ -87,6 +88,7 @@ class Page:
         self._drawn: tuple[int, int] | None = None  # the moment that is on the page, of how many
         self._cursor = 0.0  # the moment that is to be seen; a fraction of the next has passed
         self._playing, self._error = True, ""
+        self._words_due = 0.0  # [s] when the panel is next brought up to date
         _furnish(server)
         self._build(asked)
 
@@ -128,7 +130,9 @@ class Page:
         if self._push is not None:
             self._advance(self._push.live, elapsed)
             self._show(self._push)
-        self._tell()
+        if (now := time.perf_counter()) >= self._words_due:
+            self._words_due = now + _WORDS
+            self._tell()
 
     def close(self) -> None:
         """End `run`, and the server."""
@@ -154,13 +158,17 @@ class Page:
             self._when(self._drawing.target.on_update, self._drag)
 
     def _advance(self, live: Live, elapsed: float) -> None:
-        """Move the clock on, and the simulation with it."""
-        if not self._playing:
+        """Move the clock on, and the simulation with it, while somebody looks."""
+        if not self._playing or not self._server.get_clients():
             return
         self._cursor += elapsed * self._speed.value / live.period
         until = time.perf_counter() + _BUDGET
-        while len(live.past) <= self._cursor and not live.done and time.perf_counter() < until:
-            live.step()
+        while (
+            (ahead := int(self._cursor) + 1 - len(live.past)) > 0
+            and not live.done
+            and time.perf_counter() < until
+        ):
+            live.step(min(ahead, CHUNK))
         last = len(live.past) - 1
         if self._cursor > last:
             self._cursor = float(last)
@@ -175,19 +183,20 @@ class Page:
         with self._server.atomic():
             if self._drawn != (index, len(past)):
                 self._drawing.show(past, index)
-                self._time.max = max(push.live.period, (len(past) - 1) * push.live.period)
-                self._time.value = index * push.live.period
                 self._drawn = index, len(past)
             newest = index == len(past) - 1
             self._drawing.place_target(
-                push.live.p_world_target if newest else past[index].world.p_world_target[0]
+                push.live.p_world_target if newest else past[index].worlds.p_world_target[0]
             )
 
     def _tell(self) -> None:
         """Words and buttons."""
         lines = []
         if self._push is not None and self._push.live.past:
-            lines += [f"**{self._push.title}**", self._state(self._push.live)]
+            live = self._push.live
+            lines += [f"**{self._push.title}**", self._state(live)]
+            self._time.max = max(live.period, (len(live.past) - 1) * live.period)
+            self._time.value = int(self._cursor) * live.period
         if self._making is not None:
             lines.append("The push is being prepared; the first of a shape takes some seconds.")
         if self._error:
@@ -321,7 +330,7 @@ def open_page(host: str, port: int, asked: Asked, make: Callable[[Asked], Push])
         with socket.create_server((host, port)):  # viser would quietly take another port
             pass
     except OSError as error:
-        reason = error.strerror or str(error)
+        reason = (error.strerror or str(error)).partition(" (")[0]
         raise InputError(
             f"host = {host}, port = {port} cannot be served on ({reason}): choose another port."
         ) from error
@@ -332,11 +341,11 @@ def open_page(host: str, port: int, asked: Asked, make: Callable[[Asked], Push])
 def _furnish(server: ViserServer) -> None:
     """What is there without a push: camera, light, ground."""
     server.gui.configure_theme(
-        control_layout="collapsible",
         show_logo=False,
         show_share_button=False,  # it would send the scene to a server on the internet
-        brand_color=(13, 148, 141),
+        brand_color=(8, 84, 80),
     )
+    server.gui.main_panel.dock_right()
     server.gui.set_panel_label("Reactive Pushing Strategy")
     server.initial_camera.position, server.initial_camera.look_at = _CAMERA
     server.initial_camera.fov = _FIELD
