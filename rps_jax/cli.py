@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import errno
 import json
+import math
 import os
 import sys
 import time
@@ -27,6 +28,7 @@ from rps_jax.errors import InputError
 if TYPE_CHECKING:
     from rps_jax import view
     from rps_jax.domain import Domain
+    from rps_jax.film import Take
     from rps_jax.robustness import Plan, Shard
     from rps_jax.scene import Friction, Scene
     from rps_jax.slots import Progress, Setting, Timing
@@ -245,6 +247,34 @@ class Replay:
 
 
 @dataclass(frozen=True)
+class Film:
+    """Film many trials of a run at once, side by side: of a table its targets, of a sweep worlds."""
+
+    run: tyro.conf.Positional[Path]
+    """Run folder of `rps table` or `rps sweep`."""
+    grid: str = "4x6"
+    """Rows and columns of the film."""
+    object: str = "box"
+    """Of a table: the object."""
+    friction: str = "S1"
+    """Of a table: the friction."""
+    strategy: str = "rps"
+    """Of a table: the strategy."""
+    which: str = "first"
+    """Of a sweep: its first worlds, or its hardest."""
+    arm: str | None = None
+    """Of a sweep: which of its strategies with parameters; by default the first."""
+    seconds: float | None = None
+    """Simulated time that is filmed, at most [s]; by default until the last trial ends."""
+    speed: float | None = None
+    """Simulated seconds in a second of the film; by default the film lasts less than a minute."""
+    camera: str = "oblique"
+    """oblique or above."""
+    out: Path | None = None
+    """The MP4 to write; by default RUN/film.mp4."""
+
+
+@dataclass(frozen=True)
 class View(Conditions):
     """Push in the browser: watch, drag the target, shove the object, push again."""
 
@@ -405,6 +435,7 @@ Command = (
     | Annotated[Sweep, tyro.conf.subcommand("sweep")]
     | Annotated[Merge, tyro.conf.subcommand("merge")]
     | Annotated[Replay, tyro.conf.subcommand("replay")]
+    | Annotated[Film, tyro.conf.subcommand("film")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Tune, tyro.conf.subcommand("tune")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
@@ -431,6 +462,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Sweep: _sweep,
         Merge: _merge,
         Replay: _replay,
+        Film: _film_run,
         View: _view,
         Tune: _tune,
         Doctor: _doctor,
@@ -1193,6 +1225,81 @@ def _replay(options: Replay) -> None:
     if options.video:
         _film(robustness.scene_of(plan, options.index), trace, options.film_length, out)
     print(f"run folder: {out}")
+
+
+def _film_run(options: Film) -> None:
+    from tqdm import tqdm
+
+    from rps_jax import film, record, video
+
+    shape = film.shape_of(options.grid)
+    for name in ("seconds", "speed"):
+        if getattr(options, name) is not None:
+            errors.check_finite(name, getattr(options, name), above=0, at_most=1e5)
+    errors.check_name("camera", options.camera, ("oblique", "above"))
+    out = options.out or options.run / "film.mp4"
+    if out.is_dir():
+        raise InputError(f"out = {out} is a folder: name a file, as {out / 'film.mp4'}.")
+    takes, setting = _takes(options, shape[0] * shape[1])
+    record.writable(out.parent)
+    for what in video.check():
+        if not what.ok:
+            raise InputError(what.mend)
+    use_cache()
+    seconds = min(float(setting.rules.horizon), options.seconds or math.inf)
+    with tqdm(total=round(seconds), unit="s", desc="film") as bar:
+        film.shoot(
+            takes,
+            setting,
+            out,
+            shape=shape,
+            speed=options.speed or film.default_speed(seconds),
+            seconds=seconds,
+            camera=options.camera,
+            report=lambda simulated: bar.update(round(simulated) - bar.n),
+        )
+    print(f"film: {out}")
+
+
+def _takes(options: Film, count: int) -> tuple[list[Take], Setting]:
+    """The trials to film, at most so many, and what they share."""
+    from rps_jax import film, paper, record
+
+    if (options.run / record.MANIFEST).exists():
+        plan, arm = _one_world(options.run, 0, options.arm)
+        return film.of_sweep(options.run, plan, arm, options.which, count), plan.setting
+    table = _table_of(options.run)
+    for field, name in (
+        ("objects", options.object),
+        ("friction", options.friction),
+        ("strategies", options.strategy),
+    ):
+        errors.check_name(f"{field} of the run", name, getattr(table, field))
+    table = dataclasses.replace(
+        table,
+        objects=(options.object,),
+        friction=(options.friction,),
+        strategies=(options.strategy,),
+    )
+    setting = _setting(table)
+    return film.of_cases(_cases(table, (table.targets or paper.TARGETS)[:count]), setting), setting
+
+
+def _table_of(run: Path) -> Table:
+    """What was asked of `rps table` for the run in a folder."""
+    try:
+        asked = json.loads((run / "config.json").read_text())["options"]
+        return Table(**{name: _tuples(value) for name, value in asked.items()})
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"run = {run} holds neither a table nor a sweep: give the folder of `rps table` or "
+            "`rps sweep`."
+        ) from error
+
+
+def _tuples(value: Any) -> Any:
+    """JSON's lists as tuples."""
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def _view(options: View) -> None:

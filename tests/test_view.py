@@ -5,7 +5,7 @@ import math
 import shutil
 import socket
 import sys
-import threading
+import time
 from dataclasses import replace
 
 import imageio.v3 as imageio
@@ -14,7 +14,6 @@ import pytest
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
-from selenium.webdriver.support.ui import WebDriverWait
 
 from rps_jax import cli, scene, sweep, view
 from rps_jax.errors import InputError
@@ -130,7 +129,7 @@ def test_a_disturbance_that_means_nothing_is_refused(live, wrong):
 FLAGS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--window-size=700,560"),
+    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--window-size=800,640"),
 )
 ASKED = view.Asked("cylinder", "S1", "rps", (0.0, 2.0))
 
@@ -147,12 +146,8 @@ def make(asked):
 @pytest.fixture
 def page():
     page = view.open_page("127.0.0.1", 0, ASKED, make)
-    page.begin(lambda: make(ASKED))
-    thread = threading.Thread(target=page.run)
-    thread.start()
     yield page
     page.close()
-    thread.join()
 
 
 @pytest.fixture
@@ -178,29 +173,38 @@ def button(browser, name):
 
 
 def test_the_page_plays_a_push_and_says_what_is_wrong(page, browser):
-    browser.get(page.url)
-    wait = WebDriverWait(browser, 60)
-
     def text():
         return browser.find_element(By.TAG_NAME, "body").text
 
-    wait.until(lambda _: "A drum" in text() and "line contact" in text())
+    def until(met):
+        """Have the page go on, at a pace at which a processor can draw it, until this is so."""
+        began = time.monotonic()
+        while not met():
+            assert time.monotonic() - began < 90, text()
+            page.tick(0.1)
+            time.sleep(0.2)
+
+    browser.get(page.url)
+    page.begin(lambda: make(ASKED))
+    until(lambda: "line contact" in text())
+    browser.find_element(By.CSS_SELECTOR, "[class*=Notification-closeButton]").click()
+    until(lambda: not browser.find_elements(By.CSS_SELECTOR, "[class*=Notification-closeButton]"))
     first = picture(browser)
     assert len(np.unique(first.reshape(-1, 3), axis=0)) > 300
     scenery = slice(0, first.shape[1] // 2)  # left of the panel
-    wait.until(lambda _: np.any(np.abs(first.astype(int) - picture(browser))[:, scenery] > 60))
+    until(lambda: np.any(np.abs(first.astype(int) - picture(browser))[:, scenery] > 60))
 
     button(browser, "Pause").click()
-    wait.until(lambda _: button(browser, "Play"))
+    until(lambda: "Play" in text())
     button(browser, "Shove").click()
-    wait.until(lambda _: "no contact" in text())
+    until(lambda: "Pause" in text())
 
     field = browser.find_element(By.CSS_SELECTOR, "input[value='S1']")
     field.clear()
     field.send_keys("S3")
-    wait.until(lambda _: page.asked.friction == "S3")
+    until(lambda: page.asked.friction == "S3")
     button(browser, "Push").click()
-    wait.until(lambda _: "unknown friction set 'S3': choose from S1, S2." in text())
+    until(lambda: "unknown friction set 'S3': choose from S1, S2." in text())
 
 
 def rps(*arguments):
