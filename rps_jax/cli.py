@@ -248,7 +248,7 @@ class Replay:
 
 @dataclass(frozen=True)
 class Film:
-    """Film many trials of a run at once, side by side: of a table its targets, of a sweep worlds."""
+    """Film many trials of a run side by side: the targets of a table, or worlds of a sweep."""
 
     run: tyro.conf.Positional[Path]
     """Run folder of `rps table` or `rps sweep`."""
@@ -1247,7 +1247,7 @@ def _film_run(options: Film) -> None:
             raise InputError(what.mend)
     use_cache()
     seconds = min(float(setting.rules.horizon), options.seconds or math.inf)
-    with tqdm(total=round(seconds), unit="s", desc="film") as bar:
+    with tqdm(total=round(seconds), unit="s", desc="film") as bar, _one_sentence(video.VideoError):
         film.shoot(
             takes,
             setting,
@@ -1259,6 +1259,15 @@ def _film_run(options: Film) -> None:
             report=lambda simulated: bar.update(round(simulated) - bar.n),
         )
     print(f"film: {out}")
+
+
+@contextlib.contextmanager
+def _one_sentence(kind: type[Exception]) -> Iterator[None]:
+    """Report an exception that is a sentence as bad input."""
+    try:
+        yield
+    except kind as error:
+        raise InputError(str(error)) from error
 
 
 def _takes(options: Film, count: int) -> tuple[list[Take], Setting]:

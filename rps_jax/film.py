@@ -197,6 +197,8 @@ def _shots(take: Take, setting: Setting, every: int) -> Iterator[tuple[bool, lis
         steps=every,
         every=every,
     )
+    shots: list[Shot] = []
+    ended = np.zeros(len(take.labels), bool)
     while True:
         done, success, steps = jax.device_get((trials.done, trials.success, trials.steps))
         trials, snapshots = advance(trials)
@@ -204,9 +206,12 @@ def _shots(take: Take, setting: Setting, every: int) -> Iterator[tuple[bool, lis
         contacts = np.asarray(trial.p_world_contact(seen))
         time = steps * setting.physics.control_period
         shots = [
-            Shot(seen.qpos[i], contacts[i], f"{label}, {_how(done[i], success[i], time[i])}")
+            shots[i]  # the same again, which need not be drawn again
+            if ended[i]
+            else Shot(seen.qpos[i], contacts[i], f"{label}, {_how(done[i], success[i], time[i])}")
             for i, label in enumerate(take.labels)
         ]
+        ended = done
         yield bool(done.all()), shots
 
 

@@ -193,7 +193,8 @@ def render_grid(
 
     Args:
       tiles: of the grid, row by row; it may have room for more.
-      frames: what each tile shows in each frame.
+      frames: what each tile shows in each frame; one that shows the very same as in the frame
+        before is not drawn again.
       path: the file to write.
       shape: rows and columns of the grid.
       size: width and height of a tile [px], even numbers.
@@ -213,19 +214,27 @@ def render_grid(
         )
     whole = np.full((rows * height, columns * width, 3), _EMPTY, np.uint8)
     cells = whole.reshape(rows, height, columns, width, 3).swapaxes(1, 2)
-    font = ImageFont.load_default(size=max(9, height // _LABEL))
     with (
         _studios(tiles, size, camera) as studios,
         _encoder(Path(path), (columns * width, rows * height), fps) as sink,
     ):
+        shown: list[Shot | None] = [None] * len(tiles)
         for shots in frames:
             for i, (studio, shot) in enumerate(zip(studios, shots, strict=True)):
-                image = Image.fromarray(studio.draw(shot.qpos, shot.p_world_contact))
-                draw = ImageDraw.Draw(image)
-                draw.text((5, 3), shot.label, "white", font, stroke_width=2, stroke_fill=_INK)
-                draw.rectangle((0, 0, width - 1, height - 1), outline=_INK)
-                cells[divmod(i, columns)] = image
+                if shot is not shown[i]:
+                    cells[divmod(i, columns)] = _labelled(studio, shot)
+                    shown[i] = shot
             sink(whole)
+
+
+def _labelled(studio: _Studio, shot: Shot) -> Image.Image:
+    """A tile with its label and a line around it."""
+    image = Image.fromarray(studio.draw(shot.qpos, shot.p_world_contact))
+    font = ImageFont.load_default(size=max(9, image.height // _LABEL))
+    draw = ImageDraw.Draw(image)
+    draw.text((5, 3), shot.label, "white", font, stroke_width=2, stroke_fill=_INK)
+    draw.rectangle((0, 0, image.width - 1, image.height - 1), outline=_INK)
+    return image
 
 
 def _check_film(size: tuple[int, int], fps: float) -> None:
