@@ -1240,8 +1240,9 @@ def _film_run(options: Film) -> None:
     out = options.out or options.run / "film.mp4"
     if out.is_dir():
         raise InputError(f"out = {out} is a folder: name a file, as {out / 'film.mp4'}.")
+    if options.out:
+        record.writable(out.parent)
     takes, setting = _takes(options, shape[0] * shape[1])
-    record.writable(out.parent)
     for what in video.check():
         if not what.ok:
             raise InputError(what.mend)

@@ -145,7 +145,7 @@ class Live:
         # Half a period early, so that rounding cannot put it off by a step, nor repeat it.
         time = (self._now.steps - 0.5) * self.period
         dtype = self._worlds.qpos.dtype
-        shift = Shift(np.asarray(time, dtype), np.array([by], dtype))
+        shift = Shift(jnp.asarray(time, dtype), jnp.array([by], dtype))
         self._worlds = self._worlds._replace(shift=shift)
         self._go_on()
 

@@ -227,14 +227,14 @@ def render_grid(
             sink(whole)
 
 
-def _labelled(studio: _Studio, shot: Shot) -> Image.Image:
+def _labelled(studio: _Studio, shot: Shot) -> np.ndarray:
     """A tile with its label and a line around it."""
     image = Image.fromarray(studio.draw(shot.qpos, shot.p_world_contact))
     font = ImageFont.load_default(size=max(9, image.height // _LABEL))
     draw = ImageDraw.Draw(image)
     draw.text((5, 3), shot.label, "white", font, stroke_width=2, stroke_fill=_INK)
     draw.rectangle((0, 0, image.width - 1, image.height - 1), outline=_INK)
-    return image
+    return np.asarray(image)
 
 
 def _check_film(size: tuple[int, int], fps: float) -> None:

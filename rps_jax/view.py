@@ -28,6 +28,7 @@ from rps_jax.scene import Scene
 from rps_jax.skin import NONE
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
     from viser import ViserServer
 
 _TICK = 0.04  # [s] between two pictures
@@ -412,10 +413,11 @@ class _Drawing:
             )
         }
 
-    def place_target(self, p_world_target: np.ndarray) -> None:
+    def place_target(self, p_world_target: ArrayLike) -> None:
         """Put the target at (2,) [m], unless a hand holds it."""
         if not self.held:
-            self.target.position = (float(p_world_target[0]), float(p_world_target[1]), 0.0)
+            x, y = np.asarray(p_world_target, float)
+            self.target.position = (x, y, 0.0)
 
     def show(self, past: Sequence[Moment], index: int) -> None:
         """Draw one moment, and the paths up to there."""

@@ -27,11 +27,16 @@ def table(folder):
     record.write_json(folder / "config.json", {"options": options})
 
 
-def sweep(folder):
-    """A run of `rps sweep` with two worlds, of different objects."""
-    domain = dataclasses.replace(DOMAINS["wide"], objects=("random_box", "random_cylinder"))
+def plan_of(*names):
+    """Two worlds of each of these objects."""
+    domain = dataclasses.replace(DOMAINS["wide"], objects=names)
     setting = Setting(rules=Rules(horizon=20.0), engine=ENGINE)
-    robustness.open_run(folder, Plan(domain, 2, {"rps": paper.PARAMS["rps"]}, setting))
+    return Plan(domain, 2 * len(names), {"rps": paper.PARAMS["rps"]}, setting)
+
+
+def sweep(folder):
+    """A run of `rps sweep`, as far as a film reads it."""
+    robustness.open_run(folder, plan_of("random_cylinder"))
 
 
 def tiles(images, rows, columns):
@@ -61,6 +66,16 @@ def test_a_film_shows_each_trial_in_its_tile_and_holds_the_end(make, tmp_path):
         assert not differ(cells[5, 0, column], cells[-1, 0, column])
     assert np.abs(cells[:, 0, 2:] - 58).max() < 10  # no trials there
     assert np.abs(cells[:, 1] - 58).max() < 10
+
+
+def test_worlds_of_several_objects_keep_their_order(tmp_path):
+    plan = plan_of("random_cylinder", "random_box")
+    takes = film.of_sweep(tmp_path, plan, "rps", "first", 3)
+    assert [list(take.places) for take in takes] == [[0, 2], [1]]
+    assert film._placed([take.labels for take in takes], takes) == [f"world {i}" for i in range(3)]
+    assert [scene.family for scene in film._placed([t.scenes for t in takes], takes)] == [
+        *("cylinder", "box", "cylinder")
+    ]
 
 
 def test_a_trial_that_has_ended_is_told_and_not_drawn_again(tmp_path):
