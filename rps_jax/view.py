@@ -263,8 +263,13 @@ class Page:
         self._when(self._again.on_click, self._ask)
 
     def _toggle(self, event: Any) -> None:
+        """Play or pause; at its end a push is played again."""
         del event
         self._playing = not self._playing
+        if self._playing and self._push is not None:
+            live = self._push.live
+            if live.done and int(self._cursor) == len(live.past) - 1:
+                self._cursor = 0.0
 
     def _seek(self, event: Any) -> None:
         """Stop, and look at another moment."""
