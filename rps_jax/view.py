@@ -171,7 +171,7 @@ class Page:
         ):
             live.step(min(ahead, CHUNK))
         last = len(live.past) - 1
-        if self._cursor > last:
+        if int(self._cursor) > last:
             self._cursor = float(last)
             self._playing = not live.done
 
