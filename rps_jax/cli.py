@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import errno
 import json
+import math
 import os
 import sys
 import time
@@ -25,7 +26,9 @@ from rps_jax import errors
 from rps_jax.errors import InputError
 
 if TYPE_CHECKING:
+    from rps_jax import view
     from rps_jax.domain import Domain
+    from rps_jax.film import Take
     from rps_jax.law import RPSParams
     from rps_jax.robustness import Plan, Shard
     from rps_jax.scene import Friction, Scene
@@ -56,8 +59,8 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class Common:
-    """Options that every run takes."""
+class Conditions:
+    """What the trials that are asked for one by one have in common."""
 
     params: tuple[str, ...] = ()
     """Parameters to change from the paper's, as name=value; those of APS as aps.name=value."""
@@ -88,6 +91,12 @@ class Common:
     """Longest trial [s]."""
     seed: int = 0
     """Seed of the skin's imperfections."""
+
+
+@dataclass(frozen=True)
+class Common(Conditions):
+    """Options that every run of such trials takes."""
+
     out: Path | None = None
     """Run folder; by default runs/<command>-<time>."""
     overwrite: bool = False
@@ -239,6 +248,60 @@ class Replay:
 
 
 @dataclass(frozen=True)
+class Film:
+    """Film many trials of a run side by side: the targets of a table, or worlds of a sweep."""
+
+    run: tyro.conf.Positional[Path]
+    """Run folder of `rps table` or `rps sweep`."""
+    grid: str = "4x6"
+    """Rows and columns of the film."""
+    object: str = "box"
+    """Of a table: the object."""
+    friction: str = "S1"
+    """Of a table: the friction."""
+    strategy: str = "rps"
+    """Of a table: the strategy."""
+    which: str = "first"
+    """Of a sweep: its first worlds, or its hardest."""
+    arm: str | None = None
+    """Of a sweep: which of its strategies with parameters; by default the first."""
+    seconds: float | None = None
+    """Simulated time that is filmed, at most [s]; by default until the last trial ends."""
+    speed: float | None = None
+    """Simulated seconds in a second of the film; by default the film lasts less than a minute."""
+    camera: str = "oblique"
+    """oblique or above."""
+    out: Path | None = None
+    """The MP4 to write; by default RUN/film.mp4."""
+
+
+@dataclass(frozen=True)
+class View(Conditions):
+    """Push in the browser: watch, drag the target, shove the object, push again."""
+
+    run: tyro.conf.Positional[Path | None] = None
+    """Run folder of a sweep, to begin with one of its worlds; by default the options' push."""
+    index: tyro.conf.Positional[int] = 0
+    """Index of the world in the sweep."""
+    arm: str | None = None
+    """Which of the sweep's strategies with parameters; by default the first."""
+    object: str = "box"
+    """Object to push."""
+    target: tuple[float, float] = (-2.0, 0.0)
+    """Target x y [m]."""
+    friction: str = "S1"
+    """S1, S2 or ground,robot (as 0.25,0.4)."""
+    strategy: str = "rps"
+    """rps, nps or aps."""
+    engine: str = "fused"
+    """fused, mjx or quasistatic."""
+    host: str = "127.0.0.1"
+    """Address to serve the page on; by default to this machine alone."""
+    port: int = 8080
+    """Port to serve the page on; 0 takes any that is free."""
+
+
+@dataclass(frozen=True)
 class TuneOptions(Spread):
     """What every tuner takes."""
 
@@ -373,6 +436,8 @@ Command = (
     | Annotated[Sweep, tyro.conf.subcommand("sweep")]
     | Annotated[Merge, tyro.conf.subcommand("merge")]
     | Annotated[Replay, tyro.conf.subcommand("replay")]
+    | Annotated[Film, tyro.conf.subcommand("film")]
+    | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Tune, tyro.conf.subcommand("tune")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )
@@ -398,6 +463,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Sweep: _sweep,
         Merge: _merge,
         Replay: _replay,
+        Film: _film_run,
+        View: _view,
         Tune: _tune,
         Doctor: _doctor,
     }
@@ -474,7 +541,7 @@ def _assignments(kind: str, texts: Sequence[str], known: Sequence[str]) -> dict[
     return values
 
 
-def _params(common: Common, names: Sequence[str]) -> dict[str, Params]:
+def _params(common: Conditions, names: Sequence[str]) -> dict[str, Params]:
     """The parameters of these strategies, with the changes that are asked for."""
     from rps_jax import strategies
 
@@ -518,7 +585,7 @@ def _friction(text: str) -> Friction:
     return scene.Friction(ground, robot)
 
 
-def _setting(common: Common) -> Setting:
+def _setting(common: Conditions) -> Setting:
     from rps_jax import engines
     from rps_jax.physics import preset
     from rps_jax.slots import Setting
@@ -538,7 +605,7 @@ def _setting(common: Common) -> Setting:
     )
 
 
-def _per_world(common: Common) -> dict[str, Any]:
+def _per_world(common: Conditions) -> dict[str, Any]:
     """The options that become fields of every case."""
     from rps_jax import paper, skin
 
@@ -551,6 +618,20 @@ def _per_world(common: Common) -> dict[str, Any]:
         "gap": common.gap,
         "rear": common.rear,
     }
+
+
+def _case(
+    common: Conditions,
+    name: str,
+    friction: str,
+    strategy: str,
+    p_world_target: tuple[float, float],
+) -> Case:
+    """One trial, of an object by its name."""
+    from rps_jax import sweep
+
+    params = _params(common, [strategy])[strategy]
+    return sweep.Case(name, _friction(friction), p_world_target, params, **_per_world(common))
 
 
 def _cases(options: Table, targets: Sequence[tuple[float, float]]) -> list[Case]:
@@ -665,13 +746,7 @@ def _push(options: Push) -> None:
 
     setting = _setting(options)
     params = _params(options, [options.strategy])
-    case = sweep.Case(
-        options.object,
-        _friction(options.friction),
-        options.target,
-        params[options.strategy],
-        **_per_world(options),
-    )
+    case = _case(options, options.object, options.friction, options.strategy, options.target)
     sweep.check_followed(options.engine)
     errors.check_finite("film_length", options.film_length, above=0, at_most=600, unit="s")
     out = _open(options, "push")
@@ -1137,18 +1212,26 @@ def _course(options: TuneOptions) -> Course:
     )
 
 
+def _one_world(run: Path, index: int, arm: str | None) -> tuple[Plan, str]:
+    """The plan of a sweep, one of whose worlds can be followed, and the arm that is meant."""
+    from rps_jax import robustness, sweep
+
+    plan = robustness.load_plan(run)
+    arms = list(plan.arms)
+    name = errors.check_name("arm", arm or arms[0], arms)
+    errors.check_count("index", index, at_least=0, at_most=plan.worlds - 1)
+    sweep.check_followed(plan.setting.engine)
+    return plan, name
+
+
 def _replay(options: Replay) -> None:
     from rps_jax import record, robustness, strategies, sweep
 
-    plan = robustness.load_plan(options.run)
-    arms = list(plan.arms)
-    name = errors.check_name("arm", options.arm or arms[0], arms)
-    errors.check_count("index", options.index, at_least=0, at_most=plan.worlds - 1)
+    plan, name = _one_world(options.run, options.index, options.arm)
     errors.check_finite("film_length", options.film_length, above=0, at_most=600, unit="s")
-    sweep.check_followed(plan.setting.engine)
     out = record.writable(options.out or options.run / f"replay-{options.index}")
     use_cache()
-    part = robustness.world_part(plan, arms.index(name), [options.index])
+    part = robustness.world_part(plan, list(plan.arms).index(name), [options.index])
     strategy = strategies.of(plan.arms[name])
     with _clock(float(plan.setting.rules.horizon)) as report:
         (trace,) = sweep.follow_part(part, strategy, plan.setting, report=report)
@@ -1156,6 +1239,138 @@ def _replay(options: Replay) -> None:
     if options.video:
         _film(robustness.scene_of(plan, options.index), trace, options.film_length, out)
     print(f"run folder: {out}")
+
+
+def _film_run(options: Film) -> None:
+    from tqdm import tqdm
+
+    from rps_jax import film, record, video
+
+    shape = film.shape_of(options.grid)
+    for name in ("seconds", "speed"):
+        if getattr(options, name) is not None:
+            errors.check_finite(name, getattr(options, name), above=0, at_most=1e5)
+    errors.check_name("camera", options.camera, ("oblique", "above"))
+    out = options.out or options.run / "film.mp4"
+    if out.is_dir():
+        raise InputError(f"out = {out} is a folder: name a file, as {out / 'film.mp4'}.")
+    if options.out:
+        record.writable(out.parent)
+    takes, setting = _takes(options, shape[0] * shape[1])
+    for what in video.check():
+        if not what.ok:
+            raise InputError(what.mend)
+    use_cache()
+    seconds = min(float(setting.rules.horizon), options.seconds or math.inf)
+    with tqdm(total=round(seconds), unit="s", desc="film") as bar, _one_sentence(video.VideoError):
+        film.shoot(
+            takes,
+            setting,
+            out,
+            shape=shape,
+            speed=options.speed or film.default_speed(seconds),
+            seconds=seconds,
+            camera=options.camera,
+            report=lambda simulated: bar.update(round(simulated) - bar.n),
+        )
+    print(f"film: {out}")
+
+
+@contextlib.contextmanager
+def _one_sentence(kind: type[Exception]) -> Iterator[None]:
+    """Report an exception that is a sentence as bad input."""
+    try:
+        yield
+    except kind as error:
+        raise InputError(str(error)) from error
+
+
+def _takes(options: Film, count: int) -> tuple[list[Take], Setting]:
+    """The trials to film, at most so many, and what they share."""
+    from rps_jax import film, paper, record
+
+    if (options.run / record.MANIFEST).exists():
+        plan, arm = _one_world(options.run, 0, options.arm)
+        return film.of_sweep(options.run, plan, arm, options.which, count), plan.setting
+    table = _table_of(options.run)
+    for field, name in (
+        ("objects", options.object),
+        ("friction", options.friction),
+        ("strategies", options.strategy),
+    ):
+        errors.check_name(f"{field} of the run", name, getattr(table, field))
+    table = dataclasses.replace(
+        table,
+        objects=(options.object,),
+        friction=(options.friction,),
+        strategies=(options.strategy,),
+    )
+    setting = _setting(table)
+    return film.of_cases(_cases(table, (table.targets or paper.TARGETS)[:count]), setting), setting
+
+
+def _table_of(run: Path) -> Table:
+    """What was asked of `rps table` for the run in a folder."""
+    try:
+        asked = json.loads((run / "config.json").read_text())["options"]
+        return Table(**{name: _tuples(value) for name, value in asked.items()})
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"run = {run} holds neither a table nor a sweep: give the folder of `rps table` or "
+            "`rps sweep`."
+        ) from error
+
+
+def _tuples(value: Any) -> Any:
+    """JSON's lists as tuples."""
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+def _view(options: View) -> None:
+    from rps_jax import sweep, view
+
+    asked = view.Asked(options.object, options.friction, options.strategy, options.target)
+    make = partial(_push_of, options, _setting(options))
+    _case(options, *asked)
+    sweep.check_followed(options.engine)
+    first = partial(make, asked)
+    if options.run is not None:
+        plan, name = _one_world(options.run, options.index, options.arm)
+        first = partial(_push_in_world, plan, name, options.index)
+    page = view.open_page(options.host, options.port, asked, make)
+    use_cache()
+    print(f"page: {page.url} (Ctrl-C ends it)", flush=True)
+    try:
+        page.begin(first)
+        page.run()
+    except KeyboardInterrupt:
+        print("page closed.")
+    finally:
+        page.close()
+
+
+def _push_of(options: View, setting: Setting, asked: view.Asked) -> view.Push:
+    """The push that the page asks for."""
+    from rps_jax import sweep, view
+    from rps_jax.live import Live
+
+    case = _case(options, *asked)
+    title = (
+        f"{case.object.replace('_', ' ')}, friction ground {case.friction.ground:g}, robot "
+        f"{case.friction.robot:g}, {asked.strategy}"
+    )
+    return view.Push(Live.of_case(case, setting), sweep.scene_of(case, setting.physics), title)
+
+
+def _push_in_world(plan: Plan, arm: str, index: int) -> view.Push:
+    """A world of a sweep."""
+    from rps_jax import robustness, strategies, view
+    from rps_jax.live import Live
+
+    part = robustness.world_part(plan, list(plan.arms).index(arm), [index])
+    live = Live(part, strategies.of(plan.arms[arm]), plan.setting)
+    title = robustness.title_of(plan, index).replace("$\\mu$", "friction")
+    return view.Push(live, robustness.scene_of(plan, index), f"{title}, {arm}")
 
 
 def _doctor(_: Doctor) -> None:

@@ -200,14 +200,20 @@ def _shifted(world: World, trial: Trial, period: float) -> Trial:
     return trial._replace(qpos=trial.qpos.at[x : x + 2].add(jnp.where(now, by, 0.0)))
 
 
+def outline(world: World, qpos: jax.Array) -> Footprint:
+    """The object's outline in the robot frame, where qpos (10,) has them both."""
+    p_world_robot, yaw = qpos[:2], qpos[2]
+    p_world_object, object_yaw = object_pose(qpos)
+    p_robot_object = frames.rotate(-yaw, p_world_object - p_world_robot)
+    return fp.place(world.footprint, p_robot_object, object_yaw - yaw)
+
+
 def sense(
     world: World, trial: Trial, period: float
 ) -> tuple[SkinState, Reading | SmoothReading, Observation]:
     """The skin's reading of the object where it stands now, and what the law is told."""
     p_world_robot, yaw = trial.qpos[:2], trial.qpos[2]
-    p_world_object, object_yaw = object_pose(trial.qpos)
-    p_robot_object = frames.rotate(-yaw, p_world_object - p_world_robot)
-    placed = fp.place(world.footprint, p_robot_object, object_yaw - yaw)
+    placed = outline(world, trial.qpos)
     state, reading = world.skin.sense(trial.skin, placed, period)
     observation = Observation(
         p_world_robot, yaw, reading.p_robot_contact, reading.in_contact, world.p_world_target

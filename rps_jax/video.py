@@ -15,11 +15,12 @@ import sys
 import tempfile
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
 from rps_jax import errors
 
@@ -33,11 +34,14 @@ SIZE = (960, 540)  # [px] width, height
 _TRAIL_STEP = 0.02  # [m] between the points of a trail
 _TRAIL_POINTS = 1500  # at most, so that memory stays flat: 30 m; the oldest go first
 _TRAIL_WIDTH = 0.007  # [1] of the image's height
-_BASE_RGBA = (0.08, 0.09, 0.11, 1.0)
-_CONTACT_RGBA = (0.62, 0.04, 0.46, 1.0)
-_CONTACT_HEIGHT = 0.36  # [m] just above the chassis, which would hide the marker from above
-_CONTACT_RADIUS = 0.04  # [m]
+BASE_RGBA = (0.08, 0.09, 0.11, 1.0)
+CONTACT_RGBA = (0.62, 0.04, 0.46, 1.0)
+CONTACT_HEIGHT = 0.36  # [m] just above the chassis, which would hide the marker from above
+CONTACT_RADIUS = 0.04  # [m]
 _NO_CONTACT = np.full(2, np.nan)
+_EMPTY = 58  # grey of a place in a grid without a trial
+_INK = (24, 26, 30)  # RGB around labels and tiles
+_LABEL = 13  # [1] heights of a label in a tile
 
 _MEND_GL = (
     "MuJoCo cannot draw on this machine: install Mesa's EGL library (`apt install libegl1 "
@@ -48,6 +52,21 @@ _MEND_FFMPEG = "ffmpeg was not found or does not run: run `pip install imageio-f
 
 class VideoError(RuntimeError):
     """No picture or video could be made: one sentence that says how to mend it."""
+
+
+class Tile(NamedTuple):
+    """A trial in a grid of trials."""
+
+    scene: Scene
+    p_world_target: ArrayLike  # (2,) [m]
+
+
+class Shot(NamedTuple):
+    """What a tile shows in one frame."""
+
+    qpos: ArrayLike  # (10,) as for `snapshot`
+    p_world_contact: ArrayLike  # (2,) [m], NaN without contact
+    label: str
 
 
 class Check(NamedTuple):
@@ -110,7 +129,7 @@ def images(
     camera: str = "oblique",
 ) -> list[np.ndarray]:
     """Pictures as of `snapshot`, each with the path of the base up to there."""
-    with _studio(scene, p_world_target, size, camera) as studio:
+    with _studios([Tile(scene, p_world_target)], size, camera) as (studio,):
         return [studio.draw(qpos, _NO_CONTACT) for qpos in frames]
 
 
@@ -145,19 +164,83 @@ def render(
       ValueError: not as many contacts as frames.
       VideoError: this machine cannot draw or encode, or `path` cannot be written.
     """
-    errors.check_finite("fps", fps, above=0, at_most=1000)
-    if any(n % 2 for n in size):
-        raise errors.InputError(f"size = {size} is not allowed: H.264 needs two even numbers.")
+    _check_film(size, fps)
     pairs = _paired(frames, p_world_contacts)
     first = next(pairs, None)
     if first is None:
         raise errors.InputError("frames = [] is not allowed: a video needs at least one frame.")
     with (
-        _studio(scene, p_world_target, size, camera) as studio,
+        _studios([Tile(scene, p_world_target)], size, camera) as (studio,),
         _encoder(Path(path), size, fps) as sink,
     ):
         for qpos, p_world_contact in itertools.chain([first], pairs):
             sink(np.ascontiguousarray(studio.draw(qpos, p_world_contact)))
+
+
+def render_grid(
+    tiles: Sequence[Tile],
+    frames: Iterable[Sequence[Shot]],
+    path: str | os.PathLike[str],
+    *,
+    shape: tuple[int, int],
+    size: tuple[int, int],
+    fps: int = 25,
+    camera: str = "oblique",
+) -> None:
+    """Write an MP4 as of `render` of many trials side by side.
+
+    Each frame is drawn tile by tile into one image and encoded at once.
+
+    Args:
+      tiles: of the grid, row by row; it may have room for more.
+      frames: what each tile shows in each frame; one that shows the very same as in the frame
+        before is not drawn again.
+      path: the file to write.
+      shape: rows and columns of the grid.
+      size: width and height of a tile [px], even numbers.
+      fps: frames per second of the video.
+      camera: name of a camera of the scenes: oblique or above.
+
+    Raises:
+      InputError: no tiles, more than there is room for, or as for `render`.
+      VideoError: this machine cannot draw or encode, or `path` cannot be written.
+    """
+    _check_film(size, fps)
+    (rows, columns), (width, height) = shape, size
+    if not 0 < len(tiles) <= rows * columns:
+        raise errors.InputError(
+            f"grid = {rows}x{columns} is not allowed for {len(tiles)} trials: it must have room "
+            "for all, and at least one."
+        )
+    whole = np.full((rows * height, columns * width, 3), _EMPTY, np.uint8)
+    cells = whole.reshape(rows, height, columns, width, 3).swapaxes(1, 2)
+    with (
+        _studios(tiles, size, camera) as studios,
+        _encoder(Path(path), (columns * width, rows * height), fps) as sink,
+    ):
+        shown: list[Shot | None] = [None] * len(tiles)
+        for shots in frames:
+            for i, (studio, shot) in enumerate(zip(studios, shots, strict=True)):
+                if shot is not shown[i]:
+                    cells[divmod(i, columns)] = _labelled(studio, shot)
+                    shown[i] = shot
+            sink(whole)
+
+
+def _labelled(studio: _Studio, shot: Shot) -> np.ndarray:
+    """A tile with its label and a line around it."""
+    image = Image.fromarray(studio.draw(shot.qpos, shot.p_world_contact))
+    font = ImageFont.load_default(size=max(9, image.height // _LABEL))
+    draw = ImageDraw.Draw(image)
+    draw.text((5, 3), shot.label, "white", font, stroke_width=2, stroke_fill=_INK)
+    draw.rectangle((0, 0, image.width - 1, image.height - 1), outline=_INK)
+    return np.asarray(image)
+
+
+def _check_film(size: tuple[int, int], fps: float) -> None:
+    errors.check_finite("fps", fps, above=0, at_most=1000)
+    if any(n % 2 for n in size):
+        raise errors.InputError(f"size = {size} is not allowed: H.264 needs two even numbers.")
 
 
 def _paired(
@@ -200,8 +283,8 @@ class _Studio:
         self.data = self.mujoco.MjData(scene.model)
         self.data.mocap_pos[scene.model.body("target").mocapid[0], :2] = target
         self.camera = camera
-        self.base_trail = _Trail(_BASE_RGBA, 0.006)
-        self.contact_trail = _Trail(_CONTACT_RGBA, 0.010)
+        self.base_trail = _Trail(BASE_RGBA, 0.006)
+        self.contact_trail = _Trail(CONTACT_RGBA, 0.010)
 
     def draw(self, qpos: ArrayLike, p_world_contact: ArrayLike) -> np.ndarray:
         """One image (height, width, 3) uint8, and a step further along the trails."""
@@ -229,9 +312,9 @@ class _Studio:
             self.mujoco.mjv_connector(geom, geom.type, width, *ends)
 
     def _add_marker(self, point: np.ndarray) -> None:
-        position = np.array([*point, _CONTACT_HEIGHT])
-        size = np.full(3, _CONTACT_RADIUS)
-        geom = self._new_geom("mjGEOM_SPHERE", size, position, _CONTACT_RGBA)
+        position = np.array([*point, CONTACT_HEIGHT])
+        size = np.full(3, CONTACT_RADIUS)
+        geom = self._new_geom("mjGEOM_SPHERE", size, position, CONTACT_RGBA)
         if geom is not None:
             geom.emission = 1.0  # seen in the shadow of the object too
 
@@ -249,18 +332,28 @@ class _Studio:
 
 
 @contextlib.contextmanager
-def _studio(
-    scene: Scene, p_world_target: ArrayLike, size: tuple[int, int], camera: str
-) -> Iterator[_Studio]:
-    """A studio whose renderer is closed at the end; an open one complains when Python exits."""
-    model = scene.model
-    errors.check_name("camera", camera, [model.camera(i).name for i in range(model.ncam)])
-    target = _checked("p_world_target", p_world_target, 2)
-    limits = (model.vis.global_.offwidth, model.vis.global_.offheight)
-    for n, limit in zip(size, limits, strict=True):
-        errors.check_finite("size", n, at_least=2, at_most=limit, unit="px")
-    with _renderer(model, size) as renderer:
-        yield _Studio(renderer, scene, camera, target)
+def _studios(tiles: Sequence[Tile], size: tuple[int, int], camera: str) -> Iterator[list[_Studio]]:
+    """A studio for each tile, those of one scene with one renderer.
+
+    Renderers are closed at the end; an open one complains when Python exits.
+    """
+    targets = []
+    for scene, p_world_target in tiles:
+        model = scene.model
+        errors.check_name("camera", camera, [model.camera(i).name for i in range(model.ncam)])
+        targets.append(_checked("p_world_target", p_world_target, 2))
+        limits = (model.vis.global_.offwidth, model.vis.global_.offheight)
+        for n, limit in zip(size, limits, strict=True):
+            errors.check_finite("size", n, at_least=2, at_most=limit, unit="px")
+    with contextlib.ExitStack() as stack:
+        renderers: dict[int, Any] = {}
+        for scene, _ in tiles:
+            if id(scene.model) not in renderers:
+                renderers[id(scene.model)] = stack.enter_context(_renderer(scene.model, size))
+        yield [
+            _Studio(renderers[id(scene.model)], scene, camera, target)
+            for (scene, _), target in zip(tiles, targets, strict=True)
+        ]
 
 
 def _checked(name: str, values: ArrayLike, length: int) -> np.ndarray:
@@ -285,12 +378,17 @@ def _import_mujoco() -> Any:
 def _renderer(model: Any, size: tuple[int, int]) -> Iterator[Any]:
     mujoco = _import_mujoco()
     width, height = size
+    buffer = model.vis.global_
+    limits = buffer.offwidth, buffer.offheight
+    buffer.offwidth, buffer.offheight = size  # else each renderer holds images of the limits
     try:
         with warnings.catch_warnings():  # GLFW warns before it fails
             warnings.simplefilter("ignore")
             renderer = mujoco.Renderer(model, height=height, width=width)
     except Exception as error:  # likewise
         raise VideoError(_MEND_GL) from error
+    finally:
+        buffer.offwidth, buffer.offheight = limits
     with contextlib.closing(renderer):
         yield renderer
 

@@ -198,6 +198,48 @@ REPLAY = {
     "arms 0": "arms/manifest.json is corrupt",
     "physics 0": "physics/manifest.json is corrupt .timestep = -1 is not allowed",
 }
+VIEW = {
+    "--object sphere": "unknown object 'sphere': choose from box",
+    "--target inf 0": "target x = inf is not allowed",
+    "--friction S3": "unknown friction set 'S3': choose from S1, S2",
+    "--strategy RPS": "unknown strategy 'RPS': choose from rps",
+    "--engine mujoco": "engine = mujoco is not allowed: follow a trial with mjx, fused or",
+    "--params L=0": "L = 0.0 is not allowed",
+    "--horizon 0": "horizon = 0.0 is not allowed",
+    "--port -1": "port = -1 is not allowed: it must be a whole number from 0 to 65535",
+    "--port 65536": "port = 65536 is not allowed",
+    "--port http": "http",
+    "--host 203.0.113.1": "host = 203.0.113.1, port = 8080 cannot be served on .*: choose another",
+    "--out x": "--out",
+    "run 3": "index = 3 is not allowed: it must be a whole number from 0 to 2",
+    "run 0 --arm nps": "unknown arm 'nps': choose from rps",
+    "in_c 0": "engine = mujoco is not allowed",
+    "nowhere 0": "run = nowhere holds no manifest.json",
+    "cut": "cut/manifest.json is corrupt",
+}
+FILM = {
+    "": "run",
+    "run --grid 4x": "grid = 4x is not allowed: write ROWSxCOLUMNS, as 4x6, each from 1 to 12",
+    "run --grid 0x3": "grid = 0x3 is not allowed: write ROWSxCOLUMNS",
+    "run --grid 4x99": "grid = 4x99 is not allowed",
+    "run --grid 4*6": r"grid = 4\*6 is not allowed",
+    "run --grid 4x6x2": "grid = 4x6x2 is not allowed",
+    "run --seconds 0": "seconds = 0.0 is not allowed: .* above 0",
+    "run --speed nan": "speed = nan is not allowed",
+    "run --camera abov": "unknown camera 'abov': choose from oblique, above",
+    "run --arm nps": "unknown arm 'nps': choose from rps",
+    "run --which worst": "unknown which 'worst': choose from first, hardest",
+    "run --which hardest": "run = run holds no results.nc",
+    "run --out folder.json": "out = folder.json is a folder: name a file",
+    "run --out file/film.mp4": "out = file cannot be written",
+    "in_c": "engine = mujoco is not allowed",
+    "cut": "cut/manifest.json is corrupt",
+    "done": "run = done holds neither a table nor a sweep: give the folder of",
+    "file": "run = file holds neither a table nor a sweep",
+    "table --object cylinder": "unknown objects of the run 'cylinder': choose from box",
+    "table --strategy aps": "unknown strategies of the run 'aps': choose from rps, nps",
+    "table --friction S2": "unknown friction of the run 'S2': choose from S1",
+}
 TUNE = {
     "es --domain narrow": "unknown domain 'narrow': choose from paper",
     "es --objects sphere": "unknown domain object 'sphere'",
@@ -234,6 +276,8 @@ COMMANDS = {
     "sweep": SWEEP,
     "merge": MERGE,
     "replay": REPLAY,
+    "view": VIEW,
+    "film": FILM,
     "tune": TUNE,
     "doctor": {"--loudly": "--loudly"},
     "puhs": {"": "puhs"},
@@ -276,9 +320,11 @@ def folder(tmp_path_factory):
     (root / "file").touch()
     (root / "text.json").write_text("mass = 3")
     (root / "binary.json").write_bytes(b"\xff\xfe\x00")
-    for name in ("other", "folder.json", "done", "bytes", "cut", "empty", "lacking"):
+    for name in ("other", "folder.json", "done", "bytes", "cut", "empty", "lacking", "table"):
         (root / name).mkdir()
     (root / "done" / "config.json").write_text("{}")
+    options = {"objects": ["box"], "strategies": ["rps", "nps"], "friction": ["S1"]}
+    (root / "table" / "config.json").write_text(json.dumps({"options": options}))
     (root / "bytes" / "manifest.json").write_bytes(b"\xff\xfe\x00")
     for name, text in (("cut", '{"worlds": 3'), ("empty", "[]"), ("lacking", "{}")):
         (root / name / "manifest.json").write_text(text)

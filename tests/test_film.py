@@ -1,0 +1,128 @@
+"""Many trials side by side: a film of the right size, whose tiles move until their trial ends."""
+
+import dataclasses
+import tracemalloc
+
+import numpy as np
+import pytest
+from test_video import decode
+
+from rps_jax import cli, film, paper, record, robustness, video
+from rps_jax.domain import DOMAINS
+from rps_jax.errors import InputError
+from rps_jax.robustness import Plan
+from rps_jax.slots import Setting
+from rps_jax.trial import Rules
+
+pytestmark = pytest.mark.filterwarnings("ignore:os.fork")  # as in test_video
+
+ENGINE = "quasistatic"
+FPS = 25
+
+
+def table(folder):
+    """A run of `rps table` over two targets, as far as a film reads it."""
+    asked = cli.Table(objects=("box",), targets=((0.6, 0.0), (2.0, 2.0)), engine=ENGINE)
+    options = dataclasses.asdict(asked) | {"out": str(folder)}
+    record.write_json(folder / "config.json", {"options": options})
+
+
+def plan_of(*names):
+    """Two worlds of each of these objects."""
+    domain = dataclasses.replace(DOMAINS["wide"], objects=names)
+    setting = Setting(rules=Rules(horizon=20.0), engine=ENGINE)
+    return Plan(domain, 2 * len(names), {"rps": paper.PARAMS["rps"]}, setting)
+
+
+def sweep(folder):
+    """A run of `rps sweep`, as far as a film reads it."""
+    robustness.open_run(folder, plan_of("random_cylinder"))
+
+
+def tiles(images, rows, columns):
+    """The tiles of images, (count, rows, columns, height, width, 3)."""
+    count, height, width, _ = images.shape
+    cut = images.reshape(count, rows, height // rows, columns, width // columns, 3)
+    return cut.swapaxes(2, 3).astype(int)
+
+
+def differ(a, b):
+    return (np.abs(a - b).max(axis=-1) > 60).sum() > 20
+
+
+@pytest.mark.parametrize("make", [table, sweep])
+def test_a_film_shows_each_trial_in_its_tile_and_holds_the_end(make, tmp_path):
+    make(tmp_path)
+    out = tmp_path / "two.mp4"
+    arguments = ["--grid", "2x4", "--seconds", "2", "--speed", "10", "--out", str(out)]
+    assert cli.main(["film", str(tmp_path), *arguments]) == 0
+    images = decode(out)
+    # 20 control steps of 0.02 s a frame: at 0, 0.4, ... 2 s, and the last for a second more.
+    assert images.shape == (6 + FPS, 2 * 270, 4 * 480, 3)
+    cells = tiles(images, 2, 4)
+    for column in (0, 1):
+        assert cells[0, 0, column].std() > 10
+        assert differ(cells[0, 0, column], cells[5, 0, column])
+        assert not differ(cells[5, 0, column], cells[-1, 0, column])
+    assert np.abs(cells[:, 0, 2:] - 58).max() < 10  # no trials there
+    assert np.abs(cells[:, 1] - 58).max() < 10
+
+
+def test_worlds_of_several_objects_keep_their_order(tmp_path):
+    plan = plan_of("random_cylinder", "random_box")
+    takes = film.of_sweep(tmp_path, plan, "rps", "first", 3)
+    assert [list(take.places) for take in takes] == [[0, 2], [1]]
+    assert film._placed([take.labels for take in takes], takes) == [f"world {i}" for i in range(3)]
+    assert [scene.family for scene in film._placed([t.scenes for t in takes], takes)] == [
+        *("cylinder", "box", "cylinder")
+    ]
+
+
+def test_a_trial_that_has_ended_is_told_and_not_drawn_again(tmp_path):
+    table(tmp_path)
+    takes, setting = cli._takes(cli.Film(tmp_path), 2)
+    (take,) = takes
+    ((ended, first), *_, (_, before), (over, last)) = [
+        shots for shots, _ in zip(film._shots(take, setting, 50), range(20), strict=False)
+    ]
+    assert not ended
+    assert [shot.label for shot in first] == ["(0.6, 0) m, 0 s", "(2, 2) m, 0 s"]
+    assert not over
+    assert last[0].label.startswith("(0.6, 0) m, reached at ")
+    assert last[0] is before[0]
+    assert last[1] is not before[1]
+
+
+def test_the_memory_of_a_film_does_not_grow_with_its_length(tmp_path):
+    table(tmp_path)
+    takes, _ = cli._takes(cli.Film(tmp_path), 1)
+    tile = video.Tile(takes[0].scenes[0], (1.0, 1.0))
+    shot = video.Shot(takes[0].part.worlds.qpos[0], np.zeros(2), "")
+
+    def peak(count):
+        tracemalloc.start()
+        frames = ([shot] for _ in range(count))
+        video.render_grid([tile], frames, tmp_path / "x.mp4", shape=(1, 1), size=(320, 180))
+        found = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return found
+
+    peak(1)
+    assert peak(60) < peak(3) + 320 * 180 * 3 * 10  # ten pictures
+
+
+@pytest.mark.parametrize(
+    ("grid", "size"), [("4x6", (320, 180)), ("1x1", (1920, 1080)), ("12x1", (160, 90))]
+)
+def test_tiles_are_as_large_as_fits(grid, size):
+    width, height = film._tile_size(film.shape_of(grid))
+    assert (width, height) == pytest.approx(size, abs=2)
+    assert width % 2 == height % 2 == 0
+
+
+def test_more_trials_than_places_are_refused(tmp_path):
+    table(tmp_path)
+    takes, _ = cli._takes(cli.Film(tmp_path), 2)
+    tiles = [video.Tile(scene, (1.0, 1.0)) for scene in takes[0].scenes]
+    with pytest.raises(InputError, match="grid = 1x1 is not allowed for 2 trials"):
+        video.render_grid(tiles, [], tmp_path / "x.mp4", shape=(1, 1), size=(320, 180))

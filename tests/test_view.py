@@ -1,0 +1,226 @@
+"""A push in the browser: the trial that can be disturbed, and the page as Chromium shows it."""
+
+import io
+import math
+import shutil
+import socket
+import sys
+import time
+from dataclasses import replace
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+from selenium import webdriver
+from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.common.by import By
+
+from rps_jax import cli, scene, sweep, view
+from rps_jax.errors import InputError
+from rps_jax.live import Live
+from rps_jax.physics import preset
+from rps_jax.slots import Setting
+from rps_jax.sweep import Case
+from rps_jax.trial import Rules
+
+SETTING = Setting(preset(fidelity="fast"), Rules(horizon=12.0), engine="fused")
+CASE = Case("cylinder", scene.FRICTION["S1"], (0.6, 0.0))
+PERIOD = SETTING.physics.control_period
+
+
+@pytest.fixture(scope="module")
+def one():
+    return Live.of_case(CASE, SETTING)
+
+
+@pytest.fixture
+def live(one):
+    one.reset()
+    return one
+
+
+def p_world_contact(live):
+    """Where the object was last felt (2,) [m]."""
+    return view.p_world_contact(live.past[-1].seen)
+
+
+def p_robot_object(seen):
+    """Where the object is (2,) [m], in the robot's frame."""
+    c, s = math.cos(seen.qpos[2]), math.sin(seen.qpos[2])
+    return np.array([[c, s], [-s, c]]) @ (seen.qpos[3:5] - seen.qpos[:2])
+
+
+# --- the trial -----------------------------------------------------------------------------
+
+
+def test_a_push_that_is_left_alone_ends_as_any_other_trial(live):
+    found, _ = sweep.run([CASE], SETTING, slots=1, workers=1)
+    live.step(2 * round(SETTING.rules.horizon / PERIOD))
+    assert live.done
+    for name, value in live.outcome._asdict().items():
+        np.testing.assert_allclose(value, getattr(found, name)[0], atol=1e-5, err_msg=name)
+    assert live.past[-1].seen.time == pytest.approx(float(found.time[0]), abs=1e-4)
+
+
+def test_a_target_dragged_to_the_contact_is_reached_and_one_dragged_away_is_pushed_to(live):
+    live.set_target((0.0, 3.0))
+    live.step(150)
+    assert not live.done
+    live.set_target(tuple(p_world_contact(live)))
+    live.step(1)
+    assert live.done
+    assert live.outcome.success
+    ended = len(live.past)
+    live.step(5)
+    assert len(live.past) == ended
+    live.set_target((0.0, 3.0))
+    live.step(25)
+    assert not live.done
+    assert len(live.past) == ended + 25
+    assert live.outcome.min_distance > 1.0  # of the target that it has now
+
+
+def test_a_shove_moves_the_object_once_by_what_is_asked_in_the_frame_of_the_robot(live):
+    live.set_target((0.0, 3.0))
+    live.step(250)
+    before = p_robot_object(live.past[-1].seen)
+    assert abs(live.past[-1].seen.qpos[2]) > 0.05  # turned, so that the frames differ
+    live.shove((0.3, -0.2))
+    live.step(1)
+    np.testing.assert_allclose(p_robot_object(live.past[-1].seen) - before, (0.3, -0.2), atol=3e-3)
+    shoved = live.past[-1].seen.qpos[3:5]
+    live.step(2)
+    assert math.dist(live.past[-1].seen.qpos[3:5], shoved) < 3e-3
+
+
+def test_going_back_forgets_what_came_after_and_the_same_then_comes_again(live):
+    live.step(60)
+    last = live.past[-1]
+    live.rewind(20)
+    assert len(live.past) == 21
+    live.shove((0.1, 0.1))
+    live.step(5)
+    live.rewind(20)
+    live.step(39)
+    np.testing.assert_array_equal(last.seen.qpos, live.past[-1].seen.qpos)
+
+
+def test_the_foam_gives_way_where_the_object_is_felt_and_nowhere_else(live):
+    live.step(1)
+    assert not live.past[0].compression.any()  # 2 cm before the robot
+    live.step(150)
+    pressed = live.past[-1].compression
+    assert pressed.max() > 0.3
+    front = slice(15, 27)
+    assert not np.delete(pressed, np.arange(42)[front]).any()
+    assert np.argmax(pressed) in (20, 21)  # the middle of the front
+
+
+@pytest.mark.parametrize("wrong", [(math.nan, 0.0), (0.0, 99.0)])
+def test_a_disturbance_that_means_nothing_is_refused(live, wrong):
+    with pytest.raises(InputError, match="target"):
+        live.set_target(wrong)
+    with pytest.raises(InputError, match="shove"):
+        live.shove(wrong)
+
+
+# --- the page ------------------------------------------------------------------------------
+
+FLAGS = (
+    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--window-size=800,640"),
+)
+ASKED = view.Asked("cylinder", "S1", "rps", (0.0, 2.0))
+
+
+def make(asked):
+    friction = scene.FRICTION.get(asked.friction)
+    if friction is None:
+        raise InputError(f"unknown friction set '{asked.friction}': choose from S1, S2.")
+    case = Case(asked.object, friction, asked.p_world_target)
+    long = replace(SETTING, rules=Rules())
+    return view.Push(Live.of_case(case, long), sweep.scene_of(case, long.physics), "A drum")
+
+
+@pytest.fixture
+def page():
+    page = view.open_page("127.0.0.1", 0, ASKED, make)
+    yield page
+    page.close()
+
+
+@pytest.fixture
+def browser(tmp_path):
+    binary, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if not (binary and driver):
+        pytest.fail("There is no Chromium: run `apt-get install -y chromium chromium-driver`.")
+    options = webdriver.ChromeOptions()
+    options.binary_location = binary
+    for flag in (*FLAGS, f"--user-data-dir={tmp_path / 'profile'}"):
+        options.add_argument(flag)
+    with webdriver.Chrome(options=options, service=Service(driver)) as browser:
+        yield browser
+
+
+def picture(browser):
+    """What the browser shows, (height, width, 3) uint8."""
+    return imageio.imread(io.BytesIO(browser.get_screenshot_as_png()))[..., :3]
+
+
+def button(browser, name):
+    return browser.find_element(By.XPATH, f"//button[normalize-space()='{name}']")
+
+
+def test_the_page_plays_a_push_and_says_what_is_wrong(page, browser):
+    def text():
+        return browser.find_element(By.TAG_NAME, "body").text
+
+    def until(met):
+        """Have the page go on, at a pace at which a processor can draw it, until this is so."""
+        began = time.monotonic()
+        while not met():
+            assert time.monotonic() - began < 90, text()
+            page.tick(0.1)
+            time.sleep(0.2)
+
+    browser.get(page.url)
+    page.begin(lambda: make(ASKED))
+    until(lambda: "line contact" in text())
+    browser.find_element(By.CSS_SELECTOR, "[class*=Notification-closeButton]").click()
+    until(lambda: not browser.find_elements(By.CSS_SELECTOR, "[class*=Notification-closeButton]"))
+    first = picture(browser)
+    assert len(np.unique(first.reshape(-1, 3), axis=0)) > 300
+    scenery = slice(0, first.shape[1] // 2)  # left of the panel
+    until(lambda: np.any(np.abs(first.astype(int) - picture(browser))[:, scenery] > 60))
+
+    button(browser, "Pause").click()
+    until(lambda: "Play" in text())
+    button(browser, "Shove").click()
+    until(lambda: "Pause" in text())
+
+    field = browser.find_element(By.CSS_SELECTOR, "input[value='S1']")
+    field.clear()
+    field.send_keys("S3")
+    until(lambda: page.asked.friction == "S3")
+    button(browser, "Push").click()
+    until(lambda: "unknown friction set 'S3': choose from S1, S2." in text())
+
+
+def rps(*arguments):
+    return cli.main([str(a) for a in arguments])
+
+
+def test_a_port_that_is_taken_is_one_sentence(capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert rps("view", "--port", port) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert f"port = {port} cannot be served on (Address already in use)" in error
+
+
+def test_without_viser_the_command_says_how_to_install_it(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert rps("view") == 2
+    assert "viser is not installed: run pip install '.[viz]'." in capsys.readouterr().err
