@@ -1,47 +1,54 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
+#       extension: .py
 #       format_name: percent
 # ---
 
 # %% [markdown]
 # # The paper's trials, from a run folder
 #
-# This notebook computes nothing: it reads what `rps table --out runs/table` left. Set `RPS_RUN` to
-# read another folder.
+# This notebook computes nothing: it reads what `rps table --out notebooks/runs/table` left. Name
+# another folder as `run` to read your own.
 
 # %%
-import os
+import tempfile
 from pathlib import Path
 
-import matplotlib.pyplot as plt
-import numpy as np
+from IPython.display import Image, Markdown
 
-from rps_jax import record, score
+from rps_jax import figures, record, score
 
-run = Path(os.environ.get("RPS_RUN", "runs/table"))
+out = Path(tempfile.mkdtemp())
+run = Path("runs/table")
 results = record.read_results(run)
-print(score.markdown(score.table(results)))
+
+# %% [markdown]
+# ## Table II
+
+# %%
+Markdown(score.markdown(score.table(results)))
+
+# %%
 print(score.summary(results))
 
 # %% [markdown]
-# How long does a success take? The base drives at 0.05 m/s at most, so distance alone costs 20 s a
-# metre; a target behind the robot costs a turn on top.
+# ## Maps over the targets: Fig. 5
 
 # %%
-figure, ax = plt.subplots(layout="constrained")
-won = results.where(results.success == 1)
-distance = np.hypot(results.target_x, results.target_y)
-for name in results.object.values:
-    part = won.sel(object=name, strategy="rps").time.mean("friction")
-    ax.plot(distance, part, "o", label=str(name))
-ax.set(xlabel="distance of the target from the start [m]", ylabel="time to success [s]")
-ax.legend()
+Image(figures.min_distance(results, out / "maps.png"))
 
 # %% [markdown]
-# Where does the contact sit on the base while it pushes? Fig. 7 of the paper sums it up as D, the
-# mean of |l|.
+# ## How long a success takes
 
 # %%
-print(results.mean_abs_l.mean("target").to_series().unstack("strategy").round(3))
+Image(figures.time_to_success(results, "rps", out / "time.png"))
+
+# %% [markdown]
+# ## Where the contact sits
+
+# %%
+won = results.mean_abs_l.where(results.success == 1).mean("target")
+won.to_series().unstack("strategy").round(3)
