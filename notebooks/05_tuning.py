@@ -10,9 +10,9 @@
 # %% [markdown]
 # # Tuning the law
 #
-# `runs/coarse` and `runs/fine` are the logs of the two runs of CMA-ES that made `RPSParams.tuned()`
-# (their commands stand in the README), `runs/compare/wide` compares the result with the paper's
-# parameters in 1000 worlds that no tuner has seen.
+# `runs/coarse` and `runs/fine` are the logs of the two runs of CMA-ES that made
+# `RPSParams.tuned()` (their commands stand in the README), `runs/compare/wide` compares the
+# result with the paper's parameters in 1000 worlds that no tuner has seen.
 
 # %%
 import json

@@ -201,7 +201,7 @@ def influences(results: xr.Dataset, arm: str) -> list[list[str]]:
     for i in np.argsort(q, kind="stable"):
         name, found = list(binned.items())[i]
         order, unit = np.argsort(found.won / found.of, kind="stable"), drawn[name].attrs["units"]
-        told = [f"{value:.2g} {unit}".removesuffix(" 1") for value in found.middle]
+        told = [f"{value:.3g} {unit}".removesuffix(" 1") for value in found.middle]
         ends = [
             cell
             for n in (order[0], order[-1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -227,12 +228,12 @@ def profile(params: RPSParams, path: Path) -> Path:
 
 def _in_front(l: np.ndarray, error: np.ndarray, distance: float) -> Observation:  # noqa: E741
     """Contacts (n,) [m] on the front, with targets at heading errors (n,) [rad] from them."""
-    contact = np.stack([np.full_like(l, skin.HALF_LENGTH), l], axis=-1)
-    way = distance * np.stack([np.cos(error), np.sin(error)], axis=-1)
-    zero = np.zeros_like(l)
-    return jax.tree.map(
-        jnp.asarray,
-        Observation(np.zeros_like(contact), zero, contact, np.ones(l.shape, bool), contact + way),
+    place, angle = jnp.asarray(l), jnp.asarray(error)
+    contact = jnp.stack([jnp.full_like(place, skin.HALF_LENGTH), place], axis=-1)
+    way = distance * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+    touched = jnp.ones(place.shape, bool)
+    return Observation(
+        jnp.zeros_like(contact), jnp.zeros_like(place), contact, touched, contact + way
     )
 
 
@@ -244,15 +245,15 @@ def twist_field(sets: Mapping[str, RPSParams], distance: float, path: Path) -> P
     """
     l = np.linspace(-skin.HALF_WIDTH, skin.HALF_WIDTH, 117)  # noqa: E741
     error = np.radians(np.linspace(-180, 180, 120, endpoint=False) + 1.5)
-    grid = [axis.ravel() for axis in np.meshgrid(l, error)]
+    places, angles = (axis.ravel() for axis in np.meshgrid(l, error))
+    seen = _in_front(places, angles, distance)
     figure = Figure(figsize=(1 + 4.2 * len(sets), 7), layout="constrained")
     axes = figure.subplots(2, len(sets), squeeze=False, sharex=True, sharey=True)
     image = None
     for column, (name, params) in zip(axes.T, sets.items(), strict=True):
         for ax, threshold in zip(column, (params.l_cr, params.l_mr), strict=True):
             state = RPSState.init(params)._replace(l_th=jnp.asarray(threshold, float))
-            seen = _in_front(*grid, distance)
-            _, twist = jax.vmap(lambda seen, p=params, s=state: law.step(p, s, seen))(seen)
+            _, twist = jax.vmap(partial(law.step, params, state))(seen)
             v_x, v_y, omega = (np.asarray(part).reshape(error.size, l.size) for part in twist)
             limit = float(params.omega_max)
             image = ax.imshow(
