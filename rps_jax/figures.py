@@ -521,22 +521,36 @@ def tuning(log: Sequence[Mapping], names: Sequence[str], path: Path) -> Path:
 
 
 def failures(results: xr.Dataset, max_lost: float, path: Path) -> Path:
-    """Share of worlds of each object in which each arm fails, by the kind of failure."""
+    """Failures by their kind, a column for each object.
+
+    Above, the share of its worlds that each arm loses; below, how far from the target they end,
+    over the object's width.
+    """
     groups = analysis.worlds_by_object(results)
-    arms = list(map(str, results.arm.values))
-    figure = Figure(figsize=(1 + 2.6 * len(groups), 3.2), layout="constrained")
-    axes = figure.subplots(1, len(groups), squeeze=False, sharey=True)[0]
-    for ax, (name, mask) in zip(axes, groups.items(), strict=True):
-        below = np.zeros(len(arms))
-        kinds = [analysis.failure(results.sel(arm=arm), max_lost)[mask] for arm in arms]
+    arms = {str(name): results.sel(arm=name) for name in results.arm.values}
+    kinds = {name: analysis.failure(one, max_lost) for name, one in arms.items()}
+    figure = Figure(figsize=(1 + 2.8 * len(groups), 5.2), layout="constrained")
+    axes = figure.subplots(2, len(groups), squeeze=False, sharey="row")
+    for (above, below), (name, mask) in zip(axes.T, groups.items(), strict=True):
+        under = np.zeros(len(arms))
         for i, kind in enumerate(analysis.FAILURES):
-            share = np.array([100 * np.mean(found == i) for found in kinds])
-            ax.bar(arms, share, bottom=below, color=f"C{i}", label=kind)
-            below += share
-        ax.set_title(f"{_title(name)}, {mask.sum()} worlds", fontsize=9)
-        ax.grid(alpha=0.3, axis="y")
-    axes[0].set_ylabel("worlds lost [%]")
-    axes[0].legend(fontsize=8)
+            share = np.array([100 * np.mean(found[mask] == i) for found in kinds.values()])
+            above.bar(list(arms), share, bottom=under, color=f"C{i}", label=kind)
+            under += share
+            for marker, (arm, one) in zip("ox+s", arms.items(), strict=False):
+                here = mask & (kinds[arm] == i)
+                width, left = results["size"].values[here], analysis.left_over(one)[here]
+                below.semilogy(width, left, marker, ms=4, color=f"C{i}")
+        above.set_title(f"{_title(name)}, {mask.sum()} worlds", fontsize=9)
+        above.grid(alpha=0.3, axis="y")
+        below.set_xlabel("half width of the object [m]")
+        below.grid(alpha=0.3)
+    axes[0, 0].margins(y=0.08)
+    axes[0, 0].set_ylabel("worlds lost [%]")
+    axes[0, -1].legend(fontsize=8)
+    axes[1, 0].set_ylabel("least distance to the target [m]")
+    marks = [f"{arm}: {mark}" for mark, arm in zip(("dot", "cross", "plus"), arms, strict=False)]
+    axes[1, 0].set_title(", ".join(marks), fontsize=8)
     return save(figure, path)
 
 
