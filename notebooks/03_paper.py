@@ -69,8 +69,8 @@ Image(figures.time_to_success(results, "rps", out / "time.png"))
 # %% [markdown]
 # Straight ahead (dark), a metre takes 20 s: the base does its 0.05 m/s all the way. A target
 # straight behind (yellow) costs 75 to 80 s more than one ahead, whether it is 1 m or 2 m away:
-# that is the price of turning an object that may be lost. Between these, time is ordered by the
-# angle first and by the distance second, and object and friction hardly matter.
+# that is the price of turning an object that may be lost. Between these, the angle counts for
+# more than the distance, and object and friction matter little.
 #
 # One trial stands apart: the nonuniform box under S1 with its target 2 m to the right takes 256
 # s, while its mirror image, 2 m to the left, takes 91 s. The box carries its load on the left,

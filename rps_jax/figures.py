@@ -531,12 +531,14 @@ def failures(results: xr.Dataset, max_lost: float, path: Path) -> Path:
     kinds = {name: analysis.failure(one, max_lost) for name, one in arms.items()}
     figure = Figure(figsize=(1 + 2.8 * len(groups), 5.2), layout="constrained")
     axes = figure.subplots(2, len(groups), squeeze=False, sharey="row")
+    most = 1.0
     for (above, below), (name, mask) in zip(axes.T, groups.items(), strict=True):
         under = np.zeros(len(arms))
         for i, kind in enumerate(analysis.FAILURES):
             share = np.array([100 * np.mean(found[mask] == i) for found in kinds.values()])
             above.bar(list(arms), share, bottom=under, color=f"C{i}", label=kind)
             under += share
+            most = max(most, under.max())
             for marker, (arm, one) in zip("ox+s", arms.items(), strict=False):
                 here = mask & (kinds[arm] == i)
                 width, left = results["size"].values[here], analysis.left_over(one)[here]
@@ -545,8 +547,7 @@ def failures(results: xr.Dataset, max_lost: float, path: Path) -> Path:
         above.grid(alpha=0.3, axis="y")
         below.set_xlabel("half width of the object [m]")
         below.grid(alpha=0.3)
-    axes[0, 0].margins(y=0.08)
-    axes[0, 0].set_ylabel("worlds lost [%]")
+    axes[0, 0].set(ylabel="worlds lost [%]", ylim=(0, 1.08 * most))
     axes[0, -1].legend(fontsize=8)
     axes[1, 0].set_ylabel("least distance to the target [m]")
     marks = [f"{arm}: {mark}" for mark, arm in zip(("dot", "cross", "plus"), arms, strict=False)]
