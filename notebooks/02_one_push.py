@@ -43,9 +43,9 @@ Image(figures.one_trial(trace, figures.title_of(case), out / "trial.png"))
 realigning = np.asarray(seen.details.realigning)
 entries = np.flatnonzero(np.diff(realigning.astype(int)) > 0)
 print(
-    f"reached at {outcome.time:.1f} s; without contact for {outcome.contact_lost_time:.1f} s after "
-    f"the first touch; mean |l| = {outcome.mean_abs_l:.3f} m\n"
-    f"Realignment State: entered {entries.size} time(s), {100 * realigning.mean():.0f} % of the trial"
+    f"reached at {outcome.time:.1f} s; mean |l| = {outcome.mean_abs_l:.3f} m; "
+    f"without contact for {outcome.contact_lost_time:.1f} s after the first touch\n"
+    f"Realignment State: {entries.size} time(s), {100 * realigning.mean():.0f} % of the trial"
 )
 
 # %% [markdown]

@@ -565,7 +565,7 @@ def paired(results: xr.Dataset, path: Path) -> Path:
     won_a, won_b = a.success.values > 0, b.success.values > 0
     edge = 1.02 * float(results.time.max())
     x, y = np.where(won_a, a.time, 1.03 * edge), np.where(won_b, b.time, 1.03 * edge)
-    figure = Figure(figsize=(5, 4.6), layout="constrained")
+    figure = Figure(figsize=(5.4, 5.2), layout="constrained")
     ax = figure.subplots()
     for label, mask, colour in (
         ("both", won_a & won_b, "C0"),
@@ -579,7 +579,7 @@ def paired(results: xr.Dataset, path: Path) -> Path:
     neither = int(np.sum(~won_a & ~won_b))
     ax.set(xlabel=f"{first}: time to success [s]", ylabel=f"{second}: time to success [s]")
     ax.set_title(f"{won_a.size} worlds; won by neither: {neither}", fontsize=9)
-    ax.legend(fontsize=8, loc="center right")
+    figure.legend(fontsize=8, loc="outside lower center", ncols=3)
     return save(figure, path)
 
 

@@ -76,15 +76,22 @@ def reverse(scores: Scores, theta: jax.Array, worlds: Any) -> Estimate:
     return estimate(jax.grad(lambda t: jnp.sum(scores(t, worlds)))(thetas))
 
 
-def differences(scores: Scores, theta: jax.Array, worlds: Any, *, step: float) -> Estimate:
-    """By central differences of `step`, in the units of theta, in each world: 2 p n scores."""
-    thetas = _for_each(theta, worlds)
+def differences(
+    scores: Scores, theta: jax.Array, worlds: Any, *, step: float | jax.Array
+) -> Estimate:
+    """By central differences in each world: 2 p n scores.
 
-    def along(direction: jax.Array) -> jax.Array:
-        up, down = (scores(thetas + side * step * direction, worlds) for side in (1, -1))
-        return (up - down) / (2 * step)
-
-    return estimate(jax.vmap(along, out_axes=1)(jnp.eye(theta.size, dtype=theta.dtype)))
+    Args:
+      scores: see above.
+      theta: (p,).
+      worlds: (n, ...).
+      step: () or (p,), in the units of theta.
+    """
+    n, p = _for_each(theta, worlds).shape
+    steps = jnp.repeat(jnp.diag(jnp.broadcast_to(jnp.asarray(step, theta.dtype), p)), n, axis=0)
+    thetas = theta + jnp.concatenate([steps, -steps])
+    found = scores(thetas, _repeated(worlds, 2 * p)).reshape(2, p, n)
+    return estimate(((found[0] - found[1]) / (2 * jnp.reshape(step, (-1, 1)))).T)
 
 
 def evolution(
@@ -116,8 +123,8 @@ def evolution(
     n, p = _for_each(theta, worlds).shape
     directions = jax.random.normal(key, (pairs, n, p), theta.dtype)
     steps = jnp.concatenate([directions, -directions]) * sigma
-    repeated = jax.tree.map(lambda x: jnp.concatenate([x] * (2 * pairs)), worlds)
-    found = scores(theta + steps.reshape(-1, p), repeated).reshape(2, pairs, n)
+    found = scores(theta + steps.reshape(-1, p), _repeated(worlds, 2 * pairs))
+    found = found.reshape(2, pairs, n)
     slopes = (found[0] - found[1])[..., None] * directions / (2 * sigma)
     return estimate(jnp.mean(slopes, axis=0))
 
@@ -144,6 +151,11 @@ def _for_each(theta: jax.Array, worlds: Any) -> jax.Array:
     """The same theta (n, p) in each world."""
     count = jax.tree.leaves(worlds)[0].shape[0]
     return jnp.broadcast_to(theta, (count, theta.size))
+
+
+def _repeated(worlds: Any, times: int) -> Any:
+    """The same worlds (n, ...) several times, (times n, ...)."""
+    return jax.tree.map(lambda x: jnp.concatenate([x] * times), worlds)
 
 
 def window(
