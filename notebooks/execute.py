@@ -7,6 +7,7 @@ no machine and no time, so that only cells and results make a difference.
 """
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import jupytext
@@ -14,6 +15,9 @@ import nbformat
 from jupyter_client.kernelspec import KernelSpec
 from jupyter_client.manager import AsyncKernelManager
 from nbclient import NotebookClient
+from nbformat import NotebookNode
+
+from rps_jax import video
 
 HERE = Path(__file__).resolve().parent
 TEXTS = tuple(sorted(HERE.glob("[0-9]*.py")))
@@ -30,28 +34,48 @@ class ThisPython(AsyncKernelManager):
         return KernelSpec(argv=argv, display_name=KERNEL["display_name"], language="python")
 
 
-def execute(text: Path) -> nbformat.NotebookNode:
-    """The notebook of a text with its outputs; raises CellExecutionError if a cell fails."""
-    notebook = jupytext.read(text)
-    for i, cell in enumerate(notebook.cells):
-        cell.id = f"cell-{i}"
+def execute(texts: Sequence[Path]) -> list[NotebookNode]:
+    """The notebooks of texts, with their outputs; raises CellExecutionError if a cell fails.
+
+    One kernel executes them all, one after the other, and forgets its names in between: most of the
+    time would go into imports otherwise.
+    """
+    notebooks = [jupytext.read(text) for text in texts]
+    whole = nbformat.v4.new_notebook()
+    for notebook in notebooks:
+        whole.cells += [nbformat.v4.new_code_cell("%reset -f"), *notebook.cells]
     NotebookClient(
-        notebook,
+        whole,
         kernel_manager_class=ThisPython,
         timeout=600,
         record_timing=False,
         resources={"metadata": {"path": str(HERE)}},
     ).execute()
-    notebook.metadata = {"jupytext": {"formats": "ipynb,py:percent"}, "kernelspec": KERNEL}
-    return notebook
+    for notebook in notebooks:
+        notebook.metadata = {"jupytext": {"formats": "ipynb,py:percent"}, "kernelspec": KERNEL}
+        _number(notebook)
+    return notebooks
+
+
+def _number(notebook: NotebookNode) -> None:
+    """Name its cells and count those of code, as if it had been executed alone."""
+    count = 0
+    for i, cell in enumerate(notebook.cells):
+        cell.id = f"cell-{i}"
+        if cell.cell_type == "code":
+            count += 1
+            cell.execution_count = count
+            for output in cell.outputs:
+                if output.output_type == "execute_result":
+                    output.execution_count = count
 
 
 def main(names: list[str]) -> None:
     """Execute the notebooks of these names, by default all."""
-    for text in TEXTS:
-        if not names or text.stem in names:
-            print(text.stem)
-            nbformat.write(execute(text), text.with_suffix(".ipynb"))
+    video.choose_gl()  # before the kernel imports MuJoCo for any of them
+    texts = [text for text in TEXTS if not names or text.stem in names]
+    for text, notebook in zip(texts, execute(texts), strict=True):
+        nbformat.write(notebook, text.with_suffix(".ipynb"))
 
 
 if __name__ == "__main__":
