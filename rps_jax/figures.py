@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from rps_jax import ambiguity, analysis, benchmark, hardware, law, record, score, skin, trial
 from rps_jax.benchmark import Speed
-from rps_jax.law import Details, Observation, RPSParams, RPSState
+from rps_jax.law import Details, Observation, RPSParams, RPSState, Twist
 from rps_jax.skin import NONE
 from rps_jax.sweep import Case, Trace
 
@@ -226,7 +226,7 @@ def profile(params: RPSParams, path: Path) -> Path:
 # The law alone is shown for a contact on the middle of the front, and the base at the origin.
 
 
-def _in_front(l: np.ndarray, error: np.ndarray, distance: float) -> Observation:  # noqa: E741
+def _in_front(l: Any, error: Any, distance: Any) -> Observation:  # noqa: E741
     """Contacts (n,) [m] on the front, with targets at heading errors (n,) [rad] from them."""
     place, angle = jnp.asarray(l), jnp.asarray(error)
     contact = jnp.stack([jnp.full_like(place, skin.HALF_LENGTH), place], axis=-1)
@@ -235,6 +235,12 @@ def _in_front(l: np.ndarray, error: np.ndarray, distance: float) -> Observation:
     return Observation(
         jnp.zeros_like(contact), jnp.zeros_like(place), contact, touched, contact + way
     )
+
+
+@jax.jit
+def _twists(params: RPSParams, state: RPSState, seen: Observation) -> Twist:
+    """The law's twists (n,), of one state, at observations (n, ...)."""
+    return jax.vmap(lambda one: law.step(params, state, one)[1])(seen)
 
 
 def twist_field(sets: Mapping[str, RPSParams], distance: float, path: Path) -> Path:
@@ -253,7 +259,7 @@ def twist_field(sets: Mapping[str, RPSParams], distance: float, path: Path) -> P
     for column, (name, params) in zip(axes.T, sets.items(), strict=True):
         for ax, threshold in zip(column, (params.l_cr, params.l_mr), strict=True):
             state = RPSState.init(params)._replace(l_th=jnp.asarray(threshold, float))
-            _, twist = jax.vmap(partial(law.step, params, state))(seen)
+            twist = _twists(params, state, seen)
             v_x, v_y, omega = (np.asarray(part).reshape(error.size, l.size) for part in twist)
             limit = float(params.omega_max)
             image = ax.imshow(
@@ -294,7 +300,7 @@ def hysteresis(sets: Mapping[str, RPSParams], ripple: float, path: Path) -> Path
     figure = Figure(figsize=(1 + 3.6 * len(sets), 5), layout="constrained")
     axes = figure.subplots(2, len(sets), squeeze=False, sharey="row")
     for (above, below), (name, params) in zip(axes.T, sets.items(), strict=True):
-        realigning = np.asarray(_swept(params, rippled).realigning)
+        realigning = np.asarray(_swept(params, jnp.asarray(rippled)).realigning)
         entries = int(np.sum(np.diff(realigning.astype(int)) > 0))
         above.plot(time, rippled, color="C0", lw=1)
         _shade(above, time, realigning, _SHADES["realigning"])
@@ -302,7 +308,7 @@ def hysteresis(sets: Mapping[str, RPSParams], ripple: float, path: Path) -> Path
             above.axhline(float(threshold), color="0.5", lw=0.8, ls="--")
         above.set_title(f"{name}: enters Realignment {entries} times", fontsize=9)
         above.set_xlabel("time [s]")
-        a_r, half = np.asarray(_swept(params, there).a_r), time.size // 2
+        a_r, half = np.asarray(_swept(params, jnp.asarray(there)).a_r), time.size // 2
         below.plot(there[:half], a_r[:half], color="C3", label="outwards")
         below.plot(there[half:], a_r[half:], color="C0", ls="--", label="back")
         below.set_xlabel("contact location $l$ [m]")
@@ -312,14 +318,15 @@ def hysteresis(sets: Mapping[str, RPSParams], ripple: float, path: Path) -> Path
     return save(figure, path)
 
 
-def _swept(params: RPSParams, l: np.ndarray) -> Details:  # noqa: E741
+@jax.jit
+def _swept(params: RPSParams, l: jax.Array) -> Details:  # noqa: E741
     """The law, one step after the other, far from a target straight ahead: details (n,)."""
 
     def one(state: RPSState, seen: Observation) -> tuple[RPSState, Details]:
         state, _, details = law.step_with_details(params, state, seen)
         return state, details
 
-    seen = _in_front(l, np.zeros_like(l), 2 * float(params.d_th))
+    seen = _in_front(l, jnp.zeros_like(l), 2 * jnp.asarray(params.d_th))
     return jax.lax.scan(one, RPSState.init(params), seen)[1]
 
 

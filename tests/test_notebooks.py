@@ -27,7 +27,7 @@ def outputs(notebook):
     for cell in notebook.cells:
         for output in cell.get("outputs", ()):
             content = output.get("data") or {"text/plain": output.get("text", "")}
-            for kind, value in content.items():
+            for kind, value in sorted(content.items()):
                 yield output.output_type, kind, re.sub(r"base64,[\w+/=\s]+", "", value)
 
 
