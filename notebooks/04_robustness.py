@@ -18,6 +18,10 @@
 # This notebook computes nothing; it reads `runs/compare/wide`: the first 1000 of the 10,000
 # worlds of the README's comparison (`rps tune compare --params paper tuned --domain wide`, one
 # H200). Name another folder as `run` to read a sweep of your own.
+#
+# The run is older than two changes: an object that fell over was not told apart (such trials
+# count as what they ended as), and the tuned parameters did not yet keep acting upon a lost
+# contact.
 
 # %%
 import tempfile

@@ -13,7 +13,8 @@
 # The paper's parameters were chosen by hand. `RPSParams.tuned()` was found by evolution in two
 # runs of CMA-ES, a coarse and a fine one, whose commands stand in the README; `runs/coarse` and
 # `runs/fine` hold their logs. `runs/compare/wide` has both sets of parameters in 1000 worlds that
-# no tuner has seen. Only the last section simulates anything.
+# no tuner has seen. There the tuned law did not yet keep acting upon a lost contact
+# (`keep_contact`), as it does now. Only the last section simulates anything.
 
 # %%
 import json

@@ -37,7 +37,7 @@ DRAWN = {
     "v_y_error": "error of v_y",
     "omega_error": "error of omega",
 }
-FAILURES = ("never touched", "lost contact", "timeout", "diverged")
+FAILURES = ("never touched", "lost contact", "timeout", "fell over", "diverged")
 _TAIL = 0.05  # of the worlds are the worst
 
 
@@ -73,10 +73,11 @@ def failure(one: xr.Dataset, max_lost: float) -> np.ndarray:
         [
             one.success.values > 0,
             one.diverged.values > 0,
+            one.tipped.values > 0,
             ~np.isfinite(one.min_distance.values),
             one.contact_lost_time.values > max_lost,
         ],
-        [-1, FAILURES.index("diverged"), 0, FAILURES.index("lost contact")],
+        [-1, *map(FAILURES.index, ("diverged", "fell over", "never touched", "lost contact"))],
         FAILURES.index("timeout"),
     )
     return kinds

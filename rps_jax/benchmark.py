@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from rps_jax import paper, reference, strategies, sweep, trial
+from rps_jax import engines, paper, reference, strategies, sweep, trial
 from rps_jax.physics import MUJOCOS_GROUND, Physics, preset
 from rps_jax.reference import Batch
 from rps_jax.scene import FRICTION
@@ -37,6 +37,8 @@ _MUJOCOS_OWN = Physics(
 BATCHED = {
     "fused standard": Setting(engine="fused"),
     "fused fast": Setting(engine="fused", physics=preset(fidelity="fast")),
+    "warp standard": Setting(engine="warp"),
+    "warp fast": Setting(engine="warp", physics=preset(fidelity="fast")),
     "quasistatic": Setting(engine="quasistatic"),
     "mjx standard": Setting(),
     "mjx fast": Setting(physics=preset(fidelity="fast")),
@@ -46,6 +48,11 @@ IN_C = {"C in closed loop": "closed", "C, mj_step alone": "open"}
 NAMES = (*BATCHED, *IN_C)
 
 
+def here() -> tuple[str, ...]:
+    """Those of `NAMES` that this machine can run."""
+    return tuple(n for n in NAMES if n in IN_C or engines.works(BATCHED[n].engine))
+
+
 @dataclass(frozen=True)
 class Speed:
     """One measurement."""
@@ -53,7 +60,7 @@ class Speed:
     name: str
     family: str
     worlds: int
-    compile: float  # [s]
+    compile: float  # [s] until the first result, less the time of a go
     rate: float  # simulated s per s of wall clock
     memory: float  # [bytes] most in use on the device; NaN where JAX does not tell
     physics: Physics
@@ -84,16 +91,17 @@ def batched(name: str, family: str, worlds: int, simulated: float = 2.0) -> Spee
     steps = round(simulated / setting.physics.control_period)
     began = time.perf_counter()
     go = trial.advance.lower(stage, batch, start, physics=setting.physics, steps=steps).compile()
-    compiled = time.perf_counter() - began
     state = [start]
 
     def once() -> None:
         state[0] = jax.block_until_ready(go(stage, batch, state[0]))
 
     once()
+    first = time.perf_counter() - began
     best = _best(once)
     memory = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use", np.nan)
-    return Speed(name, family, worlds, compiled, worlds * simulated / best, memory, setting.physics)
+    rate = worlds * simulated / best
+    return Speed(name, family, worlds, first - best, rate, memory, setting.physics)
 
 
 def in_c(name: str, family: str, simulated: float = 2.0) -> Speed:

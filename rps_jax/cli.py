@@ -13,7 +13,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,6 +26,7 @@ from rps_jax.errors import InputError
 
 if TYPE_CHECKING:
     from rps_jax.domain import Domain
+    from rps_jax.law import RPSParams
     from rps_jax.robustness import Plan, Shard
     from rps_jax.scene import Friction, Scene
     from rps_jax.slots import Progress, Setting, Timing
@@ -65,8 +66,8 @@ class Common:
     fidelity: str = "standard"
     """How finely the physics is solved: reference, standard or fast."""
     engine: str = "mjx"
-    """mjx, fused (the same equations, specialised: much faster), mujoco (C, on all cores), or
-    quasistatic (planar, no inertia: fastest, and differentiable)."""
+    """mjx, fused (the same equations, specialised: much faster), warp (MJX-Warp, on an NVIDIA GPU),
+    mujoco (C, on all cores), or quasistatic (planar, no inertia: fastest, and differentiable)."""
     timestep: float | None = None
     """Physics step [s]; by default that of the physics."""
     control_period: float | None = None
@@ -190,8 +191,8 @@ class Sweep(Spread):
     fidelity: str = "standard"
     """How finely the physics is solved: reference, standard or fast."""
     engine: str = "mjx"
-    """mjx, fused (the same equations, specialised: much faster), mujoco (C, on all cores), or
-    quasistatic (planar, no inertia: fastest, and differentiable)."""
+    """mjx, fused (the same equations, specialised: much faster), warp (MJX-Warp, on an NVIDIA GPU),
+    mujoco (C, on all cores), or quasistatic (planar, no inertia: fastest, and differentiable)."""
     horizon: float = 300.0
     """Longest trial [s]."""
     seed: int = 0
@@ -260,7 +261,7 @@ class TuneOptions(Spread):
     fidelity: str = "standard"
     """How finely the physics is solved: reference, standard or fast."""
     engine: str = "fused"
-    """fused, mjx, mujoco or quasistatic."""
+    """fused, mjx, warp, mujoco or quasistatic."""
     horizon: float = 300.0
     """Longest trial [s]."""
     seed: int = 0
@@ -338,7 +339,7 @@ class TuneCompare(Spread):
     fidelity: str = "standard"
     """How finely the physics is solved: reference, standard or fast."""
     engine: str = "fused"
-    """fused, mjx, mujoco or quasistatic."""
+    """fused, mjx, warp, mujoco or quasistatic."""
     seed: int = 0
     """The worlds are those for testing of this seed."""
     device: str = "auto"
@@ -455,6 +456,7 @@ def use_cache() -> None:
     except OSError:
         return
     jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
+    os.environ.setdefault("WARP_CACHE_PATH", str(cache_folder() / "warp"))
 
 
 # --- what the options mean -----------------------------------------------------------------
@@ -517,10 +519,12 @@ def _friction(text: str) -> Friction:
 
 
 def _setting(common: Common) -> Setting:
+    from rps_jax import engines
     from rps_jax.physics import preset
     from rps_jax.slots import Setting
     from rps_jax.trial import Rules
 
+    engines.check(common.engine)
     steps = {"timestep": common.timestep, "control_period": common.control_period}
     physics = dataclasses.replace(
         preset(common.physics, common.fidelity),
@@ -773,7 +777,7 @@ def _paper(options: Paper) -> None:
     print(f"report: {path}")
 
 
-def _domain_of(text: str) -> Domain:
+def domain_of(text: str) -> Domain:
     """A domain by name or from a JSON file."""
     from rps_jax import domain
 
@@ -785,7 +789,7 @@ def _domain_of(text: str) -> Domain:
 def _domain(options: Sweep) -> Domain:
     from rps_jax import domain
 
-    chosen = _domain_of(options.domain)
+    chosen = domain_of(options.domain)
     changes = {}
     for text in options.change:
         name, _, values = text.partition("=")
@@ -846,6 +850,14 @@ def _of_the_law(name: str) -> dict[str, float]:
     return {key: errors.check_number(f"{name} {key}", value) for key, value in values.items()}
 
 
+def params_of(name: str) -> RPSParams:
+    """The law's parameters: `paper`, `tuned`, or the paper's with the changes of a JSON file."""
+    from rps_jax import law
+    from rps_jax.law import RPSParams
+
+    return law.check(RPSParams.paper()._replace(**_of_the_law(name)))
+
+
 def _plan(options: Sweep) -> Plan:
     from rps_jax.physics import preset
     from rps_jax.robustness import Plan
@@ -896,6 +908,14 @@ def choose_device(name: str) -> None:
     )
 
 
+def _check_here(device: str, setting: Setting, domains: Iterable[Domain]) -> None:
+    """Choose the device, on which the engine must be able to step worlds of these domains."""
+    from rps_jax import engines
+
+    choose_device(device)
+    engines.check(setting.engine, [family for one in domains for family in one.families])
+
+
 def _on_cluster(address: str, options: Sweep) -> Callable[..., Timing]:
     """`robustness.run`, by the workers of a cluster."""
     import jax
@@ -930,7 +950,7 @@ def _sweep(options: Sweep) -> None:
     if options.ray:
         run = _on_cluster(options.ray, options)
     else:
-        choose_device(options.device)
+        _check_here(options.device, plan.setting, [plan.domain])
     out = robustness.open_run(options.out, plan)
     use_cache()
     with robustness.lock(out, shard):
@@ -973,8 +993,7 @@ def _tune(options: Tune) -> None:
 
 
 def _tune_compare(options: TuneCompare) -> None:
-    from rps_jax import law, record, robustness, tune
-    from rps_jax.law import RPSParams
+    from rps_jax import record, robustness, tune
     from rps_jax.physics import preset
     from rps_jax.robustness import Plan
     from rps_jax.slots import Setting
@@ -984,17 +1003,14 @@ def _tune_compare(options: TuneCompare) -> None:
         seed=tune.seed_of(options.seed, "test"),
         engine=options.engine,  # pyright: ignore[reportArgumentType]
     )
-    arms = {
-        Path(name).stem: law.check(RPSParams.paper()._replace(**_of_the_law(name)))
-        for name in options.params
-    }
+    arms = {Path(name).stem: params_of(name) for name in options.params}
     plans = {}
     for text in options.domain:
-        one = _domain_of(text)
+        one = domain_of(text)
         count = one.combinations if one.targets else options.worlds
         plans[Path(text).stem] = Plan(one, count, arms, setting, part=4096)
     shape = options.shape()
-    choose_device(options.device)
+    _check_here(options.device, setting, [plan.domain for plan in plans.values()])
     record.writable(options.out)
     use_cache()
     for name, plan in plans.items():
@@ -1026,7 +1042,7 @@ def _tune_es(options: TuneES) -> None:
         how.seed,
     )
     shape = how.shape()
-    choose_device(how.device)
+    _check_here(how.device, course.setting, course.domains)
     out = tune.open_run(how.out, space, course, evolution)
     with _tuning(out, evolution.generations) as report:
         tune.evolve(out, space, course, evolution, report=report, **shape)
@@ -1045,7 +1061,7 @@ def _tune_grad(options: TuneGrad) -> None:
     same = {f.name for f in dataclasses.fields(descent.Descent)} & set(how.__dict__)
     chosen = descent.Descent(**{name: getattr(how, name) for name in same})
     shape = how.shape()
-    choose_device(how.device)
+    _check_here(how.device, course.setting, course.domains)
     out = descent.open_run(how.out, space, course, chosen)
     with _tuning(out, chosen.steps + 1) as report:
         descent.descend(out, space, course, chosen, report=report, **shape)
@@ -1053,12 +1069,10 @@ def _tune_grad(options: TuneGrad) -> None:
 
 
 def _space(options: TuneOptions) -> Space:
-    from rps_jax import law, tune
-    from rps_jax.law import RPSParams
+    from rps_jax import tune
 
-    base = law.check(RPSParams.paper()._replace(**_of_the_law(options.start)))
     names = [name for text in options.tuned for name in tune.SUBSETS.get(text, (text,))]
-    return tune.Space(tuple(names), base)
+    return tune.Space(tuple(names), params_of(options.start))
 
 
 @contextlib.contextmanager
@@ -1108,7 +1122,7 @@ def _course(options: TuneOptions) -> Course:
     from rps_jax.trial import Rules
     from rps_jax.tune import Course, Objective
 
-    domains = [_domain_of(text) for text in options.domain]
+    domains = [domain_of(text) for text in options.domain]
     setting = Setting(
         preset(fidelity=options.fidelity),
         Rules(horizon=options.horizon),

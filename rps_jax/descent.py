@@ -119,11 +119,15 @@ def softened(course: Course, engine: Any, seed: int, step: int) -> list[Batch]:
     ask = course.ask(jax.tree.map(lambda x: np.array([x]), RPSParams()), seed, step)
     batches = []
     for part, _, _ in tune.parts(ask, course.domains, setting):
-        sensor: Any = part.worlds.skin
-        warm = 0.03 if isinstance(sensor, CapacitiveSkin) else 0.001
-        skin = SmoothSkin(sensor, jnp.full(part.numbers.size, warm))
-        batches.append(Batch(part.stage, part.worlds._replace(skin=skin)))
+        batches.append(Batch(part.stage, soften(part.worlds)))
     return batches
+
+
+def soften(worlds: World) -> World:
+    """The same worlds (n, ...) with smooth skins."""
+    sensor: Any = worlds.skin
+    warm = 0.03 if isinstance(sensor, CapacitiveSkin) else 0.001
+    return worlds._replace(skin=SmoothSkin(sensor, jnp.full(len(worlds.key), warm)))
 
 
 def scores_of(space: Space, course: Course, descent: Descent, stage: Any) -> gradients.Scores:

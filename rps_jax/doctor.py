@@ -15,7 +15,7 @@ def report(cache: Path) -> str:
     device = environment["device"]
     rows = {
         "python": f"{environment['python']} on {environment['platform']}",
-        **{name: version or "missing" for name, version in environment["packages"].items()},
+        **{name: version or "not installed" for name, version in environment["packages"].items()},
         "device": f"{device['count']} x {device['kind']} ({device['platform']}), "
         f"{environment['processors']} processors",
         "commit": environment["commit"] or "not in a checkout",

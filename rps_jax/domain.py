@@ -118,10 +118,14 @@ class Domain:
         """Which of `objects` the worlds `index` have."""
         return index // (self.combinations // len(self.objects)) % len(self.objects)
 
+    @property
+    def families(self) -> tuple[str, ...]:
+        """The shape family of each of `objects`."""
+        return tuple(RANDOM.get(name) or FAMILIES[name] for name in self.objects)
+
     def family_of(self, index: int) -> str:
         """The shape family of one world's object."""
-        name = self.objects[int(self.object_of(np.asarray(index)))]
-        return RANDOM.get(name) or FAMILIES[name]
+        return self.families[int(self.object_of(np.asarray(index)))]
 
 
 RANDOM = {"random_box": "box", "random_cylinder": "cylinder", "random_prism": "prism"}

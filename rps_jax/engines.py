@@ -6,26 +6,48 @@ rows of a pytree. C MuJoCo shares nothing: its stage is a list of models, its fi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Literal, get_args
 
 import jax
 import numpy as np
 
-from rps_jax import fused, quasistatic, scene, solid
+from rps_jax import errors, fused, mjwarp, quasistatic, scene, solid
 from rps_jax.contacts import Body
+from rps_jax.mjwarp import Warp
 from rps_jax.physics import Physics
 from rps_jax.quasistatic import Quasistatic
 from rps_jax.scene import JOINTS, OFF_CENTRE, Friction, Scene, mjx
 from rps_jax.solid import Solid
 from rps_jax.trial import Fused, Stage
 
-Engine = Literal["mjx", "fused", "mujoco", "quasistatic"]
+Engine = Literal["mjx", "fused", "warp", "mujoco", "quasistatic"]
 ENGINES = get_args(Engine)
 
 
+def check(engine: str, families: Iterable[str] = ()) -> None:
+    """Raises InputError unless an engine can step worlds of these families on this machine."""
+    errors.check_name("engine", engine, ENGINES)
+    if engine == "warp":
+        mjwarp.check(families)
+
+
+def works(engine: str, families: Iterable[str] = ()) -> bool:
+    """Whether `check` has nothing against it."""
+    try:
+        check(engine, families)
+    except errors.InputError:
+        return False
+    return True
+
+
 def stage_of_scenes(scenes: Sequence[Scene], engine: Engine) -> tuple[Any, Any]:
-    """Stage, and fields (len(scenes), ...), of scenes of one shape family."""
+    """Stage, and fields (len(scenes), ...), of scenes of one shape family.
+
+    Raises:
+      InputError: the engine cannot step them on this machine.
+    """
+    check(engine, [s.family for s in scenes])
     if engine == "mujoco":
         return [s.physics for s in scenes], {}
     if engine == "fused":
@@ -36,8 +58,13 @@ def stage_of_scenes(scenes: Sequence[Scene], engine: Engine) -> tuple[Any, Any]:
         friction = np.array([s.physics.pair("base_object").friction[0] for s in scenes])
         half = np.array([s.physics.geom("base").size[:2] for s in scenes])
         return Quasistatic(), quasistatic.sliders(solids, friction, half)
-    model, fields = scene.stack([s.physics for s in scenes])
-    return Stage(model, mjx.make_data(scenes[0].physics)), jax.device_get(fields)
+    models = [s.physics for s in scenes]
+    if engine == "warp":
+        models = [mjwarp.own_cylinder(model) for model in models]
+        model, fields = scene.stack(models, mjwarp.put)
+        return Warp(model, mjwarp.blank(models[0])), jax.device_get(fields)
+    model, fields = scene.stack(models)
+    return Stage(model, mjx.make_data(models[0])), jax.device_get(fields)
 
 
 def stage_of_solids(
@@ -46,7 +73,11 @@ def stage_of_solids(
     """Stage, and fields (n, ...), of solids (n, ...) of a family, friction (n,) each.
 
     What MuJoCo would derive in compiling each of them is computed here, for all at once.
+
+    Raises:
+      InputError: the engine cannot step them on this machine.
     """
+    check(engine, [family])
     count = solids.mass.size
     if engine == "mujoco":
         return [

@@ -72,8 +72,9 @@ class PushEnv:
     Reward: see `Reward`. Without contact nothing is gained; a contact that is found again counts
     from where it was lost, so a sum of rewards tells by how much a push came nearer.
 
-    Done: by the rules of `setting` (the paper's: arrived, 300 s, or 150 s without contact), or if
-    the physics diverged. A state that is done stays as it is, and earns nothing.
+    Done: by the rules of `setting` (the paper's: arrived, 300 s, or 150 s without contact; or
+    the object fell over), or if the physics diverged. A state that is done stays as it is, and
+    earns nothing.
 
     Every reset takes one of `worlds` random worlds of the domain, drawn in advance on the host,
     and noise of its own; no other randomisation is needed. Shape family and engine are static.
@@ -116,7 +117,7 @@ class PushEnv:
         """One control period with the base at the twist of an action (3,)."""
         world, before = state.info["world"], state.data
         told, twist = trial.execute(world, before, self.twist(action), self.dt)
-        moved = trial.settle(before, told, *self._drive(world, told, twist))
+        moved = trial.settle(before, told, self._drive(world, told, twist))
         now, seen = self._observe(world, moved)
         gone = moved.done  # it had ended before, or the physics ended it
         progress = jnp.where(jnp.isfinite(before.strategy), before.strategy - now.strategy, 0.0)
@@ -280,10 +281,11 @@ def _one_of_many(stage: Stage | Fused, setting: Setting) -> Callable[[World, Tri
         return rows(together(*jax.tree.map(lambda x: jnp.asarray(x)[None], one)), 0)
 
     @drive.def_vmap
-    def _(size: int, batched: Any, *args: Any) -> tuple[Driven, tuple[bool, ...]]:
+    def _(size: int, batched: Any, *args: Any) -> tuple[Driven, Driven]:
         def full(x: Any, has: bool) -> Any:
             return x if has else jnp.broadcast_to(x, (size, *jnp.shape(x)))
 
-        return together(*jax.tree.map(full, args, tuple(batched))), (True,) * 3
+        driven = together(*jax.tree.map(full, args, tuple(batched)))
+        return driven, jax.tree.map(lambda _: True, driven)
 
     return drive

@@ -14,7 +14,18 @@ from matplotlib import patches
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rps_jax import ambiguity, analysis, benchmark, hardware, law, record, score, skin, trial
+from rps_jax import (
+    ambiguity,
+    analysis,
+    benchmark,
+    hardware,
+    law,
+    record,
+    score,
+    skin,
+    trial,
+    tune,
+)
 from rps_jax.benchmark import Speed
 from rps_jax.law import Details, Observation, RPSParams, RPSState, Twist
 from rps_jax.skin import NONE
@@ -630,4 +641,84 @@ def estimates(
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("gradient [m]")
     axes[0].legend(fontsize=8)
+    return save(figure, path)
+
+
+def gradient_quality(results: xr.Dataset, path: Path) -> Path:
+    """Estimators against the truth over the horizon: cosine, bias, error, share that is finite."""
+    panels = {
+        "cosine": "cosine to the truth [1]",
+        "bias": "bias / norm of the truth [1]",
+        "error": "standard error / norm of the truth [1]",
+        "finite": "share of finite derivatives [1]",
+    }
+    figure = Figure(figsize=(10, 6.5), layout="constrained")
+    x = results.horizon.values
+    for ax, (field, label) in zip(
+        figure.subplots(2, 2, sharex=True).ravel(), panels.items(), strict=True
+    ):
+        for i, name in enumerate(map(str, results.estimator.values)):
+            one = results.sel(estimator=name)
+            ax.plot(x, one[field], "o-", ms=4, color=f"C{i}", label=name)
+            if field == "cosine":
+                ax.fill_between(
+                    x, one.least_cosine, one.greatest_cosine, color=f"C{i}", alpha=0.12, lw=0
+                )
+        if field in ("bias", "error"):
+            ax.plot(x, results.doubt, "k--", lw=1, label="standard error of the truth")
+            ax.set_yscale("log")
+        ax.set(xscale="log", ylabel=label, xticks=x, xticklabels=[f"{t:g}" for t in x])
+        ax.minorticks_off()
+        ax.grid(alpha=0.3)
+        if field in ("cosine", "bias"):
+            ax.legend(fontsize=8)
+    figure.supxlabel("horizon [s]", fontsize=10)
+    return save(figure, path)
+
+
+def sensitivity(results: xr.Dataset, path: Path) -> Path:
+    """Success against each parameter alone, with Wilson 95 % intervals."""
+    names = list(map(str, results.parameter.values))
+    rows = -(-len(names) // 4)
+    figure = Figure(figsize=(12, 2.5 * rows), layout="constrained")
+    axes = figure.subplots(rows, 4, squeeze=False, sharey=True).ravel()
+    for ax in axes[len(names) :]:
+        ax.axis("off")
+    of = int(results.attrs["worlds"])
+    for ax, name in zip(axes, names, strict=False):
+        for i, which in enumerate(map(str, results.set.values)):
+            one = results.sel(set=which, parameter=name)
+            won = np.round(one.success.values * of).astype(int)
+            _rates(ax, one.value.values, won, np.full(won.size, of), color=f"C{i}", label=which)
+        ax.set_xlabel(name, fontsize=9)
+        ax.grid(alpha=0.3)
+        if tune.BOUNDS[name].log:
+            ax.set_xscale("log")
+    for ax in axes[::4]:
+        ax.set_ylabel("success [%]")
+    axes[0].legend(fontsize=8)
+    return save(figure, path)
+
+
+def front(results: xr.Dataset, path: Path) -> Path:
+    """Success against time and against the way driven; the undominated candidates are marked."""
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    labels = [str(label) for label in results.candidate.values]
+    for ax, (field, label) in zip(
+        figure.subplots(1, 2, sharey=True),
+        {"time": "median time of a success [s]", "path": "median way of the base [m]"}.items(),
+        strict=True,
+    ):
+        x, y = results[field].values, 100 * results.success.values
+        ax.plot(x, y, ".", color="0.75", label="candidates")
+        chosen = results.front.values
+        ax.plot(x[chosen], y[chosen], "o", ms=5, color="C0", label="undominated")
+        for i, name in enumerate(labels):
+            if not name.isdigit():
+                ax.plot(x[i], y[i], "*", ms=12, color="C3")
+                ax.annotate(name, (x[i], y[i]), (6, -10), textcoords="offset points", fontsize=9)
+        ax.set_xlabel(label)
+        ax.grid(alpha=0.3)
+    figure.axes[0].set_ylabel("success [%]")
+    figure.axes[0].legend(fontsize=8, loc="lower right")
     return save(figure, path)

@@ -2,10 +2,11 @@
 
 What is scored is random: worlds differ. So every estimator takes scores of many pairs at once,
 
-    scores(thetas (n, p), worlds (n, ...)) -> (n,), each of its own pair alone,
+    scores(thetas (n, p), worlds (n, ...)) -> (n, ...), each of its own pair alone,
 
 and returns the gradient at one `theta` (p,) of their mean over the worlds as an `Estimate`, by
 which two can be compared or combined. A score of one world becomes such a function by `jax.vmap`.
+It is a number, or an array of them, such as scores after different times.
 Derivatives of chaotic worlds may be finite and yet say nothing: their variance shows it.
 
 `forward` and `reverse` differentiate every world. What they differentiate must be smooth:
@@ -35,13 +36,15 @@ Scores = Callable[[jax.Array, Any], jax.Array]
 class Estimate(NamedTuple):
     """A gradient as the mean of independent samples."""
 
-    gradient: jax.Array  # (p,) 0 where no sample is finite
-    variance: jax.Array  # (p,) of the gradient, not of one sample; inf with fewer than two samples
-    finite: jax.Array  # (p,) [1] share of the samples that are finite; the others were dropped
+    gradient: jax.Array  # (p, ...) 0 where no sample is finite
+    variance: (
+        jax.Array
+    )  # (p, ...) of the gradient, not of one sample; inf with fewer than two samples
+    finite: jax.Array  # (p, ...) [1] share of the samples that are finite; the others were dropped
 
 
 def estimate(samples: jax.Array) -> Estimate:
-    """The mean of samples (n, p), entry by entry without those that are not finite."""
+    """The mean of samples (n, p, ...), entry by entry without those that are not finite."""
     there = jnp.isfinite(samples)
     samples = jnp.where(there, samples, 0.0)
     count = jnp.sum(there, axis=0)
@@ -73,7 +76,8 @@ def reverse(scores: Scores, theta: jax.Array, worlds: Any) -> Estimate:
     For models without a solver's loop.
     """
     thetas = _for_each(theta, worlds)
-    return estimate(jax.grad(lambda t: jnp.sum(scores(t, worlds)))(thetas))
+    slopes = jax.jacrev(lambda t: jnp.sum(scores(t, worlds), axis=0))(thetas)
+    return estimate(jnp.moveaxis(slopes, (-2, -1), (0, 1)))
 
 
 def differences(
@@ -90,8 +94,10 @@ def differences(
     n, p = _for_each(theta, worlds).shape
     steps = jnp.repeat(jnp.diag(jnp.broadcast_to(jnp.asarray(step, theta.dtype), p)), n, axis=0)
     thetas = theta + jnp.concatenate([steps, -steps])
-    found = scores(thetas, _repeated(worlds, 2 * p)).reshape(2, p, n)
-    return estimate(((found[0] - found[1]) / (2 * jnp.reshape(step, (-1, 1)))).T)
+    found = scores(thetas, _repeated(worlds, 2 * p))
+    rises = -jnp.diff(found.reshape(2, p, n, *found.shape[1:]), axis=0)[0]
+    width = jnp.reshape(2 * jnp.asarray(step), (-1,) + (1,) * found.ndim)
+    return estimate(jnp.swapaxes(rises / width, 0, 1))
 
 
 def evolution(
@@ -124,8 +130,9 @@ def evolution(
     directions = jax.random.normal(key, (pairs, n, p), theta.dtype)
     steps = jnp.concatenate([directions, -directions]) * sigma
     found = scores(theta + steps.reshape(-1, p), _repeated(worlds, 2 * pairs))
-    found = found.reshape(2, pairs, n)
-    slopes = (found[0] - found[1])[..., None] * directions / (2 * sigma)
+    rises = -jnp.diff(found.reshape(2, pairs, n, 1, *found.shape[1:]), axis=0)[0]
+    along = directions / (2 * sigma)
+    slopes = rises * along.reshape(*along.shape, *(1,) * (found.ndim - 1))
     return estimate(jnp.mean(slopes, axis=0))
 
 
@@ -172,7 +179,7 @@ def window(
     Args:
       stage: of MJX, `Fused`, or `Quasistatic`.
       params_of: parameters from theta (p,), differentiable.
-      cost: () of the snapshots (steps, ...) of one trial, such as its mean distance.
+      cost: () or (...) of the snapshots (steps, ...) of one trial, such as its mean distance.
       physics: with MJX of a pyramidal cone.
       strategy: that the parameters belong to.
       steps: control steps.

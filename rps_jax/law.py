@@ -65,7 +65,8 @@ class RPSParams(NamedTuple):
     def tuned(cls) -> RPSParams:
         """Tuned by evolution in random worlds of boxes and cylinders; the README says how.
 
-        Full speed until the target, and almost always realigning: Eq. 5 acts only beyond d_th.
+        Full speed until the target, and almost always realigning: Eq. 5 acts only beyond d_th. A
+        contact that is lost is acted upon as if it were still felt.
         """
         return cls(
             eta=6.537844,
@@ -81,6 +82,7 @@ class RPSParams(NamedTuple):
             d_th=1.561165,
             gamma_max=1.54169,
             v_lost=0.03373589,
+            keep_contact=1.0,
         )
 
     @classmethod
@@ -139,6 +141,11 @@ class Twist(NamedTuple):
     v_x: float | jax.Array  # () [m/s] forward
     v_y: float | jax.Array  # () [m/s] left
     omega: float | jax.Array  # () [rad/s] counter-clockwise
+
+    def in_world(self, yaw: jax.Array) -> jax.Array:
+        """Velocities (3,) [m/s, m/s, rad/s] in the world, of a base with the heading `yaw`."""
+        v_world = frames.rotate(yaw, jnp.stack([self.v_x, self.v_y]))
+        return jnp.stack([*v_world, jnp.asarray(self.omega)])
 
 
 class Details(NamedTuple):

@@ -129,7 +129,7 @@ class Quasistatic:
         )
         moved = (after - qpos)[:, :6] / period
         spin = jnp.zeros_like(moved[:, :3]).at[:, 2].set((angle - yaw) / period)
-        return after, jnp.concatenate([moved, spin], axis=-1), trials.warmstart
+        return Driven(after, jnp.concatenate([moved, spin], axis=-1), trials.warmstart)
 
     def _step(
         self, worlds: World, twist: Vec, dt: float, poses: tuple[Vec, Vec]

@@ -20,7 +20,10 @@ import xarray as xr
 from rps_jax.errors import InputError
 
 MANIFEST = "manifest.json"
-_PACKAGES = ("rps_jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "scipy", "xarray")
+_PACKAGES = (
+    *("rps_jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "warp-lang"),
+    *("numpy", "scipy", "xarray"),
+)
 
 
 def prepare(folder: Path, *, overwrite: bool = False) -> Path:

@@ -19,7 +19,7 @@ from rps_jax import trial
 from rps_jax.physics import Physics
 from rps_jax.scene import JOINTS
 from rps_jax.strategies import Strategy
-from rps_jax.trial import Rules, Trial, World
+from rps_jax.trial import Driven, Rules, Trial, World
 
 _STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _LOOK = 500  # control steps between two reports
@@ -116,7 +116,7 @@ def run(
                 batch.drive(going, np.stack(twist, axis=1)[going].astype(float), physics.substeps)
             dtype = trials.qpos.dtype
             after = (batch.qpos, batch.qvel, batch.warmstart)
-            trials = _settle(trials, told, *(x.astype(dtype) for x in after))
+            trials = _settle(trials, told, Driven(*(x.astype(dtype) for x in after)))
             count += 1
             if count % _LOOK == 0 or not going.size:
                 done, steps = np.asarray(trials.done), int(np.asarray(trials.steps).sum())

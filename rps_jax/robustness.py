@@ -48,7 +48,8 @@ from rps_jax.trial import Outcome, Rules
 
 Kind = tuple[int, type]  # of a part: the object's number and the type of the arm's parameters
 Keep = Callable[[int, bytes], Any]  # called with the number and the content of a part
-_TYPES = {"success": np.int8, "diverged": np.int8}  # of an outcome; the others are float32
+# Of an outcome; the others are float32.
+_TYPES = dict.fromkeys(("success", "tipped", "diverged"), np.int8) | {"overflows": np.int32}
 
 
 @dataclass(frozen=True)

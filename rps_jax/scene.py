@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import io
 import math
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -316,8 +317,18 @@ def initial_qpos(scene: Scene, gap: float = 0.02, yaw: float = 0.0) -> np.ndarra
     return qpos
 
 
-def stack(models: list[mujoco.MjModel]) -> tuple[mjx.Model, dict[str, jax.Array]]:
-    """One MJX model for all, and the fields that vary: name -> (len(models), ...).
+def put(model: mujoco.MjModel) -> mjx.Model:
+    """The model as MJX's own engine has it."""
+    # A static copy of the bounding radii, which only height fields use, would bar stacking.
+    unused: dict[str, Any] = {"_impl.geom_rbound_hfield": np.zeros(model.ngeom)}
+    there: Any = mjx.put_model(model).tree_replace(unused)
+    return there
+
+
+def stack(
+    models: Sequence[mujoco.MjModel], put: Callable[[mujoco.MjModel], mjx.Model] = put
+) -> tuple[mjx.Model, dict[str, jax.Array]]:
+    """One MJX model for all, `put` on the device, and the fields that vary: name -> (n, ...).
 
     The fields are always the same ones, so that a world's numbers depend neither on what it is
     batched with nor on a program of its own. They are copied from compiled models, so nothing
@@ -326,9 +337,7 @@ def stack(models: list[mujoco.MjModel]) -> tuple[mjx.Model, dict[str, jax.Array]
     Raises:
       ValueError: the models differ in anything but `FIELDS`.
     """
-    # A static copy of the bounding radii, which only height fields use, would bar stacking.
-    unused: dict[str, Any] = {"_impl.geom_rbound_hfield": np.zeros(models[0].ngeom)}
-    trees: list[Any] = [mjx.put_model(m).tree_replace(unused) for m in models]
+    trees: list[Any] = [put(m) for m in models]
     leaves, structures = zip(*map(jax.tree_util.tree_flatten_with_path, trees), strict=True)
     if any(s != structures[0] for s in structures):
         raise ValueError("models of different structure cannot be stacked")

@@ -19,8 +19,11 @@ UNITS = {
     "time": ("s", "simulated time at which the trial ended"),
     "min_distance": ("m", "least distance of the contact point to the target"),
     "contact_lost_time": ("s", "time without contact after the first touch"),
+    "path_length": ("m", "length of the base's way"),
     "mean_abs_l": ("m", "mean |l| while in contact, the paper's D"),
+    "tipped": ("1", "the object fell over"),
     "diverged": ("1", "physics became NaN or ran away"),
+    "overflows": ("1", "control steps in which the engine lost contacts for want of room"),
     "base_pose": ("m, m, rad", "x, y, yaw of the base in the world at the end"),
     "object_pose": ("m, m, rad", "x, y, yaw of the object in the world at the end"),
 }

@@ -10,6 +10,7 @@ import functools
 import os
 import threading
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -91,7 +92,7 @@ Collect = Callable[[np.ndarray, Outcome], Any]  # numbers (m,) of trials and the
 
 def default_slots(engine: Engine = "mjx") -> int:
     """Worlds stepped at once: few on a processor (small caches), many on an accelerator."""
-    if engine in ("fused", "quasistatic"):
+    if engine in ("fused", "warp", "quasistatic"):
         return 64 if jax.default_backend() == "cpu" else 65536
     return 24 if jax.default_backend() == "cpu" else 8192
 
@@ -146,8 +147,19 @@ def run(
             tasks += [queue.program for queue in queues]
             count += len(queues)
     _side_by_side(tasks, count, shared)
+    warn_of_lost(shared.overflowed)
     total = time.perf_counter() - began
     return Timing(shared.compile, total - shared.compile, shared.simulated)
+
+
+def warn_of_lost(count: int) -> None:
+    """Warns if in `count` trials, any at all, the engine lost contacts for want of room."""
+    if count:
+        warnings.warn(
+            f"the engine lost contacts for want of room in {count} trials, which are not to be "
+            "trusted",
+            stacklevel=3,
+        )
 
 
 def _side_by_side(tasks: Sequence[Callable[[], None]], count: int, shared: _Shared) -> None:
@@ -169,6 +181,7 @@ class _Shared:
     def __init__(self, collect: Collect, report: Callable[[Progress], Any]):
         self.simulated = 0.0
         self.compile = 0.0
+        self.overflowed = 0  # trials
         self.stop = False  # set when one worker fails or the user interrupts
         self._finished = 0
         self._collect, self._report = collect, report
@@ -177,6 +190,7 @@ class _Shared:
     def add(self, numbers: np.ndarray, trials: Outcome, simulated: float) -> None:
         """Trials that ended in a segment, and the time [s] all of the worker's trials advanced."""
         with self._lock:
+            self.overflowed += int(np.count_nonzero(trials.overflows))
             if numbers.size:
                 self._collect(numbers, trials)
             self._finished += numbers.size

@@ -19,7 +19,7 @@ from rps_jax.objects import FAMILIES, OBJECTS
 from rps_jax.physics import Physics
 from rps_jax.scene import JOINTS, Friction, Scene, Side
 from rps_jax.skin import IdealSkin, Skin
-from rps_jax.slots import SEGMENT, Job, Part, Progress, Setting, Timing, rows
+from rps_jax.slots import SEGMENT, Job, Part, Progress, Setting, Timing, rows, warn_of_lost
 from rps_jax.slots import run as _run
 from rps_jax.strategies import Params, Strategy
 from rps_jax.trial import Odometry, Outcome, Shift, Snapshot, World
@@ -218,7 +218,8 @@ def follow(
 
 
 def check_followed(engine: str) -> None:
-    """Raises InputError unless trials of this engine can be followed."""
+    """Raises InputError unless trials of this engine can be followed on this machine."""
+    engines.check(engine)
     if engine == "mujoco":
         raise errors.InputError(
             "engine = mujoco is not allowed: follow a trial with mjx, fused or quasistatic."
@@ -252,6 +253,7 @@ def follow_part(
         report(Progress(int(trials.done.sum()), float(trials.steps.sum()) * period))
     whole = jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
     outcomes = jax.device_get(trial.outcome(trials, period))
+    warn_of_lost(int(np.count_nonzero(outcomes.overflows)))
     timing = Timing(compiled - began, time.perf_counter() - compiled, float(np.sum(outcomes.time)))
     return [
         Trace(

@@ -7,6 +7,7 @@ is frozen, and a batch whose worlds have all ended stops.
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -31,15 +32,17 @@ _ODOMETRY = 7  # of a world's key; the skin splits it into fewer
 
 
 class Rules(NamedTuple):
-    """When a trial ends (Sec. III-B)."""
+    """When a trial ends (Sec. III-B); of objects that fall over the paper says nothing."""
 
     horizon: float | jax.Array = 300.0  # [s]
     max_lost: float | jax.Array = 150.0  # [s] without contact, in all, after the first touch
+    max_tilt: float | jax.Array = math.pi / 4  # [rad] of an object that has not fallen over
 
     def check(self) -> None:
-        """Raises InputError for times that are not positive and finite."""
+        """Raises InputError for times that are not positive and finite, or no tilt."""
         errors.check_finite("horizon", self.horizon, above=0, at_most=1e5, unit="s")
         errors.check_finite("max_lost", self.max_lost, at_least=0, unit="s")
+        errors.check_finite("max_tilt", self.max_tilt, above=0, at_most=math.pi, unit="rad")
 
 
 class Shift(NamedTuple):
@@ -93,9 +96,12 @@ class Trial(NamedTuple):
     lost_steps: jax.Array  # () int32 without contact after the first touch
     sum_abs_l: jax.Array  # () [m] over the steps in contact
     min_distance: jax.Array  # () [m] contact point to target; inf before the first touch
+    path_length: jax.Array  # () [m] of the base's way
     done: jax.Array  # () bool
     success: jax.Array  # () bool
+    tipped: jax.Array  # () bool: the object has fallen over
     diverged: jax.Array  # () bool
+    overflows: jax.Array  # () int32 control steps in which contacts were lost for want of room
 
 
 class Snapshot(NamedTuple):
@@ -116,8 +122,11 @@ class Outcome(NamedTuple):
     time: jax.Array  # () [s] at which it ended
     min_distance: jax.Array  # () [m] contact point to target; inf if never touched
     contact_lost_time: jax.Array  # () [s]
+    path_length: jax.Array  # () [m] of the base's way
     mean_abs_l: jax.Array  # () [m] the paper's D; NaN if never touched
+    tipped: jax.Array  # () bool: the object has fallen over
     diverged: jax.Array  # () bool
+    overflows: jax.Array  # () int32 control steps in which contacts were lost for want of room
     base_pose: jax.Array  # (3,) [m, m, rad] at the end
     object_pose: jax.Array  # (3,) [m, m, rad] at the end
 
@@ -128,13 +137,25 @@ def object_pose(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
     return free[:2], frames.yaw_of_quaternion(free[3:])
 
 
+def _upright(qpos: jax.Array) -> jax.Array:
+    """Cosine () of the object's tilt."""
+    _, x, y, _ = qpos[JOINTS.object][3:]
+    return 1 - 2 * (x * x + y * y)
+
+
 def p_world_contact(seen: Snapshot) -> jax.Array:
     """Contact points of snapshots (T, ...) in the world, (T, 2) [m]; NaN without contact."""
     point = seen.qpos[:, :2] + frames.rotate(seen.qpos[:, 2], seen.reading.p_robot_contact)
     return jnp.where((seen.reading.contact_type != NONE)[:, None], point, jnp.nan)
 
 
-Driven = tuple[jax.Array, jax.Array, jax.Array]  # qpos, qvel, warmstart of a batch
+class Driven(NamedTuple):
+    """A batch after one control period."""
+
+    qpos: Any  # (B, 10) as in `Trial`
+    qvel: Any  # (B, 9)
+    warmstart: Any  # (B, 9)
+    overflowed: Any = None  # (B,) bool: contacts were lost; None: this engine loses none
 
 
 class Drives(Protocol):
@@ -161,9 +182,12 @@ def start(world: World, strategy: Strategy = RPS) -> Trial:
         lost_steps=zero,
         sum_abs_l=jnp.zeros_like(world.qpos[0]),
         min_distance=jnp.full_like(world.qpos[0], jnp.inf),
+        path_length=jnp.zeros_like(world.qpos[0]),
         done=false,
         success=false,
+        tipped=false,
         diverged=false,
+        overflows=zero,
     )
 
 
@@ -213,15 +237,14 @@ class Stage(NamedTuple):
 
         def one(state, _):
             qpos, qvel, warmstart = state
-            v_world = frames.rotate(qpos[2], jnp.stack([twist.v_x, twist.v_y]))
-            qvel = qvel.at[JOINTS.base].set(jnp.stack([*v_world, jnp.asarray(twist.omega)]))
+            qvel = qvel.at[JOINTS.base].set(twist.in_world(qpos[2]))
             data = self.data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
             with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
                 data = mjx.step(model, data)
             return (data.qpos, data.qvel, data.qacc_warmstart), None
 
         state = (trial.qpos, trial.qvel, trial.warmstart)
-        return jax.lax.scan(one, state, length=substeps)[0]
+        return Driven(*jax.lax.scan(one, state, length=substeps)[0])
 
 
 class Fused(NamedTuple):
@@ -230,7 +253,7 @@ class Fused(NamedTuple):
     def drive(self, worlds: World, trials: Trial, twists: Twist, physics: Physics) -> Driven:
         """Step a batch for one control period."""
         state = (trials.qpos, trials.qvel, trials.warmstart)
-        return fused.drive(worlds.fields, *state, twists, physics)
+        return Driven(*fused.drive(worlds.fields, *state, twists, physics))
 
 
 def _believed(world: World, trial: Trial, period: float) -> tuple[jax.Array, jax.Array]:
@@ -275,7 +298,8 @@ def observe(
     touch = reading.contact_type != NONE
     lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
     success = touch & (distance < world.params.d_success)
-    over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost)
+    tipped = _upright(trial.qpos) < jnp.cos(rules.max_tilt)
+    over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost) | tipped
     told = trial._replace(
         skin=skin,
         poses=poses,
@@ -286,6 +310,7 @@ def observe(
             touch, jnp.minimum(trial.min_distance, distance), trial.min_distance
         ),
         success=success & ~over,
+        tipped=tipped,
         done=success | over,
     )
     return told, Seen(reading, seen, distance)
@@ -328,19 +353,26 @@ def decide(
     return told, twist, snapshot
 
 
-def settle(
-    before: Trial, told: Trial, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array
-) -> Trial:
-    """The trial after one control period: `told` driven to (qpos, qvel, warmstart), or ended.
+def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
+    """The trial after one control period: `told` as it was `driven`, or ended.
 
     A trial that had ended `before` comes back as it was.
     """
+    qpos, qvel, warmstart, overflowed = driven
     sane = (
         jnp.all(jnp.isfinite(qpos))
         & jnp.all(jnp.abs(qvel) < _MAX_SPEED)
         & jnp.all(jnp.abs(qpos) < _MAX_DISTANCE)
     )
-    moved = told._replace(qpos=qpos, qvel=qvel, warmstart=warmstart, steps=told.steps + 1)
+    if overflowed is not None:
+        told = told._replace(overflows=told.overflows + (overflowed & ~told.done))
+    moved = told._replace(
+        qpos=qpos,
+        qvel=qvel,
+        warmstart=warmstart,
+        path_length=told.path_length + frames.norm(qpos[:2] - told.qpos[:2]),
+        steps=told.steps + 1,
+    )
     stopped = told._replace(done=jnp.ones((), bool), diverged=~told.done & ~sane)
     return _select(before.done, before, _select(told.done | ~sane, stopped, moved))
 
@@ -358,7 +390,7 @@ def control_step(
     think = partial(decide, physics=physics, rules=rules, strategy=strategy)
     told, twists, snapshots = jax.vmap(think)(worlds, trials)
     driven = stage.drive(worlds, told, twists, physics)
-    return jax.vmap(settle)(trials, told, *driven), snapshots
+    return jax.vmap(settle)(trials, told, driven), snapshots
 
 
 def _select(condition: jax.Array, yes: Any, no: Any) -> Any:
@@ -374,10 +406,13 @@ def outcome(trial: Trial, period: float) -> Outcome:
         time=trial.steps * period,
         min_distance=trial.min_distance,
         contact_lost_time=trial.lost_steps * period,
+        path_length=trial.path_length,
         mean_abs_l=jnp.where(
             trial.contact_steps > 0, trial.sum_abs_l / jnp.maximum(trial.contact_steps, 1), jnp.nan
         ),
+        tipped=trial.tipped,
         diverged=trial.diverged,
+        overflows=trial.overflows,
         base_pose=trial.qpos[..., JOINTS.base],
         object_pose=pose.reshape(*trial.qpos.shape[:-1], 3),
     )

@@ -194,6 +194,7 @@ class Answer(NamedTuple):
     score: np.ndarray  # (P, D * W) [1]
     success: np.ndarray  # (P, D * W) [1]
     time: np.ndarray  # (P, D * W) [s]
+    path: np.ndarray  # (P, D * W) [m]
 
 
 class _Group(NamedTuple):
@@ -219,7 +220,7 @@ def try_out(
     widths = [len(domains) * ask.worlds.size for ask in asks]
     sizes = [len(ask.params.L) * width for ask, width in zip(asks, widths, strict=True)]
     firsts = [sum(sizes[:i]) for i in range(len(sizes))]
-    found = Answer(*np.full((3, sum(sizes)), np.nan))
+    found = Answer(*np.full((4, sum(sizes)), np.nan))
     lost, way = np.empty((2, sum(sizes)))  # [s], [m] missed: all the way until it ends nearer
     longest = max(domain.remembered(one, setting.physics.control_period) for one in domains)
     jobs: dict[Any, list[_Group]] = {}
@@ -234,6 +235,7 @@ def try_out(
 
     def collect(numbers: np.ndarray, outcome: Outcome) -> None:
         found.success[numbers], found.time[numbers] = outcome.success, outcome.time
+        found.path[numbers] = outcome.path_length
         lost[numbers] = outcome.contact_lost_time
         near = outcome.min_distance
         way[numbers] = np.where(np.isfinite(near), near, way[numbers])

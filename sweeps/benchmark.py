@@ -9,7 +9,7 @@ against C MuJoCo in a closed loop on all cores. A figure shows throughput agains
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -18,7 +18,7 @@ import jax
 import tyro
 from tqdm import tqdm
 
-from rps_jax import benchmark, errors, figures, record, score
+from rps_jax import benchmark, engines, errors, figures, record, score
 from rps_jax.benchmark import Speed
 from rps_jax.cli import guarded
 
@@ -27,8 +27,8 @@ from rps_jax.cli import guarded
 class Options:
     """What to time."""
 
-    names: tuple[str, ...] = benchmark.NAMES
-    """Engines and fidelities."""
+    names: tuple[str, ...] = ()
+    """Engines and fidelities; by default all that this machine can run."""
     families: tuple[str, ...] = benchmark.FAMILIES
     """box, cylinder."""
     worlds: tuple[int, ...] = (64, 512)
@@ -39,8 +39,11 @@ class Options:
 
 def main(options: Options) -> None:
     """Time every combination, then print and write the table."""
+    options = replace(options, names=options.names or benchmark.here())
     for name in options.names:
         errors.check_name("name", name, benchmark.NAMES)
+        if name in benchmark.BATCHED:
+            engines.check(benchmark.BATCHED[name].engine)
     for family in options.families:
         errors.check_name("family", family, benchmark.FAMILIES)
     for worlds in options.worlds:

@@ -2,8 +2,9 @@
 
     python sweeps/robustness.py --worlds 90 --out runs/engines
 
-runs the same worlds in every engine and prints a table: success, and the share of outcomes equal to
-those of converged C MuJoCo. It can be killed; the same command continues. `rps sweep` runs one.
+runs the same worlds in every engine that can run them here (MJX-Warp: on an NVIDIA GPU, in a domain
+without prisms) and prints a table: success, and the share of outcomes equal to those of converged C
+MuJoCo. It can be killed; the same command continues. `rps sweep` runs one.
 """
 
 import sys
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import tyro
 
-from rps_jax import analysis, errors, paper, record, robustness, score
+from rps_jax import analysis, engines, errors, paper, record, robustness, score
 from rps_jax.cli import Spread, guarded, progress_bar, use_cache
 from rps_jax.domain import DOMAINS
 from rps_jax.physics import preset
@@ -27,6 +28,7 @@ ENGINES = {
     "fused, fast": Setting(preset(fidelity="fast"), engine="fused"),
     "quasistatic": Setting(preset(), engine="quasistatic"),
     "MJX, standard": Setting(preset(), engine="mjx"),
+    "MJX-Warp, standard": Setting(preset(), engine="warp"),
 }
 
 
@@ -52,6 +54,7 @@ def main(options: Options) -> None:
     plans = {
         name: Plan(domain, options.worlds, arms, setting, part=64)
         for name, setting in ENGINES.items()
+        if engines.works(setting.engine, domain.families)
     }
     shape = options.shape()
     use_cache()

@@ -13,7 +13,9 @@ def pytest_configure(config):
     from rps_jax import video
 
     video.choose_gl()
-    jax.config.update("jax_compilation_cache_dir", str(config.rootpath / ".jax_cache"))
+    cache = config.rootpath / ".jax_cache"
+    jax.config.update("jax_compilation_cache_dir", str(cache))
+    os.environ.setdefault("WARP_CACHE_PATH", str(cache / "warp"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 

@@ -88,7 +88,7 @@ def test_antithetic_steps_find_the_slope_of_the_objective(monkeypatch):
     def pretend(asks, *_, **__):
         z = space.vector(asks[0].params)
         values = np.asarray(2 * z[:, 0] - z[:, 1])[:, None] + np.zeros(3)
-        return [tune.Answer(values, values, values)], None
+        return [tune.Answer(values, values, values, values)], None
 
     monkeypatch.setattr(tune, "try_out", pretend)
     course = Course((domain.DOMAINS["wide"],), 3, 3, SETTING)

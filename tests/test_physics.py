@@ -113,7 +113,7 @@ def in_jax(worlds, physics=STANDARD, engine="mjx", seconds=SECONDS):
     def run(*state):
         def body(state, _):
             now = blank(trial.Trial, qpos=state[0], qvel=state[1], warmstart=state[2])
-            return stage.drive(batch, now, Twist(*twist.T), physics), state[:2]
+            return stage.drive(batch, now, Twist(*twist.T), physics)[:3], state[:2]
 
         return jax.lax.scan(body, state, length=round(seconds / physics.control_period) + 1)[1]
 

@@ -76,7 +76,7 @@ def drive(stage, worlds, start, twists, physics):
 
     def step(qpos, twist):
         now = blank(trial.Trial, qpos=qpos)
-        after, _, _ = stage.drive(worlds, now, Twist(*twist.T), physics)
+        after, *_ = stage.drive(worlds, now, Twist(*twist.T), physics)
         return after, after
 
     return jnp.concatenate([start[None], jax.lax.scan(step, start, twists)[1]])

@@ -18,13 +18,25 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from rps_jax import analysis, cli, domain, paper, record, robustness, slots, strategies, trial
+from rps_jax import (
+    analysis,
+    cli,
+    domain,
+    frames,
+    paper,
+    record,
+    robustness,
+    slots,
+    strategies,
+    trial,
+)
 from rps_jax.domain import DOMAINS, Range
 from rps_jax.errors import InputError
+from rps_jax.law import RPSParams
 from rps_jax.physics import preset
 from rps_jax.robustness import Plan, Shard
 from rps_jax.slots import Job, Setting
-from rps_jax.trial import Rules
+from rps_jax.trial import Outcome, Rules
 
 SLOTS = 8
 SHORT = Setting(preset(fidelity="fast"), Rules(horizon=20.0), engine="fused")
@@ -133,6 +145,17 @@ def test_a_base_that_errs_by_nothing_is_perfect():
     for i in range(6):
         for mine, theirs in zip(a[i], b[i], strict=True):
             np.testing.assert_allclose(mine, theirs, atol=1e-4)
+
+
+def test_flat_boxes_that_nothing_touches_stay_where_they_are():
+    """Even in the long steps of `fast`, in which stiffer ground would shake them away."""
+    flat = replace(BOXES, size=Range(0.25, 0.35), height=Range(0.3, 0.4), gap=Range(0.05, 0.05))
+    still = RPSParams.paper()._replace(v_approach=0.0)
+    part = domain.worlds(flat, domain.draw(flat, 0, np.arange(SLOTS)), still, SHORT)
+    found = outcomes([part])
+    pose = np.array([found[i][Outcome._fields.index("object_pose")] for i in range(SLOTS)])
+    assert np.abs(pose[:, :2] - part.worlds.qpos[:, 3:5]).max() < 2e-3  # in 20 s
+    assert np.abs(pose[:, 2] - frames.yaw_of_quaternion(part.worlds.qpos[:, 6:])).max() < 0.01
 
 
 def test_a_faster_base_arrives_earlier():
@@ -336,6 +359,7 @@ def test_what_a_sweep_says_is_what_happened():
         {
             "success": (("arm", "world"), np.array([[1, 0, 0, 0], [1, 1, 0, 0]], np.int8)),
             "diverged": (("arm", "world"), np.array([[0, 0, 0, 1], [0, 0, 0, 0]], np.int8)),
+            "tipped": (("arm", "world"), np.array([[0, 0, 0, 0], [0, 0, 0, 1]], np.int8)),
             "time": (("arm", "world"), np.array([[50.0, 300, 200, 9], [70, 80, 300, 300]])),
             "min_distance": (("arm", "world"), np.array([[0.04, 0.5, inf, 1], [0.04, 0.04, 1, 2]])),
             "contact_lost_time": (("arm", "world"), np.array([[0.0, 0, 0, 0], [0, 0, 151, 0]])),
@@ -347,7 +371,8 @@ def test_what_a_sweep_says_is_what_happened():
     first, second = (results.sel(arm=arm) for arm in "ab")
     assert [analysis.FAILURES[k] if k >= 0 else "" for k in analysis.failure(first, 150)] == [
         "", "timeout", "never touched", "diverged"]  # fmt: skip
-    assert analysis.FAILURES[analysis.failure(second, 150)[2]] == "lost contact"
+    assert [analysis.FAILURES[k] for k in analysis.failure(second, 150)[2:]] == [
+        "lost contact", "fell over"]  # fmt: skip
     assert analysis.left_over(first).tolist() == [0.04, 0.5, 3.0, 1.0]
     assert analysis.cvar(np.arange(100.0)) == pytest.approx(97.0)  # mean of 95 .. 99
     assert analysis.cvar(np.array([1.0, 3.0])) == 3.0

@@ -107,6 +107,27 @@ def test_a_diverged_world_freezes_and_leaves_the_others_bit_unchanged(advanced):
     assert (np.asarray(healthy.steps) == 20).all()
 
 
+def test_an_object_that_leans_beyond_its_rule_has_fallen_over_and_ends_its_trial():
+    _, worlds = world_batch(SLOTS)
+    half = np.radians([0.0, 44.0, 46.0, -120.0]) / 2  # about the object's x axis
+    qpos = worlds.qpos.at[:, 6].set(np.cos(half)).at[:, 7].set(np.sin(half))
+    worlds = worlds._replace(qpos=qpos)
+    trials = trial.start_all(worlds, jnp.ones(SLOTS, bool))
+    seen = jax.vmap(lambda w, t: trial.observe(w, t, physics=preset())[0])(worlds, trials)
+    assert seen.tipped.tolist() == seen.done.tolist() == [False, False, True, True]
+    assert not seen.success.any()
+    late = jax.vmap(lambda w, t: trial.observe(w, t, physics=preset(), rules=Rules(max_tilt=3))[0])
+    assert not late(worlds, trials).tipped.any()
+
+
+def test_the_way_of_the_base_is_its_speed_times_time(outcomes, advanced):
+    # 0.4 s at 1 cm/s before the first touch; then at no more than v_max.
+    np.testing.assert_allclose(advanced[0].path_length, 0.004, rtol=1e-3)
+    ahead = outcomes.base_pose[2, :2]
+    assert outcomes.path_length[2] == pytest.approx(float(np.hypot(*ahead)), rel=0.01)
+    assert (outcomes.path_length <= 0.05 * outcomes.time).all()
+
+
 def test_padding_never_moves_and_a_finished_batch_stops_at_once():
     stage, worlds = world_batch(SLOTS)
     trials = trial.start_all(worlds, jnp.zeros(SLOTS, bool))

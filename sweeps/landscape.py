@@ -1,0 +1,72 @@
+"""What does success depend on, and what does it cost in time and in the way driven?
+
+    python sweeps/landscape.py --params paper tuned --out runs/landscape
+
+varies each of the law's parameters alone, and looks for the undominated among candidates between
+and around the sets of parameters; draws both and prints the front. Runs a few hundred candidates,
+each in --worlds worlds of each domain: for a GPU.
+"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from rps_jax import errors, figures, landscape, record, score
+from rps_jax.cli import Spread, domain_of, guarded, params_of, progress_bar, use_cache
+from rps_jax.tune import SUBSETS, Course
+
+
+@dataclass(frozen=True)
+class Options(Spread):
+    """Which parameters, where."""
+
+    params: tuple[str, ...] = ("paper", "tuned")
+    """Sets of parameters: paper, tuned, or JSON files (as {"L": 0.3})."""
+    domain: tuple[str, ...] = ("wide",)
+    """paper, hardware, wide, hostile, or JSON files of ranges."""
+    worlds: int = 999
+    """That each candidate meets, in each domain."""
+    values: int = 9
+    """Of each parameter."""
+    candidates: int = 256
+    """Between and around the sets."""
+    spread: float = 0.5
+    """Standard deviation around, in units of the bounded map."""
+    seed: int = 0
+    """Of worlds and candidates."""
+    out: Path = Path("runs/landscape")
+    """Run folder."""
+
+
+def main(options: Options) -> None:
+    """Run, draw and print."""
+    for name in ("worlds", "values", "candidates"):
+        errors.check_finite(name, getattr(options, name), at_least=2, at_most=1e6)
+    errors.check_finite("spread", options.spread, at_least=0, at_most=10)
+    sets = {Path(name).stem: params_of(name) for name in options.params}
+    course = Course(tuple(domain_of(text) for text in options.domain))
+    out = record.writable(options.out)
+    use_cache()
+    record.write_json(out / "environment.json", record.environment())
+    common: dict[str, Any] = {"worlds": options.worlds, "seed": options.seed} | options.shape()
+    each = len(course.domains) * options.worlds
+    varied = len(sets) * len(SUBSETS["full"]) * options.values
+    with progress_bar(varied * each, "sensitivity") as report:
+        found = landscape.sensitivity(sets, course, count=options.values, report=report, **common)
+    record.write_results(out / "sensitivity.nc", found)
+    figures.sensitivity(found, out / "sensitivity.png")
+    several: dict[str, Any] = {"candidates": options.candidates, "spread": options.spread}
+    with progress_bar(2 * (options.candidates + len(sets)) * each, "front") as report:
+        front = landscape.front(sets, course, report=report, **several, **common)
+    record.write_results(out / "front.nc", front)
+    figures.front(front, out / "front.png")
+    text = score.markdown(landscape.front_table(front))
+    record.write_text(out / "front.md", text + "\n")
+    print(text)
+
+
+if __name__ == "__main__":
+    sys.exit(guarded(lambda: main(tyro.cli(Options, description=__doc__))))
