@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from scipy import stats
 
 from rps_jax import score, study
 
@@ -105,8 +106,12 @@ def rates(results: xr.Dataset, max_lost: float) -> list[list[str]]:
 
 
 def _rate(won: np.ndarray) -> str:
-    low, high = score.wilson(int(won.sum()), won.size)
-    share = 100 * won.mean() if won.size else np.nan
+    return _share(int(won.sum()), won.size)
+
+
+def _share(won: int, of: int) -> str:
+    low, high = score.wilson(won, of)
+    share = 100 * won / of if of else np.nan
     return f"{share:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
 
 
@@ -181,6 +186,38 @@ def bins(values: np.ndarray, won: np.ndarray, count: int = 8) -> Bins:
         np.array([int(won[g].sum()) for g in groups]),
         np.array([g.size for g in groups]),
     )
+
+
+def influences(results: xr.Dataset, arm: str) -> list[list[str]]:
+    """Header and one row for each quantity that was drawn: the arm's worst and best bin.
+
+    Those whose bins differ most come first: by a chi-squared test that all bins have one rate,
+    false discoveries among the quantities held at 5 % (Benjamini-Hochberg) where q < 0.05.
+    """
+    won = results.success.sel(arm=arm).values > 0
+    drawn = {name: results[name] for name in DRAWN if np.nanstd(results[name].values) > 0}
+    binned = {name: bins(values.values, won) for name, values in drawn.items()}
+    q = stats.false_discovery_control([_one_rate(found) for found in binned.values()])
+    rows = [["", "worst bin, about", "success", "best bin, about", "success", "q"]]
+    for i in np.argsort(q, kind="stable"):
+        name, found = list(binned.items())[i]
+        order, unit = np.argsort(found.won / found.of, kind="stable"), drawn[name].attrs["units"]
+        told = [f"{value:.3g} {unit}".removesuffix(" 1") for value in found.middle]
+        ends = [
+            cell
+            for n in (order[0], order[-1])
+            for cell in (told[n], _share(int(found.won[n]), int(found.of[n])))
+        ]
+        rows.append([DRAWN[name], *ends, f"{q[i]:.2g}"])
+    return rows
+
+
+def _one_rate(found: Bins) -> float:
+    """The p of a chi-squared test that all bins have one success rate."""
+    counts = np.stack([found.won, found.of - found.won])
+    if len(found.of) < 2 or not counts.sum(axis=1).all():
+        return 1.0
+    return float(stats.chi2_contingency(counts).pvalue)
 
 
 def agreement(found: Mapping[str, xr.Dataset]) -> list[list[str]]:

@@ -11,7 +11,7 @@ Derivatives of chaotic worlds may be finite and yet say nothing: their variance 
 
 `forward` and `reverse` differentiate every world. What they differentiate must be smooth:
 `strategies.smooth_rps` with a `skin.SmoothSkin`; and it misses what jumps all the same. `evolution`
-needs no derivative.
+and `differences` need no derivative.
 """
 
 from __future__ import annotations
@@ -80,6 +80,26 @@ def reverse(scores: Scores, theta: jax.Array, worlds: Any) -> Estimate:
     return estimate(jnp.moveaxis(slopes, (-2, -1), (0, 1)))
 
 
+def differences(
+    scores: Scores, theta: jax.Array, worlds: Any, *, step: float | jax.Array
+) -> Estimate:
+    """By central differences in each world: 2 p n scores.
+
+    Args:
+      scores: see above.
+      theta: (p,).
+      worlds: (n, ...).
+      step: () or (p,), in the units of theta.
+    """
+    n, p = _for_each(theta, worlds).shape
+    steps = jnp.repeat(jnp.diag(jnp.broadcast_to(jnp.asarray(step, theta.dtype), p)), n, axis=0)
+    thetas = theta + jnp.concatenate([steps, -steps])
+    found = scores(thetas, _repeated(worlds, 2 * p))
+    rises = -jnp.diff(found.reshape(2, p, n, *found.shape[1:]), axis=0)[0]
+    width = jnp.reshape(2 * jnp.asarray(step), (-1,) + (1,) * found.ndim)
+    return estimate(jnp.swapaxes(rises / width, 0, 1))
+
+
 def evolution(
     scores: Scores,
     theta: jax.Array,
@@ -109,8 +129,7 @@ def evolution(
     n, p = _for_each(theta, worlds).shape
     directions = jax.random.normal(key, (pairs, n, p), theta.dtype)
     steps = jnp.concatenate([directions, -directions]) * sigma
-    repeated = jax.tree.map(lambda x: jnp.concatenate([x] * (2 * pairs)), worlds)
-    found = scores(theta + steps.reshape(-1, p), repeated)
+    found = scores(theta + steps.reshape(-1, p), _repeated(worlds, 2 * pairs))
     rises = -jnp.diff(found.reshape(2, pairs, n, 1, *found.shape[1:]), axis=0)[0]
     along = directions / (2 * sigma)
     slopes = rises * along.reshape(*along.shape, *(1,) * (found.ndim - 1))
@@ -139,6 +158,11 @@ def _for_each(theta: jax.Array, worlds: Any) -> jax.Array:
     """The same theta (n, p) in each world."""
     count = jax.tree.leaves(worlds)[0].shape[0]
     return jnp.broadcast_to(theta, (count, theta.size))
+
+
+def _repeated(worlds: Any, times: int) -> Any:
+    """The same worlds (n, ...) several times, (times n, ...)."""
+    return jax.tree.map(lambda x: jnp.concatenate([x] * times), worlds)
 
 
 def window(

@@ -1,10 +1,8 @@
 """The command line as a user meets it: whole runs, repeatable files, and teaching errors."""
 
 import json
-import runpy
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -50,13 +48,6 @@ def test_a_table_run_leaves_a_labelled_run_folder(runs):
 
 def test_the_same_command_gives_the_same_results_file_bit_for_bit(runs):
     assert (runs[0] / "results.nc").read_bytes() == (runs[1] / "results.nc").read_bytes()
-
-
-def test_the_notebook_reads_a_run_folder(runs, monkeypatch, capsys):
-    monkeypatch.setenv("RPS_RUN", str(runs[0]))
-    monkeypatch.setenv("MPLBACKEND", "Agg")
-    runpy.run_path(str(Path(__file__).parents[1] / "notebooks" / "03_paper.py"))
-    assert "| RPS | ours" in capsys.readouterr().out
 
 
 def test_a_run_is_not_overwritten_unasked(runs, capsys):

@@ -40,6 +40,9 @@ def some_worlds(key, n=32):
 ESTIMATORS = {
     "forward": lambda scores, key, worlds: gradients.forward(scores, THETA, worlds),
     "reverse": lambda scores, key, worlds: gradients.reverse(scores, THETA, worlds),
+    "differences": lambda scores, key, worlds: gradients.differences(
+        scores, THETA, worlds, step=0.1
+    ),
     "evolution": lambda scores, key, worlds: gradients.evolution(
         scores, THETA, worlds, key, sigma=0.2, pairs=2
     ),
@@ -84,10 +87,10 @@ def test_the_variance_is_that_of_repeated_estimates_and_falls_as_one_over_n(name
     np.testing.assert_allclose(few.variance.mean(0) / many.variance.mean(0), 16, rtol=0.15)
 
 
-def test_forward_and_reverse_are_the_derivatives_in_each_world():
+def test_all_but_evolution_are_the_derivatives_in_each_world():
     worlds = some_worlds(jax.random.key(2))
     slopes = STIFF * (THETA - worlds)  # (32, 3)
-    for name in ("forward", "reverse"):
+    for name in ("forward", "reverse", "differences"):
         found = found_by(name, bowls, None, worlds)
         np.testing.assert_allclose(found.gradient, slopes.mean(axis=0), rtol=1e-5)
         np.testing.assert_allclose(found.variance, slopes.var(axis=0, ddof=1) / 32, rtol=1e-4)

@@ -387,6 +387,24 @@ def test_what_a_sweep_says_is_what_happened():
     assert analysis.bins(np.array([1.0, 1, 2]), np.array([True, False, True])).of.tolist() == [2, 1]
 
 
+def test_what_success_depends_on_stands_first():
+    """Heavy objects fail, of 400; friction has nothing to do with it; all else was not varied."""
+    number = np.arange(400)
+    drawn = {name: ("world", np.zeros(400), {"units": "1"}) for name in analysis.DRAWN}
+    drawn["mass"] = ("world", number * 1.0, {"units": "kg"})
+    drawn["friction_ground"] = ("world", number % 7 * 1.0, {"units": "1"})
+    success = (("arm", "world"), (number < 350)[None].astype(np.int8))
+    results = xr.Dataset({"success": success, **drawn}, coords={"arm": ["a"]})
+    (_, mass, friction) = analysis.influences(results, "a")
+    assert mass[0] == "mass of the object"
+    assert mass[1] == "374 kg"  # the last eighth: 350 to 399
+    assert mass[2].startswith("0.0 % [0.0, ")
+    assert mass[4].startswith("100.0 %")
+    assert float(mass[5]) < 1e-10
+    assert friction[0] == "friction object-ground"
+    assert float(friction[5]) > 0.5
+
+
 def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(cli, "use_cache", lambda: None)
     tuned = tmp_path / "tuned.json"

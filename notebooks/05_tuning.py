@@ -1,0 +1,186 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+# ---
+
+# %% [markdown]
+# # Tuning the law
+#
+# The paper's parameters were chosen by hand. `RPSParams.tuned()` was found by evolution in two
+# runs of CMA-ES, a coarse and a fine one, whose commands stand in the README; `runs/coarse` and
+# `runs/fine` hold their logs. `runs/compare/wide` has both sets of parameters in 1000 worlds that
+# no tuner has seen. There the tuned law did not yet keep acting upon a lost contact
+# (`keep_contact`), as it does now. Only the last section simulates anything.
+
+# %%
+import json
+import tempfile
+from pathlib import Path
+
+import jax
+import numpy as np
+from IPython.display import Image, Markdown
+
+from rps_jax import (
+    FRICTION,
+    Case,
+    RPSParams,
+    Setting,
+    analysis,
+    figures,
+    gradients,
+    paper,
+    record,
+    score,
+    strategies,
+    sweep,
+    trial,
+    tune,
+)
+from rps_jax.skin import SmoothSkin
+
+out = Path(tempfile.mkdtemp())
+
+# %% [markdown]
+# ## The coarse search
+#
+# Every generation tries 64 candidates in 512 worlds, others in each generation; the mean of the
+# candidates' distribution is then tried in worlds kept for validation. Less is better: a success
+# scores its time, a failure one more and how far it missed.
+
+# %%
+names = tune.SUBSETS["full"]
+Image(figures.tuning(tune.read_log(Path("runs/coarse")), names, out / "coarse.png"))
+
+# %% [markdown]
+# In seven generations the objective on the validation worlds halves, from 0.31 to 0.15, and
+# success rises from 86 to 95.5 %. Then the search gets worse again, while it believes to get
+# better: the mean of the candidates falls on, and it does so because they become alike (the blue
+# band narrows), far out where the bounded map is flat: $K_v$, $a_r^{max}$ and $d_{th}$ run into
+# the upper end of what is allowed, 2, 100 and 2. Without worlds for validation this would have
+# gone unnoticed. The fine search begins at generation 6.
+#
+# ## The fine search
+#
+# A spread half as wide, and a higher price for leaving the start. Time weighs less in its
+# objective, and its worlds are others, so its values cannot be compared with those above.
+
+# %%
+Image(figures.tuning(tune.read_log(Path("runs/fine")), names, out / "fine.png"))
+
+# %% [markdown]
+# Validation falls from 0.164 to 0.117 at generation 7, which is the set that was kept. The values
+# jump from one generation to the next, and those of the start (dashed) jump with them: these are
+# the worlds, and this is why candidates are compared within a generation only. The gain over the
+# generations before and after the seventh is smaller than such jumps, so another run would end at
+# somewhat other numbers.
+#
+# ## What changed
+
+# %%
+sets = {"paper": RPSParams.paper(), "tuned": RPSParams.tuned()}
+kept = json.loads(Path("runs/fine/tuned.json").read_text())
+assert kept == {name: getattr(sets["tuned"], name) for name in names}
+space = tune.Space(names)
+places = {label: jax.nn.sigmoid(space.vector(params)) for label, params in sets.items()}
+Image(figures.between_bounds(places, names, out / "bounds.png"))
+
+# %% [markdown]
+# $K_v$, $a_r^{max}$, $K_h$ and $l_{cr}$ moved most; $\beta$ and $\gamma_{max}$ hardly at all.
+# What this means is easier to see in the twist (compare `01_the_law`), here 1 m from the target:
+
+# %%
+Image(figures.twist_field(sets, 1.0, out / "twist.png"))
+
+# %% [markdown]
+# The tuned law has all but given up Eq. 5, which acts only beyond $d_{th}$ = 1.56 m. Nearer, it
+# knows two things to do: push straight ahead and turn as fast as it may, or, beyond $l_{cr}$ = 17
+# cm, slide sideways, without pushing, until the contact is back at 12 cm. The paper's law mixes
+# the two, and leaves the contact where mixing holds it.
+#
+# ## The same worlds, twice
+
+# %%
+results = record.read_results(Path("runs/compare/wide"))
+Markdown(score.markdown(analysis.differences(results)))
+
+# %%
+Image(figures.paired(results, out / "paired.png"))
+
+# %% [markdown]
+# The tuned law wins 73 worlds that the paper's parameters lose and loses 7 that they win: no
+# accident. And it is not bought with time. Most worlds lie just below the diagonal, a little
+# faster than before; a second group, for which the paper's parameters need 150 s and more, takes
+# the tuned law no longer than the others; and so do the worlds that only it wins. A few worlds
+# became slower (above the diagonal). `04_robustness` shows which objects gained.
+#
+# ## What a gradient is worth
+#
+# Evolution needs no derivative. Does the simulator have useful ones? Here the distance to the
+# target at some time, in the quasi-static model with smooth law and skin, is differentiated with
+# respect to four parameters (in the coordinates of tuning), and averaged over the paper's 24
+# targets: by automatic differentiation (forward mode, which compiles fastest), by central
+# differences, and by antithetic random steps in all four parameters at once. The last two cost
+# equally many trials.
+
+# %%
+names = ("L", "K_h", "K_v", "beta")
+space = tune.Space(names)
+cases = [
+    Case("box", FRICTION["S1"], target, gap=0.004, skin=SmoothSkin()) for target in paper.TARGETS
+]
+setting, strategy = Setting(engine="quasistatic"), strategies.smooth_rps()
+stage, worlds = sweep.build(cases, setting)
+starts = worlds, trial.start_all(worlds, np.ones(len(cases), bool), strategy=strategy)
+horizons = np.array([1.0, 3.0, 10.0])  # [s]
+steps = np.round(horizons / setting.physics.control_period).astype(int)
+
+
+def distance_at(step):
+    return gradients.window(
+        stage,
+        space.params,
+        lambda seen: seen.details.distance[step],
+        physics=setting.physics,
+        strategy=strategy,
+        steps=int(steps[-1]) + 1,
+    )
+
+
+# Compiled once, for all horizons.
+tried = jax.jit(lambda thetas, starts, step: distance_at(step)(thetas, starts))
+derived = jax.jit(lambda theta, step: gradients.forward(distance_at(step), theta, starts))
+theta, key = space.vector(RPSParams.paper()), jax.random.key(0)
+
+
+def by_three(step):
+    def scores(thetas, starts):
+        return tried(thetas, starts, step)
+
+    return {
+        "derivative": derived(theta, step),
+        "differences": gradients.differences(scores, theta, starts, step=0.01),
+        "evolution": gradients.evolution(scores, theta, starts, key, sigma=0.15, pairs=4),
+    }
+
+
+found = jax.tree.map(lambda *rows: np.stack(rows), *(by_three(step) for step in steps))
+bars = {name: (one.gradient, one.variance) for name, one in found.items()}
+Image(figures.estimates(horizons, bars, names, out / "gradients.png"))
+
+# %% [markdown]
+# Bars are two standard errors over the targets, so they show how much targets differ as well as
+# how noisy an estimate is. Until 3 s derivatives and differences are the same; evolution agrees,
+# with bars as wide or up to twice as wide. At 10 s this still holds for $K_h$. For $L$ and $K_v$
+# the derivative's bars are about twice as wide as those of the differences, and for $\beta$ seven
+# times: in some worlds it has grown far beyond what the parameter does. Evolution's bars grow,
+# too, but remain within two to two and a half times those of the differences, for every
+# parameter.
+#
+# A success takes some 80 s. So derivatives are good for a short look ahead, and what tuned the
+# law over whole trials was evolution. This is one box, 24 worlds and four parameters: a look, not
+# a benchmark.
