@@ -524,10 +524,12 @@ def tuning(log: Sequence[Mapping], names: Sequence[str], path: Path) -> Path:
     ax.legend(fontsize=8)
     ax = figure.add_subplot(grid[0, 2:])
     ax.plot(generation, of("validation"), "C2", label="objective")
+    ax.margins(y=0.3)  # room for the legends
     ax.set(xlabel="generation", ylabel="mean on validation worlds [1]")
     ax.legend(loc="upper left", fontsize=8)
     twin = ax.twinx()
     twin.plot(generation, 100 * of("validation_success"), "C3", label="success")
+    twin.margins(y=0.3)
     twin.set_ylabel("success [%]")
     twin.legend(loc="upper right", fontsize=8)
     for i, name in enumerate(names):

@@ -3,7 +3,9 @@ allowed, before anything compiles."""
 
 import json
 import re
+import runpy
 import time
+from pathlib import Path
 
 import pytest
 
@@ -369,3 +371,24 @@ def test_a_corrupt_results_file_is_named(tmp_path):
     (tmp_path / "results.nc").write_bytes(b"not a file of results")
     with pytest.raises(InputError, match=r"results\.nc is corrupt"):
         record.read_results(tmp_path)
+
+
+SCRIPTS = [
+    ("gradient_quality", {"object": "box"}, "unknown object 'box'"),
+    ("gradient_quality", {"horizons": ()}, r"horizons = \(\) is not allowed"),
+    ("gradient_quality", {"estimators": ("backward",)}, "unknown estimator 'backward'"),
+    ("gradient_quality", {"tuned": ("v_max",)}, "unknown tuned parameter 'v_max'"),
+    ("landscape", {"candidates": 1}, "candidates = 1 is not allowed"),
+    ("landscape", {"params": ("tund",)}, "tund cannot be read"),
+    ("landscape", {"domain": ("wyde",)}, "unknown domain 'wyde'"),
+    ("benchmark", {"families": ("cone",)}, "unknown family 'cone'"),
+    ("benchmark", {"refill": -1}, "refill = -1 is not allowed"),
+]
+
+
+@pytest.mark.parametrize(("script", "options", "message"), SCRIPTS)
+def test_a_script_refuses_before_it_compiles(script, options, message, tmp_path, compiled):
+    names = runpy.run_path(str(Path(__file__).parents[1] / "sweeps" / f"{script}.py"))
+    with pytest.raises(InputError, match=message):
+        names["main"](names["Options"](**options, out=tmp_path / "run"))
+    assert not compiled
