@@ -114,9 +114,9 @@ Image(figures.paired(results, out / "paired.png"))
 # %% [markdown]
 # The tuned law wins 64 worlds that the paper's parameters lose and loses 4 that they win: no
 # accident. And it is not bought with time. Most worlds lie just below the diagonal, a fifth faster
-# than before; of a second group, for which the paper's parameters need 150 s and more, the tuned law
-# takes most no longer than the others; and so do most of the worlds that only it wins. A few worlds
-# became slower (above the diagonal). `04_robustness` shows which objects gained.
+# than before; of a second group, for which the paper's parameters need 150 s and more, the tuned
+# law takes most no longer than the others; and so do most of the worlds that only it wins. A few
+# worlds became slower (above the diagonal). `04_robustness` shows which objects gained.
 #
 # ## What a gradient is worth
 #
@@ -140,36 +140,24 @@ horizons = np.array([1.0, 3.0, 10.0])  # [s]
 steps = np.round(horizons / setting.physics.control_period).astype(int)
 
 
-def distance_at(step):
-    return gradients.window(
+# The distances after all three times at once.
+distances = jax.jit(
+    gradients.window(
         stage,
         space.params,
-        lambda seen: seen.details.distance[step],
+        lambda seen: seen.details.distance[steps],
         physics=setting.physics,
         strategy=strategy,
         steps=int(steps[-1]) + 1,
     )
-
-
-# Compiled once, for all horizons.
-tried = jax.jit(lambda thetas, starts, step: distance_at(step)(thetas, starts))
-derived = jax.jit(lambda theta, step: gradients.forward(distance_at(step), theta, starts))
+)
 theta, key = space.vector(RPSParams.paper()), jax.random.key(0)
-
-
-def by_three(step):
-    def scores(thetas, starts):
-        return tried(thetas, starts, step)
-
-    return {
-        "derivative": derived(theta, step),
-        "differences": gradients.differences(scores, theta, starts, step=0.01),
-        "evolution": gradients.evolution(scores, theta, starts, key, sigma=0.15, pairs=4),
-    }
-
-
-found = jax.tree.map(lambda *rows: np.stack(rows), *(by_three(step) for step in steps))
-bars = {name: (one.gradient, one.variance) for name, one in found.items()}
+found = {
+    "derivative": gradients.forward(distances, theta, starts),
+    "differences": gradients.differences(distances, theta, starts, step=0.01),
+    "evolution": gradients.evolution(distances, theta, starts, key, sigma=0.15, pairs=4),
+}
+bars = {name: (one.gradient.T, one.variance.T) for name, one in found.items()}
 Image(figures.estimates(horizons, bars, names, out / "gradients.png"))
 
 # %% [markdown]

@@ -60,7 +60,7 @@ def test_a_run_is_not_overwritten_unasked(runs, capsys):
 def test_a_push_draws_and_films_a_trial(tmp_path, capsys):
     out = tmp_path / "push"
     arguments = ("--target", 0.6, 0, "--horizon", 18, "--film-length", 0.4, "--out", out)
-    assert rps("push", *arguments) == 0
+    assert rps("push", "--engine", "fused", *arguments) == 0
     assert "reached at" in capsys.readouterr().out
     trace = xr.load_dataset(out / "results.nc", engine="h5netcdf")
     assert trace.sizes["time"] > 100
@@ -72,7 +72,8 @@ def test_a_push_draws_and_films_a_trial(tmp_path, capsys):
 def test_a_push_without_the_means_to_film_says_how_and_does_the_rest(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
     out = tmp_path / "push"
-    assert rps("push", "--target", 0.6, 0, "--horizon", 18, "--out", out) == 0
+    arguments = ("--engine", "fused", "--horizon", 18, "--out", out)
+    assert rps("push", "--target", 0.6, 0, *arguments) == 0
     printed = capsys.readouterr().out
     assert "no video: " in printed
     assert "pip install imageio-ffmpeg" in printed

@@ -139,6 +139,7 @@ def programs(tmp_path_factory):
     """The cache of compiled programs, also of workers."""
     before = jax.config.jax_compilation_cache_dir
     with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_worker_niceness", "0")  # or other tests starve them
         if "RPS_CACHE" not in os.environ:
             patch.setenv("RPS_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield

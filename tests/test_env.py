@@ -185,18 +185,10 @@ def test_an_action_that_is_no_number_ends_a_world_and_no_other(pushing):
     assert np.isfinite(after.obs).all()
 
 
-@pytest.mark.parametrize("engine", ["fused", "mjx"])
-def test_it_moves_as_a_trial_that_is_driven_by_the_same_twist(engine, pushing):
+def test_it_moves_as_a_trial_that_is_driven_by_the_same_twist(pushing):
     """A strategy that always says the same, in the loop of all other trials."""
-    push, action = pushing.env, jnp.array([0.8, 0.2, 0.3])
-    if engine == "fused":
-        state = pushing.start
-        mine = last(pushing.go(state, action))
-    else:
-        push = made("mjx")
-        reset, steps = programs(push)
-        state = reset(jax.random.split(jax.random.key(1), 1))
-        mine = last(steps(state, jnp.tile(action, (STEPS, 1, 1))))
+    push, state, action = pushing.env, pushing.start, jnp.array([0.8, 0.2, 0.3])
+    mine = last(pushing.go(state, action))
     constant = push.twist(action)
     dull = Strategy(
         lambda params: (), lambda params, memory, seen: (memory, constant, Details.of(seen))

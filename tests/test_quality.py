@@ -73,13 +73,13 @@ SMALL = Study(
 def test_a_study_is_continued_and_is_of_one_kind(tmp_path):
     """On the quasi-static model, to compile little."""
     asked = []
-    results = quality.run(SMALL, tmp_path, ("reverse",), report=asked.append)
-    assert asked == ["truth", "reverse"]
-    again = quality.run(SMALL, tmp_path, ("reverse",), report=asked.append)
-    assert asked == ["truth", "reverse"]
+    results = quality.run(SMALL, tmp_path, ("evolution",), report=asked.append)
+    assert asked == ["truth", "evolution"]
+    again = quality.run(SMALL, tmp_path, ("evolution",), report=asked.append)
+    assert asked == ["truth", "evolution"]
     xr.testing.assert_identical(results, again)
     assert (results.finite == 1).all()
     assert (np.abs(results.cosine) <= 1 + 1e-6).all()
     assert (results.doubt > 0).all()
     with pytest.raises(InputError, match="seed = 0 there, 1 asked for"):
-        quality.run(replace(SMALL, seed=1), tmp_path, ("reverse",), report=asked.append)
+        quality.run(replace(SMALL, seed=1), tmp_path, ("evolution",), report=asked.append)

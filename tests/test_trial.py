@@ -1,5 +1,7 @@
 """Trials end as the rules say, worlds do not touch each other, and a short push arrives."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +19,8 @@ from rps_jax.trial import Rules, Shift
 NEAR = (0.7, 0.0)  # [m] 0.32 m ahead of the front face
 AHEAD = (2.0, 0.0)
 SLOTS = 4
-SHORT = Setting(rules=Rules(horizon=24.0, max_lost=5.0))
+FUSED = Setting(engine="fused")  # which compiles sooner; the rules know no engine
+SHORT = replace(FUSED, rules=Rules(horizon=24.0, max_lost=5.0))
 
 
 def case(target=NEAR, name="box", friction="S1", **changes):
@@ -73,14 +76,14 @@ def test_contact_lost_for_too_long_ends_a_trial(outcomes):
     # Without reaction the box slides off the turning base, which creeps ahead without it.
     lost = case((0.2, 2.0), reactive=0.0)
     rules = Rules(horizon=60.0, max_lost=5.0)
-    outcome, _ = sweep.run([lost] * SLOTS, Setting(rules=rules), slots=SLOTS, workers=1)
+    outcome, _ = sweep.run([lost] * SLOTS, replace(FUSED, rules=rules), slots=SLOTS, workers=1)
     assert not outcome.success.any()
     assert outcome.contact_lost_time[0] == pytest.approx(5.0, abs=0.03)
     assert outcome.time[0] < 60.0
 
 
 def world_batch(count):
-    stage, worlds = sweep.build([case()] * count, Setting())
+    stage, worlds = sweep.build([case()] * count, FUSED)
     return stage, jax.device_put(worlds)
 
 
@@ -144,7 +147,7 @@ def test_before_the_first_touch_the_base_creeps_and_nothing_counts_as_lost(advan
 
 
 def test_the_trace_of_a_trial_tells_the_same_story_as_its_outcome():
-    setting = Setting(rules=Rules(horizon=24.0))
+    setting = replace(FUSED, rules=Rules(horizon=24.0))
     (trace,) = sweep.follow([case(skin=CapacitiveSkin())], setting, interval=0.1)
     seen, outcome = trace.snapshots, trace.outcome
     assert outcome.success
