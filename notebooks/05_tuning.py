@@ -163,10 +163,11 @@ Image(figures.estimates(horizons, bars, names, out / "gradients.png"))
 # %% [markdown]
 # Bars are two standard errors over the targets, so they show how much targets differ as well as
 # how noisy an estimate is. Until 3 s derivatives and differences are the same; evolution agrees,
-# with bars as wide or up to twice as wide. At 10 s this still holds for $K_h$. For $L$ and $K_v$
-# the derivative's bars are about twice as wide as those of the differences, and for $\beta$ seven
-# times: in some worlds it has grown far beyond what the parameter does. Evolution's bars grow,
-# too, but remain within two to two and a half times those of the differences, for every
+# with bars as wide or up to twice as wide. At 10 s this still holds for $K_h$, and nearly for $L$
+# and $K_v$. For $\beta$ the derivative's bars are three times as wide as those of the differences:
+# in some worlds it has grown far beyond what the parameter does. Which worlds, and by how much,
+# hangs on rounding: compiled in another way, the bars of $L$ and $K_v$ doubled, too. Evolution's
+# bars grow as well, but remain within two and a half times those of the differences, for every
 # parameter.
 #
 # A success takes some 80 s. So derivatives are good for a short look ahead, and what tuned the
