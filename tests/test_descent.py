@@ -108,6 +108,7 @@ class TestRuns:
             *("--tuned", "L", "K_h", "v_lost", "--slots", "4", "--out", str(folder)),
         ]
 
+    @pytest.mark.slow
     def test_the_command_line_and_a_run_of_another_kind(self, tmp_path, capsys):
         assert cli.main(self.arguments(tmp_path, 2)) == 0
         log = tune.read_log(tmp_path)

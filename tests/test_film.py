@@ -50,7 +50,7 @@ def differ(a, b):
     return (np.abs(a - b).max(axis=-1) > 60).sum() > 20
 
 
-@pytest.mark.parametrize("make", [table, sweep])
+@pytest.mark.parametrize("make", [table, pytest.param(sweep, marks=pytest.mark.slow)])
 def test_a_film_shows_each_trial_in_its_tile_and_holds_the_end(make, tmp_path):
     make(tmp_path)
     out = tmp_path / "two.mp4"

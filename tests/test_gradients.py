@@ -220,6 +220,7 @@ def test_mjx_must_have_a_pyramidal_cone():
         gradients.window(stage, params_of, final_distance, physics=Physics(), steps=10)
 
 
+@pytest.mark.slow
 def test_the_derivative_of_a_window_of_fused_trials_is_its_finite_difference():
     """A cylinder rolls along the base, in float32; one program gives scores and derivatives."""
     targets = ((1.0, -1.5), (2.0, 0.5), (-1.5, 1.0))

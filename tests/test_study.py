@@ -126,6 +126,7 @@ def test_a_shove_moves_the_object_along_the_front_of_the_robot():
     np.testing.assert_allclose(outcome.object_pose[:, :2], expected, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_hardware_experiments_cover_friction_targets_and_shoves():
     base = Case("hardware_box", hardware.MIDDLE, (2.1, 0.0), skin=hardware.SKIN)
     setting = Setting(engine="mujoco", rules=Rules(horizon=3.0))

@@ -130,6 +130,7 @@ def test_late_poses_and_late_commands_are_late_by_as_much(error):
         assert np.abs(np.array(told[steps + 1]) - told[0]).max() > 0
 
 
+@pytest.mark.slow
 def test_a_base_that_errs_by_nothing_is_perfect():
     nothing = {name: Range(0, 0) for name in domain.OF_THE_BASE}
     perfect = replace(ROUND, **nothing)
@@ -158,6 +159,7 @@ def test_flat_boxes_that_nothing_touches_stay_where_they_are():
     assert np.abs(pose[:, 2] - frames.yaw_of_quaternion(part.worlds.qpos[:, 6:])).max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_faster_base_arrives_earlier():
     quick = replace(ROUND, **{n: Range(0, 0) for n in domain.OF_THE_BASE}, gap=Range(0.05, 0.05))
     times = []

@@ -53,6 +53,7 @@ def p_robot_object(seen):
 # --- the trial -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_push_that_is_left_alone_ends_as_any_other_trial(live):
     found, _ = sweep.run([CASE], SETTING, slots=1, workers=1)
     live.step(2 * round(SETTING.rules.horizon / PERIOD))
