@@ -83,8 +83,8 @@ def _worlds(family: str, count: int, setting: Setting) -> tuple[Any, World]:
 
 
 def can(name: str, family: str) -> bool:
-    """Whether an engine steps a family: MJX-Warp knows no prisms of different shapes."""
-    return family != "prism" or name in IN_C or BATCHED[name].engine != "warp"
+    """Whether this machine can run one of `NAMES` with a family."""
+    return name in IN_C or engines.works(BATCHED[name].engine, [family])
 
 
 def _best(action: Callable[[], Any], goes: int = 3) -> float:

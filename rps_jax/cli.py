@@ -1146,8 +1146,7 @@ def _tune_grad(options: TuneGrad) -> None:
 def _space(options: TuneOptions) -> Space:
     from rps_jax import tune
 
-    names = [name for text in options.tuned for name in tune.SUBSETS.get(text, (text,))]
-    return tune.Space(tuple(names), params_of(options.start))
+    return tune.Space(tune.expanded(options.tuned), params_of(options.start))
 
 
 @contextlib.contextmanager

@@ -37,9 +37,7 @@ class Estimate(NamedTuple):
     """A gradient as the mean of independent samples."""
 
     gradient: jax.Array  # (p, ...) 0 where no sample is finite
-    variance: (
-        jax.Array
-    )  # (p, ...) of the gradient, not of one sample; inf with fewer than two samples
+    variance: jax.Array  # (p, ...) of the gradient, not of a sample; inf of fewer than two samples
     finite: jax.Array  # (p, ...) [1] share of the samples that are finite; the others were dropped
 
 

@@ -33,6 +33,7 @@ class Moment(NamedTuple):
     worlds: World  # of this moment, (1, ...): its target and its shove
     before: Trial  # as the step found it
     seen: Snapshot
+    p_world_contact: np.ndarray  # (2,) [m], NaN without contact
     compression: np.ndarray  # (42,) [1] of the foam under each taxel, in strip order
 
 
@@ -166,7 +167,7 @@ def _steps(
     physics: Physics,
     rules: Rules,
     strategy: Strategy,
-) -> tuple[Trial, tuple[Trial, Snapshot, jax.Array]]:
+) -> tuple[Trial, tuple[Trial, Snapshot, jax.Array, jax.Array]]:
     """Up to CHUNK control steps of a world (1, ...), and what each was: rows (CHUNK, ...)."""
 
     def one(trials: Trial) -> tuple[Trial, Any]:
@@ -175,7 +176,8 @@ def _steps(
         )
         placed = jax.vmap(trial.outline)(worlds, seen.qpos)
         compression = jax.vmap(_compression)(worlds.skin, placed)
-        return after, rows((trials, seen, compression), 0)
+        contact = trial.p_world_contact(seen)
+        return after, rows((trials, seen, contact, compression), 0)
 
     def body(i: jax.Array, carry: tuple[Trial, Any]) -> tuple[Trial, Any]:
         after, moment = one(carry[0])

@@ -78,11 +78,11 @@ class Study:
         return self.space.vector(self.space.base)
 
 
-def _stage_and_worlds(study: Study, engine: Engine, split: str, first: int, count: int) -> Any:
-    """Worlds (count, ...) of one split, from number `first` on, and what their engine shares."""
+def _stage_and_worlds(study: Study, engine: Engine, split: str, count: int) -> Any:
+    """What worlds share in their engine, the first worlds (count, ...) of a split, and physics."""
     alone = replace(study.domain, objects=(study.object,))
     setting = Setting(engine=engine)
-    drawn = domain.draw(alone, tune.seed_of(study.seed, split), first + np.arange(count))
+    drawn = domain.draw(alone, tune.seed_of(study.seed, split), np.arange(count))
     part = domain.worlds(alone, drawn, RPSParams(), setting)
     return part.stage, part.worlds, setting.physics
 
@@ -109,15 +109,9 @@ def _distances(study: Study, stage: Any, physics: Any, smooth: bool) -> gradient
 
 def truth(study: Study) -> Estimate:
     """Finite differences: gradient (p, H) [m], and its variance, by the number of worlds."""
-    stage, worlds, physics = _stage_and_worlds(study, study.engine, "test", 0, study.truth)
+    stage, worlds, physics = _stage_and_worlds(study, study.engine, "test", study.truth)
     scores = jax.jit(_distances(study, stage, physics, smooth=False))
-    p = study.theta.size
-    thetas = study.theta + study.delta * jnp.concatenate([jnp.eye(p), -jnp.eye(p)])
-    found = scores(
-        jnp.repeat(thetas, study.truth, axis=0),
-        jax.tree.map(lambda leaf: np.concatenate([leaf] * 2 * p), worlds),
-    ).reshape(2, p, study.truth, len(study.horizons))
-    return gradients.estimate(((found[0] - found[1]) / (2 * study.delta)).swapaxes(0, 1))
+    return gradients.differences(scores, study.theta, worlds, step=study.delta)
 
 
 def repeats(study: Study, name: str) -> Iterator[Estimate]:
@@ -125,7 +119,7 @@ def repeats(study: Study, name: str) -> Iterator[Estimate]:
     engine: Engine = "quasistatic" if name == "reverse" else study.engine
     smooth = name != "evolution"
     count = study.repeats * study.worlds
-    stage, worlds, physics = _stage_and_worlds(study, engine, "tune", 0, count)
+    stage, worlds, physics = _stage_and_worlds(study, engine, "tune", count)
     scores = _distances(study, stage, physics, smooth)
     act: dict[str, Callable[..., Estimate]] = {
         "reverse": lambda worlds, key: gradients.reverse(scores, study.theta, worlds),

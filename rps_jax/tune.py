@@ -56,6 +56,11 @@ BOUNDS = {
 SUBSETS = {"logistic": ("eta", "zeta", "beta", "k"), "full": tuple(BOUNDS)}
 
 
+def expanded(names: Sequence[str]) -> tuple[str, ...]:
+    """The same names, with those of a subset in its place."""
+    return tuple(name for text in names for name in SUBSETS.get(text, (text,)))
+
+
 @dataclass(frozen=True)
 class Space:
     """The parameters that are tuned, as vectors (p,) without bounds; the others stay.

@@ -439,9 +439,9 @@ class _Drawing:
             felt = map(float, moment.seen.reading.p_robot_contact)
             self._contact.position = (*felt, video.CONTACT_HEIGHT + 0.03)
         self._show_twist(*map(float, moment.seen.twist))
-        seen = [past[i].seen for i in (*range(0, index, _PATH_STEP), index)]
-        self._paths["base_path"].points = _joined(np.array([s.qpos[:2] for s in seen]))
-        self._paths["contact_path"].points = _joined(np.array([p_world_contact(s) for s in seen]))
+        way = [past[i] for i in (*range(0, index, _PATH_STEP), index)]
+        self._paths["base_path"].points = _joined(np.array([m.seen.qpos[:2] for m in way]))
+        self._paths["contact_path"].points = _joined(np.array([m.p_world_contact for m in way]))
 
     def _show_twist(self, v_x: float, v_y: float, omega: float) -> None:
         """An arrow from the middle of the base, and an arc about it from its heading."""
@@ -457,14 +457,6 @@ class _Drawing:
             z = np.full_like(angle, height)
             arc = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1)
             self._turn.points = np.stack([arc[:-1], arc[1:]], axis=1)
-
-
-def p_world_contact(seen: Any) -> np.ndarray:
-    """(2,) [m], NaN without contact."""
-    if int(seen.reading.contact_type) == NONE:
-        return np.full(2, np.nan)
-    c, s = math.cos(seen.qpos[2]), math.sin(seen.qpos[2])
-    return seen.qpos[:2] + np.array([[c, -s], [s, c]]) @ seen.reading.p_robot_contact
 
 
 def _joined(points: np.ndarray) -> np.ndarray:

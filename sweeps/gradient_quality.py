@@ -47,10 +47,9 @@ class Options:
 
 def main(options: Options) -> None:
     """Run what is missing, then print and write the table and the figure."""
-    names = [name for text in options.tuned for name in tune.SUBSETS.get(text, (text,))]
     study = Study(
         object=options.object,
-        space=Space(tuple(names)),
+        space=Space(tune.expanded(options.tuned)),
         horizons=options.horizons,
         worlds=options.worlds,
         repeats=options.repeats,
@@ -58,7 +57,7 @@ def main(options: Options) -> None:
         engine=options.engine,  # pyright: ignore[reportArgumentType]
         seed=options.seed,
     )
-    out = record.writable(options.out)
+    out = options.out
     use_cache()
     with tqdm(total=len(options.estimators) + 1, unit="estimator") as bar:
 

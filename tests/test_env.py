@@ -33,8 +33,8 @@ AHEAD, BACK = jnp.array([1.0, 0.0, 0.0]), jnp.array([-1.0, 0.0, 0.0])
 PERIOD = FAST.control_period
 
 
-def made(engine="fused", **options):
-    setting = Setting(FAST, Rules(horizon=20.0), engine=engine)
+def made(**options):
+    setting = Setting(FAST, Rules(horizon=20.0), engine="fused")
     return PushEnv("random_cylinder", NEAR, setting=setting, worlds=6, **options)
 
 

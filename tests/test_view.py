@@ -41,7 +41,7 @@ def live(one):
 
 def p_world_contact(live):
     """Where the object was last felt (2,) [m]."""
-    return view.p_world_contact(live.past[-1].seen)
+    return live.past[-1].p_world_contact
 
 
 def p_robot_object(seen):
