@@ -312,6 +312,8 @@ def _ending(live: Live) -> str:
     outcome = live.outcome
     if outcome.success:
         return "reached"
+    if outcome.tipped:
+        return "the object fell over"
     return "the physics ran away" if outcome.diverged else "not reached in time"
 
 
