@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -23,7 +23,7 @@ from rps_jax.reference import Batch
 from rps_jax.scene import FRICTION
 from rps_jax.slots import Job, Setting, default_workers, run
 from rps_jax.sweep import Case
-from rps_jax.trial import Rules, World
+from rps_jax.trial import Rules, Trial, World
 
 FAMILIES = ("box", "cylinder", "prism")
 _PRISMS = replace(
@@ -65,9 +65,9 @@ class Speed:
     name: str
     family: str
     worlds: int
-    compile: float  # [s] until the first result, less the time of a go
+    compile: float  # [s] tracing too
     rate: float  # simulated s per s of wall clock
-    memory: float  # [bytes] most in use on the device; NaN where JAX does not tell
+    memory: float  # [bytes] of the program on its device; NaN for C
     physics: Physics
 
 
@@ -97,27 +97,50 @@ def _best(action: Callable[[], Any], goes: int = 3) -> float:
     return min(times)
 
 
-def batched(name: str, family: str, worlds: int, simulated: float = 2.0) -> Speed:
-    """Time a full batch on JAX's default device, `simulated` [s] of each world at a time."""
+class Program(NamedTuple):
+    """What is timed on JAX's device: a full batch, `simulated` [s] of each world at a go."""
+
+    name: str
+    family: str
+    worlds: int
+    simulated: float
+    compile: float  # [s]
+    memory: float  # [bytes] of its arguments, results and all in between
+    go: Callable[[Trial], Trial]
+    start: Trial
+
+
+def compiled(name: str, family: str, worlds: int, simulated: float = 2.0) -> Program:
+    """Compile one, for as many worlds; several may be compiled side by side."""
     setting = BATCHED[name]
     stage, few = _worlds(family, len(paper.TARGETS), setting)
     rows = np.arange(worlds) % len(paper.TARGETS)
-    batch = jax.device_put(jax.tree.map(lambda leaf: leaf[rows], few))
+    batch = jax.tree.map(lambda leaf: leaf[rows], few)
     start = trial.start_all(batch, np.ones(worlds, bool))
     steps = round(simulated / setting.physics.control_period)
     began = time.perf_counter()
-    go = trial.advance.lower(stage, batch, start, physics=setting.physics, steps=steps).compile()
-    state = [start]
+    lowered = trial.advance.lower(stage, batch, start, physics=setting.physics, steps=steps)
+    program = lowered.compile()
+    took = time.perf_counter() - began
+    needs: Any = program.memory_analysis()
+    parts = ("argument", "output", "temp")
+    memory = sum(getattr(needs, f"{part}_size_in_bytes") for part in parts)
+    return Program(
+        name, family, worlds, simulated, took, memory, partial(program, stage, batch), start
+    )
+
+
+def batched(program: Program) -> Speed:
+    """Time a program."""
+    state = [program.start]
 
     def once() -> None:
-        state[0] = jax.block_until_ready(go(stage, batch, state[0]))
+        state[0] = jax.block_until_ready(program.go(state[0]))
 
     once()
-    first = time.perf_counter() - began
-    best = _best(once)
-    memory = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use", np.nan)
-    rate = worlds * simulated / best
-    return Speed(name, family, worlds, first - best, rate, memory, setting.physics)
+    rate = program.worlds * program.simulated / _best(once)
+    name, family, worlds, *_ = program
+    return Speed(name, family, worlds, program.compile, rate, program.memory, BATCHED[name].physics)
 
 
 def in_c(name: str, family: str, simulated: float = 2.0) -> Speed:
@@ -142,8 +165,16 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Speed:
     return Speed(name, family, worlds, 0.0, worlds * simulated / _best(once), np.nan, physics)
 
 
-def refilling(slots: int, times: int = 4) -> tuple[float, float]:
-    """Simulated seconds a second, with refilled slots and in batches that wait for their slowest.
+class Refilling(NamedTuple):
+    """What refilling the slots of trials that ended is worth."""
+
+    refilled: float  # simulated s per s of wall clock
+    waiting: float  # the same, of batches that wait for their slowest
+    trials: float  # per s of wall clock, refilled
+
+
+def refilling(slots: int, times: int = 4) -> Refilling:
+    """Whole trials of RPS, with refilled slots and in batches that wait for their slowest.
 
     Both run the same random boxes of the domain `wide`, `times` as many as there are slots.
     """
@@ -151,27 +182,29 @@ def refilling(slots: int, times: int = 4) -> tuple[float, float]:
     boxes = replace(DOMAINS["wide"], objects=("random_box",))
     count = slots * default_workers() * len(jax.local_devices())
 
-    def rate(groups: np.ndarray) -> float:
+    def timed(groups: np.ndarray) -> tuple[float, float]:
         timings = []
         for group in groups:
             drawn = domain.draw(boxes, 0, group)
             part = domain.worlds(boxes, drawn, RPSParams.paper(), setting)
             job = Job(strategies.RPS, group.size, [part])
             timings.append(run([job], setting, slots=slots, collect=lambda *_: None))
-        return sum(t.simulated for t in timings) / sum(t.run for t in timings)
+        wall = sum(t.run for t in timings)
+        return sum(t.simulated for t in timings) / wall, groups.size / wall
 
     numbers = np.arange(times * count)
-    rate(numbers[None, :count])  # compiles
-    return rate(numbers[None]), rate(numbers.reshape(times, count))
+    timed(numbers[None, :count])  # compiles
+    refilled, trials = timed(numbers[None])
+    return Refilling(refilled, timed(numbers.reshape(times, count))[0], trials)
 
 
 def table(speeds: list[Speed]) -> list[list[str]]:
     """Header and one row for each measurement, compared with C MuJoCo in closed loop."""
     base = {s.family: s.rate for s in speeds if s.name == "C in closed loop"}
     rows = [["what", "family", "worlds", "dt", "iterations", "compile", "simulated s/s",
-             "against C in closed loop", "peak memory"]]  # fmt: skip
+             "against C in closed loop", "memory"]]  # fmt: skip
     for s in speeds:
-        memory = "" if np.isnan(s.memory) else f"{s.memory / 2**30:.2f} GiB"
+        memory = "" if np.isnan(s.memory) else f"{s.memory / 2**20:,.0f} MiB"
         ratio = f"{s.rate / base[s.family]:.3g}" if s.family in base else ""
         solver = f"{s.physics.iterations}/{s.physics.ls_iterations}"
         rows.append(
