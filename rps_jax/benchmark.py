@@ -204,7 +204,7 @@ def table(speeds: list[Speed]) -> list[list[str]]:
     rows = [["what", "family", "worlds", "dt", "iterations", "compile", "simulated s/s",
              "against C in closed loop", "memory"]]  # fmt: skip
     for s in speeds:
-        memory = "" if np.isnan(s.memory) else f"{s.memory / 2**20:,.0f} MiB"
+        memory = "" if np.isnan(s.memory) else f"{s.memory / 2**20:,.1f} MiB"
         ratio = f"{s.rate / base[s.family]:.3g}" if s.family in base else ""
         solver = f"{s.physics.iterations}/{s.physics.ls_iterations}"
         rows.append(

@@ -1178,12 +1178,14 @@ def _tell_tuned(out: Path, names: Sequence[str]) -> None:
     log = tune.read_log(out)
     figures.tuning(log, names, out / "tuning.png")
     first, last = log[0], min(log, key=lambda line: line["validation"])
-    total = {key: sum(line[key] for line in log) for key in ("compile", "run", "simulated")}
+    keys = ("compile", "run", "differentiate", "simulated")
+    total = {key: sum(line.get(key, 0.0) for line in log) for key in keys}
     print(
         f"validation: {first['validation']:.4f} at the start, {last['validation']:.4f} after "
         f"{last['generation']} of {len(log)}; success {100 * first['validation_success']:.1f} % "
         f"and {100 * last['validation_success']:.1f} %\n"
-        f"compile {total['compile']:.1f} s, run {total['run']:.1f} s, "
+        f"compile {total['compile']:.1f} s, run {total['run']:.1f} s, gradients "
+        f"{total['differentiate']:.1f} s with their compilation, "
         f"{total['simulated']:.3g} s simulated\n"
         f"parameters: {out / 'tuned.json'}, for --params of rps sweep\n"
         f"run folder: {out}"

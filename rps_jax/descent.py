@@ -8,6 +8,7 @@ the course's engine, is the hard law under the paper's rules.
 from __future__ import annotations
 
 import functools
+import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -166,8 +167,8 @@ def _differentiated(
 
 def differentiated(
     thetas: jax.Array, space: Space, course: Course, descent: Descent, step: int
-) -> Estimate:
-    """Estimates (S, p) through the softened trials of one step's worlds."""
+) -> tuple[Estimate, float]:
+    """Estimates (S, p) through the softened trials of one step's worlds, and their length [s]."""
     batches = softened(course, _ENGINE[descent.estimator], descent.seed, step)
     found = [
         (_differentiated(thetas, b, space=space, course=course, descent=descent), len(b.worlds.key))
@@ -178,35 +179,40 @@ def differentiated(
         sum(e.gradient * (n / total) for e, n in found),  # type: ignore[arg-type]
         sum(e.variance * (n / total) ** 2 for e, n in found),  # type: ignore[arg-type]
         sum(e.finite * (n / total) for e, n in found),  # type: ignore[arg-type]
-    )
+    ), len(thetas) * total * descent.window
 
 
 def smoothed(
     thetas: jax.Array, space: Space, course: Course, descent: Descent, step: int, **shape: Any
-) -> Estimate:
-    """Evolution gradients (S, p): antithetic candidates, all in the same worlds, hard law."""
+) -> tuple[Estimate, float]:
+    """Evolution gradients (S, p) of the hard law, and the time it simulated [s].
+
+    Antithetic candidates, all of them in the same worlds.
+    """
     key = jax.random.fold_in(jax.random.key(descent.seed), step)
     count, p = thetas.shape
     steps = jax.random.normal(key, (count, descent.pairs, p), thetas.dtype)
     both = jnp.concatenate([steps, -steps], axis=1) * descent.sigma
     params = space.params((thetas[:, None] + both).reshape(-1, p))
     ask = course.ask(params, descent.seed, step)
-    (answer,), _ = tune.try_out([ask], course.domains, course.setting, course.objective, **shape)
+    tried = tune.try_out([ask], course.domains, course.setting, course.objective, **shape)
+    (answer,), timing = tried
     values = course.objective.value(answer.score).reshape(count, 2, descent.pairs)
     slopes = (values[:, 0] - values[:, 1])[..., None] * steps / (2 * descent.sigma)
-    return jax.vmap(gradients.estimate)(slopes)
+    return jax.vmap(gradients.estimate)(slopes), timing.simulated
 
 
 def estimated(
     thetas: jax.Array, space: Space, course: Course, descent: Descent, step: int, **shape: Any
-) -> Estimate:
-    """Estimates (S, p) by the estimator that the descent names."""
+) -> tuple[Estimate, float]:
+    """Estimates (S, p) by the estimator that the descent names, and the time simulated [s]."""
     if descent.estimator == "evolution":
         return smoothed(thetas, space, course, descent, step, **shape)
-    one = differentiated(thetas, space, course, descent, step)
+    one, seconds = differentiated(thetas, space, course, descent, step)
     if descent.estimator != "combined":
-        return one
-    return jax.vmap(gradients.combine)(one, smoothed(thetas, space, course, descent, step, **shape))
+        return one, seconds
+    other, more = smoothed(thetas, space, course, descent, step, **shape)
+    return jax.vmap(gradients.combine)(one, other), seconds + more
 
 
 # --- runs that can be continued ------------------------------------------------------------
@@ -253,7 +259,9 @@ def descend(
     """Tune by gradients, in a run folder; one that was killed goes on where it was.
 
     Before every step all descents are tried on the worlds for validation. Every step is a line of
-    `log.jsonl`. Returns what validated best, as `tuned.json` holds it.
+    `log.jsonl`: `compile` and `run` are the trials' times [s], `differentiate` the gradients' (in
+    a first step with their compilation), `simulated` all simulated time [s]. Returns what
+    validated best, as `tuned.json` holds it.
     """
     search, log = tune.resume(folder, begin(space, descent), "step")
     rule = descent.rule()
@@ -286,7 +294,10 @@ def descend(
             "params": tune.named(space, search.thetas[first]),
         }
         if step < descent.steps:
-            found = estimated(search.thetas, space, course, descent, step, **shape)
+            began = time.perf_counter()
+            found, seconds = jax.block_until_ready(
+                estimated(search.thetas, space, course, descent, step, **shape)
+            )
             changes, state = jax.vmap(rule.update)(found.gradient, search.rule, search.thetas)
             thetas = optax.apply_updates(search.thetas, changes)
             search = search._replace(thetas=thetas, rule=state)
@@ -296,6 +307,8 @@ def descend(
                 "gradient": tune.finite(norm.mean()),
                 "gradient_error": tune.finite(error.mean()),
                 "finite": float(found.finite.mean()),
+                "simulated": line["simulated"] + seconds,
+                "differentiate": time.perf_counter() - began,
             }
         search = search._replace(step=search.step + 1)
         log.append(line)

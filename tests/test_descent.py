@@ -13,7 +13,7 @@ from rps_jax.descent import Descent
 from rps_jax.errors import InputError
 from rps_jax.law import RPSParams
 from rps_jax.physics import preset
-from rps_jax.slots import Setting
+from rps_jax.slots import Setting, Timing
 from rps_jax.trial import Rules
 from rps_jax.tune import Course, Objective, Space
 
@@ -87,11 +87,12 @@ def test_antithetic_steps_find_the_slope_of_the_objective(monkeypatch):
     def pretend(asks, *_, **__):
         z = space.vector(asks[0].params)
         values = np.asarray(2 * z[:, 0] - z[:, 1])[:, None] + np.zeros(3)
-        return [tune.Answer(values, values, values, values)], None
+        return [tune.Answer(values, values, values, values)], Timing(0.0, 1.0, 7.0)
 
     monkeypatch.setattr(tune, "try_out", pretend)
     course = Course((domain.DOMAINS["wide"],), 3, 3, SETTING)
-    found = descent.smoothed(jnp.zeros((2, 2)), space, course, Descent(pairs=4000), 0)
+    found, simulated = descent.smoothed(jnp.zeros((2, 2)), space, course, Descent(pairs=4000), 0)
+    assert simulated == 7.0
     np.testing.assert_allclose(found.gradient, [[2, -1], [2, -1]], atol=0.2)
     errors = np.abs(found.gradient - jnp.array([2.0, -1.0])) / jnp.sqrt(found.variance)
     assert (errors < 4).all()
