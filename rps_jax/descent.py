@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from rps_jax import errors, gradients, record, tune
+from rps_jax import errors, frames, gradients, record, tune
 from rps_jax.gradients import Estimate
 from rps_jax.law import RPSParams
 from rps_jax.physics import preset
@@ -102,7 +102,7 @@ def soft_score(
         1 - under_way[-1],
         period * jnp.sum(under_way),
         period * jnp.sum(under_way * touched * (1 - contact)),
-        jnp.min(distance),
+        -frames.greatest(-distance),
         setting.rules,
     )
 

@@ -120,4 +120,5 @@ def crossing(
         ends.append((meets_edge, (shifted - origin) @ along + t * (edge @ along)))
     meets = jnp.concatenate([hit for hit, _ in ends])
     s = jnp.concatenate([value for _, value in ends])
-    return jnp.min(jnp.where(meets, s, jnp.inf)), jnp.max(jnp.where(meets, s, -jnp.inf))
+    low, high = jnp.where(meets, -s, -jnp.inf), jnp.where(meets, s, -jnp.inf)
+    return -frames.greatest(low), frames.greatest(high)

@@ -1,7 +1,7 @@
 """Planar geometry whose values and derivatives are finite everywhere.
 
 Every singularity of the project is guarded here and nowhere else: the norm at zero, the
-direction of a zero vector, the wrap at pi.
+direction of a zero vector, the wrap at pi, the greatest of several.
 """
 
 from __future__ import annotations
@@ -68,6 +68,15 @@ def safe_sqrt(x: jax.Array) -> jax.Array:
     """Square root of max(x, 0), with zero derivative where x <= 0."""
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+
+
+def greatest(x: jax.Array) -> jax.Array:
+    """The greatest () of x (n,), with the derivative of one entry.
+
+    That of `jnp.max` is shared by the entries that equal it, and NaN where a compiler computes
+    the entries twice, rounds otherwise, and finds none.
+    """
+    return x[jnp.argmax(x)]
 
 
 def yaw_of_quaternion(quaternion: jax.Array) -> jax.Array:

@@ -143,8 +143,7 @@ class Live:
             errors.check_finite(f"shove {axis}", value, at_least=-5, at_most=5, unit="m")
             for axis, value in zip("xy", p_robot, strict=True)
         ]
-        # Half a period early, so that rounding cannot put it off by a step, nor repeat it.
-        time = (self._now.steps - 0.5) * self.period
+        time = self._now.steps * self.period
         dtype = self._worlds.qpos.dtype
         shift = Shift(jnp.asarray(time, dtype), jnp.array([by], dtype))
         self._worlds = self._worlds._replace(shift=shift)

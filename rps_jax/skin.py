@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import errors
+from rps_jax import errors, frames
 from rps_jax import footprint as fp
 from rps_jax.footprint import Footprint
 
@@ -173,7 +173,7 @@ class IdealSkin(NamedTuple):
         length = jnp.sum(share * jax.nn.sigmoid(excess))
         first, last = on_strip(middle + length * jnp.array([-0.5, 0.5], s.dtype), self.half_length)
         kind = jnp.where(length > self.point_length, LINE, POINT)
-        return state, _smooth_reading(jnp.max(excess), kind, first, last)
+        return state, _smooth_reading(frames.greatest(excess), kind, first, last)
 
     def _nodes(self, footprint: Footprint, tolerance: Any) -> tuple[jax.Array, jax.Array]:
         """Points (N,) [m] of the strip within `tolerance` of a footprint, the length of each.
@@ -281,7 +281,7 @@ class CapacitiveSkin(NamedTuple):
         middles = jnp.asarray(taxels(1, self.half_length)[:, 0], excess.dtype)
         first, last = _first(excess) @ middles, _first(excess[::-1]) @ middles[::-1]
         kind = jnp.clip(jnp.sum(excess > 0), POINT, LINE)
-        return state, _smooth_reading(jnp.max(excess), kind, first, last)
+        return state, _smooth_reading(frames.greatest(excess), kind, first, last)
 
 
 class SmoothSkin(NamedTuple):

@@ -192,9 +192,9 @@ def start(world: World, strategy: Strategy = RPS) -> Trial:
 
 
 def _shifted(world: World, trial: Trial, period: float) -> Trial:
-    """The trial with its object moved, if this is the control step at which that happens."""
-    since = trial.steps * period - world.shift.time
-    now = (since >= 0) & (since < period)
+    """The trial with its object moved, if this is the control step nearest to when it shall be."""
+    # A step's number, since rounded times could meet twice or never.
+    now = trial.steps == jnp.round(world.shift.time / period)
     by = frames.rotate(trial.qpos[2], jnp.asarray(world.shift.p_robot))
     x = JOINTS.object.start
     return trial._replace(qpos=trial.qpos.at[x : x + 2].add(jnp.where(now, by, 0.0)))

@@ -220,6 +220,16 @@ def test_safe_sqrt_is_the_root_where_positive_and_zero_with_zero_derivative_else
     np.testing.assert_allclose(gradient, [0.25, 1, 5e14, 0, 0, 0], rtol=1e-6)
 
 
+# greatest
+
+
+def test_the_greatest_has_the_derivative_of_one_entry_also_of_equal_ones():
+    for x, expected in (([1.0, 3.0, 2.0], [0, 1, 0]), ([2.0, 2.0, 1.0], [1, 0, 0])):
+        value, gradient = jax.value_and_grad(frames.greatest)(jnp.array(x))
+        assert value == max(x)
+        np.testing.assert_array_equal(gradient, expected)
+
+
 # yaw_of_quaternion
 
 

@@ -56,6 +56,25 @@ def test_a_short_push_reaches_a_near_target(outcomes):
     assert (outcomes.time[:2] < 24).all()
 
 
+def test_a_shove_happens_once_however_its_time_is_rounded():
+    _, worlds = sweep.build([case()], FUSED)
+    world = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], worlds)
+    start = trial.start(world)
+    x = trial.JOINTS.object.start
+
+    def moved(time, period, steps):
+        shoved = world._replace(shift=Shift(time, jnp.array([0.1, 0.0])))
+        after = trial._shifted(shoved, start._replace(steps=steps), period)
+        return after.qpos[x] - start.qpos[x]
+
+    every = jax.jit(jax.vmap(jax.vmap(moved, (None, None, 0)), (0, None, None)), static_argnums=1)
+    times = np.concatenate([np.arange(0, 10, 0.01), [np.inf]]).astype(np.float32)
+    for period in (0.005, 0.02, 0.05):
+        total = np.asarray(every(times, period, np.arange(2100))).sum(axis=1)
+        np.testing.assert_allclose(total[:-1], 0.1, atol=1e-4)
+        assert total[-1] == 0
+
+
 def test_a_far_target_is_not_reached_in_time(outcomes):
     assert not outcomes.success[2]
     assert outcomes.time[2] == pytest.approx(24.0)
