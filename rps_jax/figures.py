@@ -463,7 +463,7 @@ def agreement(names: Sequence[str], equal: np.ndarray, ends: np.ndarray, path: P
 def throughput(speeds: Sequence[Speed], path: Path) -> Path:
     """Simulated seconds per second over the batch, a panel for each family; C as a line."""
     families = list(dict.fromkeys(s.family for s in speeds))
-    figure = Figure(figsize=(4.5 * len(families), 3.6), layout="constrained")
+    figure = Figure(figsize=(4.5 * len(families), 4.0), layout="constrained")
     axes = figure.subplots(1, len(families), squeeze=False, sharey=True)[0]
     for ax, family in zip(axes, families, strict=True):
         mine = [s for s in speeds if s.family == family]
@@ -476,7 +476,7 @@ def throughput(speeds: Sequence[Speed], path: Path) -> Path:
         ax.set(xscale="log", yscale="log", xlabel="worlds in the batch", title=_title(family))
         ax.grid(alpha=0.3, which="both")
     axes[0].set_ylabel("simulated s per s")
-    axes[0].legend(fontsize=8)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return save(figure, path)
 
 

@@ -64,6 +64,7 @@ def main(options: Options) -> None:
         where = f"{jax.devices()[0].device_kind}, {os.cpu_count()} processors"
         text = f"On {where}.\n\n{score.markdown(benchmark.table(speeds))}"
         record.write_text(options.out / "benchmark.md", text + "\n")
+        figures.throughput(speeds, options.out / "throughput.png")
     if options.refill:
         gain = benchmark.refilling(options.refill)
         text += (
@@ -72,7 +73,6 @@ def main(options: Options) -> None:
             f"{gain.waiting:,.0f}; gain {gain.refilled / gain.waiting:.2f}."
         )
         record.write_text(options.out / "benchmark.md", text + "\n")
-    figures.throughput(speeds, options.out / "throughput.png")
     print(text)
 
 

@@ -11,7 +11,6 @@ import pytest
 FOLDER = Path(__file__).parents[1] / "notebooks"
 RUNNER = runpy.run_path(str(FOLDER / "execute.py"))
 TEXTS = {text.stem: text for text in RUNNER["TEXTS"]}
-SIMULATE = ("02_one_push", "05_tuning")
 every_notebook = pytest.mark.parametrize("name", TEXTS)
 
 
@@ -62,22 +61,14 @@ def test_what_is_kept_has_figures_and_no_error_and_names_no_machine(name):
 
 @pytest.fixture(scope="module")
 def executed(request):
-    """Some of them executed anew, with the compiled programs of other tests."""
+    """All of them executed anew, with the compiled programs of other tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("JAX_COMPILATION_CACHE_DIR", str(request.config.rootpath / ".jax_cache"))
         patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
-        names = [name for name in TEXTS if (name in SIMULATE) == request.param]
-        yield dict(zip(names, RUNNER["execute"]([TEXTS[n] for n in names]), strict=True))
+        yield dict(zip(TEXTS, RUNNER["execute"](list(TEXTS.values())), strict=True))
 
 
-@pytest.mark.parametrize(
-    ("executed", "name"),
-    [
-        pytest.param(name in SIMULATE, name, marks=[pytest.mark.slow] * (name in SIMULATE), id=name)
-        for name in TEXTS
-    ],
-    indirect=["executed"],
-)
+@every_notebook
 def test_it_runs_and_where_it_only_reads_says_what_is_kept(name, executed):
     again, before = executed[name], kept(name)
     assert [kind for _, kind, _ in outputs(again)] == [kind for _, kind, _ in outputs(before)]
