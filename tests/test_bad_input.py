@@ -383,6 +383,8 @@ SCRIPTS = [
     ("landscape", {"domain": ("wyde",)}, "unknown domain 'wyde'"),
     ("benchmark", {"families": ("cone",)}, "unknown family 'cone'"),
     ("benchmark", {"refill": -1}, "refill = -1 is not allowed"),
+    ("benchmark", {"at_once": 0}, "at_once = 0 is not allowed"),
+    ("benchmark", {"mujocos": -4}, "mujocos = -4 is not allowed"),
 ]
 
 
