@@ -372,6 +372,8 @@ class TuneGrad(TuneOptions):
     """At first, in units of the bounded map; it falls to zero along a cosine."""
     clip: float = 1.0
     """Bound on the norm of a gradient."""
+    world_clip: float = 1.0
+    """Bound on that of a single world, for reverse and forward."""
     steps: int = 40
     """In all."""
     starts: int = 4

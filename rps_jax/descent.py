@@ -46,6 +46,9 @@ class Descent:
     """[1] At first, falling to zero along a cosine."""
     clip: float = 1.0
     """[1] Bound on the norm of a gradient."""
+    world_clip: float = 1.0
+    """[1] Bound on that of a single world, of reverse and forward: a few chaotic worlds would
+    outweigh all others."""
     steps: int = 40
     """In all."""
     starts: int = 4
@@ -70,7 +73,7 @@ class Descent:
             raise errors.InputError(
                 f"optimiser = {self.optimiser} is not allowed: name one of optax, as adam or sgd."
             )
-        for name in ("learning_rate", "clip", "window", "arrive", "sigma"):
+        for name in ("learning_rate", "clip", "world_clip", "window", "arrive", "sigma"):
             errors.check_finite(name, getattr(self, name), above=0)
         for name in ("steps", "starts", "pairs"):
             errors.check_finite(name, getattr(self, name), at_least=1, at_most=1e6)
@@ -162,7 +165,8 @@ def _differentiated(
     """Estimates (S, p) at thetas (S, p), each from all the worlds of a batch."""
     scores = scores_of(space, course, descent, batch.stage)
     mode = gradients.forward if descent.estimator == "forward" else gradients.reverse
-    return jax.vmap(lambda theta: mode(scores, theta, batch.worlds))(thetas)
+    clip = descent.world_clip
+    return jax.vmap(lambda theta: mode(scores, theta, batch.worlds, clip=clip))(thetas)
 
 
 def differentiated(

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax import strategies, trial
+from rps_jax import frames, strategies, trial
 from rps_jax.errors import InputError
 from rps_jax.law import RPSParams
 from rps_jax.physics import Physics
@@ -41,10 +41,17 @@ class Estimate(NamedTuple):
     finite: jax.Array  # (p, ...) [1] share of the samples that are finite; the others were dropped
 
 
-def estimate(samples: jax.Array) -> Estimate:
-    """The mean of samples (n, p, ...), entry by entry without those that are not finite."""
+def estimate(samples: jax.Array, clip: float = jnp.inf) -> Estimate:
+    """The mean of samples (n, p, ...), entry by entry without those that are not finite.
+
+    A sample whose norm (over p) is more than `clip` is scaled down to it: a bias, and the end of
+    the few samples that would outweigh all others.
+    """
     there = jnp.isfinite(samples)
     samples = jnp.where(there, samples, 0.0)
+    if clip < jnp.inf:
+        size = frames.norm(jnp.moveaxis(samples, 1, -1))[:, None]
+        samples = samples * jnp.minimum(1.0, clip / jnp.maximum(size, clip))
     count = jnp.sum(there, axis=0)
     mean = jnp.sum(samples, axis=0) / jnp.maximum(count, 1)
     squares = jnp.sum(jnp.where(there, (samples - mean) ** 2, 0.0), axis=0)
@@ -54,10 +61,11 @@ def estimate(samples: jax.Array) -> Estimate:
     )
 
 
-def forward(scores: Scores, theta: jax.Array, worlds: Any) -> Estimate:
+def forward(scores: Scores, theta: jax.Array, worlds: Any, *, clip: float = jnp.inf) -> Estimate:
     """By forward-mode differentiation in each world: p times the work of the scores.
 
-    It passes through the solvers of MJX (with a pyramidal cone) and of the fused engine.
+    `clip` is that of `estimate`. It passes through the solvers of MJX (with a pyramidal cone) and
+    of the fused engine.
     """
     thetas = _for_each(theta, worlds)
 
@@ -65,17 +73,17 @@ def forward(scores: Scores, theta: jax.Array, worlds: Any) -> Estimate:
         each = jnp.broadcast_to(direction, thetas.shape)
         return jax.jvp(lambda t: scores(t, worlds), (thetas,), (each,))[1]
 
-    return estimate(jax.vmap(along, out_axes=1)(jnp.eye(theta.size, dtype=theta.dtype)))
+    return estimate(jax.vmap(along, out_axes=1)(jnp.eye(theta.size, dtype=theta.dtype)), clip)
 
 
-def reverse(scores: Scores, theta: jax.Array, worlds: Any) -> Estimate:
+def reverse(scores: Scores, theta: jax.Array, worlds: Any, *, clip: float = jnp.inf) -> Estimate:
     """By reverse-mode differentiation in each world: the work of the scores, a few times.
 
-    For models without a solver's loop.
+    `clip` is that of `estimate`. For models without a solver's loop.
     """
     thetas = _for_each(theta, worlds)
     slopes = jax.jacrev(lambda t: jnp.sum(scores(t, worlds), axis=0))(thetas)
-    return estimate(jnp.moveaxis(slopes, (-2, -1), (0, 1)))
+    return estimate(jnp.moveaxis(slopes, (-2, -1), (0, 1)), clip)
 
 
 def differences(

@@ -29,7 +29,8 @@ from rps_jax.trial import Snapshot, World
 from rps_jax.tune import Space
 
 TRUTH = "truth"
-ESTIMATORS = ("reverse", "forward", "evolution", "combined")
+# clipped is reverse with a bound on each world's gradient; combined, of reverse and evolution.
+ESTIMATORS = ("reverse", "clipped", "forward", "evolution", "combined")
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,8 @@ class Study:
     """Half a finite difference, in units of the bounded map."""
     sigma: float = 0.15
     """Standard deviation of the steps of evolution, likewise."""
+    clip: float = 1.0
+    """[m] Bound on the norm of a world's gradient, of the estimator clipped."""
     engine: Engine = "fused"
     """Of the truth, of forward mode and of evolution; reverse mode takes the quasi-static one."""
     seed: int = 0
@@ -69,7 +72,7 @@ class Study:
             )
         for name in ("worlds", "repeats", "truth"):
             errors.check_finite(name, getattr(self, name), at_least=2, at_most=1e6)
-        for name in ("delta", "sigma"):
+        for name in ("delta", "sigma", "clip"):
             errors.check_finite(name, getattr(self, name), above=0, at_most=5)
 
     @property
@@ -116,13 +119,16 @@ def truth(study: Study) -> Estimate:
 
 def repeats(study: Study, name: str) -> Iterator[Estimate]:
     """Estimates (p, H) by one estimator, in other worlds each."""
-    engine: Engine = "quasistatic" if name == "reverse" else study.engine
+    engine: Engine = "quasistatic" if name in ("reverse", "clipped") else study.engine
     smooth = name != "evolution"
     count = study.repeats * study.worlds
     stage, worlds, physics = _stage_and_worlds(study, engine, "tune", count)
     scores = _distances(study, stage, physics, smooth)
     act: dict[str, Callable[..., Estimate]] = {
         "reverse": lambda worlds, key: gradients.reverse(scores, study.theta, worlds),
+        "clipped": lambda worlds, key: gradients.reverse(
+            scores, study.theta, worlds, clip=study.clip
+        ),
         "forward": lambda worlds, key: gradients.forward(scores, study.theta, worlds),
         "evolution": partial(gradients.evolution, scores, study.theta, sigma=study.sigma),
     }

@@ -24,7 +24,7 @@ class Options:
     """Which gradients."""
 
     estimators: tuple[str, ...] = quality.ESTIMATORS
-    """reverse, forward, evolution or combined."""
+    """reverse, clipped (reverse with a bound in each world), forward, evolution or combined."""
     object: str = Study.object
     """random_box, random_cylinder or random_prism."""
     tuned: tuple[str, ...] = Study.space.names
