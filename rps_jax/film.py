@@ -27,7 +27,7 @@ from rps_jax.video import Shot, Tile
 WHICH = ("first", "hardest")
 _MOST = 12  # rows, and columns
 _WHOLE = (1920, 1080)  # [px] that the grid is fitted into
-_LENGTH = 58  # [s] of a film at the default speed, at most
+_LENGTH = 40  # [s] of a film at the default speed, at most
 _HELD = 1.0  # [s] that the end is held
 
 
@@ -117,7 +117,7 @@ def shoot(
     shape: tuple[int, int],
     speed: float,
     seconds: float,
-    fps: int = 25,
+    fps: int = 12,
     camera: str = "oblique",
     report: Callable[[float], Any] = lambda simulated: None,
 ) -> None:

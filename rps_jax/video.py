@@ -41,6 +41,7 @@ CONTACT_RADIUS = 0.04  # [m]
 _NO_CONTACT = np.full(2, np.nan)
 _EMPTY = 58  # grey of a place in a grid without a trial
 _INK = (24, 26, 30)  # RGB around labels and tiles
+_SHADOWS_FROM = 240  # [px] height of an image: they take most of the time without a GPU
 _LABEL = 13  # [1] heights of a label in a tile
 
 _MEND_GL = (
@@ -294,6 +295,8 @@ class _Studio:
         self.mujoco.mj_kinematics(self.model, self.data)  # where things are; no dynamics
         self.mujoco.mj_camlight(self.model, self.data)
         self.renderer.update_scene(self.data, camera=self.camera)
+        view = self.renderer.scene
+        view.flags[self.mujoco.mjtRndFlag.mjRND_SHADOW] = self.renderer.height >= _SHADOWS_FROM
         self.base_trail.add(qpos[:2])
         self.contact_trail.add(contact)
         for trail in (self.base_trail, self.contact_trail):
