@@ -669,6 +669,8 @@ def gradient_quality(results: xr.Dataset, path: Path) -> Path:
         if field in ("bias", "error"):
             ax.plot(x, results.doubt, "k--", lw=1, label="standard error of the truth")
             ax.set_yscale("log")
+        if field == "finite":
+            ax.set_ylim(-0.04, 1.04)
         ax.set(xscale="log", ylabel=label, xticks=x, xticklabels=[f"{t:g}" for t in x])
         ax.minorticks_off()
         ax.grid(alpha=0.3)

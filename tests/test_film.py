@@ -17,7 +17,7 @@ from rps_jax.trial import Rules
 pytestmark = pytest.mark.filterwarnings("ignore:os.fork")  # as in test_video
 
 ENGINE = "quasistatic"
-FPS = 25
+FPS = 12
 
 
 def table(folder):
@@ -54,7 +54,7 @@ def differ(a, b):
 def test_a_film_shows_each_trial_in_its_tile_and_holds_the_end(make, tmp_path):
     make(tmp_path)
     out = tmp_path / "two.mp4"
-    arguments = ["--grid", "2x4", "--seconds", "2", "--speed", "10", "--out", str(out)]
+    arguments = ["--grid", "2x4", "--seconds", "2", "--speed", "4.8", "--out", str(out)]
     assert cli.main(["film", str(tmp_path), *arguments]) == 0
     images = decode(out)
     # 20 control steps of 0.02 s a frame: at 0, 0.4, ... 2 s, and the last for a second more.
