@@ -332,7 +332,7 @@ class TuneOptions(Spread):
     device: str = "auto"
     """auto, cpu or gpu."""
     quick: bool = False
-    """A small run: minutes on two cores."""
+    """A small run, minutes on two cores: few trials of 150 s, and by default few parameters."""
     out: Path = Path("runs/tune")
     """Run folder; a run that was killed is continued there."""
 
@@ -1106,7 +1106,7 @@ def _tune_es(options: TuneES) -> None:
     how = options
     if how.quick:
         how = dataclasses.replace(
-            how, worlds=24, validation=32, population=12, generations=10, horizon=150.0
+            _quickly(how), worlds=16, validation=32, population=10, generations=7, horizon=150.0
         )
     space, course = _space(how), _course(how)
     evolution = tune.Evolution(
@@ -1132,7 +1132,7 @@ def _tune_grad(options: TuneGrad) -> None:
     how = options
     if how.quick:
         how = dataclasses.replace(
-            how, worlds=16, validation=32, steps=10, starts=2, pairs=4, horizon=150.0
+            _quickly(how), worlds=16, validation=32, steps=8, starts=2, pairs=4, horizon=150.0
         )
     space, course = _space(how), _course(how)
     same = {f.name for f in dataclasses.fields(descent.Descent)} & set(how.__dict__)
@@ -1143,6 +1143,13 @@ def _tune_grad(options: TuneGrad) -> None:
     with _tuning(out, chosen.steps + 1) as report:
         descent.descend(out, space, course, chosen, report=report, **shape)
     _tell_tuned(out, space.names)
+
+
+def _quickly(options: Any) -> Any:
+    """The few parameters that matter most, unless others are named: few trials tell no more."""
+    if options.tuned != TuneOptions.tuned:
+        return options
+    return dataclasses.replace(options, tuned=("K_h", "K_v", "l_cr", "d_th"))
 
 
 def _space(options: TuneOptions) -> Space:

@@ -109,4 +109,5 @@ def main(options: Options) -> np.ndarray:
 
 if __name__ == "__main__":
     jax.config.update("jax_platforms", "cpu")
+    jax.config.update("jax_cpu_enable_async_dispatch", False)  # decide here, wake no other thread
     main(tyro.cli(Options, description=__doc__))
