@@ -332,7 +332,7 @@ class TuneOptions(Spread):
     device: str = "auto"
     """auto, cpu or gpu."""
     quick: bool = False
-    """A small run, minutes on two cores: few trials of 150 s, and by default few parameters."""
+    """A small run, minutes on two cores: what is not asked for is small, parameters are few."""
     out: Path = Path("runs/tune")
     """Run folder; a run that was killed is continued there."""
 
@@ -1105,9 +1105,7 @@ def _tune_es(options: TuneES) -> None:
 
     how = options
     if how.quick:
-        how = dataclasses.replace(
-            _quickly(how), worlds=16, validation=32, population=10, generations=7, horizon=150.0
-        )
+        how = _quickly(how, worlds=24, validation=32, population=12, generations=7)
     space, course = _space(how), _course(how)
     evolution = tune.Evolution(
         how.strategy,
@@ -1131,8 +1129,8 @@ def _tune_grad(options: TuneGrad) -> None:
 
     how = options
     if how.quick:
-        how = dataclasses.replace(
-            _quickly(how), worlds=16, validation=32, steps=8, starts=2, pairs=4, horizon=150.0
+        how = _quickly(
+            how, worlds=32, validation=32, steps=8, starts=2, pairs=4, estimator="reverse"
         )
     space, course = _space(how), _course(how)
     same = {f.name for f in dataclasses.fields(descent.Descent)} & set(how.__dict__)
@@ -1145,11 +1143,16 @@ def _tune_grad(options: TuneGrad) -> None:
     _tell_tuned(out, space.names)
 
 
-def _quickly(options: Any) -> Any:
-    """The few parameters that matter most, unless others are named: few trials tell no more."""
-    if options.tuned != TuneOptions.tuned:
-        return options
-    return dataclasses.replace(options, tuned=("K_h", "K_v", "l_cr", "d_th"))
+def _quickly(options: Any, **small: Any) -> Any:
+    """The options with what is small, where nothing else than the default was asked for.
+
+    Few parameters, those that matter most, since few trials tell no more; few slots, since few
+    trials leave many empty.
+    """
+    small |= {"tuned": ("K_h", "K_v", "l_cr", "d_th"), "slots": 16, "horizon": 150.0}
+    default = type(options)()
+    free = {name for name in small if getattr(options, name) == getattr(default, name)}
+    return dataclasses.replace(options, **{name: small[name] for name in free})
 
 
 def _space(options: TuneOptions) -> Space:
