@@ -1105,7 +1105,7 @@ def _tune_es(options: TuneES) -> None:
 
     how = options
     if how.quick:
-        how = _quickly(how, worlds=24, validation=32, population=12, generations=7)
+        how = _quickly(how, worlds=16, validation=32, population=10, generations=7)
     space, course = _space(how), _course(how)
     evolution = tune.Evolution(
         how.strategy,
