@@ -59,7 +59,8 @@ def main(options: Options) -> None:
     errors.check_count("at_once", options.at_once, at_most=1024)
     record.writable(options.out)
     speeds, text = [], ""
-    for speed in tqdm(_measured(options), total=len(_wanted(options)), unit="measurement"):
+    wanted = _wanted(options)
+    for speed in tqdm(_measured(wanted, options.at_once), total=len(wanted), unit="measurement"):
         speeds.append(speed)
         where = f"{jax.devices()[0].device_kind}, {os.cpu_count()} processors"
         text = f"On {where}.\n\n{score.markdown(benchmark.table(speeds))}"
@@ -81,21 +82,22 @@ def _wanted(options: Options) -> list[tuple[str, str, int]]:
     named = [pair for pair in product(options.names, options.families) if benchmark.can(*pair)]
     in_c = [(name, family, 0) for name, family in named if name in benchmark.IN_C]
     batched = [(*pair, n) for pair in named if pair[0] in benchmark.BATCHED for n in options.worlds]
-    few = ("fused", "quasistatic")
-    return in_c + [b for b in batched if b[0].startswith(few) or b[2] <= options.mujocos]
+    slow = [name for name, one in benchmark.BATCHED.items() if one.engine in ("mjx", "warp")]
+    return in_c + [b for b in batched if b[0] not in slow or b[2] <= options.mujocos]
 
 
-def _measured(options: Options) -> Iterator[Speed]:
+def _measured(wanted: list[tuple[str, str, int]], at_once: int) -> Iterator[Speed]:
     """Measure one after the other; while one is timed, nothing is compiled."""
-    wanted = _wanted(options)
-    with ThreadPoolExecutor(options.at_once) as pool:
-        for first in range(0, len(wanted), options.at_once):
-            some = wanted[first : first + options.at_once]
+    with ThreadPoolExecutor(at_once) as pool:
+        for first in range(0, len(wanted), at_once):
+            some = wanted[first : first + at_once]
             programs = [pool.submit(benchmark.compiled, *w) if w[2] else None for w in some]
             wait([program for program in programs if program])
             for (name, family, _), program in zip(some, programs, strict=True):
-                timed = benchmark.batched(program.result()) if program else None
-                yield timed or benchmark.in_c(name, family)
+                if program:
+                    yield benchmark.batched(program.result())
+                else:
+                    yield benchmark.in_c(name, family)
 
 
 if __name__ == "__main__":

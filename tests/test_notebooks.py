@@ -65,7 +65,7 @@ def executed(request):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("JAX_COMPILATION_CACHE_DIR", str(request.config.rootpath / ".jax_cache"))
         patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
-        yield dict(zip(TEXTS, RUNNER["execute"](list(TEXTS.values())), strict=True))
+        return dict(zip(TEXTS, RUNNER["execute"](list(TEXTS.values())), strict=True))
 
 
 @every_notebook
