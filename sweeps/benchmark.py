@@ -59,22 +59,25 @@ def main(options: Options) -> None:
     errors.check_count("at_once", options.at_once, at_most=1024)
     record.writable(options.out)
     speeds, text = [], ""
+    where = f"On {jax.devices()[0].device_kind}, {os.cpu_count()} processors.\n\n"
+    if options.refill:
+        where += _refilling(options.refill)
     wanted = _wanted(options)
     for speed in tqdm(_measured(wanted, options.at_once), total=len(wanted), unit="measurement"):
         speeds.append(speed)
-        where = f"{jax.devices()[0].device_kind}, {os.cpu_count()} processors"
-        text = f"On {where}.\n\n{score.markdown(benchmark.table(speeds))}"
+        text = where + score.markdown(benchmark.table(speeds))
         record.write_text(options.out / "benchmark.md", text + "\n")
         figures.throughput(speeds, options.out / "throughput.png")
-    if options.refill:
-        gain = benchmark.refilling(options.refill)
-        text += (
-            f"\n\nRefilled slots, {options.refill} a worker: {gain.refilled:,.0f} simulated s/s, "
-            f"{gain.trials:,.1f} trials/s; batches that wait for their slowest: "
-            f"{gain.waiting:,.0f}; gain {gain.refilled / gain.waiting:.2f}."
-        )
-        record.write_text(options.out / "benchmark.md", text + "\n")
     print(text)
+
+
+def _refilling(slots: int) -> str:
+    gain = benchmark.refilling(slots)
+    return (
+        f"Refilled slots, {slots} a worker: {gain.refilled:,.0f} simulated s/s, "
+        f"{gain.trials:,.1f} trials/s; batches that wait for their slowest: "
+        f"{gain.waiting:,.0f}; gain {gain.refilled / gain.waiting:.2f}.\n\n"
+    )
 
 
 def _wanted(options: Options) -> list[tuple[str, str, int]]:

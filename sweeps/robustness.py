@@ -38,6 +38,8 @@ class Options(Spread):
 
     domain: str = "wide"
     """paper, hardware, wide or hostile."""
+    engines: tuple[str, ...] = ()
+    """Engines and physics by name, the first to be compared with; by default all that run here."""
     strategy: str = "rps"
     """rps, nps or aps."""
     worlds: int = 90
@@ -51,10 +53,12 @@ def main(options: Options) -> None:
     domain = DOMAINS[errors.check_name("domain", options.domain, DOMAINS)]
     errors.check_name("strategy", options.strategy, paper.PARAMS)
     arms = {options.strategy: paper.PARAMS[options.strategy]}
+    for name in options.engines:
+        engines.check(ENGINES[errors.check_name("engines", name, ENGINES)].engine, domain.families)
+    here = (n for n, s in ENGINES.items() if engines.works(s.engine, domain.families))
     plans = {
-        name: Plan(domain, options.worlds, arms, setting, part=64)
-        for name, setting in ENGINES.items()
-        if engines.works(setting.engine, domain.families)
+        name: Plan(domain, options.worlds, arms, ENGINES[name], part=64)
+        for name in options.engines or here
     }
     shape = options.shape()
     use_cache()
