@@ -327,12 +327,15 @@ class TuneOptions(Spread):
     """fused, mjx, warp, mujoco or quasistatic."""
     horizon: float = 300.0
     """Longest trial [s]."""
+    budget: float = 0.0
+    """Simulated time after which tuning ends [s]; 0: no bound."""
     seed: int = 0
     """Of proposals and worlds."""
     device: str = "auto"
     """auto, cpu or gpu."""
     quick: bool = False
-    """A small run, minutes on two cores: what is not asked for is small, parameters are few."""
+    """A small run, minutes on two cores: what is not asked for is small, parameters are few; of
+    cylinders, on the quasi-static model."""
     out: Path = Path("runs/tune")
     """Run folder; a run that was killed is continued there."""
 
@@ -363,25 +366,28 @@ class TuneGrad(TuneOptions):
     """Worlds of a step, in each domain; others in the next step."""
     validation: int = 128
     """Worlds for validation, in each domain."""
-    estimator: str = "combined"
-    """reverse (through the quasi-static model), forward (through the fused engine), evolution
-    (antithetic steps in the engine), or combined (reverse and evolution by their variances)."""
+    estimator: str = "reverse"
+    """reverse (windows through the quasi-static model), forward (windows through the fused engine),
+    evolution (antithetic steps, in whole trials), or combined (reverse and evolution by their
+    variances)."""
     optimiser: str = "adam"
     """An optimiser of optax, by name."""
     learning_rate: float = 0.1
     """At first, in units of the bounded map; it falls to zero along a cosine."""
     clip: float = 1.0
     """Bound on the norm of a gradient."""
-    world_clip: float = 1.0
-    """Bound on that of a single world, for reverse and forward."""
+    world_clip: float = 2.0
+    """Bound on that of a single world, for reverse and forward, as a multiple of their median."""
     steps: int = 40
     """In all."""
     starts: int = 4
     """Descents side by side, the first from the start itself."""
     spread: float = 0.5
     """Standard deviation of the other starts."""
-    window: float = 30.0
-    """Length of a softened trial, for reverse and forward [s]."""
+    window: float = 8.0
+    """Length of a window of a softened trial, for reverse and forward [s]."""
+    within: float = 100.0
+    """Windows begin at random times up to this; with 0 at the start of the trials [s]."""
     sigma: float = 0.15
     """Standard deviation of the antithetic steps."""
     pairs: int = 8
@@ -1105,7 +1111,9 @@ def _tune_es(options: TuneES) -> None:
 
     how = options
     if how.quick:
-        how = _quickly(how, worlds=16, validation=32, population=10, generations=7)
+        how = _quickly(
+            how, worlds=32, validation=64, population=12, generations=8, spread=1.0, slots=64
+        )
     space, course = _space(how), _course(how)
     evolution = tune.Evolution(
         how.strategy,
@@ -1114,6 +1122,7 @@ def _tune_es(options: TuneES) -> None:
         how.spread,
         how.prior,
         how.patience,
+        how.budget,
         how.seed,
     )
     shape = how.shape()
@@ -1130,7 +1139,7 @@ def _tune_grad(options: TuneGrad) -> None:
     how = options
     if how.quick:
         how = _quickly(
-            how, worlds=32, validation=32, steps=8, starts=2, pairs=4, estimator="reverse"
+            how, worlds=64, validation=64, steps=8, starts=1, learning_rate=0.3, slots=64
         )
     space, course = _space(how), _course(how)
     same = {f.name for f in dataclasses.fields(descent.Descent)} & set(how.__dict__)
@@ -1146,10 +1155,15 @@ def _tune_grad(options: TuneGrad) -> None:
 def _quickly(options: Any, **small: Any) -> Any:
     """The options with what is small, where nothing else than the default was asked for.
 
-    Few parameters, those that matter most, since few trials tell no more; few slots, since few
-    trials leave many empty.
+    Few parameters, those that matter most, since few trials tell no more; and cylinders on the
+    quasi-static model, which compile and run fastest.
     """
-    small |= {"tuned": ("K_h", "K_v", "l_cr", "d_th"), "slots": 16, "horizon": 150.0}
+    small |= {
+        "tuned": ("K_h", "K_v", "l_cr", "d_th"),
+        "objects": ("random_cylinder",),
+        "engine": "quasistatic",
+        "horizon": 150.0,
+    }
     default = type(options)()
     free = {name for name in small if getattr(options, name) == getattr(default, name)}
     return dataclasses.replace(options, **{name: small[name] for name in free})

@@ -1,8 +1,9 @@
 """Tuning the law by gradients: of a softened trial, of randomised smoothing, or of both.
 
-The objective is that of `tune`. What is differentiated is a softened trial of fixed length: smooth
-law and skin, and a base that has arrived by a weight instead of by a switch. What is validated, in
-the course's engine, is the hard law under the paper's rules.
+The objective is that of `tune`. What is differentiated is a window of a softened trial: smooth law
+and skin, and a base that has arrived by a weight instead of by a switch; what is left of the way
+after it counts as the time of driving there. What is validated, in the course's engine, is the hard
+law under the paper's rules.
 """
 
 from __future__ import annotations
@@ -19,14 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from rps_jax import errors, frames, gradients, record, tune
+from rps_jax import errors, gradients, record, tune
 from rps_jax.gradients import Estimate
 from rps_jax.law import RPSParams
 from rps_jax.physics import preset
 from rps_jax.skin import CapacitiveSkin, SmoothSkin
 from rps_jax.slots import Progress, Setting
 from rps_jax.strategies import smooth_rps
-from rps_jax.trial import Snapshot, World, start_all
+from rps_jax.trial import Snapshot, Trial, World, control_step, select, start_all
 from rps_jax.tune import Course, Objective, Space
 
 ESTIMATORS = ("reverse", "forward", "evolution", "combined")
@@ -37,32 +38,37 @@ _ENGINE = {"reverse": "quasistatic", "forward": "fused", "combined": "quasistati
 class Descent:
     """How gradients are followed."""
 
-    estimator: str = "combined"
-    """reverse, through the quasi-static model; forward, through the fused engine; evolution,
-    antithetic steps in the course's engine; combined, reverse and evolution by their variances."""
+    estimator: str = "reverse"
+    """reverse, windows through the quasi-static model; forward, windows through the fused engine;
+    evolution, antithetic steps in whole trials of the course's engine; combined, reverse and
+    evolution by their variances, of which that of the windows is mostly much the smaller."""
     optimiser: str = "adam"
     """An optimiser of optax, by name."""
     learning_rate: float = 0.1
     """[1] At first, falling to zero along a cosine."""
     clip: float = 1.0
     """[1] Bound on the norm of a gradient."""
-    world_clip: float = 1.0
-    """[1] Bound on that of a single world, of reverse and forward: a few chaotic worlds would
-    outweigh all others."""
+    world_clip: float = 2.0
+    """[1] Bound on that of a single world, of reverse and forward, as a multiple of their median: a
+    few chaotic worlds would outweigh all others."""
     steps: int = 40
     """In all."""
     starts: int = 4
     """Descents side by side: one from the base parameters, others from random places near it."""
     spread: float = 0.5
     """[1] Standard deviation of these places, in units of the bounded map."""
-    window: float = 30.0
-    """[s] Length of a softened trial."""
+    window: float = 8.0
+    """[s] Length of a window of a softened trial, that of reverse and forward."""
+    within: float = 100.0
+    """[s] Windows begin at random times up to this; with 0 at the start of the trials."""
     arrive: float = 0.005
     """[m] Temperature at which a softened trial arrives."""
     sigma: float = 0.15
     """[1] Standard deviation of the steps of the evolution gradient."""
     pairs: int = 8
     """Antithetic pairs of these steps."""
+    budget: float = 0.0
+    """[s] Simulated time after which no step begins; 0: no bound."""
     seed: int = 0
     """Of the starts, the steps and the worlds."""
 
@@ -77,6 +83,8 @@ class Descent:
             errors.check_finite(name, getattr(self, name), above=0)
         for name in ("steps", "starts", "pairs"):
             errors.check_finite(name, getattr(self, name), at_least=1, at_most=1e6)
+        for name in ("within", "budget"):
+            errors.check_finite(name, getattr(self, name), at_least=0, unit="s")
         errors.check_finite("spread", self.spread, at_least=0, at_most=10)
         errors.check_finite("seed", self.seed, at_least=0, at_most=2**30)
 
@@ -91,10 +99,12 @@ class Descent:
 def soft_score(
     seen: Snapshot, params: RPSParams, setting: Setting, objective: Objective, arrive: float
 ) -> jax.Array:
-    """The objective's score () of a softened trial's snapshots (T, ...), differentiable.
+    """The objective's score () of a softened window's snapshots (T, ...), differentiable.
 
     At each step the base arrives by a weight, in contact and nearer than d_success within the
-    temperature `arrive` [m]; what comes after counts only as far as it has not arrived before.
+    temperature `arrive` [m]; what comes after counts only as far as it has not arrived before. So
+    far as it never arrives, the distance that is left costs the time of driving it at v_max: no
+    window is long enough to tell a failure.
     """
     period = setting.physics.control_period
     contact, distance = seen.reading.in_contact, seen.details.distance
@@ -102,10 +112,10 @@ def soft_score(
     under_way = jnp.cumprod(1 - arriving)
     touched = jax.lax.cummax(contact)
     return objective.score(
-        1 - under_way[-1],
-        period * jnp.sum(under_way),
+        1.0,
+        period * jnp.sum(under_way) + under_way[-1] * distance[-1] / params.v_max,
         period * jnp.sum(under_way * touched * (1 - contact)),
-        -frames.greatest(-distance),
+        0.0,
         setting.rules,
     )
 
@@ -115,16 +125,18 @@ class Batch(NamedTuple):
 
     stage: Any
     worlds: World  # (n, ...), with smooth skins
+    late: jax.Array  # (n,) [1] when a window begins, as a share of the latest time
 
 
 def softened(course: Course, engine: Any, seed: int, step: int) -> list[Batch]:
     """The worlds of one step of a course as smooth ones, by domain and object."""
     setting = replace(course.setting, engine=engine)
     ask = course.ask(jax.tree.map(lambda x: np.array([x]), RPSParams()), seed, step)
-    batches = []
-    for part, _, _ in tune.parts(ask, course.domains, setting):
-        batches.append(Batch(part.stage, soften(part.worlds)))
-    return batches
+    random = np.random.default_rng((seed, step))
+    return [
+        Batch(part.stage, soften(part.worlds), jnp.asarray(random.uniform(size=column.size)))
+        for part, column, _ in tune.parts(ask, course.domains, setting)
+    ]
 
 
 def soften(worlds: World) -> World:
@@ -135,25 +147,43 @@ def soften(worlds: World) -> World:
 
 
 def scores_of(space: Space, course: Course, descent: Descent, stage: Any) -> gradients.Scores:
-    """Scores of softened trials from their start, as `gradients` takes them."""
-    setting = course.setting
+    """Scores of windows of softened trials, as `gradients` takes them.
+
+    A world is a pair (World, share of `within` after which its window begins). What leads to that
+    is driven by the same parameters, and not differentiated.
+    """
+    setting, strategy, physics = course.setting, smooth_rps(), preset(fidelity="fast")
 
     def cost(seen: Snapshot) -> jax.Array:
         return soft_score(seen, space.base, setting, course.objective, descent.arrive)
 
-    strategy = smooth_rps()
+    def steps(seconds: float) -> int:
+        return round(seconds / setting.physics.control_period)
+
     score = gradients.window(
         stage,
         space.params,
         cost,
-        physics=preset(fidelity="fast"),
+        physics=physics,
         strategy=strategy,
-        steps=max(1, round(descent.window / setting.physics.control_period)),
+        steps=max(1, steps(descent.window)),
     )
 
-    def scores(thetas: jax.Array, worlds: World) -> jax.Array:
-        live = jnp.ones(len(thetas), bool)
-        return score(thetas, (worlds, start_all(worlds, live, strategy=strategy)))
+    def begun(thetas: jax.Array, worlds: World, late: jax.Array) -> Trial:
+        worlds = worlds._replace(params=jax.vmap(space.params)(thetas))
+        first = start_all(worlds, jnp.ones(len(late), bool), strategy=strategy)
+        if not descent.within:
+            return first
+
+        def one(i: jax.Array, trials: Trial) -> Trial:
+            after, _ = control_step(stage, worlds, trials, physics=physics, strategy=strategy)
+            return jax.vmap(select)(i < late * steps(descent.within), after, trials)
+
+        return jax.lax.fori_loop(0, steps(descent.within), one, first)
+
+    def scores(thetas: jax.Array, worlds: tuple[World, jax.Array]) -> jax.Array:
+        begin = begun(jax.lax.stop_gradient(thetas), *worlds)
+        return score(thetas, (worlds[0], jax.lax.stop_gradient(begin)))
 
     return scores
 
@@ -165,14 +195,17 @@ def _differentiated(
     """Estimates (S, p) at thetas (S, p), each from all the worlds of a batch."""
     scores = scores_of(space, course, descent, batch.stage)
     mode = gradients.forward if descent.estimator == "forward" else gradients.reverse
-    clip = descent.world_clip
-    return jax.vmap(lambda theta: mode(scores, theta, batch.worlds, clip=clip))(thetas)
+    worlds = (batch.worlds, batch.late)
+    return jax.vmap(lambda theta: mode(scores, theta, worlds, clip=descent.world_clip))(thetas)
 
 
 def differentiated(
     thetas: jax.Array, space: Space, course: Course, descent: Descent, step: int
 ) -> tuple[Estimate, float]:
-    """Estimates (S, p) through the softened trials of one step's worlds, and their length [s]."""
+    """Estimates (S, p) through windows of one step's softened trials, and the time simulated [s].
+
+    Counted is what leads to a window, too.
+    """
     batches = softened(course, _ENGINE[descent.estimator], descent.seed, step)
     found = [
         (_differentiated(thetas, b, space=space, course=course, descent=descent), len(b.worlds.key))
@@ -183,7 +216,7 @@ def differentiated(
         sum(e.gradient * (n / total) for e, n in found),  # type: ignore[arg-type]
         sum(e.variance * (n / total) ** 2 for e, n in found),  # type: ignore[arg-type]
         sum(e.finite * (n / total) for e, n in found),  # type: ignore[arg-type]
-    ), len(thetas) * total * descent.window
+    ), len(thetas) * total * (descent.window + descent.within / 2)
 
 
 def smoothed(
@@ -243,12 +276,13 @@ def begin(space: Space, descent: Descent) -> Search:
 
 
 def open_run(folder: Path, space: Space, course: Course, descent: Descent) -> Path:
-    """The run folder; one that holds a run must hold this one.
+    """The run folder; one that holds a run must hold this one, but for its budget.
 
     Raises:
       InputError: it cannot be written, or holds another run.
     """
-    return record.claim(folder, tune.configuration(space, course) | {"descent": asdict(descent)})
+    own = asdict(replace(descent, budget=0.0))
+    return record.claim(folder, tune.configuration(space, course) | {"descent": own})
 
 
 def descend(
@@ -269,7 +303,7 @@ def descend(
     """
     search, log = tune.resume(folder, begin(space, descent), "step")
     rule = descent.rule()
-    while int(search.step) <= descent.steps:
+    while int(search.step) <= descent.steps and not tune.spent(log, descent.budget):
         step = int(search.step)
         check = course.validate(space.params(search.thetas), descent.seed)
         (tried,), timing = tune.try_out(

@@ -540,6 +540,27 @@ def tuning(log: Sequence[Mapping], names: Sequence[str], path: Path) -> Path:
     return save(figure, path)
 
 
+def races(runs: Mapping[str, Sequence[Mapping]], path: Path) -> Path:
+    """Tuners' runs side by side: the best validation so far against what was simulated before it.
+
+    A run that continues another is the sum of both logs.
+    """
+    figure = Figure(figsize=(9, 3.4), layout="constrained")
+    axes = figure.subplots(1, 2)
+    for name, log in runs.items():
+        simulated = np.cumsum([0.0] + [line["simulated"] for line in log[:-1]]) / 1e6
+        value = np.array([line["validation"] for line in log], float)
+        best = np.fmin.accumulate(value)
+        success = np.array([line["validation_success"] for line in log], float)
+        chosen = np.maximum.accumulate(np.where(value == best, np.arange(len(log)), 0))
+        for ax, at in zip(axes, (best, 100 * success[chosen]), strict=True):
+            ax.step(simulated, at, where="post", label=name)
+    for ax, label in zip(axes, ("objective [1]", "success [%]"), strict=True):
+        ax.set(xlabel="simulated [10$^6$ s]", ylabel=f"{label}, best mean so far")
+    axes[0].legend(fontsize=8)
+    return save(figure, path)
+
+
 def failures(results: xr.Dataset, max_lost: float, path: Path) -> Path:
     """Failures by their kind, a column for each object.
 

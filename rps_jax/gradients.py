@@ -44,14 +44,16 @@ class Estimate(NamedTuple):
 def estimate(samples: jax.Array, clip: float = jnp.inf) -> Estimate:
     """The mean of samples (n, p, ...), entry by entry without those that are not finite.
 
-    A sample whose norm (over p) is more than `clip` is scaled down to it: a bias, and the end of
-    the few samples that would outweigh all others.
+    A sample whose norm (over p) is more than `clip` times their median is scaled down to it: a
+    bias, and the end of the few samples that would outweigh all others.
     """
     there = jnp.isfinite(samples)
     samples = jnp.where(there, samples, 0.0)
     if clip < jnp.inf:
         size = frames.norm(jnp.moveaxis(samples, 1, -1))[:, None]
-        samples = samples * jnp.minimum(1.0, clip / jnp.maximum(size, clip))
+        # Of the worlds that have a gradient at all: some trials have ended.
+        most = clip * jnp.nan_to_num(jnp.nanmedian(jnp.where(size > 0, size, jnp.nan), axis=0))
+        samples = samples * jnp.minimum(1.0, most / jnp.where(size > 0, size, 1.0))
     count = jnp.sum(there, axis=0)
     mean = jnp.sum(samples, axis=0) / jnp.maximum(count, 1)
     squares = jnp.sum(jnp.where(there, (samples - mean) ** 2, 0.0), axis=0)

@@ -54,8 +54,8 @@ class Study:
     """Half a finite difference, in units of the bounded map."""
     sigma: float = 0.15
     """Standard deviation of the steps of evolution, likewise."""
-    clip: float = 1.0
-    """[m] Bound on the norm of a world's gradient, of the estimator clipped."""
+    clip: float = 2.0
+    """Bound on the norm of a world's gradient, of the estimator clipped, in their medians."""
     engine: Engine = "fused"
     """Of the truth, of forward mode and of evolution; reverse mode takes the quasi-static one."""
     seed: int = 0

@@ -380,7 +380,7 @@ def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
         steps=told.steps + 1,
     )
     stopped = told._replace(done=jnp.ones((), bool), diverged=~told.done & ~sane)
-    return _select(before.done, before, _select(told.done | ~sane, stopped, moved))
+    return select(before.done, before, select(told.done | ~sane, stopped, moved))
 
 
 def control_step(
@@ -399,7 +399,8 @@ def control_step(
     return jax.vmap(settle)(trials, told, driven), snapshots
 
 
-def _select(condition: jax.Array, yes: Any, no: Any) -> Any:
+def select(condition: jax.Array, yes: Any, no: Any) -> Any:
+    """One of two pytrees, by a condition () that may be traced."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 

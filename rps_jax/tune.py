@@ -313,6 +313,8 @@ class Evolution:
     search where the bounded map is not flat."""
     patience: int = 0
     """Generations without a better validation before a restart elsewhere; 0: never."""
+    budget: float = 0.0
+    """[s] Simulated time after which no generation begins; 0: no bound."""
     seed: int = 0
     """Of the proposals, and of the worlds for tuning and validation."""
 
@@ -324,6 +326,7 @@ class Evolution:
         errors.check_finite("spread", self.spread, above=0, at_most=10)
         errors.check_finite("prior", self.prior, at_least=0)
         errors.check_finite("patience", self.patience, at_least=0)
+        errors.check_finite("budget", self.budget, at_least=0, unit="s")
         errors.check_finite("seed", self.seed, at_least=0, at_most=2**30)
 
     def algorithm(self, size: int) -> Any:
@@ -442,12 +445,12 @@ class Course:
 
 
 def open_run(folder: Path, space: Space, course: Course, evolution: Evolution) -> Path:
-    """The run folder; one that holds a run must hold this one, but for its generations.
+    """The run folder; one that holds a run must hold this one, but for how long it goes on.
 
     Raises:
       InputError: it cannot be written, or holds another run.
     """
-    own = {"evolution": asdict(replace(evolution, generations=1))}
+    own = {"evolution": asdict(replace(evolution, generations=1, budget=0.0))}
     return record.claim(folder, configuration(space, course) | own)
 
 
@@ -479,7 +482,7 @@ def evolve(
     """
     search = begin(evolution, space, space.vector(space.base))
     search, log = resume(folder, search, "generation")
-    while int(search.generation) < evolution.generations:
+    while int(search.generation) < evolution.generations and not spent(log, evolution.budget):
         generation = int(search.generation)
         candidates, asked = propose(evolution, search)
         mean = asked.mean
@@ -521,6 +524,11 @@ def evolve(
         record.write_json(folder / "tuned.json", named(space, search.best))
         save(folder, search, log)
     return space.params(search.best)
+
+
+def spent(log: Sequence[dict[str, Any]], budget: float) -> bool:
+    """Whether the generations of a log have simulated a budget [s]; never one of 0."""
+    return 0 < budget <= sum(line["simulated"] for line in log)
 
 
 def finite(value: Any) -> float | None:

@@ -132,5 +132,5 @@ def test_a_quick_run_makes_small_only_what_was_not_asked_for():
     asked = cli.TuneES(quick=True, worlds=7, tuned=("logistic",))
     quick = cli._quickly(asked, worlds=16, population=10)
     assert (quick.worlds, quick.tuned) == (7, ("logistic",))
-    assert (quick.population, quick.slots, quick.horizon) == (10, 16, 150.0)
+    assert (quick.population, quick.engine, quick.horizon) == (10, "quasistatic", 150.0)
     assert quick.generations == asked.generations

@@ -39,18 +39,18 @@ class TestSoftScore:
     def test_cold_it_is_the_hard_score_of_a_success(self):
         # 1 m at 0.1 m/s in steps of 20 ms: nearer than d_success = 5 cm after 9.5 s = 475 steps.
         distance = 1.0 - 0.1 * 0.02 * np.arange(600)
-        expected = OBJECTIVE.score(1.0, 9.5, 0.0, 0.05, SETTING.rules)
+        expected = OBJECTIVE.score(1.0, 9.5, 0.0, 0.0, SETTING.rules)
         assert score(distance, np.ones(600)) == pytest.approx(float(expected), abs=1e-3)
 
-    def test_cold_it_is_the_hard_score_of_a_failure(self):
-        # 5 s in contact, then 5 s without; never nearer than 30 cm.
+    def test_the_way_that_is_left_costs_the_time_of_driving_it(self):
+        # 5 s in contact, then 5 s without; the last 30 cm take 6 s at v_max = 0.05 m/s.
         contact = np.repeat([1.0, 0.0], 250)
-        expected = OBJECTIVE.score(0.0, 10.0, 5.0, 0.3, SETTING.rules)
+        expected = OBJECTIVE.score(1.0, 10.0 + 6.0, 5.0, 0.0, SETTING.rules)
         assert score(np.full(500, 0.3), contact) == pytest.approx(float(expected), rel=1e-5)
 
     def test_time_before_the_first_touch_is_not_lost(self):
         contact = np.repeat([0.0, 1.0], 250)
-        expected = OBJECTIVE.score(0.0, 10.0, 0.0, 0.3, SETTING.rules)
+        expected = OBJECTIVE.score(1.0, 10.0 + 6.0, 0.0, 0.0, SETTING.rules)
         assert score(np.full(500, 0.3), contact) == pytest.approx(float(expected), rel=1e-5)
 
     def test_it_has_a_slope_where_the_hard_one_jumps(self):
@@ -58,12 +58,16 @@ class TestSoftScore:
             one = seen(d * jnp.ones(5), jnp.ones(5))
             return descent.soft_score(one, RPSParams(), SETTING, OBJECTIVE, 0.005)
 
-        assert float(jax.grad(at)(0.05)) > 1.0
+        slope = float(jax.grad(at)(0.05))
+        assert slope > 10 * OBJECTIVE.time / SETTING.rules.horizon  # [1/m] more than a way's own
 
 
 class TestDescent:
     def test_bad_options_are_refused(self):
-        for bad in ({"estimator": "backprop"}, {"optimiser": "sgdd"}, {"clip": 0.0}, {"pairs": 0}):
+        for bad in (
+            {"estimator": "backprop"}, {"optimiser": "sgdd"}, {"clip": 0.0}, {"pairs": 0},
+            {"within": -1.0}, {"budget": float("nan")},
+        ):  # fmt: skip
             with pytest.raises(InputError):
                 Descent(**bad)
 
@@ -105,7 +109,18 @@ class TestRuns:
         return [
             *("tune", "grad", "--engine", "quasistatic", "--estimator", "reverse"),
             *("--objects", "random_cylinder", "--worlds", "2", "--validation", "2"),
-            *("--starts", "2", "--steps", str(steps), "--window", "1", "--horizon", "5"),
+            *(
+                "--starts",
+                "2",
+                "--steps",
+                str(steps),
+                "--window",
+                "1",
+                "--within",
+                "2",
+                "--horizon",
+                "5",
+            ),
             *("--tuned", "L", "K_h", "v_lost", "--slots", "4", "--out", str(folder)),
         ]
 

@@ -155,18 +155,19 @@ def test_entries_are_dropped_one_by_one():
 
 
 def test_a_sample_beyond_the_bound_is_scaled_down_to_it_by_hand():
-    samples = jnp.array([[3.0, 4.0], [0.3, 0.4], [0.0, -1e30]])
-    found = gradients.estimate(samples, clip=1.0)
-    np.testing.assert_allclose(found.gradient, [0.3, 0.2 / 3], rtol=1e-5)  # (.6,.8) (.3,.4) (0,-1)
+    # Norms 5, 0.5, 1e30 and none: of those that are, the median is 5, and twice that 10.
+    samples = jnp.array([[3.0, 4.0], [0.3, 0.4], [0.0, -1e30], [0.0, 0.0]])
+    found = gradients.estimate(samples, clip=2.0)
+    np.testing.assert_allclose(found.gradient, [3.3 / 4, (4.4 - 10) / 4], rtol=1e-5)
     assert np.isfinite(found.variance).all()
     free = gradients.estimate(samples[:2])
     np.testing.assert_allclose(free.gradient, [1.65, 2.2], rtol=1e-6)
     # Each score of a world has a bound of its own.
-    two = jnp.stack([samples, samples / 10], axis=-1)
-    np.testing.assert_allclose(gradients.estimate(two, clip=1.0).gradient[:, 0], found.gradient)
-    np.testing.assert_allclose(
-        gradients.estimate(two, clip=1.0).gradient[:, 1], [0.11, (0.44 - 1) / 3], rtol=1e-5
-    )
+    two = jnp.stack([samples, samples[::-1] / 10], axis=-1)
+    both = gradients.estimate(two, clip=2.0).gradient
+    np.testing.assert_allclose(both, jnp.outer(found.gradient, jnp.array([1.0, 0.1])), rtol=1e-5)
+    nothing = gradients.estimate(jnp.zeros((3, 2)), clip=2.0)
+    np.testing.assert_array_equal(nothing.gradient, [0.0, 0.0])
 
 
 def test_an_estimate_of_nothing_is_zero_with_infinite_variance():

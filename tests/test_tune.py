@@ -197,8 +197,8 @@ class TestRuns:
     space = Space(("L", "K_h"))
     course = Course(worlds=4, validation=4)
 
-    def run(self, folder, generations):
-        evolution = Evolution(population=8, generations=generations)
+    def run(self, folder, generations, budget=0.0):
+        evolution = Evolution(population=8, generations=generations, budget=budget)
         tune.open_run(folder, self.space, self.course, evolution)
         return tune.evolve(folder, self.space, self.course, evolution)
 
@@ -211,6 +211,12 @@ class TestRuns:
         logs = [(tmp_path / name / "log.jsonl").read_text() for name in ("whole", "parts")]
         assert logs[0] == logs[1]
         assert len(logs[0].splitlines()) == 6
+
+    def test_it_ends_when_its_budget_is_spent_and_goes_on_with_more(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(tune, "try_out", pretend)  # of 1 s a generation
+        for budget, done in ((2.5, 3), (4.0, 4), (0.0, 6)):
+            self.run(tmp_path, 6, budget)
+            assert len(tune.read_log(tmp_path)) == done
 
     def test_it_finds_the_place_and_writes_it_down(self, tmp_path, monkeypatch):
         monkeypatch.setattr(tune, "try_out", pretend)
