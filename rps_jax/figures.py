@@ -317,7 +317,7 @@ def hysteresis(sets: Mapping[str, RPSParams], ripple: float, path: Path) -> Path
         _shade(above, time, realigning, _SHADES["realigning"])
         for threshold in (params.l_mr, params.l_cr):
             above.axhline(float(threshold), color="0.5", lw=0.8, ls="--")
-        above.set_title(f"{name}: enters Realignment {entries} times", fontsize=9)
+        above.set_title(f"{name}: entries into Realignment: {entries}", fontsize=9)
         above.set_xlabel("time [s]")
         a_r, half = np.asarray(_swept(params, jnp.asarray(there)).a_r), time.size // 2
         below.plot(there[:half], a_r[:half], color="C3", label="outwards")

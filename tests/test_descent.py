@@ -2,13 +2,14 @@
 
 import json
 from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rps_jax import cli, descent, domain, tune
+from rps_jax import cli, descent, domain, gradients, tune
 from rps_jax.descent import Descent
 from rps_jax.errors import InputError
 from rps_jax.law import RPSParams
@@ -100,6 +101,22 @@ def test_antithetic_steps_find_the_slope_of_the_objective(monkeypatch):
     np.testing.assert_allclose(found.gradient, [[2, -1], [2, -1]], atol=0.2)
     errors = np.abs(found.gradient - jnp.array([2.0, -1.0])) / jnp.sqrt(found.variance)
     assert (errors < 4).all()
+
+
+def test_windows_begin_where_their_trials_are_by_then(monkeypatch):
+    """With trials that only count their steps of 20 ms."""
+
+    class Blank(NamedTuple):
+        params: Any
+
+    monkeypatch.setattr(descent, "start_all", lambda worlds, live, strategy: jnp.zeros(live.size))
+    monkeypatch.setattr(descent, "control_step", lambda _, worlds, trials, **__: (trials + 1, None))
+    monkeypatch.setattr(gradients, "window", lambda *_, **__: lambda thetas, starts: starts[1])
+    course = Course((domain.DOMAINS["wide"],), 3, 3, SETTING)
+    late = jnp.array([0.0, 0.5, 1.0])
+    for within, steps in ((10.0, [0, 250, 500]), (0.0, [0, 0, 0])):
+        scores = descent.scores_of(Space(("L", "K_h")), course, Descent(within=within), None)
+        np.testing.assert_array_equal(scores(jnp.zeros((3, 2)), (Blank(None), late)), steps)
 
 
 class TestRuns:
