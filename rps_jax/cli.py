@@ -901,13 +901,9 @@ def _arms(options: Sweep) -> dict[str, Params]:
     from rps_jax import strategies
     from rps_jax.law import RPSParams
 
-    sets = {Path(name).stem: _of_the_law(name) for name in options.params}
-    for field, given, distinct in (
-        ("strategies", options.strategies, set(options.strategies)),
-        ("params", options.params, sets),
-    ):
-        if not given or len(distinct) < len(given):
-            raise InputError(f"{field} = {given} is not allowed: name each once, at least one.")
+    _labels("strategies", options.strategies)
+    labels = _labels("params", options.params)
+    sets = {at: _of_the_law(name) for at, name in zip(labels, options.params, strict=True)}
     arms: dict[str, Params] = {}
     for name, changes in sets.items():
         for strategy in options.strategies:
@@ -918,6 +914,19 @@ def _arms(options: Sweep) -> dict[str, Params]:
                 label = strategy if len(sets) == 1 else f"{strategy} {name}"
             arms[label] = params
     return arms
+
+
+def _labels(field: str, names: Sequence[str]) -> list[str]:
+    """Short names of what files hold: each file's own, after its folder's where two are alike.
+
+    Raises:
+      InputError: none is given, or one twice.
+    """
+    for parts in (1, 2):
+        labels = ["/".join(Path(name).with_suffix("").parts[-parts:]) for name in names]
+        if names and len(set(labels)) == len(names):
+            return labels
+    raise InputError(f"{field} = {names} is not allowed: name each once, at least one.")
 
 
 def _of_the_law(name: str) -> dict[str, float]:
@@ -1086,12 +1095,13 @@ def _tune_compare(options: TuneCompare) -> None:
         seed=tune.seed_of(options.seed, "test"),
         engine=options.engine,  # pyright: ignore[reportArgumentType]
     )
-    arms = {Path(name).stem: params_of(name) for name in options.params}
+    labels = _labels("params", options.params)
+    arms = {at: params_of(name) for at, name in zip(labels, options.params, strict=True)}
     plans = {}
-    for text in options.domain:
+    for at, text in zip(_labels("domain", options.domain), options.domain, strict=True):
         one = domain_of(text)
         count = one.combinations if one.targets else options.worlds
-        plans[Path(text).stem] = Plan(one, count, arms, setting, part=4096)
+        plans[at] = Plan(one, count, arms, setting, part=4096)
     shape = options.shape()
     _check_here(options.device, setting, [plan.domain for plan in plans.values()])
     record.writable(options.out)

@@ -150,7 +150,7 @@ SWEEP = {
     "--params L_word.json": "L_word.json L = x is not allowed: it must be a number",
     "--params reactive.json": "unknown parameter of reactive.json 'reactive'",
     "--params list.json": "list.json holds no names with values",
-    "--params good.json other/good.json": "params = .* is not allowed: name each once",
+    "--params good.json good.json": "params = .* is not allowed: name each once",
     "--worlds 0": "worlds = 0 is not allowed: it must be a whole number from 1 to",
     "--worlds -1": "worlds = -1 is not allowed",
     "--worlds 99999999999": "worlds = 99999999999 is not allowed",

@@ -9,6 +9,7 @@ import pytest
 import xarray as xr
 
 from rps_jax import cli, paper, record, score
+from rps_jax.errors import InputError
 
 SMALL = [
     *("table", "--targets", "0.6", "0", "0.62", "0.03", "--horizon", "18", "--slots", "4"),
@@ -134,3 +135,12 @@ def test_a_quick_run_makes_small_only_what_was_not_asked_for():
     assert (quick.worlds, quick.tuned) == (7, ("logistic",))
     assert (quick.population, quick.engine, quick.horizon) == (10, "quasistatic", 150.0)
     assert quick.generations == asked.generations
+
+
+def test_files_of_the_same_name_are_told_apart_by_their_folders():
+    runs = ("paper", "runs/es/tuned.json", "runs/grad/tuned.json")
+    assert cli._labels("params", runs) == ["paper", "es/tuned", "grad/tuned"]
+    assert cli._labels("params", runs[:2]) == ["paper", "tuned"]
+    for bad in ((), ("paper", "paper"), ("a/es/tuned.json", "b/es/tuned.json")):
+        with pytest.raises(InputError, match="name each once"):
+            cli._labels("params", bad)
