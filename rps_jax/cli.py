@@ -647,9 +647,7 @@ def _cases(options: Table, targets: Sequence[tuple[float, float]]) -> list[Case]
     from rps_jax import sweep
 
     for name in ("strategies", "objects", "friction"):
-        values = getattr(options, name)
-        if not values or len(set(values)) < len(values):
-            raise InputError(f"{name} = {values} is not allowed: name each once, at least one.")
+        _each_once(name, getattr(options, name))
     frictions = [_friction(text) for text in options.friction]
     return [
         sweep.Case(name, friction, target, params, **_per_world(options))
@@ -901,7 +899,7 @@ def _arms(options: Sweep) -> dict[str, Params]:
     from rps_jax import strategies
     from rps_jax.law import RPSParams
 
-    _labels("strategies", options.strategies)
+    _each_once("strategies", options.strategies)
     labels = _labels("params", options.params)
     sets = {at: _of_the_law(name) for at, name in zip(labels, options.params, strict=True)}
     arms: dict[str, Params] = {}
@@ -924,9 +922,16 @@ def _labels(field: str, names: Sequence[str]) -> list[str]:
     """
     for parts in (1, 2):
         labels = ["/".join(Path(name).with_suffix("").parts[-parts:]) for name in names]
-        if names and len(set(labels)) == len(names):
-            return labels
-    raise InputError(f"{field} = {names} is not allowed: name each once, at least one.")
+        if len(set(labels)) == len(names):
+            break
+    _each_once(field, names, labels)
+    return labels
+
+
+def _each_once(field: str, given: Sequence[Any], labels: Sequence[Any] | None = None) -> None:
+    """Raises InputError if nothing is given, or one twice, by its label if it has one."""
+    if not given or len(set(given if labels is None else labels)) < len(given):
+        raise InputError(f"{field} = {given} is not allowed: name each once, at least one.")
 
 
 def _of_the_law(name: str) -> dict[str, float]:

@@ -204,7 +204,7 @@ def differentiated(
 ) -> tuple[Estimate, float]:
     """Estimates (S, p) through windows of one step's softened trials, and the time simulated [s].
 
-    Counted is what leads to a window, too.
+    Counted is what leads to a window, too, but not that worlds wait there for the latest to begin.
     """
     batches = softened(course, _ENGINE[descent.estimator], descent.seed, step)
     found = [

@@ -126,18 +126,8 @@ class TestRuns:
         return [
             *("tune", "grad", "--engine", "quasistatic", "--estimator", "reverse"),
             *("--objects", "random_cylinder", "--worlds", "2", "--validation", "2"),
-            *(
-                "--starts",
-                "2",
-                "--steps",
-                str(steps),
-                "--window",
-                "1",
-                "--within",
-                "2",
-                "--horizon",
-                "5",
-            ),
+            *("--starts", "2", "--steps", str(steps), "--horizon", "5"),
+            *("--window", "1", "--within", "2"),
             *("--tuned", "L", "K_h", "v_lost", "--slots", "4", "--out", str(folder)),
         ]
 
