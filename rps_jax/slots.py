@@ -11,7 +11,6 @@ import os
 import threading
 import time
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -246,20 +245,19 @@ class _Queue:
         first = next(self._parts)
         self.stage = first.stage
         self._worlds = jax.tree.map(self._batched, first.worlds)
-        self._waiting: deque[tuple[Part, int]] = deque()
-        self._add(first)
+        self._waiting: Part | None = first  # what is left of it
         self._lock, self._compiling = threading.Lock(), threading.Lock()
         self._program = None
 
-    def _add(self, part: Part) -> None:
-        self._waiting.extend((part, row) for row in range(part.numbers.size))
-
-    def take(self, count: int) -> list[tuple[Part, int]]:
-        """Up to `count` waiting trials, each a row of a part."""
+    def take(self, count: int) -> list[Part]:
+        """Up to `count` waiting trials, as pieces of parts."""
+        taken = []
         with self._lock:
-            while len(self._waiting) < count and (part := next(self._parts, None)) is not None:
-                self._add(part)
-            return [self._waiting.popleft() for _ in range(min(count, len(self._waiting)))]
+            while count and (part := self._waiting or next(self._parts, None)):
+                piece, self._waiting = _cut(part, count)
+                taken.append(piece)
+                count -= piece.numbers.size
+        return taken
 
     def program(self) -> Any:
         """The compiled `trial.advance`; the first to come compiles, others wait."""
@@ -331,6 +329,20 @@ def rows(tree: Any, which: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[which], tree)
 
 
+def _cut(part: Part, count: int) -> tuple[Part, Part | None]:
+    """The first `count` trials of a part, and the others if there are any."""
+
+    def piece(which: slice) -> Part:
+        return Part(part.numbers[which], rows(part.worlds, which), part.stage)
+
+    over = part.numbers.size > count
+    return piece(slice(count)), piece(slice(count, None)) if over else None
+
+
+def _count(parts: Sequence[Part]) -> int:
+    return sum(part.numbers.size for part in parts)
+
+
 @partial(jax.jit, static_argnames=("strategy",), donate_argnames=("trials",))
 def _refill(worlds: World, trials: Trial, fresh: jax.Array, *, strategy: Strategy) -> Trial:
     """Start a new trial in the slots that are `fresh` (B,)."""
@@ -354,36 +366,30 @@ def _work(queues: list[_Queue], shared: _Shared) -> None:
 class _Held:
     """The worlds in the slots of one worker, on the host."""
 
-    def __init__(self, first: list[tuple[Part, int]], slots: int):
-        part, row = first[0]
+    def __init__(self, like: Part, slots: int):
         self.numbers = np.zeros(slots, np.int64)
-        self._worlds = jax.tree.map(
-            lambda leaf: np.repeat(leaf[row][None], slots, axis=0), part.worlds
-        )
+        self._worlds = jax.tree.map(lambda leaf: np.repeat(leaf[:1], slots, axis=0), like.worlds)
 
-    def put(self, at: np.ndarray, taken: list[tuple[Part, int]]) -> World:
+    def put(self, at: np.ndarray, taken: Sequence[Part]) -> World:
         """Put trials into the slots `at`; returns the worlds."""
-        by_part: dict[int, tuple[Part, list[int], list[int]]] = {}
-        for slot, (part, row) in zip(at, taken, strict=True):
-            _, slots, of = by_part.setdefault(id(part), (part, [], []))
-            slots.append(int(slot))
-            of.append(row)
-        for part, slots, of in by_part.values():
-            self.numbers[slots] = part.numbers[of]
+        ends = np.cumsum([part.numbers.size for part in taken])
+        for part, slots in zip(taken, np.split(at, ends[:-1]), strict=True):
+            self.numbers[slots] = part.numbers
             for mine, theirs in zip(
                 jax.tree.leaves(self._worlds), jax.tree.leaves(part.worlds), strict=True
             ):
-                mine[slots] = theirs[of]
+                mine[slots] = theirs
         # A copy: the device may otherwise share the host's memory, which the next call changes.
         return jax.tree.map(np.copy, self._worlds)
 
 
-def _drain(queue: _Queue, program: Any, taken: list[tuple[Part, int]], shared: _Shared) -> None:
+def _drain(queue: _Queue, program: Any, taken: list[Part], shared: _Shared) -> None:
     """Run trials, the `taken` first, until none waits and none of this worker's runs."""
     stage, period = queue.stage, queue.setting.physics.control_period
-    held = _Held(taken, queue.slots)
-    live = np.arange(queue.slots) < len(taken)
-    worlds = queue.put(held.put(np.arange(len(taken)), taken))
+    held = _Held(taken[0], queue.slots)
+    first = np.arange(_count(taken))
+    live = np.arange(queue.slots) < first.size
+    worlds = queue.put(held.put(first, taken))
     trials = queue.start(worlds, live)
     while live.any() and not shared.stop:
         before = np.asarray(trials.steps)
@@ -398,7 +404,7 @@ def _drain(queue: _Queue, program: Any, taken: list[tuple[Part, int]], shared: _
         live &= ~ended
         taken = queue.take(at.size)
         if taken:
-            fresh = at[: len(taken)]
+            fresh = at[: _count(taken)]
             live[fresh] = True
             worlds = queue.put(held.put(fresh, taken))
             trials = queue.refill(worlds, trials, np.isin(np.arange(queue.slots), fresh))
