@@ -9,6 +9,7 @@ registers: `contacts.py` finds the points, `newton.py` solves.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -26,6 +27,7 @@ from rps_jax.physics import Physics
 from rps_jax.scene import JOINTS
 from rps_jax.spatial import Vec
 
+_ROWS = 8  # numbers of a world read by one load of the kernel
 _BLOCK = 64  # worlds of one program of the kernel; they go on until the last has converged
 
 
@@ -167,37 +169,82 @@ def _kernel(
     scalars: Body, state: State, twist: Vec, physics: Physics, interpret: bool = False
 ) -> State:
     """`_steps` as one kernel, a world to a thread, which keeps its world in registers."""
-    args = (scalars, state, twist)
-    leaves, tree = jax.tree.flatten(args)
-    count = state.p[0].size
-    padded = -(-count // _BLOCK) * _BLOCK
-    leaves = [
-        jnp.pad(x, (*((0, 0),) * (x.ndim - 1), (0, padded - count)), mode="edge") for x in leaves
-    ]
-    shape = state.p[0]
-
-    def block(leaf: Any) -> pallas.BlockSpec:
-        corners = leaf.shape[:-1]
-        return pallas.BlockSpec((*corners, _BLOCK), lambda i: (*(0,) * len(corners), i))
+    count, moving = state.p[0].size, (state, twist)
+    bodies, motion = _packed(scalars), _packed(moving)
 
     def kernel(*refs):
-        values = [ref[...] for ref in refs[: len(leaves)]]
-        body, state, twist = jax.tree.unflatten(tree, values)
-        after = _steps(body, state, twist, physics)
-        for ref, value in zip(refs[len(leaves) :], jax.tree.leaves(after), strict=True):
-            ref[...] = value
+        *given, out = refs
+        body = _unpacked(scalars, given[: len(bodies)])
+        after = _steps(body, *_unpacked(moving, given[len(bodies) :]), physics)
+        _give(out, jax.tree.leaves(after))
 
-    out = [jax.ShapeDtypeStruct((padded,), shape.dtype) for _ in jax.tree.leaves(state)]
+    def block(outer: tuple[int, ...]) -> pallas.BlockSpec:
+        return pallas.BlockSpec((*outer, _BLOCK), lambda i: (*(0,) * len(outer), i))
+
+    inputs = [*bodies, *motion]
+    numbers, worlds = len(jax.tree.leaves(state)), motion[0].shape[-1]
     after = pallas.pallas_call(
         kernel,
-        grid=(padded // _BLOCK,),
-        in_specs=[block(x) for x in leaves],
-        out_specs=[block(x) for x in out],
-        out_shape=out,
+        grid=(worlds // _BLOCK,),
+        in_specs=[block(x.shape[:-1]) for x in inputs],
+        out_specs=block((numbers,)),
+        out_shape=jax.ShapeDtypeStruct((numbers, worlds), motion[0].dtype),
         interpret=interpret,
         compiler_params=triton.CompilerParams(num_warps=_BLOCK // 32),
-    )(*leaves)
-    return jax.tree.unflatten(jax.tree.structure(state), [x[:count] for x in after])
+    )(*inputs)
+    return jax.tree.unflatten(jax.tree.structure(state), list(after[:, :count]))
+
+
+def _packed(tree: Any) -> list[jax.Array]:
+    """Numbers of worlds (B,), and those of their corners (N, B), as arrays (K, B) and (K, N, B).
+
+    The worlds are filled up to whole blocks by copies of the last.
+    """
+    kinds: dict[int, list[jax.Array]] = {}
+    for leaf in jax.tree.leaves(tree):
+        kinds.setdefault(leaf.ndim, []).append(leaf)
+    stacks = [jnp.stack(leaves) for leaves in kinds.values()]
+    over = -stacks[0].shape[-1] % _BLOCK
+    return [jnp.pad(x, (*((0, 0),) * (x.ndim - 1), (0, over)), mode="edge") for x in stacks]
+
+
+def _unpacked(tree: Any, refs: Sequence[Any]) -> Any:
+    """A block of what `_packed` has packed, of the form and the types of `tree`."""
+    rows = {len(ref.shape) - 1: iter(_taken(ref)) for ref in refs}
+    return jax.tree.map(lambda leaf: next(rows[leaf.ndim]).astype(leaf.dtype), tree)
+
+
+# A kernel's compiler takes a time that grows with its loads and stores times the square of all it
+# does (Triton's pass `coalesce`): with one for each number that is three quarters of the whole.
+
+
+def _taken(ref: Any) -> list[jax.Array]:
+    """The rows of a reference (K, ...), by few loads."""
+    rows = []
+    for first in range(0, ref.shape[0], _ROWS):
+        some = range(first, min(first + _ROWS, ref.shape[0]))
+
+        def take(i: Any, taken: list[jax.Array], some: range = some) -> list[jax.Array]:
+            row = ref[i]
+            return [jnp.where(i == j, row, x) for j, x in zip(some, taken, strict=True)]
+
+        nothing = [jnp.zeros(ref.shape[1:], ref.dtype)] * len(some)
+        rows += jax.lax.fori_loop(some.start, some.stop, take, nothing)
+    return rows
+
+
+def _give(ref: Any, rows: list[jax.Array]) -> None:
+    """The opposite of `_taken`."""
+    for first in range(0, len(rows), _ROWS):
+        some = range(first, min(first + _ROWS, len(rows)))
+
+        def give(i: Any, _: None, some: range = some) -> None:
+            row = rows[some.start]
+            for j in some[1:]:
+                row = jnp.where(i == j, rows[j], row)
+            ref[i] = row
+
+        jax.lax.fori_loop(some.start, some.stop, give, None)
 
 
 def spread(body: Body) -> Body:

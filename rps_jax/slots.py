@@ -343,6 +343,12 @@ def _count(parts: Sequence[Part]) -> int:
     return sum(part.numbers.size for part in parts)
 
 
+@jax.jit
+def _seen(trials: Trial, period: float) -> tuple[jax.Array, jax.Array, Outcome]:
+    """Steps so far, who has ended, and how."""
+    return trials.steps, trials.done, trial.outcome(trials, period)
+
+
 @partial(jax.jit, static_argnames=("strategy",), donate_argnames=("trials",))
 def _refill(worlds: World, trials: Trial, fresh: jax.Array, *, strategy: Strategy) -> Trial:
     """Start a new trial in the slots that are `fresh` (B,)."""
@@ -391,20 +397,18 @@ def _drain(queue: _Queue, program: Any, taken: list[Part], shared: _Shared) -> N
     live = np.arange(queue.slots) < first.size
     worlds = queue.put(held.put(first, taken))
     trials = queue.start(worlds, live)
+    before = np.zeros(queue.slots, int)
     while live.any() and not shared.stop:
-        before = np.asarray(trials.steps)
         trials = program(stage, worlds, trials, queue.setting.rules)
-        steps = np.asarray(trials.steps)
-        ended = np.asarray(trials.done) & live
-        at = np.flatnonzero(ended)
-        outcomes = jax.device_get(trial.outcome(trials, period))
-        shared.add(
-            held.numbers[at], rows(outcomes, at), float((steps - before)[live].sum()) * period
-        )
-        live &= ~ended
+        steps, done, outcomes = jax.device_get(_seen(trials, period))
+        at = np.flatnonzero(done & live)
+        simulated = float((steps - before)[live].sum()) * period
+        shared.add(held.numbers[at], rows(outcomes, at), simulated)
+        before = steps.copy()
+        live[at] = False
         taken = queue.take(at.size)
         if taken:
             fresh = at[: _count(taken)]
-            live[fresh] = True
+            live[fresh], before[fresh] = True, 0
             worlds = queue.put(held.put(fresh, taken))
             trials = queue.refill(worlds, trials, np.isin(np.arange(queue.slots), fresh))
