@@ -260,7 +260,7 @@ class _Queue:
         return taken
 
     def program(self) -> Any:
-        """The compiled `trial.advance`; the first to come compiles, others wait."""
+        """The compiled program; the first to come compiles, others wait."""
         with self._compiling:
             if self._program is None:
                 self._program = self._compile()
@@ -299,10 +299,15 @@ def _compiled(
     tree: Any,
     leaves: tuple[jax.ShapeDtypeStruct, ...],
 ) -> Any:
-    """`trial.advance` compiled for arguments of these shapes; later runs of the kind reuse it."""
+    """`trial.advance` compiled for arguments of these shapes; later runs of the kind reuse it.
 
-    def advance(stage: Any, worlds: World, trials: Trial, rules: Rules) -> Trial:
-        return trial.advance(
+    With the trials come their steps, who has ended, and how.
+    """
+
+    def advance(
+        stage: Any, worlds: World, trials: Trial, rules: Rules
+    ) -> tuple[Trial, tuple[jax.Array, jax.Array, Outcome]]:
+        after = trial.advance(
             stage,
             worlds,
             trials,
@@ -311,6 +316,8 @@ def _compiled(
             strategy=strategy,
             steps=max(1, round(SEGMENT / physics.control_period)),
         )
+        # Of the same program: one of its own would wait for the other workers' segments.
+        return after, (after.steps, after.done, trial.outcome(after, physics.control_period))
 
     if sharding is not None:  # each device runs its own worlds and waits for no other
         advance = jax.shard_map(
@@ -341,12 +348,6 @@ def _cut(part: Part, count: int) -> tuple[Part, Part | None]:
 
 def _count(parts: Sequence[Part]) -> int:
     return sum(part.numbers.size for part in parts)
-
-
-@jax.jit
-def _seen(trials: Trial, period: float) -> tuple[jax.Array, jax.Array, Outcome]:
-    """Steps so far, who has ended, and how."""
-    return trials.steps, trials.done, trial.outcome(trials, period)
 
 
 @partial(jax.jit, static_argnames=("strategy",), donate_argnames=("trials",))
@@ -399,8 +400,8 @@ def _drain(queue: _Queue, program: Any, taken: list[Part], shared: _Shared) -> N
     trials = queue.start(worlds, live)
     before = np.zeros(queue.slots, int)
     while live.any() and not shared.stop:
-        trials = program(stage, worlds, trials, queue.setting.rules)
-        steps, done, outcomes = jax.device_get(_seen(trials, period))
+        trials, seen = program(stage, worlds, trials, queue.setting.rules)
+        steps, done, outcomes = jax.device_get(seen)
         at = np.flatnonzero(done & live)
         simulated = float((steps - before)[live].sum()) * period
         shared.add(held.numbers[at], rows(outcomes, at), simulated)

@@ -433,6 +433,7 @@ def start_all(worlds: World, live: jax.Array, strategy: Strategy = RPS) -> Trial
 
 
 _STATIC = ("physics", "strategy", "steps")
+_UNASKED = 20  # control steps between two looks at whether any trial still runs, at most
 
 
 @partial(jax.jit, static_argnames=_STATIC, donate_argnames=("trials",))
@@ -453,9 +454,13 @@ def advance(
         count, trials = carry
         return (count < steps) & ~jnp.all(trials.done)
 
+    # A GPU waits for the host whenever it is asked whether any still runs.
+    between = math.gcd(steps, _UNASKED)
+
     def body(carry):
         count, trials = carry
-        return count + 1, one(worlds, trials)[0]
+        after = jax.lax.fori_loop(0, between, lambda _, now: one(worlds, now)[0], trials)
+        return count + between, after
 
     return jax.lax.while_loop(some_run, body, (0, trials))[1]
 
