@@ -203,14 +203,14 @@ class Refilling(NamedTuple):
     trials: float  # per s of wall clock, refilled
 
 
-def refilling(slots: int, times: int = 4) -> Refilling:
+def refilling(slots: int, rounds: int = 4) -> Refilling:
     """Whole trials of RPS, with refilled slots and in batches that wait for their slowest.
 
-    Both run the same random boxes of the domain `wide`, `times` as many as there are slots.
+    Both run the same random boxes of the domain `wide`, `rounds` times as many as there are slots.
     """
     setting = BATCHED["fused standard"]
     boxes = replace(DOMAINS["wide"], objects=("random_box",))
-    count = slots * default_workers() * len(jax.local_devices())
+    count = slots * default_workers(setting.engine) * len(jax.local_devices())
 
     def timed(groups: np.ndarray) -> tuple[float, float]:
         timings = []
@@ -222,10 +222,10 @@ def refilling(slots: int, times: int = 4) -> Refilling:
         wall = sum(t.run for t in timings)
         return sum(t.simulated for t in timings) / wall, groups.size / wall
 
-    numbers = np.arange(times * count)
+    numbers = np.arange(rounds * count)
     timed(numbers[None, :count])  # compiles
     refilled, trials = timed(numbers[None])
-    return Refilling(refilled, timed(numbers.reshape(times, count))[0], trials)
+    return Refilling(refilled, timed(numbers.reshape(rounds, count))[0], trials)
 
 
 def table(speeds: list[Speed]) -> list[list[str]]:

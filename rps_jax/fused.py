@@ -175,8 +175,8 @@ def _kernel(
     def kernel(*refs):
         *given, out = refs
         body = _unpacked(scalars, given[: len(bodies)])
-        after = _steps(body, *_unpacked(moving, given[len(bodies) :]), physics)
-        _give(out, jax.tree.leaves(after))
+        now, wanted = _unpacked(moving, given[len(bodies) :])
+        _give(out, jax.tree.leaves(_steps(body, now, wanted, physics)))
 
     def block(outer: tuple[int, ...]) -> pallas.BlockSpec:
         return pallas.BlockSpec((*outer, _BLOCK), lambda i: (*(0,) * len(outer), i))

@@ -16,7 +16,8 @@ import io
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -313,10 +314,12 @@ def work(
     There are as many slots as the whole plan has use for, whatever parts are run, so that a part
     has the same bits whoever runs it, and with whatever other parts.
     """
-    jobs = [
-        Job(strategies.STRATEGIES[kind[1]], plan.sizes[kind], _made(plan, some))
-        for kind, some in numbers.items()
-    ]
+    jobs = []
+    for kind, some in numbers.items():
+        parts = _made(plan, some)
+        if isinstance(some, Sequence):  # what is asked for elsewhere is asked for when it is needed
+            parts = _ahead(parts)
+        jobs.append(Job(strategies.STRATEGIES[kind[1]], plan.sizes[kind], parts))
     collect = _Parts(plan, keep).collect
     return slots.run(jobs, plan.setting, collect=collect, report=report, **shape)
 
@@ -346,6 +349,15 @@ def _made(plan: Plan, numbers: Iterable[int]) -> Iterator[Part]:
         trials = plan.parts[number]
         arm, _ = plan.arm_and_object(number)
         yield world_part(plan, arm, trials % plan.worlds)._replace(numbers=trials)
+
+
+def _ahead(parts: Iterator[Part]) -> Iterator[Part]:
+    """The same, each made while what came before it runs."""
+    with ThreadPoolExecutor(1) as maker:
+        coming = maker.submit(next, parts, None)
+        while (part := coming.result()) is not None:
+            coming = maker.submit(next, parts, None)
+            yield part
 
 
 def scene_of(plan: Plan, index: int) -> Scene:

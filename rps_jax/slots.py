@@ -65,7 +65,7 @@ class Progress:
 class Timing:
     """Where the time of a sweep went."""
 
-    compile: float  # [s] that the worker waited who waited longest
+    compile: float  # [s] until the worker who waited longest had its programs
     run: float  # [s] wall clock after that
     simulated: float  # [s] of trials
 
@@ -90,15 +90,20 @@ Collect = Callable[[np.ndarray, Outcome], Any]  # numbers (m,) of trials and the
 
 
 def default_slots(engine: Engine = "mjx") -> int:
-    """Worlds stepped at once: few on a processor (small caches), many on an accelerator."""
-    if engine in ("fused", "warp", "quasistatic"):
-        return 64 if jax.default_backend() == "cpu" else 65536
-    return 24 if jax.default_backend() == "cpu" else 8192
+    """Worlds that a worker steps at once: few on a processor (small caches), many on a GPU."""
+    if engine == "mjx":
+        return 24 if jax.default_backend() == "cpu" else 8192
+    if jax.default_backend() == "cpu":
+        return 64
+    return 16384 if engine == "fused" else 65536
 
 
-def default_workers() -> int:
-    """One thread for each core of a processor, since XLA steps a small batch on one core."""
-    return os.cpu_count() or 1 if jax.default_backend() == "cpu" else 1
+def default_workers(engine: Engine = "mjx") -> int:
+    """Of a processor one for each core, since XLA steps a small batch on one core. On a GPU the
+    second steps its worlds while the host sees to those of the first."""
+    if jax.default_backend() == "cpu":
+        return os.cpu_count() or 1
+    return 2 if engine == "fused" else 1
 
 
 def check_shape(slots: int | None, workers: int | None) -> None:
@@ -131,7 +136,7 @@ def run(
     """
     check_shape(slots, workers)
     slots = slots or default_slots(setting.engine)
-    workers = workers or default_workers()
+    workers = workers or default_workers(setting.engine)
     shared = _Shared(collect, report)
     began = time.perf_counter()
     if setting.engine == "mujoco":
@@ -197,7 +202,7 @@ class _Shared:
             self._report(Progress(self._finished, self.simulated))
 
     def compiled(self, seconds: float) -> None:
-        """One worker has waited this long for programs."""
+        """One worker had no program for this long."""
         with self._lock:
             self.compile = max(self.compile, seconds)
 
@@ -248,6 +253,7 @@ class _Queue:
         self._waiting: Part | None = first  # what is left of it
         self._lock, self._compiling = threading.Lock(), threading.Lock()
         self._program = None
+        self.ready = 0.0  # [s] of `time.perf_counter`, when the program was there
 
     def take(self, count: int) -> list[Part]:
         """Up to `count` waiting trials, as pieces of parts."""
@@ -264,6 +270,7 @@ class _Queue:
         with self._compiling:
             if self._program is None:
                 self._program = self._compile()
+                self.ready = time.perf_counter()
             return self._program
 
     def put(self, tree: Any) -> Any:
@@ -361,11 +368,11 @@ def _refill(worlds: World, trials: Trial, fresh: jax.Array, *, strategy: Strateg
 def _work(queues: list[_Queue], shared: _Shared) -> None:
     waited = 0.0
     for queue in queues:
+        began = time.perf_counter()
         taken = [] if shared.stop else queue.take(queue.slots)
         if taken:
-            began = time.perf_counter()
             program = queue.program()
-            waited += time.perf_counter() - began
+            waited += max(0.0, queue.ready - began)
             shared.compiled(waited)
             _drain(queue, program, taken, shared)
 

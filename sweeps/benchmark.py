@@ -39,6 +39,8 @@ class Options:
     """Programs compiled side by side; what compiling takes is that of a program alone only if 1."""
     refill: int = 64
     """Slots of each worker for the gain of refilling them; 0: not measured."""
+    rounds: int = 4
+    """How many trials there are then for each slot."""
     out: Path = Path("runs/benchmark")
     """Run folder."""
 
@@ -52,7 +54,8 @@ def main(options: Options) -> None:
             engines.check(benchmark.BATCHED[name].engine)
     for family in options.families:
         errors.check_name("family", family, benchmark.FAMILIES)
-    errors.check_finite("refill", options.refill, at_least=0, at_most=1e6)
+    errors.check_count("refill", options.refill, at_least=0, at_most=1_000_000)
+    errors.check_count("rounds", options.rounds, at_most=1000)
     for worlds in options.worlds:
         errors.check_count("worlds", worlds, at_most=10_000_000)
     errors.check_count("mujocos", options.mujocos, at_most=10_000_000)
@@ -61,7 +64,7 @@ def main(options: Options) -> None:
     speeds, text = [], ""
     where = f"On {jax.devices()[0].device_kind}, {os.cpu_count()} processors.\n\n"
     if options.refill:
-        where += _refilling(options.refill)
+        where += _refilling(options.refill, options.rounds)
     wanted = _wanted(options)
     for speed in tqdm(_measured(wanted, options.at_once), total=len(wanted), unit="measurement"):
         speeds.append(speed)
@@ -71,10 +74,10 @@ def main(options: Options) -> None:
     print(text)
 
 
-def _refilling(slots: int) -> str:
-    gain = benchmark.refilling(slots)
+def _refilling(slots: int, rounds: int) -> str:
+    gain = benchmark.refilling(slots, rounds)
     return (
-        f"Refilled slots, {slots} a worker: {gain.refilled:,.0f} simulated s/s, "
+        f"Refilled slots, {slots} a worker, {rounds} trials each: {gain.refilled:,.0f} simulated s/s, "
         f"{gain.trials:,.1f} trials/s; batches that wait for their slowest: "
         f"{gain.waiting:,.0f}; gain {gain.refilled / gain.waiting:.2f}.\n\n"
     )

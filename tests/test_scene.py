@@ -1,7 +1,5 @@
 """The scenes are the paper's, and MJX steps them as C MuJoCo does."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -35,7 +33,7 @@ def step_c(loaded, qpos, steps):
     return data
 
 
-@partial(jax.jit, static_argnames="steps")
+@jax.jit
 def step_mjx(model, data, fields, qpos, steps):
     def one_world(fields, qpos):
         world = scene.apply(model, fields)

@@ -226,7 +226,7 @@ KILLED = replace(
     PLAN,
     domain=replace(ROUND, skin="ideal"),
     worlds=60,
-    setting=replace(SHORT, engine="mujoco", rules=Rules(horizon=6.0)),
+    setting=replace(SHORT, engine="mujoco", rules=Rules(horizon=3.0)),
     part=5,
 )
 
