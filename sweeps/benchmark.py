@@ -77,8 +77,8 @@ def main(options: Options) -> None:
 def _refilling(slots: int, rounds: int) -> str:
     gain = benchmark.refilling(slots, rounds)
     return (
-        f"Refilled slots, {slots} a worker, {rounds} trials each: {gain.refilled:,.0f} simulated s/s, "
-        f"{gain.trials:,.1f} trials/s; batches that wait for their slowest: "
+        f"Refilled slots, {slots} a worker and {rounds} trials in each: {gain.refilled:,.0f} "
+        f"simulated s/s, {gain.trials:,.1f} trials/s; batches that wait for their slowest: "
         f"{gain.waiting:,.0f}; gain {gain.refilled / gain.waiting:.2f}.\n\n"
     )
 
