@@ -128,6 +128,8 @@ def test_the_kernel_compiles_for_an_nvidia_gpu(name):
     with as_if_there_were_a_gpu():
         traced = jax.jit(partial(fused._kernel, physics=Physics())).trace(scalars, state, twist)
         assert "triton" in traced.lower(lowering_platforms=("cuda",)).as_text()
+    # Each load and store lengthens the compilation: see `fused._taken`.
+    assert 2 < str(traced.jaxpr).count("<-") < 20
 
 
 def as_if_there_were_a_gpu():
