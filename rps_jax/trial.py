@@ -433,7 +433,7 @@ def start_all(worlds: World, live: jax.Array, strategy: Strategy = RPS) -> Trial
 
 
 _STATIC = ("physics", "strategy", "steps")
-_UNASKED = 20  # control steps between two looks at whether any trial still runs, at most
+_UNASKED = 20  # control steps of a GPU between two looks at whether any trial runs, at most
 
 
 @partial(jax.jit, static_argnames=_STATIC, donate_argnames=("trials",))
@@ -454,12 +454,15 @@ def advance(
         count, trials = carry
         return (count < steps) & ~jnp.all(trials.done)
 
+    def on(_, trials):
+        return one(worlds, trials)[0]
+
     # A GPU waits for the host whenever it is asked whether any still runs.
-    between = math.gcd(steps, _UNASKED)
+    between = 1 if jax.default_backend() == "cpu" else math.gcd(steps, _UNASKED)
 
     def body(carry):
         count, trials = carry
-        after = jax.lax.fori_loop(0, between, lambda _, now: one(worlds, now)[0], trials)
+        after = jax.lax.fori_loop(0, between, on, trials) if between > 1 else on(0, trials)
         return count + between, after
 
     return jax.lax.while_loop(some_run, body, (0, trials))[1]
