@@ -1,7 +1,9 @@
 """Trials end as the rules say, worlds do not touch each other, and a short push arrives."""
 
 from dataclasses import replace
+from functools import partial
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -54,6 +56,26 @@ def test_a_short_push_reaches_a_near_target(outcomes):
     # 2 s of approach, then 0.32 m: at 0.05 m/s, slower below 0.5 m by K_v: some 10 ln(.32/.05) s.
     assert (outcomes.time[:2] > 15).all()
     assert (outcomes.time[:2] < 24).all()
+
+
+def test_a_gpu_that_seldom_asks_who_still_runs_finds_the_same(monkeypatch):
+    """As it would be traced there: 40 steps, in which trials end by their horizon, or do not."""
+    setting = Setting(engine="quasistatic")
+    stage, worlds = sweep.build([case(), case(AHEAD)], setting)
+    start = trial.start_all(worlds, np.ones(2, bool))
+
+    def run(backend):
+        monkeypatch.setattr(jax, "default_backend", lambda: backend)
+        traced = partial(trial.advance.__wrapped__, physics=setting.physics, steps=40)
+        program = jax.jit(traced)
+        return [program(stage, worlds, start, rules=Rules(horizon=t)) for t in (0.29, 300.0)]
+
+    ended, running = seldom = run("gpu")
+    assert ended.done.all()
+    assert not running.done.any()
+    assert ended.steps.tolist() == [15, 15]
+    assert running.steps.tolist() == [40, 40]
+    chex.assert_trees_all_close(seldom, run("cpu"), atol=1e-6)
 
 
 def test_a_shove_happens_once_however_its_time_is_rounded():
