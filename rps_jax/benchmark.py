@@ -1,13 +1,14 @@
 """How fast is it? Simulated seconds in a second of wall clock, by engine, shape family and batch.
 
-Every world is being pushed while it is timed: no trial has ended, so all seconds are of use.
+Every world is being pushed while it is timed, from the first step: the base begins at the object,
+and no trial has ended.
 """
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -31,7 +32,7 @@ from rps_jax.trial import Rules, Stage, Trial, World
 FAMILIES = ("box", "cylinder", "prism")
 _SPEED = 0.05  # [m/s] at which C MuJoCo alone pushes
 _PRISMS = replace(
-    DOMAINS["paper"], objects=("random_prism",), frictions=(FRICTION["S1"],), gap=Range(0.0, 0.02)
+    DOMAINS["paper"], objects=("random_prism",), frictions=(FRICTION["S1"],), gap=Range(0.0, 0.0)
 )
 _MUJOCOS_OWN = Physics(
     timestep=0.002,
@@ -83,7 +84,7 @@ def _worlds(family: str, count: int, setting: Setting) -> tuple[Any, World]:
         part = domain.worlds(_PRISMS, drawn, RPSParams.paper(), setting)
         return part.stage, part.worlds
     targets = paper.TARGETS
-    cases = [Case(family, FRICTION["S1"], targets[i % len(targets)]) for i in range(count)]
+    cases = [Case(family, FRICTION["S1"], targets[i % len(targets)], gap=0) for i in range(count)]
     return sweep.build(cases, setting)
 
 
@@ -135,28 +136,62 @@ class Program(NamedTuple):
     compile: float  # [s]
     memory: float  # [bytes] of its arguments, results and all in between
     contacts: int
+    physics: Physics
     go: Callable[[Trial], Trial]
     start: Trial
 
 
-def compiled(name: str, family: str, worlds: int, simulated: float = 2.0) -> Program:
-    """Compile one, for as many worlds; several may be compiled side by side."""
-    setting = BATCHED[name]
-    stage, few = _worlds(family, len(paper.TARGETS), setting)
+def compiled(name: str, family: str, worlds: int) -> Program:
+    """One of `BATCHED`, compiled for as many worlds; several may be compiled side by side."""
+    return traced(name, BATCHED[name], family, worlds)()
+
+
+def traced(
+    name: str,
+    setting: Setting,
+    family: str,
+    worlds: int,
+    *,
+    simulated: float = 2.0,
+    stage: Callable[[Any], Any] = lambda stage: stage,
+    donated: bool = True,
+    flags: Mapping[str, Any] | None = None,
+) -> Callable[[], Program]:
+    """What compiles a program that has been traced.
+
+    Args:
+      name: of the program, for tables.
+      setting: physics and engine.
+      family: of the worlds.
+      worlds: how many.
+      simulated: [s] of each world at a go.
+      stage: changes the engine's stage.
+      donated: whether the state of the worlds is overwritten at each go.
+      flags: of XLA.
+    """
+    physics = setting.physics
+    usual, few = _worlds(family, len(paper.TARGETS), setting)
     rows = np.arange(worlds) % len(paper.TARGETS)
     batch = jax.device_put(jax.tree.map(lambda leaf: leaf[rows], few))
     start = trial.start_all(batch, np.ones(worlds, bool))
-    steps = round(simulated / setting.physics.control_period)
+    shared, steps = stage(usual), round(simulated / physics.control_period)
     began = time.perf_counter()
-    lowered = trial.advance.lower(stage, batch, start, physics=setting.physics, steps=steps)
-    program = lowered.compile()
-    took = time.perf_counter() - began
-    needs: Any = program.memory_analysis()
-    parts = ("argument", "output", "temp")
-    memory = sum(getattr(needs, f"{part}_size_in_bytes") for part in parts)
-    contacts = _contacts(stage, few)
-    go = partial(program, stage, batch)
-    return Program(name, family, worlds, simulated, took, memory, contacts, go, start)
+    advance = partial(trial.advance, physics=physics, steps=steps)
+    lowered = jax.jit(advance, donate_argnums=2 if donated else ()).lower(shared, batch, start)
+    tracing = time.perf_counter() - began
+
+    def compile_() -> Program:
+        began = time.perf_counter()
+        program = lowered.compile(compiler_options=dict(flags or {}))
+        took = tracing + time.perf_counter() - began
+        needs: Any = program.memory_analysis()
+        parts = ("argument", "output", "temp")
+        memory = sum(getattr(needs, f"{part}_size_in_bytes") for part in parts)
+        contacts = _contacts(usual, few)
+        go = partial(program, shared, batch)
+        return Program(name, family, worlds, simulated, took, memory, contacts, physics, go, start)
+
+    return compile_
 
 
 def batched(program: Program) -> Speed:
@@ -167,8 +202,8 @@ def batched(program: Program) -> Speed:
         state[0] = jax.block_until_ready(program.go(state[0]))
 
     rate = program.worlds * program.simulated / _best(once)
-    name, family, worlds, _, took, memory, contacts, *_ = program
-    return Speed(name, family, worlds, took, rate, memory, contacts, BATCHED[name].physics)
+    name, family, worlds, _, took, memory, contacts, physics, *_ = program
+    return Speed(name, family, worlds, took, rate, memory, contacts, physics)
 
 
 def in_c(name: str, family: str, simulated: float = 2.0) -> Speed:

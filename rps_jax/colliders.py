@@ -11,6 +11,8 @@ that it stands on, and so may differ from world to world.
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -61,12 +63,19 @@ def box_prism(model: Model, data: Data, key: Any, geom: jax.Array) -> Collision:
     )
     if (boxes.size, meshes.size) != (1, 1) or not feet.size:
         return _BOX_MESH(model, data, key, geom)
-    base, body = boxes[0], model.geom_bodyid[meshes[0]]
-    corners, half = model.geom_pos[feet], model.geom_size[base]
+    return upright(model, data, boxes[0], meshes[0], model.geom_pos[feet])
+
+
+def upright(model: Model, data: Data, base: int, thing: int, corners: jax.Array) -> Collision:
+    """Distances (4,), points (4, 3) and frames (4, 3, 3) [m] of a box and an upright prism.
+
+    `base` and `thing` are their geoms; `corners` (N, 3) [m] are the prism's feet, in its body.
+    """
+    body, half = model.geom_bodyid[thing], model.geom_size[base]
     lower = -jnp.abs(corners[:, 2])
     turn = data.geom_xmat[base][:2, 0]
     middle = data.geom_xpos[base]
-    thing: Any = SimpleNamespace(
+    solid: Any = SimpleNamespace(
         vertices=Corners.of((corners[:, 0], corners[:, 1], lower)),
         height=-2 * lower[0],
         up=spatial.Z,
@@ -75,13 +84,36 @@ def box_prism(model: Model, data: Data, key: Any, geom: jax.Array) -> Collision:
     )
     state: Any = SimpleNamespace(base=middle, p=data.xpos[body])
     m: Any = [tuple(row) for row in data.xmat[body]]
-    z, normal, point, distance = meetings(thing, state, m, (turn[0], turn[1]))
+    z, normal, point, distance = meetings(solid, state, m, (turn[0], turn[1]))
     back = jnp.array([[turn[0], turn[1]], [-turn[1], turn[0]]])
     n = jnp.stack(normal) @ back
     place = middle[:2] + jnp.stack(point, axis=-1) @ back
     zero, one = jnp.zeros_like(n[0]), jnp.ones_like(n[0])
     frame = jnp.stack([n[0], n[1], zero, -n[1], n[0], zero, zero, zero, one]).reshape(3, 3)
     return distance, jnp.concatenate([place, z[:, None]], axis=-1), jnp.stack([frame] * 4)
+
+
+@contextlib.contextmanager
+def box_as_prism(points: int) -> Iterator[None]:
+    """While it lasts, MJX finds where a box meets the base as it does for a prism.
+
+    `points` is 4, or 2 for the lower edge alone.
+    """
+
+    def collide(model: Model, data: Data, key: Any, geom: jax.Array) -> Collision:
+        base, thing = map(int, np.flatnonzero(model.geom_type == GeomType.BOX))
+        signs = np.array([[1, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1]])
+        found = upright(model, data, base, thing, model.geom_size[thing] * signs)
+        return tuple(x[:points] for x in found)  # pyright: ignore[reportReturnType]
+
+    collide.ncon = points  # pyright: ignore[reportFunctionMemberAccess]
+    pair = GeomType.BOX, GeomType.BOX
+    usual = _FUNCTIONS[pair]
+    _FUNCTIONS[pair] = collide
+    try:
+        yield
+    finally:
+        _FUNCTIONS[pair] = usual
 
 
 box_prism.ncon = 4  # pyright: ignore[reportFunctionMemberAccess]

@@ -28,6 +28,7 @@ from rps_jax import (
 )
 from rps_jax.benchmark import Speed
 from rps_jax.law import Details, Observation, RPSParams, RPSState, Twist
+from rps_jax.levers import Gain
 from rps_jax.skin import NONE
 from rps_jax.sweep import Case, Trace
 
@@ -477,6 +478,28 @@ def throughput(speeds: Sequence[Speed], path: Path) -> Path:
         ax.grid(alpha=0.3, which="both")
     axes[0].set_ylabel("simulated s per s")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return save(figure, path)
+
+
+def levers(gains: Sequence[Gain], path: Path) -> Path:
+    """How many times as fast each lever makes a program, as bars from 1."""
+    pulled = gains[::-1]
+    figure = Figure(figsize=(7.0, 1.2 + 0.28 * len(pulled)), layout="constrained")
+    ax = figure.subplots()
+    times = np.array([g.times for g in pulled])
+    colours = ["C0" if t >= 1 else "C1" for t in times]
+    ax.barh([g.lever for g in pulled], times - 1, left=1, color=colours)
+    for row, t in enumerate(times):
+        ax.annotate(
+            f"{t:.2f}", (t, row), (3 if t >= 1 else -3, 0), textcoords="offset points",
+            va="center", ha="left" if t >= 1 else "right", fontsize=8,
+        )  # fmt: skip
+    ax.axvline(1, color="k", lw=0.8)
+    ax.set(
+        xscale="log", xlabel="times as fast", title=f"{gains[0].name}, {_title(gains[0].family)}"
+    )
+    ax.margins(x=0.15)
+    ax.grid(alpha=0.3, axis="x", which="both")
     return save(figure, path)
 
 

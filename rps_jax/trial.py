@@ -233,24 +233,26 @@ class Stage(NamedTuple):
         The base is a velocity source: before each step the commanded twist is written into its
         joint velocities, turned into the world.
         """
-        one = partial(self._drive, substeps=physics.substeps)
-        return jax.vmap(one)(worlds.fields, trials, twists)
+        state = (trials.qpos, trials.qvel, trials.warmstart)
+        step = jax.vmap(self._step)
 
-    def _drive(
-        self, fields: dict[str, jax.Array], trial: Trial, twist: Twist, substeps: int
-    ) -> Driven:
-        model = scene.apply(self.model, fields)
+        def one(state, _):  # batched inside of the loop: a loop that is batched is traced anew
+            return step(worlds.fields, state, twists), None
 
-        def one(state, _):
-            qpos, qvel, warmstart = state
-            qvel = qvel.at[JOINTS.base].set(twist.in_world(qpos[2]))
-            data = self.data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
-            with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
-                data = mjx.step(model, data)
-            return (data.qpos, data.qvel, data.qacc_warmstart), None
+        return Driven(*jax.lax.scan(one, state, length=physics.substeps)[0])
 
-        state = (trial.qpos, trial.qvel, trial.warmstart)
-        return Driven(*jax.lax.scan(one, state, length=substeps)[0])
+    def _step(
+        self,
+        fields: dict[str, jax.Array],
+        state: tuple[jax.Array, jax.Array, jax.Array],
+        twist: Twist,
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        model, (qpos, qvel, warmstart) = scene.apply(self.model, fields), state
+        qvel = qvel.at[JOINTS.base].set(twist.in_world(qpos[2]))
+        data = self.data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
+        with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
+            data = mjx.step(model, data)
+        return data.qpos, data.qvel, data.qacc_warmstart
 
 
 class Fused(NamedTuple):

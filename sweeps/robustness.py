@@ -2,20 +2,20 @@
 
     python sweeps/robustness.py --worlds 90 --out runs/engines
 
-runs the same worlds in every engine that can run them here (MJX-Warp: on an NVIDIA GPU, in a domain
-without prisms) and prints a table: success, and the share of outcomes equal to those of converged C
-MuJoCo. It can be killed; the same command continues. `rps sweep` runs one.
+runs the same worlds in every engine that can run them here (MJX-Warp: on an NVIDIA GPU, and without
+prisms, as with `--objects random_box random_cylinder`) and prints a table: success, and the share
+of outcomes equal to those of converged C MuJoCo. It can be killed; the same command continues. `rps
+sweep` runs one.
 """
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import tyro
 
 from rps_jax import analysis, engines, errors, paper, record, robustness, score
-from rps_jax.cli import Spread, guarded, progress_bar, use_cache
-from rps_jax.domain import DOMAINS
+from rps_jax.cli import Spread, domain_of, guarded, progress_bar, use_cache
 from rps_jax.physics import preset
 from rps_jax.robustness import Plan
 from rps_jax.slots import Setting
@@ -37,7 +37,9 @@ class Options(Spread):
     """Which worlds."""
 
     domain: str = "wide"
-    """paper, hardware, wide or hostile."""
+    """paper, hardware, wide or hostile, or a JSON file of ranges."""
+    objects: tuple[str, ...] = ()
+    """Objects to push, as random_box random_cylinder; by default the domain's."""
     engines: tuple[str, ...] = ()
     """Engines and physics by name, the first to be compared with; by default all that run here."""
     strategy: str = "rps"
@@ -50,7 +52,8 @@ class Options(Spread):
 
 def main(options: Options) -> None:
     """Run what is missing, then print and write the table."""
-    domain = DOMAINS[errors.check_name("domain", options.domain, DOMAINS)]
+    domain = domain_of(options.domain)
+    domain = replace(domain, objects=options.objects or domain.objects)
     errors.check_name("strategy", options.strategy, paper.PARAMS)
     arms = {options.strategy: paper.PARAMS[options.strategy]}
     for name in options.engines:

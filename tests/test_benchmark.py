@@ -8,7 +8,8 @@ from rps_jax import benchmark
 
 
 def test_a_program_is_timed_and_compared_with_c_in_the_closed_loop():
-    program = benchmark.compiled("quasistatic", "cylinder", 2, simulated=0.1)
+    setting = benchmark.BATCHED["quasistatic"]
+    program = benchmark.traced("quasistatic", setting, "cylinder", 2, simulated=0.1)()
     assert program.compile > 0
     speed = benchmark.batched(program)
     assert (speed.name, speed.family, speed.worlds) == ("quasistatic", "cylinder", 2)
