@@ -500,6 +500,7 @@ def levers(gains: Sequence[Gain], path: Path) -> Path:
     )
     ax.margins(x=0.15)
     ax.grid(alpha=0.3, axis="x", which="both")
+    ax.set_axisbelow(True)
     return save(figure, path)
 
 

@@ -91,11 +91,9 @@ Collect = Callable[[np.ndarray, Outcome], Any]  # numbers (m,) of trials and the
 
 def default_slots(engine: Engine = "mjx") -> int:
     """Worlds that a worker steps at once: few on a processor (small caches), many on a GPU."""
-    if engine == "mjx":
-        return 24 if jax.default_backend() == "cpu" else 8192
     if jax.default_backend() == "cpu":
-        return 64
-    return 16384 if engine == "fused" else 65536
+        return 24 if engine == "mjx" else 64
+    return 16384 if engine in ("mjx", "fused") else 65536
 
 
 def default_workers(engine: Engine = "mjx") -> int:

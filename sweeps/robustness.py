@@ -46,6 +46,8 @@ class Options(Spread):
     """rps, nps or aps."""
     worlds: int = 90
     """How many."""
+    part: int = 256
+    """Trials of a part: the most that is lost when killed. C MuJoCo ends a part with its slowest."""
     out: Path = Path("runs/engines")
     """Run folder; a run that was killed is continued there."""
 
@@ -60,7 +62,7 @@ def main(options: Options) -> None:
         engines.check(ENGINES[errors.check_name("engines", name, ENGINES)].engine, domain.families)
     here = (n for n, s in ENGINES.items() if engines.works(s.engine, domain.families))
     plans = {
-        name: Plan(domain, options.worlds, arms, ENGINES[name], part=64)
+        name: Plan(domain, options.worlds, arms, ENGINES[name], options.part)
         for name in options.engines or here
     }
     shape = options.shape()

@@ -2,6 +2,7 @@
 allowed, before anything compiles."""
 
 import json
+import math
 import re
 import runpy
 import time
@@ -385,6 +386,12 @@ SCRIPTS = [
     ("benchmark", {"refill": -1}, "refill = -1 is not allowed"),
     ("benchmark", {"at_once": 0}, "at_once = 0 is not allowed"),
     ("benchmark", {"mujocos": -4}, "mujocos = -4 is not allowed"),
+    ("levers", {"name": "mjx"}, "unknown name 'mjx'"),
+    ("levers", {"family": "cone"}, "unknown family 'cone'"),
+    ("levers", {"worlds": 1}, "worlds = 1 is not allowed"),
+    ("levers", {"simulated": math.nan}, "simulated = nan is not allowed"),
+    ("robustness", {"objects": ("cone",)}, "unknown domain object 'cone'"),
+    ("robustness", {"domain": "wyde"}, "unknown domain 'wyde'"),
 ]
 
 

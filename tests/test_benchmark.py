@@ -3,8 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
-from rps_jax import benchmark
+from rps_jax import benchmark, colliders, levers, scene, sweep, trial
+from rps_jax.law import Twist
+from rps_jax.physics import preset
+from rps_jax.scene import FRICTION, mjx
+from rps_jax.slots import Setting
+from rps_jax.sweep import Case
 
 
 def test_a_program_is_timed_and_compared_with_c_in_the_closed_loop():
@@ -27,3 +33,54 @@ def test_every_measurement_is_of_an_engine_or_of_c():
     assert not set(benchmark.BATCHED) & set(benchmark.IN_C)
     assert benchmark.can("C in closed loop", "prism")
     assert not benchmark.can("warp standard", "prism")  # whose worlds share a mesh's corners
+
+
+def test_levers_are_timed_beside_the_program_as_it_is(monkeypatch):
+    some = ("no physics: law, skin, rules", "four times the worlds", "state not donated")
+    every = levers.levers("quasistatic", "cylinder")
+    monkeypatch.setattr(levers, "levers", lambda *_: {name: every[name] for name in some})
+    gains = list(levers.measure("quasistatic", "cylinder", 2, simulated=0.1, goes=1))
+    assert [gain.lever for gain in gains] == [levers.AS_IT_IS, *some]
+    assert [gain.worlds for gain in gains] == [2, 2, 8, 2]
+    assert all(0 < gain.times < np.inf for gain in gains)
+    assert len(levers.table(gains)) == 1 + len(gains)
+
+
+def test_an_engine_has_the_levers_that_it_knows():
+    mjx, fused = (levers.levers(f"{name} standard", "box") for name in ("mjx", "fused"))
+    assert set(fused) < set(mjx)
+    assert "4 solver iterations" in fused
+    assert "4 solver iterations" not in levers.levers("quasistatic", "box")
+    assert set(mjx) - set(levers.levers("mjx standard", "cylinder")) == {
+        "own box-box collider",
+        "own, two points",
+    }
+
+
+def test_without_physics_the_base_goes_and_the_object_stays():
+    _, worlds = sweep.build([Case("box", FRICTION["S1"], (2.0, 0.0), gap=0)], Setting())
+    start = trial.start_all(worlds, np.ones(1, bool))
+    twists = Twist(*(np.full(1, x) for x in (0.05, 0.0, 0.0)))
+    driven = levers.Unmoved().drive(worlds, start, twists, preset())
+    moved = np.asarray(driven.qpos - start.qpos)[0]
+    np.testing.assert_allclose(moved, [0.05 * 0.02, *[0] * 9], atol=1e-9)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.3])
+def test_a_box_found_as_a_prism_is_where_mjx_finds_it(yaw):
+    at = scene.load("box")
+    model, data = mjx.put_model(at.physics), mjx.make_data(at.physics)
+    data = data.replace(qpos=scene.initial_qpos(at, -0.001, yaw))
+
+    def deepest():
+        contact = mjx.collision(model, mjx.kinematics(model, data))._impl.contact
+        robot = np.asarray(contact.geom1 != at.physics.geom("ground").id)
+        least = np.argmin(np.asarray(contact.dist)[robot])
+        return len(robot), contact.dist[robot][least], contact.frame[robot][least, 0]
+
+    with colliders.box_as_prism(2):
+        few, distance, normal = deepest()
+    many, theirs, their_normal = deepest()
+    assert (few, many) == (6, 8)
+    np.testing.assert_allclose(distance, theirs, atol=1e-6)
+    np.testing.assert_allclose(normal, their_normal, atol=1e-6)
