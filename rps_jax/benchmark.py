@@ -6,6 +6,7 @@ and no trial has ended.
 
 from __future__ import annotations
 
+import inspect
 import os
 import time
 from collections.abc import Callable, Mapping
@@ -176,7 +177,8 @@ def traced(
     start = trial.start_all(batch, np.ones(worlds, bool))
     shared, steps = stage(usual), round(simulated / physics.control_period)
     began = time.perf_counter()
-    advance = partial(trial.advance, physics=physics, steps=steps)
+    # Not as it is jitted: that gives back what it has traced before for such arguments.
+    advance = partial(inspect.unwrap(trial.advance), physics=physics, steps=steps)
     lowered = jax.jit(advance, donate_argnums=2 if donated else ()).lower(shared, batch, start)
     tracing = time.perf_counter() - began
 

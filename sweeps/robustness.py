@@ -47,7 +47,7 @@ class Options(Spread):
     worlds: int = 90
     """How many."""
     part: int = 256
-    """Trials of a part: the most that is lost when killed. C MuJoCo ends a part with its slowest."""
+    """Trials of a part: the most that is lost when killed. C waits for the slowest of each."""
     out: Path = Path("runs/engines")
     """Run folder; a run that was killed is continued there."""
 

@@ -1,13 +1,16 @@
 """A speed is of what was timed, and is compared with C MuJoCo in the closed loop."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from rps_jax import benchmark, colliders, levers, scene, sweep, trial
 from rps_jax.law import Twist
 from rps_jax.physics import preset
+from rps_jax.quasistatic import Quasistatic
 from rps_jax.scene import FRICTION, mjx
 from rps_jax.slots import Setting
 from rps_jax.sweep import Case
@@ -66,21 +69,46 @@ def test_without_physics_the_base_goes_and_the_object_stays():
     np.testing.assert_allclose(moved, [0.05 * 0.02, *[0] * 9], atol=1e-9)
 
 
-@pytest.mark.parametrize("yaw", [0.0, 0.3])
-def test_a_box_found_as_a_prism_is_where_mjx_finds_it(yaw):
-    at = scene.load("box")
-    model, data = mjx.put_model(at.physics), mjx.make_data(at.physics)
-    data = data.replace(qpos=scene.initial_qpos(at, -0.001, yaw))
+def test_a_program_is_traced_anew_for_each_lever():
+    """Since what MJX has for all may have changed, though no argument shows it."""
+    asked = []
 
-    def deepest():
-        contact = mjx.collision(model, mjx.kinematics(model, data))._impl.contact
-        robot = np.asarray(contact.geom1 != at.physics.geom("ground").id)
-        least = np.argmin(np.asarray(contact.dist)[robot])
-        return len(robot), contact.dist[robot][least], contact.frame[robot][least, 0]
+    class Told(NamedTuple):
+        def drive(self, *args):
+            asked.append(args)
+            return Quasistatic().drive(*args)
+
+    setting = benchmark.BATCHED["quasistatic"]
+    counts = []
+    for _ in range(2):
+        options = {"simulated": 0.1, "stage": lambda _: Told()}
+        benchmark.traced("quasistatic", setting, "cylinder", 2, **options)
+        counts.append(len(asked))
+    assert counts[1] == 2 * counts[0] > 0
+
+
+def test_a_box_found_as_a_prism_is_where_mjx_finds_it():
+    at = scene.load("box")
+    model, blank = mjx.put_model(at.physics), mjx.make_data(at.physics)
+    starts = [scene.initial_qpos(at, -0.001, yaw) for yaw in (0.0, 0.3)]
+
+    def found():
+        @jax.jit
+        @jax.vmap
+        def contacts(qpos):
+            return mjx.collision(model, mjx.kinematics(model, blank.replace(qpos=qpos)))
+
+        return contacts(jnp.asarray(starts, jnp.float32))._impl.contact
+
+    def deepest(contact):
+        robot = contact.geom1[0] != at.physics.geom("ground").id
+        least = np.argmin(contact.dist[:, robot], axis=1)
+        both = np.arange(len(starts))
+        return contact.dist[:, robot][both, least], contact.frame[:, robot][both, least, 0]
 
     with colliders.box_as_prism(2):
-        few, distance, normal = deepest()
-    many, theirs, their_normal = deepest()
-    assert (few, many) == (6, 8)
-    np.testing.assert_allclose(distance, theirs, atol=1e-6)
-    np.testing.assert_allclose(normal, their_normal, atol=1e-6)
+        ours = found()
+    theirs = found()
+    assert (ours.dist.shape, theirs.dist.shape) == ((2, 6), (2, 8))
+    for mine, other in zip(deepest(ours), deepest(theirs), strict=True):
+        np.testing.assert_allclose(mine, other, atol=1e-6)
