@@ -6,10 +6,10 @@ and no trial has ended.
 
 from __future__ import annotations
 
-import inspect
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -142,11 +142,6 @@ class Program(NamedTuple):
     start: Trial
 
 
-def compiled(name: str, family: str, worlds: int) -> Program:
-    """One of `BATCHED`, compiled for as many worlds; several may be compiled side by side."""
-    return traced(name, BATCHED[name], family, worlds)()
-
-
 def traced(
     name: str,
     setting: Setting,
@@ -156,7 +151,7 @@ def traced(
     simulated: float = 2.0,
     stage: Callable[[Any], Any] = lambda stage: stage,
     donated: bool = True,
-    flags: Mapping[str, Any] | None = None,
+    flags: dict[str, Any] | None = None,
 ) -> Callable[[], Program]:
     """What compiles a program that has been traced.
 
@@ -178,13 +173,13 @@ def traced(
     shared, steps = stage(usual), round(simulated / physics.control_period)
     began = time.perf_counter()
     # Not as it is jitted: that gives back what it has traced before for such arguments.
-    advance = partial(inspect.unwrap(trial.advance), physics=physics, steps=steps)
+    advance = partial(trial.advance.__wrapped__, physics=physics, steps=steps)
     lowered = jax.jit(advance, donate_argnums=2 if donated else ()).lower(shared, batch, start)
     tracing = time.perf_counter() - began
 
     def compile_() -> Program:
         began = time.perf_counter()
-        program = lowered.compile(compiler_options=dict(flags or {}))
+        program = lowered.compile(compiler_options=flags)
         took = tracing + time.perf_counter() - began
         needs: Any = program.memory_analysis()
         parts = ("argument", "output", "temp")
@@ -194,6 +189,22 @@ def traced(
         return Program(name, family, worlds, simulated, took, memory, contacts, physics, go, start)
 
     return compile_
+
+
+def side_by_side(
+    programs: Sequence[Callable[[], Callable[[], Program]]], at_once: int
+) -> Iterator[Program]:
+    """Programs in their order, `at_once` of them compiled side by side.
+
+    Each call is of `traced`, and is made when its turn has come, one after the other. While the
+    caller holds a program nothing is compiled, so that it can be timed.
+    """
+    with ThreadPoolExecutor(at_once) as pool:
+        for first in range(0, len(programs), at_once):
+            jobs = [pool.submit(trace()) for trace in programs[first : first + at_once]]
+            wait(jobs)
+            for job in jobs:
+                yield job.result()
 
 
 def batched(program: Program) -> Speed:
@@ -263,6 +274,11 @@ def refilling(slots: int, rounds: int = 4) -> Refilling:
     timed(numbers[None, :count])  # compiles
     refilled, trials = timed(numbers[None])
     return Refilling(refilled, timed(numbers.reshape(rounds, count))[0], trials)
+
+
+def machine() -> str:
+    """What a table of speeds begins with."""
+    return f"On {jax.devices()[0].device_kind}, {os.cpu_count()} processors.\n\n"
 
 
 def table(speeds: list[Speed]) -> list[list[str]]:

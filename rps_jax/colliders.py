@@ -93,6 +93,19 @@ def upright(model: Model, data: Data, base: int, thing: int, corners: jax.Array)
     return distance, jnp.concatenate([place, z[:, None]], axis=-1), jnp.stack([frame] * 4)
 
 
+box_prism.ncon = 4  # pyright: ignore[reportFunctionMemberAccess]
+_FUNCTIONS = collision_driver._COLLISION_FUNC
+_BOX_MESH = _FUNCTIONS[GeomType.BOX, GeomType.MESH]
+
+
+def register() -> None:
+    """Have MJX use them; doing so twice does no harm."""
+    for pair, function in _FUNCTIONS.items():
+        if function is collision_primitive.plane_cylinder:
+            _FUNCTIONS[pair] = plane_cylinder
+    _FUNCTIONS[GeomType.BOX, GeomType.MESH] = box_prism
+
+
 @contextlib.contextmanager
 def box_as_prism(points: int) -> Iterator[None]:
     """While it lasts, MJX finds where a box meets the base as it does for a prism.
@@ -114,16 +127,3 @@ def box_as_prism(points: int) -> Iterator[None]:
         yield
     finally:
         _FUNCTIONS[pair] = usual
-
-
-box_prism.ncon = 4  # pyright: ignore[reportFunctionMemberAccess]
-_FUNCTIONS = collision_driver._COLLISION_FUNC
-_BOX_MESH = _FUNCTIONS[GeomType.BOX, GeomType.MESH]
-
-
-def register() -> None:
-    """Have MJX use them; doing so twice does no harm."""
-    for pair, function in _FUNCTIONS.items():
-        if function is collision_primitive.plane_cylinder:
-            _FUNCTIONS[pair] = plane_cylinder
-    _FUNCTIONS[GeomType.BOX, GeomType.MESH] = box_prism

@@ -10,7 +10,6 @@ import contextlib
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -33,7 +32,7 @@ class Lever(NamedTuple):
     stage: Callable[[Any], Any] = lambda stage: stage
     tracing: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext
     donated: bool = True
-    flags: Mapping[str, Any] = {}  # of XLA
+    flags: dict[str, Any] | None = None  # of XLA
     worlds: float = 1.0  # times as many
 
 
@@ -150,19 +149,12 @@ def measure(
       goes: of each.
       at_once: programs compiled side by side; what one takes is its own only if 1.
     """
-    wanted = list(({AS_IT_IS: Lever()} | levers(name, family)).items())
+    wanted = {AS_IT_IS: Lever()} | levers(name, family)
+    calls = [partial(_traced, name, family, worlds, lever, simulated) for lever in wanted.values()]
     usual = None
-    with ThreadPoolExecutor(at_once) as pool:
-        for first in range(0, len(wanted), at_once):
-            jobs = {}
-            for what, lever in wanted[first : first + at_once]:
-                # Traced one by one: a lever may change what MJX has for all.
-                jobs[what] = pool.submit(_traced(name, family, worlds, lever, simulated))
-            wait(jobs.values())
-            for what, job in jobs.items():
-                program = job.result()
-                usual = usual or program
-                yield _gain(what, usual, program, goes)
+    for what, program in zip(wanted, benchmark.side_by_side(calls, at_once), strict=True):
+        usual = usual or program
+        yield _gain(what, usual, program, goes)
 
 
 def _traced(

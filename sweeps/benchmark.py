@@ -6,15 +6,13 @@ prints a table: simulated seconds in a second of wall clock, by engine, shape fa
 against C MuJoCo in a closed loop on all cores. A figure shows throughput against batch.
 """
 
-import os
 import sys
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 
-import jax
 import tyro
 from tqdm import tqdm
 
@@ -62,11 +60,13 @@ def main(options: Options) -> None:
     errors.check_count("at_once", options.at_once, at_most=1024)
     record.writable(options.out)
     speeds, text = [], ""
-    where = f"On {jax.devices()[0].device_kind}, {os.cpu_count()} processors.\n\n"
+    where = benchmark.machine()
     if options.refill:
         where += _refilling(options.refill, options.rounds)
     wanted = _wanted(options)
-    for speed in tqdm(_measured(wanted, options.at_once), total=len(wanted), unit="measurement"):
+    for speed in tqdm(
+        _measured(wanted, options.at_once), total=sum(map(len, wanted)), unit="measurement"
+    ):
         speeds.append(speed)
         text = where + score.markdown(benchmark.table(speeds))
         record.write_text(options.out / "benchmark.md", text + "\n")
@@ -83,27 +83,26 @@ def _refilling(slots: int, rounds: int) -> str:
     )
 
 
-def _wanted(options: Options) -> list[tuple[str, str, int]]:
-    """C first, since the others are compared with it."""
+Wanted = tuple[list[tuple[str, str]], list[tuple[str, str, int]]]
+
+
+def _wanted(options: Options) -> Wanted:
+    """Names and families in C; and with their worlds, of what is batched."""
     named = [pair for pair in product(options.names, options.families) if benchmark.can(*pair)]
-    in_c = [(name, family, 0) for name, family in named if name in benchmark.IN_C]
+    in_c = [pair for pair in named if pair[0] in benchmark.IN_C]
     batched = [(*pair, n) for pair in named if pair[0] in benchmark.BATCHED for n in options.worlds]
     slow = [name for name, one in benchmark.BATCHED.items() if one.engine in ("mjx", "warp")]
-    return in_c + [b for b in batched if b[0] not in slow or b[2] <= options.mujocos]
+    return in_c, [b for b in batched if b[0] not in slow or b[2] <= options.mujocos]
 
 
-def _measured(wanted: list[tuple[str, str, int]], at_once: int) -> Iterator[Speed]:
-    """Measure one after the other; while one is timed, nothing is compiled."""
-    with ThreadPoolExecutor(at_once) as pool:
-        for first in range(0, len(wanted), at_once):
-            some = wanted[first : first + at_once]
-            programs = [pool.submit(benchmark.compiled, *w) if w[2] else None for w in some]
-            wait([program for program in programs if program])
-            for (name, family, _), program in zip(some, programs, strict=True):
-                if program:
-                    yield benchmark.batched(program.result())
-                else:
-                    yield benchmark.in_c(name, family)
+def _measured(wanted: Wanted, at_once: int) -> Iterator[Speed]:
+    """C first, since the others are compared with it."""
+    in_c, batched = wanted
+    for name, family in in_c:
+        yield benchmark.in_c(name, family)
+    calls = [partial(benchmark.traced, n, benchmark.BATCHED[n], *rest) for n, *rest in batched]
+    for program in benchmark.side_by_side(calls, at_once):
+        yield benchmark.batched(program)
 
 
 if __name__ == "__main__":

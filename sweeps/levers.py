@@ -6,12 +6,10 @@ changes one thing at a time about a program (its physics, what a step does, how 
 times it in turns with the program as it is. Prints a table and draws it.
 """
 
-import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-import jax
 import tyro
 from tqdm import tqdm
 
@@ -55,8 +53,7 @@ def main(options: Options) -> None:
     gains, text = [], ""
     for gain in tqdm(pulled, total=total, unit="lever"):
         gains.append(gain)
-        text = f"On {jax.devices()[0].device_kind}, {os.cpu_count()} processors.\n\n"
-        text += score.markdown(levers.table(gains))
+        text = benchmark.machine() + score.markdown(levers.table(gains))
         record.write_text(options.out / "levers.md", text + "\n")
         figures.levers(gains, options.out / "levers.png")
     print(text)

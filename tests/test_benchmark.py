@@ -50,11 +50,11 @@ def test_levers_are_timed_beside_the_program_as_it_is(monkeypatch):
 
 
 def test_an_engine_has_the_levers_that_it_knows():
-    mjx, fused = (levers.levers(f"{name} standard", "box") for name in ("mjx", "fused"))
-    assert set(fused) < set(mjx)
-    assert "4 solver iterations" in fused
+    of_mjx, of_fused = (levers.levers(f"{name} standard", "box") for name in ("mjx", "fused"))
+    assert set(of_fused) < set(of_mjx)
+    assert "4 solver iterations" in of_fused
     assert "4 solver iterations" not in levers.levers("quasistatic", "box")
-    assert set(mjx) - set(levers.levers("mjx standard", "cylinder")) == {
+    assert set(of_mjx) - set(levers.levers("mjx standard", "cylinder")) == {
         "own box-box collider",
         "own, two points",
     }
