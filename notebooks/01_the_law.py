@@ -66,7 +66,7 @@ Image(figures.twist_field(sets, 2.0, out / "twist.png"))
 #   back.
 # - Within the Realignment State, beyond the dashed lines below, turning comes back gradually, for
 #   errors within some 80 degrees, as the contact approaches the middle: this is $\sigma$ of Eq.
-#   9. Just outside $l_{mr}$ the base turns faster than just inside, since Eq. 8 turns in
+#   10. Just outside $l_{mr}$ the base turns faster than just inside, since Eq. 9 turns in
 #   proportion to $v^*$ and not to $v_x$.
 #
 # Right, the paper's tangent taken literally: beyond 90 degrees its sign changes. A base whose

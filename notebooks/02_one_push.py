@@ -10,7 +10,7 @@
 # %% [markdown]
 # # One push
 #
-# The box, on slippery ground (S1), with its target 2 m behind the robot: the trial of the paper's
+# The box, under the friction set S1, with its target 2 m behind the robot: the trial of the paper's
 # Fig. 6. The fused engine steps it; `rps push` does the same in MJX.
 
 # %%
@@ -65,7 +65,7 @@ print(
 # half metre takes 23 s, nearly a fifth of the trial.
 #
 # Contact is never lost. The fast changes of $\omega$ around 4 s are $|l|$ at the edge of the
-# critical region, where $\sigma$ of Eq. 9 is zero on one side and turns the base on the other.
+# critical region, where $\sigma$ of Eq. 10 is zero on one side and turns the base on the other.
 #
 # ## The same in pictures
 

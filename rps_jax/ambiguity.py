@@ -94,6 +94,7 @@ CHOICES = (
         "ahead at 0.01 m/s",
         "the one behaviour without contact that the paper reports",
     ),
+    ("150 s without contact", "in all, after the first touch", "stricter than at a stretch"),
     ("length of the base", "0.725 m", "42 equal taxels over three sides of a front of 58 cm"),
     (
         "simulated skin",

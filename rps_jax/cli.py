@@ -129,6 +129,9 @@ class Push(Common):
     """S1, S2 or ground,robot (as 0.25,0.4)."""
     strategy: str = "rps"
     """rps, nps or aps."""
+    engine: str = "mjx"
+    """mjx, fused (the same equations, specialised: much faster), warp (MJX-Warp, on an NVIDIA GPU),
+    or quasistatic (planar, no inertia)."""
     video: bool = True
     """Film the push."""
     film_length: float = 12.0
@@ -165,6 +168,15 @@ class StudyOptions(Spread):
 class Hardware(Spread, Common):
     """Run the paper's hardware experiments in simulation, over a range of friction; draw Fig. 7."""
 
+    physics: str = "default"
+    """default (isotropic friction) or paper_gazebo (friction pyramid)."""
+    engine: str = "mjx"
+    """mjx, fused (the same equations, specialised: much faster), warp (MJX-Warp, on an NVIDIA GPU),
+    or quasistatic (planar, no inertia)."""
+    mass: float | None = None
+    """Not to be set: each object of the hardware has the paper's."""
+    rear: str = "near"
+    """Of no effect: no object of the hardware is nonuniform."""
     skin: str | None = "hardware"
     """hardware (42 taxels with noise and unequal gains), capacitive, ideal or thin."""
     layout: str = "circle"
@@ -186,7 +198,7 @@ class Sweep(Spread):
     """Push in many random worlds, every strategy in the same ones; the run can be continued."""
 
     domain: str = "wide"
-    """paper, hardware, wide or hostile, or a JSON file of ranges, as {"mass": [3, 60]}."""
+    """paper, hardware, wide, prisms or hostile, or a JSON file of ranges, as {"mass": [3, 60]}."""
     change: tuple[str, ...] = ()
     """Ranges to change, each as quantity=low,high (as mass=3,10)."""
     strategies: tuple[str, ...] = ("rps", "nps", "aps")
@@ -306,11 +318,12 @@ class TuneOptions(Spread):
     """What every tuner takes."""
 
     domain: tuple[str, ...] = ("wide",)
-    """Domains to tune in: paper, hardware, wide, hostile, or JSON files of ranges."""
+    """Domains to tune in: paper, hardware, wide, prisms, hostile, or JSON files of ranges."""
     objects: tuple[str, ...] = ("random_box", "random_cylinder")
     """Objects of these domains; random_prism is held out by default."""
     tuned: tuple[str, ...] = ("full",)
-    """Parameters to tune, by name, or logistic (eta, zeta, beta, k), or full (all of the law's)."""
+    """Parameters to tune, by name, or logistic (eta, zeta, beta, k), or full (all that
+    are the law's, not the robot's speeds, the rules or the switches)."""
     start: str = "paper"
     """Parameters to begin with: paper, tuned, or a JSON file (as {"L": 0.3})."""
     worlds: int = 512

@@ -68,11 +68,11 @@ class Domain:
     friction_robot: Range = Range(0.1, 0.8)  # [1] object-robot
     frictions: tuple[Friction, ...] = ()
     # The task.
-    lateral: Range = Range(-0.12, 0.12)  # [m] of the object's middle from the robot's axis
-    yaw: Range = Range(-0.6, 0.6)  # [rad] of the object
+    lateral: Range = Range(-0.12, 0.12)  # [m] of the object's middle, left of the robot's axis
+    yaw: Range = Range(-0.6, 0.6)  # [rad] of the object, counter-clockwise
     gap: Range = Range(0, 0.05)  # [m] between base and object
     distance: Range = Range(1, 3)  # [m] of the target from the start
-    bearing: Range = Range(-math.pi, math.pi)  # [rad] of the target
+    bearing: Range = Range(-math.pi, math.pi)  # [rad] of the target, counter-clockwise from ahead
     targets: tuple[tuple[float, float], ...] = ()  # [m]
     # The skin: ideal, or 42 capacitive taxels with these imperfections.
     skin: str = "capacitive"

@@ -1,4 +1,4 @@
-"""The Reactive Pushing Strategy (RPS): Eqs. 1-9 and Algorithm 1 of Ozdamar, Sirintuna, Arbaud
+"""The Reactive Pushing Strategy (RPS): Eqs. 1-10 and Algorithm 1 of Ozdamar, Sirintuna, Arbaud
 and Ajoudani, "Pushing in the Dark" (IEEE RA-L 2024). Nothing here knows of MuJoCo.
 
 Frames: W is the world, R the robot (origin at the middle of the base, x forward, y left).
@@ -36,7 +36,7 @@ class RPSParams(NamedTuple):
     k: float | jax.Array = 60.0  # [1/m] steepness, Eq. 5
     K_h: float | jax.Array = 1.0  # [1] heading gain, Eq. 7
     K_v: float | jax.Array = 0.1  # [1/s] velocity gain, Eq. 3
-    L: float | jax.Array = 0.2  # [m] turning length, Eqs. 6 and 8
+    L: float | jax.Array = 0.2  # [m] turning length, Eqs. 6 and 9
     l_cr: float | jax.Array = 0.24  # [m] the critical region starts here
     d_th: float | jax.Array = 0.5  # [m] no lateral motion nearer than this, Eq. 5
     v_max: float | jax.Array = 0.05  # [m/s] bound on the norm of (v_x, v_y)
@@ -65,8 +65,9 @@ class RPSParams(NamedTuple):
     def tuned(cls) -> RPSParams:
         """Tuned by evolution in random worlds of boxes and cylinders; the README says how.
 
-        Full speed until the target, and almost always realigning: Eq. 5 acts only beyond d_th. A
-        contact that is lost is acted upon as if it were still felt.
+        Full speed until the target. Nearer than d_th it drives straight on or, beyond l_cr, almost
+        purely sideways; Eq. 5 acts only farther away. A contact that is lost is acted upon as if it
+        were still felt.
         """
         return cls(
             eta=6.537844,
@@ -267,7 +268,7 @@ def linear_velocity(v_star: jax.Array, a_r: jax.Array) -> tuple[jax.Array, jax.A
 
 
 def steering_angle(params: RPSParams, d: jax.Array, yaw: jax.Array) -> jax.Array:
-    """Eq. 7: gamma = K_h (theta* - theta) [rad], theta* the direction of d (..., 2) [m].
+    """Eqs. 7-8: gamma = K_h (theta* - theta) [rad], theta* the direction of d (..., 2) [m].
 
     The heading error is wrapped to [-pi, pi). The paper's tangent changes sign beyond pi / 2,
     where the robot would turn away from its target, so gamma is held within +-gamma_max.
@@ -277,7 +278,7 @@ def steering_angle(params: RPSParams, d: jax.Array, yaw: jax.Array) -> jax.Array
 
 
 def realignment_gain(params: RPSParams, l: jax.Array) -> jax.Array:  # noqa: E741
-    """Eq. 9: sigma = 1 - |l| / l_cr [1], zero in the critical region."""
+    """Eq. 10: sigma = 1 - |l| / l_cr [1] of l [m], zero in the critical region."""
     return 1.0 - jnp.minimum(jnp.abs(l), params.l_cr) / params.l_cr
 
 
@@ -320,7 +321,7 @@ def _push(
     forward = jnp.where(first, bounded.v_x, v_x)
     speed = jnp.where(first, jnp.minimum(v_star, params.v_max), v_star)
     turning_speed = _choose(realigning, realignment_gain(params, l) * speed, forward)
-    omega = turning_speed / params.L * jnp.tan(gamma)  # Eq. 8 or 6
+    omega = turning_speed / params.L * jnp.tan(gamma)  # Eq. 9 or 6
     twist = saturate(params, Twist(v_x, v_y, omega))
 
     arrived = _below(distance, params.d_success, soft.arrive)
@@ -371,7 +372,7 @@ def step(
 ) -> tuple[RPSState, Twist]:
     """Algorithm 1: one control step of RPS (or NPS, by `params.reactive`).
 
-    In contact: the saturated twist of Eqs. 1-9, or zero once ||d|| < d_success. Without contact:
+    In contact: the saturated twist of Eqs. 1-10, or zero once ||d|| < d_success. Without contact:
     straight ahead, at v_approach before the first touch and at v_lost after a loss, l_th
     unchanged; with `keep_contact`, a loss is ignored and the last contact acted upon.
     Algorithm 1's last line prints v_x twice; (v_x, v_y, omega) is meant.

@@ -76,7 +76,7 @@ class World(NamedTuple):
     params: Params
     p_world_target: jax.Array  # (2,) [m]
     shift: Shift
-    qpos: jax.Array  # (10,) [m, rad] at the start
+    qpos: jax.Array  # (10,) at the start, as in `Trial`
     key: jax.Array  # of the imperfections of skin and odometry
     odometry: Odometry = Odometry()
 
@@ -84,8 +84,10 @@ class World(NamedTuple):
 class Trial(NamedTuple):
     """The running state of one world."""
 
-    qpos: jax.Array  # (10,) base x, y [m], yaw [rad]; object position [m], quaternion
-    qvel: jax.Array  # (9,) [m/s, rad/s]
+    # In the world: base x, y [m], yaw [rad]; object position [m] and quaternion, scalar first.
+    qpos: jax.Array  # (10,)
+    # Of these [m/s, rad/s]; the object's angular velocity is in its own frame.
+    qvel: jax.Array  # (9,)
     warmstart: jax.Array  # (9,) [m/s^2, rad/s^2] last accelerations, for the solver
     strategy: Any  # what the strategy remembers
     skin: SkinState
@@ -108,7 +110,7 @@ class Snapshot(NamedTuple):
     """What one control step saw and did."""
 
     time: jax.Array  # () [s]
-    qpos: jax.Array  # (10,)
+    qpos: jax.Array  # (10,) as in `Trial`
     reading: Reading | SmoothReading
     twist: Twist  # [m/s, m/s, rad/s] commanded, robot frame
     details: Details
@@ -127,8 +129,8 @@ class Outcome(NamedTuple):
     tipped: jax.Array  # () bool: the object has fallen over
     diverged: jax.Array  # () bool
     overflows: jax.Array  # () int32 control steps in which contacts were lost for want of room
-    base_pose: jax.Array  # (3,) [m, m, rad] at the end
-    object_pose: jax.Array  # (3,) [m, m, rad] at the end
+    base_pose: jax.Array  # (3,) [m, m, rad] in the world, at the end
+    object_pose: jax.Array  # (3,) [m, m, rad] likewise
 
 
 def object_pose(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -211,7 +213,10 @@ def outline(world: World, qpos: jax.Array) -> Footprint:
 def sense(
     world: World, trial: Trial, period: float
 ) -> tuple[SkinState, Reading | SmoothReading, Observation]:
-    """The skin's reading of the object where it stands now, and what the law is told."""
+    """The skin's reading of the object where it stands now, and what the law is told.
+
+    `period` [s] is that of the control loop.
+    """
     p_world_robot, yaw = trial.qpos[:2], trial.qpos[2]
     placed = outline(world, trial.qpos)
     state, reading = world.skin.sense(trial.skin, placed, period)
@@ -325,7 +330,10 @@ def observe(
 
 
 def execute(world: World, trial: Trial, twist: Twist, period: float) -> tuple[Trial, Twist]:
-    """The trial that remembers a commanded twist, and the twist that the base carries out."""
+    """The trial that remembers a commanded twist, and the twist that the base carries out.
+
+    Both are in the robot frame; `period` [s] is that of the control loop.
+    """
     if not trial.twists.shape[0]:
         return trial, twist
     twists = jnp.concatenate([jnp.stack(twist)[None], trial.twists[:-1]])

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import tyro
 
-from rps_jax import errors, fidelity, paper, record, score, study
+from rps_jax import engines, errors, fidelity, paper, record, score, study
 from rps_jax.cli import StudyOptions, guarded, progress_bar
 
 
@@ -21,15 +21,17 @@ class Options(StudyOptions):
     """Which settings of the solver to compare."""
 
     conditions: tuple[str, ...] = tuple(fidelity.CONDITIONS)
-    """Names of the settings; the reference is always among them."""
+    """Names of the settings, the reference always among them; by default all that run everywhere:
+    warp_standard and warp_fast (MJX-Warp) take an NVIDIA GPU."""
     out: Path = Path("runs/fidelity")
     """Run folder; a run that was killed is continued there."""
 
 
 def main(options: Options) -> None:
     """Run the conditions that are missing, then print and write the table."""
+    known = fidelity.CONDITIONS | fidelity.IN_WARP
     for name in options.conditions:
-        errors.check_name("condition", name, fidelity.CONDITIONS)
+        engines.check(known[errors.check_name("condition", name, known)].setting.engine)
     names = tuple(dict.fromkeys([fidelity.REFERENCE, *options.conditions]))
     grid = study.Grid(strategies=paper.STRATEGIES, targets=options.targets())
     out = options.open()

@@ -26,7 +26,7 @@ class Options(Spread):
     params: tuple[str, ...] = ("paper", "tuned")
     """Sets of parameters: paper, tuned, or JSON files (as {"L": 0.3})."""
     domain: tuple[str, ...] = ("wide",)
-    """paper, hardware, wide, hostile, or JSON files of ranges."""
+    """paper, hardware, wide, prisms, hostile, or JSON files of ranges."""
     worlds: int = 999
     """That each candidate meets, in each domain."""
     values: int = 9

@@ -37,7 +37,7 @@ class Options(Spread):
     """Which worlds."""
 
     domain: str = "wide"
-    """paper, hardware, wide or hostile, or a JSON file of ranges."""
+    """paper, hardware, wide, prisms or hostile, or a JSON file of ranges."""
     objects: tuple[str, ...] = ()
     """Objects to push, as random_box random_cylinder; by default the domain's."""
     engines: tuple[str, ...] = ()

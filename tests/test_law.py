@@ -1,4 +1,4 @@
-"""The law of the paper: Eqs. 1-9 and Algorithm 1, by golden values and by symmetries.
+"""The law of the paper: Eqs. 1-10 and Algorithm 1, by golden values and by symmetries.
 
 Golden values are worked out by hand from the printed equations. The recurring displacements are
 Pythagorean, so that norms and tangents are rational: (0.384, 0.112) has norm 0.4 and tangent 7/24,

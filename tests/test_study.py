@@ -150,7 +150,8 @@ def test_the_hardware_targets_are_2_1_m_from_the_start():
 
 
 def test_every_condition_is_a_study_that_could_run():
-    for conditions in (fidelity.CONDITIONS, ambiguity.READINGS, ambiguity.GAZEBO):
+    ours = fidelity.CONDITIONS, fidelity.IN_WARP, ambiguity.READINGS, ambiguity.GAZEBO
+    for conditions in ours:
         for condition in conditions.values():
             assert len(condition.cases(Grid(targets=NEAR))) == 12
     assert len(ambiguity.curve()) == 3 * len(ambiguity.TOLERANCES)
