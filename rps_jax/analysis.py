@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import NamedTuple
@@ -53,6 +54,15 @@ def worlds_by_object(results: xr.Dataset) -> dict[str, np.ndarray]:
     """Which worlds, a mask, have each object."""
     which = results.which_object.values
     return {str(name): which == i for i, name in enumerate(results.object.values)}
+
+
+def drawn(results: xr.Dataset) -> list[str]:
+    """Names of those of `DRAWN` that differ between worlds."""
+
+    def differs(values: np.ndarray) -> bool:
+        return np.unique(values[np.isfinite(values)]).size > 1
+
+    return [name for name in DRAWN if differs(results[name].values)]
 
 
 def cvar(values: np.ndarray, tail: float = _TAIL) -> float:
@@ -110,9 +120,10 @@ def _rate(won: np.ndarray) -> str:
 
 
 def _share(won: int, of: int) -> str:
+    if not of:
+        return "-"
     low, high = score.wilson(won, of)
-    share = 100 * won / of if of else np.nan
-    return f"{share:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+    return f"{100 * won / of:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
 
 
 def differences(results: xr.Dataset) -> list[list[str]]:
@@ -151,6 +162,7 @@ def hardest_table(results: xr.Dataset, run: str, count: int = 10) -> list[list[s
     for world in hardest(results, count):
         one = results.isel(world=world)
         x = float(one.distance), float(np.degrees(one.bearing))
+        fails = next(arm for arm in arms if not int(one.success.sel(arm=arm)))
         rows.append(
             [
                 str(int(world)),
@@ -159,7 +171,7 @@ def hardest_table(results: xr.Dataset, run: str, count: int = 10) -> list[list[s
                 f"{float(one.mass):.1f} kg",
                 f"{float(one.friction_ground):.2f}, {float(one.friction_robot):.2f}",
                 f"{x[0]:.1f} m at {x[1]:.0f} deg",
-                f"`rps replay {run} {int(world)} --arm {arms[0]!r} --video`",
+                f"`rps replay {shlex.quote(run)} {int(world)} --arm {shlex.quote(fails)} --video`",
             ]
         )
     return rows
@@ -195,13 +207,13 @@ def influences(results: xr.Dataset, arm: str) -> list[list[str]]:
     false discoveries among the quantities held at 5 % (Benjamini-Hochberg) where q < 0.05.
     """
     won = results.success.sel(arm=arm).values > 0
-    drawn = {name: results[name] for name in DRAWN if np.nanstd(results[name].values) > 0}
-    binned = {name: bins(values.values, won) for name, values in drawn.items()}
-    q = stats.false_discovery_control([_one_rate(found) for found in binned.values()])
+    binned = {name: bins(results[name].values, won) for name in drawn(results)}
+    p = [_one_rate(found) for found in binned.values()]
+    q = stats.false_discovery_control(p) if p else []
     rows = [["", "worst bin, about", "success", "best bin, about", "success", "q"]]
     for i in np.argsort(q, kind="stable"):
         name, found = list(binned.items())[i]
-        order, unit = np.argsort(found.won / found.of, kind="stable"), drawn[name].attrs["units"]
+        order, unit = np.argsort(found.won / found.of, kind="stable"), results[name].attrs["units"]
         told = [f"{value:.3g} {unit}".removesuffix(" 1") for value in found.middle]
         ends = [
             cell

@@ -214,6 +214,7 @@ def batched(program: Program) -> Speed:
     def once() -> None:
         state[0] = jax.block_until_ready(program.go(state[0]))
 
+    once()  # in which MJX-Warp builds its kernels
     rate = program.worlds * program.simulated / _best(once)
     name, family, worlds, _, took, memory, contacts, physics, *_ = program
     return Speed(name, family, worlds, took, rate, memory, contacts, physics)

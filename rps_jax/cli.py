@@ -153,15 +153,17 @@ class StudyOptions(Spread):
 
         return study.FEW_TARGETS if self.quick else paper.TARGETS
 
-    def open(self) -> Path:
-        """The run folder, new or to be continued; checks the options first."""
+    @contextlib.contextmanager
+    def opened(self) -> Iterator[Path]:
+        """The run folder, new or to be continued, in use; checks the options first."""
         from rps_jax import record
 
         self.shape()
         record.writable(self.out)
         use_cache()
-        record.write_json(self.out / "environment.json", record.environment())
-        return self.out
+        with record.hold(self.out):
+            record.sign(self.out)
+            yield self.out
 
 
 @dataclass(frozen=True)
@@ -515,6 +517,13 @@ def guarded(action: Callable[[], None]) -> int:
             file=sys.stderr,
         )
         return 2
+    except MemoryError:
+        print(
+            "rps: error: this machine is out of memory: ask for fewer worlds; what is done is "
+            "kept.",
+            file=sys.stderr,
+        )
+        return 2
     except KeyboardInterrupt:
         print("rps: interrupted.", file=sys.stderr)
         return 130
@@ -865,8 +874,7 @@ def _paper(options: Paper) -> None:
     from rps_jax import reproduce
 
     plan = reproduce.Plan.quick() if options.quick else reproduce.Plan()
-    out = options.open()
-    with progress_bar(plan.trials()) as report:
+    with options.opened() as out, progress_bar(plan.trials()) as report:
         path = reproduce.run(out, plan, report=report, **options.shape())
     print(f"report: {path}")
 
@@ -890,6 +898,11 @@ def _domain(options: Sweep) -> Domain:
         errors.check_name("domain quantity", name, domain.RANGES)
         if values.count(",") != 1:
             raise InputError(f"change '{text}' is not allowed: write quantity=low,high.")
+        if name in chosen.idle:
+            raise InputError(
+                f"change '{text}' is not allowed: the domain's objects, frictions, targets or skin "
+                f"leave no {name} to draw."
+            )
         low, high = (errors.check_number(f"domain {name}", end) for end in values.split(","))
         changes[name] = getattr(chosen, name)._replace(low=low, high=high)
     return dataclasses.replace(chosen, **changes)
@@ -934,7 +947,7 @@ def _labels(field: str, names: Sequence[str]) -> list[str]:
       InputError: none is given, or one twice.
     """
     for parts in (1, 2):
-        labels = ["/".join(Path(name).with_suffix("").parts[-parts:]) for name in names]
+        labels = ["/".join((*Path(name).parts[:-1], Path(name).stem)[-parts:]) for name in names]
         if len(set(labels)) == len(names):
             break
     _each_once(field, names, labels)
@@ -990,7 +1003,7 @@ def _shard(text: str) -> Shard:
     from rps_jax.robustness import Shard
 
     number, _, of = text.partition("/")
-    if not (number.isdigit() and of.isdigit()):
+    if not (number.isdecimal() and of.isdecimal()):
         raise InputError(f"shard '{text}' is not allowed: write k/n, as 3/8.")
     return Shard(int(number), int(of))
 
@@ -1005,6 +1018,13 @@ def choose_device(name: str) -> None:
 
     errors.check_name("device", name, DEVICES)
     if name == "auto":
+        try:
+            jax.devices()
+        except (RuntimeError, AssertionError) as error:  # whichever JAX raises
+            asked = jax.config.jax_platforms
+            raise InputError(
+                f"JAX_PLATFORMS = {asked} is not there: name a device that is, or none."
+            ) from error
         return
     before = jax.config.jax_platforms
     jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[name])
@@ -1063,12 +1083,11 @@ def _sweep(options: Sweep) -> None:
         _check_here(options.device, plan.setting, [plan.domain])
     out = robustness.open_run(options.out, plan)
     use_cache()
-    with robustness.lock(out, shard):
-        record.write_json(out / "environment.json", record.environment())
+    with record.hold(out, shard.number, shard.of):
         trials = sum(numbers.size for numbers in robustness.share(plan, shard).values())
         with progress_bar(trials, "sweep") as report:
             timing = run(out, plan, shard=shard, report=report, **shape)
-        _tell(timing, _json(out / "environment.json")["device"]["kind"])
+        _tell(timing, record.signed(out)["device"]["kind"])
         if shard.of == 1:
             robustness.merge([out], out)
             _report_sweep(out)
@@ -1083,6 +1102,8 @@ def _merge(options: Merge) -> None:
         raise InputError("folders = () is not allowed: give the run folders of the shards.")
     record.writable(options.out)
     robustness.merge(list(options.folders), options.out)
+    for folder in options.folders:
+        record.sign(options.out, record.signed(folder))
     _report_sweep(options.out)
 
 
@@ -1126,12 +1147,12 @@ def _tune_compare(options: TuneCompare) -> None:
     use_cache()
     for name, plan in plans.items():
         out = robustness.open_run(options.out / name, plan)
-        with robustness.lock(out), progress_bar(plan.trials, name) as report:
-            record.write_json(out / "environment.json", record.environment())
-            robustness.run(out, plan, report=report, **shape)
-        robustness.merge([out], out)
-        print(f"## {name}\n")
-        _report_sweep(out)
+        with record.hold(out):
+            with progress_bar(plan.trials, name) as report:
+                robustness.run(out, plan, report=report, **shape)
+            robustness.merge([out], out)
+            print(f"## {name}\n")
+            _report_sweep(out)
 
 
 def _tune_es(options: TuneES) -> None:
@@ -1208,11 +1229,11 @@ def _tuning(out: Path, count: int) -> Iterator[Callable[[int, Progress], None]]:
     """The run folder in use, and a bar over generations or steps, for tuners to report to."""
     from tqdm import tqdm
 
-    from rps_jax import record, robustness
+    from rps_jax import record
 
     use_cache()
-    with robustness.lock(out), tqdm(total=count, unit="generation", desc="compile") as bar:
-        record.write_json(out / "environment.json", record.environment())
+    with record.hold(out), tqdm(total=count, unit="generation", desc="compile") as bar:
+        record.sign(out)
 
         def report(generation: int, progress: Progress) -> None:
             bar.set_description("tune", refresh=False)
@@ -1275,6 +1296,9 @@ def _one_world(run: Path, index: int, arm: str | None) -> tuple[Plan, str]:
     arms = list(plan.arms)
     name = errors.check_name("arm", arm or arms[0], arms)
     errors.check_count("index", index, at_least=0, at_most=plan.worlds - 1)
+    if plan.setting.engine == "mujoco":
+        print("C MuJoCo's trials are not followed: this is the same world in the fused engine.")
+        plan = dataclasses.replace(plan, setting=dataclasses.replace(plan.setting, engine="fused"))
     sweep.check_followed(plan.setting.engine)
     return plan, name
 

@@ -201,7 +201,7 @@ def run(
                 lacking.discard(number)
             if news.workers != known:
                 known = news.workers
-                record.write_json(folder / "environment.json", own | _environment(known))
+                record.sign(folder, own | _environment(known))
             simulated = news.simulated
             stepped = stepped or (time.perf_counter() if simulated else None)
             report(Progress(before + news.ended, simulated))

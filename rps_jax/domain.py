@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -92,6 +93,8 @@ class Domain:
             raise InputError("domain objects = () is not allowed: name at least one.")
         for name in self.objects:
             errors.check_name("domain object", name, (*RANDOM, *OBJECTS))
+        if len(set(self.objects)) < len(self.objects):
+            raise InputError(f"domain objects = {self.objects} is not allowed: name each once.")
         for friction in self.frictions:
             scene.check(friction, None)
         for target in self.targets:
@@ -117,6 +120,20 @@ class Domain:
     def object_of(self, index: np.ndarray) -> np.ndarray:
         """Which of `objects` the worlds `index` have."""
         return index // (self.combinations // len(self.objects)) % len(self.objects)
+
+    @property
+    def idle(self) -> frozenset[str]:
+        """Ranges of which nothing is drawn, since something else says what they would."""
+        found = set()
+        if not set(self.objects) & set(RANDOM):
+            found |= {"mass", "size", "aspect", "height", "com_offset"}
+        if self.frictions:
+            found |= {"friction_ground", "friction_robot"}
+        if self.targets:
+            found |= {"distance", "bearing"}
+        if self.skin == "ideal":
+            found |= set(_OF_TAXELS)
+        return frozenset(found)
 
     @property
     def families(self) -> tuple[str, ...]:
@@ -211,6 +228,9 @@ DOMAINS = {
 }
 
 
+_OF_TAXELS = ("noise", "gain_spread", "dead_share")  # which an ideal skin has not
+
+
 class Draw(NamedTuple):
     """Worlds of one object or shape family, as drawn; leaves lead with their number, n."""
 
@@ -260,6 +280,8 @@ def _drawn(domain: Domain, index: np.ndarray, numbers: np.ndarray) -> Draw:
     u = dict(zip(_USES, numbers.T, strict=False))
     name = domain.objects[int(domain.object_of(index[0]))]
     at = {name: getattr(domain, name).at(u[name]) for name in _ALLOWED if name in u}
+    if domain.skin == "ideal":
+        at |= {name: np.zeros(index.size) for name in _OF_TAXELS}
     error = [
         domain.velocity_error.at(u[name]) for name in ("v_x_error", "v_y_error", "omega_error")
     ]
@@ -463,6 +485,16 @@ def _names(values: list[str]) -> tuple[str, ...]:
     return tuple(values)
 
 
+def _range(name: str, values: Any) -> Range:
+    if not isinstance(values, list | tuple):
+        raise TypeError("no list")
+    low, high, *log = values
+    if len(log) > 1 or not all(isinstance(one, bool) for one in log):
+        raise ValueError("more than low, high, and whether evenly in the logarithm")
+    usual = getattr(DOMAINS["wide"], name).log
+    return Range(float(low), float(high), *(log or [usual]))
+
+
 # How JSON has what is not a range.
 _FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
     "objects": (_names, 'names, as ["random_box"]'),
@@ -488,9 +520,9 @@ def from_json(values: dict[str, Any]) -> Domain:
     known = {f.name: f for f in fields(Domain)}
     for name, value in values.items():
         errors.check_name("domain quantity", name, known)
-        read, form = _FORMS.get(name, (lambda pair: Range(*pair), "low and high, as [0.1, 0.5]"))
+        read, form = _FORMS.get(name, (partial(_range, name), "low and high, as [0.1, 0.5]"))
         try:
             given[name] = read(value)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise InputError(f"domain {name} = {value} is not allowed: write {form}.") from error
     return Domain(**given)

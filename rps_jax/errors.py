@@ -37,7 +37,7 @@ def check_number(
     allowed = " and ".join(["a number", *bounds]) + (f" [{unit}]" if unit else "")
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if math.isnan(number) or not (above < number and at_least <= number <= at_most):
         raise InputError(f"{name} = {value} is not allowed: it must be {allowed}.")

@@ -506,7 +506,7 @@ def levers(gains: Sequence[Gain], path: Path) -> Path:
 
 def success_curves(results: xr.Dataset, path: Path) -> Path:
     """Success against every quantity that was drawn, one line an arm, Wilson 95 % intervals."""
-    drawn = [name for name in analysis.DRAWN if np.nanstd(results[name].values) > 0]
+    drawn = analysis.drawn(results)
     rows = -(-len(drawn) // 4)
     figure = Figure(figsize=(13, 2.6 * rows), layout="constrained")
     axes = figure.subplots(rows, 4, squeeze=False, sharey=True)

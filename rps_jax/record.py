@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import importlib.metadata
 import json
 import os
@@ -11,15 +13,16 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import xarray as xr
 
 from rps_jax.errors import InputError
 
 MANIFEST = "manifest.json"
+ENVIRONMENT = "environment.json"
 _PACKAGES = (
     *("rps_jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "warp-lang"),
     *("numpy", "scipy", "xarray"),
@@ -64,16 +67,51 @@ def claim(folder: Path, wanted: dict[str, Any]) -> Path:
     """
     writable(folder)
     wanted = json.loads(json.dumps(wanted))
-    if (folder / MANIFEST).exists():
-        found = manifest(folder)
-        if found != wanted:
+    with _alone(folder):
+        if not (folder / MANIFEST).exists():
+            write_json(folder / MANIFEST, wanted)
+        elif (found := manifest(folder)) != wanted:
             raise InputError(
                 f"out = {folder} holds another run ({difference(found, wanted)}): choose another "
                 "folder, or ask for the same."
             )
-    else:
-        write_json(folder / MANIFEST, wanted)
     return folder
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """For the moment of a look and a note other processes wait."""
+    with open(folder / ".lock", "a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+@contextlib.contextmanager
+def hold(folder: Path, number: int = 1, of: int = 1) -> Iterator[None]:
+    """Hold a run folder, or one of several equal shares of it, against other processes.
+
+    Raises:
+      InputError: another process holds it, or shares it otherwise.
+    """
+    own = folder / f".lock-{number}-{of}"
+    with open(own, "a") as file:
+        with _alone(folder):
+            for path in folder.glob(".lock-*-*"):
+                if not path.name.endswith(f"-{of}"):
+                    with open(path, "a") as other:
+                        _seize(other, folder)  # and let go at once
+            _seize(file, folder)
+        yield
+
+
+def _seize(file: IO[str], folder: Path) -> None:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        raise InputError(
+            f"out = {folder} is in use by another process: wait for its end, or choose another "
+            "folder."
+        ) from error
 
 
 def manifest(folder: Path) -> dict[str, Any]:
@@ -82,13 +120,15 @@ def manifest(folder: Path) -> dict[str, Any]:
     Raises:
       InputError: there is none, or it is corrupt.
     """
-    path = folder / MANIFEST
+    return _noted(folder, MANIFEST)
+
+
+def _noted(folder: Path, name: str) -> dict[str, Any]:
+    path = folder / name
     try:
         found = json.loads(path.read_text())
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise InputError(
-            f"run = {folder} holds no {MANIFEST}: give the folder of a run."
-        ) from error
+        raise InputError(f"run = {folder} holds no {name}: give the folder of a run.") from error
     except ValueError as error:
         raise corrupt(path, error) from error
     if not isinstance(found, dict):
@@ -186,7 +226,7 @@ def read(path: Path) -> xr.Dataset:
     """
     try:
         return xr.load_dataset(path, engine="h5netcdf")
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise InputError(f"{path} is corrupt ({error}): run again, or restore it.") from error
 
 
@@ -210,6 +250,51 @@ def environment() -> dict[str, Any]:
         "x64": bool(jax.config.jax_enable_x64),
         "packages": {name: _version(name) for name in _PACKAGES},
     }
+
+
+def sign(folder: Path, signed: Mapping[str, Any] | None = None) -> None:
+    """Note in `environment.json` on what a run, or some of it, is made: by default by this process.
+
+    What it was made on before stays there, under `before`, if anything but the time differs.
+    """
+    new = dict(signed or environment())
+    with _alone(folder):
+        earlier = []
+        if (folder / ENVIRONMENT).exists():
+            old = _noted(folder, ENVIRONMENT)
+            earlier = [*old.pop("before", []), old]
+        earlier = [*new.pop("before", []), *earlier]
+        others = [one for one in earlier if _made_by(one) != _made_by(new)]
+        write_json(folder / ENVIRONMENT, new | ({"before": others} if others else {}))
+
+
+def signed(folder: Path) -> dict[str, Any]:
+    """What `sign` noted.
+
+    Raises:
+      InputError: there is nothing, or it is corrupt.
+    """
+    return _noted(folder, ENVIRONMENT)
+
+
+def _made_by(environment: Mapping[str, Any]) -> dict[str, Any]:
+    """What the bits of results depend on, and who asked."""
+    return {k: v for k, v in environment.items() if k not in ("time", "workers", "before")}
+
+
+def told(folder: Path) -> str:
+    """What `sign` noted, in words."""
+    found = signed(folder)
+    try:
+        last, *before = (
+            f"`{' '.join(one['command'])}`, commit {one['commit']}, {one['time']}, on "
+            f"{one['device']['kind']} with {one['processors']} processors, jax "
+            f"{one['packages']['jax']}, mujoco {one['packages']['mujoco']}"
+            for one in (found, *reversed(found.get("before", [])))
+        )
+    except (KeyError, TypeError, AttributeError) as error:
+        raise corrupt(folder / ENVIRONMENT, error) from error
+    return f"Made by {'; before that by '.join([last, *before])}."
 
 
 def _version(package: str) -> str | None:

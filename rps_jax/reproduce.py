@@ -5,7 +5,6 @@ again, so a run that was killed continues.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -136,13 +135,9 @@ def run(
 
 def report_to(out: Path, sections: list[Section]) -> Path:
     """`report.md` and `report.html`, with what they were made by."""
-    environment = json.loads((out / "environment.json").read_text())
     intro = (
         "The numbers of the paper *Pushing in the Dark* beside ours. Intervals: Wilson 95 %.\n\n"
-        f"Made by `{' '.join(environment['command'])}`, commit {environment['commit']}, "
-        f"{environment['time']}, on {environment['device']['kind']} with "
-        f"{environment['processors']} processors, jax {environment['packages']['jax']}, "
-        f"mujoco {environment['packages']['mujoco']}."
+        + record.told(out)
     )
     return write_report(out, "Pushing in the Dark, reproduced", intro, sections)
 

@@ -7,9 +7,7 @@ hash of its content. A part that is there is not run again.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import fcntl
 import functools
 import hashlib
 import io
@@ -170,14 +168,16 @@ def load_plan(folder: Path) -> Plan:
     """The plan of a run folder.
 
     Raises:
-      InputError: it holds none, or a corrupt one.
+      InputError: it holds none, or a corrupt one, or one of another version of this code.
     """
     found = record.manifest(folder)
+    if "arms" not in found:
+        raise InputError(f"run = {folder} is not of a sweep: give the folder of `rps sweep`.")
     try:
         physics: dict[str, Any] = {
             k: tuple(v) if isinstance(v, list) else v for k, v in found["physics"].items()
         }
-        return Plan(
+        plan = Plan(
             domain.from_json(found["domain"]),
             found["worlds"],
             {name: _params(dict(arm)) for name, arm in found["arms"].items()},
@@ -186,30 +186,19 @@ def load_plan(folder: Path) -> Plan:
         )
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise record.corrupt(folder / record.MANIFEST, error) from error
+    # What an older version did not write down would else be what this one does by default.
+    if (now := json.loads(json.dumps(plan.configuration()))) != found:
+        raise InputError(
+            f"run = {folder} was made by another version ({record.difference(found, now)}): use "
+            "that version."
+        )
+    return plan
 
 
 def _params(arm: dict[str, Any]) -> Params:
     name = arm.pop("strategy")
     kinds = {kind.__name__: kind for kind in strategies.STRATEGIES}
     return kinds[errors.check_name("class of parameters", name, kinds)](**arm)
-
-
-@contextlib.contextmanager
-def lock(folder: Path, shard: Shard = Shard()) -> Iterator[None]:
-    """Hold a run folder, or one shard of it, against other processes.
-
-    Raises:
-      InputError: another process holds it.
-    """
-    with open(folder / f".lock-{shard.number}-{shard.of}", "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise InputError(
-                f"out = {folder} is in use by another process: wait for its end, or choose "
-                "another folder."
-            ) from error
-        yield
 
 
 def finished(folder: Path) -> dict[int, Path]:
@@ -294,6 +283,8 @@ def run(
     """Run what is missing of a plan, or of one shard of it, in a folder that `open_run` opened."""
     missing, before = remaining(folder, plan, shard)
     report(Progress(before, 0.0))
+    if missing:
+        record.sign(folder)
 
     def tell(progress: Progress) -> None:
         report(Progress(before + progress.finished, progress.simulated))
@@ -389,8 +380,11 @@ def world_part(plan: Plan, arm: int, index: Any) -> Part:
 def merge(folders: list[Path], out: Path) -> Path:
     """One `results.nc` of all parts in run folders of one plan: (arm, world), and (world) drawn.
 
+    `out` becomes a run folder of that plan, if it is not one of these folders.
+
     Raises:
-      InputError: the folders differ in their plan, or parts are missing.
+      InputError: the folders differ in their plan, or parts are missing; `out` cannot be written,
+        or holds another run.
     """
     manifest = record.manifest(folders[0])
     for other in folders[1:]:
@@ -407,7 +401,7 @@ def merge(folders: list[Path], out: Path) -> Path:
             f"run = {', '.join(map(str, folders))} lacks {len(missing)} of {len(plan.parts)} "
             "parts: run the same command again, or give the folders of all shards."
         )
-    return record.write_bytes(out / "results.nc", _merged(plan, found))
+    return record.write_bytes(open_run(out, plan) / "results.nc", _merged(plan, found))
 
 
 def _merged(plan: Plan, found: dict[int, Path]) -> bytes:
@@ -431,6 +425,8 @@ def _merged(plan: Plan, found: dict[int, Path]) -> bytes:
         for number, source in found.items():
             arm, _ = plan.arm_and_object(number)
             part = record.read(source)
+            if not {"trial", *outcomes} <= set(part):
+                raise record.corrupt(source, "it lacks what this version writes")
             world = part.trial.values % plan.worlds
             for name, variable in outcomes.items():
                 _put(variable, (arm,), world, part[name].values)
@@ -455,28 +451,26 @@ def _put(variable: h5netcdf.Variable, at: tuple[int, ...], world: np.ndarray, va
 def write_report(folder: Path) -> Path:
     """`report.md`, `report.html` and the figure of a run folder with results; returns the first."""
     plan, results = load_plan(folder), record.read_results(folder)
-    environment = json.loads((folder / "environment.json").read_text())
-    picture = figures.success_curves(results, folder / "success.png")
     intro = (
         f"{plan.worlds} worlds, seed {plan.setting.seed}, engine {plan.setting.engine}, "
         f"{1000 * plan.setting.physics.timestep:g} ms steps; every arm meets the same worlds. "
-        "Intervals: Wilson 95 %.\n\n"
-        f"Made by `{' '.join(environment['command'])}`, commit {environment['commit']}, "
-        f"{environment['time']}, on {environment['device']['kind']} with "
-        f"{environment['processors']} processors."
+        f"Intervals: Wilson 95 %.\n\n{record.told(folder)}"
     )
+    rates = analysis.rates(results, float(plan.setting.rules.max_lost))
     failures = (
         "CVaR: mean over the worst 5 % of worlds of the least distance between contact point and "
         "target; of an object that was never touched, the whole way."
     )
+    if lost := int((results.overflows.values > 0).sum()):
+        failures += f" {lost} trials lost contacts for want of room: they are not to be trusted."
     hard = "Worlds in which most arms fail, and most distance is left."
-    sections = [
-        Section("Success", failures, analysis.rates(results, float(plan.setting.rules.max_lost))),
-        Section("Success against what was drawn", "", (), picture),
-        Section("The hardest worlds", hard, analysis.hardest_table(results, str(folder))),
-    ]
+    sections = [Section("Success", failures, rates)]
     if len(plan.arms) > 1:
-        paired = Section("Differences, world by world", "", analysis.differences(results))
-        sections.insert(1, paired)
+        sections.append(Section("Differences, world by world", "", analysis.differences(results)))
+    if analysis.drawn(results):
+        picture = figures.success_curves(results, folder / "success.png")
+        sections.append(Section("Success against what was drawn", "", (), picture))
+    hardest = analysis.hardest_table(results, str(folder))
+    sections.append(Section("The hardest worlds", hard, hardest))
     _write(folder, "Sweep over random worlds", intro, sections)
     return folder / "report.md"

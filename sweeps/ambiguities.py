@@ -46,8 +46,7 @@ def main(options: Options) -> None:
         names = tuple(dict.fromkeys([ambiguity.DEFAULT, *names]))
     strategies = paper.STRATEGIES if options.gazebo else ("rps",)
     grid = study.Grid(strategies=strategies, targets=options.targets())
-    out = options.open()
-    with progress_bar(len(names) * grid.size) as report:
+    with options.opened() as out, progress_bar(len(names) * grid.size) as report:
         results = study.run(
             {name: known[name] for name in names}, grid, out, **options.shape(), report=report
         )

@@ -58,12 +58,17 @@ def main(options: Options) -> None:
         errors.check_count("worlds", worlds, at_most=10_000_000)
     errors.check_count("mujocos", options.mujocos, at_most=10_000_000)
     errors.check_count("at_once", options.at_once, at_most=1024)
+    wanted = _wanted(options)
+    if not any(wanted):
+        raise errors.InputError(
+            f"names = {options.names} with worlds = {options.worlds} leave nothing to time: MJX "
+            f"and MJX-Warp are timed up to --mujocos {options.mujocos} worlds."
+        )
     record.writable(options.out)
     speeds, text = [], ""
     where = benchmark.machine()
     if options.refill:
         where += _refilling(options.refill, options.rounds)
-    wanted = _wanted(options)
     for speed in tqdm(
         _measured(wanted, options.at_once), total=sum(map(len, wanted)), unit="measurement"
     ):

@@ -34,8 +34,7 @@ def main(options: Options) -> None:
         engines.check(known[errors.check_name("condition", name, known)].setting.engine)
     names = tuple(dict.fromkeys([fidelity.REFERENCE, *options.conditions]))
     grid = study.Grid(strategies=paper.STRATEGIES, targets=options.targets())
-    out = options.open()
-    with progress_bar(len(names) * grid.size) as report:
+    with options.opened() as out, progress_bar(len(names) * grid.size) as report:
         results = fidelity.run(names, grid, out, **options.shape(), report=report)
     record.write_results(out / "results.nc", results)
     text = score.markdown(fidelity.table(results))

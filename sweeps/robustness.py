@@ -70,9 +70,10 @@ def main(options: Options) -> None:
     found = {}
     for name, plan in plans.items():
         folder = robustness.open_run(options.out / name.replace(", ", "_"), plan)
-        with robustness.lock(folder), progress_bar(plan.trials, name) as report:
-            robustness.run(folder, plan, report=report, **shape)
-        robustness.merge([folder], folder)
+        with record.hold(folder):
+            with progress_bar(plan.trials, name) as report:
+                robustness.run(folder, plan, report=report, **shape)
+            robustness.merge([folder], folder)
         found[name] = record.read_results(folder).isel(arm=0)
     text = score.markdown(analysis.agreement(found))
     record.write_text(options.out / "engines.md", text + "\n")

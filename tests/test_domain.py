@@ -255,3 +255,15 @@ def test_a_domain_survives_json():
         domain.from_json({"masss": [1, 2]})
     with pytest.raises(InputError, match="write low and high"):
         domain.from_json({"mass": 3})
+    assert domain.from_json({"mass": [3, 10]}).mass == Range(3, 10, log=True)  # as it is in `wide`
+    assert domain.from_json({"mass": [3, 10, False]}).mass == Range(3, 10)
+
+
+def test_what_a_domain_does_not_draw_is_known_and_not_told_as_drawn():
+    assert not DOMAINS["wide"].idle
+    assert {"mass", "com_offset", "friction_robot", "bearing", "noise"} < DOMAINS["paper"].idle
+    assert not {"gap", "yaw", "pose_noise"} & DOMAINS["paper"].idle
+    ideal = dataclasses.replace(DOMAINS["wide"], objects=("random_box",), skin="ideal")
+    assert ideal.idle == {"noise", "gain_spread", "dead_share"}
+    table = domain.table(domain.draw(ideal, 0, np.arange(9)))
+    assert {name for name, (values, _) in table.items() if not values.any()} == ideal.idle

@@ -18,6 +18,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from rps_jax import engines, frames, scene, sweep, trial
+from rps_jax.law import RPSParams
 from rps_jax.physics import Physics, preset
 from rps_jax.reference import Batch
 from rps_jax.scene import FRICTION, OBJECTS, Friction, mjx
@@ -429,3 +430,21 @@ def test_on_the_pyramid_an_object_slides_farther_along_the_diagonal_by_the_root_
     thrown = [still._replace(thrown=(*polar(0.5, degrees), 0.0)) for degrees in (0, 45)]
     ahead, diagonal = in_c(thrown, preset("paper_gazebo"))
     assert diagonal.way / ahead.way == pytest.approx(math.sqrt(2), rel=0.03)
+
+
+def test_a_world_that_runs_away_in_c_mujoco_ends_diverged_and_prints_nothing(
+    capfd, tmp_path, monkeypatch
+):
+    """MuJoCo by itself would put it back to its start and go on."""
+    monkeypatch.chdir(tmp_path)
+    params = RPSParams.paper()._replace(v_approach=1e11)
+    setting = Setting(STANDARD, Rules(horizon=0.1), engine="mujoco")
+    outcome, _ = sweep.run([Case("box", FRICTION["S1"], (2.0, 0.0), params)], setting)
+    assert outcome.diverged.all()
+    assert not outcome.success.any()
+    assert capfd.readouterr() == ("", "")
+    assert not list(tmp_path.iterdir())  # no log
+    batch = Batch([scene.load("box").physics], np.zeros((1, 10)), threads=1)
+    batch.drive(np.arange(1), np.array([[np.nan, 0.0, 0.0]]), 2)
+    assert np.isnan(batch.qpos).all()
+    batch.close()

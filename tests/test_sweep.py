@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import jax
@@ -325,6 +326,29 @@ def test_a_corrupt_part_is_set_aside_and_done_again_alone(whole, tmp_path):
     assert payload(folder) == payload(whole)
 
 
+def test_a_part_of_an_older_version_is_named(whole, tmp_path):
+    folder = shutil.copytree(whole, tmp_path / "run")
+    victim = sorted(folder.glob("parts/*.nc"))[0]
+    older = record.encoded(record.read(victim).drop_vars("overflows"))
+    victim.unlink()
+    kept = robustness.store(folder, 0, older)
+    with pytest.raises(InputError, match=f"{kept.name} is corrupt .it lacks what this version"):
+        robustness.merge([folder], folder)
+
+
+def test_the_report_of_one_world_tells_what_was_lost_and_how_to_see_it(whole, tmp_path):
+    folder = shutil.copytree(whole, tmp_path / "a run")
+    robustness.merge([folder], folder)
+    one = record.read_results(folder).isel(world=[0])
+    one.success[:], one.overflows[:] = [[1], [0]], [[0], [3]]
+    record.write_results(folder / "results.nc", one)
+    text = robustness.write_report(folder).read_text()
+    assert "1 trials lost contacts for want of room: they are not to be trusted" in text
+    assert f"`rps replay '{folder}' 0 --arm nps --video`" in text  # the arm that fails
+    assert not (folder / "success.png").exists()  # nothing was drawn but once
+    assert analysis.influences(one, "rps")[1:] == []
+
+
 def test_shards_merge_to_the_whole(whole, tmp_path):
     folders = [swept(tmp_path / f"{k}", shard=Shard(k, 3)) for k in (1, 2, 3)]
     with pytest.raises(InputError, match="lacks 2 of 6 parts"):
@@ -347,11 +371,60 @@ def test_another_configuration_is_refused_with_what_differs(whole):
 
 
 def test_two_processes_may_not_share_a_run_but_may_share_its_shards(tmp_path):
-    with robustness.lock(tmp_path), pytest.raises(InputError, match="in use by another process"):  # noqa: SIM117
-        with robustness.lock(tmp_path):
-            pass
-    with robustness.lock(tmp_path, Shard(1, 2)), robustness.lock(tmp_path, Shard(2, 2)):
+    def refused(number, of):
+        with pytest.raises(InputError, match="in use by another process"):
+            record.hold(tmp_path, number, of).__enter__()
+
+    with record.hold(tmp_path):
+        refused(1, 1)
+        refused(1, 2)
+    with record.hold(tmp_path, 1, 2):
+        with record.hold(tmp_path, 2, 2):
+            refused(1, 2)
+        refused(1, 1)
+        refused(2, 3)  # which has parts of both
+    with record.hold(tmp_path, 1, 3):
         pass
+
+
+def claims(folder, wanted, results):
+    try:
+        record.claim(Path(folder), wanted)
+        record.sign(Path(folder), {"time": "now", "pid": os.getpid()})
+        results.put(wanted)
+    except InputError as error:
+        results.put(str(error))
+
+
+def test_of_processes_that_begin_a_run_at_once_all_agree_or_are_refused(tmp_path):
+    context = multiprocessing.get_context("forkserver")
+    results = context.Queue()
+    wanted = [{"worlds": i % 2} for i in range(6)]
+    processes = [context.Process(target=claims, args=(tmp_path, w, results)) for w in wanted]
+    for process in processes:
+        process.start()
+    told = [results.get(timeout=60) for _ in processes]
+    for process in processes:
+        process.join()
+    kept = record.manifest(tmp_path)
+    assert sorted(t == kept for t in told) == [False] * 3 + [True] * 3
+    assert all("holds another run" in t for t in told if t != kept)
+    signed = record.signed(tmp_path)
+    assert len({signed["pid"], *(one["pid"] for one in signed["before"])}) == 3
+
+
+def test_what_a_run_was_made_on_before_is_not_forgotten(tmp_path):
+    this = record.environment()
+    there = this | {"commit": "abc", "device": this["device"] | {"kind": "H200"}, "time": "then"}
+    record.sign(tmp_path, there)
+    record.sign(tmp_path, this)
+    record.sign(tmp_path, this | {"time": "later"})  # the same command again
+    assert record.signed(tmp_path) == this | {"time": "later", "before": [there]}
+    text = record.told(tmp_path)
+    assert text.index("later") < text.index("before that by") < text.index("commit abc, then, on H")
+    (tmp_path / record.ENVIRONMENT).write_text("{}")
+    with pytest.raises(InputError, match=r"environment\.json is corrupt"):
+        record.told(tmp_path)
 
 
 def test_what_a_sweep_says_is_what_happened():
@@ -403,6 +476,9 @@ def test_what_success_depends_on_stands_first():
     assert mass[2].startswith("0.0 % [0.0, ")
     assert mass[4].startswith("100.0 %")
     assert float(mass[5]) < 1e-10
+    constant = results.assign(yaw=("world", np.full(400, 0.1, np.float32), {"units": "rad"}))
+    assert np.nanstd(constant.yaw.values) > 0  # by rounding
+    assert analysis.drawn(constant) == ["mass", "friction_ground"]
     assert friction[0] == "friction object-ground"
     assert float(friction[5]) > 0.5
 
@@ -424,8 +500,14 @@ def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys, monkeypatc
     assert "rps tuned against rps paper" in text
     results = record.read_results(Path(run))
     assert results.arm.values.tolist() == ["rps paper", "rps tuned"]
-    for name in ("report.html", "report.md", "success.png"):
-        assert (tmp_path / "run" / name).exists()
+    assert cli.main(["merge", run, "--out", str(tmp_path / "there")]) == 0
+    for folder, name in product(("run", "there"), ("report.html", "report.md", "success.png")):
+        assert (tmp_path / folder / name).exists()
+    assert robustness.load_plan(tmp_path / "there") == robustness.load_plan(Path(run))
+    other = robustness.open_run(tmp_path / "other", PLAN)
+    assert cli.main(["merge", run, "--out", str(other)]) == 2
+    assert "other holds another run (domain.objects = " in capsys.readouterr().err
+    assert not (other / "results.nc").exists()
     assert cli.main(["replay", run, "4", "--arm", "rps tuned"]) == 0
     seen = record.read(Path(run) / "replay-4" / "results.nc")
     # Followed alone, in another batch than in the sweep.
