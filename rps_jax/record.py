@@ -264,7 +264,7 @@ def sign(folder: Path, signed: Mapping[str, Any] | None = None) -> None:
             old = _noted(folder, ENVIRONMENT)
             earlier = [*old.pop("before", []), old]
         earlier = [*new.pop("before", []), *earlier]
-        others = [one for one in earlier if _made_by(one) != _made_by(new)]
+        others = [one for one in earlier if not _same(one, new)]
         write_json(folder / ENVIRONMENT, new | ({"before": others} if others else {}))
 
 
@@ -277,9 +277,11 @@ def signed(folder: Path) -> dict[str, Any]:
     return _noted(folder, ENVIRONMENT)
 
 
-def _made_by(environment: Mapping[str, Any]) -> dict[str, Any]:
-    """What the bits of results depend on, and who asked."""
-    return {k: v for k, v in environment.items() if k not in ("time", "workers", "before")}
+def _same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether it is one process, whose workers may have become more, or another all like it."""
+    process = all(one.get(name) == other.get(name) for name in ("time", "command"))
+    differ = {name for name in (*one, *other) if one.get(name) != other.get(name)}
+    return process or differ <= {"time", "workers", "before"}
 
 
 def told(folder: Path) -> str:
