@@ -159,6 +159,7 @@ class StudyOptions(Spread):
         from rps_jax import record
 
         self.shape()
+        choose_device("auto")
         record.writable(self.out)
         use_cache()
         with record.hold(self.out):
@@ -190,7 +191,8 @@ class Paper(StudyOptions):
     """Reproduce all of the paper into one run folder, with report.md and report.html."""
 
     out: Path = Path("runs/paper")
-    """Run folder; a run that was killed is continued there."""
+    """Run folder; a run that was killed is continued there. Another than the default with --quick,
+    if both are wanted."""
     quick: bool = False
     """Table II in full; of everything else a few conditions, RPS alone, four of 24 targets."""
 
@@ -685,6 +687,7 @@ def _open(common: Common, command: str) -> Path:
     from rps_jax import record
 
     out = common.out or Path("runs") / f"{command}-{time.strftime('%Y%m%d-%H%M%S')}"
+    choose_device("auto")
     record.prepare(out, overwrite=common.overwrite)
     use_cache()
     record.write_json(out / "environment.json", record.environment())
@@ -701,7 +704,7 @@ def _write_config(out: Path, common: Common, setting: Setting, params: dict[str,
         "rules": setting.rules._asdict(),
         "skin": _per_world(common)["skin"]._asdict(),
     }
-    record.write_json(out / "config.json", config)
+    record.write_json(out / record.CONFIG, config)
 
 
 @contextlib.contextmanager
@@ -871,11 +874,13 @@ def _hardware(options: Hardware) -> None:
 
 
 def _paper(options: Paper) -> None:
-    from rps_jax import reproduce
+    from rps_jax import record, reproduce
 
     plan = reproduce.Plan.quick() if options.quick else reproduce.Plan()
-    with options.opened() as out, progress_bar(plan.trials()) as report:
-        path = reproduce.run(out, plan, report=report, **options.shape())
+    with options.opened() as out:
+        record.claim(out, dataclasses.asdict(plan))
+        with progress_bar(plan.trials()) as report:
+            path = reproduce.run(out, plan, report=report, **options.shape())
     print(f"report: {path}")
 
 
@@ -926,7 +931,7 @@ def _arms(options: Sweep) -> dict[str, Params]:
     from rps_jax.law import RPSParams
 
     _each_once("strategies", options.strategies)
-    labels = _labels("params", options.params)
+    labels = labels_of("params", options.params)
     sets = {at: _of_the_law(name) for at, name in zip(labels, options.params, strict=True)}
     arms: dict[str, Params] = {}
     for name, changes in sets.items():
@@ -940,7 +945,7 @@ def _arms(options: Sweep) -> dict[str, Params]:
     return arms
 
 
-def _labels(field: str, names: Sequence[str]) -> list[str]:
+def labels_of(field: str, names: Sequence[str]) -> list[str]:
     """Short names of what files hold: each file's own, after its folder's where two are alike.
 
     Raises:
@@ -1134,10 +1139,10 @@ def _tune_compare(options: TuneCompare) -> None:
         seed=tune.seed_of(options.seed, "test"),
         engine=options.engine,  # pyright: ignore[reportArgumentType]
     )
-    labels = _labels("params", options.params)
+    labels = labels_of("params", options.params)
     arms = {at: params_of(name) for at, name in zip(labels, options.params, strict=True)}
     plans = {}
-    for at, text in zip(_labels("domain", options.domain), options.domain, strict=True):
+    for at, text in zip(labels_of("domain", options.domain), options.domain, strict=True):
         one = domain_of(text)
         count = one.combinations if one.targets else options.worlds
         plans[at] = Plan(one, count, arms, setting, part=4096)
@@ -1262,7 +1267,7 @@ def _tell_tuned(out: Path, names: Sequence[str]) -> None:
         f"compile {total['compile']:.1f} s, run {total['run']:.1f} s, gradients "
         f"{total['differentiate']:.1f} s with their compilation, "
         f"{total['simulated']:.3g} s simulated\n"
-        f"parameters: {out / 'tuned.json'}, for --params of rps sweep\n"
+        f"parameters: {out / 'tuned.json'}, for --params of rps tune compare and rps sweep\n"
         f"run folder: {out}"
     )
 
@@ -1455,4 +1460,5 @@ def _push_in_world(plan: Plan, arm: str, index: int) -> view.Push:
 def _doctor(_: Doctor) -> None:
     from rps_jax import doctor
 
+    choose_device("auto")
     print(doctor.report(cache_folder()))

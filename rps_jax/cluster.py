@@ -192,6 +192,7 @@ def run(
     lacking = set(itertools.chain.from_iterable(waiting))
     claim = {"num_cpus": workers or 1, "num_gpus": int(gpus)}
     own, known = record.environment(), {}
+    record.sign(folder, own)
     began, stepped, simulated = time.perf_counter(), None, 0.0
     given = (_same(own), prepare, slots)
     with connected(address) as ray, _started(ray, plan, waiting, claim, given) as (board, tasks):

@@ -170,23 +170,49 @@ Point = tuple[Any, Any]
 def meetings(
     body: Body, state: State, m: Sequence[Vec], turn: Point
 ) -> tuple[Any, Point, Point, Any]:
-    """Heights, normals, points and distances [m] of the contacts (C, ...), in the base's frame."""
+    """Heights, normals, points and distances [m] of the contacts (C, ...), in the base's frame.
+
+    At the upper and lower edge of the base; where the object leans away, at its own lower edge.
+    """
     c, s = turn
     up = sp.to_world(m, body.up)
     slope = (up[0] / up[2], up[1] / up[2])
     slope = (c * slope[0] + s * slope[1], -s * slope[0] + c * slope[1])
     low, high = body.base_z[0], jnp.minimum(body.base_z[1], 0.98 * body.height)
+    feet = body.vertices.at if isinstance(body.vertices, Corners) else body.vertices
+
+    def seen(point: Vec) -> Vec:
+        """A point of the object in the base's frame, its height as in the world."""
+        x, y, h = sp.sub(sp.add(sp.to_world(m, point), state.p), (*state.base[:2], 0.0))
+        return c * x + s * y, -s * x + c * y, h
 
     def outline(foot: Vec, z: Any) -> Point:
         """Points of the lower face, moved up along the edges to the height z."""
-        x, y, h = sp.sub(sp.add(sp.to_world(m, foot), state.p), (*state.base[:2], 0.0))
+        x, y, h = seen(foot)
         rise = z - h
-        return c * x + s * y + slope[0] * rise, -s * x + c * y + slope[1] * rise
+        return x + slope[0] * rise, y + slope[1] * rise
+
+    def on_object(z: Any, normal: Point, surface: Point, distance: Any) -> tuple[Any, Any]:
+        """Heights and distances, those below the object's lower face moved up its side to there."""
+        middle, face = seen((0.0, 0.0, 0.0)), sp.dot(body.up, feet)
+        face = jnp.max(face, axis=0) if isinstance(body.vertices, Corners) else face
+        away = (surface[0] - middle[0], surface[1] - middle[1])
+        above = up[2] * (sp.dot(slope, away) + z - middle[2]) - face
+        rise = jnp.clip(-above * up[2], 0.0, high - z)
+        return z + rise, distance + sp.dot(slope, normal) * rise
 
     if not isinstance(body.vertices, Corners):
         z = jnp.where(_index(2, body.radius) == 0, low, high)
         centre = outline(body.vertices, z)
-        return z, *circle_and_rectangle(centre, body.radius, body.base_half)
+        normal, point, distance = circle_and_rectangle(centre, body.radius, body.base_half)
+        # Level with the ground a leaning cylinder is an ellipse: so much wider along the normal.
+        lean = sp.dot(slope, normal)
+        wider = body.radius * (jnp.sqrt(1 + lean * lean) - 1)
+        point = (point[0] - 0.5 * wider * normal[0], point[1] - 0.5 * wider * normal[1])
+        distance = distance - wider
+        surface = (point[0] + 0.5 * distance * normal[0], point[1] + 0.5 * distance * normal[1])
+        z, distance = on_object(z, normal, surface, distance)
+        return z, normal, point, distance
     middle = 0.5 * (low + high)
     here, ahead = (outline(foot, middle) for foot in (body.vertices.at, body.vertices.ahead))
     normal, points, distances = polygon_and_rectangle(here, ahead, body.base_half)
@@ -194,7 +220,11 @@ def meetings(
     first = i % 2 == 0
     z = jnp.where(i < 2, low, high)
     point = tuple(jnp.where(first, a, b) for a, b in zip(*points, strict=True))
-    distance = jnp.where(first, *distances) + sp.dot(slope, normal) * (z - middle)
+    apart = jnp.where(first, *distances)
+    distance = apart + sp.dot(slope, normal) * (z - middle)
+    half = distance - 0.5 * apart  # from the point, which is midway at the middle height
+    surface = (point[0] + half * normal[0], point[1] + half * normal[1])
+    z, distance = on_object(z, normal, surface, distance)
     return z, normal, point, distance  # type: ignore[return-value]
 
 

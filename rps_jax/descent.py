@@ -41,7 +41,8 @@ class Descent:
     estimator: str = "reverse"
     """reverse, windows through the quasi-static model; forward, windows through the fused engine;
     evolution, antithetic steps in whole trials of the course's engine; combined, reverse and
-    evolution by their variances, of which that of the windows is mostly much the smaller."""
+    evolution by their variances, as if they were independent; that of the windows is mostly much
+    the smaller."""
     optimiser: str = "adam"
     """An optimiser of optax, by name."""
     learning_rate: float = 0.1
@@ -75,10 +76,6 @@ class Descent:
     def __post_init__(self) -> None:
         """Raises InputError for unknown names or numbers that mean nothing."""
         errors.check_name("estimator", self.estimator, ESTIMATORS)
-        if not callable(getattr(optax, self.optimiser, None)):
-            raise errors.InputError(
-                f"optimiser = {self.optimiser} is not allowed: name one of optax, as adam or sgd."
-            )
         for name in ("learning_rate", "clip", "world_clip", "window", "arrive", "sigma"):
             errors.check_finite(name, getattr(self, name), above=0)
         for name in ("steps", "starts", "pairs"):
@@ -86,6 +83,13 @@ class Descent:
         for name in ("within", "budget"):
             errors.check_finite(name, getattr(self, name), at_least=0, unit="s")
         errors.check_finite("spread", self.spread, at_least=0, at_most=10)
+        try:  # as `descend` will
+            jax.eval_shape(lambda x: self.rule().update(x, self.rule().init(x), x), jnp.zeros(1))
+        except (AttributeError, TypeError, ValueError) as error:
+            raise errors.InputError(
+                f"optimiser = {self.optimiser} is not allowed: name one of optax that needs "
+                "gradients alone, as adam or sgd."
+            ) from error
         errors.check_finite("seed", self.seed, at_least=0, at_most=2**30)
 
     def rule(self) -> optax.GradientTransformation:

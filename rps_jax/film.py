@@ -172,7 +172,9 @@ def _frames(
     every = max(1, round(speed / (fps * period)))
     running = [_shots(take, setting, every) for take in takes]
     shots: list[Shot] = []
-    for count in range(math.floor(seconds / (every * period)) + 1):
+    # One more where they run to their ends, which are seen a step later.
+    whole = seconds >= float(setting.rules.horizon)
+    for count in range(math.floor(seconds / (every * period)) + 1 + whole):
         ended, of_takes = zip(*map(next, running), strict=True)
         shots = _placed(of_takes, takes)
         yield shots

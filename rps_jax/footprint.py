@@ -86,7 +86,8 @@ def signed_distance(footprint: Footprint, point: jax.Array) -> jax.Array:
         t = jnp.clip((x * along[i, 0] + y * along[i, 1]) / length2[i], 0.0, 1.0)
         away = jnp.stack([x - t * along[i, 0], y - t * along[i, 1]], axis=-1)
         nearest = jnp.minimum(nearest, frames.norm(away))
-        inside &= along[i, 0] * y - along[i, 1] * x > 0
+        repeated = (along[i, 0] == 0) & (along[i, 1] == 0)
+        inside &= repeated | (along[i, 0] * y - along[i, 1] * x > 0)
     if footprint.vertices.shape[0] < 3:  # a point or a segment encloses nothing
         return nearest - footprint.radius
     return jnp.where(inside, -nearest, nearest) - footprint.radius

@@ -109,6 +109,8 @@ class Live:
             )
             some -= int(kept[0].done[:some].sum())  # it ended before these
             self.past += [Moment(self._worlds, *rows(kept, i)) for i in range(some)]
+            # Done: an ended trial's clock stands, and would meet the moment of the shove again.
+            self._worlds = self._worlds._replace(shift=self._first.shift)
             count -= CHUNK
 
     def rewind(self, index: int) -> None:

@@ -21,7 +21,8 @@ import xarray as xr
 
 from rps_jax.errors import InputError
 
-MANIFEST = "manifest.json"
+MANIFEST = "manifest.json"  # of a run that can be continued
+CONFIG = "config.json"  # of one that cannot
 ENVIRONMENT = "environment.json"
 _PACKAGES = (
     *("rps_jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "warp-lang"),
@@ -35,7 +36,11 @@ def prepare(folder: Path, *, overwrite: bool = False) -> Path:
     Raises:
       InputError: it cannot be written, or holds a run already and `overwrite` is off.
     """
-    if (folder / "config.json").exists() and not overwrite:
+    if (folder / MANIFEST).exists():
+        raise InputError(
+            f"out = {folder} holds a run that can be continued: choose another folder."
+        )
+    if (folder / CONFIG).exists() and not overwrite:
         raise InputError(
             f"out = {folder} already holds a run: choose another folder or pass --overwrite."
         )
@@ -66,6 +71,8 @@ def claim(folder: Path, wanted: dict[str, Any]) -> Path:
       InputError: it cannot be written, or holds a run of another configuration.
     """
     writable(folder)
+    if (folder / CONFIG).exists():
+        raise InputError(f"out = {folder} holds another run: choose another folder.")
     wanted = json.loads(json.dumps(wanted))
     with _alone(folder):
         if not (folder / MANIFEST).exists():

@@ -116,7 +116,8 @@ def table(results: xr.Dataset) -> list[list[str]]:
     """Header and rows of Table II: successes with Wilson 95 % intervals in percent, and the
     paper's beside them."""
     trials = results.sizes["target"]
-    whole = trials == len(paper.TARGETS)
+    targets = np.stack([results.target_x, results.target_y], axis=-1)
+    whole = np.array_equal(targets, paper.TARGETS)
     columns = [(str(o), str(f)) for o in results.object.values for f in results.friction.values]
     rows = [["", "", *(f"{o} {f}" for o, f in columns), "all"]]
     for strategy in map(str, results.strategy.values):

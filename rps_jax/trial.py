@@ -42,7 +42,7 @@ class Rules(NamedTuple):
         """Raises InputError for times that are not positive and finite, or no tilt."""
         errors.check_finite("horizon", self.horizon, above=0, at_most=1e5, unit="s")
         errors.check_finite("max_lost", self.max_lost, at_least=0, unit="s")
-        errors.check_finite("max_tilt", self.max_tilt, above=0, at_most=math.pi, unit="rad")
+        errors.check_finite("max_tilt", self.max_tilt, above=0, at_most=1.4, unit="rad")
 
 
 class Shift(NamedTuple):
@@ -378,7 +378,7 @@ def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
     sane = (
         jnp.all(jnp.isfinite(qpos))
         & jnp.all(jnp.abs(qvel) < _MAX_SPEED)
-        & jnp.all(jnp.abs(qpos) < _MAX_DISTANCE)
+        & jnp.all(jnp.abs(qpos.at[2].set(0.0)) < _MAX_DISTANCE)  # but for the turns of the base
     )
     if overflowed is not None:
         told = told._replace(overflows=told.overflows + (overflowed & ~told.done))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import json
 import math
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -181,7 +182,10 @@ SPLITS = ("tune", "validate", "test")
 
 
 def seed_of(seed: int, split: str) -> int:
-    """The seed of the worlds of one split: no two splits of any seeds share a world."""
+    """The seed of the worlds of one split: no two splits of any seeds share a world.
+
+    Of a domain that draws little, as `paper`, the worlds hardly depend on the seed.
+    """
     return len(SPLITS) * seed + SPLITS.index(errors.check_name("split", split, SPLITS))
 
 
@@ -322,6 +326,10 @@ class Evolution:
         """Raises InputError for an unknown strategy or counts that mean nothing."""
         errors.check_name("strategy", self.strategy, STRATEGIES)
         errors.check_finite("population", self.population, at_least=4, at_most=1e5)
+        if self.strategy == "PGPE" and self.population % 2:
+            raise errors.InputError(
+                f"population = {self.population} is not allowed for PGPE: its candidates are pairs."
+            )
         errors.check_finite("generations", self.generations, at_least=1, at_most=1e6)
         errors.check_finite("spread", self.spread, above=0, at_most=10)
         errors.check_finite("prior", self.prior, at_least=0)
@@ -537,9 +545,12 @@ def finite(value: Any) -> float | None:
 
 
 def named(space: Space, vector: jax.Array) -> dict[str, float]:
-    """The tuned parameters of a vector (p,), by name."""
-    params = space.params(vector)
-    return {name: float(f"{float(getattr(params, name)):.7g}") for name in space.names}
+    """The tuned parameters of a vector (p,) by name, and the others that are not the paper's."""
+    found, usual = (
+        {name: float(f"{float(value):.7g}") for name, value in params._asdict().items()}
+        for params in (space.params(vector), RPSParams.paper())
+    )
+    return {n: x for n, x in found.items() if n in space.names or x != usual[n]}
 
 
 def save(folder: Path, search: Any, log: list[dict[str, Any]]) -> None:
@@ -572,7 +583,7 @@ def resume(folder: Path, search: Any, done: str) -> tuple[Any, list[dict[str, An
             leaves = [jnp.asarray(file[name]) for name in sorted(file.files)]
         search = jax.tree.unflatten(jax.tree.structure(search), leaves)
         return search, read_log(folder)[: int(getattr(search, done))]
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise errors.InputError(
             f"{folder} holds a corrupt run ({error}): restore it, or choose another folder."
         ) from error

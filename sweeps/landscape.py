@@ -15,7 +15,7 @@ from typing import Any
 import tyro
 
 from rps_jax import errors, figures, landscape, record, score
-from rps_jax.cli import Spread, domain_of, guarded, params_of, progress_bar, use_cache
+from rps_jax.cli import Spread, domain_of, guarded, labels_of, params_of, progress_bar, use_cache
 from rps_jax.tune import SUBSETS, Course
 
 
@@ -46,7 +46,8 @@ def main(options: Options) -> None:
     for name in ("worlds", "values", "candidates"):
         errors.check_finite(name, getattr(options, name), at_least=2, at_most=1e6)
     errors.check_finite("spread", options.spread, at_least=0, at_most=10)
-    sets = {Path(name).stem: params_of(name) for name in options.params}
+    labels = labels_of("params", options.params)
+    sets = {label: params_of(name) for label, name in zip(labels, options.params, strict=True)}
     course = Course(tuple(domain_of(text) for text in options.domain))
     out = record.writable(options.out)
     use_cache()

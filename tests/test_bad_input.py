@@ -18,6 +18,7 @@ from rps_jax.slots import Setting
 
 # What is asked for, and what the answer says of it.
 TABLE = {
+    "--out run": "out = run holds a run that can be continued: choose another folder",
     "--objects bx": "unknown object 'bx': choose from box, cylinder, .*did you mean 'box'",
     "--objects": r"objects = \(\) is not allowed: name each once, at least one",
     "--objects box box": r"objects = .* is not allowed: name each once",
@@ -177,6 +178,7 @@ SWEEP = {
     "--out file": "out = file cannot be written",
     "--out /dev/null/x": "out = /dev/null/x cannot be written",
     "--out run": "out = run holds another run .domain.objects = .* choose another folder",
+    "--out done": "out = done holds another run: choose another folder",
     "--out cut": "cut/manifest.json is corrupt .*: restore it, or choose another folder",
     "--out bytes": "bytes/manifest.json is corrupt",
     "--out empty": "empty/manifest.json is corrupt .it holds no names",
@@ -257,6 +259,7 @@ TUNE = {
     "es --start lost.json": "lost.json cannot be read",
     "es --start L.json": "L = -1.0 is not allowed: it must be a number and above 0",
     "es --strategy CMA": "unknown strategy 'CMA': choose from .*CMA_ES",
+    "es --strategy PGPE --population 5": "population = 5 is not allowed for PGPE: .* are pairs",
     "es --population 2": "population = 2 is not allowed: .* at least 4",
     "es --generations 0": "generations = 0 is not allowed",
     "es --spread nan": "spread = nan is not allowed",
@@ -269,6 +272,8 @@ TUNE = {
     "es --out file": "out = file cannot be written",
     "grad --estimator backprop": "unknown estimator 'backprop': choose from reverse",
     "grad --optimiser sgdd": "optimiser = sgdd is not allowed: name one of optax",
+    "grad --optimiser huber_loss": "optimiser = huber_loss is not allowed: name one of optax",
+    "grad --optimiser lbfgs": "optimiser = lbfgs is not allowed: name one of optax",
     "grad --learning-rate 0": "learning_rate = 0.0 is not allowed",
     "grad --window -1": "window = -1.0 is not allowed",
     "grad --starts 0": "starts = 0 is not allowed",

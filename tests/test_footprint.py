@@ -116,6 +116,16 @@ def test_two_vertices_and_a_radius_are_a_stadium():
     np.testing.assert_allclose([low, high], [-0.38, 0.38], atol=1e-6)  # 6-8-10 at each end
 
 
+def test_a_repeated_corner_changes_no_distance():
+    """As those by which prisms are filled up to one number of corners."""
+    square = jnp.array([[0.2, -0.2], [0.2, 0.2], [-0.2, 0.2], [-0.2, -0.2]])
+    filled = jnp.concatenate([square, jnp.tile(square[-1], (4, 1))])
+    points = jnp.array([[0.0, 0.0], [0.19, 0.0], [0.3, 0.1], [-0.25, -0.25]])
+    found = [fp.signed_distance(Footprint(v, jnp.array(0.0)), points) for v in (square, filled)]
+    np.testing.assert_allclose(found[0], [-0.2, -0.01, 0.1, 0.05 * 2**0.5], atol=1e-6)
+    np.testing.assert_array_equal(*found)
+
+
 def test_place_turns_and_then_moves():
     placed = fp.place(fp.rectangle(0.3, 0.2), jnp.array([1.0, 2.0]), jnp.float32(math.pi / 2))
     expected = [[0.8, 2.3], [0.8, 1.7], [1.2, 1.7], [1.2, 2.3]]

@@ -170,3 +170,32 @@ def test_a_contacts_force_and_stiffness_are_derivatives_of_its_cost(cone):
         np.testing.assert_allclose(full, jax.hessian(cost)(x), rtol=1e-3, atol=2e-3)
         zones.add((bool(force[0] == 0), bool(np.linalg.matrix_rank(full) == 3)))
     assert len(zones) > 1
+
+
+@pytest.mark.parametrize("name", ["box", "cylinder"])
+@pytest.mark.parametrize("degrees", [0, 5, 10, 20, 40])
+def test_an_object_that_leans_away_is_touched_where_it_is(name, degrees):
+    """Its rear lower edge 5 mm before the base, at any lean; below that edge there is nothing."""
+    loaded = scene.load(name)
+    size = loaded.physics.geom("object").size
+    half, tall = (size[0], size[2]) if name == "box" else (size[0], size[1])
+    lean = np.radians(degrees)
+    c, s = np.cos(lean), np.sin(lean)
+    front = loaded.physics.geom("base").size[0]
+    x, z = front + 0.005 + tall * s + half * c, tall * c + half * s  # on its front lower edge
+    qpos = np.array([0, 0, 0, x, 0, z, np.cos(lean / 2), 0, np.sin(lean / 2), 0])
+    data = mujoco.MjData(loaded.physics)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(loaded.physics, data)
+    base, thing = (loaded.physics.geom(g).id for g in ("base", "object"))
+    true = mujoco.mj_geomDistance(loaded.physics, data, base, thing, 1.0, None)
+    body = fused.body(loaded.physics, np.asarray(loaded.footprint.vertices))
+    body = jax.tree.map(lambda leaf: jnp.asarray(leaf, float)[None], body)
+    still = jnp.zeros((1, 9))
+    state = fused.enter(body, jnp.asarray(qpos, float)[None], still, still)
+    ahead = jnp.ones(1), jnp.zeros(1)
+    found = contacts.meetings(fused.spread(body), state, spatial.matrix(state.q), ahead)
+    heights, _, _, distances = (np.asarray(x) for x in found)
+    corner = z - tall * c + half * s
+    assert heights.min() >= max(0.06, corner) - 1e-5
+    assert distances.min() == pytest.approx(true, abs=5e-4)

@@ -78,6 +78,14 @@ def test_a_gpu_that_seldom_asks_who_still_runs_finds_the_same(monkeypatch):
     chex.assert_trees_all_close(seldom, run("cpu"), atol=1e-6)
 
 
+def test_a_base_may_turn_as_often_as_it_likes_and_not_go_as_far():
+    _, worlds = sweep.build([case()], FUSED)
+    now = trial.start(jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], worlds))
+    for i, value, diverges in ((2, 500.0, False), (2, np.nan, True), (0, 101.0, True)):
+        driven = trial.Driven(now.qpos.at[i].set(value), now.qvel, now.warmstart)
+        assert bool(trial.settle(now, now, driven).diverged) == diverges
+
+
 def test_a_shove_happens_once_however_its_time_is_rounded():
     _, worlds = sweep.build([case()], FUSED)
     world = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], worlds)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rps_jax import cli, domain, tune
+from rps_jax import cli, domain, law, tune
 from rps_jax.errors import InputError
 from rps_jax.law import RPSParams
 from rps_jax.physics import preset
@@ -36,6 +36,19 @@ class TestSpace:
     def test_there_and_back(self):
         vectors = self.vectors / 2
         np.testing.assert_allclose(FULL.vector(FULL.params(vectors)), vectors, atol=2e-3)
+
+    def test_what_is_written_is_the_whole_law(self):
+        """Also what is not tuned: of another start, or moved by a bound that is."""
+        paper, tuned = RPSParams.paper(), RPSParams.tuned()
+        narrow = Space(("l_cr",))
+        low = narrow.params(narrow.vector(paper._replace(l_cr=0.12)))
+        written = tune.named(narrow, narrow.vector(low))
+        assert written == pytest.approx({"l_cr": 0.12, "l_mr": 0.12})
+        law.check(paper._replace(**written))
+        other = Space(("eta",), tuned)
+        again = paper._replace(**tune.named(other, other.vector(tuned)))
+        np.testing.assert_allclose(again, tuned, rtol=1e-5)
+        assert set(tune.named(narrow, narrow.vector(paper))) == {"l_cr"}
 
     def test_the_papers_parameters_come_back(self):
         paper = RPSParams.paper()
@@ -234,9 +247,11 @@ class TestRuns:
     def test_a_corrupt_state_is_refused(self, tmp_path, monkeypatch):
         monkeypatch.setattr(tune, "try_out", pretend)
         self.run(tmp_path, 1)
-        (tmp_path / "state.npz").write_bytes(b"no")
-        with pytest.raises(InputError, match="corrupt"):
-            self.run(tmp_path, 2)
+        whole = (tmp_path / "state.npz").read_bytes()
+        for content in (b"no", b"", whole[:100]):
+            (tmp_path / "state.npz").write_bytes(content)
+            with pytest.raises(InputError, match="corrupt"):
+                self.run(tmp_path, 2)
 
 
 class TestInWorlds:

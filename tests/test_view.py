@@ -94,6 +94,22 @@ def test_a_shove_moves_the_object_once_by_what_is_asked_in_the_frame_of_the_robo
     assert math.dist(live.past[-1].seen.qpos[3:5], shoved) < 3e-3
 
 
+def test_a_shove_after_the_end_happens_once_however_often_the_target_is_dragged(live):
+    live.set_target((0.0, 3.0))
+    live.step(150)
+    live.set_target(tuple(p_world_contact(live)))
+    live.step(1)
+    assert live.done
+    live.shove((0.0, 0.02))
+    live.step(1)
+    shoved = live.past[-1].seen.qpos[3:5]
+    for _ in range(3):  # the trial ends again at once, at the same step of its clock
+        live.set_target(tuple(p_world_contact(live)))
+        live.step(1)
+        assert live.done
+    assert math.dist(live.past[-1].seen.qpos[3:5], shoved) < 3e-3
+
+
 def test_going_back_forgets_what_came_after_and_the_same_then_comes_again(live):
     live.step(60)
     last = live.past[-1]
