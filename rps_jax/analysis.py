@@ -171,7 +171,7 @@ def hardest_table(results: xr.Dataset, run: str, count: int = 10) -> list[list[s
                 f"{float(one.mass):.1f} kg",
                 f"{float(one.friction_ground):.2f}, {float(one.friction_robot):.2f}",
                 f"{x[0]:.1f} m at {x[1]:.0f} deg",
-                f"`rps replay {shlex.quote(run)} {int(world)} --arm {shlex.quote(fails)} --video`",
+                f"`rps replay {shlex.quote(run)} {int(world)} --arm {fails!r} --video`",
             ]
         )
     return rows

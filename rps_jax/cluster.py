@@ -184,15 +184,16 @@ def run(
         software; workers died too often. Like every error of a worker, it leaves in the folder
         what came back until then.
     """
+    own, known = record.environment(), {}
     missing, before = robustness.remaining(folder, plan, shard)
+    if missing:
+        record.sign(folder, own)
     report(Progress(before, 0.0))
     if not missing:
         return Timing(0.0, 0.0, 0.0)
     waiting = list(missing.values())
     lacking = set(itertools.chain.from_iterable(waiting))
     claim = {"num_cpus": workers or 1, "num_gpus": int(gpus)}
-    own, known = record.environment(), {}
-    record.sign(folder, own)
     began, stepped, simulated = time.perf_counter(), None, 0.0
     given = (_same(own), prepare, slots)
     with connected(address) as ray, _started(ray, plan, waiting, claim, given) as (board, tasks):

@@ -79,7 +79,7 @@ def _edges(footprint: Footprint) -> tuple[jax.Array, jax.Array, jax.Array]:
 def signed_distance(footprint: Footprint, point: jax.Array) -> jax.Array:
     """Distance (...) [m] of `point` (..., 2) [m] to the outline, negative inside."""
     start, along, length2 = _edges(footprint)
-    nearest, inside = jnp.inf, jnp.ones((), bool)
+    nearest, inside = jnp.inf, ~jnp.all(along == 0)
     # Edge by edge and coordinate by coordinate: GPUs are slow at reducing axes this short.
     for i in range(footprint.vertices.shape[0]):
         x, y = point[..., 0] - start[i, 0], point[..., 1] - start[i, 1]

@@ -139,8 +139,8 @@ def test_a_quick_run_makes_small_only_what_was_not_asked_for():
 
 def test_files_of_the_same_name_are_told_apart_by_their_folders():
     runs = ("paper", "runs/es/tuned.json", "runs/grad/tuned.json")
-    assert cli._labels("params", runs) == ["paper", "es/tuned", "grad/tuned"]
-    assert cli._labels("params", runs[:2]) == ["paper", "tuned"]
+    assert cli.labels_of("params", runs) == ["paper", "es/tuned", "grad/tuned"]
+    assert cli.labels_of("params", runs[:2]) == ["paper", "tuned"]
     for bad in ((), ("paper", "paper"), ("a/es/tuned.json", "b/es/tuned.json")):
         with pytest.raises(InputError, match="name each once"):
-            cli._labels("params", bad)
+            cli.labels_of("params", bad)

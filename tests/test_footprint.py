@@ -124,6 +124,10 @@ def test_a_repeated_corner_changes_no_distance():
     found = [fp.signed_distance(Footprint(v, jnp.array(0.0)), points) for v in (square, filled)]
     np.testing.assert_allclose(found[0], [-0.2, -0.01, 0.1, 0.05 * 2**0.5], atol=1e-6)
     np.testing.assert_array_equal(*found)
+    point = Footprint(jnp.zeros((4, 2)), jnp.array(0.1))  # a circle, filled up likewise
+    np.testing.assert_allclose(
+        fp.signed_distance(point, points), [-0.1, 0.09, 0.2162278, 0.2535534], rtol=1e-5
+    )
 
 
 def test_place_turns_and_then_moves():

@@ -128,6 +128,8 @@ def test_each_switch_comes_the_nearer_to_the_laws_the_colder_it_is(seed):
     observation = observation._replace(in_contact=jnp.ones(WORLDS))
     worlds = (params, state, observation)
     exact = hard(*worlds)[2]
+    sure = clear(*worlds, exact, 1e-4)  # a cold switch at its very edge hides what a warm one does
+    assert sure.mean() > 0.9
     for name, value in WARM._asdict().items():
         gaps = []
         for factor in (1.0, 0.3, 0.1):
@@ -135,8 +137,8 @@ def test_each_switch_comes_the_nearer_to_the_laws_the_colder_it_is(seed):
             gaps.append(
                 np.abs(warmer.a_r - exact.a_r) + np.abs(warmer.realigning - exact.realigning)
             )
-        assert (gaps[1] <= gaps[0] + 1e-4).all(), name
-        assert (gaps[2] <= gaps[1] + 1e-4).all(), name
+        assert (gaps[1] <= gaps[0] + 1e-4)[sure].all(), name
+        assert (gaps[2] <= gaps[1] + 1e-4)[sure].all(), name
 
 
 @property_test

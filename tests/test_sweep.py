@@ -346,7 +346,7 @@ def test_the_report_of_one_world_tells_what_was_lost_and_how_to_see_it(whole, tm
     record.write_results(folder / "results.nc", one)
     text = robustness.write_report(folder).read_text()
     assert "1 trials lost contacts for want of room: they are not to be trusted" in text
-    assert f"`rps replay '{folder}' 0 --arm nps --video`" in text  # the arm that fails
+    assert f"`rps replay '{folder}' 0 --arm 'nps' --video`" in text  # the arm that fails
     assert not (folder / "success.png").exists()  # nothing was drawn but once
     assert analysis.influences(one, "rps")[1:] == []
 
