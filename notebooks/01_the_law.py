@@ -22,7 +22,8 @@ from pathlib import Path
 
 from IPython.display import Image
 
-from rps_jax import RPSParams, figures
+from rps_jax import RPSParams
+from rps_jax.analysis import figures
 
 out = Path(tempfile.mkdtemp())
 paper = RPSParams.paper()

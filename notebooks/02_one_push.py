@@ -17,15 +17,17 @@
 import tempfile
 from pathlib import Path
 
-from rps_jax import video
+from rps_jax.analysis import video
 
 video.choose_gl()  # before MuJoCo is imported
 
 import numpy as np
 from IPython.display import Image, Video
 
-from rps_jax import FRICTION, Case, Setting, figures, follow, sweep
-from rps_jax.trial import p_world_contact
+from rps_jax import FRICTION, Case, Setting, follow
+from rps_jax.analysis import figures
+from rps_jax.trials import pushes
+from rps_jax.trials.trial import p_world_contact
 
 out = Path(tempfile.mkdtemp())
 
@@ -70,7 +72,7 @@ print(
 # ## The same in pictures
 
 # %%
-scene = sweep.scene_of(case, setting.physics)
+scene = pushes.scene_of(case, setting.physics)
 film = {"p_world_target": trace.p_world_target, "size": (480, 270)}
 rows = np.linspace(0, len(seen.time) - 1, 6).astype(int)
 images = video.images(scene, seen.qpos[rows], **film)

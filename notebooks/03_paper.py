@@ -20,7 +20,8 @@ from pathlib import Path
 
 from IPython.display import Image, Markdown
 
-from rps_jax import figures, record, score
+from rps_jax.analysis import figures, tables
+from rps_jax.record import folder as record
 
 out = Path(tempfile.mkdtemp())
 run = Path("runs/table")
@@ -32,7 +33,7 @@ results = record.read_results(run)
 # Successes of 24, with Wilson 95 % intervals in percent, and the paper's counts below ours.
 
 # %%
-Markdown(score.markdown(score.table(results)))
+Markdown(tables.markdown(tables.table(results)))
 
 # %% [markdown]
 # RPS reaches every target here. The paper's 127 of 144 lies outside our interval, and so do three
@@ -42,7 +43,7 @@ Markdown(score.markdown(score.table(results)))
 # whether the paper's simulator did that.
 
 # %%
-print(score.summary(results))
+print(tables.summary(results))
 
 # %% [markdown]
 # ## Maps over the targets: Fig. 5

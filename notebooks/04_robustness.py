@@ -25,11 +25,13 @@ from pathlib import Path
 
 from IPython.display import Image, Markdown
 
-from rps_jax import analysis, figures, record, robustness, score
+from rps_jax.analysis import figures, statistics, tables
+from rps_jax.record import folder as record
+from rps_jax.runs import sweep
 
 out = Path(tempfile.mkdtemp())
 run = Path("runs/compare/wide")
-plan, results = robustness.load_plan(run), record.read_results(run)
+plan, results = sweep.load_plan(run), record.read_results(run)
 max_lost = float(plan.setting.rules.max_lost)
 
 # %% [markdown]
@@ -38,7 +40,7 @@ max_lost = float(plan.setting.rules.max_lost)
 # Intervals are Wilson's, of 95 %.
 
 # %%
-Markdown(score.markdown(analysis.rates(results, max_lost)))
+Markdown(tables.markdown(statistics.rates(results, max_lost)))
 
 # %% [markdown]
 # With the paper's parameters the law fails in one world of 15, with the tuned ones in 6 of 1000.
@@ -72,7 +74,7 @@ Image(figures.success_curves(results, out / "success.png"))
 # is what 1000 worlds can show.
 
 # %%
-Markdown(score.markdown(analysis.influences(results, "paper")[:9]))
+Markdown(tables.markdown(statistics.influences(results, "paper")[:9]))
 
 # %% [markdown]
 # For the paper's parameters it is width: from about 25 cm of half width on, success falls to five
@@ -81,7 +83,7 @@ Markdown(score.markdown(analysis.influences(results, "paper")[:9]))
 # and friction at the robot, but here they do no more than chance might.
 
 # %%
-Markdown(score.markdown(analysis.influences(results, "tuned")[:4]))
+Markdown(tables.markdown(statistics.influences(results, "tuned")[:4]))
 
 # %% [markdown]
 # For the tuned parameters no quantity has any influence that 1000 worlds could show: the loss of
@@ -92,7 +94,7 @@ Markdown(score.markdown(analysis.influences(results, "tuned")[:4]))
 # Those in which most arms fail, and among these the most distance is left.
 
 # %%
-Markdown(score.markdown(analysis.hardest_table(results, str(run))))
+Markdown(tables.markdown(statistics.hardest_table(results, str(run))))
 
 # %% [markdown]
 # The last column replays a world, draws it as in `02_one_push` and films it; run it in this

@@ -25,23 +25,15 @@ import jax
 import numpy as np
 from IPython.display import Image, Markdown
 
-from rps_jax import (
-    FRICTION,
-    Case,
-    RPSParams,
-    Setting,
-    analysis,
-    figures,
-    gradients,
-    paper,
-    record,
-    score,
-    strategies,
-    sweep,
-    trial,
-    tune,
-)
-from rps_jax.skin import SmoothSkin
+from rps_jax import FRICTION, Case, RPSParams, Setting
+from rps_jax.analysis import figures, statistics, tables
+from rps_jax.control import strategies
+from rps_jax.record import folder as record
+from rps_jax.robot.skin import SmoothSkin
+from rps_jax.trials import pushes, trial
+from rps_jax.tuning import evolution as tune
+from rps_jax.tuning import gradients
+from rps_jax.world import paper
 
 out = Path(tempfile.mkdtemp())
 
@@ -106,7 +98,7 @@ Image(figures.twist_field(sets, 1.0, out / "twist.png"))
 
 # %%
 results = record.read_results(Path("runs/compare/wide"))
-Markdown(score.markdown(analysis.differences(results)))
+Markdown(tables.markdown(statistics.differences(results)))
 
 # %%
 Image(figures.paired(results, out / "paired.png"))
@@ -134,7 +126,7 @@ cases = [
     Case("box", FRICTION["S1"], target, gap=0.004, skin=SmoothSkin()) for target in paper.TARGETS
 ]
 setting, strategy = Setting(engine="quasistatic"), strategies.smooth_rps()
-stage, worlds = sweep.build(cases, setting)
+stage, worlds = pushes.build(cases, setting)
 starts = worlds, trial.start_all(worlds, np.ones(len(cases), bool), strategy=strategy)
 horizons = np.array([1.0, 3.0, 10.0])  # [s]
 steps = np.round(horizons / setting.physics.control_period).astype(int)

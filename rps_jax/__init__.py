@@ -10,19 +10,19 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rps_jax.domain import DOMAINS, Domain
-    from rps_jax.env import PushEnv
+    from rps_jax.control.law import Details, Observation, RPSParams, RPSState, Twist, step
+    from rps_jax.control.strategies import Strategy, register_strategy
     from rps_jax.errors import InputError
-    from rps_jax.footprint import Footprint
-    from rps_jax.law import Details, Observation, RPSParams, RPSState, Twist, step
-    from rps_jax.objects import OBJECTS, register_object
-    from rps_jax.physics import PHYSICS, Physics
-    from rps_jax.scene import FRICTION, Friction
-    from rps_jax.skin import CapacitiveSkin, IdealSkin
-    from rps_jax.slots import Setting
-    from rps_jax.strategies import Strategy, register_strategy
-    from rps_jax.sweep import Case, follow, run
-    from rps_jax.trial import Outcome, Rules
+    from rps_jax.geometry.footprint import Footprint
+    from rps_jax.robot.skin import CapacitiveSkin, IdealSkin
+    from rps_jax.trials.batch import Setting
+    from rps_jax.trials.env import PushEnv
+    from rps_jax.trials.pushes import Case, follow, run
+    from rps_jax.trials.trial import Outcome, Rules
+    from rps_jax.world.domain import DOMAINS, Domain
+    from rps_jax.world.objects import OBJECTS, register_object
+    from rps_jax.world.physics import PHYSICS, Physics
+    from rps_jax.world.scene import FRICTION, Friction
 
 __version__ = "0.1.0"
 
@@ -57,19 +57,19 @@ __all__ = [
 ]
 
 _MODULES = {
-    "domain": ("DOMAINS", "Domain"),
-    "env": ("PushEnv",),
+    "world.domain": ("DOMAINS", "Domain"),
+    "trials.env": ("PushEnv",),
     "errors": ("InputError",),
-    "footprint": ("Footprint",),
-    "law": ("Details", "Observation", "RPSParams", "RPSState", "Twist", "step"),
-    "objects": ("OBJECTS", "register_object"),
-    "physics": ("PHYSICS", "Physics"),
-    "scene": ("FRICTION", "Friction"),
-    "skin": ("CapacitiveSkin", "IdealSkin"),
-    "slots": ("Setting",),
-    "strategies": ("Strategy", "register_strategy"),
-    "sweep": ("Case", "follow", "run"),
-    "trial": ("Outcome", "Rules"),
+    "geometry.footprint": ("Footprint",),
+    "control.law": ("Details", "Observation", "RPSParams", "RPSState", "Twist", "step"),
+    "world.objects": ("OBJECTS", "register_object"),
+    "world.physics": ("PHYSICS", "Physics"),
+    "world.scene": ("FRICTION", "Friction"),
+    "robot.skin": ("CapacitiveSkin", "IdealSkin"),
+    "trials.batch": ("Setting",),
+    "control.strategies": ("Strategy", "register_strategy"),
+    "trials.pushes": ("Case", "follow", "run"),
+    "trials.trial": ("Outcome", "Rules"),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
 

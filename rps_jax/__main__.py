@@ -2,6 +2,6 @@
 
 import sys
 
-from rps_jax.cli import main
+from rps_jax.app.cli import main
 
 sys.exit(main())

@@ -13,9 +13,13 @@ from pathlib import Path
 
 import tyro
 
-from rps_jax import ambiguity, errors, figures, paper, record, score, study
-from rps_jax.cli import StudyOptions, guarded, progress_bar
-from rps_jax.objects import PAPER_OBJECTS
+from rps_jax import errors
+from rps_jax.analysis import figures, tables
+from rps_jax.app.cli import StudyOptions, guarded, progress_bar
+from rps_jax.record import folder as record
+from rps_jax.studies import ambiguity, study
+from rps_jax.world import paper
+from rps_jax.world.objects import PAPER_OBJECTS
 
 
 @dataclass(frozen=True)
@@ -51,14 +55,14 @@ def main(options: Options) -> None:
             {name: known[name] for name in names}, grid, out, **options.shape(), report=report
         )
     record.write_results(out / "results.nc", results)
-    tables = [study.rows(results, names[0], strategy) for strategy in strategies]
+    found = [study.rows(results, names[0], strategy) for strategy in strategies]
     if options.gazebo and "paper_gazebo" in names:
-        tables.append(ambiguity.cells(results))
+        found.append(ambiguity.cells(results))
     if options.curve and not options.readings:
         curve = ambiguity.by_tolerance(results, ambiguity.TOLERANCES)
         trials = grid.size // len(PAPER_OBJECTS)
         figures.tolerance_curve(curve, trials, out / "tolerance.png")
-    text = "\n\n".join(score.markdown(rows) for rows in tables)
+    text = "\n\n".join(tables.markdown(rows) for rows in found)
     record.write_text(out / "table.md", text + "\n")
     print(text)
 

@@ -16,9 +16,13 @@ from pathlib import Path
 import tyro
 from tqdm import tqdm
 
-from rps_jax import benchmark, engines, errors, figures, record, score
-from rps_jax.benchmark import Speed
-from rps_jax.cli import guarded
+from rps_jax import errors
+from rps_jax.analysis import figures, tables
+from rps_jax.app.cli import guarded
+from rps_jax.engines import base as engines
+from rps_jax.record import folder as record
+from rps_jax.studies import benchmark
+from rps_jax.studies.benchmark import Speed
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,7 @@ def main(options: Options) -> None:
         _measured(wanted, options.at_once), total=sum(map(len, wanted)), unit="measurement"
     ):
         speeds.append(speed)
-        text = where + score.markdown(benchmark.table(speeds))
+        text = where + tables.markdown(benchmark.table(speeds))
         record.write_text(options.out / "benchmark.md", text + "\n")
         figures.throughput(speeds, options.out / "throughput.png")
     print(text)

@@ -12,8 +12,13 @@ from pathlib import Path
 
 import tyro
 
-from rps_jax import engines, errors, fidelity, paper, record, score, study
-from rps_jax.cli import StudyOptions, guarded, progress_bar
+from rps_jax import errors
+from rps_jax.analysis import tables
+from rps_jax.app.cli import StudyOptions, guarded, progress_bar
+from rps_jax.engines import base as engines
+from rps_jax.record import folder as record
+from rps_jax.studies import fidelity, study
+from rps_jax.world import paper
 
 
 @dataclass(frozen=True)
@@ -37,7 +42,7 @@ def main(options: Options) -> None:
     with options.opened() as out, progress_bar(len(names) * grid.size) as report:
         results = fidelity.run(names, grid, out, **options.shape(), report=report)
     record.write_results(out / "results.nc", results)
-    text = score.markdown(fidelity.table(results))
+    text = tables.markdown(fidelity.table(results))
     record.write_text(out / "fidelity.md", text + "\n")
     print(text)
 

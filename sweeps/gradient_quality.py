@@ -13,17 +13,20 @@ from pathlib import Path
 import tyro
 from tqdm import tqdm
 
-from rps_jax import figures, quality, record, score, tune
-from rps_jax.cli import guarded, use_cache
-from rps_jax.quality import Study
-from rps_jax.tune import Space
+from rps_jax.analysis import figures, tables
+from rps_jax.app.cli import guarded, use_cache
+from rps_jax.record import folder as record
+from rps_jax.studies import gradient_quality
+from rps_jax.studies.gradient_quality import Study
+from rps_jax.tuning import evolution as tune
+from rps_jax.tuning.evolution import Space
 
 
 @dataclass(frozen=True)
 class Options:
     """Which gradients."""
 
-    estimators: tuple[str, ...] = quality.ESTIMATORS
+    estimators: tuple[str, ...] = gradient_quality.ESTIMATORS
     """reverse, clipped (reverse with a bound in each world), forward, evolution or combined."""
     object: str = Study.object
     """random_box, random_cylinder or random_prism."""
@@ -65,10 +68,10 @@ def main(options: Options) -> None:
             bar.set_description(name)
             bar.update(bool(bar.desc))
 
-        results = quality.run(study, out, options.estimators, report=report)
+        results = gradient_quality.run(study, out, options.estimators, report=report)
         bar.update(bar.total - bar.n)
     record.write_results(out / "results.nc", results)
-    text = score.markdown(quality.table(results))
+    text = tables.markdown(gradient_quality.table(results))
     record.write_text(out / "quality.md", text + "\n")
     figures.gradient_quality(results, out / "quality.png")
     print(text)

@@ -14,9 +14,20 @@ from typing import Any
 
 import tyro
 
-from rps_jax import errors, figures, landscape, record, score
-from rps_jax.cli import Spread, domain_of, guarded, labels_of, params_of, progress_bar, use_cache
-from rps_jax.tune import SUBSETS, Course
+from rps_jax import errors
+from rps_jax.analysis import figures, tables
+from rps_jax.app.cli import (
+    Spread,
+    domain_of,
+    guarded,
+    labels_of,
+    params_of,
+    progress_bar,
+    use_cache,
+)
+from rps_jax.record import folder as record
+from rps_jax.studies import sensitivity
+from rps_jax.tuning.evolution import SUBSETS, Course
 
 
 @dataclass(frozen=True)
@@ -56,15 +67,15 @@ def main(options: Options) -> None:
     each = len(course.domains) * options.worlds
     varied = len(sets) * len(SUBSETS["full"]) * options.values
     with progress_bar(varied * each, "sensitivity") as report:
-        found = landscape.sensitivity(sets, course, count=options.values, report=report, **common)
+        found = sensitivity.sensitivity(sets, course, count=options.values, report=report, **common)
     record.write_results(out / "sensitivity.nc", found)
     figures.sensitivity(found, out / "sensitivity.png")
     several: dict[str, Any] = {"candidates": options.candidates, "spread": options.spread}
     with progress_bar(2 * (options.candidates + len(sets)) * each, "front") as report:
-        front = landscape.front(sets, course, report=report, **several, **common)
+        front = sensitivity.front(sets, course, report=report, **several, **common)
     record.write_results(out / "front.nc", front)
     figures.front(front, out / "front.png")
-    text = score.markdown(landscape.front_table(front))
+    text = tables.markdown(sensitivity.front_table(front))
     record.write_text(out / "front.md", text + "\n")
     print(text)
 

@@ -13,8 +13,12 @@ from pathlib import Path
 import tyro
 from tqdm import tqdm
 
-from rps_jax import benchmark, engines, errors, figures, levers, record, score
-from rps_jax.cli import guarded
+from rps_jax import errors
+from rps_jax.analysis import figures, tables
+from rps_jax.app.cli import guarded
+from rps_jax.engines import base as engines
+from rps_jax.record import folder as record
+from rps_jax.studies import ablation, benchmark
 
 
 @dataclass(frozen=True)
@@ -47,13 +51,13 @@ def main(options: Options) -> None:
     errors.check_count("goes", options.goes, at_most=1000)
     errors.check_count("at_once", options.at_once, at_most=1024)
     record.writable(options.out)
-    total = 1 + len(levers.levers(options.name, options.family))
+    total = 1 + len(ablation.levers(options.name, options.family))
     shape = {"goes": options.goes, "at_once": options.at_once, "simulated": options.simulated}
-    pulled = levers.measure(options.name, options.family, options.worlds, **shape)
+    pulled = ablation.measure(options.name, options.family, options.worlds, **shape)
     gains, text = [], ""
     for gain in tqdm(pulled, total=total, unit="lever"):
         gains.append(gain)
-        text = benchmark.machine() + score.markdown(levers.table(gains))
+        text = benchmark.machine() + tables.markdown(ablation.table(gains))
         record.write_text(options.out / "levers.md", text + "\n")
         figures.levers(gains, options.out / "levers.png")
     print(text)

@@ -5,7 +5,7 @@ python sweeps/reproduce_paper.py --quick
 
 import sys
 
-from rps_jax import cli
+from rps_jax.app import cli
 
 if __name__ == "__main__":
     sys.exit(cli.main(["paper", *sys.argv[1:]]))

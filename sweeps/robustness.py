@@ -14,11 +14,16 @@ from pathlib import Path
 
 import tyro
 
-from rps_jax import analysis, engines, errors, paper, record, robustness, score
-from rps_jax.cli import Spread, domain_of, guarded, progress_bar, use_cache
-from rps_jax.physics import preset
-from rps_jax.robustness import Plan
-from rps_jax.slots import Setting
+from rps_jax import errors
+from rps_jax.analysis import statistics, tables
+from rps_jax.app.cli import Spread, domain_of, guarded, progress_bar, use_cache
+from rps_jax.engines import base as engines
+from rps_jax.record import folder as record
+from rps_jax.runs import sweep
+from rps_jax.runs.sweep import Plan
+from rps_jax.trials.batch import Setting
+from rps_jax.world import paper
+from rps_jax.world.physics import preset
 
 # The first is what the others are compared with.
 ENGINES = {
@@ -69,13 +74,13 @@ def main(options: Options) -> None:
     use_cache()
     found = {}
     for name, plan in plans.items():
-        folder = robustness.open_run(options.out / name.replace(", ", "_"), plan)
+        folder = sweep.open_run(options.out / name.replace(", ", "_"), plan)
         with record.hold(folder):
             with progress_bar(plan.trials, name) as report:
-                robustness.run(folder, plan, report=report, **shape)
-            robustness.merge([folder], folder)
+                sweep.run(folder, plan, report=report, **shape)
+            sweep.merge([folder], folder)
         found[name] = record.read_results(folder).isel(arm=0)
-    text = score.markdown(analysis.agreement(found))
+    text = tables.markdown(statistics.agreement(found))
     record.write_text(options.out / "engines.md", text + "\n")
     print(text)
 

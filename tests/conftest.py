@@ -10,7 +10,7 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 def pytest_configure(config):
     import jax
 
-    from rps_jax import video
+    from rps_jax.analysis import video
 
     video.choose_gl()
     cache = config.rootpath / ".jax_cache"

@@ -10,11 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from rps_jax import cli, paper, record, robustness
-from rps_jax.domain import DOMAINS
+from rps_jax.app import cli
 from rps_jax.errors import InputError
-from rps_jax.robustness import Plan
-from rps_jax.slots import Setting
+from rps_jax.record import folder as record
+from rps_jax.runs import sweep
+from rps_jax.runs.sweep import Plan
+from rps_jax.trials.batch import Setting
+from rps_jax.world import paper
+from rps_jax.world.domain import DOMAINS
 
 # What is asked for, and what the answer says of it.
 TABLE = {
@@ -352,7 +355,7 @@ def folder(tmp_path_factory):
         (root / f"{name}.json").write_text(json.dumps(values))
     arms = {"rps": paper.PARAMS["rps"]}
     for name, engine in (("run", "mjx"), ("in_c", "mujoco")):
-        robustness.open_run(root / name, Plan(DOMAINS["paper"], 3, arms, Setting(engine=engine)))
+        sweep.open_run(root / name, Plan(DOMAINS["paper"], 3, arms, Setting(engine=engine)))
     good = json.loads((root / "run" / "manifest.json").read_text())
     for name, changes in CHANGED_MANIFESTS.items():
         (root / name).mkdir()

@@ -5,18 +5,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rps_jax import baselines, errors, sweep
-from rps_jax.baselines import APSParams, APSState, TrackedObservation
-from rps_jax.law import Observation
-from rps_jax.scene import FRICTION
-from rps_jax.slots import Setting
-from rps_jax.sweep import Case
-from rps_jax.trial import Rules
+from rps_jax import errors
+from rps_jax.control import aps
+from rps_jax.control.aps import APSParams, APSState, TrackedObservation
+from rps_jax.control.law import Observation
+from rps_jax.trials import pushes
+from rps_jax.trials.batch import Setting
+from rps_jax.trials.pushes import Case
+from rps_jax.trials.trial import Rules
+from rps_jax.world.scene import FRICTION
 
 APS = APSParams()
 PLAIN = APS._replace(aim_beyond=0.0)  # as published: the object's centre to the target
 START = APSState.init(APS)
-aps_step = jax.jit(baselines.aps_step)
+aps_step = jax.jit(aps.aps_step)
 
 
 def seen(robot, yaw=0.0, obj=(0.0, 0.0), target=(2.0, 0.0), r_object=0.2):
@@ -39,7 +41,7 @@ def in_world(twist, yaw):
 
 def test_the_prior_predictive_has_mean_pi_and_variance_0_793():
     # 1 / (1 / (pi/4) + 100 / (pi/4)) + pi/4 = (pi/4) (1 / 101 + 1) = 0.79317.
-    mean, variance = baselines.predictive(APS, START)
+    mean, variance = aps.predictive(APS, START)
     assert float(mean) == pytest.approx(np.pi, rel=1e-6)
     assert float(variance) == pytest.approx(np.pi / 4 * (1 + 1 / 101), rel=1e-6)
 
@@ -60,7 +62,7 @@ def test_the_prior_predictive_has_mean_pi_and_variance_0_793():
     ],
 )
 def test_activations_by_hand(alpha, near, expected):
-    push, relocate = baselines.activations(APS, START, jnp.array(alpha), jnp.array(near))
+    push, relocate = aps.activations(APS, START, jnp.array(alpha), jnp.array(near))
     assert (float(push), float(relocate)) == pytest.approx(expected, abs=2e-5)
 
 
@@ -172,7 +174,7 @@ def test_it_succeeds_with_targets_straight_ahead_and_only_if_it_aims_beyond_them
         return Case("box", FRICTION["S1"], (1.0, 0.0), params)
 
     setting = Setting(engine="mujoco", rules=Rules(horizon=60.0))
-    outcome, _ = sweep.run([case(APS), case(PLAIN)], setting)
+    outcome, _ = pushes.run([case(APS), case(PLAIN)], setting)
     np.testing.assert_array_equal(outcome.success, [True, False])
     # As published the object's centre, a half side of 0.2 m further, comes to the target.
     assert outcome.min_distance[1] == pytest.approx(0.2, abs=0.01)
@@ -182,4 +184,4 @@ def test_it_succeeds_with_targets_straight_ahead_and_only_if_it_aims_beyond_them
 @pytest.mark.parametrize("value", [float("nan"), -0.1, float("inf")])
 def test_parameters_that_mean_nothing_are_refused_by_name(name, value):
     with pytest.raises(errors.InputError, match=rf"aps\.{name} = "):
-        baselines.check(APS._replace(**{name: value}))
+        aps.check(APS._replace(**{name: value}))

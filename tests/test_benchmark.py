@@ -7,13 +7,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import benchmark, colliders, levers, scene, sweep, trial
-from rps_jax.law import Twist
-from rps_jax.physics import preset
-from rps_jax.quasistatic import Quasistatic
-from rps_jax.scene import FRICTION, mjx
-from rps_jax.slots import Setting
-from rps_jax.sweep import Case
+from rps_jax.control.law import Twist
+from rps_jax.engines import mjx_colliders
+from rps_jax.engines.quasistatic import Quasistatic
+from rps_jax.studies import ablation, benchmark
+from rps_jax.trials import pushes, trial
+from rps_jax.trials.batch import Setting
+from rps_jax.trials.pushes import Case
+from rps_jax.world import scene
+from rps_jax.world.physics import preset
+from rps_jax.world.scene import FRICTION, mjx
 
 
 def test_a_program_is_timed_and_compared_with_c_in_the_closed_loop():
@@ -40,31 +43,31 @@ def test_every_measurement_is_of_an_engine_or_of_c():
 
 def test_levers_are_timed_beside_the_program_as_it_is(monkeypatch):
     some = ("no physics: law, skin, rules", "four times the worlds", "state not donated")
-    every = levers.levers("quasistatic", "cylinder")
-    monkeypatch.setattr(levers, "levers", lambda *_: {name: every[name] for name in some})
-    gains = list(levers.measure("quasistatic", "cylinder", 2, simulated=0.1, goes=1))
-    assert [gain.lever for gain in gains] == [levers.AS_IT_IS, *some]
+    every = ablation.levers("quasistatic", "cylinder")
+    monkeypatch.setattr(ablation, "levers", lambda *_: {name: every[name] for name in some})
+    gains = list(ablation.measure("quasistatic", "cylinder", 2, simulated=0.1, goes=1))
+    assert [gain.lever for gain in gains] == [ablation.AS_IT_IS, *some]
     assert [gain.worlds for gain in gains] == [2, 2, 8, 2]
     assert all(0 < gain.times < np.inf for gain in gains)
-    assert len(levers.table(gains)) == 1 + len(gains)
+    assert len(ablation.table(gains)) == 1 + len(gains)
 
 
 def test_an_engine_has_the_levers_that_it_knows():
-    of_mjx, of_fused = (levers.levers(f"{name} standard", "box") for name in ("mjx", "fused"))
+    of_mjx, of_fused = (ablation.levers(f"{name} standard", "box") for name in ("mjx", "fused"))
     assert set(of_fused) < set(of_mjx)
     assert "4 solver iterations" in of_fused
-    assert "4 solver iterations" not in levers.levers("quasistatic", "box")
-    assert set(of_mjx) - set(levers.levers("mjx standard", "cylinder")) == {
+    assert "4 solver iterations" not in ablation.levers("quasistatic", "box")
+    assert set(of_mjx) - set(ablation.levers("mjx standard", "cylinder")) == {
         "own box-box collider",
         "own, two points",
     }
 
 
 def test_without_physics_the_base_goes_and_the_object_stays():
-    _, worlds = sweep.build([Case("box", FRICTION["S1"], (2.0, 0.0), gap=0)], Setting())
+    _, worlds = pushes.build([Case("box", FRICTION["S1"], (2.0, 0.0), gap=0)], Setting())
     start = trial.start_all(worlds, np.ones(1, bool))
     twists = Twist(*(np.full(1, x) for x in (0.05, 0.0, 0.0)))
-    driven = levers.Unmoved().drive(worlds, start, twists, preset())
+    driven = ablation.Unmoved().drive(worlds, start, twists, preset())
     moved = np.asarray(driven.qpos - start.qpos)[0]
     np.testing.assert_allclose(moved, [0.05 * 0.02, *[0] * 9], atol=1e-9)
 
@@ -106,7 +109,7 @@ def test_a_box_found_as_a_prism_is_where_mjx_finds_it():
         both = np.arange(len(starts))
         return contact.dist[:, robot][both, least], contact.frame[:, robot][both, least, 0]
 
-    with colliders.box_as_prism(2):
+    with mjx_colliders.box_as_prism(2):
         ours = found()
     theirs = found()
     assert (ours.dist.shape, theirs.dist.shape) == ((2, 6), (2, 8))

@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from rps_jax import cli, paper, record, score
+from rps_jax.analysis import tables
+from rps_jax.app import cli
 from rps_jax.errors import InputError
+from rps_jax.record import folder as record
+from rps_jax.world import paper
 
 SMALL = [
     *("table", "--targets", "0.6", "0", "0.62", "0.03", "--horizon", "18", "--slots", "4"),
@@ -32,7 +35,7 @@ def runs(tmp_path_factory):
 
 def test_a_table_run_leaves_a_labelled_run_folder(runs):
     results = record.read_results(runs[0])
-    assert results.success.dims == score.DIMS
+    assert results.success.dims == tables.DIMS
     assert results.sizes == {"strategy": 2, "object": 2, "friction": 2, "target": 2, "pose": 3}
     assert list(results.object.values) == ["box", "nonuniform_box"]
     assert results.time.attrs["units"] == "s"
@@ -112,12 +115,12 @@ def test_importing_sets_no_flags_prints_nothing_and_touches_no_device(tmp_path):
 
 def test_wilsons_interval_by_hand():
     # n = 24, all succeed: low = 1 / (1 + z^2 / n) with z = 1.959964.
-    low, high = score.wilson(24, 24)
+    low, high = tables.wilson(24, 24)
     assert low == pytest.approx(1 / (1 + 1.959964**2 / 24), abs=1e-6)
     assert high == pytest.approx(1.0)
-    assert score.wilson(0, 0) == (0.0, 1.0)
+    assert tables.wilson(0, 0) == (0.0, 1.0)
     # p = 1/2 is symmetric about itself.
-    low, high = score.wilson(12, 24)
+    low, high = tables.wilson(12, 24)
     assert low + high == pytest.approx(1.0)
 
 

@@ -11,14 +11,17 @@ import sys
 import jax
 import pytest
 
-from rps_jax import cli, cluster, paper, record, robustness
-from rps_jax.board import Board
-from rps_jax.domain import from_json
+from rps_jax.app import cli
 from rps_jax.errors import InputError
-from rps_jax.physics import preset
-from rps_jax.robustness import Plan
-from rps_jax.slots import Setting
-from rps_jax.trial import Rules
+from rps_jax.record import folder as record
+from rps_jax.runs import cluster, sweep
+from rps_jax.runs.board import Board
+from rps_jax.runs.sweep import Plan
+from rps_jax.trials.batch import Setting
+from rps_jax.trials.trial import Rules
+from rps_jax.world import paper
+from rps_jax.world.domain import from_json
+from rps_jax.world.physics import preset
 
 SWEEP = [
     *("sweep", "--engine", "fused", "--fidelity", "fast", "--horizon", "20", "--worlds", "20"),
@@ -167,7 +170,7 @@ def opened(folder):
         Setting(preset(fidelity="fast"), Rules(horizon=20.0), engine="fused"),
         part=7,
     )
-    return robustness.open_run(folder, plan), plan
+    return sweep.open_run(folder, plan), plan
 
 
 def test_a_worker_killed_at_work_changes_nothing(domain, tmp_path, two_workers, monkeypatch):
@@ -175,7 +178,7 @@ def test_a_worker_killed_at_work_changes_nothing(domain, tmp_path, two_workers, 
     out, plan = opened(tmp_path / "run")
     plain, _ = opened(tmp_path / "plain")
     cli.use_cache()
-    robustness.run(plain, plan, slots=8)
+    sweep.run(plain, plan, slots=8)
     seen, killed = set(), []
 
     @contextlib.contextmanager

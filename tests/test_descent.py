@@ -9,14 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rps_jax import cli, descent, domain, gradients, tune
-from rps_jax.descent import Descent
+from rps_jax.app import cli
+from rps_jax.control.law import RPSParams
 from rps_jax.errors import InputError
-from rps_jax.law import RPSParams
-from rps_jax.physics import preset
-from rps_jax.slots import Setting, Timing
-from rps_jax.trial import Rules
-from rps_jax.tune import Course, Objective, Space
+from rps_jax.trials.batch import Setting, Timing
+from rps_jax.trials.trial import Rules
+from rps_jax.tuning import descent, gradients
+from rps_jax.tuning import evolution as tune
+from rps_jax.tuning.descent import Descent
+from rps_jax.tuning.evolution import Course, Objective, Space
+from rps_jax.world import domain
+from rps_jax.world.physics import preset
 
 SETTING = Setting(preset(), Rules(horizon=20.0, max_lost=10.0), engine="quasistatic")
 OBJECTIVE = Objective(time=0.3, lost=0.1, miss=0.5)

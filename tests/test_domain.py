@@ -11,14 +11,18 @@ import mujoco
 import numpy as np
 import pytest
 
-from rps_jax import domain, engines, fused, paper, scene, solid, sweep
-from rps_jax.domain import DOMAINS, RANDOM, Domain, Range
+from rps_jax.engines import base as engines
+from rps_jax.engines.fused import step as fused
 from rps_jax.errors import InputError
-from rps_jax.objects import PAPER_OBJECTS
-from rps_jax.physics import preset
-from rps_jax.scene import FRICTION, mjx
-from rps_jax.slots import Setting
-from rps_jax.sweep import Case
+from rps_jax.geometry import solid
+from rps_jax.trials import pushes
+from rps_jax.trials.batch import Setting
+from rps_jax.trials.pushes import Case
+from rps_jax.world import domain, paper, scene
+from rps_jax.world.domain import DOMAINS, RANDOM, Domain, Range
+from rps_jax.world.objects import PAPER_OBJECTS
+from rps_jax.world.physics import preset
+from rps_jax.world.scene import FRICTION, mjx
 
 WIDE = DOMAINS["wide"]
 COUNT = 12
@@ -86,7 +90,7 @@ def test_the_paper_domain_is_the_papers_grid(engine):
         index = np.flatnonzero(chosen.object_of(np.arange(144)) == which)
         part = domain.worlds(chosen, domain.draw(chosen, 0, index), paper.PARAMS["rps"], setting)
         cases = [Case(name, f, t) for f in FRICTION.values() for t in paper.TARGETS]
-        _, worlds = sweep.build(cases, setting)
+        _, worlds = pushes.build(cases, setting)
         mine, theirs = (w._replace(key=0, odometry=0) for w in (part.worlds, worlds))
         for world in (mine, theirs) if engine == "mjx" else ():
             for field in (".body_pos", ".qpos0", ".qpos_spring"):  # of a body that is free

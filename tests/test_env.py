@@ -7,15 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rps_jax import domain, env, skin, trial
-from rps_jax.domain import DOMAINS, Range
-from rps_jax.env import PushEnv, Reward
+from rps_jax.control.law import Details, RPSParams
+from rps_jax.control.strategies import Strategy
 from rps_jax.errors import InputError
-from rps_jax.law import Details, RPSParams
-from rps_jax.physics import preset
-from rps_jax.slots import Setting
-from rps_jax.strategies import Strategy
-from rps_jax.trial import Rules
+from rps_jax.robot import skin
+from rps_jax.trials import env, trial
+from rps_jax.trials.batch import Setting
+from rps_jax.trials.env import PushEnv, Reward
+from rps_jax.trials.trial import Rules
+from rps_jax.world import domain
+from rps_jax.world.domain import DOMAINS, Range
+from rps_jax.world.physics import preset
 
 FAST = preset(fidelity="fast")
 # Targets ahead, so near that a push of a few seconds arrives; a perfect base.

@@ -9,28 +9,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rps_jax import (
-    cli,
-    domain,
-    engines,
-    figures,
-    objects,
-    record,
-    robustness,
-    scene,
-    strategies,
-    sweep,
-)
-from rps_jax.domain import Domain, Range
+from rps_jax.analysis import figures
+from rps_jax.app import cli
+from rps_jax.control import strategies
+from rps_jax.control.law import Details, Observation, RPSParams, RPSState, step
+from rps_jax.control.strategies import Strategy
+from rps_jax.engines import base as engines
 from rps_jax.errors import InputError
-from rps_jax.footprint import Footprint, circle, polygon, rectangle
-from rps_jax.law import Details, Observation, RPSParams, RPSState, step
-from rps_jax.robustness import Plan
-from rps_jax.scene import FRICTION, Friction
-from rps_jax.skin import POINT, CapacitiveSkin
-from rps_jax.slots import Setting
-from rps_jax.strategies import Strategy
-from rps_jax.sweep import Case
+from rps_jax.geometry.footprint import Footprint, circle, polygon, rectangle
+from rps_jax.record import folder as record
+from rps_jax.robot.skin import POINT, CapacitiveSkin
+from rps_jax.runs.sweep import Plan
+from rps_jax.trials import pushes
+from rps_jax.trials.batch import Setting
+from rps_jax.trials.pushes import Case
+from rps_jax.world import domain, objects, scene
+from rps_jax.world.domain import Domain, Range
+from rps_jax.world.scene import FRICTION, Friction
 
 EXAMPLES = Path(__file__).parents[1] / "notebooks" / "examples"
 BOX, CYLINDER = (objects.mjcf_folder() / f"{name}.xml" for name in ("box", "cylinder"))
@@ -110,7 +105,7 @@ def test_an_object_of_the_paper_that_is_registered_anew_is_the_same_world(name, 
     objects.register_object("mine", path)
     cases = [Case(n, FRICTION["S2"], (2.0, 1.0), mass=m) for n in (name, "mine") for m in (None, 9)]
     for engine in ("fused", "mjx"):
-        _, worlds = sweep.build(cases, Setting(engine=engine))
+        _, worlds = pushes.build(cases, Setting(engine=engine))
         for leaf in jax.tree.leaves(worlds._replace(key=None, shift=None)):
             leaf = np.asarray(leaf)
             np.testing.assert_allclose(leaf[:2], leaf[2:], rtol=1e-6, atol=1e-6)
@@ -124,7 +119,7 @@ def test_an_object_of_ones_own_may_be_of_a_domain_and_has_its_looks_in_a_replay(
     part = domain.worlds(own, drawn, RPSParams.paper(), Setting(engine="fused"))
     assert part.worlds.footprint.vertices.shape == (5, 8, 2)
     plan = Plan(own, 5, {"rps": RPSParams.paper()})
-    assert robustness.scene_of(plan, 3).model.ngeom == hexagon.model.ngeom
+    assert sweep.scene_of(plan, 3).model.ngeom == hexagon.model.ngeom
 
 
 def changed(tmp_path, change):
@@ -248,11 +243,11 @@ def test_a_sweep_finds_a_registered_strategy_again(tmp_path):
     own = Strategy(lambda params: (), made["step"])
     strategies.register_strategy("p_control", own, made["PParams"]())
     plan = Plan(Domain(), 3, {"p": made["PParams"](v=0.03)})
-    robustness.open_run(tmp_path, plan)
-    assert robustness.load_plan(tmp_path) == plan
+    sweep.open_run(tmp_path, plan)
+    assert sweep.load_plan(tmp_path) == plan
     strategies.STRATEGIES.pop(made["PParams"])
     with pytest.raises(InputError, match="unknown class of parameters 'PParams'"):
-        robustness.load_plan(tmp_path)
+        sweep.load_plan(tmp_path)
 
 
 def test_a_strategy_registered_again_replaces_the_old_one():

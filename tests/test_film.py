@@ -7,12 +7,16 @@ import numpy as np
 import pytest
 from test_video import decode
 
-from rps_jax import cli, film, paper, record, robustness, video
-from rps_jax.domain import DOMAINS
+from rps_jax.analysis import video
+from rps_jax.app import cli, film
 from rps_jax.errors import InputError
-from rps_jax.robustness import Plan
-from rps_jax.slots import Setting
-from rps_jax.trial import Rules
+from rps_jax.record import folder as record
+from rps_jax.runs import sweep
+from rps_jax.runs.sweep import Plan
+from rps_jax.trials.batch import Setting
+from rps_jax.trials.trial import Rules
+from rps_jax.world import paper
+from rps_jax.world.domain import DOMAINS
 
 pytestmark = pytest.mark.filterwarnings("ignore:os.fork")  # as in test_video
 
@@ -34,9 +38,9 @@ def plan_of(*names):
     return Plan(domain, 2 * len(names), {"rps": paper.PARAMS["rps"]}, setting)
 
 
-def sweep(folder):
+def a_sweep(folder):
     """A run of `rps sweep`, as far as a film reads it."""
-    robustness.open_run(folder, plan_of("random_cylinder"))
+    sweep.open_run(folder, plan_of("random_cylinder"))
 
 
 def tiles(images, rows, columns):

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull, cKDTree
 
-from rps_jax import footprint as fp
-from rps_jax import frames
-from rps_jax.footprint import Footprint
+from rps_jax.geometry import footprint as fp
+from rps_jax.geometry import planar
+from rps_jax.geometry.footprint import Footprint
 
 property_test = hypothesis.settings(max_examples=100, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -165,7 +165,7 @@ def test_the_signed_distance_does_not_depend_on_the_frame(kind, seed):
     points = rng.uniform(-1, 1, (BATCH, POINTS, 2)).astype(np.float32)
     position = rng.uniform(-2, 2, (BATCH, 2)).astype(np.float32)
     yaw = rng.uniform(-4, 4, BATCH).astype(np.float32)
-    moved = frames.rotate(yaw[:, None], points) + position[:, None]
+    moved = planar.rotate(yaw[:, None], points) + position[:, None]
     got = distances(jax.vmap(fp.place)(footprints, position, yaw), moved)
     np.testing.assert_allclose(got, distances(footprints, points), atol=3e-6)
 

@@ -13,18 +13,18 @@ import pytest
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rps_jax import frames
+from rps_jax.geometry import planar
 
 PI = np.float32(np.pi)  # a little above pi
 
 property_test = hypothesis.settings(max_examples=100, deadline=None)
 finite32 = st.floats(allow_nan=False, allow_infinity=False, width=32)
 
-wrap = jax.jit(frames.wrap)
-yaw_of_quaternion = jax.jit(frames.yaw_of_quaternion)
-norm_and_gradient = jax.jit(jax.vmap(jax.value_and_grad(frames.norm)))
-direction_and_gradient = jax.jit(jax.vmap(jax.value_and_grad(frames.direction)))
-sqrt_and_gradient = jax.jit(jax.vmap(jax.value_and_grad(frames.safe_sqrt)))
+wrap = jax.jit(planar.wrap)
+yaw_of_quaternion = jax.jit(planar.yaw_of_quaternion)
+norm_and_gradient = jax.jit(jax.vmap(jax.value_and_grad(planar.norm)))
+direction_and_gradient = jax.jit(jax.vmap(jax.value_and_grad(planar.direction)))
+sqrt_and_gradient = jax.jit(jax.vmap(jax.value_and_grad(planar.safe_sqrt)))
 
 
 def ordinary(v: np.ndarray) -> np.ndarray:
@@ -36,7 +36,7 @@ def ordinary(v: np.ndarray) -> np.ndarray:
 
 
 def test_a_rotation_by_a_quarter_turn_takes_x_to_y_and_y_to_minus_x():
-    got = frames.rotate(jnp.float32(math.pi / 2), jnp.array([[2.0, 0.0], [0.0, 3.0], [1.0, 1.0]]))
+    got = planar.rotate(jnp.float32(math.pi / 2), jnp.array([[2.0, 0.0], [0.0, 3.0], [1.0, 1.0]]))
     np.testing.assert_allclose(got, [[0, 2], [-3, 0], [-1, 1]], atol=1e-6)
 
 
@@ -44,8 +44,8 @@ def test_rotations_compose_by_adding_their_angles_and_keep_lengths():
     rng = np.random.default_rng(0)
     a, b = rng.uniform(-4, 4, (2, 100)).astype(np.float32)
     v = rng.normal(size=(100, 2)).astype(np.float32)
-    twice = frames.rotate(a, frames.rotate(b, v))
-    np.testing.assert_allclose(twice, frames.rotate(a + b, v), atol=3e-6)
+    twice = planar.rotate(a, planar.rotate(b, v))
+    np.testing.assert_allclose(twice, planar.rotate(a + b, v), atol=3e-6)
     np.testing.assert_allclose(np.hypot(*np.asarray(twice).T), np.hypot(*v.T), rtol=1e-6)
 
 
@@ -67,7 +67,7 @@ def test_rotations_compose_by_adding_their_angles_and_keep_lengths():
     ],
 )
 def test_wrap_gives_the_same_angle_within_half_a_turn(angle, expected):
-    assert frames.wrap(jnp.float32(angle)) == pytest.approx(expected, abs=2e-6)
+    assert planar.wrap(jnp.float32(angle)) == pytest.approx(expected, abs=2e-6)
 
 
 @property_test
@@ -97,7 +97,7 @@ def test_wrap_excludes_pi_in_float64_where_the_modulus_rounds_up_to_a_turn():
     # 2 pi - 4.4e-16 is halfway between two float64, of which 2 pi is the even one.
     with jax.enable_x64(True):
         below = np.nextafter(-np.pi, -np.inf)
-        assert -np.pi <= frames.wrap(jnp.asarray(below)) < np.pi
+        assert -np.pi <= planar.wrap(jnp.asarray(below)) < np.pi
 
 
 @property_test
@@ -111,7 +111,7 @@ def test_wrap_changes_no_angle_beyond_rounding(angle):
 
 def test_the_derivative_of_wrap_is_one_even_at_the_jump():
     angle = jnp.array([0.0, 1.0, PI, -PI, 100.0, -3.0])
-    np.testing.assert_array_equal(jax.vmap(jax.grad(frames.wrap))(angle), np.ones(6))
+    np.testing.assert_array_equal(jax.vmap(jax.grad(planar.wrap))(angle), np.ones(6))
 
 
 # norm
@@ -150,11 +150,11 @@ def test_norm_and_its_derivative_are_right_up_to_the_largest_numbers():
 
 def test_norm_is_over_the_last_axis():
     v = np.random.default_rng(0).normal(size=(4, 3, 5))
-    np.testing.assert_allclose(frames.norm(jnp.asarray(v)), np.linalg.norm(v, axis=-1), rtol=1e-6)
+    np.testing.assert_allclose(planar.norm(jnp.asarray(v)), np.linalg.norm(v, axis=-1), rtol=1e-6)
 
 
 def test_norm_hides_no_nan():
-    assert np.isnan(frames.norm(jnp.array([jnp.nan, 1.0])))
+    assert np.isnan(planar.norm(jnp.array([jnp.nan, 1.0])))
 
 
 # direction
@@ -174,7 +174,7 @@ def test_norm_hides_no_nan():
     ],
 )
 def test_direction_is_the_angle_from_x_to_y_at_any_length(unit, expected, scale):
-    assert frames.direction(jnp.float32(scale) * jnp.array(unit)) == pytest.approx(expected)
+    assert planar.direction(jnp.float32(scale) * jnp.array(unit)) == pytest.approx(expected)
 
 
 def test_the_derivative_of_direction_is_across_and_inverse_to_the_length():
@@ -225,7 +225,7 @@ def test_safe_sqrt_is_the_root_where_positive_and_zero_with_zero_derivative_else
 
 def test_the_greatest_has_the_derivative_of_one_entry_also_of_equal_ones():
     for x, expected in (([1.0, 3.0, 2.0], [0, 1, 0]), ([2.0, 2.0, 1.0], [1, 0, 0])):
-        value, gradient = jax.value_and_grad(frames.greatest)(jnp.array(x))
+        value, gradient = jax.value_and_grad(planar.greatest)(jnp.array(x))
         assert value == max(x)
         np.testing.assert_array_equal(gradient, expected)
 
@@ -236,7 +236,7 @@ def test_the_greatest_has_the_derivative_of_one_entry_also_of_equal_ones():
 def test_yaw_of_quaternion_by_hand():
     half = math.sqrt(0.5)
     quaternions = jnp.array([[1, 0, 0, 0], [half, 0, 0, half], [half, 0, 0, -half], [0, 1, 0, 0]])
-    got = frames.yaw_of_quaternion(quaternions)
+    got = planar.yaw_of_quaternion(quaternions)
     np.testing.assert_allclose(got, [0, math.pi / 2, -math.pi / 2, 0], atol=1e-6)
 
 
@@ -257,6 +257,6 @@ def test_yaw_of_quaternion_is_where_the_tilted_body_heads(seed):
 
 def test_the_yaw_of_a_body_on_its_nose_is_finite_with_finite_derivatives():
     upright = jnp.array([1.0, 0.0, 1.0, 0.0]) * jnp.sqrt(0.5)
-    value, gradient = jax.value_and_grad(frames.yaw_of_quaternion)(upright)
+    value, gradient = jax.value_and_grad(planar.yaw_of_quaternion)(upright)
     assert abs(value) <= PI
     assert np.isfinite(gradient).all()

@@ -11,10 +11,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from rps_jax import contacts, fused, newton, scene, spatial
-from rps_jax.objects import FAMILIES
-from rps_jax.physics import Physics
-from rps_jax.scene import Friction
+from rps_jax.engines.fused import contacts, newton
+from rps_jax.engines.fused import step as fused
+from rps_jax.geometry import vectors
+from rps_jax.world import scene
+from rps_jax.world.objects import FAMILIES
+from rps_jax.world.physics import Physics
+from rps_jax.world.scene import Friction
 
 TWIST = (0.05, 0.01, 0.05)  # [m/s, m/s, rad/s]
 FINE = Physics(control_period=0.01, iterations=30, ls_iterations=20)
@@ -147,7 +150,7 @@ def test_a_contacts_force_and_stiffness_are_derivatives_of_its_cost(cone):
     """Force = - d s / d x and stiffness = d^2 s / d x^2, with MuJoCo's s in its three zones."""
     physics = Physics(cone=cone)
     d, f = 20.0, 0.4
-    point = contacts.Contact(spatial.X, spatial.X, spatial.Y, spatial.Z, spatial.X, d, f)
+    point = contacts.Contact(vectors.X, vectors.X, vectors.Y, vectors.Z, vectors.X, d, f)
 
     def cost(x):
         if cone == "pyramidal":
@@ -194,7 +197,7 @@ def test_an_object_that_leans_away_is_touched_where_it_is(name, degrees):
     still = jnp.zeros((1, 9))
     state = fused.enter(body, jnp.asarray(qpos, float)[None], still, still)
     ahead = jnp.ones(1), jnp.zeros(1)
-    found = contacts.meetings(fused.spread(body), state, spatial.matrix(state.q), ahead)
+    found = contacts.meetings(fused.spread(body), state, vectors.matrix(state.q), ahead)
     heights, _, _, distances = (np.asarray(x) for x in found)
     corner = z - tall * c + half * s
     assert heights.min() >= max(0.06, corner) - 1e-5

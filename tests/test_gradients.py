@@ -12,15 +12,18 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from rps_jax import errors, gradients, strategies, sweep, trial
-from rps_jax.gradients import Estimate
-from rps_jax.law import RPSParams
-from rps_jax.physics import Physics
-from rps_jax.scene import FRICTION
-from rps_jax.skin import SmoothSkin
-from rps_jax.slots import Setting
-from rps_jax.sweep import Case
-from rps_jax.trial import Stage
+from rps_jax import errors
+from rps_jax.control import strategies
+from rps_jax.control.law import RPSParams
+from rps_jax.robot.skin import SmoothSkin
+from rps_jax.trials import pushes, trial
+from rps_jax.trials.batch import Setting
+from rps_jax.trials.pushes import Case
+from rps_jax.trials.trial import Stage
+from rps_jax.tuning import gradients
+from rps_jax.tuning.gradients import Estimate
+from rps_jax.world.physics import Physics
+from rps_jax.world.scene import FRICTION
 
 THETA = jnp.array([0.5, -1.0, 2.0])
 STIFF = jnp.array([1.0, 2.0, 0.5])
@@ -242,7 +245,7 @@ def test_the_derivative_of_a_window_of_fused_trials_is_its_finite_difference():
     targets = ((1.0, -1.5), (2.0, 0.5), (-1.5, 1.0))
     skin, setting = SmoothSkin(), Setting(engine="fused")
     cases = [Case("cylinder", FRICTION["S1"], t, skin=skin, gap=0.004) for t in targets]
-    stage, worlds = sweep.build(cases, setting)
+    stage, worlds = pushes.build(cases, setting)
     strategy = strategies.smooth_rps()
     starts = (worlds, trial.start_all(worlds, np.ones(3, bool), strategy=strategy))
     scores = gradients.window(stage, params_of, final_distance, physics=setting.physics, steps=50)

@@ -4,10 +4,11 @@ import jax
 import numpy as np
 import pytest
 
-from rps_jax import landscape, tune
-from rps_jax.landscape import Aims
-from rps_jax.law import RPSParams
-from rps_jax.tune import BOUNDS, SUBSETS, Answer, Course
+from rps_jax.control.law import RPSParams
+from rps_jax.studies import sensitivity
+from rps_jax.studies.sensitivity import Aims
+from rps_jax.tuning import evolution as tune
+from rps_jax.tuning.evolution import BOUNDS, SUBSETS, Answer, Course
 
 FULL = SUBSETS["full"]
 SETS = {"paper": RPSParams.paper(), "tuned": RPSParams.tuned()}
@@ -20,7 +21,7 @@ def test_aims_by_hand():
         time=np.array([[10.0, 30, 20, 300], [300, 300, 300, 300]]),
         path=np.array([[1.0, 2, 6, 9], [9, 9, 9, 9]]),
     )
-    found = landscape.aims(answer)
+    found = sensitivity.aims(answer)
     assert found.success.tolist() == [0.75, 0.0]
     np.testing.assert_array_equal(found.time, [20, np.nan])
     np.testing.assert_array_equal(found.path, [2, np.nan])
@@ -34,12 +35,12 @@ def test_the_undominated_by_hand():
     )
     # The third is slower than the first, the fourth worse than the second in all, the fifth never
     # measured; the last equals the first, and neither beats the other.
-    assert landscape.undominated(found).tolist() == [True, True, False, False, False, True]
+    assert sensitivity.undominated(found).tolist() == [True, True, False, False, False, True]
 
 
 def test_a_line_varies_one_parameter_within_its_bounds_and_no_other():
     base = RPSParams.tuned()
-    grid = landscape.lines(base, FULL, 5)
+    grid = sensitivity.lines(base, FULL, 5)
     for i, name in enumerate(FULL):
         for other in RPSParams._fields:
             values = np.asarray(getattr(grid, other))[i]
@@ -55,7 +56,7 @@ def test_a_line_varies_one_parameter_within_its_bounds_and_no_other():
 
 
 def test_candidates_begin_with_the_sets_and_without_spread_lie_between_two_of_them():
-    found = landscape.cloud(list(SETS.values()), FULL, 30, 0.0, seed=3)
+    found = sensitivity.cloud(list(SETS.values()), FULL, 30, 0.0, seed=3)
     space = tune.Space(FULL)
     z = space.vector(found)
     for i, params in enumerate(SETS.values()):
@@ -88,7 +89,7 @@ def pretended(monkeypatch):
 
 
 def test_sensitivity_is_labelled_and_from_worlds_for_validation(pretended):
-    found = landscape.sensitivity(SETS, Course(), names=("L", "K_h"), count=3, worlds=8)
+    found = sensitivity.sensitivity(SETS, Course(), names=("L", "K_h"), count=3, worlds=8)
     assert dict(found.sizes) == {"set": 2, "parameter": 2, "step": 3}
     assert [ask.seed for ask in pretended] == [tune.seed_of(0, "validate")]
     one = found.sel(set="paper", parameter="L")
@@ -99,13 +100,13 @@ def test_sensitivity_is_labelled_and_from_worlds_for_validation(pretended):
 
 
 def test_the_front_is_chosen_in_worlds_for_validation_and_measured_in_those_for_testing(pretended):
-    found = landscape.front(SETS, Course(), candidates=6, worlds=8)
+    found = sensitivity.front(SETS, Course(), candidates=6, worlds=8)
     assert [ask.seed for ask in pretended] == [tune.seed_of(0, s) for s in ("validate", "test")]
     params = [jax.tree.map(np.asarray, ask.params) for ask in pretended]
     jax.tree.map(np.testing.assert_array_equal, *params)
     # All succeed alike and drive as far: the quickest alone is undominated.
     assert found.front.values.sum() == 1
     assert np.argmax(found.front.values) == np.argmin(found.L.values)
-    table = landscape.front_table(found)
+    table = sensitivity.front_table(found)
     assert {row[0] for row in table[1:]} >= {"paper", "tuned"}
     assert sum(row[-1] == "yes" for row in table) == 1

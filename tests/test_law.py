@@ -20,8 +20,9 @@ import pytest
 from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 
-from rps_jax import errors, law
-from rps_jax.law import Observation, RPSParams, RPSState, Twist
+from rps_jax import errors
+from rps_jax.control import law
+from rps_jax.control.law import Observation, RPSParams, RPSState, Twist
 
 PAPER = RPSParams.paper()
 FRONT = 0.3625  # [m] x of a contact on the front face

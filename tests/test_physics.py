@@ -17,14 +17,17 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from rps_jax import engines, frames, scene, sweep, trial
-from rps_jax.law import RPSParams
-from rps_jax.physics import Physics, preset
-from rps_jax.reference import Batch
-from rps_jax.scene import FRICTION, OBJECTS, Friction, mjx
-from rps_jax.slots import Setting
-from rps_jax.sweep import Case
-from rps_jax.trial import Rules, Twist
+from rps_jax.control.law import RPSParams
+from rps_jax.engines import base as engines
+from rps_jax.engines.mujoco import Batch
+from rps_jax.geometry import planar
+from rps_jax.trials import pushes, trial
+from rps_jax.trials.batch import Setting
+from rps_jax.trials.pushes import Case
+from rps_jax.trials.trial import Rules, Twist
+from rps_jax.world import scene
+from rps_jax.world.physics import Physics, preset
+from rps_jax.world.scene import FRICTION, OBJECTS, Friction, mjx
 
 G = 9.81  # [m/s^2]
 MASS = {"box": 20.0, "cylinder": 25.0}  # [kg]
@@ -406,9 +409,9 @@ def ends(physics, *bearings):
     bearings = np.radians(bearings)
     cases = [Case("cylinder", Friction(0.05, 0.5), (0.4, 2.0), bearing=b) for b in bearings]
     setting = Setting(physics, Rules(horizon=6.0), engine="mujoco")
-    poses = sweep.run(cases, setting, workers=1)[0].object_pose
-    yaw = frames.wrap(jnp.asarray(poses[:, 2] - bearings))
-    return np.column_stack([frames.rotate(jnp.asarray(-bearings), jnp.asarray(poses[:, :2])), yaw])
+    poses = pushes.run(cases, setting, workers=1)[0].object_pose
+    yaw = planar.wrap(jnp.asarray(poses[:, 2] - bearings))
+    return np.column_stack([planar.rotate(jnp.asarray(-bearings), jnp.asarray(poses[:, :2])), yaw])
 
 
 def test_with_the_cone_a_trial_turned_by_45_degrees_ends_the_same_turned():
@@ -439,7 +442,7 @@ def test_a_world_that_runs_away_in_c_mujoco_ends_diverged_and_prints_nothing(
     monkeypatch.chdir(tmp_path)
     params = RPSParams.paper()._replace(v_approach=1e11)
     setting = Setting(STANDARD, Rules(horizon=0.1), engine="mujoco")
-    outcome, _ = sweep.run([Case("box", FRICTION["S1"], (2.0, 0.0), params)], setting)
+    outcome, _ = pushes.run([Case("box", FRICTION["S1"], (2.0, 0.0), params)], setting)
     assert outcome.diverged.all()
     assert not outcome.success.any()
     assert capfd.readouterr() == ("", "")

@@ -16,18 +16,21 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from rps_jax import engines, objects, paper, scene, solid, sweep, trial
-from rps_jax import footprint as fp
+from rps_jax.control.law import RPSParams
+from rps_jax.engines import base as engines
+from rps_jax.engines.quasistatic import Contact, Problem, Quasistatic, Slider, _divide, rollout
 from rps_jax.errors import InputError
-from rps_jax.footprint import Footprint
-from rps_jax.law import RPSParams
-from rps_jax.physics import Physics, preset
-from rps_jax.quasistatic import Contact, Problem, Quasistatic, Slider, _divide, rollout
-from rps_jax.scene import FRICTION, OBJECTS
-from rps_jax.slots import Setting
-from rps_jax.solid import Solid
-from rps_jax.sweep import Case
-from rps_jax.trial import Twist
+from rps_jax.geometry import footprint as fp
+from rps_jax.geometry import solid
+from rps_jax.geometry.footprint import Footprint
+from rps_jax.geometry.solid import Solid
+from rps_jax.trials import pushes, trial
+from rps_jax.trials.batch import Setting
+from rps_jax.trials.pushes import Case
+from rps_jax.trials.trial import Twist
+from rps_jax.world import objects, paper, scene
+from rps_jax.world.physics import Physics, preset
+from rps_jax.world.scene import FRICTION, OBJECTS
 
 FRONT, SIDE = 0.3625, 0.29  # [m] half length and width of the base
 HALF, RADIUS = 0.20, 0.25  # [m] half a side of the box; of the cylinder
@@ -475,7 +478,7 @@ def closed_loop():
             nudges += [RPSParams()._replace(**{name: getattr(RPSParams(), name) * (1 + e)})
                        for e in (1e-5, -1e-5)]  # fmt: skip
         cases = [Case("box", FRICTION["S1"], (1.0, 2.0), p, gap=0.0) for p in nudges]
-        stage, worlds = sweep.build(cases, Setting(engine="quasistatic"))
+        stage, worlds = pushes.build(cases, Setting(engine="quasistatic"))
         worlds = jax.device_put(worlds)
 
         @jax.jit
@@ -553,7 +556,7 @@ def test_the_papers_grid_ends_as_in_the_other_engines():
         for friction in FRICTION
         for target in paper.TARGETS
     ]
-    outcome, _ = sweep.run(cases, Setting(engine="quasistatic"))
+    outcome, _ = pushes.run(cases, Setting(engine="quasistatic"))
     rps, nps = outcome.success.reshape(2, -1, len(paper.TARGETS)).sum(axis=-1)
     assert rps.tolist() == [24] * 6
     assert nps.tolist() == [4, 4, 4, 4, 3, 6]

@@ -6,10 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from rps_jax import errors, scene, skin
-from rps_jax.objects import FAMILIES, OBJECTS
-from rps_jax.physics import Physics
-from rps_jax.scene import FRICTION, JOINTS, mjx
+from rps_jax import errors
+from rps_jax.robot import skin
+from rps_jax.world import scene
+from rps_jax.world.objects import FAMILIES, OBJECTS
+from rps_jax.world.physics import Physics
+from rps_jax.world.scene import FRICTION, JOINTS, mjx
 
 STEP = 0.01  # [s]
 TWIST = np.array([0.05, 0.01, 0.1])  # base x, y [m/s], yaw [rad/s] in the world

@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from rps_jax import errors, skin
-from rps_jax import footprint as fp
-from rps_jax.footprint import Footprint
-from rps_jax.skin import LINE, NONE, POINT, CapacitiveSkin, IdealSkin
+from rps_jax import errors
+from rps_jax.geometry import footprint as fp
+from rps_jax.geometry.footprint import Footprint
+from rps_jax.robot import skin
+from rps_jax.robot.skin import LINE, NONE, POINT, CapacitiveSkin, IdealSkin
 
 FRONT, SIDE = 0.3625, 0.29  # [m]
 PITCH = 0.58 / 12  # [m] from taxel to taxel

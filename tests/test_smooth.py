@@ -14,15 +14,18 @@ import pytest
 from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 
-from rps_jax import errors, law, reference, strategies, sweep
-from rps_jax import footprint as fp
-from rps_jax.footprint import Footprint
-from rps_jax.law import Observation, RPSParams, RPSState, Temperatures
-from rps_jax.scene import FRICTION
-from rps_jax.skin import HALF_LENGTH, HALF_WIDTH, NONE, CapacitiveSkin, IdealSkin, SmoothSkin
-from rps_jax.slots import Setting
-from rps_jax.sweep import Case
-from rps_jax.trial import Rules
+from rps_jax import errors
+from rps_jax.control import law, strategies
+from rps_jax.control.law import Observation, RPSParams, RPSState, Temperatures
+from rps_jax.engines import mujoco as c_mujoco
+from rps_jax.geometry import footprint as fp
+from rps_jax.geometry.footprint import Footprint
+from rps_jax.robot.skin import HALF_LENGTH, HALF_WIDTH, NONE, CapacitiveSkin, IdealSkin, SmoothSkin
+from rps_jax.trials import pushes
+from rps_jax.trials.batch import Setting
+from rps_jax.trials.pushes import Case
+from rps_jax.trials.trial import Rules
+from rps_jax.world.scene import FRICTION
 
 PAPER = RPSParams.paper()
 WARM = Temperatures()
@@ -548,7 +551,7 @@ def test_a_skin_that_is_not_warm_is_refused(value):
 def push(case: Case, strategy, horizon: float):
     """The trial of a case after `horizon` [s], or at its end."""
     setting = Setting(engine="mujoco", rules=Rules(horizon=horizon))
-    models, worlds = sweep.build([case], setting)
+    models, worlds = pushes.build([case], setting)
     seen = []
 
     def report(ended, trials, simulated):
@@ -556,7 +559,7 @@ def push(case: Case, strategy, horizon: float):
         return True
 
     options = {"physics": setting.physics, "rules": setting.rules, "threads": 1}
-    reference.run(models, worlds, strategy=strategy, report=report, **options)
+    c_mujoco.run(models, worlds, strategy=strategy, report=report, **options)
     return jax.tree.map(lambda x: np.asarray(x)[0], seen[-1])
 
 

@@ -5,30 +5,23 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from rps_jax import (
-    ambiguity,
-    errors,
-    fidelity,
-    hardware,
-    paper,
-    record,
-    reference,
-    report,
-    scene,
-    score,
-    study,
-    sweep,
-)
-from rps_jax.law import RPSParams
-from rps_jax.objects import PAPER_OBJECTS
-from rps_jax.physics import preset
-from rps_jax.report import Section
-from rps_jax.scene import FRICTION
-from rps_jax.skin import IdealSkin
-from rps_jax.slots import Setting
-from rps_jax.study import Condition, Grid
-from rps_jax.sweep import Case
-from rps_jax.trial import Rules, Shift
+from rps_jax import errors
+from rps_jax.analysis import report, tables
+from rps_jax.analysis.report import Section
+from rps_jax.control.law import RPSParams
+from rps_jax.engines import mujoco as c_mujoco
+from rps_jax.record import folder as record
+from rps_jax.robot.skin import IdealSkin
+from rps_jax.studies import ambiguity, fidelity, hardware, study
+from rps_jax.studies.study import Condition, Grid
+from rps_jax.trials import pushes
+from rps_jax.trials.batch import Setting
+from rps_jax.trials.pushes import Case
+from rps_jax.trials.trial import Rules, Shift
+from rps_jax.world import paper, scene
+from rps_jax.world.objects import PAPER_OBJECTS
+from rps_jax.world.physics import preset
+from rps_jax.world.scene import FRICTION
 
 NEAR = ((0.6, 0.0), (0.62, 0.03))
 SHORT = Setting(engine="mujoco", rules=Rules(horizon=18.0))
@@ -49,8 +42,8 @@ def folder(tmp_path_factory):
 
 def test_a_study_labels_its_conditions_and_compares_them(folder):
     results = study.run(CONDITIONS, GRID, folder)
-    assert results.success.dims == ("condition", *score.DIMS)
-    won = results.success.sum(score.DIMS).values
+    assert results.success.dims == ("condition", *tables.DIMS)
+    won = results.success.sum(tables.DIMS).values
     np.testing.assert_array_equal(won, [2, 0, 2])
     rows = study.rows(results, "default")
     assert [row[0] for row in rows] == ["reading", "the defaults", "slow", "thin skin"]
@@ -62,13 +55,13 @@ def test_a_study_continues_where_it_stopped_and_redoes_alone_what_is_corrupt(fol
     before = record.read(folder / "thin.nc")
     (folder / "thin.nc").write_bytes(b"torn")
     ran = []
-    run = sweep.run
+    run = pushes.run
 
     def counted(cases, *args, **options):
         ran.extend(cases)
         return run(cases, *args, **options)
 
-    monkeypatch.setattr(sweep, "run", counted)
+    monkeypatch.setattr(pushes, "run", counted)
     study.run(CONDITIONS, GRID, folder)
     assert ran == CONDITIONS["thin"].cases(GRID)
     xr.testing.assert_identical(record.read(folder / "thin.nc").drop_attrs(), before.drop_attrs())
@@ -96,7 +89,7 @@ def test_c_mujoco_driven_by_periods_matches_c_mujoco_driven_by_steps():
     at = scene.load("box", physics)
     qpos = scene.initial_qpos(at, gap=0.001)
     twist = np.array([[0.05, 0.02, 0.1]])
-    batch = reference.Batch([at.physics], qpos[None], 1)
+    batch = c_mujoco.Batch([at.physics], qpos[None], 1)
     data = mujoco.MjData(at.physics)
     data.qpos[:] = qpos
     for _ in range(100):
@@ -120,7 +113,7 @@ def test_a_shove_moves_the_object_along_the_front_of_the_robot():
         for y, bearing in ((0.1, 0.0), (-0.1, 0.0), (0.1, np.pi / 2))
     ]
     setting = Setting(engine="mujoco", rules=Rules(horizon=1.0))
-    outcome, _ = sweep.run(cases, setting)
+    outcome, _ = pushes.run(cases, setting)
     x = 0.3625 + 0.02 + 0.2
     expected = [[x, 0.1], [x, -0.1], [-0.1, x]]
     np.testing.assert_allclose(outcome.object_pose[:, :2], expected, atol=1e-3)
@@ -165,7 +158,7 @@ def test_the_cells_of_table_ii_are_judged_by_their_intervals():
     success = np.ones(shape, np.int8)
     success[:, 1:] = 0
     results = xr.Dataset(
-        {"success": (("condition", *score.DIMS), success)},
+        {"success": (("condition", *tables.DIMS), success)},
         coords={
             "condition": ["paper_gazebo"],
             "strategy": list(paper.STRATEGIES),
@@ -191,8 +184,8 @@ def test_the_tolerance_curve_sums_each_behaviour_and_tolerance():
     success[names.index("drive_6mm"), 0, 1] = 1
     results = xr.Dataset(
         {
-            "success": (("condition", *score.DIMS), success),
-            "contact_lost_time": (("condition", *score.DIMS), np.full(shape, 2.0)),
+            "success": (("condition", *tables.DIMS), success),
+            "contact_lost_time": (("condition", *tables.DIMS), np.full(shape, 2.0)),
         },
         coords={"condition": names, "strategy": ["rps"], "object": list(PAPER_OBJECTS)},
     )

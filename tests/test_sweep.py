@@ -21,25 +21,21 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from rps_jax import (
-    analysis,
-    cli,
-    domain,
-    frames,
-    paper,
-    record,
-    robustness,
-    slots,
-    strategies,
-    trial,
-)
-from rps_jax.domain import DOMAINS, Range
+from rps_jax.analysis import statistics
+from rps_jax.app import cli
+from rps_jax.control import strategies
+from rps_jax.control.law import RPSParams
 from rps_jax.errors import InputError
-from rps_jax.law import RPSParams
-from rps_jax.physics import preset
-from rps_jax.robustness import Plan, Shard
-from rps_jax.slots import Job, Setting
-from rps_jax.trial import Outcome, Rules
+from rps_jax.geometry import planar
+from rps_jax.record import folder as record
+from rps_jax.runs import sweep
+from rps_jax.runs.sweep import Plan, Shard
+from rps_jax.trials import batch, trial
+from rps_jax.trials.batch import Job, Setting
+from rps_jax.trials.trial import Outcome, Rules
+from rps_jax.world import domain, paper
+from rps_jax.world.domain import DOMAINS, Range
+from rps_jax.world.physics import preset
 
 SLOTS = 8
 SHORT = Setting(preset(fidelity="fast"), Rules(horizon=20.0), engine="fused")
@@ -72,7 +68,7 @@ def outcomes(parts, setting=SHORT):
             found[int(number)] = [leaf[i] for leaf in rows]
 
     job = Job(strategies.RPS, sum(p.numbers.size for p in parts), parts)
-    slots.run([job], setting, slots=SLOTS, workers=1, collect=collect)
+    batch.run([job], setting, slots=SLOTS, workers=1, collect=collect)
     return found
 
 
@@ -81,8 +77,8 @@ def made(index):
 
 
 def swept(folder, plan=PLAN, **options):
-    robustness.open_run(folder, plan)
-    robustness.run(folder, plan, slots=SLOTS, **options)
+    sweep.open_run(folder, plan)
+    sweep.run(folder, plan, slots=SLOTS, **options)
     return folder
 
 
@@ -159,7 +155,7 @@ def test_flat_boxes_that_nothing_touches_stay_where_they_are():
     found = outcomes([part])
     pose = np.array([found[i][Outcome._fields.index("object_pose")] for i in range(SLOTS)])
     assert np.abs(pose[:, :2] - part.worlds.qpos[:, 3:5]).max() < 2e-3  # in 20 s
-    assert np.abs(pose[:, 2] - frames.yaw_of_quaternion(part.worlds.qpos[:, 6:])).max() < 0.01
+    assert np.abs(pose[:, 2] - planar.yaw_of_quaternion(part.worlds.qpos[:, 6:])).max() < 0.01
 
 
 @pytest.mark.slow
@@ -198,7 +194,7 @@ def test_two_devices_find_what_one_finds_and_never_talk(whole, tmp_path, cache):
     assert done.stdout.split() == ["16"]  # slots, and no collective
     results = []
     for folder in (tmp_path / "run", whole):
-        robustness.merge([folder], tmp_path)
+        sweep.merge([folder], tmp_path)
         results.append(record.read_results(tmp_path))
     # Another program rounds otherwise, and contact amplifies it.
     two, one = results
@@ -208,20 +204,20 @@ def test_two_devices_find_what_one_finds_and_never_talk(whole, tmp_path, cache):
 
 
 def test_results_hold_every_world_with_what_was_drawn(whole, tmp_path):
-    robustness.merge([whole], tmp_path)
+    sweep.merge([whole], tmp_path)
     results = record.read_results(tmp_path)
     assert dict(results.sizes) == {"arm": 2, "world": 20, "pose": 3, "object": 1}
     columns = domain.table(domain.draw(BOXES, 0, np.arange(20)))
     for name, (values, unit) in columns.items():
         np.testing.assert_allclose(results[name], values, rtol=1e-6)
         assert results[name].attrs["units"] == unit
-    assert set(analysis.DRAWN) == set(columns)
+    assert set(statistics.DRAWN) == set(columns)
     again = outcomes([made(np.arange(20))])
     for i, row in again.items():
         assert float(results.time.sel(arm="rps")[i]) == row[1]
         assert int(results.success.sel(arm="rps")[i]) == int(row[0])
-    json.dumps(robustness.load_plan(whole).configuration())
-    assert robustness.load_plan(whole) == PLAN
+    json.dumps(sweep.load_plan(whole).configuration())
+    assert sweep.load_plan(whole) == PLAN
 
 
 # C MuJoCo compiles little, so that a process is soon at work.
@@ -243,7 +239,7 @@ def sweep_in_a_process(folder, cache):
 def test_a_run_killed_twenty_times_ends_as_one_that_was_not(tmp_path, cache):
     """SIGKILL at random moments, in turn of a start and of the work; then one may end."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["rps_jax.robustness"])
+    context.set_forkserver_preload(["rps_jax.runs.sweep"])
     folder, dice, interrupted = tmp_path / "run", random.Random(0), 0
 
     def done():
@@ -296,7 +292,7 @@ def test_a_full_disk_loses_nothing(whole, tmp_path, capsys, monkeypatch):
 
 
 def test_a_device_out_of_memory_loses_nothing(whole, tmp_path, capsys, monkeypatch):
-    compiled = slots._Queue.program
+    compiled = batch._Queue.program
 
     def starved(queue):
         def program(*arguments):
@@ -306,7 +302,7 @@ def test_a_device_out_of_memory_loses_nothing(whole, tmp_path, capsys, monkeypat
 
         return program
 
-    monkeypatch.setattr(slots._Queue, "program", starved)
+    monkeypatch.setattr(batch._Queue, "program", starved)
     words = ("out of memory", "--slots", "is kept")
     ends_in_one_sentence_and_is_continued(tmp_path, whole, capsys, monkeypatch, *words)
 
@@ -333,43 +329,43 @@ def test_a_part_of_an_older_version_is_named(whole, tmp_path):
     victim = sorted(folder.glob("parts/*.nc"))[0]
     older = record.encoded(record.read(victim).drop_vars("overflows"))
     victim.unlink()
-    kept = robustness.store(folder, 0, older)
+    kept = sweep.store(folder, 0, older)
     with pytest.raises(InputError, match=f"{kept.name} is corrupt .it lacks what this version"):
-        robustness.merge([folder], folder)
+        sweep.merge([folder], folder)
 
 
 def test_the_report_of_one_world_tells_what_was_lost_and_how_to_see_it(whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "a run")
-    robustness.merge([folder], folder)
+    sweep.merge([folder], folder)
     one = record.read_results(folder).isel(world=[0])
     one.success[:], one.overflows[:] = [[1], [0]], [[0], [3]]
     record.write_results(folder / "results.nc", one)
-    text = robustness.write_report(folder).read_text()
+    text = sweep.write_report(folder).read_text()
     assert "1 trials lost contacts for want of room: they are not to be trusted" in text
     assert f"`rps replay '{folder}' 0 --arm 'nps' --video`" in text  # the arm that fails
     assert not (folder / "success.png").exists()  # nothing was drawn but once
-    assert analysis.influences(one, "rps")[1:] == []
+    assert statistics.influences(one, "rps")[1:] == []
 
 
 def test_shards_merge_to_the_whole(whole, tmp_path):
     folders = [swept(tmp_path / f"{k}", shard=Shard(k, 3)) for k in (1, 2, 3)]
     with pytest.raises(InputError, match="lacks 2 of 6 parts"):
-        robustness.merge(folders[:2], tmp_path)
-    robustness.merge(folders, tmp_path)
+        sweep.merge(folders[:2], tmp_path)
+    sweep.merge(folders, tmp_path)
     (tmp_path / "direct").mkdir()
-    robustness.merge([whole], tmp_path / "direct")
+    sweep.merge([whole], tmp_path / "direct")
     together = [record.read_results(f) for f in (tmp_path, tmp_path / "direct")]
     xr.testing.assert_identical(*together)
     other = replace(PLAN, setting=replace(SHORT, seed=5))
-    robustness.open_run(tmp_path / "other", other)
+    sweep.open_run(tmp_path / "other", other)
     with pytest.raises(InputError, match="seed = 0 there, 5 asked for"):
-        robustness.merge([folders[0], tmp_path / "other"], tmp_path)
+        sweep.merge([folders[0], tmp_path / "other"], tmp_path)
 
 
 def test_another_configuration_is_refused_with_what_differs(whole):
     other = replace(PLAN, worlds=30, domain=replace(BOXES, mass=Range(1, 2)))
     with pytest.raises(InputError, match=r"domain.mass = .*there, .* asked for; worlds = 20 there"):
-        robustness.open_run(whole, other)
+        sweep.open_run(whole, other)
 
 
 def test_two_processes_may_not_share_a_run_but_may_share_its_shards(tmp_path):
@@ -444,33 +440,36 @@ def test_what_a_sweep_says_is_what_happened():
         coords={"arm": ["a", "b"], "object": ["box", "drum"], "world": range(4)},
     )
     first, second = (results.sel(arm=arm) for arm in "ab")
-    assert [analysis.FAILURES[k] if k >= 0 else "" for k in analysis.failure(first, 150)] == [
+    assert [statistics.FAILURES[k] if k >= 0 else "" for k in statistics.failure(first, 150)] == [
         "", "timeout", "never touched", "diverged"]  # fmt: skip
-    assert [analysis.FAILURES[k] for k in analysis.failure(second, 150)[2:]] == [
+    assert [statistics.FAILURES[k] for k in statistics.failure(second, 150)[2:]] == [
         "lost contact", "fell over"]  # fmt: skip
-    assert analysis.left_over(first).tolist() == [0.04, 0.5, 3.0, 1.0]
-    assert analysis.cvar(np.arange(100.0)) == pytest.approx(97.0)  # mean of 95 .. 99
-    assert analysis.cvar(np.array([1.0, 3.0])) == 3.0
-    assert analysis.differences(results)[1][1:4] == ["1", "0", "+25.00 %"]
-    assert analysis.hardest(results).tolist() == [2, 3, 1]
-    rates = analysis.rates(results, 150)
+    assert statistics.left_over(first).tolist() == [0.04, 0.5, 3.0, 1.0]
+    assert statistics.cvar(np.arange(100.0)) == pytest.approx(97.0)  # mean of 95 .. 99
+    assert statistics.cvar(np.array([1.0, 3.0])) == 3.0
+    assert statistics.differences(results)[1][1:4] == ["1", "0", "+25.00 %"]
+    assert statistics.hardest(results).tolist() == [2, 3, 1]
+    rates = statistics.rates(results, 150)
     assert rates[1][1].startswith("50.0 %")  # of a with the box
     assert rates[2][3].startswith("50.0 %")  # of b in all
-    bins = analysis.bins(np.arange(16.0), np.arange(16) < 4, count=4)
+    bins = statistics.bins(np.arange(16.0), np.arange(16) < 4, count=4)
     assert bins.won.tolist() == [4, 0, 0, 0]
     assert bins.of.tolist() == [4] * 4
-    assert analysis.bins(np.array([1.0, 1, 2]), np.array([True, False, True])).of.tolist() == [2, 1]
+    assert statistics.bins(np.array([1.0, 1, 2]), np.array([True, False, True])).of.tolist() == [
+        2,
+        1,
+    ]
 
 
 def test_what_success_depends_on_stands_first():
     """Heavy objects fail, of 400; friction has nothing to do with it; all else was not varied."""
     number = np.arange(400)
-    drawn = {name: ("world", np.zeros(400), {"units": "1"}) for name in analysis.DRAWN}
+    drawn = {name: ("world", np.zeros(400), {"units": "1"}) for name in statistics.DRAWN}
     drawn["mass"] = ("world", number * 1.0, {"units": "kg"})
     drawn["friction_ground"] = ("world", number % 7 * 1.0, {"units": "1"})
     success = (("arm", "world"), (number < 350)[None].astype(np.int8))
     results = xr.Dataset({"success": success, **drawn}, coords={"arm": ["a"]})
-    (_, mass, friction) = analysis.influences(results, "a")
+    (_, mass, friction) = statistics.influences(results, "a")
     assert mass[0] == "mass of the object"
     assert mass[1] == "374 kg"  # the last eighth: 350 to 399
     assert mass[2].startswith("0.0 % [0.0, ")
@@ -478,7 +477,7 @@ def test_what_success_depends_on_stands_first():
     assert float(mass[5]) < 1e-10
     constant = results.assign(yaw=("world", np.full(400, 0.1, np.float32), {"units": "rad"}))
     assert np.nanstd(constant.yaw.values) > 0  # by rounding
-    assert analysis.drawn(constant) == ["mass", "friction_ground"]
+    assert statistics.drawn(constant) == ["mass", "friction_ground"]
     assert friction[0] == "friction object-ground"
     assert float(friction[5]) > 0.5
 
@@ -503,8 +502,8 @@ def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys, monkeypatc
     assert cli.main(["merge", run, "--out", str(tmp_path / "there")]) == 0
     for folder, name in product(("run", "there"), ("report.html", "report.md", "success.png")):
         assert (tmp_path / folder / name).exists()
-    assert robustness.load_plan(tmp_path / "there") == robustness.load_plan(Path(run))
-    other = robustness.open_run(tmp_path / "other", PLAN)
+    assert sweep.load_plan(tmp_path / "there") == sweep.load_plan(Path(run))
+    other = sweep.open_run(tmp_path / "other", PLAN)
     assert cli.main(["merge", run, "--out", str(other)]) == 2
     assert "other holds another run (domain.objects = " in capsys.readouterr().err
     assert not (other / "results.nc").exists()

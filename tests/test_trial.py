@@ -9,14 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rps_jax import errors, sweep, trial
-from rps_jax.law import RPSParams
-from rps_jax.physics import preset
-from rps_jax.scene import FRICTION
-from rps_jax.skin import CapacitiveSkin, IdealSkin
-from rps_jax.slots import Setting
-from rps_jax.sweep import Case
-from rps_jax.trial import Rules, Shift
+from rps_jax import errors
+from rps_jax.control.law import RPSParams
+from rps_jax.robot.skin import CapacitiveSkin, IdealSkin
+from rps_jax.trials import pushes, trial
+from rps_jax.trials.batch import Setting
+from rps_jax.trials.pushes import Case
+from rps_jax.trials.trial import Rules, Shift
+from rps_jax.world.physics import preset
+from rps_jax.world.scene import FRICTION
 
 NEAR = (0.7, 0.0)  # [m] 0.32 m ahead of the front face
 AHEAD = (2.0, 0.0)
@@ -45,7 +46,7 @@ CASES = [
 @pytest.fixture(scope="module")
 def outcomes():
     """Seven trials through four slots: three slots are refilled while their neighbours run."""
-    outcome, timing = sweep.run(CASES, SHORT, slots=SLOTS, workers=1)
+    outcome, timing = pushes.run(CASES, SHORT, slots=SLOTS, workers=1)
     assert timing.run > 0
     return outcome
 
@@ -61,7 +62,7 @@ def test_a_short_push_reaches_a_near_target(outcomes):
 def test_a_gpu_that_seldom_asks_who_still_runs_finds_the_same(monkeypatch):
     """As it would be traced there: 40 steps, in which trials end by their horizon, or do not."""
     setting = Setting(engine="quasistatic")
-    stage, worlds = sweep.build([case(), case(AHEAD)], setting)
+    stage, worlds = pushes.build([case(), case(AHEAD)], setting)
     start = trial.start_all(worlds, np.ones(2, bool))
 
     def run(backend):
@@ -79,7 +80,7 @@ def test_a_gpu_that_seldom_asks_who_still_runs_finds_the_same(monkeypatch):
 
 
 def test_a_base_may_turn_as_often_as_it_likes_and_not_go_as_far():
-    _, worlds = sweep.build([case()], FUSED)
+    _, worlds = pushes.build([case()], FUSED)
     now = trial.start(jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], worlds))
     for i, value, diverges in ((2, 500.0, False), (2, np.nan, True), (0, 101.0, True)):
         driven = trial.Driven(now.qpos.at[i].set(value), now.qvel, now.warmstart)
@@ -87,7 +88,7 @@ def test_a_base_may_turn_as_often_as_it_likes_and_not_go_as_far():
 
 
 def test_a_shove_happens_once_however_its_time_is_rounded():
-    _, worlds = sweep.build([case()], FUSED)
+    _, worlds = pushes.build([case()], FUSED)
     world = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], worlds)
     start = trial.start(world)
     x = trial.JOINTS.object.start
@@ -113,7 +114,7 @@ def test_a_far_target_is_not_reached_in_time(outcomes):
 
 def test_a_trial_is_bit_identical_alone_or_among_others(outcomes):
     for index in (1, 3, 5):
-        alone, _ = sweep.run([CASES[index]] * SLOTS, SHORT, slots=SLOTS, workers=1)
+        alone, _ = pushes.run([CASES[index]] * SLOTS, SHORT, slots=SLOTS, workers=1)
         for slot in range(SLOTS):
             for name in outcomes._fields:
                 np.testing.assert_array_equal(
@@ -125,14 +126,14 @@ def test_contact_lost_for_too_long_ends_a_trial(outcomes):
     # Without reaction the box slides off the turning base, which creeps ahead without it.
     lost = case((0.2, 2.0), reactive=0.0)
     rules = Rules(horizon=60.0, max_lost=5.0)
-    outcome, _ = sweep.run([lost] * SLOTS, replace(FUSED, rules=rules), slots=SLOTS, workers=1)
+    outcome, _ = pushes.run([lost] * SLOTS, replace(FUSED, rules=rules), slots=SLOTS, workers=1)
     assert not outcome.success.any()
     assert outcome.contact_lost_time[0] == pytest.approx(5.0, abs=0.03)
     assert outcome.time[0] < 60.0
 
 
 def world_batch(count):
-    stage, worlds = sweep.build([case()] * count, FUSED)
+    stage, worlds = pushes.build([case()] * count, FUSED)
     return stage, jax.device_put(worlds)
 
 
@@ -197,7 +198,7 @@ def test_before_the_first_touch_the_base_creeps_and_nothing_counts_as_lost(advan
 
 def test_the_trace_of_a_trial_tells_the_same_story_as_its_outcome():
     setting = replace(FUSED, rules=Rules(horizon=24.0))
-    (trace,) = sweep.follow([case(skin=CapacitiveSkin())], setting, interval=0.1)
+    (trace,) = pushes.follow([case(skin=CapacitiveSkin())], setting, interval=0.1)
     seen, outcome = trace.snapshots, trace.outcome
     assert outcome.success
     assert np.allclose(np.diff(seen.time), 0.1, atol=1e-4)

@@ -9,13 +9,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rps_jax import cli, domain, law, tune
+from rps_jax.app import cli
+from rps_jax.control import law
+from rps_jax.control.law import RPSParams
 from rps_jax.errors import InputError
-from rps_jax.law import RPSParams
-from rps_jax.physics import preset
-from rps_jax.slots import Setting, Timing
-from rps_jax.trial import Rules
-from rps_jax.tune import BOUNDS, SUBSETS, Answer, Ask, Course, Evolution, Objective, Space
+from rps_jax.trials.batch import Setting, Timing
+from rps_jax.trials.trial import Rules
+from rps_jax.tuning import evolution as tune
+from rps_jax.tuning.evolution import (
+    BOUNDS,
+    SUBSETS,
+    Answer,
+    Ask,
+    Course,
+    Evolution,
+    Objective,
+    Space,
+)
+from rps_jax.world import domain
+from rps_jax.world.physics import preset
 
 FULL = Space(SUBSETS["full"])
 RULES = Rules(horizon=300.0, max_lost=150.0)

@@ -10,11 +10,12 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from rps_jax import errors, video
+from rps_jax import errors
+from rps_jax.analysis import video
 
 video.choose_gl()  # before anything imports MuJoCo
 
-from rps_jax import scene  # noqa: E402
+from rps_jax.world import scene  # noqa: E402
 
 # imageio_ffmpeg's reader, used here alone, forks; JAX warns that its threads might then lock.
 pytestmark = pytest.mark.filterwarnings("ignore:os.fork")
@@ -195,7 +196,7 @@ def test_a_machine_that_cannot_draw_is_told_how_to_mend_it() -> None:
 
 def test_importing_the_module_changes_nothing() -> None:
     code = (
-        "import os, sys; before = dict(os.environ); import rps_jax.video; "
+        "import os, sys; before = dict(os.environ); import rps_jax.analysis.video; "
         "assert 'mujoco' not in sys.modules and before == dict(os.environ)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

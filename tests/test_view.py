@@ -15,13 +15,15 @@ from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
 
-from rps_jax import cli, scene, sweep, view
+from rps_jax.app import cli, viewer
 from rps_jax.errors import InputError
-from rps_jax.live import Live
-from rps_jax.physics import preset
-from rps_jax.slots import Setting
-from rps_jax.sweep import Case
-from rps_jax.trial import Rules
+from rps_jax.trials import pushes
+from rps_jax.trials.batch import Setting
+from rps_jax.trials.pushes import Case
+from rps_jax.trials.stepper import Live
+from rps_jax.trials.trial import Rules
+from rps_jax.world import scene
+from rps_jax.world.physics import preset
 
 SETTING = Setting(preset(fidelity="fast"), Rules(horizon=12.0), engine="fused")
 CASE = Case("cylinder", scene.FRICTION["S1"], (0.6, 0.0))
@@ -55,7 +57,7 @@ def p_robot_object(seen):
 
 @pytest.mark.slow
 def test_a_push_that_is_left_alone_ends_as_any_other_trial(live):
-    found, _ = sweep.run([CASE], SETTING, slots=1, workers=1)
+    found, _ = pushes.run([CASE], SETTING, slots=1, workers=1)
     live.step(2 * round(SETTING.rules.horizon / PERIOD))
     assert live.done
     for name, value in live.outcome._asdict().items():
@@ -148,7 +150,7 @@ FLAGS = (
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
     *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--window-size=800,640"),
 )
-ASKED = view.Asked("cylinder", "S1", "rps", (0.0, 2.0))
+ASKED = viewer.Asked("cylinder", "S1", "rps", (0.0, 2.0))
 
 
 def make(asked):
@@ -157,12 +159,12 @@ def make(asked):
         raise InputError(f"unknown friction set '{asked.friction}': choose from S1, S2.")
     case = Case(asked.object, friction, asked.p_world_target)
     long = replace(SETTING, rules=Rules())
-    return view.Push(Live.of_case(case, long), sweep.scene_of(case, long.physics), "A drum")
+    return viewer.Push(Live.of_case(case, long), pushes.scene_of(case, long.physics), "A drum")
 
 
 @pytest.fixture
 def page():
-    page = view.open_page("127.0.0.1", 0, ASKED, make)
+    page = viewer.open_page("127.0.0.1", 0, ASKED, make)
     yield page
     page.close()
 

@@ -2,10 +2,12 @@
 
 import pytest
 
-from rps_jax import cli, engines, mjwarp
+from rps_jax.app import cli
+from rps_jax.engines import base as engines
+from rps_jax.engines import warp
 from rps_jax.errors import InputError
-from rps_jax.physics import Physics
-from rps_jax.scene import mjx
+from rps_jax.world.physics import Physics
+from rps_jax.world.scene import mjx
 
 WANTED = [
     ("table",),
@@ -31,16 +33,16 @@ def test_without_an_nvidia_gpu_it_is_refused_in_one_sentence_before_anything_com
 
 
 def test_without_warp_lang_the_extra_is_named(monkeypatch):
-    monkeypatch.setattr(mjwarp, "_on_nvidia", lambda: True)
+    monkeypatch.setattr(warp, "_on_nvidia", lambda: True)
     monkeypatch.setattr(mjx.warp, "WARP_INSTALLED", True)
-    mjwarp.check(["box", "cylinder"])
+    warp.check(["box", "cylinder"])
     monkeypatch.setattr(mjx.warp, "WARP_INSTALLED", False)
     with pytest.raises(InputError, match=r"\(no warp-lang\): pip install '\.\[cuda,warp\]'"):
-        mjwarp.check()
+        warp.check()
 
 
 def test_prisms_are_refused(capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(mjwarp, "_on_nvidia", lambda: True)
+    monkeypatch.setattr(warp, "_on_nvidia", lambda: True)
     run = ["sweep", "--domain", "wide", "--engine", "warp", "--out", str(tmp_path / "run")]
     assert cli.main(run) == 2
     assert "not allowed for prisms" in capsys.readouterr().err

@@ -16,14 +16,17 @@ import numpy as np
 import pytest
 from test_fused import FINE, STARTS, TWIST, in_c, start
 
-from rps_jax import domain, engines, mjwarp, scene, sweep
-from rps_jax.domain import DOMAINS
-from rps_jax.law import RPSParams, Twist
-from rps_jax.objects import FAMILIES
-from rps_jax.physics import Physics
-from rps_jax.scene import FRICTION, mjx
-from rps_jax.slots import Setting
-from rps_jax.trial import Driven, Rules, Trial, World
+from rps_jax.control.law import RPSParams, Twist
+from rps_jax.engines import base as engines
+from rps_jax.engines import warp
+from rps_jax.trials import pushes
+from rps_jax.trials.batch import Setting
+from rps_jax.trials.trial import Driven, Rules, Trial, World
+from rps_jax.world import domain, scene
+from rps_jax.world.domain import DOMAINS
+from rps_jax.world.objects import FAMILIES
+from rps_jax.world.physics import Physics
+from rps_jax.world.scene import FRICTION, mjx
 
 SHORT = Setting(FINE, Rules(horizon=0.1), engine="warp")
 
@@ -41,7 +44,7 @@ def plain_kernels():
 @pytest.fixture
 def allowed(monkeypatch):
     """As if there were a GPU."""
-    monkeypatch.setattr(mjwarp, "check", lambda families: None)
+    monkeypatch.setattr(warp, "check", lambda families: None)
 
 
 def drive(stage, fields, qpos, steps=1):
@@ -76,7 +79,7 @@ def pushed(family, cone, steps):
     stage, fields = engines.stage_of_scenes([loaded for loaded, *_ in begun], "warp")
     qpos = np.array([qpos for *_, qpos in begun])
     found = drive(stage, fields, qpos, steps)
-    models = [mjwarp.own_cylinder(loaded.physics) for loaded, *_ in begun]
+    models = [warp.own_cylinder(loaded.physics) for loaded, *_ in begun]
     theirs = [in_c(m, q, steps) for m, q in zip(models, qpos, strict=True)]
     return found, [np.array(x) for x in zip(*theirs, strict=True)]
 
@@ -106,7 +109,7 @@ def test_the_physics_that_was_asked_for_is_solved():
     """Warp by itself would end its solver at 1e-6, long before an object's accelerations are."""
     physics = Physics(impratio=7.0, iterations=9, ls_iterations=11)
     loaded = scene.load("box", physics, FRICTION["S2"])
-    model = mjwarp.put(loaded.physics)
+    model = warp.put(loaded.physics)
     assert (model.opt.iterations, model.opt.ls_iterations) == (9, 11)
     assert float(model.opt.tolerance) == pytest.approx(1e-13)
     assert float(model.opt._impl.impratio_invsqrt) == pytest.approx(7**-0.5)
@@ -120,13 +123,13 @@ def test_the_base_touches_the_cylinder_itself_not_the_capsule_that_stands_in_for
     ground, base, cylinder, side = (
         loaded.geom(name).id for name in ("ground", "base", "object", "object_side")
     )
-    model = mjwarp.put(mjwarp.own_cylinder(loaded))
+    model = warp.put(warp.own_cylinder(loaded))
     pairs = {tuple(sorted(map(int, pair))) for pair in model._impl.nxn_geom_pair_filtered}
     assert pairs == {(ground, cylinder), (base, cylinder)}
     assert side in loaded.pair_geom2  # C MuJoCo and MJX still have it
     # Which is seen in C MuJoCo: flat on the base's face, the capsule touches it at one point only.
     with_capsule, _, qpos = start("cylinder", 0.0, 0.08)
-    models = with_capsule.physics, mjwarp.own_cylinder(with_capsule.physics)
+    models = with_capsule.physics, warp.own_cylinder(with_capsule.physics)
     one, both = (in_c(m, qpos, 1)[0] for m in models)
     assert np.abs(one - both).max() > 1e-4
 
@@ -138,7 +141,7 @@ def test_all_that_differs_between_worlds_is_batched_by_warp_or_not_used_by_it():
     batched = mjx.warp.types._BATCH_DIM["Model"]
     others = [name for name in scene.FIELDS if not batched.get(name.removeprefix("."))]
     assert others == [".stat.meaninertia", ".dof_M0"]
-    model = mjwarp.put(scene.load("box").physics)
+    model = warp.put(scene.load("box").physics)
     assert not any(hasattr(model._impl, name) for name in ("meaninertia", "dof_M0"))
 
 
@@ -177,11 +180,11 @@ def test_double_precision_is_given_back_as_double(allowed):
 def test_contacts_that_find_no_room_are_counted_and_reported_and_print_nothing(
     allowed, monkeypatch, capfd
 ):
-    cases = [sweep.Case("box", FRICTION["S1"], (2.0, y)) for y in (-1.0, 0.0, 1.0)]
+    cases = [pushes.Case("box", FRICTION["S1"], (2.0, y)) for y in (-1.0, 0.0, 1.0)]
     # The box stands on four points: room for two in each world holds half of them.
-    monkeypatch.setattr(mjwarp, "blank", functools.partial(mjwarp.blank, contacts=2))
+    monkeypatch.setattr(warp, "blank", functools.partial(warp.blank, contacts=2))
     with pytest.warns(UserWarning, match="lost contacts for want of room in 3 trials"):
-        outcome, _ = sweep.run(cases, SHORT, slots=3, workers=1)
+        outcome, _ = pushes.run(cases, SHORT, slots=3, workers=1)
     assert (outcome.overflows >= 5).all()  # control periods
     np.testing.assert_allclose(outcome.time, 0.1, atol=0.02)
     assert capfd.readouterr() == ("", "")

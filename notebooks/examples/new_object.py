@@ -3,7 +3,7 @@
     python notebooks/examples/new_object.py
 
 Once registered, its name works wherever `box` and `cylinder` do, in every engine: in cases, in
-domains, in `PushEnv`, in films, and in `rps_jax.cli.main(["push", "--object", "hexagon"])`.
+domains, in `PushEnv`, in films, and in `rps_jax.app.cli.main(["push", "--object", "hexagon"])`.
 """
 
 from pathlib import Path
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import rps_jax
-from rps_jax.footprint import polygon
+from rps_jax.geometry.footprint import polygon
 
 CORNERS = np.pi / 180 * np.arange(30, 390, 60)  # [rad] counter-clockwise
 OUTLINE = 0.2 * np.stack([np.cos(CORNERS), np.sin(CORNERS)], axis=-1)  # (6, 2) [m]

@@ -3,7 +3,7 @@
     python notebooks/examples/new_strategy.py
 
 Once registered, its name works wherever `rps` does: in cases by its parameters, and by name in
-`rps_jax.cli.main(["table", "--strategies", "rps", "p_control"])`.
+`rps_jax.app.cli.main(["table", "--strategies", "rps", "p_control"])`.
 """
 
 from typing import NamedTuple
@@ -11,7 +11,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 import rps_jax
-from rps_jax import Details, Strategy, Twist, frames, law
+from rps_jax import Details, Strategy, Twist
+from rps_jax.control import law
+from rps_jax.geometry import planar
 
 
 class PParams(NamedTuple):
@@ -22,7 +24,7 @@ class PParams(NamedTuple):
 
 
 def step(params, memory, seen):
-    error = frames.wrap(frames.direction(law.displacement(seen)) - seen.yaw)
+    error = planar.wrap(planar.direction(law.displacement(seen)) - seen.yaw)
     omega = jnp.clip(params.K_h * error, -0.15, 0.15)
     v_y = params.K_l * seen.p_robot_contact[1]
     twist = Twist(params.v, v_y, jnp.where(seen.in_contact, omega, 0.0))

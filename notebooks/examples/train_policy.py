@@ -16,7 +16,7 @@ import tyro
 from jax.flatten_util import ravel_pytree
 
 import rps_jax
-from rps_jax.physics import preset
+from rps_jax.world.physics import preset
 
 
 @dataclass(frozen=True)

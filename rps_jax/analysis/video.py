@@ -1,0 +1,460 @@
+"""Pictures of a trial: one image of a qpos, or a video of many.
+
+MuJoCo reads the environment variable MUJOCO_GL when it is imported, so nothing here imports it
+before something is drawn: a command line calls `choose_gl` first of all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import itertools
+import math
+import os
+import sys
+import tempfile
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from rps_jax import errors
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from rps_jax.world.scene import Scene
+
+SIZE = (960, 540)  # [px] width, height
+
+_TRAIL_STEP = 0.02  # [m] between the points of a trail
+_TRAIL_POINTS = 1500  # at most, so that memory stays flat: 30 m; the oldest go first
+_TRAIL_WIDTH = 0.007  # [1] of the image's height
+BASE_RGBA = (0.08, 0.09, 0.11, 1.0)
+CONTACT_RGBA = (0.62, 0.04, 0.46, 1.0)
+CONTACT_HEIGHT = 0.36  # [m] just above the chassis, which would hide the marker from above
+CONTACT_RADIUS = 0.04  # [m]
+_NO_CONTACT = np.full(2, np.nan)
+_EMPTY = 58  # grey of a place in a grid without a trial
+_INK = (24, 26, 30)  # RGB around labels and tiles
+_SHADOWS_FROM = 240  # [px] height of an image: they take most of the time without a GPU
+_LABEL = 13  # [1] heights of a label in a tile
+
+_MEND_GL = (
+    "MuJoCo cannot draw on this machine: install Mesa's EGL library (`apt install libegl1 "
+    "libgl1-mesa-dri`) and set MUJOCO_GL=egl, or set MUJOCO_GL=osmesa (`apt install libosmesa6`)."
+)
+_MEND_FFMPEG = "ffmpeg was not found or does not run: run `pip install imageio-ffmpeg`."
+
+
+class VideoError(RuntimeError):
+    """No picture or video could be made: one sentence that says how to mend it."""
+
+
+class Tile(NamedTuple):
+    """A trial in a grid of trials."""
+
+    scene: Scene
+    p_world_target: ArrayLike  # (2,) [m]
+
+
+class Shot(NamedTuple):
+    """What a tile shows in one frame."""
+
+    qpos: ArrayLike  # (10,) as for `snapshot`
+    p_world_contact: ArrayLike  # (2,) [m], NaN without contact
+    label: str
+
+
+class Check(NamedTuple):
+    """One thing that a video needs."""
+
+    what: str
+    ok: bool
+    mend: str  # how to mend it, one sentence; empty if `ok`
+
+
+def choose_gl() -> None:
+    """Set MUJOCO_GL to egl on a Linux machine without a display; call before MuJoCo is imported.
+
+    A variable that is set, and a machine that lacks the EGL library, are left alone: with egl
+    asked for and absent, MuJoCo could not even be imported.
+    """
+    if sys.platform != "linux" or os.environ.get("MUJOCO_GL") or os.environ.get("DISPLAY"):
+        return
+    with contextlib.suppress(OSError):
+        ctypes.CDLL("libEGL.so.1")
+        os.environ["MUJOCO_GL"] = "egl"
+
+
+def check() -> list[Check]:
+    """Whether this machine can draw and can encode, tried out; never raises VideoError."""
+    return [_attempt("rendering", _try_drawing), _attempt("ffmpeg", _try_encoding)]
+
+
+def snapshot(
+    scene: Scene,
+    qpos: ArrayLike,
+    *,
+    p_world_target: ArrayLike,
+    size: tuple[int, int] = SIZE,
+    camera: str = "oblique",
+) -> np.ndarray:
+    """One RGB image (height, width, 3) uint8.
+
+    Args:
+      scene: as `scene.load` gives it.
+      qpos: (10,) base x, y [m], yaw [rad]; object position [m] and quaternion, in the world.
+      p_world_target: (2,) [m] where the flag stands.
+      size: width and height [px].
+      camera: name of a camera of the scene: oblique or above.
+
+    Raises:
+      InputError: a qpos, target, size or camera that cannot be used.
+      VideoError: this machine cannot draw.
+    """
+    options = {"p_world_target": p_world_target, "size": size, "camera": camera}
+    return images(scene, [qpos], **options)[0]
+
+
+def images(
+    scene: Scene,
+    frames: Iterable[ArrayLike],
+    *,
+    p_world_target: ArrayLike,
+    size: tuple[int, int] = SIZE,
+    camera: str = "oblique",
+) -> list[np.ndarray]:
+    """Pictures as of `snapshot`, each with the path of the base up to there."""
+    with _studios([Tile(scene, p_world_target)], size, camera) as (studio,):
+        return [studio.draw(qpos, _NO_CONTACT) for qpos in frames]
+
+
+def render(
+    scene: Scene,
+    frames: Iterable[ArrayLike],
+    path: str | os.PathLike[str],
+    *,
+    p_world_target: ArrayLike,
+    fps: int = 30,
+    size: tuple[int, int] = SIZE,
+    camera: str = "oblique",
+    p_world_contacts: Iterable[ArrayLike] | None = None,
+) -> None:
+    """Write an MP4 (H.264, yuv420p) with the paths of the base and of the contact point.
+
+    Frames are drawn and encoded one by one as they come, so memory does not grow with them. The
+    file appears at `path` when it is complete, and a file already there stays until then.
+
+    Args:
+      scene: as `scene.load` gives it.
+      frames: qpos of each frame, (10,), as for `snapshot`; at least one.
+      path: the file to write.
+      p_world_target: (2,) [m] where the flag stands.
+      fps: frames per second of the video.
+      size: width and height [px], even numbers.
+      camera: name of a camera of the scene: oblique or above.
+      p_world_contacts: contact point of each frame, (2,) [m], NaN without contact.
+
+    Raises:
+      InputError: no frames, or a frame, target, rate, size or camera that cannot be used.
+      ValueError: not as many contacts as frames.
+      VideoError: this machine cannot draw or encode, or `path` cannot be written.
+    """
+    _check_film(size, fps)
+    pairs = _paired(frames, p_world_contacts)
+    first = next(pairs, None)
+    if first is None:
+        raise errors.InputError("frames = [] is not allowed: a video needs at least one frame.")
+    with (
+        _studios([Tile(scene, p_world_target)], size, camera) as (studio,),
+        _encoder(Path(path), size, fps) as sink,
+    ):
+        for qpos, p_world_contact in itertools.chain([first], pairs):
+            sink(np.ascontiguousarray(studio.draw(qpos, p_world_contact)))
+
+
+def render_grid(
+    tiles: Sequence[Tile],
+    frames: Iterable[Sequence[Shot]],
+    path: str | os.PathLike[str],
+    *,
+    shape: tuple[int, int],
+    size: tuple[int, int],
+    fps: int = 25,
+    camera: str = "oblique",
+) -> None:
+    """Write an MP4 as of `render` of many trials side by side.
+
+    Each frame is drawn tile by tile into one image and encoded at once.
+
+    Args:
+      tiles: of the grid, row by row; it may have room for more.
+      frames: what each tile shows in each frame; one that shows the very same as in the frame
+        before is not drawn again.
+      path: the file to write.
+      shape: rows and columns of the grid.
+      size: width and height of a tile [px], even numbers.
+      fps: frames per second of the video.
+      camera: name of a camera of the scenes: oblique or above.
+
+    Raises:
+      InputError: no tiles, more than there is room for, or as for `render`.
+      VideoError: this machine cannot draw or encode, or `path` cannot be written.
+    """
+    _check_film(size, fps)
+    (rows, columns), (width, height) = shape, size
+    if not 0 < len(tiles) <= rows * columns:
+        raise errors.InputError(
+            f"grid = {rows}x{columns} is not allowed for {len(tiles)} trials: it must have room "
+            "for all, and at least one."
+        )
+    whole = np.full((rows * height, columns * width, 3), _EMPTY, np.uint8)
+    cells = whole.reshape(rows, height, columns, width, 3).swapaxes(1, 2)
+    with (
+        _studios(tiles, size, camera) as studios,
+        _encoder(Path(path), (columns * width, rows * height), fps) as sink,
+    ):
+        shown: list[Shot | None] = [None] * len(tiles)
+        for shots in frames:
+            for i, (studio, shot) in enumerate(zip(studios, shots, strict=True)):
+                if shot is not shown[i]:
+                    cells[divmod(i, columns)] = _labelled(studio, shot)
+                    shown[i] = shot
+            sink(whole)
+
+
+def _labelled(studio: _Studio, shot: Shot) -> np.ndarray:
+    """A tile with its label and a line around it."""
+    image = Image.fromarray(studio.draw(shot.qpos, shot.p_world_contact))
+    font = ImageFont.load_default(size=max(9, image.height // _LABEL))
+    draw = ImageDraw.Draw(image)
+    draw.text((5, 3), shot.label, "white", font, stroke_width=2, stroke_fill=_INK)
+    draw.rectangle((0, 0, image.width - 1, image.height - 1), outline=_INK)
+    return np.asarray(image)
+
+
+def _check_film(size: tuple[int, int], fps: float) -> None:
+    errors.check_finite("fps", fps, above=0, at_most=1000)
+    if any(n % 2 for n in size):
+        raise errors.InputError(f"size = {size} is not allowed: H.264 needs two even numbers.")
+
+
+def _paired(
+    frames: Iterable[ArrayLike], p_world_contacts: Iterable[ArrayLike] | None
+) -> Iterator[tuple[ArrayLike, ArrayLike]]:
+    if p_world_contacts is None:
+        return zip(frames, itertools.repeat(_NO_CONTACT), strict=False)
+    return zip(frames, p_world_contacts, strict=True)
+
+
+class _Trail:
+    """A path on the ground, thinned to `_TRAIL_STEP`. NaN interrupts it."""
+
+    def __init__(self, rgba: tuple[float, ...], height: float) -> None:
+        self.rgba = rgba
+        self.height = height  # [m] above the ground, so that one trail lies over another
+        self.points: deque[np.ndarray] = deque(maxlen=_TRAIL_POINTS)
+
+    def add(self, point: np.ndarray) -> None:
+        """Note a point (2,) [m] unless it lies close to the last one."""
+        last = self.points[-1] if self.points else _NO_CONTACT
+        both = np.isnan([point[0], last[0]])
+        if not both.all() and (both.any() or math.dist(point, last) >= _TRAIL_STEP):
+            self.points.append(point)
+
+    def segments(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Pairs of neighbouring points without a gap between them."""
+        for a, b in itertools.pairwise(self.points):
+            if not (math.isnan(a[0]) or math.isnan(b[0])):
+                yield a, b
+
+
+class _Studio:
+    """A scene before a camera, with what has been drawn so far left as trails."""
+
+    def __init__(self, renderer: Any, scene: Scene, camera: str, target: np.ndarray) -> None:
+        self.mujoco = _import_mujoco()
+        self.renderer = renderer
+        self.model = scene.model
+        self.data = self.mujoco.MjData(scene.model)
+        self.data.mocap_pos[scene.model.body("target").mocapid[0], :2] = target
+        self.camera = camera
+        self.base_trail = _Trail(BASE_RGBA, 0.006)
+        self.contact_trail = _Trail(CONTACT_RGBA, 0.010)
+
+    def draw(self, qpos: ArrayLike, p_world_contact: ArrayLike) -> np.ndarray:
+        """One image (height, width, 3) uint8, and a step further along the trails."""
+        qpos = _checked("qpos", qpos, self.model.nq)
+        contact = np.array(p_world_contact, float)  # a copy: the trail keeps it
+        self.data.qpos[:] = qpos
+        self.mujoco.mj_kinematics(self.model, self.data)  # where things are; no dynamics
+        self.mujoco.mj_camlight(self.model, self.data)
+        self.renderer.update_scene(self.data, camera=self.camera)
+        view = self.renderer.scene
+        view.flags[self.mujoco.mjtRndFlag.mjRND_SHADOW] = self.renderer.height >= _SHADOWS_FROM
+        self.base_trail.add(qpos[:2])
+        self.contact_trail.add(contact)
+        for trail in (self.base_trail, self.contact_trail):
+            for a, b in trail.segments():
+                self._add_line(a, b, trail)
+        if not np.isnan(contact).any():
+            self._add_marker(contact)
+        return self.renderer.render()
+
+    def _add_line(self, a: np.ndarray, b: np.ndarray, trail: _Trail) -> None:
+        """A line on the ground from `a` to `b`: quicker to draw than any solid."""
+        geom = self._new_geom("mjGEOM_LINE", np.zeros(3), np.zeros(3), trail.rgba)
+        if geom is not None:
+            width = _TRAIL_WIDTH * self.renderer.height
+            ends = ([*point, trail.height] for point in (a, b))
+            self.mujoco.mjv_connector(geom, geom.type, width, *ends)
+
+    def _add_marker(self, point: np.ndarray) -> None:
+        position = np.array([*point, CONTACT_HEIGHT])
+        size = np.full(3, CONTACT_RADIUS)
+        geom = self._new_geom("mjGEOM_SPHERE", size, position, CONTACT_RGBA)
+        if geom is not None:
+            geom.emission = 1.0  # seen in the shadow of the object too
+
+    def _new_geom(self, kind: str, size: np.ndarray, position: np.ndarray, rgba: Any) -> Any:
+        """Another geom of this frame; None if there is no room for it."""
+        view = self.renderer.scene
+        if view.ngeom == view.maxgeom:
+            return None
+        geom = view.geoms[view.ngeom]
+        kind = getattr(self.mujoco.mjtGeom, kind)
+        colour = np.array(rgba, np.float32)
+        self.mujoco.mjv_initGeom(geom, kind, size, position, np.eye(3).ravel(), colour)
+        view.ngeom += 1
+        return geom
+
+
+@contextlib.contextmanager
+def _studios(tiles: Sequence[Tile], size: tuple[int, int], camera: str) -> Iterator[list[_Studio]]:
+    """A studio for each tile, those of one scene with one renderer.
+
+    Renderers are closed at the end; an open one complains when Python exits.
+    """
+    targets = []
+    for scene, p_world_target in tiles:
+        model = scene.model
+        errors.check_name("camera", camera, [model.camera(i).name for i in range(model.ncam)])
+        targets.append(_checked("p_world_target", p_world_target, 2))
+        limits = (model.vis.global_.offwidth, model.vis.global_.offheight)
+        for n, limit in zip(size, limits, strict=True):
+            errors.check_finite("size", n, at_least=2, at_most=limit, unit="px")
+    with contextlib.ExitStack() as stack:
+        renderers: dict[int, Any] = {}
+        for scene, _ in tiles:
+            if id(scene.model) not in renderers:
+                renderers[id(scene.model)] = stack.enter_context(_renderer(scene.model, size))
+        yield [
+            _Studio(renderers[id(scene.model)], scene, camera, target)
+            for (scene, _), target in zip(tiles, targets, strict=True)
+        ]
+
+
+def _checked(name: str, values: ArrayLike, length: int) -> np.ndarray:
+    """A copy (length,) of finite `values`, or an InputError."""
+    array = np.array(values, float)
+    if array.shape != (length,) or not np.isfinite(array).all():
+        raise errors.InputError(
+            f"{name} = {array} is not allowed: it must be {length} finite numbers."
+        )
+    return array
+
+
+def _import_mujoco() -> Any:
+    try:
+        import mujoco
+    except Exception as error:  # what a missing GL library raises depends on the library
+        raise VideoError(_MEND_GL) from error
+    return mujoco
+
+
+@contextlib.contextmanager
+def _renderer(model: Any, size: tuple[int, int]) -> Iterator[Any]:
+    mujoco = _import_mujoco()
+    width, height = size
+    buffer = model.vis.global_
+    limits = buffer.offwidth, buffer.offheight
+    buffer.offwidth, buffer.offheight = size  # else each renderer holds images of the limits
+    try:
+        with warnings.catch_warnings():  # GLFW warns before it fails
+            warnings.simplefilter("ignore")
+            renderer = mujoco.Renderer(model, height=height, width=width)
+    except Exception as error:  # likewise
+        raise VideoError(_MEND_GL) from error
+    finally:
+        buffer.offwidth, buffer.offheight = limits
+    with contextlib.closing(renderer):
+        yield renderer
+
+
+@contextlib.contextmanager
+def _encoder(path: Path, size: tuple[int, int], fps: int) -> Iterator[Callable[[Any], None]]:
+    """Takes raw RGB images; `path` appears if all goes well, and nothing is left behind if not."""
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise VideoError(_MEND_FFMPEG) from error
+    part = path.parent / f".{path.stem}.{os.getpid()}.part.mp4"
+    try:
+        part.touch()
+        sink = imageio_ffmpeg.write_frames(
+            str(part), size, fps=fps, codec="libx264", quality=7, macro_block_size=2
+        )
+        with contextlib.closing(sink):
+            with warnings.catch_warnings():  # JAX warns of forks; this one only starts ffmpeg
+                warnings.simplefilter("ignore", RuntimeWarning)
+                sink.send(None)
+            yield sink.send
+        if part.stat().st_size == 0:  # a silent death of ffmpeg goes unnoticed by its wrapper
+            raise VideoError(_MEND_FFMPEG)
+        os.replace(part, path)
+    except OSError as error:
+        # ffmpeg's own failure comes as an OSError too, with the end of its log as the message.
+        reason = error.strerror or str(error).strip().splitlines()[-1]
+        raise VideoError(
+            f"{path} could not be written ({reason}): choose a folder that exists, can be "
+            "written to and has space left; if it does, run `pip install imageio-ffmpeg`."
+        ) from error
+    except RuntimeError as error:
+        raise error if isinstance(error, VideoError) else VideoError(_MEND_FFMPEG) from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink()
+
+
+def _attempt(what: str, action: Callable[[], None]) -> Check:
+    try:
+        action()
+    except VideoError as error:
+        return Check(what, False, str(error))
+    return Check(what, True, "")
+
+
+def _try_drawing() -> None:
+    mujoco = _import_mujoco()
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>'
+    )
+    with _renderer(model, (16, 16)) as renderer:
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        renderer.update_scene(data)
+        if not renderer.render().any():
+            raise VideoError(_MEND_GL)
+
+
+def _try_encoding() -> None:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        _encoder(Path(folder) / "black.mp4", (16, 16), 1) as sink,
+    ):
+        sink(bytes(16 * 16 * 3))

@@ -1,0 +1,228 @@
+"""Many trials of a run in one film: stepped together, and drawn side by side as they go.
+
+Neither the trials' pasts nor the pictures are kept, so memory does not grow with the film.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from rps_jax import errors
+from rps_jax.analysis import statistics, video
+from rps_jax.analysis.video import Shot, Tile
+from rps_jax.control import strategies
+from rps_jax.control.strategies import Strategy
+from rps_jax.errors import InputError
+from rps_jax.record import folder as record
+from rps_jax.runs.sweep import Plan
+from rps_jax.trials import pushes, trial
+from rps_jax.trials.batch import Part, Setting, rows
+from rps_jax.trials.pushes import Case
+from rps_jax.world.scene import Scene
+
+WHICH = ("first", "hardest")
+_MOST = 12  # rows, and columns
+_WHOLE = (1920, 1080)  # [px] that the grid is fitted into
+_LENGTH = 40  # [s] of a film at the default speed, at most
+_HELD = 1.0  # [s] that the end is held
+
+
+class Take(NamedTuple):
+    """Trials of one kind, of those that are filmed."""
+
+    places: Sequence[int]  # in the grid, counted row by row
+    part: Part
+    strategy: Strategy
+    scenes: Sequence[Scene]
+    labels: Sequence[str]
+
+
+def shape_of(grid: str) -> tuple[int, int]:
+    """Rows and columns of a grid, written as 4x6.
+
+    Raises:
+      InputError: it is not written so, or has no place, or too many.
+    """
+    found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", grid)
+    if not found or not all(1 <= int(n) <= _MOST for n in found.groups()):
+        raise InputError(
+            f"grid = {grid} is not allowed: write ROWSxCOLUMNS, as 4x6, each from 1 to {_MOST}."
+        )
+    rows_, columns = map(int, found.groups())
+    return rows_, columns
+
+
+def of_cases(cases: Sequence[Case], setting: Setting) -> list[Take]:
+    """The takes of cases of one kind, labelled by their targets."""
+    pushes.check_followed(setting.engine)
+    stage, worlds = pushes.build(cases, setting)
+    part = Part(np.arange(len(cases)), worlds, stage)
+    one = pushes.scene_of(cases[0], setting.physics)
+    labels = [f"({x:g}, {y:g}) m" for x, y in (case.p_world_target for case in cases)]
+    strategy = strategies.of(cases[0].params)
+    return [Take(range(len(cases)), part, strategy, [one] * len(cases), labels)]
+
+
+def of_sweep(run: Path, plan: Plan, arm: str, which: str, count: int) -> list[Take]:
+    """The takes of worlds of a sweep.
+
+    Args:
+      run: its folder.
+      plan: its plan.
+      arm: one of the plan's.
+      which: `first`, those of the least index; `hardest`, as the report of the sweep has them.
+      count: how many, at most.
+
+    Raises:
+      InputError: an unknown choice, an engine that is not followed, or no results to choose by.
+    """
+    errors.check_name("which", which, WHICH)
+    pushes.check_followed(plan.setting.engine)
+    index = np.arange(min(count, plan.worlds))
+    if which == "hardest":
+        index = statistics.hardest(record.read_results(run), count)
+        if not index.size:
+            raise InputError("which = hardest is not allowed: no trial of this run failed.")
+    of_object = plan.domain.object_of(index)
+    takes = []
+    for one in np.unique(of_object):
+        places = np.flatnonzero(of_object == one)
+        worlds = index[places]
+        takes.append(
+            Take(
+                [int(place) for place in places],
+                sweep.world_part(plan, list(plan.arms).index(arm), worlds),
+                strategies.of(plan.arms[arm]),
+                [sweep.scene_of(plan, int(i)) for i in worlds],
+                [f"world {i}" for i in worlds],
+            )
+        )
+    return takes
+
+
+def default_speed(seconds: float) -> float:
+    """Simulated seconds in a second of the film, so that it lasts less than a minute."""
+    return float(max(1, math.ceil(seconds / _LENGTH)))
+
+
+def shoot(
+    takes: Sequence[Take],
+    setting: Setting,
+    path: Path,
+    *,
+    shape: tuple[int, int],
+    speed: float,
+    seconds: float,
+    fps: int = 12,
+    camera: str = "oblique",
+    report: Callable[[float], Any] = lambda simulated: None,
+) -> None:
+    """Film trials from their start until all have ended, or for some simulated time.
+
+    Args:
+      takes: the trials.
+      setting: what they share.
+      path: the MP4 to write.
+      shape: rows and columns of the grid.
+      speed: simulated seconds in a second of the film; rounded to whole control steps a frame.
+      seconds: simulated time that is filmed, at most [s].
+      fps: frames per second of the film.
+      camera: oblique or above.
+      report: called with the simulated time [s] after each frame.
+
+    Raises:
+      InputError: grid or camera do not fit the trials.
+      VideoError: this machine cannot draw or encode, or `path` cannot be written.
+    """
+    of_takes = [list(map(Tile, take.scenes, take.part.worlds.p_world_target)) for take in takes]
+    tiles = _placed(of_takes, takes)
+    frames = _frames(takes, setting, speed, seconds, fps, report)
+    size = _tile_size(shape)
+    video.render_grid(tiles, frames, path, shape=shape, size=size, fps=fps, camera=camera)
+
+
+def _tile_size(shape: tuple[int, int]) -> tuple[int, int]:
+    """Width and height [px], even, of the greatest tiles of 16 to 9 that fit."""
+    rows_, columns = shape
+    unit = min(_WHOLE[0] / columns / 16, _WHOLE[1] / rows_ / 9)
+    return 2 * int(8 * unit), 2 * int(4.5 * unit)
+
+
+def _placed(of_takes: Sequence[Sequence[Any]], takes: Sequence[Take]) -> list[Any]:
+    """What each take has of its trials, in the order of the grid."""
+    places = [place for take in takes for place in take.places]
+    things = [thing for some in of_takes for thing in some]
+    return [things[i] for i in np.argsort(places)]
+
+
+def _frames(
+    takes: Sequence[Take],
+    setting: Setting,
+    speed: float,
+    seconds: float,
+    fps: int,
+    report: Callable[[float], Any],
+) -> Iterator[list[Shot]]:
+    """What all tiles show in each frame."""
+    period = setting.physics.control_period
+    every = max(1, round(speed / (fps * period)))
+    running = [_shots(take, setting, every) for take in takes]
+    shots: list[Shot] = []
+    # One more where they run to their ends, which are seen a step later.
+    whole = seconds >= float(setting.rules.horizon)
+    for count in range(math.floor(seconds / (every * period)) + 1 + whole):
+        ended, of_takes = zip(*map(next, running), strict=True)
+        shots = _placed(of_takes, takes)
+        yield shots
+        report(count * every * period)
+        if all(ended):
+            break
+    for _ in range(round(_HELD * fps)):
+        yield shots
+
+
+def _shots(take: Take, setting: Setting, every: int) -> Iterator[tuple[bool, list[Shot]]]:
+    """Whether all of a take's trials have ended, and what they show, each `every` steps."""
+    worlds = jax.device_put(take.part.worlds)
+    trials = trial.start_all(worlds, np.ones(len(take.labels), bool), strategy=take.strategy)
+    advance = partial(
+        trial.record,
+        take.part.stage,
+        worlds,
+        physics=setting.physics,
+        rules=setting.rules,
+        strategy=take.strategy,
+        steps=every,
+        every=every,
+    )
+    shots: list[Shot] = []
+    ended = np.zeros(len(take.labels), bool)
+    while True:
+        done, success, steps = jax.device_get((trials.done, trials.success, trials.steps))
+        trials, snapshots = advance(trials)
+        seen = rows(jax.device_get(snapshots), 0)
+        contacts = np.asarray(trial.p_world_contact(seen))
+        time = steps * setting.physics.control_period
+        shots = [
+            shots[i]  # the same again, which need not be drawn again
+            if ended[i]
+            else Shot(seen.qpos[i], contacts[i], f"{label}, {_how(done[i], success[i], time[i])}")
+            for i, label in enumerate(take.labels)
+        ]
+        ended = done
+        yield bool(done.all()), shots
+
+
+def _how(done: bool, success: bool, time: float) -> str:
+    """How a trial stands after this time [s]."""
+    if not done:
+        return f"{time:.0f} s"
+    return f"reached at {time:.0f} s" if success else "not reached"

@@ -1,0 +1,202 @@
+"""Baselines that the law is compared with. NPS is the law itself with `reactive=0`.
+
+APS, the adaptive pushing skill of Krivic and Piater, "Pushing corridors for delivering unknown
+objects with a mobile robot" (Autonomous Robots 43, 2019), learns from which side to push while it
+orbits the object. It needs what RPS does not: the object's position.
+
+As published it brings the object's centre O to the target, where the paper's rule asks it of the
+contact point, some radius behind O. So that it can pass at all, it aims as far beyond the target:
+`aim_beyond`, our choice, without which no trial succeeds by that rule.
+
+Symbols: O object, R robot, T target. alpha is the angle at O from T to R, so that at alpha = pi
+the robot stands behind the object, seen from the target.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rps_jax import errors
+from rps_jax.control import law
+from rps_jax.control.law import Details, Observation, Twist
+from rps_jax.geometry import planar
+from rps_jax.robot.skin import HALF_LENGTH
+
+
+class APSParams(NamedTuple):
+    """Parameters of APS; those marked * are ours, where the publication is silent."""
+
+    K1: float | jax.Array = 0.05  # [1] gain of the mean motion error
+    K2: float | jax.Array = 0.1  # [1] gain of the motion error
+    K_p: float | jax.Array = 0.6  # [1/s] heading gain
+    K_d: float | jax.Array = 0.4  # [1] heading rate gain
+    yaw_error_max: float | jax.Array = 0.3  # [rad] beyond it the robot turns on the spot
+    margin: float | jax.Array = 0.10  # [m] gap beyond which the robot approaches straight
+    r_robot: float | jax.Array = HALF_LENGTH  # [m] * radius of a base that is not round
+    gamma_drop: float | jax.Array = 0.01  # [rad] fall of |gamma| by which an alpha was a good one
+    alpha_mean: float | jax.Array = jnp.pi  # [rad] prior mean of good alphas
+    alpha_variance: float | jax.Array = jnp.pi / 4  # [rad^2] prior variance
+    alpha_count: float | jax.Array = 100.0  # [1] weight of the prior
+    aim_beyond: float | jax.Array = 1.0  # [1] * object radii beyond the target; 0: as published
+    min_motion: float | jax.Array = 0.001  # [m] * a shorter way of the object is no motion
+    v_max: float | jax.Array = 0.05  # [m/s] bound on the speed
+    v_min: float | jax.Array = 0.01  # [m/s] * least speed
+    omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
+    d_success: float | jax.Array = 0.05  # [m] target reached
+
+
+class APSState(NamedTuple):
+    """What APS remembers between two control steps."""
+
+    p_world_object: jax.Array  # (2,) [m] O where it last moved
+    a_OT: jax.Array  # () [rad] direction from there to T
+    started: jax.Array  # () bool: the fields above hold something
+    alpha: jax.Array  # () [rad] of the last step
+    gamma: jax.Array  # () [rad] the last motion error
+    gamma_mean: jax.Array  # () [rad] m_gamma
+    gamma_count: jax.Array  # () [1]
+    mean: jax.Array  # () [rad] m, running mean of good alphas
+    variance: jax.Array  # () [rad^2] s2, running variance of good alphas
+    weight: jax.Array  # () [1] how many alphas these two sum up
+    yaw_error: jax.Array  # () [rad] of the last step
+
+    @classmethod
+    def init(cls, params: APSParams) -> APSState:
+        """Before anything was seen: the prior alone."""
+        zero = jnp.zeros_like(jnp.asarray(params.K1, float))
+        return cls(
+            jnp.zeros(2, zero.dtype),
+            *(zero, jnp.zeros((), bool), zero, zero, zero, zero),
+            *(zero + params.alpha_mean, zero + params.alpha_variance, zero + params.alpha_count),
+            zero,
+        )
+
+
+class TrackedObservation(NamedTuple):
+    """What APS may know: what RPS knows, and where and how large the object is."""
+
+    touch: Observation
+    p_world_object: jax.Array  # (2,) [m]
+    r_object: jax.Array  # () [m] radius of the object's outline
+    period: float | jax.Array  # () [s] since the last step
+
+
+def check(params: APSParams) -> APSParams:
+    """The same parameters, if scalars that mean something.
+
+    Raises:
+      InputError: a value is not a finite number, or is out of bounds.
+    """
+    positive = ("alpha_variance", "alpha_count", "v_max", "omega_max", "d_success")
+    for name in params._fields:
+        bounds = {"above": 0} if name in positive else {"at_least": 0}
+        errors.check_finite(f"aps.{name}", getattr(params, name), **bounds)
+    return params
+
+
+def predictive(params: APSParams, state: APSState) -> tuple[jax.Array, jax.Array]:
+    """Mean [rad] and variance [rad^2] of the next good alpha: Gaussian with unknown mean."""
+    precision = 1 / params.alpha_variance + state.weight / state.variance
+    mean = params.alpha_mean / params.alpha_variance + state.weight * state.mean / state.variance
+    return mean / precision, 1 / precision + state.variance
+
+
+def activations(
+    params: APSParams, state: APSState, alpha: jax.Array, near: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """(psi_push, psi_relocate) [1] at alpha [rad]; `near` is false where the robot approaches.
+
+    The released controller puts the predictive variance in the place of its root; so do we.
+    """
+    mean, variance = predictive(params, state)
+    peak = jnp.exp(-0.5 * ((alpha - mean) / variance) ** 2)
+    push = jnp.minimum(peak, jnp.abs(jnp.cos(alpha)))
+    relocate = planar.safe_sqrt(1 - push * push)
+    back_off = jnp.where(jnp.cos(alpha) > 0, -push, push)  # on the target's side
+    return jnp.where(near, back_off, 1.0), jnp.where(near, relocate, 0.0)
+
+
+def _learn(
+    params: APSParams, state: APSState, p_world_object: jax.Array, a_OT: jax.Array
+) -> APSState:
+    """The state after the object moved, or did not, from where it last was."""
+    way = p_world_object - state.p_world_object
+    moved = state.started & (planar.norm(way) > params.min_motion)
+    gamma = planar.wrap(state.a_OT - planar.direction(way))
+    gamma_count = state.gamma_count + 1
+    good = moved & (jnp.abs(gamma) < jnp.abs(state.gamma) - params.gamma_drop)
+    good &= state.gamma_count > 0
+    count = state.weight + 1
+    offset = state.alpha - state.mean
+    mean = state.mean + offset / count
+    variance = state.variance + (offset * (state.alpha - mean) - state.variance) / count
+    place = moved | ~state.started
+    return APSState(
+        p_world_object=jnp.where(place, p_world_object, state.p_world_object),
+        a_OT=jnp.where(place, a_OT, state.a_OT),
+        started=jnp.ones_like(state.started),
+        alpha=state.alpha,
+        gamma=jnp.where(moved, gamma, state.gamma),
+        gamma_mean=jnp.where(
+            moved, state.gamma_mean + (gamma - state.gamma_mean) / gamma_count, state.gamma_mean
+        ),
+        gamma_count=jnp.where(moved, gamma_count, state.gamma_count),
+        mean=jnp.where(good, mean, state.mean),
+        variance=jnp.where(good, variance, state.variance),
+        weight=jnp.where(good, count, state.weight),
+        yaw_error=state.yaw_error,
+    )
+
+
+def _aim(params: APSParams, observation: TrackedObservation) -> jax.Array:
+    """T (2,) [m]: beyond the target, seen from the contact point, or else from the object."""
+    seen = observation.touch
+    angle = jnp.where(
+        seen.in_contact,
+        planar.direction(law.displacement(seen)),
+        planar.direction(seen.p_world_target - observation.p_world_object),
+    )
+    beyond = params.aim_beyond * observation.r_object
+    return seen.p_world_target + beyond * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+
+
+def aps_step(
+    params: APSParams, state: APSState, observation: TrackedObservation
+) -> tuple[APSState, Twist, Details]:
+    """One control step of APS.
+
+    On the target's side of the object the robot backs off while it orbits, but not where it is
+    so far away that it approaches.
+    """
+    seen = observation.touch
+    to_target = _aim(params, observation) - observation.p_world_object
+    from_object = seen.p_world_robot - observation.p_world_object
+    a_OT = planar.direction(to_target)
+    first = ~state.started
+    state = _learn(params, state, observation.p_world_object, a_OT)
+
+    alpha = jnp.mod(planar.direction(from_object) - a_OT, 2 * jnp.pi)
+    reach = params.r_robot + observation.r_object + params.margin
+    near = planar.norm(from_object) <= reach
+    push, relocate = activations(params, state, alpha, near)
+    radial = -jnp.stack([jnp.cos(alpha), jnp.sin(alpha)])  # towards the object
+    orbit = jnp.sign(jnp.sin(alpha)) * jnp.stack([-jnp.sin(alpha), jnp.cos(alpha)])  # to alpha = pi
+    heading = planar.direction(push * radial + relocate * orbit)
+    correction = params.K1 * state.gamma_mean + params.K2 * state.gamma
+    heading = heading - jnp.where(near, correction, 0.0) + a_OT - seen.yaw
+
+    yaw_error = planar.wrap(planar.direction(-from_object) - seen.yaw)
+    rate = jnp.where(first, 0.0, planar.wrap(yaw_error - state.yaw_error) / observation.period)
+    omega = params.K_p * yaw_error + params.K_d * rate
+    speed = jnp.maximum(params.v_max / (1 + jnp.abs(state.gamma_mean)), params.v_min)
+    speed = jnp.where(jnp.abs(yaw_error) > params.yaw_error_max, 0.0, speed)
+    twist = Twist(
+        speed * jnp.cos(heading),
+        speed * jnp.sin(heading),
+        jnp.clip(omega, -params.omega_max, params.omega_max),
+    )
+    details = Details.of(seen)._replace(gamma=state.gamma)
+    return state._replace(alpha=alpha, yaw_error=yaw_error), twist, details

@@ -1,0 +1,390 @@
+"""The Reactive Pushing Strategy (RPS): Eqs. 1-10 and Algorithm 1 of Ozdamar, Sirintuna, Arbaud
+and Ajoudani, "Pushing in the Dark" (IEEE RA-L 2024). Nothing here knows of MuJoCo.
+
+Frames: W is the world, R the robot (origin at the middle of the base, x forward, y left).
+`p_robot_contact` is the paper's p^R_C; `l` is its y component. Every function takes single
+worlds; `jax.vmap` batches any argument, parameters included.
+
+The law switches. With `Temperatures` each of its switches is a weight from 0 to 1 instead, what it
+chose between is mixed by that weight, and the law is smooth; without them it is the paper's.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rps_jax import errors
+from rps_jax.geometry import planar
+
+# Inputs are held within this distance [m] so that no finite float32 overflows on the way.
+_WORLD_SIZE = 1e9
+
+
+class RPSParams(NamedTuple):
+    """Parameters of the law, all floats, all leaves of a pytree (any may be batched).
+
+    The paper gives the first block; it leaves the second open, and the defaults are ours.
+    """
+
+    eta: float | jax.Array = 10.0  # [1] upper asymptote of the adaptive rate, Eq. 5
+    zeta: float | jax.Array = 0.0  # [1] lower asymptote, Eq. 5
+    beta: float | jax.Array = 0.12  # [m] inflection point of |l|, Eq. 5
+    k: float | jax.Array = 60.0  # [1/m] steepness, Eq. 5
+    K_h: float | jax.Array = 1.0  # [1] heading gain, Eq. 7
+    K_v: float | jax.Array = 0.1  # [1/s] velocity gain, Eq. 3
+    L: float | jax.Array = 0.2  # [m] turning length, Eqs. 6 and 9
+    l_cr: float | jax.Array = 0.24  # [m] the critical region starts here
+    d_th: float | jax.Array = 0.5  # [m] no lateral motion nearer than this, Eq. 5
+    v_max: float | jax.Array = 0.05  # [m/s] bound on the norm of (v_x, v_y)
+    omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
+    d_success: float | jax.Array = 0.05  # [m] target reached, Algorithm 1
+    v_approach: float | jax.Array = 0.01  # [m/s] forward speed without contact (Sec. III-B)
+
+    l_mr: float | jax.Array = 0.15  # [m] the middle region ends here; Realignment stops
+    a_r_max: float | jax.Array = 10.0  # [1] adaptive rate in Realignment; eta's value
+    gamma_max: float | jax.Array = 1.56  # [rad] bound on |gamma|; inf is the tangent as printed
+    v_lost: float | jax.Array = 0.01  # [m/s] forward speed after contact is lost
+    sgn_0: float | jax.Array = 0.0  # [1] sgn(0), from 0 to 1
+
+    # Switches, each 0 or 1.
+    reactive: float | jax.Array = 1.0  # 1: RPS; 0: NPS (a_r = 0 and no Realignment)
+    keep_contact: float | jax.Array = 0.0  # 1: a loss is ignored, the last contact acted upon
+    saturate_first: float | jax.Array = 0.0  # 1: omega from the saturated linear velocity
+    clip_each: float | jax.Array = 0.0  # 1: v_x and v_y clipped one by one, not as a vector
+
+    @classmethod
+    def paper(cls) -> RPSParams:
+        """The paper's values (Sec. III-A), with our defaults for what it leaves open."""
+        return cls()
+
+    @classmethod
+    def tuned(cls) -> RPSParams:
+        """Tuned by evolution in random worlds of boxes and cylinders; the README says how.
+
+        Full speed until the target. Nearer than d_th it drives straight on or, beyond l_cr, almost
+        purely sideways; Eq. 5 acts only farther away. A contact that is lost is acted upon as if it
+        were still felt.
+        """
+        return cls(
+            eta=6.537844,
+            zeta=-1.251917,
+            beta=0.1163395,
+            k=17.22659,
+            K_h=0.2083339,
+            K_v=1.297107,
+            L=0.2713795,
+            l_cr=0.1687817,
+            l_mr=0.1217143,
+            a_r_max=64.85278,
+            d_th=1.561165,
+            gamma_max=1.54169,
+            v_lost=0.03373589,
+            keep_contact=1.0,
+        )
+
+    @classmethod
+    def nps(cls) -> RPSParams:
+        """The non-reactive baseline: a_r = 0 throughout and no Realignment State (Sec. III-B)."""
+        return cls(reactive=0.0)
+
+
+class Temperatures(NamedTuple):
+    """How far each switch of the smooth law reaches to either side, all [m].
+
+    As they go to zero the law tends to the paper's, but for l = 0 exactly, where a smooth sgn is
+    zero whatever `sgn_0`. They are small against what they soften: a Realignment State with a
+    memory needs realign < (l_cr - l_mr) / 4, beyond which l_th has one equilibrium for each l.
+    """
+
+    realign: float | jax.Array = 0.01  # Algorithm 1's |l| > l_th
+    d_th: float | jax.Array = 0.02  # Eq. 5's ||d|| > d_th
+    sgn: float | jax.Array = 0.01  # sgn(l)
+    arrive: float | jax.Array = 0.002  # ||d|| < d_success
+
+    def check(self) -> None:
+        """Raises InputError for a temperature that is not a positive length."""
+        for name, value in self._asdict().items():
+            errors.check_finite(f"temperature {name}", value, above=0, at_most=1, unit="m")
+
+
+class RPSState(NamedTuple):
+    """What the law remembers between two control steps."""
+
+    l_th: jax.Array  # () [m] dynamic threshold: l_cr normally, l_mr while realigning
+    p_robot_contact: jax.Array  # (2,) [m] the last contact, in the robot frame
+    touched: jax.Array  # () bool: the skin has felt the object at least once; smooth: a weight
+
+    @classmethod
+    def init(cls, params: RPSParams, temperatures: Temperatures | None = None) -> RPSState:
+        """Algorithm 1's initialisation, l_th = l_cr, before any contact."""
+        l_th = jnp.asarray(params.l_cr, float)
+        touched = jnp.zeros((), bool if temperatures is None else l_th.dtype)
+        return cls(l_th, jnp.zeros(2, l_th.dtype), touched)
+
+
+class Observation(NamedTuple):
+    """What the law may know: odometry, touch and the target."""
+
+    p_world_robot: jax.Array  # (2,) [m]
+    yaw: jax.Array  # () [rad] heading of the robot in the world
+    p_robot_contact: jax.Array  # (2,) [m] contact location; ignored unless in_contact
+    in_contact: jax.Array  # () bool; for the smooth law also a weight from 0 to 1
+    p_world_target: jax.Array  # (2,) [m]
+
+
+class Twist(NamedTuple):
+    """Commanded velocity of the base, in the robot frame."""
+
+    v_x: float | jax.Array  # () [m/s] forward
+    v_y: float | jax.Array  # () [m/s] left
+    omega: float | jax.Array  # () [rad/s] counter-clockwise
+
+    def in_world(self, yaw: jax.Array) -> jax.Array:
+        """Velocities (3,) [m/s, m/s, rad/s] in the world, of a base with the heading `yaw`."""
+        v_world = planar.rotate(yaw, jnp.stack([self.v_x, self.v_y]))
+        return jnp.stack([*v_world, jnp.asarray(self.omega)])
+
+
+class Details(NamedTuple):
+    """The quantities behind one twist, for plots and tests."""
+
+    l: jax.Array  # noqa: E741  () [m] lateral contact location, the paper's symbol
+    distance: jax.Array  # () [m] ||d||, contact point to target
+    a_r: jax.Array  # () [1] adaptive rate
+    gamma: jax.Array  # () [rad] steering angle
+    realigning: jax.Array  # () bool: in the Realignment State; smooth: a weight
+
+    @classmethod
+    def of(cls, observation: Observation) -> Details:
+        """Of a strategy that has neither an adaptive rate nor a steering angle: both are 0."""
+        distance = planar.norm(displacement(observation))
+        zero = jnp.zeros_like(distance)
+        l = observation.p_robot_contact[..., 1]  # noqa: E741
+        return cls(l, distance, zero, zero, zero > 0)
+
+
+def check(params: RPSParams) -> RPSParams:
+    """The same parameters, if scalars that mean something.
+
+    Raises:
+      InputError: a value is not a number, negative where it must not be, or infinite (only
+        gamma_max may be, for the tangent as printed).
+    """
+    errors.check_finite("zeta", params.zeta)
+    for name in ("eta", "beta", "k", "d_th", "a_r_max", "l_mr", "v_approach", "v_lost"):
+        errors.check_finite(name, getattr(params, name), at_least=0)
+    for name in ("K_h", "K_v", "L", "l_cr", "v_max", "omega_max", "d_success"):
+        errors.check_finite(name, getattr(params, name), above=0)
+    errors.check_finite("l_mr", params.l_mr, at_most=params.l_cr)
+    errors.check_number("gamma_max", params.gamma_max, above=0)
+    errors.check_finite("sgn_0", params.sgn_0, at_least=0, at_most=1)
+    for name in ("reactive", "keep_contact", "saturate_first", "clip_each"):
+        errors.check_finite(name, getattr(params, name), at_least=0, at_most=1)
+    return params
+
+
+_HARD: Any = Temperatures._make([None] * len(Temperatures._fields))
+
+# A switch is a bool, or in the smooth law a weight from 0 to 1.
+
+
+def _above(
+    x: jax.Array,
+    threshold: Any,
+    temperature: Any,
+    compare: Callable[[Any, Any], jax.Array] = operator.gt,
+) -> jax.Array:
+    """The switch `compare(x, threshold)`; smooth if there is a temperature."""
+    if temperature is None:
+        return compare(x, threshold)
+    return jax.nn.sigmoid((x - threshold) / temperature)
+
+
+def _below(x: jax.Array, threshold: Any, temperature: Any) -> jax.Array:
+    """The switch x < threshold; smooth if there is a temperature."""
+    if temperature is None:
+        return x < threshold
+    return jax.nn.sigmoid((threshold - x) / temperature)
+
+
+def _not(switch: jax.Array) -> jax.Array:
+    return ~switch if switch.dtype == bool else 1 - switch
+
+
+def _both(a: jax.Array, b: jax.Array) -> jax.Array:
+    return a & b if a.dtype == b.dtype == bool else a * b
+
+
+def _either(a: jax.Array, b: jax.Array) -> jax.Array:
+    return a | b if a.dtype == b.dtype == bool else jnp.maximum(a, b)
+
+
+def _choose(switch: jax.Array, yes: Any, no: Any) -> jax.Array:
+    """`yes` or `no`; of a weight, the mixture."""
+    if switch.dtype == bool:
+        return jnp.where(switch, yes, no)
+    return switch * yes + (1 - switch) * no
+
+
+def _sgn(params: RPSParams, x: jax.Array, temperature: Any = None) -> jax.Array:
+    """Sgn, with the parameter sgn(0): by default a centred contact asks for no lateral motion."""
+    if temperature is None:
+        return jnp.where(x == 0, params.sgn_0, jnp.sign(x))
+    return jnp.tanh(x / temperature)
+
+
+def displacement(observation: Observation) -> jax.Array:
+    """Eq. 4: d = p^W_T - (p^W_R + R^W_R p^R_C), from contact to target, (2,) [m] in the world."""
+    p_world_contact = observation.p_world_robot + planar.rotate(
+        observation.yaw, observation.p_robot_contact
+    )
+    d = observation.p_world_target - p_world_contact
+    return jnp.clip(d, -_WORLD_SIZE, _WORLD_SIZE)
+
+
+def adaptive_rate(
+    params: RPSParams,
+    l: jax.Array,  # noqa: E741
+    distance: jax.Array,
+    temperatures: Temperatures | None = None,
+) -> jax.Array:
+    """Eq. 5: a_r (...) [1] from the lateral contact location l [m] and ||d|| [m]."""
+    soft = temperatures or _HARD
+    logistic = jax.nn.sigmoid((jnp.abs(l) - params.beta) * params.k)
+    a_r = (params.zeta + (params.eta - params.zeta) * logistic) * _sgn(params, l, soft.sgn)
+    far = _above(distance, params.d_th, soft.d_th)
+    return _choose(far, a_r, 0.0) * params.reactive
+
+
+def linear_velocity(v_star: jax.Array, a_r: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Eqs. 1-2: (v_x, v_y) [m/s] of norm v_star [m/s] and slope v_y / v_x = a_r [1]."""
+    a_r = jnp.asarray(a_r) * 1.0  # a float, of the width it came in
+    length = planar.norm(jnp.stack([jnp.ones_like(a_r), a_r], axis=-1))
+    return v_star / length, v_star * (a_r / length)
+
+
+def steering_angle(params: RPSParams, d: jax.Array, yaw: jax.Array) -> jax.Array:
+    """Eqs. 7-8: gamma = K_h (theta* - theta) [rad], theta* the direction of d (..., 2) [m].
+
+    The heading error is wrapped to [-pi, pi). The paper's tangent changes sign beyond pi / 2,
+    where the robot would turn away from its target, so gamma is held within +-gamma_max.
+    """
+    gamma = params.K_h * planar.wrap(planar.direction(d) - yaw)
+    return jnp.clip(gamma, -jnp.asarray(params.gamma_max), params.gamma_max)
+
+
+def realignment_gain(params: RPSParams, l: jax.Array) -> jax.Array:  # noqa: E741
+    """Eq. 10: sigma = 1 - |l| / l_cr [1] of l [m], zero in the critical region."""
+    return 1.0 - jnp.minimum(jnp.abs(l), params.l_cr) / params.l_cr
+
+
+def saturate(params: RPSParams, twist: Twist) -> Twist:
+    """Bound the commanded twist: (v_x, v_y) scaled as a vector to norm v_max, omega clipped.
+
+    With `clip_each`, v_x and v_y are clipped to +-v_max one by one, which turns the vector.
+    """
+    v = jnp.stack([twist.v_x, twist.v_y], axis=-1)
+    v_max = jnp.asarray(params.v_max)
+    scaled = v * (v_max / jnp.maximum(planar.norm(v), v_max))[..., None]
+    clipped = jnp.clip(v, -v_max[..., None], v_max[..., None])
+    v = jnp.where(jnp.asarray(params.clip_each > 0)[..., None], clipped, scaled)
+    omega = jnp.clip(twist.omega, -jnp.asarray(params.omega_max), params.omega_max)
+    return Twist(v[..., 0], v[..., 1], omega)
+
+
+def _push(
+    params: RPSParams, l_th: jax.Array, observation: Observation, temperatures: Temperatures | None
+) -> tuple[jax.Array, Twist, Details]:
+    """One pass of Algorithm 1's control loop, in contact."""
+    l = observation.p_robot_contact[..., 1]  # noqa: E741
+    d = displacement(observation)
+    distance = planar.norm(d)
+    v_star = params.K_v * distance  # Eq. 3
+    gamma = steering_angle(params, d, observation.yaw)
+
+    soft = temperatures or _HARD
+    realigning = _both(
+        _above(jnp.abs(l), l_th, soft.realign), jnp.asarray(params.reactive) > 0
+    )  # Algorithm 1's switch into, and out of, the Realignment State
+    a_r = _choose(
+        realigning,
+        params.a_r_max * _sgn(params, l, soft.sgn),
+        adaptive_rate(params, l, distance, temperatures),
+    )
+    v_x, v_y = linear_velocity(v_star, a_r)  # Eqs. 1-2
+    bounded = saturate(params, Twist(v_x, v_y, jnp.zeros_like(v_x)))
+    first = jnp.asarray(params.saturate_first) > 0
+    forward = jnp.where(first, bounded.v_x, v_x)
+    speed = jnp.where(first, jnp.minimum(v_star, params.v_max), v_star)
+    turning_speed = _choose(realigning, realignment_gain(params, l) * speed, forward)
+    omega = turning_speed / params.L * jnp.tan(gamma)  # Eq. 9 or 6
+    twist = saturate(params, Twist(v_x, v_y, omega))
+
+    arrived = _below(distance, params.d_success, soft.arrive)
+    twist = jax.tree.map(lambda v: _choose(arrived, 0.0, v), twist)
+    new_l_th = _choose(realigning, params.l_mr, params.l_cr)
+    return (
+        _choose(arrived, l_th, new_l_th),
+        twist,
+        Details(l, distance, a_r, gamma, _both(realigning, _not(arrived))),
+    )
+
+
+def step_with_details(
+    params: RPSParams,
+    state: RPSState,
+    observation: Observation,
+    temperatures: Temperatures | None = None,
+) -> tuple[RPSState, Twist, Details]:
+    """`step`, and the quantities behind its twist (those of the last contact without one)."""
+    in_contact = jnp.asarray(observation.in_contact)
+    if temperatures is not None:
+        in_contact = in_contact.astype(state.l_th.dtype)
+    soft = temperatures or _HARD
+    # Without contact the location means nothing; the last one keeps every branch finite.
+    contact = _choose(in_contact, observation.p_robot_contact, state.p_robot_contact)
+    told = observation._replace(p_robot_contact=contact)
+    l_th, push, details = _push(params, state.l_th, told, temperatures)
+    kept = _both(state.touched, jnp.asarray(params.keep_contact) > 0)
+    # A remembered contact near the target must not stop the robot: only a felt one arrives.
+    away = _above(details.distance, params.d_success, soft.arrive, operator.ge)
+    pushing = _either(in_contact, _both(kept, away))
+    ahead = Twist(_choose(state.touched, params.v_lost, params.v_approach), 0.0, 0.0)
+    twist = jax.tree.map(lambda a, b: _choose(pushing, a, b), push, ahead)
+    state = RPSState(
+        l_th=_choose(pushing, l_th, state.l_th),
+        p_robot_contact=contact,
+        touched=_either(state.touched, in_contact),
+    )
+    return state, twist, details._replace(realigning=_both(details.realigning, pushing))
+
+
+@jax.jit
+def step(
+    params: RPSParams,
+    state: RPSState,
+    observation: Observation,
+    temperatures: Temperatures | None = None,
+) -> tuple[RPSState, Twist]:
+    """Algorithm 1: one control step of RPS (or NPS, by `params.reactive`).
+
+    In contact: the saturated twist of Eqs. 1-10, or zero once ||d|| < d_success. Without contact:
+    straight ahead, at v_approach before the first touch and at v_lost after a loss, l_th
+    unchanged; with `keep_contact`, a loss is ignored and the last contact acted upon.
+    Algorithm 1's last line prints v_x twice; (v_x, v_y, omega) is meant.
+
+    With `temperatures` the smooth law: l_th moves continuously between l_mr and l_cr, a_r and the
+    turning speed between their values in and out of the Realignment State, and the contact's
+    weight mixes pushing with going straight ahead, and the contact felt with the last one (so
+    `p_robot_contact` must be finite, and the state from `RPSState.init(params, temperatures)`).
+    The speed stays v* split by the slope a_r. The 0-or-1 parameters switch as ever, and bounds
+    (saturation, gamma_max, sigma) stay as they are: they have kinks, but no jumps. One jump is
+    left: at a heading error of exactly pi the robot chooses a side.
+    """
+    state, twist, _ = step_with_details(params, state, observation, temperatures)
+    return state, twist

@@ -1,0 +1,243 @@
+"""MuJoCo's convex problem for one free object, by Newton's method with an exact line search.
+
+Its accelerations minimise
+
+    (a - a_free)' M (a - a_free) / 2 + sum over contacts of s(J a - a_ref),
+
+as MuJoCo's and MJX's do. For `rps_jax.engines.fused.step`.
+
+Reference: MuJoCo documentation, "Computation: Constraint model" and "Solver".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from rps_jax.engines.fused.contacts import Body, Contact, State
+from rps_jax.geometry import vectors as sp
+from rps_jax.geometry.vectors import Vec
+from rps_jax.world.physics import Physics
+
+GRAVITY = 9.81  # [m/s^2]
+_ENOUGH = 1e-4  # [m/s^2] error of the acceleration with which the solver ends
+_FAR = 1e9  # no upper bound of the line search
+
+
+def _law(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tuple[Any, ...]]:
+    """Force [N] along (n, t, s) at J a - aref = x, and the stiffness against x.
+
+    The stiffness is (nn, nt, ns, tt, ts, ss), minus the force's derivative.
+    """
+    if physics.cone == "pyramidal":
+        return _pyramid(contact, x, physics)
+    d, f = contact.d, contact.friction
+    d_t = physics.impratio * d
+    mu = f * physics.impratio**-0.5
+    n, t, s = mu * x[0], f * x[1], f * x[2]
+    slip = sp.norm((t, s))
+    sticks = mu * n + slip <= 0
+    slides = (n < mu * slip) & ~sticks
+    d_m = jnp.where(slides, d / (mu * mu * (1 + mu * mu)), 0.0)
+    h = n - mu * slip
+    e_t, e_s = t / slip, s / slip
+    pull = -d_m * h * mu  # normal force of a sliding contact
+    force = (
+        jnp.where(sticks, -d * x[0], pull),
+        jnp.where(sticks, -d_t * x[1], -pull * f * e_t),
+        jnp.where(sticks, -d_t * x[2], -pull * f * e_s),
+    )
+    nn = d_m * mu * mu
+    along = nn * f * f  # of the slip
+    across = pull * f * f / slip
+    stiffness = (
+        jnp.where(sticks, d, nn),
+        jnp.where(sticks, 0.0, -nn * f * e_t),
+        jnp.where(sticks, 0.0, -nn * f * e_s),
+        jnp.where(sticks, d_t, along * e_t * e_t + across * e_s * e_s),
+        jnp.where(sticks, 0.0, (along - across) * e_t * e_s),
+        jnp.where(sticks, d_t, along * e_s * e_s + across * e_t * e_t),
+    )
+    return force, stiffness
+
+
+def _pyramid(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tuple[Any, ...]]:
+    """The same of four frictionless edges n +- friction t, n +- friction s."""
+    f = contact.friction
+    d = contact.d * physics.impratio / (2 * f * f * (1 + f * f))
+    up_t, down_t = x[0] + f * x[1], x[0] - f * x[1]
+    up_s, down_s = x[0] + f * x[2], x[0] - f * x[2]
+    rows = [jnp.where(y < 0, d, 0.0) for y in (up_t, down_t, up_s, down_s)]
+    p, q, r, o = (-y * k for y, k in zip((up_t, down_t, up_s, down_s), rows, strict=True))
+    force = (p + q + r + o, f * (p - q), f * (r - o))
+    stiffness = (
+        rows[0] + rows[1] + rows[2] + rows[3],
+        f * (rows[0] - rows[1]),
+        f * (rows[2] - rows[3]),
+        f * f * (rows[0] + rows[1]),
+        0.0,
+        f * f * (rows[2] + rows[3]),
+    )
+    return force, stiffness
+
+
+def _rows(contact: Contact, a: Vec, alpha: Vec) -> Vec:
+    """J of an acceleration: of the contact's point along n, t, s."""
+    u = sp.add(a, sp.cross(alpha, contact.r))
+    return sp.dot(contact.n, u), sp.dot(contact.t, u), sp.dot(contact.s, u)
+
+
+def _solve(h: list[list[Any]], g: Sequence[Any]) -> list[Any]:
+    """Solve h x = g for a symmetric positive definite h, given by its lower triangle."""
+    size = len(g)
+    low: list[list[Any]] = [[None] * size for _ in range(size)]
+    for i in range(size):
+        for j in range(i + 1):
+            rest = h[i][j] - sp.dot(low[i][:j], low[j][:j]) if j else h[i][j]
+            low[i][j] = jax.lax.rsqrt(rest) if i == j else rest * low[j][j]
+        # the diagonal holds the reciprocals
+    y: list[Any] = []
+    for i in range(size):
+        y.append((g[i] - sp.dot(low[i][:i], y) if i else g[i]) * low[i][i])
+    x: list[Any] = [None] * size
+    for i in reversed(range(size)):
+        below = [low[k][i] for k in range(i + 1, size)]
+        x[i] = (y[i] - sp.dot(below, x[i + 1 :]) if below else y[i]) * low[i][i]
+    return x
+
+
+def accelerations(
+    body: Body, state: State, m: Sequence[Vec], contacts: list[Contact], physics: Physics
+) -> tuple[Vec, Vec]:
+    """Linear and angular acceleration of the object: the minimum of MuJoCo's convex cost.
+
+    Newton's method with an exact line search, from the last accelerations. It ends at an error of
+    `_ENOUGH`; the tolerance of `physics`, relative to the mass of the base too, is not used.
+    """
+    i_w = _spin(body, m)
+    i, w = body.inertia, state.w
+    torque = sp.cross((i[0] * w[0], i[1] * w[1], i[2] * w[2]), w)  # - w x (I w)
+    free = sp.to_world(m, (torque[0] / i[0], torque[1] / i[1], torque[2] / i[2]))
+
+    def gauss(a: Vec, alpha: Vec) -> tuple[Vec, Vec]:
+        """M (a - free accelerations)."""
+        linear = sp.scale(body.mass, (a[0], a[1], a[2] + GRAVITY))
+        return linear, sp.to_world(i_w, sp.sub(alpha, free))
+
+    def gradient(a: Vec, alpha: Vec):
+        linear, angular = gauss(a, alpha)
+        h: list[list[Any]] = [[0.0] * 6 for _ in range(6)]
+        for row in range(3):
+            h[row][row] = body.mass
+            for column in range(row + 1):
+                h[3 + row][3 + column] = i_w[row][column]
+        for c in contacts:
+            x = sp.add(_rows(c, a, alpha), c.bias)
+            force, k = _law(c, x, physics)
+            f = sp.combine(force, (c.n, c.t, c.s))
+            linear = sp.sub(linear, _sums(f))
+            angular = sp.sub(angular, _sums(sp.cross(c.r, f)))
+            _stiffen(h, c, k)
+        return (*linear, *angular), h
+
+    def improve(carry):
+        count, a, alpha, active, _ = carry
+        g, h = gradient(a, alpha)
+        step = _solve(h, [-x for x in g])
+        d, delta = (step[0], step[1], step[2]), (step[3], step[4], step[5])
+        x = _line_search(contacts, a, alpha, d, delta, gauss, body.mass, i_w, physics)
+        # An inner product of step and gradient: twice what a quadratic cost would gain.
+        gain = -sp.dot(step, g)
+        going = gain > 2 * body.mass * _ENOUGH**2
+        # A world that is done stays as it is while others go on: its numbers are its own.
+        move = jnp.where(active > 0, jnp.where(going, x, jnp.minimum(x, 1.0)), 0.0)
+        a, alpha = sp.add(a, sp.scale(move, d)), sp.add(alpha, sp.scale(move, delta))
+        active = jnp.where(going, active, 0.0)
+        return count + 1, a, alpha, active, _some(active)
+
+    active = jnp.ones_like(body.mass)
+    start = (0, state.a, state.alpha, active, _some(active))
+    _, a, alpha, _, _ = jax.lax.while_loop(
+        lambda carry: (carry[0] < physics.iterations) & carry[4], improve, start
+    )
+    return a, alpha
+
+
+def _sum(entry: Any) -> Any:
+    """Over the contacts, of what each adds to an entry."""
+    return entry if isinstance(entry, float) else jnp.sum(entry, axis=0)
+
+
+def _sums(vector: Vec) -> Vec:
+    return _sum(vector[0]), _sum(vector[1]), _sum(vector[2])
+
+
+def _some(active: jax.Array) -> jax.Array:
+    """Whether any is above zero, in a form that Triton knows."""
+    return jnp.sum(active) > 0
+
+
+def _spin(body: Body, m: Sequence[Vec]) -> list[Vec]:
+    """The inertia tensor in the world's axes."""
+    i = body.inertia
+    return [
+        tuple(sum(m[r][k] * m[c][k] * i[k] for k in range(3)) for c in range(3)) for r in range(3)
+    ]  # type: ignore[return-value]
+
+
+def _stiffen(h: list[list[Any]], c: Contact, k: tuple[Any, ...]) -> None:
+    """Add the contacts' J^T K J to the lower triangle of h."""
+    nn, nt, ns, tt, ts, ss = k
+    # K in the world's axes: columns of Q K Q^T with Q = (n, t, s).
+    axes = (c.n, c.t, c.s)
+    sides = [sp.combine(row, axes) for row in ((nn, nt, ns), (nt, tt, ts), (ns, ts, ss))]
+    columns = [sp.combine([axis[j] for axis in axes], sides) for j in range(3)]
+    turned = [sp.cross(c.r, column) for column in columns]  # columns of [r] K
+    for i in range(3):
+        for j in range(i + 1):
+            h[i][j] = sp.plus(h[i][j], _sum(columns[j][i]))
+        for j in range(3):
+            h[3 + i][j] = sp.plus(h[3 + i][j], _sum(turned[j][i]))
+        row = sp.cross(c.r, (turned[0][i], turned[1][i], turned[2][i]))
+        for j in range(i + 1):
+            h[3 + i][3 + j] = sp.plus(h[3 + i][3 + j], _sum(row[j]))
+
+
+def _line_search(
+    contacts: list[Contact],
+    a: Vec,
+    alpha: Vec,
+    d: Vec,
+    delta: Vec,
+    gauss: Callable[[Vec, Vec], tuple[Vec, Vec]],
+    mass: Any,
+    i_w: list[Vec],
+    physics: Physics,
+) -> Any:
+    """How far from (a, alpha) along (d, delta) the cost is least: Newton's method, bracketed."""
+    linear, angular = gauss(a, alpha)
+    slope = sp.dot(linear, d) + sp.dot(angular, delta)
+    bend = mass * sp.dot(d, d) + sp.dot(delta, sp.to_world(i_w, delta))
+    lines = [(c, sp.add(_rows(c, a, alpha), c.bias), _rows(c, d, delta)) for c in contacts]
+
+    def refine(_, carry):
+        x, low, high = carry
+        first, second = slope + x * bend, bend
+        for c, start, pace in lines:
+            force, k = _law(c, sp.add(start, sp.scale(x, pace)), physics)
+            first = first - _sum(sp.dot(force, pace))
+            nn, nt, ns, tt, ts, ss = k
+            p, q, r = pace
+            curve = nn * p * p + tt * q * q + ss * r * r
+            second = second + _sum(curve + 2 * (nt * p * q + ns * p * r + ts * q * r))
+        low, high = jnp.where(first < 0, x, low), jnp.where(first < 0, high, x)
+        new = x - first / second
+        halved = jnp.where(high < _FAR, 0.5 * (low + high), 2 * x)
+        return jnp.where((new > low) & (new < high), new, halved), low, high
+
+    one = jnp.ones_like(slope)
+    start = (one, 0.0 * one, _FAR * one)
+    return jax.lax.fori_loop(0, physics.ls_iterations, refine, start)[0]

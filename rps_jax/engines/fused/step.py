@@ -1,0 +1,261 @@
+"""MuJoCo's equations for these scenes alone: one free object, on the ground, before the base.
+
+MJX solves any scene. Here the scene is known: the base is a velocity source, so only the object's
+six accelerations are unknown; it touches the ground with the corners of its lower face and the
+base along two lines. What MuJoCo computes (its soft contacts, its two cones, its Newton solver and
+Euler's rule) is written out for that in scalars, so that a compiler can keep a whole world in
+registers: `contacts.py` finds the points, `newton.py` solves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax.experimental import pallas
+from jax.experimental.pallas import triton
+
+from rps_jax.engines.fused.contacts import Body, Corners, State, on_base, on_ground
+from rps_jax.engines.fused.newton import accelerations
+from rps_jax.geometry import vectors as sp
+from rps_jax.geometry.vectors import Vec
+from rps_jax.world.physics import Physics
+from rps_jax.world.scene import JOINTS
+
+_ROWS = 8  # numbers of a world read by one load of the kernel
+_BLOCK = 64  # worlds of one program of the kernel; they go on until the last has converged
+
+
+def body(model: mujoco.MjModel, vertices: np.ndarray) -> Body:
+    """The constants of a physics model and the vertices (N, 2) [m] of its footprint."""
+    thing, base = model.body("object"), model.body("base")
+    geom, front = model.geom("object"), model.geom("base")
+    frame = sp.matrix(thing.iquat)
+    round_ = len(vertices) == 1
+    half = thing.pos[2]  # a scene starts with its object on the ground
+    bottom = np.column_stack([vertices, np.full(len(vertices), -half)])
+    pairs = [model.pair(i) for i in range(model.npair)]
+    friction = {pair.name.partition("_")[0]: pair.friction[0] for pair in pairs}
+    return Body(
+        mass=thing.mass[0],
+        inertia=thing.inertia.copy(),
+        p_object_com=thing.ipos.copy(),
+        q_object_body=thing.iquat.copy(),
+        vertices=np.array([sp.to_body(frame, v) for v in bottom - thing.ipos]),
+        radius=geom.size[0] if round_ else 0.0,
+        height=2 * half,
+        up=np.array(sp.to_body(frame, (0.0, 0.0, 1.0))),
+        friction_ground=friction["ground"],
+        friction_robot=friction["base"],
+        invweight=model.body_invweight0[thing.id, 0],
+        base_invweight=model.body_invweight0[base.id, 0],
+        base_half=front.size[:2].copy(),
+        base_z=front.pos[2] + front.size[2] * np.array([-1.0, 1.0]),
+    )
+
+
+def _split(array: jax.Array, at: slice = slice(None)) -> Any:
+    return tuple(array[..., i] for i in range(array.shape[-1]))[at]
+
+
+def enter(body: Body, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array) -> State:
+    """The state of worlds as MuJoCo holds them: qpos (..., 10), qvel and warmstart (..., 9)."""
+    free, spin = _split(qpos, JOINTS.object), _split(qvel, slice(6, 9))
+    com, axes = _split(body.p_object_com), _split(body.q_object_body)
+    m = sp.matrix(free[3:])
+    v = sp.add(_split(qvel, slice(3, 6)), sp.to_world(m, sp.cross(spin, com)))
+    return State(
+        base=_split(qpos, JOINTS.base),
+        p=sp.add(free[:3], sp.to_world(m, com)),
+        q=sp.times(free[3:], axes),
+        v=v,
+        w=sp.to_body(sp.matrix(axes), spin),
+        a=_split(warmstart, slice(3, 6)),
+        alpha=_split(warmstart, slice(6, 9)),
+    )
+
+
+def leave(body: Body, state: State, twist: Vec) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The opposite of `enter`, after a period at `twist`: (qpos, qvel, warmstart)."""
+    com, axes = _split(body.p_object_com), _split(body.q_object_body)
+    q = sp.times(state.q, (axes[0], -axes[1], -axes[2], -axes[3]))
+    m = sp.matrix(q)
+    spin = sp.to_world(sp.matrix(axes), state.w)
+    v = sp.sub(state.v, sp.to_world(m, sp.cross(spin, com)))
+    c, s = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+    base = (c * twist[0] - s * twist[1], s * twist[0] + c * twist[1], twist[2])
+    p = sp.sub(state.p, sp.to_world(m, com))
+    still = tuple(jnp.zeros_like(x) for x in state.base)
+    return (
+        jnp.stack([*state.base, *p, *q], axis=-1),
+        jnp.stack([*base, *v, *spin], axis=-1),
+        jnp.stack([*still, *state.a, *state.alpha], axis=-1),
+    )
+
+
+def step(body: Body, state: State, twist: Vec, physics: Physics) -> State:
+    """One step of MuJoCo's semi-implicit Euler rule with the base held at `twist`.
+
+    `twist` [m/s, m/s, rad/s] is in the base's frame.
+    """
+    m = sp.matrix(state.q)
+    contacts = [on_ground(body, state, m, physics), on_base(body, state, m, twist, physics)]
+    a, alpha = accelerations(body, state, m, contacts, physics)
+    dt = physics.timestep
+    v = sp.add(state.v, sp.scale(dt, a))
+    w = sp.add(state.w, sp.scale(dt, sp.to_body(m, alpha)))
+    angle = sp.scale(dt, w)
+    half = 0.5 * sp.norm(angle)
+    # By their series: the angles of one step are small.
+    sinc = 0.5 * (1 - half * half / 6)
+    turn = (1 - half * half / 2 + half**4 / 24, *sp.scale(sinc, angle))
+    q = sp.times(state.q, turn)
+    length = jax.lax.rsqrt(sp.dot(q, q))
+    c, s = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+    base = (
+        state.base[0] + dt * (c * twist[0] - s * twist[1]),
+        state.base[1] + dt * (s * twist[0] + c * twist[1]),
+        state.base[2] + dt * twist[2],
+    )
+    p = sp.add(state.p, sp.scale(dt, v))
+    return State(base, p, tuple(x * length for x in q), v, w, a, alpha)  # type: ignore[arg-type]
+
+
+def drive(
+    body: Body,
+    qpos: jax.Array,
+    qvel: jax.Array,
+    warmstart: jax.Array,
+    twist: Vec,
+    physics: Physics,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """One control period of a batch of worlds (B, 10), (B, 9), (B, 9) at `twist` (B,).
+
+    On an NVIDIA GPU it is one kernel; elsewhere, and where it is differentiated, XLA compiles it.
+    """
+    state = _period(physics, spread(body), enter(body, qpos, qvel, warmstart), twist)
+    return leave(body, state, twist)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _period(physics: Physics, scalars: Body, state: State, twist: Vec) -> State:
+    return jax.lax.platform_dependent(
+        scalars,
+        state,
+        twist,
+        cuda=partial(_kernel, physics=physics),
+        default=partial(_steps, physics=physics),
+    )
+
+
+@_period.defjvp
+def _period_jvp(physics: Physics, primals: Any, tangents: Any) -> tuple[State, State]:
+    """Forward mode: a kernel has none, and the solver's loop no other."""
+    return jax.jvp(partial(_steps, physics=physics), primals, tangents)
+
+
+def _steps(scalars: Body, state: State, twist: Vec, physics: Physics) -> State:
+    return jax.lax.fori_loop(
+        0, physics.substeps, lambda _, s: step(scalars, s, twist, physics), state
+    )
+
+
+def _kernel(
+    scalars: Body, state: State, twist: Vec, physics: Physics, interpret: bool = False
+) -> State:
+    """`_steps` as one kernel, a world to a thread, which keeps its world in registers."""
+    count, moving = state.p[0].size, (state, twist)
+    bodies, motion = _packed(scalars), _packed(moving)
+
+    def kernel(*refs):
+        *given, out = refs
+        body = _unpacked(scalars, given[: len(bodies)])
+        now, wanted = _unpacked(moving, given[len(bodies) :])
+        _give(out, jax.tree.leaves(_steps(body, now, wanted, physics)))
+
+    def block(outer: tuple[int, ...]) -> pallas.BlockSpec:
+        return pallas.BlockSpec((*outer, _BLOCK), lambda i: (*(0,) * len(outer), i))
+
+    inputs = [*bodies, *motion]
+    numbers, worlds = len(jax.tree.leaves(state)), motion[0].shape[-1]
+    after = pallas.pallas_call(
+        kernel,
+        grid=(worlds // _BLOCK,),
+        in_specs=[block(x.shape[:-1]) for x in inputs],
+        out_specs=block((numbers,)),
+        out_shape=jax.ShapeDtypeStruct((numbers, worlds), motion[0].dtype),
+        interpret=interpret,
+        compiler_params=triton.CompilerParams(num_warps=_BLOCK // 32),
+    )(*inputs)
+    return jax.tree.unflatten(jax.tree.structure(state), list(after[:, :count]))
+
+
+def _packed(tree: Any) -> list[jax.Array]:
+    """Numbers of worlds (B,), and those of their corners (N, B), as arrays (K, B) and (K, N, B).
+
+    The worlds are filled up to whole blocks by copies of the last.
+    """
+    kinds: dict[int, list[jax.Array]] = {}
+    for leaf in jax.tree.leaves(tree):
+        kinds.setdefault(leaf.ndim, []).append(leaf)
+    stacks = [jnp.stack(leaves) for leaves in kinds.values()]
+    over = -stacks[0].shape[-1] % _BLOCK
+    return [jnp.pad(x, (*((0, 0),) * (x.ndim - 1), (0, over)), mode="edge") for x in stacks]
+
+
+def _unpacked(tree: Any, refs: Sequence[Any]) -> Any:
+    """A block of what `_packed` has packed, of the form and the types of `tree`."""
+    rows = {len(ref.shape) - 1: iter(_taken(ref)) for ref in refs}
+    return jax.tree.map(lambda leaf: next(rows[leaf.ndim]).astype(leaf.dtype), tree)
+
+
+# A kernel's compiler takes a time that grows with its loads and stores times the square of all it
+# does (Triton's pass `coalesce`): with one for each number that is three quarters of the whole.
+
+
+def _taken(ref: Any) -> list[jax.Array]:
+    """The rows of a reference (K, ...), by few loads."""
+    rows = []
+    for first in range(0, ref.shape[0], _ROWS):
+        some = range(first, min(first + _ROWS, ref.shape[0]))
+
+        def take(i: Any, taken: list[jax.Array], some: range = some) -> list[jax.Array]:
+            row = ref[i]
+            return [jnp.where(i == j, row, x) for j, x in zip(some, taken, strict=True)]
+
+        nothing = [jnp.zeros(ref.shape[1:], ref.dtype)] * len(some)
+        rows += jax.lax.fori_loop(some.start, some.stop, take, nothing)
+    return rows
+
+
+def _give(ref: Any, rows: list[jax.Array]) -> None:
+    """The opposite of `_taken`."""
+    for first in range(0, len(rows), _ROWS):
+        some = range(first, min(first + _ROWS, len(rows)))
+
+        def give(i: Any, _: None, some: range = some) -> None:
+            row = rows[some.start]
+            for j in some[1:]:
+                row = jnp.where(i == j, rows[j], row)
+            ref[i] = row
+
+        jax.lax.fori_loop(some.start, some.stop, give, None)
+
+
+def spread(body: Body) -> Body:
+    """Bodies (...) with every entry an array of its own, as `step` has them."""
+    leaves = body._replace(vertices=None)
+    entries = {
+        name: _split(leaf) if jnp.ndim(leaf) > jnp.ndim(body.mass) else leaf
+        for name, leaf in leaves._asdict().items()
+        if leaf is not None
+    }
+    corners = _split(jnp.moveaxis(body.vertices, -2, 0))
+    if body.vertices.shape[-2] == 1:
+        return Body(vertices=tuple(x[0] for x in corners), **entries)
+    return Body(vertices=Corners.of(corners), **entries)

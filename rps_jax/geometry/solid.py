@@ -1,0 +1,208 @@
+"""Solids of any size, many at once: their mass properties, and what each engine makes of them.
+
+A solid is an upright prism or cylinder of even density with a compact load inside. Its frame has
+its origin in the middle of its height above the centroid of its outline; z is up. All arrays are
+NumPy in double precision and lead with the number of solids, n.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+
+from rps_jax import errors
+from rps_jax.geometry import vectors
+
+Support = Literal["feet", "even"]  # what bears a solid on the ground
+SIDES = 8  # vertices of a prism at most; those of fewer sides repeat some
+_LOAD_AT = 0.8  # of the way from the middle to the outline stands the load
+_CELLS = 8  # into which the evenly borne parts of an outline are split, along and across
+
+
+class Solid(NamedTuple):
+    """Outline, height and mass properties of solids of one shape family."""
+
+    vertices: (
+        np.ndarray
+    )  # (n, N, 2) [m] counter-clockwise, padded by repetition; (n, 1, 2) if round
+    radius: np.ndarray  # (n,) [m] of a cylinder; 0 of a prism
+    height: np.ndarray  # (n,) [m]
+    mass: np.ndarray  # (n,) [kg]
+    p_object_com: np.ndarray  # (n, 3) [m]
+    inertia: np.ndarray  # (n, 3) [kg m^2] principal moments about the centre of mass
+    q_object_body: np.ndarray  # (n, 4) principal axes in the object's frame, scalar first
+
+
+def build(
+    vertices: np.ndarray,
+    radius: np.ndarray,
+    height: np.ndarray,
+    mass: np.ndarray,
+    com_offset: np.ndarray,
+    com_bearing: np.ndarray,
+) -> Solid:
+    """Solids whose centre of mass a load moves off the middle.
+
+    The load is a share of the mass, at `_LOAD_AT` of the way to the outline and at half height,
+    such that the centre of mass moves by `com_offset` (n,) [1] of that way, in the direction
+    `com_bearing` (n,) [rad]. What is left of the mass fills the solid evenly, so an offset of 0 is
+    a solid of even density.
+    """
+    direction = np.stack([np.cos(com_bearing), np.sin(com_bearing)], axis=-1)
+    at = _LOAD_AT * reach(vertices, radius, direction)[:, None] * direction
+    share = com_offset / _LOAD_AT
+    xx, yy, xy = _second_moments(vertices, radius)
+    rest, pair = 1 - share, share * (1 - share)
+    xx = rest * xx + pair * at[:, 0] ** 2
+    yy = rest * yy + pair * at[:, 1] ** 2
+    xy = rest * xy + pair * at[:, 0] * at[:, 1]
+    zz = rest * height**2 / 12
+    middle, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
+    turn = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the axis along which the mass is spread most
+    inertia = mass[:, None] * np.stack([middle - half + zz, middle + half + zz, xx + yy], axis=-1)
+    zero = np.zeros_like(mass)
+    return Solid(
+        vertices,
+        radius,
+        height,
+        mass,
+        np.concatenate([share[:, None] * at, zero[:, None]], axis=-1),
+        inertia,
+        np.stack([np.cos(turn / 2), zero, zero, np.sin(turn / 2)], axis=-1),
+    )
+
+
+def rectangles(half_x: np.ndarray, half_y: np.ndarray) -> np.ndarray:
+    """Outlines (n, 4, 2) [m] of boxes, as `footprint.rectangle` has them."""
+    signs = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+    return signs * np.stack([half_x, half_y], axis=-1)[:, None, :]
+
+
+def centred(vertices: np.ndarray) -> np.ndarray:
+    """Polygons (n, N, 2) [m] moved so that the centroids of their areas are the origin."""
+    cross, ahead = _triangles(vertices)
+    area = cross.sum(axis=1) / 2
+    third = (vertices + ahead) * cross[..., None] / 6
+    return vertices - (third.sum(axis=1) / area[:, None])[:, None, :]
+
+
+def reach(vertices: np.ndarray, radius: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Distance (n,) [m] from the origin to the outline in the directions (n, 2)."""
+    if vertices.shape[1] == 1:
+        return radius
+    edge = np.roll(vertices, -1, axis=1) - vertices
+    outward = np.stack([edge[..., 1], -edge[..., 0]], axis=-1)
+    away = np.sum(outward * vertices, axis=-1)
+    pace = np.sum(outward * direction[:, None, :], axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = np.where(pace > 1e-12, away / pace, np.inf)
+    return distance.min(axis=1)
+
+
+def area(solid: Solid) -> np.ndarray:
+    """Areas (n,) [m^2] of the outlines."""
+    if solid.vertices.shape[1] == 1:
+        return np.pi * solid.radius**2
+    return _triangles(solid.vertices)[0].sum(axis=1) / 2
+
+
+def corners(solid: Solid) -> np.ndarray:
+    """Numbers (n,) of corners of the outlines, those repeated counted once; 0 of a cylinder."""
+    if solid.vertices.shape[1] == 1:
+        return np.zeros(solid.mass.size)
+    new = np.any(solid.vertices != np.roll(solid.vertices, 1, axis=1), axis=2)
+    return new.sum(axis=1).astype(float)
+
+
+def extent(solid: Solid, yaw: np.ndarray) -> np.ndarray:
+    """How far (n,) [m] the solids, turned by `yaw` (n,) [rad], reach towards -x."""
+    c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+    x = c * solid.vertices[..., 0] - s * solid.vertices[..., 1]
+    return solid.radius - x.min(axis=1)
+
+
+def axes(solid: Solid) -> np.ndarray:
+    """Rotation matrices (n, 3, 3) from principal axes to the object's frame."""
+    w, x, y, z = solid.q_object_body.T
+    rows = vectors.matrix((w, x, y, z))
+    return np.stack([entry for row in rows for entry in row], axis=-1).reshape(-1, 3, 3)
+
+
+def friction_arm(solid: Solid, support: Support = "feet") -> np.ndarray:
+    """Arms m_max / f_max (n,) [m] of the ground's friction about the centres of mass.
+
+    That is the mean distance of the load from its centre. The load is what springs under `support`
+    bear that give way alike and only push: `feet`, points as engines stand solids on (the corners
+    of a prism, three points of a cylinder's rim, one where it leans to); `even`, all of the ground
+    that is covered.
+
+    Raises:
+      InputError: unknown support.
+    """
+    errors.check_name("support", support, get_args(Support))
+    at, share = _feet(solid) if support == "feet" else _bed(solid)
+    com = solid.p_object_com[:, :2]
+    rows = np.concatenate([np.ones((*share.shape, 1)), at - com[:, None]], axis=-1)
+    bears = np.ones(share.shape, bool)
+    load = share
+    for _ in range(at.shape[1]):
+        some = rows * (bears * share)[..., None]
+        # Pressure is linear in place; its sum is 1, its centre the centre of mass.
+        pressure = np.linalg.pinv(some.swapaxes(1, 2) @ rows)[..., :1]
+        load = (some @ pressure)[..., 0]
+        if not np.any(load < 0):
+            break
+        bears &= load >= 0
+    return np.sum(load * np.linalg.norm(rows[..., 1:], axis=-1), axis=1)
+
+
+def _feet(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, N, 2) [m] on which engines stand solids, and whether (n, N) each counts."""
+    at = solid.vertices
+    if at.shape[1] > 1:
+        return at, np.any(at != np.roll(at, 1, axis=1), axis=2).astype(float)
+    x, y, _ = solid.p_object_com.T
+    lean = np.arctan2(y, x)[:, None] + np.array([0, 2, 4]) * np.pi / 3
+    return _on_circle(solid.radius, lean), np.ones(lean.shape)
+
+
+def _bed(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, M, 2) [m] all over the outlines, and the area (n, M) [m^2] of each."""
+    vertices = solid.vertices
+    if vertices.shape[1] == 1:
+        angles = np.arange(8 * _CELLS) * np.pi / (4 * _CELLS)
+        vertices = _on_circle(solid.radius, np.tile(angles, (len(vertices), 1)))
+    cross, ahead = _triangles(vertices)
+    along, out = np.meshgrid(*[(np.arange(_CELLS) + 0.5) / _CELLS] * 2)
+    edge = vertices[:, :, None] + along.ravel()[:, None] * (ahead - vertices)[:, :, None]
+    at = out.ravel()[:, None] * edge
+    area = cross[:, :, None] * out.ravel() / _CELLS**2
+    return at.reshape(len(at), -1, 2), area.reshape(len(at), -1)
+
+
+def _on_circle(radius: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Points (n, M, 2) [m] at angles (n, M) [rad]."""
+    return radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def _triangles(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cross products (n, N) [m^2] of consecutive vertices, and the following vertices."""
+    ahead = np.roll(vertices, -1, axis=1)
+    return vertices[..., 0] * ahead[..., 1] - vertices[..., 1] * ahead[..., 0], ahead
+
+
+def _second_moments(
+    vertices: np.ndarray, radius: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean of x^2, y^2 and x y [m^2] over outlines centred at the origin."""
+    if vertices.shape[1] == 1:
+        quarter = radius**2 / 4
+        return quarter, quarter, np.zeros_like(quarter)
+    cross, ahead = _triangles(vertices)
+    x, y, x2, y2 = vertices[..., 0], vertices[..., 1], ahead[..., 0], ahead[..., 1]
+    area = cross.sum(axis=1) / 2
+    xx = (cross * (x * x + x * x2 + x2 * x2)).sum(axis=1) / 12
+    yy = (cross * (y * y + y * y2 + y2 * y2)).sum(axis=1) / 12
+    xy = (cross * (x * y2 + 2 * x * y + 2 * x2 * y2 + x2 * y)).sum(axis=1) / 24
+    return xx / area, yy / area, xy / area

@@ -1,0 +1,382 @@
+"""The tactile skin: where does the object touch the base?
+
+Two sensors behind one interface, both purely geometric: they read the object's footprint, placed
+in the robot frame, and never the engine's contacts. The skin covers the front, left and right
+faces. Positions along it form one strip that starts at the rear of the left face, runs forward,
+across the front from left to right, and back along the right face; the two extreme positions of a
+contact are its first and last along this strip.
+
+    sensor.init(key) -> state
+    sensor.sense(state, footprint, period) -> (state, Reading)
+
+`SmoothSkin` makes either sensor smooth: a reading tells how much contact there is, from 0 to 1.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rps_jax import errors
+from rps_jax.geometry import footprint as fp
+from rps_jax.geometry import planar
+from rps_jax.geometry.footprint import Footprint
+
+HALF_LENGTH = 0.3625  # [m] of the base: 15 taxels of 48.3 mm make 0.725 m
+HALF_WIDTH = 0.29  # [m] of the base: l_cr + 5 cm, Sec. III-A
+BOARDS = {"left": 5, "front": 4, "right": 5}  # 14 boards, Sec. II-B
+ELECTRODES = 3  # on each board
+_SAMPLES = 5  # of each taxel, about 1 cm apart: a corner pressed home is felt
+
+_NODES = 16  # points on each face of the smooth ideal sensor
+_REACH = 8.0  # [1] temperatures beyond its tolerance at which they end, with 3e-4 of the weight
+_NEVER = -1e9  # of a dead taxel: its excess over the threshold, in temperatures
+
+NONE, POINT, LINE = 0, 1, 2  # contact types, Fig. 6c
+
+
+class Face(NamedTuple):
+    """One side of the base, in strip order."""
+
+    start: jax.Array  # (2,) [m] in the robot frame
+    along: np.ndarray  # (2,) unit vector
+    length: Any  # () [m]
+
+
+def faces(half_length: Any = HALF_LENGTH) -> dict[str, Face]:
+    """The covered sides of a base of length 2 half_length [m], in strip order."""
+    x, y = half_length, HALF_WIDTH
+    return {
+        "left": Face(jnp.stack([-x, y]), np.array([1.0, 0.0]), 2 * x),
+        "front": Face(jnp.stack([x, y]), np.array([0.0, -1.0]), 2 * y),
+        "right": Face(jnp.stack([x, -y]), np.array([-1.0, 0.0]), 2 * x),
+    }
+
+
+class Reading(NamedTuple):
+    """What the skin tells the law."""
+
+    contact_type: jax.Array  # () int32: NONE, POINT or LINE
+    p_robot_contact: jax.Array  # (2,) [m] contact location in the robot frame; 0 if NONE
+
+    @property
+    def in_contact(self) -> jax.Array:
+        """() bool."""
+        return self.contact_type != NONE
+
+
+class SmoothReading(NamedTuple):
+    """What a smooth skin tells: a `Reading` whose contact is a weight."""
+
+    contact_type: jax.Array  # () int32: NONE up to a weight of 1/2, beyond it POINT or LINE
+    p_robot_contact: jax.Array  # (2,) [m] contact location in the robot frame, at any weight
+    in_contact: jax.Array  # () [1] weight of the contact, from 0 to 1
+
+
+class Skin(Protocol):
+    """A tactile sensor: a pytree of parameters with two pure functions."""
+
+    @property
+    def half_length(self) -> float | jax.Array:
+        """Of the base that it covers [m]."""
+        ...
+
+    def check(self) -> None:
+        """Raises InputError for scalar parameters that mean nothing."""
+        ...
+
+    def init(self, key: jax.Array) -> SkinState:
+        """The sensor before it has felt anything; `key` draws its imperfections."""
+        ...
+
+    def sense(
+        self, state: SkinState, footprint: Footprint, period: float
+    ) -> tuple[SkinState, Reading | SmoothReading]:
+        """One reading of a footprint placed in the robot frame, `period` [s] after the last."""
+        ...
+
+
+class SkinState(NamedTuple):
+    """What a sensor carries from one reading to the next (empty for the ideal one)."""
+
+    key: jax.Array  # noise of the readings to come
+    signal: jax.Array  # (T,) [1] filtered relative change of capacitance
+    gain: jax.Array  # (T,) [1] of each taxel
+    alive: jax.Array  # (T,) bool
+
+
+class IdealSkin(NamedTuple):
+    """The exact contact interval, as the position of the paper's Gazebo contact sensor.
+
+    A point of a face is in contact if it lies within `tolerance` of the object: foam gives a real
+    skin several millimetres of it, and without any, the corners of a box alternate and the law
+    chatters.
+    """
+
+    tolerance: float | jax.Array = 0.006  # [m]
+    point_length: float | jax.Array = 2 * HALF_WIDTH / 12  # [m] up to one taxel long: a point
+    half_length: float | jax.Array = HALF_LENGTH  # [m] of the base
+
+    def check(self) -> None:
+        """Raises InputError unless all are lengths."""
+        for name in ("tolerance", "point_length"):
+            errors.check_finite(
+                f"skin {name}", getattr(self, name), at_least=0, at_most=0.1, unit="m"
+            )
+        _check_half_length(self.half_length)
+
+    def init(self, key: jax.Array) -> SkinState:
+        """No memory, no imperfections."""
+        return SkinState(key, *(jnp.zeros(0),) * 3)
+
+    def sense(
+        self, state: SkinState, footprint: Footprint, period: float
+    ) -> tuple[SkinState, Reading]:
+        """The middle between the two ends of the contact interval; the period is unused."""
+        del period
+        dtype = footprint.vertices.dtype
+        strip_start = 0.0
+        hits, ends = [], []  # of both ends of each face's interval, in strip order
+        for face in faces(self.half_length).values():
+            start, along = jnp.asarray(face.start, dtype), jnp.asarray(face.along, dtype)
+            low, high = fp.crossing(footprint, start, along, self.tolerance)
+            hit = (low <= high) & (high >= 0) & (low <= face.length)
+            for s in (low, high):
+                s = jnp.clip(s, 0.0, face.length)
+                ends.append(jnp.concatenate([start + s * along, strip_start + s[None]]))
+                hits.append(hit)
+            strip_start += face.length
+        ends, hits = jnp.stack(ends), jnp.stack(hits)
+        first, last = _extremes(hits, ends)
+        kind = jnp.where(last[2] - first[2] > self.point_length, LINE, POINT)
+        return state, _reading(jnp.where(jnp.any(hits), kind, NONE), first[:2], last[:2])
+
+    def sense_smoothly(
+        self, state: SkinState, footprint: Footprint, period: float, temperature: Any
+    ) -> tuple[SkinState, SmoothReading]:
+        """The reading if a point at signed distance x is active by its excess, tolerance - x.
+
+        Active is sigmoid(excess / temperature [m]). The contact is one run along the strip, so
+        its mean is the middle of its two ends and its total activity their distance, also around
+        a corner. The points lie where `footprint.crossing` finds a face near enough, and so move
+        with the object: a few suffice, and as the temperature falls their reading tends to that
+        of `sense`.
+        """
+        del period
+        s, share = self._nodes(footprint, self.tolerance + _REACH * temperature)
+        distance = fp.signed_distance(footprint, on_strip(s, self.half_length))
+        excess = (self.tolerance - distance) / temperature
+        # A softmax: defined where nothing is near too, by whatever is nearest.
+        middle = jnp.sum(s * jax.nn.softmax(jax.nn.log_sigmoid(excess) + jnp.log(share)))
+        length = jnp.sum(share * jax.nn.sigmoid(excess))
+        first, last = on_strip(middle + length * jnp.array([-0.5, 0.5], s.dtype), self.half_length)
+        kind = jnp.where(length > self.point_length, LINE, POINT)
+        return state, _smooth_reading(planar.greatest(excess), kind, first, last)
+
+    def _nodes(self, footprint: Footprint, tolerance: Any) -> tuple[jax.Array, jax.Array]:
+        """Points (N,) [m] of the strip within `tolerance` of a footprint, the length of each.
+
+        Of a face that lies beyond it, points all along.
+        """
+        middles = (np.arange(_NODES) + 0.5) / _NODES
+        nodes, shares, strip_start = [], [], 0.0
+        for face in faces(self.half_length).values():
+            dtype = footprint.vertices.dtype
+            start, along = jnp.asarray(face.start, dtype), jnp.asarray(face.along, dtype)
+            low, high = fp.crossing(footprint, start, along, tolerance)
+            near = (low <= high) & (high >= 0) & (low <= face.length)
+            low = jnp.where(near, jnp.clip(low, 0.0, face.length), 0.0)
+            high = jnp.where(near, jnp.clip(high, 0.0, face.length), face.length)
+            nodes.append(strip_start + low + (high - low) * middles)
+            share = jnp.maximum(high - low, 1e-6) / _NODES  # not zero: its logarithm is taken
+            shares.append(jnp.broadcast_to(share, _NODES))
+            strip_start += face.length
+        return jnp.concatenate(nodes), jnp.concatenate(shares)
+
+
+class CapacitiveSkin(NamedTuple):
+    """42 taxels under foam: compression -> capacitance -> low-pass -> threshold (Sec. II-B).
+
+    The foam stands proud of the rigid base by `foam`. An electrode's capacitance is the mean of
+    eps / gap over its length, the gap being what the object leaves of the foam.
+    """
+
+    foam: float | jax.Array = 0.010  # [m] thickness, uncompressed
+    max_compression: float | jax.Array = 0.9  # [1] share of the thickness that can give way
+    time_constant: float | jax.Array = 0.05  # [s] of the low-pass filter
+    threshold: float | jax.Array = 0.25  # [1] relative change of capacitance that counts as touch
+    noise: float | jax.Array = 0.0  # [1] standard deviation of each raw reading
+    gain_spread: float | jax.Array = 0.0  # [1] standard deviation of the taxels' gains about 1
+    dead_share: float | jax.Array = 0.0  # [1] probability that a taxel never answers
+    half_length: float | jax.Array = HALF_LENGTH  # [m] of the base
+
+    def check(self) -> None:
+        """Raises InputError for foam, filter or imperfections that no skin can have."""
+        errors.check_finite("skin foam", self.foam, above=0, at_most=0.1, unit="m")
+        errors.check_finite("skin max_compression", self.max_compression, above=0, at_most=0.99)
+        errors.check_finite("skin time_constant", self.time_constant, above=0, unit="s")
+        for name in ("threshold", "noise", "gain_spread"):
+            errors.check_finite(f"skin {name}", getattr(self, name), at_least=0)
+        errors.check_finite("skin dead_share", self.dead_share, at_least=0, at_most=1)
+        _check_half_length(self.half_length)
+
+    def init(self, key: jax.Array) -> SkinState:
+        """Draws each taxel's gain and whether it is dead."""
+        key, key_gain, key_dead = jax.random.split(key, 3)
+        n = sum(BOARDS.values()) * ELECTRODES
+        gain = 1 + self.gain_spread * jax.random.normal(key_gain, (n,))
+        alive = jax.random.uniform(key_dead, (n,)) >= self.dead_share
+        return SkinState(key, jnp.zeros(n), gain, alive)
+
+    def compression(self, footprint: Footprint) -> jax.Array:
+        """How far the object presses into the foam (T, S) [m] at each sample of each taxel."""
+        samples = jnp.asarray(taxels(_SAMPLES, self.half_length), footprint.vertices.dtype)
+        depth = self.foam - fp.signed_distance(footprint, samples)
+        return jnp.clip(depth, 0.0, self.max_compression * self.foam)
+
+    def _scan(self, state: SkinState, footprint: Footprint) -> tuple[SkinState, jax.Array]:
+        """What all taxels answer (T,) [1], as foam, gains and noise have it."""
+        gap = self.foam - self.compression(footprint)
+        change = jnp.mean(self.foam / gap, axis=-1) - 1.0
+        key, key_noise = jax.random.split(state.key)
+        noise = self.noise * jax.random.normal(key_noise, change.shape, change.dtype)
+        return state._replace(key=key), state.gain * change + noise
+
+    def _filtered(self, state: SkinState, raw: jax.Array, period: float) -> SkinState:
+        signal = state.signal + (1 - jnp.exp(-period / self.time_constant)) * (raw - state.signal)
+        return state._replace(signal=signal)
+
+    def read(self, state: SkinState, raw: jax.Array, period: float) -> tuple[SkinState, Reading]:
+        """One scan of a real skin, or of a simulated one, filtered and compared to the threshold.
+
+        `raw` (42,) [1] is each taxel's relative change of capacitance, in strip order (that of
+        `taxels`), `period` [s] after the last scan.
+        """
+        state = self._filtered(state, raw, period)
+        active = (state.signal > self.threshold) & state.alive
+        middles = jnp.asarray(taxels(1, self.half_length)[:, 0], raw.dtype)
+        first, last = _extremes(active, middles)
+        kind = jnp.minimum(jnp.sum(active), LINE)
+        return state, _reading(kind, first, last)
+
+    def sense(
+        self, state: SkinState, footprint: Footprint, period: float
+    ) -> tuple[SkinState, Reading]:
+        """One scan of all taxels, read."""
+        return self.read(*self._scan(state, footprint), period)
+
+    def sense_smoothly(
+        self, state: SkinState, footprint: Footprint, period: float, temperature: Any
+    ) -> tuple[SkinState, SmoothReading]:
+        """The reading if a taxel is active by its excess, signal - threshold.
+
+        Active is sigmoid(excess / temperature [1]). As if each were so with that probability, the
+        two ends are the means of the first and of the last active taxel. As the temperature falls
+        they tend to those of `sense`, also where dead taxels interrupt a contact.
+        """
+        state = self._filtered(*self._scan(state, footprint), period)
+        excess = jnp.where(state.alive, (state.signal - self.threshold) / temperature, _NEVER)
+        middles = jnp.asarray(taxels(1, self.half_length)[:, 0], excess.dtype)
+        first, last = _first(excess) @ middles, _first(excess[::-1]) @ middles[::-1]
+        kind = jnp.clip(jnp.sum(excess > 0), POINT, LINE)
+        return state, _smooth_reading(planar.greatest(excess), kind, first, last)
+
+
+class SmoothSkin(NamedTuple):
+    """A sensor whose threshold is soft. As the temperature goes to zero it tends to the sensor.
+
+    The temperature is of the threshold's unit: [m] of an ideal sensor; [1], a relative change of
+    capacitance, of a capacitive one, where 0.03 is a good value. It must be well below the
+    threshold itself, or the skin feels what is not there.
+    """
+
+    sensor: IdealSkin | CapacitiveSkin = IdealSkin()
+    temperature: float | jax.Array = 0.001
+
+    @property
+    def half_length(self) -> float | jax.Array:
+        """Of the base that it covers [m]."""
+        return self.sensor.half_length
+
+    def check(self) -> None:
+        """Raises InputError for a sensor or a temperature that means nothing."""
+        self.sensor.check()
+        errors.check_finite("skin temperature", self.temperature, above=0, at_most=1)
+
+    def init(self, key: jax.Array) -> SkinState:
+        """As of the sensor."""
+        return self.sensor.init(key)
+
+    def sense(
+        self, state: SkinState, footprint: Footprint, period: float
+    ) -> tuple[SkinState, SmoothReading]:
+        """A smooth reading, by the rule of the sensor."""
+        return self.sensor.sense_smoothly(state, footprint, period, self.temperature)
+
+
+# "thin" chatters between the corners of a box, as a rigid contact sensor does.
+SKINS = {
+    "ideal": IdealSkin(),
+    "thin": IdealSkin(tolerance=0.001),
+    "capacitive": CapacitiveSkin(),
+    "hardware": CapacitiveSkin(noise=0.05, gain_spread=0.1),  # noise a fifth of the threshold
+}
+
+
+def _check_half_length(value: Any) -> None:
+    errors.check_finite("skin half_length", value, at_least=0.1, at_most=2, unit="m")
+
+
+def taxels(samples: int = 1, half_length: Any = HALF_LENGTH) -> jax.Array:
+    """Sample points (42, samples, 2) [m] of the taxels, in strip order, in the robot frame."""
+    rows = []
+    for name, face in faces(half_length).items():
+        count = BOARDS[name] * ELECTRODES * samples
+        s = (np.arange(count) + 0.5) / count * face.length
+        rows.append((face.start + s[:, None] * face.along).reshape(-1, samples, 2))
+    return jnp.concatenate(rows)
+
+
+def on_strip(s: jax.Array, half_length: Any = HALF_LENGTH) -> jax.Array:
+    """Points (..., 2) [m] of the strip in the robot frame, `s` (...) [m] from its start."""
+    x = jnp.asarray(half_length, s.dtype)
+    corners = jnp.cumsum(jnp.stack([0 * x, 2 * x, jnp.full_like(x, 2 * HALF_WIDTH), 2 * x]))
+    at_x = jnp.interp(s, corners, jnp.stack([-x, x, x, -x]))
+    y = HALF_WIDTH * np.array([1.0, 1.0, -1.0, -1.0])
+    return jnp.stack([at_x, jnp.interp(s, corners, jnp.asarray(y, s.dtype))], axis=-1)
+
+
+def _first(excess: jax.Array) -> jax.Array:
+    """Probability (n,) of each to be the first active one, given that there is one.
+
+    Each is active with the probability sigmoid(excess), independently.
+    """
+    none_before = -jnp.cumsum(jax.nn.softplus(excess))[:-1]
+    return jax.nn.softmax(
+        jax.nn.log_sigmoid(excess) + jnp.concatenate([jnp.zeros_like(excess[:1]), none_before])
+    )
+
+
+def _extremes(active: jax.Array, values: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The rows of `values` (n, m) at the first and the last True of `active` (n,)."""
+    first = jnp.argmax(active)
+    last = active.shape[0] - 1 - jnp.argmax(active[::-1])
+    return values[first], values[last]
+
+
+def _reading(kind: jax.Array, first: jax.Array, last: jax.Array) -> Reading:
+    """Sec. II-B: one position is the location itself, several give the mean of the extremes."""
+    location = jnp.where(kind == NONE, 0.0, 0.5 * (first + last))
+    return Reading(kind.astype(jnp.int32), location)
+
+
+def _smooth_reading(
+    excess: jax.Array, kind: jax.Array, first: jax.Array, last: jax.Array
+) -> SmoothReading:
+    """As much contact as where there is most: so it is 1/2 at the threshold at any temperature."""
+    in_contact = jax.nn.sigmoid(excess)
+    kind = jnp.where(excess > 0, kind, NONE)
+    return SmoothReading(kind.astype(jnp.int32), 0.5 * (first + last), in_contact)

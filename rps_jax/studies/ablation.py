@@ -1,0 +1,196 @@
+"""What is each choice for speed worth? One change at a time, timed beside the program as it is.
+
+A lever is a change of the physics, of what a step does, or of how the program is compiled. Some
+change outcomes: which of them may be had is for `rps_jax.studies.fidelity` to say, not for a clock.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rps_jax.control.law import Twist
+from rps_jax.engines import mjx_colliders
+from rps_jax.studies import benchmark
+from rps_jax.studies.benchmark import Program
+from rps_jax.trials.trial import Driven, Stage, Trial, World
+from rps_jax.world.physics import Physics
+from rps_jax.world.scene import mjx
+
+
+class Lever(NamedTuple):
+    """One change to a program of `benchmark.BATCHED`."""
+
+    physics: Mapping[str, Any] = {}  # fields of `Physics` to change
+    stage: Callable[[Any], Any] = lambda stage: stage
+    tracing: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext
+    donated: bool = True
+    flags: dict[str, Any] | None = None  # of XLA
+    worlds: float = 1.0  # times as many
+
+
+class Unmoved(NamedTuple):
+    """An engine without physics: the base goes, the object stays. What is left is the law's."""
+
+    def drive(self, worlds: World, trials: Trial, twists: Twist, physics: Physics) -> Driven:
+        """Step a batch for one control period."""
+        turn = jax.vmap(lambda twist, yaw: twist.in_world(yaw))
+        ahead = physics.control_period * turn(twists, trials.qpos[:, 2])
+        return Driven(trials.qpos.at[:, :3].add(ahead), trials.qvel, trials.warmstart)
+
+
+def _option(**values: Any) -> Callable[[Stage], Stage]:
+    """The stage of MJX with other options of the model."""
+    changes = {f"opt.{name}": value for name, value in values.items()}
+
+    def change(stage: Stage) -> Stage:
+        model: Any = stage.model.tree_replace(changes)
+        return Stage(model, mjx.make_data(model))
+
+    return change
+
+
+# Not in these scenes: equalities, joint limits and friction, actuators, springs, sensors.
+_UNUSED = mjx.DisableBit(sum(mjx.DisableBit[name] for name in (
+    *("EQUALITY", "FRICTIONLOSS", "LIMIT", "ACTUATION", "CLAMPCTRL"),
+    *("SPRING", "DAMPER", "SENSOR", "EULERDAMP"),
+)))  # fmt: skip
+_OF_ALL = {
+    "no physics: law, skin, rules": Lever(stage=lambda _: Unmoved()),
+    "steps of 5 ms": Lever({"timestep": 0.005}),
+    "steps of 20 ms": Lever({"timestep": 0.02}),
+    "a decision in 10 ms": Lever({"control_period": 0.01}),
+    "a decision in 40 ms": Lever({"control_period": 0.04}),
+    "a quarter of the worlds": Lever(worlds=0.25),
+    "four times the worlds": Lever(worlds=4.0),
+    "state not donated": Lever(donated=False),
+}
+_OF_SOLVERS = {
+    "friction pyramid": Lever({"cone": "pyramidal"}),
+    "4 solver iterations": Lever({"iterations": 4}),
+    "16 solver iterations": Lever({"iterations": 16}),
+    "5 line-search steps": Lever({"ls_iterations": 5}),
+    "20 line-search steps": Lever({"ls_iterations": 20}),
+}
+_OF_MJX = {
+    "own box-box collider": Lever(tracing=partial(mjx_colliders.box_as_prism, 4)),
+    "own, two points": Lever(tracing=partial(mjx_colliders.box_as_prism, 2)),
+    "unused stages disabled": Lever(stage=_option(disableflags=_UNUSED)),
+    "sparse inertia matrix": Lever(stage=_option(jacobian=mjx.JacobianType.SPARSE)),
+}
+_FLAGS = {
+    "cpu": {
+        "XLA: older emitters": {"xla_cpu_use_fusion_emitters": False},
+        "XLA: vectors of 128 bits": {"xla_cpu_prefer_vector_width": 128},
+        "XLA: LLVM's level 1": {"xla_backend_optimization_level": 1},
+    },
+    "gpu": {
+        "XLA: no command buffers": {"xla_gpu_enable_command_buffer": ""},
+        "XLA: loops double-buffered": {"xla_gpu_enable_while_loop_double_buffering": True},
+        "XLA: no autotuning": {"xla_gpu_autotune_level": 0},
+    },
+}
+
+
+def levers(name: str, family: str) -> dict[str, Lever]:
+    """All that can be changed about one of `benchmark.BATCHED` on this machine."""
+    engine = benchmark.BATCHED[name].engine
+    found = dict(_OF_ALL)
+    if engine != "quasistatic":
+        found |= _OF_SOLVERS
+    if engine == "mjx":
+        found |= {k: v for k, v in _OF_MJX.items() if family == "box" or not k.startswith("own")}
+    flags = _FLAGS.get(jax.default_backend(), {})
+    return found | {what: Lever(flags=values) for what, values in flags.items()}
+
+
+class Gain(NamedTuple):
+    """What a lever does to a program."""
+
+    name: str
+    family: str
+    lever: str
+    worlds: int
+    compile: float  # [s] tracing too
+    memory: float  # [bytes]
+    rate: float  # simulated s per s of wall clock
+    times: float  # as fast as the program without it, timed beside it
+
+
+AS_IT_IS = "as it is"
+
+
+def measure(
+    name: str,
+    family: str,
+    worlds: int,
+    *,
+    simulated: float = 2.0,
+    goes: int = 5,
+    at_once: int = 1,
+) -> Iterator[Gain]:
+    """Pull every lever of one of `benchmark.BATCHED` in turn, first none.
+
+    Program and program with a lever are timed in turns, `goes` times each, since a machine that
+    others use is now faster, now slower; the gain is the median of the ratios.
+
+    Args:
+      name: of `benchmark.BATCHED`.
+      family: of its worlds.
+      worlds: how many, but for the levers that change that.
+      simulated: [s] at a go.
+      goes: of each.
+      at_once: programs compiled side by side; what one takes is its own only if 1.
+    """
+    wanted = {AS_IT_IS: Lever()} | levers(name, family)
+    calls = [partial(_traced, name, family, worlds, lever, simulated) for lever in wanted.values()]
+    usual = None
+    for what, program in zip(wanted, benchmark.side_by_side(calls, at_once), strict=True):
+        usual = usual or program
+        yield _gain(what, usual, program, goes)
+
+
+def _traced(
+    name: str, family: str, worlds: int, lever: Lever, simulated: float
+) -> Callable[[], Program]:
+    setting = benchmark.BATCHED[name]
+    changed = replace(setting, physics=replace(setting.physics, **lever.physics))
+    count = max(1, round(worlds * lever.worlds))
+    how = {"stage": lever.stage, "donated": lever.donated, "flags": lever.flags}
+    with lever.tracing():
+        return benchmark.traced(name, changed, family, count, simulated=simulated, **how)
+
+
+def _rate(program: Program) -> float:
+    """Simulated s per s of wall clock of one go from the start."""
+    start = jax.block_until_ready(jax.tree.map(jnp.copy, program.start))
+    began = time.perf_counter()
+    jax.block_until_ready(program.go(start))
+    return program.worlds * program.simulated / (time.perf_counter() - began)
+
+
+def _gain(what: str, usual: Program, p: Program, goes: int) -> Gain:
+    """The first go of each is not counted."""
+    rates = [(_rate(usual), _rate(p)) for _ in range(goes + 1)][1:]
+    rate = statistics.median(after for _, after in rates)
+    times = statistics.median(after / before for before, after in rates)
+    return Gain(p.name, p.family, what, p.worlds, p.compile, p.memory, rate, times)
+
+
+def table(gains: Sequence[Gain]) -> list[list[str]]:
+    """Header, and one row for each lever."""
+    rows = [["what", "family", "lever", "worlds", "simulated s/s", "times", "compile", "memory"]]
+    for g in gains:
+        rows.append(
+            [g.name, g.family, g.lever, f"{g.worlds}", f"{g.rate:,.0f}", f"{g.times:.2f}",
+             f"{g.compile:.1f} s", f"{g.memory / 2**20:,.1f} MiB"]
+        )  # fmt: skip
+    return rows

@@ -1,0 +1,224 @@
+"""The paper's trials under changed conditions: one condition a row, resumable.
+
+A study runs the same grid of trials under every condition, so that conditions are compared trial
+by trial. Each condition leaves one file in the run folder as soon as it is done; running the same
+study again in the same folder computes only what is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import xarray as xr
+from scipy import stats
+
+from rps_jax.analysis import tables
+from rps_jax.errors import InputError
+from rps_jax.record import folder as record
+from rps_jax.trials import pushes
+from rps_jax.trials.batch import Progress, Setting
+from rps_jax.trials.pushes import Case
+from rps_jax.world import paper
+from rps_jax.world.objects import PAPER_OBJECTS
+from rps_jax.world.scene import FRICTION, Friction
+
+# Trials run at once: more keep the device busier, fewer lose less when killed.
+_TOGETHER = {"cpu": 600, "gpu": 100_000}
+
+
+class Grid(NamedTuple):
+    """Which trials, in the nesting order of `score.dataset`."""
+
+    strategies: tuple[str, ...] = ("rps",)
+    objects: tuple[str, ...] = PAPER_OBJECTS
+    friction: Mapping[str, Friction] = FRICTION
+    targets: tuple[tuple[float, float], ...] = paper.TARGETS
+
+    @property
+    def size(self) -> int:
+        """Trials."""
+        return len(self.strategies) * len(self.objects) * len(self.friction) * len(self.targets)
+
+
+# Four of the paper's targets, ahead, beside and behind, for quick looks.
+FEW_TARGETS = ((2.0, 0.0), (1.0, 1.0), (0.0, -2.0), (-2.0, 1.0))
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What one row changes: of the setting, of the law's parameters, of every case."""
+
+    what: str
+    setting: Setting = Setting()
+    params: Mapping[str, float] = field(default_factory=dict)  # of RPS and NPS
+    case: Mapping[str, Any] = field(default_factory=dict)  # skin, gap, rear, bearing, ...
+
+    def cases(self, grid: Grid) -> list[Case]:
+        """The trials of a grid under this condition."""
+        changed = {
+            name: paper.PARAMS[name]._replace(**(self.params if name != "aps" else {}))
+            for name in grid.strategies
+        }
+        return [
+            Case(name, friction, target, changed[strategy], **self.case)
+            for strategy in grid.strategies
+            for name in grid.objects
+            for friction in grid.friction.values()
+            for target in grid.targets
+        ]
+
+
+def run(
+    conditions: Mapping[str, Condition],
+    grid: Grid,
+    folder: Path,
+    *,
+    slots: int | None = None,
+    workers: int | None = None,
+    report: Callable[[Progress], Any] = lambda progress: None,
+) -> xr.Dataset:
+    """Outcomes (condition, strategy, object, friction, target), computed or found in `folder`.
+
+    Raises:
+      InputError: the folder holds a condition of the same name that was run otherwise.
+    """
+    found = {name: _load(folder, name, c, grid) for name, c in conditions.items()}
+    missing = [name for name, results in found.items() if results is None]
+    finished, simulated = grid.size * (len(found) - len(missing)), 0.0
+    report(Progress(finished, simulated))
+    for names in _chunks(missing, conditions, grid):
+        cases = [case for name in names for case in conditions[name].cases(grid)]
+
+        def tell(progress: Progress, before=(finished, simulated)) -> None:
+            report(Progress(before[0] + progress.finished, before[1] + progress.simulated))
+
+        outcome, timing = pushes.run(
+            cases, conditions[names[0]].setting, slots=slots, workers=workers, report=tell
+        )
+        finished, simulated = finished + len(cases), simulated + timing.simulated
+        for i, name in enumerate(names):
+            rows = slice(i * grid.size, (i + 1) * grid.size)
+            part = type(outcome)(*(values[rows] for values in outcome))
+            results = tables.dataset(
+                part, grid.strategies, grid.objects, tuple(grid.friction), grid.targets
+            )
+            # Shared by all that ran together.
+            share = grid.size / len(cases)
+            results.attrs = {
+                "run_as": _fingerprint(conditions[name], grid),
+                "run_time": timing.run * share,
+                "simulated": timing.simulated * share,
+            }
+            record.write_results(folder / f"{name}.nc", results)
+            found[name] = results
+    done = {name: results for name, results in found.items() if results is not None}
+    whole = xr.concat(
+        [results.drop_attrs(deep=False) for results in done.values()],
+        xr.DataArray(list(done), dims="condition", name="condition"),
+    )
+    for attribute in ("run_time", "simulated"):
+        values = [results.attrs[attribute] for results in done.values()]
+        whole = whole.assign_coords({attribute: ("condition", values)})
+    return whole.assign_coords(what=("condition", [conditions[name].what for name in done]))
+
+
+def _fingerprint(condition: Condition, grid: Grid) -> str:
+    """All that the outcomes depend on, as text."""
+    same = replace(condition, what="", params=dict(condition.params), case=dict(condition.case))
+    return f"{same!r} {grid._replace(friction=dict(grid.friction))!r}"
+
+
+def _load(folder: Path, name: str, condition: Condition, grid: Grid) -> xr.Dataset | None:
+    """A condition's results, if the folder has them; a file that cannot be read is set aside."""
+    path = folder / f"{name}.nc"
+    if not path.exists():
+        return None
+    try:
+        results = record.read(path)
+    except InputError:
+        path.rename(path.with_suffix(".nc.corrupt"))
+        return None
+    if results.attrs.get("run_as") != _fingerprint(condition, grid):
+        raise InputError(
+            f"{path} was run with other options: choose another folder, or delete it to run again."
+        )
+    return results
+
+
+def _chunks(
+    names: Sequence[str], conditions: Mapping[str, Condition], grid: Grid
+) -> list[list[str]]:
+    """Names of conditions to run together: of one setting, and not too many."""
+    groups: dict[Setting, list[str]] = {}
+    for name in names:
+        groups.setdefault(conditions[name].setting, []).append(name)
+    at_once = max(1, _TOGETHER.get(jax.default_backend(), 600) // grid.size)
+    return [
+        group[i : i + at_once] for group in groups.values() for i in range(0, len(group), at_once)
+    ]
+
+
+class Comparison(NamedTuple):
+    """Two conditions, trial by trial."""
+
+    equal: float  # [1] share of trials with the same outcome
+    equal_interval: tuple[float, float]  # Wilson, 95 %
+    gained: int  # trials that fail under the first and succeed under the second
+    lost: int  # trials that succeed under the first and fail under the second
+    p: float  # [1] of McNemar's exact test that gains and losses are equally likely
+
+
+def compare(first: xr.DataArray, second: xr.DataArray) -> Comparison:
+    """Compare outcomes (any equal shape) of the same trials."""
+    a, b = first.values.astype(bool).ravel(), second.values.astype(bool).ravel()
+    gained, lost = int(np.sum(~a & b)), int(np.sum(a & ~b))
+    equal = a.size - gained - lost
+    p = float(stats.binomtest(gained, gained + lost).pvalue) if gained + lost else 1.0
+    return Comparison(equal / a.size, tables.wilson(equal, a.size), gained, lost, p)
+
+
+def rows(results: xr.Dataset, baseline: str, strategy: str = "rps") -> list[list[str]]:
+    """Header and one row for each condition: counts, interval, median time, and the difference.
+
+    The last column says how outcomes differ from the baseline's, and whether significantly:
+    McNemar's exact test, false discoveries among all rows held at 5 % (Benjamini-Hochberg).
+    """
+    part = results.sel(strategy=strategy)
+    base = part.success.sel(condition=baseline)
+    names = [str(name) for name in part.condition.values]
+    against = [compare(base, part.success.sel(condition=name)) for name in names]
+    others = [i for i, name in enumerate(names) if name != baseline]
+    q = np.ones(len(names))
+    if others:
+        q[others] = stats.false_discovery_control([against[i].p for i in others])
+    objects = [str(o) for o in part.object.values]
+    header = ["reading", *objects, "all", "95 %", "median time", "against the first"]
+    table = [header]
+    for i, name in enumerate(names):
+        one = part.sel(condition=name)
+        won = one.success.values.astype(bool)
+        counts = one.success.sum("target").transpose("object", "friction").values.astype(int)
+        low, high = tables.wilson(int(won.sum()), won.size)
+        time = one.time.values[won]
+        difference = (
+            ""
+            if name == baseline
+            else f"+{against[i].gained} -{against[i].lost}, q = {q[i]:.2g}"
+            + (" *" if q[i] < 0.05 else "")
+        )
+        table.append(
+            [
+                str(one.what.values),
+                *(" ".join(map(str, row)) for row in counts),
+                f"{won.sum()} of {won.size}",
+                f"{100 * low:.0f}-{100 * high:.0f} %",
+                f"{np.median(time):.1f} s" if time.size else "-",
+                difference,
+            ]
+        )
+    return table

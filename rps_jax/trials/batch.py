@@ -1,0 +1,423 @@
+"""Trials on a device: slots of a batch, each refilled as soon as its trial ends.
+
+A job is all that one compiled program runs; its trials come in parts, which are made only when a
+slot waits for one of their trials, so that memory does not grow with the number of trials.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import AxisType, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+from rps_jax import errors
+from rps_jax.control.strategies import Strategy
+from rps_jax.engines import base as engines
+from rps_jax.engines import mujoco as c_mujoco
+from rps_jax.engines.base import Engine
+from rps_jax.trials import trial
+from rps_jax.trials.trial import Outcome, Rules, Trial, World
+from rps_jax.world.physics import PHYSICS, Physics
+
+SEGMENT = 10.0  # [s] simulated between two looks at which trials have ended
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What all trials of a run share."""
+
+    physics: Physics = PHYSICS["default"]["standard"]
+    rules: Rules = Rules()
+    seed: int = 0  # of the skins' imperfections, and of random worlds
+    engine: Engine = "mjx"
+
+    def __post_init__(self) -> None:
+        """Raises InputError for rules, a seed or an engine that mean nothing, or do together."""
+        self.rules.check()
+        errors.check_count("seed", self.seed, at_least=0, at_most=2**32 - 1)
+        errors.check_name("engine", self.engine, engines.ENGINES)
+        if self.engine == "quasistatic" and self.physics.cone != "elliptic":
+            raise errors.InputError(
+                f"cone = {self.physics.cone} is not allowed with the engine quasistatic: its "
+                "friction is the same in all directions, elliptic."
+            )
+
+
+@dataclass(frozen=True)
+class Progress:
+    """A look at a running sweep."""
+
+    finished: int  # trials
+    simulated: float  # [s] summed over trials, ended or running
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Where the time of a sweep went."""
+
+    compile: float  # [s] until the worker who waited longest had its programs
+    run: float  # [s] wall clock after that
+    simulated: float  # [s] of trials
+
+
+class Part(NamedTuple):
+    """Some trials of a job."""
+
+    numbers: np.ndarray  # (n,) of the trials
+    worlds: World  # leaves (n, ...), on the host
+    stage: Any
+
+
+class Job(NamedTuple):
+    """Trials of one kind: one compiled program runs them all."""
+
+    strategy: Strategy
+    trials: int  # at most; there are no more slots than that
+    parts: Iterable[Part]  # of one stage, but for the engine `mujoco`
+
+
+Collect = Callable[[np.ndarray, Outcome], Any]  # numbers (m,) of trials and their outcomes
+
+
+def default_slots(engine: Engine = "mjx") -> int:
+    """Worlds that a worker steps at once: few on a processor (small caches), many on a GPU."""
+    if jax.default_backend() == "cpu":
+        return 24 if engine == "mjx" else 64
+    return 16384 if engine in ("mjx", "fused") else 65536
+
+
+def default_workers(engine: Engine = "mjx") -> int:
+    """Of a processor one for each core, since XLA steps a small batch on one core. On a GPU the
+    second steps its worlds while the host sees to those of the first."""
+    if jax.default_backend() == "cpu":
+        return os.cpu_count() or 1
+    return 2 if engine == "fused" else 1
+
+
+def check_shape(slots: int | None, workers: int | None) -> None:
+    """Raises InputError unless each is left open or a sensible number."""
+    if slots is not None:
+        errors.check_count("slots", slots, at_most=10_000_000)
+    if workers is not None:
+        errors.check_count("workers", workers, at_most=1024)
+
+
+def run(
+    jobs: Sequence[Job],
+    setting: Setting,
+    *,
+    slots: int | None = None,
+    workers: int | None = None,
+    collect: Collect,
+    report: Callable[[Progress], Any] = lambda progress: None,
+) -> Timing:
+    """Run every trial of every job to its end.
+
+    Args:
+      jobs: what to run.
+      setting: what they share.
+      slots: worlds stepped at once by one worker on each of the host's devices.
+      workers: host threads that each drive a batch of their own, or, with the engine `mujoco`,
+        that step worlds.
+      collect: called with the outcomes of trials that ended, in any order, one call at a time.
+      report: called after every segment, likewise.
+    """
+    check_shape(slots, workers)
+    slots = slots or default_slots(setting.engine)
+    workers = workers or default_workers(setting.engine)
+    shared = _Shared(collect, report)
+    began = time.perf_counter()
+    if setting.engine == "mujoco":
+        count = max(1, min(workers, len(jobs)))
+        tasks = [partial(_run_in_c, job, setting, workers // count, shared) for job in jobs]
+    else:
+        count = workers
+        queues = [_Queue(job, setting, slots) for job in jobs]
+        orders = [queues[w % len(queues) :] + queues for w in range(count if queues else 0)]
+        tasks = [partial(_work, order, shared) for order in orders]
+        if jax.default_backend() != "cpu":  # the processor is idle: compile all at once
+            tasks += [queue.program for queue in queues]
+            count += len(queues)
+    _side_by_side(tasks, count, shared)
+    warn_of_lost(shared.overflowed)
+    total = time.perf_counter() - began
+    return Timing(shared.compile, total - shared.compile, shared.simulated)
+
+
+def warn_of_lost(count: int) -> None:
+    """Warns if in `count` trials, any at all, the engine lost contacts for want of room."""
+    if count:
+        warnings.warn(
+            f"the engine lost contacts for want of room in {count} trials, which are not to be "
+            "trusted",
+            stacklevel=3,
+        )
+
+
+def _side_by_side(tasks: Sequence[Callable[[], None]], count: int, shared: _Shared) -> None:
+    """Run tasks on `count` threads; the first that fails stops the others."""
+    with ThreadPoolExecutor(count) as pool:
+        jobs = [pool.submit(task) for task in tasks]
+        try:
+            for job in as_completed(jobs):
+                job.result()
+        except BaseException:
+            shared.stop = True
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+class _Shared:
+    """What the workers report into."""
+
+    def __init__(self, collect: Collect, report: Callable[[Progress], Any]):
+        self.simulated = 0.0
+        self.compile = 0.0
+        self.overflowed = 0  # trials
+        self.stop = False  # set when one worker fails or the user interrupts
+        self._finished = 0
+        self._collect, self._report = collect, report
+        self._lock = threading.Lock()
+
+    def add(self, numbers: np.ndarray, trials: Outcome, simulated: float) -> None:
+        """Trials that ended in a segment, and the time [s] all of the worker's trials advanced."""
+        with self._lock:
+            self.overflowed += int(np.count_nonzero(trials.overflows))
+            if numbers.size:
+                self._collect(numbers, trials)
+            self._finished += numbers.size
+            self.simulated += simulated
+            self._report(Progress(self._finished, self.simulated))
+
+    def compiled(self, seconds: float) -> None:
+        """One worker had no program for this long."""
+        with self._lock:
+            self.compile = max(self.compile, seconds)
+
+
+# --- C MuJoCo ------------------------------------------------------------------------------
+
+
+def _run_in_c(job: Job, setting: Setting, threads: int, shared: _Shared) -> None:
+    for part in job.parts:
+
+        def tell(ended: np.ndarray, trials: Trial, simulated: float, part: Part = part) -> bool:
+            outcomes = jax.device_get(trial.outcome(trials, setting.physics.control_period))
+            shared.add(part.numbers[ended], rows(outcomes, ended), simulated)
+            return not shared.stop
+
+        if shared.stop:
+            return
+        c_mujoco.run(
+            part.stage,
+            part.worlds,
+            physics=setting.physics,
+            rules=setting.rules,
+            strategy=job.strategy,
+            threads=max(1, threads),
+            report=tell,
+        )
+
+
+# --- JAX -----------------------------------------------------------------------------------
+
+
+class _Queue:
+    """The waiting trials of one job, and its program once compiled."""
+
+    def __init__(self, job: Job, setting: Setting, slots: int):
+        self.strategy = job.strategy
+        self.setting = setting
+        devices = jax.device_count()
+        self.slots = devices * min(slots, -(-job.trials // devices))
+        self.sharding = None
+        if devices > 1:
+            mesh = jax.make_mesh((devices,), ("worlds",), (AxisType.Auto,))
+            self.sharding = NamedSharding(mesh, P("worlds"))
+        self._parts = iter(job.parts)
+        first = next(self._parts)
+        self.stage = first.stage
+        self._worlds = jax.tree.map(self._batched, first.worlds)
+        self._waiting: Part | None = first  # what is left of it
+        self._lock, self._compiling = threading.Lock(), threading.Lock()
+        self._program = None
+        self.ready = 0.0  # [s] of `time.perf_counter`, when the program was there
+
+    def take(self, count: int) -> list[Part]:
+        """Up to `count` waiting trials, as pieces of parts."""
+        taken = []
+        with self._lock:
+            while count and (part := self._waiting or next(self._parts, None)):
+                piece, self._waiting = _cut(part, count)
+                taken.append(piece)
+                count -= piece.numbers.size
+        return taken
+
+    def program(self) -> Any:
+        """The compiled program; the first to come compiles, others wait."""
+        with self._compiling:
+            if self._program is None:
+                self._program = self._compile()
+                self.ready = time.perf_counter()
+            return self._program
+
+    def put(self, tree: Any) -> Any:
+        """Leaves (slots, ...) on the device, or split over all devices of the host."""
+        return jax.device_put(tree, self.sharding)
+
+    def start(self, worlds: World, live: np.ndarray) -> Trial:
+        """New trials in all slots."""
+        return self.put(trial.start_all(worlds, live, strategy=self.strategy))
+
+    def refill(self, worlds: World, trials: Trial, fresh: np.ndarray) -> Trial:
+        """New trials in the slots that are `fresh` (slots,)."""
+        return self.put(_refill(worlds, trials, fresh, strategy=self.strategy))
+
+    def _batched(self, leaf: Any) -> jax.ShapeDtypeStruct:
+        shape = (self.slots, *leaf.shape[1:])
+        return jax.ShapeDtypeStruct(shape, leaf.dtype, sharding=self.sharding)
+
+    def _compile(self) -> Any:
+        start = partial(trial.start_all, strategy=self.strategy)
+        live = jax.ShapeDtypeStruct((self.slots,), bool)
+        trials = jax.tree.map(self._batched, jax.eval_shape(start, self._worlds, live))
+        stage, rules = jax.eval_shape(lambda: (self.stage, self.setting.rules))
+        leaves, tree = jax.tree.flatten((stage, self._worlds, trials, rules))
+        return _compiled(self.setting.physics, self.strategy, self.sharding, tree, tuple(leaves))
+
+
+@functools.lru_cache(maxsize=32)
+def _compiled(
+    physics: Physics,
+    strategy: Strategy,
+    sharding: NamedSharding | None,
+    tree: Any,
+    leaves: tuple[jax.ShapeDtypeStruct, ...],
+) -> Any:
+    """`trial.advance` compiled for arguments of these shapes; later runs of the kind reuse it.
+
+    With the trials come their steps, who has ended, and how.
+    """
+
+    def advance(
+        stage: Any, worlds: World, trials: Trial, rules: Rules
+    ) -> tuple[Trial, tuple[jax.Array, jax.Array, Outcome]]:
+        after = trial.advance(
+            stage,
+            worlds,
+            trials,
+            physics=physics,
+            rules=rules,
+            strategy=strategy,
+            steps=max(1, round(SEGMENT / physics.control_period)),
+        )
+        # Of the same program: one of its own would wait for the other workers' segments.
+        return after, (after.steps, after.done, trial.outcome(after, physics.control_period))
+
+    if sharding is not None:  # each device runs its own worlds and waits for no other
+        advance = jax.shard_map(
+            advance,
+            mesh=sharding.mesh,
+            in_specs=(P(), P("worlds"), P("worlds"), P()),
+            out_specs=P("worlds"),
+            check_vma=False,
+        )
+    program = jax.jit(advance, donate_argnums=2)
+    return program.lower(*jax.tree.unflatten(tree, leaves)).compile()
+
+
+def rows(tree: Any, which: Any) -> Any:
+    """The same rows of every leaf."""
+    return jax.tree.map(lambda leaf: leaf[which], tree)
+
+
+def _cut(part: Part, count: int) -> tuple[Part, Part | None]:
+    """The first `count` trials of a part, and the others if there are any."""
+
+    def piece(which: slice) -> Part:
+        return Part(part.numbers[which], rows(part.worlds, which), part.stage)
+
+    over = part.numbers.size > count
+    return piece(slice(count)), piece(slice(count, None)) if over else None
+
+
+def _count(parts: Sequence[Part]) -> int:
+    return sum(part.numbers.size for part in parts)
+
+
+@partial(jax.jit, static_argnames=("strategy",), donate_argnames=("trials",))
+def _refill(worlds: World, trials: Trial, fresh: jax.Array, *, strategy: Strategy) -> Trial:
+    """Start a new trial in the slots that are `fresh` (B,)."""
+    started = trial.start_all(worlds, jnp.ones_like(fresh), strategy=strategy)
+    pick = partial(jax.vmap(lambda f, a, b: jnp.where(f, a, b)), fresh)
+    return jax.tree.map(pick, started, trials)
+
+
+def _work(queues: list[_Queue], shared: _Shared) -> None:
+    waited = 0.0
+    for queue in queues:
+        began = time.perf_counter()
+        taken = [] if shared.stop else queue.take(queue.slots)
+        if taken:
+            program = queue.program()
+            waited += max(0.0, queue.ready - began)
+            shared.compiled(waited)
+            _drain(queue, program, taken, shared)
+
+
+class _Held:
+    """The worlds in the slots of one worker, on the host."""
+
+    def __init__(self, like: Part, slots: int):
+        self.numbers = np.zeros(slots, np.int64)
+        self._worlds = jax.tree.map(lambda leaf: np.repeat(leaf[:1], slots, axis=0), like.worlds)
+
+    def put(self, at: np.ndarray, taken: Sequence[Part]) -> World:
+        """Put trials into the slots `at`; returns the worlds."""
+        ends = np.cumsum([part.numbers.size for part in taken])
+        for part, slots in zip(taken, np.split(at, ends[:-1]), strict=True):
+            self.numbers[slots] = part.numbers
+            for mine, theirs in zip(
+                jax.tree.leaves(self._worlds), jax.tree.leaves(part.worlds), strict=True
+            ):
+                mine[slots] = theirs
+        # A copy: the device may otherwise share the host's memory, which the next call changes.
+        return jax.tree.map(np.copy, self._worlds)
+
+
+def _drain(queue: _Queue, program: Any, taken: list[Part], shared: _Shared) -> None:
+    """Run trials, the `taken` first, until none waits and none of this worker's runs."""
+    stage, period = queue.stage, queue.setting.physics.control_period
+    held = _Held(taken[0], queue.slots)
+    first = np.arange(_count(taken))
+    live = np.arange(queue.slots) < first.size
+    worlds = queue.put(held.put(first, taken))
+    trials = queue.start(worlds, live)
+    before = np.zeros(queue.slots, int)
+    while live.any() and not shared.stop:
+        trials, seen = program(stage, worlds, trials, queue.setting.rules)
+        steps, done, outcomes = jax.device_get(seen)
+        at = np.flatnonzero(done & live)
+        simulated = float((steps - before)[live].sum()) * period
+        shared.add(held.numbers[at], rows(outcomes, at), simulated)
+        before = steps.copy()
+        live[at] = False
+        taken = queue.take(at.size)
+        if taken:
+            fresh = at[: _count(taken)]
+            live[fresh], before[fresh] = True, 0
+            worlds = queue.put(held.put(fresh, taken))
+            trials = queue.refill(worlds, trials, np.isin(np.arange(queue.slots), fresh))

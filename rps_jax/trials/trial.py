@@ -1,0 +1,507 @@
+"""One pushing trial: sense -> decide -> step, until the paper's success rule says stop.
+
+`decide` and `settle` are pure functions of one world; between them an engine drives the batch.
+`advance` and `record` jit that for a batch of worlds of one shape family; a world that has ended
+is frozen, and a batch whose worlds have all ended stops.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rps_jax import errors
+from rps_jax.control import law
+from rps_jax.control.aps import TrackedObservation
+from rps_jax.control.law import Details, Observation, Twist
+from rps_jax.control.strategies import RPS, Params, Strategy
+from rps_jax.engines.fused import step as fused
+from rps_jax.geometry import footprint as fp
+from rps_jax.geometry import planar
+from rps_jax.geometry.footprint import Footprint
+from rps_jax.robot.skin import NONE, Reading, Skin, SkinState, SmoothReading
+from rps_jax.world import scene
+from rps_jax.world.physics import Physics
+from rps_jax.world.scene import JOINTS, mjx
+
+# A world is a runaway beyond these, far outside anything a base at 0.05 m/s can cause.
+_MAX_SPEED = 20.0  # [m/s], [rad/s]
+_MAX_DISTANCE = 100.0  # [m]
+_ODOMETRY = 7  # of a world's key; the skin splits it into fewer
+
+
+class Rules(NamedTuple):
+    """When a trial ends (Sec. III-B); of objects that fall over the paper says nothing."""
+
+    horizon: float | jax.Array = 300.0  # [s]
+    max_lost: float | jax.Array = 150.0  # [s] without contact, in all, after the first touch
+    max_tilt: float | jax.Array = math.pi / 4  # [rad] of an object that has not fallen over
+
+    def check(self) -> None:
+        """Raises InputError for times that are not positive and finite, or no tilt."""
+        errors.check_finite("horizon", self.horizon, above=0, at_most=1e5, unit="s")
+        errors.check_finite("max_lost", self.max_lost, at_least=0, unit="s")
+        errors.check_finite("max_tilt", self.max_tilt, above=0, at_most=1.4, unit="rad")
+
+
+class Shift(NamedTuple):
+    """The object is moved by a hand during the push, as in the paper's video."""
+
+    time: float | jax.Array = jnp.inf  # () [s]
+    p_robot: tuple[float, float] | jax.Array = (0.0, 0.0)  # (2,) [m] how far, in the robot frame
+
+
+class Odometry(NamedTuple):
+    """What a base gets wrong: where it believes it is, and how it does what it is told.
+
+    Ages are rounded to control steps. `past` only gives, by its shape, how many steps are
+    remembered, at least one more than the greatest age; without any the base is perfect.
+    """
+
+    pose_noise: float | jax.Array = 0.0  # () [m] standard deviation of each position reading
+    yaw_noise: float | jax.Array = 0.0  # () [rad] and of each heading reading
+    pose_latency: float | jax.Array = 0.0  # () [s] age of the pose that the law is told
+    command_delay: float | jax.Array = 0.0  # () [s] until a twist is acted upon
+    velocity_error: float | jax.Array = 0.0  # (3,) [1] of each component of the twist
+    past: Any = np.zeros(0)  # (K,)
+
+
+class World(NamedTuple):
+    """What makes one world; every leaf is batched."""
+
+    fields: Any  # for its stage: of the model, as named by `scene.stack`; a `Body`
+    footprint: Footprint
+    skin: Skin
+    params: Params
+    p_world_target: jax.Array  # (2,) [m]
+    shift: Shift
+    qpos: jax.Array  # (10,) at the start, as in `Trial`
+    key: jax.Array  # of the imperfections of skin and odometry
+    odometry: Odometry = Odometry()
+
+
+class Trial(NamedTuple):
+    """The running state of one world."""
+
+    # In the world: base x, y [m], yaw [rad]; object position [m] and quaternion, scalar first.
+    qpos: jax.Array  # (10,)
+    # Of these [m/s, rad/s]; the object's angular velocity is in its own frame.
+    qvel: jax.Array  # (9,)
+    warmstart: jax.Array  # (9,) [m/s^2, rad/s^2] last accelerations, for the solver
+    strategy: Any  # what the strategy remembers
+    skin: SkinState
+    poses: jax.Array  # (K, 3) [m, m, rad] of the base in the last steps, the latest first
+    twists: jax.Array  # (K, 3) [m/s, m/s, rad/s] commanded, likewise
+    steps: jax.Array  # () int32 control steps done
+    contact_steps: jax.Array  # () int32 of them in contact
+    lost_steps: jax.Array  # () int32 without contact after the first touch
+    sum_abs_l: jax.Array  # () [m] over the steps in contact
+    min_distance: jax.Array  # () [m] contact point to target; inf before the first touch
+    path_length: jax.Array  # () [m] of the base's way
+    done: jax.Array  # () bool
+    success: jax.Array  # () bool
+    tipped: jax.Array  # () bool: the object has fallen over
+    diverged: jax.Array  # () bool
+    overflows: jax.Array  # () int32 control steps in which contacts were lost for want of room
+
+
+class Snapshot(NamedTuple):
+    """What one control step saw and did."""
+
+    time: jax.Array  # () [s]
+    qpos: jax.Array  # (10,) as in `Trial`
+    reading: Reading | SmoothReading
+    twist: Twist  # [m/s, m/s, rad/s] commanded, robot frame
+    details: Details
+    done: jax.Array  # () bool: the trial had ended
+
+
+class Outcome(NamedTuple):
+    """The result of one trial."""
+
+    success: jax.Array  # () bool
+    time: jax.Array  # () [s] at which it ended
+    min_distance: jax.Array  # () [m] contact point to target; inf if never touched
+    contact_lost_time: jax.Array  # () [s]
+    path_length: jax.Array  # () [m] of the base's way
+    mean_abs_l: jax.Array  # () [m] the paper's D; NaN if never touched
+    tipped: jax.Array  # () bool: the object has fallen over
+    diverged: jax.Array  # () bool
+    overflows: jax.Array  # () int32 control steps in which contacts were lost for want of room
+    base_pose: jax.Array  # (3,) [m, m, rad] in the world, at the end
+    object_pose: jax.Array  # (3,) [m, m, rad] likewise
+
+
+def object_pose(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Planar position (2,) [m] and yaw () [rad] of the object in the world."""
+    free = qpos[JOINTS.object]
+    return free[:2], planar.yaw_of_quaternion(free[3:])
+
+
+def _upright(qpos: jax.Array) -> jax.Array:
+    """Cosine () of the object's tilt."""
+    _, x, y, _ = qpos[JOINTS.object][3:]
+    return 1 - 2 * (x * x + y * y)
+
+
+def p_world_contact(seen: Snapshot) -> jax.Array:
+    """Contact points of snapshots (T, ...) in the world, (T, 2) [m]; NaN without contact."""
+    point = seen.qpos[:, :2] + planar.rotate(seen.qpos[:, 2], seen.reading.p_robot_contact)
+    return jnp.where((seen.reading.contact_type != NONE)[:, None], point, jnp.nan)
+
+
+class Driven(NamedTuple):
+    """A batch after one control period."""
+
+    qpos: Any  # (B, 10) as in `Trial`
+    qvel: Any  # (B, 9)
+    warmstart: Any  # (B, 9)
+    overflowed: Any = None  # (B,) bool: contacts were lost; None: this engine loses none
+
+
+class Drives(Protocol):
+    """What all worlds of a batch share, and how their engine steps them."""
+
+    def drive(self, worlds: World, trials: Trial, twists: Twist, physics: Physics) -> Driven:
+        """Step a batch for one control period."""
+        ...
+
+
+def start(world: World, strategy: Strategy = RPS) -> Trial:
+    """The trial of a world before its first control step."""
+    zero, false = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+    return Trial(
+        qpos=world.qpos,
+        qvel=jnp.zeros_like(world.qpos[:9]),
+        warmstart=jnp.zeros_like(world.qpos[:9]),
+        strategy=strategy.init(world.params),
+        skin=world.skin.init(world.key),
+        poses=jnp.tile(world.qpos[JOINTS.base], (*world.odometry.past.shape, 1)),
+        twists=jnp.zeros((*world.odometry.past.shape, 3), world.qpos.dtype),
+        steps=zero,
+        contact_steps=zero,
+        lost_steps=zero,
+        sum_abs_l=jnp.zeros_like(world.qpos[0]),
+        min_distance=jnp.full_like(world.qpos[0], jnp.inf),
+        path_length=jnp.zeros_like(world.qpos[0]),
+        done=false,
+        success=false,
+        tipped=false,
+        diverged=false,
+        overflows=zero,
+    )
+
+
+def _shifted(world: World, trial: Trial, period: float) -> Trial:
+    """The trial with its object moved, if this is the control step nearest to when it shall be."""
+    # A step's number, since rounded times could meet twice or never.
+    now = trial.steps == jnp.round(world.shift.time / period)
+    by = planar.rotate(trial.qpos[2], jnp.asarray(world.shift.p_robot))
+    x = JOINTS.object.start
+    return trial._replace(qpos=trial.qpos.at[x : x + 2].add(jnp.where(now, by, 0.0)))
+
+
+def outline(world: World, qpos: jax.Array) -> Footprint:
+    """The object's outline in the robot frame, where qpos (10,) has them both."""
+    p_world_robot, yaw = qpos[:2], qpos[2]
+    p_world_object, object_yaw = object_pose(qpos)
+    p_robot_object = planar.rotate(-yaw, p_world_object - p_world_robot)
+    return fp.place(world.footprint, p_robot_object, object_yaw - yaw)
+
+
+def sense(
+    world: World, trial: Trial, period: float
+) -> tuple[SkinState, Reading | SmoothReading, Observation]:
+    """The skin's reading of the object where it stands now, and what the law is told.
+
+    `period` [s] is that of the control loop.
+    """
+    p_world_robot, yaw = trial.qpos[:2], trial.qpos[2]
+    placed = outline(world, trial.qpos)
+    state, reading = world.skin.sense(trial.skin, placed, period)
+    observation = Observation(
+        p_world_robot, yaw, reading.p_robot_contact, reading.in_contact, world.p_world_target
+    )
+    return state, reading, observation
+
+
+class Stage(NamedTuple):
+    """What all worlds of a batch that MJX steps share."""
+
+    model: mjx.Model
+    data: mjx.Data  # a blank to be filled with each world's state
+
+    def drive(self, worlds: World, trials: Trial, twists: Twist, physics: Physics) -> Driven:
+        """Step a batch for one control period.
+
+        The base is a velocity source: before each step the commanded twist is written into its
+        joint velocities, turned into the world.
+        """
+        state = (trials.qpos, trials.qvel, trials.warmstart)
+        step = jax.vmap(self._step)
+
+        def one(state, _):  # batched inside of the loop: a loop that is batched is traced anew
+            return step(worlds.fields, state, twists), None
+
+        return Driven(*jax.lax.scan(one, state, length=physics.substeps)[0])
+
+    def _step(
+        self,
+        fields: dict[str, jax.Array],
+        state: tuple[jax.Array, jax.Array, jax.Array],
+        twist: Twist,
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        model, (qpos, qvel, warmstart) = scene.apply(self.model, fields), state
+        qvel = qvel.at[JOINTS.base].set(twist.in_world(qpos[2]))
+        data = self.data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
+        with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
+            data = mjx.step(model, data)
+        return data.qpos, data.qvel, data.qacc_warmstart
+
+
+class Fused(NamedTuple):
+    """Worlds stepped by `rps_jax.engines.fused.step` share nothing."""
+
+    def drive(self, worlds: World, trials: Trial, twists: Twist, physics: Physics) -> Driven:
+        """Step a batch for one control period."""
+        state = (trials.qpos, trials.qvel, trials.warmstart)
+        return Driven(*fused.drive(worlds.fields, *state, twists, physics))
+
+
+def _believed(world: World, trial: Trial, period: float) -> tuple[jax.Array, jax.Array]:
+    """The last poses (K, 3), and the pose (3,) of the base as the law is told it."""
+    now = trial.qpos[JOINTS.base]
+    if not trial.poses.shape[0]:
+        return trial.poses, now
+    poses = jnp.concatenate([now[None], trial.poses[:-1]])
+    told = poses[_age(world.odometry.pose_latency, period)]
+    key = jax.random.fold_in(jax.random.fold_in(world.key, _ODOMETRY), trial.steps)
+    sigma = jnp.stack([world.odometry.pose_noise] * 2 + [world.odometry.yaw_noise])
+    return poses, told + sigma * jax.random.normal(key, (3,), now.dtype)
+
+
+def _age(time: Any, period: float) -> jax.Array:
+    return jnp.round(time / period).astype(jnp.int32)
+
+
+class Seen(NamedTuple):
+    """What skin and odometry tell at one moment."""
+
+    reading: Reading | SmoothReading
+    observation: Observation  # by where the base believes to be
+    distance: jax.Array  # () [m] contact point to target, by where it is; without contact, base's
+
+
+def observe(
+    world: World, trial: Trial, *, physics: Physics, rules: Rules = Rules()
+) -> tuple[Trial, Seen]:
+    """The first half of `decide`: sense and judge.
+
+    The rules judge by where the base is, the law by where it believes to be.
+    """
+    period = physics.control_period
+    time = trial.steps * period
+    trial = _shifted(world, trial, period)
+    skin, reading, observation = sense(world, trial, period)
+    distance = planar.norm(law.displacement(observation))
+    poses, believed = _believed(world, trial, period)
+    seen = observation._replace(p_world_robot=believed[:2], yaw=believed[2])
+
+    touch = reading.contact_type != NONE
+    lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
+    success = touch & (distance < world.params.d_success)
+    tipped = _upright(trial.qpos) < jnp.cos(rules.max_tilt)
+    over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost) | tipped
+    told = trial._replace(
+        skin=skin,
+        poses=poses,
+        contact_steps=trial.contact_steps + touch,
+        lost_steps=lost_steps,
+        sum_abs_l=trial.sum_abs_l + jnp.where(touch, jnp.abs(reading.p_robot_contact[1]), 0.0),
+        min_distance=jnp.where(
+            touch, jnp.minimum(trial.min_distance, distance), trial.min_distance
+        ),
+        success=success & ~over,
+        tipped=tipped,
+        done=success | over,
+    )
+    return told, Seen(reading, seen, distance)
+
+
+def execute(world: World, trial: Trial, twist: Twist, period: float) -> tuple[Trial, Twist]:
+    """The trial that remembers a commanded twist, and the twist that the base carries out.
+
+    Both are in the robot frame; `period` [s] is that of the control loop.
+    """
+    if not trial.twists.shape[0]:
+        return trial, twist
+    twists = jnp.concatenate([jnp.stack(twist)[None], trial.twists[:-1]])
+    done = twists[_age(world.odometry.command_delay, period)]
+    return trial._replace(twists=twists), Twist(*(done * (1 + world.odometry.velocity_error)))
+
+
+def decide(
+    world: World,
+    trial: Trial,
+    *,
+    physics: Physics,
+    rules: Rules = Rules(),
+    strategy: Strategy = RPS,
+) -> tuple[Trial, Twist, Snapshot]:
+    """What happens between two control periods of one world: sense, judge, decide.
+
+    Returns the trial as it will be driven on, or ended; the twist that the base carries out; and
+    what was seen.
+    """
+    period = physics.control_period
+    told, seen = observe(world, trial, physics=physics, rules=rules)
+    observation: Any = seen.observation
+    if not strategy.smooth:
+        observation = observation._replace(in_contact=seen.reading.contact_type != NONE)
+    if strategy.tracks:
+        observation = TrackedObservation(
+            observation, object_pose(told.qpos)[0], fp.circumradius(world.footprint), period
+        )
+    state, twist, details = strategy.step(world.params, trial.strategy, observation)
+    snapshot = Snapshot(trial.steps * period, told.qpos, seen.reading, twist, details, trial.done)
+    told, twist = execute(world, told._replace(strategy=state), twist, period)
+    return told, twist, snapshot
+
+
+def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
+    """The trial after one control period: `told` as it was `driven`, or ended.
+
+    A trial that had ended `before` comes back as it was.
+    """
+    qpos, qvel, warmstart, overflowed = driven
+    sane = (
+        jnp.all(jnp.isfinite(qpos))
+        & jnp.all(jnp.abs(qvel) < _MAX_SPEED)
+        & jnp.all(jnp.abs(qpos.at[2].set(0.0)) < _MAX_DISTANCE)  # but for the turns of the base
+    )
+    if overflowed is not None:
+        told = told._replace(overflows=told.overflows + (overflowed & ~told.done))
+    moved = told._replace(
+        qpos=qpos,
+        qvel=qvel,
+        warmstart=warmstart,
+        path_length=told.path_length + planar.norm(qpos[:2] - told.qpos[:2]),
+        steps=told.steps + 1,
+    )
+    stopped = told._replace(done=jnp.ones((), bool), diverged=~told.done & ~sane)
+    return select(before.done, before, select(told.done | ~sane, stopped, moved))
+
+
+def control_step(
+    stage: Drives,
+    worlds: World,
+    trials: Trial,
+    *,
+    physics: Physics,
+    rules: Rules = Rules(),
+    strategy: Strategy = RPS,
+) -> tuple[Trial, Snapshot]:
+    """One pass of the loop of a batch of worlds. One that has ended comes back as it is."""
+    think = partial(decide, physics=physics, rules=rules, strategy=strategy)
+    told, twists, snapshots = jax.vmap(think)(worlds, trials)
+    driven = stage.drive(worlds, told, twists, physics)
+    return jax.vmap(settle)(trials, told, driven), snapshots
+
+
+def select(condition: jax.Array, yes: Any, no: Any) -> Any:
+    """One of two pytrees, by a condition () that may be traced."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+
+
+def outcome(trial: Trial, period: float) -> Outcome:
+    """The result of a trial of control period `period` [s], batched or not."""
+    position, yaw = jax.vmap(object_pose)(trial.qpos.reshape(-1, 10))
+    pose = jnp.concatenate([position, yaw[:, None]], axis=-1)
+    return Outcome(
+        success=trial.success,
+        time=trial.steps * period,
+        min_distance=trial.min_distance,
+        contact_lost_time=trial.lost_steps * period,
+        path_length=trial.path_length,
+        mean_abs_l=jnp.where(
+            trial.contact_steps > 0, trial.sum_abs_l / jnp.maximum(trial.contact_steps, 1), jnp.nan
+        ),
+        tipped=trial.tipped,
+        diverged=trial.diverged,
+        overflows=trial.overflows,
+        base_pose=trial.qpos[..., JOINTS.base],
+        object_pose=pose.reshape(*trial.qpos.shape[:-1], 3),
+    )
+
+
+@partial(jax.jit, static_argnames=("strategy",))
+def start_all(worlds: World, live: jax.Array, strategy: Strategy = RPS) -> Trial:
+    """Trials of a batch of worlds; those not `live` (B,) are padding, ended from the start."""
+    trials = jax.vmap(partial(start, strategy=strategy))(worlds)
+    return trials._replace(done=~live)
+
+
+_STATIC = ("physics", "strategy", "steps")
+_UNASKED = 20  # control steps of a GPU between two looks at whether any trial runs, at most
+
+
+@partial(jax.jit, static_argnames=_STATIC, donate_argnames=("trials",))
+def advance(
+    stage: Drives,
+    worlds: World,
+    trials: Trial,
+    *,
+    physics: Physics,
+    rules: Rules = Rules(),
+    strategy: Strategy = RPS,
+    steps: int,
+) -> Trial:
+    """Up to `steps` control steps of a batch of worlds; fewer if all of them end before."""
+    one = partial(control_step, stage, physics=physics, rules=rules, strategy=strategy)
+
+    def some_run(carry):
+        count, trials = carry
+        return (count < steps) & ~jnp.all(trials.done)
+
+    def on(_, trials):
+        return one(worlds, trials)[0]
+
+    # A GPU waits for the host whenever it is asked whether any still runs.
+    between = 1 if jax.default_backend() == "cpu" else math.gcd(steps, _UNASKED)
+
+    def body(carry):
+        count, trials = carry
+        after = jax.lax.fori_loop(0, between, on, trials) if between > 1 else on(0, trials)
+        return count + between, after
+
+    return jax.lax.while_loop(some_run, body, (0, trials))[1]
+
+
+@partial(jax.jit, static_argnames=(*_STATIC, "every"), donate_argnames=("trials",))
+def record(
+    stage: Drives,
+    worlds: World,
+    trials: Trial,
+    *,
+    physics: Physics,
+    rules: Rules = Rules(),
+    strategy: Strategy = RPS,
+    steps: int,
+    every: int = 1,
+) -> tuple[Trial, Snapshot]:
+    """`steps` control steps of a batch, and every `every`-th snapshot (steps // every, B, ...)."""
+    one = partial(control_step, stage, physics=physics, rules=rules, strategy=strategy)
+
+    def body(trials, _):
+        return one(worlds, trials)
+
+    def interval(trials, _):
+        trials, snapshots = jax.lax.scan(body, trials, length=every)
+        return trials, jax.tree.map(lambda x: x[0], snapshots)
+
+    return jax.lax.scan(interval, trials, length=steps // every)

@@ -1,0 +1,533 @@
+"""Random worlds: what is drawn from which range. A world is addressed by (domain, seed, index).
+
+Whatever the batch, whatever the device, the same address gives the same world: the bits come from
+a counter-based generator, and everything after them is computed on the host in double precision.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rps_jax import errors
+from rps_jax.control.strategies import Params
+from rps_jax.engines import base as engines
+from rps_jax.errors import InputError
+from rps_jax.geometry import solid
+from rps_jax.geometry.footprint import Footprint
+from rps_jax.geometry.solid import SIDES, Solid
+from rps_jax.robot import skin
+from rps_jax.robot.skin import CapacitiveSkin, IdealSkin, Skin
+from rps_jax.studies import hardware
+from rps_jax.trials.batch import Part, Setting
+from rps_jax.trials.trial import Odometry, Shift, World
+from rps_jax.world import paper, scene
+from rps_jax.world.objects import FAMILIES, OBJECTS, PAPER_OBJECTS
+from rps_jax.world.physics import Physics
+from rps_jax.world.scene import FRICTION, JOINTS, Friction, Scene, mjx
+
+_COLUMNS = 64  # random numbers of a world, more than are used, so that new ones change no old ones
+
+
+class Range(NamedTuple):
+    """From where to where a quantity is drawn, evenly, or evenly in its logarithm."""
+
+    low: float
+    high: float
+    log: bool = False
+
+    def at(self, u: np.ndarray) -> np.ndarray:
+        """The quantity at u in [0, 1)."""
+        if self.log:
+            return self.low * (self.high / self.low) ** u
+        return self.low + u * (self.high - self.low)
+
+
+def _only(value: float) -> Range:
+    return Range(value, value)
+
+
+@dataclass(frozen=True)
+class Domain:
+    """Ranges of all that differs between worlds.
+
+    Worlds take the `objects` in turn. A domain with `frictions` or `targets` takes these in turn
+    too, targets fastest, then friction, then objects, instead of drawing them.
+    """
+
+    # The object: a scene of `mjcf/` as it is, or a random one of a shape family.
+    objects: tuple[str, ...] = ("random_box", "random_cylinder", "random_prism")
+    mass: Range = Range(3, 60, log=True)  # [kg]
+    size: Range = Range(0.1, 0.35)  # [m] half width, square root of half depth times half breadth
+    aspect: Range = Range(0.5, 2.0, log=True)  # [1] breadth over depth
+    height: Range = Range(0.3, 0.8)  # [m]
+    com_offset: Range = Range(0, 0.4)  # [1] of the way from the middle to the outline
+    friction_ground: Range = Range(0.1, 0.7)  # [1] object-ground
+    friction_robot: Range = Range(0.1, 0.8)  # [1] object-robot
+    frictions: tuple[Friction, ...] = ()
+    # The task.
+    lateral: Range = Range(-0.12, 0.12)  # [m] of the object's middle, left of the robot's axis
+    yaw: Range = Range(-0.6, 0.6)  # [rad] of the object, counter-clockwise
+    gap: Range = Range(0, 0.05)  # [m] between base and object
+    distance: Range = Range(1, 3)  # [m] of the target from the start
+    bearing: Range = Range(-math.pi, math.pi)  # [rad] of the target, counter-clockwise from ahead
+    targets: tuple[tuple[float, float], ...] = ()  # [m]
+    # The skin: ideal, or 42 capacitive taxels with these imperfections.
+    skin: str = "capacitive"
+    noise: Range = Range(0, 0.05)  # [1] of each raw reading, as a change of capacitance
+    gain_spread: Range = Range(0, 0.1)  # [1] of the taxels' gains
+    dead_share: Range = Range(0, 0.05)  # [1] probability that a taxel never answers
+    # The base: where it believes it is, and how it does what it is told.
+    pose_noise: Range = Range(0, 0.005)  # [m] of each position reading
+    yaw_noise: Range = Range(0, 0.01)  # [rad] of each heading reading
+    pose_latency: Range = Range(0, 0.1)  # [s] age of the pose that the law is told
+    command_delay: Range = Range(0, 0.1)  # [s] until a twist is acted upon
+    velocity_error: Range = Range(-0.03, 0.03)  # [1] of each component of the twist, all trial long
+
+    def __post_init__(self) -> None:
+        """Raises InputError for ranges that are empty or leave what is possible."""
+        if not self.objects:
+            raise InputError("domain objects = () is not allowed: name at least one.")
+        for name in self.objects:
+            errors.check_name("domain object", name, (*RANDOM, *OBJECTS))
+        if len(set(self.objects)) < len(self.objects):
+            raise InputError(f"domain objects = {self.objects} is not allowed: name each once.")
+        for friction in self.frictions:
+            scene.check(friction, None)
+        for target in self.targets:
+            scene.check_target(target)
+        errors.check_name("domain skin", self.skin, ("ideal", "capacitive"))
+        for name, (least, most, unit) in _ALLOWED.items():
+            low, high, log = getattr(self, name)
+            for side, value in (("low", low), ("high", high)):
+                errors.check_finite(
+                    f"domain {name} ({side})", value, at_least=least, at_most=most, unit=unit
+                )
+            if low > high or (log and low <= 0):
+                raise InputError(
+                    f"domain {name} = {low:g} to {high:g} is not allowed: low must not exceed high"
+                    f"{', and be above 0' if log else ''}."
+                )
+
+    @property
+    def combinations(self) -> int:
+        """How many indices see every combination of objects, frictions and targets once."""
+        return len(self.objects) * max(1, len(self.frictions)) * max(1, len(self.targets))
+
+    def object_of(self, index: np.ndarray) -> np.ndarray:
+        """Which of `objects` the worlds `index` have."""
+        return index // (self.combinations // len(self.objects)) % len(self.objects)
+
+    @property
+    def idle(self) -> frozenset[str]:
+        """Ranges of which nothing is drawn, since something else says what they would."""
+        found = set()
+        if not set(self.objects) & set(RANDOM):
+            found |= {"mass", "size", "aspect", "height", "com_offset"}
+        if self.frictions:
+            found |= {"friction_ground", "friction_robot"}
+        if self.targets:
+            found |= {"distance", "bearing"}
+        if self.skin == "ideal":
+            found |= set(_OF_TAXELS)
+        return frozenset(found)
+
+    @property
+    def families(self) -> tuple[str, ...]:
+        """The shape family of each of `objects`."""
+        return tuple(RANDOM.get(name) or FAMILIES[name] for name in self.objects)
+
+    def family_of(self, index: int) -> str:
+        """The shape family of one world's object."""
+        return self.families[int(self.object_of(np.asarray(index)))]
+
+
+RANDOM = {"random_box": "box", "random_cylinder": "cylinder", "random_prism": "prism"}
+OF_THE_BASE = ("pose_noise", "yaw_noise", "pose_latency", "command_delay", "velocity_error")
+_POSITIVE = 1e-3
+# What a range must not leave.
+_ALLOWED = {
+    "mass": (0.1, 1e3, "kg"),
+    "size": (0.03, 1.0, "m"),
+    "aspect": (0.1, 10, "1"),
+    "height": (0.1, 2.0, "m"),
+    "com_offset": (0, 0.75, "1"),
+    "friction_ground": (_POSITIVE, 10, "1"),
+    "friction_robot": (_POSITIVE, 10, "1"),
+    "lateral": (-0.5, 0.5, "m"),
+    "yaw": (-math.pi, math.pi, "rad"),
+    "gap": (0, 1, "m"),
+    "distance": (0.7, 20, "m"),
+    "bearing": (-math.pi, math.pi, "rad"),
+    "noise": (0, 1, "1"),
+    "gain_spread": (0, 1, "1"),
+    "dead_share": (0, 1, "1"),
+    "pose_noise": (0, 1, "m"),
+    "yaw_noise": (0, 1, "rad"),
+    "pose_latency": (0, 1, "s"),
+    "command_delay": (0, 1, "s"),
+    "velocity_error": (-0.9, 0.9, "1"),
+}
+RANGES = tuple(_ALLOWED)
+_UNITS = {
+    **dict.fromkeys(("lateral", "gap", "pose_noise"), "m"),
+    **dict.fromkeys(("yaw", "yaw_noise"), "rad"),
+    **dict.fromkeys(("noise", "gain_spread", "dead_share"), "1"),
+    **dict.fromkeys(("pose_latency", "command_delay"), "s"),
+}
+_PERFECT: dict[str, Any] = {
+    **dict.fromkeys(
+        ("noise", "gain_spread", "dead_share", "pose_noise", "yaw_noise", "pose_latency"), _only(0)
+    ),
+    **dict.fromkeys(("command_delay", "velocity_error", "lateral", "yaw"), _only(0)),
+}
+_HARDWARE: dict[str, Any] = _PERFECT | {"noise": _only(0.05), "gain_spread": _only(0.1)}
+DOMAINS = {
+    "paper": Domain(
+        objects=PAPER_OBJECTS,
+        frictions=tuple(FRICTION.values()),
+        targets=paper.TARGETS,
+        gap=_only(0.02),
+        skin="ideal",
+        **_PERFECT,
+    ),
+    "hardware": Domain(
+        objects=hardware.OBJECTS,
+        friction_ground=Range(hardware.GROUND[0], hardware.GROUND[-1]),
+        friction_robot=Range(hardware.ROBOT[0], hardware.ROBOT[-1]),
+        gap=_only(0.02),
+        distance=_only(2.1),
+        **_HARDWARE,
+    ),
+    "wide": Domain(),
+    "prisms": Domain(objects=("random_prism",)),  # of wide, held out from tuning
+    "hostile": Domain(
+        mass=Range(1, 100, log=True),
+        size=Range(0.06, 0.45),
+        aspect=Range(0.33, 3.0, log=True),
+        height=Range(0.2, 1.0),
+        com_offset=Range(0, 0.7),
+        friction_ground=Range(0.05, 1.0),
+        friction_robot=Range(0.05, 1.2),
+        lateral=Range(-0.25, 0.25),
+        yaw=Range(-math.pi, math.pi),
+        gap=Range(0, 0.1),
+        distance=Range(0.8, 4),
+        noise=Range(0, 0.1),
+        gain_spread=Range(0, 0.25),
+        dead_share=Range(0, 0.15),
+        pose_noise=Range(0, 0.02),
+        yaw_noise=Range(0, 0.03),
+        pose_latency=Range(0, 0.2),
+        command_delay=Range(0, 0.2),
+        velocity_error=Range(-0.1, 0.1),
+    ),
+}
+
+
+_OF_TAXELS = ("noise", "gain_spread", "dead_share")  # which an ideal skin has not
+
+
+class Draw(NamedTuple):
+    """Worlds of one object or shape family, as drawn; leaves lead with their number, n."""
+
+    number: np.ndarray  # (n,) their indices
+    solid: Solid
+    friction: Friction  # (n,) each
+    lateral: np.ndarray  # (n,) [m]
+    yaw: np.ndarray  # (n,) [rad]
+    gap: np.ndarray  # (n,) [m]
+    p_world_target: np.ndarray  # (n, 2) [m]
+    noise: np.ndarray  # (n,) [1]
+    gain_spread: np.ndarray  # (n,) [1]
+    dead_share: np.ndarray  # (n,) [1]
+    pose_noise: np.ndarray  # (n,) [m]
+    yaw_noise: np.ndarray  # (n,) [rad]
+    pose_latency: np.ndarray  # (n,) [s]
+    command_delay: np.ndarray  # (n,) [s]
+    velocity_error: np.ndarray  # (n, 3) [1]
+    key: np.ndarray  # (n, 2) uint32, of all that is drawn while the world runs
+
+
+# Which random number of a world is what; a new quantity goes to the end.
+_USES = (
+    *("mass", "size", "aspect", "height", "com_offset", "com_bearing"),
+    *("friction_ground", "friction_robot", "lateral", "yaw", "gap", "distance", "bearing"),
+    *("noise", "gain_spread", "dead_share", "pose_noise", "yaw_noise", "pose_latency"),
+    *("command_delay", "v_x_error", "v_y_error", "omega_error", "key_0", "key_1", "sides", "turn"),
+    *(f"corner_{i}" for i in range(SIDES)),
+)
+
+
+def draw(domain: Domain, seed: int, index: ArrayLike) -> Draw:
+    """The worlds `index` (n,), all of one object of the domain.
+
+    Raises:
+      ValueError: they are of several objects.
+    """
+    index = np.asarray(index, np.int64)
+    which = domain.object_of(index)
+    if (which != which[0]).any():
+        raise ValueError("worlds of several objects cannot be batched")
+    return _drawn(domain, index, _uniform(seed, index))
+
+
+def _drawn(domain: Domain, index: np.ndarray, numbers: np.ndarray) -> Draw:
+    """Worlds of the same object, from their random numbers (n, _COLUMNS)."""
+    u = dict(zip(_USES, numbers.T, strict=False))
+    name = domain.objects[int(domain.object_of(index[0]))]
+    at = {name: getattr(domain, name).at(u[name]) for name in _ALLOWED if name in u}
+    if domain.skin == "ideal":
+        at |= {name: np.zeros(index.size) for name in _OF_TAXELS}
+    error = [
+        domain.velocity_error.at(u[name]) for name in ("v_x_error", "v_y_error", "omega_error")
+    ]
+    key = [np.floor(u[name] * 2**32).astype(np.uint32) for name in ("key_0", "key_1")]
+    return Draw(
+        number=index,
+        solid=_solid(name, at, u),
+        friction=_friction(domain, index, at),
+        p_world_target=_targets(domain, index, at),
+        velocity_error=np.stack(error, axis=-1),
+        key=np.stack(key, axis=-1),
+        **{name: at[name] for name in Draw._fields if name in at},
+    )
+
+
+def _uniform(seed: int, index: np.ndarray) -> np.ndarray:
+    """Random numbers (n, _COLUMNS) in [0, 1): those of each index, however it is asked for."""
+    rows = np.empty((index.size, _COLUMNS))
+    order = np.argsort(index)
+    far = np.flatnonzero(np.diff(index[order]) > 100) + 1
+    for near in np.split(order, far):
+        first, last = int(index[near[0]]), int(index[near[-1]])
+        # Philox counts in steps of four numbers.
+        bits = np.random.Philox(key=seed).advance(first * _COLUMNS // 4)
+        block = np.random.Generator(bits).random((last - first + 1, _COLUMNS))
+        rows[near] = block[index[near] - first]
+    return rows
+
+
+def _solid(name: str, at: dict[str, np.ndarray], u: dict[str, np.ndarray]) -> Solid:
+    """The objects called `name`: a scene's, or random ones."""
+    count = u["mass"].size
+    if name not in RANDOM:
+        one = scene.solid_of(scene.load(name))
+        return Solid(*(np.repeat(leaf, count, axis=0) for leaf in one))
+    depth, breadth = at["size"] / np.sqrt(at["aspect"]), at["size"] * np.sqrt(at["aspect"])
+    radius = np.zeros(count)
+    if name == "random_cylinder":
+        vertices, radius = np.zeros((count, 1, 2)), at["size"]
+    elif name == "random_box":
+        vertices = solid.rectangles(depth, breadth)
+    else:
+        vertices = _polygons(depth, breadth, u)
+    return solid.build(
+        vertices, radius, at["height"], at["mass"], at["com_offset"], 2 * np.pi * u["com_bearing"]
+    )
+
+
+def _polygons(depth: np.ndarray, breadth: np.ndarray, u: dict[str, np.ndarray]) -> np.ndarray:
+    """Convex polygons (n, SIDES, 2) of 3 to SIDES corners on ellipses of these half axes."""
+    sides = 3 + np.floor((SIDES - 2) * u["sides"]).astype(int)[:, None]
+    corner = np.minimum(np.arange(SIDES), sides - 1)  # the last one repeated
+    jitter = np.stack([u[f"corner_{i}"] for i in range(SIDES)], axis=-1) - 0.5
+    jitter = np.take_along_axis(jitter, corner, axis=1)
+    angle = 2 * np.pi * (u["turn"][:, None] + (corner + 0.5 * jitter) / sides)
+    half = np.stack([depth, breadth], axis=-1)[:, None, :]
+    return solid.centred(half * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+
+
+def _friction(domain: Domain, index: np.ndarray, at: dict[str, np.ndarray]) -> Friction:
+    if not domain.frictions:
+        return Friction(at["friction_ground"], at["friction_robot"])
+    which = index // max(1, len(domain.targets)) % len(domain.frictions)
+    return Friction(*np.array(domain.frictions)[which].T)
+
+
+def _targets(domain: Domain, index: np.ndarray, at: dict[str, np.ndarray]) -> np.ndarray:
+    if domain.targets:
+        return np.array(domain.targets)[index % len(domain.targets)]
+    along = np.stack([np.cos(at["bearing"]), np.sin(at["bearing"])], axis=-1)
+    return at["distance"][:, None] * along
+
+
+def domain_randomize(
+    model: mjx.Model, rng: jax.Array, domain: Domain = DOMAINS["wide"]
+) -> tuple[mjx.Model, mjx.Model]:
+    """Models of random objects for a loop of one's own, as mujoco_playground has them.
+
+    Args:
+      model: of a random object's scene, as `mjx.put_model(scene.shaped(...).physics)` gives it.
+      rng: keys (n, 2), one a world.
+      domain: ranges of the object's mass, size, centre of mass and friction.
+
+    Returns:
+      The model with its fields batched, (n, ...), and which of them are: 0, the others None, for
+      `jax.vmap(..., in_axes=(in_axes, ...))`. Not to be traced: it works on the host.
+    """
+    family = scene.family_of(model)
+    (name,) = [name for name, of in RANDOM.items() if of == family]
+    keys = np.asarray(rng, np.uint32).astype(object)
+    numbers = np.stack([_uniform(int(a) << 32 | int(b), np.zeros(1, int))[0] for a, b in keys])
+    alone = replace(domain, objects=(name,), frictions=(), targets=())
+    drawn = _drawn(alone, np.zeros(len(keys), int), numbers)
+    _, own = engines.stage_of_solids(family, drawn.solid, drawn.friction, "mjx", Physics())
+    dtype = model.body_mass.dtype
+    batched = scene.apply(model, {k: jnp.asarray(v, dtype) for k, v in own.items()})
+    in_axes = jax.tree_util.tree_map_with_path(
+        lambda path, _: 0 if jax.tree_util.keystr(path) in own else None, model
+    )
+    return batched, in_axes
+
+
+def worlds(domain: Domain, drawn: Draw, params: Params, setting: Setting) -> Part:
+    """The worlds of a draw as a part of a job, all with the same parameters."""
+    family = domain.family_of(drawn.number[0])
+    count, dtype = drawn.number.size, jnp.zeros(()).dtype
+    stage, own = engines.stage_of_solids(
+        family, drawn.solid, drawn.friction, setting.engine, setting.physics
+    )
+    world: Any = {
+        "fields": own,
+        "footprint": Footprint(*_any(drawn.solid.vertices, drawn.solid.radius)),
+        "skin": _skin(domain, drawn),
+        "params": jax.tree.map(lambda value: np.full(count, value), params),
+        "p_world_target": drawn.p_world_target,
+        "shift": Shift(*_any(np.full(count, np.inf), np.zeros((count, 2)))),
+        "qpos": _starts(drawn),
+        "key": drawn.key,
+        "odometry": _odometry(domain, drawn, setting.physics.control_period),
+    }
+    narrow = jax.tree.map(lambda x: x if x.dtype == np.uint32 else x.astype(dtype), world)
+    return Part(drawn.number, World(**narrow), stage)
+
+
+def _any(*arrays: Any) -> tuple[Any, ...]:
+    """Host arrays where a type asks for those of the device."""
+    return arrays
+
+
+def _skin(domain: Domain, drawn: Draw) -> Skin:
+    count = drawn.number.size
+    plain = IdealSkin() if domain.skin == "ideal" else CapacitiveSkin()
+    full = jax.tree.map(lambda value: np.full(count, value, float), plain)
+    if isinstance(full, IdealSkin):
+        return full
+    return full._replace(
+        noise=drawn.noise, gain_spread=drawn.gain_spread, dead_share=drawn.dead_share
+    )
+
+
+def _starts(drawn: Draw) -> np.ndarray:
+    """Positions (n, 10) at the start: the base at the origin, the object before it."""
+    qpos = np.zeros((drawn.number.size, 10))
+    front = skin.HALF_LENGTH + drawn.gap + solid.extent(drawn.solid, drawn.yaw)
+    half = drawn.yaw / 2
+    zero = np.zeros_like(half)
+    place = [front, drawn.lateral, drawn.solid.height / 2, np.cos(half), zero, zero, np.sin(half)]
+    qpos[:, JOINTS.object] = np.stack(place, axis=-1)
+    return qpos
+
+
+def remembered(domain: Domain, period: float) -> int:
+    """How many control steps of `period` [s] the odometry of the domain's worlds looks back."""
+    if all(getattr(domain, name) == _PERFECT[name] for name in OF_THE_BASE):
+        return 0
+    return 1 + round(max(domain.pose_latency.high, domain.command_delay.high) / period)
+
+
+def _odometry(domain: Domain, drawn: Draw, period: float) -> Odometry:
+    past = np.zeros((drawn.number.size, remembered(domain, period)))
+    return Odometry(*_any(*(getattr(drawn, name) for name in OF_THE_BASE), past))
+
+
+def scene_of(domain: Domain, drawn: Draw, physics: Physics, i: int) -> Scene:
+    """The compiled scene of the i-th world of a draw, for pictures: with its looks, if it has."""
+    index = int(drawn.number[i])
+    name = domain.objects[int(domain.object_of(drawn.number[i]))]
+    if name in RANDOM:
+        return engines.scene_of_solid(
+            domain.family_of(index), drawn.solid, drawn.friction, physics, i
+        )
+    ground, robot = (float(leaf[i]) for leaf in drawn.friction)
+    return scene.load(name, physics, Friction(ground, robot))
+
+
+def table(drawn: Draw) -> dict[str, tuple[np.ndarray, str]]:
+    """What was drawn, one column (n,) and its unit a quantity."""
+    shape = drawn.solid
+    away = np.linalg.norm(shape.p_object_com, axis=1)
+    toward = shape.p_object_com[:, :2] / np.maximum(away, 1e-12)[:, None]
+    x, y = drawn.p_world_target.T
+    errors_ = zip(("v_x_error", "v_y_error", "omega_error"), drawn.velocity_error.T, strict=True)
+    return {
+        "mass": (shape.mass, "kg"),
+        "size": (np.sqrt(solid.area(shape)) / 2, "m"),
+        "height": (shape.height, "m"),
+        "corners": (solid.corners(shape), "1"),
+        "com_offset": (away / solid.reach(shape.vertices, shape.radius, toward), "1"),
+        "friction_ground": (drawn.friction.ground, "1"),
+        "friction_robot": (drawn.friction.robot, "1"),
+        "distance": (np.hypot(x, y), "m"),
+        "bearing": (np.arctan2(y, x), "rad"),
+        **{name: (getattr(drawn, name), unit) for name, unit in _UNITS.items()},
+        **{name: (values, "1") for name, values in errors_},
+    }
+
+
+def _names(values: list[str]) -> tuple[str, ...]:
+    if isinstance(values, str):
+        raise TypeError("one name, not a list")
+    return tuple(values)
+
+
+def _range(name: str, values: Any) -> Range:
+    if not isinstance(values, list | tuple):
+        raise TypeError("no list")
+    low, high, *log = values
+    if len(log) > 1 or not all(isinstance(one, bool) for one in log):
+        raise ValueError("more than low, high, and whether evenly in the logarithm")
+    usual = getattr(DOMAINS["wide"], name).log
+    return Range(float(low), float(high), *(log or [usual]))
+
+
+# How JSON has what is not a range.
+_FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "objects": (_names, 'names, as ["random_box"]'),
+    "frictions": (
+        lambda pairs: tuple(Friction(*map(float, pair)) for pair in pairs),
+        "pairs of ground and robot, as [[0.3, 0.35]]",
+    ),
+    "targets": (
+        lambda pairs: tuple((float(x), float(y)) for x, y in pairs),
+        "pairs of x and y [m], as [[2, 0]]",
+    ),
+    "skin": (str, "its name"),
+}
+
+
+def from_json(values: dict[str, Any]) -> Domain:
+    """The domain that was written as JSON by `dataclasses.asdict`.
+
+    Raises:
+      InputError: a name or a value is not of a domain.
+    """
+    given = {}
+    known = {f.name: f for f in fields(Domain)}
+    for name, value in values.items():
+        errors.check_name("domain quantity", name, known)
+        read, form = _FORMS.get(name, (partial(_range, name), "low and high, as [0.1, 0.5]"))
+        try:
+            given[name] = read(value)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InputError(f"domain {name} = {value} is not allowed: write {form}.") from error
+    return Domain(**given)

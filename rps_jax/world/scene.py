@@ -1,0 +1,369 @@
+"""Scenes: `mjcf/` -> a MuJoCo model for looking at, and one stripped to the physics for stepping.
+
+The physics model holds the three geoms that touch and nothing else; it is what C MuJoCo and MJX
+both step. All objects of one shape family compile to the same MJX structure, so that they can
+be batched in one program: `stack` collects the fields in which they differ.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from rps_jax import errors
+from rps_jax.geometry import footprint as fp
+from rps_jax.geometry.footprint import Footprint
+from rps_jax.geometry.solid import Solid
+from rps_jax.robot import skin
+from rps_jax.world import objects
+from rps_jax.world.objects import FAMILIES, OBJECTS, SHAPES, path_of
+from rps_jax.world.physics import PHYSICS, Physics
+
+with contextlib.redirect_stdout(io.StringIO()):  # MJX reports on the console that warp is absent
+    from mujoco import mjx
+
+    from rps_jax.engines import mjx_colliders
+mjx_colliders.register()
+
+Side = Literal["near", "far"]
+SIDES = ("near", "far")
+# All that differs between objects of one shape family, as paths into an MJX model.
+FIELDS = (
+    ".stat.meaninertia",
+    *(f".body_{name}" for name in ("pos", "ipos", "iquat", "mass", "subtreemass", "inertia")),
+    *(".body_invweight0", ".dof_invweight0", ".dof_M0", ".qpos0", ".qpos_spring"),
+    *(".geom_pos", ".geom_size", ".geom_aabb", ".geom_rbound", ".pair_friction"),
+)
+# An inertial frame off by this [m] keeps MuJoCo from compiling centred bodies to a structure of
+# their own, which could not be batched with the others.
+OFF_CENTRE = 1e-6
+
+
+class Friction(NamedTuple):
+    """Coulomb coefficients of the two contacts."""
+
+    ground: Any  # [1] object-ground; a number, or (n,) of many worlds
+    robot: Any  # [1] object-robot
+
+
+FRICTION = {"S1": Friction(0.3, 0.35), "S2": Friction(0.2, 0.5)}  # Table I
+
+
+class Scene(NamedTuple):
+    """One object before the robot."""
+
+    name: str
+    family: str
+    model: mujoco.MjModel  # everything, for pictures
+    physics: mujoco.MjModel  # the three geoms that touch, for stepping
+    footprint: Footprint
+
+
+class Joints(NamedTuple):
+    """Where the joints are in qpos and qvel; the same in every scene and in both models."""
+
+    base: slice = slice(0, 3)  # x, y [m], yaw [rad] in the world
+    object: slice = slice(3, 10)  # position [m] and quaternion, scalar first
+
+
+JOINTS = Joints()
+
+
+def load(
+    name: str,
+    physics: Physics = PHYSICS["default"]["standard"],
+    friction: Friction = FRICTION["S1"],
+    *,
+    rear: Side = "near",
+    mass: float | None = None,
+    half_length: float = skin.HALF_LENGTH,
+) -> Scene:
+    """Compile a scene.
+
+    Args:
+      name: one of `OBJECTS`.
+      physics: how it will be stepped.
+      friction: coefficients of its two contacts.
+      rear: which side the nonuniform box's load stands on, nearest the robot or farthest; the
+        paper says "rear left corner".
+      mass: of the object [kg], its inertia scaled along; None: the object's own.
+      half_length: of the base [m].
+
+    Raises:
+      InputError: unknown name, or friction or mass that is not a positive finite number.
+    """
+    errors.check_name("object", name, OBJECTS)
+    errors.check_name("rear", rear, SIDES)
+    check(friction, mass)
+    if name in objects.REGISTERED:
+        return _load_registered(name, physics, friction, mass, half_length)
+    spec = objects.read(path_of(name))
+    for geom in spec.geoms:
+        if geom.name == "load" and rear == "far":
+            geom.pos[0] = -geom.pos[0]
+    if mass is not None:
+        _set_mass(spec, mass)
+    model, stripped = _compile(spec, physics, friction, half_length)
+    return Scene(name, FAMILIES[name], model, stripped, _footprint(stripped))
+
+
+def _load_registered(
+    name: str, physics: Physics, friction: Friction, mass: float | None, half_length: float
+) -> Scene:
+    """The looks of a registered object, and the solid that stands for it in the physics."""
+    one = objects.REGISTERED[name].solid
+    if mass is not None:
+        one = one._replace(mass=np.asarray(mass), inertia=one.inertia * mass / one.mass)
+    spec = objects.read(path_of(name))
+    _set_length(spec, half_length)
+    upright = shaped(FAMILIES[name], one, physics, friction, half_length=half_length)
+    return upright._replace(name=name, model=spec.compile())
+
+
+def shaped(
+    family: str,
+    one: Solid,
+    physics: Physics = PHYSICS["default"]["standard"],
+    friction: Friction = FRICTION["S1"],
+    *,
+    half_length: float = skin.HALF_LENGTH,
+) -> Scene:
+    """Compile a scene with one solid (its leaves without a leading axis) of a shape family.
+
+    Raises:
+      InputError: unknown family, or friction that is not a positive finite number.
+    """
+    errors.check_name("family", family, SHAPES)
+    check(friction, float(one.mass))
+    spec = objects.read(path_of(family))
+    body = spec.body("object")
+    body.pos[2] = one.height / 2
+    for geom in list(body.geoms):
+        if not geom.name:
+            spec.delete(geom)  # the looks of the object that gave the family its file
+    for name, size in geom_sizes(family, one).items():
+        spec.geom(name).size[: size.size] = size
+    if family == "prism":
+        _set_corners(spec, one)
+    body.explicitinertial = True
+    body.mass, body.ipos = one.mass, one.p_object_com
+    body.iquat, body.inertia = one.q_object_body, one.inertia
+    outline = Footprint(jnp.asarray(one.vertices, float), jnp.asarray(one.radius, float))
+    models = _compile(spec, physics, friction, half_length)
+    return Scene(family, family, *models, outline)
+
+
+def geom_sizes(family: str, solids: Solid) -> dict[str, np.ndarray]:
+    """Sizes (..., 3) [m], as MuJoCo means them, of the geoms of solids (...)."""
+    half = solids.height / 2
+    if family == "box":
+        corner = solids.vertices[..., 0, :]
+        return {"object": np.stack([corner[..., 0], corner[..., 1], half], axis=-1)}
+    if family == "cylinder":
+        size = np.stack([solids.radius, half, np.zeros_like(half)], axis=-1)
+        return {"object": size, "object_side": size}
+    return {}  # of a mesh and points
+
+
+def _set_corners(spec: mujoco.MjSpec, one: Solid) -> None:
+    """Give the mesh and the feet of a prism their places."""
+    real = np.any(one.vertices != np.roll(one.vertices, 1, axis=0), axis=1)
+    half = one.height / 2
+    spec.mesh("prism").uservert = np.concatenate(
+        [np.column_stack([one.vertices[real], np.full(real.sum(), z)]) for z in (-half, half)]
+    ).ravel()
+    for i, foot in enumerate(feet(one)):
+        spec.geom(f"foot_{i}").pos = foot
+
+
+def feet(solids: Solid) -> np.ndarray:
+    """Where prisms (...) stand, (..., N, 3) [m]; a repeated corner's foot is at the top, unused."""
+    repeated = np.all(solids.vertices == np.roll(solids.vertices, 1, axis=-2), axis=-1)
+    half = np.expand_dims(solids.height / 2, -1)
+    return np.concatenate([solids.vertices, np.where(repeated, half, -half)[..., None]], axis=-1)
+
+
+def _compile(
+    spec: mujoco.MjSpec, physics: Physics, friction: Friction, half_length: float
+) -> tuple[mujoco.MjModel, mujoco.MjModel]:
+    """The model for looking at, and the one stripped to the physics."""
+    _set_length(spec, half_length)
+    for pair in spec.pairs:
+        if pair.name == "base_object":
+            pair.solref[:] = physics.base_solref
+        else:
+            pair.solref[:] = physics.ground_solref
+            pair.solimp[:2] = physics.ground_impedance
+        pair.friction[:2] = friction.robot if pair.name == "base_object" else friction.ground
+    _set_options(spec.option, physics)
+    model = spec.compile()
+    return model, _strip(spec, model)
+
+
+def check(friction: Friction, mass: float | None) -> None:
+    """Raises InputError unless friction and mass are positive and finite, as MuJoCo does not."""
+    for side, value in friction._asdict().items():
+        errors.check_finite(f"friction {side}", value, above=0, at_most=10)
+    if mass is not None:
+        errors.check_finite("mass", mass, above=0, at_most=1e4, unit="kg")
+
+
+def check_target(p_world_target: tuple[float, float]) -> None:
+    """Raises InputError for a target [m] that is under the robot, or out of the world."""
+    x, y = (
+        errors.check_finite(f"target {axis}", value, at_least=-50, at_most=50, unit="m")
+        for axis, value in zip("xy", p_world_target, strict=True)
+    )
+    if abs(x) <= skin.HALF_LENGTH and abs(y) <= skin.HALF_WIDTH:
+        raise errors.InputError(
+            f"target = ({x:g}, {y:g}) m is not allowed: it must lie outside the robot, which "
+            f"covers |x| <= {skin.HALF_LENGTH:g} m and |y| <= {skin.HALF_WIDTH:g} m."
+        )
+
+
+def _set_length(spec: mujoco.MjSpec, half_length: float) -> None:
+    """Stretch the base and its skin to this half length [m]."""
+    spec.geom("skin_front").pos[0] = half_length
+    for name in ("base", "skin_left", "skin_right"):
+        spec.geom(name).size[0] = half_length
+
+
+def _set_mass(spec: mujoco.MjSpec, mass: float) -> None:
+    """Scale the object's geoms to this mass in all [kg]."""
+    geoms = [geom for geom in spec.body("object").geoms if geom.mass > 0]
+    total = sum(geom.mass for geom in geoms)
+    for geom in geoms:
+        geom.mass *= mass / total
+
+
+def _set_options(option: mujoco.MjOption, physics: Physics) -> None:
+    option.timestep = physics.timestep
+    option.cone = {
+        "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC,
+        "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL,
+    }[physics.cone]
+    option.impratio = physics.impratio
+    option.iterations = physics.iterations
+    option.ls_iterations = physics.ls_iterations
+    option.tolerance = physics.tolerance
+
+
+def _strip(spec: mujoco.MjSpec, full: mujoco.MjModel) -> mujoco.MjModel:
+    """Only what touches: the geoms of the contact pairs, with each body's whole inertia."""
+    spec = spec.copy()
+    spec.modelname = "physics"
+    spec.stat.meanmass, spec.stat.meansize = 1.0, 1.0  # unused, and so the same for all
+    spec.delete(spec.body("target"))
+    touching = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
+    for geom in list(spec.geoms):
+        if geom.name not in touching:
+            spec.delete(geom)
+    for item in [*spec.lights, *spec.cameras]:
+        spec.delete(item)
+    for name in ("base", "object"):
+        body, compiled = spec.body(name), full.body(name)
+        body.explicitinertial = True
+        body.mass = compiled.mass[0]
+        body.ipos = compiled.ipos + OFF_CENTRE
+        body.iquat = compiled.iquat
+        body.inertia = compiled.inertia
+    model = spec.compile()
+    model.body_sameframe[:] = 0  # likewise: always the general formula for the inertial frame
+    return model
+
+
+def _footprint(model: mujoco.MjModel) -> Footprint:
+    """The outline of the object's geom that stands on the ground."""
+    geom = model.geom("object")
+    half_x, half_y, _ = geom.size
+    if geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX:
+        return fp.rectangle(half_x, half_y)
+    return fp.circle(half_x)
+
+
+def solid_of(scene: Scene) -> Solid:
+    """The object of a scene as solids, one of them."""
+    thing, geom = scene.physics.body("object"), scene.physics.geom("object")
+    return Solid(
+        vertices=np.asarray(scene.footprint.vertices, float)[None],
+        radius=geom.size[:1] * (scene.family == "cylinder"),
+        height=2 * thing.pos[2:],
+        mass=thing.mass.copy(),
+        p_object_com=thing.ipos[None] - OFF_CENTRE,
+        inertia=thing.inertia[None].copy(),
+        q_object_body=thing.iquat[None].copy(),
+    )
+
+
+def initial_qpos(scene: Scene, gap: float = 0.02, yaw: float = 0.0) -> np.ndarray:
+    """Base at the origin, object `gap` [m] in front of the middle of its front face: (10,).
+
+    `yaw` [rad] turns the object.
+    """
+    placed = fp.place(scene.footprint, jnp.zeros(2), jnp.asarray(yaw, float))
+    reach = float(fp.extent(placed, jnp.array([-1.0, 0.0])))
+    qpos = scene.physics.qpos0.copy()
+    qpos[JOINTS.base] = 0.0
+    height = qpos[JOINTS.object][2]
+    front = scene.physics.geom("base").size[0]
+    position = [front + gap + reach, 0.0, height]
+    qpos[JOINTS.object] = [*position, math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
+    return qpos
+
+
+def put(model: mujoco.MjModel) -> mjx.Model:
+    """The model as MJX's own engine has it."""
+    # A static copy of the bounding radii, which only height fields use, would bar stacking.
+    unused: dict[str, Any] = {"_impl.geom_rbound_hfield": np.zeros(model.ngeom)}
+    there: Any = mjx.put_model(model).tree_replace(unused)
+    return there
+
+
+def stack(
+    models: Sequence[mujoco.MjModel], put: Callable[[mujoco.MjModel], mjx.Model] = put
+) -> tuple[mjx.Model, dict[str, jax.Array]]:
+    """One MJX model for all, `put` on the device, and the fields that vary: name -> (n, ...).
+
+    The fields are always the same ones, so that a world's numbers depend neither on what it is
+    batched with nor on a program of its own. They are copied from compiled models, so nothing
+    that MuJoCo derives from a mass, a size or a friction is forgotten.
+
+    Raises:
+      ValueError: the models differ in anything but `FIELDS`.
+    """
+    trees: list[Any] = [put(m) for m in models]
+    leaves, structures = zip(*map(jax.tree_util.tree_flatten_with_path, trees), strict=True)
+    if any(s != structures[0] for s in structures):
+        raise ValueError("models of different structure cannot be stacked")
+    fields = {}
+    for columns in zip(*leaves, strict=True):
+        name = jax.tree_util.keystr(columns[0][0])
+        values = [np.asarray(leaf) for _, leaf in columns]
+        if name in FIELDS:
+            fields[name] = jnp.stack(values)
+        elif any(not np.array_equal(v, values[0]) for v in values):
+            raise ValueError(f"models that differ in {name} cannot be stacked")
+    return trees[0], fields
+
+
+def family_of(model: mjx.Model) -> str:
+    """The shape family of an MJX model's object."""
+    kinds = {int(kind) for kind in model.geom_type}
+    if int(mujoco.mjtGeom.mjGEOM_MESH) in kinds:
+        return "prism"
+    return "cylinder" if int(mujoco.mjtGeom.mjGEOM_CYLINDER) in kinds else "box"
+
+
+def apply(model: mjx.Model, fields: dict[str, jax.Array]) -> mjx.Model:
+    """The model with one world's fields, as named by `stack`, put in place."""
+    return jax.tree_util.tree_map_with_path(
+        lambda path, leaf: fields.get(jax.tree_util.keystr(path), leaf), model
+    )
