@@ -19,6 +19,7 @@ from rps_jax.errors import InputError
 from rps_jax.geometry.footprint import Footprint, circle, polygon, rectangle
 from rps_jax.record import folder as record
 from rps_jax.robot.skin import POINT, CapacitiveSkin
+from rps_jax.runs import sweep
 from rps_jax.runs.sweep import Plan
 from rps_jax.trials import pushes
 from rps_jax.trials.batch import Setting

@@ -22,6 +22,7 @@ from rps_jax.control import strategies
 from rps_jax.control.strategies import Strategy
 from rps_jax.errors import InputError
 from rps_jax.record import folder as record
+from rps_jax.runs import sweep
 from rps_jax.runs.sweep import Plan
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.batch import Part, Setting, rows
