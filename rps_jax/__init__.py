@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from rps_jax.errors import InputError
     from rps_jax.geometry.footprint import Footprint
     from rps_jax.robot.skin import CapacitiveSkin, IdealSkin
-    from rps_jax.trials.batch import Setting
     from rps_jax.trials.env import PushEnv
     from rps_jax.trials.pushes import Case, follow, run
+    from rps_jax.trials.setting import Setting
     from rps_jax.trials.trial import Outcome, Rules
     from rps_jax.world.domain import DOMAINS, Domain
     from rps_jax.world.objects import OBJECTS, register_object

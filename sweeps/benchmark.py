@@ -16,10 +16,9 @@ from pathlib import Path
 import tyro
 from tqdm import tqdm
 
-from rps_jax import errors
+from rps_jax import engines, errors
 from rps_jax.analysis import figures, tables
 from rps_jax.app.cli import guarded
-from rps_jax.engines import base as engines
 from rps_jax.record import folder as record
 from rps_jax.studies import benchmark
 from rps_jax.studies.benchmark import Speed
@@ -53,7 +52,7 @@ def main(options: Options) -> None:
     for name in options.names:
         errors.check_name("name", name, benchmark.NAMES)
         if name in benchmark.BATCHED:
-            engines.check(benchmark.BATCHED[name].engine)
+            engines.get(benchmark.BATCHED[name].engine).check()
     for family in options.families:
         errors.check_name("family", family, benchmark.FAMILIES)
     errors.check_count("refill", options.refill, at_least=0, at_most=1_000_000)

@@ -12,10 +12,9 @@ from pathlib import Path
 
 import tyro
 
-from rps_jax import errors
+from rps_jax import engines, errors
 from rps_jax.analysis import tables
 from rps_jax.app.cli import StudyOptions, guarded, progress_bar
-from rps_jax.engines import base as engines
 from rps_jax.record import folder as record
 from rps_jax.studies import fidelity, study
 from rps_jax.world import paper
@@ -36,7 +35,8 @@ def main(options: Options) -> None:
     """Run the conditions that are missing, then print and write the table."""
     known = fidelity.CONDITIONS | fidelity.IN_WARP
     for name in options.conditions:
-        engines.check(known[errors.check_name("condition", name, known)].setting.engine)
+        condition = known[errors.check_name("condition", name, known)]
+        engines.get(condition.setting.engine).check()
     names = tuple(dict.fromkeys([fidelity.REFERENCE, *options.conditions]))
     grid = study.Grid(strategies=paper.STRATEGIES, targets=options.targets())
     with options.opened() as out, progress_bar(len(names) * grid.size) as report:

@@ -13,10 +13,9 @@ from pathlib import Path
 import tyro
 from tqdm import tqdm
 
-from rps_jax import errors
+from rps_jax import engines, errors
 from rps_jax.analysis import figures, tables
 from rps_jax.app.cli import guarded
-from rps_jax.engines import base as engines
 from rps_jax.record import folder as record
 from rps_jax.studies import ablation, benchmark
 
@@ -45,7 +44,7 @@ def main(options: Options) -> None:
     """Pull every lever; print, draw and write what it is worth."""
     errors.check_name("name", options.name, benchmark.BATCHED)
     errors.check_name("family", options.family, benchmark.FAMILIES)
-    engines.check(benchmark.BATCHED[options.name].engine, [options.family])
+    engines.get(benchmark.BATCHED[options.name].engine).check([options.family])
     errors.check_count("worlds", options.worlds, at_least=4, at_most=10_000_000)
     errors.check_finite("simulated", options.simulated, at_least=0.04, at_most=60, unit="s")
     errors.check_count("goes", options.goes, at_most=1000)

@@ -14,14 +14,13 @@ from pathlib import Path
 
 import tyro
 
-from rps_jax import errors
+from rps_jax import engines, errors
 from rps_jax.analysis import statistics, tables
 from rps_jax.app.cli import Spread, domain_of, guarded, progress_bar, use_cache
-from rps_jax.engines import base as engines
 from rps_jax.record import folder as record
 from rps_jax.runs import sweep
 from rps_jax.runs.sweep import Plan
-from rps_jax.trials.batch import Setting
+from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
 from rps_jax.world.physics import preset
 
@@ -64,8 +63,9 @@ def main(options: Options) -> None:
     errors.check_name("strategy", options.strategy, paper.PARAMS)
     arms = {options.strategy: paper.PARAMS[options.strategy]}
     for name in options.engines:
-        engines.check(ENGINES[errors.check_name("engines", name, ENGINES)].engine, domain.families)
-    here = (n for n, s in ENGINES.items() if engines.works(s.engine, domain.families))
+        setting = ENGINES[errors.check_name("engines", name, ENGINES)]
+        engines.get(setting.engine).check(domain.families)
+    here = (n for n, s in ENGINES.items() if engines.get(s.engine).works(domain.families))
     plans = {
         name: Plan(domain, options.worlds, arms, ENGINES[name], options.part)
         for name in options.engines or here

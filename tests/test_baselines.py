@@ -10,8 +10,8 @@ from rps_jax.control import aps
 from rps_jax.control.aps import APSParams, APSState, TrackedObservation
 from rps_jax.control.law import Observation
 from rps_jax.trials import pushes
-from rps_jax.trials.batch import Setting
 from rps_jax.trials.pushes import Case
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world.scene import FRICTION
 

@@ -9,14 +9,15 @@ import numpy as np
 
 from rps_jax.control.law import Twist
 from rps_jax.engines import mjx_colliders
+from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.engines.quasistatic import Quasistatic
 from rps_jax.studies import ablation, benchmark
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.batch import Setting
 from rps_jax.trials.pushes import Case
+from rps_jax.trials.setting import Setting
 from rps_jax.world import scene
 from rps_jax.world.physics import preset
-from rps_jax.world.scene import FRICTION, mjx
+from rps_jax.world.scene import FRICTION
 
 
 def test_a_program_is_timed_and_compared_with_c_in_the_closed_loop():
@@ -65,10 +66,10 @@ def test_an_engine_has_the_levers_that_it_knows():
 
 def test_without_physics_the_base_goes_and_the_object_stays():
     _, worlds = pushes.build([Case("box", FRICTION["S1"], (2.0, 0.0), gap=0)], Setting())
-    start = trial.start_all(worlds, np.ones(1, bool))
+    start = trial.motion(trial.start_all(worlds, np.ones(1, bool)))
     twists = Twist(*(np.full(1, x) for x in (0.05, 0.0, 0.0)))
-    driven = ablation.Unmoved().drive(worlds, start, twists, preset())
-    moved = np.asarray(driven.qpos - start.qpos)[0]
+    driven = ablation.Unmoved().drive(worlds.fields, start, twists, preset())
+    moved = np.asarray(driven.motion.qpos - start.qpos)[0]
     np.testing.assert_allclose(moved, [0.05 * 0.02, *[0] * 9], atol=1e-9)
 
 

@@ -12,7 +12,7 @@ import pytest
 from rps_jax.app import cli
 from rps_jax.control.law import RPSParams
 from rps_jax.errors import InputError
-from rps_jax.trials.batch import Setting, Timing
+from rps_jax.trials.setting import Setting, Timing
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import descent, gradients
 from rps_jax.tuning import evolution as tune

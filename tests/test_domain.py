@@ -11,18 +11,21 @@ import mujoco
 import numpy as np
 import pytest
 
-from rps_jax.engines import base as engines
+from rps_jax import engines
+from rps_jax.engines import mjx as mjx_engine
 from rps_jax.engines.fused import step as fused
+from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.errors import InputError
 from rps_jax.geometry import solid
 from rps_jax.trials import pushes
-from rps_jax.trials.batch import Setting
 from rps_jax.trials.pushes import Case
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.worlds import domain_randomize, drawn_worlds
 from rps_jax.world import domain, paper, scene
 from rps_jax.world.domain import DOMAINS, RANDOM, Domain, Range
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.physics import preset
-from rps_jax.world.scene import FRICTION, mjx
+from rps_jax.world.scene import FRICTION
 
 WIDE = DOMAINS["wide"]
 COUNT = 12
@@ -88,7 +91,7 @@ def test_the_paper_domain_is_the_papers_grid(engine):
     assert chosen.combinations == 144
     for which, name in enumerate(PAPER_OBJECTS):
         index = np.flatnonzero(chosen.object_of(np.arange(144)) == which)
-        part = domain.worlds(chosen, domain.draw(chosen, 0, index), paper.PARAMS["rps"], setting)
+        part = drawn_worlds(chosen, domain.draw(chosen, 0, index), paper.PARAMS["rps"], setting)
         cases = [Case(name, f, t) for f in FRICTION.values() for t in paper.TARGETS]
         _, worlds = pushes.build(cases, setting)
         mine, theirs = (w._replace(key=0, odometry=0) for w in (part.worlds, worlds))
@@ -102,9 +105,11 @@ def test_the_paper_domain_is_the_papers_grid(engine):
 @pytest.mark.parametrize("name", ["random_box", "random_cylinder"])
 def test_fused_bodies_equal_those_of_recompiled_models(name):
     worlds, family = drawn(name), RANDOM[name]
-    _, bodies = engines.stage_of_solids(family, worlds.solid, worlds.friction, "fused", preset())
+    _, bodies = engines.get("fused").stage_of_solids(
+        family, worlds.solid, worlds.friction, preset()
+    )
     for i in range(COUNT):
-        one = engines.scene_of_solid(family, worlds.solid, worlds.friction, preset(), i)
+        one = scene.of_solid(family, worlds.solid, worlds.friction, preset(), i)
         compiled = fused.body(one.physics, np.asarray(one.footprint.vertices, float))
         for field, a, b in zip(compiled._fields, bodies, compiled, strict=True):
             np.testing.assert_allclose(a[i], b, rtol=1e-6, atol=1e-7, err_msg=field)
@@ -113,16 +118,16 @@ def test_fused_bodies_equal_those_of_recompiled_models(name):
 @pytest.mark.parametrize("name", list(RANDOM))
 def test_applied_domain_equals_the_recompiled_model_in_every_field(name):
     worlds, family = drawn(name), RANDOM[name]
-    _, fields = engines.stage_of_solids(family, worlds.solid, worlds.friction, "mjx", preset())
-    assert set(fields) <= set(scene.FIELDS)
+    _, fields = engines.get("mjx").stage_of_solids(family, worlds.solid, worlds.friction, preset())
+    assert set(fields) <= set(mjx_engine.FIELDS)
     for i in range(COUNT):
-        one = engines.scene_of_solid(family, worlds.solid, worlds.friction, preset(), i)
+        one = scene.of_solid(family, worlds.solid, worlds.friction, preset(), i)
         compiled = mjx.put_model(one.physics)
         # The mesh of a prism stands for it in C MuJoCo alone: MJX reads its corners off its feet.
         real = one.physics.geom_type != mujoco.mjtGeom.mjGEOM_MESH
         leaves = jax.tree_util.tree_flatten_with_path(compiled)[0]
         values = {jax.tree_util.keystr(path): np.asarray(leaf, float) for path, leaf in leaves}
-        for field in scene.FIELDS:
+        for field in mjx_engine.FIELDS:
             mine, theirs = fields[field][i], values[field]
             if field.startswith(".geom"):
                 mine, theirs = mine[real], theirs[real]
@@ -134,11 +139,11 @@ def test_models_of_a_family_differ_in_nothing_but_these_fields():
     for name, family in RANDOM.items():
         worlds = drawn(name, 2)
         models = [
-            engines.scene_of_solid(family, worlds.solid, worlds.friction, preset(), i).physics
+            scene.of_solid(family, worlds.solid, worlds.friction, preset(), i).physics
             for i in range(2)
         ]
         if family != "prism":  # whose meshes differ, and are not read
-            scene.stack(models)
+            mjx_engine.stack(models)
 
 
 @pytest.mark.parametrize("name", list(RANDOM))
@@ -218,14 +223,14 @@ def test_a_load_moves_the_centre_of_mass_by_the_share_that_is_asked_for():
 def test_domain_randomize_gives_models_for_a_loop_of_ones_own():
     for name, family in RANDOM.items():
         worlds = drawn(name, 1)
-        one = engines.scene_of_solid(family, worlds.solid, worlds.friction, preset(), 0)
+        one = scene.of_solid(family, worlds.solid, worlds.friction, preset(), 0)
         model = mjx.put_model(one.physics)
         keys = jax.random.split(jax.random.PRNGKey(0), 5)
-        batched, in_axes = domain.domain_randomize(model, keys)
+        batched, in_axes = domain_randomize(model, keys)
         mass = jax.vmap(lambda m: m.body_mass[-1], in_axes=(in_axes,))(batched)
         assert mass.shape == (5,)
         assert jnp.unique(mass).size == 5
-        again, _ = domain.domain_randomize(model, keys[2:3])
+        again, _ = domain_randomize(model, keys[2:3])
         np.testing.assert_array_equal(again.body_inertia[0], batched.body_inertia[2])
         assert in_axes.opt.timestep is None
         assert in_axes.pair_friction == 0

@@ -12,8 +12,8 @@ from rps_jax.control.strategies import Strategy
 from rps_jax.errors import InputError
 from rps_jax.robot import skin
 from rps_jax.trials import env, trial
-from rps_jax.trials.batch import Setting
 from rps_jax.trials.env import PushEnv, Reward
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import domain
 from rps_jax.world.domain import DOMAINS, Range
@@ -212,9 +212,9 @@ def test_a_batch_is_driven_as_one_and_not_world_by_world():
     sizes = []
 
     class Stage:
-        def drive(self, worlds, trials, twists, physics):
-            sizes.append(jnp.shape(worlds)[0])
-            return worlds + 0 * twists, trials, twists
+        def drive(self, fields, motion, twists, physics):
+            sizes.append(jnp.shape(fields)[0])
+            return fields + 0 * twists, motion, twists
 
     drive = env._one_of_many(Stage(), Setting())  # type: ignore[arg-type]
     batch = jnp.arange(5.0)
@@ -242,7 +242,7 @@ def test_states_are_drawn_each_in_its_own_world(pushing):
     [
         ({"object": "ball"}, "unknown domain object 'ball'"),
         ({"worlds": 0}, "worlds = 0"),
-        ({"setting": Setting(engine="mujoco")}, "unknown engine 'mujoco': choose from mjx, fused"),
+        ({"setting": Setting(engine="mujoco")}, "engine = mujoco is not allowed"),
         ({"domain": DOMAINS["paper"]}, "skin of an environment 'ideal': choose from capacitive"),
         ({"params": RPSParams(v_max=-1.0)}, "v_max = -1.0"),
         ({"weights": Reward(success=float("nan"))}, "success = nan"),

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rps_jax import engines
 from rps_jax.analysis import figures
 from rps_jax.app import cli
 from rps_jax.control import strategies
 from rps_jax.control.law import Details, Observation, RPSParams, RPSState, step
 from rps_jax.control.strategies import Strategy
-from rps_jax.engines import base as engines
 from rps_jax.errors import InputError
 from rps_jax.geometry.footprint import Footprint, circle, polygon, rectangle
 from rps_jax.record import folder as record
@@ -22,8 +22,9 @@ from rps_jax.robot.skin import POINT, CapacitiveSkin
 from rps_jax.runs import sweep
 from rps_jax.runs.sweep import Plan
 from rps_jax.trials import pushes
-from rps_jax.trials.batch import Setting
 from rps_jax.trials.pushes import Case
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import domain, objects, scene
 from rps_jax.world.domain import Domain, Range
 from rps_jax.world.scene import FRICTION, Friction
@@ -92,8 +93,8 @@ def test_every_engine_has_the_same_hexagon(hexagon):
     solids, friction = scene.solid_of(hexagon), Friction(np.array([0.3]), np.array([0.35]))
     physics = Setting().physics
     for engine in ("fused", "mjx"):
-        _, alone = engines.stage_of_scenes([hexagon], engine)
-        _, drawn = engines.stage_of_solids("prism", solids, friction, engine, physics)
+        _, alone = engines.get(engine).stage_of_scenes([hexagon], np.zeros(1, int))
+        _, drawn = engines.get(engine).stage_of_solids("prism", solids, friction, physics)
         if engine == "mjx":
             assert set(alone) == set(drawn)
         for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(drawn), strict=True):
@@ -117,7 +118,7 @@ def test_an_object_of_ones_own_may_be_of_a_domain_and_has_its_looks_in_a_replay(
     own = Domain(objects=("hexagon",), friction_robot=Range(0.4, 0.5))
     drawn = domain.draw(own, 0, np.arange(5))
     assert (drawn.solid.mass == 12.0).all()
-    part = domain.worlds(own, drawn, RPSParams.paper(), Setting(engine="fused"))
+    part = drawn_worlds(own, drawn, RPSParams.paper(), Setting(engine="fused"))
     assert part.worlds.footprint.vertices.shape == (5, 8, 2)
     plan = Plan(own, 5, {"rps": RPSParams.paper()})
     assert sweep.scene_of(plan, 3).model.ngeom == hexagon.model.ngeom

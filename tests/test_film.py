@@ -13,7 +13,7 @@ from rps_jax.errors import InputError
 from rps_jax.record import folder as record
 from rps_jax.runs import sweep
 from rps_jax.runs.sweep import Plan
-from rps_jax.trials.batch import Setting
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import paper
 from rps_jax.world.domain import DOMAINS

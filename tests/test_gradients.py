@@ -12,14 +12,13 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from rps_jax import errors
+from rps_jax import engines, errors
 from rps_jax.control import strategies
 from rps_jax.control.law import RPSParams
 from rps_jax.robot.skin import SmoothSkin
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.batch import Setting
 from rps_jax.trials.pushes import Case
-from rps_jax.trials.trial import Stage
+from rps_jax.trials.setting import Setting
 from rps_jax.tuning import gradients
 from rps_jax.tuning.gradients import Estimate
 from rps_jax.world.physics import Physics
@@ -234,9 +233,10 @@ def final_distance(seen):
 
 
 def test_mjx_must_have_a_pyramidal_cone():
-    stage: Stage = Stage(None, None)  # type: ignore[arg-type]
     with pytest.raises(errors.InputError, match="cone = elliptic"):
-        gradients.window(stage, params_of, final_distance, physics=Physics(), steps=10)
+        engines.get("mjx").check_derivatives("forward", Physics())
+    with pytest.raises(errors.InputError, match="reverse-mode"):
+        engines.get("mjx").check_derivatives("reverse", Physics(cone="pyramidal"))
 
 
 @pytest.mark.slow

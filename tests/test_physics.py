@@ -17,17 +17,19 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
+from rps_jax import engines
 from rps_jax.control.law import RPSParams
-from rps_jax.engines import base as engines
+from rps_jax.engines.base import Motion
+from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.engines.mujoco import Batch
 from rps_jax.geometry import planar
-from rps_jax.trials import pushes, trial
-from rps_jax.trials.batch import Setting
+from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules, Twist
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics, preset
-from rps_jax.world.scene import FRICTION, OBJECTS, Friction, mjx
+from rps_jax.world.scene import FRICTION, OBJECTS, Friction
 
 G = 9.81  # [m/s^2]
 MASS = {"box": 20.0, "cylinder": 25.0}  # [kg]
@@ -103,21 +105,18 @@ def in_c(worlds, physics=REFERENCE, seconds=SECONDS):
     return [Film(*both, physics) for both in zip(qpos, qvel, strict=True)]
 
 
-def blank(kind, **given):
-    return kind(**(dict.fromkeys(kind._fields) | given))
-
-
 def in_jax(worlds, physics=STANDARD, engine="mjx", seconds=SECONDS):
     scenes, *start, twist = starts(worlds, physics)
-    stage, fields = engines.stage_of_scenes(scenes, engine)
+    stage, fields = engines.get(engine).stage_of_scenes(scenes, np.arange(len(scenes)))
     qpos, qvel, twist = (jnp.asarray(x, float) for x in (*start, twist))
-    batch = blank(trial.World, fields=jax.tree.map(jnp.asarray, fields))
+    fields = jax.tree.map(jnp.asarray, fields)
 
     @jax.jit
     def run(*state):
+        state = Motion(*state)
+
         def body(state, _):
-            now = blank(trial.Trial, qpos=state[0], qvel=state[1], warmstart=state[2])
-            return stage.drive(batch, now, Twist(*twist.T), physics)[:3], state[:2]
+            return stage.drive(fields, state, Twist(*twist.T), physics).motion, state[:2]
 
         return jax.lax.scan(body, state, length=round(seconds / physics.control_period) + 1)[1]
 

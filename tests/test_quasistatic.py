@@ -16,17 +16,18 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
+from rps_jax import engines
 from rps_jax.control.law import RPSParams
-from rps_jax.engines import base as engines
-from rps_jax.engines.quasistatic import Contact, Problem, Quasistatic, Slider, _divide, rollout
+from rps_jax.engines.base import Motion
+from rps_jax.engines.quasistatic import Contact, Problem, Quasistatic, Slider, _divide
 from rps_jax.errors import InputError
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import Solid
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.batch import Setting
 from rps_jax.trials.pushes import Case
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Twist
 from rps_jax.world import objects, paper, scene
 from rps_jax.world.physics import Physics, preset
@@ -74,19 +75,15 @@ class Film(NamedTuple):
 
 
 @partial(jax.jit, static_argnames=("stage", "physics"))
-def drive(stage, worlds, start, twists, physics):
+def drive(stage, fields, start, twists, physics):
     """Positions (T + 1, B, 10) of worlds that start at (B, 10), driven by twists (T, B, 3)."""
 
     def step(qpos, twist):
-        now = blank(trial.Trial, qpos=qpos)
-        after, *_ = stage.drive(worlds, now, Twist(*twist.T), physics)
-        return after, after
+        still = jnp.zeros_like(qpos[:, :9])
+        driven = stage.drive(fields, Motion(qpos, still, still), Twist(*twist.T), physics)
+        return driven.motion.qpos, driven.motion.qpos
 
     return jnp.concatenate([start[None], jax.lax.scan(step, start, twists)[1]])
-
-
-def blank(kind, **given):
-    return kind(**(dict.fromkeys(kind._fields) | given))
 
 
 def film(pushes):
@@ -94,9 +91,8 @@ def film(pushes):
     with jax.enable_x64(True):
         rows = lambda name: np.array([getattr(p, name) for p in pushes], float)  # noqa: E731
         base = np.tile([FRONT, SIDE], (len(pushes), 1))
-        slider = Slider(rows("com"), rows("arm"), rows("friction"), base)
         outline = jax.tree.map(lambda *x: np.array(x, float), *[p.outline for p in pushes])
-        worlds = blank(trial.World, fields=slider, footprint=outline)
+        fields = Slider(rows("com"), rows("arm"), rows("friction"), base, *outline)
         pose, half = rows("pose"), rows("pose")[:, 2] / 2
         nil = np.zeros(len(pushes))
         quaternion = np.stack([np.cos(half), nil, nil, np.sin(half)], axis=1)
@@ -105,8 +101,8 @@ def film(pushes):
         going = np.arange(STEPS)[:, None] * scale < STEPS
         twists = (going * scale)[..., None] * rows("twist")
         physics = Physics(timestep=PERIOD, control_period=PERIOD)
-        worlds, start = jax.tree.map(lambda x: jnp.asarray(x, float), (worlds, start))
-        qpos = np.asarray(drive(Quasistatic(), worlds, start, jnp.asarray(twists), physics))
+        fields, start = jax.tree.map(lambda x: jnp.asarray(x, float), (fields, start))
+        qpos = np.asarray(drive(Quasistatic(), fields, start, jnp.asarray(twists), physics))
     yaw = np.unwrap(2 * np.arctan2(qpos[..., 9], qpos[..., 6]), axis=0)
     thing = np.concatenate([qpos[..., 3:5], yaw[..., None]], axis=-1)
     return [Film(qpos[:, i, :3], thing[:, i]) for i in range(len(pushes))]
@@ -440,9 +436,10 @@ def test_derivatives_of_a_push_are_those_of_finite_differences():
     """Of where a cylinder, pushed in curves, ends: by what it is, where it starts and the push."""
     time = np.arange(50)[:, None] * PERIOD
     waves = 0.05 + 0.01 * np.sin(2 * time), 0.02 * np.cos(3 * time), 0.1 * np.sin(4 * time)
-    object_ = Slider(*(np.array(x) for x in ((0.01, 0.02), 0.2, 0.3, (FRONT, SIDE))))
+    parts = (0.01, 0.02), 0.2, 0.3, (FRONT, SIDE), np.zeros((1, 2)), RADIUS
+    object_ = Slider(*map(np.array, parts))
     pose = np.array([0, 0, 0, FRONT + RADIUS, 0, 0.2, 1, 0, 0, 0])
-    given = (object_, np.array(RADIUS)), pose, np.concatenate(waves, axis=1)
+    given = object_, pose, np.concatenate(waves, axis=1)
     with jax.enable_x64(True):
         moved, ways = moved_both_ways(given, 0)
         physics = Physics(timestep=PERIOD, control_period=PERIOD)
@@ -450,10 +447,8 @@ def test_derivatives_of_a_push_are_those_of_finite_differences():
         @jax.jit
         @partial(jax.value_and_grad, has_aux=True)
         def end(given):
-            (slider, radius), start, twists = given
-            outline = Footprint(jnp.zeros((7, 1, 2)), radius)
-            worlds = blank(trial.World, fields=slider, footprint=outline)
-            qpos = drive(Quasistatic(), worlds, start, twists.swapaxes(0, 1), physics)[-1]
+            slider, start, twists = given
+            qpos = drive(Quasistatic(), slider, start, twists.swapaxes(0, 1), physics)[-1]
             where = qpos[:, 3] + 2 * qpos[:, 4] + 3 * qpos[:, 9]
             return where[0], where
 
@@ -484,30 +479,24 @@ def closed_loop():
         @jax.jit
         @partial(jax.value_and_grad, has_aux=True)
         def run(params):
-            seen = rollout(stage, worlds._replace(params=params), physics=preset(), steps=150)
-            return jnp.sum(seen.mean_distance), seen
+            pushed = worlds._replace(params=params)
+            start = trial.start_all(pushed, jnp.ones(len(nudges), bool))
+            one = partial(trial.control_step, stage, pushed, physics=preset())
+            _, seen = jax.lax.scan(lambda trials, _: one(trials), start, length=150)
+            distance = jnp.mean(seen.details.distance, axis=0)
+            return jnp.sum(distance), distance
 
-        (_, seen), gradient = run(worlds.params)
-        return jax.device_get(seen), jax.device_get(gradient)
+        (_, distance), gradient = run(worlds.params)
+        return jax.device_get(distance), jax.device_get(gradient)
 
 
 @pytest.mark.parametrize("name", TUNED)
 def test_derivatives_of_the_closed_loop_are_those_of_finite_differences(name):
-    seen, gradient = closed_loop()
+    distance, gradient = closed_loop()
     i = 1 + 2 * TUNED.index(name)
     step = 2e-5 * getattr(RPSParams(), name)
-    slope = (seen.mean_distance[i] - seen.mean_distance[i + 1]) / step
+    slope = (distance[i] - distance[i + 1]) / step
     assert getattr(gradient, name)[0] == pytest.approx(slope, rel=1e-3, abs=1e-9)
-
-
-def test_a_rollout_tells_how_near_and_how_long():
-    seen, _ = closed_loop()
-    distance = seen.snapshots.details.distance
-    np.testing.assert_allclose(seen.mean_distance, distance.mean(axis=0))
-    np.testing.assert_allclose(seen.end_distance, distance[-1])
-    np.testing.assert_allclose(seen.min_distance, distance.min(axis=0))
-    touch = seen.snapshots.reading.contact_type != 0
-    np.testing.assert_allclose(seen.lost_time, 0.02 * (~touch).sum(axis=0))
 
 
 # --- the stage ------------------------------------------------------------------------------
@@ -539,7 +528,7 @@ def test_feet_bear_what_holds_the_centre_of_mass_and_none_pulls():
 @pytest.mark.parametrize("name", OBJECTS)
 def test_every_scene_has_a_slider(name):
     loaded = scene.load(name, friction=scene.Friction(0.3, 0.4), half_length=0.3)
-    stage, slider = engines.stage_of_scenes([loaded], "quasistatic")
+    stage, slider = engines.get("quasistatic").stage_of_scenes([loaded], np.zeros(1, int))
     assert isinstance(stage, Quasistatic)
     np.testing.assert_allclose(slider.friction_robot, [0.4])
     np.testing.assert_allclose(slider.base_half, [[0.3, SIDE]])

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from rps_jax import errors
+from rps_jax.engines import mjx as mjx_engine
+from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.robot import skin
 from rps_jax.world import scene
 from rps_jax.world.objects import FAMILIES, OBJECTS
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import FRICTION, JOINTS, mjx
+from rps_jax.world.scene import FRICTION, JOINTS
 
 STEP = 0.01  # [s]
 TWIST = np.array([0.05, 0.01, 0.1])  # base x, y [m/s], yaw [rad/s] in the world
@@ -38,7 +40,7 @@ def step_c(loaded, qpos, steps):
 @jax.jit
 def step_mjx(model, data, fields, qpos, steps):
     def one_world(fields, qpos):
-        world = scene.apply(model, fields)
+        world = mjx_engine.apply(model, fields)
 
         def body(_, data):
             data = data.replace(qvel=data.qvel.at[JOINTS.base].set(jnp.asarray(TWIST, jnp.float32)))
@@ -62,7 +64,7 @@ FAMILY_OBJECTS = [
 )
 def test_mjx_agrees_with_c_mujoco_at_one_step_and_over_0_4_seconds(names):
     scenes = [load(name, friction=f) for name in names for f in FRICTION.values()]
-    model, fields = scene.stack([s.physics for s in scenes])
+    model, fields = mjx_engine.stack([s.physics for s in scenes])
     data = mjx.make_data(scenes[0].physics)
     # Where capsule and face are exactly parallel, MJX reports both ends of the line of contact
     # and C MuJoCo one: the first step of a cylinder is compared before it touches.
@@ -163,11 +165,11 @@ def test_a_stack_holds_every_field_of_each_recompiled_model():
             ("hardware_box", FRICTION["S2"], 7.0),
         )
     ]
-    model, fields = scene.stack([s.physics for s in scenes])
-    assert set(fields) == set(scene.FIELDS)
+    model, fields = mjx_engine.stack([s.physics for s in scenes])
+    assert set(fields) == set(mjx_engine.FIELDS)
     for i, loaded in enumerate(scenes):
-        applied = scene.apply(model, {name: values[i] for name, values in fields.items()})
-        alone, _ = scene.stack([loaded.physics])  # recompiled by itself
+        applied = mjx_engine.apply(model, {name: values[i] for name, values in fields.items()})
+        alone, _ = mjx_engine.stack([loaded.physics])  # recompiled by itself
         jax.tree.map(np.testing.assert_array_equal, applied, alone)
 
 

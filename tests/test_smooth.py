@@ -14,16 +14,15 @@ import pytest
 from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 
-from rps_jax import errors
+from rps_jax import engines, errors
 from rps_jax.control import law, strategies
 from rps_jax.control.law import Observation, RPSParams, RPSState, Temperatures
-from rps_jax.engines import mujoco as c_mujoco
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.skin import HALF_LENGTH, HALF_WIDTH, NONE, CapacitiveSkin, IdealSkin, SmoothSkin
-from rps_jax.trials import pushes
-from rps_jax.trials.batch import Setting
+from rps_jax.trials import host, pushes
 from rps_jax.trials.pushes import Case
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world.scene import FRICTION
 
@@ -559,7 +558,7 @@ def push(case: Case, strategy, horizon: float):
         return True
 
     options = {"physics": setting.physics, "rules": setting.rules, "threads": 1}
-    c_mujoco.run(models, worlds, strategy=strategy, report=report, **options)
+    host.run(engines.get("mujoco"), models, worlds, strategy=strategy, report=report, **options)
     return jax.tree.map(lambda x: np.asarray(x)[0], seen[-1])
 
 

@@ -15,8 +15,8 @@ from rps_jax.robot.skin import IdealSkin
 from rps_jax.studies import ambiguity, fidelity, hardware, study
 from rps_jax.studies.study import Condition, Grid
 from rps_jax.trials import pushes
-from rps_jax.trials.batch import Setting
 from rps_jax.trials.pushes import Case
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules, Shift
 from rps_jax.world import paper, scene
 from rps_jax.world.objects import PAPER_OBJECTS
@@ -124,7 +124,7 @@ def test_the_hardware_experiments_cover_friction_targets_and_shoves():
     base = Case("hardware_box", hardware.MIDDLE, (2.1, 0.0), skin=hardware.SKIN)
     setting = Setting(engine="mujoco", rules=Rules(horizon=3.0))
     results = hardware.run(base, setting)
-    assert results.sizes["friction"] == len(hardware.GROUND) * len(hardware.ROBOT)
+    assert results.sizes["friction"] == len(paper.HARDWARE_GROUND) * len(paper.HARDWARE_ROBOT)
     assert results.sizes["target"] == 8
     assert (results.mean_abs_l < 0.29).any()  # it was touched
     rows = hardware.table(results)
@@ -137,9 +137,9 @@ def test_the_hardware_experiments_cover_friction_targets_and_shoves():
 
 
 def test_the_hardware_targets_are_2_1_m_from_the_start():
-    distance = np.linalg.norm(hardware.LAYOUTS["circle"], axis=1)
+    distance = np.linalg.norm(paper.HARDWARE_LAYOUTS["circle"], axis=1)
     np.testing.assert_allclose(distance, 2.1)
-    assert len(set(hardware.LAYOUTS["grid"])) == 8
+    assert len(set(paper.HARDWARE_LAYOUTS["grid"])) == 8
 
 
 def test_every_condition_is_a_study_that_could_run():

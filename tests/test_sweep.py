@@ -31,8 +31,10 @@ from rps_jax.record import folder as record
 from rps_jax.runs import sweep
 from rps_jax.runs.sweep import Plan, Shard
 from rps_jax.trials import batch, trial
-from rps_jax.trials.batch import Job, Setting
+from rps_jax.trials.batch import Job
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome, Rules
+from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import domain, paper
 from rps_jax.world.domain import DOMAINS, Range
 from rps_jax.world.physics import preset
@@ -73,7 +75,7 @@ def outcomes(parts, setting=SHORT):
 
 
 def made(index):
-    return domain.worlds(BOXES, domain.draw(BOXES, 0, index), paper.PARAMS["rps"], SHORT)
+    return drawn_worlds(BOXES, domain.draw(BOXES, 0, index), paper.PARAMS["rps"], SHORT)
 
 
 def swept(folder, plan=PLAN, **options):
@@ -110,7 +112,7 @@ def test_late_poses_and_late_commands_are_late_by_as_much(error):
     steps, period = 3, SHORT.physics.control_period
     still = replace(BOXES, **{name: Range(0, 0) for name in domain.OF_THE_BASE})
     late = replace(still, **{error: Range(steps * period, steps * period)})
-    part = domain.worlds(late, domain.draw(late, 0, [0]), paper.PARAMS["rps"], SHORT)
+    part = drawn_worlds(late, domain.draw(late, 0, [0]), paper.PARAMS["rps"], SHORT)
     world = jax.tree.map(lambda leaf: leaf[0], part.worlds)
     now = jax.tree.map(jnp.asarray, trial.start(world))
     told, done = [], []
@@ -135,7 +137,7 @@ def test_a_base_that_errs_by_nothing_is_perfect():
     perfect = replace(ROUND, **nothing)
     assert made(np.arange(2)).worlds.odometry.past.shape[1] > 1
     drawn = domain.draw(perfect, 0, np.arange(6))
-    part = domain.worlds(perfect, drawn, paper.PARAMS["rps"], SHORT)
+    part = drawn_worlds(perfect, drawn, paper.PARAMS["rps"], SHORT)
     assert part.worlds.odometry.past.shape == (6, 0)
     remembered = part.worlds._replace(
         odometry=part.worlds.odometry._replace(past=np.zeros((6, 4), np.float32))
@@ -151,7 +153,7 @@ def test_flat_boxes_that_nothing_touches_stay_where_they_are():
     """Even in the long steps of `fast`, in which stiffer ground would shake them away."""
     flat = replace(BOXES, size=Range(0.25, 0.35), height=Range(0.3, 0.4), gap=Range(0.05, 0.05))
     still = RPSParams.paper()._replace(v_approach=0.0)
-    part = domain.worlds(flat, domain.draw(flat, 0, np.arange(SLOTS)), still, SHORT)
+    part = drawn_worlds(flat, domain.draw(flat, 0, np.arange(SLOTS)), still, SHORT)
     found = outcomes([part])
     pose = np.array([found[i][Outcome._fields.index("object_pose")] for i in range(SLOTS)])
     assert np.abs(pose[:, :2] - part.worlds.qpos[:, 3:5]).max() < 2e-3  # in 20 s
@@ -164,7 +166,7 @@ def test_a_faster_base_arrives_earlier():
     times = []
     for error in (-0.5, 0.0):
         chosen = replace(quick, velocity_error=Range(error, error))
-        part = domain.worlds(chosen, domain.draw(chosen, 0, [1]), paper.PARAMS["rps"], SHORT)
+        part = drawn_worlds(chosen, domain.draw(chosen, 0, [1]), paper.PARAMS["rps"], SHORT)
         times.append(outcomes([part])[1][-2][0])  # x of the base at the end
     assert times[0] < 0.7 * times[1]
 

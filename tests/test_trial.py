@@ -11,10 +11,11 @@ import pytest
 
 from rps_jax import errors
 from rps_jax.control.law import RPSParams
+from rps_jax.engines.base import Driven
 from rps_jax.robot.skin import CapacitiveSkin, IdealSkin
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.batch import Setting
 from rps_jax.trials.pushes import Case
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules, Shift
 from rps_jax.world.physics import preset
 from rps_jax.world.scene import FRICTION
@@ -83,7 +84,7 @@ def test_a_base_may_turn_as_often_as_it_likes_and_not_go_as_far():
     _, worlds = pushes.build([case()], FUSED)
     now = trial.start(jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], worlds))
     for i, value, diverges in ((2, 500.0, False), (2, np.nan, True), (0, 101.0, True)):
-        driven = trial.Driven(now.qpos.at[i].set(value), now.qvel, now.warmstart)
+        driven = Driven(trial.motion(now)._replace(qpos=now.qpos.at[i].set(value)))
         assert bool(trial.settle(now, now, driven).diverged) == diverges
 
 

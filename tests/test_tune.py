@@ -13,7 +13,7 @@ from rps_jax.app import cli
 from rps_jax.control import law
 from rps_jax.control.law import RPSParams
 from rps_jax.errors import InputError
-from rps_jax.trials.batch import Setting, Timing
+from rps_jax.trials.setting import Setting, Timing
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import evolution as tune
 from rps_jax.tuning.evolution import (

@@ -18,8 +18,8 @@ from selenium.webdriver.common.by import By
 from rps_jax.app import cli, viewer
 from rps_jax.errors import InputError
 from rps_jax.trials import pushes
-from rps_jax.trials.batch import Setting
 from rps_jax.trials.pushes import Case
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.stepper import Live
 from rps_jax.trials.trial import Rules
 from rps_jax.world import scene

@@ -2,12 +2,12 @@
 
 import pytest
 
+from rps_jax import engines
 from rps_jax.app import cli
-from rps_jax.engines import base as engines
 from rps_jax.engines import warp
+from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.errors import InputError
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import mjx
 
 WANTED = [
     ("table",),
@@ -47,4 +47,4 @@ def test_prisms_are_refused(capsys, monkeypatch, tmp_path):
     assert cli.main(run) == 2
     assert "not allowed for prisms" in capsys.readouterr().err
     with pytest.raises(InputError, match="not allowed for prisms"):
-        engines.stage_of_solids("prism", *[None] * 2, "warp", Physics())
+        engines.get("warp").stage_of_solids("prism", *[None] * 2, Physics())

@@ -16,17 +16,20 @@ import numpy as np
 import pytest
 from test_fused import FINE, STARTS, TWIST, in_c, start
 
+from rps_jax import engines
 from rps_jax.control.law import RPSParams, Twist
-from rps_jax.engines import base as engines
 from rps_jax.engines import warp
+from rps_jax.engines.base import Driven, Motion
+from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.trials import pushes
-from rps_jax.trials.batch import Setting
-from rps_jax.trials.trial import Driven, Rules, Trial, World
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import domain, scene
 from rps_jax.world.domain import DOMAINS
 from rps_jax.world.objects import FAMILIES
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import FRICTION, mjx
+from rps_jax.world.scene import FRICTION
 
 SHORT = Setting(FINE, Rules(horizon=0.1), engine="warp")
 
@@ -44,31 +47,25 @@ def plain_kernels():
 @pytest.fixture
 def allowed(monkeypatch):
     """As if there were a GPU."""
-    monkeypatch.setattr(warp, "check", lambda families: None)
+    monkeypatch.setattr(warp.Warp, "check", lambda self, families=(): None)
 
 
 def drive(stage, fields, qpos, steps=1):
     """Worlds `Driven` for some steps from rest at qpos (n, 10)."""
     still = jnp.zeros((len(qpos), 9))
-    state = Driven(jnp.asarray(qpos), still, still, jnp.zeros(len(qpos), bool))
+    state = Driven(Motion(jnp.asarray(qpos), still, still), jnp.zeros(len(qpos), bool))
     return _drive(stage, jax.tree.map(jnp.asarray, fields), state, steps)
 
 
 @jax.jit
 def _drive(stage, fields, state, steps):
-    twists = Twist(*(jnp.full(len(state.qpos), v) for v in TWIST))
-    worlds = blank(World, fields=fields)
+    twists = Twist(*(jnp.full(len(state.motion.qpos), v) for v in TWIST))
 
     def one(_, now):
-        trials = blank(Trial, qpos=now.qpos, qvel=now.qvel, warmstart=now.warmstart)
-        driven = stage.drive(worlds, trials, twists, FINE)
+        driven = stage.drive(fields, now.motion, twists, FINE)
         return driven._replace(overflowed=driven.overflowed | now.overflowed)
 
     return jax.lax.fori_loop(0, steps, one, state)
-
-
-def blank(kind, **given):
-    return kind(**(dict.fromkeys(kind._fields) | given))
 
 
 @functools.cache
@@ -76,7 +73,9 @@ def pushed(family, cone, steps):
     """Worlds of a family after some steps: in Warp, as one batch, and in C."""
     physics = replace(FINE, cone=cone)
     begun = [start(*s, physics) for s in STARTS if FAMILIES[s[0]] == family]
-    stage, fields = engines.stage_of_scenes([loaded for loaded, *_ in begun], "warp")
+    stage, fields = engines.get("warp").stage_of_scenes(
+        [loaded for loaded, *_ in begun], np.arange(len(begun))
+    )
     qpos = np.array([qpos for *_, qpos in begun])
     found = drive(stage, fields, qpos, steps)
     models = [warp.own_cylinder(loaded.physics) for loaded, *_ in begun]
@@ -152,15 +151,15 @@ def test_random_worlds_are_stepped_in_a_batch_as_each_is_alone(name, allowed):
     count = sum(FAMILIES[s[0]] == family for s in STARTS)  # as in `pushed`: compiled once
     chosen = replace(DOMAINS["wide"], objects=(name,), gap=domain.Range(0, 0))
     drawn = domain.draw(chosen, 3, range(count))
-    part = domain.worlds(chosen, drawn, RPSParams.paper(), SHORT)
+    part = drawn_worlds(chosen, drawn, RPSParams.paper(), SHORT)
     qpos = np.array(part.worlds.qpos)
     qpos[:, 3] -= 5e-4  # sunk, so that they touch
     qpos[:, 5] -= 5e-4
     found, *_ = drive(part.stage, part.worlds.fields, qpos)
     assert np.unique(np.abs(found - qpos).sum(axis=1)).size == count
     for i in range(count):
-        one = engines.scene_of_solid(family, drawn.solid, drawn.friction, FINE, i)
-        stage, fields = engines.stage_of_scenes([one] * count, "warp")
+        one = scene.of_solid(family, drawn.solid, drawn.friction, FINE, i)
+        stage, fields = engines.get("warp").stage_of_scenes([one], np.zeros(count, int))
         alone, *_ = drive(stage, fields, qpos[[i] * count])
         np.testing.assert_allclose(alone, jnp.tile(found[i], (count, 1)), atol=1e-6)
 
@@ -168,7 +167,7 @@ def test_random_worlds_are_stepped_in_a_batch_as_each_is_alone(name, allowed):
 def test_double_precision_is_given_back_as_double(allowed):
     with jax.enable_x64(True):
         loaded, _, qpos = start("box", 0.0, 0.0)
-        stage, fields = engines.stage_of_scenes([loaded], "warp")
+        stage, fields = engines.get("warp").stage_of_scenes([loaded], np.zeros(1, int))
         found = drive(stage, fields, qpos[None].astype(float))
         assert {str(x.dtype) for x in found} == {"float64", "bool"}
         np.testing.assert_allclose(found.qpos[0], in_c(loaded.physics, qpos, 1)[0], atol=1e-6)

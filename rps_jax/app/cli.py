@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from rps_jax import errors
+from rps_jax import engines, errors
 from rps_jax.errors import InputError
 
 if TYPE_CHECKING:
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from rps_jax.control.law import RPSParams
     from rps_jax.control.strategies import Params
     from rps_jax.runs.sweep import Plan, Shard
-    from rps_jax.trials.batch import Progress, Setting, Timing
     from rps_jax.trials.pushes import Case, Trace
+    from rps_jax.trials.setting import Progress, Setting, Timing
     from rps_jax.tuning.evolution import Course, Space
     from rps_jax.world.domain import Domain
     from rps_jax.world.scene import Friction, Scene
@@ -619,12 +619,11 @@ def _friction(text: str) -> Friction:
 
 
 def _setting(common: Conditions) -> Setting:
-    from rps_jax.engines import base as engines
-    from rps_jax.trials.batch import Setting
+    from rps_jax.trials.setting import Setting
     from rps_jax.trials.trial import Rules
     from rps_jax.world.physics import preset
 
-    engines.check(common.engine)
+    engines.get(common.engine).check()
     steps = {"timestep": common.timestep, "control_period": common.control_period}
     physics = dataclasses.replace(
         preset(common.physics, common.fidelity),
@@ -786,7 +785,7 @@ def _push(options: Push) -> None:
     setting = _setting(options)
     params = _params(options, [options.strategy])
     case = _case(options, options.object, options.friction, options.strategy, options.target)
-    pushes.check_followed(options.engine)
+    engines.get(options.engine).check_followed()
     errors.check_finite("film_length", options.film_length, above=0, at_most=600, unit="s")
     out = _open(options, "push")
     _write_config(out, options, setting, params)
@@ -857,14 +856,17 @@ def _hardware(options: Hardware) -> None:
     from rps_jax.record import folder as record
     from rps_jax.studies import hardware, reproduce
     from rps_jax.trials import pushes
+    from rps_jax.world import paper
 
     setting = _setting(options)
     params = _params(options, ["rps"])
-    layout = hardware.LAYOUTS[errors.check_name("layout", options.layout, hardware.LAYOUTS)]
+    layout = paper.HARDWARE_LAYOUTS[
+        errors.check_name("layout", options.layout, paper.HARDWARE_LAYOUTS)
+    ]
     case = pushes.Case(
-        hardware.OBJECTS[0], hardware.MIDDLE, layout[0], params["rps"], **_per_world(options)
+        paper.HARDWARE_OBJECTS[0], hardware.MIDDLE, layout[0], params["rps"], **_per_world(options)
     )
-    pushes.check_followed(options.engine)  # by Fig. 7
+    engines.get(options.engine).check_followed()  # by Fig. 7
     if options.mass is not None:
         raise InputError(
             f"mass = {options.mass:g} is not allowed: each object of the hardware has the paper's."
@@ -873,10 +875,14 @@ def _hardware(options: Hardware) -> None:
     out = _open(options, "hardware")
     _write_config(out, options, setting, params)
     given = {"layout": options.layout}
-    with progress_bar(len(hardware.OBJECTS) * len(layout) * len(hardware.frictions())) as report:
+    with progress_bar(
+        len(paper.HARDWARE_OBJECTS) * len(layout) * len(hardware.frictions())
+    ) as report:
         results = hardware.run(case, setting, **given, **shape, report=report)
     record.write_results(out / "results.nc", results)
-    with progress_bar(2 * len(hardware.OBJECTS) * len(layout) * len(hardware.SHIFTS)) as report:
+    with progress_bar(
+        2 * len(paper.HARDWARE_OBJECTS) * len(layout) * len(hardware.SHIFTS)
+    ) as report:
         shifted = hardware.disturb(case, setting, **given, **shape, report=report)
     record.write_results(out / "shifted.nc", shifted)
     figures.paths(hardware.paths(case, setting, **given), layout, out / "paths.png")
@@ -1002,7 +1008,7 @@ def params_of(name: str) -> RPSParams:
 
 def _plan(options: Sweep) -> Plan:
     from rps_jax.runs.sweep import Plan
-    from rps_jax.trials.batch import Setting
+    from rps_jax.trials.setting import Setting
     from rps_jax.trials.trial import Rules
     from rps_jax.world.physics import preset
 
@@ -1059,10 +1065,10 @@ def choose_device(name: str) -> None:
 
 def _check_here(device: str, setting: Setting, domains: Iterable[Domain]) -> None:
     """Choose the device, on which the engine must be able to step worlds of these domains."""
-    from rps_jax.engines import base as engines
 
     choose_device(device)
-    engines.check(setting.engine, [family for one in domains for family in one.families])
+    families = [family for one in domains for family in one.families]
+    engines.get(setting.engine).check(families)
 
 
 def _on_cluster(address: str, options: Sweep) -> Callable[..., Timing]:
@@ -1148,7 +1154,7 @@ def _tune_compare(options: TuneCompare) -> None:
     from rps_jax.record import folder as record
     from rps_jax.runs import sweep
     from rps_jax.runs.sweep import Plan
-    from rps_jax.trials.batch import Setting
+    from rps_jax.trials.setting import Setting
     from rps_jax.tuning import evolution as tune
     from rps_jax.world.physics import preset
 
@@ -1292,7 +1298,7 @@ def _tell_tuned(out: Path, names: Sequence[str]) -> None:
 
 
 def _course(options: TuneOptions) -> Course:
-    from rps_jax.trials.batch import Setting
+    from rps_jax.trials.setting import Setting
     from rps_jax.trials.trial import Rules
     from rps_jax.tuning.evolution import Course, Objective
     from rps_jax.world.physics import preset
@@ -1315,7 +1321,6 @@ def _course(options: TuneOptions) -> Course:
 def _one_world(run: Path, index: int, arm: str | None) -> tuple[Plan, str]:
     """The plan of a sweep, one of whose worlds can be followed, and the arm that is meant."""
     from rps_jax.runs import sweep
-    from rps_jax.trials import pushes
 
     plan = sweep.load_plan(run)
     arms = list(plan.arms)
@@ -1324,7 +1329,7 @@ def _one_world(run: Path, index: int, arm: str | None) -> tuple[Plan, str]:
     if plan.setting.engine == "mujoco":
         print("C MuJoCo's trials are not followed: this is the same world in the fused engine.")
         plan = dataclasses.replace(plan, setting=dataclasses.replace(plan.setting, engine="fused"))
-    pushes.check_followed(plan.setting.engine)
+    engines.get(plan.setting.engine).check_followed()
     return plan, name
 
 
@@ -1439,12 +1444,11 @@ def _tuples(value: Any) -> Any:
 
 def _view(options: View) -> None:
     from rps_jax.app import viewer
-    from rps_jax.trials import pushes
 
     asked = viewer.Asked(options.object, options.friction, options.strategy, options.target)
     make = partial(_push_of, options, _setting(options))
     _case(options, *asked)
-    pushes.check_followed(options.engine)
+    engines.get(options.engine).check_followed()
     first = partial(make, asked)
     if options.run is not None:
         plan, name = _one_world(options.run, options.index, options.arm)

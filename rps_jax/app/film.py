@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from rps_jax import errors
+from rps_jax import engines, errors
 from rps_jax.analysis import statistics, video
 from rps_jax.analysis.video import Shot, Tile
 from rps_jax.control import strategies
@@ -25,8 +25,9 @@ from rps_jax.record import folder as record
 from rps_jax.runs import sweep
 from rps_jax.runs.sweep import Plan
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.batch import Part, Setting, rows
+from rps_jax.trials.batch import Part, rows
 from rps_jax.trials.pushes import Case
+from rps_jax.trials.setting import Setting
 from rps_jax.world.scene import Scene
 
 WHICH = ("first", "hardest")
@@ -63,7 +64,7 @@ def shape_of(grid: str) -> tuple[int, int]:
 
 def of_cases(cases: Sequence[Case], setting: Setting) -> list[Take]:
     """The takes of cases of one kind, labelled by their targets."""
-    pushes.check_followed(setting.engine)
+    engines.get(setting.engine).check_followed()
     stage, worlds = pushes.build(cases, setting)
     part = Part(np.arange(len(cases)), worlds, stage)
     one = pushes.scene_of(cases[0], setting.physics)
@@ -86,7 +87,7 @@ def of_sweep(run: Path, plan: Plan, arm: str, which: str, count: int) -> list[Ta
       InputError: an unknown choice, an engine that is not followed, or no results to choose by.
     """
     errors.check_name("which", which, WHICH)
-    pushes.check_followed(plan.setting.engine)
+    engines.get(plan.setting.engine).check_followed()
     index = np.arange(min(count, plan.worlds))
     if which == "hardest":
         index = statistics.hardest(record.read_results(run), count)

@@ -1,1 +1,33 @@
-"""engines."""
+"""How worlds are stepped. Each engine is one object, `ENGINE` of the module of its name.
+
+A new engine is one file beside these and one line below.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Literal, get_args
+
+from rps_jax import errors
+
+if TYPE_CHECKING:
+    from rps_jax.engines.base import Engine
+
+EngineName = Literal[
+    "mjx",
+    "fused",
+    "warp",
+    "mujoco",
+    "quasistatic",
+]
+ENGINES: tuple[EngineName, ...] = get_args(EngineName)
+
+
+def get(name: str) -> Engine:
+    """The engine of a name.
+
+    Raises:
+      InputError: no engine has this name.
+    """
+    errors.check_name("engine", name, ENGINES)
+    return importlib.import_module(f"{__name__}.{name}").ENGINE

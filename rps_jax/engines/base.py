@@ -1,204 +1,174 @@
-"""What each engine steps: scenes as MuJoCo compiled them, or many solids at once.
+"""What an engine is: how it checks, stages and drives worlds, and what it can do.
 
-An engine's stage is what all worlds of a batch share, its fields are what each has of its own,
-rows of a pytree. C MuJoCo shares nothing: its stage is a list of models, its fields are empty.
+An engine's stage is what all worlds of a batch share; its fields are what each world has of its
+own, rows of a pytree. Most engines are traced by JAX: their stage drives a batch inside a compiled
+program. One that is not (`traced = False`) steps worlds on the host, by `stepper`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any, Literal, get_args
+import abc
+import os
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import jax
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.engines import quasistatic, warp
-from rps_jax.engines.fused import step as fused
-from rps_jax.engines.fused.contacts import Body
-from rps_jax.engines.quasistatic import Quasistatic
-from rps_jax.engines.warp import Warp
-from rps_jax.geometry import solid
+from rps_jax.control.law import Twist
 from rps_jax.geometry.solid import Solid
-from rps_jax.trials.trial import Fused, Stage
-from rps_jax.world import scene
+from rps_jax.world.objects import SHAPES
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS, OFF_CENTRE, Friction, Scene, mjx
+from rps_jax.world.scene import Friction, Scene
 
-Engine = Literal["mjx", "fused", "warp", "mujoco", "quasistatic"]
-ENGINES = get_args(Engine)
-
-
-def check(engine: str, families: Iterable[str] = ()) -> None:
-    """Raises InputError unless an engine can step worlds of these families on this machine."""
-    errors.check_name("engine", engine, ENGINES)
-    if engine == "warp":
-        warp.check(families)
+Mode = Literal["forward", "reverse"]  # of differentiation
 
 
-def works(engine: str, families: Iterable[str] = ()) -> bool:
-    """Whether `check` has nothing against it."""
-    try:
-        check(engine, families)
-    except errors.InputError:
-        return False
-    return True
+class Motion(NamedTuple):
+    """Where the bodies of a batch of worlds are, and how they move."""
+
+    # In the world: base x, y [m], yaw [rad]; object position [m] and quaternion, scalar first.
+    qpos: Any  # (B, 10)
+    # Of these [m/s, rad/s]; the object's angular velocity is in its own frame.
+    qvel: Any  # (B, 9)
+    warmstart: Any  # (B, 9) [m/s^2, rad/s^2] last accelerations, for a solver
 
 
-def stage_of_scenes(scenes: Sequence[Scene], engine: Engine) -> tuple[Any, Any]:
-    """Stage, and fields (len(scenes), ...), of scenes of one shape family.
+class Driven(NamedTuple):
+    """A batch after one control period."""
 
-    Raises:
-      InputError: the engine cannot step them on this machine.
-    """
-    check(engine, [s.family for s in scenes])
-    if engine == "mujoco":
-        return [s.physics for s in scenes], {}
-    if engine == "fused":
-        bodies = [fused.body(s.physics, np.asarray(s.footprint.vertices)) for s in scenes]
-        return Fused(), jax.tree.map(lambda *leaves: np.stack(leaves), *bodies)
-    if engine == "quasistatic":
-        solids = jax.tree.map(lambda *x: np.concatenate(x), *map(scene.solid_of, scenes))
-        friction = np.array([s.physics.pair("base_object").friction[0] for s in scenes])
-        half = np.array([s.physics.geom("base").size[:2] for s in scenes])
-        return Quasistatic(), quasistatic.sliders(solids, friction, half)
-    models = [s.physics for s in scenes]
-    if engine == "warp":
-        models = [warp.own_cylinder(model) for model in models]
-        model, fields = scene.stack(models, warp.put)
-        return Warp(model, warp.blank(models[0])), jax.device_get(fields)
-    model, fields = scene.stack(models)
-    return Stage(model, mjx.make_data(models[0])), jax.device_get(fields)
+    motion: Motion
+    overflowed: Any = None  # (B,) bool: contacts were lost; None: this engine loses none
 
 
-def stage_of_solids(
-    family: str, solids: Solid, friction: Friction, engine: Engine, physics: Physics
-) -> tuple[Any, Any]:
-    """Stage, and fields (n, ...), of solids (n, ...) of a family, friction (n,) each.
+class Stage(Protocol):
+    """What all worlds of a batch share, and how they are stepped together."""
 
-    What MuJoCo would derive in compiling each of them is computed here, for all at once.
+    def drive(self, fields: Any, motion: Motion, twists: Twist, physics: Physics) -> Driven:
+        """Step a batch of worlds with these fields (B, ...) for one control period.
 
-    Raises:
-      InputError: the engine cannot step them on this machine.
-    """
-    check(engine, [family])
-    count = solids.mass.size
-    if engine == "mujoco":
-        return [
-            scene_of_solid(family, solids, friction, physics, i).physics for i in range(count)
-        ], {}
-    if engine == "fused":
-        known = scene.load("box", physics)  # of which only the base matters
-        one = fused.body(known.physics, np.asarray(known.footprint.vertices))
-        return Fused(), bodies(solids, friction, one)
-    template = scene_of_solid(family, solids, friction, physics, 0)
-    if engine == "quasistatic":
-        half = template.physics.geom("base").size[:2]
-        return Quasistatic(), quasistatic.sliders(solids, friction.robot, half)
-    stage, fields = stage_of_scenes([template], engine)
-    return stage, mjx_fields(family, solids, friction, template, fields)
+        The base is a velocity source at `twists` (B,) [m/s, m/s, rad/s], in its own frame.
+        """
+        ...
 
 
-def scene_of_solid(
-    family: str, solids: Solid, friction: Friction, physics: Physics, i: int
-) -> Scene:
-    """The compiled scene of one of the solids."""
-    one, pair = jax.tree.map(lambda leaf: leaf[i], (solids, friction))
-    return scene.shaped(family, one, physics, Friction(float(pair.ground), float(pair.robot)))
+class Stepper(Protocol):
+    """Worlds that are stepped on the host; its arrays can be written to."""
+
+    qpos: np.ndarray  # (n, 10) as in `Motion`
+    qvel: np.ndarray  # (n, 9)
+    warmstart: np.ndarray  # (n, 9)
+
+    def drive(self, which: np.ndarray, twist: np.ndarray, substeps: int) -> None:
+        """Step the worlds `which` (m,) with the base held at `twist` (m, 3) in its own frame."""
+        ...
+
+    def close(self) -> None:
+        """End the threads of the stepper."""
+        ...
 
 
-def bodies(solids: Solid, friction: Friction, template: Body) -> Body:
-    """Solids as the fused engine has them, before the base of `template`."""
-    com = solids.p_object_com + OFF_CENTRE
-    corners = np.concatenate(
-        [
-            solids.vertices,
-            np.broadcast_to(-solids.height[:, None, None] / 2, (*solids.vertices.shape[:2], 1)),
-        ],
-        axis=-1,
-    )
-    count, axes = solids.mass.size, solid.axes(solids)
-    own = Body(
-        mass=solids.mass,
-        inertia=solids.inertia,
-        p_object_com=com,
-        q_object_body=solids.q_object_body,
-        vertices=(corners - com[:, None, :]) @ axes,
-        radius=solids.radius,
-        height=solids.height,
-        up=axes[:, 2],
-        friction_ground=friction.ground,
-        friction_robot=friction.robot,
-        invweight=1 / solids.mass,
-        base_invweight=None,
-        base_half=None,
-        base_z=None,
-    )
-    shared = [np.broadcast_to(np.asarray(x), (count, *np.shape(x))) for x in template]
-    return Body(
-        *(theirs if mine is None else mine for mine, theirs in zip(own, shared, strict=True))
-    )
+class Engine(abc.ABC):
+    """A way to step worlds; its subclasses say what it knows and what suits it."""
+
+    name: ClassVar[str]
+    shapes: ClassVar[tuple[str, ...]] = SHAPES  # the shape families that it knows
+    cones: ClassVar[tuple[str, ...]] = ("elliptic", "pyramidal")  # the friction that it knows
+    traced: ClassVar[bool] = True  # JAX steps it: its trials can be followed, viewed, learned in
+    modes: ClassVar[tuple[Mode, ...]] = ()  # in which it can be differentiated
+    newton: ClassVar[bool] = True  # it solves as `Physics` says: by so many iterations
+
+    def check(self, families: Iterable[str] = ()) -> None:
+        """Raises InputError unless this machine can step worlds of these shape families."""
+        for family in families:
+            if family not in self.shapes:
+                raise errors.InputError(
+                    f"engine = {self.name} is not allowed for objects of the shape {family}: it "
+                    f"knows {' and '.join(self.shapes)}."
+                )
+
+    def works(self, families: Iterable[str] = ()) -> bool:
+        """Whether `check` has nothing against it."""
+        try:
+            self.check(families)
+        except errors.InputError:
+            return False
+        return True
+
+    def check_physics(self, physics: Physics) -> None:
+        """Raises InputError unless the engine knows such physics."""
+        if physics.cone not in self.cones:
+            raise errors.InputError(
+                f"cone = {physics.cone} is not allowed with the engine {self.name}: it must be "
+                f"{' or '.join(self.cones)}."
+            )
+
+    def check_followed(self) -> None:
+        """Raises InputError unless trials can be followed step by step on this machine."""
+        self.check()
+        if not self.traced:
+            raise errors.InputError(
+                f"engine = {self.name} is not allowed: follow a trial with mjx, fused or "
+                "quasistatic."
+            )
+
+    def check_derivatives(self, mode: Mode, physics: Physics) -> None:
+        """Raises InputError unless a trial can be differentiated in this mode."""
+        if mode not in self.modes:
+            known = f"it knows {' and '.join(self.modes)} mode" if self.modes else "it knows none"
+            raise errors.InputError(
+                f"engine = {self.name} is not allowed in {mode}-mode differentiation: {known}."
+            )
+
+    @abc.abstractmethod
+    def stage_of_scenes(self, scenes: Sequence[Scene], which: np.ndarray) -> tuple[Any, Any]:
+        """Stage, and fields (n, ...) on the host, of worlds in scenes of one shape family.
+
+        Args:
+          scenes: the different scenes.
+          which: (n,) of them each world has.
+
+        Raises:
+          InputError: the engine cannot step them on this machine.
+        """
+
+    @abc.abstractmethod
+    def stage_of_solids(
+        self, family: str, solids: Solid, friction: Friction, physics: Physics
+    ) -> tuple[Any, Any]:
+        """Stage, and fields (n, ...) on the host, of solids (n, ...), friction (n,) each.
+
+        What MuJoCo would derive in compiling each of them is computed here, for all at once.
+
+        Raises:
+          InputError: the engine cannot step them on this machine.
+        """
+
+    def slots(self, backend: str) -> int:
+        """Worlds that one worker steps at once on a device of this kind."""
+        return 64 if backend == "cpu" else 65536
+
+    def workers(self, backend: str) -> int:
+        """Host threads that each drive a batch of their own.
+
+        A processor gets one for each core, since XLA steps a small batch on one core.
+        """
+        return (os.cpu_count() or 1) if backend == "cpu" else 1
+
+    def levers(self, family: str) -> dict[str, Callable[[Any], Any]]:
+        """Changes of the stage that are worth timing, by name: see `studies.ablation`."""
+        return {}
+
+    def contacts(self, stage: Any, corners: int) -> int:
+        """Points of contact that a program looks into, in a world of an object with `corners`."""
+        return 3 + 2 if corners == 1 else corners + 4
+
+    def stepper(self, stage: Any, qpos: np.ndarray, threads: int) -> Stepper:
+        """Worlds on the host, at rest at positions (n, 10), of an engine that is not traced."""
+        raise NotImplementedError(f"{self.name} is traced")
 
 
-def mjx_fields(
-    family: str, solids: Solid, friction: Friction, template: Scene, fields: dict[str, np.ndarray]
-) -> dict[str, np.ndarray]:
-    """Fields of an MJX model for solids, from those (1, ...) of a scene with another solid."""
-    count = solids.mass.size
-    new = {name: np.repeat(np.asarray(row, float), count, axis=0) for name, row in fields.items()}
-    model = template.physics
-    thing, mass = model.body("object").id, solids.mass
-    com = solids.p_object_com + OFF_CENTRE
-    turn = solid.axes(solids)
-    moments = np.einsum("nij,nj,nkj->nik", turn, solids.inertia, turn)
-    inverse = np.einsum("nij,nj,nkj->nik", turn, 1 / solids.inertia, turn)
-    z = JOINTS.object.start + 2
-    new[".body_pos"][:, thing, 2] = solids.height / 2
-    new[".qpos0"][:, z] = new[".qpos_spring"][:, z] = solids.height / 2
-    new[".body_ipos"][:, thing], new[".body_iquat"][:, thing] = com, solids.q_object_body
-    new[".body_mass"][:, thing] = new[".body_subtreemass"][:, thing] = mass
-    new[".body_subtreemass"][:, 0] = new[".body_mass"].sum(axis=1)
-    new[".body_inertia"][:, thing] = solids.inertia
-    spin = np.mean(1 / solids.inertia, axis=1)
-    new[".body_invweight0"][:, thing] = np.stack([1 / mass, spin], axis=-1)
-    # The free joint moves the object's origin, which feels the spin through the arm of the centre.
-    arm = _skew(com)
-    shift = 1 / mass + np.trace(arm @ inverse @ arm.swapaxes(1, 2), axis1=1, axis2=2) / 3
-    new[".dof_invweight0"][:, 3:6], new[".dof_invweight0"][:, 6:9] = shift[:, None], spin[:, None]
-    about = moments - mass[:, None, None] * (arm @ arm)
-    new[".dof_M0"][:, 3:6] = mass[:, None]
-    new[".dof_M0"][:, 6:9] = np.diagonal(about, axis1=1, axis2=2)
-    new[".stat.meaninertia"] = new[".dof_M0"].mean(axis=1)
-    _size_geoms(family, solids, template, new)
-    robot = np.array([model.pair(i).name == "base_object" for i in range(model.npair)])
-    new[".pair_friction"][:, :, :2] = np.where(
-        robot[:, None], friction.robot[:, None, None], friction.ground[:, None, None]
-    )
-    return new
-
-
-def _size_geoms(family: str, solids: Solid, template: Scene, new: dict[str, np.ndarray]) -> None:
-    """Sizes, bounding boxes and radii of the object's geoms."""
-    model, half = template.physics, solids.height / 2
-    for name, size in scene.geom_sizes(family, solids).items():
-        geom = model.geom(name).id
-        new[".geom_size"][:, geom] = size
-        box = size if family == "box" else size[:, [0, 0, 1]]
-        bound = np.linalg.norm(size[:, :3] if family == "box" else size[:, :2], axis=1)
-        if name == "object_side":  # a capsule reaches farther up by its radius
-            box, bound = box + [0, 0, 1] * size[:, :1], half + solids.radius
-        new[".geom_aabb"][:, geom] = np.concatenate([0 * box, box], axis=-1).reshape(
-            new[".geom_aabb"][:, geom].shape
-        )
-        new[".geom_rbound"][:, geom] = bound
-    if family == "prism":
-        for i, at in enumerate(scene.feet(solids).swapaxes(0, 1)):
-            new[".geom_pos"][:, model.geom(f"foot_{i}").id] = at
-
-
-def _skew(v: np.ndarray) -> np.ndarray:
-    """Matrices (n, 3, 3) of the cross products with v (n, 3)."""
-    x, y, z = v.T
-    zero = np.zeros_like(x)
-    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
-    return np.stack(rows, axis=-1).reshape(-1, 3, 3)
+def taken(tree: Any, which: Any) -> Any:
+    """Rows `which` of every leaf of a pytree on the host."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[which], tree)

@@ -12,6 +12,7 @@ that it stands on, and so may differ from world to world.
 from __future__ import annotations
 
 import contextlib
+import io
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -19,12 +20,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from mujoco.mjx._src import collision_driver, collision_primitive, math
-from mujoco.mjx._src.collision_types import Collision, GeomInfo
-from mujoco.mjx._src.types import Data, GeomType, Model
 
 from rps_jax.engines.fused.contacts import Corners, meetings
 from rps_jax.geometry import vectors
+
+with contextlib.redirect_stdout(io.StringIO()):  # MJX reports on the console that warp is absent
+    from mujoco import mjx as mjx
+    from mujoco.mjx._src import collision_driver, collision_primitive, math
+    from mujoco.mjx._src.collision_types import Collision, GeomInfo
+    from mujoco.mjx._src.types import Data, GeomType, Model
 
 _UPRIGHT = 1e-6  # [rad] below this tilt every point of the rim is the lowest
 
@@ -127,3 +131,6 @@ def box_as_prism(points: int) -> Iterator[None]:
         yield
     finally:
         _FUNCTIONS[pair] = usual
+
+
+register()

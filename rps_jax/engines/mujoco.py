@@ -1,37 +1,22 @@
-"""The same trials in C MuJoCo, the engine that MJX is measured against.
-
-Sensing, deciding and the rules are those of `trials.trial`, called through JAX on the host; the
-engine is the only difference. Positions are handed over in JAX's precision and stepped in double.
-"""
+"""C MuJoCo, the engine that MJX is measured against: it steps worlds on the host, in double."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import Any
 
-import jax
 import mujoco
 import numpy as np
 from mujoco import rollout
 
-from rps_jax.control.strategies import Strategy
-from rps_jax.trials import trial
-from rps_jax.trials.trial import Driven, Rules, Trial, World
+from rps_jax.engines.base import Engine
+from rps_jax.geometry.solid import Solid
+from rps_jax.world import scene
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS
+from rps_jax.world.scene import JOINTS, Friction, Scene
 
 _STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
-_LOOK = 500  # control steps between two reports
-
-
-@partial(jax.jit, static_argnames=("physics", "strategy"))
-def _decide(worlds: World, trials: Trial, **options: Any):
-    return jax.vmap(partial(trial.decide, **options))(worlds, trials)[:2]
-
-
-_settle = jax.jit(jax.vmap(trial.settle))
 
 
 def _as_it_goes(model: mujoco.MjModel) -> mujoco.MjModel:
@@ -59,11 +44,14 @@ class Batch:
         self._timestep = models[0].opt.timestep
         self._data = [mujoco.MjData(models[0]) for _ in range(threads)]
         self._pool = rollout.Rollout(nthread=threads)
+        self._warning = mujoco.get_mju_user_warning()
+        # What runs away is an outcome, not a file of lines.
+        mujoco.set_mju_user_warning(lambda _: None)
 
     def drive(self, which: np.ndarray, twist: np.ndarray, substeps: int) -> None:
         """Step the worlds `which` (n,) with the base held at `twist` (n, 3) in its own frame.
 
-        The velocity is written once, along the heading of mid-period. `trial.drive` turns it at
+        The velocity is written once, along the heading of mid-period. The other engines turn it at
         every step, along the heading of the step's beginning, half a step behind: less than
         0.001 rad.
         """
@@ -87,53 +75,31 @@ class Batch:
         self.state[which], self.warmstart[which] = after[:, -1], difference / self._timestep
 
     def close(self) -> None:
-        """Ends the threads."""
+        """End the threads, and let MuJoCo warn again."""
+        mujoco.set_mju_user_warning(self._warning)
         self._pool.close()
 
 
-def run(
-    models: Sequence[mujoco.MjModel],
-    worlds: World,
-    *,
-    physics: Physics,
-    rules: Rules,
-    strategy: Strategy,
-    threads: int,
-    report: Callable[[np.ndarray, Trial, float], bool],
-) -> None:
-    """Run a batch of worlds to their ends.
+class MuJoCo(Engine):
+    """C MuJoCo on all cores; worlds share nothing, and their stage is a list of models."""
 
-    `report(ended, trials, simulated)` is told now and then which trials (n,) have ended since, and
-    how many seconds were simulated, summed over all; it answers whether to go on.
-    """
-    options = {"physics": physics, "rules": rules, "strategy": strategy}
-    host = jax.devices("cpu")[0]  # where the engine is
-    worlds = jax.device_put(worlds, host)
-    trials = trial.start_all(worlds, np.ones(len(models), bool), strategy=strategy)
-    batch = Batch(models, np.asarray(trials.qpos, float), threads)
-    warning = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda _: None)  # what runs away is an outcome, not a file of lines
-    try:
-        told_of = np.zeros(len(models), bool)
-        before, count = 0, 0
-        while not told_of.all():
-            told, twist = _decide(worlds, trials, **options)
-            going = np.flatnonzero(~np.asarray(told.done))
-            # Only a hand that shifts the object moves it outside the engine.
-            shifted = np.flatnonzero(np.any(np.asarray(told.qpos != trials.qpos), axis=1))
-            batch.qpos[shifted] = np.asarray(told.qpos)[shifted]
-            if going.size:
-                batch.drive(going, np.stack(twist, axis=1)[going].astype(float), physics.substeps)
-            dtype = trials.qpos.dtype
-            after = (batch.qpos, batch.qvel, batch.warmstart)
-            trials = _settle(trials, told, Driven(*(x.astype(dtype) for x in after)))
-            count += 1
-            if count % _LOOK == 0 or not going.size:
-                done, steps = np.asarray(trials.done), int(np.asarray(trials.steps).sum())
-                simulated = (steps - before) * physics.control_period
-                if not report(np.flatnonzero(done & ~told_of), trials, simulated):
-                    return
-                told_of, before = done, steps
-    finally:
-        mujoco.set_mju_user_warning(warning)
-        batch.close()
+    name = "mujoco"
+    traced = False
+
+    def stage_of_scenes(self, scenes: Sequence[Scene], which: np.ndarray) -> tuple[Any, Any]:
+        """The models of worlds in scenes of one shape family."""
+        return [scenes[i].physics for i in which], {}
+
+    def stage_of_solids(
+        self, family: str, solids: Solid, friction: Friction, physics: Physics
+    ) -> tuple[Any, Any]:
+        """The models of solids (n, ...)."""
+        every = range(solids.mass.size)
+        return [scene.of_solid(family, solids, friction, physics, i).physics for i in every], {}
+
+    def stepper(self, stage: Any, qpos: np.ndarray, threads: int) -> Batch:
+        """Worlds on a pool of threads."""
+        return Batch(stage, qpos, threads)
+
+
+ENGINE = MuJoCo()

@@ -28,18 +28,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.control import strategies
 from rps_jax.control.law import Twist
-from rps_jax.control.strategies import Strategy
+from rps_jax.engines.base import Driven, Engine, Motion, taken
 from rps_jax.engines.fused.contacts import Point, circle_and_rectangle, polygon_and_rectangle
 from rps_jax.geometry import planar, solid
 from rps_jax.geometry import vectors as sp
 from rps_jax.geometry.solid import Solid, Support
 from rps_jax.geometry.vectors import Vec
-from rps_jax.trials import trial
-from rps_jax.trials.trial import Driven, Rules, Snapshot, Trial, World
+from rps_jax.world import scene
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS
+from rps_jax.world.scene import JOINTS, Friction, Scene
 
 _LEAST_SPEED = 1e-5  # [m/s] taken for that of a base at rest
 _SHARP = 3  # last steps of Newton's method, on the problem itself; those before widen its slip
@@ -53,6 +51,8 @@ class Slider(NamedTuple):
     arm: Any  # () [m] c = m_max / f_max of the friction with the ground
     friction_robot: Any  # () [1]
     base_half: Any  # (2,) [m] half length and width of the base
+    vertices: Any  # (N, 2) [m] of the outline, counter-clockwise, in the object's frame
+    radius: Any  # () [m] of the outline
 
 
 def sliders(
@@ -68,6 +68,8 @@ def sliders(
         arm=solid.friction_arm(solids, support),
         friction_robot=np.broadcast_to(friction_robot, count),
         base_half=np.broadcast_to(base_half, (count, 2)),
+        vertices=solids.vertices,
+        radius=solids.radius,
     )
 
 
@@ -104,25 +106,21 @@ class Quasistatic:
         errors.check_finite("slip", self.slip, above=0, at_most=1)
         errors.check_finite("iterations", self.iterations, at_least=_SHARP + 1)
 
-    def drive(self, worlds: World, trials: Trial, twists: Twist, physics: Physics) -> Driven:
+    def drive(self, fields: Slider, motion: Motion, twists: Twist, physics: Physics) -> Driven:
         """Step a batch for one control period; height and tilt of the object stay.
 
         The velocities that come back are means over the period.
         """
-        slider, outline = worlds.fields, worlds.footprint
-        com, qpos, period = slider.p_object_com, trials.qpos, physics.control_period
+        com, qpos, period = fields.p_object_com, motion.qpos, physics.control_period
         free = qpos[:, JOINTS.object]
         yaw = planar.yaw_of_quaternion(free[:, 3:])
         p = free[:, :2] + planar.rotate(yaw, com)
         # The batch comes last, as `contacts` has it.
-        corners = jnp.moveaxis(outline.vertices - com[:, None], (0, 1), (2, 1))
-        worlds = worlds._replace(
-            fields=slider._replace(base_half=tuple(slider.base_half.T)),
-            footprint=outline._replace(vertices=tuple(corners)),
-        )
+        corners = jnp.moveaxis(fields.vertices - com[:, None], (0, 1), (2, 1))
+        sliders = fields._replace(base_half=tuple(fields.base_half.T), vertices=tuple(corners))
         before = (tuple(qpos[:, JOINTS.base].T), (*p.T, yaw))
         twist = (twists.v_x, twists.v_y, twists.omega)
-        step = partial(self._step, worlds, twist, physics.timestep)
+        step = partial(self._step, sliders, twist, physics.timestep)
         base, (x, y, angle) = jax.lax.fori_loop(0, physics.substeps, lambda _, s: step(s), before)
         half = 0.5 * (angle - yaw)
         q = sp.times((jnp.cos(half), 0.0, 0.0, jnp.sin(half)), tuple(free[:, 3:].T))
@@ -132,24 +130,24 @@ class Quasistatic:
         )
         moved = (after - qpos)[:, :6] / period
         spin = jnp.zeros_like(moved[:, :3]).at[:, 2].set((angle - yaw) / period)
-        return Driven(after, jnp.concatenate([moved, spin], axis=-1), trials.warmstart)
+        velocity = jnp.concatenate([moved, spin], axis=-1)
+        return Driven(Motion(after, velocity, motion.warmstart))
 
     def _step(
-        self, worlds: World, twist: Vec, dt: float, poses: tuple[Vec, Vec]
+        self, slider: Slider, twist: Vec, dt: float, poses: tuple[Vec, Vec]
     ) -> tuple[Vec, Vec]:
         """Poses of the base and of the object, about its centre of mass, after dt [s] at `twist`.
 
         Each is x, y [m], yaw [rad] in the world.
         """
         base, thing = poses
-        slider: Slider = worlds.fields
         c, s = jnp.cos(base[2]), jnp.sin(base[2])
         apart = (thing[0] - base[0], thing[1] - base[1])
         p = (c * apart[0] + s * apart[1], c * apart[1] - s * apart[0])
         v_x, v_y, omega = twist
         reach = sp.dot(slider.base_half, slider.base_half)
         problem = Problem(
-            _contacts(worlds, (*p, thing[2] - base[2]), twist),
+            _contacts(slider, (*p, thing[2] - base[2]), twist),
             jnp.sqrt(v_x * v_x + v_y * v_y + reach * omega * omega + _LEAST_SPEED**2),
             slider.arm,
             slider.friction_robot,
@@ -206,13 +204,13 @@ class Quasistatic:
         return gradient, hessian
 
 
-def _contacts(worlds: World, pose: Vec, twist: Vec) -> list[Contact]:
+def _contacts(slider: Slider, pose: Vec, twist: Vec) -> list[Contact]:
     """Where a base at `twist` may push the object, at `pose`; all in the base's frame."""
     p_x, p_y, yaw = pose
     c, s = jnp.cos(yaw), jnp.sin(yaw)
-    x, y = worlds.footprint.vertices  # (N, ...) each, from the centre of mass
+    x, y = slider.vertices  # (N, ...) each, from the centre of mass
     here = (p_x + c * x - s * y, p_y + s * x + c * y)
-    radius, half = worlds.footprint.radius, worlds.fields.base_half
+    radius, half = slider.radius, slider.base_half
     if x.shape[0] == 1:
         normal, point, gap = circle_and_rectangle((here[0][0], here[1][0]), radius, half)
         points, gaps = [point], [gap]
@@ -259,44 +257,32 @@ def _divide(g: Vec, h: Sequence[Any]) -> Vec:
     return (g[0] - b * y - c * z) / a, y, z
 
 
-class Rollout(NamedTuple):
-    """What a batch of trials did in a fixed time; distances from contact point to target."""
+class QuasistaticEngine(Engine):
+    """Planar, without inertia: the fastest, and differentiable in both modes."""
 
-    trials: Trial  # at the end
-    snapshots: Snapshot  # (steps, B, ...)
-    min_distance: jax.Array  # (B,) [m] while in contact; inf without any
-    end_distance: jax.Array  # (B,) [m] at the last decision, from the last contact
-    mean_distance: jax.Array  # (B,) [m] over time, likewise
-    lost_time: jax.Array  # (B,) [s] without contact after the first touch
+    name = "quasistatic"
+    cones = ("elliptic",)  # its friction is the same in all directions
+    modes = ("forward", "reverse")
+    newton = False  # but by its own rule
+
+    def stage_of_scenes(self, scenes: Sequence[Scene], which: np.ndarray) -> tuple[Any, Any]:
+        """Stage and fields of worlds in scenes of one shape family."""
+        solids = jax.tree.map(lambda *x: np.concatenate(x), *map(scene.solid_of, scenes))
+        friction = np.array([s.physics.pair("base_object").friction[0] for s in scenes])
+        half = np.array([s.physics.geom("base").size[:2] for s in scenes])
+        return Quasistatic(), taken(sliders(solids, friction, half), which)
+
+    def stage_of_solids(
+        self, family: str, solids: Solid, friction: Friction, physics: Physics
+    ) -> tuple[Any, Any]:
+        """Stage and fields of solids (n, ...)."""
+        template = scene.of_solid(family, solids, friction, physics, 0)
+        half = template.physics.geom("base").size[:2]
+        return Quasistatic(), sliders(solids, friction.robot, half)
+
+    def contacts(self, stage: Any, corners: int) -> int:
+        """Points of contact that the program looks into."""
+        return min(corners, 2)
 
 
-def rollout(
-    stage: Quasistatic,
-    worlds: World,
-    *,
-    physics: Physics,
-    steps: int,
-    rules: Rules = Rules(),
-    strategy: Strategy = strategies.RPS,
-) -> Rollout:
-    """`steps` control periods of a batch, from its start: pure, and differentiable in reverse.
-
-    What senses is the skin of the worlds, what decides the strategy. Derivatives are those of a
-    trial's smooth pieces: as far as law and skin switch, the switch itself has none. Memory grows
-    by one trial's state a step: a step is run again when it is differentiated.
-    """
-    one = partial(
-        trial.control_step, stage, worlds, physics=physics, rules=rules, strategy=strategy
-    )
-    again = jax.checkpoint(lambda trials, _: one(trials), prevent_cse=False)
-    start = jax.vmap(partial(trial.start, strategy=strategy))(worlds)
-    trials, seen = jax.lax.scan(again, start, length=steps)
-    distance = seen.details.distance
-    return Rollout(
-        trials=trials,
-        snapshots=seen,
-        min_distance=trials.min_distance,
-        end_distance=distance[-1],
-        mean_distance=jnp.mean(distance, axis=0),
-        lost_time=trials.lost_steps * physics.control_period,
-    )
+ENGINE = QuasistaticEngine()

@@ -4,14 +4,14 @@ Three things differ from MJX. A cylinder touches the base as the cylinder that i
 a batch share one list of contacts, of a length given beforehand: what finds no room is lost, which
 is counted. And all worlds share the corners of a mesh, so that there are no random prisms.
 
-What differs between worlds is batched field by field, as in MJX: all of `scene.FIELDS` but the two
+What differs between worlds is batched field by field, as in MJX: all of `mjx.FIELDS` but the two
 that Warp does not have a use for, since it sums the inertia up anew (`stat.meaninertia`, `dof_M0`).
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -21,34 +21,19 @@ import mujoco
 import numpy as np
 
 from rps_jax.control.law import Twist
+from rps_jax.engines.base import Driven, Engine, Motion, taken
+from rps_jax.engines.mjx import apply, solids_by_template, stack
+from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.errors import InputError
-from rps_jax.trials.trial import Driven, Trial, World
-from rps_jax.world import scene
+from rps_jax.geometry.solid import Solid
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS, mjx
+from rps_jax.world.scene import JOINTS, Friction, Scene
 
 _CONTACTS = 4  # of a pair of geoms, at most
 _ROWS = 4  # of a contact in the solver, at most: those of a pyramid
 # Bits of Warp's `overflow` by which contacts or their constraints were lost. Not that its solver
 # made all its iterations: `Physics` bounds them on purpose.
 _LOST = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")
-
-
-def check(families: Iterable[str] = ()) -> None:
-    """Raises InputError unless this machine can step worlds of these shape families."""
-    if "prism" in families:
-        raise InputError(
-            "engine = warp is not allowed for prisms, whose corners it has the same in all worlds: "
-            "choose mjx, fused, mujoco or quasistatic, or boxes and cylinders alone."
-        )
-    missing = [] if mjx.warp.WARP_INSTALLED else ["no warp-lang"]
-    if not _on_nvidia():
-        missing.append(f"no NVIDIA GPU, JAX runs on {jax.default_backend()}")
-    if missing:
-        raise InputError(
-            f"engine = warp is not there ({' and '.join(missing)}): pip install '.[cuda,warp]' on "
-            "a machine with an NVIDIA GPU, or choose mjx, fused, mujoco or quasistatic."
-        )
 
 
 def _on_nvidia() -> bool:
@@ -91,20 +76,62 @@ def blank(model: mujoco.MjModel, contacts: int | None = None) -> mjx.Data:
     return mjx.make_data(model, impl="warp", naconmax=room, naccdmax=pairs, njmax=_ROWS * room)
 
 
-class Warp(NamedTuple):
+class WarpStage(NamedTuple):
     """What all worlds of a batch that MJX-Warp steps share."""
 
     model: mjx.Model
     data: mjx.Data  # a blank, with room for the contacts of one world
 
-    def drive(self, worlds: World, trials: Trial, twists: Twist, physics: Physics) -> Driven:
+    def drive(
+        self, fields: dict[str, jax.Array], motion: Motion, twists: Twist, physics: Physics
+    ) -> Driven:
         """Step a batch for one control period, in float32 whatever the precision of its states."""
-        state = trials.qpos, trials.qvel, trials.warmstart
-        narrow = jax.tree.map(lambda x: x.astype(jnp.float32), (worlds.fields, *state, twists))
-        room = _for_worlds(self.data, len(trials.qpos))
+        narrow = jax.tree.map(lambda x: x.astype(jnp.float32), (fields, *motion, twists))
+        room = _for_worlds(self.data, len(motion.qpos))
         one = partial(_drive, self.model, room, substeps=physics.substeps)
         *after, lost = jax.vmap(one)(*narrow)
-        return Driven(*(x.astype(trials.qpos.dtype) for x in after), overflowed=lost)
+        return Driven(Motion(*(x.astype(motion.qpos.dtype) for x in after)), overflowed=lost)
+
+
+class Warp(Engine):
+    """MuJoCo's own kernels on an NVIDIA GPU."""
+
+    name = "warp"
+    shapes = ("box", "cylinder")
+
+    def check(self, families: Iterable[str] = ()) -> None:
+        """Raises InputError unless this machine can step worlds of these shape families."""
+        if set(families) - set(self.shapes):
+            raise InputError(
+                "engine = warp is not allowed for prisms, whose corners it has the same in all "
+                "worlds: choose mjx, fused, mujoco or quasistatic, or boxes and cylinders alone."
+            )
+        missing = [] if mjx.warp.WARP_INSTALLED else ["no warp-lang"]
+        if not _on_nvidia():
+            missing.append(f"no NVIDIA GPU, JAX runs on {jax.default_backend()}")
+        if missing:
+            raise InputError(
+                f"engine = warp is not there ({' and '.join(missing)}): pip install '.[cuda,warp]' "
+                "on a machine with an NVIDIA GPU, or choose mjx, fused, mujoco or quasistatic."
+            )
+
+    def stage_of_scenes(self, scenes: Sequence[Scene], which: np.ndarray) -> tuple[Any, Any]:
+        """Stage and fields of worlds in scenes of one shape family."""
+        self.check([s.family for s in scenes])
+        models = [own_cylinder(s.physics) for s in scenes]
+        model, fields = stack(models, put)
+        return WarpStage(model, blank(models[0])), taken(jax.device_get(fields), which)
+
+    def stage_of_solids(
+        self, family: str, solids: Solid, friction: Friction, physics: Physics
+    ) -> tuple[Any, Any]:
+        """Stage and fields of solids (n, ...)."""
+        self.check([family])
+        return solids_by_template(self, family, solids, friction, physics)
+
+    def contacts(self, stage: WarpStage, corners: int) -> int:
+        """Points of contact for which there is room."""
+        return stage.data._impl.naconmax  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _for_worlds(data: mjx.Data, count: int) -> mjx.Data:
@@ -131,7 +158,7 @@ def _drive(
     substeps: int,
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Positions, velocities and warm start of one world after steps at `twist`; what was lost."""
-    model = scene.apply(model, fields)
+    model = apply(model, fields)
     data = data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
 
     def one(data, _):
@@ -142,3 +169,6 @@ def _drive(
     data, _ = jax.lax.scan(one, data, length=substeps)
     bits = sum(mjx.warp.mujoco_warp.OverflowType[name] for name in _LOST)
     return data.qpos, data.qvel, data.qacc_warmstart, data._impl.overflow & bits != 0
+
+
+ENGINE = Warp()

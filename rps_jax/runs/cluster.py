@@ -33,7 +33,7 @@ from rps_jax.runs import sweep
 from rps_jax.runs.board import Board, News
 from rps_jax.errors import InputError
 from rps_jax.runs.sweep import Plan, Shard
-from rps_jax.trials.batch import Progress, Timing
+from rps_jax.trials.setting import Progress, Timing
 
 POLL = 0.5  # [s] between two looks at what the workers have done
 PATIENCE = 10.0  # [s] to reach a cluster

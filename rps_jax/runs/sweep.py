@@ -25,6 +25,7 @@ import h5py
 import numpy as np
 import xarray as xr
 
+from rps_jax.trials.worlds import drawn_scene, drawn_worlds
 from rps_jax import errors
 from rps_jax.analysis import statistics
 from rps_jax.world import domain
@@ -39,7 +40,8 @@ from rps_jax.world.physics import Physics
 from rps_jax.analysis.report import Section
 from rps_jax.analysis.report import write_report as _write
 from rps_jax.world.scene import Scene
-from rps_jax.trials.batch import Job, Part, Progress, Setting, Timing
+from rps_jax.trials.batch import Job, Part
+from rps_jax.trials.setting import Progress, Setting, Timing
 from rps_jax.control.strategies import Params
 from rps_jax.trials.trial import Outcome, Rules
 
@@ -352,7 +354,7 @@ def _ahead(parts: Iterator[Part]) -> Iterator[Part]:
 def scene_of(plan: Plan, index: int) -> Scene:
     """The compiled scene of one world, for pictures."""
     drawn = domain.draw(plan.domain, plan.setting.seed, [index])
-    return domain.scene_of(plan.domain, drawn, plan.setting.physics, 0)
+    return drawn_scene(plan.domain, drawn, plan.setting.physics, 0)
 
 
 def title_of(plan: Plan, index: int) -> str:
@@ -369,7 +371,7 @@ def title_of(plan: Plan, index: int) -> str:
 def world_part(plan: Plan, arm: int, index: Any) -> Part:
     """Worlds of one object, by their indices, with the parameters of an arm."""
     drawn = domain.draw(plan.domain, plan.setting.seed, index)
-    return domain.worlds(plan.domain, drawn, list(plan.arms.values())[arm], plan.setting)
+    return drawn_worlds(plan.domain, drawn, list(plan.arms.values())[arm], plan.setting)
 
 
 # --- results -------------------------------------------------------------------------------

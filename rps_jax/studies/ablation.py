@@ -17,13 +17,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from rps_jax import engines
 from rps_jax.control.law import Twist
 from rps_jax.engines import mjx_colliders
+from rps_jax.engines.base import Driven, Motion
 from rps_jax.studies import benchmark
 from rps_jax.studies.benchmark import Program
-from rps_jax.trials.trial import Driven, Stage, Trial, World
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import mjx
 
 
 class Lever(NamedTuple):
@@ -40,29 +40,13 @@ class Lever(NamedTuple):
 class Unmoved(NamedTuple):
     """An engine without physics: the base goes, the object stays. What is left is the law's."""
 
-    def drive(self, worlds: World, trials: Trial, twists: Twist, physics: Physics) -> Driven:
+    def drive(self, fields: Any, motion: Motion, twists: Twist, physics: Physics) -> Driven:
         """Step a batch for one control period."""
         turn = jax.vmap(lambda twist, yaw: twist.in_world(yaw))
-        ahead = physics.control_period * turn(twists, trials.qpos[:, 2])
-        return Driven(trials.qpos.at[:, :3].add(ahead), trials.qvel, trials.warmstart)
+        ahead = physics.control_period * turn(twists, motion.qpos[:, 2])
+        return Driven(motion._replace(qpos=motion.qpos.at[:, :3].add(ahead)))
 
 
-def _option(**values: Any) -> Callable[[Stage], Stage]:
-    """The stage of MJX with other options of the model."""
-    changes = {f"opt.{name}": value for name, value in values.items()}
-
-    def change(stage: Stage) -> Stage:
-        model: Any = stage.model.tree_replace(changes)
-        return Stage(model, mjx.make_data(model))
-
-    return change
-
-
-# Not in these scenes: equalities, joint limits and friction, actuators, springs, sensors.
-_UNUSED = mjx.DisableBit(sum(mjx.DisableBit[name] for name in (
-    *("EQUALITY", "FRICTIONLOSS", "LIMIT", "ACTUATION", "CLAMPCTRL"),
-    *("SPRING", "DAMPER", "SENSOR", "EULERDAMP"),
-)))  # fmt: skip
 _OF_ALL = {
     "no physics: law, skin, rules": Lever(stage=lambda _: Unmoved()),
     "steps of 5 ms": Lever({"timestep": 0.005}),
@@ -83,8 +67,6 @@ _OF_SOLVERS = {
 _OF_MJX = {
     "own box-box collider": Lever(tracing=partial(mjx_colliders.box_as_prism, 4)),
     "own, two points": Lever(tracing=partial(mjx_colliders.box_as_prism, 2)),
-    "unused stages disabled": Lever(stage=_option(disableflags=_UNUSED)),
-    "sparse inertia matrix": Lever(stage=_option(jacobian=mjx.JacobianType.SPARSE)),
 }
 _FLAGS = {
     "cpu": {
@@ -102,12 +84,9 @@ _FLAGS = {
 
 def levers(name: str, family: str) -> dict[str, Lever]:
     """All that can be changed about one of `benchmark.BATCHED` on this machine."""
-    engine = benchmark.BATCHED[name].engine
-    found = dict(_OF_ALL)
-    if engine != "quasistatic":
-        found |= _OF_SOLVERS
-    if engine == "mjx":
-        found |= {k: v for k, v in _OF_MJX.items() if family == "box" or not k.startswith("own")}
+    engine = engines.get(benchmark.BATCHED[name].engine)
+    found = _OF_ALL | (_OF_SOLVERS if engine.newton else {})
+    found |= {what: Lever(stage=change) for what, change in engine.levers(family).items()}
     flags = _FLAGS.get(jax.default_backend(), {})
     return found | {what: Lever(flags=values) for what, values in flags.items()}
 

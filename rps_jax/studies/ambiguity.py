@@ -17,7 +17,7 @@ from scipy import stats
 from rps_jax.analysis import tables
 from rps_jax.robot.skin import CapacitiveSkin, IdealSkin
 from rps_jax.studies.study import Condition
-from rps_jax.trials.batch import Setting
+from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
 from rps_jax.world.physics import PHYSICS, Physics
 

@@ -18,17 +18,15 @@ import jax
 import mujoco
 import numpy as np
 
+from rps_jax import engines
 from rps_jax.control import strategies
 from rps_jax.control.law import RPSParams
-from rps_jax.engines import base as engines
-from rps_jax.engines import mujoco as c_mujoco
-from rps_jax.engines.mujoco import Batch
-from rps_jax.engines.quasistatic import Quasistatic
-from rps_jax.engines.warp import Warp
-from rps_jax.trials import pushes, trial
-from rps_jax.trials.batch import Job, Setting, default_workers, run
+from rps_jax.trials import host, pushes, trial
+from rps_jax.trials.batch import Job, run
 from rps_jax.trials.pushes import Case
-from rps_jax.trials.trial import Rules, Stage, Trial, World
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules, Trial, World
+from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import domain, paper
 from rps_jax.world.domain import DOMAINS, Range
 from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
@@ -65,7 +63,7 @@ NAMES = (*BATCHED, *IN_C)
 
 def here() -> tuple[str, ...]:
     """Those of `NAMES` that this machine can run."""
-    return tuple(n for n in NAMES if n in IN_C or engines.works(BATCHED[n].engine))
+    return tuple(n for n in NAMES if n in IN_C or engines.get(BATCHED[n].engine).works())
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,7 @@ def _worlds(family: str, count: int, setting: Setting) -> tuple[Any, World]:
     """Stage and worlds (count, ...): the paper's targets under S1, a box, a cylinder or prisms."""
     if family == "prism":
         drawn = domain.draw(_PRISMS, 0, np.arange(count))
-        part = domain.worlds(_PRISMS, drawn, RPSParams.paper(), setting)
+        part = drawn_worlds(_PRISMS, drawn, RPSParams.paper(), setting)
         return part.stage, part.worlds
     targets = paper.TARGETS
     cases = [Case(family, FRICTION["S1"], targets[i % len(targets)], gap=0) for i in range(count)]
@@ -95,7 +93,7 @@ def _worlds(family: str, count: int, setting: Setting) -> tuple[Any, World]:
 
 def can(name: str, family: str) -> bool:
     """Whether this machine can run one of `NAMES` with a family."""
-    return name in IN_C or engines.works(BATCHED[name].engine, [family])
+    return name in IN_C or engines.get(BATCHED[name].engine).works([family])
 
 
 def _best(action: Callable[[], Any], goes: int = 4, enough: float = 5.0) -> float:
@@ -106,18 +104,6 @@ def _best(action: Callable[[], Any], goes: int = 4, enough: float = 5.0) -> floa
         action()
         times.append(time.perf_counter() - began)
     return min(times)
-
-
-def _contacts(stage: Any, worlds: World) -> int:
-    """Points of contact that a program looks into, in each world."""
-    corners = worlds.footprint.vertices.shape[-2]  # 1 of a cylinder
-    if isinstance(stage, Stage):
-        return stage.data._impl.contact.dist.size  # pyright: ignore[reportAttributeAccessIssue]
-    if isinstance(stage, Warp):
-        return stage.data._impl.naconmax  # pyright: ignore[reportAttributeAccessIssue]
-    if isinstance(stage, Quasistatic):
-        return min(corners, 2)
-    return 3 + 2 if corners == 1 else corners + 4
 
 
 def _contacts_in_c(model: mujoco.MjModel, qpos: np.ndarray, seconds: float = 2.0) -> int:
@@ -188,7 +174,8 @@ def traced(
         needs: Any = program.memory_analysis()
         parts = ("argument", "output", "temp")
         memory = sum(getattr(needs, f"{part}_size_in_bytes") for part in parts)
-        contacts = _contacts(usual, few)
+        corners = few.footprint.vertices.shape[-2]  # 1 of a cylinder
+        contacts = engines.get(setting.engine).contacts(usual, corners)
         go = partial(program, shared, batch)
         return Program(name, family, worlds, simulated, took, memory, contacts, physics, go, start)
 
@@ -229,17 +216,17 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Speed:
     physics = preset()
     threads = os.cpu_count() or 1
     worlds = 64 * threads
-    setting = Setting(engine="mujoco", physics=physics)
+    setting, engine = Setting(engine="mujoco", physics=physics), engines.get("mujoco")
     stage, batch = _worlds(family, worlds, setting)
     if IN_C[name] == "closed":
         options = {"strategy": strategies.RPS, "threads": threads, "report": lambda *_: True}
         rules = Rules(horizon=simulated)
 
         def once() -> None:
-            c_mujoco.run(stage, batch, physics=physics, rules=rules, **options)
+            host.run(engine, stage, batch, physics=physics, rules=rules, **options)
 
     else:
-        stepper = Batch(stage, np.asarray(batch.qpos, float), threads)
+        stepper = engine.stepper(stage, np.asarray(batch.qpos, float), threads)
         twist = np.tile([_SPEED, 0.0, 0.0], (worlds, 1))
         once = partial(stepper.drive, np.arange(worlds), twist, round(simulated / physics.timestep))
     once()  # compiles the law
@@ -263,13 +250,17 @@ def refilling(slots: int, rounds: int = 4) -> Refilling:
     """
     setting = BATCHED["fused standard"]
     boxes = replace(DOMAINS["wide"], objects=("random_box",))
-    count = slots * default_workers(setting.engine) * len(jax.local_devices())
+    count = (
+        slots
+        * engines.get(setting.engine).workers(jax.default_backend())
+        * len(jax.local_devices())
+    )
 
     def timed(groups: np.ndarray) -> tuple[float, float]:
         timings = []
         for group in groups:
             drawn = domain.draw(boxes, 0, group)
-            part = domain.worlds(boxes, drawn, RPSParams.paper(), setting)
+            part = drawn_worlds(boxes, drawn, RPSParams.paper(), setting)
             job = Job(strategies.RPS, group.size, [part])
             timings.append(run([job], setting, slots=slots, collect=lambda *_: None))
         wall = sum(t.run for t in timings)

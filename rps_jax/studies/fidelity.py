@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from rps_jax.engines.base import Engine
+from rps_jax.engines import EngineName
 from rps_jax.studies import study
 from rps_jax.studies.study import Condition, Grid
-from rps_jax.trials.batch import Progress, Setting
+from rps_jax.trials.setting import Progress, Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
 
@@ -26,7 +26,7 @@ REFERENCE = "reference"
 _EARLY = 5.0  # [s] after which the object's place is compared
 
 
-def _condition(engine: Engine, base: Physics, what: str, **changes: Any) -> Condition:
+def _condition(engine: EngineName, base: Physics, what: str, **changes: Any) -> Condition:
     return Condition(what, Setting(physics=replace(base, **changes), engine=engine))
 
 

@@ -21,11 +21,12 @@ import xarray as xr
 from rps_jax import errors
 from rps_jax.control import strategies
 from rps_jax.control.law import RPSParams
-from rps_jax.engines.base import Engine
+from rps_jax.engines import EngineName
 from rps_jax.record import folder as record
 from rps_jax.trials import trial
-from rps_jax.trials.batch import Setting
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Snapshot, World
+from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.tuning import evolution as tune
 from rps_jax.tuning import gradients
 from rps_jax.tuning.descent import soften
@@ -62,7 +63,7 @@ class Study:
     """Standard deviation of the steps of evolution, likewise."""
     clip: float = 2.0
     """Bound on the norm of a world's gradient, of the estimator clipped, in their medians."""
-    engine: Engine = "fused"
+    engine: EngineName = "fused"
     """Of the truth, of forward mode and of evolution; reverse mode takes the quasi-static one."""
     seed: int = 0
 
@@ -87,12 +88,12 @@ class Study:
         return self.space.vector(self.space.base)
 
 
-def _stage_and_worlds(study: Study, engine: Engine, split: str, count: int) -> Any:
+def _stage_and_worlds(study: Study, engine: EngineName, split: str, count: int) -> Any:
     """What worlds share in their engine, the first worlds (count, ...) of a split, and physics."""
     alone = replace(study.domain, objects=(study.object,))
     setting = Setting(engine=engine)
     drawn = domain.draw(alone, tune.seed_of(study.seed, split), np.arange(count))
-    part = domain.worlds(alone, drawn, RPSParams(), setting)
+    part = drawn_worlds(alone, drawn, RPSParams(), setting)
     return part.stage, part.worlds, setting.physics
 
 
@@ -125,7 +126,7 @@ def truth(study: Study) -> Estimate:
 
 def repeats(study: Study, name: str) -> Iterator[Estimate]:
     """Estimates (p, H) by one estimator, in other worlds each."""
-    engine: Engine = "quasistatic" if name in ("reverse", "clipped") else study.engine
+    engine: EngineName = "quasistatic" if name in ("reverse", "clipped") else study.engine
     smooth = name != "evolution"
     count = study.repeats * study.worlds
     stage, worlds, physics = _stage_and_worlds(study, engine, "tune", count)

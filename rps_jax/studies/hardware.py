@@ -4,10 +4,9 @@ shove of its video. Friction was never measured, so a plausible range is run.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -15,38 +14,22 @@ import xarray as xr
 from rps_jax.analysis import tables
 from rps_jax.robot.skin import SKINS
 from rps_jax.trials import pushes
-from rps_jax.trials.batch import Progress, Setting
 from rps_jax.trials.pushes import Case, Trace
+from rps_jax.trials.setting import Progress, Setting
 from rps_jax.trials.trial import Shift
+from rps_jax.world.paper import (
+    HARDWARE_GROUND,
+    HARDWARE_LAYOUTS,
+    HARDWARE_OBJECTS,
+    HARDWARE_RESULTS,
+    HARDWARE_ROBOT,
+)
 from rps_jax.world.scene import Friction
 
-OBJECTS = ("hardware_box", "hardware_cylinder")
-_REACH = 2.1  # [m]
-LAYOUTS = {
-    "circle": tuple(
-        (_REACH * math.cos(k * math.pi / 4), _REACH * math.sin(k * math.pi / 4)) for k in range(8)
-    ),
-    "grid": tuple(
-        (x, y) for x in (_REACH, 0, -_REACH) for y in (_REACH, 0, -_REACH) if (x, y) != (0, 0)
-    ),
-}  # the paper's "8 different target points at 2.1 m intervals apart" may be read either way
-GROUND = (0.2, 0.35, 0.5, 0.65)  # [1] object-ground
-ROBOT = (0.3, 0.5, 0.7)  # [1] object-robot: polyurethane foam coated with ink
 MIDDLE = Friction(0.35, 0.5)  # of which the paths are drawn
 SKIN = SKINS["hardware"]
 SHIFT_TIME = 30.0  # [s] when the object is shifted
 SHIFTS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4)  # [m] to either side of the robot
-
-
-class Paper(NamedTuple):
-    """What the paper reports of one object, over eight targets."""
-
-    success: int
-    mean_abs_l: float  # [m] D
-    time: float  # [s]
-
-
-PAPER = {"hardware_box": Paper(8, 0.032, 89.0), "hardware_cylinder": Paper(8, 0.059, 88.0)}
 
 
 def _label(friction: Friction) -> str:
@@ -55,7 +38,7 @@ def _label(friction: Friction) -> str:
 
 def frictions() -> dict[str, Friction]:
     """The range of friction, labelled ground,robot."""
-    return {_label(f): f for f in (Friction(g, r) for g in GROUND for r in ROBOT)}
+    return {_label(f): f for f in (Friction(g, r) for g in HARDWARE_GROUND for r in HARDWARE_ROBOT)}
 
 
 def run(
@@ -70,15 +53,15 @@ def run(
 
     `base` gives whatever else the cases have in common: skin, gap, parameters.
     """
-    targets = LAYOUTS[layout]
+    targets = HARDWARE_LAYOUTS[layout]
     cases = [
         replace(base, object=name, friction=friction, p_world_target=target)
-        for name in OBJECTS
+        for name in HARDWARE_OBJECTS
         for friction in frictions().values()
         for target in targets
     ]
     outcome, _ = pushes.run(cases, setting, report=report, **shape)
-    return tables.dataset(outcome, ["rps"], OBJECTS, tuple(frictions()), targets)
+    return tables.dataset(outcome, ["rps"], HARDWARE_OBJECTS, tuple(frictions()), targets)
 
 
 def paths(base: Case, setting: Setting, *, layout: str = "circle") -> dict[str, list[Trace]]:
@@ -87,12 +70,12 @@ def paths(base: Case, setting: Setting, *, layout: str = "circle") -> dict[str, 
         name: pushes.follow(
             [
                 replace(base, object=name, friction=MIDDLE, p_world_target=target)
-                for target in LAYOUTS[layout]
+                for target in HARDWARE_LAYOUTS[layout]
             ],
             setting,
             interval=0.5,
         )
-        for name in OBJECTS
+        for name in HARDWARE_OBJECTS
     }
 
 
@@ -110,7 +93,7 @@ def disturb(
     It is moved at once, `SHIFT_TIME` after the start, to the left and to the right.
     """
     sides = (1.0, -1.0)
-    targets = LAYOUTS[layout]
+    targets = HARDWARE_LAYOUTS[layout]
     cases = [
         replace(
             base,
@@ -119,13 +102,13 @@ def disturb(
             p_world_target=target,
             shift=Shift(SHIFT_TIME, (0.0, side * size)),
         )
-        for name in OBJECTS
+        for name in HARDWARE_OBJECTS
         for size in shifts
         for side in sides
         for target in targets
     ]
     outcome, _ = pushes.run(cases, setting, report=report, **shape)
-    sizes = (len(OBJECTS), len(shifts), len(sides), len(targets))
+    sizes = (len(HARDWARE_OBJECTS), len(shifts), len(sides), len(targets))
     dims = ("object", "shift", "side", "target")
     # A trial that had ended before the object was to be moved tells nothing.
     counted = outcome.time > SHIFT_TIME
@@ -136,7 +119,7 @@ def disturb(
             "time": (dims, outcome.time.reshape(sizes), {"units": "s"}),
         },
         coords={
-            "object": list(OBJECTS),
+            "object": list(HARDWARE_OBJECTS),
             "shift": ("shift", list(shifts), {"units": "m"}),
             "side": ["left", "right"],
         },
@@ -150,7 +133,7 @@ def table(results: xr.Dataset) -> list[list[str]]:
         one = results.sel(strategy="rps", object=name)
         won = one.success.values.astype(bool)
         low, high = tables.wilson(int(won.sum()), won.size)
-        theirs = PAPER[name]
+        theirs = HARDWARE_RESULTS[name]
         rows.append(
             [
                 name,

@@ -15,13 +15,13 @@ import xarray as xr
 
 from rps_jax.analysis import figures, tables, video
 from rps_jax.analysis.report import Section, write_report
-from rps_jax.engines.base import Engine
+from rps_jax.engines import EngineName
 from rps_jax.record import folder as record
 from rps_jax.studies import ambiguity, fidelity, hardware, study
 from rps_jax.studies.study import Condition, Grid
 from rps_jax.trials import pushes
-from rps_jax.trials.batch import Progress, Setting
 from rps_jax.trials.pushes import Case
+from rps_jax.trials.setting import Progress, Setting
 from rps_jax.world import paper, scene
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.scene import FRICTION
@@ -33,7 +33,7 @@ _FIG_6 = Case("box", FRICTION["S1"], (-2.0, 0.0))
 class Plan:
     """How much to run."""
 
-    engine: Engine = "mjx"  # of Table II and Fig. 6
+    engine: EngineName = "mjx"  # of Table II and Fig. 6
     # Of the studies; Table II has all.
     targets: tuple[tuple[float, float], ...] = paper.TARGETS
     strategies: tuple[str, ...] = paper.STRATEGIES
@@ -72,8 +72,12 @@ class Plan:
         table = Grid(strategies=paper.STRATEGIES).size
         many = len(self.fidelity) + len(self.gazebo)
         few = len(self.readings) + len(ambiguity.ON_LOSS) * len(self.tolerances)
-        targets = len(hardware.LAYOUTS["circle"])
-        hard = len(hardware.OBJECTS) * targets * (len(hardware.frictions()) + 2 * len(self.shifts))
+        targets = len(paper.HARDWARE_LAYOUTS["circle"])
+        hard = (
+            len(paper.HARDWARE_OBJECTS)
+            * targets
+            * (len(hardware.frictions()) + 2 * len(self.shifts))
+        )
         return table + many * self.all_strategies.size + few * self.rps_alone.size + hard
 
 
@@ -207,7 +211,7 @@ def _one_trial(out: Path, plan: Plan) -> list[Section]:
 def _hardware(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any]) -> list[Section]:
     base = Case("hardware_box", hardware.MIDDLE, (2.1, 0.0), skin=hardware.SKIN)
     setting = Setting(engine="fused")
-    each = len(hardware.OBJECTS) * len(hardware.LAYOUTS["circle"])
+    each = len(paper.HARDWARE_OBJECTS) * len(paper.HARDWARE_LAYOUTS["circle"])
     results = _kept(
         out / "hardware.nc",
         each * len(hardware.frictions()),
@@ -222,16 +226,16 @@ def _hardware(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any])
     )
     if not (out / "paths.png").exists():
         traces = hardware.paths(base, setting)
-        figures.paths(traces, hardware.LAYOUTS["circle"], out / "paths.png")
+        figures.paths(traces, paper.HARDWARE_LAYOUTS["circle"], out / "paths.png")
     return hardware_sections(out, results, shifted)
 
 
 def hardware_sections(out: Path, results: xr.Dataset, shifted: xr.Dataset) -> list[Section]:
     """The hardware experiments, with `paths.png` of the same folder."""
     friction = (
-        f"Friction was not measured: object-ground {hardware.GROUND} and object-robot "
-        f"{hardware.ROBOT}, every pair. Skin: 42 taxels, noise and unequal gains. D and time are "
-        "means over successes; in brackets the least and greatest mean among the frictions."
+        f"Friction was not measured: object-ground {paper.HARDWARE_GROUND} and object-robot "
+        f"{paper.HARDWARE_ROBOT}, every pair. Skin: 42 taxels, noise and unequal gains. D and time "
+        "are means over successes; in brackets the least and greatest mean among the frictions."
     )
     ground, robot = hardware.MIDDLE
     shove = (

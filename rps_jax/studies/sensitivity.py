@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from rps_jax.control.law import RPSParams
-from rps_jax.trials.batch import Progress
+from rps_jax.trials.setting import Progress
 from rps_jax.tuning import evolution as tune
 from rps_jax.tuning.evolution import Answer, Ask, Course, Space
 

@@ -21,8 +21,8 @@ from rps_jax.analysis import tables
 from rps_jax.errors import InputError
 from rps_jax.record import folder as record
 from rps_jax.trials import pushes
-from rps_jax.trials.batch import Progress, Setting
 from rps_jax.trials.pushes import Case
+from rps_jax.trials.setting import Progress, Setting
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.scene import FRICTION, Friction

@@ -7,13 +7,11 @@ slot waits for one of their trials, so that memory does not grow with the number
 from __future__ import annotations
 
 import functools
-import os
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,54 +21,14 @@ import numpy as np
 from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from rps_jax import errors
+from rps_jax import engines, errors
 from rps_jax.control.strategies import Strategy
-from rps_jax.engines import base as engines
-from rps_jax.engines import mujoco as c_mujoco
-from rps_jax.engines.base import Engine
-from rps_jax.trials import trial
+from rps_jax.trials import host, trial
+from rps_jax.trials.setting import Progress, Setting, Timing
 from rps_jax.trials.trial import Outcome, Rules, Trial, World
-from rps_jax.world.physics import PHYSICS, Physics
+from rps_jax.world.physics import Physics
 
 SEGMENT = 10.0  # [s] simulated between two looks at which trials have ended
-
-
-@dataclass(frozen=True)
-class Setting:
-    """What all trials of a run share."""
-
-    physics: Physics = PHYSICS["default"]["standard"]
-    rules: Rules = Rules()
-    seed: int = 0  # of the skins' imperfections, and of random worlds
-    engine: Engine = "mjx"
-
-    def __post_init__(self) -> None:
-        """Raises InputError for rules, a seed or an engine that mean nothing, or do together."""
-        self.rules.check()
-        errors.check_count("seed", self.seed, at_least=0, at_most=2**32 - 1)
-        errors.check_name("engine", self.engine, engines.ENGINES)
-        if self.engine == "quasistatic" and self.physics.cone != "elliptic":
-            raise errors.InputError(
-                f"cone = {self.physics.cone} is not allowed with the engine quasistatic: its "
-                "friction is the same in all directions, elliptic."
-            )
-
-
-@dataclass(frozen=True)
-class Progress:
-    """A look at a running sweep."""
-
-    finished: int  # trials
-    simulated: float  # [s] summed over trials, ended or running
-
-
-@dataclass(frozen=True)
-class Timing:
-    """Where the time of a sweep went."""
-
-    compile: float  # [s] until the worker who waited longest had its programs
-    run: float  # [s] wall clock after that
-    simulated: float  # [s] of trials
 
 
 class Part(NamedTuple):
@@ -86,25 +44,10 @@ class Job(NamedTuple):
 
     strategy: Strategy
     trials: int  # at most; there are no more slots than that
-    parts: Iterable[Part]  # of one stage, but for the engine `mujoco`
+    parts: Iterable[Part]  # of one stage, if JAX traces the engine
 
 
 Collect = Callable[[np.ndarray, Outcome], Any]  # numbers (m,) of trials and their outcomes
-
-
-def default_slots(engine: Engine = "mjx") -> int:
-    """Worlds that a worker steps at once: few on a processor (small caches), many on a GPU."""
-    if jax.default_backend() == "cpu":
-        return 24 if engine == "mjx" else 64
-    return 16384 if engine in ("mjx", "fused") else 65536
-
-
-def default_workers(engine: Engine = "mjx") -> int:
-    """Of a processor one for each core, since XLA steps a small batch on one core. On a GPU the
-    second steps its worlds while the host sees to those of the first."""
-    if jax.default_backend() == "cpu":
-        return os.cpu_count() or 1
-    return 2 if engine == "fused" else 1
 
 
 def check_shape(slots: int | None, workers: int | None) -> None:
@@ -130,25 +73,26 @@ def run(
       jobs: what to run.
       setting: what they share.
       slots: worlds stepped at once by one worker on each of the host's devices.
-      workers: host threads that each drive a batch of their own, or, with the engine `mujoco`,
-        that step worlds.
+      workers: host threads that each drive a batch of their own, or that step worlds, if JAX does
+        not trace the engine.
       collect: called with the outcomes of trials that ended, in any order, one call at a time.
       report: called after every segment, likewise.
     """
     check_shape(slots, workers)
-    slots = slots or default_slots(setting.engine)
-    workers = workers or default_workers(setting.engine)
+    engine, backend = engines.get(setting.engine), jax.default_backend()
+    slots = slots or engine.slots(backend)
+    workers = workers or engine.workers(backend)
     shared = _Shared(collect, report)
     began = time.perf_counter()
-    if setting.engine == "mujoco":
+    if not engine.traced:
         count = max(1, min(workers, len(jobs)))
-        tasks = [partial(_run_in_c, job, setting, workers // count, shared) for job in jobs]
+        tasks = [partial(_run_on_host, job, setting, workers // count, shared) for job in jobs]
     else:
         count = workers
         queues = [_Queue(job, setting, slots) for job in jobs]
         orders = [queues[w % len(queues) :] + queues for w in range(count if queues else 0)]
         tasks = [partial(_work, order, shared) for order in orders]
-        if jax.default_backend() != "cpu":  # the processor is idle: compile all at once
+        if backend != "cpu":  # the processor is idle: compile all at once
             tasks += [queue.program for queue in queues]
             count += len(queues)
     _side_by_side(tasks, count, shared)
@@ -208,10 +152,10 @@ class _Shared:
             self.compile = max(self.compile, seconds)
 
 
-# --- C MuJoCo ------------------------------------------------------------------------------
+# --- on the host ---------------------------------------------------------------------------
 
 
-def _run_in_c(job: Job, setting: Setting, threads: int, shared: _Shared) -> None:
+def _run_on_host(job: Job, setting: Setting, threads: int, shared: _Shared) -> None:
     for part in job.parts:
 
         def tell(ended: np.ndarray, trials: Trial, simulated: float, part: Part = part) -> bool:
@@ -221,7 +165,8 @@ def _run_in_c(job: Job, setting: Setting, threads: int, shared: _Shared) -> None
 
         if shared.stop:
             return
-        c_mujoco.run(
+        host.run(
+            engines.get(setting.engine),
             part.stage,
             part.worlds,
             physics=setting.physics,
@@ -232,7 +177,7 @@ def _run_in_c(job: Job, setting: Setting, threads: int, shared: _Shared) -> None
         )
 
 
-# --- JAX -----------------------------------------------------------------------------------
+# --- on a device -----------------------------------------------------------------------------
 
 
 class _Queue:

@@ -23,17 +23,21 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from rps_jax import errors
+from rps_jax import engines, errors
 from rps_jax.analysis import video
 from rps_jax.control import law, strategies
 from rps_jax.control.law import RPSParams, Twist
+from rps_jax.engines.base import Driven, Motion, Stage
+from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.geometry import planar
 from rps_jax.trials import trial
-from rps_jax.trials.batch import Part, Setting, rows
-from rps_jax.trials.trial import Driven, Fused, Seen, Stage, Trial, World
+from rps_jax.trials.batch import Part, rows
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Seen, Trial, World
+from rps_jax.trials.worlds import drawn_scene, drawn_worlds
 from rps_jax.world import domain, objects
 from rps_jax.world.domain import DOMAINS, Domain, Draw
-from rps_jax.world.scene import Scene, mjx
+from rps_jax.world.scene import Scene
 
 
 class Reward(NamedTuple):
@@ -97,7 +101,7 @@ class PushEnv:
 
     def __post_init__(self) -> None:
         """Draws the worlds: now, and not while a loop is traced."""
-        errors.check_name("engine", self.setting.engine, ("mjx", "fused"))
+        engines.get(self.setting.engine).check_followed()
         errors.check_name("skin of an environment", self.domain.skin, ("capacitive",))
         errors.check_count("worlds", self.worlds, at_most=1_000_000)
         law.check(self.params)
@@ -122,7 +126,7 @@ class PushEnv:
         """One control period with the base at the twist of an action (3,)."""
         world, before = state.info["world"], state.data
         told, twist = trial.execute(world, before, self.twist(action), self.dt)
-        moved = trial.settle(before, told, self._drive(world, told, twist))
+        moved = trial.settle(before, told, self._drive(world.fields, trial.motion(told), twist))
         now, seen = self._observe(world, moved)
         gone = moved.done  # it had ended before, or the physics ended it
         progress = jnp.where(jnp.isfinite(before.strategy), before.strategy - now.strategy, 0.0)
@@ -215,15 +219,15 @@ class PushEnv:
     @functools.cached_property
     def _part(self) -> Part:
         """All worlds, on the device."""
-        part = domain.worlds(self._alone, self._drawn, self.params, self.setting)
+        part = drawn_worlds(self._alone, self._drawn, self.params, self.setting)
         return part._replace(worlds=jax.tree.map(jnp.asarray, part.worlds))
 
     @functools.cached_property
-    def _drive(self) -> Callable[[World, Trial, Twist], Driven]:
+    def _drive(self) -> Callable[[Any, Motion, Twist], Driven]:
         return _one_of_many(self._part.stage, self.setting)
 
     def _scene(self, index: int) -> Scene:
-        return domain.scene_of(self._alone, self._drawn, self.setting.physics, index)
+        return drawn_scene(self._alone, self._drawn, self.setting.physics, index)
 
     def render(
         self,
@@ -277,7 +281,7 @@ def _metrics(now: Trial, seen: Seen, progress: jax.Array) -> dict[str, jax.Array
     return {"progress": progress} | {k: v.astype(progress.dtype) for k, v in flags.items()}
 
 
-def _one_of_many(stage: Stage | Fused, setting: Setting) -> Callable[[World, Trial, Twist], Driven]:
+def _one_of_many(stage: Stage, setting: Setting) -> Callable[[Any, Motion, Twist], Driven]:
     """Drives one world; under vmap the stage drives the whole batch, on a GPU as one kernel."""
     together = partial(stage.drive, physics=setting.physics)
 

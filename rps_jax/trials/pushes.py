@@ -13,16 +13,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import errors
+from rps_jax import engines, errors
 from rps_jax.control import strategies
 from rps_jax.control.law import RPSParams
 from rps_jax.control.strategies import Params, Strategy
-from rps_jax.engines import base as engines
+from rps_jax.robot.base import Odometry
 from rps_jax.robot.skin import IdealSkin, Skin
 from rps_jax.trials import trial
-from rps_jax.trials.batch import SEGMENT, Job, Part, Progress, Setting, Timing, rows, warn_of_lost
+from rps_jax.trials.batch import SEGMENT, Job, Part, rows, warn_of_lost
 from rps_jax.trials.batch import run as _run
-from rps_jax.trials.trial import Odometry, Outcome, Shift, Snapshot, World
+from rps_jax.trials.setting import Progress, Setting, Timing
+from rps_jax.trials.trial import Outcome, Shift, Snapshot, World
 from rps_jax.world import scene
 from rps_jax.world.objects import FAMILIES, OBJECTS
 from rps_jax.world.physics import Physics
@@ -112,15 +113,13 @@ def build(
     indices count from 0.
     """
     scenes, which = _scenes(cases, setting.physics)
-    stage, fields = engines.stage_of_scenes(scenes, setting.engine)
-    if isinstance(stage, list):
-        stage = [stage[i] for i in which]
+    stage, fields = engines.get(setting.engine).stage_of_scenes(scenes, which)
     starts = [_start_of(case, scenes[i]) for case, i in zip(cases, which, strict=True)]
     dtype = jnp.zeros(()).dtype
     numbers = np.arange(len(cases)) if indices is None else np.asarray(indices)
     root = jax.random.PRNGKey(setting.seed)
     world = World(
-        fields=rows(jax.tree.map(lambda leaf: np.asarray(leaf, dtype), fields), which),
+        fields=jax.tree.map(lambda leaf: np.asarray(leaf, dtype), fields),
         footprint=_stack([s.footprint for s in scenes], dtype, which),
         skin=_stack([case.skin for case in cases], dtype),
         params=_stack([case.params for case in cases], dtype),
@@ -178,8 +177,8 @@ def run(
       setting: what they share.
       slots: worlds stepped at once by one worker. Results are bit-identical for equal slots on
         one kind of device, whatever shares the batch.
-      workers: host threads that each drive a batch of their own, or, with the engine `mujoco`,
-        that step worlds; see `slots.default_workers`.
+      workers: host threads that each drive a batch of their own, or that step worlds, if JAX does
+        not trace the engine; by default as many as suit the engine and the device.
       report: called after every segment, from worker threads, one at a time.
 
     Returns:
@@ -212,22 +211,13 @@ def follow(
     """Run trials of one kind to their ends and keep what they looked like every `interval` [s].
 
     Raises:
-      InputError: the engine is `mujoco`, which is not followed.
+      InputError: the engine's trials cannot be followed on this machine.
     """
-    check_followed(setting.engine)
+    engines.get(setting.engine).check_followed()
     stage, worlds = build(cases, setting)
     part = Part(np.arange(len(cases)), worlds, stage)
     strategy = strategies.of(cases[0].params)
     return follow_part(part, strategy, setting, interval=interval, report=report)
-
-
-def check_followed(engine: str) -> None:
-    """Raises InputError unless trials of this engine can be followed on this machine."""
-    engines.check(engine)
-    if engine == "mujoco":
-        raise errors.InputError(
-            "engine = mujoco is not allowed: follow a trial with mjx, fused or quasistatic."
-        )
 
 
 def follow_part(

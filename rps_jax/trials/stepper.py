@@ -15,14 +15,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import errors
+from rps_jax import engines, errors
 from rps_jax.control import strategies
 from rps_jax.control.strategies import Strategy
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.skin import CapacitiveSkin
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.batch import Part, Setting, rows
+from rps_jax.trials.batch import Part, rows
 from rps_jax.trials.pushes import Case
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome, Rules, Shift, Snapshot, Trial, World
 from rps_jax.world.physics import Physics
 
@@ -51,7 +52,7 @@ class Live:
 
     def __init__(self, part: Part, strategy: Strategy, setting: Setting) -> None:
         """The first world of a part, at its start."""
-        pushes.check_followed(setting.engine)
+        engines.get(setting.engine).check_followed()
         self._stage, self._strategy, self._setting = part.stage, strategy, setting
         self._first: World = rows(part.worlds, slice(1))
         self.past: list[Moment] = []

@@ -9,30 +9,29 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from rps_jax import errors
 from rps_jax.control import law
 from rps_jax.control.aps import TrackedObservation
 from rps_jax.control.law import Details, Observation, Twist
 from rps_jax.control.strategies import RPS, Params, Strategy
-from rps_jax.engines.fused import step as fused
+from rps_jax.engines.base import Driven, Motion, Stage
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.geometry.footprint import Footprint
+from rps_jax.robot import base
+from rps_jax.robot.base import Odometry
 from rps_jax.robot.skin import NONE, Reading, Skin, SkinState, SmoothReading
-from rps_jax.world import scene
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS, mjx
+from rps_jax.world.scene import JOINTS
 
 # A world is a runaway beyond these, far outside anything a base at 0.05 m/s can cause.
 _MAX_SPEED = 20.0  # [m/s], [rad/s]
 _MAX_DISTANCE = 100.0  # [m]
-_ODOMETRY = 7  # of a world's key; the skin splits it into fewer
 
 
 class Rules(NamedTuple):
@@ -56,25 +55,10 @@ class Shift(NamedTuple):
     p_robot: tuple[float, float] | jax.Array = (0.0, 0.0)  # (2,) [m] how far, in the robot frame
 
 
-class Odometry(NamedTuple):
-    """What a base gets wrong: where it believes it is, and how it does what it is told.
-
-    Ages are rounded to control steps. `past` only gives, by its shape, how many steps are
-    remembered, at least one more than the greatest age; without any the base is perfect.
-    """
-
-    pose_noise: float | jax.Array = 0.0  # () [m] standard deviation of each position reading
-    yaw_noise: float | jax.Array = 0.0  # () [rad] and of each heading reading
-    pose_latency: float | jax.Array = 0.0  # () [s] age of the pose that the law is told
-    command_delay: float | jax.Array = 0.0  # () [s] until a twist is acted upon
-    velocity_error: float | jax.Array = 0.0  # (3,) [1] of each component of the twist
-    past: Any = np.zeros(0)  # (K,)
-
-
 class World(NamedTuple):
     """What makes one world; every leaf is batched."""
 
-    fields: Any  # for its stage: of the model, as named by `scene.stack`; a `Body`
+    fields: Any  # for its engine's stage
     footprint: Footprint
     skin: Skin
     params: Params
@@ -155,23 +139,6 @@ def p_world_contact(seen: Snapshot) -> jax.Array:
     return jnp.where((seen.reading.contact_type != NONE)[:, None], point, jnp.nan)
 
 
-class Driven(NamedTuple):
-    """A batch after one control period."""
-
-    qpos: Any  # (B, 10) as in `Trial`
-    qvel: Any  # (B, 9)
-    warmstart: Any  # (B, 9)
-    overflowed: Any = None  # (B,) bool: contacts were lost; None: this engine loses none
-
-
-class Drives(Protocol):
-    """What all worlds of a batch share, and how their engine steps them."""
-
-    def drive(self, worlds: World, trials: Trial, twists: Twist, physics: Physics) -> Driven:
-        """Step a batch for one control period."""
-        ...
-
-
 def start(world: World, strategy: Strategy = RPS) -> Trial:
     """The trial of a world before its first control step."""
     zero, false = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
@@ -230,65 +197,6 @@ def sense(
     return state, reading, observation
 
 
-class Stage(NamedTuple):
-    """What all worlds of a batch that MJX steps share."""
-
-    model: mjx.Model
-    data: mjx.Data  # a blank to be filled with each world's state
-
-    def drive(self, worlds: World, trials: Trial, twists: Twist, physics: Physics) -> Driven:
-        """Step a batch for one control period.
-
-        The base is a velocity source: before each step the commanded twist is written into its
-        joint velocities, turned into the world.
-        """
-        state = (trials.qpos, trials.qvel, trials.warmstart)
-        step = jax.vmap(self._step)
-
-        def one(state, _):  # batched inside of the loop: a loop that is batched is traced anew
-            return step(worlds.fields, state, twists), None
-
-        return Driven(*jax.lax.scan(one, state, length=physics.substeps)[0])
-
-    def _step(
-        self,
-        fields: dict[str, jax.Array],
-        state: tuple[jax.Array, jax.Array, jax.Array],
-        twist: Twist,
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        model, (qpos, qvel, warmstart) = scene.apply(self.model, fields), state
-        qvel = qvel.at[JOINTS.base].set(twist.in_world(qpos[2]))
-        data = self.data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
-        with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
-            data = mjx.step(model, data)
-        return data.qpos, data.qvel, data.qacc_warmstart
-
-
-class Fused(NamedTuple):
-    """Worlds stepped by `rps_jax.engines.fused.step` share nothing."""
-
-    def drive(self, worlds: World, trials: Trial, twists: Twist, physics: Physics) -> Driven:
-        """Step a batch for one control period."""
-        state = (trials.qpos, trials.qvel, trials.warmstart)
-        return Driven(*fused.drive(worlds.fields, *state, twists, physics))
-
-
-def _believed(world: World, trial: Trial, period: float) -> tuple[jax.Array, jax.Array]:
-    """The last poses (K, 3), and the pose (3,) of the base as the law is told it."""
-    now = trial.qpos[JOINTS.base]
-    if not trial.poses.shape[0]:
-        return trial.poses, now
-    poses = jnp.concatenate([now[None], trial.poses[:-1]])
-    told = poses[_age(world.odometry.pose_latency, period)]
-    key = jax.random.fold_in(jax.random.fold_in(world.key, _ODOMETRY), trial.steps)
-    sigma = jnp.stack([world.odometry.pose_noise] * 2 + [world.odometry.yaw_noise])
-    return poses, told + sigma * jax.random.normal(key, (3,), now.dtype)
-
-
-def _age(time: Any, period: float) -> jax.Array:
-    return jnp.round(time / period).astype(jnp.int32)
-
-
 class Seen(NamedTuple):
     """What skin and odometry tell at one moment."""
 
@@ -309,7 +217,10 @@ def observe(
     trial = _shifted(world, trial, period)
     skin, reading, observation = sense(world, trial, period)
     distance = planar.norm(law.displacement(observation))
-    poses, believed = _believed(world, trial, period)
+    now = trial.qpos[JOINTS.base]
+    poses, believed = base.believed(
+        world.odometry, trial.poses, now, world.key, trial.steps, period
+    )
     seen = observation._replace(p_world_robot=believed[:2], yaw=believed[2])
 
     touch = reading.contact_type != NONE
@@ -340,9 +251,8 @@ def execute(world: World, trial: Trial, twist: Twist, period: float) -> tuple[Tr
     """
     if not trial.twists.shape[0]:
         return trial, twist
-    twists = jnp.concatenate([jnp.stack(twist)[None], trial.twists[:-1]])
-    done = twists[_age(world.odometry.command_delay, period)]
-    return trial._replace(twists=twists), Twist(*(done * (1 + world.odometry.velocity_error)))
+    twists, done = base.executed(world.odometry, trial.twists, jnp.stack(twist), period)
+    return trial._replace(twists=twists), Twist(*done)
 
 
 def decide(
@@ -378,7 +288,7 @@ def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
 
     A trial that had ended `before` comes back as it was.
     """
-    qpos, qvel, warmstart, overflowed = driven
+    (qpos, qvel, warmstart), overflowed = driven
     sane = (
         jnp.all(jnp.isfinite(qpos))
         & jnp.all(jnp.abs(qvel) < _MAX_SPEED)
@@ -398,7 +308,7 @@ def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
 
 
 def control_step(
-    stage: Drives,
+    stage: Stage,
     worlds: World,
     trials: Trial,
     *,
@@ -409,8 +319,13 @@ def control_step(
     """One pass of the loop of a batch of worlds. One that has ended comes back as it is."""
     think = partial(decide, physics=physics, rules=rules, strategy=strategy)
     told, twists, snapshots = jax.vmap(think)(worlds, trials)
-    driven = stage.drive(worlds, told, twists, physics)
+    driven = stage.drive(worlds.fields, motion(told), twists, physics)
     return jax.vmap(settle)(trials, told, driven), snapshots
+
+
+def motion(trials: Trial) -> Motion:
+    """What an engine steps of trials."""
+    return Motion(trials.qpos, trials.qvel, trials.warmstart)
 
 
 def select(condition: jax.Array, yes: Any, no: Any) -> Any:
@@ -452,7 +367,7 @@ _UNASKED = 20  # control steps of a GPU between two looks at whether any trial r
 
 @partial(jax.jit, static_argnames=_STATIC, donate_argnames=("trials",))
 def advance(
-    stage: Drives,
+    stage: Stage,
     worlds: World,
     trials: Trial,
     *,
@@ -484,7 +399,7 @@ def advance(
 
 @partial(jax.jit, static_argnames=(*_STATIC, "every"), donate_argnames=("trials",))
 def record(
-    stage: Drives,
+    stage: Stage,
     worlds: World,
     trials: Trial,
     *,

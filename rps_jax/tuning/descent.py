@@ -25,7 +25,7 @@ from rps_jax.control.law import RPSParams
 from rps_jax.control.strategies import smooth_rps
 from rps_jax.record import folder as record
 from rps_jax.robot.skin import CapacitiveSkin, SmoothSkin
-from rps_jax.trials.batch import Progress, Setting
+from rps_jax.trials.setting import Progress, Setting
 from rps_jax.trials.trial import Snapshot, Trial, World, control_step, select, start_all
 from rps_jax.tuning import evolution as tune
 from rps_jax.tuning import gradients

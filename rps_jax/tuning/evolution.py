@@ -25,8 +25,10 @@ from rps_jax.control import strategies
 from rps_jax.control.law import RPSParams
 from rps_jax.record import folder as record
 from rps_jax.trials import batch
-from rps_jax.trials.batch import Job, Part, Progress, Setting, Timing
+from rps_jax.trials.batch import Job, Part
+from rps_jax.trials.setting import Progress, Setting, Timing
 from rps_jax.trials.trial import Outcome, Rules
+from rps_jax.trials.worlds import drawn_worlds, remembered_steps
 from rps_jax.world import domain
 from rps_jax.world.domain import Domain
 
@@ -235,7 +237,7 @@ def try_out(
     firsts = [sum(sizes[:i]) for i in range(len(sizes))]
     found = Answer(*np.full((4, sum(sizes)), np.nan))
     lost, way = np.empty((2, sum(sizes)))  # [s], [m] missed: all the way until it ends nearer
-    longest = max(domain.remembered(one, setting.physics.control_period) for one in domains)
+    longest = max(remembered_steps(one, setting.physics.control_period) for one in domains)
     jobs: dict[Any, list[_Group]] = {}
     for ask, width, first, size in zip(asks, widths, firsts, sizes, strict=True):
         params, of_ask = jax.device_get(ask.params), way[first : first + size].reshape(-1, width)
@@ -278,7 +280,7 @@ def parts(
         for thing in np.unique(which):
             rows = np.flatnonzero(which == thing)
             drawn = domain.draw(one, ask.seed, ask.worlds[rows])
-            part = domain.worlds(one, drawn, RPSParams(), setting)
+            part = drawn_worlds(one, drawn, RPSParams(), setting)
             yield part, d * ask.worlds.size + rows, np.linalg.norm(drawn.p_world_target, axis=1)
 
 

@@ -26,10 +26,9 @@ import jax.numpy as jnp
 from rps_jax.control import strategies
 from rps_jax.control.law import RPSParams
 from rps_jax.control.strategies import Strategy
-from rps_jax.errors import InputError
 from rps_jax.geometry import planar
 from rps_jax.trials import trial
-from rps_jax.trials.trial import Snapshot, Stage, Trial
+from rps_jax.trials.trial import Snapshot, Trial
 from rps_jax.world.physics import Physics
 
 Scores = Callable[[jax.Array, Any], jax.Array]
@@ -187,24 +186,17 @@ def window(
     """Scores of trials driven on for some control steps from where they are.
 
     Args:
-      stage: of MJX, `Fused`, or `Quasistatic`.
+      stage: of an engine with derivatives: see `Engine.check_derivatives`.
       params_of: parameters from theta (p,), differentiable.
       cost: () or (...) of the snapshots (steps, ...) of one trial, such as its mean distance.
-      physics: with MJX of a pyramidal cone.
+      physics: how the worlds are stepped.
       strategy: that the parameters belong to.
       steps: control steps.
 
     Returns:
       Scores whose worlds are pairs (World, Trial), batched: the trials say where to start.
 
-    Raises:
-      InputError: MJX with the elliptic cone.
     """
-    if isinstance(stage, Stage) and physics.cone == "elliptic":
-        raise InputError(
-            "cone = elliptic is not allowed: MJX's elliptic cone has no finite derivatives, so it "
-            "must be pyramidal (or the engine fused)."
-        )
 
     def scores(thetas: jax.Array, starts: Any) -> jax.Array:
         worlds, trials = starts

@@ -8,31 +8,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rps_jax import errors
-from rps_jax.control.strategies import Params
-from rps_jax.engines import base as engines
 from rps_jax.errors import InputError
 from rps_jax.geometry import solid
-from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import SIDES, Solid
-from rps_jax.robot import skin
-from rps_jax.robot.skin import CapacitiveSkin, IdealSkin, Skin
-from rps_jax.studies import hardware
-from rps_jax.trials.batch import Part, Setting
-from rps_jax.trials.trial import Odometry, Shift, World
 from rps_jax.world import paper, scene
 from rps_jax.world.objects import FAMILIES, OBJECTS, PAPER_OBJECTS
-from rps_jax.world.physics import Physics
-from rps_jax.world.scene import FRICTION, JOINTS, Friction, Scene, mjx
+from rps_jax.world.scene import FRICTION, Friction
 
 _COLUMNS = 64  # random numbers of a world, more than are used, so that new ones change no old ones
 
@@ -137,7 +126,7 @@ class Domain:
         if self.targets:
             found |= {"distance", "bearing"}
         if self.skin == "ideal":
-            found |= set(_OF_TAXELS)
+            found |= set(OF_TAXELS)
         return frozenset(found)
 
     @property
@@ -183,13 +172,13 @@ _UNITS = {
     **dict.fromkeys(("noise", "gain_spread", "dead_share"), "1"),
     **dict.fromkeys(("pose_latency", "command_delay"), "s"),
 }
-_PERFECT: dict[str, Any] = {
+PERFECT: dict[str, Any] = {
     **dict.fromkeys(
         ("noise", "gain_spread", "dead_share", "pose_noise", "yaw_noise", "pose_latency"), _only(0)
     ),
     **dict.fromkeys(("command_delay", "velocity_error", "lateral", "yaw"), _only(0)),
 }
-_HARDWARE: dict[str, Any] = _PERFECT | {"noise": _only(0.05), "gain_spread": _only(0.1)}
+_HARDWARE: dict[str, Any] = PERFECT | {"noise": _only(0.05), "gain_spread": _only(0.1)}
 DOMAINS = {
     "paper": Domain(
         objects=PAPER_OBJECTS,
@@ -197,12 +186,12 @@ DOMAINS = {
         targets=paper.TARGETS,
         gap=_only(0.02),
         skin="ideal",
-        **_PERFECT,
+        **PERFECT,
     ),
     "hardware": Domain(
-        objects=hardware.OBJECTS,
-        friction_ground=Range(hardware.GROUND[0], hardware.GROUND[-1]),
-        friction_robot=Range(hardware.ROBOT[0], hardware.ROBOT[-1]),
+        objects=paper.HARDWARE_OBJECTS,
+        friction_ground=Range(paper.HARDWARE_GROUND[0], paper.HARDWARE_GROUND[-1]),
+        friction_robot=Range(paper.HARDWARE_ROBOT[0], paper.HARDWARE_ROBOT[-1]),
         gap=_only(0.02),
         distance=_only(2.1),
         **_HARDWARE,
@@ -233,7 +222,7 @@ DOMAINS = {
 }
 
 
-_OF_TAXELS = ("noise", "gain_spread", "dead_share")  # which an ideal skin has not
+OF_TAXELS = ("noise", "gain_spread", "dead_share")  # which an ideal skin has not
 
 
 class Draw(NamedTuple):
@@ -277,16 +266,16 @@ def draw(domain: Domain, seed: int, index: ArrayLike) -> Draw:
     which = domain.object_of(index)
     if (which != which[0]).any():
         raise ValueError("worlds of several objects cannot be batched")
-    return _drawn(domain, index, _uniform(seed, index))
+    return drawn_at(domain, index, numbers_of(seed, index))
 
 
-def _drawn(domain: Domain, index: np.ndarray, numbers: np.ndarray) -> Draw:
+def drawn_at(domain: Domain, index: np.ndarray, numbers: np.ndarray) -> Draw:
     """Worlds of the same object, from their random numbers (n, _COLUMNS)."""
     u = dict(zip(_USES, numbers.T, strict=False))
     name = domain.objects[int(domain.object_of(index[0]))]
     at = {name: getattr(domain, name).at(u[name]) for name in _ALLOWED if name in u}
     if domain.skin == "ideal":
-        at |= {name: np.zeros(index.size) for name in _OF_TAXELS}
+        at |= {name: np.zeros(index.size) for name in OF_TAXELS}
     error = [
         domain.velocity_error.at(u[name]) for name in ("v_x_error", "v_y_error", "omega_error")
     ]
@@ -302,7 +291,7 @@ def _drawn(domain: Domain, index: np.ndarray, numbers: np.ndarray) -> Draw:
     )
 
 
-def _uniform(seed: int, index: np.ndarray) -> np.ndarray:
+def numbers_of(seed: int, index: np.ndarray) -> np.ndarray:
     """Random numbers (n, _COLUMNS) in [0, 1): those of each index, however it is asked for."""
     rows = np.empty((index.size, _COLUMNS))
     order = np.argsort(index)
@@ -358,108 +347,6 @@ def _targets(domain: Domain, index: np.ndarray, at: dict[str, np.ndarray]) -> np
         return np.array(domain.targets)[index % len(domain.targets)]
     along = np.stack([np.cos(at["bearing"]), np.sin(at["bearing"])], axis=-1)
     return at["distance"][:, None] * along
-
-
-def domain_randomize(
-    model: mjx.Model, rng: jax.Array, domain: Domain = DOMAINS["wide"]
-) -> tuple[mjx.Model, mjx.Model]:
-    """Models of random objects for a loop of one's own, as mujoco_playground has them.
-
-    Args:
-      model: of a random object's scene, as `mjx.put_model(scene.shaped(...).physics)` gives it.
-      rng: keys (n, 2), one a world.
-      domain: ranges of the object's mass, size, centre of mass and friction.
-
-    Returns:
-      The model with its fields batched, (n, ...), and which of them are: 0, the others None, for
-      `jax.vmap(..., in_axes=(in_axes, ...))`. Not to be traced: it works on the host.
-    """
-    family = scene.family_of(model)
-    (name,) = [name for name, of in RANDOM.items() if of == family]
-    keys = np.asarray(rng, np.uint32).astype(object)
-    numbers = np.stack([_uniform(int(a) << 32 | int(b), np.zeros(1, int))[0] for a, b in keys])
-    alone = replace(domain, objects=(name,), frictions=(), targets=())
-    drawn = _drawn(alone, np.zeros(len(keys), int), numbers)
-    _, own = engines.stage_of_solids(family, drawn.solid, drawn.friction, "mjx", Physics())
-    dtype = model.body_mass.dtype
-    batched = scene.apply(model, {k: jnp.asarray(v, dtype) for k, v in own.items()})
-    in_axes = jax.tree_util.tree_map_with_path(
-        lambda path, _: 0 if jax.tree_util.keystr(path) in own else None, model
-    )
-    return batched, in_axes
-
-
-def worlds(domain: Domain, drawn: Draw, params: Params, setting: Setting) -> Part:
-    """The worlds of a draw as a part of a job, all with the same parameters."""
-    family = domain.family_of(drawn.number[0])
-    count, dtype = drawn.number.size, jnp.zeros(()).dtype
-    stage, own = engines.stage_of_solids(
-        family, drawn.solid, drawn.friction, setting.engine, setting.physics
-    )
-    world: Any = {
-        "fields": own,
-        "footprint": Footprint(*_any(drawn.solid.vertices, drawn.solid.radius)),
-        "skin": _skin(domain, drawn),
-        "params": jax.tree.map(lambda value: np.full(count, value), params),
-        "p_world_target": drawn.p_world_target,
-        "shift": Shift(*_any(np.full(count, np.inf), np.zeros((count, 2)))),
-        "qpos": _starts(drawn),
-        "key": drawn.key,
-        "odometry": _odometry(domain, drawn, setting.physics.control_period),
-    }
-    narrow = jax.tree.map(lambda x: x if x.dtype == np.uint32 else x.astype(dtype), world)
-    return Part(drawn.number, World(**narrow), stage)
-
-
-def _any(*arrays: Any) -> tuple[Any, ...]:
-    """Host arrays where a type asks for those of the device."""
-    return arrays
-
-
-def _skin(domain: Domain, drawn: Draw) -> Skin:
-    count = drawn.number.size
-    plain = IdealSkin() if domain.skin == "ideal" else CapacitiveSkin()
-    full = jax.tree.map(lambda value: np.full(count, value, float), plain)
-    if isinstance(full, IdealSkin):
-        return full
-    return full._replace(
-        noise=drawn.noise, gain_spread=drawn.gain_spread, dead_share=drawn.dead_share
-    )
-
-
-def _starts(drawn: Draw) -> np.ndarray:
-    """Positions (n, 10) at the start: the base at the origin, the object before it."""
-    qpos = np.zeros((drawn.number.size, 10))
-    front = skin.HALF_LENGTH + drawn.gap + solid.extent(drawn.solid, drawn.yaw)
-    half = drawn.yaw / 2
-    zero = np.zeros_like(half)
-    place = [front, drawn.lateral, drawn.solid.height / 2, np.cos(half), zero, zero, np.sin(half)]
-    qpos[:, JOINTS.object] = np.stack(place, axis=-1)
-    return qpos
-
-
-def remembered(domain: Domain, period: float) -> int:
-    """How many control steps of `period` [s] the odometry of the domain's worlds looks back."""
-    if all(getattr(domain, name) == _PERFECT[name] for name in OF_THE_BASE):
-        return 0
-    return 1 + round(max(domain.pose_latency.high, domain.command_delay.high) / period)
-
-
-def _odometry(domain: Domain, drawn: Draw, period: float) -> Odometry:
-    past = np.zeros((drawn.number.size, remembered(domain, period)))
-    return Odometry(*_any(*(getattr(drawn, name) for name in OF_THE_BASE), past))
-
-
-def scene_of(domain: Domain, drawn: Draw, physics: Physics, i: int) -> Scene:
-    """The compiled scene of the i-th world of a draw, for pictures: with its looks, if it has."""
-    index = int(drawn.number[i])
-    name = domain.objects[int(domain.object_of(drawn.number[i]))]
-    if name in RANDOM:
-        return engines.scene_of_solid(
-            domain.family_of(index), drawn.solid, drawn.friction, physics, i
-        )
-    ground, robot = (float(leaf[i]) for leaf in drawn.friction)
-    return scene.load(name, physics, Friction(ground, robot))
 
 
 def table(drawn: Draw) -> dict[str, tuple[np.ndarray, str]]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 from rps_jax.control.aps import APSParams
 from rps_jax.control.law import RPSParams
 
@@ -33,4 +36,32 @@ TABLE_II = {
     ("aps", "cylinder", "S2"): 2,
     ("aps", "nonuniform_box", "S1"): 0,
     ("aps", "nonuniform_box", "S2"): 0,
+}
+
+# Sec. III-C, on the robot itself.
+HARDWARE_OBJECTS = ("hardware_box", "hardware_cylinder")
+_REACH = 2.1  # [m]
+HARDWARE_LAYOUTS = {
+    "circle": tuple(
+        (_REACH * math.cos(k * math.pi / 4), _REACH * math.sin(k * math.pi / 4)) for k in range(8)
+    ),
+    "grid": tuple(
+        (x, y) for x in (_REACH, 0, -_REACH) for y in (_REACH, 0, -_REACH) if (x, y) != (0, 0)
+    ),
+}  # the paper's "8 different target points at 2.1 m intervals apart" may be read either way
+HARDWARE_GROUND = (0.2, 0.35, 0.5, 0.65)  # [1] object-ground
+HARDWARE_ROBOT = (0.3, 0.5, 0.7)  # [1] object-robot: polyurethane foam coated with ink
+
+
+class HardwareResult(NamedTuple):
+    """What the paper reports of one object, over eight targets."""
+
+    success: int
+    mean_abs_l: float  # [m] D
+    time: float  # [s]
+
+
+HARDWARE_RESULTS = {
+    "hardware_box": HardwareResult(8, 0.032, 89.0),
+    "hardware_cylinder": HardwareResult(8, 0.059, 88.0),
 }

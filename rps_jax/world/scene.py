@@ -1,16 +1,12 @@
 """Scenes: `mjcf/` -> a MuJoCo model for looking at, and one stripped to the physics for stepping.
 
 The physics model holds the three geoms that touch and nothing else; it is what C MuJoCo and MJX
-both step. All objects of one shape family compile to the same MJX structure, so that they can
-be batched in one program: `stack` collects the fields in which they differ.
+both step.
 """
 
 from __future__ import annotations
 
-import contextlib
-import io
 import math
-from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -27,21 +23,8 @@ from rps_jax.world import objects
 from rps_jax.world.objects import FAMILIES, OBJECTS, SHAPES, path_of
 from rps_jax.world.physics import PHYSICS, Physics
 
-with contextlib.redirect_stdout(io.StringIO()):  # MJX reports on the console that warp is absent
-    from mujoco import mjx
-
-    from rps_jax.engines import mjx_colliders
-mjx_colliders.register()
-
 Side = Literal["near", "far"]
 SIDES = ("near", "far")
-# All that differs between objects of one shape family, as paths into an MJX model.
-FIELDS = (
-    ".stat.meaninertia",
-    *(f".body_{name}" for name in ("pos", "ipos", "iquat", "mass", "subtreemass", "inertia")),
-    *(".body_invweight0", ".dof_invweight0", ".dof_M0", ".qpos0", ".qpos_spring"),
-    *(".geom_pos", ".geom_size", ".geom_aabb", ".geom_rbound", ".pair_friction"),
-)
 # An inertial frame off by this [m] keeps MuJoCo from compiling centred bodies to a structure of
 # their own, which could not be batched with the others.
 OFF_CENTRE = 1e-6
@@ -159,6 +142,12 @@ def shaped(
     outline = Footprint(jnp.asarray(one.vertices, float), jnp.asarray(one.radius, float))
     models = _compile(spec, physics, friction, half_length)
     return Scene(family, family, *models, outline)
+
+
+def of_solid(family: str, solids: Solid, friction: Friction, physics: Physics, i: int) -> Scene:
+    """Compile a scene with the i-th of solids (n, ...), friction (n,) each."""
+    one, pair = jax.tree.map(lambda leaf: leaf[i], (solids, friction))
+    return shaped(family, one, physics, Friction(float(pair.ground), float(pair.robot)))
 
 
 def geom_sizes(family: str, solids: Solid) -> dict[str, np.ndarray]:
@@ -317,53 +306,3 @@ def initial_qpos(scene: Scene, gap: float = 0.02, yaw: float = 0.0) -> np.ndarra
     position = [front + gap + reach, 0.0, height]
     qpos[JOINTS.object] = [*position, math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
     return qpos
-
-
-def put(model: mujoco.MjModel) -> mjx.Model:
-    """The model as MJX's own engine has it."""
-    # A static copy of the bounding radii, which only height fields use, would bar stacking.
-    unused: dict[str, Any] = {"_impl.geom_rbound_hfield": np.zeros(model.ngeom)}
-    there: Any = mjx.put_model(model).tree_replace(unused)
-    return there
-
-
-def stack(
-    models: Sequence[mujoco.MjModel], put: Callable[[mujoco.MjModel], mjx.Model] = put
-) -> tuple[mjx.Model, dict[str, jax.Array]]:
-    """One MJX model for all, `put` on the device, and the fields that vary: name -> (n, ...).
-
-    The fields are always the same ones, so that a world's numbers depend neither on what it is
-    batched with nor on a program of its own. They are copied from compiled models, so nothing
-    that MuJoCo derives from a mass, a size or a friction is forgotten.
-
-    Raises:
-      ValueError: the models differ in anything but `FIELDS`.
-    """
-    trees: list[Any] = [put(m) for m in models]
-    leaves, structures = zip(*map(jax.tree_util.tree_flatten_with_path, trees), strict=True)
-    if any(s != structures[0] for s in structures):
-        raise ValueError("models of different structure cannot be stacked")
-    fields = {}
-    for columns in zip(*leaves, strict=True):
-        name = jax.tree_util.keystr(columns[0][0])
-        values = [np.asarray(leaf) for _, leaf in columns]
-        if name in FIELDS:
-            fields[name] = jnp.stack(values)
-        elif any(not np.array_equal(v, values[0]) for v in values):
-            raise ValueError(f"models that differ in {name} cannot be stacked")
-    return trees[0], fields
-
-
-def family_of(model: mjx.Model) -> str:
-    """The shape family of an MJX model's object."""
-    kinds = {int(kind) for kind in model.geom_type}
-    if int(mujoco.mjtGeom.mjGEOM_MESH) in kinds:
-        return "prism"
-    return "cylinder" if int(mujoco.mjtGeom.mjGEOM_CYLINDER) in kinds else "box"
-
-
-def apply(model: mjx.Model, fields: dict[str, jax.Array]) -> mjx.Model:
-    """The model with one world's fields, as named by `stack`, put in place."""
-    return jax.tree_util.tree_map_with_path(
-        lambda path, leaf: fields.get(jax.tree_util.keystr(path), leaf), model
-    )

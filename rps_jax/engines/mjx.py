@@ -1,0 +1,243 @@
+"""MuJoCo MJX: MuJoCo's own equations, written in JAX, for any scene.
+
+All objects of one shape family compile to the same MJX structure, so that they can be batched in
+one program: `stack` collects the fields in which they differ, `apply` puts one world's in place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from rps_jax import errors
+from rps_jax.control.law import Twist
+from rps_jax.engines.base import Driven, Engine, Mode, Motion, taken
+from rps_jax.engines.mjx_colliders import mjx
+from rps_jax.geometry import solid
+from rps_jax.geometry.solid import Solid
+from rps_jax.world import scene
+from rps_jax.world.physics import Physics
+from rps_jax.world.scene import JOINTS, OFF_CENTRE, Friction, Scene
+
+# All that differs between objects of one shape family, as paths into an MJX model.
+FIELDS = (
+    ".stat.meaninertia",
+    *(f".body_{name}" for name in ("pos", "ipos", "iquat", "mass", "subtreemass", "inertia")),
+    *(".body_invweight0", ".dof_invweight0", ".dof_M0", ".qpos0", ".qpos_spring"),
+    *(".geom_pos", ".geom_size", ".geom_aabb", ".geom_rbound", ".pair_friction"),
+)
+
+
+class MJXStage(NamedTuple):
+    """What all worlds of a batch that MJX steps share."""
+
+    model: mjx.Model
+    data: mjx.Data  # a blank to be filled with each world's state
+
+    def drive(
+        self, fields: dict[str, jax.Array], motion: Motion, twists: Twist, physics: Physics
+    ) -> Driven:
+        """Step a batch for one control period.
+
+        Before each step the commanded twist is written into the base's joint velocities, turned
+        into the world.
+        """
+        step = jax.vmap(self._step)
+
+        def one(state: Motion, _: None) -> tuple[Motion, None]:
+            # Batched inside of the loop: a loop that is batched is traced anew.
+            return step(fields, state, twists), None
+
+        return Driven(jax.lax.scan(one, motion, length=physics.substeps)[0])
+
+    def _step(self, fields: dict[str, jax.Array], state: Motion, twist: Twist) -> Motion:
+        model, (qpos, qvel, warmstart) = apply(self.model, fields), state
+        qvel = qvel.at[JOINTS.base].set(twist.in_world(qpos[2]))
+        data = self.data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
+        with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
+            data = mjx.step(model, data)
+        return Motion(data.qpos, data.qvel, data.qacc_warmstart)
+
+
+class MJX(Engine):
+    """The engine of the paper's tables."""
+
+    name = "mjx"
+    modes = ("forward",)
+
+    def check_derivatives(self, mode: Mode, physics: Physics) -> None:
+        """Raises InputError unless a trial can be differentiated in this mode."""
+        super().check_derivatives(mode, physics)
+        if physics.cone == "elliptic":
+            raise errors.InputError(
+                "cone = elliptic is not allowed: MJX's elliptic cone has no finite derivatives, so "
+                "it must be pyramidal (or the engine fused)."
+            )
+
+    def stage_of_scenes(self, scenes: Sequence[Scene], which: np.ndarray) -> tuple[Any, Any]:
+        """Stage and fields of worlds in scenes of one shape family."""
+        models = [s.physics for s in scenes]
+        model, fields = stack(models)
+        return MJXStage(model, mjx.make_data(models[0])), taken(jax.device_get(fields), which)
+
+    def stage_of_solids(
+        self, family: str, solids: Solid, friction: Friction, physics: Physics
+    ) -> tuple[Any, Any]:
+        """Stage and fields of solids (n, ...)."""
+        return solids_by_template(self, family, solids, friction, physics)
+
+    def slots(self, backend: str) -> int:
+        """Worlds that one worker steps at once: few on a processor, whose caches are small."""
+        return 24 if backend == "cpu" else 16384
+
+    def levers(self, family: str) -> dict[str, Callable[[MJXStage], MJXStage]]:
+        """Other options of the model."""
+        return {
+            "unused stages disabled": _option(disableflags=_UNUSED),
+            "sparse inertia matrix": _option(jacobian=mjx.JacobianType.SPARSE),
+        }
+
+    def contacts(self, stage: MJXStage, corners: int) -> int:
+        """Points of contact that the program looks into."""
+        return stage.data._impl.contact.dist.size  # pyright: ignore[reportAttributeAccessIssue]
+
+
+# Not in these scenes: equalities, joint limits and friction, actuators, springs, sensors.
+_UNUSED = mjx.DisableBit(sum(mjx.DisableBit[name] for name in (
+    *("EQUALITY", "FRICTIONLOSS", "LIMIT", "ACTUATION", "CLAMPCTRL"),
+    *("SPRING", "DAMPER", "SENSOR", "EULERDAMP"),
+)))  # fmt: skip
+
+
+def _option(**values: Any) -> Callable[[MJXStage], MJXStage]:
+    """The stage with other options of the model."""
+    changes = {f"opt.{name}": value for name, value in values.items()}
+
+    def change(stage: MJXStage) -> MJXStage:
+        model: Any = stage.model.tree_replace(changes)
+        return MJXStage(model, mjx.make_data(model))
+
+    return change
+
+
+def solids_by_template(
+    engine: Engine, family: str, solids: Solid, friction: Friction, physics: Physics
+) -> tuple[Any, Any]:
+    """Stage of the first of the solids, and fields (n, ...) of all."""
+    template = scene.of_solid(family, solids, friction, physics, 0)
+    stage, fields = engine.stage_of_scenes([template], np.zeros(1, int))
+    return stage, mjx_fields(family, solids, friction, template, fields)
+
+
+def put(model: mujoco.MjModel) -> mjx.Model:
+    """The model as MJX's own engine has it."""
+    # A static copy of the bounding radii, which only height fields use, would bar stacking.
+    unused: dict[str, Any] = {"_impl.geom_rbound_hfield": np.zeros(model.ngeom)}
+    there: Any = mjx.put_model(model).tree_replace(unused)
+    return there
+
+
+def stack(
+    models: Sequence[mujoco.MjModel], put: Callable[[mujoco.MjModel], mjx.Model] = put
+) -> tuple[mjx.Model, dict[str, jax.Array]]:
+    """One MJX model for all, `put` on the device, and the fields that vary: name -> (n, ...).
+
+    The fields are always the same ones, so that a world's numbers depend neither on what it is
+    batched with nor on a program of its own. They are copied from compiled models, so nothing
+    that MuJoCo derives from a mass, a size or a friction is forgotten.
+
+    Raises:
+      ValueError: the models differ in anything but `FIELDS`.
+    """
+    trees: list[Any] = [put(m) for m in models]
+    leaves, structures = zip(*map(jax.tree_util.tree_flatten_with_path, trees), strict=True)
+    if any(s != structures[0] for s in structures):
+        raise ValueError("models of different structure cannot be stacked")
+    fields = {}
+    for columns in zip(*leaves, strict=True):
+        name = jax.tree_util.keystr(columns[0][0])
+        values = [np.asarray(leaf) for _, leaf in columns]
+        if name in FIELDS:
+            fields[name] = jnp.stack(values)
+        elif any(not np.array_equal(v, values[0]) for v in values):
+            raise ValueError(f"models that differ in {name} cannot be stacked")
+    return trees[0], fields
+
+
+def apply(model: mjx.Model, fields: dict[str, jax.Array]) -> mjx.Model:
+    """The model with one world's fields, as named by `stack`, put in place."""
+    return jax.tree_util.tree_map_with_path(
+        lambda path, leaf: fields.get(jax.tree_util.keystr(path), leaf), model
+    )
+
+
+def mjx_fields(
+    family: str, solids: Solid, friction: Friction, template: Scene, fields: dict[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Fields of an MJX model for solids, from those (1, ...) of a scene with another solid."""
+    count = solids.mass.size
+    new = {name: np.repeat(np.asarray(row, float), count, axis=0) for name, row in fields.items()}
+    model = template.physics
+    thing, mass = model.body("object").id, solids.mass
+    com = solids.p_object_com + OFF_CENTRE
+    turn = solid.axes(solids)
+    moments = np.einsum("nij,nj,nkj->nik", turn, solids.inertia, turn)
+    inverse = np.einsum("nij,nj,nkj->nik", turn, 1 / solids.inertia, turn)
+    z = JOINTS.object.start + 2
+    new[".body_pos"][:, thing, 2] = solids.height / 2
+    new[".qpos0"][:, z] = new[".qpos_spring"][:, z] = solids.height / 2
+    new[".body_ipos"][:, thing], new[".body_iquat"][:, thing] = com, solids.q_object_body
+    new[".body_mass"][:, thing] = new[".body_subtreemass"][:, thing] = mass
+    new[".body_subtreemass"][:, 0] = new[".body_mass"].sum(axis=1)
+    new[".body_inertia"][:, thing] = solids.inertia
+    spin = np.mean(1 / solids.inertia, axis=1)
+    new[".body_invweight0"][:, thing] = np.stack([1 / mass, spin], axis=-1)
+    # The free joint moves the object's origin, which feels the spin through the arm of the centre.
+    arm = _skew(com)
+    shift = 1 / mass + np.trace(arm @ inverse @ arm.swapaxes(1, 2), axis1=1, axis2=2) / 3
+    new[".dof_invweight0"][:, 3:6], new[".dof_invweight0"][:, 6:9] = shift[:, None], spin[:, None]
+    about = moments - mass[:, None, None] * (arm @ arm)
+    new[".dof_M0"][:, 3:6] = mass[:, None]
+    new[".dof_M0"][:, 6:9] = np.diagonal(about, axis1=1, axis2=2)
+    new[".stat.meaninertia"] = new[".dof_M0"].mean(axis=1)
+    _size_geoms(family, solids, template, new)
+    robot = np.array([model.pair(i).name == "base_object" for i in range(model.npair)])
+    new[".pair_friction"][:, :, :2] = np.where(
+        robot[:, None], friction.robot[:, None, None], friction.ground[:, None, None]
+    )
+    return new
+
+
+def _size_geoms(family: str, solids: Solid, template: Scene, new: dict[str, np.ndarray]) -> None:
+    """Sizes, bounding boxes and radii of the object's geoms."""
+    model, half = template.physics, solids.height / 2
+    for name, size in scene.geom_sizes(family, solids).items():
+        geom = model.geom(name).id
+        new[".geom_size"][:, geom] = size
+        box = size if family == "box" else size[:, [0, 0, 1]]
+        bound = np.linalg.norm(size[:, :3] if family == "box" else size[:, :2], axis=1)
+        if name == "object_side":  # a capsule reaches farther up by its radius
+            box, bound = box + [0, 0, 1] * size[:, :1], half + solids.radius
+        new[".geom_aabb"][:, geom] = np.concatenate([0 * box, box], axis=-1).reshape(
+            new[".geom_aabb"][:, geom].shape
+        )
+        new[".geom_rbound"][:, geom] = bound
+    if family == "prism":
+        for i, at in enumerate(scene.feet(solids).swapaxes(0, 1)):
+            new[".geom_pos"][:, model.geom(f"foot_{i}").id] = at
+
+
+def _skew(v: np.ndarray) -> np.ndarray:
+    """Matrices (n, 3, 3) of the cross products with v (n, 3)."""
+    x, y, z = v.T
+    zero = np.zeros_like(x)
+    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
+    return np.stack(rows, axis=-1).reshape(-1, 3, 3)
+
+
+ENGINE = MJX()

@@ -1,0 +1,78 @@
+"""Trials of an engine that JAX does not trace: stepped on the host, decided through JAX.
+
+Sensing, deciding and the rules are those of `trial`; the engine is the only difference. Positions
+are handed over in JAX's precision and stepped in the engine's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+
+from rps_jax.control.strategies import Strategy
+from rps_jax.engines.base import Driven, Engine, Motion
+from rps_jax.trials import trial
+from rps_jax.trials.trial import Rules, Trial, World
+from rps_jax.world.physics import Physics
+
+_LOOK = 500  # control steps between two reports
+
+
+@partial(jax.jit, static_argnames=("physics", "strategy"))
+def _decide(worlds: World, trials: Trial, **options: Any):
+    return jax.vmap(partial(trial.decide, **options))(worlds, trials)[:2]
+
+
+_settle = jax.jit(jax.vmap(trial.settle))
+
+
+def run(
+    engine: Engine,
+    stage: Any,
+    worlds: World,
+    *,
+    physics: Physics,
+    rules: Rules,
+    strategy: Strategy,
+    threads: int,
+    report: Callable[[np.ndarray, Trial, float], bool],
+) -> None:
+    """Run a batch of worlds to their ends.
+
+    `report(ended, trials, simulated)` is told now and then which trials (n,) have ended since, and
+    how many seconds were simulated, summed over all; it answers whether to go on.
+    """
+    options = {"physics": physics, "rules": rules, "strategy": strategy}
+    count = len(worlds.qpos)
+    host = jax.devices("cpu")[0]  # where the engine is
+    worlds = jax.device_put(worlds, host)
+    trials = trial.start_all(worlds, np.ones(count, bool), strategy=strategy)
+    batch = engine.stepper(stage, np.asarray(trials.qpos, float), threads)
+    try:
+        told_of = np.zeros(count, bool)
+        before, passes = 0, 0
+        while not told_of.all():
+            told, twist = _decide(worlds, trials, **options)
+            going = np.flatnonzero(~np.asarray(told.done))
+            # Only a hand that shifts the object moves it outside the engine.
+            shifted = np.flatnonzero(np.any(np.asarray(told.qpos != trials.qpos), axis=1))
+            batch.qpos[shifted] = np.asarray(told.qpos)[shifted]
+            if going.size:
+                batch.drive(going, np.stack(twist, axis=1)[going].astype(float), physics.substeps)
+            dtype = trials.qpos.dtype
+            after = (batch.qpos, batch.qvel, batch.warmstart)
+            motion = Motion(*(x.astype(dtype) for x in after))
+            trials = _settle(trials, told, Driven(motion))
+            passes += 1
+            if passes % _LOOK == 0 or not going.size:
+                done, steps = np.asarray(trials.done), int(np.asarray(trials.steps).sum())
+                simulated = (steps - before) * physics.control_period
+                if not report(np.flatnonzero(done & ~told_of), trials, simulated):
+                    return
+                told_of, before = done, steps
+    finally:
+        batch.close()
