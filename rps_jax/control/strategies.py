@@ -13,7 +13,6 @@ from rps_jax import errors
 from rps_jax.control import aps, law
 from rps_jax.control.aps import APSParams, APSState
 from rps_jax.control.law import Details, RPSParams, RPSState, Temperatures, Twist
-from rps_jax.world import paper
 
 
 def check_finite(params: Any) -> Any:
@@ -37,7 +36,9 @@ Params = RPSParams | APSParams | Any  # a NamedTuple of numbers, of a class in S
 RPS = Strategy(RPSState.init, law.step_with_details, check=law.check)  # and NPS, by `reactive`
 APS = Strategy(APSState.init, aps.aps_step, tracks=True, check=aps.check)
 STRATEGIES: dict[type, Strategy] = {RPSParams: RPS, APSParams: APS}  # by class of parameters
-PARAMS: dict[str, Params] = dict(paper.PARAMS)  # by name
+# The paper's, by name, with their parameters.
+PAPER: dict[str, Params] = {"rps": RPSParams.paper(), "nps": RPSParams.nps(), "aps": APSParams()}
+PARAMS: dict[str, Params] = dict(PAPER)  # by name
 
 
 @functools.cache  # equal temperatures are one strategy, and so one compiled program
@@ -88,9 +89,9 @@ def register_strategy(name: str, strategy: Strategy, params: Params) -> None:
       InputError: the name is one of the paper's, the parameters are not such, or their class is
         that of another strategy.
     """
-    if name in paper.PARAMS:
+    if name in PAPER:
         raise errors.InputError(
-            f"strategy name '{name}' is not allowed: {', '.join(paper.PARAMS)} are the paper's."
+            f"strategy name '{name}' is not allowed: {', '.join(PAPER)} are the paper's."
         )
     if not hasattr(params, "_asdict") or not hasattr(params, "d_success"):
         raise errors.InputError(

@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from rps_jax.control.aps import APSParams
-from rps_jax.control.law import RPSParams
+from rps_jax.control.strategies import PAPER as PARAMS
 
 TARGETS = tuple(
     (float(x), float(y)) for x in (2, 1, 0, -1, -2) for y in (2, 1, 0, -1, -2) if (x, y) != (0, 0)
 )  # [m] Sec. III-B: a grid of 1 m, without the robot's place
 
-PARAMS = {"rps": RPSParams.paper(), "nps": RPSParams.nps(), "aps": APSParams()}
 STRATEGIES = tuple(PARAMS)
 SKIN = {"default": "ideal", "paper_gazebo": "thin"}  # that goes with each physics
 
