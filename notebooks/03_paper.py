@@ -21,11 +21,11 @@ from pathlib import Path
 from IPython.display import Image, Markdown
 
 from rps_jax.analysis import figures, tables
-from rps_jax.record import folder as record
+from rps_jax.record import files
 
 out = Path(tempfile.mkdtemp())
 run = Path("runs/table")
-results = record.read_results(run)
+results = files.read_results(run)
 
 # %% [markdown]
 # ## Table II

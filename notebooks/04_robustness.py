@@ -26,12 +26,12 @@ from pathlib import Path
 from IPython.display import Image, Markdown
 
 from rps_jax.analysis import figures, statistics, tables
-from rps_jax.record import folder as record
+from rps_jax.record import files
 from rps_jax.runs import sweep
 
 out = Path(tempfile.mkdtemp())
 run = Path("runs/compare/wide")
-plan, results = sweep.load_plan(run), record.read_results(run)
+plan, results = sweep.load_plan(run), files.read_results(run)
 max_lost = float(plan.setting.rules.max_lost)
 
 # %% [markdown]

@@ -28,7 +28,7 @@ from IPython.display import Image, Markdown
 from rps_jax import FRICTION, Case, RPSParams, Setting
 from rps_jax.analysis import figures, statistics, tables
 from rps_jax.control import strategies
-from rps_jax.record import folder as record
+from rps_jax.record import files
 from rps_jax.robot.skin import SmoothSkin
 from rps_jax.trials import pushes, trial
 from rps_jax.tuning import evolution as tune
@@ -97,7 +97,7 @@ Image(figures.twist_field(sets, 1.0, out / "twist.png"))
 # ## The same worlds, twice
 
 # %%
-results = record.read_results(Path("runs/compare/wide"))
+results = files.read_results(Path("runs/compare/wide"))
 Markdown(tables.markdown(statistics.differences(results)))
 
 # %%

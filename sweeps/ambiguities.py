@@ -16,7 +16,7 @@ import tyro
 from rps_jax import errors
 from rps_jax.analysis import figures, tables
 from rps_jax.app.cli import StudyOptions, guarded, progress_bar
-from rps_jax.record import folder as record
+from rps_jax.record import files
 from rps_jax.studies import ambiguity, study
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
@@ -54,7 +54,7 @@ def main(options: Options) -> None:
         results = study.run(
             {name: known[name] for name in names}, grid, out, **options.shape(), report=report
         )
-    record.write_results(out / "results.nc", results)
+    files.write_results(out / "results.nc", results)
     found = [study.rows(results, names[0], strategy) for strategy in strategies]
     if options.gazebo and "paper_gazebo" in names:
         found.append(ambiguity.cells(results))
@@ -63,7 +63,7 @@ def main(options: Options) -> None:
         trials = grid.size // len(PAPER_OBJECTS)
         figures.tolerance_curve(curve, trials, out / "tolerance.png")
     text = "\n\n".join(tables.markdown(rows) for rows in found)
-    record.write_text(out / "table.md", text + "\n")
+    files.write_text(out / "table.md", text + "\n")
     print(text)
 
 

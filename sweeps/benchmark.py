@@ -19,7 +19,8 @@ from tqdm import tqdm
 from rps_jax import engines, errors
 from rps_jax.analysis import figures, tables
 from rps_jax.app.cli import guarded
-from rps_jax.record import folder as record
+from rps_jax.record import files
+from rps_jax.record import folder as run_folder
 from rps_jax.studies import benchmark
 from rps_jax.studies.benchmark import Speed
 
@@ -67,7 +68,7 @@ def main(options: Options) -> None:
             f"names = {options.names} with worlds = {options.worlds} leave nothing to time: MJX "
             f"and MJX-Warp are timed up to --mujocos {options.mujocos} worlds."
         )
-    record.writable(options.out)
+    run_folder.writable(options.out)
     speeds, text = [], ""
     where = benchmark.machine()
     if options.refill:
@@ -77,7 +78,7 @@ def main(options: Options) -> None:
     ):
         speeds.append(speed)
         text = where + tables.markdown(benchmark.table(speeds))
-        record.write_text(options.out / "benchmark.md", text + "\n")
+        files.write_text(options.out / "benchmark.md", text + "\n")
         figures.throughput(speeds, options.out / "throughput.png")
     print(text)
 

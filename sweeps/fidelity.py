@@ -15,7 +15,7 @@ import tyro
 from rps_jax import engines, errors
 from rps_jax.analysis import tables
 from rps_jax.app.cli import StudyOptions, guarded, progress_bar
-from rps_jax.record import folder as record
+from rps_jax.record import files
 from rps_jax.studies import fidelity, study
 from rps_jax.world import paper
 
@@ -41,9 +41,9 @@ def main(options: Options) -> None:
     grid = study.Grid(strategies=paper.STRATEGIES, targets=options.targets())
     with options.opened() as out, progress_bar(len(names) * grid.size) as report:
         results = fidelity.run(names, grid, out, **options.shape(), report=report)
-    record.write_results(out / "results.nc", results)
+    files.write_results(out / "results.nc", results)
     text = tables.markdown(fidelity.table(results))
-    record.write_text(out / "fidelity.md", text + "\n")
+    files.write_text(out / "fidelity.md", text + "\n")
     print(text)
 
 

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from rps_jax.analysis import figures, tables
 from rps_jax.app.cli import guarded, use_cache
-from rps_jax.record import folder as record
+from rps_jax.record import files
 from rps_jax.studies import gradient_quality
 from rps_jax.studies.gradient_quality import Study
 from rps_jax.tuning import evolution as tune
@@ -70,9 +70,9 @@ def main(options: Options) -> None:
 
         results = gradient_quality.run(study, out, options.estimators, report=report)
         bar.update(bar.total - bar.n)
-    record.write_results(out / "results.nc", results)
+    files.write_results(out / "results.nc", results)
     text = tables.markdown(gradient_quality.table(results))
-    record.write_text(out / "quality.md", text + "\n")
+    files.write_text(out / "quality.md", text + "\n")
     figures.gradient_quality(results, out / "quality.png")
     print(text)
 

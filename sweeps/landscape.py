@@ -25,7 +25,8 @@ from rps_jax.app.cli import (
     progress_bar,
     use_cache,
 )
-from rps_jax.record import folder as record
+from rps_jax.record import files, provenance
+from rps_jax.record import folder as run_folder
 from rps_jax.studies import sensitivity
 from rps_jax.tuning.evolution import SUBSETS, Course
 
@@ -60,23 +61,23 @@ def main(options: Options) -> None:
     labels = labels_of("params", options.params)
     sets = {label: params_of(name) for label, name in zip(labels, options.params, strict=True)}
     course = Course(tuple(domain_of(text) for text in options.domain))
-    out = record.writable(options.out)
+    out = run_folder.writable(options.out)
     use_cache()
-    record.write_json(out / "environment.json", record.environment())
+    files.write_json(out / "environment.json", provenance.environment())
     common: dict[str, Any] = {"worlds": options.worlds, "seed": options.seed} | options.shape()
     each = len(course.domains) * options.worlds
     varied = len(sets) * len(SUBSETS["full"]) * options.values
     with progress_bar(varied * each, "sensitivity") as report:
         found = sensitivity.sensitivity(sets, course, count=options.values, report=report, **common)
-    record.write_results(out / "sensitivity.nc", found)
+    files.write_results(out / "sensitivity.nc", found)
     figures.sensitivity(found, out / "sensitivity.png")
     several: dict[str, Any] = {"candidates": options.candidates, "spread": options.spread}
     with progress_bar(2 * (options.candidates + len(sets)) * each, "front") as report:
         front = sensitivity.front(sets, course, report=report, **several, **common)
-    record.write_results(out / "front.nc", front)
+    files.write_results(out / "front.nc", front)
     figures.front(front, out / "front.png")
     text = tables.markdown(sensitivity.front_table(front))
-    record.write_text(out / "front.md", text + "\n")
+    files.write_text(out / "front.md", text + "\n")
     print(text)
 
 

@@ -16,7 +16,8 @@ from tqdm import tqdm
 from rps_jax import engines, errors
 from rps_jax.analysis import figures, tables
 from rps_jax.app.cli import guarded
-from rps_jax.record import folder as record
+from rps_jax.record import files
+from rps_jax.record import folder as run_folder
 from rps_jax.studies import ablation, benchmark
 
 
@@ -49,7 +50,7 @@ def main(options: Options) -> None:
     errors.check_finite("simulated", options.simulated, at_least=0.04, at_most=60, unit="s")
     errors.check_count("goes", options.goes, at_most=1000)
     errors.check_count("at_once", options.at_once, at_most=1024)
-    record.writable(options.out)
+    run_folder.writable(options.out)
     total = 1 + len(ablation.levers(options.name, options.family))
     shape = {"goes": options.goes, "at_once": options.at_once, "simulated": options.simulated}
     pulled = ablation.measure(options.name, options.family, options.worlds, **shape)
@@ -57,7 +58,7 @@ def main(options: Options) -> None:
     for gain in tqdm(pulled, total=total, unit="lever"):
         gains.append(gain)
         text = benchmark.machine() + tables.markdown(ablation.table(gains))
-        record.write_text(options.out / "levers.md", text + "\n")
+        files.write_text(options.out / "levers.md", text + "\n")
         figures.levers(gains, options.out / "levers.png")
     print(text)
 

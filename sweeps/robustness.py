@@ -17,7 +17,8 @@ import tyro
 from rps_jax import engines, errors
 from rps_jax.analysis import statistics, tables
 from rps_jax.app.cli import Spread, domain_of, guarded, progress_bar, use_cache
-from rps_jax.record import folder as record
+from rps_jax.record import files
+from rps_jax.record import folder as run_folder
 from rps_jax.runs import sweep
 from rps_jax.runs.sweep import Plan
 from rps_jax.trials.setting import Setting
@@ -75,13 +76,13 @@ def main(options: Options) -> None:
     found = {}
     for name, plan in plans.items():
         folder = sweep.open_run(options.out / name.replace(", ", "_"), plan)
-        with record.hold(folder):
+        with run_folder.hold(folder):
             with progress_bar(plan.trials, name) as report:
                 sweep.run(folder, plan, report=report, **shape)
             sweep.merge([folder], folder)
-        found[name] = record.read_results(folder).isel(arm=0)
+        found[name] = files.read_results(folder).isel(arm=0)
     text = tables.markdown(statistics.agreement(found))
-    record.write_text(options.out / "engines.md", text + "\n")
+    files.write_text(options.out / "engines.md", text + "\n")
     print(text)
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from rps_jax.app import cli
 from rps_jax.errors import InputError
-from rps_jax.record import folder as record
+from rps_jax.record import files
 from rps_jax.runs import sweep
 from rps_jax.runs.sweep import Plan
 from rps_jax.trials.setting import Setting
@@ -391,7 +391,7 @@ def test_bad_input_is_one_sentence_and_exit_code_2_before_anything_compiles(
 def test_a_corrupt_results_file_is_named(tmp_path):
     (tmp_path / "results.nc").write_bytes(b"not a file of results")
     with pytest.raises(InputError, match=r"results\.nc is corrupt"):
-        record.read_results(tmp_path)
+        files.read_results(tmp_path)
 
 
 SCRIPTS = [

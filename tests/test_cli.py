@@ -11,7 +11,7 @@ import xarray as xr
 from rps_jax.analysis import tables
 from rps_jax.app import cli
 from rps_jax.errors import InputError
-from rps_jax.record import folder as record
+from rps_jax.record import files
 from rps_jax.world import paper
 
 SMALL = [
@@ -34,7 +34,7 @@ def runs(tmp_path_factory):
 
 
 def test_a_table_run_leaves_a_labelled_run_folder(runs):
-    results = record.read_results(runs[0])
+    results = files.read_results(runs[0])
     assert results.success.dims == tables.DIMS
     assert results.sizes == {"strategy": 2, "object": 2, "friction": 2, "target": 2, "pose": 3}
     assert list(results.object.values) == ["box", "nonuniform_box"]

@@ -13,7 +13,7 @@ import pytest
 
 from rps_jax.app import cli
 from rps_jax.errors import InputError
-from rps_jax.record import folder as record
+from rps_jax.record import files, provenance
 from rps_jax.runs import cluster, sweep
 from rps_jax.runs.board import Board
 from rps_jax.runs.sweep import Plan
@@ -201,7 +201,7 @@ def test_a_worker_killed_at_work_changes_nothing(domain, tmp_path, two_workers, 
     assert len(seen) > len(json.loads((out / "environment.json").read_text())["workers"])
     assert len(payload(plain)) == 6
     assert payload(out) == payload(plain)
-    assert record.read_results(out).success.shape == (2, 20)
+    assert files.read_results(out).success.shape == (2, 20)
 
 
 def test_what_ends_a_worker_ends_the_run_as_itself(tmp_path, two_workers):
@@ -213,8 +213,8 @@ def test_what_ends_a_worker_ends_the_run_as_itself(tmp_path, two_workers):
 
 
 def test_a_worker_with_other_software_is_refused(tmp_path, two_workers, monkeypatch):
-    here = record.environment()
-    monkeypatch.setattr(record, "environment", lambda: here | {"commit": "another"})
+    here = provenance.environment()
+    monkeypatch.setattr(provenance, "environment", lambda: here | {"commit": "another"})
     with pytest.raises(
         InputError, match=r"other software \(commit = .* there, .another. asked for"
     ):

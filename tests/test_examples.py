@@ -17,7 +17,7 @@ from rps_jax.control.law import Details, Observation, RPSParams, RPSState, step
 from rps_jax.control.strategies import Strategy
 from rps_jax.errors import InputError
 from rps_jax.geometry.footprint import Footprint, circle, polygon, rectangle
-from rps_jax.record import folder as record
+from rps_jax.record import files
 from rps_jax.robot.skin import POINT, CapacitiveSkin
 from rps_jax.runs import sweep
 from rps_jax.runs.sweep import Plan
@@ -233,7 +233,7 @@ def test_registered_names_work_on_the_command_line(tmp_path, capsys, hexagon):
     command += ["--targets", "2", "0", "--horizon", "4", "--engine", "mujoco", "--out", str(out)]
     assert cli.main([*command, "--params", "p_control.v=0.02"]) == 0
     assert "P_CONTROL" in capsys.readouterr().out
-    results = record.read_results(out)
+    results = files.read_results(out)
     assert results.object.values.tolist() == ["hexagon"]
     assert float(results.base_pose[0, 0, 0, 0, 0]) == pytest.approx(0.08, abs=0.002)
     assert cli.main([*command, "--params", "p_control.w=1"]) == 2

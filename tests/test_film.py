@@ -10,7 +10,7 @@ from test_video import decode
 from rps_jax.analysis import video
 from rps_jax.app import cli, film
 from rps_jax.errors import InputError
-from rps_jax.record import folder as record
+from rps_jax.record import files
 from rps_jax.runs import sweep
 from rps_jax.runs.sweep import Plan
 from rps_jax.trials.setting import Setting
@@ -28,7 +28,7 @@ def table(folder):
     """A run of `rps table` over two targets, as far as a film reads it."""
     asked = cli.Table(objects=("box",), targets=((0.6, 0.0), (2.0, 2.0)), engine=ENGINE)
     options = dataclasses.asdict(asked) | {"out": str(folder)}
-    record.write_json(folder / "config.json", {"options": options})
+    files.write_json(folder / "config.json", {"options": options})
 
 
 def plan_of(*names):

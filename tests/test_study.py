@@ -10,7 +10,7 @@ from rps_jax.analysis import report, tables
 from rps_jax.analysis.report import Section
 from rps_jax.control.law import RPSParams
 from rps_jax.engines import mujoco as c_mujoco
-from rps_jax.record import folder as record
+from rps_jax.record import files
 from rps_jax.robot.skin import IdealSkin
 from rps_jax.studies import ambiguity, fidelity, hardware, study
 from rps_jax.studies.study import Condition, Grid
@@ -52,7 +52,7 @@ def test_a_study_labels_its_conditions_and_compares_them(folder):
 
 
 def test_a_study_continues_where_it_stopped_and_redoes_alone_what_is_corrupt(folder, monkeypatch):
-    before = record.read(folder / "thin.nc")
+    before = files.read(folder / "thin.nc")
     (folder / "thin.nc").write_bytes(b"torn")
     ran = []
     run = pushes.run
@@ -64,7 +64,7 @@ def test_a_study_continues_where_it_stopped_and_redoes_alone_what_is_corrupt(fol
     monkeypatch.setattr(pushes, "run", counted)
     study.run(CONDITIONS, GRID, folder)
     assert ran == CONDITIONS["thin"].cases(GRID)
-    xr.testing.assert_identical(record.read(folder / "thin.nc").drop_attrs(), before.drop_attrs())
+    xr.testing.assert_identical(files.read(folder / "thin.nc").drop_attrs(), before.drop_attrs())
     assert (folder / "thin.nc.corrupt").exists()
 
 

@@ -27,7 +27,8 @@ from rps_jax.control import strategies
 from rps_jax.control.law import RPSParams
 from rps_jax.errors import InputError
 from rps_jax.geometry import planar
-from rps_jax.record import folder as record
+from rps_jax.record import files, provenance
+from rps_jax.record import folder as run_folder
 from rps_jax.runs import sweep
 from rps_jax.runs.sweep import Plan, Shard
 from rps_jax.trials import batch, trial
@@ -197,7 +198,7 @@ def test_two_devices_find_what_one_finds_and_never_talk(whole, tmp_path, cache):
     results = []
     for folder in (tmp_path / "run", whole):
         sweep.merge([folder], tmp_path)
-        results.append(record.read_results(tmp_path))
+        results.append(files.read_results(tmp_path))
     # Another program rounds otherwise, and contact amplifies it.
     two, one = results
     np.testing.assert_array_equal(two.success, one.success)
@@ -207,7 +208,7 @@ def test_two_devices_find_what_one_finds_and_never_talk(whole, tmp_path, cache):
 
 def test_results_hold_every_world_with_what_was_drawn(whole, tmp_path):
     sweep.merge([whole], tmp_path)
-    results = record.read_results(tmp_path)
+    results = files.read_results(tmp_path)
     assert dict(results.sizes) == {"arm": 2, "world": 20, "pose": 3, "object": 1}
     columns = domain.table(domain.draw(BOXES, 0, np.arange(20)))
     for name, (values, unit) in columns.items():
@@ -329,7 +330,7 @@ def test_a_corrupt_part_is_set_aside_and_done_again_alone(whole, tmp_path):
 def test_a_part_of_an_older_version_is_named(whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "run")
     victim = sorted(folder.glob("parts/*.nc"))[0]
-    older = record.encoded(record.read(victim).drop_vars("overflows"))
+    older = files.encoded(files.read(victim).drop_vars("overflows"))
     victim.unlink()
     kept = sweep.store(folder, 0, older)
     with pytest.raises(InputError, match=f"{kept.name} is corrupt .it lacks what this version"):
@@ -339,9 +340,9 @@ def test_a_part_of_an_older_version_is_named(whole, tmp_path):
 def test_the_report_of_one_world_tells_what_was_lost_and_how_to_see_it(whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "a run")
     sweep.merge([folder], folder)
-    one = record.read_results(folder).isel(world=[0])
+    one = files.read_results(folder).isel(world=[0])
     one.success[:], one.overflows[:] = [[1], [0]], [[0], [3]]
-    record.write_results(folder / "results.nc", one)
+    files.write_results(folder / "results.nc", one)
     text = sweep.write_report(folder).read_text()
     assert "1 trials lost contacts for want of room: they are not to be trusted" in text
     assert f"`rps replay '{folder}' 0 --arm 'nps' --video`" in text  # the arm that fails
@@ -356,7 +357,7 @@ def test_shards_merge_to_the_whole(whole, tmp_path):
     sweep.merge(folders, tmp_path)
     (tmp_path / "direct").mkdir()
     sweep.merge([whole], tmp_path / "direct")
-    together = [record.read_results(f) for f in (tmp_path, tmp_path / "direct")]
+    together = [files.read_results(f) for f in (tmp_path, tmp_path / "direct")]
     xr.testing.assert_identical(*together)
     other = replace(PLAN, setting=replace(SHORT, seed=5))
     sweep.open_run(tmp_path / "other", other)
@@ -373,17 +374,17 @@ def test_another_configuration_is_refused_with_what_differs(whole):
 def test_two_processes_may_not_share_a_run_but_may_share_its_shards(tmp_path):
     def refused(number, of):
         with pytest.raises(InputError, match="in use by another process"):
-            record.hold(tmp_path, number, of).__enter__()
+            run_folder.hold(tmp_path, number, of).__enter__()
 
-    with record.hold(tmp_path):
+    with run_folder.hold(tmp_path):
         refused(1, 1)
         refused(1, 2)
-    with record.hold(tmp_path, 1, 2):
-        with record.hold(tmp_path, 2, 2):
+    with run_folder.hold(tmp_path, 1, 2):
+        with run_folder.hold(tmp_path, 2, 2):
             refused(1, 2)
         refused(1, 1)
         refused(2, 3)  # which has parts of both
-    with record.hold(tmp_path, 1, 3):
+    with run_folder.hold(tmp_path, 1, 3):
         pass
 
 
@@ -395,34 +396,34 @@ def test_of_those_that_begin_a_run_at_once_all_agree_or_are_refused(tmp_path):
         wanted = {"worlds": number % 2}
         together.wait()
         try:
-            record.claim(tmp_path, wanted)
+            run_folder.claim(tmp_path, wanted)
         except InputError as error:
             return str(error)
-        record.sign(tmp_path, {"time": number})
+        provenance.sign(tmp_path, {"time": number})
         return wanted
 
     with ThreadPoolExecutor(8) as pool:
         told = list(pool.map(begin, range(8)))
-    kept = record.manifest(tmp_path)
+    kept = run_folder.manifest(tmp_path)
     assert sorted(t == kept for t in told) == [False] * 4 + [True] * 4
     assert all("holds another run" in t for t in told if t != kept)
-    assert record.signed(tmp_path)["time"] in range(8)
+    assert provenance.signed(tmp_path)["time"] in range(8)
 
 
 def test_what_a_run_was_made_on_before_is_not_forgotten(tmp_path):
-    this = record.environment()
+    this = provenance.environment()
     there = this | {"commit": "abc", "device": this["device"] | {"kind": "H200"}, "time": "then"}
-    record.sign(tmp_path, there)
-    record.sign(tmp_path, this)
-    record.sign(tmp_path, this | {"processors": 99})  # of a cluster that grows
-    record.sign(tmp_path, this)
-    record.sign(tmp_path, this | {"time": "later"})  # the same command again
-    assert record.signed(tmp_path) == this | {"time": "later", "before": [there]}
-    text = record.told(tmp_path)
+    provenance.sign(tmp_path, there)
+    provenance.sign(tmp_path, this)
+    provenance.sign(tmp_path, this | {"processors": 99})  # of a cluster that grows
+    provenance.sign(tmp_path, this)
+    provenance.sign(tmp_path, this | {"time": "later"})  # the same command again
+    assert provenance.signed(tmp_path) == this | {"time": "later", "before": [there]}
+    text = provenance.told(tmp_path)
     assert text.index("later") < text.index("before that by") < text.index("commit abc, then, on H")
-    (tmp_path / record.ENVIRONMENT).write_text("{}")
+    (tmp_path / provenance.ENVIRONMENT).write_text("{}")
     with pytest.raises(InputError, match=r"environment\.json is corrupt"):
-        record.told(tmp_path)
+        provenance.told(tmp_path)
 
 
 def test_what_a_sweep_says_is_what_happened():
@@ -499,7 +500,7 @@ def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys, monkeypatc
     assert cli.main(["merge", run, "--out", run]) == 0
     text = capsys.readouterr().out
     assert "rps tuned against rps paper" in text
-    results = record.read_results(Path(run))
+    results = files.read_results(Path(run))
     assert results.arm.values.tolist() == ["rps paper", "rps tuned"]
     assert cli.main(["merge", run, "--out", str(tmp_path / "there")]) == 0
     for folder, name in product(("run", "there"), ("report.html", "report.md", "success.png")):
@@ -510,6 +511,6 @@ def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys, monkeypatc
     assert "other holds another run (domain.objects = " in capsys.readouterr().err
     assert not (other / "results.nc").exists()
     assert cli.main(["replay", run, "4", "--arm", "rps tuned"]) == 0
-    seen = record.read(Path(run) / "replay-4" / "results.nc")
+    seen = files.read(Path(run) / "replay-4" / "results.nc")
     # Followed alone, in another batch than in the sweep.
     assert float(seen.outcome_time) == pytest.approx(float(results.time[1, 4]), abs=0.5)

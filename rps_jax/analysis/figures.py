@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from rps_jax.analysis import statistics, tables
 from rps_jax.control import law
 from rps_jax.control.law import Details, Observation, RPSParams, RPSState, Twist
-from rps_jax.record import folder as record
+from rps_jax.record import files
 from rps_jax.robot import skin
 from rps_jax.robot.skin import NONE
 from rps_jax.studies import ambiguity, benchmark, hardware
@@ -39,7 +39,7 @@ def _title(name: str) -> str:
 
 def save(figure: Figure, path: Path) -> Path:
     """Write the figure, atomically and without a date, so equal figures are equal files."""
-    return record.atomic(
+    return files.atomic(
         path, lambda partial: figure.savefig(partial, dpi=150, metadata={"Software": None})
     )
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import markdown
 
 from rps_jax.analysis import tables
-from rps_jax.record import folder as record
+from rps_jax.record import files
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 72em; margin: 2em auto; padding: 0 1em; }
@@ -44,7 +44,7 @@ def write_report(folder: Path, title: str, intro: str, sections: Sequence[Sectio
         if section.picture:
             texts.append(f"![{section.title}]({section.picture.relative_to(folder)})")
     text = "\n\n".join(texts) + "\n"
-    record.write_text(folder / "report.md", text)
+    files.write_text(folder / "report.md", text)
     body = markdown.markdown(text, extensions=["tables"])
     for section in sections:
         if section.picture:
@@ -55,4 +55,4 @@ def write_report(folder: Path, title: str, intro: str, sections: Sequence[Sectio
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
         f"<style>{_STYLE}</style>{body}</html>\n"
     )
-    return record.write_text(folder / "report.html", page)
+    return files.write_text(folder / "report.html", page)

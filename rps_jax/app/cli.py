@@ -157,14 +157,15 @@ class StudyOptions(Spread):
     @contextlib.contextmanager
     def opened(self) -> Iterator[Path]:
         """The run folder, new or to be continued, in use; checks the options first."""
-        from rps_jax.record import folder as record
+        from rps_jax.record import folder as run_folder
+        from rps_jax.record import provenance
 
         self.shape()
         choose_device("auto")
-        record.writable(self.out)
+        run_folder.writable(self.out)
         use_cache()
-        with record.hold(self.out):
-            record.sign(self.out)
+        with run_folder.hold(self.out):
+            provenance.sign(self.out)
             yield self.out
 
 
@@ -685,18 +686,20 @@ def _cases(options: Table, targets: Sequence[tuple[float, float]]) -> list[Case]
 
 def _open(common: Common, command: str) -> Path:
     """The run folder, with what was asked and what it runs on already in it."""
-    from rps_jax.record import folder as record
+    from rps_jax.record import files, provenance
+    from rps_jax.record import folder as run_folder
 
     out = common.out or Path("runs") / f"{command}-{time.strftime('%Y%m%d-%H%M%S')}"
     choose_device("auto")
-    record.prepare(out, overwrite=common.overwrite)
+    run_folder.prepare(out, overwrite=common.overwrite)
     use_cache()
-    record.write_json(out / "environment.json", record.environment())
+    files.write_json(out / "environment.json", provenance.environment())
     return out
 
 
 def _write_config(out: Path, common: Common, setting: Setting, params: dict[str, Params]) -> None:
-    from rps_jax.record import folder as record
+    from rps_jax.record import files
+    from rps_jax.record import folder as run_folder
 
     config = {
         "options": dataclasses.asdict(common) | {"out": str(out)},
@@ -705,7 +708,7 @@ def _write_config(out: Path, common: Common, setting: Setting, params: dict[str,
         "rules": setting.rules._asdict(),
         "skin": _per_world(common)["skin"]._asdict(),
     }
-    record.write_json(out / record.CONFIG, config)
+    files.write_json(out / run_folder.CONFIG, config)
 
 
 @contextlib.contextmanager
@@ -752,7 +755,7 @@ def _tell(timing: Timing, device: str | None = None) -> None:
 
 def _table(options: Table) -> None:
     from rps_jax.analysis import figures, tables
-    from rps_jax.record import folder as record
+    from rps_jax.record import files
     from rps_jax.trials import pushes
     from rps_jax.world import paper
 
@@ -767,11 +770,11 @@ def _table(options: Table) -> None:
     results = tables.dataset(
         outcome, options.strategies, options.objects, options.friction, targets
     )
-    record.write_results(out / "results.nc", results)
+    files.write_results(out / "results.nc", results)
     title = "Successes, with Wilson 95 % intervals in percent"
     table = tables.markdown(tables.table(results))
     text = f"{title}\n\n{table}\n\n{tables.summary(results)}\n"
-    record.write_text(out / "table.txt", text)
+    files.write_text(out / "table.txt", text)
     figures.min_distance(results, out / "min_distance.png")
     print(text)
     _tell(timing)
@@ -801,9 +804,9 @@ def _push(options: Push) -> None:
 def _show(trace: Trace, name: str, title: str, out: Path) -> None:
     """Results, figure and a line on the screen for one trial."""
     from rps_jax.analysis import figures, tables
-    from rps_jax.record import folder as record
+    from rps_jax.record import files
 
-    record.write_results(out / "results.nc", tables.trace_dataset(trace))
+    files.write_results(out / "results.nc", tables.trace_dataset(trace))
     figures.one_trial(trace, title, out / "trial.png")
     result = trace.outcome
     x, y = trace.p_world_target
@@ -853,7 +856,7 @@ def _evenly(length: int, count: int) -> list[int]:
 
 def _hardware(options: Hardware) -> None:
     from rps_jax.analysis import figures
-    from rps_jax.record import folder as record
+    from rps_jax.record import files
     from rps_jax.studies import hardware, reproduce
     from rps_jax.trials import pushes
     from rps_jax.world import paper
@@ -879,12 +882,12 @@ def _hardware(options: Hardware) -> None:
         len(paper.HARDWARE_OBJECTS) * len(layout) * len(hardware.frictions())
     ) as report:
         results = hardware.run(case, setting, **given, **shape, report=report)
-    record.write_results(out / "results.nc", results)
+    files.write_results(out / "results.nc", results)
     with progress_bar(
         2 * len(paper.HARDWARE_OBJECTS) * len(layout) * len(hardware.SHIFTS)
     ) as report:
         shifted = hardware.disturb(case, setting, **given, **shape, report=report)
-    record.write_results(out / "shifted.nc", shifted)
+    files.write_results(out / "shifted.nc", shifted)
     figures.paths(hardware.paths(case, setting, **given), layout, out / "paths.png")
     sections = reproduce.hardware_sections(out, results, shifted)
     reproduce.report_to(out, sections)
@@ -893,12 +896,12 @@ def _hardware(options: Hardware) -> None:
 
 
 def _paper(options: Paper) -> None:
-    from rps_jax.record import folder as record
+    from rps_jax.record import folder as run_folder
     from rps_jax.studies import reproduce
 
     plan = reproduce.Plan.quick() if options.quick else reproduce.Plan()
     with options.opened() as out:
-        record.claim(out, dataclasses.asdict(plan))
+        run_folder.claim(out, dataclasses.asdict(plan))
         with progress_bar(plan.trials()) as report:
             path = reproduce.run(out, plan, report=report, **options.shape())
     print(f"report: {path}")
@@ -1098,7 +1101,8 @@ def _prepare(device: str, x64: bool) -> None:
 
 
 def _sweep(options: Sweep) -> None:
-    from rps_jax.record import folder as record
+    from rps_jax.record import folder as run_folder
+    from rps_jax.record import provenance
     from rps_jax.runs import sweep
 
     plan, shard, shape = _plan(options), _shard(options.shard), options.shape()
@@ -1109,11 +1113,11 @@ def _sweep(options: Sweep) -> None:
         _check_here(options.device, plan.setting, [plan.domain])
     out = sweep.open_run(options.out, plan)
     use_cache()
-    with record.hold(out, shard.number, shard.of):
+    with run_folder.hold(out, shard.number, shard.of):
         trials = sum(numbers.size for numbers in sweep.share(plan, shard).values())
         with progress_bar(trials, "sweep") as report:
             timing = run(out, plan, shard=shard, report=report, **shape)
-        _tell(timing, record.signed(out)["device"]["kind"])
+        _tell(timing, provenance.signed(out)["device"]["kind"])
         if shard.of == 1:
             sweep.merge([out], out)
             _report_sweep(out)
@@ -1122,15 +1126,16 @@ def _sweep(options: Sweep) -> None:
 
 
 def _merge(options: Merge) -> None:
-    from rps_jax.record import folder as record
+    from rps_jax.record import folder as run_folder
+    from rps_jax.record import provenance
     from rps_jax.runs import sweep
 
     if not options.folders:
         raise InputError("folders = () is not allowed: give the run folders of the shards.")
-    record.writable(options.out)
+    run_folder.writable(options.out)
     sweep.merge(list(options.folders), options.out)
     for folder in options.folders:
-        record.sign(options.out, record.signed(folder))
+        provenance.sign(options.out, provenance.signed(folder))
     _report_sweep(options.out)
 
 
@@ -1151,7 +1156,7 @@ def _tune(options: Tune) -> None:
 
 
 def _tune_compare(options: TuneCompare) -> None:
-    from rps_jax.record import folder as record
+    from rps_jax.record import folder as run_folder
     from rps_jax.runs import sweep
     from rps_jax.runs.sweep import Plan
     from rps_jax.trials.setting import Setting
@@ -1172,11 +1177,11 @@ def _tune_compare(options: TuneCompare) -> None:
         plans[at] = Plan(one, count, arms, setting, part=4096)
     shape = options.shape()
     _check_here(options.device, setting, [plan.domain for plan in plans.values()])
-    record.writable(options.out)
+    run_folder.writable(options.out)
     use_cache()
     for name, plan in plans.items():
         out = sweep.open_run(options.out / name, plan)
-        with record.hold(out):
+        with run_folder.hold(out):
             with progress_bar(plan.trials, name) as report:
                 sweep.run(out, plan, report=report, **shape)
             sweep.merge([out], out)
@@ -1258,11 +1263,12 @@ def _tuning(out: Path, count: int) -> Iterator[Callable[[int, Progress], None]]:
     """The run folder in use, and a bar over generations or steps, for tuners to report to."""
     from tqdm import tqdm
 
-    from rps_jax.record import folder as record
+    from rps_jax.record import folder as run_folder
+    from rps_jax.record import provenance
 
     use_cache()
-    with record.hold(out), tqdm(total=count, unit="generation", desc="compile") as bar:
-        record.sign(out)
+    with run_folder.hold(out), tqdm(total=count, unit="generation", desc="compile") as bar:
+        provenance.sign(out)
 
         def report(generation: int, progress: Progress) -> None:
             bar.set_description("tune", refresh=False)
@@ -1335,13 +1341,13 @@ def _one_world(run: Path, index: int, arm: str | None) -> tuple[Plan, str]:
 
 def _replay(options: Replay) -> None:
     from rps_jax.control import strategies
-    from rps_jax.record import folder as record
+    from rps_jax.record import folder as run_folder
     from rps_jax.runs import sweep
     from rps_jax.trials import pushes
 
     plan, name = _one_world(options.run, options.index, options.arm)
     errors.check_finite("film_length", options.film_length, above=0, at_most=600, unit="s")
-    out = record.writable(options.out or options.run / f"replay-{options.index}")
+    out = run_folder.writable(options.out or options.run / f"replay-{options.index}")
     use_cache()
     part = sweep.world_part(plan, list(plan.arms).index(name), [options.index])
     strategy = strategies.of(plan.arms[name])
@@ -1358,7 +1364,7 @@ def _film_run(options: Film) -> None:
 
     from rps_jax.analysis import video
     from rps_jax.app import film
-    from rps_jax.record import folder as record
+    from rps_jax.record import folder as run_folder
 
     shape = film.shape_of(options.grid)
     for name in ("seconds", "speed"):
@@ -1369,7 +1375,7 @@ def _film_run(options: Film) -> None:
     if out.is_dir():
         raise InputError(f"out = {out} is a folder: name a file, as {out / 'film.mp4'}.")
     if options.out:
-        record.writable(out.parent)
+        run_folder.writable(out.parent)
     takes, setting = _takes(options, shape[0] * shape[1])
     for what in video.check():
         if not what.ok:
@@ -1402,10 +1408,10 @@ def _one_sentence(kind: type[Exception]) -> Iterator[None]:
 def _takes(options: Film, count: int) -> tuple[list[Take], Setting]:
     """The trials to film, at most so many, and what they share."""
     from rps_jax.app import film
-    from rps_jax.record import folder as record
+    from rps_jax.record import folder as run_folder
     from rps_jax.world import paper
 
-    if (options.run / record.MANIFEST).exists():
+    if (options.run / run_folder.MANIFEST).exists():
         plan, arm = _one_world(options.run, 0, options.arm)
         return film.of_sweep(options.run, plan, arm, options.which, count), plan.setting
     table = _table_of(options.run)

@@ -6,13 +6,14 @@ from pathlib import Path
 
 from rps_jax.analysis import video
 from rps_jax.errors import InputError
-from rps_jax.record import folder as record
+from rps_jax.record import folder as run_folder
+from rps_jax.record import provenance
 
 
 def report(cache: Path) -> str:
     """Versions, devices, folders and the state of rendering, one line each."""
     checks = [("cache", *_writable(cache)), *video.check()]
-    environment = record.environment()
+    environment = provenance.environment()
     device = environment["device"]
     rows = {
         "python": f"{environment['python']} on {environment['platform']}",
@@ -28,7 +29,7 @@ def report(cache: Path) -> str:
 
 def _writable(folder: Path) -> tuple[bool, str]:
     try:
-        record.writable(folder)
+        run_folder.writable(folder)
     except InputError:
         return False, f"{folder} cannot be written: set RPS_CACHE to a writable folder"
     return True, ""

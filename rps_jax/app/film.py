@@ -21,7 +21,7 @@ from rps_jax.analysis.video import Shot, Tile
 from rps_jax.control import strategies
 from rps_jax.control.strategies import Strategy
 from rps_jax.errors import InputError
-from rps_jax.record import folder as record
+from rps_jax.record import files
 from rps_jax.runs import sweep
 from rps_jax.runs.sweep import Plan
 from rps_jax.trials import pushes, trial
@@ -90,7 +90,7 @@ def of_sweep(run: Path, plan: Plan, arm: str, which: str, count: int) -> list[Ta
     engines.get(plan.setting.engine).check_followed()
     index = np.arange(min(count, plan.worlds))
     if which == "hardest":
-        index = statistics.hardest(record.read_results(run), count)
+        index = statistics.hardest(files.read_results(run), count)
         if not index.size:
             raise InputError("which = hardest is not allowed: no trial of this run failed.")
     of_object = plan.domain.object_of(index)

@@ -28,7 +28,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from rps_jax.record import folder as record
+from rps_jax.record import provenance
+from rps_jax.record import folder as run_folder
 from rps_jax.runs import sweep
 from rps_jax.runs.board import Board, News
 from rps_jax.errors import InputError
@@ -59,11 +60,11 @@ def _work(
         return ray.get(getattr(board, what).remote(worker, *arguments))
 
     prepare()
-    environment = record.environment() | {"host": socket.gethostname(), "pid": os.getpid()}
+    environment = provenance.environment() | {"host": socket.gethostname(), "pid": os.getpid()}
     if _same(environment) != same:
         raise InputError(
             f"ray: host {environment['host']} has other software "
-            f"({record.difference(_same(environment), same)}): install the same on all hosts."
+            f"({run_folder.difference(_same(environment), same)}): install the same on all hosts."
         )
     ask("enter", environment)
     shape = {"slots": slots, "workers": threads}
@@ -185,10 +186,10 @@ def run(
         software; workers died too often. Like every error of a worker, it leaves in the folder
         what came back until then.
     """
-    own, known = record.environment(), {}
+    own, known = provenance.environment(), {}
     missing, before = sweep.remaining(folder, plan, shard)
     if missing:
-        record.sign(folder, own)
+        provenance.sign(folder, own)
     report(Progress(before, 0.0))
     if not missing:
         return Timing(0.0, 0.0, 0.0)
@@ -204,7 +205,7 @@ def run(
                 lacking.discard(number)
             if news.workers != known:
                 known = news.workers
-                record.sign(folder, own | _environment(known))
+                provenance.sign(folder, own | _environment(known))
             simulated = news.simulated
             stepped = stepped or (time.perf_counter() if simulated else None)
             report(Progress(before + news.ended, simulated))
@@ -274,7 +275,7 @@ def _news(ray: ModuleType, board: Any, tasks: list[Any]) -> Iterator[News]:
 
 
 def _environment(workers: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
-    """What `record.environment` says of one process, of all workers; and who they are."""
+    """What `provenance.environment` says of one process, of all workers; and who they are."""
     some = next(iter(workers.values()))
     processors = {worker["host"]: worker["processors"] for worker in workers.values()}
     return {

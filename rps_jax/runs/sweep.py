@@ -30,7 +30,8 @@ from rps_jax import errors
 from rps_jax.analysis import statistics
 from rps_jax.world import domain
 from rps_jax.analysis import figures
-from rps_jax.record import folder as record
+from rps_jax.record import files, provenance
+from rps_jax.record import folder as run_folder
 from rps_jax.analysis import tables
 from rps_jax.trials import batch
 from rps_jax.control import strategies
@@ -159,7 +160,7 @@ def open_run(folder: Path, plan: Plan) -> Path:
     Raises:
       InputError: it cannot be written, or holds a run of another configuration.
     """
-    record.claim(folder, plan.configuration())
+    run_folder.claim(folder, plan.configuration())
     (folder / "parts").mkdir(exist_ok=True)
     return folder
 
@@ -170,7 +171,7 @@ def load_plan(folder: Path) -> Plan:
     Raises:
       InputError: it holds none, or a corrupt one, or one of another version of this code.
     """
-    found = record.manifest(folder)
+    found = run_folder.manifest(folder)
     if "arms" not in found:
         raise InputError(f"run = {folder} is not of a sweep: give the folder of `rps sweep`.")
     try:
@@ -185,11 +186,11 @@ def load_plan(folder: Path) -> Plan:
             found["part"],
         )
     except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise record.corrupt(folder / record.MANIFEST, error) from error
+        raise files.corrupt(folder / run_folder.MANIFEST, error) from error
     # What an older version did not write down would else be what this one does by default.
     if (now := json.loads(json.dumps(plan.configuration()))) != found:
         raise InputError(
-            f"run = {folder} was made by another version ({record.difference(found, now)}): use "
+            f"run = {folder} was made by another version ({run_folder.difference(found, now)}): use "
             "that version."
         )
     return plan
@@ -215,7 +216,7 @@ def finished(folder: Path) -> dict[int, Path]:
 
 def store(folder: Path, number: int, content: bytes) -> Path:
     """Write the file of a part into a run folder, whole or not at all."""
-    return record.write_bytes(folder / "parts" / f"{number:07d}-{_digest(content)}.nc", content)
+    return files.write_bytes(folder / "parts" / f"{number:07d}-{_digest(content)}.nc", content)
 
 
 def _digest(content: bytes) -> str:
@@ -266,7 +267,7 @@ def _content(trials: np.ndarray, leaves: dict[str, np.ndarray]) -> bytes:
     columns: dict[str, Any] = {"trial": ("row", trials)}
     for name, leaf in leaves.items():
         columns[name] = (("row", "pose")[: leaf.ndim], leaf)
-    return record.encoded(xr.Dataset(columns))
+    return files.encoded(xr.Dataset(columns))
 
 
 # --- running -------------------------------------------------------------------------------
@@ -284,7 +285,7 @@ def run(
     missing, before = remaining(folder, plan, shard)
     report(Progress(before, 0.0))
     if missing:
-        record.sign(folder)
+        provenance.sign(folder)
 
     def tell(progress: Progress) -> None:
         report(Progress(before + progress.finished, progress.simulated))
@@ -386,12 +387,12 @@ def merge(folders: list[Path], out: Path) -> Path:
       InputError: the folders differ in their plan, or parts are missing; `out` cannot be written,
         or holds another run.
     """
-    manifest = record.manifest(folders[0])
+    manifest = run_folder.manifest(folders[0])
     for other in folders[1:]:
-        if (theirs := record.manifest(other)) != manifest:
+        if (theirs := run_folder.manifest(other)) != manifest:
             raise InputError(
                 f"run = {other} is of another plan than {folders[0]} "
-                f"({record.difference(manifest, theirs)}): merge shards of one run."
+                f"({run_folder.difference(manifest, theirs)}): merge shards of one run."
             )
     plan = load_plan(folders[0])
     found = {n: path for folder in folders for n, path in finished(folder).items()}
@@ -401,11 +402,11 @@ def merge(folders: list[Path], out: Path) -> Path:
             f"run = {', '.join(map(str, folders))} lacks {len(missing)} of {len(plan.parts)} "
             "parts: run the same command again, or give the folders of all shards."
         )
-    return record.write_bytes(open_run(out, plan) / "results.nc", _merged(plan, found))
+    return files.write_bytes(open_run(out, plan) / "results.nc", _merged(plan, found))
 
 
 def _merged(plan: Plan, found: dict[int, Path]) -> bytes:
-    """The file of all results, made in memory as `record.encoded` says."""
+    """The file of all results, made in memory as `files.encoded` says."""
     content = io.BytesIO()
     with h5netcdf.File(content, "w") as file:
         sizes = {"arm": len(plan.arms), "world": plan.worlds, "pose": 3}
@@ -424,9 +425,9 @@ def _merged(plan: Plan, found: dict[int, Path]) -> bytes:
             outcomes[name].attrs.update(units=unit, long_name=meaning)
         for number, source in found.items():
             arm, _ = plan.arm_and_object(number)
-            part = record.read(source)
+            part = files.read(source)
             if not {"trial", *outcomes} <= set(part):
-                raise record.corrupt(source, "it lacks what this version writes")
+                raise files.corrupt(source, "it lacks what this version writes")
             world = part.trial.values % plan.worlds
             for name, variable in outcomes.items():
                 _put(variable, (arm,), world, part[name].values)
@@ -450,11 +451,11 @@ def _put(variable: h5netcdf.Variable, at: tuple[int, ...], world: np.ndarray, va
 
 def write_report(folder: Path) -> Path:
     """`report.md`, `report.html` and the figure of a run folder with results; returns the first."""
-    plan, results = load_plan(folder), record.read_results(folder)
+    plan, results = load_plan(folder), files.read_results(folder)
     intro = (
         f"{plan.worlds} worlds, seed {plan.setting.seed}, engine {plan.setting.engine}, "
         f"{1000 * plan.setting.physics.timestep:g} ms steps; every arm meets the same worlds. "
-        f"Intervals: Wilson 95 %.\n\n{record.told(folder)}"
+        f"Intervals: Wilson 95 %.\n\n{provenance.told(folder)}"
     )
     rates = statistics.rates(results, float(plan.setting.rules.max_lost))
     failures = (

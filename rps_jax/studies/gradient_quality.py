@@ -22,7 +22,8 @@ from rps_jax import errors
 from rps_jax.control import strategies
 from rps_jax.control.law import RPSParams
 from rps_jax.engines import EngineName
-from rps_jax.record import folder as record
+from rps_jax.record import files
+from rps_jax.record import folder as run_folder
 from rps_jax.trials import trial
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Snapshot, World
@@ -158,7 +159,7 @@ def run(
     """
     for name in names:
         errors.check_name("estimator", name, ESTIMATORS)
-    record.claim(folder, asdict(study))
+    run_folder.claim(folder, asdict(study))
     wanted = dict.fromkeys((TRUTH, *names))
     if "combined" in wanted:
         wanted = dict.fromkeys((TRUTH, "reverse", "evolution", *names))
@@ -167,8 +168,8 @@ def run(
         path = folder / f"{name}.nc"
         if not path.exists():
             report(name)
-            record.write_results(path, _measured(study, name, found))
-        found[name] = record.read(path)
+            files.write_results(path, _measured(study, name, found))
+        found[name] = files.read(path)
     return judged(found, names)
 
 

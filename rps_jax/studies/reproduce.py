@@ -15,8 +15,9 @@ import xarray as xr
 
 from rps_jax.analysis import figures, tables, video
 from rps_jax.analysis.report import Section, write_report
+from rps_jax.control.law import RPSParams
 from rps_jax.engines import EngineName
-from rps_jax.record import folder as record
+from rps_jax.record import files, provenance
 from rps_jax.studies import ambiguity, fidelity, hardware, study
 from rps_jax.studies.study import Condition, Grid
 from rps_jax.trials import pushes
@@ -133,7 +134,7 @@ def report_to(out: Path, sections: list[Section]) -> Path:
     """`report.md` and `report.html`, with what they were made by."""
     intro = (
         "The numbers of the paper *Pushing in the Dark* beside ours. Intervals: Wilson 95 %.\n\n"
-        + record.told(out)
+        + provenance.told(out)
     )
     return write_report(out, "Pushing in the Dark, reproduced", intro, sections)
 
@@ -148,9 +149,9 @@ def _kept(path: Path, trials: int, progress: _Progress, make: Callable[..., xr.D
     """A part's results: read if its file is there, else made with a progress and written."""
     if path.exists():
         progress.skip(trials)
-        return record.read(path)
+        return files.read(path)
     results = make(progress.part())
-    record.write_results(path, results)
+    files.write_results(path, results)
     return results
 
 
@@ -159,7 +160,7 @@ def _setup(out: Path) -> list[Section]:
     for i, name in enumerate(("object-ground", "object-robot")):
         rows.append([name, *(f"{friction[i]:g}" for friction in FRICTION.values())])
     picture = out / "profile.png"
-    figures.profile(paper.PARAMS["rps"], picture)
+    figures.profile(RPSParams.paper(), picture)
     return [
         Section("Table I: friction", "As in the paper, by construction.", rows),
         Section("Fig. 3: the adaptive rate", "", (), picture),
@@ -201,8 +202,8 @@ def _one_trial(out: Path, plan: Plan) -> list[Section]:
     if not (picture.exists() and file.exists()):
         (trace,) = pushes.follow([_FIG_6], Setting(engine=plan.engine))
         figures.one_trial(trace, figures.title_of(_FIG_6), picture)
-        record.write_results(file, tables.trace_dataset(trace))
-    seen = record.read(file)
+        files.write_results(file, tables.trace_dataset(trace))
+    seen = files.read(file)
     reached = "reached" if int(seen.outcome_success) else "not reached"
     text = f"The target is {reached} at {float(seen.outcome_time):.1f} s."
     return [Section("Fig. 6: the box to (-2, 0) under S1", text, (), picture)]
@@ -257,7 +258,7 @@ def _fidelity(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any])
     results = fidelity.run(
         plan.fidelity, plan.all_strategies, folder, **shape, report=progress.part()
     )
-    record.write_results(out / "fidelity.nc", results)
+    files.write_results(out / "fidelity.nc", results)
     base = results.success.sel(condition=fidelity.REFERENCE)
     names = [str(name) for name in results.condition.values if name != fidelity.REFERENCE]
     against = [study.compare(base, results.success.sel(condition=name)) for name in names]
@@ -323,7 +324,7 @@ def _study(
         **shape,
         report=progress.part(),
     )
-    record.write_results(out / f"{name}.nc", results)
+    files.write_results(out / f"{name}.nc", results)
     return results
 
 

@@ -19,7 +19,7 @@ from scipy import stats
 
 from rps_jax.analysis import tables
 from rps_jax.errors import InputError
-from rps_jax.record import folder as record
+from rps_jax.record import files
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Progress, Setting
@@ -114,7 +114,7 @@ def run(
                 "run_time": timing.run * share,
                 "simulated": timing.simulated * share,
             }
-            record.write_results(folder / f"{name}.nc", results)
+            files.write_results(folder / f"{name}.nc", results)
             found[name] = results
     done = {name: results for name, results in found.items() if results is not None}
     whole = xr.concat(
@@ -139,7 +139,7 @@ def _load(folder: Path, name: str, condition: Condition, grid: Grid) -> xr.Datas
     if not path.exists():
         return None
     try:
-        results = record.read(path)
+        results = files.read(path)
     except InputError:
         path.rename(path.with_suffix(".nc.corrupt"))
         return None

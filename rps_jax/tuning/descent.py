@@ -23,7 +23,8 @@ import optax
 from rps_jax import errors
 from rps_jax.control.law import RPSParams
 from rps_jax.control.strategies import smooth_rps
-from rps_jax.record import folder as record
+from rps_jax.record import files
+from rps_jax.record import folder as run_folder
 from rps_jax.robot.skin import CapacitiveSkin, SmoothSkin
 from rps_jax.trials.setting import Progress, Setting
 from rps_jax.trials.trial import Snapshot, Trial, World, control_step, select, start_all
@@ -289,7 +290,7 @@ def open_run(folder: Path, space: Space, course: Course, descent: Descent) -> Pa
       InputError: it cannot be written, or holds another run.
     """
     own = asdict(replace(descent, budget=0.0))
-    return record.claim(folder, tune.configuration(space, course) | {"descent": own})
+    return run_folder.claim(folder, tune.configuration(space, course) | {"descent": own})
 
 
 def descend(
@@ -357,6 +358,6 @@ def descend(
             }
         search = search._replace(step=search.step + 1)
         log.append(line)
-        record.write_json(folder / "tuned.json", tune.named(space, search.best))
+        files.write_json(folder / "tuned.json", tune.named(space, search.best))
         tune.save(folder, search, log)
     return space.params(search.best)

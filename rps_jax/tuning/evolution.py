@@ -23,7 +23,8 @@ from numpy.typing import ArrayLike
 from rps_jax import errors
 from rps_jax.control import strategies
 from rps_jax.control.law import RPSParams
-from rps_jax.record import folder as record
+from rps_jax.record import files
+from rps_jax.record import folder as run_folder
 from rps_jax.trials import batch
 from rps_jax.trials.batch import Job, Part
 from rps_jax.trials.setting import Progress, Setting, Timing
@@ -465,7 +466,7 @@ def open_run(folder: Path, space: Space, course: Course, evolution: Evolution) -
       InputError: it cannot be written, or holds another run.
     """
     own = {"evolution": asdict(replace(evolution, generations=1, budget=0.0))}
-    return record.claim(folder, configuration(space, course) | own)
+    return run_folder.claim(folder, configuration(space, course) | own)
 
 
 def configuration(space: Space, course: Course) -> dict[str, Any]:
@@ -535,7 +536,7 @@ def evolve(
                 "params": named(space, mean),
             }
         )
-        record.write_json(folder / "tuned.json", named(space, search.best))
+        files.write_json(folder / "tuned.json", named(space, search.best))
         save(folder, search, log)
     return space.params(search.best)
 
@@ -561,9 +562,9 @@ def named(space: Space, vector: jax.Array) -> dict[str, float]:
 
 def save(folder: Path, search: Any, log: list[dict[str, Any]]) -> None:
     """Write the state of a search, a pytree of arrays, and its log."""
-    record.write_text(folder / "log.jsonl", "".join(json.dumps(line) + "\n" for line in log))
+    files.write_text(folder / "log.jsonl", "".join(json.dumps(line) + "\n" for line in log))
     leaves: dict[str, Any] = {f"{i:03d}": x for i, x in enumerate(jax.tree.leaves(search))}
-    record.atomic(folder / "state.npz", lambda path: np.savez(path, **leaves))
+    files.atomic(folder / "state.npz", lambda path: np.savez(path, **leaves))
 
 
 def read_log(folder: Path) -> list[dict[str, Any]]:

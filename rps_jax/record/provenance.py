@@ -1,0 +1,121 @@
+"""What a run was made by: command, versions, device and commit, noted in its folder."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rps_jax.record import files
+from rps_jax.record import folder as run_folder
+
+ENVIRONMENT = "environment.json"
+_PACKAGES = (
+    *("rps_jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "warp-lang"),
+    *("numpy", "scipy", "xarray"),
+)
+
+
+def environment() -> dict[str, Any]:
+    """Versions, device, commit and command of this process."""
+    import jax
+
+    device = jax.devices()[0]
+    return {
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "commit": commit(),
+        "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "processors": os.cpu_count(),
+        "device": {
+            "platform": device.platform,
+            "kind": device.device_kind,
+            "count": jax.device_count(),
+        },
+        "x64": bool(jax.config.jax_enable_x64),
+        "packages": {name: _version(name) for name in _PACKAGES},
+    }
+
+
+def sign(folder: Path, signed: Mapping[str, Any] | None = None) -> None:
+    """Note in `environment.json` on what a run, or some of it, is made: by default by this process.
+
+    What it was made on before stays there, under `before`, if anything but the time differs.
+    """
+    new = dict(signed or environment())
+    with run_folder.alone(folder):
+        earlier = []
+        if (folder / ENVIRONMENT).exists():
+            old = run_folder.noted(folder, ENVIRONMENT)
+            earlier = [*old.pop("before", []), old]
+        earlier = [*new.pop("before", []), *earlier]
+        others = [one for one in earlier if not _same(one, new)]
+        files.write_json(folder / ENVIRONMENT, new | ({"before": others} if others else {}))
+
+
+def signed(folder: Path) -> dict[str, Any]:
+    """What `sign` noted.
+
+    Raises:
+      InputError: there is nothing, or it is corrupt.
+    """
+    return run_folder.noted(folder, ENVIRONMENT)
+
+
+def _same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether it is one process, whose workers may have become more, or another all like it."""
+    process = all(one.get(name) == other.get(name) for name in ("time", "command"))
+    differ = {name for name in (*one, *other) if one.get(name) != other.get(name)}
+    return process or differ <= {"time", "workers", "before"}
+
+
+def told(folder: Path) -> str:
+    """What `sign` noted, in words."""
+    found = signed(folder)
+    try:
+        last, *before = (
+            f"`{' '.join(one['command'])}`, commit {one['commit']}, {one['time']}, on "
+            f"{one['device']['kind']} with {one['processors']} processors, jax "
+            f"{one['packages']['jax']}, mujoco {one['packages']['mujoco']}"
+            for one in (found, *reversed(found.get("before", [])))
+        )
+    except (KeyError, TypeError, AttributeError) as error:
+        raise files.corrupt(folder / ENVIRONMENT, error) from error
+    return f"Made by {'; before that by '.join([last, *before])}."
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def commit() -> str | None:
+    """The git commit of the checkout this code runs from, marked if changed; None elsewhere."""
+    here = Path(__file__).resolve().parent.parent
+
+    def git(*arguments: str) -> str:
+        return subprocess.run(
+            ["git", "-C", str(here), *arguments],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=10,
+        ).stdout.strip()
+
+    try:
+        if Path(git("rev-parse", "--show-toplevel")) != here.parent:
+            return None
+        return git("rev-parse", "HEAD") + (
+            "-changed" if git("status", "--porcelain", "-uno") else ""
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
