@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import numbers
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 
@@ -74,3 +74,9 @@ def check_name(kind: str, name: str, known: Iterable[str]) -> str:
     near = difflib.get_close_matches(str(name), known, n=1)
     hint = f" (did you mean '{near[0]}'?)" if near else ""
     raise InputError(f"unknown {kind} '{name}': choose from {', '.join(known)}{hint}.")
+
+
+def check_each_once(field: str, given: Sequence[Any], labels: Sequence[Any] | None = None) -> None:
+    """Raises InputError if nothing is given, or one twice, by its label if it has one."""
+    if not given or len(set(given if labels is None else labels)) < len(given):
+        raise InputError(f"{field} = {given} is not allowed: name each once, at least one.")

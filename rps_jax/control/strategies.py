@@ -1,13 +1,20 @@
-"""What decides: the law, its baselines and one's own strategies, by name and by their parameters.
+"""What decides: the law, its baselines and strategies of one's own, by name and by parameters.
 
-A strategy is known by the class of its parameters: whoever has parameters has the strategy.
+The class of the parameters selects the strategy. Parameters may be any pytree of numbers.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+import hashlib
+import importlib.util
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
+
+import jax
+import numpy as np
 
 from rps_jax import errors
 from rps_jax.control import aps, law
@@ -15,10 +22,36 @@ from rps_jax.control.aps import APSParams, APSState
 from rps_jax.control.law import Details, RPSParams, RPSState, Temperatures, Twist
 
 
+def numbers(params: Any) -> dict[str, Any]:
+    """The leaves of parameters by their place in the pytree, as `gains.k`."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(params)
+    return {jax.tree_util.keystr(at, simple=True, separator="."): leaf for at, leaf in leaves}
+
+
+def as_json(params: Any) -> dict[str, Any]:
+    """`numbers` as JSON has them: floats, and lists of floats."""
+    found = numbers(params)
+    return {name: np.asarray(leaf, float).tolist() for name, leaf in found.items()}
+
+
+def changed(params: Any, changes: Mapping[str, Any]) -> Any:
+    """The parameters with other values at some places of the pytree, named as in `numbers`.
+
+    Raises:
+      InputError: there is no such place.
+    """
+    known = numbers(params)
+    for name in changes:
+        errors.check_name(f"parameter of {type(params).__name__}", name, known)
+    leaves = [changes.get(name, leaf) for name, leaf in known.items()]
+    return jax.tree.unflatten(jax.tree.structure(params), leaves)
+
+
 def check_finite(params: Any) -> Any:
-    """The same parameters (a NamedTuple), if all are finite numbers; otherwise an InputError."""
-    for name, value in params._asdict().items():
-        errors.check_finite(name, value)
+    """The same parameters, if all their leaves are finite numbers; otherwise an InputError."""
+    for name, leaf in numbers(params).items():
+        for value in np.ravel(leaf):
+            errors.check_finite(name, value)
     return params
 
 
@@ -32,13 +65,14 @@ class Strategy(NamedTuple):
     check: Callable[[Any], Any] = check_finite  # raises InputError for params that mean nothing
 
 
-Params = RPSParams | APSParams | Any  # a NamedTuple of numbers, of a class in STRATEGIES
+Params = RPSParams | APSParams | Any  # a pytree of numbers, of a class in STRATEGIES
 RPS = Strategy(RPSState.init, law.step_with_details, check=law.check)  # and NPS, by `reactive`
 APS = Strategy(APSState.init, aps.aps_step, tracks=True, check=aps.check)
 STRATEGIES: dict[type, Strategy] = {RPSParams: RPS, APSParams: APS}  # by class of parameters
 # The paper's, by name, with their parameters.
 PAPER: dict[str, Params] = {"rps": RPSParams.paper(), "nps": RPSParams.nps(), "aps": APSParams()}
 PARAMS: dict[str, Params] = dict(PAPER)  # by name
+_SOURCES: dict[str, dict[str, str]] = {}  # by the class of the parameters: where it was loaded from
 
 
 @functools.cache  # equal temperatures are one strategy, and so one compiled program
@@ -82,24 +116,36 @@ def register_strategy(name: str, strategy: Strategy, params: Params) -> None:
     Args:
       name: what it is called; registered again, it replaces what was called so.
       strategy: its functions, as `law.step_with_details` and `RPSState.init`.
-      params: its parameters: a NamedTuple of finite numbers, one of them `d_success` [m], the
-        distance to the target at which a trial has succeeded.
+      params: its parameters: a pytree of finite numbers (or arrays of them) of a class of its own,
+        as a NamedTuple, which may be nested. Its field or property `d_success` [m] is the distance
+        to the target at which a trial has succeeded.
 
     Raises:
       InputError: the name is one of the paper's, the parameters are not such, or their class is
         that of another strategy.
+
+    Example:
+      >>> from typing import NamedTuple
+      >>> from rps_jax import Details, Strategy, Twist, register_strategy
+      >>> class Ahead(NamedTuple):
+      ...     v: float = 0.05  # [m/s]
+      ...     d_success: float = 0.05  # [m]
+      >>> def step(params, memory, seen):
+      ...     return memory, Twist(params.v, 0.0, 0.0), Details.of(seen)
+      >>> register_strategy("ahead", Strategy(lambda params: (), step), Ahead())
     """
     if name in PAPER:
         raise errors.InputError(
             f"strategy name '{name}' is not allowed: {', '.join(PAPER)} are the paper's."
         )
-    if not hasattr(params, "_asdict") or not hasattr(params, "d_success"):
+    kind, leaves = type(params), jax.tree.leaves(params)
+    own = kind not in (dict, list, tuple) and leaves != [params]
+    if not own or not hasattr(params, "d_success") or not all(map(_is_number, leaves)):
         raise errors.InputError(
-            f"params = {params} of strategy '{name}' is not allowed: give a NamedTuple of numbers, "
-            "one of them d_success [m]."
+            f"params = {params} of strategy '{name}' is not allowed: give a pytree of numbers of a "
+            "class of its own, as a NamedTuple, with a field or property d_success [m]."
         )
     strategy.check(params)
-    kind = type(params)
     for other, theirs in PARAMS.items():
         if other != name and type(theirs).__name__ == kind.__name__ and of(theirs) != strategy:
             raise errors.InputError(
@@ -110,3 +156,98 @@ def register_strategy(name: str, strategy: Strategy, params: Params) -> None:
     STRATEGIES[kind] = strategy
     for unused in set(STRATEGIES) - {type(p) for p in PARAMS.values()}:
         del STRATEGIES[unused]  # of what was called so before
+
+
+def _is_number(leaf: Any) -> bool:
+    return np.issubdtype(np.asarray(leaf).dtype, np.number)
+
+
+# --- strategies of a user's file -----------------------------------------------------------
+
+
+def named(text: str) -> tuple[str, Params]:
+    """A strategy's name and parameters, by its name or as `my_law.py:MyParams`.
+
+    The file is run; it must register the strategy whose parameters are of that class.
+
+    Raises:
+      InputError: there is no such strategy, file or class, or the file does not register it.
+    """
+    path, _, kind = text.rpartition(":")
+    if not path.endswith(".py"):
+        return text, PARAMS[errors.check_name("strategy", text, PARAMS)]
+    content = _read(Path(path))
+    digest = hashlib.sha256(content).hexdigest()[:16]
+    module = f"_rps_jax_{Path(path).stem}_{digest}"
+    if module not in sys.modules:
+        _run(Path(path), module)
+    found = getattr(sys.modules[module], kind, None)
+    for name, params in PARAMS.items():
+        if type(params) is found:
+            _SOURCES[kind] = {"file": str(Path(path).resolve()), "digest": digest}
+            return name, params
+    raise errors.InputError(
+        f"strategy = {text} is not allowed: {path} must define the class {kind or 'of parameters'} "
+        "and call rps_jax.register_strategy with parameters of it."
+    )
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise errors.InputError(
+            f"strategy = {path} cannot be read ({error.strerror}): give FILE.py:CLASS."
+        ) from error
+
+
+def _run(path: Path, name: str) -> None:
+    """Run a file as a module of this name."""
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except errors.InputError:
+        del sys.modules[name]
+        raise
+    except Exception as error:  # whatever a user's file raises
+        del sys.modules[name]
+        raise errors.InputError(
+            f"strategy = {path} cannot be run ({type(error).__name__}: {error}): mend the file."
+        ) from error
+
+
+def recorded(params: Params) -> dict[str, Any]:
+    """Parameters as JSON, with the class that selects their strategy, and its file if it has one.
+
+    `restored` is the opposite.
+    """
+    kind = type(params).__name__
+    return {"strategy": kind} | _SOURCES.get(kind, {}) | as_json(params)
+
+
+def restored(values: Mapping[str, Any]) -> Params:
+    """The parameters that `recorded` wrote.
+
+    Raises:
+      InputError: their class or a name in it is unknown, or their file is not what it was.
+    """
+    left = dict(values)
+    kind, file, digest = (left.pop(key, None) for key in ("strategy", "file", "digest"))
+    if file:
+        named(f"{file}:{kind}")
+        if _SOURCES[str(kind)]["digest"] != digest:
+            raise errors.InputError(
+                f"strategy = {file} is not what it was when the run was made: restore the file."
+            )
+    known = {type(params).__name__: params for params in PARAMS.values()}
+    like = known[errors.check_name("class of parameters", str(kind), known)]
+    if set(left) != set(numbers(like)):
+        raise errors.InputError(
+            f"parameters of {kind} are {', '.join(numbers(like))}, and not {', '.join(left)}."
+        )
+    shaped = {name: np.asarray(x, float) if np.ndim(x) else float(x) for name, x in left.items()}
+    return changed(like, shaped)

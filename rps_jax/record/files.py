@@ -89,3 +89,20 @@ def corrupt(path: Path, why: Any) -> InputError:
     """The error for a file that cannot be understood."""
     reason = str(why).rstrip(".")
     return InputError(f"{path} is corrupt ({reason}): restore it, or choose another folder.")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Names with values from a JSON file that a user wrote.
+
+    Raises:
+      InputError: it cannot be read, or holds something else.
+    """
+    try:
+        values = json.loads(path.read_text())
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}): give a JSON file.") from error
+    except ValueError as error:
+        raise InputError(f"{path} is not JSON ({error}).") from error
+    if not isinstance(values, dict):
+        raise InputError(f'{path} holds no names with values: write {{"name": value}}.')
+    return values

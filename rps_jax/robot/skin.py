@@ -14,7 +14,7 @@ contact are its first and last along this strip.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -317,8 +317,9 @@ class SmoothSkin(NamedTuple):
         return self.sensor.sense_smoothly(state, footprint, period, self.temperature)
 
 
+SkinName = Literal["ideal", "thin", "capacitive", "hardware"]
 # "thin" chatters between the corners of a box, as a rigid contact sensor does.
-SKINS = {
+SKINS: dict[SkinName, Skin] = {
     "ideal": IdealSkin(),
     "thin": IdealSkin(tolerance=0.001),
     "capacitive": CapacitiveSkin(),

@@ -5,7 +5,7 @@ one part after the other while its slots run, so that it compiles each kind once
 full, and it sends the content of every part that is complete. The hosts need not share a file
 system: the process that was started by the user, alone, writes into the run folder.
 
-What holds: a part that came back is there as after `robustness.run`. When a worker dies, Ray starts
+What holds: a part that came back is there as after `sweep.run_missing`. When a worker dies, Ray starts
 its task again, on whatever host has room, and the parts it had begun are run again. A part has the
 bits that one process gives it which sees one GPU, or processors alone, with as many `slots`:
 whatever the number of workers and threads, whichever worker runs it, and with whatever other parts.
@@ -152,7 +152,7 @@ def _line(error: BaseException) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[-1].rstrip(".")
 
 
-def run(
+def run_on_cluster(
     folder: Path,
     plan: Plan,
     *,
@@ -164,10 +164,10 @@ def run(
     slots: int | None = None,
     workers: int | None = None,
 ) -> Timing:
-    """Run what is missing of a plan, as `robustness.run` does, on the workers of a cluster.
+    """Run what is missing of a plan, as `sweep.run_missing` does, on the workers of a cluster.
 
     Args:
-      folder: a run folder that `robustness.open_run` opened; `environment.json` in it will name
+      folder: a run folder that `results.open_run` opened; `environment.json` in it will name
         the workers.
       plan: what is run.
       address: of the cluster; see `connected`.

@@ -144,7 +144,7 @@ class _Shared:
                 self._collect(numbers, trials)
             self._finished += numbers.size
             self.simulated += simulated
-            self._report(Progress(self._finished, self.simulated))
+            self._report(Progress(self._finished, self.simulated, self.compile))
 
     def compiled(self, seconds: float) -> None:
         """One worker had no program for this long."""

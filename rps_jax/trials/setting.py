@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from rps_jax import engines, errors
@@ -32,6 +33,14 @@ class Progress:
 
     finished: int  # trials
     simulated: float  # [s] summed over trials, ended or running
+    compile: float = 0.0  # [s] until the worker who waited longest had its programs
+
+
+Report = Callable[[Progress], object]  # called now and then by what runs
+
+
+def unheard(progress: Progress) -> None:
+    """The report of a run that nobody watches."""
 
 
 @dataclass(frozen=True)

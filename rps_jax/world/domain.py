@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from rps_jax import errors
 from rps_jax.errors import InputError
 from rps_jax.geometry import solid
 from rps_jax.geometry.solid import SIDES, Solid
+from rps_jax.record import files
 from rps_jax.world import paper, scene
 from rps_jax.world.objects import FAMILIES, OBJECTS, PAPER_OBJECTS
 from rps_jax.world.scene import FRICTION, Friction
@@ -223,6 +225,19 @@ DOMAINS = {
 
 
 OF_TAXELS = ("noise", "gain_spread", "dead_share")  # which an ideal skin has not
+
+
+def named(domain: Domain | str) -> Domain:
+    """A domain by its name in `DOMAINS`, or from a JSON file of ranges; a domain is itself.
+
+    Raises:
+      InputError: no domain has this name, or the file is no domain.
+    """
+    if isinstance(domain, Domain):
+        return domain
+    if domain.endswith(".json"):
+        return from_json(files.read_json(Path(domain)))
+    return DOMAINS[errors.check_name("domain", domain, DOMAINS)]
 
 
 class Draw(NamedTuple):

@@ -78,7 +78,11 @@ PHYSICS = {
 }
 
 
-def preset(name: str = "default", fidelity: str = "standard") -> Physics:
+PhysicsName = Literal["default", "paper_gazebo"]
+Fidelity = Literal["reference", "standard", "fast"]
+
+
+def preset(name: PhysicsName = "default", fidelity: Fidelity = "standard") -> Physics:
     """Physics by name.
 
     Args:

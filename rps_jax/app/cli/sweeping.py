@@ -1,0 +1,210 @@
+"""The commands of random worlds: sweep, merge, replay."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from rps_jax.app.cli import parsing, running
+from rps_jax.app.cli.options import Device, Engine, Fidelity, Physics, Spread, Strategies
+from rps_jax.app.cli.replicating import show
+from rps_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from rps_jax.runs.plan import Plan
+    from rps_jax.trials.setting import Timing
+
+Domain = Annotated[
+    str,
+    tyro.conf.arg(
+        help=(
+            "Ranges from which worlds are drawn: paper, hardware, wide, prisms or hostile, or a "
+            'JSON file of ranges, as {"mass": [3, 60]}.'
+        )
+    ),
+]
+
+
+@dataclass(frozen=True)
+class Sweep(Spread):
+    """Push in many random worlds, every strategy in the same ones; the run can be continued."""
+
+    domain: Domain = "wide"
+    change: tuple[str, ...] = ()
+    """Ranges to change, each as QUANTITY=LOW,HIGH (for instance mass=3,10)."""
+    strategies: Strategies = ("rps", "nps", "aps")
+    params: tuple[str, ...] = ("paper",)
+    """Sets of parameters of RPS and NPS, each of which is run: paper, tuned, or JSON files of
+    changes to the paper's, as {"L": 0.3}."""
+    worlds: int | None = None
+    """Number of worlds; by default 1000, or the whole grid of a domain with listed targets."""
+    physics: Physics = "default"
+    fidelity: Fidelity = "standard"
+    engine: Engine = "fused"
+    horizon: float = 300.0
+    """Time after which a trial has failed [s]."""
+    seed: int = 0
+    """Seed of the worlds."""
+    part: int = 1024
+    """Number of trials in a part: the most that is lost for each strategy and object when killed."""
+    device: Device = "auto"
+    shard: str = "1/1"
+    """Share K/N of the run: the N shares are run apart, and joined by `rps merge`."""
+    ray: str | None = None
+    """Run on the workers of a Ray cluster: auto, its HOST:PORT, or local (all of this host). Each
+    worker claims a GPU, or else as many processors as --workers, one by default."""
+    out: Path = Path("runs/sweep")
+    """Run folder; a run that was killed is continued there."""
+
+    def plan(self) -> Plan:
+        """What is run."""
+        from rps_jax.runs.plan import Plan
+        from rps_jax.trials.setting import Setting
+        from rps_jax.trials.trial import Rules
+        from rps_jax.world.physics import preset
+
+        domain = parsing.domain_of(self.domain, self.change)
+        every = domain.combinations if domain.targets else 1000
+        arms = parsing.sweep_arms(self.strategies, self.params)
+        physics = preset(self.physics, self.fidelity)
+        setting = Setting(physics, Rules(horizon=self.horizon), self.seed, self.engine)
+        return Plan(domain, every if self.worlds is None else self.worlds, arms, setting, self.part)
+
+    def run(self) -> None:
+        """Run what is missing, then write and print the report."""
+        from rps_jax.runs import sweep
+        from rps_jax.trials.progress import progress_bar
+
+        plan, shard, shape = self.plan(), parsing.shard_of(self.shard), self.shape()
+        if self.ray:
+            by = _on_cluster(self.ray, self.device, plan)
+        else:
+            running.choose_device(self.device)
+            plan.check_here()
+            by = sweep.run_missing
+        running.use_cache()
+        with progress_bar(plan.trials_of(shard), "sweep") as report:
+            timing = sweep.complete(self.out, plan, shard, by=by, report=report, **shape)
+        tell_made(self.out, timing)
+        if shard.of == 1:
+            tell_report(self.out)
+        else:
+            print(
+                f"run folder: {self.out}; when all shards are done: rps merge {self.out} --out "
+                f"{self.out}"
+            )
+
+
+def tell_made(out: Path, timing: Timing) -> None:
+    """Print where the time of a run went, and on what."""
+    from rps_jax.record import provenance
+
+    running.tell(timing, provenance.signed(out)["device"]["kind"])
+
+
+def tell_report(out: Path) -> None:
+    """Write and print the report of a sweep."""
+    from rps_jax.runs.report import write_report
+
+    print(write_report(out).read_text())
+    print(f"run folder: {out}")
+
+
+def _on_cluster(address: str, device: str, plan: Plan) -> Callable[..., Timing]:
+    """What runs a plan on the workers of a cluster."""
+    import jax
+
+    from rps_jax import engines
+    from rps_jax.runs import cluster
+
+    running.choose_device("cpu")  # for this process: the workers here need the GPUs
+    return partial(
+        cluster.run_on_cluster,
+        address=address,
+        prepare=partial(_prepare, device, bool(jax.config.jax_enable_x64)),
+        gpus=device != "cpu" and engines.get(plan.setting.engine).traced,
+    )
+
+
+def _prepare(device: str, x64: bool) -> None:
+    """Make a worker's process compute as this one would."""
+    import jax
+
+    running.be_deterministic()
+    jax.config.update("jax_enable_x64", x64)
+    running.choose_device(device)
+    running.use_cache()
+
+
+@dataclass(frozen=True)
+class Merge:
+    """Merge the shards of a sweep into one run folder, with results.nc and the report."""
+
+    folders: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folders of the shards; one, if they share it."""
+    out: Path
+    """Run folder of the whole."""
+
+    def run(self) -> None:
+        """Merge, then write and print the report."""
+        from rps_jax.record import folder, provenance
+        from rps_jax.runs.results import merge
+
+        if not self.folders:
+            raise InputError("folders = () is not allowed: give the run folders of the shards.")
+        folder.writable(self.out)
+        merge(list(self.folders), self.out)
+        for one in self.folders:
+            provenance.sign(self.out, provenance.signed(one))
+        tell_report(self.out)
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Run one world of a sweep again; draw it as in the paper's Fig. 6 and film it."""
+
+    folder: tyro.conf.Positional[Path]
+    """Run folder of the sweep."""
+    index: tyro.conf.Positional[int]
+    """Index of the world."""
+    arm: str | None = None
+    """Which of the sweep's strategies with parameters; by default the first."""
+    video: bool = False
+    """Whether to film the push."""
+    film_length: float = 12.0
+    """Length of the film [s], whatever the trial's."""
+    out: Path | None = None
+    """Folder of what is made; by default RUN/replay-INDEX."""
+
+    def run(self) -> None:
+        """Follow the world, then show it."""
+        from rps_jax.record import folder
+        from rps_jax.runs.replay import chosen, replay
+        from rps_jax.trials.progress import clock
+        from rps_jax.trials.push import check_length
+
+        plan, name = chosen(self.folder, self.index, self.arm)
+        tell_followed(self.folder, plan)
+        check_length(self.film_length)
+        out = folder.writable(self.out or self.folder / f"replay-{self.index}")
+        running.use_cache()
+        with clock(float(plan.setting.rules.horizon)) as report:
+            seen = replay(self.folder, self.index, name, report=report)
+        show(seen, f"world {self.index}, {name}", out, self.film_length if self.video else None)
+
+
+def tell_followed(folder: Path, plan: Plan) -> None:
+    """Say so if a world is followed in another engine than the run's."""
+    from rps_jax.runs.plan import load_plan
+
+    theirs = load_plan(folder).setting.engine
+    if theirs != plan.setting.engine:
+        print(
+            f"Trials of the engine {theirs} cannot be followed: this is the same world in the "
+            f"engine {plan.setting.engine}."
+        )
