@@ -65,7 +65,7 @@ def claim(folder: Path, wanted: dict[str, Any]) -> Path:
     wanted = json.loads(json.dumps(wanted))
     with alone(folder):
         if not (folder / MANIFEST).exists():
-            files.write_json(folder / MANIFEST, wanted)
+            files.write_json(folder / MANIFEST, wanted, checked=True)
         elif (found := manifest(folder)) != wanted:
             raise InputError(
                 f"out = {folder} holds another run ({difference(found, wanted)}): choose another "
@@ -116,21 +116,24 @@ def manifest(folder: Path) -> dict[str, Any]:
     Raises:
       InputError: there is none, or it is corrupt.
     """
-    return noted(folder, MANIFEST)
+    return noted(folder / MANIFEST)
 
 
-def noted(folder: Path, name: str) -> dict[str, Any]:
+def noted(path: Path) -> dict[str, Any]:
     """What a JSON file of a run folder says, by name.
 
     Raises:
       InputError: there is no such file, or it is corrupt.
     """
-    path = folder / name
     try:
-        found = json.loads(path.read_text())
+        content = files.read_bytes(path)
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise InputError(f"run = {folder} holds no {name}: give the folder of a run.") from error
-    except ValueError as error:
+        raise InputError(
+            f"run = {path.parent} holds no {path.name}: give the folder of a run."
+        ) from error
+    try:
+        found = json.loads(content)
+    except (ValueError, RecursionError) as error:
         raise files.corrupt(path, error) from error
     if not isinstance(found, dict):
         raise files.corrupt(path, "it holds no names with values")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 import io
 import json
 import math
@@ -32,6 +31,7 @@ from rps_jax.world import domain
 from rps_jax.analysis import figures
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
+from rps_jax.record.checkpoint import Parts
 from rps_jax.analysis import tables
 from rps_jax.trials import batch
 from rps_jax.control import strategies
@@ -161,7 +161,6 @@ def open_run(folder: Path, plan: Plan) -> Path:
       InputError: it cannot be written, or holds a run of another configuration.
     """
     run_folder.claim(folder, plan.configuration())
-    (folder / "parts").mkdir(exist_ok=True)
     return folder
 
 
@@ -204,23 +203,16 @@ def _params(arm: dict[str, Any]) -> Params:
 
 def finished(folder: Path) -> dict[int, Path]:
     """Files of the parts that are done; one whose content is not what was written is set aside."""
-    found = {}
-    for path in sorted((folder / "parts").glob("[0-9]*-*.nc")):
-        number, _, digest = path.stem.partition("-")
-        if _digest(path.read_bytes()) == digest:
-            found[int(number)] = path
-        else:
-            path.rename(path.with_suffix(".nc.corrupt"))
-    return found
+    return {int(name): path for name, path in Parts(folder).found().items() if name.isdigit()}
 
 
 def store(folder: Path, number: int, content: bytes) -> Path:
     """Write the file of a part into a run folder, whole or not at all."""
-    return files.write_bytes(folder / "parts" / f"{number:07d}-{_digest(content)}.nc", content)
+    return Parts(folder).put(_name(number), content, new=True)
 
 
-def _digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()[:16]
+def _name(number: int) -> str:
+    return f"{number:07d}"
 
 
 class _Rows:
