@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import io
 import json
 import math
 from collections import Counter
@@ -19,8 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5netcdf
-import h5py
 import numpy as np
 import xarray as xr
 
@@ -387,58 +384,51 @@ def merge(folders: list[Path], out: Path) -> Path:
                 f"({run_folder.difference(manifest, theirs)}): merge shards of one run."
             )
     plan = load_plan(folders[0])
-    found = {n: path for folder in folders for n, path in finished(folder).items()}
-    missing = [n for n in plan.parts if n not in found]
-    if missing:
+    kept = {name: part for one in folders for name, part in Parts(one).contents().items()}
+    contents = {n: kept[_name(n)] for n in plan.parts if _name(n) in kept}
+    if missing := len(plan.parts) - len(contents):
         raise InputError(
-            f"run = {', '.join(map(str, folders))} lacks {len(missing)} of {len(plan.parts)} "
-            "parts: run the same command again, or give the folders of all shards."
+            f"run = {', '.join(map(str, folders))} lacks {missing} of {len(plan.parts)} parts: run "
+            "the same command again, or give the folders of all shards."
         )
-    return files.write_bytes(open_run(out, plan) / "results.nc", _merged(plan, found))
+    return files.write_results(open_run(out, plan) / "results.nc", dataset(plan, contents))
 
 
-def _merged(plan: Plan, found: dict[int, Path]) -> bytes:
-    """The file of all results, made in memory as `files.encoded` says."""
-    content = io.BytesIO()
-    with h5netcdf.File(content, "w") as file:
-        sizes = {"arm": len(plan.arms), "world": plan.worlds, "pose": 3}
-        file.dimensions = sizes | {"object": len(plan.domain.objects)}
-        names = {"arm": list(plan.arms), "object": list(plan.domain.objects)}
-        for name, values in names.items():
-            file.create_variable(name, (name,), h5py.string_dtype(), data=np.array(values, object))
-        every = np.arange(plan.worlds)
-        file.create_variable("world", ("world",), data=every)
-        which = plan.domain.object_of(every).astype(np.int16)
-        file.create_variable("which_object", ("world",), data=which)
-        outcomes, drawn = {}, {}
-        for name, (unit, meaning) in tables.UNITS.items():
-            dims = ("arm", "world", "pose") if name.endswith("pose") else ("arm", "world")
-            outcomes[name] = file.create_variable(name, dims, _TYPES.get(name, np.float32))
-            outcomes[name].attrs.update(units=unit, long_name=meaning)
-        for number, source in found.items():
-            arm, _ = plan.arm_and_object(number)
-            part = files.read(source)
-            if not {"trial", *outcomes} <= set(part):
-                raise files.corrupt(source, "it lacks what this version writes")
-            world = part.trial.values % plan.worlds
-            for name, variable in outcomes.items():
-                _put(variable, (arm,), world, part[name].values)
-            if arm == 0:
-                columns = domain.table(domain.draw(plan.domain, plan.setting.seed, world))
-                for name, (values, unit) in columns.items():
-                    if name not in drawn:
-                        drawn[name] = file.create_variable(name, ("world",), np.float32)
-                        drawn[name].attrs["units"] = unit
-                    _put(drawn[name], (), world, values)
-    return content.getvalue()
+def dataset(plan: Plan, contents: Mapping[int, bytes]) -> xr.Dataset:
+    """All results of a plan, from the contents of all its parts: (arm, world), and (world) drawn.
 
-
-def _put(variable: h5netcdf.Variable, at: tuple[int, ...], world: np.ndarray, values: Any) -> None:
-    """Write the rows of some worlds, which are in order but seldom adjacent."""
-    span = slice(int(world[0]), int(world[-1]) + 1)
-    rows = variable[(*at, span)]
-    rows[world - world[0]] = values
-    variable[(*at, span)] = rows
+    Raises:
+      InputError: a part was made by another version of this code.
+    """
+    every = np.arange(plan.worlds)
+    columns = {"which_object": xr.Variable("world", plan.domain.object_of(every).astype(np.int16))}
+    for name, (unit, meaning) in tables.UNITS.items():
+        dims = ("arm", "world", "pose") if name.endswith("pose") else ("arm", "world")
+        shape = (len(plan.arms), plan.worlds, 3)[: len(dims)]
+        values = np.zeros(shape, _TYPES.get(name, np.float32))
+        columns[name] = xr.Variable(dims, values, {"units": unit, "long_name": meaning})
+    for number, content in contents.items():
+        arm, _ = plan.arm_and_object(number)
+        part = files.decoded(content, f"part {number}")
+        if lacking := sorted({"trial", *tables.UNITS} - set(part)):
+            raise InputError(
+                f"part {number} of the run was made by another version (it lacks "
+                f"{', '.join(lacking)}): use that version."
+            )
+        world = part.trial.values % plan.worlds
+        for name in tables.UNITS:
+            columns[name].values[arm, world] = part[name].values
+        if arm == 0:
+            drawn = domain.table(domain.draw(plan.domain, plan.setting.seed, world))
+            for name, (values, unit) in drawn.items():
+                if name not in columns:
+                    empty = np.zeros(plan.worlds, np.float32)
+                    columns[name] = xr.Variable("world", empty, {"units": unit})
+                columns[name].values[world] = values
+    for column in columns.values():
+        column.encoding["_FillValue"] = None  # every number is a result
+    names = {"arm": list(plan.arms), "object": list(plan.domain.objects), "world": every}
+    return xr.Dataset(columns, names)
 
 
 def write_report(folder: Path) -> Path:
