@@ -182,7 +182,7 @@ SWEEP = {
     "--out /dev/null/x": "out = /dev/null/x cannot be written",
     "--out run": "out = run holds another run .domain.objects = .* choose another folder",
     "--out done": "out = done holds another run: choose another folder",
-    "--out cut": "cut/manifest.json is corrupt .*: restore it, or choose another folder",
+    "--out cut": "cut/manifest.json is corrupt .*: restore it, or delete it",
     "--out bytes": "bytes/manifest.json is corrupt",
     "--out empty": "empty/manifest.json is corrupt .it holds no names",
 }

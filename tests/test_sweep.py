@@ -8,9 +8,7 @@ import random
 import shutil
 import subprocess
 import sys
-import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -27,8 +25,7 @@ from rps_jax.control import strategies
 from rps_jax.control.law import RPSParams
 from rps_jax.errors import InputError
 from rps_jax.geometry import planar
-from rps_jax.record import files, provenance
-from rps_jax.record import folder as run_folder
+from rps_jax.record import files
 from rps_jax.runs import sweep
 from rps_jax.runs.sweep import Plan, Shard
 from rps_jax.trials import batch, trial
@@ -332,8 +329,8 @@ def test_a_part_of_an_older_version_is_named(whole, tmp_path):
     victim = sorted(folder.glob("parts/*.nc"))[0]
     older = files.encoded(files.read(victim).drop_vars("overflows"))
     victim.unlink()
-    kept = sweep.store(folder, 0, older)
-    with pytest.raises(InputError, match=f"{kept.name} is corrupt .it lacks what this version"):
+    sweep.store(folder, 0, older)
+    with pytest.raises(InputError, match=r"part 0 .* another version .it lacks overflows"):
         sweep.merge([folder], folder)
 
 
@@ -369,61 +366,6 @@ def test_another_configuration_is_refused_with_what_differs(whole):
     other = replace(PLAN, worlds=30, domain=replace(BOXES, mass=Range(1, 2)))
     with pytest.raises(InputError, match=r"domain.mass = .*there, .* asked for; worlds = 20 there"):
         sweep.open_run(whole, other)
-
-
-def test_two_processes_may_not_share_a_run_but_may_share_its_shards(tmp_path):
-    def refused(number, of):
-        with pytest.raises(InputError, match="in use by another process"):
-            run_folder.hold(tmp_path, number, of).__enter__()
-
-    with run_folder.hold(tmp_path):
-        refused(1, 1)
-        refused(1, 2)
-    with run_folder.hold(tmp_path, 1, 2):
-        with run_folder.hold(tmp_path, 2, 2):
-            refused(1, 2)
-        refused(1, 1)
-        refused(2, 3)  # which has parts of both
-    with run_folder.hold(tmp_path, 1, 3):
-        pass
-
-
-def test_of_those_that_begin_a_run_at_once_all_agree_or_are_refused(tmp_path):
-    """Threads, whose file locks are as much each one's own as those of processes."""
-    together = threading.Barrier(8)
-
-    def begin(number):
-        wanted = {"worlds": number % 2}
-        together.wait()
-        try:
-            run_folder.claim(tmp_path, wanted)
-        except InputError as error:
-            return str(error)
-        provenance.sign(tmp_path, {"time": number})
-        return wanted
-
-    with ThreadPoolExecutor(8) as pool:
-        told = list(pool.map(begin, range(8)))
-    kept = run_folder.manifest(tmp_path)
-    assert sorted(t == kept for t in told) == [False] * 4 + [True] * 4
-    assert all("holds another run" in t for t in told if t != kept)
-    assert provenance.signed(tmp_path)["time"] in range(8)
-
-
-def test_what_a_run_was_made_on_before_is_not_forgotten(tmp_path):
-    this = provenance.environment()
-    there = this | {"commit": "abc", "device": this["device"] | {"kind": "H200"}, "time": "then"}
-    provenance.sign(tmp_path, there)
-    provenance.sign(tmp_path, this)
-    provenance.sign(tmp_path, this | {"processors": 99})  # of a cluster that grows
-    provenance.sign(tmp_path, this)
-    provenance.sign(tmp_path, this | {"time": "later"})  # the same command again
-    assert provenance.signed(tmp_path) == this | {"time": "later", "before": [there]}
-    text = provenance.told(tmp_path)
-    assert text.index("later") < text.index("before that by") < text.index("commit abc, then, on H")
-    (tmp_path / provenance.ENVIRONMENT).write_text("{}")
-    with pytest.raises(InputError, match=r"environment\.json is corrupt"):
-        provenance.told(tmp_path)
 
 
 def test_what_a_sweep_says_is_what_happened():

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import reprlib
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
+
+from filelock import FileLock, Timeout
 
 from rps_jax.errors import InputError
 from rps_jax.record import files
@@ -64,7 +65,7 @@ def claim(folder: Path, wanted: dict[str, Any]) -> Path:
     wanted = json.loads(json.dumps(wanted))
     with alone(folder):
         if not (folder / MANIFEST).exists():
-            files.write_json(folder / MANIFEST, wanted)
+            files.write_json(folder / MANIFEST, wanted, checked=True)
         elif (found := manifest(folder)) != wanted:
             raise InputError(
                 f"out = {folder} holds another run ({difference(found, wanted)}): choose another "
@@ -73,12 +74,12 @@ def claim(folder: Path, wanted: dict[str, Any]) -> Path:
     return folder
 
 
-@contextlib.contextmanager
-def alone(folder: Path) -> Iterator[None]:
-    """For the moment of a look and a note other processes wait."""
-    with open(folder / ".lock", "a") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
+def alone(folder: Path) -> FileLock:
+    """A lock for the moment of a look and a note, for which other processes wait.
+
+    Like every lock here it is let go by the operating system when its process is killed.
+    """
+    return FileLock(folder / ".lock", poll_interval=0.01)
 
 
 @contextlib.contextmanager
@@ -88,25 +89,25 @@ def hold(folder: Path, number: int = 1, of: int = 1) -> Iterator[None]:
     Raises:
       InputError: another process holds it, or shares it otherwise.
     """
-    own = folder / f".lock-{number}-{of}"
-    with open(own, "a") as file:
+    with contextlib.ExitStack() as held:
         with alone(folder):
             for path in folder.glob(".lock-*-*"):
                 if not path.name.endswith(f"-{of}"):
-                    with open(path, "a") as other:
-                        _seize(other, folder)  # and let go at once
-            _seize(file, folder)
+                    _seize(path, folder).release()
+            held.callback(_seize(folder / f".lock-{number}-{of}", folder).release)
         yield
 
 
-def _seize(file: IO[str], folder: Path) -> None:
+def _seize(path: Path, folder: Path) -> FileLock:
+    lock = FileLock(path, timeout=0)
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
+        lock.acquire()
+    except Timeout as error:
         raise InputError(
             f"out = {folder} is in use by another process: wait for its end, or choose another "
             "folder."
         ) from error
+    return lock
 
 
 def manifest(folder: Path) -> dict[str, Any]:
@@ -115,21 +116,24 @@ def manifest(folder: Path) -> dict[str, Any]:
     Raises:
       InputError: there is none, or it is corrupt.
     """
-    return noted(folder, MANIFEST)
+    return noted(folder / MANIFEST)
 
 
-def noted(folder: Path, name: str) -> dict[str, Any]:
+def noted(path: Path) -> dict[str, Any]:
     """What a JSON file of a run folder says, by name.
 
     Raises:
       InputError: there is no such file, or it is corrupt.
     """
-    path = folder / name
     try:
-        found = json.loads(path.read_text())
+        content = files.read_bytes(path)
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise InputError(f"run = {folder} holds no {name}: give the folder of a run.") from error
-    except ValueError as error:
+        raise InputError(
+            f"run = {path.parent} holds no {path.name}: give the folder of a run."
+        ) from error
+    try:
+        found = json.loads(content)
+    except (ValueError, RecursionError) as error:
         raise files.corrupt(path, error) from error
     if not isinstance(found, dict):
         raise files.corrupt(path, "it holds no names with values")

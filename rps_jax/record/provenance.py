@@ -51,13 +51,11 @@ def sign(folder: Path, signed: Mapping[str, Any] | None = None) -> None:
     """
     new = dict(signed or environment())
     with run_folder.alone(folder):
-        earlier = []
-        if (folder / ENVIRONMENT).exists():
-            old = run_folder.noted(folder, ENVIRONMENT)
-            earlier = [*old.pop("before", []), old]
+        earlier = _history(folder) if (folder / ENVIRONMENT).exists() else []
         earlier = [*new.pop("before", []), *earlier]
         others = [one for one in earlier if not _same(one, new)]
-        files.write_json(folder / ENVIRONMENT, new | ({"before": others} if others else {}))
+        note = new | ({"before": others} if others else {})
+        files.write_json(folder / ENVIRONMENT, note, checked=True)
 
 
 def signed(folder: Path) -> dict[str, Any]:
@@ -66,7 +64,16 @@ def signed(folder: Path) -> dict[str, Any]:
     Raises:
       InputError: there is nothing, or it is corrupt.
     """
-    return run_folder.noted(folder, ENVIRONMENT)
+    return run_folder.noted(folder / ENVIRONMENT)
+
+
+def _history(folder: Path) -> list[dict[str, Any]]:
+    """What `sign` noted, the latest last."""
+    last = signed(folder)
+    before = last.pop("before", [])
+    if not (isinstance(before, list) and all(isinstance(one, dict) for one in before)):
+        raise files.corrupt(folder / ENVIRONMENT, "before is no list of names with values")
+    return [*before, last]
 
 
 def _same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
@@ -78,13 +85,12 @@ def _same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
 
 def told(folder: Path) -> str:
     """What `sign` noted, in words."""
-    found = signed(folder)
     try:
         last, *before = (
             f"`{' '.join(one['command'])}`, commit {one['commit']}, {one['time']}, on "
             f"{one['device']['kind']} with {one['processors']} processors, jax "
             f"{one['packages']['jax']}, mujoco {one['packages']['mujoco']}"
-            for one in (found, *reversed(found.get("before", [])))
+            for one in reversed(_history(folder))
         )
     except (KeyError, TypeError, AttributeError) as error:
         raise files.corrupt(folder / ENVIRONMENT, error) from error

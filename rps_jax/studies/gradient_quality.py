@@ -22,8 +22,8 @@ from rps_jax import errors
 from rps_jax.control import strategies
 from rps_jax.control.law import RPSParams
 from rps_jax.engines import EngineName
-from rps_jax.record import files
 from rps_jax.record import folder as run_folder
+from rps_jax.record.checkpoint import Parts
 from rps_jax.trials import trial
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Snapshot, World
@@ -164,12 +164,11 @@ def run(
     if "combined" in wanted:
         wanted = dict.fromkeys((TRUTH, "reverse", "evolution", *names))
     found: dict[str, xr.Dataset] = {}
+    parts = Parts(folder)
     for name in wanted:
-        path = folder / f"{name}.nc"
-        if not path.exists():
+        if parts.get(name) is None:
             report(name)
-            files.write_results(path, _measured(study, name, found))
-        found[name] = files.read(path)
+        found[name] = parts.results(name, partial(_measured, study, name, found))
     return judged(found, names)
 
 

@@ -18,6 +18,7 @@ from rps_jax.analysis.report import Section, write_report
 from rps_jax.control.law import RPSParams
 from rps_jax.engines import EngineName
 from rps_jax.record import files, provenance
+from rps_jax.record.checkpoint import Parts
 from rps_jax.studies import ambiguity, fidelity, hardware, study
 from rps_jax.studies.study import Condition, Grid
 from rps_jax.trials import pushes
@@ -120,7 +121,7 @@ def run(
     sections = [
         *_setup(out),
         *_table_ii(out, plan, progress, shape),
-        *_one_trial(out, plan),
+        *_one_trial(out, plan, progress),
         *_hardware(out, plan, progress, shape),
         *_fidelity(out, plan, progress, shape),
         *_gazebo(out, plan, progress, shape),
@@ -145,13 +146,15 @@ def _folder(out: Path, name: str) -> Path:
     return folder
 
 
-def _kept(path: Path, trials: int, progress: _Progress, make: Callable[..., xr.Dataset]):
-    """A part's results: read if its file is there, else made with a progress and written."""
-    if path.exists():
+def _kept(
+    out: Path, name: str, trials: int, progress: _Progress, make: Callable[..., xr.Dataset]
+) -> xr.Dataset:
+    """A part's results: read if it is finished, else made with a progress; also in `NAME.nc`."""
+    parts = Parts(out)
+    if parts.get(name) is not None:
         progress.skip(trials)
-        return files.read(path)
-    results = make(progress.part())
-    files.write_results(path, results)
+    results = parts.results(name, lambda: make(progress.part()))
+    files.write_results(out / f"{name}.nc", results)
     return results
 
 
@@ -197,13 +200,15 @@ def _table_ii(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any])
     ]
 
 
-def _one_trial(out: Path, plan: Plan) -> list[Section]:
-    picture, file = out / "trial.png", out / "trial.nc"
-    if not (picture.exists() and file.exists()):
+def _one_trial(out: Path, plan: Plan, progress: _Progress) -> list[Section]:
+    picture = out / "trial.png"
+
+    def follow(tell: Any) -> xr.Dataset:
         (trace,) = pushes.follow([_FIG_6], Setting(engine=plan.engine))
         figures.one_trial(trace, figures.title_of(_FIG_6), picture)
-        files.write_results(file, tables.trace_dataset(trace))
-    seen = files.read(file)
+        return tables.trace_dataset(trace)
+
+    seen = _kept(out, "trial", 0, progress, follow)
     reached = "reached" if int(seen.outcome_success) else "not reached"
     text = f"The target is {reached} at {float(seen.outcome_time):.1f} s."
     return [Section("Fig. 6: the box to (-2, 0) under S1", text, (), picture)]
@@ -214,13 +219,15 @@ def _hardware(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any])
     setting = Setting(engine="fused")
     each = len(paper.HARDWARE_OBJECTS) * len(paper.HARDWARE_LAYOUTS["circle"])
     results = _kept(
-        out / "hardware.nc",
+        out,
+        "hardware",
         each * len(hardware.frictions()),
         progress,
         lambda tell: hardware.run(base, setting, report=tell, **shape),
     )
     shifted = _kept(
-        out / "shifted.nc",
+        out,
+        "shifted",
         each * 2 * len(plan.shifts),
         progress,
         lambda tell: hardware.disturb(base, setting, shifts=plan.shifts, report=tell, **shape),

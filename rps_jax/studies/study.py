@@ -1,8 +1,8 @@
 """The paper's trials under changed conditions: one condition a row, resumable.
 
 A study runs the same grid of trials under every condition, so that conditions are compared trial
-by trial. Each condition leaves one file in the run folder as soon as it is done; running the same
-study again in the same folder computes only what is missing.
+by trial. Each condition is a part of the run folder as soon as it is done; running the same study
+again in the same folder computes only what is missing.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from scipy import stats
 from rps_jax.analysis import tables
 from rps_jax.errors import InputError
 from rps_jax.record import files
+from rps_jax.record.checkpoint import Parts
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Progress, Setting
@@ -87,7 +88,8 @@ def run(
     Raises:
       InputError: the folder holds a condition of the same name that was run otherwise.
     """
-    found = {name: _load(folder, name, c, grid) for name, c in conditions.items()}
+    parts = Parts(folder)
+    found = {name: _load(parts, name, c, grid) for name, c in conditions.items()}
     missing = [name for name, results in found.items() if results is None]
     finished, simulated = grid.size * (len(found) - len(missing)), 0.0
     report(Progress(finished, simulated))
@@ -114,7 +116,7 @@ def run(
                 "run_time": timing.run * share,
                 "simulated": timing.simulated * share,
             }
-            files.write_results(folder / f"{name}.nc", results)
+            parts.put(name, files.encoded(results))
             found[name] = results
     done = {name: results for name, results in found.items() if results is not None}
     whole = xr.concat(
@@ -133,19 +135,15 @@ def _fingerprint(condition: Condition, grid: Grid) -> str:
     return f"{same!r} {grid._replace(friction=dict(grid.friction))!r}"
 
 
-def _load(folder: Path, name: str, condition: Condition, grid: Grid) -> xr.Dataset | None:
-    """A condition's results, if the folder has them; a file that cannot be read is set aside."""
-    path = folder / f"{name}.nc"
-    if not path.exists():
+def _load(parts: Parts, name: str, condition: Condition, grid: Grid) -> xr.Dataset | None:
+    """A condition's results, if it is among the finished parts."""
+    if (content := parts.get(name)) is None:
         return None
-    try:
-        results = files.read(path)
-    except InputError:
-        path.rename(path.with_suffix(".nc.corrupt"))
-        return None
+    results = files.decoded(content, name)
     if results.attrs.get("run_as") != _fingerprint(condition, grid):
         raise InputError(
-            f"{path} was run with other options: choose another folder, or delete it to run again."
+            f"{parts.folder / name}-*.nc was run with other options: choose another folder, or "
+            "delete it to run again."
         )
     return results
 

@@ -1,0 +1,97 @@
+"""Checkpoints: the finished parts of a run, which are not run again when it is continued."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import xarray as xr
+
+from rps_jax.record import files
+
+_DIGITS = 16  # of the digest in a file's name
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The finished parts of a run, each in a file `parts/NAME-DIGEST.SUFFIX` of its folder.
+
+    The digest is of the file's content and is compared before anything else looks at the file. A
+    file that is not what was written is set aside, as `*.corrupt`, and its part is as if it had
+    never been finished.
+    """
+
+    run: Path
+
+    @property
+    def folder(self) -> Path:
+        """Where the files are."""
+        return self.run / "parts"
+
+    def found(self) -> dict[str, Path]:
+        """The files of all parts, in the order of their names."""
+        return {name: path for name, path, _ in self._sound()}
+
+    def contents(self) -> dict[str, bytes]:
+        """The contents of all parts, in the order of their names."""
+        return {name: content for name, _, content in self._sound()}
+
+    def get(self, name: str) -> bytes | None:
+        """The content of one part, if it is finished."""
+        return next((content for _, _, content in self._sound(name)), None)
+
+    def put(self, name: str, content: bytes, suffix: str = ".nc", *, new: bool = False) -> Path:
+        """Write the file of a part, whole or not at all, and then remove what it had before.
+
+        A process that is killed in between leaves both, of which the newer counts. Nothing is
+        removed for a part that the caller knows to be `new`, which spares a look at the folder.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        older = [] if new else self._files(name)
+        path = self.folder / f"{name}-{files.digest(content)[:_DIGITS]}{suffix}"
+        files.write_bytes(path, content)
+        for one in older:
+            if one != path:
+                one.unlink(missing_ok=True)
+        return path
+
+    def results(self, name: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
+        """The labelled results of a part, which are made and put if it is not finished."""
+        if (content := self.get(name)) is None:
+            content = files.encoded(make())
+            self.put(name, content)
+        return files.decoded(content, self.folder / name)
+
+    def _files(self, name: str | None = None) -> list[Path]:
+        """Files of one part, or of all, by name, and of one name the newest first."""
+        found = []
+        for path in self.folder.glob("*-*"):
+            whole = path.name[0] != "." and path.suffix != ".corrupt"
+            if whole and name in (None, _name(path)):
+                with contextlib.suppress(FileNotFoundError):  # another process has set it aside
+                    found.append((_name(path), -path.stat().st_mtime_ns, path))
+        return [path for *_, path in sorted(found)]
+
+    def _sound(self, name: str | None = None) -> Iterator[tuple[str, Path, bytes]]:
+        """The newest sound file of every part, or of one: name, path and content."""
+        last = None
+        for path in self._files(name):
+            if _name(path) != last and (content := _content(path)) is not None:
+                last = _name(path)
+                yield last, path, content
+
+
+def _name(path: Path) -> str:
+    return path.stem.rpartition("-")[0]
+
+
+def _content(path: Path) -> bytes | None:
+    """What was written into a file; None of one that is damaged, which is set aside, or gone."""
+    with contextlib.suppress(FileNotFoundError):  # another process has set it aside
+        content = path.read_bytes()
+        if files.digest(content)[:_DIGITS] == path.stem.rpartition("-")[2]:
+            return content
+        path.replace(path.with_name(f"{path.name}.corrupt"))
+    return None
