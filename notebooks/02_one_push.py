@@ -10,8 +10,8 @@
 # %% [markdown]
 # # One push
 #
-# The box, under the friction set S1, with its target 2 m behind the robot: the trial of the paper's
-# Fig. 6. The fused engine steps it; `rps push` does the same in MJX.
+# This is the trial of the paper's Fig. 6: the box under the friction set S1, with its target 2 m
+# behind the robot. The fused engine steps it here; `rps push` runs the same trial in MJX.
 
 # %%
 import tempfile
@@ -54,20 +54,22 @@ print(
 # The trial has four acts.
 #
 # 1. *Approach* (yellow). Nothing is felt; the base creeps forward at 1 cm/s until the skin
-# touches. 2. *Turning on the edge* (blue, until 44 s). The target lies straight behind, so the
-# base turns right at once, and the contact runs to the left edge of the front within seconds.
-# There the law enters the Realignment State: $a_r$ = 10, all speed goes sideways after the
-# contact. The box is held by one point, near $l_{cr}$ (dashed), and base and box turn about each
-# other. Since $\sigma$ is nearly zero so far out, the turn is slow: this act takes a third of the
-# trial. 3. *Pushing home* (44 to 98 s). The box has come round until its side lies flat on the
-# front (point becomes line at 37 s). The contact slides back to 7 cm, below $\beta$; $a_r$ falls
-# to 0.4, and the base drives forward at nearly full speed with a little motion to the left. 4.
-# *Arriving* (from 98 s). Nearer than $d_{th}$ = 0.5 m Eq. 5 gives no more lateral motion: $a_r$
-# is 0 at once, and the path bends visibly. Speed falls with the distance (Eq. 3), so the last
-# half metre takes 23 s, nearly a fifth of the trial.
+#    touches.
+# 2. *Turning on the edge* (blue, until 44 s). The target lies straight behind, so the base turns
+#    right at once, and the contact runs to the left edge of the front within seconds. There the
+#    law enters the Realignment State: $a_r$ = 10, and all speed goes sideways, after the contact.
+#    One point holds the box, near $l_{cr}$ (dashed), and base and box turn about each other. Since
+#    $\sigma$ is nearly zero so far out, the turn is slow: this act takes a third of the trial.
+# 3. *Pushing home* (44 to 98 s). The box has come round until its side lies flat on the front (the
+#    point becomes a line at 37 s). The contact slides back to 7 cm, below $\beta$; $a_r$ falls to
+#    0.4, and the base drives forward at nearly full speed with a little motion to the left.
+# 4. *Arriving* (from 98 s). Nearer than $d_{th}$ = 0.5 m Eq. 5 gives no more lateral motion: $a_r$
+#    is 0 at once, and the path bends visibly. Speed falls with the distance (Eq. 3), so the last
+#    half metre takes 23 s, nearly a fifth of the trial.
 #
-# Contact is never lost. The fast changes of $\omega$ around 4 s are $|l|$ at the edge of the
-# critical region, where $\sigma$ of Eq. 10 is zero on one side and turns the base on the other.
+# Contact is never lost. The angular velocity changes fast around 4 s because $|l|$ is then at the
+# edge of the critical region, where $\sigma$ of Eq. 10 is zero on one side and turns the base on
+# the other.
 #
 # ## The same in pictures
 
@@ -79,9 +81,9 @@ images = video.images(scene, seen.qpos[rows], **film)
 Image(figures.stills(images, [f"{t:.0f} s" for t in seen.time[rows]], out / "stills.png"))
 
 # %% [markdown]
-# In the second picture the base has gone round the box's corner; in the third it stands behind
-# the box, as seen from the target, and from then on it pushes. The film shows the whole, twelve
-# times as fast; the purple trail is the contact point.
+# In the second picture the base has gone round the corner of the box. In the third it stands
+# behind the box, as seen from the target, and from then on it pushes. The film shows the whole
+# trial twelve times as fast; the purple trail is that of the contact point.
 
 # %%
 rows = np.linspace(0, len(seen.time) - 1, 60).astype(int)

@@ -10,14 +10,14 @@
 # %% [markdown]
 # # Random worlds, from a run folder
 #
-# The paper's grid is solved (`03_paper`); this asks where the law ends. Worlds of the domain
-# `wide` differ in mass, size, shape, friction, centre of mass, start, target, and in the faults
-# of skin, odometry and drive. Both arms, the paper's parameters and `RPSParams.tuned()`, meet the
-# same worlds.
+# The paper's grid is solved (`03_paper`); this notebook asks where the law ends. Worlds of the
+# domain `wide` differ in mass, size, shape, friction, centre of mass, start and target, and in the
+# faults of skin, odometry and drive. Both arms, the paper's parameters and `RPSParams.tuned()`,
+# meet the same worlds.
 #
-# This notebook computes nothing; it reads `runs/compare/wide`: the first 1000 of the 10,000
-# worlds of the README's comparison (`rps tune compare --params paper tuned --domain wide --seed 2`,
-# one H200). Name another folder as `run` to read a sweep of your own.
+# This notebook computes nothing; it reads `runs/compare/wide`, the first 1000 of 10,000 worlds of
+# `rps tune compare --params paper tuned --domain wide --seed 2` (one H200). Name another folder as
+# `run` to read a sweep of your own.
 
 # %%
 import tempfile
@@ -37,15 +37,15 @@ max_lost = float(plan.setting.rules.max_lost)
 # %% [markdown]
 # ## How often, how near, how long
 #
-# Intervals are Wilson's, of 95 %.
+# The intervals are Wilson's, of 95 %.
 
 # %%
 Markdown(tables.markdown(statistics.rates(results, max_lost)))
 
 # %% [markdown]
 # With the paper's parameters the law fails in one world of 15, with the tuned ones in 6 of 1000.
-# The intervals of the two do not touch, over all worlds nor for boxes and cylinders. For prisms,
-# which no tuner has seen, they just do.
+# The intervals of the two do not touch, neither over all worlds nor for boxes or cylinders. For
+# prisms, which no tuner has seen, they just touch.
 #
 # ## How it fails
 
@@ -53,13 +53,13 @@ Markdown(tables.markdown(statistics.rates(results, max_lost)))
 Image(figures.failures(results, max_lost, out / "failures.png"))
 
 # %% [markdown]
-# There are two ways to fail, and the lower row tells them apart. With the paper's parameters, a
-# world that is lost by *timeout* (green) ends within 30 cm of its target, all but one, and more
-# than half of them within 10 cm: the base circles around it and does not arrive. Boxes and prisms
-# that do so are wide, from 25 cm on; cylinders do so at any width. A world that is lost by *lost
-# contact* (orange) ends more than a metre away in 14 of 20 cases, at any width. The tuned
-# parameters act upon the last contact when it is lost, and lose none so. What is left are six
-# timeouts, of wide objects, too few to say more.
+# There are two ways to fail, and the lower row tells them apart. With the paper's parameters all
+# but one of the worlds that are lost by *timeout* (green) end within 30 cm of their target, and
+# more than half of them within 10 cm: the base circles around the target and does not arrive.
+# Boxes and prisms that do so are wide, from 25 cm on; cylinders do so at any width. A world that
+# is lost by *lost contact* (orange) ends more than a metre away in 14 of 20 cases, at any width.
+# The tuned parameters act upon the last contact when it is lost, and lose no world in this way.
+# Six timeouts of wide objects are left, too few to say more.
 #
 # ## What success depends on
 #
@@ -69,35 +69,38 @@ Image(figures.failures(results, max_lost, out / "failures.png"))
 Image(figures.success_curves(results, out / "success.png"))
 
 # %% [markdown]
-# Most curves are flat within their intervals, and where a curve of 22 dips once, chance is the
-# first explanation. So each is tested, and the tests are corrected for their number: q below 0.05
-# is what 1000 worlds can show.
+# Most of the 22 curves are flat within their intervals, and where one of so many dips once, chance
+# is the first explanation. So each curve is tested, and the tests are corrected for their number:
+# a q below 0.05 is what 1000 worlds can show.
 
 # %%
 Markdown(tables.markdown(statistics.influences(results, "paper")[:9]))
 
 # %% [markdown]
-# For the paper's parameters it is width: from about 25 cm of half width on, success falls to five
-# in six. The base itself is 29 cm of half width. And it is the number of corners, of which 0 is a
-# cylinder. The README's run of 240,000 worlds finds more, such as the centre of mass, dead taxels
-# and friction at the robot, but here they do no more than chance might.
+# For the paper's parameters width matters: from about 25 cm of half width on, success falls to
+# five in six. The base itself has a half width of 29 cm. The number of corners matters as well (a
+# cylinder counts as 0). A run of 240,000 worlds (`sweeps/README.md`) finds more influences, such
+# as the centre of mass, dead taxels and friction at the robot, but here they do no more than
+# chance might.
 
 # %%
 Markdown(tables.markdown(statistics.influences(results, "tuned")[:4]))
 
 # %% [markdown]
-# For the tuned parameters no quantity has any influence that 1000 worlds could show: the loss of
-# wide objects is gone.
+# For the tuned parameters no quantity has an influence that 1000 worlds could show: wide objects
+# are no longer lost.
 #
 # ## The hardest worlds
 #
-# Those in which most arms fail, and among these the most distance is left.
+# The hardest worlds are those in which most arms fail, and among these those with the most
+# distance left.
 
 # %%
 Markdown(tables.markdown(statistics.hardest_table(results, str(run))))
 
 # %% [markdown]
-# The last column replays a world, draws it as in `02_one_push` and films it; run it in this
-# folder. Only the first two are lost by both arms, and the tuned parameters bring them to within 7
-# cm. In the others the paper's parameters lose the object far from its target, mostly one behind
-# the robot (beyond 90 degrees), and the tuned ones arrive in 85 to 155 s.
+# The command in the last column replays a world, draws it as in `02_one_push` and films it; run it
+# in this folder. Only the first two worlds are lost by both arms, and the tuned parameters bring
+# their objects to within 7 cm. In the others the paper's parameters lose the object far from its
+# target, mostly a target behind the robot (beyond 90 degrees), and the tuned ones arrive in 85 to
+# 155 s.

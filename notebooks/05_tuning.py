@@ -11,10 +11,11 @@
 # # Tuning the law
 #
 # The paper's parameters were chosen by hand. `RPSParams.tuned()` was found by evolution in two
-# runs of CMA-ES, a coarse and a fine one, whose commands stand in the README; `runs/coarse` and
-# `runs/fine` hold their logs. `runs/compare/wide` has both sets of parameters in 1000 worlds that
-# no tuner has seen. To what evolution found, one switch was added by hand: on a lost contact the
-# tuned law acts upon the last one (`keep_contact`). Only the last section simulates anything.
+# runs of CMA-ES, a coarse and a fine one, whose commands stand in `sweeps/README.md`;
+# `runs/coarse` and `runs/fine` hold their logs. `runs/compare/wide` has both sets of parameters in
+# 1000 worlds that no tuner has seen. One switch was added by hand to what evolution found: when
+# contact is lost, the tuned law acts upon the last one (`keep_contact`). Only the section about
+# gradients simulates anything.
 
 # %%
 import json
@@ -40,9 +41,9 @@ out = Path(tempfile.mkdtemp())
 # %% [markdown]
 # ## The coarse search
 #
-# Every generation tries 64 candidates in 512 worlds, others in each generation; the mean of the
-# candidates' distribution is then tried in worlds kept for validation. Less is better: a success
-# scores its time, a failure one more and how far it missed.
+# Every generation tries 64 candidates in 512 worlds, others in each generation. The mean of the
+# distribution of candidates is then tried in worlds that are kept for validation. Less is better:
+# a success scores its time, and a failure scores one more and how far it missed.
 
 # %%
 names = tune.SUBSETS["full"]
@@ -50,24 +51,25 @@ Image(figures.tuning(tune.read_log(Path("runs/coarse")), names, out / "coarse.pn
 
 # %% [markdown]
 # In seven generations the objective on the validation worlds halves, from 0.31 to 0.15, and
-# success rises from 86 to 95.5 %. Then the search gets worse again, while it believes to get
-# better: the mean of the candidates falls on, and it does so because they become alike (the blue
-# band narrows), far out where the bounded map is flat: $K_v$, $a_r^{max}$ and $d_{th}$ run into
-# the upper end of what is allowed, 2, 100 and 2. Without worlds for validation this would have
+# success rises from 86 to 95.5 %. Then the search gets worse again, while by its own measure it
+# gets better: the mean score of the candidates keeps falling, because they become alike (the blue
+# band narrows), far out where the bounded map is flat. $K_v$, $a_r^{max}$ and $d_{th}$ run into
+# the upper ends of what is allowed, 2, 100 and 2. Without worlds for validation this would have
 # gone unnoticed. The fine search begins at generation 6.
 #
 # ## The fine search
 #
-# A spread half as wide, and a higher price for leaving the start. Time weighs less in its
-# objective, and its worlds are others, so its values cannot be compared with those above.
+# The fine search has a spread half as wide and a higher price for leaving the start. Time weighs
+# less in its objective, and its worlds are others, so its values cannot be compared with those
+# above.
 
 # %%
 Image(figures.tuning(tune.read_log(Path("runs/fine")), names, out / "fine.png"))
 
 # %% [markdown]
-# Validation falls from 0.164 to 0.117 at generation 7, which is the set that was kept. The values
-# jump from one generation to the next, and those of the start (dashed) jump with them: these are
-# the worlds, and this is why candidates are compared within a generation only. The gain over the
+# Validation falls from 0.164 to 0.117 at generation 7, whose mean was kept. The values jump from
+# one generation to the next, and those of the start (dashed) jump with them: the worlds make them
+# jump, and this is why candidates are compared within a generation only. The gain over the
 # generations before and after the seventh is smaller than such jumps, so another run would end at
 # somewhat other numbers.
 #
@@ -82,17 +84,17 @@ places = {label: jax.nn.sigmoid(space.vector(params)) for label, params in sets.
 Image(figures.between_bounds(places, names, out / "bounds.png"))
 
 # %% [markdown]
-# $K_v$, $a_r^{max}$, $K_h$ and $l_{cr}$ moved most; $\beta$ and $\gamma_{max}$ hardly at all.
-# What this means is easier to see in the twist (compare `01_the_law`), here 1 m from the target:
+# $K_v$, $a_r^{max}$, $K_h$ and $l_{cr}$ moved most; $\beta$ and $\gamma_{max}$ hardly moved. What
+# this means is easier to see in the twist (compare `01_the_law`), here 1 m from the target:
 
 # %%
 Image(figures.twist_field(sets, 1.0, out / "twist.png"))
 
 # %% [markdown]
-# The tuned law has all but given up Eq. 5, which acts only beyond $d_{th}$ = 1.56 m. Nearer, it
-# knows two things to do: push straight ahead and turn as fast as it may, or, beyond $l_{cr}$ = 17
-# cm, slide sideways, without pushing, until the contact is back at 12 cm. The paper's law mixes
-# the two, and leaves the contact where mixing holds it.
+# The tuned law has all but given up Eq. 5, which acts only beyond $d_{th}$ = 1.56 m. Nearer to the
+# target it does one of two things: it pushes straight ahead and turns as fast as it may, or,
+# beyond $l_{cr}$ = 17 cm, it slides sideways, without pushing, until the contact is back at 12 cm.
+# The paper's law mixes the two, and leaves the contact where mixing holds it.
 #
 # ## The same worlds, twice
 
@@ -104,11 +106,12 @@ Markdown(tables.markdown(statistics.differences(results)))
 Image(figures.paired(results, out / "paired.png"))
 
 # %% [markdown]
-# The tuned law wins 64 worlds that the paper's parameters lose and loses 4 that they win: no
-# accident. And it is not bought with time. Most worlds lie just below the diagonal, a fifth faster
-# than before; of a second group, for which the paper's parameters need 150 s and more, the tuned
-# law takes most no longer than the others; and so do most of the worlds that only it wins. A few
-# worlds became slower (above the diagonal). `04_robustness` shows which objects gained.
+# The tuned law wins 64 worlds that the paper's parameters lose and loses 4 that they win, which is
+# no accident. Nor is this bought with time. Most worlds lie just below the diagonal: they end a
+# fifth sooner than before. In a second group of worlds the paper's parameters need 150 s and more;
+# the tuned law takes no longer for most of these than for the others, nor for most of the worlds
+# that only it wins. A few worlds became slower (above the diagonal). `04_robustness` shows which
+# objects gained.
 #
 # ## What a gradient is worth
 #
@@ -156,22 +159,23 @@ Image(figures.estimates(horizons, bars, names, out / "gradients.png"))
 # Bars are two standard errors over the targets, so they show how much targets differ as well as
 # how noisy an estimate is. Until 3 s derivatives and differences are the same; evolution agrees,
 # with bars as wide or up to twice as wide. At 10 s this still holds for $K_h$, and nearly for $L$
-# and $K_v$. For $\beta$ the derivative's bars are three times as wide as those of the differences:
-# in some worlds it has grown far beyond what the parameter does. Which worlds, and by how much,
-# hangs on rounding: compiled in another way, the bars of $L$ and $K_v$ doubled, too. Evolution's
-# bars grow as well, but remain within two and a half times those of the differences, for every
-# parameter.
+# and $K_v$. For $\beta$ the bars of the derivative are three times as wide as those of the
+# differences: in some worlds the derivative has grown far beyond what the parameter does. Rounding
+# decides in which worlds, and by how much: compiled in another way, the bars of $L$ and $K_v$
+# doubled, too. The bars of evolution grow as well, but for every parameter they remain within two
+# and a half times those of the differences.
 #
-# A success takes some 80 s. So derivatives are good for a short look ahead, and what tuned the
-# law over whole trials was evolution. This is one box, 24 worlds and four parameters: a look, not
-# a benchmark.
+# A success takes some 80 s. So derivatives are good for a short look ahead, and over whole trials
+# the law was tuned by evolution. This is one box, 24 worlds and four parameters, so it is a look
+# and not a benchmark; `sweeps/README.md` has the study.
 #
 # ## The same, at equal cost
 #
 # So a gradient that is to tune the law looks at windows of 8 s, which begin anywhere in a trial;
-# what is left of the way after it costs the time of driving it. `runs/race` holds the logs of four
-# runs from the paper's parameters, in the same worlds: evolution and gradients at 2.4 million
-# simulated seconds each; and half of the gradients' run, continued by evolution.
+# what is left of the way after a window costs the time of driving it. `runs/race` holds the logs
+# of four runs from the paper's parameters, in the same worlds: evolution and gradients at 2.4
+# million simulated seconds each, half of the run by gradients, and evolution that continued this
+# half.
 
 # %%
 logs = {name: tune.read_log(Path("runs/race") / name) for name in ("evolution", "gradient")}
@@ -182,7 +186,7 @@ Image(figures.races(logs, out / "race.png"))
 
 # %% [markdown]
 # In one step, gradients come as far as evolution in its first generation, at equal cost; the best
-# of both runs are about equally good in test worlds of `wide` (96.1 and 95.5 %; the README has
-# the table). Then gradients find nothing more and steer ever harder, perhaps because 8 s do not
-# show what that does to the contact later. And evolution that starts where they stopped, with a
-# small spread, takes long before it finds better.
+# parameters of both runs are about equally good in test worlds of `wide` (96.1 and 95.5 %;
+# `sweeps/README.md` has the table). Then gradients find nothing more and steer ever harder,
+# perhaps because 8 s do not show what that does to the contact later. Evolution that starts where
+# they stopped, with a small spread, takes long before it finds better.

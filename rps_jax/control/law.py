@@ -64,7 +64,7 @@ class RPSParams(NamedTuple):
 
     @classmethod
     def tuned(cls) -> RPSParams:
-        """Tuned by evolution in random worlds of boxes and cylinders; the README says how.
+        """Tuned by evolution in random worlds of boxes and cylinders (`sweeps/README.md` says how).
 
         Full speed until the target. Nearer than d_th it drives straight on or, beyond l_cr, almost
         purely sideways; Eq. 5 acts only farther away. A contact that is lost is acted upon as if it

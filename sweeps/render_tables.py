@@ -1,0 +1,148 @@
+"""Write the published tables, which live as data, into the Markdown pages that show them.
+
+    python sweeps/render_tables.py [--check]
+
+`sweeps/results/NAME.json` holds one table: the command, device, versions, commit and date that made
+it, its columns and its rows. A page shows it between `<!-- table: NAME -->` and `<!-- end -->`, and
+its commands between `<!-- command: NAME -->` and `<!-- end -->`. With `--check` nothing is written,
+and the exit code is 1 if a page differs from the data. Only the standard library is needed.
+
+A cell is a text, a number, a list of numbers (a rate and the ends of its interval), or null. The
+`format` of a column is applied to a number and to the first of a list, its `rest` to those that
+follow. A column with `merge` shows no text twice below itself. A cell `{"from": NAME, "row": [...],
+"column": ...}` shows a cell of another table, in the row that begins with the values given.
+"""
+
+import json
+import os
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "sweeps" / "results"
+KEYS = ("command", "device", "versions", "commit", "date", "columns", "rows")
+_BLOCK = re.compile(r"(<!-- (table|command): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+_SKIPPED = {"runs", "build", "dist"}  # folders of the root that hold no pages of the repository
+
+
+def load(name: str, results: Path = RESULTS) -> dict[str, Any]:
+    """The data of a table; raises ValueError, with one sentence, if it is no such file."""
+    path = results / f"{name}.json"
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}.") from error
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path} is not JSON: {error}.") from error
+    missing = [key for key in KEYS if key not in data]
+    if missing:
+        raise ValueError(f"{path} lacks {', '.join(missing)}.")
+    for row in data["rows"]:
+        if len(row) != len(data["columns"]):
+            raise ValueError(f"{path}: the row {row[:2]} has not one cell for each column.")
+    return data
+
+
+def table(data: dict[str, Any], results: Path = RESULTS) -> str:
+    """The Markdown table of some data."""
+    lines = [[column["name"] for column in data["columns"]]]
+    before: list[Any] = [None] * len(data["columns"])
+    for row in data["rows"]:
+        texts = []
+        for cell, column, above in zip(row, data["columns"], before, strict=True):
+            merged = column.get("merge") and cell == above
+            texts.append("" if merged else _text(cell, column, results))
+        lines.append(texts)
+        before = row
+    lines.insert(1, ["---"] * len(data["columns"]))
+    return "".join(f"| {' | '.join(texts)} |\n" for texts in lines)
+
+
+def _text(cell: Any, column: dict[str, Any], results: Path) -> str:
+    if cell is None:
+        return ""
+    if isinstance(cell, str):
+        return cell
+    if isinstance(cell, dict):
+        return _cited(cell, results)
+    first, *rest = cell if isinstance(cell, list) else [cell]
+    text = column.get("format", "{}").format(first)
+    return text + column.get("rest", "").format(*rest) if rest else text
+
+
+def _cited(cell: dict[str, Any], results: Path) -> str:
+    """The text of a cell of another table."""
+    data, first = load(cell["from"], results), cell["row"]
+    names = [column["name"] for column in data["columns"]]
+    rows = [row for row in data["rows"] if row[: len(first)] == first]
+    if len(rows) != 1 or cell["column"] not in names:
+        raise ValueError(f"{cell} does not name one cell of {cell['from']}.json.")
+    i = names.index(cell["column"])
+    return _text(rows[0][i], data["columns"][i], results)
+
+
+def caption(data: dict[str, Any], link: str) -> str:
+    """One line that says where the numbers were made and links to all that is known of them."""
+    known = [f"Device: {data['device']}"] if data["device"] else []
+    known += [f"date: {data['date']}"] if data["date"] else []
+    return f"\n<sub>{'; '.join([*known, f'[command, versions and values]({link})'])}.</sub>\n"
+
+
+def commands(data: dict[str, Any]) -> str:
+    """The commands of some data, to be copied into a shell."""
+    lines = data["command"] if isinstance(data["command"], list) else [data["command"]]
+    return "```bash\n" + "".join(f"{line}\n" for line in lines) + "```\n"
+
+
+def render(page: Path, results: Path = RESULTS) -> str:
+    """The text of a page with all its blocks made anew from the data."""
+
+    def block(found: re.Match[str]) -> str:
+        begin, kind, name, end = found.groups()
+        data = load(name, results)
+        if kind == "command":
+            return begin + commands(data) + end
+        link = Path(os.path.relpath(results / f"{name}.json", page.parent)).as_posix()
+        return begin + table(data, results) + caption(data, link) + end
+
+    return _BLOCK.sub(block, page.read_text(encoding="utf-8"))
+
+
+def pages(root: Path = ROOT) -> list[Path]:
+    """Every Markdown page of the repository."""
+    found = []
+    for folder, folders, files in os.walk(root):
+        skipped = _SKIPPED if Path(folder) == root else ()
+        folders[:] = [name for name in folders if name[0] != "." and name not in skipped]
+        found += [Path(folder) / name for name in files if name.endswith(".md")]
+    return sorted(found)
+
+
+def main(arguments: list[str]) -> int:
+    """Render every page, or check that each is as the data say; returns the exit code."""
+    if arguments not in ([], ["--check"]):
+        print(__doc__, file=sys.stderr)
+        return 2
+    stale = []
+    try:
+        for path in RESULTS.glob("*.json"):
+            table(load(path.stem))
+        for page in pages():
+            text = render(page)
+            if text != page.read_text(encoding="utf-8"):
+                stale.append(page)
+                if not arguments:
+                    page.write_text(text, encoding="utf-8")
+    except ValueError as error:
+        print(f"render_tables: error: {error}", file=sys.stderr)
+        return 1
+    for page in stale:
+        what = "differs from its data; run this without --check" if arguments else "was rendered"
+        print(f"{page.relative_to(ROOT)} {what}.")
+    return 1 if stale and arguments else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

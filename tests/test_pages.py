@@ -1,0 +1,81 @@
+"""The pages say what the data say, lead where they say, and stay short."""
+
+import json
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+TABLES = runpy.run_path(str(ROOT / "sweeps" / "render_tables.py"))
+PAGES = TABLES["pages"]()
+TEXTS = sorted((ROOT / "notebooks").glob("[0-9]*.py"))
+
+
+def named(path):
+    return str(path.relative_to(ROOT))
+
+
+def anchors(page):
+    """What a heading of a page can be linked by."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
+    return {
+        re.sub(r"[^\w\- ]", "", heading).strip().lower().replace(" ", "-") for heading in headings
+    }
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_tables_are_as_their_data(page):
+    assert TABLES["render"](page) == page.read_text()
+
+
+def test_every_table_is_shown_on_some_page():
+    shown = set(re.findall(r"<!-- table: (\S+) -->", "".join(p.read_text() for p in PAGES)))
+    assert shown == {path.stem for path in TABLES["RESULTS"].glob("*.json")}
+
+
+def test_a_table_follows_its_data_and_those_it_cites(tmp_path):
+    columns = [
+        {"name": "what", "merge": True},
+        {"name": "rate", "format": "{:.1f} %", "rest": " [{}]"},
+    ]
+    one = dict.fromkeys(TABLES["KEYS"], "") | {"device": "a core", "columns": columns}
+    two = one | {"rows": [["b", {"from": "one", "row": ["a", 1.0], "column": "rate"}]]}
+    page = tmp_path / "page.md"
+    page.write_text("<!-- table: one -->\n<!-- end -->\n<!-- table: two -->\n<!-- end -->\n")
+
+    def rendered(rows):
+        for name, data in (("one", one | {"rows": rows}), ("two", two)):
+            (tmp_path / f"{name}.json").write_text(json.dumps(data))
+        return TABLES["render"](page, tmp_path)
+
+    text = rendered([["a", 1.0], ["a", [2.26, 3]]])
+    assert "| a | 1.0 % |\n|  | 2.3 % [3] |\n" in text
+    assert "| b | 1.0 % |" in text
+    assert "Device: a core" in text
+    with pytest.raises(ValueError, match=r"does not name one cell of one\.json"):
+        rendered([["a", 1.5]])
+    with pytest.raises(ValueError, match="has not one cell for each column"):
+        rendered([["a"]])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_links_lead_somewhere(page):
+    links = re.findall(r"\]\(([^)\s]+)\)", page.read_text())
+    for link in links:
+        if link.startswith("https://"):
+            continue
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+@pytest.mark.parametrize("page", [*PAGES, *TEXTS], ids=named)
+def test_no_sentence_names_a_commit(page):
+    assert not re.search(r"\b(?=\d*[a-f])(?=[a-f]*\d)[0-9a-f]{7,40}\b", page.read_text())
+
+
+def test_the_front_page_is_short():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 150
