@@ -1,4 +1,4 @@
-"""The Reactive Pushing Strategy as a pure function, and thousands of MJX worlds to try it in.
+"""The Reactive Pushing Strategy as a pure function, and thousands of MuJoCo worlds to try it in.
 
 Importing this package sets no flags, writes no file, prints nothing and touches no device: its
 names are loaded when first used.
@@ -10,68 +10,75 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rps_jax.control.law import Details, Observation, RPSParams, RPSState, Twist, step
-    from rps_jax.control.strategies import Strategy, register_strategy
-    from rps_jax.errors import InputError
-    from rps_jax.geometry.footprint import Footprint
-    from rps_jax.robot.skin import CapacitiveSkin, IdealSkin
-    from rps_jax.trials.env import PushEnv
-    from rps_jax.trials.pushes import Case, follow, run
-    from rps_jax.trials.setting import Setting
-    from rps_jax.trials.trial import Outcome, Rules
-    from rps_jax.world.domain import DOMAINS, Domain
-    from rps_jax.world.objects import OBJECTS, register_object
-    from rps_jax.world.physics import PHYSICS, Physics
-    from rps_jax.world.scene import FRICTION, Friction
+    from rps_jax.control.law import Details as Details
+    from rps_jax.control.law import Observation as Observation
+    from rps_jax.control.law import RPSParams as RPSParams
+    from rps_jax.control.law import RPSState as RPSState
+    from rps_jax.control.law import Temperatures as Temperatures
+    from rps_jax.control.law import Twist as Twist
+    from rps_jax.control.law import step as step
+    from rps_jax.control.strategies import Strategy as Strategy
+    from rps_jax.control.strategies import register_strategy as register_strategy
+    from rps_jax.errors import InputError as InputError
+    from rps_jax.geometry.footprint import Footprint as Footprint
+    from rps_jax.robot.skin import CapacitiveSkin as CapacitiveSkin
+    from rps_jax.robot.skin import IdealSkin as IdealSkin
+    from rps_jax.robot.skin import SmoothSkin as SmoothSkin
+    from rps_jax.runs.evaluate import evaluate as evaluate
+    from rps_jax.runs.replay import replay as replay
+    from rps_jax.runs.results import load as load
+    from rps_jax.runs.sweep import sweep as sweep
+    from rps_jax.studies.table import table as table
+    from rps_jax.trials.conditions import Conditions as Conditions
+    from rps_jax.trials.env import PushEnv as PushEnv
+    from rps_jax.trials.progress import progress_bar as progress_bar
+    from rps_jax.trials.push import Push as Push
+    from rps_jax.trials.push import push as push
+    from rps_jax.trials.pushes import Case as Case
+    from rps_jax.trials.setting import Progress as Progress
+    from rps_jax.trials.setting import Setting as Setting
+    from rps_jax.trials.trial import Outcome as Outcome
+    from rps_jax.trials.trial import Rules as Rules
+    from rps_jax.world.domain import DOMAINS as DOMAINS
+    from rps_jax.world.domain import Domain as Domain
+    from rps_jax.world.domain import Range as Range
+    from rps_jax.world.objects import OBJECTS as OBJECTS
+    from rps_jax.world.objects import register_object as register_object
+    from rps_jax.world.physics import PHYSICS as PHYSICS
+    from rps_jax.world.physics import Physics as Physics
+    from rps_jax.world.scene import FRICTION as FRICTION
+    from rps_jax.world.scene import Friction as Friction
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
-__all__ = [
-    "DOMAINS",
-    "FRICTION",
-    "OBJECTS",
-    "PHYSICS",
-    "CapacitiveSkin",
-    "Case",
-    "Details",
-    "Domain",
-    "Footprint",
-    "Friction",
-    "IdealSkin",
-    "InputError",
-    "Observation",
-    "Outcome",
-    "Physics",
-    "PushEnv",
-    "RPSParams",
-    "RPSState",
-    "Rules",
-    "Setting",
-    "Strategy",
-    "Twist",
-    "follow",
-    "register_object",
-    "register_strategy",
-    "run",
-    "step",
-]
-
-_MODULES = {
-    "world.domain": ("DOMAINS", "Domain"),
-    "trials.env": ("PushEnv",),
+_HOMES = {
+    "control.law": (
+        *("Details", "Observation", "RPSParams", "RPSState"),
+        *("Temperatures", "Twist", "step"),
+    ),
+    "control.strategies": ("Strategy", "register_strategy"),
     "errors": ("InputError",),
     "geometry.footprint": ("Footprint",),
-    "control.law": ("Details", "Observation", "RPSParams", "RPSState", "Twist", "step"),
+    "robot.skin": ("CapacitiveSkin", "IdealSkin", "SmoothSkin"),
+    "runs.evaluate": ("evaluate",),
+    "runs.replay": ("replay",),
+    "runs.results": ("load",),
+    "runs.sweep": ("sweep",),
+    "studies.table": ("table",),
+    "trials.conditions": ("Conditions",),
+    "trials.env": ("PushEnv",),
+    "trials.progress": ("progress_bar",),
+    "trials.push": ("Push", "push"),
+    "trials.pushes": ("Case",),
+    "trials.setting": ("Progress", "Setting"),
+    "trials.trial": ("Outcome", "Rules"),
+    "world.domain": ("DOMAINS", "Domain", "Range"),
     "world.objects": ("OBJECTS", "register_object"),
     "world.physics": ("PHYSICS", "Physics"),
     "world.scene": ("FRICTION", "Friction"),
-    "robot.skin": ("CapacitiveSkin", "IdealSkin"),
-    "trials.batch": ("Setting",),
-    "control.strategies": ("Strategy", "register_strategy"),
-    "trials.pushes": ("Case", "follow", "run"),
-    "trials.trial": ("Outcome", "Rules"),
 }
-_HOME = {name: module for module, names in _MODULES.items() for name in names}
+_HOME = {name: module for module, names in _HOMES.items() for name in names}
+__all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:

@@ -15,9 +15,11 @@ import tyro
 
 from rps_jax import errors
 from rps_jax.analysis import figures, tables
-from rps_jax.app.cli import StudyOptions, guarded, progress_bar
+from rps_jax.app.cli.options import StudyOptions
+from rps_jax.app.cli.running import guarded
 from rps_jax.record import files
 from rps_jax.studies import ambiguity, study
+from rps_jax.trials.progress import progress_bar
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
 

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from rps_jax import engines, errors
 from rps_jax.analysis import figures, tables
-from rps_jax.app.cli import guarded
+from rps_jax.app.cli.running import guarded
 from rps_jax.record import files
 from rps_jax.record import folder as run_folder
 from rps_jax.studies import benchmark

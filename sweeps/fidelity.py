@@ -14,9 +14,11 @@ import tyro
 
 from rps_jax import engines, errors
 from rps_jax.analysis import tables
-from rps_jax.app.cli import StudyOptions, guarded, progress_bar
+from rps_jax.app.cli.options import StudyOptions
+from rps_jax.app.cli.running import guarded
 from rps_jax.record import files
 from rps_jax.studies import fidelity, study
+from rps_jax.trials.progress import progress_bar
 from rps_jax.world import paper
 
 

@@ -14,7 +14,7 @@ import tyro
 from tqdm import tqdm
 
 from rps_jax.analysis import figures, tables
-from rps_jax.app.cli import guarded, use_cache
+from rps_jax.app.cli.running import guarded, use_cache
 from rps_jax.record import files
 from rps_jax.studies import gradient_quality
 from rps_jax.studies.gradient_quality import Study

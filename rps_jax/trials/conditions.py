@@ -15,7 +15,7 @@ from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import paper
-from rps_jax.world.physics import Fidelity, PhysicsName, preset
+from rps_jax.world.physics import PHYSICS, Fidelity, PhysicsName, preset
 from rps_jax.world.scene import FRICTION, Friction, Side
 
 Which = str | Friction | tuple[float, float]  # a friction set, or coefficients ground, robot
@@ -37,6 +37,12 @@ class Conditions:
     rear: Side = "near"  # where the nonuniform box's load stands
     horizon: float = 300.0  # [s] of the longest trial
     seed: int = 0  # of the skin's imperfections
+
+    def __post_init__(self) -> None:
+        """Raises InputError for names that are unknown."""
+        for name, known in (("engine", engines.ENGINES), ("physics", PHYSICS), ("skin", SKINS)):
+            if getattr(self, name) is not None:
+                errors.check_name(name, getattr(self, name), known)
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> Conditions:
@@ -64,8 +70,7 @@ class Conditions:
 
     def sensor(self) -> Skin:
         """The skin."""
-        name = self.skin or paper.SKIN[self.physics]
-        usual = SKINS[errors.check_name("skin", name, SKINS)]
+        usual: Any = SKINS[self.skin or paper.SKIN[self.physics]]
         for changed in self.skin_params:
             errors.check_name("skin-params", changed, usual._fields)
         return usual._replace(**self.skin_params)

@@ -100,6 +100,16 @@ def sweep_arms(names: Sequence[str], sets: Sequence[str]) -> dict[str, Params]:
     return arms
 
 
+def compared_arms(names: Sequence[str], sets: Sequence[str]) -> dict[str, Params]:
+    """RPS with every set of parameters, by the set's name; other strategies as `sweep_arms`."""
+    others = [name for name in names if name != "rps"]
+    errors.check_each_once("strategies", names)
+    arms = {}
+    if "rps" in names:
+        arms = dict(zip(labels_of("params", sets), map(params_of, sets), strict=True))
+    return arms | (sweep_arms(others, sets) if others else {})
+
+
 def labels_of(field: str, names: Sequence[str]) -> list[str]:
     """Short names of what files hold: each file's own, after its folder's where two are alike.
 

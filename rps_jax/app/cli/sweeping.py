@@ -51,7 +51,7 @@ class Sweep(Spread):
     seed: int = 0
     """Seed of the worlds."""
     part: int = 1024
-    """Number of trials in a part: the most that is lost for each strategy and object when killed."""
+    """Number of trials in a part: what is lost of each strategy and object when killed, at most."""
     device: Device = "auto"
     shard: str = "1/1"
     """Share K/N of the run: the N shares are run apart, and joined by `rps merge`."""

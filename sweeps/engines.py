@@ -1,6 +1,6 @@
 """Do the engines agree in random worlds?
 
-    python sweeps/robustness.py --worlds 90 --out runs/engines
+    python sweeps/engines.py --worlds 90 --out runs/engines
 
 runs the same worlds in every engine that can run them here (MJX-Warp: on an NVIDIA GPU, and without
 prisms, as with `--objects random_box random_cylinder`) and prints a table: success, and the share
@@ -16,11 +16,13 @@ import tyro
 
 from rps_jax import engines, errors
 from rps_jax.analysis import statistics, tables
-from rps_jax.app.cli import Spread, domain_of, guarded, progress_bar, use_cache
+from rps_jax.app.cli.options import Spread
+from rps_jax.app.cli.parsing import domain_of
+from rps_jax.app.cli.running import guarded, use_cache
 from rps_jax.record import files
-from rps_jax.record import folder as run_folder
 from rps_jax.runs import sweep
 from rps_jax.runs.sweep import Plan
+from rps_jax.trials.progress import progress_bar
 from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
 from rps_jax.world.physics import preset
@@ -75,11 +77,9 @@ def main(options: Options) -> None:
     use_cache()
     found = {}
     for name, plan in plans.items():
-        folder = sweep.open_run(options.out / name.replace(", ", "_"), plan)
-        with run_folder.hold(folder):
-            with progress_bar(plan.trials, name) as report:
-                sweep.run(folder, plan, report=report, **shape)
-            sweep.merge([folder], folder)
+        folder = options.out / name.replace(", ", "_")
+        with progress_bar(plan.trials, name) as report:
+            sweep.complete(folder, plan, report=report, **shape)
         found[name] = files.read_results(folder).isel(arm=0)
     text = tables.markdown(statistics.agreement(found))
     files.write_text(options.out / "engines.md", text + "\n")
