@@ -1,0 +1,98 @@
+"""The house: its rooms and their sizes, one test command, and what an engine of one's own takes."""
+
+import ast
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import rps_jax
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = ROOT / "rps_jax"
+ROOMS = sorted(path.parent for path in PACKAGE.glob("*/__init__.py"))
+
+
+def test_there_are_twelve_rooms_at_most_and_nothing_else_beside_them():
+    assert len(ROOMS) <= 12
+    files = {path.name for path in PACKAGE.iterdir() if path.is_file()}
+    assert files == {"__init__.py", "__main__.py", "errors.py", "py.typed"}
+
+
+@pytest.mark.parametrize("room", ROOMS, ids=lambda room: room.name)
+def test_a_room_says_what_it_is_for_and_stays_small(room):
+    assert ast.get_docstring(ast.parse((room / "__init__.py").read_text()))
+    assert len([path for path in room.glob("*.py") if path.stem != "__init__"]) <= 10
+    for path in room.rglob("*.py"):
+        assert len(path.read_text().splitlines()) <= 450, path
+
+
+def test_the_test_command_of_the_readme_is_that_of_ci():
+    of_ci = re.findall(r"^python3 -m venv .*pytest$", (ROOT / ".ci" / "run").read_text(), re.M)
+    assert len(of_ci) == 1
+    assert of_ci[0] in (ROOT / "README.md").read_text().splitlines()
+
+
+def imported(path):
+    """Names of the package that a script imports."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rps_jax"):
+            yield node.module
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name.startswith("rps_jax"))
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "notebooks").glob("examples/*.py")), ids=lambda path: path.stem
+)
+def test_examples_import_the_package_and_nothing_below_it(path):
+    assert set(imported(path)) <= {"rps_jax"}
+
+
+def test_every_public_name_is_there():
+    for name in rps_jax.__all__:
+        assert getattr(rps_jax, name).__doc__
+
+
+DUMMY = '''"""The fused engine under another name."""
+
+from rps_jax.engines.fused import Fused
+
+
+class Dummy(Fused):
+    """An engine of one's own."""
+
+    name = "dummy"
+
+
+ENGINE = Dummy()
+'''
+SWEEP = """
+import rps_jax
+arms, rules = {"rps": rps_jax.RPSParams.paper()}, rps_jax.Rules(horizon=0.5)
+found = rps_jax.sweep("wide", arms, worlds=1, engine="dummy", rules=rules)
+print(rps_jax.__file__, found.success.size)
+"""
+
+
+def test_an_engine_of_ones_own_is_one_file_and_one_line(tmp_path):
+    """It then works from Python and on the command line, which lists it."""
+    shutil.copytree(PACKAGE, tmp_path / "rps_jax", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "mjcf", tmp_path / "mjcf")
+    (tmp_path / "rps_jax" / "engines" / "dummy.py").write_text(DUMMY)
+    registry = tmp_path / "rps_jax" / "engines" / "__init__.py"
+    before = registry.read_text()
+    registry.write_text(before.replace('    "quasistatic",\n', '    "quasistatic",\n    "dummy",\n'))
+    assert len(registry.read_text().splitlines()) == len(before.splitlines()) + 1
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+
+    def run(*arguments):
+        command = [sys.executable, *arguments]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+
+    assert run("-c", SWEEP).stdout.split() == [str(tmp_path / "rps_jax" / "__init__.py"), "1"]
+    assert "quasistatic,dummy}" in re.sub(r"\s", "", run("-m", "rps_jax", "sweep", "--help").stdout)
