@@ -10,6 +10,10 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rps_jax.analysis import figures as figures
+    from rps_jax.analysis import statistics as statistics
+    from rps_jax.analysis import tables as tables
+    from rps_jax.control import law as law
     from rps_jax.control.law import Details as Details
     from rps_jax.control.law import Observation as Observation
     from rps_jax.control.law import RPSParams as RPSParams
@@ -20,6 +24,8 @@ if TYPE_CHECKING:
     from rps_jax.control.strategies import Strategy as Strategy
     from rps_jax.control.strategies import register_strategy as register_strategy
     from rps_jax.errors import InputError as InputError
+    from rps_jax.geometry import footprint as footprint
+    from rps_jax.geometry import planar as planar
     from rps_jax.geometry.footprint import Footprint as Footprint
     from rps_jax.robot.skin import CapacitiveSkin as CapacitiveSkin
     from rps_jax.robot.skin import IdealSkin as IdealSkin
@@ -39,6 +45,7 @@ if TYPE_CHECKING:
     from rps_jax.trials.setting import Setting as Setting
     from rps_jax.trials.trial import Outcome as Outcome
     from rps_jax.trials.trial import Rules as Rules
+    from rps_jax.world import paper as paper
     from rps_jax.world.domain import DOMAINS as DOMAINS
     from rps_jax.world.domain import Domain as Domain
     from rps_jax.world.domain import Range as Range
@@ -78,14 +85,26 @@ _HOMES = {
     "world.scene": ("FRICTION", "Friction"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
-__all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
+# Modules for laws, pictures and analyses of one's own.
+_MODULES = {
+    "figures": "analysis.figures",
+    "footprint": "geometry.footprint",
+    "law": "control.law",
+    "paper": "world.paper",
+    "planar": "geometry.planar",
+    "statistics": "analysis.statistics",
+    "tables": "analysis.tables",
+}
+__all__ = sorted([*_HOME, *_MODULES])  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
     if name in _HOME:
         return getattr(importlib.import_module(f"rps_jax.{_HOME[name]}"), name)
+    if name in _MODULES:
+        return importlib.import_module(f"rps_jax.{_MODULES[name]}")
     raise AttributeError(f"module 'rps_jax' has no attribute '{name}'")
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOME])
+    return sorted([*globals(), *__all__])

@@ -86,7 +86,9 @@ def test_an_engine_of_ones_own_is_one_file_and_one_line(tmp_path):
     (tmp_path / "rps_jax" / "engines" / "dummy.py").write_text(DUMMY)
     registry = tmp_path / "rps_jax" / "engines" / "__init__.py"
     before = registry.read_text()
-    registry.write_text(before.replace('    "quasistatic",\n', '    "quasistatic",\n    "dummy",\n'))
+    registry.write_text(
+        before.replace('    "quasistatic",\n', '    "quasistatic",\n    "dummy",\n')
+    )
     assert len(registry.read_text().splitlines()) == len(before.splitlines()) + 1
     environment = os.environ | {"PYTHONPATH": str(tmp_path)}
 

@@ -16,7 +16,6 @@ import tyro
 from jax.flatten_util import ravel_pytree
 
 import rps_jax
-from rps_jax.world.physics import preset
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ def total(env: rps_jax.PushEnv, steps: int, weights: dict, key: jax.Array) -> ja
 
 def main(options: Options) -> list[float]:
     """Train; returns the mean return of each iteration."""
-    physics = preset(fidelity="fast")
+    physics = rps_jax.PHYSICS["default"]["fast"]
     env = rps_jax.PushEnv("random_box", setting=rps_jax.Setting(physics, engine="fused"))
     steps = round(options.seconds / env.dt)
     start = {"w": jnp.zeros((3, 44)), "b": jnp.zeros(3)}

@@ -1,0 +1,29 @@
+"""A domain of one's own: heavy, slippery, tall boxes, and what success depends on there.
+
+    python notebooks/examples/own_domain.py
+
+Ranges that are not named keep those of the domain `wide`.
+"""
+
+import rps_jax
+from rps_jax import Range
+
+TALL = rps_jax.Domain(
+    objects=("random_box",),
+    mass=Range(30, 80, log=True),  # [kg]
+    height=Range(0.6, 1.0),  # [m]
+    friction_robot=Range(0.1, 0.3),  # [1]
+)
+
+
+def main(worlds: int = 300, horizon: float = 300.0):
+    """Success of the paper's and the tuned parameters, and by the width of the object."""
+    arms = {"paper": rps_jax.RPSParams.paper(), "tuned": rps_jax.RPSParams.tuned()}
+    found = rps_jax.sweep(TALL, arms, worlds=worlds, rules=rps_jax.Rules(horizon=horizon))
+    print(found.success.mean("world").to_series())
+    print(found.success.groupby_bins("size", 4).mean().to_pandas())
+    return found
+
+
+if __name__ == "__main__":
+    main()
