@@ -1,4 +1,4 @@
-"""A law of one's own in random worlds: a pure function from parameters, memory and touch to a twist.
+"""A law of one's own in random worlds: a pure function from memory and touch to a twist.
 
 python notebooks/examples/own_law.py
 rps sweep --strategies rps notebooks/examples/own_law.py:PParams --worlds 1000
