@@ -63,13 +63,14 @@ Image(figures.failures(results, max_lost, out / "failures.png"))
 #
 # ## What success depends on
 #
-# Success against everything that was drawn, in eight bins of equally many worlds each.
+# Success against the six drawn quantities that matter first, in eight bins of equally many worlds
+# each. The lines below the panels say how they were chosen, and name the others.
 
 # %%
 Image(figures.success_curves(results, out / "success.png"))
 
 # %% [markdown]
-# Most of the 22 curves are flat within their intervals, and where one of so many dips once, chance
+# Even of these most are flat within their intervals, and where one of 22 curves dips once, chance
 # is the first explanation. So each curve is tested, and the tests are corrected for their number:
 # a q below 0.05 is what 1000 worlds can show.
 

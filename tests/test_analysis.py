@@ -1,5 +1,7 @@
 """Statistics, tables, figures and reports, from results made up by hand."""
 
+import itertools
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -7,6 +9,7 @@ import xarray as xr
 from rps_jax.analysis import figures, report, statistics, tables
 from rps_jax.analysis.figures import paper, studies, style, sweeps
 from rps_jax.analysis.report import Section
+from rps_jax.analysis.statistics import Bins
 
 
 @pytest.fixture
@@ -112,6 +115,43 @@ def test_what_success_depends_on_stands_first():
     assert statistics.drawn(constant) == ["mass", "friction_ground"]
     assert friction[0] == "friction object-ground"
     assert float(friction[5]) > 0.5
+
+
+def test_chance_alone_leaves_no_spread_unexplained_on_average():
+    """Over all ways in which 3 of 9 trials may succeed, in bins of 2, 3 and 4."""
+    found = []
+    for chosen in itertools.combinations(range(9), 3):
+        won = np.isin(np.arange(9), chosen)
+        counts = np.array([part.sum() for part in np.split(won, (2, 5))])
+        found.append(statistics.unexplained(Bins(np.arange(3), counts, np.array([2, 3, 4]))))
+    assert np.mean(found) == pytest.approx(0, abs=1e-15)
+    # Rates of 1 and 0 have a variance of 1/4, of which 1/28 is noise.
+    apart = Bins(np.arange(2), np.array([4, 0]), np.array([4, 4]))
+    assert statistics.unexplained(apart) == pytest.approx(1 / 4 - 1 / 28)
+
+
+def test_of_what_was_drawn_the_figure_shows_the_six_that_matter_first(drawn):
+    """Yaw decides for arm b and mass for arm a, the next six bring chance alone."""
+    number, random = np.arange(400), np.random.default_rng(0)
+    noise = ("size", "height", "gap", "noise", "distance", "lateral")
+    columns = {name: random.permutation(400) * 1.0 for name in noise}
+    columns |= {"mass": number * 1.0, "yaw": number * 7 % 100 * 1.0}
+    results = random_worlds(np.stack([number < 370, columns["yaw"] < 50]), **columns)
+    found = statistics.influences(results)
+    assert [one.name for one in found[:2]] == ["yaw", "mass"]
+    assert [one.q < 0.05 for one in found] == [True] * 2 + [False] * 6
+    figure = drawn(figures.success_curves, results)
+    titles = [ax.get_title() for ax in figure.axes]
+    assert len(titles) == 6
+    assert titles[0].startswith("spread 49.6 %, q = ")  # 1/4 (1 - 7/399), as a deviation
+    assert ["chance" in title for title in titles] == [False] * 2 + [True] * 4
+    told = figure.get_suptitle().replace("\N{NO-BREAK SPACE}", " ")
+    assert "6 of 8 drawn quantities" in told
+    assert "first: yaw of the object, mass of the object, " in told
+    below = figure.get_supxlabel().replace("\N{NO-BREAK SPACE}", " ")
+    for one in found:
+        assert (statistics.DRAWN[one.name] in told) == (one in found[:6])
+        assert (statistics.DRAWN[one.name] in below) == (one in found[6:])
 
 
 def test_a_path_is_drawn_with_its_target_and_its_last_contact(drawn):

@@ -56,6 +56,14 @@ class Bins(NamedTuple):
     of: np.ndarray  # (n,)
 
 
+class Influence(NamedTuple):
+    """How far success hangs on one quantity."""
+
+    name: str  # of `DRAWN`
+    variance: float  # [1] of the success rate over its bins, as of `unexplained`
+    q: float  # [1] false discovery rate of the test that all bins have one rate
+
+
 def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
     """Wilson score interval of a success rate, each end in [0, 1]; all of it without trials."""
     if trials == 0:
@@ -152,3 +160,32 @@ def one_rate(found: Bins) -> float:
 def false_discovery(p: Sequence[float]) -> np.ndarray:
     """The false discovery rates q (n,) of tests with these p, by Benjamini and Hochberg."""
     return np.asarray(stats.false_discovery_control(p) if len(p) else [])
+
+
+def unexplained(found: Bins) -> float:
+    """Variance [1] of the success rate over bins, less what binomial noise puts there.
+
+    It is negative where bins differ less than the noise of one rate lets them differ on average.
+    """
+    trials, mean = found.of.sum(), found.won.sum() / found.of.sum()
+    noise = (len(found.of) - 1) * mean * (1 - mean) / max(trials - 1, 1)
+    return float(np.sum(found.of * (found.won / found.of - mean) ** 2) / trials - noise)
+
+
+def influences(results: xr.Dataset) -> list[Influence]:
+    """How far success hangs on each of `drawn`, the greatest spread first.
+
+    Each has the spread of the arm in which it is greatest, and the least q of all arms.
+    """
+    arms = results.arm.values
+    binned = {
+        name: [bins(results[name].values, results.success.sel(arm=arm).values > 0) for arm in arms]
+        for name in drawn(results)
+    }
+    q = false_discovery([one_rate(found) for each in binned.values() for found in each])
+    q = q.reshape(len(binned), len(arms))
+    found = [
+        Influence(name, max(map(unexplained, each)), float(least))
+        for (name, each), least in zip(binned.items(), q.min(axis=1), strict=True)
+    ]
+    return sorted(found, key=lambda one: -one.variance)

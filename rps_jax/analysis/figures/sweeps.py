@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,27 +14,66 @@ from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import save, success_rates, words
 
 
-def success_curves(results: xr.Dataset, path: Path) -> Path:
-    """Success against every quantity that was drawn, one line an arm, Wilson 95 % intervals."""
-    drawn = statistics.drawn(results)
-    rows = -(-len(drawn) // 4)
-    figure = Figure(figsize=(13, 2.6 * rows), layout="constrained")
-    axes = figure.subplots(rows, 4, squeeze=False, sharey=True)
-    for ax in axes.ravel()[len(drawn) :]:
+def success_curves(results: xr.Dataset, path: Path, count: int = 6) -> Path:
+    """Success against the drawn quantities that matter first, one line an arm.
+
+    Of all quantities these have the greatest standard deviation of the success rate over their
+    bins beyond what binomial noise explains, in the arm in which it is greatest. Below, the others
+    are named: those whose bins differ nevertheless by a chi-squared test (q < 0.05, as of
+    `statistics.influences`), and those that are flat. Intervals are Wilson's, of 95 %.
+    """
+    found = statistics.influences(results)
+    shown, others = found[:count], found[count:]
+    columns = min(3, len(shown))
+    rows = -(-len(shown) // columns)
+    figure = Figure(figsize=(1 + 3.5 * columns, 1.6 + 2.5 * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, sharey=True)
+    for ax in axes.ravel()[len(shown) :]:
         ax.axis("off")
-    least = 1.0
-    for ax, name in zip(axes.ravel(), drawn, strict=False):
+    for ax, one in zip(axes.ravel(), shown, strict=False):
         for i, arm in enumerate(map(str, results.arm.values)):
             won = results.success.sel(arm=arm).values > 0
-            found = statistics.bins(results[name].values, won)
-            success_rates(ax, found.middle, found.won, found.of, color=f"C{i}", label=arm)
-            least = min(least, (found.won / found.of).min())
-        ax.set_xlabel(f"{statistics.DRAWN[name]} [{results[name].attrs['units']}]", fontsize=8)
+            bins = statistics.bins(results[one.name].values, won)
+            success_rates(ax, bins.middle, bins.won, bins.of, color=f"C{i}", label=arm)
+        unit = f" [{results[one.name].attrs['units']}]".removesuffix(" [1]")
+        ax.set_xlabel(f"{statistics.DRAWN[one.name]}{unit}", fontsize=9)
+        chance = " (may be chance)" * _is_flat(one)
+        ax.set_title(f"spread {_spread(one)}, q = {one.q:.1g}{chance}", fontsize=8)
         ax.grid(alpha=0.3)
     for ax in axes[:, 0]:
-        ax.set(ylabel="success [%]", ylim=(max(-3.0, 100 * least - 10), 103))
+        ax.set_ylabel("success [%]")
+    axes[0, 0].set_ylim(top=103)
     axes[0, 0].legend(fontsize=8)
+    which = f"{len(shown)} of {len(found)} drawn quantities, those that matter first"
+    title = f"Success against {which}: {_names(shown)}"
+    figure.suptitle(_filled(title, 42 * columns), fontsize=10)
+    parts = {
+        "Chosen for their spread": "the greatest standard deviation of success over the bins "
+        "beyond binomial noise, in the arm in which it is greatest",
+        "Weaker": _names([o for o in others if not _is_flat(o)], spread=True),
+        "Flat within the noise": _names([o for o in others if _is_flat(o)]),
+    }
+    lines = (_filled(f"{k}: {v}.", 60 * columns) for k, v in parts.items() if v)
+    figure.supxlabel("\n".join(lines), fontsize=8, x=0.01, ha="left")
     return save(figure, path)
+
+
+def _filled(text: str, width: int) -> str:
+    return textwrap.fill(text, width, break_on_hyphens=False)
+
+
+def _is_flat(one: statistics.Influence) -> bool:
+    return one.q >= 0.05
+
+
+def _spread(one: statistics.Influence) -> str:
+    return f"{100 * max(one.variance, 0) ** 0.5:.1f} %"
+
+
+def _names(found: Sequence[statistics.Influence], *, spread: bool = False) -> str:
+    """Quantities in words, which no line break separates."""
+    names = (statistics.DRAWN[one.name] + f" ({_spread(one)})" * spread for one in found)
+    return ", ".join(name.replace(" ", "\N{NO-BREAK SPACE}") for name in names)
 
 
 def failures(results: xr.Dataset, max_lost: float, path: Path) -> Path:
