@@ -111,7 +111,7 @@ def one_trial(trace: xr.Dataset, title: str, path: File) -> File:
     velocity.plot(time, trace.v_x, label="$v_x$ [m/s]", color="C0")
     velocity.plot(time, trace.v_y, label="$v_y$ [m/s]", color="C1")
     velocity.plot(time, trace.omega, label=r"$\omega$ [rad/s]", color="C2")
-    velocity.legend(ncols=3, fontsize=8, loc="upper right")
+    velocity.legend(ncols=3, fontsize=8, loc="lower right")
     velocity.set_ylabel("a) twist")
 
     place = figure.add_subplot(grid[1, 1], sharex=velocity)

@@ -115,7 +115,11 @@ def levers(gains: Mapping[str, float], title: str, path: Path) -> Path:
     ax.invert_yaxis()
     ax.set(xscale="log", xlabel="times as fast", title=title)
     ax.margins(x=0.15)
-    ax.grid(alpha=0.3, axis="x", which="both")
+    low, high = ax.get_xlim()
+    ticks = [t for t in (0.1, 0.2, 0.3, 0.5, 0.7, 1, 1.5, 2, 3, 5, 7, 10, 20) if low <= t <= high]
+    ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
+    ax.minorticks_off()
+    ax.grid(alpha=0.3, axis="x")
     ax.set_axisbelow(True)
     return save(figure, path)
 
