@@ -27,6 +27,7 @@ from IPython.display import Image, Video
 from rps_jax import FRICTION, Case, Setting, follow
 from rps_jax.analysis import figures
 from rps_jax.trials import pushes
+from rps_jax.trials.results import title_of, trace_dataset
 from rps_jax.trials.trial import p_world_contact
 
 out = Path(tempfile.mkdtemp())
@@ -39,7 +40,7 @@ case = Case("box", FRICTION["S1"], p_world_target=(-2.0, 0.0))
 setting = Setting(engine="fused")
 (trace,) = follow([case], setting)
 seen, outcome = trace.snapshots, trace.outcome
-Image(figures.one_trial(trace, figures.title_of(case), out / "trial.png"))
+Image(figures.one_trial(trace_dataset(trace), title_of(case), out / "trial.png"))
 
 # %%
 realigning = np.asarray(seen.details.realigning)

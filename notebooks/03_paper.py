@@ -33,7 +33,7 @@ results = files.read_results(run)
 # Successes of 24, with Wilson 95 % intervals in percent, and the paper's counts below ours.
 
 # %%
-Markdown(tables.markdown(tables.table(results)))
+Markdown(tables.markdown(tables.table_ii(results)))
 
 # %% [markdown]
 # RPS reaches every target here. The paper's 127 of 144 lies outside our interval, and so do three

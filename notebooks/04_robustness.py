@@ -25,7 +25,7 @@ from pathlib import Path
 
 from IPython.display import Image, Markdown
 
-from rps_jax.analysis import figures, statistics, tables
+from rps_jax.analysis import figures, tables
 from rps_jax.record import files
 from rps_jax.runs import sweep
 
@@ -40,7 +40,7 @@ max_lost = float(plan.setting.rules.max_lost)
 # The intervals are Wilson's, of 95 %.
 
 # %%
-Markdown(tables.markdown(statistics.rates(results, max_lost)))
+Markdown(tables.markdown(tables.success_table(results, max_lost)))
 
 # %% [markdown]
 # With the paper's parameters the law fails in one world of 15, with the tuned ones in 6 of 1000.
@@ -63,18 +63,19 @@ Image(figures.failures(results, max_lost, out / "failures.png"))
 #
 # ## What success depends on
 #
-# Success against everything that was drawn, in eight bins of equally many worlds each.
+# Success against the six drawn quantities that matter first, in eight bins of equally many worlds
+# each. The lines below the panels say how they were chosen, and name the others.
 
 # %%
 Image(figures.success_curves(results, out / "success.png"))
 
 # %% [markdown]
-# Most of the 22 curves are flat within their intervals, and where one of so many dips once, chance
+# Even of these most are flat within their intervals, and where one of 22 curves dips once, chance
 # is the first explanation. So each curve is tested, and the tests are corrected for their number:
 # a q below 0.05 is what 1000 worlds can show.
 
 # %%
-Markdown(tables.markdown(statistics.influences(results, "paper")[:9]))
+Markdown(tables.markdown(tables.influence_table(results, "paper")[:9]))
 
 # %% [markdown]
 # For the paper's parameters width matters: from about 25 cm of half width on, success falls to
@@ -84,7 +85,7 @@ Markdown(tables.markdown(statistics.influences(results, "paper")[:9]))
 # chance might.
 
 # %%
-Markdown(tables.markdown(statistics.influences(results, "tuned")[:4]))
+Markdown(tables.markdown(tables.influence_table(results, "tuned")[:4]))
 
 # %% [markdown]
 # For the tuned parameters no quantity has an influence that 1000 worlds could show: wide objects
@@ -96,7 +97,7 @@ Markdown(tables.markdown(statistics.influences(results, "tuned")[:4]))
 # distance left.
 
 # %%
-Markdown(tables.markdown(statistics.hardest_table(results, str(run))))
+Markdown(tables.markdown(tables.hardest_table(results, str(run))))
 
 # %% [markdown]
 # The command in the last column replays a world, draws it as in `02_one_push` and films it; run it

@@ -27,7 +27,7 @@ import numpy as np
 from IPython.display import Image, Markdown
 
 from rps_jax import FRICTION, Case, RPSParams, Setting
-from rps_jax.analysis import figures, statistics, tables
+from rps_jax.analysis import figures, tables
 from rps_jax.control import strategies
 from rps_jax.record import files
 from rps_jax.robot.skin import SmoothSkin
@@ -47,7 +47,7 @@ out = Path(tempfile.mkdtemp())
 
 # %%
 names = tune.SUBSETS["full"]
-Image(figures.tuning(tune.read_log(Path("runs/coarse")), names, out / "coarse.png"))
+Image(figures.tuning_log(tune.read_log(Path("runs/coarse")), names, out / "coarse.png"))
 
 # %% [markdown]
 # In seven generations the objective on the validation worlds halves, from 0.31 to 0.15, and
@@ -64,7 +64,7 @@ Image(figures.tuning(tune.read_log(Path("runs/coarse")), names, out / "coarse.pn
 # above.
 
 # %%
-Image(figures.tuning(tune.read_log(Path("runs/fine")), names, out / "fine.png"))
+Image(figures.tuning_log(tune.read_log(Path("runs/fine")), names, out / "fine.png"))
 
 # %% [markdown]
 # Validation falls from 0.164 to 0.117 at generation 7, whose mean was kept. The values jump from
@@ -100,7 +100,7 @@ Image(figures.twist_field(sets, 1.0, out / "twist.png"))
 
 # %%
 results = files.read_results(Path("runs/compare/wide"))
-Markdown(tables.markdown(statistics.differences(results)))
+Markdown(tables.markdown(tables.difference_table(results)))
 
 # %%
 Image(figures.paired(results, out / "paired.png"))

@@ -79,7 +79,8 @@ def main(options: Options) -> None:
         speeds.append(speed)
         text = where + tables.markdown(benchmark.table(speeds))
         files.write_text(options.out / "benchmark.md", text + "\n")
-        figures.throughput(speeds, options.out / "throughput.png")
+        points = [(s.family, s.name, s.worlds, s.rate) for s in speeds]
+        figures.throughput(points, benchmark.IN_C, options.out / "throughput.png")
     print(text)
 
 

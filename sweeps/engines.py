@@ -15,7 +15,7 @@ from pathlib import Path
 import tyro
 
 from rps_jax import engines, errors
-from rps_jax.analysis import statistics, tables
+from rps_jax.analysis import tables
 from rps_jax.app.cli.options import Spread
 from rps_jax.app.cli.parsing import domain_of
 from rps_jax.app.cli.running import guarded, use_cache
@@ -81,7 +81,7 @@ def main(options: Options) -> None:
         with progress_bar(plan.trials, name) as report:
             sweep.complete(folder, plan, report=report, **shape)
         found[name] = files.read_results(folder).isel(arm=0)
-    text = tables.markdown(statistics.agreement(found))
+    text = tables.markdown(tables.agreement_table(found))
     files.write_text(options.out / "engines.md", text + "\n")
     print(text)
 

@@ -28,7 +28,7 @@ from rps_jax.app.cli import (
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
 from rps_jax.studies import sensitivity
-from rps_jax.tuning.evolution import SUBSETS, Course
+from rps_jax.tuning.evolution import BOUNDS, SUBSETS, Course
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,8 @@ def main(options: Options) -> None:
     with progress_bar(varied * each, "sensitivity") as report:
         found = sensitivity.sensitivity(sets, course, count=options.values, report=report, **common)
     files.write_results(out / "sensitivity.nc", found)
-    figures.sensitivity(found, out / "sensitivity.png")
+    log = [name for name, bound in BOUNDS.items() if bound.log]
+    figures.sensitivity(found, log, out / "sensitivity.png")
     several: dict[str, Any] = {"candidates": options.candidates, "spread": options.spread}
     with progress_bar(2 * (options.candidates + len(sets)) * each, "front") as report:
         front = sensitivity.front(sets, course, report=report, **several, **common)

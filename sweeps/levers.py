@@ -59,7 +59,8 @@ def main(options: Options) -> None:
         gains.append(gain)
         text = benchmark.machine() + tables.markdown(ablation.table(gains))
         files.write_text(options.out / "levers.md", text + "\n")
-        figures.levers(gains, options.out / "levers.png")
+        title = f"{options.name}, {options.family}"
+        figures.levers({g.lever: g.times for g in gains}, title, options.out / "levers.png")
     print(text)
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from rps_jax.analysis import tables
 from rps_jax.app import cli
 from rps_jax.errors import InputError
 from rps_jax.record import files
+from rps_jax.trials.results import DIMS
 from rps_jax.world import paper
 
 SMALL = [
@@ -35,7 +35,7 @@ def runs(tmp_path_factory):
 
 def test_a_table_run_leaves_a_labelled_run_folder(runs):
     results = files.read_results(runs[0])
-    assert results.success.dims == tables.DIMS
+    assert results.success.dims == DIMS
     assert results.sizes == {"strategy": 2, "object": 2, "friction": 2, "target": 2, "pose": 3}
     assert list(results.object.values) == ["box", "nonuniform_box"]
     assert results.time.attrs["units"] == "s"
@@ -111,17 +111,6 @@ def test_importing_sets_no_flags_prints_nothing_and_touches_no_device(tmp_path):
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_wilsons_interval_by_hand():
-    # n = 24, all succeed: low = 1 / (1 + z^2 / n) with z = 1.959964.
-    low, high = tables.wilson(24, 24)
-    assert low == pytest.approx(1 / (1 + 1.959964**2 / 24), abs=1e-6)
-    assert high == pytest.approx(1.0)
-    assert tables.wilson(0, 0) == (0.0, 1.0)
-    # p = 1/2 is symmetric about itself.
-    low, high = tables.wilson(12, 24)
-    assert low + high == pytest.approx(1.0)
 
 
 def test_the_papers_totals_and_targets():

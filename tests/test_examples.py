@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from rps_jax import engines
-from rps_jax.analysis import figures
 from rps_jax.app import cli
 from rps_jax.control import strategies
 from rps_jax.control.law import Details, Observation, RPSParams, RPSState, step
@@ -23,6 +22,7 @@ from rps_jax.runs.plan import Plan, load_plan, scene_of
 from rps_jax.runs.results import open_run
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
+from rps_jax.trials.results import title_of
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import domain, objects, scene
@@ -114,7 +114,7 @@ def test_an_object_of_the_paper_that_is_registered_anew_is_the_same_world(name, 
 
 
 def test_an_object_of_ones_own_may_be_of_a_domain_and_has_its_looks_in_a_replay(hexagon):
-    assert figures.title_of(Case("hexagon", FRICTION["S1"], (2.0, 0.0))).startswith("hexagon, ")
+    assert title_of(Case("hexagon", FRICTION["S1"], (2.0, 0.0))).startswith("hexagon, ")
     own = Domain(objects=("hexagon",), friction_robot=Range(0.4, 0.5))
     drawn = domain.draw(own, 0, np.arange(5))
     assert (drawn.solid.mass == 12.0).all()

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from rps_jax.analysis import statistics
+from rps_jax.analysis import statistics, tables
 from rps_jax.app import cli
 from rps_jax.control import strategies
 from rps_jax.control.law import RPSParams
@@ -344,7 +344,7 @@ def test_the_report_of_one_world_tells_what_was_lost_and_how_to_see_it(whole, tm
     assert "1 trials lost contacts for want of room: they are not to be trusted" in text
     assert f"`rps replay '{folder}' 0 --arm 'nps' --video`" in text  # the arm that fails
     assert not (folder / "success.png").exists()  # nothing was drawn but once
-    assert statistics.influences(one, "rps")[1:] == []
+    assert tables.influence_table(one, "rps")[1:] == []
 
 
 def test_shards_merge_to_the_whole(whole, tmp_path):
@@ -366,65 +366,6 @@ def test_another_configuration_is_refused_with_what_differs(whole):
     other = replace(PLAN, worlds=30, domain=replace(BOXES, mass=Range(1, 2)))
     with pytest.raises(InputError, match=r"domain.mass = .*there, .* asked for; worlds = 20 there"):
         sweep.open_run(whole, other)
-
-
-def test_what_a_sweep_says_is_what_happened():
-    """Worked out by hand on four worlds."""
-    inf = np.inf
-    results = xr.Dataset(
-        {
-            "success": (("arm", "world"), np.array([[1, 0, 0, 0], [1, 1, 0, 0]], np.int8)),
-            "diverged": (("arm", "world"), np.array([[0, 0, 0, 1], [0, 0, 0, 0]], np.int8)),
-            "tipped": (("arm", "world"), np.array([[0, 0, 0, 0], [0, 0, 0, 1]], np.int8)),
-            "time": (("arm", "world"), np.array([[50.0, 300, 200, 9], [70, 80, 300, 300]])),
-            "min_distance": (("arm", "world"), np.array([[0.04, 0.5, inf, 1], [0.04, 0.04, 1, 2]])),
-            "contact_lost_time": (("arm", "world"), np.array([[0.0, 0, 0, 0], [0, 0, 151, 0]])),
-            "which_object": ("world", [0, 0, 1, 1]),
-            "distance": ("world", [1.0, 2.0, 3.0, 1.0]),
-        },
-        coords={"arm": ["a", "b"], "object": ["box", "drum"], "world": range(4)},
-    )
-    first, second = (results.sel(arm=arm) for arm in "ab")
-    assert [statistics.FAILURES[k] if k >= 0 else "" for k in statistics.failure(first, 150)] == [
-        "", "timeout", "never touched", "diverged"]  # fmt: skip
-    assert [statistics.FAILURES[k] for k in statistics.failure(second, 150)[2:]] == [
-        "lost contact", "fell over"]  # fmt: skip
-    assert statistics.left_over(first).tolist() == [0.04, 0.5, 3.0, 1.0]
-    assert statistics.cvar(np.arange(100.0)) == pytest.approx(97.0)  # mean of 95 .. 99
-    assert statistics.cvar(np.array([1.0, 3.0])) == 3.0
-    assert statistics.differences(results)[1][1:4] == ["1", "0", "+25.00 %"]
-    assert statistics.hardest(results).tolist() == [2, 3, 1]
-    rates = statistics.rates(results, 150)
-    assert rates[1][1].startswith("50.0 %")  # of a with the box
-    assert rates[2][3].startswith("50.0 %")  # of b in all
-    bins = statistics.bins(np.arange(16.0), np.arange(16) < 4, count=4)
-    assert bins.won.tolist() == [4, 0, 0, 0]
-    assert bins.of.tolist() == [4] * 4
-    assert statistics.bins(np.array([1.0, 1, 2]), np.array([True, False, True])).of.tolist() == [
-        2,
-        1,
-    ]
-
-
-def test_what_success_depends_on_stands_first():
-    """Heavy objects fail, of 400; friction has nothing to do with it; all else was not varied."""
-    number = np.arange(400)
-    drawn = {name: ("world", np.zeros(400), {"units": "1"}) for name in statistics.DRAWN}
-    drawn["mass"] = ("world", number * 1.0, {"units": "kg"})
-    drawn["friction_ground"] = ("world", number % 7 * 1.0, {"units": "1"})
-    success = (("arm", "world"), (number < 350)[None].astype(np.int8))
-    results = xr.Dataset({"success": success, **drawn}, coords={"arm": ["a"]})
-    (_, mass, friction) = statistics.influences(results, "a")
-    assert mass[0] == "mass of the object"
-    assert mass[1] == "374 kg"  # the last eighth: 350 to 399
-    assert mass[2].startswith("0.0 % [0.0, ")
-    assert mass[4].startswith("100.0 %")
-    assert float(mass[5]) < 1e-10
-    constant = results.assign(yaw=("world", np.full(400, 0.1, np.float32), {"units": "rad"}))
-    assert np.nanstd(constant.yaw.values) > 0  # by rounding
-    assert statistics.drawn(constant) == ["mass", "friction_ground"]
-    assert friction[0] == "friction object-ground"
-    assert float(friction[5]) > 0.5
 
 
 def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys, monkeypatch):

@@ -185,7 +185,7 @@ def test_this_machine_can_draw_and_encode() -> None:
 
 
 def test_a_machine_that_cannot_draw_is_told_how_to_mend_it() -> None:
-    code = "from rps_jax import video; print(video.check()[0])"
+    code = "from rps_jax.analysis import video; print(video.check()[0])"
     environment = os.environ | {"MUJOCO_GL": "disable"}
     command = [sys.executable, "-c", code]
     told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)

@@ -1,18 +1,13 @@
-"""What a sweep over random worlds says: rates, differences, kinds of failure, hard worlds."""
+"""What outcomes say: rates and their intervals, differences, kinds of failure, hard worlds."""
 
 from __future__ import annotations
 
-import shlex
-from collections.abc import Mapping, Sequence
-from itertools import combinations
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 from scipy import stats
-
-from rps_jax.analysis import tables
-from rps_jax.studies import study
 
 # Of a sweep's results, what was drawn, and its name in words.
 DRAWN = {
@@ -43,12 +38,47 @@ FAILURES = ("never touched", "lost contact", "timeout", "fell over", "diverged")
 _TAIL = 0.05  # of the worlds are the worst
 
 
+class Comparison(NamedTuple):
+    """Outcomes of the same trials under two conditions, trial by trial."""
+
+    equal: float  # [1] share of trials with the same outcome
+    equal_interval: tuple[float, float]  # Wilson, 95 %
+    gained: int  # trials that fail under the first and succeed under the second
+    lost: int  # trials that succeed under the first and fail under the second
+    p: float  # [1] of McNemar's exact test that gains and losses are equally likely
+
+
 class Bins(NamedTuple):
     """Success of one arm against one quantity."""
 
     middle: np.ndarray  # (n,) of each bin: the median of its worlds
     won: np.ndarray  # (n,)
     of: np.ndarray  # (n,)
+
+
+class Influence(NamedTuple):
+    """How far success hangs on one quantity."""
+
+    name: str  # of `DRAWN`
+    variance: float  # [1] of the success rate over its bins, as of `unexplained`
+    q: float  # [1] false discovery rate of the test that all bins have one rate
+
+
+def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Wilson score interval of a success rate, each end in [0, 1]; all of it without trials."""
+    if trials == 0:
+        return 0.0, 1.0
+    interval = stats.binomtest(successes, trials).proportion_ci(confidence, method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def compare(first: xr.DataArray, second: xr.DataArray) -> Comparison:
+    """Compare outcomes (any equal shape) of the same trials."""
+    a, b = first.values.astype(bool).ravel(), second.values.astype(bool).ravel()
+    gained, lost = int(np.sum(~a & b)), int(np.sum(a & ~b))
+    equal = a.size - gained - lost
+    p = float(stats.binomtest(gained, gained + lost).pvalue) if gained + lost else 1.0
+    return Comparison(equal / a.size, wilson(equal, a.size), gained, lost, p)
 
 
 def worlds_by_object(results: xr.Dataset) -> dict[str, np.ndarray]:
@@ -94,58 +124,6 @@ def failure(one: xr.Dataset, max_lost: float) -> np.ndarray:
     return kinds
 
 
-def rates(results: xr.Dataset, max_lost: float) -> list[list[str]]:
-    """Header and one row for each arm: success by object, distance left, time, failures."""
-    groups = worlds_by_object(results)
-    header = ["", *groups, "all", "CVaR 5 % of distance", "median time", *FAILURES]
-    rows = [header]
-    for arm in map(str, results.arm.values):
-        one = results.sel(arm=arm)
-        won = one.success.values > 0
-        kinds = failure(one, max_lost)
-        rows.append(
-            [
-                arm,
-                *(_rate(won[mask]) for mask in groups.values()),
-                _rate(won),
-                f"{cvar(left_over(one)):.2f} m",
-                f"{np.median(one.time.values[won]):.1f} s" if won.any() else "-",
-                *(str(int((kinds == i).sum())) for i in range(len(FAILURES))),
-            ]
-        )
-    return rows
-
-
-def _rate(won: np.ndarray) -> str:
-    return _share(int(won.sum()), won.size)
-
-
-def _share(won: int, of: int) -> str:
-    if not of:
-        return "-"
-    low, high = tables.wilson(won, of)
-    return f"{100 * won / of:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
-
-
-def differences(results: xr.Dataset) -> list[list[str]]:
-    """Header and one row for each pair of arms, world by world, with McNemar's exact test."""
-    rows = [["second against first", "gained", "lost", "difference", "McNemar p"]]
-    for first, second in combinations(map(str, results.arm.values), 2):
-        a, b = results.success.sel(arm=first), results.success.sel(arm=second)
-        c = study.compare(a, b)
-        share = 100 * (c.gained - c.lost) / a.size
-        rows.append(
-            [
-                f"{second} against {first}",
-                str(c.gained),
-                str(c.lost),
-                f"{share:+.2f} %",
-                f"{c.p:.2g}",
-            ]
-        )
-    return rows
-
-
 def hardest(results: xr.Dataset, count: int = 10) -> np.ndarray:
     """Worlds (count,) in which most arms fail, and among these the most distance is left."""
     arms = [results.sel(arm=arm) for arm in results.arm.values]
@@ -153,36 +131,6 @@ def hardest(results: xr.Dataset, count: int = 10) -> np.ndarray:
     left = np.mean([left_over(one) for one in arms], axis=0)
     order = np.lexsort((-left, -np.asarray(failed)))
     return order[: min(count, int((np.asarray(failed) > 0).sum()))]
-
-
-def hardest_table(results: xr.Dataset, run: str, count: int = 10) -> list[list[str]]:
-    """Header and one row for each of the hardest worlds, with the command that replays it."""
-    names = [str(name) for name in results.object.values]
-    arms = [str(arm) for arm in results.arm.values]
-    rows = [["world", "object", *arms, "mass", "friction", "target", "replay"]]
-    for world in hardest(results, count):
-        one = results.isel(world=world)
-        x = float(one.distance), float(np.degrees(one.bearing))
-        fails = next(arm for arm in arms if not int(one.success.sel(arm=arm)))
-        rows.append(
-            [
-                str(int(world)),
-                names[int(one.which_object)],
-                *(_told(one.sel(arm=arm)) for arm in arms),
-                f"{float(one.mass):.1f} kg",
-                f"{float(one.friction_ground):.2f}, {float(one.friction_robot):.2f}",
-                f"{x[0]:.1f} m at {x[1]:.0f} deg",
-                f"`rps replay {shlex.quote(run)} {int(world)} --arm {fails!r} --video`",
-            ]
-        )
-    return rows
-
-
-def _told(trial: xr.Dataset) -> str:
-    if int(trial.success):
-        return f"{float(trial.time):.0f} s"
-    distance = float(trial.min_distance)
-    return f"fails, {100 * distance:.0f} cm off" if np.isfinite(distance) else "never touches"
 
 
 def bins(values: np.ndarray, won: np.ndarray, count: int = 8) -> Bins:
@@ -201,31 +149,7 @@ def bins(values: np.ndarray, won: np.ndarray, count: int = 8) -> Bins:
     )
 
 
-def influences(results: xr.Dataset, arm: str) -> list[list[str]]:
-    """Header and one row for each quantity that was drawn: the arm's worst and best bin.
-
-    Those whose bins differ most come first: by a chi-squared test that all bins have one rate,
-    false discoveries among the quantities held at 5 % (Benjamini-Hochberg) where q < 0.05.
-    """
-    won = results.success.sel(arm=arm).values > 0
-    binned = {name: bins(results[name].values, won) for name in drawn(results)}
-    p = [_one_rate(found) for found in binned.values()]
-    q = stats.false_discovery_control(p) if p else []
-    rows = [["", "worst bin, about", "success", "best bin, about", "success", "q"]]
-    for i in np.argsort(q, kind="stable"):
-        name, found = list(binned.items())[i]
-        order, unit = np.argsort(found.won / found.of, kind="stable"), results[name].attrs["units"]
-        told = [f"{value:.3g} {unit}".removesuffix(" 1") for value in found.middle]
-        ends = [
-            cell
-            for n in (order[0], order[-1])
-            for cell in (told[n], _share(int(found.won[n]), int(found.of[n])))
-        ]
-        rows.append([DRAWN[name], *ends, f"{q[i]:.2g}"])
-    return rows
-
-
-def _one_rate(found: Bins) -> float:
+def one_rate(found: Bins) -> float:
     """The p of a chi-squared test that all bins have one success rate."""
     counts = np.stack([found.won, found.of - found.won])
     if len(found.of) < 2 or not counts.sum(axis=1).all():
@@ -233,27 +157,35 @@ def _one_rate(found: Bins) -> float:
     return float(stats.chi2_contingency(counts).pvalue)
 
 
-def agreement(found: Mapping[str, xr.Dataset]) -> list[list[str]]:
-    """Header and one row for each engine: success, and outcomes equal to the first's, by object.
+def false_discovery(p: Sequence[float]) -> np.ndarray:
+    """The false discovery rates q (n,) of tests with these p, by Benjamini and Hochberg."""
+    return np.asarray(stats.false_discovery_control(p) if len(p) else [])
 
-    The results are those of one arm in the same worlds.
+
+def unexplained(found: Bins) -> float:
+    """Variance [1] of the success rate over bins, less what binomial noise puts there.
+
+    It is negative where bins differ less than the noise of one rate lets them differ on average.
     """
-    base = next(iter(found.values()))
-    groups = worlds_by_object(base)
-    rows = [["engine", *groups, "equal outcomes", "95 %", *(f"equal, {g}" for g in groups), "+/-"]]
-    for name, one in found.items():
-        won = one.success.values > 0
-        same = won == (base.success.values > 0)
-        c = study.compare(base.success, one.success)
-        low, high = c.equal_interval
-        rows.append(
-            [
-                name,
-                *(f"{won[mask].sum()} of {mask.sum()}" for mask in groups.values()),
-                f"{100 * c.equal:.1f} %",
-                f"{100 * low:.0f}-{100 * high:.0f} %",
-                *(f"{same[mask].sum()} of {mask.sum()}" for mask in groups.values()),
-                f"+{c.gained} -{c.lost}",
-            ]
-        )
-    return rows
+    trials, mean = found.of.sum(), found.won.sum() / found.of.sum()
+    noise = (len(found.of) - 1) * mean * (1 - mean) / max(trials - 1, 1)
+    return float(np.sum(found.of * (found.won / found.of - mean) ** 2) / trials - noise)
+
+
+def influences(results: xr.Dataset) -> list[Influence]:
+    """How far success hangs on each of `drawn`, the greatest spread first.
+
+    Each has the spread of the arm in which it is greatest, and the least q of all arms.
+    """
+    arms = results.arm.values
+    binned = {
+        name: [bins(results[name].values, results.success.sel(arm=arm).values > 0) for arm in arms]
+        for name in drawn(results)
+    }
+    q = false_discovery([one_rate(found) for each in binned.values() for found in each])
+    q = q.reshape(len(binned), len(arms))
+    found = [
+        Influence(name, max(map(unexplained, each)), float(least))
+        for (name, each), least in zip(binned.items(), q.min(axis=1), strict=True)
+    ]
+    return sorted(found, key=lambda one: -one.variance)

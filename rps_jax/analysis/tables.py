@@ -1,104 +1,16 @@
-"""Outcomes -> labelled results, and rates with honest intervals."""
+"""Tables of results: a header and rows of texts, and how they read in Markdown."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import shlex
+from collections.abc import Mapping, Sequence
+from itertools import combinations
 
 import numpy as np
 import xarray as xr
-from scipy import stats
 
-from rps_jax.trials.pushes import Trace
-from rps_jax.trials.trial import Outcome
+from rps_jax.analysis import statistics
 from rps_jax.world import paper
-
-DIMS = ("strategy", "object", "friction", "target")
-UNITS = {
-    "success": ("1", "target reached within the rules"),
-    "time": ("s", "simulated time at which the trial ended"),
-    "min_distance": ("m", "least distance of the contact point to the target"),
-    "contact_lost_time": ("s", "time without contact after the first touch"),
-    "path_length": ("m", "length of the base's way"),
-    "mean_abs_l": ("m", "mean |l| while in contact, the paper's D"),
-    "tipped": ("1", "the object fell over"),
-    "diverged": ("1", "physics became NaN or ran away"),
-    "overflows": ("1", "control steps in which the engine lost contacts for want of room"),
-    "base_pose": ("m, m, rad", "x, y, yaw of the base in the world at the end"),
-    "object_pose": ("m, m, rad", "x, y, yaw of the object in the world at the end"),
-}
-
-
-def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Wilson score interval of a success rate, each end in [0, 1]; all of it without trials."""
-    if trials == 0:
-        return 0.0, 1.0
-    interval = stats.binomtest(successes, trials).proportion_ci(confidence, method="wilson")
-    return float(interval.low), float(interval.high)
-
-
-def dataset(
-    outcome: Outcome,
-    strategies: Sequence[str],
-    objects: Sequence[str],
-    frictions: Sequence[str],
-    targets: Sequence[tuple[float, float]],
-) -> xr.Dataset:
-    """Outcomes (S * O * F * T, ...) in this nesting order, as a Dataset labelled by `DIMS`."""
-    shape = (len(strategies), len(objects), len(frictions), len(targets))
-    variables = {}
-    for name, values in outcome._asdict().items():
-        values = _plain(values)
-        dims = DIMS + ("pose",) * (values.ndim - 1)
-        unit, meaning = UNITS[name]
-        attrs = {"units": unit, "long_name": meaning}
-        variables[name] = xr.Variable(dims, values.reshape(shape + values.shape[1:]), attrs)
-    position = np.asarray(targets, float)
-    return xr.Dataset(
-        variables,
-        coords={
-            "strategy": list(strategies),
-            "object": list(objects),
-            "friction": list(frictions),
-            "target": np.arange(len(targets)),
-            "target_x": ("target", position[:, 0], {"units": "m"}),
-            "target_y": ("target", position[:, 1], {"units": "m"}),
-            "pose": ["x", "y", "yaw"],
-        },
-    )
-
-
-def _plain(values: Any) -> np.ndarray:
-    """As an array that NetCDF can hold, which has no booleans."""
-    values = np.asarray(values)
-    return values.astype(np.int8) if values.dtype == bool else values
-
-
-def trace_dataset(trace: Trace) -> xr.Dataset:
-    """One trial over time: variables (time, ...), its outcome as scalars."""
-    seen = trace.snapshots
-
-    def over_time(values: Any, unit: str, *dims: str) -> xr.Variable:
-        return xr.Variable(("time", *dims), _plain(values), {"units": unit})
-
-    variables = {
-        "qpos": over_time(seen.qpos, "m, rad, 1", "joint"),
-        "contact_type": over_time(seen.reading.contact_type, "1"),
-        "p_robot_contact": over_time(seen.reading.p_robot_contact, "m", "axis"),
-        "v_x": over_time(seen.twist.v_x, "m/s"),
-        "v_y": over_time(seen.twist.v_y, "m/s"),
-        "omega": over_time(seen.twist.omega, "rad/s"),
-        "l": over_time(seen.details.l, "m"),
-        "distance": over_time(seen.details.distance, "m"),
-        "a_r": over_time(seen.details.a_r, "1"),
-        "gamma": over_time(seen.details.gamma, "rad"),
-        "realigning": over_time(seen.details.realigning, "1"),
-    }
-    for name, value in trace.outcome._asdict().items():
-        value = _plain(value)
-        attrs = {"units": UNITS[name][0], "long_name": UNITS[name][1]}
-        variables[f"outcome_{name}"] = xr.Variable(("pose",) * value.ndim, value, attrs)
-    return xr.Dataset(variables, coords={"time": ("time", seen.time, {"units": "s"})})
 
 
 def markdown(rows: Sequence[Sequence[str]]) -> str:
@@ -112,7 +24,7 @@ def markdown(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([lines[0], rule, *lines[1:]])
 
 
-def table(results: xr.Dataset) -> list[list[str]]:
+def table_ii(results: xr.Dataset) -> list[list[str]]:
     """Header and rows of Table II: successes with Wilson 95 % intervals in percent, and the
     paper's beside them."""
     trials = results.sizes["target"]
@@ -136,7 +48,7 @@ def table(results: xr.Dataset) -> list[list[str]]:
 
 
 def _percent(successes: int, trials: int) -> str:
-    low, high = wilson(successes, trials)
+    low, high = statistics.wilson(successes, trials)
     return f"[{100 * low:.0f}, {100 * high:.0f}]"
 
 
@@ -155,3 +67,136 @@ def summary(results: xr.Dataset) -> str:
             )
         lines.append(f"{line}; {int(part.diverged.sum())} diverged")
     return "\n".join(lines)
+
+
+def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
+    """Header and one row for each arm: success by object, distance left, time, failures."""
+    groups = statistics.worlds_by_object(results)
+    header = ["", *groups, "all", "CVaR 5 % of distance", "median time", *statistics.FAILURES]
+    rows = [header]
+    for arm in map(str, results.arm.values):
+        one = results.sel(arm=arm)
+        won = one.success.values > 0
+        kinds = statistics.failure(one, max_lost)
+        rows.append(
+            [
+                arm,
+                *(_rate(won[mask]) for mask in groups.values()),
+                _rate(won),
+                f"{statistics.cvar(statistics.left_over(one)):.2f} m",
+                f"{np.median(one.time.values[won]):.1f} s" if won.any() else "-",
+                *(str(int((kinds == i).sum())) for i in range(len(statistics.FAILURES))),
+            ]
+        )
+    return rows
+
+
+def _rate(won: np.ndarray) -> str:
+    return _share(int(won.sum()), won.size)
+
+
+def _share(won: int, of: int) -> str:
+    if not of:
+        return "-"
+    low, high = statistics.wilson(won, of)
+    return f"{100 * won / of:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+
+
+def difference_table(results: xr.Dataset) -> list[list[str]]:
+    """Header and one row for each pair of arms, world by world, with McNemar's exact test."""
+    rows = [["second against first", "gained", "lost", "difference", "McNemar p"]]
+    for first, second in combinations(map(str, results.arm.values), 2):
+        a, b = results.success.sel(arm=first), results.success.sel(arm=second)
+        c = statistics.compare(a, b)
+        share = 100 * (c.gained - c.lost) / a.size
+        rows.append(
+            [
+                f"{second} against {first}",
+                str(c.gained),
+                str(c.lost),
+                f"{share:+.2f} %",
+                f"{c.p:.2g}",
+            ]
+        )
+    return rows
+
+
+def hardest_table(results: xr.Dataset, run: str, count: int = 10) -> list[list[str]]:
+    """Header and one row for each of the hardest worlds, with the command that replays it."""
+    names = [str(name) for name in results.object.values]
+    arms = [str(arm) for arm in results.arm.values]
+    rows = [["world", "object", *arms, "mass", "friction", "target", "replay"]]
+    for world in statistics.hardest(results, count):
+        one = results.isel(world=world)
+        x = float(one.distance), float(np.degrees(one.bearing))
+        fails = next(arm for arm in arms if not int(one.success.sel(arm=arm)))
+        rows.append(
+            [
+                str(int(world)),
+                names[int(one.which_object)],
+                *(_told(one.sel(arm=arm)) for arm in arms),
+                f"{float(one.mass):.1f} kg",
+                f"{float(one.friction_ground):.2f}, {float(one.friction_robot):.2f}",
+                f"{x[0]:.1f} m at {x[1]:.0f} deg",
+                f"`rps replay {shlex.quote(run)} {int(world)} --arm {fails!r} --video`",
+            ]
+        )
+    return rows
+
+
+def _told(trial: xr.Dataset) -> str:
+    if int(trial.success):
+        return f"{float(trial.time):.0f} s"
+    distance = float(trial.min_distance)
+    return f"fails, {100 * distance:.0f} cm off" if np.isfinite(distance) else "never touches"
+
+
+def influence_table(results: xr.Dataset, arm: str) -> list[list[str]]:
+    """Header and one row for each quantity that was drawn: the arm's worst and best bin.
+
+    Those whose bins differ most come first: by a chi-squared test that all bins have one rate,
+    false discoveries among the quantities held at 5 % (Benjamini-Hochberg) where q < 0.05.
+    """
+    won = results.success.sel(arm=arm).values > 0
+    binned = {
+        name: statistics.bins(results[name].values, won) for name in statistics.drawn(results)
+    }
+    q = statistics.false_discovery([statistics.one_rate(found) for found in binned.values()])
+    rows = [["", "worst bin, about", "success", "best bin, about", "success", "q"]]
+    for i in np.argsort(q, kind="stable"):
+        name, found = list(binned.items())[i]
+        order, unit = np.argsort(found.won / found.of, kind="stable"), results[name].attrs["units"]
+        told = [f"{value:.3g} {unit}".removesuffix(" 1") for value in found.middle]
+        ends = [
+            cell
+            for n in (order[0], order[-1])
+            for cell in (told[n], _share(int(found.won[n]), int(found.of[n])))
+        ]
+        rows.append([statistics.DRAWN[name], *ends, f"{q[i]:.2g}"])
+    return rows
+
+
+def agreement_table(found: Mapping[str, xr.Dataset]) -> list[list[str]]:
+    """Header and one row for each engine: success, and outcomes equal to the first's, by object.
+
+    The results are those of one arm in the same worlds.
+    """
+    base = next(iter(found.values()))
+    groups = statistics.worlds_by_object(base)
+    rows = [["engine", *groups, "equal outcomes", "95 %", *(f"equal, {g}" for g in groups), "+/-"]]
+    for name, one in found.items():
+        won = one.success.values > 0
+        same = won == (base.success.values > 0)
+        c = statistics.compare(base.success, one.success)
+        low, high = c.equal_interval
+        rows.append(
+            [
+                name,
+                *(f"{won[mask].sum()} of {mask.sum()}" for mask in groups.values()),
+                f"{100 * c.equal:.1f} %",
+                f"{100 * low:.0f}-{100 * high:.0f} %",
+                *(f"{same[mask].sum()} of {mask.sum()}" for mask in groups.values()),
+                f"+{c.gained} -{c.lost}",
+            ]
+        )
+    return rows

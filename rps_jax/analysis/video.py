@@ -9,12 +9,10 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import itertools
-import math
 import os
 import sys
 import tempfile
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -23,6 +21,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from rps_jax import errors
+from rps_jax.analysis.studio import NO_CONTACT, Studio, Tile, VideoError, open_studios, try_drawing
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -31,35 +30,11 @@ if TYPE_CHECKING:
 
 SIZE = (960, 540)  # [px] width, height
 
-_TRAIL_STEP = 0.02  # [m] between the points of a trail
-_TRAIL_POINTS = 1500  # at most, so that memory stays flat: 30 m; the oldest go first
-_TRAIL_WIDTH = 0.007  # [1] of the image's height
-BASE_RGBA = (0.08, 0.09, 0.11, 1.0)
-CONTACT_RGBA = (0.62, 0.04, 0.46, 1.0)
-CONTACT_HEIGHT = 0.36  # [m] just above the chassis, which would hide the marker from above
-CONTACT_RADIUS = 0.04  # [m]
-_NO_CONTACT = np.full(2, np.nan)
 _EMPTY = 58  # grey of a place in a grid without a trial
 _INK = (24, 26, 30)  # RGB around labels and tiles
-_SHADOWS_FROM = 240  # [px] height of an image: they take most of the time without a GPU
 _LABEL = 13  # [1] heights of a label in a tile
 
-_MEND_GL = (
-    "MuJoCo cannot draw on this machine: install Mesa's EGL library (`apt install libegl1 "
-    "libgl1-mesa-dri`) and set MUJOCO_GL=egl, or set MUJOCO_GL=osmesa (`apt install libosmesa6`)."
-)
 _MEND_FFMPEG = "ffmpeg was not found or does not run: run `pip install imageio-ffmpeg`."
-
-
-class VideoError(RuntimeError):
-    """No picture or video could be made: one sentence that says how to mend it."""
-
-
-class Tile(NamedTuple):
-    """A trial in a grid of trials."""
-
-    scene: Scene
-    p_world_target: ArrayLike  # (2,) [m]
 
 
 class Shot(NamedTuple):
@@ -93,7 +68,7 @@ def choose_gl() -> None:
 
 def check() -> list[Check]:
     """Whether this machine can draw and can encode, tried out; never raises VideoError."""
-    return [_attempt("rendering", _try_drawing), _attempt("ffmpeg", _try_encoding)]
+    return [_attempt("rendering", try_drawing), _attempt("ffmpeg", _try_encoding)]
 
 
 def snapshot(
@@ -130,8 +105,8 @@ def images(
     camera: str = "oblique",
 ) -> list[np.ndarray]:
     """Pictures as of `snapshot`, each with the path of the base up to there."""
-    with _studios([Tile(scene, p_world_target)], size, camera) as (studio,):
-        return [studio.draw(qpos, _NO_CONTACT) for qpos in frames]
+    with open_studios([Tile(scene, p_world_target)], size, camera) as (studio,):
+        return [studio.draw(qpos, NO_CONTACT) for qpos in frames]
 
 
 def render(
@@ -171,7 +146,7 @@ def render(
     if first is None:
         raise errors.InputError("frames = [] is not allowed: a video needs at least one frame.")
     with (
-        _studios([Tile(scene, p_world_target)], size, camera) as (studio,),
+        open_studios([Tile(scene, p_world_target)], size, camera) as (studio,),
         _encoder(Path(path), size, fps) as sink,
     ):
         for qpos, p_world_contact in itertools.chain([first], pairs):
@@ -216,7 +191,7 @@ def render_grid(
     whole = np.full((rows * height, columns * width, 3), _EMPTY, np.uint8)
     cells = whole.reshape(rows, height, columns, width, 3).swapaxes(1, 2)
     with (
-        _studios(tiles, size, camera) as studios,
+        open_studios(tiles, size, camera) as studios,
         _encoder(Path(path), (columns * width, rows * height), fps) as sink,
     ):
         shown: list[Shot | None] = [None] * len(tiles)
@@ -228,7 +203,7 @@ def render_grid(
             sink(whole)
 
 
-def _labelled(studio: _Studio, shot: Shot) -> np.ndarray:
+def _labelled(studio: Studio, shot: Shot) -> np.ndarray:
     """A tile with its label and a line around it."""
     image = Image.fromarray(studio.draw(shot.qpos, shot.p_world_contact))
     font = ImageFont.load_default(size=max(9, image.height // _LABEL))
@@ -248,152 +223,8 @@ def _paired(
     frames: Iterable[ArrayLike], p_world_contacts: Iterable[ArrayLike] | None
 ) -> Iterator[tuple[ArrayLike, ArrayLike]]:
     if p_world_contacts is None:
-        return zip(frames, itertools.repeat(_NO_CONTACT), strict=False)
+        return zip(frames, itertools.repeat(NO_CONTACT), strict=False)
     return zip(frames, p_world_contacts, strict=True)
-
-
-class _Trail:
-    """A path on the ground, thinned to `_TRAIL_STEP`. NaN interrupts it."""
-
-    def __init__(self, rgba: tuple[float, ...], height: float) -> None:
-        self.rgba = rgba
-        self.height = height  # [m] above the ground, so that one trail lies over another
-        self.points: deque[np.ndarray] = deque(maxlen=_TRAIL_POINTS)
-
-    def add(self, point: np.ndarray) -> None:
-        """Note a point (2,) [m] unless it lies close to the last one."""
-        last = self.points[-1] if self.points else _NO_CONTACT
-        both = np.isnan([point[0], last[0]])
-        if not both.all() and (both.any() or math.dist(point, last) >= _TRAIL_STEP):
-            self.points.append(point)
-
-    def segments(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Pairs of neighbouring points without a gap between them."""
-        for a, b in itertools.pairwise(self.points):
-            if not (math.isnan(a[0]) or math.isnan(b[0])):
-                yield a, b
-
-
-class _Studio:
-    """A scene before a camera, with what has been drawn so far left as trails."""
-
-    def __init__(self, renderer: Any, scene: Scene, camera: str, target: np.ndarray) -> None:
-        self.mujoco = _import_mujoco()
-        self.renderer = renderer
-        self.model = scene.model
-        self.data = self.mujoco.MjData(scene.model)
-        self.data.mocap_pos[scene.model.body("target").mocapid[0], :2] = target
-        self.camera = camera
-        self.base_trail = _Trail(BASE_RGBA, 0.006)
-        self.contact_trail = _Trail(CONTACT_RGBA, 0.010)
-
-    def draw(self, qpos: ArrayLike, p_world_contact: ArrayLike) -> np.ndarray:
-        """One image (height, width, 3) uint8, and a step further along the trails."""
-        qpos = _checked("qpos", qpos, self.model.nq)
-        contact = np.array(p_world_contact, float)  # a copy: the trail keeps it
-        self.data.qpos[:] = qpos
-        self.mujoco.mj_kinematics(self.model, self.data)  # where things are; no dynamics
-        self.mujoco.mj_camlight(self.model, self.data)
-        self.renderer.update_scene(self.data, camera=self.camera)
-        view = self.renderer.scene
-        view.flags[self.mujoco.mjtRndFlag.mjRND_SHADOW] = self.renderer.height >= _SHADOWS_FROM
-        self.base_trail.add(qpos[:2])
-        self.contact_trail.add(contact)
-        for trail in (self.base_trail, self.contact_trail):
-            for a, b in trail.segments():
-                self._add_line(a, b, trail)
-        if not np.isnan(contact).any():
-            self._add_marker(contact)
-        return self.renderer.render()
-
-    def _add_line(self, a: np.ndarray, b: np.ndarray, trail: _Trail) -> None:
-        """A line on the ground from `a` to `b`: quicker to draw than any solid."""
-        geom = self._new_geom("mjGEOM_LINE", np.zeros(3), np.zeros(3), trail.rgba)
-        if geom is not None:
-            width = _TRAIL_WIDTH * self.renderer.height
-            ends = ([*point, trail.height] for point in (a, b))
-            self.mujoco.mjv_connector(geom, geom.type, width, *ends)
-
-    def _add_marker(self, point: np.ndarray) -> None:
-        position = np.array([*point, CONTACT_HEIGHT])
-        size = np.full(3, CONTACT_RADIUS)
-        geom = self._new_geom("mjGEOM_SPHERE", size, position, CONTACT_RGBA)
-        if geom is not None:
-            geom.emission = 1.0  # seen in the shadow of the object too
-
-    def _new_geom(self, kind: str, size: np.ndarray, position: np.ndarray, rgba: Any) -> Any:
-        """Another geom of this frame; None if there is no room for it."""
-        view = self.renderer.scene
-        if view.ngeom == view.maxgeom:
-            return None
-        geom = view.geoms[view.ngeom]
-        kind = getattr(self.mujoco.mjtGeom, kind)
-        colour = np.array(rgba, np.float32)
-        self.mujoco.mjv_initGeom(geom, kind, size, position, np.eye(3).ravel(), colour)
-        view.ngeom += 1
-        return geom
-
-
-@contextlib.contextmanager
-def _studios(tiles: Sequence[Tile], size: tuple[int, int], camera: str) -> Iterator[list[_Studio]]:
-    """A studio for each tile, those of one scene with one renderer.
-
-    Renderers are closed at the end; an open one complains when Python exits.
-    """
-    targets = []
-    for scene, p_world_target in tiles:
-        model = scene.model
-        errors.check_name("camera", camera, [model.camera(i).name for i in range(model.ncam)])
-        targets.append(_checked("p_world_target", p_world_target, 2))
-        limits = (model.vis.global_.offwidth, model.vis.global_.offheight)
-        for n, limit in zip(size, limits, strict=True):
-            errors.check_finite("size", n, at_least=2, at_most=limit, unit="px")
-    with contextlib.ExitStack() as stack:
-        renderers: dict[int, Any] = {}
-        for scene, _ in tiles:
-            if id(scene.model) not in renderers:
-                renderers[id(scene.model)] = stack.enter_context(_renderer(scene.model, size))
-        yield [
-            _Studio(renderers[id(scene.model)], scene, camera, target)
-            for (scene, _), target in zip(tiles, targets, strict=True)
-        ]
-
-
-def _checked(name: str, values: ArrayLike, length: int) -> np.ndarray:
-    """A copy (length,) of finite `values`, or an InputError."""
-    array = np.array(values, float)
-    if array.shape != (length,) or not np.isfinite(array).all():
-        raise errors.InputError(
-            f"{name} = {array} is not allowed: it must be {length} finite numbers."
-        )
-    return array
-
-
-def _import_mujoco() -> Any:
-    try:
-        import mujoco
-    except Exception as error:  # what a missing GL library raises depends on the library
-        raise VideoError(_MEND_GL) from error
-    return mujoco
-
-
-@contextlib.contextmanager
-def _renderer(model: Any, size: tuple[int, int]) -> Iterator[Any]:
-    mujoco = _import_mujoco()
-    width, height = size
-    buffer = model.vis.global_
-    limits = buffer.offwidth, buffer.offheight
-    buffer.offwidth, buffer.offheight = size  # else each renderer holds images of the limits
-    try:
-        with warnings.catch_warnings():  # GLFW warns before it fails
-            warnings.simplefilter("ignore")
-            renderer = mujoco.Renderer(model, height=height, width=width)
-    except Exception as error:  # likewise
-        raise VideoError(_MEND_GL) from error
-    finally:
-        buffer.offwidth, buffer.offheight = limits
-    with contextlib.closing(renderer):
-        yield renderer
 
 
 @contextlib.contextmanager
@@ -437,19 +268,6 @@ def _attempt(what: str, action: Callable[[], None]) -> Check:
     except VideoError as error:
         return Check(what, False, str(error))
     return Check(what, True, "")
-
-
-def _try_drawing() -> None:
-    mujoco = _import_mujoco()
-    model = mujoco.MjModel.from_xml_string(
-        '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>'
-    )
-    with _renderer(model, (16, 16)) as renderer:
-        data = mujoco.MjData(model)
-        mujoco.mj_forward(model, data)
-        renderer.update_scene(data)
-        if not renderer.render().any():
-            raise VideoError(_MEND_GL)
 
 
 def _try_encoding() -> None:

@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.analysis import video
+from rps_jax.analysis import studio
 from rps_jax.control import strategies
 from rps_jax.errors import InputError
 from rps_jax.robot import skin
@@ -403,7 +403,7 @@ class _Drawing:
         front = scene.physics.geom("base").size[0]
         self._taxels = _add_taxels(world, f"{_ROOT}/base/taxels", float(front))
         self._contact = world.add_icosphere(
-            f"{_ROOT}/base/contact", video.CONTACT_RADIUS, color=_rgb(video.CONTACT_RGBA)
+            f"{_ROOT}/base/contact", studio.CONTACT_RADIUS, color=_rgb(studio.CONTACT_RGBA)
         )
         nowhere = np.zeros((1, 2, 3))
         self._velocity = world.add_arrows(
@@ -419,8 +419,8 @@ class _Drawing:
         self._paths = {
             name: line(f"{_ROOT}/{name}", colors=_rgb(rgba), thickness=0.025, position=(0, 0, z))
             for name, rgba, z in (
-                ("base_path", video.BASE_RGBA, 0.006),
-                ("contact_path", video.CONTACT_RGBA, 0.012),
+                ("base_path", studio.BASE_RGBA, 0.006),
+                ("contact_path", studio.CONTACT_RGBA, 0.012),
             )
         }
 
@@ -443,7 +443,7 @@ class _Drawing:
         self._contact.visible = touching
         if touching:
             felt = map(float, moment.seen.reading.p_robot_contact)
-            self._contact.position = (*felt, video.CONTACT_HEIGHT + 0.03)
+            self._contact.position = (*felt, studio.CONTACT_HEIGHT + 0.03)
         self._show_twist(*map(float, moment.seen.twist))
         way = [past[i] for i in (*range(0, index, _PATH_STEP), index)]
         self._paths["base_path"].points = _joined(np.array([m.seen.qpos[:2] for m in way]))

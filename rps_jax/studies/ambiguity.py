@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from rps_jax.analysis import tables
+from rps_jax.analysis import statistics
 from rps_jax.robot.skin import CapacitiveSkin, IdealSkin
 from rps_jax.studies.study import Condition
 from rps_jax.trials.setting import Setting
@@ -179,7 +179,12 @@ def by_tolerance(results: xr.Dataset, tolerances: tuple[float, ...]) -> xr.Datas
             )
             for name, values in measures.items()
         },
-        coords={"loss": list(ON_LOSS), "tolerance": list(tolerances), "object": one.object},
+        coords={
+            "loss": list(ON_LOSS),
+            "what": ("loss", [what for what, _ in ON_LOSS.values()]),
+            "tolerance": list(tolerances),
+            "object": one.object,
+        },
     )
 
 
@@ -196,7 +201,7 @@ def cells(results: xr.Dataset, condition: str = "paper_gazebo") -> list[list[str
             for friction in map(str, one.friction.values):
                 won = int(one.sel(strategy=strategy, object=name, friction=friction).sum())
                 theirs, of = paper.TABLE_II[strategy, name, friction], len(paper.TARGETS)
-                low, high = tables.wilson(theirs, of)
+                low, high = statistics.wilson(theirs, of)
                 table = [[won, trials - won], [theirs, of - theirs]]
                 rows.append(
                     [

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from rps_jax.analysis import statistics
 from rps_jax.engines import EngineName
 from rps_jax.studies import study
 from rps_jax.studies.study import Condition, Grid
@@ -132,7 +133,7 @@ def table(results: xr.Dataset) -> list[list[str]]:
     for name in map(str, results.condition.values):
         one = results.sel(condition=name)
         counts = one.success.sum(("friction", "target"))
-        c = study.compare(base, one.success)
+        c = statistics.compare(base, one.success)
         low, high = c.equal_interval
         median, worst = np.quantile(one.early_error.values, (0.5, 0.95))
         cost = float(one.run_time) / float(one.simulated)
@@ -160,7 +161,7 @@ def by_strategy(results: xr.Dataset) -> list[list[str]]:
         one = results.success.sel(condition=name)
         shares = []
         for s in strategies:
-            c = study.compare(base.sel(strategy=s), one.sel(strategy=s))
+            c = statistics.compare(base.sel(strategy=s), one.sel(strategy=s))
             low, high = c.equal_interval
             shares.append(f"{100 * c.equal:.1f} % ({100 * low:.0f}-{100 * high:.0f})")
         rows.append([str(results.what.sel(condition=name).values), *shares])

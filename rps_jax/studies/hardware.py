@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from rps_jax.analysis import tables
+from rps_jax.analysis import statistics
 from rps_jax.robot.skin import SKINS
 from rps_jax.trials import pushes
-from rps_jax.trials.pushes import Case, Trace
+from rps_jax.trials.pushes import Case
+from rps_jax.trials.results import outcome_dataset, trace_dataset
 from rps_jax.trials.setting import Progress, Setting
 from rps_jax.trials.trial import Shift
 from rps_jax.world.paper import (
@@ -61,20 +62,23 @@ def run(
         for target in targets
     ]
     outcome, _ = pushes.run(cases, setting, report=report, **shape)
-    return tables.dataset(outcome, ["rps"], HARDWARE_OBJECTS, tuple(frictions()), targets)
+    return outcome_dataset(outcome, ["rps"], HARDWARE_OBJECTS, tuple(frictions()), targets)
 
 
-def paths(base: Case, setting: Setting, *, layout: str = "circle") -> dict[str, list[Trace]]:
+def paths(base: Case, setting: Setting, *, layout: str = "circle") -> dict[str, list[xr.Dataset]]:
     """Fig. 7: the traces of every object to every target, at the middle of the friction range."""
     return {
-        name: pushes.follow(
-            [
-                replace(base, object=name, friction=MIDDLE, p_world_target=target)
-                for target in HARDWARE_LAYOUTS[layout]
-            ],
-            setting,
-            interval=0.5,
-        )
+        name: [
+            trace_dataset(trace)
+            for trace in pushes.follow(
+                [
+                    replace(base, object=name, friction=MIDDLE, p_world_target=target)
+                    for target in HARDWARE_LAYOUTS[layout]
+                ],
+                setting,
+                interval=0.5,
+            )
+        ]
         for name in HARDWARE_OBJECTS
     }
 
@@ -132,7 +136,7 @@ def table(results: xr.Dataset) -> list[list[str]]:
     for name in map(str, results.object.values):
         one = results.sel(strategy="rps", object=name)
         won = one.success.values.astype(bool)
-        low, high = tables.wilson(int(won.sum()), won.size)
+        low, high = statistics.wilson(int(won.sum()), won.size)
         theirs = HARDWARE_RESULTS[name]
         rows.append(
             [
@@ -163,18 +167,20 @@ def _spread(values: xr.DataArray, digits: int, unit: str) -> str:
 def shift_table(results: xr.Dataset) -> list[list[str]]:
     """Header and one row for each size of shift: successes of those still under way."""
     rows = [["shift", *(str(o) for o in results.object.values)]]
-    for size in results["shift"].values:
+    found = recovered(results)
+    for size in found["shift"].values:
         cells = []
-        for name in results.object.values:
-            won, of = recovered(results, str(name), float(size))
-            low, high = tables.wilson(won, of)
+        for name in found.object.values:
+            one = found.sel(object=name, shift=size)
+            won, of = int(one.won), int(one.of)
+            low, high = statistics.wilson(won, of)
             cells.append(f"{won} of {of} ({100 * low:.0f}-{100 * high:.0f} %)")
         rows.append([f"{100 * float(size):g} cm", *cells])
     return rows
 
 
-def recovered(results: xr.Dataset, name: str, size: float) -> tuple[int, int]:
-    """Successes, and the trials that were under way when the object was shifted."""
-    one = results.sel(object=name, shift=size)
-    counted = one.counted.values.astype(bool)
-    return int(one.success.values[counted].sum()), int(counted.sum())
+def recovered(results: xr.Dataset) -> xr.Dataset:
+    """Trials under way when the object was shifted, (object, shift): those `won`, `of` all."""
+    counted = results.counted > 0
+    both = ("side", "target")
+    return xr.Dataset({"won": (counted & (results.success > 0)).sum(both), "of": counted.sum(both)})

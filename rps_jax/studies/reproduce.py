@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from rps_jax.analysis import figures, tables, video
+from rps_jax.analysis import figures, statistics, tables, video
 from rps_jax.analysis.report import Section, write_report
 from rps_jax.control.law import RPSParams
 from rps_jax.engines import EngineName
@@ -23,6 +23,7 @@ from rps_jax.studies import ambiguity, fidelity, hardware, study
 from rps_jax.studies.study import Condition, Grid
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
+from rps_jax.trials.results import title_of, trace_dataset
 from rps_jax.trials.setting import Progress, Setting
 from rps_jax.world import paper, scene
 from rps_jax.world.objects import PAPER_OBJECTS
@@ -195,7 +196,7 @@ def _table_ii(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any])
     picture = figures.min_distance(results, out / "min_distance.png")
     text = "  \n".join(tables.summary(results).splitlines())
     return [
-        Section("Table II: successes of 24", text, tables.table(results)),
+        Section("Table II: successes of 24", text, tables.table_ii(results)),
         Section("Fig. 5: least distance of contact to target", "", (), picture),
     ]
 
@@ -205,8 +206,9 @@ def _one_trial(out: Path, plan: Plan, progress: _Progress) -> list[Section]:
 
     def follow(tell: Any) -> xr.Dataset:
         (trace,) = pushes.follow([_FIG_6], Setting(engine=plan.engine))
-        figures.one_trial(trace, figures.title_of(_FIG_6), picture)
-        return tables.trace_dataset(trace)
+        seen = trace_dataset(trace)
+        figures.one_trial(seen, title_of(_FIG_6), picture)
+        return seen
 
     seen = _kept(out, "trial", 0, progress, follow)
     reached = "reached" if int(seen.outcome_success) else "not reached"
@@ -233,8 +235,7 @@ def _hardware(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any])
         lambda tell: hardware.disturb(base, setting, shifts=plan.shifts, report=tell, **shape),
     )
     if not (out / "paths.png").exists():
-        traces = hardware.paths(base, setting)
-        figures.paths(traces, paper.HARDWARE_LAYOUTS["circle"], out / "paths.png")
+        figures.paths(hardware.paths(base, setting), out / "paths.png")
     return hardware_sections(out, results, shifted)
 
 
@@ -251,7 +252,7 @@ def hardware_sections(out: Path, results: xr.Dataset, shifted: xr.Dataset) -> li
         f"the robot, to either side (friction {ground:g}, {robot:g}). Trials that had ended by "
         "then are not counted."
     )
-    picture = figures.shift_curve(shifted, out / "shifted.png")
+    picture = figures.shift_curve(hardware.recovered(shifted), out / "shifted.png")
     return [
         Section("Hardware experiments", friction, hardware.table(results)),
         Section("Fig. 7: paths of the base", "", (), out / "paths.png"),
@@ -268,7 +269,7 @@ def _fidelity(out: Path, plan: Plan, progress: _Progress, shape: dict[str, Any])
     files.write_results(out / "fidelity.nc", results)
     base = results.success.sel(condition=fidelity.REFERENCE)
     names = [str(name) for name in results.condition.values if name != fidelity.REFERENCE]
-    against = [study.compare(base, results.success.sel(condition=name)) for name in names]
+    against = [statistics.compare(base, results.success.sel(condition=name)) for name in names]
     picture = figures.agreement(
         [str(results.what.sel(condition=name).values) for name in names],
         np.array([c.equal for c in against]),

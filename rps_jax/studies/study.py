@@ -15,14 +15,14 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import xarray as xr
-from scipy import stats
 
-from rps_jax.analysis import tables
+from rps_jax.analysis import statistics
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Parts
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
+from rps_jax.trials.results import outcome_dataset
 from rps_jax.trials.setting import Progress, Setting
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
@@ -33,7 +33,7 @@ _TOGETHER = {"cpu": 600, "gpu": 100_000}
 
 
 class Grid(NamedTuple):
-    """Which trials, in the nesting order of `score.dataset`."""
+    """Which trials, in the nesting order of `outcome_dataset`."""
 
     strategies: tuple[str, ...] = ("rps",)
     objects: tuple[str, ...] = PAPER_OBJECTS
@@ -106,7 +106,7 @@ def run(
         for i, name in enumerate(names):
             rows = slice(i * grid.size, (i + 1) * grid.size)
             part = type(outcome)(*(values[rows] for values in outcome))
-            results = tables.dataset(
+            results = outcome_dataset(
                 part, grid.strategies, grid.objects, tuple(grid.friction), grid.targets
             )
             # Shared by all that ran together.
@@ -161,25 +161,6 @@ def _chunks(
     ]
 
 
-class Comparison(NamedTuple):
-    """Two conditions, trial by trial."""
-
-    equal: float  # [1] share of trials with the same outcome
-    equal_interval: tuple[float, float]  # Wilson, 95 %
-    gained: int  # trials that fail under the first and succeed under the second
-    lost: int  # trials that succeed under the first and fail under the second
-    p: float  # [1] of McNemar's exact test that gains and losses are equally likely
-
-
-def compare(first: xr.DataArray, second: xr.DataArray) -> Comparison:
-    """Compare outcomes (any equal shape) of the same trials."""
-    a, b = first.values.astype(bool).ravel(), second.values.astype(bool).ravel()
-    gained, lost = int(np.sum(~a & b)), int(np.sum(a & ~b))
-    equal = a.size - gained - lost
-    p = float(stats.binomtest(gained, gained + lost).pvalue) if gained + lost else 1.0
-    return Comparison(equal / a.size, tables.wilson(equal, a.size), gained, lost, p)
-
-
 def rows(results: xr.Dataset, baseline: str, strategy: str = "rps") -> list[list[str]]:
     """Header and one row for each condition: counts, interval, median time, and the difference.
 
@@ -189,11 +170,10 @@ def rows(results: xr.Dataset, baseline: str, strategy: str = "rps") -> list[list
     part = results.sel(strategy=strategy)
     base = part.success.sel(condition=baseline)
     names = [str(name) for name in part.condition.values]
-    against = [compare(base, part.success.sel(condition=name)) for name in names]
+    against = [statistics.compare(base, part.success.sel(condition=name)) for name in names]
     others = [i for i, name in enumerate(names) if name != baseline]
     q = np.ones(len(names))
-    if others:
-        q[others] = stats.false_discovery_control([against[i].p for i in others])
+    q[others] = statistics.false_discovery([against[i].p for i in others])
     objects = [str(o) for o in part.object.values]
     header = ["reading", *objects, "all", "95 %", "median time", "against the first"]
     table = [header]
@@ -201,7 +181,7 @@ def rows(results: xr.Dataset, baseline: str, strategy: str = "rps") -> list[list
         one = part.sel(condition=name)
         won = one.success.values.astype(bool)
         counts = one.success.sum("target").transpose("object", "friction").values.astype(int)
-        low, high = tables.wilson(int(won.sum()), won.size)
+        low, high = statistics.wilson(int(won.sum()), won.size)
         time = one.time.values[won]
         difference = (
             ""

@@ -1,0 +1,191 @@
+"""The paper's figures, from its grid of trials and from traces over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from matplotlib import patches
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from rps_jax.analysis.figures.style import SHADES, File, base_patch, save, shade, words
+from rps_jax.robot import skin
+
+
+def min_distance(results: xr.Dataset, path: Path) -> Path:
+    """Fig. 5: least distance of contact to target, over the targets, mean of the friction sets.
+
+    Rows are strategies, columns objects; the number at a target counts the successes of its
+    trials, and the last column sums them over objects.
+    """
+    strategies, objects = (list(map(str, results[dim].values)) for dim in ("strategy", "object"))
+    columns = [*objects, "all"] if len(objects) > 1 else objects
+    figure = Figure(
+        figsize=(0.9 + 2.6 * len(columns), 0.9 + 2.5 * len(strategies)), layout="constrained"
+    )
+    axes = figure.subplots(len(strategies), len(columns), squeeze=False, sharex=True, sharey=True)
+    image = None
+    for row, strategy in zip(axes, strategies, strict=True):
+        for ax, column in zip(row, columns, strict=True):
+            part = results.sel(strategy=strategy)
+            part = part if column == "all" else part.sel(object=[column])
+            image = _map(ax, part)
+            won, of = int(part.success.sum()), part.success.size
+            name = "all objects" if column == "all" else words(column)
+            ax.set_title(f"{strategy.upper()}, {name}: {won}/{of}", fontsize=9)
+    for ax in axes[-1]:
+        ax.set_xlabel("x [m]")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("y [m]")
+    assert image is not None
+    bar = figure.colorbar(image, ax=axes, shrink=0.8, extend="max")
+    bar.set_label("least distance of contact to target [m]")
+    return save(figure, path)
+
+
+def _map(ax: Axes, part: xr.Dataset):
+    """One panel: a coloured square and the count of successes at each target."""
+    # A trial that never touched has no least distance; it is drawn as the far end of the scale.
+    distance = part.min_distance.where(np.isfinite(part.min_distance), 3.0)
+    distance = distance.mean(("object", "friction")).values
+    count = part.success.sum(("object", "friction")).values
+    x, y = part.target_x.values, part.target_y.values
+    image = ax.scatter(
+        x, y, c=distance, s=420, marker="s", cmap="viridis_r", vmin=0.0, vmax=2.0, linewidths=0
+    )
+    for point in zip(x, y, distance, count, strict=True):
+        colour = "white" if point[2] > 1.0 else "black"
+        ax.annotate(
+            str(int(point[3])), point[:2], ha="center", va="center", fontsize=8, color=colour
+        )
+    ax.add_patch(base_patch(np.zeros(3), fill=True))
+    margin = 0.6
+    ax.set(
+        xlim=(x.min() - margin, x.max() + margin),
+        ylim=(y.min() - margin, y.max() + margin),
+        aspect="equal",
+    )
+    return image
+
+
+def time_to_success(results: xr.Dataset, strategy: str, path: Path) -> Path:
+    """Time of the successes over the target's distance, coloured by how far it lies off ahead."""
+    distance = np.hypot(results.target_x.values, results.target_y.values)
+    off = np.degrees(np.abs(np.arctan2(results.target_y.values, results.target_x.values)))
+    objects = list(map(str, results.object.values))
+    figure = Figure(figsize=(1 + 3.2 * len(objects), 3.4), layout="constrained")
+    axes = figure.subplots(1, len(objects), squeeze=False, sharey=True)[0]
+    image = None
+    for ax, name in zip(axes, objects, strict=True):
+        part = results.sel(strategy=strategy, object=name)
+        for marker, friction in zip("osv^", map(str, part.friction.values), strict=False):
+            one = part.sel(friction=friction)
+            time = one.time.where(one.success == 1).values
+            image = ax.scatter(
+                distance, time, c=off, marker=marker, vmin=0, vmax=180, s=26, label=friction
+            )
+        ax.set(xlabel="distance of the target [m]", title=words(name))
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel("time to success [s]")
+    axes[0].legend(fontsize=8)
+    assert image is not None
+    figure.colorbar(image, ax=axes).set_label("target off straight ahead [deg]")
+    return save(figure, path)
+
+
+def one_trial(trace: xr.Dataset, title: str, path: File) -> File:
+    """Fig. 6: the path with contact points; velocities; l and a_r; contact type.
+
+    Blue shade: Realignment State. Yellow: no contact. The trace is of one trial over time, with
+    the contact `p_world_contact`, the target and the radius `d_success`; dashed: `l_cr`, if any.
+    """
+    time, touching = trace.time.values, trace.contact_type.values != skin.NONE
+    figure = Figure(figsize=(11, 6), layout="constrained")
+    grid = figure.add_gridspec(3, 2, width_ratios=(1.1, 1))
+    _path(figure.add_subplot(grid[:, 0]), trace)
+
+    velocity = figure.add_subplot(grid[0, 1])
+    velocity.plot(time, trace.v_x, label="$v_x$ [m/s]", color="C0")
+    velocity.plot(time, trace.v_y, label="$v_y$ [m/s]", color="C1")
+    velocity.plot(time, trace.omega, label=r"$\omega$ [rad/s]", color="C2")
+    velocity.legend(ncols=3, fontsize=8, loc="lower right")
+    velocity.set_ylabel("a) twist")
+
+    place = figure.add_subplot(grid[1, 1], sharex=velocity)
+    place.plot(time, np.where(touching, trace.l, np.nan), color="C0")
+    place.set_ylabel("b) $l$ [m]", color="C0")
+    place.set_ylim(-skin.HALF_WIDTH, skin.HALF_WIDTH)
+    for sign in (-1, 1) if "l_cr" in trace else ():
+        place.axhline(sign * float(trace.l_cr), color="0.6", lw=0.7, ls="--")
+    rate = place.twinx()
+    rate.plot(time, np.where(touching, trace.a_r, np.nan), color="C3", lw=0.9)
+    rate.set_ylabel("$a_r$ [1]", color="C3")
+
+    kind = figure.add_subplot(grid[2, 1], sharex=velocity)
+    kind.step(time, trace.contact_type, where="post", color="0.2", lw=0.9)
+    kind.set_yticks((0, 1, 2), ("none", "point", "line"))
+    kind.set_ylim(-0.2, 2.2)
+    kind.set(ylabel="c) contact", xlabel="time [s]")
+    for ax in (velocity, place, kind):
+        shade(ax, time, trace.realigning.values > 0.5, SHADES["realigning"])
+        shade(ax, time, ~touching, SHADES["lost"])
+    result = "reached" if trace.outcome_success else "not reached"
+    x, y = trace.p_world_target.values
+    figure.suptitle(
+        f"{title}, target ({x:.3g}, {y:.3g}) m: {result} at {float(trace.outcome_time):.1f} s"
+    )
+    return save(figure, path)
+
+
+def _path(ax: Axes, trace: xr.Dataset) -> None:
+    """Left column of Fig. 6: the way of the base and of the contact point."""
+    pose, target = trace.qpos.values[:, :3], trace.p_world_target.values
+    ax.plot(*pose[:, :2].T, color="0.35", label="base")
+    ax.plot(*trace.p_world_contact.values.T, ".", ms=1.5, color="C0", label="contact point")
+    for index in np.linspace(0, len(pose) - 1, 7).astype(int):
+        ax.add_patch(base_patch(pose[index], fill=False))
+    ax.plot(*target, "*", ms=14, color="C3", label="target")
+    ax.add_patch(patches.Circle(target, float(trace.d_success), fill=False, color="C3"))
+    ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    ax.grid(alpha=0.3)
+    ax.legend(fontsize=8)
+
+
+def paths(traces: Mapping[str, Sequence[xr.Dataset]], path: Path) -> Path:
+    """Fig. 7: the ways of the base to every target, and the contact points at the end.
+
+    `traces` has a panel's title and its trials over time, as for `one_trial`.
+    """
+    figure = Figure(figsize=(5.2 * len(traces), 5), layout="constrained")
+    axes = figure.subplots(1, len(traces), squeeze=False, sharey=True)[0]
+    for ax, (name, rows) in zip(axes, traces.items(), strict=True):
+        ax.add_patch(base_patch(np.zeros(3), fill=True))
+        for trace in rows:
+            (line,) = ax.plot(*trace.qpos.values[:, :2].T, lw=1.2)
+            ax.plot(*trace.p_world_target.values, "*", ms=12, color=line.get_color())
+            touching = trace.p_world_contact.dropna("time").values
+            if len(touching):
+                ax.plot(*touching[-1], "o", ms=5, mfc="white", color=line.get_color())
+        won = sum(bool(trace.outcome_success) for trace in rows)
+        ax.set(xlabel="x [m]", aspect="equal")
+        ax.set_title(f"{words(name)}: {won} of {len(rows)}", fontsize=10)
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel("y [m]")
+    figure.suptitle("lines: base; stars: targets; circles: last contact point", fontsize=9)
+    return save(figure, path)
+
+
+def stills(images: Sequence[np.ndarray], titles: Sequence[str], path: Path) -> Path:
+    """Figs. 1 and 4: pictures (height, width, 3), three in a row, with their titles."""
+    rows = -(-len(images) // 3)
+    figure = Figure(figsize=(12, 2.3 * rows), layout="constrained")
+    axes = figure.subplots(rows, 3, squeeze=False).ravel()
+    for ax in axes:
+        ax.axis("off")
+    for ax, image, title in zip(axes, images, titles, strict=False):
+        ax.imshow(image)
+        ax.set_title(words(title), fontsize=9)
+    return save(figure, path)

@@ -1,0 +1,62 @@
+"""What the figures have in common: how they are saved, colours, and parts of a panel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import IO, TypeVar
+
+import numpy as np
+from matplotlib import patches
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from rps_jax.analysis import statistics
+from rps_jax.record import files
+from rps_jax.robot import skin
+
+File = TypeVar("File", bound=Path | IO[bytes])
+OBJECT_COLOURS = {"box": "C0", "cylinder": "C1", "nonuniform_box": "C2"}
+OBJECT_COLOURS |= {"hardware_box": "C0", "hardware_cylinder": "C1"}
+SHADES = {"realigning": "#bcd7f2", "lost": "#f8e3a1"}
+
+
+def save(figure: Figure, file: File) -> File:
+    """Write the figure, without a date, so that equal figures are equal; a path atomically."""
+
+    def write(to: Path | IO[bytes]) -> None:
+        figure.savefig(to, dpi=150, metadata={"Software": None})
+
+    if isinstance(file, Path):
+        files.atomic(file, write)
+    else:
+        write(file)
+    return file
+
+
+def words(name: str) -> str:
+    """A name as words."""
+    return name.replace("_", " ")
+
+
+def base_patch(pose: np.ndarray, *, fill: bool) -> patches.Polygon:
+    """Outline of the base at a pose (3,) [m, m, rad] in the world."""
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * [skin.HALF_LENGTH, skin.HALF_WIDTH]
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    world = corners @ np.array([[c, s], [-s, c]]) + pose[:2]
+    return patches.Polygon(
+        world, closed=True, facecolor="0.35" if fill else "none", edgecolor="0.35"
+    )
+
+
+def shade(ax: Axes, time: np.ndarray, active: np.ndarray, colour: str) -> None:
+    """Colour the times (T,) at which a mask (T,) holds, over the whole height of a panel."""
+    across = ax.get_xaxis_transform()
+    ax.fill_between(time, 0, 1, where=active, transform=across, color=colour, lw=0, step="post")
+
+
+def success_rates(ax: Axes, x: np.ndarray, won: np.ndarray, of: np.ndarray, **style) -> None:
+    """Draw success rates in percent with their Wilson 95 % intervals."""
+    rate = 100 * won / np.maximum(of, 1)
+    ends = 100 * np.array([statistics.wilson(int(n), int(m)) for n, m in zip(won, of, strict=True)])
+    errors = np.abs(np.stack([rate - ends[:, 0], ends[:, 1] - rate]))
+    ax.errorbar(x, rate, errors, capsize=2, marker="o", ms=4, lw=1.2, **style)

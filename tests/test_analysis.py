@@ -1,0 +1,229 @@
+"""Statistics, tables, figures and reports, from results made up by hand."""
+
+import itertools
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from rps_jax.analysis import figures, report, statistics, tables
+from rps_jax.analysis.figures import paper, studies, style, sweeps
+from rps_jax.analysis.report import Section
+from rps_jax.analysis.statistics import Bins
+
+
+@pytest.fixture
+def drawn(monkeypatch, tmp_path):
+    """What draws a figure: gives the figure back, which has been saved as well."""
+    kept = []
+    for theme in (paper, studies, sweeps):
+        monkeypatch.setattr(theme, "save", lambda *given: kept.append(given) or style.save(*given))
+
+    def draw(what, *given):
+        path = tmp_path / f"{what.__name__}.png"
+        what(*given, path)
+        ((figure, saved),) = kept
+        assert saved == path
+        assert path.read_bytes().startswith(b"\x89PNG")
+        kept.clear()
+        return figure
+
+    return draw
+
+
+def test_wilsons_interval_by_hand():
+    # n = 24, all succeed: low = 1 / (1 + z^2 / n) with z = 1.959964.
+    low, high = statistics.wilson(24, 24)
+    assert low == pytest.approx(1 / (1 + 1.959964**2 / 24), abs=1e-6)
+    assert high == pytest.approx(1.0)
+    assert statistics.wilson(0, 0) == (0.0, 1.0)
+    # p = 1/2 is symmetric about itself.
+    low, high = statistics.wilson(12, 24)
+    assert low + high == pytest.approx(1.0)
+
+
+def test_mcnemars_exact_test_by_hand():
+    a = xr.DataArray([1, 1, 1, 1, 1, 1, 0, 0])
+    b = xr.DataArray([0, 0, 0, 0, 0, 1, 0, 0])
+    c = statistics.compare(a, b)
+    # Five of five differences go one way: 2 / 2^5.
+    assert (c.gained, c.lost, c.p) == (0, 5, pytest.approx(0.0625))
+    assert c.equal == pytest.approx(3 / 8)
+    assert statistics.compare(a, a).p == 1.0
+
+
+def test_what_a_sweep_says_is_what_happened():
+    """Worked out by hand on four worlds."""
+    inf = np.inf
+    results = xr.Dataset(
+        {
+            "success": (("arm", "world"), np.array([[1, 0, 0, 0], [1, 1, 0, 0]], np.int8)),
+            "diverged": (("arm", "world"), np.array([[0, 0, 0, 1], [0, 0, 0, 0]], np.int8)),
+            "tipped": (("arm", "world"), np.array([[0, 0, 0, 0], [0, 0, 0, 1]], np.int8)),
+            "time": (("arm", "world"), np.array([[50.0, 300, 200, 9], [70, 80, 300, 300]])),
+            "min_distance": (("arm", "world"), np.array([[0.04, 0.5, inf, 1], [0.04, 0.04, 1, 2]])),
+            "contact_lost_time": (("arm", "world"), np.array([[0.0, 0, 0, 0], [0, 0, 151, 0]])),
+            "which_object": ("world", [0, 0, 1, 1]),
+            "distance": ("world", [1.0, 2.0, 3.0, 1.0]),
+        },
+        coords={"arm": ["a", "b"], "object": ["box", "drum"], "world": range(4)},
+    )
+    first, second = (results.sel(arm=arm) for arm in "ab")
+    assert [statistics.FAILURES[k] if k >= 0 else "" for k in statistics.failure(first, 150)] == [
+        "", "timeout", "never touched", "diverged"]  # fmt: skip
+    assert [statistics.FAILURES[k] for k in statistics.failure(second, 150)[2:]] == [
+        "lost contact", "fell over"]  # fmt: skip
+    assert statistics.left_over(first).tolist() == [0.04, 0.5, 3.0, 1.0]
+    assert statistics.cvar(np.arange(100.0)) == pytest.approx(97.0)  # mean of 95 .. 99
+    assert statistics.cvar(np.array([1.0, 3.0])) == 3.0
+    assert tables.difference_table(results)[1][1:4] == ["1", "0", "+25.00 %"]
+    assert statistics.hardest(results).tolist() == [2, 3, 1]
+    rates = tables.success_table(results, 150)
+    assert rates[1][1].startswith("50.0 %")  # of a with the box
+    assert rates[2][3].startswith("50.0 %")  # of b in all
+    bins = statistics.bins(np.arange(16.0), np.arange(16) < 4, count=4)
+    assert bins.won.tolist() == [4, 0, 0, 0]
+    assert bins.of.tolist() == [4] * 4
+    assert statistics.bins(np.array([1.0, 1, 2]), np.array([True, False, True])).of.tolist() == [
+        2,
+        1,
+    ]
+
+
+def random_worlds(success, **drawn):
+    """Results of arms (arms, worlds), of which only what is given was drawn."""
+    count = success.shape[1]
+    columns = {name: ("world", np.zeros(count), {"units": "1"}) for name in statistics.DRAWN}
+    columns |= {name: ("world", values, {"units": "kg"}) for name, values in drawn.items()}
+    columns["success"] = (("arm", "world"), success.astype(np.int8))
+    return xr.Dataset(columns, coords={"arm": list("ab")[: len(success)]})
+
+
+def test_what_success_depends_on_stands_first():
+    """Heavy objects fail, of 400; friction has nothing to do with it; all else was not varied."""
+    number = np.arange(400)
+    drawn = {"mass": number * 1.0, "friction_ground": number % 7 * 1.0}
+    results = random_worlds((number < 350)[None], **drawn)
+    (_, mass, friction) = tables.influence_table(results, "a")
+    assert mass[0] == "mass of the object"
+    assert mass[1] == "374 kg"  # the last eighth: 350 to 399
+    assert mass[2].startswith("0.0 % [0.0, ")
+    assert mass[4].startswith("100.0 %")
+    assert float(mass[5]) < 1e-10
+    constant = results.assign(yaw=("world", np.full(400, 0.1, np.float32), {"units": "rad"}))
+    assert np.nanstd(constant.yaw.values) > 0  # by rounding
+    assert statistics.drawn(constant) == ["mass", "friction_ground"]
+    assert friction[0] == "friction object-ground"
+    assert float(friction[5]) > 0.5
+
+
+def test_chance_alone_leaves_no_spread_unexplained_on_average():
+    """Over all ways in which 3 of 9 trials may succeed, in bins of 2, 3 and 4."""
+    found = []
+    for chosen in itertools.combinations(range(9), 3):
+        won = np.isin(np.arange(9), chosen)
+        counts = np.array([part.sum() for part in np.split(won, (2, 5))])
+        found.append(statistics.unexplained(Bins(np.arange(3), counts, np.array([2, 3, 4]))))
+    assert np.mean(found) == pytest.approx(0, abs=1e-15)
+    # Rates of 1 and 0 have a variance of 1/4, of which 1/28 is noise.
+    apart = Bins(np.arange(2), np.array([4, 0]), np.array([4, 4]))
+    assert statistics.unexplained(apart) == pytest.approx(1 / 4 - 1 / 28)
+
+
+def test_of_what_was_drawn_the_figure_shows_the_six_that_matter_first(drawn):
+    """Yaw decides for arm b and mass for arm a, the next six bring chance alone."""
+    number, random = np.arange(400), np.random.default_rng(0)
+    noise = ("size", "height", "gap", "noise", "distance", "lateral")
+    columns = {name: random.permutation(400) * 1.0 for name in noise}
+    columns |= {"mass": number * 1.0, "yaw": number * 7 % 100 * 1.0}
+    results = random_worlds(np.stack([number < 370, columns["yaw"] < 50]), **columns)
+    found = statistics.influences(results)
+    assert [one.name for one in found[:2]] == ["yaw", "mass"]
+    assert [one.q < 0.05 for one in found] == [True] * 2 + [False] * 6
+    figure = drawn(figures.success_curves, results)
+    titles = [ax.get_title() for ax in figure.axes]
+    assert len(titles) == 6
+    assert titles[0].startswith("spread 49.6 %, q = ")  # 1/4 (1 - 7/399), as a deviation
+    assert ["chance" in title for title in titles] == [False] * 2 + [True] * 4
+    told = figure.get_suptitle().replace("\N{NO-BREAK SPACE}", " ")
+    assert "6 of 8 drawn quantities" in told
+    assert "first: yaw of the object, mass of the object, " in told
+    below = figure.get_supxlabel().replace("\N{NO-BREAK SPACE}", " ")
+    for one in found:
+        assert (statistics.DRAWN[one.name] in told) == (one in found[:6])
+        assert (statistics.DRAWN[one.name] in below) == (one in found[6:])
+
+
+def test_a_path_is_drawn_with_its_target_and_its_last_contact(drawn):
+    nowhere = np.nan
+    trace = xr.Dataset(
+        {
+            "qpos": (("time", "joint"), np.linspace(0, 1, 30).reshape(3, 10)),
+            "p_world_contact": (("time", "axis"), [[0.3, 0.1], [0.4, 0.2], [nowhere, nowhere]]),
+            "p_world_target": ("axis", [2.0, 1.0]),
+            "outcome_success": 1,
+        },
+        {"time": [0.0, 0.5, 1.0]},
+    )
+    never = trace.assign(p_world_contact=np.nan * trace.p_world_contact, outcome_success=0)
+    (ax,) = drawn(figures.paths, {"a_box": [trace, never]}).axes
+    assert ax.get_title() == "a box: 1 of 2"
+    lines = [line.get_xydata().tolist() for line in ax.lines]
+    assert lines == [
+        trace.qpos.values[:, :2].tolist(), [[2.0, 1.0]], [[0.4, 0.2]],
+        trace.qpos.values[:, :2].tolist(), [[2.0, 1.0]],
+    ]  # fmt: skip
+
+
+def test_rates_are_drawn_in_percent_by_object(drawn):
+    dims = ("loss", "tolerance", "object")
+    coords = {"loss": ["creep"], "what": ("loss", ["ahead"]), "tolerance": [1.0, 6.0]}
+    coords["object"] = ["box"]
+    curve = xr.Dataset({"won": (dims, [[[1], [4]]]), "lost": (dims, [[[5.0], [2.0]]])}, coords)
+    above, below = drawn(figures.tolerance_curve, curve, 4).axes
+    assert above.get_title() == "on loss: ahead"
+    assert above.lines[0].get_ydata().tolist() == [25.0, 100.0]
+    assert below.lines[0].get_ydata().tolist() == [5.0, 2.0]
+    shoved = xr.Dataset(
+        {"won": (("object", "shift"), [[3, 0]]), "of": (("object", "shift"), [[4, 0]])},
+        {"object": ["hardware_box"], "shift": [0.1, 0.4]},
+    )
+    (ax,) = drawn(figures.shift_curve, shoved).axes
+    assert ax.lines[0].get_xydata().tolist() == [[10.0, 75.0], [40.0, 0.0]]
+
+
+def test_speeds_are_drawn_by_batch_and_gains_from_one(drawn):
+    rows = [("box", "fast", 64, 100.0), ("box", "fast", 512, 300.0), ("box", "C", 8, 50.0)]
+    (ax,) = drawn(figures.throughput, rows, {"C"}).axes
+    fast, level = ax.lines
+    assert fast.get_xydata().tolist() == [[64, 100.0], [512, 300.0]]
+    assert list(level.get_ydata()) == [50.0, 50.0]
+    gains = {"as it is": 1.0, "long steps": 2.5, "short steps": 0.4}
+    (ax,) = drawn(figures.levers, gains, "MJX").axes
+    assert [bar.get_x() + bar.get_width() for bar in ax.patches] == [1.0, 2.5, 0.4]
+    assert [label.get_text() for label in ax.get_yticklabels()][1] == "long steps"
+
+
+def test_a_parameter_is_drawn_on_the_axis_of_its_bounds(drawn):
+    dims = ("set", "parameter", "step")
+    found = xr.Dataset(
+        {"success": (dims, [[[0.5, 1.0]] * 2]), "value": (dims, [[[1.0, 10.0], [0.0, 1.0]]])},
+        {"set": ["paper"], "parameter": ["k", "zeta"]},
+        {"worlds": 10},
+    )
+    k, zeta, *_ = drawn(figures.sensitivity, found, ["k"]).axes
+    assert (k.get_xscale(), zeta.get_xscale()) == ("log", "linear")
+    assert k.lines[0].get_xydata().tolist() == [[1.0, 50.0], [10.0, 100.0]]
+
+
+def test_a_report_is_one_html_file_that_needs_no_other(tmp_path):
+    picture = tmp_path / "dot.png"
+    picture.write_bytes(b"\x89PNG")
+    sections = [Section("Numbers", "in *words*", [["a", "b"], ["1", "2"]], picture)]
+    path = report.write_report(tmp_path, "A <title>", "intro", sections)
+    page = path.read_text()
+    assert "<td>1</td>" in page
+    assert 'src="data:image/png;base64,' in page
+    assert "dot.png" not in page
+    assert "A &lt;title&gt;" in page
+    assert "![Numbers](dot.png)" in (tmp_path / "report.md").read_text()
