@@ -70,7 +70,8 @@ class Conditions:
 
     def sensor(self) -> Skin:
         """The skin."""
-        usual: Any = SKINS[self.skin or paper.SKIN[self.physics]]
+        name: Any = self.skin or paper.SKIN[self.physics]
+        usual: Any = SKINS[name]
         for changed in self.skin_params:
             errors.check_name("skin-params", changed, usual._fields)
         return usual._replace(**self.skin_params)
