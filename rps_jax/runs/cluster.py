@@ -28,11 +28,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from rps_jax.record import provenance
+from rps_jax.errors import InputError
 from rps_jax.record import folder as run_folder
+from rps_jax.record import provenance
 from rps_jax.runs import sweep
 from rps_jax.runs.board import Board, News
-from rps_jax.errors import InputError
 from rps_jax.runs.sweep import Plan, Shard
 from rps_jax.trials.setting import Progress, Timing
 

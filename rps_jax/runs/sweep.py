@@ -18,8 +18,8 @@ import xarray as xr
 from rps_jax.control import strategies
 from rps_jax.control.strategies import Params
 from rps_jax.engines import EngineName
-from rps_jax.record import provenance
 from rps_jax.record import folder as run_folder
+from rps_jax.record import provenance
 from rps_jax.record.checkpoint import Parts
 from rps_jax.runs.plan import Kind, Plan, Shard, share, world_part
 from rps_jax.runs.results import (

@@ -1,0 +1,253 @@
+"""How a push looks in the browser: the ground, the bodies, the taxels, the way and the twist."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+from rps_jax.analysis import studio
+from rps_jax.robot import skin
+from rps_jax.robot.skin import NONE
+from rps_jax.trials.stepper import Moment
+from rps_jax.world.scene import Scene
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+    from viser import ViserServer
+
+_PATH_STEP = 10  # moments between two points of a path
+_ROOT = "/push"
+_SIDES = 48  # facets of what is round
+_CAMERA = ((-2.7, -4.6, 3.7), (0.25, 0.1, 0.0))  # [m] where it stands, and what it looks at
+_FIELD = 0.75  # [rad] of view, upright
+_GROUND, _CELL, _METRE = (226, 226, 223), (198, 198, 196), (158, 158, 156)  # RGB
+_SKIN, _PRESSED = np.array([13, 168, 161]), np.array([255, 176, 0])  # RGB, from none to all foam
+_TWIST = (228, 88, 20)  # RGB
+_TAXEL = (0.022, 0.125, 0.2925)  # [m] depth, height, and height above the ground of its middle
+_ARROW = 12.0  # [s] of the commanded velocity that an arrow shows
+_ARC = (10.0, 0.56, 0.40)  # [s] of turning that an arc shows, its radius and height [m]
+
+
+def furnish(server: ViserServer) -> None:
+    """What is there without a push: camera, light, ground."""
+    server.gui.configure_theme(
+        show_logo=False,
+        show_share_button=False,  # it would send the scene to a server on the internet
+        brand_color=(8, 84, 80),
+    )
+    server.gui.main_panel.dock_right()
+    server.gui.set_panel_label("Reactive Pushing Strategy")
+    server.initial_camera.position, server.initial_camera.look_at = _CAMERA
+    server.initial_camera.fov = _FIELD
+    server.scene.add_grid(
+        "/ground",
+        infinite_grid=True,
+        cell_size=0.5,
+        section_size=1.0,
+        cell_color=_CELL,
+        section_color=_METRE,
+        plane_color=_GROUND,
+        plane_opacity=1.0,
+        shadow_opacity=0.35,
+        fade_distance=30.0,
+    )
+
+
+# --- what is drawn -------------------------------------------------------------------------
+
+
+class Drawing:
+    """One push in the 3-D scene, in place of the one before."""
+
+    def __init__(self, server: ViserServer, scene: Scene) -> None:
+        world = server.scene
+        world.remove_by_name(_ROOT)
+        world.add_frame(_ROOT, show_axes=False)
+        self.held = False  # whether a hand holds the target
+        self.target = world.add_transform_controls(
+            f"{_ROOT}/target",
+            scale=0.45,
+            active_axes=(True, True, False),
+            disable_rotations=True,
+            depth_test=False,
+            opacity=0.7,
+        )
+        self._base = world.add_frame(f"{_ROOT}/base", show_axes=False)
+        self._object = world.add_frame(f"{_ROOT}/object", show_axes=False)
+        for i, (body, colour, vertices, faces) in enumerate(meshes(scene.model)):
+            world.add_mesh_simple(
+                f"{_ROOT}/{body}/{i}", vertices, faces, color=colour, flat_shading=True
+            )
+        front = scene.physics.geom("base").size[0]
+        self._taxels = _add_taxels(world, f"{_ROOT}/base/taxels", float(front))
+        self._contact = world.add_icosphere(
+            f"{_ROOT}/base/contact", studio.CONTACT_RADIUS, color=_rgb(studio.CONTACT_RGBA)
+        )
+        nowhere = np.zeros((1, 2, 3))
+        self._velocity = world.add_arrows(
+            f"{_ROOT}/base/velocity",
+            nowhere,
+            _TWIST,
+            shaft_radius=0.016,
+            head_radius=0.045,
+            head_length=0.1,
+        )
+        line = partial(world.add_line_segments, points=nowhere)
+        self._turn = line(f"{_ROOT}/base/turn", colors=_TWIST, thickness=0.022)
+        self._paths = {
+            name: line(f"{_ROOT}/{name}", colors=_rgb(rgba), thickness=0.025, position=(0, 0, z))
+            for name, rgba, z in (
+                ("base_path", studio.BASE_RGBA, 0.006),
+                ("contact_path", studio.CONTACT_RGBA, 0.012),
+            )
+        }
+
+    def place_target(self, p_world_target: ArrayLike) -> None:
+        """Put the target at (2,) [m], unless a hand holds it."""
+        if not self.held:
+            x, y = np.asarray(p_world_target, float)
+            self.target.position = (x, y, 0.0)
+
+    def show(self, past: Sequence[Moment], index: int) -> None:
+        """Draw one moment, and the paths up to there."""
+        moment = past[index]
+        x, y, yaw = map(float, moment.seen.qpos[:3])
+        self._base.position = (x, y, 0.0)
+        self._base.wxyz = (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
+        self._object.position, self._object.wxyz = moment.seen.qpos[3:6], moment.seen.qpos[6:10]
+        colour = _SKIN + moment.compression[:, None] * (_PRESSED - _SKIN)
+        self._taxels.batched_colors = np.round(colour).astype(np.uint8)
+        touching = int(moment.seen.reading.contact_type) != NONE
+        self._contact.visible = touching
+        if touching:
+            felt = map(float, moment.seen.reading.p_robot_contact)
+            self._contact.position = (*felt, studio.CONTACT_HEIGHT + 0.03)
+        self._show_twist(*map(float, moment.seen.twist))
+        way = [past[i] for i in (*range(0, index, _PATH_STEP), index)]
+        self._paths["base_path"].points = _joined(np.array([m.seen.qpos[:2] for m in way]))
+        self._paths["contact_path"].points = _joined(np.array([m.p_world_contact for m in way]))
+
+    def _show_twist(self, v_x: float, v_y: float, omega: float) -> None:
+        """An arrow from the middle of the base, and an arc about it from its heading."""
+        top = 0.95  # [m] above the arm
+        moves, turns = math.hypot(v_x, v_y) > 1e-3, abs(omega) > 1e-3
+        self._velocity.visible, self._turn.visible = moves, turns
+        if moves:
+            tip = [_ARROW * v_x, _ARROW * v_y, top]
+            self._velocity.points = np.array([[[0.0, 0.0, top], tip]])
+        if turns:
+            scale, radius, height = _ARC
+            angle = np.linspace(0.0, scale * omega, 24)
+            z = np.full_like(angle, height)
+            arc = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1)
+            self._turn.points = np.stack([arc[:-1], arc[1:]], axis=1)
+
+
+def _joined(points: np.ndarray) -> np.ndarray:
+    """Lines (m, 2, 3) between neighbours of points (n, 2) [m] on the ground; NaN is a gap."""
+    flat = np.column_stack([points, np.zeros(len(points))])
+    lines = np.stack([flat[:-1], flat[1:]], axis=1)
+    lines = lines[np.isfinite(lines).all(axis=(1, 2))]
+    return lines if len(lines) else np.zeros((1, 2, 3))
+
+
+def _add_taxels(world: Any, name: str, half_length: float) -> Any:
+    """A tile for each taxel, along the rim of the base."""
+    middles = np.asarray(skin.taxels(1, half_length))[:, 0]
+    depth, height, z = _TAXEL
+    faces = skin.faces(half_length).items()
+    counts = [skin.BOARDS[side] * skin.ELECTRODES for side, _ in faces]
+    along = np.repeat([face.along for _, face in faces], counts, axis=0)
+    length = np.repeat([float(face.length) for _, face in faces], counts) / np.repeat(
+        counts, counts
+    )
+    inward = np.stack([along[:, 1], -along[:, 0]], axis=-1)  # the strip runs clockwise
+    places = np.column_stack([middles + (depth / 2 - 0.004) * inward, np.full(len(middles), z)])
+    sizes = np.abs(along) * 0.92 * length[:, None] + np.abs(inward) * depth
+    box = _solid_of(mujoco.mjtGeom.mjGEOM_BOX, np.full(3, 0.5))
+    return world.add_batched_meshes_simple(
+        name,
+        *box,
+        batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (len(places), 1)),
+        batched_positions=places,
+        batched_scales=np.column_stack([sizes, np.full(len(places), height)]),
+        batched_colors=np.tile(_SKIN, (len(places), 1)).astype(np.uint8),
+        flat_shading=True,
+        lod="off",
+    )
+
+
+def meshes(
+    model: mujoco.MjModel,
+) -> Iterator[tuple[str, tuple[int, int, int], np.ndarray, np.ndarray]]:
+    """What can be seen of a model's bodies: body, RGB, vertices (V, 3) [m] and faces (F, 3).
+
+    One mesh for each colour of each body, in the body's frame.
+    """
+    parts: dict[tuple[str, tuple[int, int, int]], list[tuple[np.ndarray, np.ndarray]]] = {}
+    for i in range(model.ngeom):
+        geom = model.geom(i)
+        body = model.body(int(geom.bodyid[0])).name
+        if geom.group[0] > 2 or geom.type[0] == mujoco.mjtGeom.mjGEOM_PLANE:
+            continue  # MuJoCo hides these groups, and the page has a ground of its own
+        vertices, faces = _mesh_of(model, geom)
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, geom.quat)
+        placed = vertices @ turn.reshape(3, 3).T + geom.pos
+        parts.setdefault((body, _colour_of(model, geom)), []).append((placed, faces))
+    for (body, colour), some in parts.items():
+        starts = np.cumsum([0, *(len(vertices) for vertices, _ in some[:-1])])
+        vertices = np.concatenate([vertices for vertices, _ in some])
+        faces = np.concatenate([f + n for (_, f), n in zip(some, starts, strict=True)])
+        yield body, colour, vertices.astype(np.float32), faces.astype(np.uint32)
+
+
+def _mesh_of(model: mujoco.MjModel, geom: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) [m] and faces (F, 3) of a geom, in its frame."""
+    if geom.type[0] == mujoco.mjtGeom.mjGEOM_MESH:
+        mesh = model.mesh(int(geom.dataid[0]))
+        first_vertex, first_face = int(mesh.vertadr[0]), int(mesh.faceadr[0])
+        vertices = model.mesh_vert[first_vertex : first_vertex + int(mesh.vertnum[0])]
+        return vertices, model.mesh_face[first_face : first_face + int(mesh.facenum[0])]
+    return _solid_of(geom.type[0], geom.size)
+
+
+def _solid_of(kind: int, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a primitive of MuJoCo's."""
+    from trimesh import creation  # comes with viser
+
+    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+        made = creation.box(extents=2 * size)
+    elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        made = creation.cylinder(radius=size[0], height=2 * size[1], sections=_SIDES)
+    elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        made = creation.capsule(radius=size[0], height=2 * size[1], count=(_SIDES // 2, 12))
+    else:  # a sphere, or an ellipsoid
+        made = creation.icosphere()
+        made.apply_scale(size if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID else size[0])
+    return np.asarray(made.vertices), np.asarray(made.faces)
+
+
+def _colour_of(model: mujoco.MjModel, geom: Any) -> tuple[int, int, int]:
+    """RGB of a geom: its own or its material's, times what is commonest in its texture."""
+    if geom.matid[0] < 0:
+        return _rgb(geom.rgba)
+    material = model.mat(int(geom.matid[0]))
+    colour = np.array(material.rgba[:3])
+    texture = int(material.texid[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)])
+    if texture >= 0:
+        one = model.tex(texture)
+        first, size = int(one.adr[0]), int(one.width[0] * one.height[0] * one.nchannel[0])
+        pixels = model.tex_data[first : first + size].reshape(-1, int(one.nchannel[0]))
+        colour = colour * np.median(pixels[:, :3], axis=0) / 255
+    return _rgb(colour)
+
+
+def _rgb(colour: Any) -> tuple[int, int, int]:
+    r, g, b = (round(255 * float(c)) for c in colour[:3])
+    return r, g, b

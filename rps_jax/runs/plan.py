@@ -1,0 +1,198 @@
+"""What a sweep runs: every arm, a strategy with its parameters, in the same random worlds.
+
+Trials are kept in parts, each of one arm and one object; parts of one kind are run by one compiled
+program.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from rps_jax import engines, errors
+from rps_jax.control import strategies
+from rps_jax.control.strategies import Params
+from rps_jax.errors import InputError
+from rps_jax.record import files
+from rps_jax.record import folder as run_folder
+from rps_jax.trials.batch import Part
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+from rps_jax.trials.worlds import drawn_scene, drawn_worlds
+from rps_jax.world import domain
+from rps_jax.world.domain import Domain
+from rps_jax.world.physics import Physics
+from rps_jax.world.scene import Scene
+
+Kind = tuple[Any, ...]  # of a part: the object's number, and the form of the arm's parameters
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is run: every arm in the worlds 0 to `worlds` - 1 of a domain."""
+
+    domain: Domain
+    worlds: int
+    arms: Mapping[str, Params]
+    setting: Setting = Setting()  # its seed draws the worlds, too
+    part: int = 1024  # trials of a part, at most
+
+    def __post_init__(self) -> None:
+        """Raises InputError for no worlds, no arms, or parameters that mean nothing."""
+        errors.check_count("worlds", self.worlds, at_most=1_000_000_000)
+        errors.check_count("part", self.part, at_most=1_000_000)
+        if not self.arms:
+            raise InputError("arms = {} is not allowed: name at least one strategy.")
+        for params in self.arms.values():
+            strategies.of(params).check(params)
+
+    def check_here(self) -> None:
+        """Raises InputError unless the engine can step these worlds on this machine."""
+        engines.get(self.setting.engine).check(self.domain.families)
+
+    @property
+    def trials(self) -> int:
+        """How many: trial a * worlds + i is of arm a in world i."""
+        return len(self.arms) * self.worlds
+
+    def trials_of(self, shard: Shard) -> int:
+        """How many trials one shard has."""
+        return sum(numbers.size for numbers in share(self, shard).values())
+
+    @functools.cached_property
+    def blocks(self) -> int:
+        """Parts of one arm and one object, at most."""
+        return math.ceil(self.worlds_of(0).size / self.part)
+
+    def worlds_of(self, which: int) -> np.ndarray:
+        """Indices of the worlds with the object `which` of the domain, in order."""
+        every = np.arange(self.worlds)
+        return every[self.domain.object_of(every) == which]
+
+    @functools.cached_property
+    def parts(self) -> dict[int, np.ndarray]:
+        """Numbers of the trials of every part, by the part's number."""
+        found = {}
+        for which in range(len(self.domain.objects)):
+            of_object = self.worlds_of(which)
+            for arm in range(len(self.arms)):
+                for block in range(math.ceil(of_object.size / self.part)):
+                    some = of_object[block * self.part : (block + 1) * self.part]
+                    number = (arm * len(self.domain.objects) + which) * self.blocks + block
+                    found[number] = arm * self.worlds + some
+        return found
+
+    def arm_and_object(self, part: int) -> tuple[int, int]:
+        """Which arm a part is of, and which object."""
+        return divmod(part // self.blocks, len(self.domain.objects))
+
+    def kind(self, part: int) -> Kind:
+        """Parts of a kind are run by one compiled program."""
+        arm, which = self.arm_and_object(part)
+        params = list(self.arms.values())[arm]
+        return which, type(params), *map(np.shape, jax.tree.leaves(params))
+
+    @functools.cached_property
+    def sizes(self) -> Counter[Kind]:
+        """How many trials of each kind there are."""
+        counts: Counter[Kind] = Counter()
+        for number, trials in self.parts.items():
+            counts[self.kind(number)] += trials.size
+        return counts
+
+    def configuration(self) -> dict[str, Any]:
+        """All that the results depend on, as JSON."""
+        whole = {
+            "domain": dataclasses.asdict(self.domain),
+            "worlds": self.worlds,
+            "arms": {name: strategies.recorded(params) for name, params in self.arms.items()},
+            "physics": dataclasses.asdict(self.setting.physics),
+            "rules": strategies.as_json(self.setting.rules),
+            "seed": self.setting.seed,
+            "engine": self.setting.engine,
+            "part": self.part,
+        }
+        return whole
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One of several shares of a run, to be merged: parts number, number + of, ..."""
+
+    number: int = 1
+    of: int = 1
+
+    def __post_init__(self) -> None:
+        """Raises InputError unless 1 <= number <= of."""
+        errors.check_count("shard", self.of, at_most=1_000_000)
+        errors.check_count("shard", self.number, at_most=self.of)
+
+
+def load_plan(folder: Path) -> Plan:
+    """The plan of a run folder.
+
+    Raises:
+      InputError: it holds none, or a corrupt one, or one of another version of this code.
+    """
+    found = run_folder.manifest(folder)
+    if "arms" not in found:
+        raise InputError(f"run = {folder} is not of a sweep: give the folder of `rps sweep`.")
+    try:
+        physics: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in found["physics"].items()
+        }
+        plan = Plan(
+            domain.from_json(found["domain"]),
+            found["worlds"],
+            {name: strategies.restored(arm) for name, arm in found["arms"].items()},
+            Setting(Physics(**physics), Rules(**found["rules"]), found["seed"], found["engine"]),
+            found["part"],
+        )
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise files.corrupt(folder / run_folder.MANIFEST, error) from error
+    # What an older version did not write down would else be what this one does by default.
+    if (now := json.loads(json.dumps(plan.configuration()))) != found:
+        raise InputError(
+            f"run = {folder} was made by another version ({run_folder.difference(found, now)}): use "
+            "that version."
+        )
+    return plan
+
+
+def share(plan: Plan, shard: Shard) -> dict[int, np.ndarray]:
+    """The parts of one shard: numbers of their trials, by the part's number."""
+    every = plan.parts.items()
+    return {n: trials for i, (n, trials) in enumerate(every) if i % shard.of == shard.number - 1}
+
+
+def scene_of(plan: Plan, index: int) -> Scene:
+    """The compiled scene of one world, for pictures."""
+    drawn = domain.draw(plan.domain, plan.setting.seed, [index])
+    return drawn_scene(plan.domain, drawn, plan.setting.physics, 0)
+
+
+def title_of(plan: Plan, index: int) -> str:
+    """What one world is, in words."""
+    drawn = domain.table(domain.draw(plan.domain, plan.setting.seed, [index]))
+    name = plan.domain.objects[int(plan.domain.object_of(np.asarray(index)))].replace("_", " ")
+    value = {key: float(values[0]) for key, (values, _) in drawn.items()}
+    return (
+        f"world {index}: {name}, {value['mass']:.1f} kg, $\\mu$ ground "
+        f"{value['friction_ground']:.2f}, robot {value['friction_robot']:.2f}"
+    )
+
+
+def world_part(plan: Plan, arm: int, index: Any) -> Part:
+    """Worlds of one object, by their indices, with the parameters of an arm."""
+    drawn = domain.draw(plan.domain, plan.setting.seed, index)
+    return drawn_worlds(plan.domain, drawn, list(plan.arms.values())[arm], plan.setting)

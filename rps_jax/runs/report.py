@@ -1,0 +1,39 @@
+"""The report of a sweep: rates, differences, what success depends on, and the hardest worlds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rps_jax.analysis import figures, statistics
+from rps_jax.analysis.report import Section
+from rps_jax.analysis.report import write_report as _write
+from rps_jax.record import files, provenance
+from rps_jax.runs.plan import load_plan
+
+
+def write_report(folder: Path) -> Path:
+    """`report.md`, `report.html` and the figure of a run folder with results; returns the first."""
+    plan, results = load_plan(folder), files.read_results(folder)
+    intro = (
+        f"{plan.worlds} worlds, seed {plan.setting.seed}, engine {plan.setting.engine}, "
+        f"{1000 * plan.setting.physics.timestep:g} ms steps; every arm meets the same worlds. "
+        f"Intervals: Wilson 95 %.\n\n{provenance.told(folder)}"
+    )
+    rates = statistics.rates(results, float(plan.setting.rules.max_lost))
+    failures = (
+        "CVaR: mean over the worst 5 % of worlds of the least distance between contact point and "
+        "target; of an object that was never touched, the whole way."
+    )
+    if lost := int((results.overflows.values > 0).sum()):
+        failures += f" {lost} trials lost contacts for want of room: they are not to be trusted."
+    hard = "Worlds in which most arms fail, and most distance is left."
+    sections = [Section("Success", failures, rates)]
+    if len(plan.arms) > 1:
+        sections.append(Section("Differences, world by world", "", statistics.differences(results)))
+    if statistics.drawn(results):
+        picture = figures.success_curves(results, folder / "success.png")
+        sections.append(Section("Success against what was drawn", "", (), picture))
+    hardest = statistics.hardest_table(results, str(folder))
+    sections.append(Section("The hardest worlds", hard, hardest))
+    _write(folder, "Sweep over random worlds", intro, sections)
+    return folder / "report.md"

@@ -1,0 +1,168 @@
+"""Outcomes on their way into the parts of a sweep, and the parts into one labelled Dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from rps_jax.errors import InputError
+from rps_jax.record import files
+from rps_jax.record import folder as run_folder
+from rps_jax.record.checkpoint import Parts
+from rps_jax.runs.plan import Plan, load_plan
+from rps_jax.trials.results import UNITS
+from rps_jax.trials.trial import Outcome
+from rps_jax.world import domain
+
+Keep = Callable[[int, bytes], Any]  # called with the number and the content of a part
+# Of an outcome; the others are float32.
+_TYPES = dict.fromkeys(("success", "tipped", "diverged"), np.int8) | {"overflows": np.int32}
+
+
+def open_run(folder: Path, plan: Plan) -> Path:
+    """The run folder with the plan in it; a folder that has one must have the same.
+
+    Raises:
+      InputError: it cannot be written, or holds a run of another configuration.
+    """
+    return run_folder.claim(folder, plan.configuration())
+
+
+def name_of(part: int) -> str:
+    """What a part of a sweep is called in its run folder."""
+    return f"{part:07d}"
+
+
+class _Rows:
+    """Outcomes of the trials of a part that is begun, by name."""
+
+    def __init__(self, size: int, like: Outcome):
+        self.missing = size
+        self.leaves = {
+            name: np.empty((size, *leaf.shape[1:]), _TYPES.get(name, np.float32))
+            for name, leaf in like._asdict().items()
+        }
+
+
+class Collector:
+    """Trials on their way into the files of their parts."""
+
+    def __init__(self, plan: Plan, keep: Keep):
+        self._keep = keep
+        self._parts = plan.parts
+        self._part_of = np.empty(plan.trials, np.int32)
+        for number, trials in plan.parts.items():
+            self._part_of[trials] = number
+        self._open: dict[int, _Rows] = {}
+
+    def collect(self, numbers: np.ndarray, outcomes: Outcome) -> None:
+        """Outcomes of trials that ended; the parts that are complete with them are kept."""
+        part_of = self._part_of[numbers]
+        for part in map(int, np.unique(part_of)):
+            ended = part_of == part
+            trials = self._parts[part]
+            if part not in self._open:
+                self._open[part] = _Rows(trials.size, outcomes)
+            rows = self._open[part]
+            at = np.searchsorted(trials, numbers[ended])
+            for name, leaf in outcomes._asdict().items():
+                rows.leaves[name][at] = leaf[ended]
+            rows.missing -= at.size
+            if not rows.missing:
+                self._keep(part, _content(trials, self._open.pop(part).leaves))
+
+
+def _content(trials: np.ndarray, leaves: dict[str, np.ndarray]) -> bytes:
+    """The file of a part."""
+    columns: dict[str, Any] = {"trial": ("row", trials)}
+    for name, leaf in leaves.items():
+        columns[name] = (("row", "pose")[: leaf.ndim], leaf)
+    return files.encoded(xr.Dataset(columns))
+
+
+def merge(folders: list[Path], out: Path) -> Path:
+    """One `results.nc` of all parts in run folders of one plan: (arm, world), and (world) drawn.
+
+    `out` becomes a run folder of that plan, if it is not one of these folders.
+
+    Raises:
+      InputError: the folders differ in their plan, or parts are missing; `out` cannot be written,
+        or holds another run.
+    """
+    manifest = run_folder.manifest(folders[0])
+    for other in folders[1:]:
+        if (theirs := run_folder.manifest(other)) != manifest:
+            raise InputError(
+                f"run = {other} is of another plan than {folders[0]} "
+                f"({run_folder.difference(manifest, theirs)}): merge shards of one run."
+            )
+    plan = load_plan(folders[0])
+    kept = {name: part for one in folders for name, part in Parts(one).contents().items()}
+    contents = {n: kept[name_of(n)] for n in plan.parts if name_of(n) in kept}
+    if missing := len(plan.parts) - len(contents):
+        raise InputError(
+            f"run = {', '.join(map(str, folders))} lacks {missing} of {len(plan.parts)} parts: run "
+            "the same command again, or give the folders of all shards."
+        )
+    return files.write_results(open_run(out, plan) / "results.nc", dataset(plan, contents))
+
+
+def dataset(plan: Plan, contents: Mapping[int, bytes]) -> xr.Dataset:
+    """All results of a plan, from the contents of all its parts: (arm, world), and (world) drawn.
+
+    Raises:
+      InputError: a part was made by another version of this code.
+    """
+    every = np.arange(plan.worlds)
+    columns = {"which_object": xr.Variable("world", plan.domain.object_of(every).astype(np.int16))}
+    for name, (unit, meaning) in UNITS.items():
+        dims = ("arm", "world", "pose") if name.endswith("pose") else ("arm", "world")
+        shape = (len(plan.arms), plan.worlds, 3)[: len(dims)]
+        values = np.zeros(shape, _TYPES.get(name, np.float32))
+        columns[name] = xr.Variable(dims, values, {"units": unit, "long_name": meaning})
+    for number, content in contents.items():
+        arm, _ = plan.arm_and_object(number)
+        part = files.decoded(content, f"part {number}")
+        if lacking := sorted({"trial", *UNITS} - set(part)):
+            raise InputError(
+                f"part {number} of the run was made by another version (it lacks "
+                f"{', '.join(lacking)}): use that version."
+            )
+        world = part.trial.values % plan.worlds
+        for name in UNITS:
+            columns[name].values[arm, world] = part[name].values
+        if arm == 0:
+            drawn = domain.table(domain.draw(plan.domain, plan.setting.seed, world))
+            for name, (values, unit) in drawn.items():
+                if name not in columns:
+                    empty = np.zeros(plan.worlds, np.float32)
+                    columns[name] = xr.Variable("world", empty, {"units": unit})
+                columns[name].values[world] = values
+    for column in columns.values():
+        column.encoding["_FillValue"] = None  # every number is a result
+    names = {"arm": list(plan.arms), "object": list(plan.domain.objects), "world": every}
+    return xr.Dataset(columns, names)
+
+
+def labelled(results: xr.Dataset) -> xr.Dataset:
+    """Results with what was drawn as coordinates of the worlds."""
+    return results.set_coords([name for name in results if results[name].dims == ("world",)])
+
+
+def load(run: str | Path) -> xr.Dataset:
+    """The results of a run folder, of a sweep with what was drawn as coordinates.
+
+    Raises:
+      InputError: the folder holds no results, or its file is damaged.
+
+    Example:
+      >>> import rps_jax
+      >>> rps_jax.load("no/such/run")
+      Traceback (most recent call last):
+      rps_jax.errors.InputError: run = no/such/run holds no results.nc: give the folder of a ...
+    """
+    return labelled(files.read_results(Path(run)))
