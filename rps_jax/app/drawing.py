@@ -65,6 +65,7 @@ class Drawing:
     """One push in the 3-D scene, in place of the one before."""
 
     def __init__(self, server: ViserServer, scene: Scene) -> None:
+        """The bodies of a scene, on the page of a server."""
         world = server.scene
         world.remove_by_name(_ROOT)
         world.add_frame(_ROOT, show_axes=False)

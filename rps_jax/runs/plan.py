@@ -163,8 +163,8 @@ def load_plan(folder: Path) -> Plan:
     # What an older version did not write down would else be what this one does by default.
     if (now := json.loads(json.dumps(plan.configuration()))) != found:
         raise InputError(
-            f"run = {folder} was made by another version ({run_folder.difference(found, now)}): use "
-            "that version."
+            f"run = {folder} was made by another version ({run_folder.difference(found, now)}): "
+            "use that version."
         )
     return plan
 

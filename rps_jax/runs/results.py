@@ -52,6 +52,7 @@ class Collector:
     """Trials on their way into the files of their parts."""
 
     def __init__(self, plan: Plan, keep: Keep):
+        """For the parts of a plan, each handed to `keep` when it is complete."""
         self._keep = keep
         self._parts = plan.parts
         self._part_of = np.empty(plan.trials, np.int32)
