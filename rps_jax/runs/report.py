@@ -4,22 +4,23 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rps_jax.analysis import figures, statistics
+import xarray as xr
+
+from rps_jax.analysis import figures, statistics, tables
 from rps_jax.analysis.report import Section
 from rps_jax.analysis.report import write_report as _write
-from rps_jax.record import files, provenance
-from rps_jax.runs.plan import load_plan
+from rps_jax.record import provenance
+from rps_jax.runs.plan import Plan
 
 
-def write_report(folder: Path) -> Path:
-    """`report.md`, `report.html` and the figure of a run folder with results; returns the first."""
-    plan, results = load_plan(folder), files.read_results(folder)
+def write_report(folder: Path, plan: Plan, results: xr.Dataset) -> Path:
+    """Write `report.md`, `report.html` and the figure of a sweep; returns the path of the first."""
     intro = (
         f"{plan.worlds} worlds, seed {plan.setting.seed}, engine {plan.setting.engine}, "
         f"{1000 * plan.setting.physics.timestep:g} ms steps; every arm meets the same worlds. "
         f"Intervals: Wilson 95 %.\n\n{provenance.told(folder)}"
     )
-    rates = statistics.rates(results, float(plan.setting.rules.max_lost))
+    rates = tables.success_table(results, float(plan.setting.rules.max_lost))
     failures = (
         "CVaR: mean over the worst 5 % of worlds of the least distance between contact point and "
         "target; of an object that was never touched, the whole way."
@@ -29,11 +30,13 @@ def write_report(folder: Path) -> Path:
     hard = "Worlds in which most arms fail, and most distance is left."
     sections = [Section("Success", failures, rates)]
     if len(plan.arms) > 1:
-        sections.append(Section("Differences, world by world", "", statistics.differences(results)))
+        sections.append(
+            Section("Differences, world by world", "", tables.difference_table(results))
+        )
     if statistics.drawn(results):
         picture = figures.success_curves(results, folder / "success.png")
         sections.append(Section("Success against what was drawn", "", (), picture))
-    hardest = statistics.hardest_table(results, str(folder))
+    hardest = tables.hardest_table(results, str(folder))
     sections.append(Section("The hardest worlds", hard, hardest))
     _write(folder, "Sweep over random worlds", intro, sections)
     return folder / "report.md"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -85,8 +85,8 @@ def _content(trials: np.ndarray, leaves: dict[str, np.ndarray]) -> bytes:
     return files.encoded(xr.Dataset(columns))
 
 
-def merge(folders: list[Path], out: Path) -> Path:
-    """One `results.nc` of all parts in run folders of one plan: (arm, world), and (world) drawn.
+def merge(folders: list[Path], out: Path) -> tuple[Plan, xr.Dataset]:
+    """The plan of some run folders, and `gather`.
 
     `out` becomes a run folder of that plan, if it is not one of these folders.
 
@@ -102,6 +102,15 @@ def merge(folders: list[Path], out: Path) -> Path:
                 f"({run_folder.difference(manifest, theirs)}): merge shards of one run."
             )
     plan = load_plan(folders[0])
+    return plan, gather(plan, folders, open_run(out, plan))
+
+
+def gather(plan: Plan, folders: Sequence[Path], out: Path) -> xr.Dataset:
+    """All parts of a plan as one Dataset, and as `results.nc` in the folder `out`.
+
+    Raises:
+      InputError: parts are missing in the folders, or `out` cannot be written.
+    """
     kept = {name: part for one in folders for name, part in Parts(one).contents().items()}
     contents = {n: kept[name_of(n)] for n in plan.parts if name_of(n) in kept}
     if missing := len(plan.parts) - len(contents):
@@ -109,7 +118,9 @@ def merge(folders: list[Path], out: Path) -> Path:
             f"run = {', '.join(map(str, folders))} lacks {missing} of {len(plan.parts)} parts: run "
             "the same command again, or give the folders of all shards."
         )
-    return files.write_results(open_run(out, plan) / "results.nc", dataset(plan, contents))
+    results = dataset(plan, contents)
+    files.write_results(out / "results.nc", results)
+    return results
 
 
 def dataset(plan: Plan, contents: Mapping[int, bytes]) -> xr.Dataset:

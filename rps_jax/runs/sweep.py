@@ -26,9 +26,8 @@ from rps_jax.runs.results import (
     Collector,
     Keep,
     dataset,
+    gather,
     labelled,
-    load,
-    merge,
     name_of,
     open_run,
 )
@@ -97,8 +96,9 @@ def sweep(
             every.setdefault(plan.kind(number), []).append(number)
         work(plan, every, contents.__setitem__, **shape)
         return labelled(dataset(plan, contents))
-    complete(Path(out), plan, **shape)
-    return load(out)
+    _, results = complete(Path(out), plan, **shape)
+    assert results is not None
+    return labelled(results)
 
 
 def run_missing(
@@ -128,8 +128,8 @@ def complete(
     *,
     by: Callable[..., Timing] = run_missing,
     **options: Any,
-) -> Timing:
-    """Run what a folder lacks of a plan, or of one shard of it; merge the whole into results.nc.
+) -> tuple[Timing, xr.Dataset | None]:
+    """Run what a folder lacks of a plan, or of one shard of it; gather the whole in `results.nc`.
 
     Args:
       folder: the run folder, new or to be continued.
@@ -138,15 +138,16 @@ def complete(
       by: what runs it, as `run_missing` or `cluster.run_on_cluster`.
       options: of `by`.
 
+    Returns:
+      Where the time went; and all results, unless it was but a share of them.
+
     Raises:
       InputError: the folder cannot be written, is in use, or holds another run.
     """
     open_run(folder, plan)
     with run_folder.hold(folder, shard.number, shard.of):
         timing = by(folder, plan, shard=shard, **options)
-        if shard.of == 1:
-            merge([folder], folder)
-    return timing
+        return timing, gather(plan, [folder], folder) if shard.of == 1 else None
 
 
 def work(

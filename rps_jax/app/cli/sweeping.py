@@ -16,6 +16,8 @@ from rps_jax.app.cli.replicating import show
 from rps_jax.errors import InputError
 
 if TYPE_CHECKING:
+    from xarray import Dataset
+
     from rps_jax.runs.plan import Plan
     from rps_jax.trials.setting import Timing
 
@@ -89,10 +91,10 @@ class Sweep(Spread):
             by = sweep.run_missing
         running.use_cache()
         with progress_bar(plan.trials_of(shard), "sweep") as report:
-            timing = sweep.complete(self.out, plan, shard, by=by, report=report, **shape)
+            timing, results = sweep.complete(self.out, plan, shard, by=by, report=report, **shape)
         tell_made(self.out, timing)
-        if shard.of == 1:
-            tell_report(self.out)
+        if results is not None:
+            tell_report(self.out, plan, results)
         else:
             print(
                 f"run folder: {self.out}; when all shards are done: rps merge {self.out} --out "
@@ -107,11 +109,11 @@ def tell_made(out: Path, timing: Timing) -> None:
     running.tell(timing, provenance.signed(out)["device"]["kind"])
 
 
-def tell_report(out: Path) -> None:
+def tell_report(out: Path, plan: Plan, results: Dataset) -> None:
     """Write and print the report of a sweep."""
     from rps_jax.runs.report import write_report
 
-    print(write_report(out).read_text())
+    print(write_report(out, plan, results).read_text())
     print(f"run folder: {out}")
 
 
@@ -158,10 +160,10 @@ class Merge:
         if not self.folders:
             raise InputError("folders = () is not allowed: give the run folders of the shards.")
         folder.writable(self.out)
-        merge(list(self.folders), self.out)
+        plan, results = merge(list(self.folders), self.out)
         for one in self.folders:
             provenance.sign(self.out, provenance.signed(one))
-        tell_report(self.out)
+        tell_report(self.out, plan, results)
 
 
 @dataclass(frozen=True)

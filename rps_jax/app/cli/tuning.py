@@ -283,9 +283,9 @@ class TuneCompare(Spread):
         running.use_cache()
         for name, plan in plans.items():
             with progress_bar(plan.trials, name) as report:
-                sweep.complete(self.out / name, plan, report=report, **shape)
+                _, results = sweep.complete(self.out / name, plan, report=report, **shape)
             print(f"## {name}\n")
-            tell_report(self.out / name)
+            tell_report(self.out / name, plan, results)
 
 
 @dataclass(frozen=True)
