@@ -7,9 +7,10 @@ system: the process that was started by the user, alone, writes into the run fol
 
 What holds: a part that came back is there as after `sweep.run_missing`. When a worker dies, Ray
 starts its task again, on whatever host has room, and the parts it had begun are run again. A part
-has the bits that one process gives it which sees one GPU, or processors alone, with as many `slots`:
-whatever the number of workers and threads, whichever worker runs it, and with whatever other parts.
-That asks for devices of one kind; versions and commit are compared when a worker begins.
+has the bits that one process gives it which sees one GPU, or processors alone, with as many
+`slots`: whatever the number of workers and threads, whichever worker runs it, and with whatever
+other parts. That asks for devices of one kind; versions and commit are compared when a worker
+begins.
 """
 
 from __future__ import annotations

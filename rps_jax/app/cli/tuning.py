@@ -97,7 +97,7 @@ class TuneOptions(Spread):
         free = {name for name in small if getattr(self, name) == getattr(default, name)}
         return dataclasses.replace(self, **{name: small[name] for name in free})
 
-    def tune(self, search: Callable[..., Tuner], kind: Callable[..., Any]) -> None:
+    def tune(self, search: Callable[..., Tuner], kind: Any) -> None:
         """Run a tuner that is made of a dataclass with some of these options."""
         from rps_jax import engines
         from rps_jax.tuning import run
@@ -284,6 +284,7 @@ class TuneCompare(Spread):
         for name, plan in plans.items():
             with progress_bar(plan.trials, name) as report:
                 _, results = sweep.complete(self.out / name, plan, report=report, **shape)
+            assert results is not None  # it is the whole
             print(f"## {name}\n")
             tell_report(self.out / name, plan, results)
 
