@@ -31,18 +31,18 @@ if TYPE_CHECKING:
     from rps_jax.robot.skin import IdealSkin as IdealSkin
     from rps_jax.robot.skin import SmoothSkin as SmoothSkin
     from rps_jax.runs.evaluate import evaluate as evaluate
-    from rps_jax.runs.replay import replay as replay
+    from rps_jax.runs.push import Push as Push
+    from rps_jax.runs.push import push as push
+    from rps_jax.runs.push import replay as replay
     from rps_jax.runs.results import load as load
     from rps_jax.runs.sweep import sweep as sweep
     from rps_jax.studies.table import table as table
     from rps_jax.trials.conditions import Conditions as Conditions
     from rps_jax.trials.env import PushEnv as PushEnv
-    from rps_jax.trials.progress import progress_bar as progress_bar
-    from rps_jax.trials.push import Push as Push
-    from rps_jax.trials.push import push as push
     from rps_jax.trials.pushes import Case as Case
     from rps_jax.trials.setting import Progress as Progress
     from rps_jax.trials.setting import Setting as Setting
+    from rps_jax.trials.setting import progress_bar as progress_bar
     from rps_jax.trials.trial import Outcome as Outcome
     from rps_jax.trials.trial import Rules as Rules
     from rps_jax.world import paper as paper
@@ -68,16 +68,14 @@ _HOMES = {
     "geometry.footprint": ("Footprint",),
     "robot.skin": ("CapacitiveSkin", "IdealSkin", "SmoothSkin"),
     "runs.evaluate": ("evaluate",),
-    "runs.replay": ("replay",),
+    "runs.push": ("Push", "push", "replay"),
     "runs.results": ("load",),
     "runs.sweep": ("sweep",),
     "studies.table": ("table",),
     "trials.conditions": ("Conditions",),
     "trials.env": ("PushEnv",),
-    "trials.progress": ("progress_bar",),
-    "trials.push": ("Push", "push"),
     "trials.pushes": ("Case",),
-    "trials.setting": ("Progress", "Setting"),
+    "trials.setting": ("Progress", "Setting", "progress_bar"),
     "trials.trial": ("Outcome", "Rules"),
     "world.domain": ("DOMAINS", "Domain", "Range"),
     "world.objects": ("OBJECTS", "register_object"),

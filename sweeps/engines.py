@@ -22,8 +22,7 @@ from rps_jax.app.cli.running import guarded, use_cache
 from rps_jax.record import files
 from rps_jax.runs import sweep
 from rps_jax.runs.sweep import Plan
-from rps_jax.trials.progress import progress_bar
-from rps_jax.trials.setting import Setting
+from rps_jax.trials.setting import Setting, progress_bar
 from rps_jax.world import paper
 from rps_jax.world.physics import preset
 

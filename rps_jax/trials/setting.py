@@ -1,8 +1,10 @@
-"""What all trials of a run share, and what a run tells of itself."""
+"""What all trials of a run share, and what a run tells of itself while it runs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from rps_jax import engines, errors
@@ -50,3 +52,63 @@ class Timing:
     compile: float  # [s] until the worker who waited longest had its programs
     run: float  # [s] wall clock after that
     simulated: float  # [s] of trials
+
+
+class Told:
+    """What a run has reported: called with each `Progress`, it keeps the last."""
+
+    def __init__(self, show: Report):
+        """Shows each progress by `show`, too."""
+        self._show, self._began = show, time.perf_counter()
+        self._last = Progress(0, 0.0)
+
+    def __call__(self, progress: Progress) -> None:
+        """Take note of how far the run is."""
+        self._last = progress
+        self._show(progress)
+
+    @property
+    def timing(self) -> Timing:
+        """Where the time went until now."""
+        spent = time.perf_counter() - self._began
+        compile_ = self._last.compile
+        return Timing(compile_, spent - compile_, self._last.simulated)
+
+
+@contextlib.contextmanager
+def progress_bar(trials: int, what: str = "push") -> Iterator[Told]:
+    """A bar over trials on the error stream, to be handed to a run as its `report`.
+
+    Example:
+      >>> import rps_jax
+      >>> with rps_jax.progress_bar(2) as report:
+      ...     arms = {"rps": rps_jax.RPSParams.paper()}
+      ...     rules = rps_jax.Rules(horizon=1.0)
+      ...     found = rps_jax.sweep("wide", arms, worlds=2, rules=rules, report=report)
+      >>> report.timing.simulated > 0
+      True
+    """
+    from tqdm import tqdm
+
+    with tqdm(total=trials, unit="trial", desc="compile", mininterval=0.5) as bar:
+
+        def show(progress: Progress) -> None:
+            bar.set_description(what, refresh=False)
+            bar.set_postfix_str(f"{progress.simulated:.0f} s simulated", refresh=False)
+            bar.update(progress.finished - bar.n)
+
+        yield Told(show)
+
+
+@contextlib.contextmanager
+def clock(horizon: float) -> Iterator[Told]:
+    """A bar over the simulated seconds of one trial, likewise."""
+    from tqdm import tqdm
+
+    with tqdm(total=horizon, unit="s", desc="compile", smoothing=0.05) as bar:
+
+        def show(progress: Progress) -> None:
+            bar.set_description("push", refresh=False)
+            bar.update(round(progress.simulated - bar.n, 3))
+
+        yield Told(show)

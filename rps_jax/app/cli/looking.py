@@ -95,7 +95,7 @@ class Film:
         """The trials to film, at most so many, and what they share."""
         from rps_jax.app import film
         from rps_jax.record import folder
-        from rps_jax.runs.replay import chosen
+        from rps_jax.runs.push import chosen
         from rps_jax.studies.table import cases_of
         from rps_jax.world import paper
 
@@ -174,7 +174,7 @@ class View(Asked):
         """Serve the page until it is ended."""
         from rps_jax import engines
         from rps_jax.app import viewer
-        from rps_jax.runs.replay import chosen
+        from rps_jax.runs.push import chosen
 
         self.conditions().setting()
         asked = viewer.Asked(self.object, self.friction, self.strategy, self.target)

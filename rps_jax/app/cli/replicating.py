@@ -19,7 +19,7 @@ from rps_jax.app.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from rps_jax.trials.push import Push as Seen
+    from rps_jax.runs.push import Push as Seen
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Table(Spread, Objects):
         from rps_jax.analysis import figures, tables
         from rps_jax.record import files
         from rps_jax.studies.table import cases_of, table
-        from rps_jax.trials.progress import progress_bar
+        from rps_jax.trials.setting import progress_bar
         from rps_jax.world import paper
 
         conditions = self.conditions()
@@ -97,8 +97,8 @@ class Push(Objects):
     def run(self) -> None:
         """Follow the trial, then show it."""
         from rps_jax import engines
-        from rps_jax.trials.progress import clock
-        from rps_jax.trials.push import check_length, push
+        from rps_jax.runs.push import check_length, push
+        from rps_jax.trials.setting import clock
 
         conditions = self.conditions()
         conditions.setting()
@@ -161,7 +161,7 @@ class Hardware(Spread, Recorded):
         from rps_jax.analysis import figures
         from rps_jax.record import files
         from rps_jax.studies import hardware, reproduce
-        from rps_jax.trials.progress import progress_bar
+        from rps_jax.trials.setting import progress_bar
         from rps_jax.world import paper
 
         conditions = self.conditions()
@@ -200,7 +200,7 @@ class Paper(StudyOptions):
         """Run what is missing, then write the report."""
         from rps_jax.record import folder
         from rps_jax.studies import reproduce
-        from rps_jax.trials.progress import progress_bar
+        from rps_jax.trials.setting import progress_bar
 
         plan = reproduce.Plan.quick() if self.quick else reproduce.Plan()
         with self.opened() as out:

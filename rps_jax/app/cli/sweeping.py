@@ -80,7 +80,7 @@ class Sweep(Spread):
     def run(self) -> None:
         """Run what is missing, then write and print the report."""
         from rps_jax.runs import sweep
-        from rps_jax.trials.progress import progress_bar
+        from rps_jax.trials.setting import progress_bar
 
         plan, shard, shape = self.plan(), parsing.shard_of(self.shard), self.shape()
         if self.ray:
@@ -186,9 +186,8 @@ class Replay:
     def run(self) -> None:
         """Follow the world, then show it."""
         from rps_jax.record import folder
-        from rps_jax.runs.replay import chosen, replay
-        from rps_jax.trials.progress import clock
-        from rps_jax.trials.push import check_length
+        from rps_jax.runs.push import check_length, chosen, replay
+        from rps_jax.trials.setting import clock
 
         plan, name = chosen(self.folder, self.index, self.arm)
         tell_followed(self.folder, plan)

@@ -262,8 +262,7 @@ class TuneCompare(Spread):
         from rps_jax.runs import sweep
         from rps_jax.runs.evaluate import seed_of
         from rps_jax.runs.plan import Plan
-        from rps_jax.trials.progress import progress_bar
-        from rps_jax.trials.setting import Setting
+        from rps_jax.trials.setting import Setting, progress_bar
         from rps_jax.world.physics import preset
 
         physics = preset(self.physics, self.fidelity)

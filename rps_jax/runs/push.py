@@ -1,7 +1,11 @@
-"""One trial, followed from its start to its end: its data, its picture and its film."""
+"""One trial, followed from its start to its end: its data, its picture and its film.
+
+It is asked for by name (`push`), or is a world of a sweep again (`replay`).
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import io
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -12,7 +16,9 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import engines, errors
+from rps_jax.control import strategies
 from rps_jax.control.strategies import Params
+from rps_jax.runs.plan import Plan, load_plan, scene_of, title_of, world_part
 from rps_jax.trials import pushes, results
 from rps_jax.trials.conditions import Conditions, Which, arms_of
 from rps_jax.trials.pushes import Trace
@@ -145,3 +151,50 @@ def _evenly(length: int, count: int) -> list[int]:
     """At least two indices into `length` items, from the first to the last."""
     count = max(2, count)
     return [round(i * (length - 1) / (count - 1)) for i in range(count)]
+
+
+def chosen(run: Path, world: int, arm: str | None = None) -> tuple[Plan, str]:
+    """The plan of a sweep, one of whose worlds can be followed, and the arm that is meant.
+
+    An engine whose trials cannot be followed is replaced by the fused one.
+
+    Raises:
+      InputError: the folder holds no sweep, or not this world or arm.
+    """
+    plan = load_plan(run)
+    name = errors.check_name("arm", arm or next(iter(plan.arms)), plan.arms)
+    errors.check_count("index", world, at_least=0, at_most=plan.worlds - 1)
+    if not engines.get(plan.setting.engine).traced:
+        plan = dataclasses.replace(plan, setting=dataclasses.replace(plan.setting, engine="fused"))
+    engines.get(plan.setting.engine).check_followed()
+    return plan, name
+
+
+def replay(
+    run: str | Path, world: int, arm: str | None = None, *, report: Report = unheard
+) -> Push:
+    """One world of a sweep again, followed from its start to its end.
+
+    Args:
+      run: the run folder of the sweep.
+      world: index of the world.
+      arm: which of the sweep's arms; by default the first.
+      report: called now and then.
+
+    Raises:
+      InputError: the folder holds no sweep, or not this world or arm.
+
+    Example:
+      >>> import tempfile, rps_jax
+      >>> arms, rules = {"rps": rps_jax.RPSParams.paper()}, rps_jax.Rules(horizon=1.0)
+      >>> with tempfile.TemporaryDirectory() as run:
+      ...     found = rps_jax.sweep("wide", arms, worlds=3, out=run, rules=rules)
+      ...     again = rps_jax.replay(run, 2)
+      >>> bool(again.outcome.success) == bool(found.success.sel(arm="rps", world=2))
+      True
+    """
+    plan, name = chosen(Path(run), world, arm)
+    part = world_part(plan, list(plan.arms).index(name), [world])
+    decides = strategies.of(plan.arms[name])
+    (trace,) = pushes.follow_part(part, decides, plan.setting, report=report)
+    return Push(trace, scene_of(plan, world), title_of(plan, world))
