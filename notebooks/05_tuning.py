@@ -32,8 +32,9 @@ from rps_jax.control import strategies
 from rps_jax.record import files
 from rps_jax.robot.skin import SmoothSkin
 from rps_jax.trials import pushes, trial
-from rps_jax.tuning import evolution as tune
 from rps_jax.tuning import gradients
+from rps_jax.tuning.run import read_log
+from rps_jax.tuning.space import SUBSETS, Space
 from rps_jax.world import paper
 
 out = Path(tempfile.mkdtemp())
@@ -46,8 +47,8 @@ out = Path(tempfile.mkdtemp())
 # a success scores its time, and a failure scores one more and how far it missed.
 
 # %%
-names = tune.SUBSETS["full"]
-Image(figures.tuning_log(tune.read_log(Path("runs/coarse")), names, out / "coarse.png"))
+names = SUBSETS["full"]
+Image(figures.tuning_log(read_log(Path("runs/coarse")), names, out / "coarse.png"))
 
 # %% [markdown]
 # In seven generations the objective on the validation worlds halves, from 0.31 to 0.15, and
@@ -64,7 +65,7 @@ Image(figures.tuning_log(tune.read_log(Path("runs/coarse")), names, out / "coars
 # above.
 
 # %%
-Image(figures.tuning_log(tune.read_log(Path("runs/fine")), names, out / "fine.png"))
+Image(figures.tuning_log(read_log(Path("runs/fine")), names, out / "fine.png"))
 
 # %% [markdown]
 # Validation falls from 0.164 to 0.117 at generation 7, whose mean was kept. The values jump from
@@ -79,7 +80,7 @@ Image(figures.tuning_log(tune.read_log(Path("runs/fine")), names, out / "fine.pn
 sets = {"paper": RPSParams.paper(), "tuned": RPSParams.tuned()}
 kept = json.loads(Path("runs/fine/tuned.json").read_text())
 assert kept == {name: getattr(sets["tuned"], name) for name in names}
-space = tune.Space(names)
+space = Space(names)
 places = {label: jax.nn.sigmoid(space.vector(params)) for label, params in sets.items()}
 Image(figures.between_bounds(places, names, out / "bounds.png"))
 
@@ -124,7 +125,7 @@ Image(figures.paired(results, out / "paired.png"))
 
 # %%
 names = ("L", "K_h", "K_v", "beta")
-space = tune.Space(names)
+space = Space(names)
 cases = [
     Case("box", FRICTION["S1"], target, gap=0.004, skin=SmoothSkin()) for target in paper.TARGETS
 ]
@@ -178,9 +179,9 @@ Image(figures.estimates(horizons, bars, names, out / "gradients.png"))
 # half.
 
 # %%
-logs = {name: tune.read_log(Path("runs/race") / name) for name in ("evolution", "gradient")}
+logs = {name: read_log(Path("runs/race") / name) for name in ("evolution", "gradient")}
 logs["gradient, then evolution"] = [
-    line for name in ("half", "hybrid") for line in tune.read_log(Path("runs/race") / name)
+    line for name in ("half", "hybrid") for line in read_log(Path("runs/race") / name)
 ]
 Image(figures.races(logs, out / "race.png"))
 

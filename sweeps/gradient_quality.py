@@ -18,8 +18,7 @@ from rps_jax.app.cli.running import guarded, use_cache
 from rps_jax.record import files
 from rps_jax.studies import gradient_quality
 from rps_jax.studies.gradient_quality import Study
-from rps_jax.tuning import evolution as tune
-from rps_jax.tuning.evolution import Space
+from rps_jax.tuning.space import Space, expanded
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ def main(options: Options) -> None:
     """Run what is missing, then print and write the table and the figure."""
     study = Study(
         object=options.object,
-        space=Space(tune.expanded(options.tuned)),
+        space=Space(expanded(options.tuned)),
         horizons=options.horizons,
         worlds=options.worlds,
         repeats=options.repeats,

@@ -28,7 +28,8 @@ from rps_jax.app.cli import (
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
 from rps_jax.studies import sensitivity
-from rps_jax.tuning.evolution import BOUNDS, SUBSETS, Course
+from rps_jax.tuning.run import Course
+from rps_jax.tuning.space import BOUNDS, SUBSETS
 
 
 @dataclass(frozen=True)

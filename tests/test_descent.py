@@ -12,12 +12,14 @@ import pytest
 from rps_jax.app import cli
 from rps_jax.control.law import RPSParams
 from rps_jax.errors import InputError
-from rps_jax.trials.setting import Setting, Timing
+from rps_jax.runs.evaluate import Answer
+from rps_jax.runs.objective import Objective
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import descent, gradients
-from rps_jax.tuning import evolution as tune
-from rps_jax.tuning.descent import Descent
-from rps_jax.tuning.evolution import Course, Objective, Space
+from rps_jax.tuning.descent import Descent, Search
+from rps_jax.tuning.run import Course, read_log
+from rps_jax.tuning.space import SUBSETS, Space
 from rps_jax.world import domain
 from rps_jax.world.physics import preset
 
@@ -76,8 +78,10 @@ class TestDescent:
                 Descent(**bad)
 
     def test_the_first_start_is_the_base(self):
-        space = Space(tune.SUBSETS["full"])
-        thetas = descent.begin(space, Descent(starts=3)).thetas
+        space = Space(SUBSETS["full"])
+        search = Search(Descent(starts=3), space, Course())
+        search.begin()
+        thetas = search.propose()
         np.testing.assert_array_equal(thetas[0], space.vector(space.base))
         assert (np.abs(thetas[1:] - thetas[0]).max(axis=1) > 0.1).all()
 
@@ -88,19 +92,16 @@ class TestDescent:
         np.testing.assert_allclose(change, [-0.3, -0.4], rtol=1e-6)
 
 
-def test_antithetic_steps_find_the_slope_of_the_objective(monkeypatch):
+def test_antithetic_steps_find_the_slope_of_the_objective():
     # value = 2 z_0 - z_1 in the coordinates of the map, the same in all worlds.
     space = Space(("L", "K_h"))
 
-    def pretend(asks, *_, **__):
+    def pretend(asks):
         z = space.vector(asks[0].params)
-        values = np.asarray(2 * z[:, 0] - z[:, 1])[:, None] + np.zeros(3)
-        return [tune.Answer(values, values, values, values)], Timing(0.0, 1.0, 7.0)
+        return [Answer(None, np.asarray(2 * z[:, 0] - z[:, 1])[:, None] + np.zeros(3))]
 
-    monkeypatch.setattr(tune, "try_out", pretend)
     course = Course((domain.DOMAINS["wide"],), 3, 3, SETTING)
-    found, simulated = descent.smoothed(jnp.zeros((2, 2)), space, course, Descent(pairs=4000), 0)
-    assert simulated == 7.0
+    found = descent.smoothed(jnp.zeros((2, 2)), space, course, Descent(pairs=4000), 0, pretend)
     np.testing.assert_allclose(found.gradient, [[2, -1], [2, -1]], atol=0.2)
     errors = np.abs(found.gradient - jnp.array([2.0, -1.0])) / jnp.sqrt(found.variance)
     assert (errors < 4).all()
@@ -137,7 +138,7 @@ class TestRuns:
     @pytest.mark.slow
     def test_the_command_line_and_a_run_of_another_kind(self, tmp_path, capsys):
         assert cli.main(self.arguments(tmp_path, 2)) == 0
-        log = tune.read_log(tmp_path)
+        log = read_log(tmp_path)
         assert len(log) == 3
         for line in log[:2]:
             assert line["finite"] == 1.0

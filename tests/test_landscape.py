@@ -5,23 +5,30 @@ import numpy as np
 import pytest
 
 from rps_jax.control.law import RPSParams
+from rps_jax.runs import evaluate
+from rps_jax.runs.evaluate import Answer, seed_of
 from rps_jax.studies import sensitivity
 from rps_jax.studies.sensitivity import Aims
-from rps_jax.tuning import evolution as tune
-from rps_jax.tuning.evolution import BOUNDS, SUBSETS, Answer, Course
+from rps_jax.trials.trial import Outcome
+from rps_jax.tuning.run import Course
+from rps_jax.tuning.space import BOUNDS, SUBSETS, Space
 
 FULL = SUBSETS["full"]
 SETS = {"paper": RPSParams.paper(), "tuned": RPSParams.tuned()}
 
 
+def outcomes(**known):
+    """Outcomes of which nothing else is looked at."""
+    return Outcome(**dict.fromkeys(Outcome._fields) | known)
+
+
 def test_aims_by_hand():
-    answer = Answer(
-        score=np.zeros((2, 4)),
-        success=np.array([[1.0, 1, 1, 0], [0, 0, 0, 0]]),
-        time=np.array([[10.0, 30, 20, 300], [300, 300, 300, 300]]),
-        path=np.array([[1.0, 2, 6, 9], [9, 9, 9, 9]]),
+    outcome = outcomes(
+        success=np.array([[1, 1, 1, 0], [0, 0, 0, 0]], bool),
+        time=np.array([[10.0, 30, 20, 300], [300, 300, 300, 300]], np.float32),
+        path_length=np.array([[1.0, 2, 6, 9], [9, 9, 9, 9]], np.float32),
     )
-    found = sensitivity.aims(answer)
+    found = sensitivity.aims(outcome)
     assert found.success.tolist() == [0.75, 0.0]
     np.testing.assert_array_equal(found.time, [20, np.nan])
     np.testing.assert_array_equal(found.path, [2, np.nan])
@@ -57,7 +64,7 @@ def test_a_line_varies_one_parameter_within_its_bounds_and_no_other():
 
 def test_candidates_begin_with_the_sets_and_without_spread_lie_between_two_of_them():
     found = sensitivity.cloud(list(SETS.values()), FULL, 30, 0.0, seed=3)
-    space = tune.Space(FULL)
+    space = Space(FULL)
     z = space.vector(found)
     for i, params in enumerate(SETS.values()):
         np.testing.assert_allclose(z[i], space.vector(params), rtol=1e-4, atol=1e-4)
@@ -81,17 +88,18 @@ def pretended(monkeypatch):
             asked.append(ask)
             L = np.asarray(ask.params.L)[:, None]
             won = np.broadcast_to((ask.seed + ask.worlds) % 4 > 0, (L.size, ask.worlds.size))
-            answers.append(Answer(0 * won, won * 1.0, 100 * L + 0 * won, 5 + 0 * won))
+            outcome = outcomes(success=won, time=100 * L + 0 * won, path_length=5 + 0 * won)
+            answers.append(Answer(outcome, 0 * won))
         return answers, None
 
-    monkeypatch.setattr(tune, "try_out", try_out)
+    monkeypatch.setattr(evaluate, "try_out", try_out)
     return asked
 
 
 def test_sensitivity_is_labelled_and_from_worlds_for_validation(pretended):
     found = sensitivity.sensitivity(SETS, Course(), names=("L", "K_h"), count=3, worlds=8)
     assert dict(found.sizes) == {"set": 2, "parameter": 2, "step": 3}
-    assert [ask.seed for ask in pretended] == [tune.seed_of(0, "validate")]
+    assert [ask.seed for ask in pretended] == [seed_of(0, "validate")]
     one = found.sel(set="paper", parameter="L")
     np.testing.assert_allclose(one.time, 100 * one.value, rtol=1e-5)
     other = found.sel(set="tuned", parameter="K_h")
@@ -101,7 +109,7 @@ def test_sensitivity_is_labelled_and_from_worlds_for_validation(pretended):
 
 def test_the_front_is_chosen_in_worlds_for_validation_and_measured_in_those_for_testing(pretended):
     found = sensitivity.front(SETS, Course(), candidates=6, worlds=8)
-    assert [ask.seed for ask in pretended] == [tune.seed_of(0, s) for s in ("validate", "test")]
+    assert [ask.seed for ask in pretended] == [seed_of(0, s) for s in ("validate", "test")]
     params = [jax.tree.map(np.asarray, ask.params) for ask in pretended]
     jax.tree.map(np.testing.assert_array_equal, *params)
     # All succeed alike and drive as far: the quickest alone is undominated.

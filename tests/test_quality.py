@@ -9,7 +9,7 @@ import xarray as xr
 from rps_jax.errors import InputError
 from rps_jax.studies import gradient_quality
 from rps_jax.studies.gradient_quality import Study
-from rps_jax.tuning.evolution import Space
+from rps_jax.tuning.space import Space
 
 
 def estimates(gradients, variance=0.0, finite=1.0):

@@ -24,15 +24,15 @@ from rps_jax.control.law import RPSParams
 from rps_jax.engines import EngineName
 from rps_jax.record import folder as run_folder
 from rps_jax.record.checkpoint import Parts
+from rps_jax.runs.evaluate import Split, seed_of
 from rps_jax.trials import trial
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Snapshot, World
 from rps_jax.trials.worlds import drawn_worlds
-from rps_jax.tuning import evolution as tune
 from rps_jax.tuning import gradients
 from rps_jax.tuning.descent import soften
-from rps_jax.tuning.evolution import Space
 from rps_jax.tuning.gradients import Estimate
+from rps_jax.tuning.space import Space
 from rps_jax.world import domain
 from rps_jax.world.domain import DOMAINS, RANDOM, Domain, Range
 
@@ -89,11 +89,11 @@ class Study:
         return self.space.vector(self.space.base)
 
 
-def _stage_and_worlds(study: Study, engine: EngineName, split: str, count: int) -> Any:
+def _stage_and_worlds(study: Study, engine: EngineName, split: Split, count: int) -> Any:
     """What worlds share in their engine, the first worlds (count, ...) of a split, and physics."""
     alone = replace(study.domain, objects=(study.object,))
     setting = Setting(engine=engine)
-    drawn = domain.draw(alone, tune.seed_of(study.seed, split), np.arange(count))
+    drawn = domain.draw(alone, seed_of(study.seed, split), np.arange(count))
     part = drawn_worlds(alone, drawn, RPSParams(), setting)
     return part.stage, part.worlds, setting.physics
 

@@ -11,9 +11,12 @@ import numpy as np
 import xarray as xr
 
 from rps_jax.control.law import RPSParams
+from rps_jax.runs import evaluate
+from rps_jax.runs.evaluate import Ask, Split
 from rps_jax.trials.setting import Progress
-from rps_jax.tuning import evolution as tune
-from rps_jax.tuning.evolution import Answer, Ask, Course, Space
+from rps_jax.trials.trial import Outcome
+from rps_jax.tuning.run import Course
+from rps_jax.tuning.space import SUBSETS, Space
 
 _EDGE = 0.03  # how near to a parameter's bounds it is varied, as a share of the range
 
@@ -26,25 +29,26 @@ class Aims(NamedTuple):
     path: np.ndarray  # [m] of the base, likewise
 
 
-def aims(answer: Answer) -> Aims:
-    """The aims of candidates by how they went."""
-    won = answer.success > 0
+def aims(outcome: Outcome) -> Aims:
+    """The aims of candidates by their outcomes (P, W)."""
+    won = np.asarray(outcome.success) > 0
     with np.errstate(all="ignore"):
         medians = [
             np.array(
                 [np.median(x[w]) if w.any() else np.nan for x, w in zip(rows, won, strict=True)]
             )
-            for rows in (answer.time, answer.path)
+            for rows in np.asarray((outcome.time, outcome.path_length), float)
         ]
     return Aims(won.mean(axis=1), *medians)
 
 
 def _try(
-    params: Any, course: Course, splits: Sequence[str], seed: int, count: int, **run: Any
-) -> list[Answer]:
-    """How candidates went in the worlds of each split."""
-    asks = [Ask(params, tune.seed_of(seed, split), np.arange(count)) for split in splits]
-    return tune.try_out(asks, course.domains, course.setting, course.objective, **run)[0]
+    params: Any, course: Course, splits: Sequence[Split], seed: int, count: int, **run: Any
+) -> list[Outcome]:
+    """The outcomes (P, D * W) of candidates in the worlds of each split."""
+    asks = [Ask(params, evaluate.seed_of(seed, split), np.arange(count)) for split in splits]
+    answers, _ = evaluate.try_out(asks, course.domains, course.setting, course.objective, **run)
+    return [answer.outcome for answer in answers]
 
 
 # --- one parameter at a time ---------------------------------------------------------------
@@ -61,7 +65,7 @@ def sensitivity(
     sets: dict[str, RPSParams],
     course: Course,
     *,
-    names: Sequence[str] = tune.SUBSETS["full"],
+    names: Sequence[str] = SUBSETS["full"],
     count: int = 9,
     worlds: int = 1000,
     seed: int = 0,
@@ -77,17 +81,17 @@ def sensitivity(
         lambda *x: jnp.stack(x), *(lines(one, names, count) for one in sets.values())
     )
     params = jax.tree.map(lambda leaf: leaf.reshape(-1), grid)
-    (answer,) = _try(params, course, ("validate",), seed, worlds, report=report, **shape)
+    (found,) = _try(params, course, ("validate",), seed, worlds, report=report, **shape)
     dims = ("set", "parameter", "step")
     columns: dict[str, Any] = {
-        name: (dims, values.reshape(shape_of)) for name, values in aims(answer)._asdict().items()
+        name: (dims, values.reshape(shape_of)) for name, values in aims(found)._asdict().items()
     }
     varied = [np.asarray(getattr(grid, name))[:, i] for i, name in enumerate(names)]
     columns["value"] = (dims, np.stack(varied, axis=1))
     return xr.Dataset(
         columns,
         {"set": list(sets), "parameter": list(names)},
-        {"worlds": answer.success.shape[1]},
+        {"worlds": found.success.shape[1]},
     )
 
 
@@ -132,7 +136,7 @@ def front(
     sets: dict[str, RPSParams],
     course: Course,
     *,
-    names: Sequence[str] = tune.SUBSETS["full"],
+    names: Sequence[str] = SUBSETS["full"],
     candidates: int = 256,
     spread: float = 0.5,
     worlds: int = 1000,
@@ -146,8 +150,8 @@ def front(
     measured in worlds for testing, so that luck in the choice does not count.
     """
     params = cloud(list(sets.values()), names, candidates, spread, seed)
-    answer, again = _try(params, course, ("validate", "test"), seed, worlds, report=report, **shape)
-    chosen = undominated(aims(answer))
+    found, again = _try(params, course, ("validate", "test"), seed, worlds, report=report, **shape)
+    chosen = undominated(aims(found))
     labels = [*sets, *(f"{i}" for i in range(candidates))]
     columns: dict[str, Any] = {k: ("candidate", v) for k, v in aims(again)._asdict().items()}
     columns["front"] = ("candidate", chosen)

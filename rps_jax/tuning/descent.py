@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -23,18 +21,18 @@ import optax
 from rps_jax import errors
 from rps_jax.control.law import RPSParams
 from rps_jax.control.strategies import smooth_rps
-from rps_jax.record import files
-from rps_jax.record import folder as run_folder
 from rps_jax.robot.skin import CapacitiveSkin, SmoothSkin
-from rps_jax.trials.setting import Progress, Setting
+from rps_jax.runs import evaluate
+from rps_jax.runs.objective import Objective
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Snapshot, Trial, World, control_step, select, start_all
-from rps_jax.tuning import evolution as tune
 from rps_jax.tuning import gradients
-from rps_jax.tuning.evolution import Course, Objective, Space
 from rps_jax.tuning.gradients import Estimate
+from rps_jax.tuning.run import Course, Told, TryOut, finite
+from rps_jax.tuning.space import Space
 from rps_jax.world.physics import preset
 
-ESTIMATORS = ("reverse", "forward", "evolution", "combined")
+Estimator = Literal["reverse", "forward", "evolution", "combined"]
 _ENGINE = {"reverse": "quasistatic", "forward": "fused", "combined": "quasistatic"}
 
 
@@ -42,44 +40,45 @@ _ENGINE = {"reverse": "quasistatic", "forward": "fused", "combined": "quasistati
 class Descent:
     """How gradients are followed."""
 
-    estimator: str = "reverse"
-    """reverse, windows through the quasi-static model; forward, windows through the fused engine;
-    evolution, antithetic steps in whole trials of the course's engine; combined, reverse and
-    evolution by their variances, as if they were independent; that of the windows is mostly much
-    the smaller."""
+    estimator: Estimator = "reverse"
+    """reverse differentiates windows through the quasi-static model, forward through the fused
+    engine; evolution takes antithetic steps in whole trials of the course's engine; combined weighs
+    reverse and evolution by their variances, of which that of the windows is mostly much the
+    smaller, as if they were independent."""
     optimiser: str = "adam"
-    """An optimiser of optax, by name."""
+    """Name of an optimiser of optax that needs gradients alone."""
     learning_rate: float = 0.1
-    """[1] At first, falling to zero along a cosine."""
+    """[1] Learning rate of the first step, which falls to zero along a cosine."""
     clip: float = 1.0
     """[1] Bound on the norm of a gradient."""
     world_clip: float = 2.0
-    """[1] Bound on that of a single world, of reverse and forward, as a multiple of their median: a
-    few chaotic worlds would outweigh all others."""
+    """[1] Bound on the norm of a single world's gradient, for reverse and forward, as a multiple of
+    their median; a few chaotic worlds would outweigh all others."""
     steps: int = 40
-    """In all."""
+    """Number of steps of each descent."""
     starts: int = 4
-    """Descents side by side: one from the base parameters, others from random places near it."""
+    """Number of descents side by side: one from the base parameters, others from random places
+    near them."""
     spread: float = 0.5
     """[1] Standard deviation of these places, in units of the bounded map."""
     window: float = 8.0
-    """[s] Length of a window of a softened trial, that of reverse and forward."""
+    """[s] Length of a window of a softened trial, for reverse and forward."""
     within: float = 100.0
-    """[s] Windows begin at random times up to this; with 0 at the start of the trials."""
+    """[s] Windows begin at random times up to this; with 0 they begin with the trials."""
     arrive: float = 0.005
     """[m] Temperature at which a softened trial arrives."""
     sigma: float = 0.15
-    """[1] Standard deviation of the steps of the evolution gradient."""
+    """[1] Standard deviation of the antithetic steps."""
     pairs: int = 8
-    """Antithetic pairs of these steps."""
+    """Number of antithetic pairs for each descent."""
     budget: float = 0.0
-    """[s] Simulated time after which no step begins; 0: no bound."""
+    """[s] Simulated time after which no step begins; 0 stands for no bound."""
     seed: int = 0
-    """Of the starts, the steps and the worlds."""
+    """Seed of the starts, the steps and the worlds."""
 
     def __post_init__(self) -> None:
         """Raises InputError for unknown names or numbers that mean nothing."""
-        errors.check_name("estimator", self.estimator, ESTIMATORS)
+        errors.check_name("estimator", self.estimator, get_args(Estimator))
         for name in ("learning_rate", "clip", "world_clip", "window", "arrive", "sigma"):
             errors.check_finite(name, getattr(self, name), above=0)
         for name in ("steps", "starts", "pairs"):
@@ -88,7 +87,8 @@ class Descent:
             errors.check_finite(name, getattr(self, name), at_least=0, unit="s")
         errors.check_finite("spread", self.spread, at_least=0, at_most=10)
         try:  # as `descend` will
-            jax.eval_shape(lambda x: self.rule().update(x, self.rule().init(x), x), jnp.zeros(1))
+            one = jax.ShapeDtypeStruct((1,), float)
+            jax.eval_shape(lambda x: self.rule().update(x, self.rule().init(x), x), one)
         except (AttributeError, TypeError, ValueError) as error:
             raise errors.InputError(
                 f"optimiser = {self.optimiser} is not allowed: name one of optax that needs "
@@ -143,7 +143,7 @@ def softened(course: Course, engine: Any, seed: int, step: int) -> list[Batch]:
     random = np.random.default_rng((seed, step))
     return [
         Batch(part.stage, soften(part.worlds), jnp.asarray(random.uniform(size=column.size)))
-        for part, column, _ in tune.parts(ask, course.domains, setting)
+        for part, column, _ in evaluate.parts(ask, course.domains, setting)
     ]
 
 
@@ -228,136 +228,101 @@ def differentiated(
 
 
 def smoothed(
-    thetas: jax.Array, space: Space, course: Course, descent: Descent, step: int, **shape: Any
-) -> tuple[Estimate, float]:
-    """Evolution gradients (S, p) of the hard law, and the time it simulated [s].
-
-    Antithetic candidates, all of them in the same worlds.
-    """
+    thetas: jax.Array, space: Space, course: Course, descent: Descent, step: int, try_out: TryOut
+) -> Estimate:
+    """Evolution gradients (S, p) of the hard law, of antithetic candidates in the same worlds."""
     key = jax.random.fold_in(jax.random.key(descent.seed), step)
     count, p = thetas.shape
     steps = jax.random.normal(key, (count, descent.pairs, p), thetas.dtype)
     both = jnp.concatenate([steps, -steps], axis=1) * descent.sigma
     params = space.params((thetas[:, None] + both).reshape(-1, p))
-    ask = course.ask(params, descent.seed, step)
-    tried = tune.try_out([ask], course.domains, course.setting, course.objective, **shape)
-    (answer,), timing = tried
+    (answer,) = try_out([course.ask(params, descent.seed, step)])
     values = course.objective.value(answer.score).reshape(count, 2, descent.pairs)
     slopes = (values[:, 0] - values[:, 1])[..., None] * steps / (2 * descent.sigma)
-    return jax.vmap(gradients.estimate)(slopes), timing.simulated
+    return jax.vmap(gradients.estimate)(slopes)
 
 
-def estimated(
-    thetas: jax.Array, space: Space, course: Course, descent: Descent, step: int, **shape: Any
-) -> tuple[Estimate, float]:
-    """Estimates (S, p) by the estimator that the descent names, and the time simulated [s]."""
-    if descent.estimator == "evolution":
-        return smoothed(thetas, space, course, descent, step, **shape)
-    one, seconds = differentiated(thetas, space, course, descent, step)
-    if descent.estimator != "combined":
-        return one, seconds
-    other, more = smoothed(thetas, space, course, descent, step, **shape)
-    return jax.vmap(gradients.combine)(one, other), seconds + more
+# --- the descent ---------------------------------------------------------------------------
 
 
-# --- runs that can be continued ------------------------------------------------------------
+class Search:
+    """Descents under way, all together: a tuner that `rps_jax.tuning.run` drives.
 
-
-class Search(NamedTuple):
-    """The state of all descents."""
-
-    thetas: jax.Array  # (S, p)
-    rule: Any  # state of the optimiser, (S, ...)
-    step: jax.Array  # () int32: how many are done
-    best: jax.Array  # (p,) that validated best
-    best_value: jax.Array  # ()
-
-
-def begin(space: Space, descent: Descent) -> Search:
-    """The state before the first step."""
-    base = space.vector(space.base)
-    key = jax.random.key(descent.seed)
-    away = jax.random.normal(key, (descent.starts, base.size), base.dtype).at[0].set(0.0)
-    thetas = base + descent.spread * away
-    rule = jax.vmap(descent.rule().init)(thetas)
-    return Search(thetas, rule, jnp.zeros((), jnp.int32), base, jnp.asarray(jnp.inf))
-
-
-def open_run(folder: Path, space: Space, course: Course, descent: Descent) -> Path:
-    """The run folder; one that holds a run must hold this one, but for its budget.
-
-    Raises:
-      InputError: it cannot be written, or holds another run.
+    Before every step all descents are tried in the worlds for validation.
     """
-    own = asdict(replace(descent, budget=0.0))
-    return run_folder.claim(folder, tune.configuration(space, course) | {"descent": own})
 
+    def __init__(self, descent: Descent, space: Space, course: Course):
+        """Begin nothing yet."""
+        self.descent, self.space, self.course = descent, space, course
+        self.options = {"descent": asdict(replace(descent, budget=0.0))}
+        self.generations, self.budget = descent.steps + 1, descent.budget
 
-def descend(
-    folder: Path,
-    space: Space,
-    course: Course,
-    descent: Descent,
-    *,
-    report: Callable[[int, Progress], Any] = lambda step, progress: None,
-    **shape: Any,
-) -> RPSParams:
-    """Tune by gradients, in a run folder; one that was killed goes on where it was.
+    def begin(self) -> None:
+        """Begin at the base parameters of the space, and at random places near them."""
+        descent, base = self.descent, self.space.vector(self.space.base)
+        key = jax.random.key(descent.seed)
+        away = jax.random.normal(key, (descent.starts, base.size), base.dtype).at[0].set(0.0)
+        self.thetas = base + descent.spread * away  # (S, p)
+        self.best, self.best_value = np.asarray(base), np.inf
+        self._base_value: float | None = None  # of the base parameters in the worlds for validation
+        self._rule = descent.rule()
+        self._state = jax.vmap(self._rule.init)(self.thetas)
 
-    Before every step all descents are tried on the worlds for validation. Every step is a line of
-    `log.jsonl`: `compile` and `run` are the trials' times [s], `differentiate` the gradients' (in
-    a first step with their compilation), `simulated` all simulated time [s]. Returns what
-    validated best, as `tuned.json` holds it.
-    """
-    search, log = tune.resume(folder, begin(space, descent), "step")
-    rule = descent.rule()
-    while int(search.step) <= descent.steps and not tune.spent(log, descent.budget):
-        step = int(search.step)
-        check = course.validate(space.params(search.thetas), descent.seed)
-        (tried,), timing = tune.try_out(
-            [check],
-            course.domains,
-            course.setting,
-            course.objective,
-            report=lambda progress, step=step: report(step, progress),
-            **shape,
-        )
-        values = course.objective.value(tried.score)
+    def propose(self) -> np.ndarray:
+        """Where the descents (S, p) are."""
+        return np.asarray(self.thetas)
+
+    def judge(self, vectors: np.ndarray, generation: int, try_out: TryOut) -> tuple[Told, Any]:
+        """Values (S,) in the worlds for validation, and, except after the last step, gradients."""
+        check = self.course.validate(self.space.params(vectors), self.descent.seed)
+        (tried,) = try_out([check])
+        values = self.course.objective.value(tried.score)
         first = int(jnp.nanargmin(values))
-        if float(values[first]) < float(search.best_value):
-            search = search._replace(best=search.thetas[first], best_value=values[first])
+        base = self._base_value if generation else float(values[0])
+        told = {"validation": np.asarray(values)}
         line = {
-            "generation": step,
-            "validation": tune.finite(values[first]),
-            "validation_success": float(tried.success[first].mean()),
-            "mean": tune.finite(jnp.nanmean(values)),
-            "spread": tune.finite(jnp.nanstd(values)),
-            "best": tune.finite(values[first]),
-            "base": log[0]["base"] if log else tune.finite(values[0]),
-            "simulated": timing.simulated,
-            "compile": timing.compile,
-            "run": timing.run,
-            "params": tune.named(space, search.thetas[first]),
+            "validation": finite(values[first]),
+            "validation_success": float(tried.outcome.success[first].mean()),
+            "mean": finite(jnp.nanmean(values)),
+            "spread": finite(jnp.nanstd(values)),
+            "best": finite(values[first]),
+            "base": finite(base),
+            "params": self.space.named(vectors[first]),
         }
-        if step < descent.steps:
-            began = time.perf_counter()
-            found, seconds = jax.block_until_ready(
-                estimated(search.thetas, space, course, descent, step, **shape)
-            )
-            changes, state = jax.vmap(rule.update)(found.gradient, search.rule, search.thetas)
-            thetas = optax.apply_updates(search.thetas, changes)
-            search = search._replace(thetas=thetas, rule=state)
-            norm = jnp.linalg.norm(found.gradient, axis=1)
-            error = jnp.sqrt(jnp.sum(found.variance, axis=1))
-            line |= {
-                "gradient": tune.finite(norm.mean()),
-                "gradient_error": tune.finite(error.mean()),
-                "finite": float(found.finite.mean()),
-                "simulated": line["simulated"] + seconds,
-                "differentiate": time.perf_counter() - began,
-            }
-        search = search._replace(step=search.step + 1)
-        log.append(line)
-        files.write_json(folder / "tuned.json", tune.named(space, search.best))
-        tune.save(folder, search, log)
-    return space.params(search.best)
+        if generation == self.descent.steps:
+            return told, line
+        found, more = self._estimated(jnp.asarray(vectors), generation, try_out)
+        told["gradient"] = np.asarray(found.gradient)
+        return told, line | more | {
+            "gradient": finite(jnp.linalg.norm(found.gradient, axis=1).mean()),
+            "gradient_error": finite(jnp.sqrt(jnp.sum(found.variance, axis=1)).mean()),
+            "finite": float(found.finite.mean()),
+        }
+
+    def _estimated(
+        self, thetas: jax.Array, step: int, try_out: TryOut
+    ) -> tuple[Estimate, dict[str, float]]:
+        """Estimates (S, p), and the times simulated and taken [s] by windows."""
+        how = self.space, self.course, self.descent, step
+        if self.descent.estimator == "evolution":
+            return smoothed(thetas, *how, try_out), {"simulated": 0.0, "differentiate": 0.0}
+        began = time.perf_counter()
+        found, seconds = jax.block_until_ready(differentiated(thetas, *how))
+        more = {"simulated": seconds, "differentiate": time.perf_counter() - began}
+        if self.descent.estimator == "combined":
+            found = jax.vmap(gradients.combine)(found, smoothed(thetas, *how, try_out))
+        return found, more
+
+    def learn(self, vectors: np.ndarray, told: Told) -> None:
+        """Follow the gradients by one step."""
+        values = told["validation"]
+        first = int(jnp.nanargmin(values))
+        if self._base_value is None:
+            self._base_value = float(values[0])
+        if values[first] < self.best_value:
+            self.best, self.best_value = vectors[first], float(values[first])
+        if "gradient" in told:
+            thetas = jnp.asarray(vectors)
+            gradient = jnp.asarray(told["gradient"])
+            changes, self._state = jax.vmap(self._rule.update)(gradient, self._state, thetas)
+            self.thetas = jnp.asarray(optax.apply_updates(thetas, changes))

@@ -1,0 +1,171 @@
+"""Candidates in random worlds: the same ones for all, one program, parameters of any strategy."""
+
+from dataclasses import replace
+from typing import Any, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rps_jax.control import strategies
+from rps_jax.control.law import Details, RPSParams, Twist
+from rps_jax.control.strategies import Strategy
+from rps_jax.errors import InputError
+from rps_jax.runs import evaluate as room
+from rps_jax.runs.evaluate import Ask, Split, evaluate, seed_of
+from rps_jax.runs.objective import Objective
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+from rps_jax.tuning.space import Space
+from rps_jax.world import domain
+from rps_jax.world.domain import DOMAINS, Range
+
+CYLINDERS = replace(DOMAINS["wide"], objects=("random_cylinder",))
+SHORT: Any = {"engine": "quasistatic", "rules": Rules(horizon=8.0), "slots": 6}
+
+
+def paper(count, **changes):
+    """The paper's parameters for so many candidates, some of them changed."""
+    same = jax.tree.map(lambda value: np.full(count, value), RPSParams.paper())
+    return same._replace(**changes)
+
+
+def test_no_two_splits_share_a_seed():
+    seeds = [seed_of(seed, split) for seed in range(50) for split in get_args(Split)]
+    assert len(set(seeds)) == len(seeds)
+
+
+class TestEvaluate:
+    def test_results_are_labelled_as_those_of_a_sweep(self):
+        both = replace(CYLINDERS, objects=("random_cylinder", "cylinder"))
+        found = evaluate(paper(2), both, 3, seed=4, split="test", **SHORT)
+        assert dict(found.sizes) == {"candidate": 2, "world": 3, "pose": 3}
+        assert found.object.values.tolist() == ["random_cylinder", "cylinder", "random_cylinder"]
+        for index in range(3):
+            drawn = domain.table(domain.draw(both, seed_of(4, "test"), [index]))
+            for name, ((value,), unit) in drawn.items():
+                assert found[name].values[index] == value
+                assert found[name].attrs["units"] == unit
+        assert found.time.attrs["units"] == "s"
+        assert found.success.dtype == np.int8
+        expected = Objective().score(0.0, found.time, found.contact_lost_time, 0.0, SHORT["rules"])
+        away = np.where(np.isfinite(found.min_distance), found.min_distance, found.distance)
+        missed = 0.5 * np.minimum(away, 1.0)
+        assert (found.success == 0).all()
+        np.testing.assert_allclose(found.score, expected + missed, rtol=1e-5)
+
+    def test_another_call_of_the_same_shape_compiles_nothing(self, compiled):
+        one = evaluate(paper(3), CYLINDERS, 4, **SHORT)
+        before = len(compiled)
+        L = np.array([0.1, 0.2, 0.4])
+        other = evaluate(paper(3, L=L), CYLINDERS, 4, seed=7, split="validate", **SHORT)
+        assert len(compiled) == before
+        assert (one.score != other.score).any()
+
+    def test_candidates_differ_by_their_parameters_alone(self):
+        found = evaluate(paper(3, v_approach=np.array([0.01, 0.05, 0.01])), CYLINDERS, 4, **SHORT)
+        first, faster, again = found.transpose("candidate", ...).path_length.values
+        np.testing.assert_array_equal(first, again)
+        assert (first != faster).any()
+
+    def test_splits_and_seeds_have_worlds_of_their_own(self):
+        masses = [
+            evaluate(paper(1), CYLINDERS, 4, seed=seed, split=split, **SHORT).mass.values
+            for seed, split in ((0, "tune"), (0, "test"), (1, "tune"))
+        ]
+        assert len(np.unique(masses)) == 12
+
+    @pytest.mark.parametrize(
+        ("bad", "why"),
+        [
+            ({"params": RPSParams.paper()}, "one for each candidate"),
+            ({"params": paper(0)}, "one for each candidate"),
+            ({"params": paper(3, L=np.ones(2))}, r"\.L of 2 are not allowed"),
+            ({"params": paper(3, L=np.array([1, np.nan, 1]))}, r"RPSParams\.L of a candidate"),
+            ({"params": paper(3, L=np.array([1, 1, np.inf]))}, "candidate 2: L = inf"),
+            ({"params": paper(3, l_mr=np.array([0.1, 0.3, 0.1]))}, "candidate 1: l_mr"),
+            ({"params": paper(2, L=np.array(["a", "b"]))}, "array of numbers"),
+            ({"params": (np.ones(3),)}, "belong to no strategy"),
+            ({"split": "train"}, "choose from tune, validate, test"),
+            ({"domain": "wild"}, "did you mean 'wide'"),
+            ({"engine": "fuse"}, "unknown engine"),
+            ({"worlds": 0}, "worlds = 0"),
+            ({"seed": -1}, "seed = -1"),
+            ({"slots": 0}, "slots = 0"),
+        ],
+    )
+    def test_bad_input_is_told_before_anything_compiles(self, bad, why, compiled):
+        before = len(compiled)
+        with pytest.raises(InputError, match=why) as caught:
+            evaluate(**{"params": paper(3), "worlds": 4} | SHORT | bad)
+        assert "\n" not in str(caught.value)
+        assert len(compiled) == before
+
+
+class Nested(NamedTuple):
+    """Of a law that drives ahead: a pytree within a pytree, and a leaf with further axes."""
+
+    gains: dict[str, Any]
+    curve: Any  # (3,)
+    d_success: Any = 0.05
+
+
+@pytest.fixture
+def nested():
+    """The strategy is forgotten after the test."""
+    tables = strategies.PARAMS, strategies.STRATEGIES
+    before = [dict(table) for table in tables]
+
+    def step(params, state, observation):
+        v = params.gains["v"] * jnp.sum(params.curve)
+        return state, Twist(v, 0 * v, 0 * v), Details.of(observation)
+
+    own = Strategy(lambda params: (), step, check=lambda params: params)
+    strategies.register_strategy("nested", own, Nested({"v": 0.01}, np.ones(3)))
+    yield
+    for table, content in zip(tables, before, strict=True):
+        table.clear()
+        table.update(content)
+
+
+def test_any_registered_strategy_with_nested_parameters(nested):
+    curve = np.array([[1, 0, 0], [0, 0, 2], [0, 0, 0]])
+    params = Nested({"v": np.full(3, 0.01)}, curve, np.full(3, 0.05))
+    prompt = replace(CYLINDERS, velocity_error=Range(0, 0), command_delay=Range(0, 0))
+    found = evaluate(params, prompt, 2, **SHORT)
+    expected = np.array([[0.08], [0.16], [0.0]])  # [m] in 8 s
+    np.testing.assert_allclose(found.path_length, expected + np.zeros((3, 2)), rtol=0.01)
+
+
+class TestSeveralAsks:
+    def test_every_candidate_meets_the_same_worlds_whatever_shares_its_batch(self):
+        faster, params = paper(2, v_approach=np.array([0.01, 0.05])), paper(2)
+        hostile = replace(DOMAINS["hostile"], objects=("random_cylinder",))
+        asks = [Ask(faster, 3, np.arange(3)), Ask(params, 3, np.arange(3))]
+        where = [CYLINDERS, hostile], Setting(rules=SHORT["rules"], engine="quasistatic")
+        (one, two), _ = room.try_out(asks, *where, Objective(), slots=6)
+        assert one.score.shape == (2, 6)
+        np.testing.assert_array_equal(one.score[0], two.score[0])
+        np.testing.assert_array_equal(two.score[0], two.score[1])
+        assert (one.score[1] != one.score[0]).any()
+        (alone,), _ = room.try_out(
+            [Ask(paper(3), 3, np.arange(1, 2))], *where, Objective(), slots=6
+        )
+        np.testing.assert_allclose(alone.score[0], two.score[0, [1, 4]], rtol=1e-4)
+
+    def test_scores_are_those_of_the_first_version(self):
+        """The last digits depend on the processor."""
+        space = Space(("L", "K_h", "beta"))
+        away = np.array([[0, 0, 0], [0.5, -0.5, 0.3], [-0.7, 0.4, -0.2]], np.float32)
+        params = space.params(away + np.asarray(space.vector(space.base)))
+        near = replace(CYLINDERS, distance=Range(0.7, 0.9), gap=Range(0, 0))
+        setting = Setting(rules=Rules(horizon=20.0), engine="fused")
+        ask = Ask(params, 1, np.arange(6))
+        (answer,), _ = room.try_out([ask], [near], setting, Objective())
+        expected = [
+            [1.5613247156, 1.6000000238, 1.3565973043, 1.5677981377, 1.3648988008, 1.6000000238],
+            [1.5611727238, 1.6000000238, 1.3189700842, 1.5676416159, 1.3648886681, 1.6000000238],
+            [1.5615780354, 1.6000000238, 1.3576272726, 1.5680555105, 1.3642046452, 1.6000000238],
+        ]
+        np.testing.assert_allclose(answer.score, expected, rtol=1e-4)
