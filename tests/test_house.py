@@ -95,7 +95,9 @@ def test_an_engine_of_ones_own_is_one_file_and_one_line(tmp_path):
 
     def run(*arguments):
         command = [sys.executable, *arguments]
-        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        return subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+        )
 
     assert run("-c", SWEEP).stdout.split() == [str(tmp_path / "rps_jax" / "__init__.py"), "1"]
     assert "quasistatic,dummy}" in re.sub(r"\s", "", run("-m", "rps_jax", "sweep", "--help").stdout)
