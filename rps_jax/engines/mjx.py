@@ -7,6 +7,7 @@ one program: `stack` collects the fields in which they differ, `apply` puts one 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +18,17 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.control.law import Twist
 from rps_jax.engines.base import Driven, Engine, Mode, Motion, taken
-from rps_jax.engines.mjx_colliders import mjx
+from rps_jax.engines.mjx_colliders import (
+    OWN,
+    GeomType,
+    Pair,
+    collision,
+    constraint,
+    forward,
+    mjx,
+    smooth,
+    solver,
+)
 from rps_jax.geometry import solid
 from rps_jax.geometry.solid import Solid
 from rps_jax.world import scene
@@ -33,11 +44,20 @@ FIELDS = (
 )
 
 
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Colliders:
+    """Which colliders are ours; of the others MJX's own are taken."""
+
+    pairs: frozenset[Pair] = frozenset(OWN)
+
+
 class MJXStage(NamedTuple):
     """What all worlds of a batch that MJX steps share."""
 
     model: mjx.Model
     data: mjx.Data  # a blank to be filled with each world's state
+    colliders: Colliders = Colliders()
 
     def drive(
         self, fields: dict[str, jax.Array], motion: Motion, twists: Twist, physics: Physics
@@ -60,8 +80,28 @@ class MJXStage(NamedTuple):
         qvel = qvel.at[JOINTS.base].set(twist.in_world(qpos[2]))
         data = self.data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
         with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
-            data = mjx.step(model, data)
+            data = step(model, data, self.colliders)
         return Motion(data.qpos, data.qvel, data.qacc_warmstart)
+
+
+def step(model: mjx.Model, data: mjx.Data, colliders: Colliders = Colliders()) -> mjx.Data:
+    """One step of MJX by MJX's own stages, and our colliders.
+
+    Left out is what these scenes have not: tendons, actuators, sensors, springs, dampers, cameras
+    and lights. As in C MuJoCo, without dampers nothing is integrated implicitly.
+    """
+    data = smooth.kinematics(model, data)
+    data = smooth.com_pos(model, data)
+    data = smooth.crb(model, data)
+    data = smooth.factor_m(model, data)
+    data = collision(model, data, {pair: OWN[pair] for pair in colliders.pairs})
+    data = constraint.make_constraint(model, data)
+    data = smooth.com_vel(model, data)
+    data = smooth.rne(model, data)
+    force = -data.qfrc_bias
+    free = smooth.solve_m(model, data, force)
+    data = solver.solve(model, data.replace(qfrc_smooth=force, qacc_smooth=free))
+    return forward._advance(model, data, data.act_dot, data.qacc)
 
 
 class MJX(Engine):
@@ -96,33 +136,23 @@ class MJX(Engine):
         return 24 if backend == "cpu" else 16384
 
     def levers(self, family: str) -> dict[str, Callable[[MJXStage], MJXStage]]:
-        """Other options of the model."""
-        return {
-            "unused stages disabled": _option(disableflags=_UNUSED),
-            "sparse inertia matrix": _option(jacobian=mjx.JacobianType.SPARSE),
-        }
+        """Other options of the model, and MJX's own box collider."""
+        found = {"sparse inertia matrix": _sparse}
+        boxes = GeomType.BOX, GeomType.BOX
+        if family == "box":
+            usual = Colliders(frozenset(OWN) - {boxes})
+            found["MJX's own box collider"] = lambda stage: stage._replace(colliders=usual)
+        return found
 
     def contacts(self, stage: MJXStage, corners: int) -> int:
         """Points of contact that the program looks into."""
         return stage.data._impl.contact.dist.size  # pyright: ignore[reportAttributeAccessIssue]
 
 
-# Not in these scenes: equalities, joint limits and friction, actuators, springs, sensors.
-_UNUSED = mjx.DisableBit(sum(mjx.DisableBit[name] for name in (
-    *("EQUALITY", "FRICTIONLOSS", "LIMIT", "ACTUATION", "CLAMPCTRL"),
-    *("SPRING", "DAMPER", "SENSOR", "EULERDAMP"),
-)))  # fmt: skip
-
-
-def _option(**values: Any) -> Callable[[MJXStage], MJXStage]:
-    """The stage with other options of the model."""
-    changes = {f"opt.{name}": value for name, value in values.items()}
-
-    def change(stage: MJXStage) -> MJXStage:
-        model: Any = stage.model.tree_replace(changes)
-        return MJXStage(model, mjx.make_data(model))
-
-    return change
+def _sparse(stage: MJXStage) -> MJXStage:
+    """The stage with a sparse inertia matrix."""
+    model: Any = stage.model.tree_replace({"opt.jacobian": mjx.JacobianType.SPARSE})
+    return stage._replace(model=model, data=mjx.make_data(model))
 
 
 def solids_by_template(

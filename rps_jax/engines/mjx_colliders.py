@@ -1,4 +1,4 @@
-"""Colliders of MJX: of a plane and a cylinder, mended for float32; of a base and a prism.
+"""Colliders for our models in MJX: of a plane and a cylinder, of a base and a box or a prism.
 
 MJX 3.17.0 finds the lowest point of the rim from `axis * (axis . n) - n`. Of a standing cylinder,
 all but rounding cancels in that difference: a tilt of 1e-5 rad puts the contact points 12 mm off,
@@ -6,15 +6,18 @@ none at all up to 25 cm, and the cylinder gains energy. Here the direction comes
 product, which is exact for any tilt.
 
 The corners of a mesh are constants of a compiled program. Those of a prism are read from the feet
-that it stands on, and so may differ from world to world.
+that it stands on, and so may differ from world to world. A box is found in the same way, with four
+points as in the fused engine: MJX's own box collider finds the same ones more slowly.
+
+MJX's table of colliders is read and never written: other models in the process are not concerned.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Iterator
-from types import SimpleNamespace
+from collections.abc import Mapping
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import jax
@@ -27,6 +30,10 @@ from rps_jax.geometry import vectors
 with contextlib.redirect_stdout(io.StringIO()):  # MJX reports on the console that warp is absent
     from mujoco import mjx as mjx
     from mujoco.mjx._src import collision_driver, collision_primitive, math
+    from mujoco.mjx._src import constraint as constraint
+    from mujoco.mjx._src import forward as forward
+    from mujoco.mjx._src import smooth as smooth
+    from mujoco.mjx._src import solver as solver
     from mujoco.mjx._src.collision_types import Collision, GeomInfo
     from mujoco.mjx._src.types import Data, GeomType, Model
 
@@ -55,19 +62,20 @@ def plane_cylinder(plane: GeomInfo, cylinder: GeomInfo) -> tuple[jax.Array, jax.
     return distance, points - 0.5 * distance[:, None] * n, frames
 
 
-def box_prism(model: Model, data: Data, key: Any, geom: jax.Array) -> Collision:
-    """Distances (4,), points (4, 3) and frames (4, 3, 3) [m] of a base and an upright prism.
+def _box_box(model: Model, data: Data, key: Any, geom: jax.Array) -> Collision:
+    """Distances (4,), points (4, 3) and frames (4, 3, 3) [m] of a base and an upright box."""
+    base, thing = map(int, np.flatnonzero(model.geom_type == GeomType.BOX))
+    signs = np.array([[1, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1]])
+    return upright(model, data, base, thing, model.geom_size[thing] * signs)
 
-    As in the fused engine: two points each at the lower and the upper edge. Any other mesh, one
-    without feet, is left to MJX.
-    """
-    boxes, meshes, feet = (
+
+def _box_prism(model: Model, data: Data, key: Any, geom: jax.Array) -> Collision:
+    """Distances (4,), points (4, 3) and frames (4, 3, 3) [m] of a base and an upright prism."""
+    base, thing, feet = (
         np.flatnonzero(model.geom_type == kind)
         for kind in (GeomType.BOX, GeomType.MESH, GeomType.SPHERE)
     )
-    if (boxes.size, meshes.size) != (1, 1) or not feet.size:
-        return _BOX_MESH(model, data, key, geom)
-    return upright(model, data, boxes[0], meshes[0], model.geom_pos[feet])
+    return upright(model, data, base[0], thing[0], model.geom_pos[feet])
 
 
 def upright(model: Model, data: Data, base: int, thing: int, corners: jax.Array) -> Collision:
@@ -97,40 +105,24 @@ def upright(model: Model, data: Data, base: int, thing: int, corners: jax.Array)
     return distance, jnp.concatenate([place, z[:, None]], axis=-1), jnp.stack([frame] * 4)
 
 
-box_prism.ncon = 4  # pyright: ignore[reportFunctionMemberAccess]
-_FUNCTIONS = collision_driver._COLLISION_FUNC
-_BOX_MESH = _FUNCTIONS[GeomType.BOX, GeomType.MESH]
+Pair = tuple[GeomType, GeomType]
+# Each has as many points as MJX's own collider of the pair, for which a `Data` has room.
+OWN: dict[Pair, Any] = {
+    (GeomType.PLANE, GeomType.CYLINDER): plane_cylinder,
+    (GeomType.BOX, GeomType.BOX): _box_box,
+    (GeomType.BOX, GeomType.MESH): _box_prism,
+}
 
 
-def register() -> None:
-    """Have MJX use them; doing so twice does no harm."""
-    for pair, function in _FUNCTIONS.items():
-        if function is collision_primitive.plane_cylinder:
-            _FUNCTIONS[pair] = plane_cylinder
-    _FUNCTIONS[GeomType.BOX, GeomType.MESH] = box_prism
-
-
-@contextlib.contextmanager
-def box_as_prism(points: int) -> Iterator[None]:
-    """While it lasts, MJX finds where a box meets the base as it does for a prism.
-
-    `points` is 4, or 2 for the lower edge alone.
-    """
-
-    def collide(model: Model, data: Data, key: Any, geom: jax.Array) -> Collision:
-        base, thing = map(int, np.flatnonzero(model.geom_type == GeomType.BOX))
-        signs = np.array([[1, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1]])
-        found = upright(model, data, base, thing, model.geom_size[thing] * signs)
-        return tuple(x[:points] for x in found)  # pyright: ignore[reportReturnType]
-
-    collide.ncon = points  # pyright: ignore[reportFunctionMemberAccess]
-    pair = GeomType.BOX, GeomType.BOX
-    usual = _FUNCTIONS[pair]
-    _FUNCTIONS[pair] = collide
-    try:
-        yield
-    finally:
-        _FUNCTIONS[pair] = usual
-
-
-register()
+def collision(model: Model, data: Data, own: Mapping[Pair, Any] = MappingProxyType(OWN)) -> Data:
+    """The contacts of a world as `mjx.collision` has them, by our colliders where there are any."""
+    contacts = []
+    for key, contact in collision_driver._contact_groups(model, data).items():
+        pair: Any = key.types
+        usual = collision_driver._COLLISION_FUNC[pair]
+        distance, point, frame = own.get(pair, usual)(model, data, key, contact.geom)
+        count = usual.ncon
+        contact = jax.tree.map(lambda x, n=count: jnp.repeat(x, n, axis=0), contact)
+        contacts.append(contact.replace(dist=distance, pos=point, frame=frame))
+    whole = jax.tree.map(lambda *x: jnp.concatenate(x), *contacts)
+    return data.tree_replace({"_impl.contact": whole})  # pyright: ignore[reportReturnType]

@@ -6,7 +6,6 @@ change outcomes: which of them may be had is for `rps_jax.studies.fidelity` to s
 
 from __future__ import annotations
 
-import contextlib
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,7 +18,6 @@ import jax.numpy as jnp
 
 from rps_jax import engines
 from rps_jax.control.law import Twist
-from rps_jax.engines import mjx_colliders
 from rps_jax.engines.base import Driven, Motion
 from rps_jax.studies import benchmark
 from rps_jax.studies.benchmark import Program
@@ -31,7 +29,6 @@ class Lever(NamedTuple):
 
     physics: Mapping[str, Any] = {}  # fields of `Physics` to change
     stage: Callable[[Any], Any] = lambda stage: stage
-    tracing: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext
     donated: bool = True
     flags: dict[str, Any] | None = None  # of XLA
     worlds: float = 1.0  # times as many
@@ -63,10 +60,6 @@ _OF_SOLVERS = {
     "16 solver iterations": Lever({"iterations": 16}),
     "5 line-search steps": Lever({"ls_iterations": 5}),
     "20 line-search steps": Lever({"ls_iterations": 20}),
-}
-_OF_MJX = {
-    "own box-box collider": Lever(tracing=partial(mjx_colliders.box_as_prism, 4)),
-    "own, two points": Lever(tracing=partial(mjx_colliders.box_as_prism, 2)),
 }
 _FLAGS = {
     "cpu": {
@@ -144,8 +137,7 @@ def _traced(
     changed = replace(setting, physics=replace(setting.physics, **lever.physics))
     count = max(1, round(worlds * lever.worlds))
     how = {"stage": lever.stage, "donated": lever.donated, "flags": lever.flags}
-    with lever.tracing():
-        return benchmark.traced(name, changed, family, count, simulated=simulated, **how)
+    return benchmark.traced(name, changed, family, count, simulated=simulated, **how)
 
 
 def _rate(program: Program) -> float:

@@ -1,0 +1,43 @@
+"""Using this package changes MJX for nobody else in the process."""
+
+import subprocess
+import sys
+
+OTHERS = """
+import contextlib, io
+with contextlib.redirect_stdout(io.StringIO()):
+    from mujoco import mjx
+    from mujoco.mjx._src import collision_driver
+import jax, mujoco, numpy as np
+
+CYLINDER = '<mujoco><worldbody><geom type="plane" size="1 1 1"/><body pos="0 0 .499">'\
+    '<freejoint/><geom type="cylinder" size=".3 .5"/></body></worldbody></mujoco>'
+
+def others():
+    model = mujoco.MjModel.from_xml_string(CYLINDER)
+    data = jax.jit(mjx.step)(mjx.put_model(model), mjx.make_data(model))
+    return np.concatenate([data.qpos, data.qvel]).tobytes().hex()
+"""
+ALONE = OTHERS + "print(others())"
+BESIDE = (
+    OTHERS
+    + """
+before = dict(collision_driver._COLLISION_FUNC)
+import rps_jax
+few = {"targets": [(1.0, 0.0)], "strategies": ["rps"], "friction": ["S1"], "horizon": 0.1}
+rps_jax.table(["cylinder"], **few, engine="mjx")
+assert collision_driver._COLLISION_FUNC == before
+print(others())
+"""
+)
+
+
+def test_somebody_elses_cylinder_falls_as_if_we_were_not_there():
+    """Bit by bit, after a cylinder of ours was stepped by MJX in the same process."""
+
+    def said(code):
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.split()[-1]
+
+    assert said(BESIDE) == said(ALONE)
