@@ -42,3 +42,12 @@ def compiled():
     monitoring.register_event_duration_secs_listener(note)
     yield took
     monitoring.unregister_event_duration_listener(note)
+
+
+@pytest.fixture
+def registries():
+    """What a test registers is forgotten after it."""
+    from helpers import temporary_names
+
+    with temporary_names():
+        yield
