@@ -18,7 +18,7 @@ from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.runs import cluster, sweep
 from rps_jax.runs.board import Board
-from rps_jax.trials import progress
+from rps_jax.trials import setting
 from rps_jax.world.domain import from_json
 
 NEAR = {"objects": ["random_cylinder"], "distance": [0.7, 0.8], "bearing": [-0.5, 0.5]}
@@ -170,7 +170,7 @@ def test_a_worker_killed_at_work_changes_nothing(domain, tmp_path, two_workers, 
 
         yield report
 
-    monkeypatch.setattr(progress, "progress_bar", killing)
+    monkeypatch.setattr(setting, "progress_bar", killing)
     assert rps(*SWEEP, "--domain", domain, "--out", out, "--ray", "local") == 0
     assert killed
     assert len(seen) > len(json.loads((out / "environment.json").read_text())["workers"])
