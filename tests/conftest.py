@@ -21,7 +21,10 @@ def pytest_configure(config):
 
 
 # The files that take longest, to be begun first: what is begun last leaves a processor idle.
-LONGEST = ("sweep", "notebooks", "cluster", "scene", "cli", "quasistatic", "view", "physics")
+LONGEST = (
+    *("sweep", "notebooks", "cluster", "scene", "cli", "quasistatic", "view", "physics"),
+    "library",
+)
 
 
 def pytest_collection_modifyitems(items):
