@@ -14,13 +14,17 @@ def pytest_configure(config):
 
     video.choose_gl()
     cache = config.rootpath / ".jax_cache"
-    jax.config.update("jax_compilation_cache_dir", str(cache))
+    os.environ.setdefault("RPS_CACHE", str(cache))  # of commands, also in processes of their own
+    jax.config.update("jax_compilation_cache_dir", os.environ["RPS_CACHE"])
     os.environ.setdefault("WARP_CACHE_PATH", str(cache / "warp"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 # The files that take longest, to be begun first: what is begun last leaves a processor idle.
-LONGEST = ("sweep", "notebooks", "cluster", "scene", "cli", "quasistatic", "view", "physics")
+LONGEST = (
+    *("sweep", "notebooks", "cluster", "scene", "cli", "quasistatic", "view", "physics"),
+    "library",
+)
 
 
 def pytest_collection_modifyitems(items):
@@ -42,3 +46,12 @@ def compiled():
     monitoring.register_event_duration_secs_listener(note)
     yield took
     monitoring.unregister_event_duration_listener(note)
+
+
+@pytest.fixture
+def registries():
+    """What a test registers is forgotten after it."""
+    from helpers import temporary_names
+
+    with temporary_names():
+        yield

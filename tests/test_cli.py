@@ -7,8 +7,10 @@ import sys
 import numpy as np
 import pytest
 import xarray as xr
+from helpers import refusal, rps
 
-from rps_jax.app import cli
+from rps_jax.app.cli import parsing
+from rps_jax.app.cli.tuning import TuneES
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.trials.results import DIMS
@@ -18,10 +20,6 @@ SMALL = [
     *("table", "--targets", "0.6", "0", "0.62", "0.03", "--horizon", "18", "--slots", "4"),
     *("--objects", "box", "nonuniform_box", "--workers", "1", "--strategies", "rps", "nps"),
 ]
-
-
-def rps(*arguments):
-    return cli.main([str(a) for a in arguments])
 
 
 @pytest.fixture(scope="module")
@@ -50,14 +48,13 @@ def test_a_table_run_leaves_a_labelled_run_folder(runs):
     assert "| RPS | ours" in (runs[0] / "table.txt").read_text()
 
 
-def test_the_same_command_gives_the_same_results_file_bit_for_bit(runs):
+def test_the_same_command_gives_the_same_results_bit_for_bit(runs):
     assert (runs[0] / "results.nc").read_bytes() == (runs[1] / "results.nc").read_bytes()
 
 
 def test_a_run_is_not_overwritten_unasked(runs, capsys):
     before = (runs[0] / "results.nc").read_bytes()
-    assert rps(*SMALL, "--out", runs[0]) == 2
-    assert "--overwrite" in capsys.readouterr().err
+    assert "--overwrite" in refusal(capsys, *SMALL, "--out", runs[0])
     assert (runs[0] / "results.nc").read_bytes() == before
 
 
@@ -73,7 +70,7 @@ def test_a_push_draws_and_films_a_trial(tmp_path, capsys):
     assert (out / "push.mp4").stat().st_size > 1_000
 
 
-def test_a_push_without_the_means_to_film_says_how_and_does_the_rest(tmp_path, capsys, monkeypatch):
+def test_a_push_that_cannot_be_filmed_says_how_and_does_the_rest(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
     out = tmp_path / "push"
     arguments = ("--engine", "fused", "--horizon", 18, "--out", out)
@@ -122,8 +119,8 @@ def test_the_papers_totals_and_targets():
 
 
 def test_a_quick_run_makes_small_only_what_was_not_asked_for():
-    asked = cli.TuneES(quick=True, worlds=7, tuned=("logistic",))
-    quick = cli._quickly(asked, worlds=16, population=10)
+    asked = TuneES(quick=True, worlds=7, tuned=("logistic",))
+    quick = asked.quickly(worlds=16, population=10)
     assert (quick.worlds, quick.tuned) == (7, ("logistic",))
     assert (quick.population, quick.engine, quick.horizon) == (10, "quasistatic", 150.0)
     assert quick.generations == asked.generations
@@ -131,8 +128,8 @@ def test_a_quick_run_makes_small_only_what_was_not_asked_for():
 
 def test_files_of_the_same_name_are_told_apart_by_their_folders():
     runs = ("paper", "runs/es/tuned.json", "runs/grad/tuned.json")
-    assert cli.labels_of("params", runs) == ["paper", "es/tuned", "grad/tuned"]
-    assert cli.labels_of("params", runs[:2]) == ["paper", "tuned"]
+    assert parsing.labels_of("params", runs) == ["paper", "es/tuned", "grad/tuned"]
+    assert parsing.labels_of("params", runs[:2]) == ["paper", "tuned"]
     for bad in ((), ("paper", "paper"), ("a/es/tuned.json", "b/es/tuned.json")):
         with pytest.raises(InputError, match="name each once"):
-            cli.labels_of("params", bad)
+            parsing.labels_of("params", bad)

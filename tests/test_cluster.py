@@ -7,27 +7,26 @@ import random
 import signal
 import socket
 import sys
+from dataclasses import replace
 
 import jax
 import pytest
+from helpers import PLAN, SLOTS, one_sentence, parts_of, rps, swept
 
-from rps_jax.app import cli
+from rps_jax.app.cli import running
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.runs import cluster, sweep
 from rps_jax.runs.board import Board
-from rps_jax.runs.sweep import Plan
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
-from rps_jax.world import paper
+from rps_jax.trials import setting
 from rps_jax.world.domain import from_json
-from rps_jax.world.physics import preset
 
-SWEEP = [
-    *("sweep", "--engine", "fused", "--fidelity", "fast", "--horizon", "20", "--worlds", "20"),
-    *("--strategies", "rps", "nps", "--part", "7", "--slots", "8"),
-]
 NEAR = {"objects": ["random_cylinder"], "distance": [0.7, 0.8], "bearing": [-0.5, 0.5]}
+OF_NEAR = replace(PLAN, domain=from_json(NEAR))
+SWEEP = [
+    *("sweep", "--fidelity", "fast", "--horizon", 20, "--worlds", 20),
+    *("--strategies", "rps", "nps", "--part", 7, "--slots", SLOTS),
+]
 
 
 # --- the board -----------------------------------------------------------------------------
@@ -107,7 +106,7 @@ def test_room_for_workers_by_hand():
 @pytest.fixture
 def domain(tmp_path):
     (tmp_path / "near.json").write_text(json.dumps(NEAR))
-    return str(tmp_path / "near.json")
+    return tmp_path / "near.json"
 
 
 def closed_port():
@@ -117,20 +116,18 @@ def closed_port():
 
 
 @pytest.mark.parametrize("wrong", ["closed", "auto", "what", "missing"])
-def test_without_ray_or_its_cluster_a_sweep_ends_in_one_sentence(
+def test_without_a_cluster_a_sweep_ends_in_one_sentence(
     wrong, domain, tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr(cli, "use_cache", lambda: None)
     nobody = f"127.0.0.1:{closed_port()}"
     address = {"closed": nobody, "missing": "local"}.get(wrong, wrong)
     monkeypatch.setenv("RAY_ADDRESS", nobody)
     if wrong == "missing":
         monkeypatch.setitem(sys.modules, "ray", None)
-    out = str(tmp_path / "run")
-    assert cli.main([*SWEEP, "--domain", domain, "--ray", address, "--out", out]) == 2
-    error = capsys.readouterr().err.splitlines()[-1]
+    out = tmp_path / "run"
+    assert rps(*SWEEP, "--domain", domain, "--ray", address, "--out", out) == 2
+    error = one_sentence(capsys.readouterr().err.splitlines(keepends=True)[-1])  # after its bar
     message = "pip install 'rps_jax[cluster]'" if wrong == "missing" else f"ray = {address}"
-    assert error.startswith("rps: error: ")
     assert message in error
 
 
@@ -138,47 +135,25 @@ def test_without_ray_or_its_cluster_a_sweep_ends_in_one_sentence(
 
 
 @pytest.fixture(scope="module")
-def programs(tmp_path_factory):
-    """The cache of compiled programs, also of workers."""
-    before = jax.config.jax_compilation_cache_dir
+def two_workers():
+    """Ray, until the end of the module."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_worker_niceness", "0")  # or other tests starve them
-        if "RPS_CACHE" not in os.environ:
-            patch.setenv("RPS_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
-    jax.config.update("jax_compilation_cache_dir", before)
-
-
-@pytest.fixture(scope="module")
-def two_workers(programs):
-    """Ray, until the end of the module."""
-    with cluster.connected("local", num_cpus=2, object_store_memory=100 * 2**20) as ray:
-        yield ray
-    assert not ray.is_initialized()
-
-
-def payload(folder):
-    return {path.name: path.read_bytes() for path in (folder / "parts").iterdir()}
+        with cluster.connected("local", num_cpus=2, object_store_memory=100 * 2**20) as ray:
+            yield ray
+        assert not ray.is_initialized()
 
 
 def opened(folder):
     """A run folder with the plan of `SWEEP` in it, and the plan."""
-    plan = Plan(
-        from_json(NEAR),
-        20,
-        {name: paper.PARAMS[name] for name in ("rps", "nps")},
-        Setting(preset(fidelity="fast"), Rules(horizon=20.0), engine="fused"),
-        part=7,
-    )
-    return sweep.open_run(folder, plan), plan
+    return sweep.open_run(folder, OF_NEAR), OF_NEAR
 
 
 def test_a_worker_killed_at_work_changes_nothing(domain, tmp_path, two_workers, monkeypatch):
     """SIGKILL after some of its trials; the parts are those of one process without Ray."""
     out, plan = opened(tmp_path / "run")
-    plain, _ = opened(tmp_path / "plain")
-    cli.use_cache()
-    sweep.run(plain, plan, slots=8)
+    running.use_cache()
+    plain = swept(tmp_path / "plain", plan)
     seen, killed = set(), []
 
     @contextlib.contextmanager
@@ -195,12 +170,12 @@ def test_a_worker_killed_at_work_changes_nothing(domain, tmp_path, two_workers, 
 
         yield report
 
-    monkeypatch.setattr(cli, "progress_bar", killing)
-    assert cli.main([*SWEEP, "--domain", domain, "--out", str(out), "--ray", "local"]) == 0
+    monkeypatch.setattr(setting, "progress_bar", killing)
+    assert rps(*SWEEP, "--domain", domain, "--out", out, "--ray", "local") == 0
     assert killed
     assert len(seen) > len(json.loads((out / "environment.json").read_text())["workers"])
-    assert len(payload(plain)) == 6
-    assert payload(out) == payload(plain)
+    assert len(parts_of(plain)) == 6
+    assert parts_of(out) == parts_of(plain)
     assert files.read_results(out).success.shape == (2, 20)
 
 
@@ -209,7 +184,7 @@ def test_what_ends_a_worker_ends_the_run_as_itself(tmp_path, two_workers):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
 
     with pytest.raises(RuntimeError, match="RESOURCE_EXHAUSTED: Out of memory"):
-        cluster.run(*opened(tmp_path), address="local", prepare=prepare)
+        cluster.run_on_cluster(*opened(tmp_path), address="local", prepare=prepare)
 
 
 def test_a_worker_with_other_software_is_refused(tmp_path, two_workers, monkeypatch):
@@ -218,9 +193,9 @@ def test_a_worker_with_other_software_is_refused(tmp_path, two_workers, monkeypa
     with pytest.raises(
         InputError, match=r"other software \(commit = .* there, .another. asked for"
     ):
-        cluster.run(*opened(tmp_path), address="local", prepare=int)
+        cluster.run_on_cluster(*opened(tmp_path), address="local", prepare=int)
 
 
 def test_a_cluster_without_room_for_a_worker_is_refused(tmp_path, two_workers):
     with pytest.raises(InputError, match=r"workers = 3 .* so many processors"):
-        cluster.run(*opened(tmp_path), address="local", prepare=int, workers=3)
+        cluster.run_on_cluster(*opened(tmp_path), address="local", prepare=int, workers=3)

@@ -5,17 +5,19 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from test_video import decode
+from helpers import decode, rps
 
 from rps_jax.analysis import video
-from rps_jax.app import cli, film
+from rps_jax.app import film
+from rps_jax.app.cli.looking import Film
+from rps_jax.app.cli.replicating import Table
+from rps_jax.control.law import RPSParams
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.runs import sweep
-from rps_jax.runs.sweep import Plan
+from rps_jax.runs.plan import Plan
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
-from rps_jax.world import paper
 from rps_jax.world.domain import DOMAINS
 
 pytestmark = pytest.mark.filterwarnings("ignore:os.fork")  # as in test_video
@@ -26,7 +28,7 @@ FPS = 12
 
 def table(folder):
     """A run of `rps table` over two targets, as far as a film reads it."""
-    asked = cli.Table(objects=("box",), targets=((0.6, 0.0), (2.0, 2.0)), engine=ENGINE)
+    asked = Table(objects=("box",), targets=((0.6, 0.0), (2.0, 2.0)), engine=ENGINE)
     options = dataclasses.asdict(asked) | {"out": str(folder)}
     files.write_json(folder / "config.json", {"options": options})
 
@@ -35,7 +37,7 @@ def plan_of(*names):
     """Two worlds of each of these objects."""
     domain = dataclasses.replace(DOMAINS["wide"], objects=names)
     setting = Setting(rules=Rules(horizon=20.0), engine=ENGINE)
-    return Plan(domain, 2 * len(names), {"rps": paper.PARAMS["rps"]}, setting)
+    return Plan(domain, 2 * len(names), {"rps": RPSParams.paper()}, setting)
 
 
 def a_sweep(folder):
@@ -54,12 +56,12 @@ def differ(a, b):
     return (np.abs(a - b).max(axis=-1) > 60).sum() > 20
 
 
-@pytest.mark.parametrize("make", [table, pytest.param(sweep, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("make", [table, pytest.param(a_sweep, marks=pytest.mark.slow)])
 def test_a_film_shows_each_trial_in_its_tile_and_holds_the_end(make, tmp_path):
     make(tmp_path)
     out = tmp_path / "two.mp4"
-    arguments = ["--grid", "2x4", "--seconds", "2", "--speed", "4.8", "--out", str(out)]
-    assert cli.main(["film", str(tmp_path), *arguments]) == 0
+    arguments = ["--grid", "2x4", "--seconds", 2, "--speed", 4.8, "--out", out]
+    assert rps("film", tmp_path, *arguments) == 0
     images = decode(out)
     # 20 control steps of 0.02 s a frame: at 0, 0.4, ... 2 s, and the last for a second more.
     assert images.shape == (6 + FPS, 2 * 270, 4 * 480, 3)
@@ -84,7 +86,7 @@ def test_worlds_of_several_objects_keep_their_order(tmp_path):
 
 def test_a_trial_that_has_ended_is_told_and_not_drawn_again(tmp_path):
     table(tmp_path)
-    takes, setting = cli._takes(cli.Film(tmp_path), 2)
+    takes, setting = Film(tmp_path).takes(2)
     (take,) = takes
     ((ended, first), *_, (_, before), (over, last)) = [
         shots for shots, _ in zip(film._shots(take, setting, 50), range(20), strict=False)
@@ -99,7 +101,7 @@ def test_a_trial_that_has_ended_is_told_and_not_drawn_again(tmp_path):
 
 def test_the_memory_of_a_film_does_not_grow_with_its_length(tmp_path):
     table(tmp_path)
-    takes, _ = cli._takes(cli.Film(tmp_path), 1)
+    takes, _ = Film(tmp_path).takes(1)
     tile = video.Tile(takes[0].scenes[0], (1.0, 1.0))
     shot = video.Shot(takes[0].part.worlds.qpos[0], np.zeros(2), "")
 
@@ -126,7 +128,7 @@ def test_tiles_are_as_large_as_fits(grid, size):
 
 def test_more_trials_than_places_are_refused(tmp_path):
     table(tmp_path)
-    takes, _ = cli._takes(cli.Film(tmp_path), 2)
+    takes, _ = Film(tmp_path).takes(2)
     tiles = [video.Tile(scene, (1.0, 1.0)) for scene in takes[0].scenes]
     with pytest.raises(InputError, match="grid = 1x1 is not allowed for 2 trials"):
         video.render_grid(tiles, [], tmp_path / "x.mp4", shape=(1, 1), size=(320, 180))

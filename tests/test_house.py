@@ -6,13 +6,12 @@ import re
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from helpers import ROOT
 
 import rps_jax
 
-ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "rps_jax"
 ROOMS = sorted(path.parent for path in PACKAGE.glob("*/__init__.py"))
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from helpers import ROOT
 
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
@@ -153,7 +154,8 @@ def test_a_wrong_digest_is_damage_too(folder):
 @pytest.mark.parametrize(
     "content", [b"", b"torn", b"\xff\xfe", b"[1]", b"[" * 100_000, b"{'a': 1}"]
 )
-def test_what_an_older_version_left_without_checksum_is_named_when_it_is_no_json(content, folder):
+def test_a_file_without_checksum_that_is_no_json_is_named(content, folder):
+    """As an older version left it."""
     for name, read in (
         ("manifest.json", run_folder.manifest),
         ("environment.json", provenance.told),
@@ -163,7 +165,8 @@ def test_what_an_older_version_left_without_checksum_is_named_when_it_is_no_json
         in_one_sentence(folder / name, read, folder)
 
 
-def test_what_an_older_version_left_without_checksum_is_read(sound, tmp_path):
+def test_a_file_without_checksum_is_read(sound, tmp_path):
+    """As an older version left it."""
     folder = shutil.copytree(sound, tmp_path / "run")
     for path in folder.glob("*.sha256"):
         path.unlink()
@@ -250,7 +253,8 @@ def test_a_write_killed_at_any_moment_leaves_the_old_file_or_the_new(tmp_path, m
     assert files.checksum(path).exists()
 
 
-def test_a_part_replaced_and_killed_at_any_moment_is_the_old_one_or_the_new(tmp_path, monkeypatch):
+def test_a_part_that_is_replaced_is_the_old_one_or_the_new(tmp_path, monkeypatch):
+    """Whenever the process is killed."""
     parts, seen = Parts(tmp_path), set()
 
     def check():
@@ -310,8 +314,7 @@ with run_folder.hold(Path(sys.argv[1])):
 
 def test_a_killed_process_holds_nothing_and_the_record_needs_no_jax(tmp_path):
     command = [sys.executable, "-c", _HOLDER, str(tmp_path)]
-    here = Path(__file__).parent.parent
-    with subprocess.Popen(command, cwd=here, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as one:
+    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as one:
         assert one.stdout.readline() == b"held\n"
         refused(tmp_path)
         one.kill()

@@ -22,8 +22,7 @@ from rps_jax.control import strategies
 from rps_jax.control.strategies import Strategy
 from rps_jax.errors import InputError
 from rps_jax.record import files
-from rps_jax.runs import sweep
-from rps_jax.runs.sweep import Plan
+from rps_jax.runs.plan import Plan, scene_of, world_part
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.batch import Part, rows
 from rps_jax.trials.pushes import Case
@@ -101,9 +100,9 @@ def of_sweep(run: Path, plan: Plan, arm: str, which: str, count: int) -> list[Ta
         takes.append(
             Take(
                 [int(place) for place in places],
-                sweep.world_part(plan, list(plan.arms).index(arm), worlds),
+                world_part(plan, list(plan.arms).index(arm), worlds),
                 strategies.of(plan.arms[arm]),
-                [sweep.scene_of(plan, int(i)) for i in worlds],
+                [scene_of(plan, int(i)) for i in worlds],
                 [f"world {i}" for i in worlds],
             )
         )

@@ -385,6 +385,21 @@ def step(
     The speed stays v* split by the slope a_r. The 0-or-1 parameters switch as ever, and bounds
     (saturation, gamma_max, sigma) stay as they are: they have kinks, but no jumps. One jump is
     left: at a heading error of exactly pi the robot chooses a side.
+
+    Example:
+      >>> import numpy as np
+      >>> import rps_jax
+      >>> params = rps_jax.RPSParams.paper()
+      >>> seen = rps_jax.Observation(
+      ...     p_world_robot=np.zeros(2),
+      ...     yaw=0.0,
+      ...     p_robot_contact=np.array([0.36, 0.0]),
+      ...     in_contact=True,
+      ...     p_world_target=np.array([2.0, 0.0]),
+      ... )
+      >>> state, twist = rps_jax.step(params, rps_jax.RPSState.init(params), seen)
+      >>> f"{float(twist.v_x):.2f} m/s straight ahead"
+      '0.05 m/s straight ahead'
     """
     state, twist, _ = step_with_details(params, state, observation, temperatures)
     return state, twist

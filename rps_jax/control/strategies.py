@@ -249,5 +249,8 @@ def restored(values: Mapping[str, Any]) -> Params:
         raise errors.InputError(
             f"parameters of {kind} are {', '.join(numbers(like))}, and not {', '.join(left)}."
         )
-    shaped = {name: np.asarray(x, float) if np.ndim(x) else float(x) for name, x in left.items()}
+    shaped = {
+        name: np.asarray(x, float) if np.ndim(x) else errors.check_number(name, x)
+        for name, x in left.items()
+    }
     return changed(like, shaped)

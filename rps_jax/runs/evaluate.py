@@ -89,11 +89,12 @@ def evaluate(
       >>> import jax
       >>> import numpy as np
       >>> import rps_jax
-      >>> same = jax.tree.map(lambda value: np.full(8, value), rps_jax.RPSParams.paper())
-      >>> eight, rules = same._replace(L=np.geomspace(0.1, 1, 8)), rps_jax.Rules(horizon=2.0)
-      >>> found = rps_jax.evaluate(eight, "wide", worlds=6, rules=rules)
+      >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
+      >>> same = jax.tree.map(lambda value: np.full(4, value), rps_jax.RPSParams.paper())
+      >>> four = same._replace(L=np.geomspace(0.1, 1, 4))
+      >>> found = rps_jax.evaluate(four, drums, worlds=2, rules=rules)
       >>> found.score.mean("world").shape
-      (8,)
+      (4,)
     """
     domain = named(domain)
     errors.check_count("worlds", worlds, at_most=10_000_000)

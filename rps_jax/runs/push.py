@@ -133,7 +133,7 @@ def push(
 
     Example:
       >>> import rps_jax
-      >>> seen = rps_jax.push(target=(1.0, 0.5), engine="fused", horizon=3.0)
+      >>> seen = rps_jax.push("cylinder", (1.0, 0.5), engine="quasistatic", horizon=3.0)
       >>> seen.data.v_x.dims
       ('time',)
     """
@@ -185,10 +185,12 @@ def replay(
       InputError: the folder holds no sweep, or not this world or arm.
 
     Example:
-      >>> import tempfile, rps_jax
-      >>> arms, rules = {"rps": rps_jax.RPSParams.paper()}, rps_jax.Rules(horizon=1.0)
+      >>> import tempfile
+      >>> import rps_jax
+      >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
+      >>> arms = {"rps": rps_jax.RPSParams.paper()}
       >>> with tempfile.TemporaryDirectory() as run:
-      ...     found = rps_jax.sweep("wide", arms, worlds=3, out=run, rules=rules)
+      ...     found = rps_jax.sweep(drums, arms, worlds=8, out=run, rules=rules)
       ...     again = rps_jax.replay(run, 2)
       >>> bool(again.outcome.success) == bool(found.success.sel(arm="rps", world=2))
       True

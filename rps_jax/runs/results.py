@@ -172,9 +172,14 @@ def load(run: str | Path) -> xr.Dataset:
       InputError: the folder holds no results, or its file is damaged.
 
     Example:
+      >>> import tempfile
       >>> import rps_jax
-      >>> rps_jax.load("no/such/run")
-      Traceback (most recent call last):
-      rps_jax.errors.InputError: run = no/such/run holds no results.nc: give the folder of a ...
+      >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
+      >>> arms = {"rps": rps_jax.RPSParams.paper()}
+      >>> with tempfile.TemporaryDirectory() as run:
+      ...     made = rps_jax.sweep(drums, arms, worlds=8, out=run, rules=rules)
+      ...     found = rps_jax.load(run)
+      >>> found.equals(made)
+      True
     """
     return labelled(files.read_results(Path(run)))

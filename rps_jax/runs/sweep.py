@@ -80,10 +80,11 @@ def sweep(
 
     Example:
       >>> import rps_jax
+      >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
       >>> both = {"paper": rps_jax.RPSParams.paper(), "tuned": rps_jax.RPSParams.tuned()}
-      >>> found = rps_jax.sweep("wide", both, worlds=6, rules=rps_jax.Rules(horizon=2.0))
+      >>> found = rps_jax.sweep(drums, both, worlds=4, rules=rules)
       >>> dict(found.success.sizes)
-      {'arm': 2, 'world': 6}
+      {'arm': 2, 'world': 4}
     """
     setting = Setting(preset(physics, fidelity), rules, seed, engine)
     plan = Plan(named(domain), worlds, arms, setting, part)

@@ -74,7 +74,7 @@ def table(
     Example:
       >>> import rps_jax
       >>> few = {"targets": [(1.0, 0.0), (1.0, 1.0)], "objects": ["cylinder"]}
-      >>> found = rps_jax.table(**few, strategies=["rps"], engine="fused", horizon=2.0)
+      >>> found = rps_jax.table(**few, strategies=["rps"], engine="mujoco", horizon=2.0)
       >>> dict(found.success.sizes)
       {'strategy': 1, 'object': 1, 'friction': 2, 'target': 2}
     """

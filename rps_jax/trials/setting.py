@@ -81,10 +81,10 @@ def progress_bar(trials: int, what: str = "push") -> Iterator[Told]:
 
     Example:
       >>> import rps_jax
-      >>> with rps_jax.progress_bar(2) as report:
-      ...     arms = {"rps": rps_jax.RPSParams.paper()}
-      ...     rules = rps_jax.Rules(horizon=1.0)
-      ...     found = rps_jax.sweep("wide", arms, worlds=2, rules=rules, report=report)
+      >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
+      >>> arms = {"rps": rps_jax.RPSParams.paper()}
+      >>> with rps_jax.progress_bar(8) as report:
+      ...     found = rps_jax.sweep(drums, arms, worlds=8, rules=rules, report=report)
       >>> report.timing.simulated > 0
       True
     """

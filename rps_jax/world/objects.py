@@ -83,6 +83,24 @@ def register_object(name: str, path: str | Path, footprint: Footprint | None = N
 
     Raises:
       InputError: the name is one of the paper's, or file or footprint are not such.
+
+    Example:
+      >>> from pathlib import Path
+      >>> import rps_jax
+      >>> crate = '''
+      ... <mujoco model="crate">
+      ...   <include file="base.xml"/>
+      ...   <worldbody>
+      ...     <body name="object">
+      ...       <freejoint name="object"/>
+      ...       <geom name="object" class="object" type="box" size="0.2 0.3 0.25" mass="12"/>
+      ...     </body>
+      ...   </worldbody>
+      ... </mujoco>'''
+      >>> _ = Path("crate.xml").write_text(crate)
+      >>> rps_jax.register_object("crate", "crate.xml")
+      >>> "crate" in rps_jax.OBJECTS
+      True
     """
     if name in _BUILT_IN:
         raise InputError(

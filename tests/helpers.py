@@ -1,0 +1,147 @@
+"""What several files of tests share: commands, small trials and sweeps, shapes and comparisons."""
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import imageio_ffmpeg
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rps_jax.app import cli
+from rps_jax.control import strategies
+from rps_jax.control.law import RPSParams
+from rps_jax.geometry import footprint as fp
+from rps_jax.geometry.footprint import Footprint
+from rps_jax.robot.skin import HALF_LENGTH, HALF_WIDTH
+from rps_jax.runs import sweep
+from rps_jax.runs.plan import Plan
+from rps_jax.trials.pushes import Case
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+from rps_jax.world import objects, paper
+from rps_jax.world.domain import DOMAINS, Range
+from rps_jax.world.physics import preset
+from rps_jax.world.scene import FRICTION
+
+ROOT = Path(__file__).resolve().parent.parent
+PAPER = RPSParams.paper()
+
+
+# --- the command line ----------------------------------------------------------------------
+
+
+def rps(*arguments: Any) -> int:
+    """Exit code of a command; tyro ends the process for what it cannot read."""
+    try:
+        return cli.main([str(a) for a in arguments])
+    except SystemExit as end:
+        return end.code
+
+
+def refusal(capsys, *arguments: Any) -> str:
+    """The one sentence in which a command refuses its input, on the error stream."""
+    capsys.readouterr()
+    assert rps(*arguments) == 2
+    return one_sentence(capsys.readouterr().err)
+
+
+def one_sentence(error: str) -> str:
+    """The error, which must be one sentence of `rps`."""
+    assert error.startswith("rps: error: ")
+    assert error.count("\n") == 1
+    assert error.endswith(".\n")
+    return error
+
+
+# --- trials and sweeps ---------------------------------------------------------------------
+
+FAST = preset(fidelity="fast")
+# The fused engine, which compiles soonest of those that solve for contact.
+SHORT = Setting(FAST, Rules(horizon=20.0), engine="fused")
+SLOTS = 8  # of all sweeps of this setting, so that they share their programs
+BOXES = replace(
+    DOMAINS["wide"],
+    objects=("random_box",),
+    distance=Range(0.7, 0.8),
+    bearing=Range(-0.5, 0.5),
+    gap=Range(0, 0.01),
+)
+CYLINDERS = replace(BOXES, objects=("random_cylinder",))
+PLAN = Plan(BOXES, 20, {"rps": paper.PARAMS["rps"], "nps": paper.PARAMS["nps"]}, SHORT, part=7)
+
+
+def case(
+    target: tuple[float, float], name: str = "box", friction: str = "S1", **changes: Any
+) -> Case:
+    """A trial of the law; changes are fields of `Case` or of the law's parameters."""
+    of_case = {k: changes.pop(k) for k in list(changes) if k in Case.__dataclass_fields__}
+    return Case(name, FRICTION[friction], target, PAPER._replace(**changes), **of_case)
+
+
+def swept(folder: Path, plan: Plan = PLAN, **options: Any) -> Path:
+    """A run folder with all parts of a plan, or of one of its shards."""
+    sweep.open_run(folder, plan)
+    sweep.run_missing(folder, plan, slots=SLOTS, **options)
+    return folder
+
+
+def parts_of(folder: Path) -> dict[str, bytes]:
+    """The files of the parts in a run folder, by name."""
+    return {path.name: path.read_bytes() for path in (folder / "parts").iterdir()}
+
+
+@contextlib.contextmanager
+def temporary_names() -> Iterator[None]:
+    """Objects and strategies that are registered meanwhile are forgotten afterwards."""
+    tables = (objects.FAMILIES, objects.REGISTERED, strategies.PARAMS, strategies.STRATEGIES)
+    before = [dict(table) for table in tables]
+    try:
+        yield
+    finally:
+        for table, content in zip(tables, before, strict=True):
+            table.clear()
+            table.update(content)
+
+
+# --- shapes before the robot ---------------------------------------------------------------
+
+FRONT, SIDE = HALF_LENGTH, HALF_WIDTH  # [m] the front face is x = FRONT, the sides y = +-SIDE
+SETTLED = 1e3  # [s] a period after which a skin's low-pass filter has forgotten its past
+
+
+def box(x: Any, y: Any, half: float = 0.2, yaw: Any = 0.0) -> Footprint:
+    """A square of this half width [m] about (x, y) [m]."""
+    return fp.place(fp.rectangle(half, half), jnp.array([x, y]), jnp.float32(yaw))
+
+
+@jax.jit
+def place_before_the_front(shape: Footprint, yaw: Any, y: Any, gap: Any) -> Footprint:
+    """`shape` turned by `yaw`, its origin at `y`, its nearest point `gap` before the front."""
+    turned = fp.place(shape, jnp.zeros(2), yaw)
+    x = FRONT + gap + fp.extent(turned, jnp.array([-1.0, 0.0]))
+    return fp.place(turned, jnp.stack([x, jnp.asarray(y, x.dtype)]), 0.0)
+
+
+# --- comparisons ---------------------------------------------------------------------------
+
+
+def row(tree: Any, i: Any) -> Any:
+    """One row, or a slice of them, of every leaf."""
+    return jax.tree.map(lambda leaf: leaf[i], tree)
+
+
+def same(a: Any, b: Any) -> None:
+    """Asserts that two trees are equal bit by bit."""
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def decode(path: Path) -> np.ndarray:
+    """All images of a video (count, height, width, 3); its reader forks, of which JAX warns."""
+    reader = imageio_ffmpeg.read_frames(str(path))
+    width, height = next(reader)["size"]
+    return np.array([np.frombuffer(f, np.uint8).reshape(height, width, 3) for f in reader])

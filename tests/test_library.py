@@ -1,0 +1,148 @@
+"""The library as a user calls it: labelled data, the same as on the command line."""
+
+import doctest
+import inspect
+
+import numpy as np
+import pytest
+import xarray as xr
+from helpers import PAPER, SLOTS, decode, rps
+
+import rps_jax
+from rps_jax.analysis import statistics
+from rps_jax.errors import InputError
+from rps_jax.record import files
+
+ARMS = {"paper": PAPER, "slow": PAPER._replace(v_max=0.02)}
+# As the examples of the docstrings, so that all share one program.
+DRUMS = rps_jax.Domain(("random_cylinder",))
+BRIEF = {"rules": rps_jax.Rules(horizon=2.0), "slots": SLOTS}
+
+
+def identical(a, b):
+    """The same variables and coordinates, with the same types, labels and bits."""
+    xr.testing.assert_identical(a, b)
+    for name in a.variables:
+        assert a[name].dtype == b[name].dtype, name
+        np.testing.assert_array_equal(a[name].values, b[name].values, err_msg=name)
+
+
+# --- sweeps --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("engine", "domain"),
+    [("fused", DRUMS), ("mujoco", rps_jax.Domain(("random_box", "random_cylinder")))],
+)
+def test_a_sweep_in_memory_is_the_same_as_one_in_a_folder(engine, domain, tmp_path):
+    asked = {"worlds": 8, "seed": 3, "engine": engine, "part": 4, **BRIEF}
+    found = rps_jax.sweep(domain, ARMS, **asked)
+    assert found.success.dims == ("arm", "world")
+    assert dict(found.sizes) == {"arm": 2, "world": 8, "pose": 3, "object": len(domain.objects)}
+    identical(found, rps_jax.sweep(domain, ARMS, out=tmp_path, **asked))
+    identical(found, rps_jax.load(tmp_path))
+    identical(found, rps_jax.sweep(domain, ARMS, out=str(tmp_path), **asked))  # there is no more
+
+
+def test_what_was_drawn_is_a_coordinate_of_the_worlds(tmp_path):
+    found = rps_jax.sweep(DRUMS, ARMS, worlds=4, **BRIEF)
+    drawn = {name for name in found.coords if found[name].dims == ("world",)}
+    assert drawn == {"world", "which_object", *statistics.DRAWN}
+    assert all(found[name].dims[:2] == ("arm", "world") for name in found)
+    heavy = found.where(found.mass > found.mass.median(), drop=True)
+    assert heavy.world.size == 2
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The folder of a sweep, and its results."""
+    folder = tmp_path_factory.mktemp("sweep")
+    return folder, rps_jax.sweep(DRUMS, ARMS, worlds=4, out=folder, **BRIEF)
+
+
+def test_a_folder_without_results_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"holds no results\.nc: give the folder"):
+        rps_jax.load(tmp_path)
+
+
+# --- one trial -----------------------------------------------------------------------------
+
+
+def test_a_world_of_a_sweep_is_replayed(run):
+    """Alone, in another program, which rounds otherwise."""
+    folder, found = run
+    again = rps_jax.replay(folder, 3, "slow")
+    there = found.sel(arm="slow", world=3)
+    assert int(again.outcome.success) == int(there.success)
+    np.testing.assert_allclose(again.outcome.base_pose, there.base_pose, atol=1e-3)
+    assert "world 3" in again.title
+    with pytest.raises(InputError, match="unknown arm 'fast': choose from paper, slow"):
+        rps_jax.replay(folder, 3, "fast")
+    with pytest.raises(InputError, match=r"index = 4 is not allowed: .* from 0 to 3"):
+        rps_jax.replay(folder, 4)
+
+
+@pytest.mark.filterwarnings("ignore:os.fork")  # by the reader of the film
+def test_a_push_is_plotted_and_filmed(tmp_path):
+    seen = rps_jax.push("cylinder", (1.0, 0.5), engine="quasistatic", horizon=3.0)
+    assert seen.data.time[-1] == pytest.approx(3.0, abs=0.11)
+    assert seen.data.l.dims == ("time",)
+    picture = seen.plot()
+    assert min(picture.size) > 200
+    assert np.asarray(picture).std() > 10
+    seen.plot(tmp_path / "push.png")
+    assert (tmp_path / "push.png").stat().st_size > 10_000
+    assert seen.film(tmp_path / "push.mp4", 0.4) == tmp_path / "push.mp4"
+    images = decode(tmp_path / "push.mp4")
+    assert len(images) == 10
+    assert np.abs(images[0].astype(int) - images[-1]).max() > 60
+    with pytest.raises(InputError, match="film_length = 0 is not allowed"):
+        seen.film(tmp_path / "none.mp4", 0)
+
+
+# --- a table -------------------------------------------------------------------------------
+
+
+def test_a_table_is_what_the_command_writes(tmp_path):
+    asked = ["--objects", "box", "--strategies", "rps", "aps", "--friction", "S2", "0.3,0.4"]
+    asked += ["--targets", 0.6, 0, 1, 1, "--engine", "mujoco", "--horizon", 3, "--mass", 5]
+    assert rps("table", *asked, "--out", tmp_path / "run") == 0
+    found = rps_jax.table(
+        objects=["box"],
+        strategies=["rps", "aps"],
+        friction=["S2", (0.3, 0.4)],
+        targets=[(0.6, 0.0), (1.0, 1.0)],
+        engine="mujoco",
+        horizon=3.0,
+        mass=5.0,
+    )
+    identical(found, files.read_results(tmp_path / "run"))
+    identical(found, rps_jax.load(tmp_path / "run"))
+
+
+# --- examples ------------------------------------------------------------------------------
+
+PUBLIC = [name for name in rps_jax.__all__ if callable(getattr(rps_jax, name))]
+OPTIONS = doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
+
+
+def examples(name):
+    """The examples of a public function, or of a class and its methods."""
+    return [
+        one for one in doctest.DocTestFinder().find(getattr(rps_jax, name), name) if one.examples
+    ]
+
+
+def test_every_public_function_has_an_example():
+    functions = [name for name in PUBLIC if not inspect.isclass(getattr(rps_jax, name))]
+    assert {"sweep", "evaluate", "table", "push", "step"} <= set(functions)
+    assert [name for name in functions if not examples(name)] == []
+
+
+@pytest.mark.parametrize("name", [name for name in PUBLIC if examples(name)])
+def test_the_examples_of_docstrings_run(name, tmp_path, monkeypatch, registries):
+    monkeypatch.chdir(tmp_path)
+    told = []
+    runner = doctest.DocTestRunner(optionflags=OPTIONS)
+    for one in examples(name):
+        assert runner.run(one, out=told.append).failed == 0, "".join(told)
