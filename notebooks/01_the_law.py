@@ -22,8 +22,7 @@ from pathlib import Path
 
 from IPython.display import Image
 
-from rps_jax import RPSParams
-from rps_jax.analysis import figures
+from rps_jax import RPSParams, figures
 
 out = Path(tempfile.mkdtemp())
 paper = RPSParams.paper()

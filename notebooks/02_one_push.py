@@ -17,18 +17,13 @@
 import tempfile
 from pathlib import Path
 
-from rps_jax.analysis import video
+from rps_jax import video
 
 video.choose_gl()  # before MuJoCo is imported
 
-import numpy as np
 from IPython.display import Image, Video
 
-from rps_jax import FRICTION, Case, Setting, follow
-from rps_jax.analysis import figures
-from rps_jax.trials import pushes
-from rps_jax.trials.results import title_of, trace_dataset
-from rps_jax.trials.trial import p_world_contact
+import rps_jax
 
 out = Path(tempfile.mkdtemp())
 
@@ -36,19 +31,16 @@ out = Path(tempfile.mkdtemp())
 # ## What the base did, and why
 
 # %%
-case = Case("box", FRICTION["S1"], p_world_target=(-2.0, 0.0))
-setting = Setting(engine="fused")
-(trace,) = follow([case], setting)
-seen, outcome = trace.snapshots, trace.outcome
-Image(figures.one_trial(trace_dataset(trace), title_of(case), out / "trial.png"))
+seen = rps_jax.push("box", target=(-2.0, 0.0), friction="S1", engine="fused")
+seen.plot()
 
 # %%
-realigning = np.asarray(seen.details.realigning)
-entries = np.flatnonzero(np.diff(realigning.astype(int)) > 0)
+outcome, realigning = seen.outcome, seen.data.realigning
+entries = int((realigning.diff("time") > 0).sum())
 print(
     f"reached at {outcome.time:.1f} s; mean |l| = {outcome.mean_abs_l:.3f} m; "
     f"without contact for {outcome.contact_lost_time:.1f} s after the first touch\n"
-    f"Realignment State: {entries.size} time(s), {100 * realigning.mean():.0f} % of the trial"
+    f"Realignment State: {entries} time(s), {100 * float(realigning.mean()):.0f} % of the trial"
 )
 
 # %% [markdown]
@@ -75,11 +67,7 @@ print(
 # ## The same in pictures
 
 # %%
-scene = pushes.scene_of(case, setting.physics)
-film = {"p_world_target": trace.p_world_target, "size": (480, 270)}
-rows = np.linspace(0, len(seen.time) - 1, 6).astype(int)
-images = video.images(scene, seen.qpos[rows], **film)
-Image(figures.stills(images, [f"{t:.0f} s" for t in seen.time[rows]], out / "stills.png"))
+Image(seen.stills(out / "stills.png"))
 
 # %% [markdown]
 # In the second picture the base has gone round the corner of the box. In the third it stands
@@ -87,7 +75,5 @@ Image(figures.stills(images, [f"{t:.0f} s" for t in seen.time[rows]], out / "sti
 # trial twelve times as fast; the purple trail is that of the contact point.
 
 # %%
-rows = np.linspace(0, len(seen.time) - 1, 60).astype(int)
-contacts = np.asarray(p_world_contact(seen))[rows]
-video.render(scene, seen.qpos[rows], out / "push.mp4", fps=6, p_world_contacts=contacts, **film)
-Video(out / "push.mp4", embed=True, width=480)
+film = seen.film(out / "push.mp4", seconds=10.0, fps=6, size=(480, 270))
+Video(film, embed=True, width=480)

@@ -20,12 +20,12 @@ from pathlib import Path
 
 from IPython.display import Image, Markdown
 
-from rps_jax.analysis import figures, tables
-from rps_jax.record import files
+import rps_jax
+from rps_jax import figures, tables
 
 out = Path(tempfile.mkdtemp())
-run = Path("runs/table")
-results = files.read_results(run)
+run = "runs/table"
+results = rps_jax.load(run)
 
 # %% [markdown]
 # ## Table II

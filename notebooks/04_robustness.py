@@ -25,14 +25,13 @@ from pathlib import Path
 
 from IPython.display import Image, Markdown
 
-from rps_jax.analysis import figures, tables
-from rps_jax.record import files
-from rps_jax.runs import sweep
+import rps_jax
+from rps_jax import figures, tables
 
 out = Path(tempfile.mkdtemp())
-run = Path("runs/compare/wide")
-plan, results = sweep.load_plan(run), files.read_results(run)
-max_lost = float(plan.setting.rules.max_lost)
+run = "runs/compare/wide"
+results = rps_jax.load(run)
+max_lost = rps_jax.Rules().max_lost  # [s] without contact, which end a trial
 
 # %% [markdown]
 # ## How often, how near, how long
@@ -97,7 +96,7 @@ Markdown(tables.markdown(tables.influence_table(results, "tuned")[:4]))
 # distance left.
 
 # %%
-Markdown(tables.markdown(tables.hardest_table(results, str(run))))
+Markdown(tables.markdown(tables.hardest_table(results, run)))
 
 # %% [markdown]
 # The command in the last column replays a world, draws it as in `02_one_push` and films it; run it

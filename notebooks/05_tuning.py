@@ -23,21 +23,18 @@ import tempfile
 from pathlib import Path
 
 import jax
-import numpy as np
 from IPython.display import Image, Markdown
 
-from rps_jax import FRICTION, Case, RPSParams, Setting
-from rps_jax.analysis import figures, tables
-from rps_jax.control import strategies
-from rps_jax.record import files
-from rps_jax.robot.skin import SmoothSkin
-from rps_jax.trials import pushes, trial
-from rps_jax.tuning import gradients
-from rps_jax.tuning.run import read_log
-from rps_jax.tuning.space import SUBSETS, Space
-from rps_jax.world import paper
+import rps_jax
+from rps_jax import FRICTION, Case, RPSParams, SmoothSkin, Space, figures, gradients, paper, tables
 
 out = Path(tempfile.mkdtemp())
+
+
+def read_log(run):
+    """What a tuner wrote down of each generation."""
+    return [json.loads(line) for line in Path("runs", run, "log.jsonl").read_text().splitlines()]
+
 
 # %% [markdown]
 # ## The coarse search
@@ -47,8 +44,9 @@ out = Path(tempfile.mkdtemp())
 # a success scores its time, and a failure scores one more and how far it missed.
 
 # %%
-names = SUBSETS["full"]
-Image(figures.tuning_log(read_log(Path("runs/coarse")), names, out / "coarse.png"))
+log = read_log("coarse")
+names = tuple(log[0]["params"])
+Image(figures.tuning_log(log, names, out / "coarse.png"))
 
 # %% [markdown]
 # In seven generations the objective on the validation worlds halves, from 0.31 to 0.15, and
@@ -65,7 +63,7 @@ Image(figures.tuning_log(read_log(Path("runs/coarse")), names, out / "coarse.png
 # above.
 
 # %%
-Image(figures.tuning_log(read_log(Path("runs/fine")), names, out / "fine.png"))
+Image(figures.tuning_log(read_log("fine"), names, out / "fine.png"))
 
 # %% [markdown]
 # Validation falls from 0.164 to 0.117 at generation 7, whose mean was kept. The values jump from
@@ -100,7 +98,7 @@ Image(figures.twist_field(sets, 1.0, out / "twist.png"))
 # ## The same worlds, twice
 
 # %%
-results = files.read_results(Path("runs/compare/wide"))
+results = rps_jax.load("runs/compare/wide")
 Markdown(tables.markdown(tables.difference_table(results)))
 
 # %%
@@ -129,24 +127,8 @@ space = Space(names)
 cases = [
     Case("box", FRICTION["S1"], target, gap=0.004, skin=SmoothSkin()) for target in paper.TARGETS
 ]
-setting, strategy = Setting(engine="quasistatic"), strategies.smooth_rps()
-stage, worlds = pushes.build(cases, setting)
-starts = worlds, trial.start_all(worlds, np.ones(len(cases), bool), strategy=strategy)
-horizons = np.array([1.0, 3.0, 10.0])  # [s]
-steps = np.round(horizons / setting.physics.control_period).astype(int)
-
-
-# The distances after all three times at once.
-distances = jax.jit(
-    gradients.window(
-        stage,
-        space.params,
-        lambda seen: seen.details.distance[steps],
-        physics=setting.physics,
-        strategy=strategy,
-        steps=int(steps[-1]) + 1,
-    )
-)
+horizons = (1.0, 3.0, 10.0)  # [s]
+distances, starts = gradients.distances(cases, space.params, horizons)  # of all three at once
 theta, key = space.vector(RPSParams.paper()), jax.random.key(0)
 found = {
     "derivative": gradients.forward(distances, theta, starts),
@@ -179,10 +161,8 @@ Image(figures.estimates(horizons, bars, names, out / "gradients.png"))
 # half.
 
 # %%
-logs = {name: read_log(Path("runs/race") / name) for name in ("evolution", "gradient")}
-logs["gradient, then evolution"] = [
-    line for name in ("half", "hybrid") for line in read_log(Path("runs/race") / name)
-]
+logs = {name: read_log(f"race/{name}") for name in ("evolution", "gradient")}
+logs["gradient, then evolution"] = read_log("race/half") + read_log("race/hybrid")
 Image(figures.races(logs, out / "race.png"))
 
 # %% [markdown]

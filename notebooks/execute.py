@@ -17,7 +17,7 @@ from jupyter_client.manager import AsyncKernelManager
 from nbclient import NotebookClient
 from nbformat import NotebookNode
 
-from rps_jax.analysis import video
+from rps_jax import video
 
 HERE = Path(__file__).resolve().parent
 TEXTS = tuple(sorted(HERE.glob("[0-9]*.py")))

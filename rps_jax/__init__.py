@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rps_jax.analysis import figures as figures
     from rps_jax.analysis import statistics as statistics
     from rps_jax.analysis import tables as tables
+    from rps_jax.analysis import video as video
     from rps_jax.control import law as law
     from rps_jax.control.law import Details as Details
     from rps_jax.control.law import Observation as Observation
@@ -45,6 +46,8 @@ if TYPE_CHECKING:
     from rps_jax.trials.setting import progress_bar as progress_bar
     from rps_jax.trials.trial import Outcome as Outcome
     from rps_jax.trials.trial import Rules as Rules
+    from rps_jax.tuning import gradients as gradients
+    from rps_jax.tuning.space import Space as Space
     from rps_jax.world import paper as paper
     from rps_jax.world.domain import DOMAINS as DOMAINS
     from rps_jax.world.domain import Domain as Domain
@@ -77,6 +80,7 @@ _HOMES = {
     "trials.pushes": ("Case",),
     "trials.setting": ("Progress", "Setting", "progress_bar"),
     "trials.trial": ("Outcome", "Rules"),
+    "tuning.space": ("Space",),
     "world.domain": ("DOMAINS", "Domain", "Range"),
     "world.objects": ("OBJECTS", "register_object"),
     "world.physics": ("PHYSICS", "Physics"),
@@ -87,11 +91,13 @@ _HOME = {name: module for module, names in _HOMES.items() for name in names}
 _MODULES = {
     "figures": "analysis.figures",
     "footprint": "geometry.footprint",
+    "gradients": "tuning.gradients",
     "law": "control.law",
     "paper": "world.paper",
     "planar": "geometry.planar",
     "statistics": "analysis.statistics",
     "tables": "analysis.tables",
+    "video": "analysis.video",
 }
 __all__ = sorted([*_HOME, *_MODULES])  # pyright: ignore[reportUnsupportedDunderAll]
 

@@ -26,8 +26,6 @@ from rps_jax.trials.setting import Report, unheard
 from rps_jax.trials.trial import Outcome, p_world_contact
 from rps_jax.world.scene import Scene
 
-_FPS = 25  # frames per second of a film
-
 
 @dataclass(frozen=True)
 class Push:
@@ -75,6 +73,8 @@ class Push:
         path: str | Path,
         seconds: float = 12.0,
         *,
+        fps: int = 25,
+        size: tuple[int, int] = (960, 540),
         watch: Callable[[Iterable[Any]], Iterable[Any]] = iter,
     ) -> Path:
         """An MP4 of the trial.
@@ -82,24 +82,27 @@ class Push:
         Args:
           path: of the MP4.
           seconds: length of the film, whatever the trial's.
+          fps: frames per second of the film.
+          size: width and height [px], even numbers.
           watch: is handed the frames and hands them on, as `tqdm.tqdm` does.
 
         Raises:
-          InputError: the length is not allowed.
+          InputError: the length, rate or size is not allowed.
           VideoError: this machine cannot draw or encode.
         """
         from rps_jax.analysis import video
 
         check_length(seconds)
         seen = self.trace.snapshots
-        shown = _evenly(len(seen.time), round(seconds * _FPS))
+        shown = _evenly(len(seen.time), round(seconds * fps))
         video.render(
             self.scene,
             watch(seen.qpos[shown]),
             Path(path),
             p_world_target=np.array(self.trace.p_world_target),
             p_world_contacts=np.asarray(p_world_contact(seen))[shown],
-            fps=_FPS,
+            fps=fps,
+            size=size,
         )
         return Path(path)
 

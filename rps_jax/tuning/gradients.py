@@ -16,18 +16,21 @@ and `differences` need no derivative.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from rps_jax.control import strategies
 from rps_jax.control.law import RPSParams
 from rps_jax.control.strategies import Strategy
 from rps_jax.geometry import planar
-from rps_jax.trials import trial
+from rps_jax.trials import pushes, trial
+from rps_jax.trials.pushes import Case
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Snapshot, Trial
 from rps_jax.world.physics import Physics
 
@@ -195,7 +198,6 @@ def window(
 
     Returns:
       Scores whose worlds are pairs (World, Trial), batched: the trials say where to start.
-
     """
 
     def scores(thetas: jax.Array, starts: Any) -> jax.Array:
@@ -210,3 +212,42 @@ def window(
         return jax.vmap(cost, in_axes=1)(seen)
 
     return scores
+
+
+def distances(
+    cases: Sequence[Case],
+    params_of: Callable[[jax.Array], RPSParams],
+    horizons: Sequence[float],
+    setting: Setting = Setting(engine="quasistatic"),
+) -> tuple[Scores, Any]:
+    """How far from their targets pushes are after some times, under the smooth law.
+
+    Args:
+      cases: pushes of one kind, with smooth skins.
+      params_of: parameters from theta (p,), differentiable.
+      horizons: the times (H,) [s], in order.
+      setting: what the pushes share; its engine has derivatives.
+
+    Returns:
+      Scores (n, H) [m], compiled when first called, and the worlds that they take.
+
+    Example:
+      >>> import rps_jax
+      >>> from rps_jax import Case, RPSParams, SmoothSkin, Space, gradients
+      >>> space = Space(("K_h", "L"))
+      >>> ahead = Case("box", rps_jax.FRICTION["S1"], (1.0, 1.0), skin=SmoothSkin(), gap=0.0)
+      >>> scores, worlds = gradients.distances([ahead], space.params, [0.2, 0.4])
+      >>> found = gradients.forward(scores, space.vector(RPSParams.paper()), worlds)
+      >>> found.gradient.shape
+      (2, 2)
+    """
+    stage, worlds = pushes.build(cases, setting)
+    strategy, physics = strategies.smooth_rps(), setting.physics
+    at = np.round(np.asarray(horizons) / physics.control_period).astype(int)
+
+    def left(seen: Snapshot) -> jax.Array:
+        return seen.details.distance[at]
+
+    options: dict[str, Any] = {"physics": physics, "strategy": strategy, "steps": int(at[-1]) + 1}
+    scores = jax.jit(window(stage, params_of, left, **options))
+    return scores, (worlds, trial.start_all(worlds, np.ones(len(cases), bool), strategy=strategy))
