@@ -169,7 +169,7 @@ def test_it_turns_on_the_spot_until_it_faces_the_object():
     assert twist.omega == pytest.approx(-0.15)  # 0.6 * 0.5, clipped
 
 
-def test_it_succeeds_with_targets_straight_ahead_and_only_if_it_aims_beyond_them():
+def test_it_reaches_targets_ahead_only_if_it_aims_beyond_them():
     def case(params):
         return Case("box", FRICTION["S1"], (1.0, 0.0), params)
 

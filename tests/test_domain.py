@@ -40,7 +40,8 @@ def same(a, b):
         np.testing.assert_array_equal(x, y)
 
 
-def test_a_world_is_the_same_alone_as_among_others_however_they_are_asked_for():
+def test_a_world_is_the_same_alone_as_among_others():
+    """And whatever the order in which worlds are asked for."""
     many = domain.draw(WIDE, 7, np.arange(1, 3000, 3))
     for i in (0, 17, 999):
         alone = domain.draw(WIDE, 7, [1 + 3 * i])
@@ -147,7 +148,8 @@ def test_models_of_a_family_differ_in_nothing_but_these_fields():
 
 
 @pytest.mark.parametrize("name", list(RANDOM))
-def test_mass_properties_are_those_mujoco_finds_for_an_even_solid_and_a_small_load(name):
+def test_mass_properties_are_those_that_mujoco_finds(name):
+    """For a solid of even density with a small load in it."""
     worlds = drawn(name, 6, seed=1)
     for i in range(6):
         one = jax.tree.map(lambda leaf, i=i: leaf[i], worlds.solid)

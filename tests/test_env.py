@@ -15,6 +15,7 @@ from rps_jax.trials import env, trial
 from rps_jax.trials.env import PushEnv, Reward
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
+from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import domain
 from rps_jax.world.domain import DOMAINS, Range
 from rps_jax.world.physics import preset
@@ -86,6 +87,7 @@ def test_the_spaces_are_those_of_the_skin_the_target_and_the_twist(pushing):
     assert push.xml_path.endswith("cylinder.xml")
     assert push.mj_model.nq == push.mjx_model.nq == 10
     assert push.unwrapped is push
+    assert PushEnv.setting.engine == "fused"  # unless another is asked for
 
 
 def test_step_gives_back_what_reset_gave_so_that_a_loop_can_scan(pushing):
@@ -149,7 +151,7 @@ def test_a_push_earns_what_it_brings_nearer_less_the_time_without_contact(pushin
         assert seen.obs[end, i, 15:27].max() > 0.25  # taxels of the front, by the skin's threshold
 
 
-def test_contact_that_is_lost_costs_and_found_again_counts_from_where_it_was_lost(pushing):
+def test_lost_contact_costs_and_counts_again_from_where_it_was_lost(pushing):
     there = last(pushing.go(pushing.start, AHEAD, times=2))
     assert (there.metrics["in_contact"] == 1).all()
     away = pushing.go(there, BACK)
@@ -198,7 +200,9 @@ def test_it_moves_as_a_trial_that_is_driven_by_the_same_twist(pushing):
     worlds = state.info["world"]
     trials = trial.start_all(worlds, np.ones(mine.done.size, bool), strategy=dull)
     options = {"physics": FAST, "rules": push.setting.rules, "strategy": dull}
-    theirs = trial.advance(push._part.stage, worlds, trials, **options, steps=STEPS)
+    drawn = domain.draw(replace(NEAR, objects=(push.object,)), 0, np.arange(1))
+    stage = drawn_worlds(NEAR, drawn, push.params, push.setting).stage
+    theirs = trial.advance(stage, worlds, trials, **options, steps=STEPS)
     np.testing.assert_array_equal(mine.data.steps, STEPS)
     np.testing.assert_allclose(mine.data.qpos, theirs.qpos, atol=2e-5)
     assert (theirs.contact_steps > 0).all()
@@ -216,7 +220,7 @@ def test_a_batch_is_driven_as_one_and_not_world_by_world():
             sizes.append(jnp.shape(fields)[0])
             return fields + 0 * twists, motion, twists
 
-    drive = env._one_of_many(Stage(), Setting())  # type: ignore[arg-type]
+    drive = env.one_of_many(Stage(), Setting())  # type: ignore[arg-type]
     batch = jnp.arange(5.0)
     together = jax.vmap(drive, (0, 0, None))(batch, batch, jnp.array(2.0))
     np.testing.assert_array_equal(together[0], batch)

@@ -113,7 +113,8 @@ def test_an_object_of_the_paper_that_is_registered_anew_is_the_same_world(name, 
             np.testing.assert_allclose(leaf[:2], leaf[2:], rtol=1e-6, atol=1e-6)
 
 
-def test_an_object_of_ones_own_may_be_of_a_domain_and_has_its_looks_in_a_replay(hexagon):
+def test_an_object_of_ones_own_may_be_of_a_domain(hexagon):
+    """Its mass and outline are those of all worlds, and a replay has its looks."""
     assert title_of(Case("hexagon", FRICTION["S1"], (2.0, 0.0))).startswith("hexagon, ")
     own = Domain(objects=("hexagon",), friction_robot=Range(0.4, 0.5))
     drawn = domain.draw(own, 0, np.arange(5))

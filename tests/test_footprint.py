@@ -288,7 +288,7 @@ def random_lines(rng, footprints: Footprint) -> tuple[np.ndarray, np.ndarray]:
 @every_kind
 @property_test
 @hypothesis.given(seeds)
-def test_the_crossing_holds_exactly_the_points_of_the_line_within_the_tolerance(kind, seed):
+def test_a_crossing_holds_exactly_the_points_within_the_tolerance(kind, seed):
     rng = np.random.default_rng(seed)
     footprints = KINDS[kind](rng)
     origin, along = random_lines(rng, footprints)
@@ -326,7 +326,9 @@ def test_the_ends_of_a_crossing_are_at_the_tolerance(kind):
     assert 0.2 < np.mean(hits) < 0.95
 
 
-def test_derivatives_of_a_crossing_are_finite_where_the_line_grazes_or_misses():
+def test_derivatives_of_a_crossing_are_finite_if_the_line_only_grazes():
+    """Or misses."""
+
     def chord(shape, y):
         origin = jnp.stack([0.0 * y, y])
         low, high = fp.crossing(shape, origin, jnp.array([1.0, 0.0]), 0.0)
@@ -376,7 +378,7 @@ def test_the_extent_is_the_furthest_point_of_the_outline(kind):
 # Constructors
 
 
-def test_the_constructors_make_counter_clockwise_outlines_of_the_given_size():
+def test_outlines_are_counter_clockwise_and_of_the_given_size():
     box = fp.rectangle(0.3, 0.2)
     x, y = np.asarray(box.vertices, float).T
     area = 0.5 * (x * np.roll(y, -1) - np.roll(x, -1) * y).sum()

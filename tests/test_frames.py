@@ -118,7 +118,7 @@ def test_the_derivative_of_wrap_is_one_even_at_the_jump():
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-36, 1e-30, 1e-20, 1e20, 1e30, 1e37])
-def test_norm_and_its_derivative_are_right_where_squares_overflow_or_vanish(scale):
+def test_norm_and_its_derivative_are_right_if_squares_overflow_or_vanish(scale):
     v = np.float32(scale) * np.float32([[3, 4], [-4, 3], [0, -5]])
     value, gradient = norm_and_gradient(v)
     np.testing.assert_allclose(value, np.full(3, 5 * np.float32(scale)), rtol=1e-6)
@@ -214,7 +214,7 @@ def test_direction_is_right_up_to_the_largest_numbers():
 # safe_sqrt
 
 
-def test_safe_sqrt_is_the_root_where_positive_and_zero_with_zero_derivative_elsewhere():
+def test_safe_sqrt_is_the_root_or_zero_with_zero_derivative():
     value, gradient = sqrt_and_gradient(jnp.array([4.0, 0.25, 1e-30, 0.0, -1.0, -1e30]))
     np.testing.assert_allclose(value, [2, 0.5, 1e-15, 0, 0, 0], rtol=1e-6)
     np.testing.assert_allclose(gradient, [0.25, 1, 5e14, 0, 0, 0], rtol=1e-6)

@@ -117,8 +117,8 @@ def test_the_kernel_computes_what_xla_computes(name):
     physics = Physics(timestep=0.02)
     scalars, state = some_worlds(name, physics)
     twist = tuple(jnp.full(5, x) for x in TWIST)
-    expected = jax.jit(partial(fused._steps, physics=physics))(scalars, state, twist)
-    kernel = partial(fused._kernel, physics=physics, interpret=True)
+    expected = jax.jit(partial(fused.in_xla, physics=physics))(scalars, state, twist)
+    kernel = partial(fused.in_a_kernel, physics=physics, interpret=True)
     for a, b in zip(jax.tree.leaves(jax.jit(kernel)(scalars, state, twist)),
                     jax.tree.leaves(expected), strict=True):  # fmt: skip
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
@@ -129,9 +129,9 @@ def test_the_kernel_compiles_for_an_nvidia_gpu(name):
     scalars, state = some_worlds(name, Physics())
     twist = tuple(jnp.full(5, x) for x in TWIST)
     with as_if_there_were_a_gpu():
-        traced = jax.jit(partial(fused._kernel, physics=Physics())).trace(scalars, state, twist)
+        traced = jax.jit(partial(fused.in_a_kernel, physics=Physics())).trace(scalars, state, twist)
         assert "triton" in traced.lower(lowering_platforms=("cuda",)).as_text()
-    # Each load and store lengthens the compilation: see `fused._taken`.
+    # Each load and store lengthens the compilation: see `fused.rows_taken`.
     assert 2 < str(traced.jaxpr).count("<-") < 20
 
 
@@ -166,7 +166,7 @@ def test_a_contacts_force_and_stiffness_are_derivatives_of_its_cost(cone):
     xs = np.random.default_rng(0).normal(size=(40, 3)).astype(np.float32)
     zones = set()
     for x in map(jnp.asarray, xs):
-        force, k = newton._law(point, tuple(x), physics)
+        force, k = newton.contact_force(point, tuple(x), physics)
         np.testing.assert_allclose(force, -jax.grad(cost)(x), rtol=1e-3, atol=1e-3)
         nn, nt, ns, tt, ts, ss = k
         full = np.array([[nn, nt, ns], [nt, tt, ts], [ns, ts, ss]])

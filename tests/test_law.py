@@ -255,7 +255,8 @@ def test_gamma_is_held_within_gamma_max():
     np.testing.assert_allclose(as_printed, errors_, rtol=1e-6)
 
 
-def test_eq_9_falls_linearly_from_one_at_the_centre_to_zero_in_the_critical_region():
+def test_eq_9_falls_linearly_from_the_centre_to_the_critical_region():
+    """From one to zero."""
     sigma = law.realignment_gain(PAPER, jnp.array([0.0, 0.06, -0.12, 0.24, -0.24, 0.29, 9.0]))
     np.testing.assert_allclose(sigma, [1.0, 0.75, 0.5, 0.0, 0.0, 0.0, 0.0], atol=1e-6)
 
@@ -355,7 +356,7 @@ def after_a_loss(params, d=(1.2, -0.5)):
     return state, np.stack(twist), np.stack(felt)
 
 
-def test_after_a_loss_the_robot_creeps_or_drives_or_acts_on_the_last_contact():
+def test_after_a_loss_the_robot_creeps_drives_or_keeps_the_last_contact():
     _, creep, felt = after_a_loss(PAPER)
     np.testing.assert_allclose(creep, [0.01, 0.0, 0.0])
     _, drive, _ = after_a_loss(PAPER._replace(v_lost=0.05))
@@ -419,7 +420,7 @@ def test_the_target_is_reached_strictly_within_d_success():
 
 
 @pytest.mark.parametrize("l_th", [0.24, 0.15])
-def test_without_contact_the_robot_creeps_straight_ahead_and_the_threshold_stays(l_th):
+def test_without_contact_the_robot_creeps_ahead_and_the_threshold_stays(l_th):
     for params in (PAPER, RPSParams.nps()):
         before = state_with(l_th)._replace(p_robot_contact=jnp.array([FRONT, 0.27]))
         observation = observe((1.0, 2.0), l=0.2, in_contact=False)
@@ -494,7 +495,7 @@ def test_a_mirrored_world_gives_the_mirrored_twist(seed):
 
 @property_test
 @hypothesis.given(st.integers(0, 2**32 - 1), st.floats(-10, 10), st.floats(-50, 50))
-def test_the_twist_does_not_depend_on_where_the_world_has_its_origin_and_axes(seed, turn, shift):
+def test_the_twist_does_not_depend_on_the_worlds_origin_and_axes(seed, turn, shift):
     c, s = math.cos(turn), math.sin(turn)
     R = np.array([[c, -s], [s, c]])
     with jax.enable_x64(True):
@@ -520,7 +521,7 @@ def any_finite_floats(rng, shape) -> np.ndarray:
 
 @property_test
 @hypothesis.given(st.integers(0, 2**32 - 1))
-def test_whatever_the_finite_input_the_twist_is_finite_and_within_its_bounds(seed):
+def test_for_any_finite_input_the_twist_is_finite_and_within_bounds(seed):
     rng = np.random.default_rng(seed)
     x = any_finite_floats(rng, (256, 9))
     params = random_params(seed, 256)
@@ -549,7 +550,7 @@ def test_the_farthest_target_is_driven_to_at_full_speed():
 
 @property_test
 @hypothesis.given(st.floats(-100, 100), st.floats(-100, 100), st.floats(-100, 100))
-def test_saturation_keeps_the_direction_of_the_velocity_and_what_is_within_bounds(v_x, v_y, omega):
+def test_saturation_keeps_the_direction_and_what_is_within_bounds(v_x, v_y, omega):
     v_x, v_y, omega = map(np.float32, (v_x, v_y, omega))
     out = law.saturate(PAPER, Twist(v_x, v_y, omega))
     speed = math.hypot(v_x, v_y)
@@ -655,7 +656,7 @@ def test_derivatives_agree_with_each_other_and_with_finite_differences():
     assert (np.abs(differences - ahead) / scale)[~kink].max() < 1e-4
 
 
-def test_without_contact_a_nan_contact_location_does_no_harm_to_derivatives():
+def test_without_contact_a_nan_location_does_no_harm_to_derivatives():
     observation = observe((1.0, 0.0), in_contact=False)
     observation = observation._replace(p_robot_contact=jnp.full(2, jnp.nan))
 

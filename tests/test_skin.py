@@ -106,7 +106,7 @@ def test_15_taxels_lie_on_each_side_and_12_on_the_front():
         assert (np.abs(face) <= np.array([FRONT, SIDE]) + 1e-7).all()
 
 
-def test_the_critical_region_ends_5_cm_beyond_l_cr_at_the_edge_of_the_front():
+def test_the_critical_region_ends_5_cm_beyond_l_cr():
     assert pytest.approx(0.24 + 0.05) == skin.HALF_WIDTH
 
 
@@ -181,7 +181,8 @@ def test_a_contact_longer_than_one_taxel_is_a_line():
     assert read(IDEAL._replace(point_length=1.0), box(FRONT + 0.2, 0.0))[0] == POINT
 
 
-def test_a_tilted_corner_is_felt_as_far_as_the_tolerance_reaches_along_its_two_sides():
+def test_a_tilted_corner_is_felt_as_far_as_the_tolerance_reaches():
+    """Along both of its sides."""
     # The corner (-h, h) of a box turned by the angle of (4, 3) is at (-1.4, 0.2) h. From it one
     # side leaves along (4, 3) / 5, above, and one along (3, -4) / 5. Shifted outward by 6 mm they
     # meet the front 6 / 0.8 = 7.5 mm above and 6 / 0.6 = 10 mm below the corner.
@@ -189,7 +190,7 @@ def test_a_tilted_corner_is_felt_as_far_as_the_tolerance_reaches_along_its_two_s
     assert read(IDEAL, shape) == about(POINT, FRONT, -0.1 - 0.00125)
 
 
-def test_a_contact_around_the_corner_runs_from_its_end_on_the_side_to_its_end_on_the_front():
+def test_a_contact_around_the_corner_ends_on_the_side_and_on_the_front():
     # A flush box over y = 0.05 ... 0.45: the left face is within 6 mm of it from x = FRONT - 6 mm,
     # the front down to y = 0.05 - 6 mm.
     expected = (FRONT - 0.003, 0.5 * (SIDE + 0.044))
@@ -207,7 +208,7 @@ def test_a_flush_box_beside_the_base_touches_its_side(x):
         assert abs(got_x - x) <= PITCH / 2
 
 
-def test_an_object_that_overhangs_the_rear_end_of_a_side_touches_only_the_side():
+def test_an_object_that_overhangs_the_rear_touches_only_the_side():
     # Over x = -0.5625 ... -0.1625: from the end at -0.3625 to 6 mm beyond -0.1625.
     for side in (1, -1):
         expected = about(LINE, 0.5 * (-FRONT - 0.1565), side * SIDE)
@@ -250,7 +251,8 @@ def test_the_ideal_sensor_has_no_memory():
 
 @property_test
 @hypothesis.given(seeds)
-def test_an_ideal_contact_is_on_the_skin_or_between_two_of_its_points_and_near_the_object(seed):
+def test_an_ideal_contact_is_on_the_skin_and_near_the_object(seed):
+    """Or between two points of the skin, if the object touches around a corner."""
     for shapes in random_placements(seed).values():
         reading = sense_all(IDEAL, shapes)
         touch, at = np.asarray(reading.in_contact), np.asarray(reading.p_robot_contact)
@@ -263,7 +265,7 @@ def test_an_ideal_contact_is_on_the_skin_or_between_two_of_its_points_and_near_t
         assert (distance[touch] <= 0.006 + 1e-5).all()
 
 
-def test_the_derivatives_of_a_reading_are_finite_even_where_nothing_is_felt():
+def test_derivatives_of_a_reading_are_finite_even_if_nothing_is_felt():
     state = IDEAL.init(jax.random.key(0)), CAPACITIVE.init(jax.random.key(0))
 
     @jax.jit
@@ -332,7 +334,7 @@ def test_in_firm_contact_both_sensors_agree_within_one_taxel(seed):
 
 
 @pytest.mark.parametrize(("gap", "kind"), [(1.4e-3, LINE), (1.5e-3, NONE)])
-def test_a_sharp_corner_between_two_taxels_must_press_deeper_than_a_flush_box(gap, kind):
+def test_a_corner_between_two_taxels_must_press_deeper_than_a_flush_box(gap, kind):
     # A corner at 45 degrees, 4.83 mm beside the nearest sample of each of the two taxels, is
     # (gap + 4.83 mm) / sqrt(2) from it; the other samples feel nothing. The mean of five changes
     # is 1/4 if this one is 5/4: 10 mm / 2.25 = 4.44 mm, a gap of 1.45 mm.
@@ -377,7 +379,7 @@ def test_one_taxel_is_a_point_contact_at_its_position():
 
 @property_test
 @hypothesis.given(st.sets(st.integers(0, 41), min_size=2))
-def test_several_taxels_are_a_line_contact_at_the_mean_of_the_two_extreme_ones(active):
+def test_several_taxels_are_a_line_at_the_mean_of_the_two_extreme_ones(active):
     reading = active_taxels(np.isin(np.arange(42), list(active)))
     assert reading.contact_type == LINE
     expected = (TAXELS[min(active)] + TAXELS[max(active)]) / 2
@@ -453,7 +455,8 @@ def test_touch_begins_when_the_signal_passes_the_threshold():
     assert touch == [False] * 14 + [True] * 6
 
 
-def test_a_flush_box_is_felt_where_the_settled_signal_exceeds_the_threshold():
+def test_a_flush_box_is_felt_where_the_signal_exceeds_the_threshold():
+    """Once the low-pass filter has settled."""
     # 10 mm / gap - 1 > 0.25: a gap below 8 mm. And with threshold 1: below 5 mm.
     for threshold, gap in [(0.25, 0.008), (1.0, 0.005)]:
         sensor = CAPACITIVE._replace(threshold=threshold)

@@ -168,7 +168,7 @@ def test_on_its_surface_a_switch_is_half_on():
     assert twist.v_x == pytest.approx(0.0025, rel=1e-4)
 
 
-def test_the_dynamic_threshold_lies_between_its_two_values_by_the_weight_of_the_realignment():
+def test_the_threshold_lies_between_its_values_by_the_realignments_weight():
     # |l| is one temperature beyond l_th: 1 / (1 + 1/e) = 0.7310586 of l_mr, the rest of l_cr.
     state, _, details = one_step(state_with(0.2), observe((1.0, 0.0), l=-0.21))
     assert details.realigning == pytest.approx(0.7310586, rel=1e-4)
@@ -199,7 +199,7 @@ def test_the_realignment_state_keeps_its_memory(side):
         assert way[-1] > 0.99
 
 
-def test_sgn_has_the_derivative_of_a_hyperbolic_tangent_where_the_law_has_none():
+def test_sgn_has_the_derivative_of_a_tanh_where_the_law_has_none():
     # Beside l = 0, a_r = 10 / (1 + e^7.2) tanh(l / 0.01) and e^7.2 = 1339.43: 0.746 per metre.
     slope = jax.jit(jax.grad(law.adaptive_rate, argnums=1))
     assert slope(PAPER, 0.0, 1.0, WARM) == pytest.approx(0.746027, rel=1e-3)
@@ -224,7 +224,8 @@ def test_the_smooth_speed_is_still_v_star_split_by_the_slope(seed):
     )
 
 
-def test_the_weight_of_a_contact_mixes_pushing_with_going_ahead_and_the_contact_with_the_last():
+def test_the_weight_of_a_contact_mixes_pushing_with_going_ahead():
+    """And where the contact is with where it was last."""
     before = state_with()._replace(p_robot_contact=jnp.array([FRONT, -0.10]))
     seen = observe((2.0, 0.0), l=0.10, in_contact=0.25)
     state, twist, details = one_step(before, seen)
@@ -287,7 +288,7 @@ def flatten(params, state, observation, temperatures) -> np.ndarray:
     return np.concatenate([np.reshape(x, (WORLDS, -1)) for x in map(np.asarray, parts)], axis=1)
 
 
-def test_derivatives_are_finite_on_every_surface_and_at_every_singular_point():
+def test_derivatives_are_finite_on_surfaces_and_at_singular_points():
     points = [
         (d, l)
         for d in ((0.0, 0.0), (1e-30, 0.0), (0.05, 0.0), (0.5, 0.0), (-1.0, 0.0), (0.0, 1.0))
@@ -447,7 +448,7 @@ def test_the_skin_comes_nearer_as_its_temperature_falls(sensor, seed):
 
 
 @both_sensors
-def test_a_contact_grows_as_the_object_comes_nearer_and_is_half_at_the_threshold(skin):
+def test_a_contact_grows_as_the_object_nears_and_is_half_at_the_threshold(skin):
     # The ideal threshold is 6 mm; foam of 10 mm has 1.25 times its capacitance at 8 mm.
     threshold = 0.006 if isinstance(skin.sensor, IdealSkin) else 0.008
     gaps = np.append(np.linspace(0.03, -0.001, 63), threshold)

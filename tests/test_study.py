@@ -51,7 +51,7 @@ def test_a_study_labels_its_conditions_and_compares_them(folder):
     assert rows[2][-1].startswith("+0 -2")
 
 
-def test_a_study_continues_where_it_stopped_and_redoes_alone_what_is_corrupt(folder, monkeypatch):
+def test_a_study_continues_and_redoes_alone_what_is_corrupt(folder, monkeypatch):
     parts = Parts(folder)
     before, others = parts.contents(), parts.found()
     thin = others.pop("thin")

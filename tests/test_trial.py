@@ -96,7 +96,7 @@ def test_a_shove_happens_once_however_its_time_is_rounded():
 
     def moved(time, period, steps):
         shoved = world._replace(shift=Shift(time, jnp.array([0.1, 0.0])))
-        after = trial._shifted(shoved, start._replace(steps=steps), period)
+        after = trial.shifted(shoved, start._replace(steps=steps), period)
         return after.qpos[x] - start.qpos[x]
 
     every = jax.jit(jax.vmap(jax.vmap(moved, (None, None, 0)), (0, None, None)), static_argnums=1)
@@ -161,7 +161,7 @@ def test_a_diverged_world_freezes_and_leaves_the_others_bit_unchanged(advanced):
     assert (np.asarray(healthy.steps) == 20).all()
 
 
-def test_an_object_that_leans_beyond_its_rule_has_fallen_over_and_ends_its_trial():
+def test_an_object_that_leans_too_far_has_fallen_over_and_ends_its_trial():
     _, worlds = world_batch(SLOTS)
     half = np.radians([0.0, 44.0, 46.0, -120.0]) / 2  # about the object's x axis
     qpos = worlds.qpos.at[:, 6].set(np.cos(half)).at[:, 7].set(np.sin(half))

@@ -20,9 +20,10 @@ WANTED = [
 
 
 @pytest.mark.parametrize("command", WANTED, ids=" ".join)
-def test_without_an_nvidia_gpu_it_is_refused_in_one_sentence_before_anything_compiles(
+def test_without_an_nvidia_gpu_it_is_refused_before_anything_compiles(
     command, capsys, monkeypatch, tmp_path
 ):
+    """In one sentence."""
     monkeypatch.setattr(mjx.warp, "WARP_INSTALLED", True)
     monkeypatch.setattr("jax.stages.Lowered.compile", lambda *_: pytest.fail("compiled"))
     assert cli.main([*command, "--engine", "warp", "--out", str(tmp_path / "run")]) == 2
@@ -33,16 +34,16 @@ def test_without_an_nvidia_gpu_it_is_refused_in_one_sentence_before_anything_com
 
 
 def test_without_warp_lang_the_extra_is_named(monkeypatch):
-    monkeypatch.setattr(warp, "_on_nvidia", lambda: True)
+    monkeypatch.setattr(warp, "on_nvidia", lambda: True)
     monkeypatch.setattr(mjx.warp, "WARP_INSTALLED", True)
-    warp.check(["box", "cylinder"])
+    engines.get("warp").check(["box", "cylinder"])
     monkeypatch.setattr(mjx.warp, "WARP_INSTALLED", False)
     with pytest.raises(InputError, match=r"\(no warp-lang\): pip install '\.\[cuda,warp\]'"):
-        warp.check()
+        engines.get("warp").check()
 
 
 def test_prisms_are_refused(capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(warp, "_on_nvidia", lambda: True)
+    monkeypatch.setattr(warp, "on_nvidia", lambda: True)
     run = ["sweep", "--domain", "wide", "--engine", "warp", "--out", str(tmp_path / "run")]
     assert cli.main(run) == 2
     assert "not allowed for prisms" in capsys.readouterr().err

@@ -18,6 +18,7 @@ from test_fused import FINE, STARTS, TWIST, in_c, start
 
 from rps_jax import engines
 from rps_jax.control.law import RPSParams, Twist
+from rps_jax.engines import mjx as mjx_engine
 from rps_jax.engines import warp
 from rps_jax.engines.base import Driven, Motion
 from rps_jax.engines.mjx_colliders import mjx
@@ -117,7 +118,8 @@ def test_the_physics_that_was_asked_for_is_solved():
         np.testing.assert_allclose(getattr(model, name), getattr(loaded.physics, name), rtol=1e-6)
 
 
-def test_the_base_touches_the_cylinder_itself_not_the_capsule_that_stands_in_for_its_side():
+def test_the_base_touches_the_cylinder_itself_and_not_its_stand_in():
+    """Which is a capsule in the place of its side."""
     loaded = scene.load("cylinder").physics
     ground, base, cylinder, side = (
         loaded.geom(name).id for name in ("ground", "base", "object", "object_side")
@@ -136,9 +138,9 @@ def test_the_base_touches_the_cylinder_itself_not_the_capsule_that_stands_in_for
 # --- what is batched -----------------------------------------------------------------------
 
 
-def test_all_that_differs_between_worlds_is_batched_by_warp_or_not_used_by_it():
+def test_what_differs_between_worlds_is_batched_or_not_used_by_warp():
     batched = mjx.warp.types._BATCH_DIM["Model"]
-    others = [name for name in scene.FIELDS if not batched.get(name.removeprefix("."))]
+    others = [name for name in mjx_engine.FIELDS if not batched.get(name.removeprefix("."))]
     assert others == [".stat.meaninertia", ".dof_M0"]
     model = warp.put(scene.load("box").physics)
     assert not any(hasattr(model._impl, name) for name in ("meaninertia", "dof_M0"))
@@ -176,7 +178,7 @@ def test_double_precision_is_given_back_as_double(allowed):
 # --- what is lost --------------------------------------------------------------------------
 
 
-def test_contacts_that_find_no_room_are_counted_and_reported_and_print_nothing(
+def test_contacts_without_room_are_counted_and_reported_and_print_nothing(
     allowed, monkeypatch, capfd
 ):
     cases = [pushes.Case("box", FRICTION["S1"], (2.0, y)) for y in (-1.0, 0.0, 1.0)]

@@ -152,14 +152,14 @@ class Quasistatic:
             slider.arm,
             slider.friction_robot,
         )
-        v = self._solve(problem, (v_x - omega * p[1], v_y + omega * p[0], omega), dt)
+        v = self.solve(problem, (v_x - omega * p[1], v_y + omega * p[0], omega), dt)
 
         def turned(u: Vec) -> Vec:
             return c * u[0] - s * u[1], s * u[0] + c * u[1], u[2]
 
         return sp.add(base, sp.scale(dt, turned(twist))), sp.add(thing, sp.scale(dt, turned(v)))
 
-    def _solve(self, problem: Problem, v: Vec, dt: float) -> Vec:
+    def solve(self, problem: Problem, v: Vec, dt: float) -> Vec:
         """The object's twist, from a first guess v, both in the base's frame.
 
         Newton's method starts with friction that sets in slowly, so that no step overshoots. Its
@@ -171,14 +171,14 @@ class Quasistatic:
 
         def newton(i: jax.Array, v: Vec) -> Vec:
             slip = self.slip ** jnp.minimum(i / widening, 1.0).astype(v[0].dtype)
-            gradient, hessian = self._derivatives(held, v, slip, dt)
-            return sp.sub(v, _divide(gradient, hessian))
+            gradient, hessian = self.derivatives(held, v, slip, dt)
+            return sp.sub(v, solved(gradient, hessian))
 
         v = jax.lax.stop_gradient(jax.lax.fori_loop(0, self.iterations, newton, v))
-        gradient, hessian = self._derivatives(problem, v, self.slip, dt)
-        return sp.sub(v, _divide(gradient, jax.lax.stop_gradient(hessian)))
+        gradient, hessian = self.derivatives(problem, v, self.slip, dt)
+        return sp.sub(v, solved(gradient, jax.lax.stop_gradient(hessian)))
 
-    def _derivatives(self, problem: Problem, v: Vec, slip: Any, dt: float) -> tuple[Vec, list[Any]]:
+    def derivatives(self, problem: Problem, v: Vec, slip: Any, dt: float) -> tuple[Vec, list[Any]]:
         """Gradient, and the upper entries of the Hessian, of what the object's twist minimises."""
         tiny, friction = slip * problem.speed, problem.friction
         stiff = 1 / problem.speed
@@ -246,7 +246,7 @@ def _spring(inside: Any, depth: float) -> tuple[Any, Any]:
     return force / depth, bent / (2 * depth * depth)
 
 
-def _divide(g: Vec, h: Sequence[Any]) -> Vec:
+def solved(g: Vec, h: Sequence[Any]) -> Vec:
     """The vector that the symmetric matrix of upper entries h maps to g."""
     a, b, c, d, e, f = h
     l_1, l_2 = b / a, c / a

@@ -36,7 +36,8 @@ _ROWS = 4  # of a contact in the solver, at most: those of a pyramid
 _LOST = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")
 
 
-def _on_nvidia() -> bool:
+def on_nvidia() -> bool:
+    """Whether JAX computes on an NVIDIA GPU."""
     try:
         return jax.devices()[0] in jax.devices("cuda")
     except RuntimeError:
@@ -107,7 +108,7 @@ class Warp(Engine):
                 "worlds: choose mjx, fused, mujoco or quasistatic, or boxes and cylinders alone."
             )
         missing = [] if mjx.warp.WARP_INSTALLED else ["no warp-lang"]
-        if not _on_nvidia():
+        if not on_nvidia():
             missing.append(f"no NVIDIA GPU, JAX runs on {jax.default_backend()}")
         if missing:
             raise InputError(

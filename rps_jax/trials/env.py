@@ -95,7 +95,7 @@ class PushEnv:
     object: str = "random_box"  # of all worlds; those of the domain are not used
     domain: Domain = DOMAINS["wide"]
     params: RPSParams = RPSParams.paper()  # of which the bounds of the twist and d_success count
-    setting: Setting = Setting()
+    setting: Setting = Setting(engine="fused")
     weights: Reward = Reward()
     worlds: int = 1024
 
@@ -224,7 +224,7 @@ class PushEnv:
 
     @functools.cached_property
     def _drive(self) -> Callable[[Any, Motion, Twist], Driven]:
-        return _one_of_many(self._part.stage, self.setting)
+        return one_of_many(self._part.stage, self.setting)
 
     def _scene(self, index: int) -> Scene:
         return drawn_scene(self._alone, self._drawn, self.setting.physics, index)
@@ -281,7 +281,7 @@ def _metrics(now: Trial, seen: Seen, progress: jax.Array) -> dict[str, jax.Array
     return {"progress": progress} | {k: v.astype(progress.dtype) for k, v in flags.items()}
 
 
-def _one_of_many(stage: Stage, setting: Setting) -> Callable[[Any, Motion, Twist], Driven]:
+def one_of_many(stage: Stage, setting: Setting) -> Callable[[Any, Motion, Twist], Driven]:
     """Drives one world; under vmap the stage drives the whole batch, on a GPU as one kernel."""
     together = partial(stage.drive, physics=setting.physics)
 

@@ -164,7 +164,7 @@ def start(world: World, strategy: Strategy = RPS) -> Trial:
     )
 
 
-def _shifted(world: World, trial: Trial, period: float) -> Trial:
+def shifted(world: World, trial: Trial, period: float) -> Trial:
     """The trial with its object moved, if this is the control step nearest to when it shall be."""
     # A step's number, since rounded times could meet twice or never.
     now = trial.steps == jnp.round(world.shift.time / period)
@@ -214,7 +214,7 @@ def observe(
     """
     period = physics.control_period
     time = trial.steps * period
-    trial = _shifted(world, trial, period)
+    trial = shifted(world, trial, period)
     skin, reading, observation = sense(world, trial, period)
     distance = planar.norm(law.displacement(observation))
     now = trial.qpos[JOINTS.base]

@@ -27,7 +27,7 @@ _ENOUGH = 1e-4  # [m/s^2] error of the acceleration with which the solver ends
 _FAR = 1e9  # no upper bound of the line search
 
 
-def _law(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tuple[Any, ...]]:
+def contact_force(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tuple[Any, ...]]:
     """Force [N] along (n, t, s) at J a - aref = x, and the stiffness against x.
 
     The stiffness is (nn, nt, ns, tt, ts, ss), minus the force's derivative.
@@ -136,7 +136,7 @@ def accelerations(
                 h[3 + row][3 + column] = i_w[row][column]
         for c in contacts:
             x = sp.add(_rows(c, a, alpha), c.bias)
-            force, k = _law(c, x, physics)
+            force, k = contact_force(c, x, physics)
             f = sp.combine(force, (c.n, c.t, c.s))
             linear = sp.sub(linear, _sums(f))
             angular = sp.sub(angular, _sums(sp.cross(c.r, f)))
@@ -227,7 +227,7 @@ def _line_search(
         x, low, high = carry
         first, second = slope + x * bend, bend
         for c, start, pace in lines:
-            force, k = _law(c, sp.add(start, sp.scale(x, pace)), physics)
+            force, k = contact_force(c, sp.add(start, sp.scale(x, pace)), physics)
             first = first - _sum(sp.dot(force, pace))
             nn, nt, ns, tt, ts, ss = k
             p, q, r = pace

@@ -148,27 +148,28 @@ def _period(physics: Physics, scalars: Body, state: State, twist: Vec) -> State:
         scalars,
         state,
         twist,
-        cuda=partial(_kernel, physics=physics),
-        default=partial(_steps, physics=physics),
+        cuda=partial(in_a_kernel, physics=physics),
+        default=partial(in_xla, physics=physics),
     )
 
 
 @_period.defjvp
 def _period_jvp(physics: Physics, primals: Any, tangents: Any) -> tuple[State, State]:
     """Forward mode: a kernel has none, and the solver's loop no other."""
-    return jax.jvp(partial(_steps, physics=physics), primals, tangents)
+    return jax.jvp(partial(in_xla, physics=physics), primals, tangents)
 
 
-def _steps(scalars: Body, state: State, twist: Vec, physics: Physics) -> State:
+def in_xla(scalars: Body, state: State, twist: Vec, physics: Physics) -> State:
+    """The steps of one control period, as XLA compiles them."""
     return jax.lax.fori_loop(
         0, physics.substeps, lambda _, s: step(scalars, s, twist, physics), state
     )
 
 
-def _kernel(
+def in_a_kernel(
     scalars: Body, state: State, twist: Vec, physics: Physics, interpret: bool = False
 ) -> State:
-    """`_steps` as one kernel, a world to a thread, which keeps its world in registers."""
+    """`in_xla` as one kernel, a world to a thread, which keeps its world in registers."""
     count, moving = state.p[0].size, (state, twist)
     bodies, motion = _packed(scalars), _packed(moving)
 
@@ -176,7 +177,7 @@ def _kernel(
         *given, out = refs
         body = _unpacked(scalars, given[: len(bodies)])
         now, wanted = _unpacked(moving, given[len(bodies) :])
-        _give(out, jax.tree.leaves(_steps(body, now, wanted, physics)))
+        _give(out, jax.tree.leaves(in_xla(body, now, wanted, physics)))
 
     def block(outer: tuple[int, ...]) -> pallas.BlockSpec:
         return pallas.BlockSpec((*outer, _BLOCK), lambda i: (*(0,) * len(outer), i))
