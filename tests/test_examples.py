@@ -3,6 +3,7 @@
 import runpy
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,15 +39,7 @@ def example(name):
     return runpy.run_path(str(EXAMPLES / f"{name}.py"))
 
 
-@pytest.fixture(autouse=True)
-def names():
-    """What a test registers is forgotten after it."""
-    tables = (objects.FAMILIES, objects.REGISTERED, strategies.PARAMS, strategies.STRATEGIES)
-    before = [dict(table) for table in tables]
-    yield
-    for table, content in zip(tables, before, strict=True):
-        table.clear()
-        table.update(content)
+pytestmark = pytest.mark.usefixtures("registries")
 
 
 @pytest.mark.parametrize("name", ["own_object", "own_law", "own_domain", "own_optimiser"])
@@ -216,7 +209,7 @@ def test_the_papers_names_are_taken():
 
 
 def test_a_law_of_ones_own_runs_beside_the_law(capsys):
-    found = example("own_law")["main"](worlds=2, horizon=3.0)
+    found = example("own_law")["main"](worlds=1, horizon=3.0)
     assert "mine" in capsys.readouterr().out
     # Both have touched and pushed by then, each in its way.
     moved = found.base_pose.sel(pose="x").values
@@ -237,13 +230,11 @@ def test_an_optimiser_of_ones_own_needs_evaluate_alone(capsys):
     assert "K_h" in capsys.readouterr().out
     for value, (low, high) in zip(best, made["BOUNDS"].values(), strict=True):
         assert low <= value <= high
-    assert dict(tested.success.sizes) == {"candidate": 2, "world": 12}
+    assert dict(tested.success.sizes) == {"candidate": 2, "world": 24}
 
 
 def test_registered_names_work_on_the_command_line(tmp_path, capsys, hexagon):
-    made = example("own_law")
-    own = Strategy(lambda params: (), made["step"])
-    strategies.register_strategy("p_control", own, made["PParams"]())
+    example("own_law")  # registers p_control
     out = tmp_path / "table"
     command = ["table", "--objects", "hexagon", "--strategies", "p_control", "--friction", "S1"]
     command += ["--targets", "2", "0", "--horizon", "4", "--engine", "mujoco", "--out", str(out)]
@@ -257,13 +248,11 @@ def test_registered_names_work_on_the_command_line(tmp_path, capsys, hexagon):
 
 
 def test_a_sweep_finds_a_registered_strategy_again(tmp_path):
-    made = example("own_law")
-    own = Strategy(lambda params: (), made["step"])
-    strategies.register_strategy("p_control", own, made["PParams"]())
-    plan = Plan(Domain(), 3, {"p": made["PParams"](v=0.03)})
+    kind = example("own_law")["PParams"]
+    plan = Plan(Domain(), 3, {"p": kind(v=0.03)})
     open_run(tmp_path, plan)
     assert load_plan(tmp_path) == plan
-    strategies.STRATEGIES.pop(made["PParams"])
+    strategies.PARAMS.pop("p_control")
     with pytest.raises(InputError, match="unknown class of parameters 'PParams'"):
         load_plan(tmp_path)
 
@@ -293,6 +282,17 @@ def test_a_run_made_with_a_file_knows_when_the_file_has_changed(tmp_path):
     law.write_text(LAW.read_text().replace("0.15, 0.15", "0.1, 0.1"))
     with pytest.raises(InputError, match="is not what it was when the run was made"):
         strategies.restored(kept)
+
+
+def test_a_file_is_run_again_if_another_law_took_its_name_since():
+    """And a law that no file holds is not kept as if one did."""
+    kinds = []
+    for _ in range(2):
+        _, params = strategies.named(f"{LAW}:PParams")
+        kinds.append(type(params))
+        in_a_notebook = example("own_law")["PParams"]()  # registers p_control, too
+        assert "file" not in strategies.recorded(in_a_notebook)
+    assert kinds[0] is not kinds[1]
 
 
 @pytest.mark.parametrize(
@@ -327,25 +327,27 @@ def test_parameters_that_are_arrays_and_nested_are_kept_and_found_again(tmp_path
 def test_a_strategy_registered_again_replaces_the_old_one():
     """As when a cell of a notebook is run twice, and its class of parameters is made anew."""
     kinds = [example("own_law")["PParams"] for _ in range(2)]
-    for kind in kinds:
-        strategies.register_strategy("p", Strategy(lambda params: (), lambda *_: None), kind())
     assert kinds[0] not in strategies.STRATEGIES
-    assert type(strategies.PARAMS["p"]) is kinds[1]
+    assert type(strategies.PARAMS["p_control"]) is kinds[1]
     strategies.register_strategy("slow", strategies.RPS, RPSParams(v_max=0.01))
     assert strategies.of(strategies.PARAMS["slow"]) is strategies.RPS
 
 
+class Ahead(NamedTuple):
+    v: float = 0.05  # [m/s]
+    d_success: float = 0.05  # [m]
+
+
 def test_params_that_mean_nothing_are_refused():
-    kind = example("own_law")["PParams"]
     own = Strategy(lambda params: (), lambda *_: None)
     with pytest.raises(InputError, match="v = nan is not allowed"):
-        strategies.register_strategy("p", own, kind(v=float("nan")))
+        strategies.register_strategy("p", own, Ahead(v=float("nan")))
     with pytest.raises(InputError, match=r"a field or property d_success"):
         strategies.register_strategy("p", own, (1.0, 2.0))
     with pytest.raises(InputError, match="their class RPSParams is that of 'rps'"):
         strategies.register_strategy("p", own, RPSParams())
-    with pytest.raises(InputError, match="params of class PParams belong to no strategy"):
-        Case("box", FRICTION["S1"], (2.0, 0.0), kind())
+    with pytest.raises(InputError, match="params of class Ahead belong to no strategy"):
+        Case("box", FRICTION["S1"], (2.0, 0.0), Ahead())
     details = Details.of(Observation(jnp.zeros(2), 0.0, jnp.array([0.3, 0.1]), True, jnp.ones(2)))
     assert float(details.l) == pytest.approx(0.1)
     assert float(details.distance) == pytest.approx(np.hypot(0.7, 0.9))

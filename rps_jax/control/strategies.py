@@ -72,7 +72,7 @@ STRATEGIES: dict[type, Strategy] = {RPSParams: RPS, APSParams: APS}  # by class 
 # The paper's, by name, with their parameters.
 PAPER: dict[str, Params] = {"rps": RPSParams.paper(), "nps": RPSParams.nps(), "aps": APSParams()}
 PARAMS: dict[str, Params] = dict(PAPER)  # by name
-_SOURCES: dict[str, dict[str, str]] = {}  # by the class of the parameters: where it was loaded from
+_SOURCES: dict[type, dict[str, str]] = {}  # by class of parameters: the file it was loaded from
 
 
 @functools.cache  # equal temperatures are one strategy, and so one compiled program
@@ -179,17 +179,23 @@ def named(text: str) -> tuple[str, Params]:
     content = _read(Path(path))
     digest = hashlib.sha256(content).hexdigest()[:16]
     module = f"_rps_jax_{Path(path).stem}_{digest}"
-    if module not in sys.modules:
+    # It is run again if something else was registered by its name since.
+    if (found := _registered(module, kind)) is None:
         _run(Path(path), module)
-    found = getattr(sys.modules[module], kind, None)
-    for name, params in PARAMS.items():
-        if type(params) is found:
-            _SOURCES[kind] = {"file": str(Path(path).resolve()), "digest": digest}
-            return name, params
+        found = _registered(module, kind)
+    if found is not None:
+        _SOURCES[type(found[1])] = {"file": str(Path(path).resolve()), "digest": digest}
+        return found
     raise errors.InputError(
         f"strategy = {text} is not allowed: {path} must define the class {kind or 'of parameters'} "
         "and call rps_jax.register_strategy with parameters of it."
     )
+
+
+def _registered(module: str, kind: str) -> tuple[str, Params] | None:
+    """Name and parameters of the strategy whose parameters are of a class of a module."""
+    own = getattr(sys.modules.get(module), kind, None)
+    return next(((name, params) for name, params in PARAMS.items() if type(params) is own), None)
 
 
 def _read(path: Path) -> bytes:
@@ -225,8 +231,8 @@ def recorded(params: Params) -> dict[str, Any]:
 
     `restored` is the opposite.
     """
-    kind = type(params).__name__
-    return {"strategy": kind} | _SOURCES.get(kind, {}) | as_json(params)
+    kind = type(params)
+    return {"strategy": kind.__name__} | _SOURCES.get(kind, {}) | as_json(params)
 
 
 def restored(values: Mapping[str, Any]) -> Params:
@@ -238,8 +244,8 @@ def restored(values: Mapping[str, Any]) -> Params:
     left = dict(values)
     kind, file, digest = (left.pop(key, None) for key in ("strategy", "file", "digest"))
     if file:
-        named(f"{file}:{kind}")
-        if _SOURCES[str(kind)]["digest"] != digest:
+        _, found = named(f"{file}:{kind}")
+        if _SOURCES[type(found)]["digest"] != digest:
             raise errors.InputError(
                 f"strategy = {file} is not what it was when the run was made: restore the file."
             )
