@@ -200,8 +200,9 @@ def test_it_moves_as_a_trial_that_is_driven_by_the_same_twist(pushing):
     worlds = state.info["world"]
     trials = trial.start_all(worlds, np.ones(mine.done.size, bool), strategy=dull)
     options = {"physics": FAST, "rules": push.setting.rules, "strategy": dull}
-    drawn = domain.draw(replace(NEAR, objects=(push.object,)), 0, np.arange(1))
-    stage = drawn_worlds(NEAR, drawn, push.params, push.setting).stage
+    alone = replace(NEAR, objects=(push.object,))
+    drawn = domain.draw(alone, 0, np.arange(1))
+    stage = drawn_worlds(alone, drawn, push.params, push.setting).stage
     theirs = trial.advance(stage, worlds, trials, **options, steps=STEPS)
     np.testing.assert_array_equal(mine.data.steps, STEPS)
     np.testing.assert_allclose(mine.data.qpos, theirs.qpos, atol=2e-5)

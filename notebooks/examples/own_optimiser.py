@@ -34,7 +34,7 @@ def main(worlds: int = 64, generations: int = 10, horizon: float = 300.0):
     best = LAW._replace(**dict(zip(BOUNDS, found.x, strict=True)))
     both = jax.tree.map(lambda *values: np.array(values), LAW, best)
     rules = rps_jax.Rules(horizon=horizon)
-    tested = rps_jax.evaluate(both, "wide", worlds=4 * worlds, split="test", rules=rules)
+    tested = rps_jax.evaluate(both, "wide", worlds=8 * worlds, split="test", rules=rules)
     print(dict(zip(BOUNDS, found.x, strict=True)), tested.success.mean("world").values)
     return found.x, tested
 

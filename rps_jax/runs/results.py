@@ -161,7 +161,9 @@ def dataset(plan: Plan, contents: Mapping[int, bytes]) -> xr.Dataset:
 
 
 def labelled(results: xr.Dataset) -> xr.Dataset:
-    """Results with what was drawn as coordinates of the worlds."""
+    """Results with names for the numbers of a pose, and what was drawn as coordinates of worlds."""
+    if "pose" in results.dims:
+        results = results.assign_coords(pose=["x", "y", "yaw"])
     return results.set_coords([name for name in results if results[name].dims == ("world",)])
 
 

@@ -1,6 +1,6 @@
 """Pushing as an environment for a learning loop of one's own, as mujoco_playground has them.
 
-    env = PushEnv("random_box", setting=Setting(engine="fused"))
+    env = PushEnv("random_box")
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 512))
     state = jax.jit(jax.vmap(env.step))(state, actions)
 
