@@ -48,13 +48,13 @@ print(
 #
 # 1. *Approach* (yellow). Nothing is felt; the base creeps forward at 1 cm/s until the skin
 #    touches.
-# 2. *Turning on the edge* (blue, until 44 s). The target lies straight behind, so the base turns
+# 2. *Turning on the edge* (blue, until 43 s). The target lies straight behind, so the base turns
 #    right at once, and the contact runs to the left edge of the front within seconds. There the
 #    law enters the Realignment State: $a_r$ = 10, and all speed goes sideways, after the contact.
 #    One point holds the box, near $l_{cr}$ (dashed), and base and box turn about each other. Since
 #    $\sigma$ is nearly zero so far out, the turn is slow: this act takes a third of the trial.
-# 3. *Pushing home* (44 to 98 s). The box has come round until its side lies flat on the front (the
-#    point becomes a line at 37 s). The contact slides back to 7 cm, below $\beta$; $a_r$ falls to
+# 3. *Pushing home* (43 to 98 s). The box has come round until its side lies flat on the front (the
+#    point becomes a line at 38 s). The contact slides back to 7 cm, below $\beta$; $a_r$ falls to
 #    0.4, and the base drives forward at nearly full speed with a little motion to the left.
 # 4. *Arriving* (from 98 s). Nearer than $d_{th}$ = 0.5 m Eq. 5 gives no more lateral motion: $a_r$
 #    is 0 at once, and the path bends visibly. Speed falls with the distance (Eq. 3), so the last

@@ -1,5 +1,6 @@
 """What several files of tests share: commands, small trials and sweeps, shapes and comparisons."""
 
+import ast
 import contextlib
 from collections.abc import Iterator
 from dataclasses import replace
@@ -124,6 +125,18 @@ def place_before_the_front(shape: Footprint, yaw: Any, y: Any, gap: Any) -> Foot
     turned = fp.place(shape, jnp.zeros(2), yaw)
     x = FRONT + gap + fp.extent(turned, jnp.array([-1.0, 0.0]))
     return fp.place(turned, jnp.stack([x, jnp.asarray(y, x.dtype)]), 0.0)
+
+
+# --- scripts -------------------------------------------------------------------------------
+
+
+def imported(path: Path) -> Iterator[str]:
+    """Names of the package's modules that a script imports."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rps_jax"):
+            yield str(node.module)
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name.startswith("rps_jax"))
 
 
 # --- comparisons ---------------------------------------------------------------------------

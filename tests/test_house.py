@@ -8,7 +8,7 @@ import subprocess
 import sys
 
 import pytest
-from helpers import ROOT
+from helpers import ROOT, imported
 
 import rps_jax
 
@@ -34,15 +34,6 @@ def test_the_test_command_of_the_readme_is_that_of_ci():
     of_ci = re.findall(r"^python3 -m venv .*pytest$", (ROOT / ".ci" / "run").read_text(), re.M)
     assert len(of_ci) == 1
     assert of_ci[0] in (ROOT / "README.md").read_text().splitlines()
-
-
-def imported(path):
-    """Names of the package that a script imports."""
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rps_jax"):
-            yield node.module
-        elif isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names if alias.name.startswith("rps_jax"))
 
 
 @pytest.mark.parametrize(

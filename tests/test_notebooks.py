@@ -7,6 +7,7 @@ from pathlib import Path
 import jupytext
 import nbformat
 import pytest
+from helpers import imported
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 RUNNER = runpy.run_path(str(FOLDER / "execute.py"))
@@ -40,6 +41,11 @@ def told(notebook):
 
 def test_there_are_five_of_them():
     assert [name[:2] for name in TEXTS] == ["01", "02", "03", "04", "05"]
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.py")), ids=lambda path: path.stem)
+def test_notebooks_import_the_package_and_nothing_below_it(path):
+    assert set(imported(path)) == {"rps_jax"}
 
 
 @every_notebook
