@@ -20,7 +20,7 @@ from scipy.optimize import minimize_scalar
 from rps_jax import engines
 from rps_jax.control.law import RPSParams
 from rps_jax.engines.base import Motion
-from rps_jax.engines.mjx_colliders import mjx
+from rps_jax.engines.mjx_colliders import collision, mjx
 from rps_jax.engines.mujoco import Batch
 from rps_jax.geometry import planar
 from rps_jax.trials import pushes
@@ -298,7 +298,7 @@ def test_mjx_lets_a_nearly_upright_cylinder_touch_with_its_rim_alone():
     @jax.jit
     @jax.vmap
     def ground_contact(qpos):
-        contact = mjx.collision(model, mjx.kinematics(model, data.replace(qpos=qpos)))._impl.contact
+        contact = collision(model, mjx.kinematics(model, data.replace(qpos=qpos)))._impl.contact
         return contact.dist[:3], contact.pos[:3] - qpos[3:6]
 
     depth, arm = ground_contact(qpos.astype(np.float32))
