@@ -19,8 +19,7 @@ from rps_jax.errors import InputError
 from rps_jax.geometry.footprint import Footprint, circle, polygon, rectangle
 from rps_jax.record import files
 from rps_jax.robot.skin import POINT, CapacitiveSkin
-from rps_jax.runs.plan import Plan, load_plan, scene_of
-from rps_jax.runs.results import open_run
+from rps_jax.runs.plan import Plan, load_plan, open_run, scene_of
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.results import title_of

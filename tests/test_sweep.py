@@ -41,9 +41,9 @@ from rps_jax.errors import InputError
 from rps_jax.geometry import planar
 from rps_jax.record import files
 from rps_jax.runs import sweep
-from rps_jax.runs.plan import Shard, load_plan
+from rps_jax.runs.plan import Shard, load_plan, open_run
 from rps_jax.runs.report import write_report
-from rps_jax.runs.results import merge, open_run
+from rps_jax.runs.results import merge
 from rps_jax.trials import batch, trial
 from rps_jax.trials.batch import Job
 from rps_jax.trials.trial import Rules

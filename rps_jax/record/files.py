@@ -116,6 +116,27 @@ def read_bytes(path: Path) -> bytes:
     return content
 
 
+def noted(path: Path) -> dict[str, Any]:
+    """What a JSON file of a run folder says, by name.
+
+    Raises:
+      InputError: there is no such file, or it is corrupt.
+    """
+    try:
+        content = read_bytes(path)
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise InputError(
+            f"run = {path.parent} holds no {path.name}: give the folder of a run."
+        ) from error
+    try:
+        found = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise corrupt(path, error) from error
+    if not isinstance(found, dict):
+        raise corrupt(path, "it holds no names with values")
+    return found
+
+
 def read(path: Path) -> xr.Dataset:
     """The labelled results of one file.
 

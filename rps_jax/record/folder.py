@@ -66,7 +66,7 @@ def claim(folder: Path, wanted: dict[str, Any]) -> Path:
     with alone(folder):
         if not (folder / MANIFEST).exists():
             files.write_json(folder / MANIFEST, wanted, checked=True)
-        elif (found := manifest(folder)) != wanted:
+        elif (found := files.noted(folder / MANIFEST)) != wanted:
             raise InputError(
                 f"out = {folder} holds another run ({difference(found, wanted)}): choose another "
                 "folder, or ask for the same."
@@ -116,28 +116,7 @@ def manifest(folder: Path) -> dict[str, Any]:
     Raises:
       InputError: there is none, or it is corrupt.
     """
-    return noted(folder / MANIFEST)
-
-
-def noted(path: Path) -> dict[str, Any]:
-    """What a JSON file of a run folder says, by name.
-
-    Raises:
-      InputError: there is no such file, or it is corrupt.
-    """
-    try:
-        content = files.read_bytes(path)
-    except (FileNotFoundError, NotADirectoryError) as error:
-        raise InputError(
-            f"run = {path.parent} holds no {path.name}: give the folder of a run."
-        ) from error
-    try:
-        found = json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise files.corrupt(path, error) from error
-    if not isinstance(found, dict):
-        raise files.corrupt(path, "it holds no names with values")
-    return found
+    return files.noted(folder / MANIFEST)
 
 
 def difference(found: Any, wanted: Any) -> str:

@@ -64,7 +64,7 @@ def signed(folder: Path) -> dict[str, Any]:
     Raises:
       InputError: there is nothing, or it is corrupt.
     """
-    return run_folder.noted(folder / ENVIRONMENT)
+    return files.noted(folder / ENVIRONMENT)
 
 
 def _history(folder: Path) -> list[dict[str, Any]]:

@@ -29,6 +29,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from rps_jax import engines
 from rps_jax.errors import InputError
 from rps_jax.record import folder as run_folder
 from rps_jax.record import provenance
@@ -168,12 +169,12 @@ def run_on_cluster(
     """Run what is missing of a plan, as `sweep.run_missing` does, on the workers of a cluster.
 
     Args:
-      folder: a run folder that `results.open_run` opened; `environment.json` in it will name
+      folder: a run folder that `plan.open_run` opened; `environment.json` in it will name
         the workers.
       plan: what is run.
       address: of the cluster; see `connected`.
       prepare: called first in every worker, to choose its device and its cache of programs.
-      gpus: claim a GPU for each worker if the cluster has any.
+      gpus: claim a GPU for each worker if the cluster has any and the engine can use one.
       shard: the share of the plan that is run.
       report: called now and then.
       slots: worlds stepped at once by one thread; by default chosen by the worker's device.
@@ -196,7 +197,10 @@ def run_on_cluster(
         return Timing(0.0, 0.0, 0.0)
     waiting = list(missing.values())
     lacking = set(itertools.chain.from_iterable(waiting))
-    claim = {"num_cpus": workers or 1, "num_gpus": int(gpus)}
+    claim = {
+        "num_cpus": workers or 1,
+        "num_gpus": int(gpus and engines.get(plan.setting.engine).traced),
+    }
     began, stepped, simulated = time.perf_counter(), None, 0.0
     given = (_same(own), prepare, slots)
     with connected(address) as ray, _started(ray, plan, waiting, claim, given) as (board, tasks):

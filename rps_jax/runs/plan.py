@@ -30,7 +30,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.trials.worlds import drawn_scene, drawn_worlds
 from rps_jax.world import domain
-from rps_jax.world.domain import Domain
+from rps_jax.world.domain import Domain, Draw
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import Scene
 
@@ -138,6 +138,15 @@ class Shard:
         errors.check_count("shard", self.number, at_most=self.of)
 
 
+def open_run(folder: Path, plan: Plan) -> Path:
+    """The run folder with the plan in it; a folder that has one must have the same.
+
+    Raises:
+      InputError: it cannot be written, or holds a run of another configuration.
+    """
+    return run_folder.claim(folder, plan.configuration())
+
+
 def load_plan(folder: Path) -> Plan:
     """The plan of a run folder.
 
@@ -175,15 +184,19 @@ def share(plan: Plan, shard: Shard) -> dict[int, np.ndarray]:
     return {n: trials for i, (n, trials) in enumerate(every) if i % shard.of == shard.number - 1}
 
 
+def draw(plan: Plan, index: Any) -> Draw:
+    """What is drawn for worlds of one object, by their indices."""
+    return domain.draw(plan.domain, plan.setting.seed, index)
+
+
 def scene_of(plan: Plan, index: int) -> Scene:
     """The compiled scene of one world, for pictures."""
-    drawn = domain.draw(plan.domain, plan.setting.seed, [index])
-    return drawn_scene(plan.domain, drawn, plan.setting.physics, 0)
+    return drawn_scene(plan.domain, draw(plan, [index]), plan.setting.physics, 0)
 
 
 def title_of(plan: Plan, index: int) -> str:
     """What one world is, in words."""
-    drawn = domain.table(domain.draw(plan.domain, plan.setting.seed, [index]))
+    drawn = domain.table(draw(plan, [index]))
     name = plan.domain.objects[int(plan.domain.object_of(np.asarray(index)))].replace("_", " ")
     value = {key: float(values[0]) for key, (values, _) in drawn.items()}
     return (
@@ -194,5 +207,9 @@ def title_of(plan: Plan, index: int) -> str:
 
 def world_part(plan: Plan, arm: int, index: Any) -> Part:
     """Worlds of one object, by their indices, with the parameters of an arm."""
-    drawn = domain.draw(plan.domain, plan.setting.seed, index)
+    return made(plan, arm, draw(plan, index))
+
+
+def made(plan: Plan, arm: int, drawn: Draw) -> Part:
+    """The worlds of a draw, with the parameters of an arm."""
     return drawn_worlds(plan.domain, drawn, list(plan.arms.values())[arm], plan.setting)

@@ -13,23 +13,14 @@ from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record import folder as run_folder
 from rps_jax.record.checkpoint import Parts
-from rps_jax.runs.plan import Plan, load_plan
+from rps_jax.runs.plan import Plan, load_plan, open_run
 from rps_jax.trials.results import UNITS
 from rps_jax.trials.trial import Outcome
-from rps_jax.world import domain
 
 Keep = Callable[[int, bytes], Any]  # called with the number and the content of a part
+Columns = Mapping[str, tuple[np.ndarray, str]]  # what was drawn: values (n,) and unit, by name
 # Of an outcome; the others are float32.
 _TYPES = dict.fromkeys(("success", "tipped", "diverged"), np.int8) | {"overflows": np.int32}
-
-
-def open_run(folder: Path, plan: Plan) -> Path:
-    """The run folder with the plan in it; a folder that has one must have the same.
-
-    Raises:
-      InputError: it cannot be written, or holds a run of another configuration.
-    """
-    return run_folder.claim(folder, plan.configuration())
 
 
 def name_of(part: int) -> str:
@@ -59,6 +50,11 @@ class Collector:
         for number, trials in plan.parts.items():
             self._part_of[trials] = number
         self._open: dict[int, _Rows] = {}
+        self._drawn: dict[int, Columns] = {}
+
+    def expect(self, part: int, drawn: Columns) -> None:
+        """A part is begun; what was drawn for its worlds will stand in its file."""
+        self._drawn[part] = drawn
 
     def collect(self, numbers: np.ndarray, outcomes: Outcome) -> None:
         """Outcomes of trials that ended; the parts that are complete with them are kept."""
@@ -74,14 +70,17 @@ class Collector:
                 rows.leaves[name][at] = leaf[ended]
             rows.missing -= at.size
             if not rows.missing:
-                self._keep(part, _content(trials, self._open.pop(part).leaves))
+                drawn = self._drawn.pop(part, {})
+                self._keep(part, _content(trials, self._open.pop(part).leaves, drawn))
 
 
-def _content(trials: np.ndarray, leaves: dict[str, np.ndarray]) -> bytes:
+def _content(trials: np.ndarray, leaves: dict[str, np.ndarray], drawn: Columns) -> bytes:
     """The file of a part."""
     columns: dict[str, Any] = {"trial": ("row", trials)}
     for name, leaf in leaves.items():
         columns[name] = (("row", "pose")[: leaf.ndim], leaf)
+    for name, (values, unit) in drawn.items():
+        columns[name] = ("row", values.astype(np.float32), {"units": unit})
     return files.encoded(xr.Dataset(columns))
 
 
@@ -139,21 +138,21 @@ def dataset(plan: Plan, contents: Mapping[int, bytes]) -> xr.Dataset:
     for number, content in contents.items():
         arm, _ = plan.arm_and_object(number)
         part = files.decoded(content, f"part {number}")
-        if lacking := sorted({"trial", *UNITS} - set(part)):
+        drawn = [str(name) for name in part if name not in ("trial", *UNITS)]
+        lacking = {"trial", *UNITS} - set(part) | ({"drawn"} if not (arm or drawn) else set())
+        if lacking:
             raise InputError(
                 f"part {number} of the run was made by another version (it lacks "
-                f"{', '.join(lacking)}): use that version."
+                f"{', '.join(sorted(lacking))}): use that version."
             )
         world = part.trial.values % plan.worlds
         for name in UNITS:
             columns[name].values[arm, world] = part[name].values
-        if arm == 0:
-            drawn = domain.table(domain.draw(plan.domain, plan.setting.seed, world))
-            for name, (values, unit) in drawn.items():
-                if name not in columns:
-                    empty = np.zeros(plan.worlds, np.float32)
-                    columns[name] = xr.Variable("world", empty, {"units": unit})
-                columns[name].values[world] = values
+        for name in drawn:
+            if name not in columns:
+                empty = np.zeros(plan.worlds, np.float32)
+                columns[name] = xr.Variable("world", empty, part[name].attrs)
+            columns[name].values[world] = part[name].values
     for column in columns.values():
         column.encoding["_FillValue"] = None  # every number is a result
     names = {"arm": list(plan.arms), "object": list(plan.domain.objects), "world": every}

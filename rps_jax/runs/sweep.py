@@ -21,7 +21,7 @@ from rps_jax.engines import EngineName
 from rps_jax.record import folder as run_folder
 from rps_jax.record import provenance
 from rps_jax.record.checkpoint import Parts
-from rps_jax.runs.plan import Kind, Plan, Shard, share, world_part
+from rps_jax.runs.plan import Kind, Plan, Shard, draw, made, open_run, share
 from rps_jax.runs.results import (
     Collector,
     Keep,
@@ -29,13 +29,12 @@ from rps_jax.runs.results import (
     gather,
     labelled,
     name_of,
-    open_run,
 )
 from rps_jax.trials import batch
 from rps_jax.trials.batch import Job, Part
 from rps_jax.trials.setting import Progress, Setting, Timing
 from rps_jax.trials.trial import Rules
-from rps_jax.world.domain import Domain, named
+from rps_jax.world.domain import Domain, named, table
 from rps_jax.world.physics import Fidelity, PhysicsName, preset
 
 
@@ -164,14 +163,13 @@ def work(
     There are as many slots as the whole plan has use for, whatever parts are run, so that a part
     has the same bits whoever runs it, and with whatever other parts.
     """
-    jobs = []
+    jobs, collector = [], Collector(plan, keep)
     for kind, some in numbers.items():
-        parts = _made(plan, some)
+        parts = _made(plan, some, collector)
         if isinstance(some, Sequence):  # what is asked for elsewhere is asked for when it is needed
             parts = _ahead(parts)
         jobs.append(Job(strategies.STRATEGIES[kind[1]], plan.sizes[kind], parts))
-    collect = Collector(plan, keep).collect
-    return batch.run(jobs, plan.setting, collect=collect, report=report, **shape)
+    return batch.run(jobs, plan.setting, collect=collector.collect, report=report, **shape)
 
 
 def remaining(folder: Path, plan: Plan, shard: Shard) -> tuple[dict[Kind, list[int]], int]:
@@ -187,12 +185,14 @@ def remaining(folder: Path, plan: Plan, shard: Shard) -> tuple[dict[Kind, list[i
     return missing, before
 
 
-def _made(plan: Plan, numbers: Iterable[int]) -> Iterator[Part]:
-    """The worlds of parts, made one part at a time."""
+def _made(plan: Plan, numbers: Iterable[int], collector: Collector) -> Iterator[Part]:
+    """The worlds of parts, made one part at a time; the first arm's keep what was drawn."""
     for number in numbers:
-        trials = plan.parts[number]
-        arm, _ = plan.arm_and_object(number)
-        yield world_part(plan, arm, trials % plan.worlds)._replace(numbers=trials)
+        trials, (arm, _) = plan.parts[number], plan.arm_and_object(number)
+        drawn = draw(plan, trials % plan.worlds)
+        if arm == 0:
+            collector.expect(number, table(drawn))
+        yield made(plan, arm, drawn)._replace(numbers=trials)
 
 
 def _ahead(parts: Iterator[Part]) -> Iterator[Part]:

@@ -13,6 +13,9 @@ from typing import TYPE_CHECKING
 from rps_jax.errors import InputError
 
 if TYPE_CHECKING:
+    from xarray import Dataset
+
+    from rps_jax.runs.plan import Plan
     from rps_jax.trials.setting import Timing
 
 
@@ -111,3 +114,19 @@ def tell(timing: Timing, device: str | None = None) -> None:
         f"({timing.simulated / max(timing.run, 1e-9):.0f} simulated s per s) on "
         f"{device or jax.devices()[0].device_kind}"
     )
+
+
+def tell_sweep(
+    out: Path, plan: Plan, results: Dataset | None, timing: Timing | None = None
+) -> None:
+    """Print where the time of a sweep went, if it ran; then write and print its report."""
+    from rps_jax.record import provenance
+    from rps_jax.runs.report import write_report
+
+    if timing:
+        tell(timing, provenance.signed(out)["device"]["kind"])
+    if results is None:
+        print(f"run folder: {out}; when all shards are done: rps merge {out} --out {out}")
+    else:
+        print(write_report(out, plan, results).read_text())
+        print(f"run folder: {out}")

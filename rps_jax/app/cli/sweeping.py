@@ -16,8 +16,6 @@ from rps_jax.app.cli.replicating import show
 from rps_jax.errors import InputError
 
 if TYPE_CHECKING:
-    from xarray import Dataset
-
     from rps_jax.runs.plan import Plan
     from rps_jax.trials.setting import Timing
 
@@ -84,7 +82,7 @@ class Sweep(Spread):
 
         plan, shard, shape = self.plan(), parsing.shard_of(self.shard), self.shape()
         if self.ray:
-            by = _on_cluster(self.ray, self.device, plan)
+            by = _on_cluster(self.ray, self.device)
         else:
             running.choose_device(self.device)
             plan.check_here()
@@ -92,36 +90,13 @@ class Sweep(Spread):
         running.use_cache()
         with progress_bar(plan.trials_of(shard), "sweep") as report:
             timing, results = sweep.complete(self.out, plan, shard, by=by, report=report, **shape)
-        tell_made(self.out, timing)
-        if results is not None:
-            tell_report(self.out, plan, results)
-        else:
-            print(
-                f"run folder: {self.out}; when all shards are done: rps merge {self.out} --out "
-                f"{self.out}"
-            )
+        running.tell_sweep(self.out, plan, results, timing)
 
 
-def tell_made(out: Path, timing: Timing) -> None:
-    """Print where the time of a run went, and on what."""
-    from rps_jax.record import provenance
-
-    running.tell(timing, provenance.signed(out)["device"]["kind"])
-
-
-def tell_report(out: Path, plan: Plan, results: Dataset) -> None:
-    """Write and print the report of a sweep."""
-    from rps_jax.runs.report import write_report
-
-    print(write_report(out, plan, results).read_text())
-    print(f"run folder: {out}")
-
-
-def _on_cluster(address: str, device: str, plan: Plan) -> Callable[..., Timing]:
+def _on_cluster(address: str, device: str) -> Callable[..., Timing]:
     """What runs a plan on the workers of a cluster."""
     import jax
 
-    from rps_jax import engines
     from rps_jax.runs import cluster
 
     running.choose_device("cpu")  # for this process: the workers here need the GPUs
@@ -129,7 +104,7 @@ def _on_cluster(address: str, device: str, plan: Plan) -> Callable[..., Timing]:
         cluster.run_on_cluster,
         address=address,
         prepare=partial(_prepare, device, bool(jax.config.jax_enable_x64)),
-        gpus=device != "cpu" and engines.get(plan.setting.engine).traced,
+        gpus=device != "cpu",
     )
 
 
@@ -163,7 +138,7 @@ class Merge:
         plan, results = merge(list(self.folders), self.out)
         for one in self.folders:
             provenance.sign(self.out, provenance.signed(one))
-        tell_report(self.out, plan, results)
+        running.tell_sweep(self.out, plan, results)
 
 
 @dataclass(frozen=True)

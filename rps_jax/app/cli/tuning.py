@@ -13,7 +13,6 @@ import tyro
 
 from rps_jax.app.cli import parsing, running
 from rps_jax.app.cli.options import Device, Engine, Fidelity, Physics, Spread
-from rps_jax.app.cli.sweeping import tell_report
 
 if TYPE_CHECKING:
     from rps_jax.trials.setting import Progress
@@ -285,7 +284,7 @@ class TuneCompare(Spread):
                 _, results = sweep.complete(self.out / name, plan, report=report, **shape)
             assert results is not None  # it is the whole
             print(f"## {name}\n")
-            tell_report(self.out / name, plan, results)
+            running.tell_sweep(self.out / name, plan, results)
 
 
 @dataclass(frozen=True)
