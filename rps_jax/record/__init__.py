@@ -1,1 +1,5 @@
-"""What runs leave behind: files written whole or not at all, run folders, and who made them."""
+"""What runs leave behind: files written whole or not at all, and who made them.
+
+`files` writes and checks them, `folder` claims and locks a run's folder, `checkpoint` keeps its
+finished parts, and `provenance` notes command, versions, device and commit. No file imports JAX.
+"""

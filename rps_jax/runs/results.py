@@ -151,7 +151,7 @@ def dataset(plan: Plan, contents: Mapping[int, bytes]) -> xr.Dataset:
         for name in drawn:
             if name not in columns:
                 empty = np.zeros(plan.worlds, np.float32)
-                columns[name] = xr.Variable("world", empty, part[name].attrs)
+                columns[name] = xr.Variable("world", empty, {"units": part[name].units})
             columns[name].values[world] = part[name].values
     for column in columns.values():
         column.encoding["_FillValue"] = None  # every number is a result
