@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from rps_jax.geometry import footprint as footprint
     from rps_jax.geometry import planar as planar
     from rps_jax.geometry.footprint import Footprint as Footprint
+    from rps_jax.robot.robot import ROBOTS as ROBOTS
+    from rps_jax.robot.robot import Robot as Robot
     from rps_jax.robot.skin import CapacitiveSkin as CapacitiveSkin
     from rps_jax.robot.skin import IdealSkin as IdealSkin
     from rps_jax.robot.skin import SmoothSkin as SmoothSkin
@@ -69,6 +71,7 @@ _HOMES = {
     "control.strategies": ("Strategy", "register_strategy"),
     "errors": ("InputError",),
     "geometry.footprint": ("Footprint",),
+    "robot.robot": ("ROBOTS", "Robot"),
     "robot.skin": ("CapacitiveSkin", "IdealSkin", "SmoothSkin"),
     "runs.evaluate": ("evaluate",),
     "runs.push": ("Push", "push", "replay"),

@@ -33,8 +33,13 @@ DRAWN = {
     "v_x_error": "error of v_x",
     "v_y_error": "error of v_y",
     "omega_error": "error of omega",
+    "robot_force": "greatest force of the robot",
+    "robot_traction": "traction of the robot's wheels",
+    "robot_lag": "lag of the robot",
+    "robot_acceleration": "greatest acceleration of the robot",
 }
-FAILURES = ("never touched", "lost contact", "timeout", "fell over", "diverged")
+FAILURES = ("never touched", "lost contact", "timeout", "fell over", "diverged", "stalled")
+_FIRST = ("diverged", "fell over", "stalled", "never touched", "lost contact")  # what counts first
 _TAIL = 0.05  # of the worlds are the worst
 
 
@@ -115,10 +120,11 @@ def failure(one: xr.Dataset, max_lost: float) -> np.ndarray:
             one.success.values > 0,
             one.diverged.values > 0,
             one.tipped.values > 0,
+            one.stalled.values > 0 if "stalled" in one else np.zeros(one.sizes["world"], bool),
             ~np.isfinite(one.min_distance.values),
             one.contact_lost_time.values > max_lost,
         ],
-        [-1, *map(FAILURES.index, ("diverged", "fell over", "never touched", "lost contact"))],
+        [-1, *map(FAILURES.index, _FIRST)],
         FAILURES.index("timeout"),
     )
     return kinds

@@ -18,6 +18,7 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.control.law import Twist
 from rps_jax.geometry.solid import Solid
+from rps_jax.robot.robot import Robot
 from rps_jax.world.objects import SHAPES
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import Friction, Scene
@@ -33,6 +34,7 @@ class Motion(NamedTuple):
     # Of these [m/s, rad/s]; the object's angular velocity is in its own frame.
     qvel: Any  # (B, 9)
     warmstart: Any  # (B, 9) [m/s^2, rad/s^2] last accelerations, for a solver
+    integral: Any = None  # (B, 3) [N, N, N m] of the drive of a base whose force is limited
 
 
 class Driven(NamedTuple):
@@ -45,10 +47,18 @@ class Driven(NamedTuple):
 class Stage(Protocol):
     """What all worlds of a batch share, and how they are stepped together."""
 
-    def drive(self, fields: Any, motion: Motion, twists: Twist, physics: Physics) -> Driven:
+    def drive(
+        self,
+        fields: Any,
+        motion: Motion,
+        twists: Twist,
+        physics: Physics,
+        robot: Robot | None = None,
+    ) -> Driven:
         """Step a batch of worlds with these fields (B, ...) for one control period.
 
-        The base is a velocity source at `twists` (B,) [m/s, m/s, rad/s], in its own frame.
+        The base is a velocity source at `twists` (B,) [m/s, m/s, rad/s], in its own frame; with a
+        `robot` (B,) it is a body that its drive pushes towards these, as `robot.drive.push` says.
         """
         ...
 
@@ -60,8 +70,13 @@ class Stepper(Protocol):
     qvel: np.ndarray  # (n, 9)
     warmstart: np.ndarray  # (n, 9)
 
+    integral: np.ndarray | None  # (n, 3)
+
     def drive(self, which: np.ndarray, twist: np.ndarray, substeps: int) -> None:
-        """Step the worlds `which` (m,) with the base held at `twist` (m, 3) in its own frame."""
+        """Step the worlds `which` (m,) with the base held at `twist` (m, 3) in its own frame.
+
+        Or pushed towards it, if there is a robot whose force is limited.
+        """
         ...
 
     def close(self) -> None:
@@ -78,6 +93,7 @@ class Engine(abc.ABC):
     traced: ClassVar[bool] = True  # JAX steps it: its trials can be followed, viewed, learned in
     modes: ClassVar[tuple[Mode, ...]] = ()  # in which it can be differentiated
     newton: ClassVar[bool] = True  # it solves as `Physics` says: by so many iterations
+    forces: ClassVar[bool] = True  # a contact can slow and stop the base
 
     def check(self, families: Iterable[str] = ()) -> None:
         """Raises InputError unless this machine can step worlds of these shape families."""
@@ -102,6 +118,14 @@ class Engine(abc.ABC):
             raise errors.InputError(
                 f"cone = {physics.cone} is not allowed with the engine {self.name}: it must be "
                 f"{' or '.join(self.cones)}."
+            )
+
+    def check_robot(self, robot: Robot) -> None:
+        """Raises InputError unless the engine can step such a base."""
+        if robot.driven and not self.forces:
+            raise errors.InputError(
+                f"engine = {self.name} is not allowed for a robot with a limited force: its base "
+                "follows every twist; choose fused, mjx or mujoco."
             )
 
     def check_followed(self) -> None:
@@ -135,11 +159,17 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def stage_of_solids(
-        self, family: str, solids: Solid, friction: Friction, physics: Physics
+        self,
+        family: str,
+        solids: Solid,
+        friction: Friction,
+        physics: Physics,
+        robots: Robot | None = None,
     ) -> tuple[Any, Any]:
         """Stage, and fields (n, ...) on the host, of solids (n, ...), friction (n,) each.
 
         What MuJoCo would derive in compiling each of them is computed here, for all at once.
+        `robots` (n,) are of bases whose force is limited.
 
         Raises:
           InputError: the engine cannot step them on this machine.
@@ -164,7 +194,9 @@ class Engine(abc.ABC):
         """Points of contact that a program looks into, in a world of an object with `corners`."""
         return 3 + 2 if corners == 1 else corners + 4
 
-    def stepper(self, stage: Any, qpos: np.ndarray, threads: int) -> Stepper:
+    def stepper(
+        self, stage: Any, qpos: np.ndarray, threads: int, robots: Robot | None = None
+    ) -> Stepper:
         """Worlds on the host, at rest at positions (n, 10), of an engine that is not traced."""
         raise NotImplementedError(f"{self.name} is traced")
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -31,6 +32,8 @@ from rps_jax.engines.mjx_colliders import (
 )
 from rps_jax.geometry import solid
 from rps_jax.geometry.solid import Solid
+from rps_jax.robot import drive as drives
+from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, OFF_CENTRE, Friction, Scene
@@ -60,28 +63,47 @@ class MJXStage(NamedTuple):
     colliders: Colliders = Colliders()
 
     def drive(
-        self, fields: dict[str, jax.Array], motion: Motion, twists: Twist, physics: Physics
+        self,
+        fields: dict[str, jax.Array],
+        motion: Motion,
+        twists: Twist,
+        physics: Physics,
+        robot: Robot | None = None,
     ) -> Driven:
         """Step a batch for one control period.
 
         Before each step the commanded twist is written into the base's joint velocities, turned
-        into the world.
+        into the world; or the force of its drive is applied to its joints.
         """
-        step = jax.vmap(self._step)
+        step = jax.vmap(partial(self._step, timestep=physics.timestep))
 
         def one(state: Motion, _: None) -> tuple[Motion, None]:
             # Batched inside of the loop: a loop that is batched is traced anew.
-            return step(fields, state, twists), None
+            return step(fields, state, twists, robot), None
 
         return Driven(jax.lax.scan(one, motion, length=physics.substeps)[0])
 
-    def _step(self, fields: dict[str, jax.Array], state: Motion, twist: Twist) -> Motion:
-        model, (qpos, qvel, warmstart) = apply(self.model, fields), state
-        qvel = qvel.at[JOINTS.base].set(twist.in_world(qpos[2]))
-        data = self.data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
+    def _step(
+        self,
+        fields: dict[str, jax.Array],
+        state: Motion,
+        twist: Twist,
+        robot: Robot | None,
+        timestep: float,
+    ) -> Motion:
+        model, (qpos, qvel, warmstart, integral) = apply(self.model, fields), state
+        data = self.data
+        if robot is None:
+            qvel = qvel.at[JOINTS.base].set(twist.in_world(qpos[2]))
+        else:
+            turn, base = (jnp.cos(qpos[2]), jnp.sin(qpos[2])), qvel[JOINTS.base]
+            force, after = drives.push(robot, tuple(integral), twist, tuple(base), turn, timestep)
+            applied = data.qfrc_applied.at[JOINTS.base].set(jnp.stack(force))
+            data, integral = data.replace(qfrc_applied=applied), jnp.stack(after)
+        data = data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
         with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
             data = step(model, data, self.colliders)
-        return Motion(data.qpos, data.qvel, data.qacc_warmstart)
+        return Motion(data.qpos, data.qvel, data.qacc_warmstart, integral)
 
 
 def step(model: mjx.Model, data: mjx.Data, colliders: Colliders = Colliders()) -> mjx.Data:
@@ -98,7 +120,7 @@ def step(model: mjx.Model, data: mjx.Data, colliders: Colliders = Colliders()) -
     data = constraint.make_constraint(model, data)
     data = smooth.com_vel(model, data)
     data = smooth.rne(model, data)
-    force = -data.qfrc_bias
+    force = data.qfrc_applied - data.qfrc_bias
     free = smooth.solve_m(model, data, force)
     data = solver.solve(model, data.replace(qfrc_smooth=force, qacc_smooth=free))
     return forward._advance(model, data, data.act_dot, data.qacc)
@@ -126,10 +148,15 @@ class MJX(Engine):
         return MJXStage(model, mjx.make_data(models[0])), taken(jax.device_get(fields), which)
 
     def stage_of_solids(
-        self, family: str, solids: Solid, friction: Friction, physics: Physics
+        self,
+        family: str,
+        solids: Solid,
+        friction: Friction,
+        physics: Physics,
+        robots: Robot | None = None,
     ) -> tuple[Any, Any]:
         """Stage and fields of solids (n, ...)."""
-        return solids_by_template(self, family, solids, friction, physics)
+        return solids_by_template(self, family, solids, friction, physics, robots)
 
     def slots(self, backend: str) -> int:
         """Worlds that one worker steps at once: few on a processor, whose caches are small."""
@@ -156,12 +183,20 @@ def _sparse(stage: MJXStage) -> MJXStage:
 
 
 def solids_by_template(
-    engine: Engine, family: str, solids: Solid, friction: Friction, physics: Physics
+    engine: Engine,
+    family: str,
+    solids: Solid,
+    friction: Friction,
+    physics: Physics,
+    robots: Robot | None = None,
 ) -> tuple[Any, Any]:
     """Stage of the first of the solids, and fields (n, ...) of all."""
-    template = scene.of_solid(family, solids, friction, physics, 0)
+    template = scene.of_solid(family, solids, friction, physics, 0, robots)
     stage, fields = engine.stage_of_scenes([template], np.zeros(1, int))
-    return stage, mjx_fields(family, solids, friction, template, fields)
+    fields = mjx_fields(family, solids, friction, template, fields)
+    if robots is not None:
+        _weigh_bases(fields, template.physics, robots)
+    return stage, fields
 
 
 def put(model: mujoco.MjModel) -> mjx.Model:
@@ -241,6 +276,21 @@ def mjx_fields(
         robot[:, None], friction.robot[:, None, None], friction.ground[:, None, None]
     )
     return new
+
+
+def _weigh_bases(fields: dict[str, np.ndarray], model: mujoco.MjModel, robots: Robot) -> None:
+    """The masses of bases (n,) that can be slowed, and what MuJoCo derives from them."""
+    base = model.body("base").id
+    mass, inertia = np.asarray(robots.mass, float), np.asarray(robots.inertia, float)
+    fields[".body_mass"][:, base] = fields[".body_subtreemass"][:, base] = mass
+    fields[".body_subtreemass"][:, 0] = fields[".body_mass"].sum(axis=1)
+    fields[".body_inertia"][:, base, 2] = inertia
+    fields[".body_invweight0"][:, base] = np.stack(
+        [scene.base_invweight(robots), 1 / (3 * inertia)], axis=-1
+    )
+    weights = np.stack([mass, mass, inertia], axis=-1)
+    fields[".dof_M0"][:, :3], fields[".dof_invweight0"][:, :3] = weights, 1 / weights
+    fields[".stat.meaninertia"] = fields[".dof_M0"].mean(axis=1)
 
 
 def _size_geoms(family: str, solids: Solid, template: Scene, new: dict[str, np.ndarray]) -> None:

@@ -6,12 +6,15 @@ import copy
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import mujoco
 import numpy as np
 from mujoco import rollout
 
 from rps_jax.engines.base import Engine
 from rps_jax.geometry.solid import Solid
+from rps_jax.robot import drive as drives
+from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction, Scene
@@ -29,8 +32,17 @@ def _as_it_goes(model: mujoco.MjModel) -> mujoco.MjModel:
 class Batch:
     """Worlds stepped by C MuJoCo on a pool of threads: (time, qpos, qvel) of each, in double."""
 
-    def __init__(self, models: Sequence[mujoco.MjModel], qpos: np.ndarray, threads: int):
-        """Start from positions (n, 10) at rest; the models are of one shape family."""
+    def __init__(
+        self,
+        models: Sequence[mujoco.MjModel],
+        qpos: np.ndarray,
+        threads: int,
+        robots: Robot | None = None,
+    ):
+        """Start from positions (n, 10) at rest; the models are of one shape family.
+
+        `robots` (n,) are of bases whose force is limited.
+        """
         self.models = [_as_it_goes(model) for model in models]
         nq, nv = models[0].nq, models[0].nv
         size = mujoco.mj_stateSize(models[0], _STATE)
@@ -41,6 +53,8 @@ class Batch:
         self.qvel = self.state[:, 1 + nq :]
         self.qpos[:] = qpos
         self.warmstart = np.zeros((len(models), nv))
+        self._robots = robots
+        self.integral = None if robots is None else np.zeros((len(models), 3))
         self._timestep = models[0].opt.timestep
         self._data = [mujoco.MjData(models[0]) for _ in range(threads)]
         self._pool = rollout.Rollout(nthread=threads)
@@ -55,6 +69,9 @@ class Batch:
         every step, along the heading of the step's beginning, half a step behind: less than
         0.001 rad.
         """
+        if self._robots is not None:
+            self._push(which, twist, substeps)
+            return
         models = [self.models[i] for i in which]
         state = self.state[which]
         nq = self.qpos.shape[1]
@@ -74,6 +91,34 @@ class Batch:
         difference = after[:, -1, 1 + nq :] - before_last[:, 1 + nq :]
         self.state[which], self.warmstart[which] = after[:, -1], difference / self._timestep
 
+    def _push(self, which: np.ndarray, twist: np.ndarray, substeps: int) -> None:
+        """Step the worlds `which` with their bases pushed by their drives towards `twist`."""
+        models, dt = [self.models[i] for i in which], self._timestep
+        robots = jax.tree.map(lambda leaf: np.asarray(leaf, float)[which], self._robots)
+        assert self.integral is not None
+        state, warmstart = self.state[which], self.warmstart[which]
+        integral, nq = tuple(self.integral[which].T), self.qpos.shape[1]
+        applied = np.zeros((len(which), 1, self.qvel.shape[1]))
+        for _ in range(substeps):
+            yaw, qvel = state[:, 1 + JOINTS.base.start + 2], state[:, 1 + nq :]
+            turn, base = (np.cos(yaw), np.sin(yaw)), tuple(qvel[:, JOINTS.base].T)
+            force, integral = drives.push(robots, integral, tuple(twist.T), base, turn, dt, np)
+            applied[:, 0, JOINTS.base] = np.stack(force, axis=1)
+            after, _ = self._pool.rollout(
+                models,
+                self._data,
+                state,
+                applied,
+                control_spec=int(mujoco.mjtState.mjSTATE_QFRC_APPLIED),
+                nstep=1,
+                initial_warmstart=warmstart,
+            )
+            after = np.asarray(after)[:, -1]
+            warmstart = (after[:, 1 + nq :] - qvel) / dt
+            state = after
+        self.state[which], self.warmstart[which] = state, warmstart
+        self.integral[which] = np.stack(integral, axis=1)
+
     def close(self) -> None:
         """End the threads, and let MuJoCo warn again."""
         mujoco.set_mju_user_warning(self._warning)
@@ -91,15 +136,23 @@ class MuJoCo(Engine):
         return [scenes[i].physics for i in which], {}
 
     def stage_of_solids(
-        self, family: str, solids: Solid, friction: Friction, physics: Physics
+        self,
+        family: str,
+        solids: Solid,
+        friction: Friction,
+        physics: Physics,
+        robots: Robot | None = None,
     ) -> tuple[Any, Any]:
         """The models of solids (n, ...)."""
         every = range(solids.mass.size)
-        return [scene.of_solid(family, solids, friction, physics, i).physics for i in every], {}
+        scenes = (scene.of_solid(family, solids, friction, physics, i, robots) for i in every)
+        return [one.physics for one in scenes], {}
 
-    def stepper(self, stage: Any, qpos: np.ndarray, threads: int) -> Batch:
+    def stepper(
+        self, stage: Any, qpos: np.ndarray, threads: int, robots: Robot | None = None
+    ) -> Batch:
         """Worlds on a pool of threads."""
-        return Batch(stage, qpos, threads)
+        return Batch(stage, qpos, threads, robots)
 
 
 ENGINE = MuJoCo()

@@ -35,6 +35,7 @@ from rps_jax.geometry import planar, solid
 from rps_jax.geometry import vectors as sp
 from rps_jax.geometry.solid import Solid, Support
 from rps_jax.geometry.vectors import Vec
+from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction, Scene
@@ -106,7 +107,14 @@ class Quasistatic:
         errors.check_finite("slip", self.slip, above=0, at_most=1)
         errors.check_finite("iterations", self.iterations, at_least=_SHARP + 1)
 
-    def drive(self, fields: Slider, motion: Motion, twists: Twist, physics: Physics) -> Driven:
+    def drive(
+        self,
+        fields: Slider,
+        motion: Motion,
+        twists: Twist,
+        physics: Physics,
+        robot: Robot | None = None,
+    ) -> Driven:
         """Step a batch for one control period; height and tilt of the object stay.
 
         The velocities that come back are means over the period.
@@ -264,6 +272,7 @@ class QuasistaticEngine(Engine):
     cones = ("elliptic",)  # its friction is the same in all directions
     modes = ("forward", "reverse")
     newton = False  # but by its own rule
+    forces = False
 
     def stage_of_scenes(self, scenes: Sequence[Scene], which: np.ndarray) -> tuple[Any, Any]:
         """Stage and fields of worlds in scenes of one shape family."""
@@ -273,9 +282,15 @@ class QuasistaticEngine(Engine):
         return Quasistatic(), taken(sliders(solids, friction, half), which)
 
     def stage_of_solids(
-        self, family: str, solids: Solid, friction: Friction, physics: Physics
+        self,
+        family: str,
+        solids: Solid,
+        friction: Friction,
+        physics: Physics,
+        robots: Robot | None = None,
     ) -> tuple[Any, Any]:
-        """Stage and fields of solids (n, ...)."""
+        """Stage and fields of solids (n, ...); its bases follow every twist."""
+        assert robots is None, "checked by check_robot"
         template = scene.of_solid(family, solids, friction, physics, 0)
         half = template.physics.geom("base").size[:2]
         return Quasistatic(), sliders(solids, friction.robot, half)

@@ -26,6 +26,7 @@ from rps_jax.engines.mjx import apply, solids_by_template, stack
 from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import Solid
+from rps_jax.robot.robot import Robot
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction, Scene
 
@@ -84,20 +85,28 @@ class WarpStage(NamedTuple):
     data: mjx.Data  # a blank, with room for the contacts of one world
 
     def drive(
-        self, fields: dict[str, jax.Array], motion: Motion, twists: Twist, physics: Physics
+        self,
+        fields: dict[str, jax.Array],
+        motion: Motion,
+        twists: Twist,
+        physics: Physics,
+        robot: Robot | None = None,
     ) -> Driven:
         """Step a batch for one control period, in float32 whatever the precision of its states."""
-        narrow = jax.tree.map(lambda x: x.astype(jnp.float32), (fields, *motion, twists))
+        narrow = jax.tree.map(lambda x: x.astype(jnp.float32), (fields, *motion[:3], twists))
         room = _for_worlds(self.data, len(motion.qpos))
         one = partial(_drive, self.model, room, substeps=physics.substeps)
         *after, lost = jax.vmap(one)(*narrow)
-        return Driven(Motion(*(x.astype(motion.qpos.dtype) for x in after)), overflowed=lost)
+        wide = (x.astype(motion.qpos.dtype) for x in after)
+        qpos, qvel, warmstart = wide
+        return Driven(Motion(qpos, qvel, warmstart, motion.integral), overflowed=lost)
 
 
 class Warp(Engine):
     """MuJoCo's own kernels on an NVIDIA GPU."""
 
     name = "warp"
+    forces = False
     shapes = ("box", "cylinder")
 
     def check(self, families: Iterable[str] = ()) -> None:
@@ -124,9 +133,15 @@ class Warp(Engine):
         return WarpStage(model, blank(models[0])), taken(jax.device_get(fields), which)
 
     def stage_of_solids(
-        self, family: str, solids: Solid, friction: Friction, physics: Physics
+        self,
+        family: str,
+        solids: Solid,
+        friction: Friction,
+        physics: Physics,
+        robots: Robot | None = None,
     ) -> tuple[Any, Any]:
-        """Stage and fields of solids (n, ...)."""
+        """Stage and fields of solids (n, ...); its bases follow every twist."""
+        assert robots is None, "checked by check_robot"
         self.check([family])
         return solids_by_template(self, family, solids, friction, physics)
 

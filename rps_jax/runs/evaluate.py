@@ -19,6 +19,7 @@ from rps_jax.control.law import RPSParams
 from rps_jax.control.strategies import Params
 from rps_jax.engines import EngineName
 from rps_jax.errors import InputError
+from rps_jax.robot.robot import Robot
 from rps_jax.runs.objective import Objective
 from rps_jax.trials import batch
 from rps_jax.trials.batch import Job, Part
@@ -52,6 +53,7 @@ def evaluate(
     physics: PhysicsName = "default",
     fidelity: Fidelity = "standard",
     rules: Rules = Rules(),
+    robot: Robot | str | None = None,
     objective: Objective = Objective(),
     slots: int | None = None,
     workers: int | None = None,
@@ -73,6 +75,7 @@ def evaluate(
       physics: how friction is modelled.
       fidelity: how finely the physics is solved.
       rules: when a trial ends.
+      robot: by its name in `ROBOTS`, or a JSON file's; None: the domain's.
       objective: what scores a trial.
       slots: worlds stepped at once by a worker; by default as suits engine and device.
       workers: host threads; by default as suits engine and device.
@@ -96,7 +99,7 @@ def evaluate(
       >>> found.score.mean("world").shape
       (4,)
     """
-    domain = named(domain)
+    domain = named(domain, robot)
     errors.check_count("worlds", worlds, at_most=10_000_000)
     errors.check_count("seed", seed, at_least=0, at_most=2**30)
     setting = Setting(preset(physics, fidelity), rules, engine=engine)

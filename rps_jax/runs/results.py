@@ -20,7 +20,9 @@ from rps_jax.trials.trial import Outcome
 Keep = Callable[[int, bytes], Any]  # called with the number and the content of a part
 Columns = Mapping[str, tuple[np.ndarray, str]]  # what was drawn: values (n,) and unit, by name
 # Of an outcome; the others are float32.
-_TYPES = dict.fromkeys(("success", "tipped", "diverged"), np.int8) | {"overflows": np.int32}
+_TYPES = dict.fromkeys(("success", "tipped", "diverged", "stalled"), np.int8) | {
+    "overflows": np.int32
+}
 
 
 def name_of(part: int) -> str:

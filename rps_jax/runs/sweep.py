@@ -21,6 +21,7 @@ from rps_jax.engines import EngineName
 from rps_jax.record import folder as run_folder
 from rps_jax.record import provenance
 from rps_jax.record.checkpoint import Parts
+from rps_jax.robot.robot import Robot
 from rps_jax.runs.plan import Kind, Plan, Shard, draw, made, open_run, share
 from rps_jax.runs.results import (
     Collector,
@@ -49,6 +50,7 @@ def sweep(
     physics: PhysicsName = "default",
     fidelity: Fidelity = "standard",
     rules: Rules = Rules(),
+    robot: Robot | str | None = None,
     part: int = 1024,
     slots: int | None = None,
     workers: int | None = None,
@@ -66,6 +68,7 @@ def sweep(
       physics: how friction is modelled.
       fidelity: how finely the physics is solved.
       rules: when a trial ends.
+      robot: by its name in `ROBOTS`, or a JSON file's; None: the domain's.
       part: trials of a part at most, which is what a sweep that is killed loses.
       slots: worlds stepped at once by a worker; by default as suits engine and device.
       workers: host threads; by default as suits engine and device.
@@ -86,7 +89,7 @@ def sweep(
       {'arm': 2, 'world': 4}
     """
     setting = Setting(preset(physics, fidelity), rules, seed, engine)
-    plan = Plan(named(domain), worlds, arms, setting, part)
+    plan = Plan(named(domain, robot), worlds, arms, setting, part)
     plan.check_here()
     shape = {"slots": slots, "workers": workers, "report": report}
     if out is None:

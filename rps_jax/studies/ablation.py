@@ -37,7 +37,9 @@ class Lever(NamedTuple):
 class Unmoved(NamedTuple):
     """An engine without physics: the base goes, the object stays. What is left is the law's."""
 
-    def drive(self, fields: Any, motion: Motion, twists: Twist, physics: Physics) -> Driven:
+    def drive(
+        self, fields: Any, motion: Motion, twists: Twist, physics: Physics, robot: Any = None
+    ) -> Driven:
         """Step a batch for one control period."""
         turn = jax.vmap(lambda twist, yaw: twist.in_world(yaw))
         ahead = physics.control_period * turn(twists, motion.qpos[:, 2])

@@ -10,6 +10,8 @@ from rps_jax import engines, errors
 from rps_jax.control import strategies
 from rps_jax.control.strategies import Params
 from rps_jax.engines import EngineName
+from rps_jax.robot.robot import Robot
+from rps_jax.robot.robot import named as named_robot
 from rps_jax.robot.skin import SKINS, Skin, SkinName
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
@@ -35,6 +37,7 @@ class Conditions:
     mass: float | None = None  # [kg] of the object; None: its own
     gap: float = 0.02  # [m] between base and object at the start
     rear: Side = "near"  # where the nonuniform box's load stands
+    robot: Robot | str = "ideal"  # or its name in `ROBOTS`, or a JSON file's
     horizon: float = 300.0  # [s] of the longest trial
     seed: int = 0  # of the skin's imperfections
 
@@ -93,6 +96,7 @@ class Conditions:
             skin=self.sensor(),
             gap=self.gap,
             rear=self.rear,
+            robot=named_robot(self.robot),
         )
 
 

@@ -15,7 +15,6 @@ import functools
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -30,6 +29,7 @@ from rps_jax.control.law import RPSParams, Twist
 from rps_jax.engines.base import Driven, Motion, Stage
 from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.geometry import planar
+from rps_jax.robot.robot import Robot
 from rps_jax.trials import trial
 from rps_jax.trials.batch import Part, rows
 from rps_jax.trials.setting import Setting
@@ -96,6 +96,7 @@ class PushEnv:
     domain: Domain = DOMAINS["wide"]
     params: RPSParams = RPSParams.paper()  # of which the bounds of the twist and d_success count
     setting: Setting = Setting(engine="fused")
+    robot: Robot | str | None = None  # by its name in `ROBOTS`; None: the domain's
     weights: Reward = Reward()
     worlds: int = 1024
 
@@ -126,7 +127,9 @@ class PushEnv:
         """One control period with the base at the twist of an action (3,)."""
         world, before = state.info["world"], state.data
         told, twist = trial.execute(world, before, self.twist(action), self.dt)
-        moved = trial.settle(before, told, self._drive(world.fields, trial.motion(told), twist))
+        robot = trial.pushing(world)
+        driven = self._drive(world.fields, trial.motion(told), twist, robot)
+        moved = trial.settle(before, told, driven)
         now, seen = self._observe(world, moved)
         gone = moved.done  # it had ended before, or the physics ended it
         progress = jnp.where(jnp.isfinite(before.strategy), before.strategy - now.strategy, 0.0)
@@ -206,7 +209,7 @@ class PushEnv:
 
     @functools.cached_property
     def _alone(self) -> Domain:
-        return dataclasses.replace(self.domain, objects=(self.object,))
+        return dataclasses.replace(domain.named(self.domain, self.robot), objects=(self.object,))
 
     @property
     def _family(self) -> str:
@@ -223,7 +226,7 @@ class PushEnv:
         return part._replace(worlds=jax.tree.map(jnp.asarray, part.worlds))
 
     @functools.cached_property
-    def _drive(self) -> Callable[[Any, Motion, Twist], Driven]:
+    def _drive(self) -> Callable[[Any, Motion, Twist, Robot | None], Driven]:
         return one_of_many(self._part.stage, self.setting)
 
     def _scene(self, index: int) -> Scene:
@@ -281,9 +284,13 @@ def _metrics(now: Trial, seen: Seen, progress: jax.Array) -> dict[str, jax.Array
     return {"progress": progress} | {k: v.astype(progress.dtype) for k, v in flags.items()}
 
 
-def one_of_many(stage: Stage, setting: Setting) -> Callable[[Any, Motion, Twist], Driven]:
+def one_of_many(
+    stage: Stage, setting: Setting
+) -> Callable[[Any, Motion, Twist, Robot | None], Driven]:
     """Drives one world; under vmap the stage drives the whole batch, on a GPU as one kernel."""
-    together = partial(stage.drive, physics=setting.physics)
+
+    def together(fields: Any, motion: Motion, twist: Twist, robot: Robot | None) -> Driven:
+        return stage.drive(fields, motion, twist, setting.physics, robot)
 
     @jax.custom_batching.custom_vmap
     def drive(*one: Any) -> Driven:

@@ -51,10 +51,10 @@ def run(
     host = jax.devices("cpu")[0]  # where the engine is
     worlds = jax.device_put(worlds, host)
     trials = trial.start_all(worlds, np.ones(count, bool), strategy=strategy)
-    batch = engine.stepper(stage, np.asarray(trials.qpos, float), threads)
+    batch = engine.stepper(stage, np.asarray(trials.qpos, float), threads, trial.pushing(worlds))
     try:
         told_of = np.zeros(count, bool)
-        before, passes = 0, 0
+        before, passes, dtype = 0, 0, trials.qpos.dtype
         while not told_of.all():
             told, twist = _decide(worlds, trials, **options)
             going = np.flatnonzero(~np.asarray(told.done))
@@ -63,9 +63,8 @@ def run(
             batch.qpos[shifted] = np.asarray(told.qpos)[shifted]
             if going.size:
                 batch.drive(going, np.stack(twist, axis=1)[going].astype(float), physics.substeps)
-            dtype = trials.qpos.dtype
-            after = (batch.qpos, batch.qvel, batch.warmstart)
-            motion = Motion(*(x.astype(dtype) for x in after))
+            after = Motion(batch.qpos, batch.qvel, batch.warmstart, batch.integral)
+            motion = jax.tree.map(lambda x: x.astype(dtype), after)
             trials = _settle(trials, told, Driven(motion))
             passes += 1
             if passes % _LOOK == 0 or not going.size:

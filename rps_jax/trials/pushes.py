@@ -18,6 +18,7 @@ from rps_jax.control import strategies
 from rps_jax.control.law import RPSParams
 from rps_jax.control.strategies import Params, Strategy
 from rps_jax.robot.base import Odometry
+from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import IdealSkin, Skin
 from rps_jax.trials import trial
 from rps_jax.trials.batch import SEGMENT, Job, Part, rows, warn_of_lost
@@ -44,6 +45,7 @@ class Case:
     rear: Side = "near"  # where the nonuniform box's load stands; left open by the paper
     bearing: float = 0.0  # [rad] turns the whole trial, and so matters to a friction pyramid alone
     shift: Shift = Shift()
+    robot: Robot = Robot()
 
     def __post_init__(self) -> None:
         """Raises InputError for anything that names or means no trial."""
@@ -58,6 +60,7 @@ class Case:
         errors.check_number("shift time", self.shift.time, at_least=0, unit="s")
         for axis, value in zip("xy", self.shift.p_robot, strict=True):
             errors.check_finite(f"shift {axis}", value, at_least=-5, at_most=5, unit="m")
+        self.robot.check()
 
 
 @dataclass(frozen=True)
@@ -80,12 +83,15 @@ def scene_of(case: Case, physics: Physics) -> Scene:
         rear=case.rear,
         mass=case.mass,
         half_length=float(case.skin.half_length),
+        robot=case.robot if case.robot.driven else None,
     )
 
 
 def _scenes(cases: Sequence[Case], physics: Physics) -> tuple[list[Scene], np.ndarray]:
     """The different scenes of cases, and which of them each case has, (len(cases),)."""
-    keys = [(c.object, c.friction, c.mass, c.rear, float(c.skin.half_length)) for c in cases]
+    keys = [
+        (c.object, c.friction, c.mass, c.rear, float(c.skin.half_length), c.robot) for c in cases
+    ]
     different = dict(zip(keys, cases, strict=True))
     order = {key: i for i, key in enumerate(different)}
     scenes = [scene_of(case, physics) for case in different.values()]
@@ -112,6 +118,8 @@ def build(
     Each world draws its skin's imperfections from (setting.seed, its index); by default the
     indices count from 0.
     """
+    for case in cases:
+        engines.get(setting.engine).check_robot(case.robot)
     scenes, which = _scenes(cases, setting.physics)
     stage, fields = engines.get(setting.engine).stage_of_scenes(scenes, which)
     starts = [_start_of(case, scenes[i]) for case, i in zip(cases, which, strict=True)]
@@ -131,13 +139,14 @@ def build(
         qpos=_stack([qpos for qpos, _ in starts], dtype),
         key=jax.device_get(jax.vmap(partial(jax.random.fold_in, root))(numbers)),
         odometry=_stack([Odometry()] * len(cases), dtype),
+        robot=None if cases[0].robot.ideal else _stack([case.robot for case in cases], dtype),
     )
     return stage, world
 
 
 def kind(case: Case) -> Hashable:
-    """What decides which compiled program runs a case: family, strategy and sensor."""
-    return FAMILIES[case.object], type(case.params), jax.tree.structure(case.skin)
+    """What decides which compiled program runs a case: family, strategy, sensor and robot."""
+    return FAMILIES[case.object], type(case.params), jax.tree.structure((case.skin, case.robot))
 
 
 def _by_kind(cases: Sequence[Case]) -> list[list[int]]:

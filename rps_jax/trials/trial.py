@@ -23,8 +23,10 @@ from rps_jax.engines.base import Driven, Motion, Stage
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.geometry.footprint import Footprint
-from rps_jax.robot import base
+from rps_jax.robot import base, drive
 from rps_jax.robot.base import Odometry
+from rps_jax.robot.drive import Drive
+from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import NONE, Reading, Skin, SkinState, SmoothReading
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS
@@ -32,6 +34,7 @@ from rps_jax.world.scene import JOINTS
 # A world is a runaway beyond these, far outside anything a base at 0.05 m/s can cause.
 _MAX_SPEED = 20.0  # [m/s], [rad/s]
 _MAX_DISTANCE = 100.0  # [m]
+_STALL = 1.0  # [s] for which a base has stood still that is said to have stalled
 
 
 class Rules(NamedTuple):
@@ -67,6 +70,7 @@ class World(NamedTuple):
     qpos: jax.Array  # (10,) at the start, as in `Trial`
     key: jax.Array  # of the imperfections of skin and odometry
     odometry: Odometry = Odometry()
+    robot: Robot | None = None  # with limits; None follows every twist
 
 
 class Trial(NamedTuple):
@@ -92,6 +96,7 @@ class Trial(NamedTuple):
     tipped: jax.Array  # () bool: the object has fallen over
     diverged: jax.Array  # () bool
     overflows: jax.Array  # () int32 control steps in which contacts were lost for want of room
+    drive: Drive | None = None  # of a robot with limits
 
 
 class Snapshot(NamedTuple):
@@ -116,6 +121,7 @@ class Outcome(NamedTuple):
     mean_abs_l: jax.Array  # () [m] the paper's D; NaN if never touched
     tipped: jax.Array  # () bool: the object has fallen over
     diverged: jax.Array  # () bool
+    stalled: jax.Array  # () bool: it ended with the base standing still against the object
     overflows: jax.Array  # () int32 control steps in which contacts were lost for want of room
     base_pose: jax.Array  # (3,) [m, m, rad] in the world, at the end
     object_pose: jax.Array  # (3,) [m, m, rad] likewise
@@ -161,6 +167,7 @@ def start(world: World, strategy: Strategy = RPS) -> Trial:
         tipped=false,
         diverged=false,
         overflows=zero,
+        drive=None if world.robot is None else drive.start(world.qpos),
     )
 
 
@@ -249,10 +256,14 @@ def execute(world: World, trial: Trial, twist: Twist, period: float) -> tuple[Tr
 
     Both are in the robot frame; `period` [s] is that of the control loop.
     """
-    if not trial.twists.shape[0]:
+    if trial.twists.shape[0]:
+        twists, done = base.executed(world.odometry, trial.twists, jnp.stack(twist), period)
+        trial, twist = trial._replace(twists=twists), Twist(*done)
+    if world.robot is None or trial.drive is None:
         return trial, twist
-    twists, done = base.executed(world.odometry, trial.twists, jnp.stack(twist), period)
-    return trial._replace(twists=twists), Twist(*done)
+    aim = drive.aim(world.robot, trial.drive.aim, jnp.stack(twist), period)
+    trial = trial._replace(drive=trial.drive._replace(aim=aim))
+    return trial, Twist(*drive.carried_out(world.robot, aim))
 
 
 def decide(
@@ -288,7 +299,7 @@ def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
 
     A trial that had ended `before` comes back as it was.
     """
-    (qpos, qvel, warmstart), overflowed = driven
+    (qpos, qvel, warmstart, integral), overflowed = driven
     sane = (
         jnp.all(jnp.isfinite(qpos))
         & jnp.all(jnp.abs(qvel) < _MAX_SPEED)
@@ -296,12 +307,16 @@ def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
     )
     if overflowed is not None:
         told = told._replace(overflows=told.overflows + (overflowed & ~told.done))
+    now = told.drive
+    if now is not None:
+        now = drive.stalled(now if integral is None else now._replace(integral=integral), qvel)
     moved = told._replace(
         qpos=qpos,
         qvel=qvel,
         warmstart=warmstart,
         path_length=told.path_length + planar.norm(qpos[:2] - told.qpos[:2]),
         steps=told.steps + 1,
+        drive=now,
     )
     stopped = told._replace(done=jnp.ones((), bool), diverged=~told.done & ~sane)
     return select(before.done, before, select(told.done | ~sane, stopped, moved))
@@ -319,13 +334,19 @@ def control_step(
     """One pass of the loop of a batch of worlds. One that has ended comes back as it is."""
     think = partial(decide, physics=physics, rules=rules, strategy=strategy)
     told, twists, snapshots = jax.vmap(think)(worlds, trials)
-    driven = stage.drive(worlds.fields, motion(told), twists, physics)
+    driven = stage.drive(worlds.fields, motion(told), twists, physics, pushing(worlds))
     return jax.vmap(settle)(trials, told, driven), snapshots
 
 
 def motion(trials: Trial) -> Motion:
     """What an engine steps of trials."""
-    return Motion(trials.qpos, trials.qvel, trials.warmstart)
+    integral = None if trials.drive is None else trials.drive.integral
+    return Motion(trials.qpos, trials.qvel, trials.warmstart, integral)
+
+
+def pushing(worlds: World) -> Robot | None:
+    """The robots of worlds, if their bases are bodies that contact can slow and stop."""
+    return worlds.robot if worlds.robot is not None and worlds.robot.driven else None
 
 
 def select(condition: jax.Array, yes: Any, no: Any) -> Any:
@@ -348,10 +369,17 @@ def outcome(trial: Trial, period: float) -> Outcome:
         ),
         tipped=trial.tipped,
         diverged=trial.diverged,
+        stalled=_stalled(trial, period),
         overflows=trial.overflows,
         base_pose=trial.qpos[..., JOINTS.base],
         object_pose=pose.reshape(*trial.qpos.shape[:-1], 3),
     )
+
+
+def _stalled(trial: Trial, period: float) -> jax.Array:
+    if trial.drive is None:
+        return jnp.zeros_like(trial.success)
+    return (trial.drive.stalled * period >= _STALL) & ~trial.success & ~trial.diverged
 
 
 @partial(jax.jit, static_argnames=("strategy",))

@@ -72,8 +72,14 @@ def drawn_worlds(domain: Domain, drawn: Draw, params: Params, setting: Setting) 
     """The worlds of a draw as a part of a job, all with the same parameters."""
     family = domain.family_of(drawn.number[0])
     count, dtype = drawn.number.size, jnp.zeros(()).dtype
-    stage, own = engines.get(setting.engine).stage_of_solids(
-        family, drawn.solid, drawn.friction, setting.physics
+    engine, robots = engines.get(setting.engine), drawn.robot
+    engine.check_robot(robots)
+    stage, own = engine.stage_of_solids(
+        family,
+        drawn.solid,
+        drawn.friction,
+        setting.physics,
+        robots if robots.driven else None,
     )
     world: Any = {
         "fields": own,
@@ -85,6 +91,7 @@ def drawn_worlds(domain: Domain, drawn: Draw, params: Params, setting: Setting) 
         "qpos": _starts(drawn),
         "key": drawn.key,
         "odometry": _odometry(domain, drawn, setting.physics.control_period),
+        "robot": None if robots.ideal else robots,
     }
     narrow = jax.tree.map(lambda x: x if x.dtype == np.uint32 else x.astype(dtype), world)
     return Part(drawn.number, World(**narrow), stage)

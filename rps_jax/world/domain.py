@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +21,8 @@ from rps_jax.errors import InputError
 from rps_jax.geometry import solid
 from rps_jax.geometry.solid import SIDES, Solid
 from rps_jax.record import files
+from rps_jax.robot.robot import ARM, Robot
+from rps_jax.robot.robot import named as named_robot
 from rps_jax.world import paper, scene
 from rps_jax.world.objects import FAMILIES, OBJECTS, PAPER_OBJECTS
 from rps_jax.world.scene import FRICTION, Friction
@@ -82,6 +84,12 @@ class Domain:
     pose_latency: Range = Range(0, 0.1)  # [s] age of the pose that the law is told
     command_delay: Range = Range(0, 0.1)  # [s] until a twist is acted upon
     velocity_error: Range = Range(-0.03, 0.03)  # [1] of each component of the twist, all trial long
+    # The robot, and what of it differs between worlds; None: as the robot has it.
+    robot: Robot = Robot()
+    robot_force: Range | None = None  # [N] of the drive, at most
+    robot_traction: Range | None = None  # [1] of the wheels
+    robot_lag: Range | None = None  # [s] with which a twist is followed
+    robot_acceleration: Range | None = None  # [m/s^2] at most, of the wheels when turning, too
 
     def __post_init__(self) -> None:
         """Raises InputError for ranges that are empty or leave what is possible."""
@@ -96,8 +104,11 @@ class Domain:
         for target in self.targets:
             scene.check_target(target)
         errors.check_name("domain skin", self.skin, ("ideal", "capacitive"))
+        self.robot.check()
         for name, (least, most, unit) in _ALLOWED.items():
-            low, high, log = getattr(self, name)
+            if (given := getattr(self, name)) is None:
+                continue
+            low, high, log = given
             for side, value in (("low", low), ("high", high)):
                 errors.check_finite(
                     f"domain {name} ({side})", value, at_least=least, at_most=most, unit=unit
@@ -107,6 +118,11 @@ class Domain:
                     f"domain {name} = {low:g} to {high:g} is not allowed: low must not exceed high"
                     f"{', and be above 0' if log else ''}."
                 )
+
+    @property
+    def ideal_robot(self) -> bool:
+        """Whether every base follows every twist at once, with any force."""
+        return self.robot.ideal and all(getattr(self, name) is None for name in OF_THE_ROBOT)
 
     @property
     def combinations(self) -> int:
@@ -143,6 +159,13 @@ class Domain:
 
 RANDOM = {"random_box": "box", "random_cylinder": "cylinder", "random_prism": "prism"}
 OF_THE_BASE = ("pose_noise", "yaw_noise", "pose_latency", "command_delay", "velocity_error")
+# Ranges of the robot's limits, and which they are.
+OF_THE_ROBOT = {
+    "robot_force": "force_max",
+    "robot_traction": "traction",
+    "robot_lag": "lag",
+    "robot_acceleration": "acceleration_max",
+}
 _POSITIVE = 1e-3
 # What a range must not leave.
 _ALLOWED = {
@@ -166,6 +189,10 @@ _ALLOWED = {
     "pose_latency": (0, 1, "s"),
     "command_delay": (0, 1, "s"),
     "velocity_error": (-0.9, 0.9, "1"),
+    "robot_force": (1, 1e5, "N"),
+    "robot_traction": (_POSITIVE, 5, "1"),
+    "robot_lag": (0, 5, "s"),
+    "robot_acceleration": (_POSITIVE, 100, "m/s^2"),
 }
 RANGES = tuple(_ALLOWED)
 _UNITS = {
@@ -199,6 +226,13 @@ DOMAINS = {
         **_HARDWARE,
     ),
     "wide": Domain(),
+    # Robots that exist, in the worlds of wide.
+    "real": Domain(
+        robot_force=Range(150, 800),
+        robot_traction=Range(0.3, 0.8),
+        robot_lag=Range(0, 0.5),
+        robot_acceleration=Range(0.1, 1.0),
+    ),
     "prisms": Domain(objects=("random_prism",)),  # of wide, held out from tuning
     "hostile": Domain(
         mass=Range(1, 100, log=True),
@@ -227,12 +261,16 @@ DOMAINS = {
 OF_TAXELS = ("noise", "gain_spread", "dead_share")  # which an ideal skin has not
 
 
-def named(domain: Domain | str) -> Domain:
+def named(domain: Domain | str, robot: Robot | str | None = None) -> Domain:
     """A domain by its name in `DOMAINS`, or from a JSON file of ranges; a domain is itself.
+
+    With a robot, its worlds have that one, but for what the domain draws of it.
 
     Raises:
       InputError: no domain has this name, or the file is no domain.
     """
+    if robot is not None:
+        return replace(named(domain), robot=named_robot(robot))
     if isinstance(domain, Domain):
         return domain
     if domain.endswith(".json"):
@@ -258,6 +296,7 @@ class Draw(NamedTuple):
     pose_latency: np.ndarray  # (n,) [s]
     command_delay: np.ndarray  # (n,) [s]
     velocity_error: np.ndarray  # (n, 3) [1]
+    robot: Robot  # (n,) each
     key: np.ndarray  # (n, 2) uint32, of all that is drawn while the world runs
 
 
@@ -268,6 +307,7 @@ _USES = (
     *("noise", "gain_spread", "dead_share", "pose_noise", "yaw_noise", "pose_latency"),
     *("command_delay", "v_x_error", "v_y_error", "omega_error", "key_0", "key_1", "sides", "turn"),
     *(f"corner_{i}" for i in range(SIDES)),
+    *OF_THE_ROBOT,
 )
 
 
@@ -288,7 +328,8 @@ def drawn_at(domain: Domain, index: np.ndarray, numbers: np.ndarray) -> Draw:
     """Worlds of the same object, from their random numbers (n, _COLUMNS)."""
     u = dict(zip(_USES, numbers.T, strict=False))
     name = domain.objects[int(domain.object_of(index[0]))]
-    at = {name: getattr(domain, name).at(u[name]) for name in _ALLOWED if name in u}
+    ranges = {name: getattr(domain, name) for name in _ALLOWED if name in u}
+    at = {name: one.at(u[name]) for name, one in ranges.items() if one is not None}
     if domain.skin == "ideal":
         at |= {name: np.zeros(index.size) for name in OF_TAXELS}
     error = [
@@ -301,6 +342,7 @@ def drawn_at(domain: Domain, index: np.ndarray, numbers: np.ndarray) -> Draw:
         friction=_friction(domain, index, at),
         p_world_target=_targets(domain, index, at),
         velocity_error=np.stack(error, axis=-1),
+        robot=_robots(domain.robot, at, index.size),
         key=np.stack(key, axis=-1),
         **{name: at[name] for name in Draw._fields if name in at},
     )
@@ -350,6 +392,20 @@ def _polygons(depth: np.ndarray, breadth: np.ndarray, u: dict[str, np.ndarray]) 
     return solid.centred(half * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
 
 
+def _robots(robot: Robot, at: dict[str, np.ndarray], count: int) -> Robot:
+    """The robots (count,) of worlds, with what was drawn of them."""
+    own = {name: at[drawn] for drawn, name in OF_THE_ROBOT.items() if drawn in at}
+    if (linear := own.get("acceleration_max")) is not None:
+        own["acceleration_max"] = np.stack([linear, linear / ARM], axis=-1)
+    robot = replace(robot, **dict.fromkeys(own))  # the numbers of the others alone
+    full = {
+        f.name: np.repeat(np.asarray(value, float)[None], count, axis=0)
+        for f in fields(robot)
+        if (value := getattr(robot, f.name)) is not None
+    }
+    return replace(robot, **full, **own)
+
+
 def _friction(domain: Domain, index: np.ndarray, at: dict[str, np.ndarray]) -> Friction:
     if not domain.frictions:
         return Friction(at["friction_ground"], at["friction_robot"])
@@ -383,7 +439,17 @@ def table(drawn: Draw) -> dict[str, tuple[np.ndarray, str]]:
         "bearing": (np.arctan2(y, x), "rad"),
         **{name: (getattr(drawn, name), unit) for name, unit in _UNITS.items()},
         **{name: (values, "1") for name, values in errors_},
+        **_limits(drawn.robot),
     }
+
+
+def _limits(robots: Robot) -> dict[str, tuple[np.ndarray, str]]:
+    """Limits of robots (n,) that differ between worlds, or any number at all of one world."""
+    found = {}
+    for name, limit in OF_THE_ROBOT.items():
+        if (values := getattr(robots, limit)) is not None:
+            found[name] = (values.reshape(len(values), -1)[:, 0], _ALLOWED[name][2])
+    return found
 
 
 def _names(values: list[str]) -> tuple[str, ...]:
@@ -398,8 +464,8 @@ def _range(name: str, values: Any) -> Range:
     low, high, *log = values
     if len(log) > 1 or not all(isinstance(one, bool) for one in log):
         raise ValueError("more than low, high, and whether evenly in the logarithm")
-    usual = getattr(DOMAINS["wide"], name).log
-    return Range(float(low), float(high), *(log or [usual]))
+    usual = getattr(DOMAINS["wide"], name)
+    return Range(float(low), float(high), *(log or [usual is not None and usual.log]))
 
 
 # How JSON has what is not a range.
@@ -414,6 +480,7 @@ _FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
         "pairs of x and y [m], as [[2, 0]]",
     ),
     "skin": (str, "its name"),
+    "robot": (named_robot, 'a robot\'s name or numbers, as {"force_max": 300}'),
 }
 
 
@@ -427,6 +494,8 @@ def from_json(values: dict[str, Any]) -> Domain:
     known = {f.name: f for f in fields(Domain)}
     for name, value in values.items():
         errors.check_name("domain quantity", name, known)
+        if value is None and name in OF_THE_ROBOT:
+            continue
         read, form = _FORMS.get(name, (partial(_range, name), "low and high, as [0.1, 0.5]"))
         try:
             given[name] = read(value)

@@ -19,6 +19,7 @@ from rps_jax.geometry import footprint as fp
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import Solid
 from rps_jax.robot import skin
+from rps_jax.robot.robot import Robot
 from rps_jax.world import objects
 from rps_jax.world.objects import FAMILIES, OBJECTS, SHAPES, path_of
 from rps_jax.world.physics import PHYSICS, Physics
@@ -68,6 +69,7 @@ def load(
     rear: Side = "near",
     mass: float | None = None,
     half_length: float = skin.HALF_LENGTH,
+    robot: Robot | None = None,
 ) -> Scene:
     """Compile a scene.
 
@@ -79,6 +81,7 @@ def load(
         paper says "rear left corner".
       mass: of the object [kg], its inertia scaled along; None: the object's own.
       half_length: of the base [m].
+      robot: whose base contact can slow and stop; None: a base that follows every twist.
 
     Raises:
       InputError: unknown name, or friction or mass that is not a positive finite number.
@@ -87,19 +90,24 @@ def load(
     errors.check_name("rear", rear, SIDES)
     check(friction, mass)
     if name in objects.REGISTERED:
-        return _load_registered(name, physics, friction, mass, half_length)
+        return _load_registered(name, physics, friction, mass, half_length, robot)
     spec = objects.read(path_of(name))
     for geom in spec.geoms:
         if geom.name == "load" and rear == "far":
             geom.pos[0] = -geom.pos[0]
     if mass is not None:
         _set_mass(spec, mass)
-    model, stripped = _compile(spec, physics, friction, half_length)
+    model, stripped = _compile(spec, physics, friction, half_length, robot)
     return Scene(name, FAMILIES[name], model, stripped, _footprint(stripped))
 
 
 def _load_registered(
-    name: str, physics: Physics, friction: Friction, mass: float | None, half_length: float
+    name: str,
+    physics: Physics,
+    friction: Friction,
+    mass: float | None,
+    half_length: float,
+    robot: Robot | None,
 ) -> Scene:
     """The looks of a registered object, and the solid that stands for it in the physics."""
     one = objects.REGISTERED[name].solid
@@ -107,7 +115,7 @@ def _load_registered(
         one = one._replace(mass=np.asarray(mass), inertia=one.inertia * mass / one.mass)
     spec = objects.read(path_of(name))
     _set_length(spec, half_length)
-    upright = shaped(FAMILIES[name], one, physics, friction, half_length=half_length)
+    upright = shaped(FAMILIES[name], one, physics, friction, half_length=half_length, robot=robot)
     return upright._replace(name=name, model=spec.compile())
 
 
@@ -118,6 +126,7 @@ def shaped(
     friction: Friction = FRICTION["S1"],
     *,
     half_length: float = skin.HALF_LENGTH,
+    robot: Robot | None = None,
 ) -> Scene:
     """Compile a scene with one solid (its leaves without a leading axis) of a shape family.
 
@@ -140,14 +149,30 @@ def shaped(
     body.mass, body.ipos = one.mass, one.p_object_com
     body.iquat, body.inertia = one.q_object_body, one.inertia
     outline = Footprint(jnp.asarray(one.vertices, float), jnp.asarray(one.radius, float))
-    models = _compile(spec, physics, friction, half_length)
+    models = _compile(spec, physics, friction, half_length, robot)
     return Scene(family, family, *models, outline)
 
 
-def of_solid(family: str, solids: Solid, friction: Friction, physics: Physics, i: int) -> Scene:
-    """Compile a scene with the i-th of solids (n, ...), friction (n,) each."""
-    one, pair = jax.tree.map(lambda leaf: leaf[i], (solids, friction))
-    return shaped(family, one, physics, Friction(float(pair.ground), float(pair.robot)))
+def of_solid(
+    family: str,
+    solids: Solid,
+    friction: Friction,
+    physics: Physics,
+    i: int,
+    robots: Robot | None = None,
+) -> Scene:
+    """Compile a scene with the i-th of solids (n, ...), friction and robots (n,) each."""
+    one, pair, robot = jax.tree.map(lambda leaf: leaf[i], (solids, friction, robots))
+    friction = Friction(float(pair.ground), float(pair.robot))
+    return shaped(family, one, physics, friction, robot=robot)
+
+
+def base_invweight(robots: Robot) -> np.ndarray:
+    """MuJoCo's weight [1/kg] in a contact of bases that can be slowed.
+
+    It is the mean over x, y and z of what a force of 1 N changes; along z the base does not move.
+    """
+    return 2 / (3 * np.asarray(robots.mass, float))
 
 
 def geom_sizes(family: str, solids: Solid) -> dict[str, np.ndarray]:
@@ -181,10 +206,16 @@ def feet(solids: Solid) -> np.ndarray:
 
 
 def _compile(
-    spec: mujoco.MjSpec, physics: Physics, friction: Friction, half_length: float
+    spec: mujoco.MjSpec,
+    physics: Physics,
+    friction: Friction,
+    half_length: float,
+    robot: Robot | None,
 ) -> tuple[mujoco.MjModel, mujoco.MjModel]:
     """The model for looking at, and the one stripped to the physics."""
     _set_length(spec, half_length)
+    if robot is not None:
+        _set_robot(spec, robot)
     for pair in spec.pairs:
         if pair.name == "base_object":
             pair.solref[:] = physics.base_solref
@@ -223,6 +254,14 @@ def _set_length(spec: mujoco.MjSpec, half_length: float) -> None:
     spec.geom("skin_front").pos[0] = half_length
     for name in ("base", "skin_left", "skin_right"):
         spec.geom(name).size[0] = half_length
+
+
+def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
+    """Make the base a body that contact can slow and stop."""
+    base = spec.body("base")
+    base.mass, base.inertia[2] = float(robot.mass), float(robot.inertia)
+    for joint in base.joints:
+        joint.armature = 0.0
 
 
 def _set_mass(spec: mujoco.MjSpec, mass: float) -> None:

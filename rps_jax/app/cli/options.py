@@ -56,6 +56,16 @@ Skin = Annotated[
         )
     ),
 ]
+RobotName = Annotated[
+    str,
+    tyro.conf.arg(
+        help=(
+            "The robot: ideal (it follows every twist at once, with any force), kairos (the "
+            "paper's), ridgeback or mpo_500, or a JSON file of its limits, as "
+            '{"mass": 130, "force_max": 300, "lag": 0.2}.'
+        )
+    ),
+]
 Device = Annotated[
     Literal["auto", "cpu", "gpu"],
     tyro.conf.arg(help="Where the worlds are stepped; auto takes what JAX finds."),
@@ -110,6 +120,7 @@ class Asked:
     """Parameters of the skin to change from their defaults, each as NAME=VALUE."""
     gap: float = 0.02
     """Distance between the base and the object at the start [m]."""
+    robot: RobotName = "ideal"
     horizon: float = 300.0
     """Time after which a trial has failed [s]."""
     seed: int = 0

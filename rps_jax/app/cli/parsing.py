@@ -61,11 +61,11 @@ def as_json(params: Params) -> dict[str, Any]:
     return strategies.as_json(params)
 
 
-def domain_of(text: str, changes: Sequence[str] = ()) -> Domain:
-    """A domain by name or from a JSON file, with changes as QUANTITY=LOW,HIGH."""
+def domain_of(text: str, changes: Sequence[str] = (), robot: str | None = None) -> Domain:
+    """A domain by name or from a JSON file, with changes as QUANTITY=LOW,HIGH, and its robot."""
     from rps_jax.world import domain
 
-    chosen = domain.named(text)
+    chosen = domain.named(text, robot)
     ranges = {}
     for change in changes:
         name, _, values = change.partition("=")
@@ -78,7 +78,8 @@ def domain_of(text: str, changes: Sequence[str] = ()) -> Domain:
                 f"skin leave no {name} to draw."
             )
         low, high = (errors.check_number(f"domain {name}", end) for end in values.split(","))
-        ranges[name] = getattr(chosen, name)._replace(low=low, high=high)
+        usual = getattr(chosen, name) or domain.Range(low, high)
+        ranges[name] = usual._replace(low=low, high=high)
     return dataclasses.replace(chosen, **ranges)
 
 

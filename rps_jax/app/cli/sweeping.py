@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from rps_jax.app.cli import parsing, running
-from rps_jax.app.cli.options import Device, Engine, Fidelity, Physics, Spread, Strategies
+from rps_jax.app.cli.options import Device, Engine, Fidelity, Physics, RobotName, Spread, Strategies
 from rps_jax.app.cli.replicating import show
 from rps_jax.errors import InputError
 
@@ -23,8 +23,8 @@ Domain = Annotated[
     str,
     tyro.conf.arg(
         help=(
-            "Ranges from which worlds are drawn: paper, hardware, wide, prisms or hostile, or a "
-            'JSON file of ranges, as {"mass": [3, 60]}.'
+            "Ranges from which worlds are drawn: paper, hardware, wide, real (wide, with robots that "
+            'exist), prisms or hostile, or a JSON file of ranges, as {"mass": [3, 60]}.'
         )
     ),
 ]
@@ -43,6 +43,8 @@ class Sweep(Spread):
     changes to the paper's, as {"L": 0.3}."""
     worlds: int | None = None
     """Number of worlds; by default 1000, or the whole grid of a domain with listed targets."""
+    robot: RobotName | None = None
+    """By default the domain's, which is ideal but in the domain real."""
     physics: Physics = "default"
     fidelity: Fidelity = "standard"
     engine: Engine = "fused"
@@ -68,7 +70,7 @@ class Sweep(Spread):
         from rps_jax.trials.trial import Rules
         from rps_jax.world.physics import preset
 
-        domain = parsing.domain_of(self.domain, self.change)
+        domain = parsing.domain_of(self.domain, self.change, self.robot)
         every = domain.combinations if domain.targets else 1000
         arms = parsing.sweep_arms(self.strategies, self.params)
         physics = preset(self.physics, self.fidelity)

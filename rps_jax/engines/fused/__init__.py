@@ -17,6 +17,7 @@ from rps_jax.engines.fused import step
 from rps_jax.engines.fused.contacts import Body
 from rps_jax.geometry import solid
 from rps_jax.geometry.solid import Solid
+from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import OFF_CENTRE, Friction, Scene
@@ -25,9 +26,16 @@ from rps_jax.world.scene import OFF_CENTRE, Friction, Scene
 class FusedStage(NamedTuple):
     """Worlds of the fused engine share nothing."""
 
-    def drive(self, fields: Body, motion: Motion, twists: Twist, physics: Physics) -> Driven:
+    def drive(
+        self,
+        fields: Body,
+        motion: Motion,
+        twists: Twist,
+        physics: Physics,
+        robot: Robot | None = None,
+    ) -> Driven:
         """Step a batch for one control period."""
-        return Driven(Motion(*step.drive(fields, *motion, twists, physics)))
+        return Driven(step.drive(fields, motion, twists, physics, robot))
 
 
 class Fused(Engine):
@@ -42,12 +50,20 @@ class Fused(Engine):
         return FusedStage(), taken(jax.tree.map(lambda *leaves: np.stack(leaves), *bodies), which)
 
     def stage_of_solids(
-        self, family: str, solids: Solid, friction: Friction, physics: Physics
+        self,
+        family: str,
+        solids: Solid,
+        friction: Friction,
+        physics: Physics,
+        robots: Robot | None = None,
     ) -> tuple[Any, Any]:
         """Stage and fields of solids (n, ...)."""
         known = scene.load("box", physics)  # of which only the base matters
         one = step.body(known.physics, np.asarray(known.footprint.vertices))
-        return FusedStage(), bodies_of(solids, friction, one)
+        bodies = bodies_of(solids, friction, one)
+        if robots is not None:
+            bodies = bodies._replace(base_invweight=scene.base_invweight(robots))
+        return FusedStage(), bodies
 
     def slots(self, backend: str) -> int:
         """Worlds that one worker steps at once."""

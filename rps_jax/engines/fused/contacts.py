@@ -70,6 +70,15 @@ class State(NamedTuple):
     w: Vec  # [rad/s] in principal axes
     a: Vec  # [m/s^2] last acceleration, from which the solver starts
     alpha: Vec  # [rad/s^2]
+    pushed: Pushed | None = None  # a base whose force is limited
+
+
+class Pushed(NamedTuple):
+    """A base in motion that its drive pushes; axes of the world, x, y and about the vertical."""
+
+    v: Vec  # [m/s, m/s, rad/s]
+    a: Vec  # [m/s^2, m/s^2, rad/s^2] last acceleration
+    integral: Vec  # [N, N, N m] of the drive's servo, in the base's frame
 
 
 class Contact(NamedTuple):
@@ -82,6 +91,7 @@ class Contact(NamedTuple):
     bias: Vec  # [m/s^2] -a_ref
     d: Any  # [kg] stiffness of the normal row, 0 without contact
     friction: Any  # [1]
+    arm: tuple[Any, Any] | None = None  # [m] from the origin of a base that can be slowed
 
 
 def _stiff(distance: Any, there: Any, impedance: Any, invweight: Any) -> Any:
@@ -150,18 +160,19 @@ def on_base(body: Body, state: State, m: Sequence[Vec], twist: Vec, physics: Phy
     arm = (c * q[0] - s * q[1], s * q[0] + c * q[1])  # from the base's origin
     lever = (state.base[0] + arm[0] - state.p[0], state.base[1] + arm[1] - state.p[1])
     r = (*lever, z - state.p[2])
-    of_base = (
-        c * twist[0] - s * twist[1] - twist[2] * arm[1],
-        s * twist[0] + c * twist[1] + twist[2] * arm[0],
-        0.0,
-    )
+    if state.pushed is None:
+        v, w = (c * twist[0] - s * twist[1], s * twist[0] + c * twist[1]), twist[2]
+    else:
+        *v, w = state.pushed.v
+    of_base = (v[0] - w * arm[1], v[1] + w * arm[0], 0.0)
     u = sp.sub(sp.add(state.v, sp.cross(sp.to_world(m, state.w), r)), of_base)
     x = jnp.minimum(jnp.abs(distance) / _WIDTH, 1.0)
     x = jnp.where(x < 0.5, 2 * x * x, 1 - 2 * (1 - x) * (1 - x))
     impedance = _D_MIN + x * (_D_MAX - _D_MIN)
     d = _stiff(distance, True, impedance, body.invweight + body.base_invweight)
     bias = _bias(k, b, impedance, distance, (sp.dot(n, u), sp.dot(t, u), u[2]))
-    return Contact(r, n, t, sp.Z, bias, d, body.friction_robot)
+    held = state.pushed is None
+    return Contact(r, n, t, sp.Z, bias, d, body.friction_robot, None if held else arm)
 
 
 Point = tuple[Any, Any]

@@ -1,5 +1,7 @@
 """MuJoCo's convex problem for one free object, by Newton's method with an exact line search.
 
+A base that contact can slow and stop adds its three accelerations to the object's six.
+
 Its accelerations minimise
 
     (a - a_free)' M (a - a_free) / 2 + sum over contacts of s(J a - a_ref),
@@ -11,8 +13,8 @@ Reference: MuJoCo documentation, "Computation: Constraint model" and "Solver".
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -84,9 +86,23 @@ def _pyramid(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tuple[Any
     return force, stiffness
 
 
-def _rows(contact: Contact, a: Vec, alpha: Vec) -> Vec:
-    """J of an acceleration: of the contact's point along n, t, s."""
+class Base(NamedTuple):
+    """A base that its drive pushes; axes of the world, x, y and about the vertical."""
+
+    inertia: Vec  # [kg, kg, kg m^2]
+    force: Vec  # [N, N, N m] of the drive
+    a: Vec  # [m/s^2, m/s^2, rad/s^2] last acceleration, from which the solver starts
+
+
+def _rows(contact: Contact, a: Vec, alpha: Vec, b: Vec | None) -> Vec:
+    """J of an acceleration: of the contact's point along n, t, s, against a base's if it has one.
+
+    `b` is that of the base's origin and about it.
+    """
     u = sp.add(a, sp.cross(alpha, contact.r))
+    if b is not None and contact.arm is not None:
+        x, y = contact.arm
+        u = sp.sub(u, (b[0] - b[2] * y, b[1] + b[2] * x, 0.0))
     return sp.dot(contact.n, u), sp.dot(contact.t, u), sp.dot(contact.s, u)
 
 
@@ -110,9 +126,16 @@ def _solve(h: list[list[Any]], g: Sequence[Any]) -> list[Any]:
 
 
 def accelerations(
-    body: Body, state: State, m: Sequence[Vec], contacts: list[Contact], physics: Physics
-) -> tuple[Vec, Vec]:
+    body: Body,
+    state: State,
+    m: Sequence[Vec],
+    contacts: list[Contact],
+    physics: Physics,
+    base: Base | None = None,
+) -> tuple[Vec, Vec, Vec | None]:
     """Linear and angular acceleration of the object: the minimum of MuJoCo's convex cost.
+
+    And those of the base, x, y and about the vertical, if it is not held.
 
     Newton's method with an exact line search, from the last accelerations. It ends at an error of
     `_ENOUGH`; the tolerance of `physics`, relative to the mass of the base too, is not used.
@@ -127,43 +150,72 @@ def accelerations(
         linear = sp.scale(body.mass, (a[0], a[1], a[2] + GRAVITY))
         return linear, sp.to_world(i_w, sp.sub(alpha, free))
 
-    def gradient(a: Vec, alpha: Vec):
+    def gradient(a: Vec, alpha: Vec, b: Vec | None):
         linear, angular = gauss(a, alpha)
-        h: list[list[Any]] = [[0.0] * 6 for _ in range(6)]
+        size = 6 if base is None else 9
+        h: list[list[Any]] = [[0.0] * size for _ in range(size)]
+        pushing: Any = ()
+        if base is not None:
+            pushing = _lacking(base, b)
+            for row in range(3):
+                h[6 + row][6 + row] = base.inertia[row]
         for row in range(3):
             h[row][row] = body.mass
             for column in range(row + 1):
                 h[3 + row][3 + column] = i_w[row][column]
         for c in contacts:
-            x = sp.add(_rows(c, a, alpha), c.bias)
+            x = sp.add(_rows(c, a, alpha, b), c.bias)
             force, k = contact_force(c, x, physics)
             f = sp.combine(force, (c.n, c.t, c.s))
             linear = sp.sub(linear, _sums(f))
             angular = sp.sub(angular, _sums(sp.cross(c.r, f)))
+            if base is not None and c.arm is not None:
+                pushing = sp.add(pushing, _sums(_on_base(c.arm, f)))
             _stiffen(h, c, k)
-        return (*linear, *angular), h
+        return (*linear, *angular, *pushing), h
 
     def improve(carry):
-        count, a, alpha, active, _ = carry
-        g, h = gradient(a, alpha)
+        count, a, alpha, b, active, _ = carry
+        g, h = gradient(a, alpha, b)
         step = _solve(h, [-x for x in g])
         d, delta = (step[0], step[1], step[2]), (step[3], step[4], step[5])
-        x = _line_search(contacts, a, alpha, d, delta, gauss, body.mass, i_w, physics)
+        e: Any = None if base is None else (step[6], step[7], step[8])
+        linear, angular = gauss(a, alpha)
+        slope = sp.dot(linear, d) + sp.dot(angular, delta)
+        bend = body.mass * sp.dot(d, d) + sp.dot(delta, sp.to_world(i_w, delta))
+        if base is not None:
+            slope = slope + sp.dot(_lacking(base, b), e)
+            bend = bend + sp.dot(base.inertia, tuple(x * x for x in e))
+        lines = [
+            (c, sp.add(_rows(c, a, alpha, b), c.bias), _rows(c, d, delta, e)) for c in contacts
+        ]
+        x = _line_search(lines, slope, bend, physics)
         # An inner product of step and gradient: twice what a quadratic cost would gain.
         gain = -sp.dot(step, g)
         going = gain > 2 * body.mass * _ENOUGH**2
         # A world that is done stays as it is while others go on: its numbers are its own.
         move = jnp.where(active > 0, jnp.where(going, x, jnp.minimum(x, 1.0)), 0.0)
         a, alpha = sp.add(a, sp.scale(move, d)), sp.add(alpha, sp.scale(move, delta))
+        b = None if base is None else sp.add(b, sp.scale(move, e))
         active = jnp.where(going, active, 0.0)
-        return count + 1, a, alpha, active, _some(active)
+        return count + 1, a, alpha, b, active, _some(active)
 
     active = jnp.ones_like(body.mass)
-    start = (0, state.a, state.alpha, active, _some(active))
-    _, a, alpha, _, _ = jax.lax.while_loop(
-        lambda carry: (carry[0] < physics.iterations) & carry[4], improve, start
+    start = (0, state.a, state.alpha, base and base.a, active, _some(active))
+    _, a, alpha, b, _, _ = jax.lax.while_loop(
+        lambda carry: (carry[0] < physics.iterations) & carry[5], improve, start
     )
-    return a, alpha
+    return a, alpha, b
+
+
+def _lacking(base: Base, b: Any) -> Vec:
+    """M (b - free accelerations) of a base."""
+    return sp.sub(tuple(m * x for m, x in zip(base.inertia, b, strict=True)), base.force)
+
+
+def _on_base(arm: tuple[Any, Any], f: Vec) -> Vec:
+    """A force at an arm from the base's origin: along x and y, and its torque about the origin."""
+    return f[0], f[1], sp.minus(sp.mul(arm[0], f[1]), sp.mul(arm[1], f[0]))
 
 
 def _sum(entry: Any) -> Any:
@@ -204,24 +256,29 @@ def _stiffen(h: list[list[Any]], c: Contact, k: tuple[Any, ...]) -> None:
         row = sp.cross(c.r, (turned[0][i], turned[1][i], turned[2][i]))
         for j in range(i + 1):
             h[3 + i][3 + j] = sp.plus(h[3 + i][3 + j], _sum(row[j]))
+    if c.arm is None:
+        return
+    # The base's rows: with B the way its origin's motion moves the point, -B^T K (1, [r]^T, -B).
+    onto = [_on_base(c.arm, column) for column in columns]
+    for j in range(3):
+        twisted = _on_base(c.arm, (turned[0][j], turned[1][j], turned[2][j]))
+        for i in range(3):
+            h[6 + i][j] = sp.minus(h[6 + i][j], _sum(onto[j][i]))
+            h[6 + i][3 + j] = sp.minus(h[6 + i][3 + j], _sum(twisted[i]))
+    for i in range(3):
+        row = _on_base(c.arm, (onto[0][i], onto[1][i], onto[2][i]))
+        for j in range(i + 1):
+            h[6 + i][6 + j] = sp.plus(h[6 + i][6 + j], _sum(row[j]))
 
 
 def _line_search(
-    contacts: list[Contact],
-    a: Vec,
-    alpha: Vec,
-    d: Vec,
-    delta: Vec,
-    gauss: Callable[[Vec, Vec], tuple[Vec, Vec]],
-    mass: Any,
-    i_w: list[Vec],
-    physics: Physics,
+    lines: list[tuple[Contact, Vec, Vec]], slope: Any, bend: Any, physics: Physics
 ) -> Any:
-    """How far from (a, alpha) along (d, delta) the cost is least: Newton's method, bracketed."""
-    linear, angular = gauss(a, alpha)
-    slope = sp.dot(linear, d) + sp.dot(angular, delta)
-    bend = mass * sp.dot(d, d) + sp.dot(delta, sp.to_world(i_w, delta))
-    lines = [(c, sp.add(_rows(c, a, alpha), c.bias), _rows(c, d, delta)) for c in contacts]
+    """How far the cost is least: Newton's method, bracketed.
+
+    `slope` and `bend` are the first and second derivative of what is not of contacts; `lines` are
+    the contacts, with their rows at the start and how these change.
+    """
 
     def refine(_, carry):
         x, low, high = carry

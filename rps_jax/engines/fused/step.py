@@ -1,15 +1,17 @@
 """MuJoCo's equations for these scenes alone: one free object, on the ground, before the base.
 
 MJX solves any scene. Here the scene is known: the base is a velocity source, so only the object's
-six accelerations are unknown; it touches the ground with the corners of its lower face and the
-base along two lines. What MuJoCo computes (its soft contacts, its two cones, its Newton solver and
-Euler's rule) is written out for that in scalars, so that a compiler can keep a whole world in
-registers: `contacts.py` finds the points, `newton.py` solves.
+six accelerations are unknown, and three more of a base whose force is limited; the object touches
+the ground with the corners of its lower face and the base along two lines. What MuJoCo computes
+(its soft contacts, its two cones, its Newton solver and Euler's rule) is written out for that in
+scalars, so that a compiler can keep a whole world in registers: `contacts.py` finds the points,
+`newton.py` solves.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -20,10 +22,13 @@ import numpy as np
 from jax.experimental import pallas
 from jax.experimental.pallas import triton
 
-from rps_jax.engines.fused.contacts import Body, Corners, State, on_base, on_ground
-from rps_jax.engines.fused.newton import accelerations
+from rps_jax.engines.base import Motion
+from rps_jax.engines.fused.contacts import Body, Corners, Pushed, State, on_base, on_ground
+from rps_jax.engines.fused.newton import Base, accelerations
 from rps_jax.geometry import vectors as sp
 from rps_jax.geometry.vectors import Vec
+from rps_jax.robot import drive as drives
+from rps_jax.robot.robot import Robot
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS
 
@@ -63,8 +68,9 @@ def _split(array: jax.Array, at: slice = slice(None)) -> Any:
     return tuple(array[..., i] for i in range(array.shape[-1]))[at]
 
 
-def enter(body: Body, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array) -> State:
-    """The state of worlds as MuJoCo holds them: qpos (..., 10), qvel and warmstart (..., 9)."""
+def enter(body: Body, motion: Motion, robot: Robot | None = None) -> State:
+    """The state of worlds as MuJoCo holds them."""
+    qpos, qvel, warmstart, integral = motion
     free, spin = _split(qpos, JOINTS.object), _split(qvel, slice(6, 9))
     com, axes = _split(body.p_object_com), _split(body.q_object_body)
     m = sp.matrix(free[3:])
@@ -77,11 +83,14 @@ def enter(body: Body, qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array) ->
         w=sp.to_body(sp.matrix(axes), spin),
         a=_split(warmstart, slice(3, 6)),
         alpha=_split(warmstart, slice(6, 9)),
+        pushed=None
+        if robot is None
+        else Pushed(_split(qvel, JOINTS.base), _split(warmstart, JOINTS.base), _split(integral)),
     )
 
 
-def leave(body: Body, state: State, twist: Vec) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The opposite of `enter`, after a period at `twist`: (qpos, qvel, warmstart)."""
+def leave(body: Body, state: State, twist: Vec) -> Motion:
+    """The opposite of `enter`, after a period at `twist`."""
     com, axes = _split(body.p_object_com), _split(body.q_object_body)
     q = sp.times(state.q, (axes[0], -axes[1], -axes[2], -axes[3]))
     m = sp.matrix(q)
@@ -90,23 +99,36 @@ def leave(body: Body, state: State, twist: Vec) -> tuple[jax.Array, jax.Array, j
     c, s = jnp.cos(state.base[2]), jnp.sin(state.base[2])
     base = (c * twist[0] - s * twist[1], s * twist[0] + c * twist[1], twist[2])
     p = sp.sub(state.p, sp.to_world(m, com))
-    still = tuple(jnp.zeros_like(x) for x in state.base)
-    return (
+    last, integral = tuple(jnp.zeros_like(x) for x in state.base), None
+    if state.pushed is not None:
+        base, last, integral = state.pushed
+    return Motion(
         jnp.stack([*state.base, *p, *q], axis=-1),
         jnp.stack([*base, *v, *spin], axis=-1),
-        jnp.stack([*still, *state.a, *state.alpha], axis=-1),
+        jnp.stack([*last, *state.a, *state.alpha], axis=-1),
+        None if integral is None else jnp.stack(integral, axis=-1),
     )
 
 
-def step(body: Body, state: State, twist: Vec, physics: Physics) -> State:
+def step(
+    body: Body, state: State, twist: Vec, physics: Physics, robot: Robot | None = None
+) -> State:
     """One step of MuJoCo's semi-implicit Euler rule with the base held at `twist`.
 
-    `twist` [m/s, m/s, rad/s] is in the base's frame.
+    Or, if the force of the `robot` is limited, pushed towards it. `twist` [m/s, m/s, rad/s] is in
+    the base's frame.
     """
-    m = sp.matrix(state.q)
+    m, dt, pushed = sp.matrix(state.q), physics.timestep, state.pushed
     contacts = [on_ground(body, state, m, physics), on_base(body, state, m, twist, physics)]
-    a, alpha = accelerations(body, state, m, contacts, physics)
-    dt = physics.timestep
+    if robot is None or pushed is None:
+        a, alpha, _ = accelerations(body, state, m, contacts, physics)
+    else:
+        turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+        force, integral = drives.push(robot, pushed.integral, twist, pushed.v, turn, dt)
+        base = Base((robot.mass, robot.mass, robot.inertia), force, pushed.a)
+        b: Any
+        a, alpha, b = accelerations(body, state, m, contacts, physics, base)
+        pushed = Pushed(sp.add(pushed.v, sp.scale(dt, b)), b, integral)
     v = sp.add(state.v, sp.scale(dt, a))
     w = sp.add(state.w, sp.scale(dt, sp.to_body(m, alpha)))
     angle = sp.scale(dt, w)
@@ -122,32 +144,35 @@ def step(body: Body, state: State, twist: Vec, physics: Physics) -> State:
         state.base[1] + dt * (s * twist[0] + c * twist[1]),
         state.base[2] + dt * twist[2],
     )
+    if pushed is not None:
+        base = sp.add(state.base, sp.scale(dt, pushed.v))
     p = sp.add(state.p, sp.scale(dt, v))
-    return State(base, p, tuple(x * length for x in q), v, w, a, alpha)  # type: ignore[arg-type]
+    q = tuple(x * length for x in q)
+    return State(base, p, q, v, w, a, alpha, pushed)  # type: ignore[arg-type]
 
 
 def drive(
-    body: Body,
-    qpos: jax.Array,
-    qvel: jax.Array,
-    warmstart: jax.Array,
-    twist: Vec,
-    physics: Physics,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """One control period of a batch of worlds (B, 10), (B, 9), (B, 9) at `twist` (B,).
+    body: Body, motion: Motion, twist: Vec, physics: Physics, robot: Robot | None = None
+) -> Motion:
+    """One control period of a batch of worlds (B,) at `twist` (B,), with robots (B,) if limited.
 
     On an NVIDIA GPU it is one kernel; elsewhere, and where it is differentiated, XLA compiles it.
     """
-    state = _period(physics, spread(body), enter(body, qpos, qvel, warmstart), twist)
+    if robot is not None and robot.acceleration_max is not None:
+        robot = replace(robot, acceleration_max=None)  # of the aim, not of the drive
+    state = _period(physics, spread(body), enter(body, motion, robot), twist, robot)
     return leave(body, state, twist)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _period(physics: Physics, scalars: Body, state: State, twist: Vec) -> State:
+def _period(
+    physics: Physics, scalars: Body, state: State, twist: Vec, robot: Robot | None
+) -> State:
     return jax.lax.platform_dependent(
         scalars,
         state,
         twist,
+        robot,
         cuda=partial(in_a_kernel, physics=physics),
         default=partial(in_xla, physics=physics),
     )
@@ -159,25 +184,33 @@ def _period_jvp(physics: Physics, primals: Any, tangents: Any) -> tuple[State, S
     return jax.jvp(partial(in_xla, physics=physics), primals, tangents)
 
 
-def in_xla(scalars: Body, state: State, twist: Vec, physics: Physics) -> State:
+def in_xla(
+    scalars: Body, state: State, twist: Vec, robot: Robot | None = None, *, physics: Physics
+) -> State:
     """The steps of one control period, as XLA compiles them."""
     return jax.lax.fori_loop(
-        0, physics.substeps, lambda _, s: step(scalars, s, twist, physics), state
+        0, physics.substeps, lambda _, s: step(scalars, s, twist, physics, robot), state
     )
 
 
 def in_a_kernel(
-    scalars: Body, state: State, twist: Vec, physics: Physics, interpret: bool = False
+    scalars: Body,
+    state: State,
+    twist: Vec,
+    robot: Robot | None = None,
+    *,
+    physics: Physics,
+    interpret: bool = False,
 ) -> State:
     """`in_xla` as one kernel, a world to a thread, which keeps its world in registers."""
-    count, moving = state.p[0].size, (state, twist)
+    count, moving = state.p[0].size, (state, twist, robot)
     bodies, motion = _packed(scalars), _packed(moving)
 
     def kernel(*refs):
         *given, out = refs
         body = _unpacked(scalars, given[: len(bodies)])
-        now, wanted = _unpacked(moving, given[len(bodies) :])
-        _give(out, jax.tree.leaves(in_xla(body, now, wanted, physics)))
+        now, wanted, pushing = _unpacked(moving, given[len(bodies) :])
+        _give(out, jax.tree.leaves(in_xla(body, now, wanted, pushing, physics=physics)))
 
     def block(outer: tuple[int, ...]) -> pallas.BlockSpec:
         return pallas.BlockSpec((*outer, _BLOCK), lambda i: (*(0,) * len(outer), i))
