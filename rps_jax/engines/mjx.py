@@ -284,7 +284,7 @@ def _weigh_bases(fields: dict[str, np.ndarray], model: mujoco.MjModel, robots: R
     mass, inertia = np.asarray(robots.mass, float), np.asarray(robots.inertia, float)
     fields[".body_mass"][:, base] = fields[".body_subtreemass"][:, base] = mass
     fields[".body_subtreemass"][:, 0] = fields[".body_mass"].sum(axis=1)
-    fields[".body_inertia"][:, base, 2] = inertia
+    fields[".body_inertia"][:, base] = inertia[:, None]
     fields[".body_invweight0"][:, base] = np.stack(
         [scene.base_invweight(robots), 1 / (3 * inertia)], axis=-1
     )

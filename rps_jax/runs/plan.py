@@ -58,7 +58,9 @@ class Plan:
 
     def check_here(self) -> None:
         """Raises InputError unless the engine can step these worlds on this machine."""
-        engines.get(self.setting.engine).check(self.domain.families)
+        engine = engines.get(self.setting.engine)
+        engine.check(self.domain.families)
+        engine.check_robot(draw(self, [0]).robot)
 
     @property
     def trials(self) -> int:

@@ -64,7 +64,9 @@ class Conditions:
         Raises:
           InputError: a condition is not allowed, or not on this machine.
         """
-        engines.get(self.engine).check()
+        engine = engines.get(self.engine)
+        engine.check()
+        engine.check_robot(named_robot(self.robot))
         steps = {"timestep": self.timestep, "control_period": self.control_period}
         physics = replace(
             preset(self.physics, self.fidelity), **{k: v for k, v in steps.items() if v is not None}

@@ -259,7 +259,8 @@ def _set_length(spec: mujoco.MjSpec, half_length: float) -> None:
 def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
     """Make the base a body that contact can slow and stop."""
     base = spec.body("base")
-    base.mass, base.inertia[2] = float(robot.mass), float(robot.inertia)
+    base.mass = float(robot.mass)
+    base.inertia[:] = float(robot.inertia)  # about the other axes it never turns
     for joint in base.joints:
         joint.armature = 0.0
 

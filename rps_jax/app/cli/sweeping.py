@@ -23,8 +23,8 @@ Domain = Annotated[
     str,
     tyro.conf.arg(
         help=(
-            "Ranges from which worlds are drawn: paper, hardware, wide, real (wide, with robots that "
-            'exist), prisms or hostile, or a JSON file of ranges, as {"mass": [3, 60]}.'
+            "Ranges from which worlds are drawn: paper, hardware, wide, real (wide with robots "
+            'that exist), prisms or hostile, or a JSON file of ranges, as {"mass": [3, 60]}.'
         )
     ),
 ]
