@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from rps_jax.runs.push import replay as replay
     from rps_jax.runs.results import load as load
     from rps_jax.runs.sweep import sweep as sweep
+    from rps_jax.studies.models import models as models
     from rps_jax.studies.table import table as table
     from rps_jax.trials.conditions import Conditions as Conditions
     from rps_jax.trials.env import PushEnv as PushEnv
@@ -77,6 +78,7 @@ _HOMES = {
     "runs.push": ("Push", "push", "replay"),
     "runs.results": ("load",),
     "runs.sweep": ("sweep",),
+    "studies.models": ("models",),
     "studies.table": ("table",),
     "trials.conditions": ("Conditions",),
     "trials.env": ("PushEnv",),

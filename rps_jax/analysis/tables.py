@@ -91,6 +91,23 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
     return rows
 
 
+def models_table(results: xr.Dataset) -> list[list[str]]:
+    """Header and one row for each arm: its rate on every model, and from the least to the most.
+
+    Outcomes are (model, arm, world). The last column is the share of outcomes that are equal to
+    the first model's, at the least.
+    """
+    names = list(map(str, results.model.values))
+    rows = [["", *names, "over all models", "outcomes equal to the first"]]
+    for arm in map(str, results.arm.values):
+        won = results.success.sel(arm=arm).values > 0
+        rates = 100 * won.mean(axis=1)
+        equal = 100 * (won == won[0]).mean(axis=1)[1:]
+        least = f"{equal.min():.1f} % and more" if equal.size else "-"
+        rows.append([arm, *map(_rate, won), f"{rates.min():.1f} to {rates.max():.1f} %", least])
+    return rows
+
+
 def _rate(won: np.ndarray) -> str:
     return _share(int(won.sum()), won.size)
 

@@ -13,8 +13,13 @@ from rps_jax.record import provenance
 from rps_jax.runs.plan import Plan
 
 
-def write_report(folder: Path, plan: Plan, results: xr.Dataset) -> Path:
-    """Write `report.md`, `report.html` and the figure of a sweep; returns the path of the first."""
+def write_report(
+    folder: Path, plan: Plan, results: xr.Dataset, models: xr.Dataset | None = None
+) -> Path:
+    """Write `report.md`, `report.html` and the figure of a sweep; returns the path of the first.
+
+    `models` are outcomes of the same worlds on several models, (model, arm, world).
+    """
     intro = (
         f"{plan.worlds} worlds, seed {plan.setting.seed}, engine {plan.setting.engine}, "
         f"{1000 * plan.setting.physics.timestep:g} ms steps; every arm meets the same worlds. "
@@ -29,6 +34,13 @@ def write_report(folder: Path, plan: Plan, results: xr.Dataset) -> Path:
         failures += f" {lost} trials lost contacts for want of room: they are not to be trusted."
     hard = "Worlds in which most arms fail, and most distance is left."
     sections = [Section("Success", failures, rates)]
+    if models is not None:
+        text = (
+            "The same worlds on other grounds, cones and steps that can be defended. A rate's "
+            "interval says what other worlds would have given; its range over the models says "
+            "what another simulation would have."
+        )
+        sections.append(Section("Models", text, tables.models_table(models)))
     if len(plan.arms) > 1:
         sections.append(
             Section("Differences, world by world", "", tables.difference_table(results))

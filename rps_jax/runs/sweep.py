@@ -93,15 +93,20 @@ def sweep(
     plan.check_here()
     shape = {"slots": slots, "workers": workers, "report": report}
     if out is None:
-        contents: dict[int, bytes] = {}
-        every: dict[Kind, list[int]] = {}
-        for number in plan.parts:
-            every.setdefault(plan.kind(number), []).append(number)
-        work(plan, every, contents.__setitem__, **shape)
-        return labelled(dataset(plan, contents))
+        return in_memory(plan, **shape)
     _, results = complete(Path(out), plan, **shape)
     assert results is not None
     return labelled(results)
+
+
+def in_memory(plan: Plan, **shape: Any) -> xr.Dataset:
+    """All results of a plan, run without a folder."""
+    contents: dict[int, bytes] = {}
+    every: dict[Kind, list[int]] = {}
+    for number in plan.parts:
+        every.setdefault(plan.kind(number), []).append(number)
+    work(plan, every, contents.__setitem__, **shape)
+    return labelled(dataset(plan, contents))
 
 
 def run_missing(

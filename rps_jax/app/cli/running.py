@@ -117,7 +117,11 @@ def tell(timing: Timing, device: str | None = None) -> None:
 
 
 def tell_sweep(
-    out: Path, plan: Plan, results: Dataset | None, timing: Timing | None = None
+    out: Path,
+    plan: Plan,
+    results: Dataset | None,
+    timing: Timing | None = None,
+    models: Dataset | None = None,
 ) -> None:
     """Print where the time of a sweep went, if it ran; then write and print its report."""
     from rps_jax.record import provenance
@@ -128,5 +132,5 @@ def tell_sweep(
     if results is None:
         print(f"run folder: {out}; when all shards are done: rps merge {out} --out {out}")
     else:
-        print(write_report(out, plan, results).read_text())
+        print(write_report(out, plan, results, models).read_text())
         print(f"run folder: {out}")

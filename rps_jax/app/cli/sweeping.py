@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -16,6 +16,8 @@ from rps_jax.app.cli.replicating import show
 from rps_jax.errors import InputError
 
 if TYPE_CHECKING:
+    from xarray import Dataset
+
     from rps_jax.runs.plan import Plan
     from rps_jax.trials.setting import Timing
 
@@ -60,6 +62,9 @@ class Sweep(Spread):
     ray: str | None = None
     """Run on the workers of a Ray cluster: auto, its HOST:PORT, or local (all of this host). Each
     worker claims a GPU, or else as many processors as --workers, one by default."""
+    models: bool = False
+    """Whether to run the same worlds on other grounds, cones and steps, too, and to report how
+    much the rates hang on these."""
     out: Path = Path("runs/sweep")
     """Run folder; a run that was killed is continued there."""
 
@@ -89,10 +94,25 @@ class Sweep(Spread):
             running.choose_device(self.device)
             plan.check_here()
             by = sweep.run_missing
+        if self.models and (self.ray or shard.of > 1):
+            raise InputError("models is not allowed with ray or a shard: run it in one process.")
         running.use_cache()
         with progress_bar(plan.trials_of(shard), "sweep") as report:
             timing, results = sweep.complete(self.out, plan, shard, by=by, report=report, **shape)
-        running.tell_sweep(self.out, plan, results, timing)
+        models = _on_models(self.out, plan, shape) if self.models else None
+        running.tell_sweep(self.out, plan, results, timing, models)
+
+
+def _on_models(out: Path, plan: Plan, shape: dict[str, Any]) -> Dataset:
+    """The same worlds on every model, as `models.nc` beside the results."""
+    from rps_jax.record import files
+    from rps_jax.studies import models
+    from rps_jax.trials.setting import progress_bar
+
+    with progress_bar(plan.trials * len(models.plans(plan)), "models") as report:
+        found = models.complete(plan, out, report=report, **shape)
+    files.write_results(out / "models.nc", found)
+    return found
 
 
 def _on_cluster(address: str, device: str) -> Callable[..., Timing]:

@@ -1,0 +1,130 @@
+"""How much does a success rate hang on the model? The same worlds on every physics that can be
+defended: grounds, cones and steps between which measurements have not decided.
+
+A rate has two errors. Its statistical interval says what other worlds would have given; the spread
+over models says what another simulation would have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from rps_jax.control.strategies import Params
+from rps_jax.engines import EngineName
+from rps_jax.robot.robot import Robot
+from rps_jax.runs import sweep as sweeps
+from rps_jax.runs.plan import Plan
+from rps_jax.runs.results import labelled
+from rps_jax.trials.setting import Progress, Report, Setting, unheard
+from rps_jax.trials.trial import Rules
+from rps_jax.world.domain import Domain, named
+from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
+
+_HALVED = replace(preset(), timestep=0.005)
+# Fine enough for MuJoCo's own ground, on which sliding objects hop.
+_FINE = replace(preset(), timestep=0.002, **MUJOCOS_GROUND)
+# What can be defended, beside the physics that a sweep was asked for.
+MODELS: dict[str, Physics] = {
+    "this ground, 10 ms": preset(),
+    "this ground, 5 ms": _HALVED,
+    "MuJoCo's ground, 5 ms": replace(_HALVED, **MUJOCOS_GROUND),
+    "MuJoCo's ground, 2 ms": _FINE,
+    "MuJoCo's ground, impratio 1, 2 ms": replace(_FINE, impratio=1.0),
+    "friction pyramid, 1 ms": preset("paper_gazebo"),
+}
+
+
+def plans(plan: Plan) -> dict[str, Plan]:
+    """A sweep on every model, its own first; the worlds and the engine are the same."""
+    own = {"as asked": plan}
+    others = {
+        name: replace(plan, setting=replace(plan.setting, physics=physics))
+        for name, physics in MODELS.items()
+        if physics != plan.setting.physics
+    }
+    return own | others
+
+
+def folder_of(out: Path, model: str) -> Path:
+    """Where in a run folder the sweep on a model is kept."""
+    name = "".join(letter if letter.isalnum() else "_" for letter in model)
+    return out / "models" / name
+
+
+def models(
+    domain: Domain | str,
+    arms: Mapping[str, Params],
+    worlds: int = 1000,
+    seed: int = 0,
+    engine: EngineName = "fused",
+    out: str | Path | None = None,
+    *,
+    rules: Rules = Rules(),
+    robot: Robot | str | None = None,
+    report: Report = unheard,
+    **shape: Any,
+) -> xr.Dataset:
+    """Every arm in the same random worlds, on every model.
+
+    Args:
+      domain: ranges of what differs between worlds, or their name in `DOMAINS`.
+      arms: names and parameters of any strategies.
+      worlds: how many, of indices 0, 1, ...
+      seed: of the worlds.
+      engine: what steps them.
+      out: run folder, in which a run that was killed is continued; None keeps all in memory.
+      rules: when a trial ends.
+      robot: by its name in `ROBOTS`, or a JSON file's; None: the domain's.
+      report: called after every segment of the run.
+      shape: `slots` and `workers` of `sweep`.
+
+    Returns:
+      Outcomes (model, arm, world), and what was drawn (world) as coordinates.
+
+    Raises:
+      InputError: an argument is not allowed, or `out` holds another run.
+
+    Example:
+      >>> import rps_jax
+      >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=1.0)
+      >>> arms = {"rps": rps_jax.RPSParams.paper()}
+      >>> found = rps_jax.models(drums, arms, worlds=2, rules=rules)
+      >>> found.sizes["model"]
+      6
+    """
+    setting = Setting(preset(), rules, seed, engine)
+    plan = Plan(named(domain, robot), worlds, arms, setting)
+    plan.check_here()
+    return complete(plan, None if out is None else Path(out), report=report, **shape)
+
+
+def complete(plan: Plan, out: Path | None, *, report: Report = unheard, **shape: Any) -> xr.Dataset:
+    """What a run folder lacks of a sweep on every model, and the whole as (model, arm, world).
+
+    The sweep as it was asked for stands in the folder itself, the others in folders of their own
+    in it.
+    """
+    found, ended, simulated = {}, 0, 0.0
+    for name, one in plans(plan).items():
+
+        def heard(progress: Progress, ended: int = ended, simulated: float = simulated) -> None:
+            nonlocal last
+            last = progress
+            report(Progress(ended + progress.finished, simulated + progress.simulated))
+
+        last, options = Progress(0, 0.0), {"report": heard, **shape}
+        if out is None:
+            found[name] = sweeps.in_memory(one, **options)
+        else:
+            folder = out if one is plan else folder_of(out, name)
+            _, results = sweeps.complete(folder, one, **options)
+            assert results is not None
+            found[name] = labelled(results)
+        ended, simulated = ended + one.trials, simulated + last.simulated
+    joined = xr.concat(found.values(), "model", coords="minimal", compat="override")
+    return joined.assign_coords(model=list(found))
