@@ -34,12 +34,12 @@ if TYPE_CHECKING:
     from rps_jax.robot.skin import IdealSkin as IdealSkin
     from rps_jax.robot.skin import SmoothSkin as SmoothSkin
     from rps_jax.runs.evaluate import evaluate as evaluate
+    from rps_jax.runs.models import models as models
     from rps_jax.runs.push import Push as Push
     from rps_jax.runs.push import push as push
     from rps_jax.runs.push import replay as replay
     from rps_jax.runs.results import load as load
     from rps_jax.runs.sweep import sweep as sweep
-    from rps_jax.studies.models import models as models
     from rps_jax.studies.table import table as table
     from rps_jax.trials.conditions import Conditions as Conditions
     from rps_jax.trials.env import PushEnv as PushEnv
@@ -78,7 +78,7 @@ _HOMES = {
     "runs.push": ("Push", "push", "replay"),
     "runs.results": ("load",),
     "runs.sweep": ("sweep",),
-    "studies.models": ("models",),
+    "runs.models": ("models",),
     "studies.table": ("table",),
     "trials.conditions": ("Conditions",),
     "trials.env": ("PushEnv",),

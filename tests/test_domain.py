@@ -21,7 +21,7 @@ from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.worlds import domain_randomize, drawn_worlds
-from rps_jax.world import domain, paper, scene
+from rps_jax.world import domain, draws, paper, scene
 from rps_jax.world.domain import DOMAINS, RANDOM, Domain, Range
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.physics import preset
@@ -32,7 +32,7 @@ COUNT = 12
 
 
 def drawn(name, count=COUNT, seed=3, **changes):
-    return domain.draw(replace(WIDE, objects=(name,), **changes), seed, np.arange(count))
+    return draws.draw(replace(WIDE, objects=(name,), **changes), seed, np.arange(count))
 
 
 def same(a, b):
@@ -42,11 +42,11 @@ def same(a, b):
 
 def test_a_world_is_the_same_alone_as_among_others():
     """And whatever the order in which worlds are asked for."""
-    many = domain.draw(WIDE, 7, np.arange(1, 3000, 3))
+    many = draws.draw(WIDE, 7, np.arange(1, 3000, 3))
     for i in (0, 17, 999):
-        alone = domain.draw(WIDE, 7, [1 + 3 * i])
+        alone = draws.draw(WIDE, 7, [1 + 3 * i])
         same(alone, jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], many))
-    backwards = domain.draw(WIDE, 7, np.arange(1, 3000, 3)[::-1])
+    backwards = draws.draw(WIDE, 7, np.arange(1, 3000, 3)[::-1])
     same(jax.tree.map(lambda leaf: leaf[::-1], backwards), many)
 
 
@@ -66,7 +66,7 @@ def test_a_change_of_one_range_leaves_all_else_as_it_was():
 def test_everything_lies_in_its_range_and_fills_it(name):
     chosen = DOMAINS[name]
     index = np.arange(0, 600 * len(chosen.objects), len(chosen.objects))
-    columns = domain.table(domain.draw(chosen, 0, index))
+    columns = draws.table(draws.draw(chosen, 0, index))
     for quantity in set(columns) & set(domain.RANGES):
         values = columns[quantity][0]
         low, high, log = getattr(chosen, quantity)
@@ -83,7 +83,7 @@ def test_objects_take_turns():
     assert objects.tolist() == [0, 1, 2] * 3
     assert [WIDE.family_of(i) for i in range(3)] == ["box", "cylinder", "prism"]
     with pytest.raises(ValueError, match="several objects"):
-        domain.draw(WIDE, 0, [0, 1])
+        draws.draw(WIDE, 0, [0, 1])
 
 
 @pytest.mark.parametrize("engine", ["fused", "mjx"])
@@ -92,7 +92,7 @@ def test_the_paper_domain_is_the_papers_grid(engine):
     assert chosen.combinations == 144
     for which, name in enumerate(PAPER_OBJECTS):
         index = np.flatnonzero(chosen.object_of(np.arange(144)) == which)
-        part = drawn_worlds(chosen, domain.draw(chosen, 0, index), paper.PARAMS["rps"], setting)
+        part = drawn_worlds(chosen, draws.draw(chosen, 0, index), paper.PARAMS["rps"], setting)
         cases = [Case(name, f, t) for f in FRICTION.values() for t in paper.TARGETS]
         _, worlds = pushes.build(cases, setting)
         mine, theirs = (w._replace(key=0, odometry=0) for w in (part.worlds, worlds))
@@ -219,7 +219,7 @@ def test_a_square_prism_has_a_boxs_mass_properties():
 
 def test_a_load_moves_the_centre_of_mass_by_the_share_that_is_asked_for():
     worlds = drawn("random_prism", 50, com_offset=Range(0.3, 0.3))
-    np.testing.assert_allclose(domain.table(worlds)["com_offset"][0], 0.3)
+    np.testing.assert_allclose(draws.table(worlds)["com_offset"][0], 0.3)
 
 
 def test_domain_randomize_gives_models_for_a_loop_of_ones_own():
@@ -276,5 +276,5 @@ def test_what_a_domain_does_not_draw_is_known_and_not_told_as_drawn():
     assert not {"gap", "yaw", "pose_noise"} & DOMAINS["paper"].idle
     ideal = dataclasses.replace(DOMAINS["wide"], objects=("random_box",), skin="ideal")
     assert ideal.idle == {"noise", "gain_spread", "dead_share"}
-    table = domain.table(domain.draw(ideal, 0, np.arange(9)))
+    table = draws.table(draws.draw(ideal, 0, np.arange(9)))
     assert {name for name, (values, _) in table.items() if not values.any()} == ideal.idle

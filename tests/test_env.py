@@ -16,7 +16,7 @@ from rps_jax.trials.env import PushEnv, Reward
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.trials.worlds import drawn_worlds
-from rps_jax.world import domain
+from rps_jax.world import domain, draws
 from rps_jax.world.domain import DOMAINS, Range
 from rps_jax.world.physics import preset
 
@@ -116,7 +116,7 @@ def test_a_key_decides_on_world_and_noise(pushing):
 def test_worlds_are_those_of_the_domain(pushing):
     state = pushing.start
     index = np.asarray(state.info["index"])
-    drawn = domain.draw(replace(NEAR, objects=("random_cylinder",)), 0, index)
+    drawn = draws.draw(replace(NEAR, objects=("random_cylinder",)), 0, index)
     np.testing.assert_allclose(state.info["world"].footprint.radius, drawn.solid.radius, rtol=1e-6)
     np.testing.assert_allclose(state.obs[:, 42:], drawn.p_world_target, rtol=1e-6)
     np.testing.assert_allclose(state.data.qpos[:, 4], drawn.lateral, rtol=1e-6)
@@ -201,7 +201,7 @@ def test_it_moves_as_a_trial_that_is_driven_by_the_same_twist(pushing):
     trials = trial.start_all(worlds, np.ones(mine.done.size, bool), strategy=dull)
     options = {"physics": FAST, "rules": push.setting.rules, "strategy": dull}
     alone = replace(NEAR, objects=(push.object,))
-    drawn = domain.draw(alone, 0, np.arange(1))
+    drawn = draws.draw(alone, 0, np.arange(1))
     stage = drawn_worlds(alone, drawn, push.params, push.setting).stage
     theirs = trial.advance(stage, worlds, trials, **options, steps=STEPS)
     np.testing.assert_array_equal(mine.data.steps, STEPS)

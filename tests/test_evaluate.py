@@ -18,7 +18,7 @@ from rps_jax.runs.objective import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning.space import Space
-from rps_jax.world import domain
+from rps_jax.world import draws
 from rps_jax.world.domain import DOMAINS, Range
 
 CYLINDERS = replace(DOMAINS["wide"], objects=("random_cylinder",))
@@ -43,7 +43,7 @@ class TestEvaluate:
         assert dict(found.sizes) == {"candidate": 2, "world": 3, "pose": 3}
         assert found.object.values.tolist() == ["random_cylinder", "cylinder", "random_cylinder"]
         for index in range(3):
-            drawn = domain.table(domain.draw(both, seed_of(4, "test"), [index]))
+            drawn = draws.table(draws.draw(both, seed_of(4, "test"), [index]))
             for name, ((value,), unit) in drawn.items():
                 assert found[name].values[index] == value
                 assert found[name].attrs["units"] == unit

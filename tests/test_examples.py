@@ -25,7 +25,7 @@ from rps_jax.trials.pushes import Case
 from rps_jax.trials.results import title_of
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.worlds import drawn_worlds
-from rps_jax.world import domain, objects, scene
+from rps_jax.world import draws, objects, scene
 from rps_jax.world.domain import Domain, Range
 from rps_jax.world.scene import FRICTION, Friction
 
@@ -109,7 +109,7 @@ def test_an_object_of_ones_own_may_be_of_a_domain(hexagon):
     """Its mass and outline are those of all worlds, and a replay has its looks."""
     assert title_of(Case("hexagon", FRICTION["S1"], (2.0, 0.0))).startswith("hexagon, ")
     own = Domain(objects=("hexagon",), friction_robot=Range(0.4, 0.5))
-    drawn = domain.draw(own, 0, np.arange(5))
+    drawn = draws.draw(own, 0, np.arange(5))
     assert (drawn.solid.mass == 12.0).all()
     part = drawn_worlds(own, drawn, RPSParams.paper(), Setting(engine="fused"))
     assert part.worlds.footprint.vertices.shape == (5, 8, 2)

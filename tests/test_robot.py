@@ -19,7 +19,7 @@ from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
-from rps_jax.world import domain, scene
+from rps_jax.world import domain, draws, scene
 from rps_jax.world.domain import DOMAINS
 from rps_jax.world.physics import preset
 from rps_jax.world.scene import FRICTION, JOINTS
@@ -163,7 +163,7 @@ def test_a_strong_base_is_as_good_as_a_velocity_source():
 
 @pytest.mark.parametrize("engine", ["fused", "mjx"])
 def test_worlds_by_template_equal_recompiled_ones(engine):
-    drawn = domain.draw(replace(DOMAINS["real"], objects=("random_box",)), 3, np.arange(3))
+    drawn = draws.draw(replace(DOMAINS["real"], objects=("random_box",)), 3, np.arange(3))
     args = ("box", drawn.solid, drawn.friction, STANDARD)
     heavy = replace(drawn.robot, mass=np.array([60.0, 130.0, 200.0]))
     _, fields = engines.get(engine).stage_of_solids(*args, heavy)
@@ -190,7 +190,7 @@ def test_a_trial_whose_base_stalls_says_so():
 
 def test_random_robots_are_drawn_last_and_change_no_other_number():
     index = np.arange(0, 30, 3)
-    wide, real = (domain.draw(DOMAINS[name], 5, index) for name in ("wide", "real"))
+    wide, real = (draws.draw(DOMAINS[name], 5, index) for name in ("wide", "real"))
     for name in wide._fields:
         if name != "robot":
             jax.tree.map(np.testing.assert_array_equal, getattr(wide, name), getattr(real, name))
@@ -198,10 +198,10 @@ def test_random_robots_are_drawn_last_and_change_no_other_number():
     assert real.robot.driven
     assert ((real.robot.force_max >= 150) & (real.robot.force_max <= 800)).all()
     assert real.robot.acceleration_max.shape == (10, 2)
-    columns = domain.table(real)
-    assert set(columns) - set(domain.table(wide)) == set(domain.OF_THE_ROBOT)
+    columns = draws.table(real)
+    assert set(columns) - set(draws.table(wide)) == set(domain.OF_THE_ROBOT)
     fixed = replace(DOMAINS["wide"], robot=ROBOTS["kairos"])
-    again = domain.draw(fixed, 5, index).robot
+    again = draws.draw(fixed, 5, index).robot
     np.testing.assert_array_equal(again.mass, 158.0)
     assert again.lag is None
 

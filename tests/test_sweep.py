@@ -48,7 +48,7 @@ from rps_jax.trials import batch, trial
 from rps_jax.trials.batch import Job
 from rps_jax.trials.trial import Rules
 from rps_jax.trials.worlds import drawn_worlds
-from rps_jax.world import domain
+from rps_jax.world import domain, draws
 from rps_jax.world.domain import Range
 
 
@@ -67,7 +67,7 @@ def outcomes(parts, setting=SHORT):
 
 def made(index):
     """Worlds of the domain of boxes."""
-    return drawn_worlds(BOXES, domain.draw(BOXES, 0, index), PAPER, SHORT)
+    return drawn_worlds(BOXES, draws.draw(BOXES, 0, index), PAPER, SHORT)
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def test_late_poses_and_late_commands_are_late_by_as_much(error):
     steps, period = 3, SHORT.physics.control_period
     still = replace(BOXES, **{name: Range(0, 0) for name in domain.OF_THE_BASE})
     late = replace(still, **{error: Range(steps * period, steps * period)})
-    part = drawn_worlds(late, domain.draw(late, 0, [0]), PAPER, SHORT)
+    part = drawn_worlds(late, draws.draw(late, 0, [0]), PAPER, SHORT)
     world = row(part.worlds, 0)
     now = jax.tree.map(jnp.asarray, trial.start(world))
     decide = jax.jit(partial(trial.decide, physics=SHORT.physics))
@@ -118,7 +118,7 @@ def test_a_base_that_errs_by_nothing_is_perfect():
     nothing = {name: Range(0, 0) for name in domain.OF_THE_BASE}
     perfect = replace(CYLINDERS, **nothing)
     assert made(np.arange(2)).worlds.odometry.past.shape[1] > 1
-    drawn = domain.draw(perfect, 0, np.arange(6))
+    drawn = draws.draw(perfect, 0, np.arange(6))
     part = drawn_worlds(perfect, drawn, PAPER, SHORT)
     assert part.worlds.odometry.past.shape == (6, 0)
     remembered = part.worlds._replace(
@@ -135,7 +135,7 @@ def test_flat_boxes_that_nothing_touches_stay_where_they_are():
     """Even in the long steps of `fast`, in which stiffer ground would shake them away."""
     flat = replace(BOXES, size=Range(0.25, 0.35), height=Range(0.3, 0.4), gap=Range(0.05, 0.05))
     still = PAPER._replace(v_approach=0.0)
-    part = drawn_worlds(flat, domain.draw(flat, 0, np.arange(SLOTS)), still, SHORT)
+    part = drawn_worlds(flat, draws.draw(flat, 0, np.arange(SLOTS)), still, SHORT)
     found = outcomes([part])
     pose = np.array([found[i].object_pose for i in range(SLOTS)])
     assert np.abs(pose[:, :2] - part.worlds.qpos[:, 3:5]).max() < 2e-3  # in 20 s
@@ -149,7 +149,7 @@ def test_a_faster_base_arrives_earlier():
     times = []
     for error in (-0.5, 0.0):
         chosen = replace(quick, velocity_error=Range(error, error))
-        part = drawn_worlds(chosen, domain.draw(chosen, 0, [1]), PAPER, SHORT)
+        part = drawn_worlds(chosen, draws.draw(chosen, 0, [1]), PAPER, SHORT)
         times.append(outcomes([part])[1].base_pose[0])  # x at the end
     assert times[0] < 0.7 * times[1]
 
@@ -204,11 +204,11 @@ def test_results_hold_every_world_with_what_was_drawn(whole, tmp_path):
     merge([whole], tmp_path)
     results = files.read_results(tmp_path)
     assert dict(results.sizes) == {"arm": 2, "world": 20, "pose": 3, "object": 1}
-    columns = domain.table(domain.draw(BOXES, 0, np.arange(20)))
+    columns = draws.table(draws.draw(BOXES, 0, np.arange(20)))
     for name, (values, unit) in columns.items():
         np.testing.assert_allclose(results[name], values, rtol=1e-6)
         assert results[name].attrs["units"] == unit
-    assert set(statistics.DRAWN) == set(columns)
+    assert set(statistics.DRAWN) == {*columns, *domain.OF_THE_ROBOT}
     again = outcomes([made(np.arange(20))])
     for i, one in again.items():
         assert float(results.time.sel(arm="rps")[i]) == one.time

@@ -26,7 +26,7 @@ from rps_jax.trials import pushes
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.trials.worlds import drawn_worlds
-from rps_jax.world import domain, scene
+from rps_jax.world import domain, draws, scene
 from rps_jax.world.domain import DOMAINS
 from rps_jax.world.objects import FAMILIES
 from rps_jax.world.physics import Physics
@@ -152,7 +152,7 @@ def test_random_worlds_are_stepped_in_a_batch_as_each_is_alone(name, allowed):
     family = domain.RANDOM[name]
     count = sum(FAMILIES[s[0]] == family for s in STARTS)  # as in `pushed`: compiled once
     chosen = replace(DOMAINS["wide"], objects=(name,), gap=domain.Range(0, 0))
-    drawn = domain.draw(chosen, 3, range(count))
+    drawn = draws.draw(chosen, 3, range(count))
     part = drawn_worlds(chosen, drawn, RPSParams.paper(), SHORT)
     qpos = np.array(part.worlds.qpos)
     qpos[:, 3] -= 5e-4  # sunk, so that they touch

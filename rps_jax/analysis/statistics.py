@@ -98,7 +98,7 @@ def drawn(results: xr.Dataset) -> list[str]:
     def differs(values: np.ndarray) -> bool:
         return np.unique(values[np.isfinite(values)]).size > 1
 
-    return [name for name in DRAWN if differs(results[name].values)]
+    return [name for name in DRAWN if name in results and differs(results[name].values)]
 
 
 def cvar(values: np.ndarray, tail: float = _TAIL) -> float:

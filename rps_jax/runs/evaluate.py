@@ -27,7 +27,8 @@ from rps_jax.trials.results import UNITS
 from rps_jax.trials.setting import Report, Setting, Timing, unheard
 from rps_jax.trials.trial import Outcome, Rules
 from rps_jax.trials.worlds import drawn_worlds, remembered_steps
-from rps_jax.world.domain import Domain, draw, named, table
+from rps_jax.world.domain import Domain, named
+from rps_jax.world.draws import draw, table
 from rps_jax.world.physics import Fidelity, PhysicsName, preset
 
 Split = Literal["tune", "validate", "test"]

@@ -29,8 +29,9 @@ from rps_jax.trials.batch import Part
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.trials.worlds import drawn_scene, drawn_worlds
-from rps_jax.world import domain
-from rps_jax.world.domain import Domain, Draw
+from rps_jax.world import domain, draws
+from rps_jax.world.domain import Domain
+from rps_jax.world.draws import Draw
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import Scene
 
@@ -188,7 +189,7 @@ def share(plan: Plan, shard: Shard) -> dict[int, np.ndarray]:
 
 def draw(plan: Plan, index: Any) -> Draw:
     """What is drawn for worlds of one object, by their indices."""
-    return domain.draw(plan.domain, plan.setting.seed, index)
+    return draws.draw(plan.domain, plan.setting.seed, index)
 
 
 def scene_of(plan: Plan, index: int) -> Scene:
@@ -198,7 +199,7 @@ def scene_of(plan: Plan, index: int) -> Scene:
 
 def title_of(plan: Plan, index: int) -> str:
     """What one world is, in words."""
-    drawn = domain.table(draw(plan, [index]))
+    drawn = draws.table(draw(plan, [index]))
     name = plan.domain.objects[int(plan.domain.object_of(np.asarray(index)))].replace("_", " ")
     value = {key: float(values[0]) for key, (values, _) in drawn.items()}
     return (

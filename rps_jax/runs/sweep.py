@@ -35,7 +35,8 @@ from rps_jax.trials import batch
 from rps_jax.trials.batch import Job, Part
 from rps_jax.trials.setting import Progress, Setting, Timing
 from rps_jax.trials.trial import Rules
-from rps_jax.world.domain import Domain, named, table
+from rps_jax.world.domain import Domain, named
+from rps_jax.world.draws import table
 from rps_jax.world.physics import Fidelity, PhysicsName, preset
 
 

@@ -27,7 +27,7 @@ from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules, Trial, World
 from rps_jax.trials.worlds import drawn_worlds
-from rps_jax.world import domain, paper
+from rps_jax.world import draws, paper
 from rps_jax.world.domain import DOMAINS, Range
 from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
 from rps_jax.world.scene import FRICTION, JOINTS
@@ -83,7 +83,7 @@ class Speed:
 def _worlds(family: str, count: int, setting: Setting) -> tuple[Any, World]:
     """Stage and worlds (count, ...): the paper's targets under S1, a box, a cylinder or prisms."""
     if family == "prism":
-        drawn = domain.draw(_PRISMS, 0, np.arange(count))
+        drawn = draws.draw(_PRISMS, 0, np.arange(count))
         part = drawn_worlds(_PRISMS, drawn, RPSParams.paper(), setting)
         return part.stage, part.worlds
     targets = paper.TARGETS
@@ -259,7 +259,7 @@ def refilling(slots: int, rounds: int = 4) -> Refilling:
     def timed(groups: np.ndarray) -> tuple[float, float]:
         timings = []
         for group in groups:
-            drawn = domain.draw(boxes, 0, group)
+            drawn = draws.draw(boxes, 0, group)
             part = drawn_worlds(boxes, drawn, RPSParams.paper(), setting)
             job = Job(strategies.RPS, group.size, [part])
             timings.append(run([job], setting, slots=slots, collect=lambda *_: None))

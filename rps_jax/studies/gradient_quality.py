@@ -33,7 +33,7 @@ from rps_jax.tuning import gradients
 from rps_jax.tuning.descent import soften
 from rps_jax.tuning.gradients import Estimate
 from rps_jax.tuning.space import Space
-from rps_jax.world import domain
+from rps_jax.world import draws
 from rps_jax.world.domain import DOMAINS, RANDOM, Domain, Range
 
 TRUTH = "truth"
@@ -93,7 +93,7 @@ def _stage_and_worlds(study: Study, engine: EngineName, split: Split, count: int
     """What worlds share in their engine, the first worlds (count, ...) of a split, and physics."""
     alone = replace(study.domain, objects=(study.object,))
     setting = Setting(engine=engine)
-    drawn = domain.draw(alone, seed_of(study.seed, split), np.arange(count))
+    drawn = draws.draw(alone, seed_of(study.seed, split), np.arange(count))
     part = drawn_worlds(alone, drawn, RPSParams(), setting)
     return part.stage, part.worlds, setting.physics
 

@@ -35,8 +35,9 @@ from rps_jax.trials.batch import Part, rows
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Seen, Trial, World
 from rps_jax.trials.worlds import drawn_scene, drawn_worlds
-from rps_jax.world import domain, objects
-from rps_jax.world.domain import DOMAINS, Domain, Draw
+from rps_jax.world import domain, draws, objects
+from rps_jax.world.domain import DOMAINS, Domain
+from rps_jax.world.draws import Draw
 from rps_jax.world.scene import Scene
 
 
@@ -217,7 +218,7 @@ class PushEnv:
 
     @functools.cached_property
     def _drawn(self) -> Draw:
-        return domain.draw(self._alone, self.setting.seed, np.arange(self.worlds))
+        return draws.draw(self._alone, self.setting.seed, np.arange(self.worlds))
 
     @functools.cached_property
     def _part(self) -> Part:
@@ -226,7 +227,7 @@ class PushEnv:
         return part._replace(worlds=jax.tree.map(jnp.asarray, part.worlds))
 
     @functools.cached_property
-    def _drive(self) -> Callable[[Any, Motion, Twist, Robot | None], Driven]:
+    def _drive(self) -> Callable[..., Driven]:
         return one_of_many(self._part.stage, self.setting)
 
     def _scene(self, index: int) -> Scene:
@@ -284,12 +285,10 @@ def _metrics(now: Trial, seen: Seen, progress: jax.Array) -> dict[str, jax.Array
     return {"progress": progress} | {k: v.astype(progress.dtype) for k, v in flags.items()}
 
 
-def one_of_many(
-    stage: Stage, setting: Setting
-) -> Callable[[Any, Motion, Twist, Robot | None], Driven]:
+def one_of_many(stage: Stage, setting: Setting) -> Callable[..., Driven]:
     """Drives one world; under vmap the stage drives the whole batch, on a GPU as one kernel."""
 
-    def together(fields: Any, motion: Motion, twist: Twist, robot: Robot | None) -> Driven:
+    def together(fields: Any, motion: Motion, twist: Twist, robot: Robot | None = None) -> Driven:
         return stage.drive(fields, motion, twist, setting.physics, robot)
 
     @jax.custom_batching.custom_vmap

@@ -22,9 +22,9 @@ from rps_jax.robot.skin import CapacitiveSkin, IdealSkin, Skin
 from rps_jax.trials.batch import Part
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Shift, World
-from rps_jax.world import domain as domains
-from rps_jax.world import scene
-from rps_jax.world.domain import DOMAINS, OF_THE_BASE, PERFECT, RANDOM, Domain, Draw
+from rps_jax.world import draws, scene
+from rps_jax.world.domain import DOMAINS, OF_THE_BASE, PERFECT, RANDOM, Domain
+from rps_jax.world.draws import Draw
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction, Scene
 
@@ -47,10 +47,10 @@ def domain_randomize(
     (name,) = [name for name, of in RANDOM.items() if of == family]
     keys = np.asarray(rng, np.uint32).astype(object)
     numbers = np.stack(
-        [domains.numbers_of(int(a) << 32 | int(b), np.zeros(1, int))[0] for a, b in keys]
+        [draws.numbers_of(int(a) << 32 | int(b), np.zeros(1, int))[0] for a, b in keys]
     )
     alone = replace(domain, objects=(name,), frictions=(), targets=())
-    drawn = domains.drawn_at(alone, np.zeros(len(keys), int), numbers)
+    drawn = draws.drawn_at(alone, np.zeros(len(keys), int), numbers)
     _, own = engines.get("mjx").stage_of_solids(family, drawn.solid, drawn.friction, Physics())
     dtype = model.body_mass.dtype
     batched = apply(model, {k: jnp.asarray(v, dtype) for k, v in own.items()})

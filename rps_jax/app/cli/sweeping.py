@@ -106,7 +106,7 @@ class Sweep(Spread):
 def _on_models(out: Path, plan: Plan, shape: dict[str, Any]) -> Dataset:
     """The same worlds on every model, as `models.nc` beside the results."""
     from rps_jax.record import files
-    from rps_jax.studies import models
+    from rps_jax.runs import models
     from rps_jax.trials.setting import progress_bar
 
     with progress_bar(plan.trials * len(models.plans(plan)), "models") as report:

@@ -1,0 +1,196 @@
+"""What random worlds are: a draw from the ranges of a domain, addressed by (domain, seed, index).
+
+Whatever the batch, whatever the device, the same address gives the same world: the bits come from
+a counter-based generator, and everything after them is computed on the host in double precision.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rps_jax.geometry import solid
+from rps_jax.geometry.solid import SIDES, Solid
+from rps_jax.robot.robot import ARM, Robot
+from rps_jax.world import scene
+from rps_jax.world.domain import ALLOWED, OF_TAXELS, OF_THE_ROBOT, RANDOM, UNITS, Domain
+from rps_jax.world.scene import Friction
+
+_COLUMNS = 64  # random numbers of a world, more than are used, so that new ones change no old ones
+
+
+class Draw(NamedTuple):
+    """Worlds of one object or shape family, as drawn; leaves lead with their number, n."""
+
+    number: np.ndarray  # (n,) their indices
+    solid: Solid
+    friction: Friction  # (n,) each
+    lateral: np.ndarray  # (n,) [m]
+    yaw: np.ndarray  # (n,) [rad]
+    gap: np.ndarray  # (n,) [m]
+    p_world_target: np.ndarray  # (n, 2) [m]
+    noise: np.ndarray  # (n,) [1]
+    gain_spread: np.ndarray  # (n,) [1]
+    dead_share: np.ndarray  # (n,) [1]
+    pose_noise: np.ndarray  # (n,) [m]
+    yaw_noise: np.ndarray  # (n,) [rad]
+    pose_latency: np.ndarray  # (n,) [s]
+    command_delay: np.ndarray  # (n,) [s]
+    velocity_error: np.ndarray  # (n, 3) [1]
+    robot: Robot  # (n,) each
+    key: np.ndarray  # (n, 2) uint32, of all that is drawn while the world runs
+
+
+# Which random number of a world is what; a new quantity goes to the end.
+_USES = (
+    *("mass", "size", "aspect", "height", "com_offset", "com_bearing"),
+    *("friction_ground", "friction_robot", "lateral", "yaw", "gap", "distance", "bearing"),
+    *("noise", "gain_spread", "dead_share", "pose_noise", "yaw_noise", "pose_latency"),
+    *("command_delay", "v_x_error", "v_y_error", "omega_error", "key_0", "key_1", "sides", "turn"),
+    *(f"corner_{i}" for i in range(SIDES)),
+    *OF_THE_ROBOT,
+)
+
+
+def draw(domain: Domain, seed: int, index: ArrayLike) -> Draw:
+    """The worlds `index` (n,), all of one object of the domain.
+
+    Raises:
+      ValueError: they are of several objects.
+    """
+    index = np.asarray(index, np.int64)
+    which = domain.object_of(index)
+    if (which != which[0]).any():
+        raise ValueError("worlds of several objects cannot be batched")
+    return drawn_at(domain, index, numbers_of(seed, index))
+
+
+def drawn_at(domain: Domain, index: np.ndarray, numbers: np.ndarray) -> Draw:
+    """Worlds of the same object, from their random numbers (n, _COLUMNS)."""
+    u = dict(zip(_USES, numbers.T, strict=False))
+    name = domain.objects[int(domain.object_of(index[0]))]
+    ranges = {name: getattr(domain, name) for name in ALLOWED if name in u}
+    at = {name: one.at(u[name]) for name, one in ranges.items() if one is not None}
+    if domain.skin == "ideal":
+        at |= {name: np.zeros(index.size) for name in OF_TAXELS}
+    error = [
+        domain.velocity_error.at(u[name]) for name in ("v_x_error", "v_y_error", "omega_error")
+    ]
+    key = [np.floor(u[name] * 2**32).astype(np.uint32) for name in ("key_0", "key_1")]
+    return Draw(
+        number=index,
+        solid=_solid(name, at, u),
+        friction=_friction(domain, index, at),
+        p_world_target=_targets(domain, index, at),
+        velocity_error=np.stack(error, axis=-1),
+        robot=_robots(domain.robot, at, index.size),
+        key=np.stack(key, axis=-1),
+        **{name: at[name] for name in Draw._fields if name in at},
+    )
+
+
+def numbers_of(seed: int, index: np.ndarray) -> np.ndarray:
+    """Random numbers (n, _COLUMNS) in [0, 1): those of each index, however it is asked for."""
+    rows = np.empty((index.size, _COLUMNS))
+    order = np.argsort(index)
+    far = np.flatnonzero(np.diff(index[order]) > 100) + 1
+    for near in np.split(order, far):
+        first, last = int(index[near[0]]), int(index[near[-1]])
+        # Philox counts in steps of four numbers.
+        bits = np.random.Philox(key=seed).advance(first * _COLUMNS // 4)
+        block = np.random.Generator(bits).random((last - first + 1, _COLUMNS))
+        rows[near] = block[index[near] - first]
+    return rows
+
+
+def _solid(name: str, at: dict[str, np.ndarray], u: dict[str, np.ndarray]) -> Solid:
+    """The objects called `name`: a scene's, or random ones."""
+    count = u["mass"].size
+    if name not in RANDOM:
+        one = scene.solid_of(scene.load(name))
+        return Solid(*(np.repeat(leaf, count, axis=0) for leaf in one))
+    depth, breadth = at["size"] / np.sqrt(at["aspect"]), at["size"] * np.sqrt(at["aspect"])
+    radius = np.zeros(count)
+    if name == "random_cylinder":
+        vertices, radius = np.zeros((count, 1, 2)), at["size"]
+    elif name == "random_box":
+        vertices = solid.rectangles(depth, breadth)
+    else:
+        vertices = _polygons(depth, breadth, u)
+    return solid.build(
+        vertices, radius, at["height"], at["mass"], at["com_offset"], 2 * np.pi * u["com_bearing"]
+    )
+
+
+def _polygons(depth: np.ndarray, breadth: np.ndarray, u: dict[str, np.ndarray]) -> np.ndarray:
+    """Convex polygons (n, SIDES, 2) of 3 to SIDES corners on ellipses of these half axes."""
+    sides = 3 + np.floor((SIDES - 2) * u["sides"]).astype(int)[:, None]
+    corner = np.minimum(np.arange(SIDES), sides - 1)  # the last one repeated
+    jitter = np.stack([u[f"corner_{i}"] for i in range(SIDES)], axis=-1) - 0.5
+    jitter = np.take_along_axis(jitter, corner, axis=1)
+    angle = 2 * np.pi * (u["turn"][:, None] + (corner + 0.5 * jitter) / sides)
+    half = np.stack([depth, breadth], axis=-1)[:, None, :]
+    return solid.centred(half * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+
+
+def _robots(robot: Robot, at: dict[str, np.ndarray], count: int) -> Robot:
+    """The robots (count,) of worlds, with what was drawn of them."""
+    own = {name: at[drawn] for drawn, name in OF_THE_ROBOT.items() if drawn in at}
+    if (linear := own.get("acceleration_max")) is not None:
+        own["acceleration_max"] = np.stack([linear, linear / ARM], axis=-1)
+    robot = replace(robot, **dict.fromkeys(own))  # the numbers of the others alone
+    full = {
+        f.name: np.repeat(np.asarray(value, float)[None], count, axis=0)
+        for f in fields(robot)
+        if (value := getattr(robot, f.name)) is not None
+    }
+    return replace(robot, **full, **own)
+
+
+def _friction(domain: Domain, index: np.ndarray, at: dict[str, np.ndarray]) -> Friction:
+    if not domain.frictions:
+        return Friction(at["friction_ground"], at["friction_robot"])
+    which = index // max(1, len(domain.targets)) % len(domain.frictions)
+    return Friction(*np.array(domain.frictions)[which].T)
+
+
+def _targets(domain: Domain, index: np.ndarray, at: dict[str, np.ndarray]) -> np.ndarray:
+    if domain.targets:
+        return np.array(domain.targets)[index % len(domain.targets)]
+    along = np.stack([np.cos(at["bearing"]), np.sin(at["bearing"])], axis=-1)
+    return at["distance"][:, None] * along
+
+
+def table(drawn: Draw) -> dict[str, tuple[np.ndarray, str]]:
+    """What was drawn, one column (n,) and its unit a quantity."""
+    shape = drawn.solid
+    away = np.linalg.norm(shape.p_object_com, axis=1)
+    toward = shape.p_object_com[:, :2] / np.maximum(away, 1e-12)[:, None]
+    x, y = drawn.p_world_target.T
+    errors_ = zip(("v_x_error", "v_y_error", "omega_error"), drawn.velocity_error.T, strict=True)
+    return {
+        "mass": (shape.mass, "kg"),
+        "size": (np.sqrt(solid.area(shape)) / 2, "m"),
+        "height": (shape.height, "m"),
+        "corners": (solid.corners(shape), "1"),
+        "com_offset": (away / solid.reach(shape.vertices, shape.radius, toward), "1"),
+        "friction_ground": (drawn.friction.ground, "1"),
+        "friction_robot": (drawn.friction.robot, "1"),
+        "distance": (np.hypot(x, y), "m"),
+        "bearing": (np.arctan2(y, x), "rad"),
+        **{name: (getattr(drawn, name), unit) for name, unit in UNITS.items()},
+        **{name: (values, "1") for name, values in errors_},
+        **_limits(drawn.robot),
+    }
+
+
+def _limits(robots: Robot) -> dict[str, tuple[np.ndarray, str]]:
+    """Limits of robots (n,) that differ between worlds, or any number at all of one world."""
+    found = {}
+    for name, limit in OF_THE_ROBOT.items():
+        if (values := getattr(robots, limit)) is not None:
+            found[name] = (values.reshape(len(values), -1)[:, 0], ALLOWED[name][2])
+    return found
