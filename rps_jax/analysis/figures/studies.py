@@ -235,16 +235,18 @@ def grounds(results: xr.Dataset, names: Collection[str], path: Path) -> Path:
                 ax.plot(100 * at.height, 1000 * at.lateral, mfc="none", **style)
         ax.set(title=words(thing), xlabel="height of the push [cm]")
         ax.grid(alpha=0.3)
-    above[0].set_ylabel("place along the base's front at the end [mm]")
+    above[0].set_ylabel("end, along the base's front [mm]")
     panels = {
-        "error": "distance from the rigid object [mm]",
-        "spread": "spread of the push force over its mean [%]",
+        "error": "from the rigid object's end [mm]",
+        "spread": "spread of the push force [%]",
         "hop": "largest hop [mm]",
     }
     for ax, (field, label) in zip(below, panels.items(), strict=True):
         for i, name in enumerate(chosen):
             one, over = results[field].sel(ground=name), ("object", "offset")
-            value = one.max(over) if field == "hop" else np.sqrt((one**2).mean(over))
+            value = one.max(over) if field == "hop" else one.mean(over)
+            if field == "error":
+                value = np.sqrt((one**2).mean(over))
             factor = 100 if field == "spread" else 1000
             what = str(results.what.sel(ground=name).values)
             ax.plot(100 * speeds, factor * value, "o-", ms=4, color=f"C{i}", label=what)

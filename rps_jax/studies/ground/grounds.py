@@ -43,10 +43,10 @@ _C = preset(fidelity="reference")
 _OWN = replace(_C, **MUJOCOS_GROUND)
 # In C MuJoCo, converged, in steps of 1 ms.
 CONVERGED = {
-    "ours": _on(_C, "ours", (0.002, *SPEEDS)),
-    "mujocos": _on(_OWN, "MuJoCo's own", (0.002, *SPEEDS)),
+    "ours": _on(_C, "ours, 1 ms", (0.002, *SPEEDS)),
+    "mujocos": _on(_OWN, "MuJoCo's own, 1 ms", (0.002, *SPEEDS)),
     "stiff": _on(
-        _C, "stiff: 4 ms, critically damped", ground_solref=(0.004, 1.0), ground_impedance=0.95
+        _C, "time constant 4 ms, impedance 0.95", ground_solref=(0.004, 1.0), ground_impedance=0.95
     ),
     "impratio_1": _on(_C, "ours, impratio 1", impratio=1.0),
     "impratio_100": _on(_C, "ours, impratio 100", impratio=100.0),
@@ -58,31 +58,37 @@ CONVERGED = {
 # As others step it: ever larger steps.
 STEPPED = {
     "ours_5ms": _on(_C, "ours, 5 ms", timestep=0.005),
-    "standard": _on(preset(), "ours, `standard` (10 ms, 8/10)"),
-    "fast": _on(preset(fidelity="fast"), "ours, `fast` (20 ms, 6/8, impedance 0.5)"),
+    "standard": _on(preset(), "ours, standard: 10 ms"),
+    "fast": _on(preset(fidelity="fast"), "ours, fast: 20 ms, impedance 0.5"),
     "mujocos_5ms": _on(_OWN, "MuJoCo's own, 5 ms", timestep=0.005),
     "mujocos_10ms": _on(_OWN, "MuJoCo's own, 10 ms", timestep=0.01),
 }
 # Ever stiffer: first with damping that grows along, then with hops that last as long as ours.
 STIFFER = {
-    "critical_10": _on(_OWN, "10 ms, critical", timestep=5e-4, ground_solref=(0.01, 1.0)),
-    "critical_5": _on(_OWN, "5 ms, critical", timestep=2.5e-4, ground_solref=(0.005, 1.0)),
-    "critical_2": _on(_OWN, "2 ms, critical", timestep=1e-4, ground_solref=(0.002, 1.0)),
-    "damping_01": _on(_C, "ours, 9 times as stiff", timestep=5e-4, ground_solref=(0.1, 0.1)),
-    "damping_003": _on(_C, "ours, 100 times as stiff", timestep=1e-4, ground_solref=(0.1, 0.03)),
+    "critical_10": _on(
+        _OWN, "MuJoCo's own, time constant 10 ms", timestep=5e-4, ground_solref=(0.01, 1.0)
+    ),
+    "critical_5": _on(
+        _OWN, "MuJoCo's own, time constant 5 ms", timestep=2.5e-4, ground_solref=(0.005, 1.0)
+    ),
+    "critical_2": _on(
+        _OWN, "MuJoCo's own, time constant 2 ms", timestep=1e-4, ground_solref=(0.002, 1.0)
+    ),
+    "damping_01": _on(
+        _C, "ours, damping ratio 0.1: 9 times as stiff", timestep=5e-4, ground_solref=(0.1, 0.1)
+    ),
+    "damping_003": _on(
+        _C, "ours, damping ratio 0.03: 100 times as stiff", timestep=1e-4, ground_solref=(0.1, 0.03)
+    ),
 }
-# Ever less lifted: the cones lift what slides less, the more slowly a hop decays and the lower the
-# impedance is.
+# Lifted less by MuJoCo's cones: the lower the impedance, the deeper an object rests.
+_LOW = {"ground_solref": (0.1, 0.2), "ground_impedance": 0.3}
 LOWER = {
-    "lower": _on(_C, "lower impedance", ground_solref=(0.1, 0.2), ground_impedance=0.3),
-    "lower_10ms": _on(
-        preset(), "lower impedance, 10 ms", ground_solref=(0.1, 0.2), ground_impedance=0.3
+    "lower": _on(_C, "(0.1 s, 0.2), impedance 0.3", **_LOW),
+    "lower_10ms": _on(preset(), "(0.1 s, 0.2), impedance 0.3, 10 ms", **_LOW),
+    "lower_20ms": _on(
+        preset(fidelity="fast"), "(0.1 s, 0.4), impedance 0.5, 20 ms", ground_solref=(0.1, 0.4)
     ),
-    "slower": _on(_C, "slower hops", ground_solref=(0.2, 0.2), ground_impedance=0.5),
-    "slower_10ms": _on(
-        preset(), "slower hops, 10 ms", ground_solref=(0.2, 0.2), ground_impedance=0.5
-    ),
-    "slower_20ms": _on(preset(fidelity="fast"), "slower hops, 20 ms", ground_solref=(0.2, 0.2)),
 }
 GROUNDS = CONVERGED | STEPPED | STIFFER | LOWER
 QUICK = ("ours", "mujocos", "standard")
