@@ -153,6 +153,17 @@ def test_pushes_mirror_balance_and_converge():
     assert np.abs(coarse.pose[-1] - softer.pose[-1])[:, :2].max() < 5e-4
 
 
+def test_a_steady_lift_of_what_slides_hardly_moves_the_end():
+    """Of four points it moves load between two diagonals alone, and of three none at all."""
+    for name, apart in (("box", 1e-3), ("cylinder", 1e-9)):
+        thing = pushes.things()[name]
+        ends = [
+            pushes.in_the_limit(thing, [0.08], 0.06, steps=60, rounding=Rounding(lift=lift)).lateral
+            for lift in (0.0, 1.2)
+        ]
+        assert abs(ends[0] - ends[1])[0] < apart
+
+
 def test_a_box_touches_with_its_corners_and_at_the_ends_of_the_front():
     box = blocks(0.2, 0.2)
     flush = rigid.contacts(box, np.array([[0.21, 0.0, 0.0]]))
