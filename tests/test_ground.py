@@ -147,6 +147,7 @@ def test_pushes_mirror_balance_and_converge():
     coarse, fine = (rigid.push(what, pose, 0.2, steps) for steps in (50, 100))
     np.testing.assert_allclose(fine.pose[:, 0] * [1, -1, -1], fine.pose[:, 1], atol=1e-6)
     np.testing.assert_allclose(fine.pose[:, 2] * [1, -1, -1], fine.pose[:, 3], atol=1e-6)
+    assert max(coarse.rounds, fine.rounds) < rigid.ROUNDS
     assert np.abs(coarse.pose[-1] - fine.pose[-1])[:, :2].max() < 5e-4
     np.testing.assert_allclose(fine.force[5:, :, 0], fine.power[5:], atol=2e-3)
     softer = rigid.push(what, pose, 0.2, 50, rounding=Rounding(slip=1e-3, depth=1e-5))

@@ -32,7 +32,7 @@ _FAR = 1.0  # [m] gap of a contact that cannot be
 _FACING = 0.5  # cosine of the angle to the base within which its corners may touch a side
 _ALPHAS = 0.25 ** np.arange(5)  # steps of a line search
 _NEAR = 0.1  # gap, over the step, below which a contact might close in it
-_ROUNDS = 200  # at most, in which loads and forces follow from the twist
+ROUNDS = 200  # at most, in which loads and forces follow from the twist
 _CLOSE = 1e-7  # [m g] by which the forces may still change
 _BALANCED = 1e-8  # [m g] to which they balance
 
@@ -91,6 +91,7 @@ class Way(NamedTuple):
     force: np.ndarray  # (T, B, 2) [m g]
     loads: np.ndarray  # (T, B, S) [m g]
     power: np.ndarray  # (T, B) [m g]
+    rounds: int  # the most of any step; `ROUNDS` if its forces did not come to rest
 
 
 def push(
@@ -122,7 +123,7 @@ def push(
         poses.append(pose)
         found.append(one)
     each = [np.stack([getattr(s, name) for s in found]) for name in ("force", "loads", "power")]
-    return Way(np.stack(poses), *each)
+    return Way(np.stack(poses), *each, max(one.rounds for one in found))
 
 
 def solve(
@@ -155,7 +156,7 @@ def solve(
         lifted = rounding.lift * speed[:, :many] / many
         changed = max(np.abs(pushing - pressed).max(), np.abs(loads - before).max())
         pressed, rounds = pushing, rounds + 1
-        if changed < _CLOSE or rounds == _ROUNDS:
+        if changed < _CLOSE or rounds == ROUNDS:
             break
     power = np.sum(weights * speed, axis=1)
     return Solution(twist, force, loads, power, rounds)
