@@ -122,8 +122,13 @@ def push(
         pose = np.column_stack([moved, yaw])
         poses.append(pose)
         found.append(one)
-    each = [np.stack([getattr(s, name) for s in found]) for name in ("force", "loads", "power")]
-    return Way(np.stack(poses), *each, max(one.rounds for one in found))
+    return Way(
+        pose=np.stack(poses),
+        force=np.stack([one.force for one in found]),
+        loads=np.stack([one.loads for one in found]),
+        power=np.stack([one.power for one in found]),
+        rounds=max(one.rounds for one in found),
+    )
 
 
 def solve(
