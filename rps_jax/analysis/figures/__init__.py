@@ -8,6 +8,7 @@ from rps_jax.analysis.figures.studies import (
     agreement,
     front,
     gradient_quality,
+    grounds,
     levers,
     sensitivity,
     shift_curve,

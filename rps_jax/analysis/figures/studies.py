@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from rps_jax.analysis.figures.style import OBJECT_COLOURS, save, success_rates, words
 
@@ -208,4 +209,56 @@ def front(results: xr.Dataset, path: Path) -> Path:
         ax.grid(alpha=0.3)
     figure.axes[0].set_ylabel("success [%]")
     figure.axes[0].legend(fontsize=8, loc="lower right")
+    return save(figure, path)
+
+
+def grounds(results: xr.Dataset, names: Collection[str], path: Path) -> Path:
+    """Where pushes on some grounds end beside those of a rigid object; errors, spreads and hops.
+
+    `results` are by (ground, object, offset, speed), and where a rigid object ends,
+    `limit_lateral` [m], by (object, offset, at_height, friction), of which the first is the own.
+    """
+    chosen = [name for name in map(str, results.ground.values) if name in names]
+    things = list(map(str, results.object.values))
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    above, below = figure.subplots(2, 3)
+    speeds = results.speed.values
+    for ax, thing in zip(above, things, strict=False):
+        one = results.sel(object=thing)
+        for offset in results.offset.values:
+            line = 1000 * one.limit_lateral.sel(offset=offset).isel(friction=0)
+            ax.plot(100 * results.at_height, line, "k-", lw=1)
+        for i, name in enumerate(chosen):
+            for speed, marker in zip(speeds, "vos^D", strict=False):
+                at = one.sel(ground=name, speed=speed)
+                style = {"color": f"C{i}", "marker": marker, "ls": "none", "ms": 5}
+                ax.plot(100 * at.height, 1000 * at.lateral, mfc="none", **style)
+        ax.set(title=words(thing), xlabel="height of the push [cm]")
+        ax.grid(alpha=0.3)
+    above[0].set_ylabel("end, along the base's front [mm]")
+    panels = {
+        "error": "from the rigid object's end [mm]",
+        "spread": "spread of the push force [%]",
+        "hop": "largest hop [mm]",
+    }
+    for ax, (field, label) in zip(below, panels.items(), strict=True):
+        for i, name in enumerate(chosen):
+            one, over = results[field].sel(ground=name), ("object", "offset")
+            value = one.max(over) if field == "hop" else one.mean(over)
+            if field == "error":
+                value = np.sqrt((one**2).mean(over))
+            factor = 100 if field == "spread" else 1000
+            what = str(results.what.sel(ground=name).values)
+            ax.plot(100 * speeds, factor * value, "o-", ms=4, color=f"C{i}", label=what)
+        ax.set(xscale="log", yscale="log", xlabel="speed of the base [cm/s]", ylabel=label)
+        ax.set_xticks(100 * speeds, [f"{100 * speed:g}" for speed in speeds])
+        ax.minorticks_off()
+        ax.grid(alpha=0.3)
+    marks = [
+        Line2D([], [], color="0.3", marker=marker, ls="none", mfc="none", label=f"{100 * v:g} cm/s")
+        for v, marker in zip(speeds, "vos^D", strict=False)
+    ]
+    rigid = Line2D([], [], color="k", lw=1, label="rigid object, at three offsets")
+    handles = [rigid, *marks, *below[0].get_legend_handles_labels()[0]]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8)
     return save(figure, path)

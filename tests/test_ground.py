@@ -1,0 +1,226 @@
+"""The rigid limit against answers known by hand, and what the study of grounds makes of pushes."""
+
+import math
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from rps_jax.errors import InputError
+from rps_jax.geometry import solid
+from rps_jax.robot.skin import HALF_WIDTH
+from rps_jax.studies import ground
+from rps_jax.studies.ground import grounds, pushes, rigid
+from rps_jax.studies.ground.rigid import Pushed, Rounding
+
+MU, MU_ROBOT = 0.3, 0.35
+STEP = 1e-3  # [m] of way: what is looked at is its beginning
+DRY = Rounding(slip=1e-5, depth=1e-7)
+
+
+def blocks(half_x, half_y, offset=0.0, bearing=0.0):
+    """Boxes, one for each half length and width [m]; the load moves the centre of mass."""
+    half_x, half_y = np.broadcast_arrays(np.atleast_1d(half_x), half_y)
+    one = np.ones(len(half_x))
+    outline = solid.rectangles(half_x, half_y)
+    return solid.build(outline, 0 * one, 0.8 * one, 20 * one, offset * one, bearing * one)
+
+
+def drums(count=1, radius=0.25):
+    one = np.ones(count)
+    return solid.build(np.zeros((count, 1, 2)), radius * one, 0.7 * one, 25 * one, 0 * one, 0 * one)
+
+
+def pushed(solids, robot=MU_ROBOT, height=0.0):
+    one = np.ones(solids.mass.size)
+    return Pushed(solids, MU * one, robot * one, height * one)
+
+
+def before(solids, y=0.0, yaw=0.0):
+    """Poses of solids that touch the base's front."""
+    one = np.ones(solids.mass.size)
+    return np.column_stack([solid.extent(solids, yaw * one), y * one, yaw * one])
+
+
+def begun(what, pose, direction=(1.0, 0.0), rounding=DRY):
+    """The first step of a push."""
+    here = rigid.contacts(what.solids, pose)
+    pose = pose - np.array([1.0, 0, 0]) * here.gap.min(axis=1)[:, None]  # so that it touches
+    start = np.zeros((len(pose), 3)), np.zeros((len(pose), 2))
+    return rigid.solve(what, pose, np.array(direction), STEP, *start, rounding)
+
+
+@pytest.mark.parametrize("height", [0.0, 0.2])
+def test_a_push_through_the_middle_moves_straight_on_with_mu_m_g(height):
+    for solids in (blocks(0.2, [0.2, 0.3]), drums()):
+        found = begun(pushed(solids, height=height), before(solids))
+        np.testing.assert_allclose(found.twist - [1, 0, 0], 0, atol=1e-4)
+        np.testing.assert_allclose(found.force[:, 0], MU, rtol=1e-6)
+        np.testing.assert_allclose(found.force[:, 1], 0, atol=1e-6)
+
+
+def test_the_push_shifts_the_load_ahead_by_its_moment():
+    """Four springs at x = +-a bear 1/4 +- mu z / (4 a); three bear what the moments leave them."""
+    a, z = 0.2, 0.25
+    box = begun(pushed(blocks(a, a), height=z), before(blocks(a, a)))
+    ahead = 0.25 + MU * z / (4 * a)
+    np.testing.assert_allclose(box.loads, [[ahead, 0.5 - ahead, 0.5 - ahead, ahead]], rtol=1e-5)
+    drum = begun(pushed(drums(radius=a), height=z), before(drums(radius=a)))
+    first = 1 / 3 + 2 / 3 * MU * z / a  # the point where it leans to
+    np.testing.assert_allclose(drum.loads, [[first, *[(1 - first) / 2] * 2]], rtol=1e-5)
+
+
+def test_points_that_would_have_to_pull_lift_off():
+    feet = blocks(0.2, 0.2).vertices
+    load = rigid.borne(feet, np.array([[0.12, 0.12]]), np.zeros((1, 1)))
+    assert load[0, 2] == 0  # the corner behind
+    np.testing.assert_allclose(load.sum(), 1)
+    np.testing.assert_allclose(load[0] @ feet[0], [0.12, 0.12])
+
+
+@pytest.mark.parametrize("place", [0.25, 0.5, 0.9])
+def test_a_rod_turns_about_its_far_end(place):
+    """Two feet at -a and a, pushed at d: the far one stays, and F = mu m g a / (a + d).
+
+    The friction's power, mu m g / 2 (|1 + w (d - a)| + |1 + w (d + a)|) at the turn w, is least
+    where the far foot rests, at w = -1 / (a + d), for it falls until there and rises from there.
+    """
+    a, d = 0.25, place * 0.25
+    rod = blocks(1e-9, a)  # four feet, in pairs
+    pose = np.array([[1e-3, 0.0, 0.0]])
+    feet = rigid.supports(rod, pose[:, 2], np.zeros((1, 2)))
+    here = rigid.Contacts(np.array([[[1.0, 0.0]]]), np.array([[[0.0, d]]]), np.zeros((1, 1)))
+    problem = rigid._problem(feet, here, np.array([1.0, 0.0]), STEP)
+    weights = np.array([[*[MU / 4] * 4, 0.0]])
+    twist = rigid.minimise(problem, weights, np.zeros((1, 3)), DRY, first=True)
+    np.testing.assert_allclose(twist, [[a / (a + d), 0, -1 / (a + d)]], atol=3e-4)
+    pushing = -rigid._gaps(problem, twist) / DRY.depth
+    np.testing.assert_allclose(pushing, [[MU * a / (a + d)]], rtol=1e-3)
+
+
+def test_an_object_slides_along_the_base_beyond_the_cone_of_friction():
+    """A base that drives askew takes a box along if tan(angle) <= mu_r, and else drags it along.
+
+    Then the box follows the force, (1, mu_r), which is against its velocity's friction.
+    """
+    box = blocks(0.2, 0.2)
+    for slope in (0.2, 0.34, 0.36, 0.8):
+        u = np.array([1.0, slope]) / math.hypot(1.0, slope)
+        found = begun(pushed(box), before(box), direction=tuple(u))
+        kept = min(slope, MU_ROBOT)
+        np.testing.assert_allclose(found.twist, [[u[0], u[0] * kept, 0]], atol=2e-4)
+        np.testing.assert_allclose(np.hypot(*found.force.T), MU, rtol=1e-4)
+        np.testing.assert_allclose(found.force[0, 1] / found.force[0, 0], kept, rtol=1e-3)
+
+
+def test_the_edges_of_the_cone_and_the_push_vote_on_the_sense_of_turning():
+    """Mason: the sense is that in which most of three lines pass the centre of friction.
+
+    They are the two edges of the contact's cone and the line in which the base moves there.
+    """
+    rng = np.random.default_rng(0)
+    count = 40
+    half = rng.uniform(0.1, 0.25, (2, count))
+    solids = blocks(*half)
+    pose = before(solids, rng.uniform(-0.15, 0.15, count), rng.uniform(-0.7, 0.7, count))
+    slope = rng.uniform(-0.6, 0.6, count)
+    touching = rigid.contacts(solids, pose)
+    first = touching.gap.argmin(axis=1)
+    at, normal = (x[np.arange(count), first] for x in (touching.at, touching.normal))
+    for i in range(count):
+        u = np.array([1.0, slope[i]]) / math.hypot(1.0, slope[i])
+        one = pushed(blocks(*half[:, i : i + 1]))
+        found = begun(one, pose[i : i + 1], direction=tuple(u))
+        tangent = np.array([-normal[i, 1], normal[i, 0]])
+        lines = [normal[i] + s * MU_ROBOT * tangent for s in (-1, 1)] + [u]
+        votes = np.sign([at[i, 0] * v[1] - at[i, 1] * v[0] for v in lines])
+        turn = found.twist[0, 2]
+        assert np.sign(turn) == np.sign(votes.sum()) or abs(turn) < 1e-3
+
+
+def test_pushes_mirror_balance_and_converge():
+    """Mirrored pushes end mirrored; the base's work is what friction takes; steps hardly matter."""
+    solids = blocks([0.2, 0.2, 0.3, 0.3], [0.2, 0.2, 0.3, 0.3])
+    sign = np.array([1, -1, 1, -1])
+    what = pushed(solids, height=0.2)
+    pose = before(solids, 0.1 * sign, 0.3 * sign)
+    coarse, fine = (rigid.push(what, pose, 0.2, steps) for steps in (50, 100))
+    np.testing.assert_allclose(fine.pose[:, 0] * [1, -1, -1], fine.pose[:, 1], atol=1e-6)
+    np.testing.assert_allclose(fine.pose[:, 2] * [1, -1, -1], fine.pose[:, 3], atol=1e-6)
+    assert max(coarse.rounds, fine.rounds) < rigid.ROUNDS
+    assert np.abs(coarse.pose[-1] - fine.pose[-1])[:, :2].max() < 5e-4
+    np.testing.assert_allclose(fine.force[5:, :, 0], fine.power[5:], atol=2e-3)
+    softer = rigid.push(what, pose, 0.2, 50, rounding=Rounding(slip=1e-3, depth=1e-5))
+    assert np.abs(coarse.pose[-1] - softer.pose[-1])[:, :2].max() < 5e-4
+
+
+def test_a_steady_lift_of_what_slides_hardly_moves_the_end():
+    """Of four points it moves load between two diagonals alone, and of three none at all."""
+    for name, apart in (("box", 1e-3), ("cylinder", 1e-9)):
+        thing = pushes.things()[name]
+        ends = [
+            pushes.in_the_limit(thing, [0.08], 0.06, steps=60, rounding=Rounding(lift=lift)).lateral
+            for lift in (0.0, 1.2)
+        ]
+        assert abs(ends[0] - ends[1])[0] < apart
+
+
+def test_a_box_touches_with_its_corners_and_at_the_ends_of_the_front():
+    box = blocks(0.2, 0.2)
+    flush = rigid.contacts(box, np.array([[0.21, 0.0, 0.0]]))
+    assert (flush.gap[0] < 0.011).sum() == 2  # its two rear corners
+    aside = rigid.contacts(box, np.array([[0.21, 0.2, 0.0]]))  # one corner beyond the front
+    near = aside.gap[0] < 0.5
+    np.testing.assert_allclose(aside.gap[0][near].min(), 0.01)
+    end = aside.at[0, -1]
+    np.testing.assert_allclose(end, [-0.21, HALF_WIDTH - 0.2])
+    np.testing.assert_allclose(aside.gap[0, -1], 0.01)
+    assert aside.gap[0, -2] == 1.0  # the other end meets nothing
+
+
+def test_a_push_in_mujoco_ends_where_a_rigid_object_does():
+    """On this project's ground, at 5 cm/s, pushed at the lower edge of the base."""
+    box = pushes.things()["box"]
+    found = pushes.in_mujoco(box, 0.08, 0.05, grounds.GROUNDS["standard"].physics)
+    rigid_one = pushes.in_the_limit(box, [0.08], float(found.height), steps=100)
+    assert 0.059 < found.height < 0.075
+    assert abs(found.lateral - rigid_one.lateral[0]) < 2e-3
+    np.testing.assert_allclose([found.force, found.work], [1, 0.95], atol=0.02)
+    assert found.spread < 0.02
+    assert found.aloft == 0
+    assert 0 < found.hop < 1e-3
+    assert found.tilt < 5e-3
+
+
+def test_a_study_is_labelled_kept_and_refuses_what_was_run_otherwise(tmp_path, monkeypatch):
+    tiny = grounds.GROUNDS["fast"]
+    few = {"a": tiny, "b": grounds.GROUNDS["standard"]}
+    monkeypatch.setattr(grounds, "GROUNDS", {k: _at(v, 0.2) for k, v in few.items()})
+    monkeypatch.setattr(grounds, "HEIGHTS", (0.06, 0.34))
+    some = {"objects": ("box",), "offsets": (0.05, 0.12), "steps": 50}
+    told = []
+    results = ground.run(("a", "b"), tmp_path, **some, report=told.append)
+    friction = len(grounds.FRICTIONS)
+    sizes = {
+        "ground": 2,
+        "object": 1,
+        "offset": 2,
+        "speed": 1,
+        "at_height": 2,
+        "friction": friction,
+    }
+    assert dict(results.sizes) == sizes
+    assert told[-1].finished == 4
+    assert np.isfinite(results.error).all()
+    monkeypatch.setattr(pushes, "in_mujoco", None)  # nothing is run again
+    xr.testing.assert_equal(results, ground.run(("a", "b"), tmp_path, **some))
+    header, first, *rows = ground.table(results, (0.2,))
+    assert header[0] == "ground"
+    assert first[0] == "rigid object"
+    assert [row[0] for row in rows] == [one.what for one in few.values()]
+    with pytest.raises(InputError, match="run with other options"):
+        ground.run(("a",), tmp_path, objects=("cylinder",), offsets=(0.05,))
+
+
+def _at(one, speed):
+    return grounds.Ground(one.what, one.physics, (speed,))
