@@ -217,7 +217,7 @@ def test_a_batch_is_driven_as_one_and_not_world_by_world():
     sizes = []
 
     class Stage:
-        def drive(self, fields, motion, twists, physics):
+        def drive(self, fields, motion, twists, physics, robot=None):
             sizes.append(jnp.shape(fields)[0])
             return fields + 0 * twists, motion, twists
 

@@ -72,7 +72,8 @@ def summary(results: xr.Dataset) -> str:
 def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
     """Header and one row for each arm: success by object, distance left, time, failures."""
     groups = statistics.worlds_by_object(results)
-    header = ["", *groups, "all", "CVaR 5 % of distance", "median time", *statistics.FAILURES]
+    ways = [way for way in statistics.FAILURES if way != "stalled" or "stalled" in results]
+    header = ["", *groups, "all", "CVaR 5 % of distance", "median time", *ways]
     rows = [header]
     for arm in map(str, results.arm.values):
         one = results.sel(arm=arm)
@@ -85,7 +86,7 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
                 _rate(won),
                 f"{statistics.cvar(statistics.left_over(one)):.2f} m",
                 f"{np.median(one.time.values[won]):.1f} s" if won.any() else "-",
-                *(str(int((kinds == i).sum())) for i in range(len(statistics.FAILURES))),
+                *(str(int((kinds == i).sum())) for i in range(len(ways))),
             ]
         )
     return rows
