@@ -33,7 +33,7 @@ from rps_jax.runs.results import (
 )
 from rps_jax.trials import batch
 from rps_jax.trials.batch import Job, Part
-from rps_jax.trials.setting import Progress, Setting, Timing
+from rps_jax.trials.setting import Progress, Report, Setting, Timing, unheard
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import Domain, named
 from rps_jax.world.draws import table
@@ -100,13 +100,13 @@ def sweep(
     return labelled(results)
 
 
-def in_memory(plan: Plan, **shape: Any) -> xr.Dataset:
+def in_memory(plan: Plan, *, report: Report = unheard, **shape: Any) -> xr.Dataset:
     """All results of a plan, run without a folder."""
     contents: dict[int, bytes] = {}
     every: dict[Kind, list[int]] = {}
     for number in plan.parts:
         every.setdefault(plan.kind(number), []).append(number)
-    work(plan, every, contents.__setitem__, **shape)
+    work(plan, every, contents.__setitem__, report=report, **shape)
     return labelled(dataset(plan, contents))
 
 
