@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from rps_jax.app.cli import parsing, running
-from rps_jax.app.cli.options import Device, Engine, Fidelity, Physics, RobotName, Spread, Strategies
+from rps_jax.app.cli.options import Device, Engine, Fidelity, Physics, Spread, Strategies
 from rps_jax.app.cli.replicating import show
 from rps_jax.errors import InputError
 
@@ -45,8 +45,9 @@ class Sweep(Spread):
     changes to the paper's, as {"L": 0.3}."""
     worlds: int | None = None
     """Number of worlds; by default 1000, or the whole grid of a domain with listed targets."""
-    robot: RobotName | None = None
-    """By default the domain's, which is ideal but in the domain real."""
+    robot: str | None = None
+    """The robot: ideal, kairos (the paper's), ridgeback or mpo_500, or a JSON file of its limits; by
+    default the domain's, which is ideal but in the domain real."""
     physics: Physics = "default"
     fidelity: Fidelity = "standard"
     engine: Engine = "fused"
