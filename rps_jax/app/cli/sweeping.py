@@ -46,8 +46,8 @@ class Sweep(Spread):
     worlds: int | None = None
     """Number of worlds; by default 1000, or the whole grid of a domain with listed targets."""
     robot: str | None = None
-    """The robot: ideal, kairos (the paper's), ridgeback or mpo_500, or a JSON file of its limits; by
-    default the domain's, which is ideal but in the domain real."""
+    """The robot: ideal, kairos (the paper's), ridgeback or mpo_500, or a JSON file of its limits.
+    By default the domain's, which is ideal but in the domain real."""
     physics: Physics = "default"
     fidelity: Fidelity = "standard"
     engine: Engine = "fused"
