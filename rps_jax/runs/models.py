@@ -19,7 +19,6 @@ from rps_jax.engines import EngineName
 from rps_jax.robot.robot import Robot
 from rps_jax.runs import sweep as sweeps
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.results import labelled
 from rps_jax.trials.setting import Progress, Report, Setting, unheard
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import Domain, named
@@ -28,6 +27,7 @@ from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
 _HALVED = replace(preset(), timestep=0.005)
 # Fine enough for MuJoCo's own ground, on which sliding objects hop.
 _FINE = replace(preset(), timestep=0.002, **MUJOCOS_GROUND)
+OWN = "as asked"  # the model of the sweep itself
 # What can be defended, beside the physics that a sweep was asked for.
 MODELS: dict[str, Physics] = {
     "this ground, 10 ms": preset(),
@@ -41,7 +41,7 @@ MODELS: dict[str, Physics] = {
 
 def plans(plan: Plan) -> dict[str, Plan]:
     """A sweep on every model, its own first; the worlds and the engine are the same."""
-    own = {"as asked": plan}
+    own = {OWN: plan}
     others = {
         name: replace(plan, setting=replace(plan.setting, physics=physics))
         for name, physics in MODELS.items()
@@ -103,28 +103,32 @@ def models(
     return complete(plan, None if out is None else Path(out), report=report, **shape)
 
 
-def complete(plan: Plan, out: Path | None, *, report: Report = unheard, **shape: Any) -> xr.Dataset:
+def complete(
+    plan: Plan,
+    out: Path | None,
+    own: xr.Dataset | None = None,
+    *,
+    report: Report = unheard,
+    **shape: Any,
+) -> xr.Dataset:
     """What a run folder lacks of a sweep on every model, and the whole as (model, arm, world).
 
     The sweep as it was asked for stands in the folder itself, the others in folders of their own
-    in it.
+    in it. Its `own` results are not run or read again, if they are at hand.
     """
-    found, ended, simulated = {}, 0, 0.0
+    found, ended, simulated = {} if own is None else {OWN: own}, 0, 0.0
     for name, one in plans(plan).items():
+        if name in found:
+            continue
 
         def heard(progress: Progress, ended: int = ended, simulated: float = simulated) -> None:
             nonlocal last
             last = progress
             report(Progress(ended + progress.finished, simulated + progress.simulated))
 
-        last, options = Progress(0, 0.0), {"report": heard, **shape}
-        if out is None:
-            found[name] = sweeps.in_memory(one, **options)
-        else:
-            folder = out if one is plan else folder_of(out, name)
-            _, results = sweeps.complete(folder, one, **options)
-            assert results is not None
-            found[name] = labelled(results)
+        last = Progress(0, 0.0)
+        folder = out if out is None or one is plan else folder_of(out, name)
+        found[name] = sweeps.whole(one, folder, report=heard, **shape)
         ended, simulated = ended + one.trials, simulated + last.simulated
     joined = xr.concat(found.values(), "model", coords="minimal", compat="override")
     return joined.assign_coords(model=list(found))

@@ -55,7 +55,7 @@ def sweep(
     part: int = 1024,
     slots: int | None = None,
     workers: int | None = None,
-    report: Callable[[Progress], Any] = lambda progress: None,
+    report: Report = unheard,
 ) -> xr.Dataset:
     """Every arm in the same random worlds.
 
@@ -93,15 +93,15 @@ def sweep(
     plan = Plan(named(domain, robot), worlds, arms, setting, part)
     plan.check_here()
     shape = {"slots": slots, "workers": workers, "report": report}
-    if out is None:
-        return in_memory(plan, **shape)
-    _, results = complete(Path(out), plan, **shape)
-    assert results is not None
-    return labelled(results)
+    return whole(plan, None if out is None else Path(out), **shape)
 
 
-def in_memory(plan: Plan, *, report: Report = unheard, **shape: Any) -> xr.Dataset:
-    """All results of a plan, run without a folder."""
+def whole(plan: Plan, out: Path | None, *, report: Report = unheard, **shape: Any) -> xr.Dataset:
+    """All results of a plan, in a run folder, in which it can be continued, or in memory alone."""
+    if out is not None:
+        _, results = complete(out, plan, report=report, **shape)
+        assert results is not None
+        return labelled(results)
     contents: dict[int, bytes] = {}
     every: dict[Kind, list[int]] = {}
     for number in plan.parts:
@@ -115,7 +115,7 @@ def run_missing(
     plan: Plan,
     *,
     shard: Shard = Shard(),
-    report: Callable[[Progress], Any] = lambda progress: None,
+    report: Report = unheard,
     **shape: Any,
 ) -> Timing:
     """Run what is missing of a plan, or of one shard of it, in a folder that `open_run` opened."""

@@ -25,8 +25,8 @@ Domain = Annotated[
     str,
     tyro.conf.arg(
         help=(
-            "Ranges from which worlds are drawn: paper, hardware, wide, real (wide with robots "
-            'that exist), prisms or hostile, or a JSON file of ranges, as {"mass": [3, 60]}.'
+            "Ranges from which worlds are drawn: paper, hardware, wide, real (wide, but with "
+            'limited robots), prisms or hostile, or a JSON file of ranges, as {"mass": [3, 60]}.'
         )
     ),
 ]
@@ -100,18 +100,22 @@ class Sweep(Spread):
         running.use_cache()
         with progress_bar(plan.trials_of(shard), "sweep") as report:
             timing, results = sweep.complete(self.out, plan, shard, by=by, report=report, **shape)
-        models = _on_models(self.out, plan, shape) if self.models else None
+        models = None
+        if self.models and results is not None:
+            models = _on_models(self.out, plan, results, shape)
         running.tell_sweep(self.out, plan, results, timing, models)
 
 
-def _on_models(out: Path, plan: Plan, shape: dict[str, Any]) -> Dataset:
-    """The same worlds on every model, as `models.nc` beside the results."""
+def _on_models(out: Path, plan: Plan, results: Dataset, shape: dict[str, Any]) -> Dataset:
+    """The same worlds on every other model, too, as `models.nc` beside the results."""
     from rps_jax.record import files
     from rps_jax.runs import models
+    from rps_jax.runs.results import labelled
     from rps_jax.trials.setting import progress_bar
 
-    with progress_bar(plan.trials * len(models.plans(plan)), "models") as report:
-        found = models.complete(plan, out, report=report, **shape)
+    others = len(models.plans(plan)) - 1
+    with progress_bar(plan.trials * others, "models") as report:
+        found = models.complete(plan, out, labelled(results), report=report, **shape)
     files.write_results(out / "models.nc", found)
     return found
 

@@ -25,7 +25,7 @@ class TuneOptions(Spread):
     """What every tuner takes."""
 
     domain: tuple[str, ...] = ("wide",)
-    """Domains to tune in: paper, hardware, wide, prisms, hostile, or JSON files of ranges."""
+    """Domains to tune in: paper, hardware, wide, real, prisms, hostile, or JSON files of ranges."""
     objects: tuple[str, ...] = ("random_box", "random_cylinder")
     """Objects of these domains; random_prism is held out by default."""
     tuned: tuple[str, ...] = ("full",)
@@ -242,8 +242,8 @@ class TuneCompare(Spread):
     """What decides: rps, nps, aps, and laws of files, as my_law.py:MyParams; the sets of parameters
     are those of RPS and NPS."""
     domain: tuple[str, ...] = ("paper", "wide", "hostile", "prisms")
-    """Domains, each a run of its own: paper, hardware, wide, hostile, prisms (those of wide), or
-    JSON files of ranges."""
+    """Domains, each a run of its own: paper, hardware, wide, real, hostile, prisms (those of wide),
+    or JSON files of ranges."""
     worlds: int = 10000
     """Number of worlds of each domain; the paper's domain has its grid of 144."""
     physics: Physics = "default"
