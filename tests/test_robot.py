@@ -13,8 +13,9 @@ from rps_jax import engines
 from rps_jax.control.law import Twist
 from rps_jax.engines.base import Motion
 from rps_jax.errors import InputError
+from rps_jax.geometry.solid import GRAVITY
 from rps_jax.robot import drive, robot
-from rps_jax.robot.robot import GRAVITY, ROBOTS, Robot
+from rps_jax.robot.robot import ROBOTS, Robot
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting

@@ -15,6 +15,7 @@ from rps_jax import errors
 from rps_jax.geometry import vectors
 
 Support = Literal["feet", "even"]  # what bears a solid on the ground
+GRAVITY = 9.81  # [m/s^2]
 SIDES = 8  # vertices of a prism at most; those of fewer sides repeat some
 _LOAD_AT = 0.8  # of the way from the middle to the outline stands the load
 _CELLS = 8  # into which the evenly borne parts of an outline are split, along and across

@@ -1,4 +1,4 @@
-"""The robot: the size of its base, and what keeps it from following a twist exactly.
+"""The robot: what keeps a base from following a twist exactly, and robots that exist.
 
 A limit that is None does not exist, and costs nothing: `Robot()` follows every twist at once, with
 any force.
@@ -19,10 +19,10 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.errors import InputError
+from rps_jax.geometry.solid import GRAVITY
 from rps_jax.record import files
 from rps_jax.robot.skin import HALF_LENGTH, HALF_WIDTH
 
-GRAVITY = 9.81  # [m/s^2]
 ARM = math.hypot(HALF_LENGTH, HALF_WIDTH)  # [m] from the middle of the base to its wheels
 
 
@@ -89,6 +89,11 @@ class Robot:
             return None
         return bounds[0] if len(bounds) == 1 else _least(*bounds)
 
+    @property
+    def body(self) -> Robot:
+        """What a physics step needs of it: without the limits of where it aims."""
+        return dataclasses.replace(self, **dict.fromkeys(_OF_THE_AIM))
+
     def check(self) -> None:
         """Raises InputError for numbers that no robot has; each is one number, or None."""
         errors.check_finite("robot mass", self.mass, above=0, at_most=1e4, unit="kg")
@@ -123,6 +128,7 @@ def _least(a: Any, b: Any) -> Any:
 
 
 _FIELDS = [field.name for field in dataclasses.fields(Robot)]
+_OF_THE_AIM = ("v_max", "omega_max", "lag", "acceleration_max", "slip")
 LIMITS = tuple(name for name in _FIELDS if name not in ("mass", "resistance"))
 jax.tree_util.register_dataclass(Robot, data_fields=_FIELDS, meta_fields=[])
 _LEAST = 1e-3  # of what would else bring the base to a stop

@@ -345,8 +345,8 @@ def motion(trials: Trial) -> Motion:
 
 
 def pushing(worlds: World) -> Robot | None:
-    """The robots of worlds, if their bases are bodies that contact can slow and stop."""
-    return worlds.robot if worlds.robot is not None and worlds.robot.driven else None
+    """The bodies of the robots of worlds, if contact can slow and stop them."""
+    return worlds.robot.body if worlds.robot is not None and worlds.robot.driven else None
 
 
 def select(condition: jax.Array, yes: Any, no: Any) -> Any:

@@ -21,10 +21,10 @@ import jax.numpy as jnp
 
 from rps_jax.engines.fused.contacts import Body, Contact, State
 from rps_jax.geometry import vectors as sp
+from rps_jax.geometry.solid import GRAVITY
 from rps_jax.geometry.vectors import Vec
 from rps_jax.world.physics import Physics
 
-GRAVITY = 9.81  # [m/s^2]
 _ENOUGH = 1e-4  # [m/s^2] error of the acceleration with which the solver ends
 _FAR = 1e9  # no upper bound of the line search
 

@@ -11,7 +11,6 @@ scalars, so that a compiler can keep a whole world in registers: `contacts.py` f
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -96,11 +95,12 @@ def leave(body: Body, state: State, twist: Vec) -> Motion:
     m = sp.matrix(q)
     spin = sp.to_world(sp.matrix(axes), state.w)
     v = sp.sub(state.v, sp.to_world(m, sp.cross(spin, com)))
-    c, s = jnp.cos(state.base[2]), jnp.sin(state.base[2])
-    base = (c * twist[0] - s * twist[1], s * twist[0] + c * twist[1], twist[2])
     p = sp.sub(state.p, sp.to_world(m, com))
-    last, integral = tuple(jnp.zeros_like(x) for x in state.base), None
-    if state.pushed is not None:
+    if state.pushed is None:
+        c, s = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+        base = (c * twist[0] - s * twist[1], s * twist[0] + c * twist[1], twist[2])
+        last, integral = tuple(jnp.zeros_like(x) for x in state.base), None
+    else:
         base, last, integral = state.pushed
     return Motion(
         jnp.stack([*state.base, *p, *q], axis=-1),
@@ -138,13 +138,14 @@ def step(
     turn = (1 - half * half / 2 + half**4 / 24, *sp.scale(sinc, angle))
     q = sp.times(state.q, turn)
     length = jax.lax.rsqrt(sp.dot(q, q))
-    c, s = jnp.cos(state.base[2]), jnp.sin(state.base[2])
-    base = (
-        state.base[0] + dt * (c * twist[0] - s * twist[1]),
-        state.base[1] + dt * (s * twist[0] + c * twist[1]),
-        state.base[2] + dt * twist[2],
-    )
-    if pushed is not None:
+    if pushed is None:
+        c, s = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+        base = (
+            state.base[0] + dt * (c * twist[0] - s * twist[1]),
+            state.base[1] + dt * (s * twist[0] + c * twist[1]),
+            state.base[2] + dt * twist[2],
+        )
+    else:
         base = sp.add(state.base, sp.scale(dt, pushed.v))
     p = sp.add(state.p, sp.scale(dt, v))
     q = tuple(x * length for x in q)
@@ -158,8 +159,6 @@ def drive(
 
     On an NVIDIA GPU it is one kernel; elsewhere, and where it is differentiated, XLA compiles it.
     """
-    if robot is not None and robot.acceleration_max is not None:
-        robot = replace(robot, acceleration_max=None)  # of the aim, not of the drive
     state = _period(physics, spread(body), enter(body, motion, robot), twist, robot)
     return leave(body, state, twist)
 

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rps_jax.geometry import solid
-from rps_jax.geometry.solid import Solid
+from rps_jax.geometry.solid import GRAVITY, Solid
 from rps_jax.robot import skin
 from rps_jax.studies.ground import rigid
 from rps_jax.studies.ground.rigid import Pushed, Rounding
@@ -34,7 +34,6 @@ ASKEW = 0.3  # [rad] by which a box is turned at the start, and the way before a
 SPEEDS = (0.01, 0.05, 0.2)  # [m/s] of the base
 STEPS = 500  # of the rigid limit in a push: half of them change the end by 0.1 mm
 CONTACT_HEIGHT = 0.2  # [m] of the middle of the base's front
-_GRAVITY = 9.81  # [m/s^2]
 _RISE = 0.5  # [m/s^2] at which the base reaches its speed
 _SETTLE = 1.0  # [s] that the object stands before the push
 _SAMPLE = 0.01  # [s] between two looks at the contacts
@@ -147,7 +146,7 @@ def in_mujoco(thing: Thing, offset: float, speed: float, physics: Physics) -> Pu
             seen.append((*_contact_forces(model, data), _yaw(qpos)))
             if not abs(qpos[5]) < height:
                 return Pushes(*np.full(len(Pushes._fields), np.nan))  # it ran away
-    weight = float(thing.solid.mass[0]) * _GRAVITY
+    weight = float(thing.solid.mass[0]) * GRAVITY
     unit = friction * weight
     late = force[way > DISTANCE / 2] / unit
     ground, pushing, moment, carried, turned = np.array(seen).T
