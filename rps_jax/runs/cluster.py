@@ -36,7 +36,7 @@ from rps_jax.record import provenance
 from rps_jax.runs import sweep
 from rps_jax.runs.board import Board, News
 from rps_jax.runs.sweep import Plan, Shard
-from rps_jax.trials.setting import Progress, Timing
+from rps_jax.trials.setting import Progress, Report, Timing, unheard
 
 POLL = 0.5  # [s] between two looks at what the workers have done
 PATIENCE = 10.0  # [s] to reach a cluster
@@ -162,7 +162,7 @@ def run_on_cluster(
     prepare: Callable[[], Any],
     gpus: bool = True,
     shard: Shard = Shard(),
-    report: Callable[[Progress], Any] = lambda progress: None,
+    report: Report = unheard,
     slots: int | None = None,
     workers: int | None = None,
 ) -> Timing:

@@ -6,7 +6,6 @@ the outcome, trial by trial, and the object's place after the first 5 s.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +18,7 @@ from rps_jax.analysis import statistics
 from rps_jax.engines import EngineName
 from rps_jax.studies import study
 from rps_jax.studies.study import Condition, Grid
-from rps_jax.trials.setting import Progress, Setting
+from rps_jax.trials.setting import Report, Setting, unheard
 from rps_jax.trials.trial import Rules
 from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
 
@@ -89,7 +88,7 @@ def run(
     grid: Grid,
     folder: Path,
     *,
-    report: Callable[[Progress], Any] = lambda progress: None,
+    report: Report = unheard,
     **shape: Any,
 ) -> xr.Dataset:
     """Outcomes under the named conditions, and `early_error` [m] (condition, object, ...).

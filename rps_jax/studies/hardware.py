@@ -4,7 +4,6 @@ shove of its video. Friction was never measured, so a plausible range is run.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +15,7 @@ from rps_jax.robot.skin import SKINS
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.results import outcome_dataset, trace_dataset
-from rps_jax.trials.setting import Progress, Setting
+from rps_jax.trials.setting import Report, Setting, unheard
 from rps_jax.trials.trial import Shift
 from rps_jax.world.paper import (
     HARDWARE_GROUND,
@@ -47,7 +46,7 @@ def run(
     setting: Setting,
     *,
     layout: str = "circle",
-    report: Callable[[Progress], Any] = lambda progress: None,
+    report: Report = unheard,
     **shape: Any,
 ) -> xr.Dataset:
     """Outcomes (strategy, object, friction, target) over objects, friction and targets.
@@ -89,7 +88,7 @@ def disturb(
     *,
     layout: str = "circle",
     shifts: tuple[float, ...] = SHIFTS,
-    report: Callable[[Progress], Any] = lambda progress: None,
+    report: Report = unheard,
     **shape: Any,
 ) -> xr.Dataset:
     """Success (object, shift, side, target) when the object is moved along the front of the robot.

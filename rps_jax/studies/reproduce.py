@@ -24,7 +24,7 @@ from rps_jax.studies.study import Condition, Grid
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.results import title_of, trace_dataset
-from rps_jax.trials.setting import Progress, Setting
+from rps_jax.trials.setting import Progress, Report, Setting, unheard
 from rps_jax.world import paper, scene
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.scene import FRICTION
@@ -114,7 +114,7 @@ def run(
     out: Path,
     plan: Plan,
     *,
-    report: Callable[[Progress], Any] = lambda progress: None,
+    report: Report = unheard,
     **shape: Any,
 ) -> Path:
     """Run what is missing and write the report; returns the path of `report.html`."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +13,7 @@ import xarray as xr
 from rps_jax.control.law import RPSParams
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Ask, Split
-from rps_jax.trials.setting import Progress
+from rps_jax.trials.setting import Report, unheard
 from rps_jax.trials.trial import Outcome
 from rps_jax.tuning.run import Course
 from rps_jax.tuning.space import SUBSETS, Space
@@ -69,7 +69,7 @@ def sensitivity(
     count: int = 9,
     worlds: int = 1000,
     seed: int = 0,
-    report: Callable[[Progress], Any] = lambda progress: None,
+    report: Report = unheard,
     **shape: Any,
 ) -> xr.Dataset:
     """Success, time and way against each parameter alone, in worlds for validation.
@@ -141,7 +141,7 @@ def front(
     spread: float = 0.5,
     worlds: int = 1000,
     seed: int = 0,
-    report: Callable[[Progress], Any] = lambda progress: None,
+    report: Report = unheard,
     **shape: Any,
 ) -> xr.Dataset:
     """Candidates between and around sets of parameters, and which of them are undominated.

@@ -7,7 +7,7 @@ again in the same folder computes only what is missing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ from rps_jax.record.checkpoint import Parts
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.results import outcome_dataset
-from rps_jax.trials.setting import Progress, Setting
+from rps_jax.trials.setting import Progress, Report, Setting, unheard
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.scene import FRICTION, Friction
@@ -81,7 +81,7 @@ def run(
     *,
     slots: int | None = None,
     workers: int | None = None,
-    report: Callable[[Progress], Any] = lambda progress: None,
+    report: Report = unheard,
 ) -> xr.Dataset:
     """Outcomes (condition, strategy, object, friction, target), computed or found in `folder`.
 

@@ -24,7 +24,7 @@ from jax.sharding import PartitionSpec as P
 from rps_jax import engines, errors
 from rps_jax.control.strategies import Strategy
 from rps_jax.trials import host, trial
-from rps_jax.trials.setting import Progress, Setting, Timing
+from rps_jax.trials.setting import Progress, Report, Setting, Timing, unheard
 from rps_jax.trials.trial import Outcome, Rules, Trial, World
 from rps_jax.world.physics import Physics
 
@@ -65,7 +65,7 @@ def run(
     slots: int | None = None,
     workers: int | None = None,
     collect: Collect,
-    report: Callable[[Progress], Any] = lambda progress: None,
+    report: Report = unheard,
 ) -> Timing:
     """Run every trial of every job to its end.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -23,7 +23,7 @@ from rps_jax.robot.skin import IdealSkin, Skin
 from rps_jax.trials import trial
 from rps_jax.trials.batch import SEGMENT, Job, Part, rows, warn_of_lost
 from rps_jax.trials.batch import run as _run
-from rps_jax.trials.setting import Progress, Setting, Timing
+from rps_jax.trials.setting import Progress, Report, Setting, Timing, unheard
 from rps_jax.trials.trial import Outcome, Shift, Snapshot, World
 from rps_jax.world import scene
 from rps_jax.world.objects import FAMILIES, OBJECTS
@@ -177,7 +177,7 @@ def run(
     *,
     slots: int | None = None,
     workers: int | None = None,
-    report: Callable[[Progress], Any] = lambda progress: None,
+    report: Report = unheard,
 ) -> tuple[Outcome, Timing]:
     """Run every case to its end.
 
@@ -215,7 +215,7 @@ def follow(
     setting: Setting = Setting(),
     *,
     interval: float = 0.1,
-    report: Callable[[Progress], Any] = lambda progress: None,
+    report: Report = unheard,
 ) -> list[Trace]:
     """Run trials of one kind to their ends and keep what they looked like every `interval` [s].
 
@@ -235,7 +235,7 @@ def follow_part(
     setting: Setting,
     *,
     interval: float = 0.1,
-    report: Callable[[Progress], Any] = lambda progress: None,
+    report: Report = unheard,
 ) -> list[Trace]:
     """`follow`, for worlds that are built."""
     period = setting.physics.control_period

@@ -111,11 +111,6 @@ class Domain:
                 )
 
     @property
-    def ideal_robot(self) -> bool:
-        """Whether every base follows every twist at once, with any force."""
-        return self.robot.ideal and all(getattr(self, name) is None for name in OF_THE_ROBOT)
-
-    @property
     def combinations(self) -> int:
         """How many indices see every combination of objects, frictions and targets once."""
         return len(self.objects) * max(1, len(self.frictions)) * max(1, len(self.targets))
@@ -217,7 +212,7 @@ DOMAINS = {
         **_HARDWARE,
     ),
     "wide": Domain(),
-    # Robots that exist, in the worlds of wide.
+    # The worlds of wide, and robots of limited force, traction, lag and acceleration.
     "real": Domain(
         robot_force=Range(150, 800),
         robot_traction=Range(0.3, 0.8),

@@ -14,7 +14,7 @@ from rps_jax.errors import InputError
 from rps_jax.record.checkpoint import Parts
 from rps_jax.studies.ground import pushes
 from rps_jax.studies.ground.pushes import DISTANCE, OFFSETS, SPEEDS, STEPS, Pushes
-from rps_jax.trials.setting import Progress
+from rps_jax.trials.setting import Progress, Report, unheard
 from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
 from rps_jax.world.scene import FRICTION
 
@@ -102,7 +102,7 @@ def run(
     objects: Sequence[str] = ("box", "box_60", "cylinder"),
     offsets: Sequence[float] = OFFSETS,
     steps: int = STEPS,
-    report: Callable[[Progress], Any] = lambda progress: None,
+    report: Report = unheard,
 ) -> xr.Dataset:
     """Pushes (ground, object, offset, speed) and the rigid limit's, run or found in `folder`.
 
