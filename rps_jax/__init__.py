@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from rps_jax.geometry.footprint import Footprint as Footprint
     from rps_jax.robot.robot import ROBOTS as ROBOTS
     from rps_jax.robot.robot import Robot as Robot
+    from rps_jax.robot.shell import Boards as Boards
     from rps_jax.robot.skin import CapacitiveSkin as CapacitiveSkin
     from rps_jax.robot.skin import IdealSkin as IdealSkin
     from rps_jax.robot.skin import SmoothSkin as SmoothSkin
@@ -73,6 +74,7 @@ _HOMES = {
     "errors": ("InputError",),
     "geometry.footprint": ("Footprint",),
     "robot.robot": ("ROBOTS", "Robot"),
+    "robot.shell": ("Boards",),
     "robot.skin": ("CapacitiveSkin", "IdealSkin", "SmoothSkin"),
     "runs.evaluate": ("evaluate",),
     "runs.push": ("Push", "push", "replay"),

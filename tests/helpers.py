@@ -17,7 +17,7 @@ from rps_jax.control import strategies
 from rps_jax.control.law import RPSParams
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry.footprint import Footprint
-from rps_jax.robot.skin import HALF_LENGTH, HALF_WIDTH
+from rps_jax.robot.shell import HALF_LENGTH, HALF_WIDTH
 from rps_jax.runs import sweep
 from rps_jax.runs.plan import Plan
 from rps_jax.trials.pushes import Case

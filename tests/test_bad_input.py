@@ -103,7 +103,7 @@ PUSH = {
     "--skin-params tolerance": "skin-params 'tolerance' is not allowed: write name=value",
     "--skin-params tolerance=-1": "skin tolerance = -1.0 is not allowed: .* at least 0",
     "--skin-params foam=0.01": "unknown skin-params 'foam': choose from tolerance",
-    "--skin-params half_length=9": "skin half_length = 9.0 is not allowed: .* at most 2",
+    "--skin-params half_length=9": "unknown skin-params 'half_length'",
     "--skin capacitive --skin-params foam=0": "skin foam = 0.0 is not allowed: .* above 0",
     "--skin capacitive --skin-params dead_share=2": "skin dead_share = 2.0 .* at most 1",
     "--skin capacitive --skin-params time_constant=0": "skin time_constant = 0.0 is not allowed",

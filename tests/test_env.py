@@ -10,7 +10,7 @@ import pytest
 from rps_jax.control.law import Details, RPSParams
 from rps_jax.control.strategies import Strategy
 from rps_jax.errors import InputError
-from rps_jax.robot import skin
+from rps_jax.robot.shell import Shell
 from rps_jax.trials import env, trial
 from rps_jax.trials.env import PushEnv, Reward
 from rps_jax.trials.setting import Setting
@@ -81,7 +81,7 @@ def pushing():
 
 def test_the_spaces_are_those_of_the_skin_the_target_and_the_twist(pushing):
     push, state = pushing.env, pushing.start
-    assert (push.observation_size, push.action_size) == (skin.taxels().shape[0] + 2, 3)
+    assert (push.observation_size, push.action_size) == (Shell().count + 2, 3)
     assert state.obs.shape == (COUNT, 44)
     assert (push.dt, push.sim_dt, push.n_substeps) == (0.02, 0.02, 1)
     assert push.xml_path.endswith("cylinder.xml")

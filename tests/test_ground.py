@@ -8,7 +8,7 @@ import xarray as xr
 
 from rps_jax.errors import InputError
 from rps_jax.geometry import solid
-from rps_jax.robot.skin import HALF_WIDTH
+from rps_jax.robot.shell import HALF_WIDTH
 from rps_jax.studies import ground
 from rps_jax.studies.ground import grounds, pushes, rigid
 from rps_jax.studies.ground.rigid import Pushed, Rounding

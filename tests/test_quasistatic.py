@@ -25,6 +25,7 @@ from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import Solid
+from rps_jax.robot.robot import Robot
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
@@ -527,7 +528,7 @@ def test_feet_bear_what_holds_the_centre_of_mass_and_none_pulls():
 
 @pytest.mark.parametrize("name", OBJECTS)
 def test_every_scene_has_a_slider(name):
-    loaded = scene.load(name, friction=scene.Friction(0.3, 0.4), half_length=0.3)
+    loaded = scene.load(name, friction=scene.Friction(0.3, 0.4), robot=Robot(half_length=0.3))
     stage, slider = engines.get("quasistatic").stage_of_scenes([loaded], np.zeros(1, int))
     assert isinstance(stage, Quasistatic)
     np.testing.assert_allclose(slider.friction_robot, [0.4])

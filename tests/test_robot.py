@@ -1,5 +1,6 @@
 """Robots that exist: what a twist becomes, how a base with limits pushes, and when it stalls."""
 
+import math
 from dataclasses import replace
 
 import jax
@@ -14,8 +15,8 @@ from rps_jax.control.law import Twist
 from rps_jax.engines.base import Motion
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
-from rps_jax.robot import drive, robot
-from rps_jax.robot.robot import ROBOTS, Robot
+from rps_jax.robot import drive
+from rps_jax.robot.robot import ROBOTS, Robot, named
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
@@ -72,7 +73,7 @@ def test_the_force_is_bounded_in_its_direction_by_drive_traction_and_rolling():
     one = Robot(mass=100.0, force_max=300.0, traction=0.25, resistance=0.05)
     assert one.push_max == pytest.approx(0.20 * 100 * GRAVITY)  # traction less rolling
     assert replace(one, traction=0.9).push_max == pytest.approx(300 - 0.05 * 100 * GRAVITY)
-    assert one.turn_max == pytest.approx(one.push_max * robot.ARM)
+    assert one.turn_max == pytest.approx(one.push_max * math.hypot(0.3625, 0.29))
     assert replace(one, torque_max=7.0).turn_max == 7.0
     still = (0.0, 0.0, 0.0)
     for turn in ((1.0, 0.0), (0.6, 0.8)):
@@ -103,7 +104,7 @@ def test_the_servo_meets_its_twist_with_one_overshoot_and_forgets_a_stall():
 
 def pushed(engine, one, seconds=4.0, twist=AHEAD, name="box"):
     """Base velocity [m/s] and positions (10,) after a push, from contact, at a constant twist."""
-    at = scene.load(name, STANDARD, FRICTION["S1"], robot=one if one.driven else None)
+    at = scene.load(name, STANDARD, FRICTION["S1"], robot=one)
     start = scene.initial_qpos(at, gap=0.0)[None]
     stage, fields = engines.get(engine).stage_of_scenes([at], np.zeros(1, int))
     robots = jax.tree.map(lambda x: np.asarray(x, float)[None], one) if one.driven else None
@@ -216,10 +217,10 @@ def test_a_domain_with_robots_goes_through_json():
 
 
 def test_robots_are_named_in_the_library_and_in_files(tmp_path):
-    assert robot.named("kairos") is ROBOTS["kairos"]
+    assert named("kairos") is ROBOTS["kairos"]
     path = tmp_path / "mine.json"
     path.write_text('{"mass": 50, "force_max": 120, "acceleration_max": [0.5, 1]}')
-    mine = robot.named(str(path))
+    mine = named(str(path))
     assert mine == Robot(mass=50, force_max=120, acceleration_max=(0.5, 1))
     found = rps_jax.sweep(
         replace(DOMAINS["real"], objects=("random_cylinder",), robot_force=None),
@@ -246,7 +247,7 @@ def test_robots_are_named_in_the_library_and_in_files(tmp_path):
 )
 def test_numbers_that_no_robot_has_are_one_sentence(numbers, said):
     with pytest.raises(InputError, match=said.replace("(", r"\(")):
-        robot.named(numbers)
+        named(numbers)
 
 
 def test_commands_refuse_robots_that_they_cannot_step(capsys, tmp_path):

@@ -9,7 +9,7 @@ import pytest
 from rps_jax import errors
 from rps_jax.engines import mjx as mjx_engine
 from rps_jax.engines.mjx_colliders import mjx
-from rps_jax.robot import skin
+from rps_jax.robot import shell
 from rps_jax.world import scene
 from rps_jax.world.objects import FAMILIES, OBJECTS
 from rps_jax.world.physics import Physics
@@ -130,7 +130,7 @@ def test_the_nonuniform_boxs_centre_of_mass_follows_from_its_two_parts():
 @pytest.mark.parametrize("name", OBJECTS)
 def test_the_base_is_as_large_as_its_skin(name):
     size = load(name).model.geom("base").size
-    assert size[:2] == pytest.approx([skin.HALF_LENGTH, skin.HALF_WIDTH])
+    assert size[:2] == pytest.approx([shell.HALF_LENGTH, shell.HALF_WIDTH])
 
 
 @pytest.mark.parametrize("label", FRICTION)
@@ -153,7 +153,7 @@ def test_the_object_starts_the_gap_in_front_of_the_face(yaw):
     loaded = load("box")
     qpos = scene.initial_qpos(loaded, gap=0.02, yaw=yaw)
     placed = scene.fp.place(loaded.footprint, jnp.asarray(qpos[3:5]), jnp.asarray(yaw))
-    assert float(placed.vertices[:, 0].min()) == pytest.approx(skin.HALF_LENGTH + 0.02, abs=1e-6)
+    assert float(placed.vertices[:, 0].min()) == pytest.approx(shell.HALF_LENGTH + 0.02, abs=1e-6)
 
 
 def test_a_stack_holds_every_field_of_each_recompiled_model():

@@ -19,14 +19,15 @@ from hypothesis import strategies as st
 from rps_jax import errors
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry.footprint import Footprint
-from rps_jax.robot import skin
+from rps_jax.robot import shell
+from rps_jax.robot.shell import Shell
 from rps_jax.robot.skin import LINE, NONE, POINT, CapacitiveSkin, IdealSkin
 
 FRONT, SIDE = 0.3625, 0.29  # [m]
 PITCH = 0.58 / 12  # [m] from taxel to taxel
-FACES = skin.faces()
-TAXELS = np.asarray(skin.taxels()[:, 0])  # (42, 2) [m] their middles
-TAXEL_SAMPLES = np.asarray(skin.taxels(5))  # (42, 5, 2) [m]
+FACES = dict(zip(shell.SIDES, Shell().rows(), strict=True))
+TAXELS = np.asarray(Shell().taxels()[:, 0])  # (42, 2) [m] their middles
+TAXEL_SAMPLES = np.asarray(Shell().taxels(5))  # (42, 5, 2) [m]
 SETTLED = 1e3  # [s] a period after which the low-pass filter has forgotten its past
 
 property_test = hypothesis.settings(max_examples=100, deadline=None)
@@ -93,8 +94,8 @@ def random_placements(seed: int, n: int = 64, gap=(-0.004, 0.012)) -> dict[str, 
 
 def test_there_are_42_taxels_on_14_boards_of_three_electrodes():
     assert TAXELS.shape == (42, 2)
-    assert sum(skin.BOARDS.values()) == 14
-    assert skin.ELECTRODES == 3
+    assert sum(row.count for row in shell.BOARDS) == 14
+    assert {row.electrodes for row in shell.BOARDS} == {3}
 
 
 def test_15_taxels_lie_on_each_side_and_12_on_the_front():
@@ -107,7 +108,7 @@ def test_15_taxels_lie_on_each_side_and_12_on_the_front():
 
 
 def test_the_critical_region_ends_5_cm_beyond_l_cr():
-    assert pytest.approx(0.24 + 0.05) == skin.HALF_WIDTH
+    assert pytest.approx(0.24 + 0.05) == shell.HALF_WIDTH
 
 
 def test_the_taxels_of_every_face_have_the_pitch_of_48_3_mm_and_fill_it():
@@ -346,7 +347,7 @@ def test_a_corner_between_two_taxels_must_press_deeper_than_a_flush_box(gap, kin
 @pytest.mark.parametrize("value", [math.nan, -0.01, math.inf])
 def test_check_names_the_parameter_that_no_skin_can_have(sensor, value):
     sensor.check()
-    for name in sensor._fields:
+    for name in set(sensor._fields) - {"shell"}:
         with pytest.raises(errors.InputError, match=rf"\b{name} = "):
             sensor._replace(**{name: value}).check()
 

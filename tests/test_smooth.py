@@ -19,7 +19,8 @@ from rps_jax.control import law, strategies
 from rps_jax.control.law import Observation, RPSParams, RPSState, Temperatures
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry.footprint import Footprint
-from rps_jax.robot.skin import HALF_LENGTH, HALF_WIDTH, NONE, CapacitiveSkin, IdealSkin, SmoothSkin
+from rps_jax.robot.shell import HALF_LENGTH, HALF_WIDTH
+from rps_jax.robot.skin import NONE, CapacitiveSkin, IdealSkin, SmoothSkin
 from rps_jax.trials import host, pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting

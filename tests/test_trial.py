@@ -12,7 +12,8 @@ import pytest
 from rps_jax import errors
 from rps_jax.control.law import RPSParams
 from rps_jax.engines.base import Driven
-from rps_jax.robot.skin import CapacitiveSkin, IdealSkin
+from rps_jax.robot.robot import Robot
+from rps_jax.robot.skin import CapacitiveSkin
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
@@ -224,7 +225,7 @@ def test_the_trace_of_a_trial_tells_the_same_story_as_its_outcome():
         ({"gap": -0.1}, "gap"),
         ({"rear": "left"}, "rear"),
         ({"skin": CapacitiveSkin(noise=-1.0)}, "noise"),
-        ({"skin": IdealSkin(half_length=0.0)}, "half_length"),
+        ({"robot": Robot(half_length=0.0)}, "half_length"),
         ({"bearing": float("nan")}, "bearing"),
         ({"shift": Shift(float("nan"))}, "shift time"),
         ({"shift": Shift(3.0, (0.0, float("inf")))}, "shift y"),

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from rps_jax.analysis import studio
-from rps_jax.robot import skin
+from rps_jax.robot.shell import Shell
 from rps_jax.robot.skin import NONE
 from rps_jax.trials.stepper import Moment
 from rps_jax.world.scene import Scene
@@ -84,8 +84,7 @@ class Drawing:
             world.add_mesh_simple(
                 f"{_ROOT}/{body}/{i}", vertices, faces, color=colour, flat_shading=True
             )
-        front = scene.physics.geom("base").size[0]
-        self._taxels = _add_taxels(world, f"{_ROOT}/base/taxels", float(front))
+        self._taxels = _add_taxels(world, f"{_ROOT}/base/taxels", scene.shell)
         self._contact = world.add_icosphere(
             f"{_ROOT}/base/contact", studio.CONTACT_RADIUS, color=_rgb(studio.CONTACT_RGBA)
         )
@@ -157,16 +156,13 @@ def _joined(points: np.ndarray) -> np.ndarray:
     return lines if len(lines) else np.zeros((1, 2, 3))
 
 
-def _add_taxels(world: Any, name: str, half_length: float) -> Any:
+def _add_taxels(world: Any, name: str, shell: Shell) -> Any:
     """A tile for each taxel, along the rim of the base."""
-    middles = np.asarray(skin.taxels(1, half_length))[:, 0]
+    middles = np.asarray(shell.taxels())[:, 0]
     depth, height, z = _TAXEL
-    faces = skin.faces(half_length).items()
-    counts = [skin.BOARDS[side] * skin.ELECTRODES for side, _ in faces]
-    along = np.repeat([face.along for _, face in faces], counts, axis=0)
-    length = np.repeat([float(face.length) for _, face in faces], counts) / np.repeat(
-        counts, counts
-    )
+    rows, counts = shell.rows(), [one.taxels for one in shell.boards]
+    along = np.repeat([row.along for row in rows], counts, axis=0)
+    length = np.repeat([float(row.length) for row in rows], counts) / np.repeat(counts, counts)
     inward = np.stack([along[:, 1], -along[:, 0]], axis=-1)  # the strip runs clockwise
     places = np.column_stack([middles + (depth / 2 - 0.004) * inward, np.full(len(middles), z)])
     sizes = np.abs(along) * 0.92 * length[:, None] + np.abs(inward) * depth

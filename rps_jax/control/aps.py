@@ -23,7 +23,7 @@ from rps_jax import errors
 from rps_jax.control import law
 from rps_jax.control.law import Details, Observation, Twist
 from rps_jax.geometry import planar
-from rps_jax.robot.skin import HALF_LENGTH
+from rps_jax.robot.shell import HALF_LENGTH
 
 
 class APSParams(NamedTuple):

@@ -164,12 +164,11 @@ class Engine(abc.ABC):
         solids: Solid,
         friction: Friction,
         physics: Physics,
-        robots: Robot | None = None,
+        robots: Robot = Robot(),
     ) -> tuple[Any, Any]:
-        """Stage, and fields (n, ...) on the host, of solids (n, ...), friction (n,) each.
+        """Stage, and fields (n, ...) on the host, of solids (n, ...), friction and robots (n,).
 
         What MuJoCo would derive in compiling each of them is computed here, for all at once.
-        `robots` (n,) are of bases whose force is limited.
 
         Raises:
           InputError: the engine cannot step them on this machine.

@@ -153,7 +153,7 @@ class MJX(Engine):
         solids: Solid,
         friction: Friction,
         physics: Physics,
-        robots: Robot | None = None,
+        robots: Robot = Robot(),
     ) -> tuple[Any, Any]:
         """Stage and fields of solids (n, ...)."""
         return solids_by_template(self, family, solids, friction, physics, robots)
@@ -188,13 +188,15 @@ def solids_by_template(
     solids: Solid,
     friction: Friction,
     physics: Physics,
-    robots: Robot | None = None,
+    robots: Robot = Robot(),
 ) -> tuple[Any, Any]:
     """Stage of the first of the solids, and fields (n, ...) of all."""
+    robots = scene.each(robots, solids.mass.size)
     template = scene.of_solid(family, solids, friction, physics, 0, robots)
     stage, fields = engine.stage_of_scenes([template], np.zeros(1, int))
     fields = mjx_fields(family, solids, friction, template, fields)
-    if robots is not None:
+    _size_bases(fields, template.physics, robots)
+    if robots.driven:
         _weigh_bases(fields, template.physics, robots)
     return stage, fields
 
@@ -276,6 +278,16 @@ def mjx_fields(
         robot[:, None], friction.robot[:, None, None], friction.ground[:, None, None]
     )
     return new
+
+
+def _size_bases(fields: dict[str, np.ndarray], model: mujoco.MjModel, robots: Robot) -> None:
+    """Size, bounding box and radius of the bases of robots (n,)."""
+    geom = model.geom("base").id
+    size = fields[".geom_size"][:, geom]
+    size[:, :2] = scene.base_half(robots, len(size))
+    box = np.concatenate([0 * size, size], axis=-1)
+    fields[".geom_aabb"][:, geom] = box.reshape(fields[".geom_aabb"][:, geom].shape)
+    fields[".geom_rbound"][:, geom] = np.linalg.norm(size, axis=1)
 
 
 def _weigh_bases(fields: dict[str, np.ndarray], model: mujoco.MjModel, robots: Robot) -> None:

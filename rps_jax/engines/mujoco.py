@@ -141,10 +141,11 @@ class MuJoCo(Engine):
         solids: Solid,
         friction: Friction,
         physics: Physics,
-        robots: Robot | None = None,
+        robots: Robot = Robot(),
     ) -> tuple[Any, Any]:
         """The models of solids (n, ...)."""
         every = range(solids.mass.size)
+        robots = scene.each(robots, solids.mass.size)
         scenes = (scene.of_solid(family, solids, friction, physics, i, robots) for i in every)
         return [one.physics for one in scenes], {}
 

@@ -287,12 +287,11 @@ class QuasistaticEngine(Engine):
         solids: Solid,
         friction: Friction,
         physics: Physics,
-        robots: Robot | None = None,
+        robots: Robot = Robot(),
     ) -> tuple[Any, Any]:
         """Stage and fields of solids (n, ...); its bases follow every twist."""
-        assert robots is None, "checked by check_robot"
-        template = scene.of_solid(family, solids, friction, physics, 0)
-        half = template.physics.geom("base").size[:2]
+        assert not robots.driven, "checked by check_robot"
+        half = scene.base_half(robots, solids.mass.size)
         return Quasistatic(), sliders(solids, friction.robot, half)
 
     def contacts(self, stage: Any, corners: int) -> int:

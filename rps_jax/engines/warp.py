@@ -138,12 +138,12 @@ class Warp(Engine):
         solids: Solid,
         friction: Friction,
         physics: Physics,
-        robots: Robot | None = None,
+        robots: Robot = Robot(),
     ) -> tuple[Any, Any]:
         """Stage and fields of solids (n, ...); its bases follow every twist."""
-        assert robots is None, "checked by check_robot"
+        assert not robots.driven, "checked by check_robot"
         self.check([family])
-        return solids_by_template(self, family, solids, friction, physics)
+        return solids_by_template(self, family, solids, friction, physics, robots)
 
     def contacts(self, stage: WarpStage, corners: int) -> int:
         """Points of contact for which there is room."""

@@ -18,11 +18,6 @@ import jax.numpy as jnp
 from rps_jax.geometry import planar
 from rps_jax.robot.robot import Robot
 
-BANDWIDTH = 5.0  # [Hz] of the velocity servo; data sheets do not give it, and 5 Hz is usual
-_OMEGA = 2 * math.pi * BANDWIDTH  # [rad/s]
-PROPORTIONAL = 2 * _OMEGA  # [1/s] force over momentum lacking: critically damped
-INTEGRAL = _OMEGA**2  # [1/s^2]
-UNWIND = _OMEGA  # [1/s] how fast the integral forgets what the limit cut off
 STALLED = 0.1  # [1] of the speed aimed at, below which a base stands still
 _MOVING = 1e-3  # [m/s] below which nothing is aimed at
 Triple = tuple[Any, Any, Any]
@@ -48,8 +43,10 @@ def aim(robot: Robot, before: jax.Array, twist: jax.Array, period: float) -> jax
     All in the base's frame [m/s, m/s, rad/s]; `period` [s] is that of the control loop.
     """
     if robot.v_max is not None:
-        speed = planar.norm(twist[:2])
-        twist = twist.at[:2].multiply(jnp.minimum(1.0, robot.v_max / jnp.maximum(speed, 1e-9)))
+        most = jnp.asarray(robot.v_max)
+        speed = planar.norm(twist[:2]) if most.ndim == 0 else jnp.abs(twist[:2])
+        shares = most / jnp.maximum(speed, 1e-9)  # the direction is kept
+        twist = twist.at[:2].multiply(jnp.minimum(1.0, jnp.min(shares)))
     if robot.omega_max is not None:
         twist = twist.at[2].set(jnp.clip(twist[2], -robot.omega_max, robot.omega_max))
     if robot.lag is not None:
@@ -100,7 +97,8 @@ def push(
         twist[2] - velocity[2],
     )
     inertia = (robot.mass, robot.mass, robot.inertia)
-    wanted = [m * PROPORTIONAL * e + i for m, e, i in zip(inertia, errors, integral, strict=True)]
+    rate = 2 * math.pi * robot.bandwidth  # [rad/s], critically damped
+    wanted = [m * 2 * rate * e + i for m, e, i in zip(inertia, errors, integral, strict=True)]
     given = list(wanted)
     if (most := robot.push_max) is not None:
         size = xp.sqrt(wanted[0] * wanted[0] + wanted[1] * wanted[1])
@@ -109,7 +107,7 @@ def push(
     if (most := robot.turn_max) is not None:
         given[2] = xp.minimum(xp.maximum(wanted[2], -most), most)
     after = tuple(
-        i + timestep * (m * INTEGRAL * e + UNWIND * (g - w))
+        i + timestep * (m * rate**2 * e + rate * (g - w))  # the integral forgets what is cut off
         for i, m, e, g, w in zip(integral, inertia, errors, given, wanted, strict=True)
     )
     force = (c * given[0] - s * given[1], s * given[0] + c * given[1], given[2])

@@ -1,4 +1,4 @@
-"""The robot: what keeps a base from following a twist exactly, and robots that exist.
+"""The robot: its size, its skin's boards, what keeps it from following a twist, and presets.
 
 A limit that is None does not exist, and costs nothing: `Robot()` follows every twist at once, with
 any force.
@@ -7,7 +7,6 @@ any force.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +20,7 @@ from rps_jax import errors
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.record import files
-from rps_jax.robot.skin import HALF_LENGTH, HALF_WIDTH
-
-ARM = math.hypot(HALF_LENGTH, HALF_WIDTH)  # [m] from the middle of the base to its wheels
+from rps_jax.robot.shell import BOARDS, HALF_LENGTH, HALF_WIDTH, Boards, Shell
 
 
 @dataclass(frozen=True)
@@ -33,14 +30,19 @@ class Robot:
     Twists and limits are in the robot frame, x forward and y left.
     """
 
+    half_length: Any = HALF_LENGTH  # () [m]
+    half_width: Any = HALF_WIDTH  # () [m]
+    boards: tuple[Boards, ...] = BOARDS  # of the skin
     mass: Any = 130.0  # () [kg] of the whole robot; it matters to a base with a limited force
-    v_max: Any = None  # () [m/s] greatest speed, in any direction
+    # () [m/s] greatest speed in any direction, or (2,) forward and sideways
+    v_max: Any = None
     omega_max: Any = None  # () [rad/s] greatest turning rate
     lag: Any = None  # () [s] time constant with which the base follows a twist
     # (2,) [m/s^2, rad/s^2] greatest change of the velocity in a second
     acceleration_max: Any = None
     force_max: Any = None  # () [N] of the drive, in any direction
     torque_max: Any = None  # () [N m] of the drive about the vertical
+    bandwidth: Any = 5.0  # () [Hz] of the drive's velocity servo; of a limited force alone
     traction: Any = None  # () [1] friction coefficient of the wheels, which bounds force and torque
     resistance: Any = None  # () [1] of rolling, over the weight: a force that the drive spends
     slip: Any = None  # () [1] share of the velocity that the wheels lose
@@ -58,7 +60,18 @@ class Robot:
     @property
     def inertia(self) -> Any:
         """Moment of inertia () [kg m^2] about the vertical, as of a plate of the base's outline."""
-        return self.mass * (HALF_LENGTH**2 + HALF_WIDTH**2) / 3
+        return self.mass * (self.half_length**2 + self.half_width**2) / 3
+
+    @property
+    def arm(self) -> Any:
+        """From the middle to the wheels () [m], which stand at the corners of the outline."""
+        size = self.half_length**2 + self.half_width**2
+        return jnp.sqrt(size) if isinstance(size, jax.Array) else np.sqrt(size)
+
+    @property
+    def shell(self) -> Shell:
+        """The outline and the boards, of robots on the host."""
+        return Shell.of(self.half_length, self.half_width, self.boards)
 
     @property
     def push_max(self) -> Any:
@@ -80,25 +93,31 @@ class Robot:
     def turn_max(self) -> Any:
         """The greatest torque () [N m] about the vertical; None without a limit.
 
-        The wheels stand at the corners of the base's outline and share the force.
+        The wheels share the force.
         """
         bounds = [] if self.torque_max is None else [self.torque_max]
         if (force := self.push_max) is not None:
-            bounds.append(force * ARM)
+            bounds.append(force * self.arm)
         if not bounds:
             return None
         return bounds[0] if len(bounds) == 1 else _least(*bounds)
 
     @property
     def body(self) -> Robot:
-        """What a physics step needs of it: without the limits of where it aims."""
-        return dataclasses.replace(self, **dict.fromkeys(_OF_THE_AIM))
+        """What a physics step needs of it: without its skin and the limits of where it aims."""
+        return dataclasses.replace(self, boards=(), **dict.fromkeys(_OF_THE_AIM))
 
     def check(self) -> None:
         """Raises InputError for numbers that no robot has; each is one number, or None."""
+        Shell(self.half_length, self.half_width, self.boards).check()
         errors.check_finite("robot mass", self.mass, above=0, at_most=1e4, unit="kg")
         for name, (least, most, unit) in _ALLOWED.items():
             value = getattr(self, name)
+            if name == "v_max" and np.size(value) == 2 and value[1] == 0:
+                raise InputError(
+                    f"robot v_max = {value} is not allowed: a base that cannot move sideways "
+                    "cannot follow the law, which needs v_y."
+                )
             if value is not None:
                 for one in np.atleast_1d(np.asarray(value, object)):
                     errors.check_finite(
@@ -108,6 +127,11 @@ class Robot:
             raise InputError(
                 f"robot acceleration_max = {self.acceleration_max} is not allowed: give two "
                 "numbers, [m/s^2, rad/s^2]."
+            )
+        if np.size(self.v_max) > 2:
+            raise InputError(
+                f"robot v_max = {self.v_max} is not allowed: give one number, or two, forward and "
+                "sideways [m/s]."
             )
         if self.push_max is not None and self.push_max <= 0:
             raise InputError(
@@ -129,7 +153,8 @@ def _least(a: Any, b: Any) -> Any:
 
 _FIELDS = [field.name for field in dataclasses.fields(Robot)]
 _OF_THE_AIM = ("v_max", "omega_max", "lag", "acceleration_max", "slip")
-LIMITS = tuple(name for name in _FIELDS if name not in ("mass", "resistance"))
+_NO_LIMITS = ("half_length", "half_width", "boards", "mass", "bandwidth", "resistance")
+LIMITS = tuple(name for name in _FIELDS if name not in _NO_LIMITS)
 jax.tree_util.register_dataclass(Robot, data_fields=_FIELDS, meta_fields=[])
 _LEAST = 1e-3  # of what would else bring the base to a stop
 _ALLOWED = {
@@ -137,6 +162,7 @@ _ALLOWED = {
     "omega_max": (_LEAST, 20, "rad/s"),
     "lag": (0, 5, "s"),
     "acceleration_max": (_LEAST, 100, "1"),
+    "bandwidth": (0.1, 100, "Hz"),
     "force_max": (0, 1e5, "N"),
     "torque_max": (_LEAST, 1e5, "N m"),
     "traction": (_LEAST, 5, "1"),
@@ -145,7 +171,15 @@ _ALLOWED = {
 }
 
 
-# From data sheets and the makers' robot descriptions, as far as these say.
+def _covered(length: float, width: float) -> tuple[Boards, ...]:
+    """As many of the paper's boards as a base of these [m] has room for, in the middle of sides."""
+    pitch = 2 * HALF_WIDTH / 12  # of the paper's taxels
+    side, front = (int(size / (3 * pitch) + 1e-6) for size in (length, width))
+    return Boards("left", side, pitch), Boards("front", front, pitch), Boards("right", side, pitch)
+
+
+# From data sheets and the makers' robot descriptions, as far as these say. None of these has a
+# skin of its own: they wear the paper's boards.
 ROBOTS: dict[str, Robot] = {
     # Every twist is followed at once: as the paper's simulation has it.
     "ideal": Robot(),
@@ -155,9 +189,12 @@ ROBOTS: dict[str, Robot] = {
     "kairos": Robot(
         mass=158.0, v_max=3.0, acceleration_max=(2.5, 3.2), traction=0.5, resistance=0.03
     ),
-    # Clearpath Ridgeback, mecanum wheels: 195 kg is the sum over ridgeback.urdf.xacro, speeds and
-    # accelerations are those of ridgeback_control/config/control.yaml.
+    # Clearpath Ridgeback, mecanum wheels: outline and 195 kg, the sum, are those of
+    # ridgeback.urdf.xacro, speeds and accelerations of ridgeback_control/config/control.yaml.
     "ridgeback": Robot(
+        half_length=0.48,
+        half_width=0.3965,
+        boards=_covered(0.96, 0.793),
         mass=195.0,
         v_max=1.1,
         omega_max=2.0,
@@ -165,14 +202,19 @@ ROBOTS: dict[str, Robot] = {
         traction=0.5,
         resistance=0.03,
     ),
-    # Neobotix MPO-500, mecanum wheels; its hardware documentation gives 0.9 m/s, 2.4 m/s^2, and of
-    # each of four motors 1.91 N m at most, geared 25:1, on wheels of 254 mm: 1504 N. It gives no
-    # mass, which is our choice; so is the turn, which keeps the wheels at 2.4 m/s^2.
+    # Neobotix MPO-500, mecanum wheels; its hardware documentation gives 988 by 662 mm, 0.9 m/s,
+    # 2.4 m/s^2, wheels at 250 and 274 mm from the middle, and of each of four motors 1.91 N m at
+    # most, geared 25:1, on wheels of 254 mm: 1504 N. It gives no mass, which is our choice; the
+    # turn is what keeps the wheels at 2.4 m/s^2.
     "mpo_500": Robot(
+        half_length=0.494,
+        half_width=0.331,
+        boards=_covered(0.988, 0.662),
         mass=130.0,
         v_max=0.9,
-        acceleration_max=(2.4, 2.4 / ARM),
+        acceleration_max=(2.4, 6.47),
         force_max=1504.0,
+        torque_max=558.0,
         traction=0.5,
         resistance=0.03,
     ),
@@ -192,6 +234,28 @@ def named(robot: Robot | str | Mapping[str, Any]) -> Robot:
     if isinstance(robot, Mapping):
         for name in robot:
             errors.check_name("robot quantity", name, _FIELDS)
-        robot = Robot(**{k: tuple(v) if isinstance(v, list) else v for k, v in robot.items()})
+        read = {k: tuple(v) if isinstance(v, list | tuple) else v for k, v in robot.items()}
+        if "boards" in read:
+            read["boards"] = _boards(read["boards"])
+        robot = Robot(**read)
     robot.check()
     return robot
+
+
+def _boards(rows: Any) -> tuple[Boards, ...]:
+    """Rows of boards from names with numbers."""
+    known = [field.name for field in dataclasses.fields(Boards)]
+    found = []
+    for row in rows if isinstance(rows, tuple) else (rows,):
+        if isinstance(row, Boards):
+            found.append(row)
+            continue
+        if not isinstance(row, Mapping) or not {"side", "count"} <= set(row):
+            raise InputError(
+                f"robot boards = {row} are not allowed: write each row as "
+                '{"side": "front", "count": 4, "pitch": 0.048}.'
+            )
+        for name in row:
+            errors.check_name("robot boards' quantity", name, known)
+        found.append(Boards(**row))
+    return tuple(found)

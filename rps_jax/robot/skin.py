@@ -1,10 +1,8 @@
 """The tactile skin: where does the object touch the base?
 
 Two sensors behind one interface, both purely geometric: they read the object's footprint, placed
-in the robot frame, and never the engine's contacts. The skin covers the front, left and right
-faces. Positions along it form one strip that starts at the rear of the left face, runs forward,
-across the front from left to right, and back along the right face; the two extreme positions of a
-contact are its first and last along this strip.
+in the robot frame, and never the engine's contacts. They feel where the boards of a base's shell
+are; the two extreme positions of a contact are its first and last along the shell's strip.
 
     sensor.init(key) -> state
     sensor.sense(state, footprint, period) -> (state, Reading)
@@ -24,36 +22,13 @@ from rps_jax import errors
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.geometry.footprint import Footprint
+from rps_jax.robot.shell import HALF_WIDTH, Shell
 
-HALF_LENGTH = 0.3625  # [m] of the base: 15 taxels of 48.3 mm make 0.725 m
-HALF_WIDTH = 0.29  # [m] of the base: l_cr + 5 cm, Sec. III-A
-BOARDS = {"left": 5, "front": 4, "right": 5}  # 14 boards, Sec. II-B
-ELECTRODES = 3  # on each board
-_SAMPLES = 5  # of each taxel, about 1 cm apart: a corner pressed home is felt
-
-_NODES = 16  # points on each face of the smooth ideal sensor
+_NODES = 16  # points on each row of boards of the smooth ideal sensor
 _REACH = 8.0  # [1] temperatures beyond its tolerance at which they end, with 3e-4 of the weight
 _NEVER = -1e9  # of a dead taxel: its excess over the threshold, in temperatures
 
 NONE, POINT, LINE = 0, 1, 2  # contact types, Fig. 6c
-
-
-class Face(NamedTuple):
-    """One side of the base, in strip order."""
-
-    start: jax.Array  # (2,) [m] in the robot frame
-    along: np.ndarray  # (2,) unit vector
-    length: Any  # () [m]
-
-
-def faces(half_length: Any = HALF_LENGTH) -> dict[str, Face]:
-    """The covered sides of a base of length 2 half_length [m], in strip order."""
-    x, y = half_length, HALF_WIDTH
-    return {
-        "left": Face(jnp.stack([-x, y]), np.array([1.0, 0.0]), 2 * x),
-        "front": Face(jnp.stack([x, y]), np.array([0.0, -1.0]), 2 * y),
-        "right": Face(jnp.stack([x, -y]), np.array([-1.0, 0.0]), 2 * x),
-    }
 
 
 class Reading(NamedTuple):
@@ -80,8 +55,12 @@ class Skin(Protocol):
     """A tactile sensor: a pytree of parameters with two pure functions."""
 
     @property
-    def half_length(self) -> float | jax.Array:
-        """Of the base that it covers [m]."""
+    def shell(self) -> Shell:
+        """What it covers."""
+        ...
+
+    def on(self, shell: Shell) -> Skin:
+        """The same sensor on another shell."""
         ...
 
     def check(self) -> None:
@@ -118,7 +97,7 @@ class IdealSkin(NamedTuple):
 
     tolerance: float | jax.Array = 0.006  # [m]
     point_length: float | jax.Array = 2 * HALF_WIDTH / 12  # [m] up to one taxel long: a point
-    half_length: float | jax.Array = HALF_LENGTH  # [m] of the base
+    shell: Shell = Shell()  # what it covers; in a trial, that of the robot
 
     def check(self) -> None:
         """Raises InputError unless all are lengths."""
@@ -126,7 +105,11 @@ class IdealSkin(NamedTuple):
             errors.check_finite(
                 f"skin {name}", getattr(self, name), at_least=0, at_most=0.1, unit="m"
             )
-        _check_half_length(self.half_length)
+        self.shell.check()
+
+    def on(self, shell: Shell) -> IdealSkin:
+        """The same sensor on another shell."""
+        return self._replace(shell=shell)
 
     def init(self, key: jax.Array) -> SkinState:
         """No memory, no imperfections."""
@@ -138,17 +121,15 @@ class IdealSkin(NamedTuple):
         """The middle between the two ends of the contact interval; the period is unused."""
         del period
         dtype = footprint.vertices.dtype
-        strip_start = 0.0
-        hits, ends = [], []  # of both ends of each face's interval, in strip order
-        for face in faces(self.half_length).values():
-            start, along = jnp.asarray(face.start, dtype), jnp.asarray(face.along, dtype)
+        hits, ends = [], []  # of both ends of each row's interval, in strip order
+        for row in self.shell.rows():
+            start, along = jnp.asarray(row.start, dtype), jnp.asarray(row.along, dtype)
             low, high = fp.crossing(footprint, start, along, self.tolerance)
-            hit = (low <= high) & (high >= 0) & (low <= face.length)
+            hit = (low <= high) & (high >= 0) & (low <= row.length)
             for s in (low, high):
-                s = jnp.clip(s, 0.0, face.length)
-                ends.append(jnp.concatenate([start + s * along, strip_start + s[None]]))
+                s = jnp.clip(s, 0.0, row.length)
+                ends.append(jnp.concatenate([start + s * along, row.begins + s[None]]))
                 hits.append(hit)
-            strip_start += face.length
         ends, hits = jnp.stack(ends), jnp.stack(hits)
         first, last = _extremes(hits, ends)
         kind = jnp.where(last[2] - first[2] > self.point_length, LINE, POINT)
@@ -167,38 +148,37 @@ class IdealSkin(NamedTuple):
         """
         del period
         s, share = self._nodes(footprint, self.tolerance + _REACH * temperature)
-        distance = fp.signed_distance(footprint, on_strip(s, self.half_length))
+        distance = fp.signed_distance(footprint, self.shell.on_strip(s))
         excess = (self.tolerance - distance) / temperature
         # A softmax: defined where nothing is near too, by whatever is nearest.
         middle = jnp.sum(s * jax.nn.softmax(jax.nn.log_sigmoid(excess) + jnp.log(share)))
         length = jnp.sum(share * jax.nn.sigmoid(excess))
-        first, last = on_strip(middle + length * jnp.array([-0.5, 0.5], s.dtype), self.half_length)
+        first, last = self.shell.on_strip(middle + length * jnp.array([-0.5, 0.5], s.dtype))
         kind = jnp.where(length > self.point_length, LINE, POINT)
         return state, _smooth_reading(planar.greatest(excess), kind, first, last)
 
     def _nodes(self, footprint: Footprint, tolerance: Any) -> tuple[jax.Array, jax.Array]:
         """Points (N,) [m] of the strip within `tolerance` of a footprint, the length of each.
 
-        Of a face that lies beyond it, points all along.
+        Of a row of boards that lies beyond it, points all along.
         """
         middles = (np.arange(_NODES) + 0.5) / _NODES
-        nodes, shares, strip_start = [], [], 0.0
-        for face in faces(self.half_length).values():
+        nodes, shares = [], []
+        for row in self.shell.rows():
             dtype = footprint.vertices.dtype
-            start, along = jnp.asarray(face.start, dtype), jnp.asarray(face.along, dtype)
+            start, along = jnp.asarray(row.start, dtype), jnp.asarray(row.along, dtype)
             low, high = fp.crossing(footprint, start, along, tolerance)
-            near = (low <= high) & (high >= 0) & (low <= face.length)
-            low = jnp.where(near, jnp.clip(low, 0.0, face.length), 0.0)
-            high = jnp.where(near, jnp.clip(high, 0.0, face.length), face.length)
-            nodes.append(strip_start + low + (high - low) * middles)
+            near = (low <= high) & (high >= 0) & (low <= row.length)
+            low = jnp.where(near, jnp.clip(low, 0.0, row.length), 0.0)
+            high = jnp.where(near, jnp.clip(high, 0.0, row.length), row.length)
+            nodes.append(row.begins + low + (high - low) * middles)
             share = jnp.maximum(high - low, 1e-6) / _NODES  # not zero: its logarithm is taken
             shares.append(jnp.broadcast_to(share, _NODES))
-            strip_start += face.length
         return jnp.concatenate(nodes), jnp.concatenate(shares)
 
 
 class CapacitiveSkin(NamedTuple):
-    """42 taxels under foam: compression -> capacitance -> low-pass -> threshold (Sec. II-B).
+    """Taxels under foam: compression -> capacitance -> low-pass -> threshold (Sec. II-B).
 
     The foam stands proud of the rigid base by `foam`. An electrode's capacitance is the mean of
     eps / gap over its length, the gap being what the object leaves of the foam.
@@ -211,7 +191,7 @@ class CapacitiveSkin(NamedTuple):
     noise: float | jax.Array = 0.0  # [1] standard deviation of each raw reading
     gain_spread: float | jax.Array = 0.0  # [1] standard deviation of the taxels' gains about 1
     dead_share: float | jax.Array = 0.0  # [1] probability that a taxel never answers
-    half_length: float | jax.Array = HALF_LENGTH  # [m] of the base
+    shell: Shell = Shell()  # what it covers; in a trial, that of the robot
 
     def check(self) -> None:
         """Raises InputError for foam, filter or imperfections that no skin can have."""
@@ -221,19 +201,23 @@ class CapacitiveSkin(NamedTuple):
         for name in ("threshold", "noise", "gain_spread"):
             errors.check_finite(f"skin {name}", getattr(self, name), at_least=0)
         errors.check_finite("skin dead_share", self.dead_share, at_least=0, at_most=1)
-        _check_half_length(self.half_length)
+        self.shell.check()
+
+    def on(self, shell: Shell) -> CapacitiveSkin:
+        """The same sensor on another shell."""
+        return self._replace(shell=shell)
 
     def init(self, key: jax.Array) -> SkinState:
         """Draws each taxel's gain and whether it is dead."""
         key, key_gain, key_dead = jax.random.split(key, 3)
-        n = sum(BOARDS.values()) * ELECTRODES
+        n = self.shell.count
         gain = 1 + self.gain_spread * jax.random.normal(key_gain, (n,))
         alive = jax.random.uniform(key_dead, (n,)) >= self.dead_share
         return SkinState(key, jnp.zeros(n), gain, alive)
 
     def compression(self, footprint: Footprint) -> jax.Array:
         """How far the object presses into the foam (T, S) [m] at each sample of each taxel."""
-        samples = jnp.asarray(taxels(_SAMPLES, self.half_length), footprint.vertices.dtype)
+        samples = jnp.asarray(self.shell.taxels(self.shell.samples), footprint.vertices.dtype)
         depth = self.foam - fp.signed_distance(footprint, samples)
         return jnp.clip(depth, 0.0, self.max_compression * self.foam)
 
@@ -252,12 +236,12 @@ class CapacitiveSkin(NamedTuple):
     def read(self, state: SkinState, raw: jax.Array, period: float) -> tuple[SkinState, Reading]:
         """One scan of a real skin, or of a simulated one, filtered and compared to the threshold.
 
-        `raw` (42,) [1] is each taxel's relative change of capacitance, in strip order (that of
-        `taxels`), `period` [s] after the last scan.
+        `raw` (T,) [1] is each taxel's relative change of capacitance, in the order of
+        `Shell.taxels`, `period` [s] after the last scan.
         """
         state = self._filtered(state, raw, period)
         active = (state.signal > self.threshold) & state.alive
-        middles = jnp.asarray(taxels(1, self.half_length)[:, 0], raw.dtype)
+        middles = jnp.asarray(self.shell.taxels()[:, 0], raw.dtype)
         first, last = _extremes(active, middles)
         kind = jnp.minimum(jnp.sum(active), LINE)
         return state, _reading(kind, first, last)
@@ -279,7 +263,7 @@ class CapacitiveSkin(NamedTuple):
         """
         state = self._filtered(*self._scan(state, footprint), period)
         excess = jnp.where(state.alive, (state.signal - self.threshold) / temperature, _NEVER)
-        middles = jnp.asarray(taxels(1, self.half_length)[:, 0], excess.dtype)
+        middles = jnp.asarray(self.shell.taxels()[:, 0], excess.dtype)
         first, last = _first(excess) @ middles, _first(excess[::-1]) @ middles[::-1]
         kind = jnp.clip(jnp.sum(excess > 0), POINT, LINE)
         return state, _smooth_reading(planar.greatest(excess), kind, first, last)
@@ -297,9 +281,13 @@ class SmoothSkin(NamedTuple):
     temperature: float | jax.Array = 0.001
 
     @property
-    def half_length(self) -> float | jax.Array:
-        """Of the base that it covers [m]."""
-        return self.sensor.half_length
+    def shell(self) -> Shell:
+        """What it covers."""
+        return self.sensor.shell
+
+    def on(self, shell: Shell) -> SmoothSkin:
+        """The same sensor on another shell."""
+        return self._replace(sensor=self.sensor.on(shell))
 
     def check(self) -> None:
         """Raises InputError for a sensor or a temperature that means nothing."""
@@ -325,29 +313,6 @@ SKINS: dict[SkinName, Skin] = {
     "capacitive": CapacitiveSkin(),
     "hardware": CapacitiveSkin(noise=0.05, gain_spread=0.1),  # noise a fifth of the threshold
 }
-
-
-def _check_half_length(value: Any) -> None:
-    errors.check_finite("skin half_length", value, at_least=0.1, at_most=2, unit="m")
-
-
-def taxels(samples: int = 1, half_length: Any = HALF_LENGTH) -> jax.Array:
-    """Sample points (42, samples, 2) [m] of the taxels, in strip order, in the robot frame."""
-    rows = []
-    for name, face in faces(half_length).items():
-        count = BOARDS[name] * ELECTRODES * samples
-        s = (np.arange(count) + 0.5) / count * face.length
-        rows.append((face.start + s[:, None] * face.along).reshape(-1, samples, 2))
-    return jnp.concatenate(rows)
-
-
-def on_strip(s: jax.Array, half_length: Any = HALF_LENGTH) -> jax.Array:
-    """Points (..., 2) [m] of the strip in the robot frame, `s` (...) [m] from its start."""
-    x = jnp.asarray(half_length, s.dtype)
-    corners = jnp.cumsum(jnp.stack([0 * x, 2 * x, jnp.full_like(x, 2 * HALF_WIDTH), 2 * x]))
-    at_x = jnp.interp(s, corners, jnp.stack([-x, x, x, -x]))
-    y = HALF_WIDTH * np.array([1.0, 1.0, -1.0, -1.0])
-    return jnp.stack([at_x, jnp.interp(s, corners, jnp.asarray(y, s.dtype))], axis=-1)
 
 
 def _first(excess: jax.Array) -> jax.Array:

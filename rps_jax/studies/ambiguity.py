@@ -15,6 +15,7 @@ import xarray as xr
 from scipy import stats
 
 from rps_jax.analysis import statistics
+from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import CapacitiveSkin, IdealSkin
 from rps_jax.studies.study import Condition
 from rps_jax.trials.setting import Setting
@@ -57,8 +58,8 @@ READINGS = {
     "period_100ms": Condition("control period 100 ms", _setting(control_period=0.1)),
     "drive_on_loss": _params("0.05 m/s instead of 0.01 after a loss", v_lost=0.05),
     "keep_on_loss": _params("last contact acted upon after a loss", keep_contact=1.0),
-    "base_98cm": _case("base 0.978 m long instead of 0.725", skin=IdealSkin(half_length=0.489)),
-    "base_58cm": _case("base 0.58 m long (square)", skin=IdealSkin(half_length=0.29)),
+    "base_98cm": _case("base 0.978 m long instead of 0.725", robot=Robot(half_length=0.489)),
+    "base_58cm": _case("base 0.58 m long (square)", robot=Robot(half_length=0.29)),
     "capacitive": _case("capacitive skin of 42 taxels", skin=CapacitiveSkin()),
     "tolerance_10mm": _case("skin tolerance 10 mm instead of 6", skin=IdealSkin(0.010)),
     "tolerance_3mm": _case("skin tolerance 3 mm", skin=IdealSkin(0.003)),

@@ -78,7 +78,7 @@ class Conditions:
         name: Any = self.skin or paper.SKIN[self.physics]
         usual: Any = SKINS[name]
         for changed in self.skin_params:
-            errors.check_name("skin-params", changed, usual._fields)
+            errors.check_name("skin-params", changed, set(usual._fields) - {"shell"})
         return usual._replace(**self.skin_params)
 
     def case(

@@ -72,9 +72,9 @@ class State:
 class PushEnv:
     """One object to be pushed to a target by touch.
 
-    Observation (44,): the 42 taxels, in the strip order of `skin.taxels`, each the filtered
-    relative change of its capacitance [1], 0 if it is dead; then the target (x, y) [m] in the
-    robot's frame, by where the base believes to be.
+    Observation (T + 2,): the T taxels of the robot, the paper's 42, in the order of `Shell.taxels`,
+    each the filtered relative change of its capacitance [1], 0 if it is dead; then the target
+    (x, y) [m] in the robot's frame, by where the base believes to be.
 
     Action (3,): the twist (v_x, v_y, omega) in the robot's frame, in units of the parameters'
     v_max, v_max and omega_max. (v_x, v_y) is scaled down to a norm of 1, omega is clipped to +-1.

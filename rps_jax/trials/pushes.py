@@ -19,6 +19,7 @@ from rps_jax.control.law import RPSParams
 from rps_jax.control.strategies import Params, Strategy
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.robot import Robot
+from rps_jax.robot.shell import Shell
 from rps_jax.robot.skin import IdealSkin, Skin
 from rps_jax.trials import trial
 from rps_jax.trials.batch import SEGMENT, Job, Part, rows, warn_of_lost
@@ -50,7 +51,6 @@ class Case:
     def __post_init__(self) -> None:
         """Raises InputError for anything that names or means no trial."""
         errors.check_name("object", self.object, OBJECTS)
-        scene.check_target(self.p_world_target)
         strategies.of(self.params).check(self.params)
         scene.check(self.friction, self.mass)
         self.skin.check()
@@ -61,6 +61,12 @@ class Case:
         for axis, value in zip("xy", self.shift.p_robot, strict=True):
             errors.check_finite(f"shift {axis}", value, at_least=-5, at_most=5, unit="m")
         self.robot.check()
+        scene.check_target(self.p_world_target, self.robot.shell)
+
+    @property
+    def sensor(self) -> Skin:
+        """The skin on the robot."""
+        return self.skin.on(self.robot.shell)
 
 
 @dataclass(frozen=True)
@@ -72,6 +78,7 @@ class Trace:
     timing: Timing  # of all trials followed together
     p_world_target: tuple[float, float]  # [m]
     params: Params
+    half: tuple[float, float]  # [m] half length and half width of the base
 
 
 def scene_of(case: Case, physics: Physics) -> Scene:
@@ -82,16 +89,13 @@ def scene_of(case: Case, physics: Physics) -> Scene:
         case.friction,
         rear=case.rear,
         mass=case.mass,
-        half_length=float(case.skin.half_length),
-        robot=case.robot if case.robot.driven else None,
+        robot=case.robot,
     )
 
 
 def _scenes(cases: Sequence[Case], physics: Physics) -> tuple[list[Scene], np.ndarray]:
     """The different scenes of cases, and which of them each case has, (len(cases),)."""
-    keys = [
-        (c.object, c.friction, c.mass, c.rear, float(c.skin.half_length), c.robot) for c in cases
-    ]
+    keys = [(c.object, c.friction, c.mass, c.rear, c.robot) for c in cases]
     different = dict(zip(keys, cases, strict=True))
     order = {key: i for i, key in enumerate(different)}
     scenes = [scene_of(case, physics) for case in different.values()]
@@ -129,7 +133,7 @@ def build(
     world = World(
         fields=jax.tree.map(lambda leaf: np.asarray(leaf, dtype), fields),
         footprint=_stack([s.footprint for s in scenes], dtype, which),
-        skin=_stack([case.skin for case in cases], dtype),
+        skin=_stack([case.sensor for case in cases], dtype),
         params=_stack([case.params for case in cases], dtype),
         p_world_target=_stack([target for _, target in starts], dtype),
         shift=Shift(
@@ -146,7 +150,7 @@ def build(
 
 def kind(case: Case) -> Hashable:
     """What decides which compiled program runs a case: family, strategy, sensor and robot."""
-    return FAMILIES[case.object], type(case.params), jax.tree.structure((case.skin, case.robot))
+    return FAMILIES[case.object], type(case.params), jax.tree.structure((case.sensor, case.robot))
 
 
 def _by_kind(cases: Sequence[Case]) -> list[list[int]]:
@@ -265,6 +269,12 @@ def follow_part(
             timing,
             (float(part.worlds.p_world_target[i][0]), float(part.worlds.p_world_target[i][1])),
             rows(part.worlds.params, i),
+            _half(rows(part.worlds.skin.shell, i)),
         )
         for i in range(part.numbers.size)
     ]
+
+
+def _half(shell: Shell) -> tuple[float, float]:
+    x, y = shell.half
+    return float(x), float(y)

@@ -95,6 +95,9 @@ def trace_dataset(trace: Trace) -> xr.Dataset:
     variables["p_world_target"] = xr.Variable("axis", list(trace.p_world_target), {"units": "m"})
     for name in ("d_success", *(("l_cr",) if isinstance(trace.params, RPSParams) else ())):
         variables[name] = xr.Variable((), _plain(getattr(trace.params, name)), {"units": "m"})
+    for name, value in zip(("half_length", "half_width"), trace.half, strict=True):
+        attrs = {"units": "m", "long_name": f"{name.replace('_', ' ')} of the base"}
+        variables[name] = xr.Variable((), value, attrs)
     return xr.Dataset(variables, coords={"time": ("time", seen.time, {"units": "s"})})
 
 

@@ -37,7 +37,7 @@ class Moment(NamedTuple):
     before: Trial  # as the step found it
     seen: Snapshot
     p_world_contact: np.ndarray  # (2,) [m], NaN without contact
-    compression: np.ndarray  # (42,) [1] of the foam under each taxel, in strip order
+    compression: np.ndarray  # (T,) [1] of the foam under each taxel, in strip order
 
 
 class Live:
@@ -193,8 +193,8 @@ def _steps(
 
 
 def _compression(sensor: Any, placed: Footprint) -> jax.Array:
-    """Greatest compression (42,) [1] under each taxel; an ideal sensor's tolerance is its foam."""
+    """Greatest compression (T,) [1] under each taxel; an ideal sensor's tolerance is its foam."""
     thickness = sensor.foam if isinstance(sensor, CapacitiveSkin) else sensor.tolerance
     foam = jnp.maximum(thickness, 1e-6)
-    felt = CapacitiveSkin(foam=foam, half_length=sensor.half_length).compression(placed)
+    felt = CapacitiveSkin(foam=foam, shell=sensor.shell).compression(placed)
     return jnp.max(felt, axis=-1) / foam

@@ -16,7 +16,6 @@ from rps_jax.engines.mjx import apply
 from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
-from rps_jax.robot import skin
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.skin import CapacitiveSkin, IdealSkin, Skin
 from rps_jax.trials.batch import Part
@@ -75,11 +74,7 @@ def drawn_worlds(domain: Domain, drawn: Draw, params: Params, setting: Setting) 
     engine, robots = engines.get(setting.engine), drawn.robot
     engine.check_robot(robots)
     stage, own = engine.stage_of_solids(
-        family,
-        drawn.solid,
-        drawn.friction,
-        setting.physics,
-        robots if robots.driven else None,
+        family, drawn.solid, drawn.friction, setting.physics, robots
     )
     world: Any = {
         "fields": own,
@@ -105,10 +100,10 @@ def _any(*arrays: Any) -> tuple[Any, ...]:
 def _skin(domain: Domain, drawn: Draw) -> Skin:
     count = drawn.number.size
     plain = IdealSkin() if domain.skin == "ideal" else CapacitiveSkin()
-    full = jax.tree.map(lambda value: np.full(count, value, float), plain)
+    full: Any = jax.tree.map(lambda value: np.full(count, value, float), plain)
     if isinstance(full, IdealSkin):
-        return full
-    return full._replace(
+        return full.on(drawn.robot.shell)
+    return full.on(drawn.robot.shell)._replace(
         noise=drawn.noise, gain_spread=drawn.gain_spread, dead_share=drawn.dead_share
     )
 
@@ -116,7 +111,7 @@ def _skin(domain: Domain, drawn: Draw) -> Skin:
 def _starts(drawn: Draw) -> np.ndarray:
     """Positions (n, 10) at the start: the base at the origin, the object before it."""
     qpos = np.zeros((drawn.number.size, 10))
-    front = skin.HALF_LENGTH + drawn.gap + solid.extent(drawn.solid, drawn.yaw)
+    front = drawn.robot.half_length + drawn.gap + solid.extent(drawn.solid, drawn.yaw)
     half = drawn.yaw / 2
     zero = np.zeros_like(half)
     place = [front, drawn.lateral, drawn.solid.height / 2, np.cos(half), zero, zero, np.sin(half)]
@@ -141,6 +136,9 @@ def drawn_scene(domain: Domain, drawn: Draw, physics: Physics, i: int) -> Scene:
     index = int(drawn.number[i])
     name = domain.objects[int(domain.object_of(drawn.number[i]))]
     if name in RANDOM:
-        return scene.of_solid(domain.family_of(index), drawn.solid, drawn.friction, physics, i)
+        robots = drawn.robot
+        return scene.of_solid(
+            domain.family_of(index), drawn.solid, drawn.friction, physics, i, robots
+        )
     ground, robot = (float(leaf[i]) for leaf in drawn.friction)
-    return scene.load(name, physics, Friction(ground, robot))
+    return scene.load(name, physics, Friction(ground, robot), robot=domain.robot)

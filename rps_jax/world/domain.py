@@ -92,10 +92,10 @@ class Domain:
             raise InputError(f"domain objects = {self.objects} is not allowed: name each once.")
         for friction in self.frictions:
             scene.check(friction, None)
-        for target in self.targets:
-            scene.check_target(target)
         errors.check_name("domain skin", self.skin, ("ideal", "capacitive"))
         self.robot.check()
+        for target in self.targets:
+            scene.check_target(target, self.robot.shell)
         for name, (least, most, unit) in ALLOWED.items():
             if (given := getattr(self, name)) is None:
                 continue

@@ -7,14 +7,15 @@ a counter-based generator, and everything after them is computed on the host in 
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rps_jax.geometry import solid
 from rps_jax.geometry.solid import SIDES, Solid
-from rps_jax.robot.robot import ARM, Robot
+from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.domain import ALLOWED, OF_TAXELS, OF_THE_ROBOT, RANDOM, UNITS, Domain
 from rps_jax.world.scene import Friction
@@ -140,14 +141,17 @@ def _robots(robot: Robot, at: dict[str, np.ndarray], count: int) -> Robot:
     """The robots (count,) of worlds, with what was drawn of them."""
     own = {name: at[drawn] for drawn, name in OF_THE_ROBOT.items() if drawn in at}
     if (linear := own.get("acceleration_max")) is not None:
-        own["acceleration_max"] = np.stack([linear, linear / ARM], axis=-1)
-    robot = replace(robot, **dict.fromkeys(own))  # the numbers of the others alone
+        own["acceleration_max"] = np.stack([linear, linear / robot.arm], axis=-1)
+
+    def spread(value: Any) -> np.ndarray:
+        return np.repeat(np.asarray(value, float)[None], count, axis=0)
+
     full = {
-        f.name: np.repeat(np.asarray(value, float)[None], count, axis=0)
+        f.name: spread(value)
         for f in fields(robot)
-        if (value := getattr(robot, f.name)) is not None
+        if f.name not in (*own, "boards") and (value := getattr(robot, f.name)) is not None
     }
-    return replace(robot, **full, **own)
+    return replace(robot, boards=jax.tree.map(spread, robot.boards), **full, **own)
 
 
 def _friction(domain: Domain, index: np.ndarray, at: dict[str, np.ndarray]) -> Friction:

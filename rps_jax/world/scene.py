@@ -18,8 +18,8 @@ from rps_jax import errors
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import Solid
-from rps_jax.robot import skin
 from rps_jax.robot.robot import Robot
+from rps_jax.robot.shell import Shell
 from rps_jax.world import objects
 from rps_jax.world.objects import FAMILIES, OBJECTS, SHAPES, path_of
 from rps_jax.world.physics import PHYSICS, Physics
@@ -49,6 +49,7 @@ class Scene(NamedTuple):
     model: mujoco.MjModel  # everything, for pictures
     physics: mujoco.MjModel  # the three geoms that touch, for stepping
     footprint: Footprint
+    shell: Shell  # of the robot
 
 
 class Joints(NamedTuple):
@@ -68,8 +69,7 @@ def load(
     *,
     rear: Side = "near",
     mass: float | None = None,
-    half_length: float = skin.HALF_LENGTH,
-    robot: Robot | None = None,
+    robot: Robot = Robot(),
 ) -> Scene:
     """Compile a scene.
 
@@ -80,8 +80,7 @@ def load(
       rear: which side the nonuniform box's load stands on, nearest the robot or farthest; the
         paper says "rear left corner".
       mass: of the object [kg], its inertia scaled along; None: the object's own.
-      half_length: of the base [m].
-      robot: whose base contact can slow and stop; None: a base that follows every twist.
+      robot: whose base it is; contact can slow and stop it, if its force is limited.
 
     Raises:
       InputError: unknown name, or friction or mass that is not a positive finite number.
@@ -90,15 +89,15 @@ def load(
     errors.check_name("rear", rear, SIDES)
     check(friction, mass)
     if name in objects.REGISTERED:
-        return _load_registered(name, physics, friction, mass, half_length, robot)
+        return _load_registered(name, physics, friction, mass, robot)
     spec = objects.read(path_of(name))
     for geom in spec.geoms:
         if geom.name == "load" and rear == "far":
             geom.pos[0] = -geom.pos[0]
     if mass is not None:
         _set_mass(spec, mass)
-    model, stripped = _compile(spec, physics, friction, half_length, robot)
-    return Scene(name, FAMILIES[name], model, stripped, _footprint(stripped))
+    model, stripped = _compile(spec, physics, friction, robot)
+    return Scene(name, FAMILIES[name], model, stripped, _footprint(stripped), robot.shell)
 
 
 def _load_registered(
@@ -106,16 +105,15 @@ def _load_registered(
     physics: Physics,
     friction: Friction,
     mass: float | None,
-    half_length: float,
-    robot: Robot | None,
+    robot: Robot,
 ) -> Scene:
     """The looks of a registered object, and the solid that stands for it in the physics."""
     one = objects.REGISTERED[name].solid
     if mass is not None:
         one = one._replace(mass=np.asarray(mass), inertia=one.inertia * mass / one.mass)
     spec = objects.read(path_of(name))
-    _set_length(spec, half_length)
-    upright = shaped(FAMILIES[name], one, physics, friction, half_length=half_length, robot=robot)
+    _set_robot(spec, robot)
+    upright = shaped(FAMILIES[name], one, physics, friction, robot=robot)
     return upright._replace(name=name, model=spec.compile())
 
 
@@ -125,8 +123,7 @@ def shaped(
     physics: Physics = PHYSICS["default"]["standard"],
     friction: Friction = FRICTION["S1"],
     *,
-    half_length: float = skin.HALF_LENGTH,
-    robot: Robot | None = None,
+    robot: Robot = Robot(),
 ) -> Scene:
     """Compile a scene with one solid (its leaves without a leading axis) of a shape family.
 
@@ -149,8 +146,8 @@ def shaped(
     body.mass, body.ipos = one.mass, one.p_object_com
     body.iquat, body.inertia = one.q_object_body, one.inertia
     outline = Footprint(jnp.asarray(one.vertices, float), jnp.asarray(one.radius, float))
-    models = _compile(spec, physics, friction, half_length, robot)
-    return Scene(family, family, *models, outline)
+    models = _compile(spec, physics, friction, robot)
+    return Scene(family, family, *models, outline, robot.shell)
 
 
 def of_solid(
@@ -161,10 +158,26 @@ def of_solid(
     i: int,
     robots: Robot | None = None,
 ) -> Scene:
-    """Compile a scene with the i-th of solids (n, ...), friction and robots (n,) each."""
+    """Compile a scene with the i-th of solids (n, ...), friction and robots (n,) each.
+
+    Without robots, before an ideal one.
+    """
     one, pair, robot = jax.tree.map(lambda leaf: leaf[i], (solids, friction, robots))
     friction = Friction(float(pair.ground), float(pair.robot))
-    return shaped(family, one, physics, friction, robot=robot)
+    return shaped(family, one, physics, friction, robot=robot or Robot())
+
+
+def each(robots: Robot, count: int) -> Robot:
+    """One robot, or robots (n,), as robots (count,)."""
+    if np.ndim(robots.mass):
+        return robots
+    return jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf, float)[None], count, 0), robots)
+
+
+def base_half(robots: Robot, count: int) -> np.ndarray:
+    """Half length and half width (count, 2) [m] of the bases of robots."""
+    half = np.stack([robots.half_length, robots.half_width], axis=-1)
+    return np.broadcast_to(np.asarray(half, float), (count, 2))
 
 
 def base_invweight(robots: Robot) -> np.ndarray:
@@ -209,13 +222,10 @@ def _compile(
     spec: mujoco.MjSpec,
     physics: Physics,
     friction: Friction,
-    half_length: float,
-    robot: Robot | None,
+    robot: Robot,
 ) -> tuple[mujoco.MjModel, mujoco.MjModel]:
     """The model for looking at, and the one stripped to the physics."""
-    _set_length(spec, half_length)
-    if robot is not None:
-        _set_robot(spec, robot)
+    _set_robot(spec, robot)
     for pair in spec.pairs:
         if pair.name == "base_object":
             pair.solref[:] = physics.base_solref
@@ -236,28 +246,31 @@ def check(friction: Friction, mass: float | None) -> None:
         errors.check_finite("mass", mass, above=0, at_most=1e4, unit="kg")
 
 
-def check_target(p_world_target: tuple[float, float]) -> None:
+def check_target(p_world_target: tuple[float, float], shell: Shell = Shell()) -> None:
     """Raises InputError for a target [m] that is under the robot, or out of the world."""
     x, y = (
         errors.check_finite(f"target {axis}", value, at_least=-50, at_most=50, unit="m")
         for axis, value in zip("xy", p_world_target, strict=True)
     )
-    if abs(x) <= skin.HALF_LENGTH and abs(y) <= skin.HALF_WIDTH:
+    half_x, half_y = shell.half
+    if abs(x) <= half_x and abs(y) <= half_y:
         raise errors.InputError(
             f"target = ({x:g}, {y:g}) m is not allowed: it must lie outside the robot, which "
-            f"covers |x| <= {skin.HALF_LENGTH:g} m and |y| <= {skin.HALF_WIDTH:g} m."
+            f"covers |x| <= {half_x:g} m and |y| <= {half_y:g} m."
         )
 
 
-def _set_length(spec: mujoco.MjSpec, half_length: float) -> None:
-    """Stretch the base and its skin to this half length [m]."""
-    spec.geom("skin_front").pos[0] = half_length
-    for name in ("base", "skin_left", "skin_right"):
-        spec.geom(name).size[0] = half_length
-
-
 def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
-    """Make the base a body that contact can slow and stop."""
+    """Give the base its size and, if its force is limited, a mass that contact can move."""
+    x, y = (float(half) for half in robot.shell.half)
+    spec.geom("base").size[:2] = x, y
+    spec.geom("skin_front").pos[0] = x
+    spec.geom("skin_front").size[1] = y
+    for side, sign in (("left", 1), ("right", -1)):
+        spec.geom(f"skin_{side}").size[0] = x
+        spec.geom(f"skin_{side}").pos[1] = sign * y
+    if not robot.driven:
+        return
     base = spec.body("base")
     base.mass = float(robot.mass)
     base.inertia[:] = float(robot.inertia)  # about the other axes it never turns

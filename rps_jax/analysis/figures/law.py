@@ -14,12 +14,12 @@ from matplotlib.figure import Figure
 from rps_jax.analysis.figures.style import SHADES, save, shade
 from rps_jax.control import law
 from rps_jax.control.law import Details, Observation, RPSParams, RPSState, Twist
-from rps_jax.robot import skin
+from rps_jax.robot import shell
 
 
 def profile(params: RPSParams, path: Path) -> Path:
     """The logistic profile of Eq. 5 (in the paper's Fig. 3): a_r over the contact location."""
-    l = jnp.linspace(-skin.HALF_WIDTH, skin.HALF_WIDTH, 401)  # noqa: E741
+    l = jnp.linspace(-shell.HALF_WIDTH, shell.HALF_WIDTH, 401)  # noqa: E741
     far = jnp.asarray(2 * params.d_th)
     a_r = jax.vmap(lambda l: law.adaptive_rate(params, l, far))(l)  # noqa: E741
     figure = Figure(figsize=(5.5, 3.2), layout="constrained")
@@ -27,7 +27,7 @@ def profile(params: RPSParams, path: Path) -> Path:
     ax.plot(l, a_r, color="C0")
     for side in (-1, 1):
         ax.axvspan(
-            side * float(params.l_cr), side * skin.HALF_WIDTH, color=SHADES["realigning"], lw=0
+            side * float(params.l_cr), side * shell.HALF_WIDTH, color=SHADES["realigning"], lw=0
         )
         ax.axvline(side * float(params.beta), color="0.6", lw=0.7, ls="--")
     ax.set(xlabel="contact location $l$ [m]", ylabel="adaptive rate $a_r$ [1]")
@@ -38,7 +38,7 @@ def profile(params: RPSParams, path: Path) -> Path:
 def _in_front(l: Any, error: Any, distance: Any) -> Observation:  # noqa: E741
     """Contacts (n,) [m] on the front, with targets at heading errors (n,) [rad] from them."""
     place, angle = jnp.asarray(l), jnp.asarray(error)
-    contact = jnp.stack([jnp.full_like(place, skin.HALF_LENGTH), place], axis=-1)
+    contact = jnp.stack([jnp.full_like(place, shell.HALF_LENGTH), place], axis=-1)
     way = distance * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
     touched = jnp.ones(place.shape, bool)
     return Observation(
@@ -58,7 +58,7 @@ def twist_field(sets: Mapping[str, RPSParams], distance: float, path: Path) -> P
     Arrows are (v_x, v_y), forward upwards; the colour is omega. Above from outside the Realignment
     State, which |l| > l_cr enters; below from within it, which |l| <= l_mr leaves.
     """
-    l = np.linspace(-skin.HALF_WIDTH, skin.HALF_WIDTH, 117)  # noqa: E741
+    l = np.linspace(-shell.HALF_WIDTH, shell.HALF_WIDTH, 117)  # noqa: E741
     error = np.radians(np.linspace(-180, 180, 120, endpoint=False) + 1.5)
     places, angles = (axis.ravel() for axis in np.meshgrid(l, error))
     seen = _in_front(places, angles, distance)

@@ -117,7 +117,7 @@ def one_trial(trace: xr.Dataset, title: str, path: File) -> File:
     place = figure.add_subplot(grid[1, 1], sharex=velocity)
     place.plot(time, np.where(touching, trace.l, np.nan), color="C0")
     place.set_ylabel("b) $l$ [m]", color="C0")
-    place.set_ylim(-skin.HALF_WIDTH, skin.HALF_WIDTH)
+    place.set_ylim(-trace.half_width, trace.half_width)
     for sign in (-1, 1) if "l_cr" in trace else ():
         place.axhline(sign * float(trace.l_cr), color="0.6", lw=0.7, ls="--")
     rate = place.twinx()
@@ -140,13 +140,18 @@ def one_trial(trace: xr.Dataset, title: str, path: File) -> File:
     return save(figure, path)
 
 
+def _half(trace: xr.Dataset) -> tuple[float, float]:
+    """Half length and half width of the base [m]."""
+    return float(trace.half_length), float(trace.half_width)
+
+
 def _path(ax: Axes, trace: xr.Dataset) -> None:
     """Left column of Fig. 6: the way of the base and of the contact point."""
     pose, target = trace.qpos.values[:, :3], trace.p_world_target.values
     ax.plot(*pose[:, :2].T, color="0.35", label="base")
     ax.plot(*trace.p_world_contact.values.T, ".", ms=1.5, color="C0", label="contact point")
     for index in np.linspace(0, len(pose) - 1, 7).astype(int):
-        ax.add_patch(base_patch(pose[index], fill=False))
+        ax.add_patch(base_patch(pose[index], _half(trace), fill=False))
     ax.plot(*target, "*", ms=14, color="C3", label="target")
     ax.add_patch(patches.Circle(target, float(trace.d_success), fill=False, color="C3"))
     ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
@@ -162,7 +167,7 @@ def paths(traces: Mapping[str, Sequence[xr.Dataset]], path: Path) -> Path:
     figure = Figure(figsize=(5.2 * len(traces), 5), layout="constrained")
     axes = figure.subplots(1, len(traces), squeeze=False, sharey=True)[0]
     for ax, (name, rows) in zip(axes, traces.items(), strict=True):
-        ax.add_patch(base_patch(np.zeros(3), fill=True))
+        ax.add_patch(base_patch(np.zeros(3), _half(rows[0]), fill=True))
         for trace in rows:
             (line,) = ax.plot(*trace.qpos.values[:, :2].T, lw=1.2)
             ax.plot(*trace.p_world_target.values, "*", ms=12, color=line.get_color())

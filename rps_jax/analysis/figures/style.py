@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from rps_jax.analysis import statistics
 from rps_jax.record import files
-from rps_jax.robot import skin
+from rps_jax.robot import shell
 
 File = TypeVar("File", bound=Path | IO[bytes])
 OBJECT_COLOURS = {"box": "C0", "cylinder": "C1", "nonuniform_box": "C2"}
@@ -38,9 +38,14 @@ def words(name: str) -> str:
     return name.replace("_", " ")
 
 
-def base_patch(pose: np.ndarray, *, fill: bool) -> patches.Polygon:
-    """Outline of the base at a pose (3,) [m, m, rad] in the world."""
-    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * [skin.HALF_LENGTH, skin.HALF_WIDTH]
+def base_patch(
+    pose: np.ndarray,
+    half: tuple[float, float] = (shell.HALF_LENGTH, shell.HALF_WIDTH),
+    *,
+    fill: bool,
+) -> patches.Polygon:
+    """Outline of a base of half length and width (2,) [m] at a pose (3,) [m, m, rad]."""
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half
     c, s = np.cos(pose[2]), np.sin(pose[2])
     world = corners @ np.array([[c, s], [-s, c]]) + pose[:2]
     return patches.Polygon(

@@ -133,7 +133,7 @@ class Asked:
 
         known = {f.name for f in dataclasses.fields(Conditions)}
         given = {name: value for name, value in self.__dict__.items() if name in known}
-        fields = {name for skin in SKINS.values() for name in skin._fields}
+        fields = {name for skin in SKINS.values() for name in skin._fields if name != "shell"}
         changes = parsing.assignments("skin-params", self.skin_params, sorted(fields))
         return Conditions.of(given | {"skin_params": changes})
 

@@ -55,13 +55,14 @@ class Fused(Engine):
         solids: Solid,
         friction: Friction,
         physics: Physics,
-        robots: Robot | None = None,
+        robots: Robot = Robot(),
     ) -> tuple[Any, Any]:
         """Stage and fields of solids (n, ...)."""
         known = scene.load("box", physics)  # of which only the base matters
         one = step.body(known.physics, np.asarray(known.footprint.vertices))
         bodies = bodies_of(solids, friction, one)
-        if robots is not None:
+        bodies = bodies._replace(base_half=scene.base_half(robots, solids.mass.size))
+        if robots.driven:
             bodies = bodies._replace(base_invweight=scene.base_invweight(robots))
         return FusedStage(), bodies
 

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from rps_jax.geometry import solid
 from rps_jax.geometry.solid import GRAVITY, Solid
-from rps_jax.robot import skin
+from rps_jax.robot import shell
 from rps_jax.studies.ground import rigid
 from rps_jax.studies.ground.rigid import Pushed, Rounding
 from rps_jax.world import scene
@@ -122,7 +122,7 @@ def in_mujoco(thing: Thing, offset: float, speed: float, physics: Physics) -> Pu
     x, y, yaw = start_of(thing, offset)
     free = JOINTS.object
     data.qpos[:] = scene.initial_qpos(chosen)
-    data.qpos[free] = [x + skin.HALF_LENGTH, y, height / 2, *_upright(yaw)]
+    data.qpos[free] = [x + shell.HALF_LENGTH, y, height / 2, *_upright(yaw)]
     for _ in range(round(_SETTLE / dt)):
         data.qvel[JOINTS.base] = 0.0
         mujoco.mj_step(model, data)

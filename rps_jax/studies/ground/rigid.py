@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rps_jax.geometry.solid import Solid
-from rps_jax.robot.skin import HALF_WIDTH
+from rps_jax.robot.shell import HALF_WIDTH
 
 _FAR = 1.0  # [m] gap of a contact that cannot be
 _FACING = 0.5  # cosine of the angle to the base within which its corners may touch a side
