@@ -110,10 +110,11 @@ def models_table(results: xr.Dataset) -> list[list[str]]:
 
 
 def _rate(won: np.ndarray) -> str:
-    return _share(int(won.sum()), won.size)
+    return share(int(won.sum()), won.size)
 
 
-def _share(won: int, of: int) -> str:
+def share(won: int, of: int) -> str:
+    """A success rate with its Wilson 95 % interval."""
     if not of:
         return "-"
     low, high = statistics.wilson(won, of)
@@ -188,7 +189,7 @@ def influence_table(results: xr.Dataset, arm: str) -> list[list[str]]:
         ends = [
             cell
             for n in (order[0], order[-1])
-            for cell in (told[n], _share(int(found.won[n]), int(found.of[n])))
+            for cell in (told[n], share(int(found.won[n]), int(found.of[n])))
         ]
         rows.append([statistics.DRAWN[name], *ends, f"{q[i]:.2g}"])
     return rows

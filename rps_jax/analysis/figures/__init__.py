@@ -10,10 +10,12 @@ from rps_jax.analysis.figures.studies import (
     gradient_quality,
     grounds,
     levers,
+    limits,
     sensitivity,
     shift_curve,
     throughput,
     tolerance_curve,
+    turning,
 )
 from rps_jax.analysis.figures.sweeps import failures, paired, success_curves
 from rps_jax.analysis.figures.tuning import between_bounds, estimates, races, tuning_log

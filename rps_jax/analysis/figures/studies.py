@@ -10,6 +10,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import OBJECT_COLOURS, save, success_rates, words
 
 
@@ -261,4 +262,44 @@ def grounds(results: xr.Dataset, names: Collection[str], path: Path) -> Path:
     rigid = Line2D([], [], color="k", lw=1, label="rigid object, at three offsets")
     handles = [rigid, *marks, *below[0].get_legend_handles_labels()[0]]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8)
+    return save(figure, path)
+
+
+def limits(found: Mapping[str, xr.Dataset], path: Path) -> Path:
+    """Success over each limit of a robot, with Wilson 95 % intervals; dashed: the ideal base."""
+    columns = min(3, len(found))
+    rows = -(-len(found) // columns)
+    figure = Figure(figsize=(4 * columns, 3.2 * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
+    for ax in axes[len(found) :]:
+        ax.axis("off")
+    for ax, one in zip(axes, found.values(), strict=False):
+        for i, arm in enumerate(map(str, one.arm.values)):
+            seen = statistics.bins(one.value.values, one.success.sel(arm=arm).values > 0, 12)
+            success_rates(ax, seen.middle, seen.won, seen.of, color=f"C{i}", label=arm)
+            usual = 100 * float(one.usual.sel(arm=arm).mean())
+            ax.axhline(usual, color=f"C{i}", lw=0.8, ls="--")
+        ax.set_xlabel(one.value.attrs["long_name"], fontsize=9)
+        ax.set_xscale("log" if one.attrs["log"] else "linear")
+        ax.grid(alpha=0.3)
+    for ax in axes[::columns]:
+        ax.set_ylabel("success [%]")
+    axes[0].legend(fontsize=8)
+    return save(figure, path)
+
+
+def turning(found: xr.Dataset, path: Path) -> Path:
+    """The turning rate that a law asks for, and what each robot makes of it, over time."""
+    names = list(map(str, found.robot.values))
+    figure = Figure(figsize=(8, 1.7 * len(names)), layout="constrained")
+    axes = figure.subplots(len(names), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
+    for ax, name in zip(axes, names, strict=True):
+        one = found.sel(robot=name)
+        ax.step(one.time, one.asked, color="0.7", lw=1, where="post", label="asked by the law")
+        ax.plot(one.time, one.done, color="C0", lw=1.2, label="of the base")
+        ax.set_title(name, fontsize=9, loc="left")
+        ax.set_ylabel(r"$\omega$ [rad/s]")
+        ax.grid(alpha=0.3)
+    axes[-1].set_xlabel("time [s]")
+    axes[0].legend(fontsize=8, loc="lower right")
     return save(figure, path)
