@@ -68,22 +68,22 @@ class RPSParams(NamedTuple):
 
         Full speed until the target. Nearer than d_th it drives straight on or, beyond l_cr, almost
         purely sideways; Eq. 5 acts only farther away. A contact that is lost is acted upon as if it
-        were still felt.
+        were still felt. Some of the worlds had robots with limits.
         """
         return cls(
-            eta=6.537844,
-            zeta=-1.251917,
-            beta=0.1163395,
-            k=17.22659,
-            K_h=0.2083339,
-            K_v=1.297107,
-            L=0.2713795,
-            l_cr=0.1687817,
-            l_mr=0.1217143,
-            a_r_max=64.85278,
-            d_th=1.561165,
-            gamma_max=1.54169,
-            v_lost=0.03373589,
+            eta=7.434028,
+            zeta=-1.237692,
+            beta=0.1164115,
+            k=21.5857,
+            K_h=0.2141526,
+            K_v=1.264902,
+            L=0.2451354,
+            l_cr=0.1781017,
+            l_mr=0.1356963,
+            a_r_max=60.049,
+            d_th=1.525068,
+            gamma_max=1.535043,
+            v_lost=0.03196665,
             keep_contact=1.0,
         )
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import xarray as xr
 
@@ -28,26 +28,37 @@ _HALVED = replace(preset(), timestep=0.005)
 # Fine enough for MuJoCo's own ground, on which sliding objects hop.
 _FINE = replace(preset(), timestep=0.002, **MUJOCOS_GROUND)
 OWN = "as asked"  # the model of the sweep itself
-# What can be defended, beside the physics that a sweep was asked for.
-MODELS: dict[str, Physics] = {
-    "this ground, 10 ms": preset(),
-    "this ground, 5 ms": _HALVED,
-    "MuJoCo's ground, 5 ms": replace(_HALVED, **MUJOCOS_GROUND),
-    "MuJoCo's ground, 2 ms": _FINE,
-    "MuJoCo's ground, impratio 1, 2 ms": replace(_FINE, impratio=1.0),
-    "friction pyramid, 1 ms": preset("paper_gazebo"),
+
+
+class Model(NamedTuple):
+    """A physics that can be defended."""
+
+    physics: Physics
+    engine: EngineName | None = None  # None: that of the sweep
+
+
+# What can be defended, beside what a sweep was asked for.
+MODELS = {
+    "this ground, 10 ms": Model(preset()),
+    "this ground, 5 ms": Model(_HALVED),
+    "MuJoCo's ground, 5 ms": Model(replace(_HALVED, **MUJOCOS_GROUND)),
+    "MuJoCo's ground, 2 ms": Model(_FINE),
+    "MuJoCo's ground, impratio 1, 2 ms": Model(replace(_FINE, impratio=1.0)),
+    "quasi-static": Model(preset(), "quasistatic"),
+    "friction pyramid, 1 ms": Model(preset("paper_gazebo")),
 }
 
 
 def plans(plan: Plan) -> dict[str, Plan]:
-    """A sweep on every model, its own first; the worlds and the engine are the same."""
-    own = {OWN: plan}
-    others = {
-        name: replace(plan, setting=replace(plan.setting, physics=physics))
-        for name, physics in MODELS.items()
-        if physics != plan.setting.physics
-    }
-    return own | others
+    """A sweep on every model that can step its worlds, its own first; the worlds are the same."""
+    found = {OWN: plan}
+    for name, (physics, engine) in MODELS.items():
+        engine = engine or plan.setting.engine
+        setting = replace(plan.setting, physics=physics, engine=engine)
+        other = replace(plan, setting=setting)
+        if setting != plan.setting and other.works:
+            found[name] = other
+    return found
 
 
 def folder_of(out: Path, model: str) -> Path:
@@ -95,7 +106,7 @@ def models(
       >>> arms = {"rps": rps_jax.RPSParams.paper()}
       >>> found = rps_jax.models(drums, arms, worlds=2, rules=rules)
       >>> found.sizes["model"]
-      6
+      7
     """
     setting = Setting(preset(), rules, seed, engine)
     plan = Plan(named(domain, robot), worlds, arms, setting)

@@ -64,6 +64,16 @@ class Plan:
         engine.check_robot(draw(self, [0]).robot)
 
     @property
+    def works(self) -> bool:
+        """Whether `check_here` has nothing against it, and the engine knows the physics."""
+        try:
+            engines.get(self.setting.engine).check_physics(self.setting.physics)
+            self.check_here()
+        except errors.InputError:
+            return False
+        return True
+
+    @property
     def trials(self) -> int:
         """How many: trial a * worlds + i is of arm a in world i."""
         return len(self.arms) * self.worlds
