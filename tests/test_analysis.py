@@ -162,6 +162,8 @@ def test_a_path_is_drawn_with_its_target_and_its_last_contact(drawn):
             "p_world_contact": (("time", "axis"), [[0.3, 0.1], [0.4, 0.2], [nowhere, nowhere]]),
             "p_world_target": ("axis", [2.0, 1.0]),
             "outcome_success": 1,
+            "half_length": 0.4,
+            "half_width": 0.2,
         },
         {"time": [0.0, 0.5, 1.0]},
     )

@@ -61,7 +61,7 @@ class Plan:
         """Raises InputError unless the engine can step these worlds on this machine."""
         engine = engines.get(self.setting.engine)
         engine.check(self.domain.families)
-        engine.check_robot(draw(self, [0]).robot)
+        engine.check_robot(self.domain.weakest)
 
     @property
     def works(self) -> bool:

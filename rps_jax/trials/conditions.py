@@ -78,7 +78,8 @@ class Conditions:
         name: Any = self.skin or paper.SKIN[self.physics]
         usual: Any = SKINS[name]
         for changed in self.skin_params:
-            errors.check_name("skin-params", changed, set(usual._fields) - {"shell"})
+            known = [name for name in usual._fields if name != "shell"]
+            errors.check_name("skin-params", changed, known)
         return usual._replace(**self.skin_params)
 
     def case(

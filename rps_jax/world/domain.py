@@ -111,6 +111,12 @@ class Domain:
                 )
 
     @property
+    def weakest(self) -> Robot:
+        """The robot with the lowest of what is drawn of it."""
+        drawn = {of: getattr(self, name) for name, of in OF_THE_ROBOT.items()}
+        return replace(self.robot, **{of: r.low for of, r in drawn.items() if r is not None})
+
+    @property
     def combinations(self) -> int:
         """How many indices see every combination of objects, frictions and targets once."""
         return len(self.objects) * max(1, len(self.frictions)) * max(1, len(self.targets))

@@ -128,13 +128,11 @@ class Asked:
 
     def conditions(self) -> Conditions:
         """The same as the library has them."""
-        from rps_jax.robot.skin import SKINS
         from rps_jax.trials.conditions import Conditions
 
         known = {f.name for f in dataclasses.fields(Conditions)}
         given = {name: value for name, value in self.__dict__.items() if name in known}
-        fields = {name for skin in SKINS.values() for name in skin._fields if name != "shell"}
-        changes = parsing.assignments("skin-params", self.skin_params, sorted(fields))
+        changes = parsing.assignments("skin-params", self.skin_params, sorted(_of_skins()))
         return Conditions.of(given | {"skin_params": changes})
 
 
@@ -164,16 +162,26 @@ class Recorded(Asked):
 
     def configuration(self, strategies: tuple[str, ...], out: Path) -> dict[str, Any]:
         """What was asked, and what it means, as JSON."""
+        from rps_jax.robot.robot import named
+
         chosen = self.conditions()
-        setting = chosen.setting()
+        setting, sensor = chosen.setting(), chosen.sensor()
         arms = parsing.arms_of(strategies, self.params)
         return {
             "options": dataclasses.asdict(self) | {"out": str(out)},
             "params": {name: parsing.as_json(params) for name, params in arms.items()},
             "physics": dataclasses.asdict(setting.physics),
             "rules": setting.rules._asdict(),
-            "skin": chosen.sensor()._asdict(),  # pyright: ignore[reportAttributeAccessIssue]
+            "skin": {name: getattr(sensor, name) for name in _of_skins() & set(sensor._fields)},
+            "robot": dataclasses.asdict(named(self.robot)),
         }
+
+
+def _of_skins() -> set[str]:
+    """Names of the parameters of skins; where their boards are is the robot's."""
+    from rps_jax.robot.skin import SKINS
+
+    return {name for skin in SKINS.values() for name in skin._fields} - {"shell"}
 
 
 @dataclass(frozen=True)
