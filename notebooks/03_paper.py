@@ -126,7 +126,7 @@ distance.to_series().unstack("strategy").round(3)
 # Base and skin:
 #
 # - The base is 0.725 m long, with 12 taxels in front, 15 on the left and 15 on the right, of 48.3
-#   mm each (`--skin-params half_length=`, `skin.BOARDS`).
+#   mm each (`Robot.half_length`, `Robot.boards`).
 # - The simulated contact sensor has a tolerance of 6 mm (`--skin-params tolerance=`), and what it
 #   feels is a point up to the length of one taxel (`point_length`).
 # - The capacitive skin has 10 mm of foam, a filter of 50 ms and a threshold of +25 % capacitance

@@ -10,12 +10,12 @@
 # %% [markdown]
 # # Tuning the law
 #
-# The paper's parameters were chosen by hand. `RPSParams.tuned()` was found by evolution in two
-# runs of CMA-ES, a coarse and a fine one, whose commands stand in `sweeps/README.md`;
-# `runs/coarse` and `runs/fine` hold their logs. `runs/compare/wide` has both sets of parameters in
-# 1000 worlds that no tuner has seen. One switch was added by hand to what evolution found: when
-# contact is lost, the tuned law acts upon the last one (`keep_contact`). Only the section about
-# gradients simulates anything.
+# The paper's parameters were chosen by hand. `RPSParams.tuned()` was found by evolution in three
+# runs of CMA-ES, a coarse one, a fine one, and one with robots that have limits, whose commands
+# stand in `sweeps/README.md`; `runs/coarse`, `runs/fine` and `runs/robots` hold their logs.
+# `runs/compare/wide` has both sets of parameters in 1000 worlds that no tuner has seen. One switch
+# was added by hand to what the fine run found: when contact is lost, the tuned law acts upon the
+# last one (`keep_contact`). Only the section about gradients simulates anything.
 
 # %%
 import json
@@ -72,12 +72,29 @@ Image(figures.tuning_log(read_log("fine"), names, out / "fine.png"))
 # generations before and after the seventh is smaller than such jumps, so another run would end at
 # somewhat other numbers.
 #
+# ## With robots
+#
+# Until here every base followed its twist at once. The third search began with the result of the
+# second, and a third of its worlds had robots with a lag, a bounded acceleration and a bounded
+# force (the domain `real`).
+
+# %%
+Image(figures.tuning_log(read_log("robots"), names, out / "robots.png"))
+
+# %% [markdown]
+# Validation falls from 0.100 to 0.085 in one generation, success there from 94.3 to 95.8 %, and
+# then nothing is gained for twenty generations: every mean is better than the start, and none is
+# clearly better than another. The last one validated best by a hair and was kept. In test worlds
+# of `real` it wins 96.6 instead of 94.1 %, in `wide` and `hostile` as many as before: it steers a
+# little harder and realigns a little later, and both far less than between the paper's parameters
+# and these.
+#
 # ## What changed
 
 # %%
 sets = {"paper": RPSParams.paper(), "tuned": RPSParams.tuned()}
-kept = json.loads(Path("runs/fine/tuned.json").read_text())
-assert kept == {name: getattr(sets["tuned"], name) for name in names}
+kept = json.loads(Path("runs/robots/tuned.json").read_text())
+assert kept == {name: getattr(sets["tuned"], name) for name in kept}
 space = Space(names)
 places = {label: jax.nn.sigmoid(space.vector(params)) for label, params in sets.items()}
 Image(figures.between_bounds(places, names, out / "bounds.png"))
@@ -90,9 +107,9 @@ Image(figures.between_bounds(places, names, out / "bounds.png"))
 Image(figures.twist_field(sets, 1.0, out / "twist.png"))
 
 # %% [markdown]
-# The tuned law has all but given up Eq. 5, which acts only beyond $d_{th}$ = 1.56 m. Nearer to the
+# The tuned law has all but given up Eq. 5, which acts only beyond $d_{th}$ = 1.53 m. Nearer to the
 # target it does one of two things: it pushes straight ahead and turns as fast as it may, or,
-# beyond $l_{cr}$ = 17 cm, it slides sideways, without pushing, until the contact is back at 12 cm.
+# beyond $l_{cr}$ = 18 cm, it slides sideways, without pushing, until the contact is back at 14 cm.
 # The paper's law mixes the two, and leaves the contact where mixing holds it.
 #
 # ## The same worlds, twice
@@ -105,7 +122,7 @@ Markdown(tables.markdown(tables.difference_table(results)))
 Image(figures.paired(results, out / "paired.png"))
 
 # %% [markdown]
-# The tuned law wins 64 worlds that the paper's parameters lose and loses 4 that they win, which is
+# The tuned law wins 71 worlds that the paper's parameters lose and loses 6 that they win, which is
 # no accident. Nor is this bought with time. Most worlds lie just below the diagonal: they end a
 # fifth sooner than before. In a second group of worlds the paper's parameters need 150 s and more;
 # the tuned law takes no longer for most of these than for the others, nor for most of the worlds

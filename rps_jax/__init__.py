@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from rps_jax.runs.push import replay as replay
     from rps_jax.runs.results import load as load
     from rps_jax.runs.sweep import sweep as sweep
-    from rps_jax.studies.table import table as table
+    from rps_jax.studies.replication.table import table as table
     from rps_jax.trials.conditions import Conditions as Conditions
     from rps_jax.trials.env import PushEnv as PushEnv
     from rps_jax.trials.pushes import Case as Case
@@ -81,7 +81,7 @@ _HOMES = {
     "runs.results": ("load",),
     "runs.sweep": ("sweep",),
     "runs.models": ("models",),
-    "studies.table": ("table",),
+    "studies.replication.table": ("table",),
     "trials.conditions": ("Conditions",),
     "trials.env": ("PushEnv",),
     "trials.pushes": ("Case",),

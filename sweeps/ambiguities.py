@@ -18,7 +18,8 @@ from rps_jax.analysis import figures, tables
 from rps_jax.app.cli.options import StudyOptions
 from rps_jax.app.cli.running import guarded
 from rps_jax.record import files
-from rps_jax.studies import ambiguity, study
+from rps_jax.studies import study
+from rps_jax.studies.replication import ambiguity
 from rps_jax.trials.setting import progress_bar
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS

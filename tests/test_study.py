@@ -11,7 +11,8 @@ from rps_jax.engines import mujoco as c_mujoco
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Parts
 from rps_jax.robot.skin import IdealSkin
-from rps_jax.studies import ambiguity, fidelity, hardware, study
+from rps_jax.studies import fidelity, study
+from rps_jax.studies.replication import ambiguity, hardware
 from rps_jax.studies.study import Condition, Grid
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case

@@ -79,7 +79,6 @@ LIMITS = {
         "pitch of the taxels of the front [mm]",
         robots={1e3 * 2 * HALF_WIDTH / (3 * n): _with_front(n) for n in (8, 4, 3, 2, 1)},
         harms=1,
-        log=True,
     ),
 }
 

@@ -96,7 +96,7 @@ class Film:
         from rps_jax.app import film
         from rps_jax.record import folder
         from rps_jax.runs.push import chosen
-        from rps_jax.studies.table import cases_of
+        from rps_jax.studies.replication.table import cases_of
         from rps_jax.world import paper
 
         if (self.folder / folder.MANIFEST).exists():

@@ -47,7 +47,7 @@ class Table(Spread, Objects):
         """Run the trials, then write and print the table."""
         from rps_jax.analysis import figures, tables
         from rps_jax.record import files
-        from rps_jax.studies.table import cases_of, table
+        from rps_jax.studies.replication.table import cases_of, table
         from rps_jax.trials.setting import progress_bar
         from rps_jax.world import paper
 
@@ -160,7 +160,7 @@ class Hardware(Spread, Recorded):
         from rps_jax import engines
         from rps_jax.analysis import figures
         from rps_jax.record import files
-        from rps_jax.studies import hardware, reproduce
+        from rps_jax.studies.replication import hardware, reproduce
         from rps_jax.trials.setting import progress_bar
         from rps_jax.world import paper
 
@@ -199,7 +199,7 @@ class Paper(StudyOptions):
     def run(self) -> None:
         """Run what is missing, then write the report."""
         from rps_jax.record import folder
-        from rps_jax.studies import reproduce
+        from rps_jax.studies.replication import reproduce
         from rps_jax.trials.setting import progress_bar
 
         plan = reproduce.Plan.quick() if self.quick else reproduce.Plan()

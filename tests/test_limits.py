@@ -1,0 +1,86 @@
+"""What limits of a robot cost: paired losses, and where a law has lost so much."""
+
+import math
+
+import numpy as np
+import pytest
+import xarray as xr
+from helpers import PAPER
+
+from rps_jax.errors import InputError
+from rps_jax.robot.robot import Robot
+from rps_jax.studies import limits
+from rps_jax.studies.limits import Limit, crossing
+from rps_jax.trials.setting import Progress
+from rps_jax.trials.trial import Rules
+from rps_jax.world.domain import Domain, Range
+
+VALUE = np.arange(1.0, 41.0)
+
+
+def test_a_crossing_is_where_losses_begin():
+    lost = (VALUE > 30).astype(int)
+    assert crossing(VALUE, lost, 0.1, harms=1) == 31
+    assert crossing(VALUE, lost[::-1], 0.1, harms=-1) == 10
+    assert crossing(VALUE[::-1], lost[::-1], 0.1, harms=1) == 31  # in any order
+
+
+def test_losses_and_gains_of_single_worlds_are_pooled():
+    """A loss at 11 and the gain at 12 that follows cancel; those from 31 on do not."""
+    lost = (VALUE > 30).astype(int)
+    lost[10], lost[11] = 1, -1
+    assert crossing(VALUE, lost, 0.1, harms=1) == 31
+
+
+def test_there_is_no_crossing_where_nothing_is_lost():
+    assert math.isnan(crossing(VALUE, np.zeros(40, int), 0.01, harms=1))
+
+
+def test_a_bootstrap_interval_holds_the_crossing():
+    rng = np.random.default_rng(1)
+    value = rng.uniform(0, 1, 400)
+    success = (value < 0.5).astype(np.int8)[None]
+    found = xr.Dataset(
+        {"success": (("arm", "case"), success), "usual": (("arm", "case"), np.ones_like(success))},
+        {"arm": ["rps"], "value": ("case", value)},
+        {"harms": 1},
+    )
+    at, low, high = limits.crossings(found, 0.1)["rps"]
+    assert low <= at <= high
+    assert 0.49 < low < high < 0.52
+
+
+def test_every_robot_meets_the_worlds_of_the_ideal_one(monkeypatch):
+    usual = Robot().half_width
+    few = {
+        "lag": Limit("lag [s]", {"robot_lag": Range(0, 2)}, value=lambda f: f.robot_lag.values),
+        "half_width": Limit("half width [m]", robots={usual: Robot()}),
+    }
+    monkeypatch.setattr(limits, "LIMITS", few)
+    heard: list[Progress] = []
+    found = limits.run(
+        list(few),
+        {"rps": PAPER},
+        3,
+        domain=Domain(("random_cylinder",)),
+        rules=Rules(horizon=6.0),
+        report=heard.append,
+    )
+    assert heard[-1].finished == limits.count(list(few), 1, 3) == 9
+    one = found["half_width"]
+    np.testing.assert_array_equal(one.success, one.usual)  # it is the ideal base itself
+    np.testing.assert_array_equal(one.value, [usual] * 3)
+    assert ((found["lag"].value >= 0) & (found["lag"].value <= 2)).all()
+    np.testing.assert_array_equal(found["lag"].world, np.arange(3))
+
+
+def test_a_bounded_acceleration_makes_ramps_of_the_laws_turns():
+    robot = Robot(acceleration_max=(1.0, 0.2))
+    seen = limits.turning({"slow": robot}, PAPER, 4.0).sel(robot="slow")
+    assert float(np.abs(np.diff(seen.asked)).max()) > 0.1  # it asks for jumps
+    assert float(np.abs(np.diff(seen.done)).max()) <= 0.2 * 0.02 + 1e-4  # [rad/s] in a step
+
+
+def test_an_unknown_limit_is_named():
+    with pytest.raises(InputError, match="did you mean 'lag'"):
+        limits.run(["leg"], {"rps": PAPER}, 1)
