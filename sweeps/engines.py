@@ -31,6 +31,8 @@ ENGINES = {
     "C, reference": Setting(preset(fidelity="reference"), engine="mujoco"),
     "C, standard": Setting(preset(), engine="mujoco"),
     "fused, standard": Setting(preset(), engine="fused"),
+    "fused, 5 ms": Setting(replace(preset(), timestep=0.005), engine="fused"),
+    "fused, 2 ms": Setting(replace(preset(), timestep=0.002), engine="fused"),
     "fused, fast": Setting(preset(fidelity="fast"), engine="fused"),
     "quasistatic": Setting(preset(), engine="quasistatic"),
     "MJX, standard": Setting(preset(), engine="mjx"),

@@ -219,6 +219,7 @@ def test_commands_refuse_them_in_one_sentence(capsys, tmp_path):
         mine.write_text(text)
         assert said in refusal(capsys, "sweep", "--robot", str(mine))
     mine.write_text('{"half_length": 1.5}')
+    assert "which reaches 1.53 m" in refusal(capsys, "sweep", "--robot", str(mine))
     assert "outside the robot" in refusal(
         capsys, "push", "--target", "1", "0", "--robot", str(mine)
     )

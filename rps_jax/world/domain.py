@@ -109,11 +109,17 @@ class Domain:
                     f"domain {name} = {low:g} to {high:g} is not allowed: low must not exceed high"
                     f"{', and be above 0' if log else ''}."
                 )
+        reach = math.hypot(*self.robot.shell.half)
+        if not self.targets and self.distance.low <= reach:
+            raise InputError(
+                f"domain distance (low) = {self.distance.low:g} m is not allowed: targets must lie "
+                f"outside the robot, which reaches {reach:.2f} m."
+            )
 
     @property
     def weakest(self) -> Robot:
-        """The robot with the lowest of what is drawn of it."""
-        drawn = {of: getattr(self, name) for name, of in OF_THE_ROBOT.items()}
+        """The robot with the least force and traction of what is drawn of it."""
+        drawn = {"force_max": self.robot_force, "traction": self.robot_traction}
         return replace(self.robot, **{of: r.low for of, r in drawn.items() if r is not None})
 
     @property
