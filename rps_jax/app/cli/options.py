@@ -61,8 +61,8 @@ RobotName = Annotated[
     tyro.conf.arg(
         help=(
             "The robot: ideal (it follows every twist at once, with any force), kairos (the "
-            "paper's), ridgeback or mpo_500, or a JSON file of its limits, as "
-            '{"mass": 130, "force_max": 300, "lag": 0.2}.'
+            "paper's), ridgeback or mpo_500, or a JSON file of its size, its boards and its "
+            'limits, as {"mass": 130, "force_max": 300, "lag": 0.2}.'
         )
     ),
 ]

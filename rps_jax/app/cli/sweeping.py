@@ -64,8 +64,8 @@ class Sweep(Spread):
     """Run on the workers of a Ray cluster: auto, its HOST:PORT, or local (all of this host). Each
     worker claims a GPU, or else as many processors as --workers, one by default."""
     models: bool = False
-    """Whether to run the same worlds on other grounds, cones and steps, too, and to report how
-    much the rates hang on these."""
+    """Whether to run the same worlds on other grounds, cones and steps and in the quasi-static
+    model, too, and to report how much the rates hang on these."""
     out: Path = Path("runs/sweep")
     """Run folder; a run that was killed is continued there."""
 
