@@ -19,7 +19,7 @@ from rps_jax.engines import EngineName
 from rps_jax.robot.robot import Robot
 from rps_jax.runs import sweep as sweeps
 from rps_jax.runs.plan import Plan
-from rps_jax.trials.setting import Progress, Report, Setting, unheard
+from rps_jax.trials.setting import InTurn, Report, Setting, unheard
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import Domain, named
 from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
@@ -127,19 +127,12 @@ def complete(
     The sweep as it was asked for stands in the folder itself, the others in folders of their own
     in it. Its `own` results are not run or read again, if they are at hand.
     """
-    found, ended, simulated = {} if own is None else {OWN: own}, 0, 0.0
+    found, heard = {} if own is None else {OWN: own}, InTurn(report)
     for name, one in plans(plan).items():
         if name in found:
             continue
-
-        def heard(progress: Progress, ended: int = ended, simulated: float = simulated) -> None:
-            nonlocal last
-            last = progress
-            report(Progress(ended + progress.finished, simulated + progress.simulated))
-
-        last = Progress(0, 0.0)
         folder = out if out is None or one is plan else folder_of(out, name)
         found[name] = sweeps.whole(one, folder, report=heard, **shape)
-        ended, simulated = ended + one.trials, simulated + last.simulated
+        heard.ended(one.trials)
     joined = xr.concat(found.values(), "model", coords="minimal", compat="override")
     return joined.assign_coords(model=list(found))

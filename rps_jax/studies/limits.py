@@ -25,7 +25,7 @@ from rps_jax.robot.shell import BOARDS, HALF_WIDTH
 from rps_jax.runs import sweep as sweeps
 from rps_jax.trials import pushes
 from rps_jax.trials.conditions import Conditions
-from rps_jax.trials.setting import Progress, Report, unheard
+from rps_jax.trials.setting import InTurn, Report, unheard
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import Domain, Range, named
 
@@ -121,24 +121,14 @@ def run(
     """
     for name in names:
         errors.check_name("limit", name, LIMITS)
-    base, done = named(domain), Progress(0, 0.0)
+    base, heard = named(domain), InTurn(report)
 
     def sweep(part: str, of: Domain, robot: Robot | None = None) -> xr.Dataset:
-        nonlocal done
-        last = before = done
-
-        def heard(progress: Progress) -> None:
-            nonlocal last
-            last = Progress(
-                before.finished + progress.finished, before.simulated + progress.simulated
-            )
-            report(last)
-
         folder = None if out is None else out / part
         found = sweeps.sweep(
             of, arms, worlds, seed, out=folder, rules=rules, robot=robot, report=heard, **shape
         )
-        done = Progress(before.finished + len(arms) * worlds, last.simulated)
+        heard.ended(len(arms) * worlds)
         return found
 
     ideal, found = sweep(_IDEAL, base), {}

@@ -45,6 +45,27 @@ def unheard(progress: Progress) -> None:
     """The report of a run that nobody watches."""
 
 
+class InTurn:
+    """The report of runs that follow one another, as if they were one."""
+
+    def __init__(self, report: Report):
+        """`report` hears of them all."""
+        self._report = report
+        self._before = self._now = Progress(0, 0.0)
+
+    def __call__(self, progress: Progress) -> None:
+        """A look at the run under way."""
+        before = self._before
+        self._now = Progress(
+            before.finished + progress.finished, before.simulated + progress.simulated
+        )
+        self._report(self._now)
+
+    def ended(self, trials: int) -> None:
+        """A run of so many trials has ended, even if it had nothing left to run."""
+        self._before = self._now = Progress(self._before.finished + trials, self._now.simulated)
+
+
 @dataclass(frozen=True)
 class Timing:
     """Where the time of a sweep went."""
