@@ -305,6 +305,11 @@ class SmoothSkin(NamedTuple):
         return self.sensor.sense_smoothly(state, footprint, period, self.temperature)
 
 
+def own(sensor: Any) -> list[str]:
+    """Names of the numbers of a sensor itself; where it feels is the robot's."""
+    return [name for name in sensor._fields if name != "shell"]
+
+
 SkinName = Literal["ideal", "thin", "capacitive", "hardware"]
 # "thin" chatters between the corners of a box, as a rigid contact sensor does.
 SKINS: dict[SkinName, Skin] = {

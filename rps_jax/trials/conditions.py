@@ -10,6 +10,7 @@ from rps_jax import engines, errors
 from rps_jax.control import strategies
 from rps_jax.control.strategies import Params
 from rps_jax.engines import EngineName
+from rps_jax.robot import skin as skins
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.robot import named as named_robot
 from rps_jax.robot.skin import SKINS, Skin, SkinName
@@ -78,8 +79,7 @@ class Conditions:
         name: Any = self.skin or paper.SKIN[self.physics]
         usual: Any = SKINS[name]
         for changed in self.skin_params:
-            known = [name for name in usual._fields if name != "shell"]
-            errors.check_name("skin-params", changed, known)
+            errors.check_name("skin-params", changed, skins.own(usual))
         return usual._replace(**self.skin_params)
 
     def case(

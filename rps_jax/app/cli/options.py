@@ -128,11 +128,13 @@ class Asked:
 
     def conditions(self) -> Conditions:
         """The same as the library has them."""
+        from rps_jax.robot import skin
         from rps_jax.trials.conditions import Conditions
 
         known = {f.name for f in dataclasses.fields(Conditions)}
         given = {name: value for name, value in self.__dict__.items() if name in known}
-        changes = parsing.assignments("skin-params", self.skin_params, sorted(_of_skins()))
+        of_skins = {name for one in skin.SKINS.values() for name in skin.own(one)}
+        changes = parsing.assignments("skin-params", self.skin_params, sorted(of_skins))
         return Conditions.of(given | {"skin_params": changes})
 
 
@@ -162,6 +164,7 @@ class Recorded(Asked):
 
     def configuration(self, strategies: tuple[str, ...], out: Path) -> dict[str, Any]:
         """What was asked, and what it means, as JSON."""
+        from rps_jax.robot import skin
         from rps_jax.robot.robot import named
 
         chosen = self.conditions()
@@ -172,16 +175,9 @@ class Recorded(Asked):
             "params": {name: parsing.as_json(params) for name, params in arms.items()},
             "physics": dataclasses.asdict(setting.physics),
             "rules": setting.rules._asdict(),
-            "skin": {name: getattr(sensor, name) for name in _of_skins() & set(sensor._fields)},
+            "skin": {name: getattr(sensor, name) for name in skin.own(sensor)},
             "robot": dataclasses.asdict(named(self.robot)),
         }
-
-
-def _of_skins() -> set[str]:
-    """Names of the parameters of skins; where their boards are is the robot's."""
-    from rps_jax.robot.skin import SKINS
-
-    return {name for skin in SKINS.values() for name in skin._fields} - {"shell"}
 
 
 @dataclass(frozen=True)
