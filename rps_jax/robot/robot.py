@@ -111,13 +111,18 @@ class Robot:
         """Raises InputError for numbers that no robot has; each is one number, or None."""
         Shell(self.half_length, self.half_width, self.boards).check()
         errors.check_finite("robot mass", self.mass, above=0, at_most=1e4, unit="kg")
+        if np.size(self.v_max) > 2:
+            raise InputError(
+                f"robot v_max = {self.v_max} is not allowed: give one number, or two, forward and "
+                "sideways [m/s]."
+            )
+        if np.size(self.v_max) == 2 and self.v_max[1] == 0:
+            raise InputError(
+                f"robot v_max = {self.v_max} is not allowed: a base that cannot move sideways "
+                "cannot follow the law, which needs v_y."
+            )
         for name, (least, most, unit) in _ALLOWED.items():
             value = getattr(self, name)
-            if name == "v_max" and np.size(value) == 2 and value[1] == 0:
-                raise InputError(
-                    f"robot v_max = {value} is not allowed: a base that cannot move sideways "
-                    "cannot follow the law, which needs v_y."
-                )
             if value is not None:
                 for one in np.atleast_1d(np.asarray(value, object)):
                     errors.check_finite(
@@ -127,11 +132,6 @@ class Robot:
             raise InputError(
                 f"robot acceleration_max = {self.acceleration_max} is not allowed: give two "
                 "numbers, [m/s^2, rad/s^2]."
-            )
-        if np.size(self.v_max) > 2:
-            raise InputError(
-                f"robot v_max = {self.v_max} is not allowed: give one number, or two, forward and "
-                "sideways [m/s]."
             )
         if self.push_max is not None and self.push_max <= 0:
             raise InputError(

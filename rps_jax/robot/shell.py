@@ -70,7 +70,7 @@ class Shell:
     def of(cls, half_length: Any, half_width: Any, boards: tuple[Boards, ...]) -> Shell:
         """The shell of a base or, if these are (n,), of many."""
         x, y = (float(np.max(half)) for half in (half_length, half_width))
-        sides = {"left": 2 * x, "front": 2 * y, "right": 2 * x}
+        sides = _lengths(x, y)
         pitches = [
             sides[one.side] / one.taxels if one.pitch is None else np.max(one.pitch)
             for one in boards
@@ -94,9 +94,9 @@ class Shell:
         x, y = self.half
         corners = {"left": (-x, y), "front": (x, y), "right": (x, -y)}
         begins = {"left": 0.0, "front": 2 * x, "right": 2 * x + 2 * y}
-        found = []
+        found, sides = [], _lengths(x, y)
         for one in self.boards:
-            along, side = np.array(_ALONG[one.side]), 2 * (y if one.side == "front" else x)
+            along, side = np.array(_ALONG[one.side]), sides[one.side]
             start, begin = jnp.stack(corners[one.side]), begins[one.side]
             if one.pitch is None:
                 found.append(Row(start, along, side, begin))
@@ -140,7 +140,7 @@ class Shell:
                 f"robot boards on {', '.join(one.side for one in self.boards)} are not allowed: "
                 "name the rows in the order left, front, right."
             )
-        sides = {"left": 2 * x, "front": 2 * y, "right": 2 * x}
+        sides = _lengths(x, y)
         for one in self.boards:
             first, last = _ends(one, sides[one.side])
             if first < -_ROUNDING or last > sides[one.side] + _ROUNDING:
@@ -166,6 +166,11 @@ def _register(cls: type, *, static: tuple[str, ...]) -> None:
 
 _register(Boards, static=("side", "count", "electrodes"))
 _register(Shell, static=("samples",))
+
+
+def _lengths(x: Any, y: Any) -> dict[Side, Any]:
+    """Lengths [m] of the sides of a base of half length x and half width y [m]."""
+    return {"left": 2 * x, "front": 2 * y, "right": 2 * x}
 
 
 def _ends(one: Boards, side: float) -> tuple[float, float]:
