@@ -79,15 +79,18 @@ def _edges(footprint: Footprint) -> tuple[jax.Array, jax.Array, jax.Array]:
 def signed_distance(footprint: Footprint, point: jax.Array) -> jax.Array:
     """Distance (...) [m] of `point` (..., 2) [m] to the outline, negative inside."""
     start, along, length2 = _edges(footprint)
-    nearest, inside = jnp.inf, ~jnp.all(along == 0)
-    # Edge by edge and coordinate by coordinate: GPUs are slow at reducing axes this short.
+    nearest, inside = jnp.asarray(jnp.inf), ~jnp.all(along == 0)
+    # Edge by edge and coordinate by coordinate: GPUs are slow at reducing axes this short. Squares,
+    # of which one root is taken: that is most of the work.
     for i in range(footprint.vertices.shape[0]):
         x, y = point[..., 0] - start[i, 0], point[..., 1] - start[i, 1]
-        t = jnp.clip((x * along[i, 0] + y * along[i, 1]) / length2[i], 0.0, 1.0)
-        away = jnp.stack([x - t * along[i, 0], y - t * along[i, 1]], axis=-1)
-        nearest = jnp.minimum(nearest, planar.norm(away))
+        ahead = along[i] / length2[i]
+        t = jnp.clip(x * ahead[0] + y * ahead[1], 0.0, 1.0)
+        away_x, away_y = x - t * along[i, 0], y - t * along[i, 1]
+        nearest = jnp.minimum(nearest, away_x * away_x + away_y * away_y)
         repeated = (along[i, 0] == 0) & (along[i, 1] == 0)
         inside &= repeated | (along[i, 0] * y - along[i, 1] * x > 0)
+    nearest = planar.safe_sqrt(nearest)
     if footprint.vertices.shape[0] < 3:  # a point or a segment encloses nothing
         return nearest - footprint.radius
     return jnp.where(inside, -nearest, nearest) - footprint.radius

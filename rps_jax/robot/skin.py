@@ -218,13 +218,16 @@ class CapacitiveSkin(NamedTuple):
     def compression(self, footprint: Footprint) -> jax.Array:
         """How far the object presses into the foam (T, S) [m] at each sample of each taxel."""
         samples = jnp.asarray(self.shell.taxels(self.shell.samples), footprint.vertices.dtype)
-        depth = self.foam - fp.signed_distance(footprint, samples)
+        # One long axis: a processor's vectors are filled along the last.
+        line = jnp.swapaxes(samples, 0, 1).reshape(-1, 2)
+        depth = (self.foam - fp.signed_distance(footprint, line)).reshape(samples.shape[1::-1]).T
         return jnp.clip(depth, 0.0, self.max_compression * self.foam)
 
     def _scan(self, state: SkinState, footprint: Footprint) -> tuple[SkinState, jax.Array]:
         """What all taxels answer (T,) [1], as foam, gains and noise have it."""
-        gap = self.foam - self.compression(footprint)
-        change = jnp.mean(self.foam / gap, axis=-1) - 1.0
+        share = self.foam / (self.foam - self.compression(footprint))
+        # Sample by sample: a reduction of so short an axis is slow on every device.
+        change = sum(share[:, i] for i in range(self.shell.samples)) / self.shell.samples - 1.0
         key, key_noise = jax.random.split(state.key)
         noise = self.noise * jax.random.normal(key_noise, change.shape, change.dtype)
         return state._replace(key=key), state.gain * change + noise
@@ -333,8 +336,11 @@ def _first(excess: jax.Array) -> jax.Array:
 
 def _extremes(active: jax.Array, values: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The rows of `values` (n, m) at the first and the last True of `active` (n,)."""
-    first = jnp.argmax(active)
-    last = active.shape[0] - 1 - jnp.argmax(active[::-1])
+    count = active.shape[0]
+    # Least and greatest numbers: a processor is slow at `argmax`, twenty times.
+    number = jnp.arange(count)
+    first = jnp.min(jnp.where(active, number, count - 1))
+    last = jnp.max(jnp.where(active, number, 0))
     return values[first], values[last]
 
 
