@@ -6,7 +6,9 @@ which halves a program that has axis-aligned directions in it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import reduce
 from typing import Any
 
@@ -103,3 +105,49 @@ def times(p: Sequence[Any], q: Sequence[Any]) -> tuple[Any, Any, Any, Any]:
     b, v = q[0], (q[1], q[2], q[3])
     x, y, z = add(cross(u, v), add(scale(a, v), scale(b, u)))
     return a * b - dot(u, v), x, y, z
+
+
+# --- over the leading axis, which numbers corners or contacts ---------------------------------
+
+_IN_ONE = ContextVar("rps_jax_reductions_in_one", default=False)
+
+
+@contextmanager
+def reductions_in_one() -> Iterator[None]:
+    """While this is traced, reduce as one operation: a kernel's compiler cannot take slices.
+
+    XLA makes on a processor a loop over the leading axis of it, one world at a time; of slices
+    that are added it makes vectors of worlds.
+    """
+    token = _IN_ONE.set(True)
+    try:
+        yield
+    finally:
+        _IN_ONE.reset(token)
+
+
+def _over(x: Any, in_one: Callable[..., Any], two: Callable[[Any, Any], Any]) -> Any:
+    if isinstance(x, float):
+        return x
+    if _IN_ONE.get():
+        return in_one(x, axis=0)
+    rows = [x[i] for i in range(x.shape[0])]
+    while len(rows) > 1:  # in pairs: fewer steps that wait for one another
+        over = rows[-1:] if len(rows) % 2 else []
+        rows = [two(a, b) for a, b in zip(rows[::2], rows[1::2], strict=False)] + over
+    return rows[0]
+
+
+def total(x: Any) -> Any:
+    """Sum over the leading axis; a literal number is what all together have."""
+    return _over(x, jnp.sum, jnp.add)
+
+
+def greatest(x: Any) -> Any:
+    """Greatest along the leading axis."""
+    return _over(x, jnp.max, jnp.maximum)
+
+
+def least(x: Any) -> Any:
+    """Least along the leading axis."""
+    return _over(x, jnp.min, jnp.minimum)

@@ -206,7 +206,7 @@ def meetings(
     def on_object(z: Any, normal: Point, surface: Point, distance: Any) -> tuple[Any, Any]:
         """Heights and distances, those below the object's lower face moved up its side to there."""
         middle, face = seen((0.0, 0.0, 0.0)), sp.dot(body.up, feet)
-        face = jnp.max(face, axis=0) if isinstance(body.vertices, Corners) else face
+        face = sp.greatest(face) if isinstance(body.vertices, Corners) else face
         away = (surface[0] - middle[0], surface[1] - middle[1])
         above = up[2] * (sp.dot(slope, away) + z - middle[2]) - face
         rise = jnp.clip(-above * up[2], 0.0, high - z)
@@ -276,10 +276,10 @@ def polygon_and_rectangle(
     one, nil = jnp.ones_like(separation), jnp.zeros_like(separation)
     # Reference faces: separation, normal out of its owner, a point on it, along it, its length.
     sides = [
-        (jnp.min(x, axis=0) - a, (one, nil), (a, -b), (nil, one), 2 * b),
-        (-jnp.max(x, axis=0) - a, (-one, nil), (-a, b), (nil, -one), 2 * b),
-        (jnp.min(y, axis=0) - b, (nil, one), (a, b), (-one, nil), 2 * a),
-        (-jnp.max(y, axis=0) - b, (nil, -one), (-a, -b), (one, nil), 2 * a),
+        (sp.least(x) - a, (one, nil), (a, -b), (nil, one), 2 * b),
+        (-sp.greatest(x) - a, (-one, nil), (-a, b), (nil, -one), 2 * b),
+        (sp.least(y) - b, (nil, one), (a, b), (-one, nil), 2 * a),
+        (-sp.greatest(y) - b, (nil, -one), (-a, -b), (one, nil), 2 * a),
     ]
 
     def side(score: list[Any]) -> Any:
@@ -319,8 +319,8 @@ def polygon_and_rectangle(
 
 def _best(score: Any, values: Any) -> tuple[Any, Any]:
     """The greatest score along the leading axis, and what stands there; the first of equals."""
-    top = jnp.max(score, axis=0)
+    top = sp.greatest(score)
     i = jax.lax.broadcasted_iota(jnp.int32, score.shape, 0)
-    first = jnp.min(jnp.where(score == top, i, score.shape[0]), axis=0)
+    first = sp.least(jnp.where(score == top, i, score.shape[0]))
     there = i == first
-    return top, jax.tree.map(lambda x: jnp.sum(jnp.where(there, x, 0.0), axis=0), values)
+    return top, jax.tree.map(lambda x: sp.total(jnp.where(there, x, 0.0)), values)

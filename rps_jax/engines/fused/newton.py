@@ -13,7 +13,8 @@ Reference: MuJoCo documentation, "Computation: Constraint model" and "Solver".
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -26,6 +27,7 @@ from rps_jax.geometry.vectors import Vec
 from rps_jax.world.physics import Physics
 
 _ENOUGH = 1e-4  # [m/s^2] error of the acceleration with which the solver ends
+_FLAT = 0.5  # [1] of the slope at its start, with which a line search ends
 _FAR = 1e9  # no upper bound of the line search
 
 
@@ -189,9 +191,9 @@ def accelerations(
         lines = [
             (c, sp.add(_rows(c, a, alpha, b), c.bias), _rows(c, d, delta, e)) for c in contacts
         ]
-        x = _line_search(lines, slope, bend, physics)
         # An inner product of step and gradient: twice what a quadratic cost would gain.
         gain = -sp.dot(step, g)
+        x = _line_search(lines, slope, bend, active * gain, physics)
         going = gain > 2 * body.mass * _ENOUGH**2
         # A world that is done stays as it is while others go on: its numbers are its own.
         move = jnp.where(active > 0, jnp.where(going, x, jnp.minimum(x, 1.0)), 0.0)
@@ -218,13 +220,8 @@ def _on_base(arm: tuple[Any, Any], f: Vec) -> Vec:
     return f[0], f[1], sp.minus(sp.mul(arm[0], f[1]), sp.mul(arm[1], f[0]))
 
 
-def _sum(entry: Any) -> Any:
-    """Over the contacts, of what each adds to an entry."""
-    return entry if isinstance(entry, float) else jnp.sum(entry, axis=0)
-
-
 def _sums(vector: Vec) -> Vec:
-    return _sum(vector[0]), _sum(vector[1]), _sum(vector[2])
+    return sp.total(vector[0]), sp.total(vector[1]), sp.total(vector[2])
 
 
 def _some(active: jax.Array) -> jax.Array:
@@ -250,12 +247,12 @@ def _stiffen(h: list[list[Any]], c: Contact, k: tuple[Any, ...]) -> None:
     turned = [sp.cross(c.r, column) for column in columns]  # columns of [r] K
     for i in range(3):
         for j in range(i + 1):
-            h[i][j] = sp.plus(h[i][j], _sum(columns[j][i]))
+            h[i][j] = sp.plus(h[i][j], sp.total(columns[j][i]))
         for j in range(3):
-            h[3 + i][j] = sp.plus(h[3 + i][j], _sum(turned[j][i]))
+            h[3 + i][j] = sp.plus(h[3 + i][j], sp.total(turned[j][i]))
         row = sp.cross(c.r, (turned[0][i], turned[1][i], turned[2][i]))
         for j in range(i + 1):
-            h[3 + i][3 + j] = sp.plus(h[3 + i][3 + j], _sum(row[j]))
+            h[3 + i][3 + j] = sp.plus(h[3 + i][3 + j], sp.total(row[j]))
     if c.arm is None:
         return
     # The base's rows: with B the way its origin's motion moves the point, -B^T K (1, [r]^T, -B).
@@ -263,38 +260,99 @@ def _stiffen(h: list[list[Any]], c: Contact, k: tuple[Any, ...]) -> None:
     for j in range(3):
         twisted = _on_base(c.arm, (turned[0][j], turned[1][j], turned[2][j]))
         for i in range(3):
-            h[6 + i][j] = sp.minus(h[6 + i][j], _sum(onto[j][i]))
-            h[6 + i][3 + j] = sp.minus(h[6 + i][3 + j], _sum(twisted[i]))
+            h[6 + i][j] = sp.minus(h[6 + i][j], sp.total(onto[j][i]))
+            h[6 + i][3 + j] = sp.minus(h[6 + i][3 + j], sp.total(twisted[i]))
     for i in range(3):
         row = _on_base(c.arm, (onto[0][i], onto[1][i], onto[2][i]))
         for j in range(i + 1):
-            h[6 + i][6 + j] = sp.plus(h[6 + i][6 + j], _sum(row[j]))
+            h[6 + i][6 + j] = sp.plus(h[6 + i][6 + j], sp.total(row[j]))
+
+
+class _Line(NamedTuple):
+    """Contacts (C, ...) along the line a + x step: their rows, in the axes of the cone.
+
+    Of each n(x) = n + x pace and slip(x)^2 = square + 2 x half + x^2 bend.
+    """
+
+    n: Any
+    pace: Any
+    square: Any
+    half: Any
+    bend: Any
+    weight: Any  # [kg] stiffness of what sticks
+    mu: Any
+
+
+def _line(c: Contact, start: Vec, pace: Vec, physics: Physics) -> _Line:
+    """Contacts whose rows are `start` and change by `pace`, in the elliptic cone."""
+    f = c.friction
+    mu = f * physics.impratio**-0.5
+    (n, t, s), (p, q, r) = start, pace
+    ff = f * f
+    square, half, bend = ff * (t * t + s * s), ff * (t * q + s * r), ff * (q * q + r * r)
+    return _Line(mu * n, mu * p, square, half, bend, c.d * physics.impratio / ff, mu)
+
+
+def _slope_of_ellipse(line: _Line, x: Any) -> tuple[Any, Any]:
+    """First and second derivative of the contacts' cost along the line: see `contact_force`."""
+    n, mu = line.n + x * line.pace, line.mu
+    turn = line.half + x * line.bend
+    slip = jnp.sqrt(jnp.maximum(line.square + x * (line.half + turn), 1e-30))
+    sticks = mu * n + slip <= 0
+    slides = (n < mu * slip) & ~sticks
+    h, first = n - mu * slip, turn / slip  # the slip's derivative
+    rise = line.pace - mu * first
+    d_m = line.weight / (1 + mu * mu)
+    second = rise * rise - h * mu * (line.bend - first * first) / slip
+    stuck = n * line.pace + turn, line.pace * line.pace + line.bend
+    return (
+        jnp.where(sticks, line.weight * stuck[0], jnp.where(slides, d_m * h * rise, 0.0)),
+        jnp.where(sticks, line.weight * stuck[1], jnp.where(slides, d_m * second, 0.0)),
+    )
+
+
+def _slope_of_pyramid(lines: tuple[Contact, Vec, Vec], x: Any, physics: Physics) -> tuple[Any, Any]:
+    """The same of the friction pyramid."""
+    c, start, pace = lines
+    force, k = _pyramid(c, sp.add(start, sp.scale(x, pace)), physics)
+    nn, nt, ns, tt, _, ss = k
+    p, q, r = pace
+    curve = nn * p * p + tt * q * q + ss * r * r + 2 * p * (nt * q + ns * r)
+    return -sp.dot(force, pace), curve
 
 
 def _line_search(
-    lines: list[tuple[Contact, Vec, Vec]], slope: Any, bend: Any, physics: Physics
+    lines: list[tuple[Contact, Vec, Vec]], slope: Any, bend: Any, steepness: Any, physics: Physics
 ) -> Any:
-    """How far the cost is least: Newton's method, bracketed.
+    """How far the cost is least: Newton's method, bracketed, until the slope is `_FLAT`.
 
     `slope` and `bend` are the first and second derivative of what is not of contacts; `lines` are
-    the contacts, with their rows at the start and how these change.
+    the contacts, with their rows at the start and how these change; `steepness` is minus the
+    slope at the start, 0 of worlds that need no search.
     """
+    slopes: list[Callable[[Any], tuple[Any, Any]]]
+    if physics.cone == "pyramidal":
+        slopes = [partial(lambda line, x: _slope_of_pyramid(line, x, physics), c) for c in lines]
+    else:
+        slopes = [partial(_slope_of_ellipse, _line(*c, physics)) for c in lines]
 
-    def refine(_, carry):
-        x, low, high = carry
+    def refine(carry):
+        count, x, low, high, searching, _ = carry
         first, second = slope + x * bend, bend
-        for c, start, pace in lines:
-            force, k = contact_force(c, sp.add(start, sp.scale(x, pace)), physics)
-            first = first - _sum(sp.dot(force, pace))
-            nn, nt, ns, tt, ts, ss = k
-            p, q, r = pace
-            curve = nn * p * p + tt * q * q + ss * r * r
-            second = second + _sum(curve + 2 * (nt * p * q + ns * p * r + ts * q * r))
+        for of_contacts in slopes:
+            one, two = of_contacts(x)
+            first, second = first + sp.total(one), second + sp.total(two)
+        searching = jnp.where(jnp.abs(first) > _FLAT * steepness, searching, 0.0)
         low, high = jnp.where(first < 0, x, low), jnp.where(first < 0, high, x)
         new = x - first / second
         halved = jnp.where(high < _FAR, 0.5 * (low + high), 2 * x)
-        return jnp.where((new > low) & (new < high), new, halved), low, high
+        new = jnp.where((new > low) & (new < high), new, halved)
+        x = jnp.where(searching > 0, new, x)
+        return count + 1, x, low, high, searching, _some(searching)
 
     one = jnp.ones_like(slope)
-    start = (one, 0.0 * one, _FAR * one)
-    return jax.lax.fori_loop(0, physics.ls_iterations, refine, start)[0]
+    searching = jnp.where(steepness > 0, one, 0.0)
+    start = (0, one, 0.0 * one, _FAR * one, searching, _some(searching))
+    return jax.lax.while_loop(
+        lambda carry: (carry[0] < physics.ls_iterations) & carry[5], refine, start
+    )[1]

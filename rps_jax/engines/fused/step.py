@@ -209,7 +209,9 @@ def in_a_kernel(
         *given, out = refs
         body = _unpacked(scalars, given[: len(bodies)])
         now, wanted, pushing = _unpacked(moving, given[len(bodies) :])
-        _give(out, jax.tree.leaves(in_xla(body, now, wanted, pushing, physics=physics)))
+        with sp.reductions_in_one():
+            after = in_xla(body, now, wanted, pushing, physics=physics)
+        _give(out, jax.tree.leaves(after))
 
     def block(outer: tuple[int, ...]) -> pallas.BlockSpec:
         return pallas.BlockSpec((*outer, _BLOCK), lambda i: (*(0,) * len(outer), i))
