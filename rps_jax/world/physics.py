@@ -18,7 +18,7 @@ class Physics:
     cone: Literal["elliptic", "pyramidal"] = "elliptic"
     impratio: float = 10.0  # [1] friction stiffness over normal stiffness
     iterations: int = 8  # of the Newton solver, at most; with 4 the object is lost
-    ls_iterations: int = 10  # of its line search, always done
+    ls_iterations: int = 10  # of its line search, at most
     # Of the solver, relative to the trace of the mass matrix: that is 3e6 by the base's armature,
     # so MuJoCo's own 1e-8 would end the solver far from an object's solution.
     tolerance: float = 1e-13  # [1]
