@@ -14,7 +14,7 @@ from rps_jax.control.law import RPSParams
 from rps_jax.engines.base import Driven
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import CapacitiveSkin
-from rps_jax.trials import pushes, trial
+from rps_jax.trials import batch, pushes, trial
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules, Shift
@@ -79,6 +79,32 @@ def test_a_gpu_that_seldom_asks_who_still_runs_finds_the_same(monkeypatch):
     assert ended.steps.tolist() == [15, 15]
     assert running.steps.tolist() == [40, 40]
     chex.assert_trees_all_close(seldom, run("cpu"), atol=1e-6)
+
+
+def test_the_last_trials_of_a_job_end_alike_in_fewer_slots(monkeypatch):
+    """On a GPU; here seven trials through four slots and then one, since three have ended."""
+    setting = Setting(engine="quasistatic", rules=Rules(horizon=60.0))
+    some = [case((0.6 + 0.05 * k, 0.05 * k)) for k in range(6)] + [case(AHEAD)]
+    wide, _ = pushes.run(some, setting, slots=SLOTS, workers=1)
+    programs, plain = [], batch._Worker._program
+    monkeypatch.setattr(batch, "_ever_fewer", lambda slots, fewest: (slots, 1))
+    monkeypatch.setattr(
+        batch._Worker,
+        "_program",
+        lambda self, width: programs.append(width.slots) or plain(self, width),
+    )
+    narrow, _ = pushes.run(some, setting, slots=SLOTS, workers=1)
+    assert programs == [SLOTS, 1]
+    assert wide.success.sum() > 0
+    for name in ("success", "time"):
+        np.testing.assert_array_equal(getattr(narrow, name), getattr(wide, name))
+    np.testing.assert_allclose(narrow.object_pose, wide.object_pose, atol=1e-5)
+
+
+def test_a_gpu_takes_the_last_trials_into_ever_fewer_slots_but_never_few():
+    assert list(batch._ever_fewer(65536, 4096)) == [65536, 16384, 4096]
+    assert list(batch._ever_fewer(4097, 4096)) == [4097]
+    assert list(batch._ever_fewer(64, 64)) == [64]
 
 
 def test_a_base_may_turn_as_often_as_it_likes_and_not_go_as_far():

@@ -10,7 +10,7 @@ import functools
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import partial
 from typing import Any, NamedTuple
@@ -29,6 +29,9 @@ from rps_jax.trials.trial import Outcome, Rules, Trial, World
 from rps_jax.world.physics import Physics
 
 SEGMENT = 10.0  # [s] simulated between two looks at which trials have ended
+# A GPU takes the last trials of a job into ever fewer slots, each time a quarter of them, as long
+# as there are this many: fewer take it as long.
+_FEWEST = 4096
 
 
 class Part(NamedTuple):
@@ -91,10 +94,11 @@ def run(
         count = workers
         queues = [_Queue(job, setting, slots) for job in jobs]
         orders = [queues[w % len(queues) :] + queues for w in range(count if queues else 0)]
-        tasks = [partial(_work, order, shared) for order in orders]
-        if backend != "cpu":  # the processor is idle: compile all at once
-            tasks += [queue.program for queue in queues]
-            count += len(queues)
+        tasks = [_Worker(order, shared).work for order in orders]
+        if backend != "cpu":  # the processor is idle: compile all at once, what is needed first
+            programs = [width.program for width in sorted(_widths(queues), key=_slots_of)[::-1]]
+            tasks += programs
+            count += len(programs)
     _side_by_side(tasks, count, shared)
     warn_of_lost(shared.overflowed)
     total = time.perf_counter() - began
@@ -181,25 +185,21 @@ def _run_on_host(job: Job, setting: Setting, threads: int, shared: _Shared) -> N
 
 
 class _Queue:
-    """The waiting trials of one job, and its program once compiled."""
+    """The waiting trials of one job, and the batches that can run them, the widest first."""
 
     def __init__(self, job: Job, setting: Setting, slots: int):
         self.strategy = job.strategy
-        self.setting = setting
-        devices = jax.device_count()
-        self.slots = devices * min(slots, -(-job.trials // devices))
-        self.sharding = None
-        if devices > 1:
-            mesh = jax.make_mesh((devices,), ("worlds",), (AxisType.Auto,))
-            self.sharding = NamedSharding(mesh, P("worlds"))
         self._parts = iter(job.parts)
         first = next(self._parts)
-        self.stage = first.stage
-        self._worlds = jax.tree.map(self._batched, first.worlds)
         self._waiting: Part | None = first  # what is left of it
-        self._lock, self._compiling = threading.Lock(), threading.Lock()
-        self._program = None
-        self.ready = 0.0  # [s] of `time.perf_counter`, when the program was there
+        self._lock = threading.Lock()
+        devices = jax.device_count()
+        widest = min(slots, -(-job.trials // devices))
+        fewest = _FEWEST if jax.default_backend() != "cpu" else widest
+        self.widths = [
+            _Width(job.strategy, setting, first, devices * each)
+            for each in _ever_fewer(widest, fewest)
+        ]
 
     def take(self, count: int) -> list[Part]:
         """Up to `count` waiting trials, as pieces of parts."""
@@ -210,6 +210,31 @@ class _Queue:
                 taken.append(piece)
                 count -= piece.numbers.size
         return taken
+
+
+def _ever_fewer(slots: int, fewest: int) -> Iterator[int]:
+    """`slots`, a quarter of them and so on, as long as that is not less than `fewest`."""
+    yield slots
+    while (slots := slots // 4) >= fewest:
+        yield slots
+
+
+class _Width:
+    """A batch of so many slots on all devices of the host, and its program once compiled."""
+
+    def __init__(self, strategy: Strategy, setting: Setting, like: Part, slots: int):
+        self.slots = slots
+        self.stage = like.stage
+        self.setting = setting
+        self._strategy = strategy
+        self.sharding = None
+        if jax.device_count() > 1:
+            mesh = jax.make_mesh((jax.device_count(),), ("worlds",), (AxisType.Auto,))
+            self.sharding = NamedSharding(mesh, P("worlds"))
+        self._worlds = jax.tree.map(self._batched, like.worlds)
+        self._compiling = threading.Lock()
+        self._program = None
+        self.ready = 0.0  # [s] of `time.perf_counter`, when the program was there
 
     def program(self) -> Any:
         """The compiled program; the first to come compiles, others wait."""
@@ -225,23 +250,31 @@ class _Queue:
 
     def start(self, worlds: World, live: np.ndarray) -> Trial:
         """New trials in all slots."""
-        return self.put(trial.start_all(worlds, live, strategy=self.strategy))
+        return self.put(trial.start_all(worlds, live, strategy=self._strategy))
 
     def refill(self, worlds: World, trials: Trial, fresh: np.ndarray) -> Trial:
         """New trials in the slots that are `fresh` (slots,)."""
-        return self.put(_refill(worlds, trials, fresh, strategy=self.strategy))
+        return self.put(_refill(worlds, trials, fresh, strategy=self._strategy))
 
     def _batched(self, leaf: Any) -> jax.ShapeDtypeStruct:
         shape = (self.slots, *leaf.shape[1:])
         return jax.ShapeDtypeStruct(shape, leaf.dtype, sharding=self.sharding)
 
     def _compile(self) -> Any:
-        start = partial(trial.start_all, strategy=self.strategy)
+        start = partial(trial.start_all, strategy=self._strategy)
         live = jax.ShapeDtypeStruct((self.slots,), bool)
         trials = jax.tree.map(self._batched, jax.eval_shape(start, self._worlds, live))
         stage, rules = jax.eval_shape(lambda: (self.stage, self.setting.rules))
         leaves, tree = jax.tree.flatten((stage, self._worlds, trials, rules))
-        return _compiled(self.setting.physics, self.strategy, self.sharding, tree, tuple(leaves))
+        return _compiled(self.setting.physics, self._strategy, self.sharding, tree, tuple(leaves))
+
+
+def _widths(queues: Sequence[_Queue]) -> list[_Width]:
+    return [width for queue in queues for width in queue.widths]
+
+
+def _slots_of(width: _Width) -> int:
+    return width.slots
 
 
 @functools.lru_cache(maxsize=32)
@@ -311,18 +344,6 @@ def _refill(worlds: World, trials: Trial, fresh: jax.Array, *, strategy: Strateg
     return jax.tree.map(pick, started, trials)
 
 
-def _work(queues: list[_Queue], shared: _Shared) -> None:
-    waited = 0.0
-    for queue in queues:
-        began = time.perf_counter()
-        taken = [] if shared.stop else queue.take(queue.slots)
-        if taken:
-            program = queue.program()
-            waited += max(0.0, queue.ready - began)
-            shared.compiled(waited)
-            _drain(queue, program, taken, shared)
-
-
 class _Held:
     """The worlds in the slots of one worker, on the host."""
 
@@ -342,27 +363,63 @@ class _Held:
         # A copy: the device may otherwise share the host's memory, which the next call changes.
         return jax.tree.map(np.copy, self._worlds)
 
+    def keep(self, at: np.ndarray) -> World:
+        """Keep the slots `at` alone, in that order; returns their worlds."""
+        self.numbers, self._worlds = self.numbers[at], rows(self._worlds, at)
+        return jax.tree.map(np.copy, self._worlds)
 
-def _drain(queue: _Queue, program: Any, taken: list[Part], shared: _Shared) -> None:
-    """Run trials, the `taken` first, until none waits and none of this worker's runs."""
-    stage, period = queue.stage, queue.setting.physics.control_period
-    held = _Held(taken[0], queue.slots)
-    first = np.arange(_count(taken))
-    live = np.arange(queue.slots) < first.size
-    worlds = queue.put(held.put(first, taken))
-    trials = queue.start(worlds, live)
-    before = np.zeros(queue.slots, int)
-    while live.any() and not shared.stop:
-        trials, seen = program(stage, worlds, trials, queue.setting.rules)
-        steps, done, outcomes = jax.device_get(seen)
-        at = np.flatnonzero(done & live)
-        simulated = float((steps - before)[live].sum()) * period
-        shared.add(held.numbers[at], rows(outcomes, at), simulated)
-        before = steps.copy()
-        live[at] = False
-        taken = queue.take(at.size)
-        if taken:
-            fresh = at[: _count(taken)]
-            live[fresh], before[fresh] = True, 0
-            worlds = queue.put(held.put(fresh, taken))
-            trials = queue.refill(worlds, trials, np.isin(np.arange(queue.slots), fresh))
+
+class _Worker:
+    """A host thread that drives a batch of its own through one queue after another."""
+
+    def __init__(self, queues: list[_Queue], shared: _Shared):
+        self._queues, self._shared = queues, shared
+        self._waited = 0.0  # [s] for programs
+
+    def work(self) -> None:
+        """Until no trial waits in any queue."""
+        for queue in self._queues:
+            taken = [] if self._shared.stop else queue.take(queue.widths[0].slots)
+            if taken:
+                self._drain(queue, taken)
+
+    def _program(self, width: _Width) -> Any:
+        began = time.perf_counter()
+        program = width.program()
+        self._waited += max(0.0, width.ready - began)
+        self._shared.compiled(self._waited)
+        return program
+
+    def _drain(self, queue: _Queue, taken: list[Part]) -> None:
+        """Run trials, the `taken` first, until none waits and none of this worker's runs."""
+        width, *narrower = queue.widths
+        program, period = self._program(width), width.setting.physics.control_period
+        held = _Held(taken[0], width.slots)
+        first = np.arange(_count(taken))
+        live = np.arange(width.slots) < first.size
+        worlds = width.put(held.put(first, taken))
+        trials = width.start(worlds, live)
+        before = np.zeros(width.slots, int)
+        while live.any() and not self._shared.stop:
+            trials, seen = program(width.stage, worlds, trials, width.setting.rules)
+            steps, done, outcomes = jax.device_get(seen)
+            at = np.flatnonzero(done & live)
+            simulated = float((steps - before)[live].sum()) * period
+            self._shared.add(held.numbers[at], rows(outcomes, at), simulated)
+            before = steps.copy()
+            live[at] = False
+            taken = queue.take(at.size)
+            if taken:
+                fresh = at[: _count(taken)]
+                live[fresh], before[fresh] = True, 0
+                worlds = width.put(held.put(fresh, taken))
+                trials = width.refill(worlds, trials, np.isin(np.arange(width.slots), fresh))
+            elif narrower and 0 < live.sum() <= narrower[0].slots:
+                running = np.flatnonzero(live)
+                width = narrower.pop(0)
+                program = self._program(width)
+                slots = np.resize(running, width.slots)  # the last ones are padding
+                live = np.arange(width.slots) < running.size
+                worlds, before = width.put(held.keep(slots)), before[slots]
+                last = rows(jax.device_get(trials), slots)
+                trials = width.put(last._replace(done=~live))
