@@ -32,7 +32,8 @@ from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS
 
 _ROWS = 8  # numbers of a world read by one load of the kernel
-_BLOCK = 64  # worlds of one program of the kernel; they go on until the last has converged
+_BLOCK = 16  # worlds of one program of the kernel; they go on until the last has converged
+_WARPS = 2  # of one program: four threads share a world
 
 
 def body(model: mujoco.MjModel, vertices: np.ndarray) -> Body:
@@ -225,7 +226,7 @@ def in_a_kernel(
         out_specs=block((numbers,)),
         out_shape=jax.ShapeDtypeStruct((numbers, worlds), motion[0].dtype),
         interpret=interpret,
-        compiler_params=triton.CompilerParams(num_warps=_BLOCK // 32),
+        compiler_params=triton.CompilerParams(num_warps=_WARPS),
     )(*inputs)
     return jax.tree.unflatten(jax.tree.structure(state), list(after[:, :count]))
 
