@@ -8,6 +8,7 @@ hash of its content. A part that is there is not run again.
 from __future__ import annotations
 
 import functools
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -38,6 +39,8 @@ from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import Domain, named
 from rps_jax.world.draws import table
 from rps_jax.world.physics import Fidelity, PhysicsName, preset
+
+_AHEAD = 16  # parts of a kind that are made before they are asked for, at most
 
 
 def sweep(
@@ -205,11 +208,11 @@ def _made(plan: Plan, numbers: Iterable[int], collector: Collector) -> Iterator[
 
 
 def _ahead(parts: Iterator[Part]) -> Iterator[Part]:
-    """The same, each made while what came before it runs."""
+    """The same, some made while what came before them runs."""
     with ThreadPoolExecutor(1) as maker:
-        coming = maker.submit(next, parts, None)
-        while (part := coming.result()) is not None:
-            coming = maker.submit(next, parts, None)
+        coming = deque(maker.submit(next, parts, None) for _ in range(_AHEAD))
+        while (part := coming.popleft().result()) is not None:
+            coming.append(maker.submit(next, parts, None))
             yield part
 
 

@@ -400,26 +400,33 @@ class _Worker:
         worlds = width.put(held.put(first, taken))
         trials = width.start(worlds, live)
         before = np.zeros(width.slots, int)
-        while live.any() and not self._shared.stop:
-            trials, seen = program(width.stage, worlds, trials, width.setting.rules)
-            steps, done, outcomes = jax.device_get(seen)
-            at = np.flatnonzero(done & live)
-            simulated = float((steps - before)[live].sum()) * period
-            self._shared.add(held.numbers[at], rows(outcomes, at), simulated)
-            before = steps.copy()
-            live[at] = False
-            taken = queue.take(at.size)
-            if taken:
-                fresh = at[: _count(taken)]
-                live[fresh], before[fresh] = True, 0
-                worlds = width.put(held.put(fresh, taken))
-                trials = width.refill(worlds, trials, np.isin(np.arange(width.slots), fresh))
-            elif narrower and 0 < live.sum() <= narrower[0].slots:
-                running = np.flatnonzero(live)
-                width = narrower.pop(0)
-                program = self._program(width)
-                slots = np.resize(running, width.slots)  # the last ones are padding
-                live = np.arange(width.slots) < running.size
-                worlds, before = width.put(held.keep(slots)), before[slots]
-                last = rows(jax.device_get(trials), slots)
-                trials = width.put(last._replace(done=~live))
+        with ThreadPoolExecutor(1) as teller:  # what ended is kept while the next segment runs
+            telling = None
+            while live.any() and not self._shared.stop:
+                trials, seen = program(width.stage, worlds, trials, width.setting.rules)
+                steps, done, outcomes = jax.device_get(seen)
+                at = np.flatnonzero(done & live)
+                simulated = float((steps - before)[live].sum()) * period
+                if telling is not None:
+                    telling.result()
+                ended = held.numbers[at], rows(outcomes, at), simulated
+                telling = teller.submit(self._shared.add, *ended)
+                before = steps.copy()
+                live[at] = False
+                taken = queue.take(at.size)
+                if taken:
+                    fresh = at[: _count(taken)]
+                    live[fresh], before[fresh] = True, 0
+                    worlds = width.put(held.put(fresh, taken))
+                    trials = width.refill(worlds, trials, np.isin(np.arange(width.slots), fresh))
+                elif narrower and 0 < live.sum() <= narrower[0].slots:
+                    running = np.flatnonzero(live)
+                    width = narrower.pop(0)
+                    program = self._program(width)
+                    slots = np.resize(running, width.slots)  # the last ones are padding
+                    live = np.arange(width.slots) < running.size
+                    worlds, before = width.put(held.keep(slots)), before[slots]
+                    last = rows(jax.device_get(trials), slots)
+                    trials = width.put(last._replace(done=~live))
+            if telling is not None:
+                telling.result()
