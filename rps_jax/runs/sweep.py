@@ -40,7 +40,7 @@ from rps_jax.world.domain import Domain, named
 from rps_jax.world.draws import table
 from rps_jax.world.physics import Fidelity, PhysicsName, preset
 
-_AHEAD = 16  # parts of a kind that are made before they are asked for, at most
+_AHEAD = 16384  # worlds of a kind that are made before they are asked for, about
 
 
 def sweep(
@@ -179,7 +179,7 @@ def work(
     for kind, some in numbers.items():
         parts = _made(plan, some, collector)
         if isinstance(some, Sequence):  # what is asked for elsewhere is asked for when it is needed
-            parts = _ahead(parts)
+            parts = _ahead(parts, max(1, _AHEAD // plan.part))
         jobs.append(Job(strategies.STRATEGIES[kind[1]], plan.sizes[kind], parts))
     return batch.run(jobs, plan.setting, collect=collector.collect, report=report, **shape)
 
@@ -207,10 +207,10 @@ def _made(plan: Plan, numbers: Iterable[int], collector: Collector) -> Iterator[
         yield made(plan, arm, drawn)._replace(numbers=trials)
 
 
-def _ahead(parts: Iterator[Part]) -> Iterator[Part]:
-    """The same, some made while what came before them runs."""
+def _ahead(parts: Iterator[Part], count: int) -> Iterator[Part]:
+    """The same, so many of them made while what came before them runs."""
     with ThreadPoolExecutor(1) as maker:
-        coming = deque(maker.submit(next, parts, None) for _ in range(_AHEAD))
+        coming = deque(maker.submit(next, parts, None) for _ in range(count))
         while (part := coming.popleft().result()) is not None:
             coming.append(maker.submit(next, parts, None))
             yield part

@@ -130,6 +130,7 @@ class Program(NamedTuple):
     physics: Physics
     go: Callable[[Trial], Trial]
     start: Trial
+    text: Callable[[], str | None]  # of the compiled program, if it has one
 
 
 def traced(
@@ -177,7 +178,10 @@ def traced(
         corners = few.footprint.vertices.shape[-2]  # 1 of a cylinder
         contacts = engines.get(setting.engine).contacts(usual, corners)
         go = partial(program, shared, batch)
-        return Program(name, family, worlds, simulated, took, memory, contacts, physics, go, start)
+        return Program(
+            name, family, worlds, simulated, took, memory, contacts, physics, go, start,
+            program.as_text,
+        )  # fmt: skip
 
     return compile_
 
