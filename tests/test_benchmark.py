@@ -6,12 +6,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from rps_jax.control.law import Twist
 from rps_jax.engines import mjx_colliders
 from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.engines.quasistatic import Quasistatic
-from rps_jax.studies import ablation, benchmark
+from rps_jax.studies import ablation, benchmark, profile
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
@@ -34,6 +35,52 @@ def test_a_program_is_timed_and_compared_with_c_in_the_closed_loop():
     ratio = header.index("against C in closed loop")
     assert (first[ratio], second[ratio]) == ("1", "2.5")
     assert first[-1] == ""
+
+
+def test_a_profile_charges_the_functions_that_asked():
+    found = profile.measure("quasistatic", "cylinder", 4, steps=5)
+    assert found.step > 0
+    assert sum(cost.share for cost in found.costs) == pytest.approx(1.0)
+    assert found.timed == pytest.approx(sum(cost.time for cost in found.costs))
+    wheres = [cost.where for cost in found.costs]
+    assert len(set(wheres)) == len(wheres)
+    for file in ("engines/quasistatic.py", "control/law.py", "trials/trial.py"):
+        assert any(where.startswith(file) for where in wheres)
+    assert len(profile.table([found], most=3)) == 1 + 3
+
+
+def test_an_instruction_comes_from_the_innermost_function():
+    text = """HloModule m
+
+FileNames
+1 "/somewhere/rps_jax/control/law.py"
+2 "/somewhere/rps_jax/trials/trial.py"
+
+FunctionNames
+1 "step"
+2 "decide.<locals>.think"
+
+FileLocations
+1 {file_name_id=2 function_name_id=2 line=1 end_line=1 column=1 end_column=2}
+2 {file_name_id=1 function_name_id=1 line=9 end_line=9 column=1 end_column=2}
+
+StackFrames
+1 {file_location_id=1 parent_frame_id=1}
+2 {file_location_id=2 parent_frame_id=1}
+
+ENTRY %main (a: f32[]) -> f32[] {
+  %a = f32[] parameter(0)
+  %add.1 = f32[] add(%a, %a), metadata={op_name="add" stack_frame_id=2}
+  %while.2 = f32[] while(%add.1), body=%b, metadata={op_name="w" stack_frame_id=1}
+  ROOT %mul.3 = f32[] multiply(%add.1, %a), metadata={op_name="mul" stack_frame_id=1}
+  %neg.4 = f32[] negate(%a), metadata={op_name="neg" stack_frame_id=7}
+}
+"""
+    assert profile.sources(text) == {
+        "add.1": "control/law.py: step",
+        "mul.3": "trials/trial.py: decide.think",
+        "neg.4": profile.ELSEWHERE,
+    }
 
 
 def test_every_measurement_is_of_an_engine_or_of_c():
