@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax import errors
+from rps_jax.control.bounds import Bound
 from rps_jax.geometry import planar
 
 # Inputs are held within this distance [m] so that no finite float32 overflows on the way.
@@ -93,6 +94,24 @@ class RPSParams(NamedTuple):
         return cls(reactive=0.0)
 
 
+# v_max, omega_max, v_approach and d_success belong to the robot and the task, not to the law.
+BOUNDS = {
+    "eta": Bound(1, 100, log=True),  # [1]
+    "zeta": Bound(-2, 5),  # [1]
+    "beta": Bound(0.01, 0.3),  # [m]
+    "k": Bound(5, 500, log=True),  # [1/m]
+    "K_h": Bound(0.1, 5, log=True),  # [1]
+    "K_v": Bound(0.02, 2, log=True),  # [1/s]
+    "L": Bound(0.03, 1.5, log=True),  # [m]
+    "l_cr": Bound(0.1, 0.289),  # [m] the half width of the base is 0.29
+    "l_mr": Bound(0.02, 0.98, of="l_cr"),  # [1]
+    "a_r_max": Bound(1, 100, log=True),  # [1]
+    "d_th": Bound(0.02, 2, log=True),  # [m]
+    "gamma_max": Bound(0.5, 1.57),  # [rad]
+    "v_lost": Bound(0.001, 0.05, log=True),  # [m/s]
+}
+
+
 class Temperatures(NamedTuple):
     """How far each switch of the smooth law reaches to either side, all [m].
 
@@ -143,6 +162,18 @@ class Twist(NamedTuple):
     v_x: float | jax.Array  # () [m/s] forward
     v_y: float | jax.Array  # () [m/s] left
     omega: float | jax.Array  # () [rad/s] counter-clockwise
+
+    @classmethod
+    def moving(cls, p_robot: jax.Array, v_robot: jax.Array, omega: jax.Array) -> Twist:
+        """What moves the base's point `p_robot` (2,) [m] at `v_robot` (2,) [m/s], and turns it."""
+        return cls(v_robot[0] + omega * p_robot[1], v_robot[1] - omega * p_robot[0], omega)
+
+    def within(self, v_max: float | jax.Array, omega_max: float | jax.Array) -> Twist:
+        """(v_x, v_y) scaled as a vector to norm v_max [m/s], omega clipped to omega_max [rad/s]."""
+        v, most = jnp.stack([self.v_x, self.v_y], axis=-1), jnp.asarray(v_max)
+        v = v * (most / jnp.maximum(planar.norm(v), most))[..., None]
+        omega = jnp.clip(self.omega, -jnp.asarray(omega_max), omega_max)
+        return Twist(v[..., 0], v[..., 1], omega)
 
     def in_world(self, yaw: jax.Array) -> jax.Array:
         """Velocities (3,) [m/s, m/s, rad/s] in the world, of a base with the heading `yaw`."""
@@ -288,13 +319,13 @@ def saturate(params: RPSParams, twist: Twist) -> Twist:
 
     With `clip_each`, v_x and v_y are clipped to +-v_max one by one, which turns the vector.
     """
-    v = jnp.stack([twist.v_x, twist.v_y], axis=-1)
-    v_max = jnp.asarray(params.v_max)
-    scaled = v * (v_max / jnp.maximum(planar.norm(v), v_max))[..., None]
-    clipped = jnp.clip(v, -v_max[..., None], v_max[..., None])
-    v = jnp.where(jnp.asarray(params.clip_each > 0)[..., None], clipped, scaled)
-    omega = jnp.clip(twist.omega, -jnp.asarray(params.omega_max), params.omega_max)
-    return Twist(v[..., 0], v[..., 1], omega)
+    scaled = twist.within(params.v_max, params.omega_max)
+    v_max, each = jnp.asarray(params.v_max), jnp.asarray(params.clip_each > 0)
+    v_x, v_y = (
+        jnp.where(each, jnp.clip(v, -v_max, v_max), other)
+        for v, other in zip(twist[:2], scaled[:2], strict=True)
+    )
+    return Twist(v_x, v_y, scaled.omega)
 
 
 def _push(

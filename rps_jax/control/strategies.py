@@ -11,15 +11,24 @@ import importlib.util
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.control import aps, law
+from rps_jax.control import aps, dipole, force_push, law, pursuit
 from rps_jax.control.aps import APSParams, APSState
+from rps_jax.control.bounds import Bound
+from rps_jax.control.dipole import DipoleParams
+from rps_jax.control.force_push import ForcePushParams
 from rps_jax.control.law import Details, RPSParams, RPSState, Temperatures, Twist
+from rps_jax.control.pursuit import PursuitParams
+
+# What a strategy is told: where the skin is touched (`law.Observation`), or the object's place and
+# size as well (`aps.TrackedObservation`). All know odometry and the target.
+Senses = Literal["touch", "pose"]
 
 
 def numbers(params: Any) -> dict[str, Any]:
@@ -60,18 +69,36 @@ class Strategy(NamedTuple):
 
     init: Callable[[Any], Any]  # params -> state
     step: Callable[[Any, Any, Any], tuple[Any, Twist, Details]]  # params, state, observation
-    tracks: bool = False  # observes a TrackedObservation: the object's place as well
+    senses: Senses = "touch"
     smooth: bool = False  # is told the weight of a contact; others whether there is one
     check: Callable[[Any], Any] = check_finite  # raises InputError for params that mean nothing
+    bounds: tuple[tuple[str, Bound], ...] = ()  # of the parameters that `rps tune es` may tune
+
+
+def _of_module(module: ModuleType, senses: Senses = "touch") -> Strategy:
+    """The strategy of a module that has `init`, `step`, `check` and BOUNDS."""
+    bounds = tuple(module.BOUNDS.items())
+    return Strategy(module.init, module.step, senses, check=module.check, bounds=bounds)
 
 
 Params = RPSParams | APSParams | Any  # a pytree of numbers, of a class in STRATEGIES
-RPS = Strategy(RPSState.init, law.step_with_details, check=law.check)  # and NPS, by `reactive`
-APS = Strategy(APSState.init, aps.aps_step, tracks=True, check=aps.check)
-STRATEGIES: dict[type, Strategy] = {RPSParams: RPS, APSParams: APS}  # by class of parameters
+RPS = Strategy(
+    RPSState.init, law.step_with_details, check=law.check, bounds=tuple(law.BOUNDS.items())
+)  # and NPS, by `reactive`
+APS = Strategy(APSState.init, aps.aps_step, "pose", check=aps.check)
 # The paper's, by name, with their parameters.
 PAPER: dict[str, Params] = {"rps": RPSParams.paper(), "nps": RPSParams.nps(), "aps": APSParams()}
-PARAMS: dict[str, Params] = dict(PAPER)  # by name
+# Others of this package, likewise.
+RIVALS: dict[str, tuple[Strategy, Params]] = {
+    "pursuit": (_of_module(pursuit), PursuitParams()),
+    "force_push": (_of_module(force_push), ForcePushParams()),
+    "dipole": (_of_module(dipole, "pose"), DipoleParams()),
+}
+PARAMS: dict[str, Params] = PAPER | {name: params for name, (_, params) in RIVALS.items()}
+STRATEGIES: dict[type, Strategy] = {RPSParams: RPS, APSParams: APS} | {
+    type(params): strategy for strategy, params in RIVALS.values()
+}  # by class of parameters
+_OWN = tuple(PARAMS)
 _SOURCES: dict[type, dict[str, str]] = {}  # by class of parameters: the file it was loaded from
 
 
@@ -121,7 +148,7 @@ def register_strategy(name: str, strategy: Strategy, params: Params) -> None:
         to the target at which a trial has succeeded.
 
     Raises:
-      InputError: the name is one of the paper's, the parameters are not such, or their class is
+      InputError: the name is one of this package's, the parameters are not such, or their class is
         that of another strategy.
 
     Example:
@@ -134,9 +161,9 @@ def register_strategy(name: str, strategy: Strategy, params: Params) -> None:
       ...     return memory, Twist(params.v, 0.0, 0.0), Details.of(seen)
       >>> register_strategy("ahead", Strategy(lambda params: (), step), Ahead())
     """
-    if name in PAPER:
+    if name in _OWN:
         raise errors.InputError(
-            f"strategy name '{name}' is not allowed: {', '.join(PAPER)} are the paper's."
+            f"strategy name '{name}' is not allowed: {', '.join(_OWN)} are this package's."
         )
     kind, leaves = type(params), jax.tree.leaves(params)
     own = kind not in (dict, list, tuple) and leaves != [params]

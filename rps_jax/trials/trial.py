@@ -284,7 +284,7 @@ def decide(
     observation: Any = seen.observation
     if not strategy.smooth:
         observation = observation._replace(in_contact=seen.reading.contact_type != NONE)
-    if strategy.tracks:
+    if strategy.senses == "pose":
         observation = TrackedObservation(
             observation, object_pose(told.qpos)[0], fp.circumradius(world.footprint), period
         )

@@ -1,0 +1,122 @@
+"""Force Push without a force: the law of Heins and Schoellig, told only where the skin touches.
+
+"Force Push: Robust Single-Point Pushing with Force Feedback" (IEEE RA-L 9, 2024) pushes with one
+point along a path, in the direction theta_p = (1 + k_theta) theta_f + k_y Delta from the path's,
+where theta_f is the angle of the contact force and Delta how far the contact has left the path: a
+point that goes farther out turns the object back in. Where the contact is lost, theta_p tends to
+-k_y Delta, which leads back to the path, a little each step.
+
+A flat skin without friction feels its force along its normal, whatever the object does, so here
+the force's angle gives way to where the contact has drifted: theta_f is the bearing of the contact
+from the middle of the base. As in their experiments the base turns to face along the path, at
+k_omega. Our choices: the path is the straight line from the first contact to the target, and is
+laid anew when the contact has passed the target; since a skin cannot pull, the push is held within
+angle_max of the heading; the speed is the bound of RPS.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rps_jax import errors
+from rps_jax.control import law
+from rps_jax.control.bounds import Bound
+from rps_jax.control.law import Details, Observation, Twist
+from rps_jax.geometry import planar
+
+_POSITIVE = ("angle_max", "v_max", "omega_max", "d_success")
+
+
+class ForcePushParams(NamedTuple):
+    """Parameters of Force Push; the gains are its authors', in their experiments."""
+
+    k_theta: float | jax.Array = 0.3  # [1] gain of the force's angle, beyond 1
+    k_y: float | jax.Array = 0.5  # [rad/m] gain of the path
+    k_omega: float | jax.Array = 1.0  # [1/s] gain of the heading
+    converge: float | jax.Array = 0.1  # [rad] of theta_p in a step without contact, at most
+    angle_max: float | jax.Array = 1.2  # [rad] between push and heading, at most
+    v_max: float | jax.Array = 0.05  # [m/s] speed of the contact, and bound on the base's
+    omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
+    v_approach: float | jax.Array = 0.01  # [m/s] forward speed before the first contact
+    d_success: float | jax.Array = 0.05  # [m] target reached
+
+
+BOUNDS = {
+    "k_theta": Bound(-2, 4),  # [1]
+    "k_y": Bound(-2, 2),  # [rad/m]
+    "k_omega": Bound(0.005, 2, log=True),  # [1/s]
+    "converge": Bound(0.001, 1, log=True),  # [rad]
+    "angle_max": Bound(0.2, 1.57),  # [rad]
+}
+
+
+class ForcePushState(NamedTuple):
+    """What the law remembers between two control steps."""
+
+    p_world_start: jax.Array  # (2,) [m] where the path begins
+    theta_d: jax.Array  # () [rad] the path's direction in the world
+    theta_p: jax.Array  # () [rad] the last push's, from the path's
+    p_robot_contact: jax.Array  # (2,) [m] the last contact
+    touched: jax.Array  # () bool
+
+
+def check(params: ForcePushParams) -> ForcePushParams:
+    """The same parameters, if scalars that mean something.
+
+    Raises:
+      InputError: a value is not a finite number, or is out of bounds.
+    """
+    for name in params._fields:
+        bounds = {} if name in ("k_theta", "k_y") else {"at_least": 0}
+        bounds = {"above": 0} if name in _POSITIVE else bounds
+        errors.check_finite(f"force_push.{name}", getattr(params, name), **bounds)
+    return params
+
+
+def init(params: ForcePushParams) -> ForcePushState:
+    """Before any contact there is no path."""
+    zero = jnp.zeros_like(jnp.asarray(params.v_max, float))
+    two = jnp.zeros(2, zero.dtype)
+    return ForcePushState(two, zero, zero, two, jnp.zeros((), bool))
+
+
+def step(
+    params: ForcePushParams, state: ForcePushState, seen: Observation
+) -> tuple[ForcePushState, Twist, Details]:
+    """One control step. Before the first contact it goes straight ahead."""
+    touching = jnp.asarray(seen.in_contact)
+    contact = jnp.where(touching, seen.p_robot_contact, state.p_robot_contact)
+    told = seen._replace(p_robot_contact=contact)
+    d = law.displacement(told)
+    p_world_contact = seen.p_world_target - d
+
+    along = jnp.stack([jnp.cos(state.theta_d), jnp.sin(state.theta_d)])
+    passed = state.touched & touching & (jnp.sum(d * along) < 0)
+    anew = (touching & ~state.touched) | passed
+    p_world_start = jnp.where(anew, p_world_contact, state.p_world_start)
+    theta_d = jnp.where(anew, planar.direction(d), state.theta_d)
+
+    left = jnp.stack([-jnp.sin(theta_d), jnp.cos(theta_d)])
+    offset = jnp.sum((p_world_contact - p_world_start) * left)  # [m] to the path's left
+    theta_f = planar.direction(contact)  # [rad] the contact's bearing, for the force's angle
+    pushed = (1 + params.k_theta) * theta_f + params.k_y * offset
+    back = planar.wrap(-params.k_y * offset - state.theta_p)
+    recovered = state.theta_p + jnp.clip(back, -params.converge, params.converge)
+    theta_p = planar.wrap(jnp.where(touching, pushed, recovered))
+
+    angle = planar.wrap(theta_d + theta_p - seen.yaw)
+    angle = jnp.clip(angle, -jnp.asarray(params.angle_max), params.angle_max)
+    v_contact = params.v_max * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    turn = params.k_omega * planar.wrap(theta_d - seen.yaw)
+    omega = jnp.clip(turn, -params.omega_max, params.omega_max)
+    push = Twist.moving(contact, v_contact, omega).within(params.v_max, params.omega_max)
+    touched = state.touched | touching
+    ahead = Twist(params.v_approach, 0.0, 0.0)
+    twist = jax.tree.map(lambda a, b: jnp.where(touched, a, b), push, ahead)
+    state = ForcePushState(
+        p_world_start, theta_d, jnp.where(touched, theta_p, 0.0), contact, touched
+    )
+    return state, twist, Details.of(told)._replace(gamma=theta_p)

@@ -1,0 +1,77 @@
+"""Pursuit: the simplest law that could work with what RPS feels.
+
+It moves the contact point straight to the target, and turns to face it. It neither steers round
+the object nor realigns: what it loses is what RPS adds. The law and its numbers are ours.
+
+Symbols are those of `law`: C contact point, T target, d from C to T, e the heading error.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rps_jax import errors
+from rps_jax.control import law
+from rps_jax.control.bounds import Bound
+from rps_jax.control.law import Details, Observation, Twist
+from rps_jax.geometry import planar
+
+
+class PursuitParams(NamedTuple):
+    """Parameters of pursuit; the bounds are those of RPS."""
+
+    K_v: float | jax.Array = 0.5  # [1/s] speed over distance
+    K_h: float | jax.Array = 1.0  # [1/s] turning rate over heading error
+    press: float | jax.Array = 0.2  # [1] least share of the speed that goes forward
+    v_max: float | jax.Array = 0.05  # [m/s] bound on the speed
+    omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
+    v_approach: float | jax.Array = 0.01  # [m/s] forward speed without contact
+    d_success: float | jax.Array = 0.05  # [m] target reached
+
+
+BOUNDS = {
+    "K_v": Bound(0.02, 2, log=True),  # [1/s]
+    "K_h": Bound(0.005, 2, log=True),  # [1/s]
+    "press": Bound(0, 2),  # [1]
+}
+
+
+def check(params: PursuitParams) -> PursuitParams:
+    """The same parameters, if scalars that mean something.
+
+    Raises:
+      InputError: a value is not a finite number, or is out of bounds.
+    """
+    for name in params._fields:
+        bounds = {"at_least": 0} if name in ("press", "v_approach") else {"above": 0}
+        errors.check_finite(f"pursuit.{name}", getattr(params, name), **bounds)
+    return params
+
+
+def init(params: PursuitParams) -> tuple[()]:
+    """It remembers nothing."""
+    return ()
+
+
+def step(
+    params: PursuitParams, state: tuple[()], seen: Observation
+) -> tuple[tuple[()], Twist, Details]:
+    """One control step: C towards T at K_v ||d|| but at most v_max, the base towards facing T.
+
+    In the robot frame C moves by (max(cos e, press), sin e) times that speed, so that the base
+    keeps pressing on the object while it turns. Without contact it goes straight ahead.
+    """
+    contact = jnp.where(seen.in_contact, seen.p_robot_contact, 0.0)
+    d = law.displacement(seen._replace(p_robot_contact=contact))
+    error = planar.wrap(planar.direction(d) - seen.yaw)
+    speed = jnp.minimum(params.K_v * planar.norm(d), params.v_max)
+    v_contact = speed * jnp.stack([jnp.maximum(jnp.cos(error), params.press), jnp.sin(error)])
+    omega = jnp.clip(params.K_h * error, -params.omega_max, params.omega_max)
+    push = Twist.moving(contact, v_contact, omega).within(params.v_max, params.omega_max)
+    ahead = Twist(params.v_approach, 0.0, 0.0)
+    twist = jax.tree.map(lambda a, b: jnp.where(seen.in_contact, a, b), push, ahead)
+    details = Details.of(seen._replace(p_robot_contact=contact))
+    return state, twist, details._replace(gamma=error)

@@ -1,0 +1,171 @@
+"""The rival laws: values worked out by hand, symmetry, and what they can push."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rps_jax.control import dipole, force_push, pursuit, strategies
+from rps_jax.control.aps import TrackedObservation
+from rps_jax.control.dipole import DipoleParams
+from rps_jax.control.force_push import ForcePushParams
+from rps_jax.control.law import Observation, Twist
+from rps_jax.control.pursuit import PursuitParams
+from rps_jax.errors import InputError
+from rps_jax.trials import pushes
+from rps_jax.trials.pushes import Case
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+from rps_jax.world.scene import FRICTION
+
+RIVALS = tuple(strategies.RIVALS)
+
+
+def seen(contact=(0.36, 0.0), target=(2.36, 0.0), robot=(0.0, 0.0), yaw=0.0, touching=True):
+    return Observation(
+        jnp.array(robot), jnp.asarray(yaw), jnp.array(contact), jnp.asarray(touching),
+        jnp.array(target),
+    )  # fmt: skip
+
+
+def tracked(observation, thing=(1.0, 0.0), radius=0.2):
+    return TrackedObservation(observation, jnp.array(thing), jnp.asarray(radius), 0.02)
+
+
+def test_a_twist_moves_a_point_of_the_base_as_asked():
+    twist = Twist.moving(jnp.array([0.36, 0.1]), jnp.array([0.01, 0.05]), jnp.asarray(0.15))
+    np.testing.assert_allclose(twist, [0.01 + 0.015, 0.05 - 0.054, 0.15], rtol=1e-5)
+    bounded = Twist(*map(jnp.asarray, (0.06, -0.08, -0.3))).within(0.05, 0.15)
+    np.testing.assert_allclose(bounded, [0.03, -0.04, -0.15], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("observation", "expected"),
+    [
+        (seen((0.36, 0.1), (2.36, 0.1)), (0.05, 0.0, 0.0)),
+        (seen((0.36, 0.1), (0.42, 0.1)), (0.03, 0.0, 0.0)),  # K_v d of 6 cm
+        # Sideways: 0.05 (press, 1), less what turning at the bound moves the contact by.
+        (seen((0.36, 0.1), (0.36, 1.1)), (0.01 + 0.015, 0.05 - 0.054, 0.15)),
+        (seen(touching=False), (0.01, 0.0, 0.0)),
+    ],
+)
+def test_pursuit_moves_the_contact_straight_to_the_target(observation, expected):
+    _, twist, _ = pursuit.step(PursuitParams(), (), observation)
+    np.testing.assert_allclose(twist, expected, atol=1e-7)
+
+
+def test_force_push_steers_by_where_the_contact_has_drifted():
+    params = ForcePushParams()
+    start = force_push.init(params)
+    _, twist, _ = force_push.step(params, start, seen(touching=False))
+    np.testing.assert_allclose(twist, (0.01, 0.0, 0.0), atol=1e-7)
+
+    # The path is laid from the first contact: no offset yet, only the bearing of the contact.
+    state, twist, details = force_push.step(params, start, seen((0.36, 0.12), (2.36, 0.12)))
+    angle = 1.3 * math.atan2(0.12, 0.36)
+    assert float(details.gamma) == pytest.approx(angle, abs=1e-6)
+    expected = (0.05 * math.cos(angle), 0.05 * math.sin(angle), 0.0)
+    np.testing.assert_allclose(twist, expected, atol=1e-6)
+
+    # 10 cm to the left of the path it goes farther out, which turns the object back in.
+    state, _, details = force_push.step(params, state, seen((0.36, 0.22), (2.36, 0.12)))
+    angle = 1.3 * math.atan2(0.22, 0.36) + 0.5 * 0.1
+    assert float(details.gamma) == pytest.approx(angle, abs=1e-6)
+
+    # A contact that is lost: back towards the path, 0.1 rad a step.
+    lost = seen((0.36, 0.22), (2.36, 0.12), touching=False)
+    state, _, details = force_push.step(params, state, lost)
+    assert float(details.gamma) == pytest.approx(angle - 0.1, abs=1e-6)
+    for _ in range(20):
+        state, _, details = force_push.step(params, state, lost)
+    assert float(details.gamma) == pytest.approx(-0.5 * 0.1, abs=1e-6)
+
+
+def test_force_push_lays_its_path_anew_when_it_has_passed_the_target():
+    params = ForcePushParams()
+    state, _, _ = force_push.step(params, force_push.init(params), seen())
+    assert float(state.theta_d) == 0
+    state, _, _ = force_push.step(params, state, seen(robot=(1.9, 0.0)))
+    assert float(state.theta_d) == 0  # 10 cm before it
+    state, _, _ = force_push.step(params, state, seen(robot=(2.1, 0.0)))
+    assert abs(float(state.theta_d)) == pytest.approx(math.pi)
+    np.testing.assert_allclose(state.p_world_start, (2.46, 0.0), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("robot", "yaw", "expected"),
+    [
+        ((0.0, 0.0), 0.0, (0.05, 0.0, 0.0)),  # behind the object: straight on
+        ((1.0, -1.0), math.pi / 2, (0.0, 0.05, 0.0)),  # beside it: back, to the robot's left
+        ((2.0, 0.0), math.pi, (-0.05, 0.0, 0.0)),  # before it: away from it, with the field
+        ((0.0, 0.0), 0.4, (0.05 * math.cos(0.4), -0.05 * math.sin(0.4), -0.15)),
+    ],
+)
+def test_the_dipole_leads_round_the_object(robot, yaw, expected):
+    observation = tracked(seen(target=(3.0, 0.0), robot=robot, yaw=yaw, touching=False))
+    _, twist, _ = dipole.step(DipoleParams(aim_beyond=0.0), (), observation)
+    np.testing.assert_allclose(twist, expected, atol=1e-6)
+
+
+def twist_of(name, observation, thing):
+    strategy, params = strategies.RIVALS[name]
+    state = strategy.init(params)
+    told = tracked(observation, thing) if strategy.senses == "pose" else observation
+    for _ in range(2):  # the second step remembers the first
+        state, twist, _ = strategy.step(params, state, told)
+    return np.asarray(jnp.stack(twist))
+
+
+@pytest.mark.parametrize("name", RIVALS)
+def test_a_law_is_the_same_in_a_mirror_and_in_any_frame(name):
+    rng = np.random.default_rng(3)
+    for _ in range(8):
+        contact, robot, target, thing = rng.uniform(-1, 1, (4, 2))
+        contact = np.array([0.36, 0.3 * contact[1]])
+        yaw, turn = rng.uniform(-3, 3, 2)
+        plain = twist_of(name, seen(contact, 2 * target, robot, yaw), thing)
+        flip = np.array([1.0, -1.0])
+        mirrored = twist_of(
+            name, seen(contact * flip, 2 * target * flip, robot * flip, -yaw), thing * flip
+        )
+        np.testing.assert_allclose(mirrored, plain * [1, -1, -1], atol=1e-5)
+        c, s = math.cos(turn), math.sin(turn)
+
+        def moved(point, c=c, s=s):
+            return np.array([[c, -s], [s, c]]) @ point + [0.3, -0.7]
+
+        elsewhere = seen(contact, moved(2 * target), moved(robot), yaw + turn)
+        np.testing.assert_allclose(twist_of(name, elsewhere, moved(thing)), plain, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", RIVALS)
+def test_a_law_keeps_within_the_bounds_of_the_base(name):
+    _, params = strategies.RIVALS[name]
+    rng = np.random.default_rng(4)
+    for x, y, far in rng.uniform(-1, 1, (16, 3)):
+        for touching in (True, False):
+            told = seen((0.36, 0.3 * y), (3 * x, 3 * far), (y, far), 3 * x, touching)
+            v_x, v_y, omega = twist_of(name, told, (far, x))
+            assert math.hypot(v_x, v_y) <= params.v_max * (1 + 1e-6)
+            assert abs(omega) <= params.omega_max * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("name", RIVALS)
+def test_a_law_refuses_bounds_that_mean_nothing(name):
+    strategy, params = strategies.RIVALS[name]
+    assert strategy.check(params) is params
+    with pytest.raises(InputError, match=rf"{name}\.v_max"):
+        strategy.check(params._replace(v_max=-0.05))
+    assert jax.tree.leaves(strategies.restored(strategies.recorded(params))) == list(params)
+
+
+@pytest.mark.parametrize("name", RIVALS)
+def test_a_law_pushes_a_box_straight_on(name):
+    _, params = strategies.RIVALS[name]
+    setting = Setting(engine="quasistatic", rules=Rules(horizon=60.0))
+    box = Case("box", FRICTION["S1"], (1.6, 0.0), params)
+    outcome, _ = pushes.run([box], setting, slots=1, workers=1)
+    assert outcome.success[0]
+    assert 10 < outcome.time[0] < 40
