@@ -19,12 +19,13 @@ from rps_jax.analysis import figures, tables
 from rps_jax.app.cli.options import Spread
 from rps_jax.app.cli.parsing import domain_of, labels_of, params_of
 from rps_jax.app.cli.running import guarded, use_cache
+from rps_jax.control.law import BOUNDS
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
 from rps_jax.studies import sensitivity
 from rps_jax.trials.setting import progress_bar
 from rps_jax.tuning.run import Course
-from rps_jax.tuning.space import BOUNDS, SUBSETS
+from rps_jax.tuning.space import SUBSETS
 
 
 @dataclass(frozen=True)

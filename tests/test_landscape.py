@@ -4,14 +4,14 @@ import jax
 import numpy as np
 import pytest
 
-from rps_jax.control.law import RPSParams
+from rps_jax.control.law import BOUNDS, RPSParams
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Answer, seed_of
 from rps_jax.studies import sensitivity
 from rps_jax.studies.sensitivity import Aims
 from rps_jax.trials.trial import Outcome
 from rps_jax.tuning.run import Course
-from rps_jax.tuning.space import BOUNDS, SUBSETS, Space
+from rps_jax.tuning.space import SUBSETS, Space
 
 FULL = SUBSETS["full"]
 SETS = {"paper": RPSParams.paper(), "tuned": RPSParams.tuned()}

@@ -11,7 +11,7 @@ import pytest
 from rps_jax.app import cli
 from rps_jax.app.cli import tuning
 from rps_jax.control import law
-from rps_jax.control.law import RPSParams
+from rps_jax.control.law import BOUNDS, RPSParams
 from rps_jax.errors import InputError
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Answer
@@ -22,7 +22,7 @@ from rps_jax.tuning import descent, run
 from rps_jax.tuning.descent import Descent, Estimator
 from rps_jax.tuning.evolution import Algorithm, Evolution, Search
 from rps_jax.tuning.run import Course
-from rps_jax.tuning.space import BOUNDS, SUBSETS, Space
+from rps_jax.tuning.space import SUBSETS, Space
 
 FULL = Space(SUBSETS["full"])
 RULES = Rules(horizon=300.0, max_lost=150.0)

@@ -12,7 +12,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.control.law import RPSParams
+from rps_jax.control import strategies
+from rps_jax.control.strategies import Params
 from rps_jax.record import files
 from rps_jax.record import folder as run_folder
 from rps_jax.record.checkpoint import Parts
@@ -43,12 +44,12 @@ class Course:
         errors.check_finite("worlds", self.worlds, at_least=1, at_most=1e7)
         errors.check_finite("validation", self.validation, at_least=1, at_most=1e7)
 
-    def ask(self, params: RPSParams, seed: int, generation: int) -> Ask:
+    def ask(self, params: Params, seed: int, generation: int) -> Ask:
         """Candidates with leaves (P,) in the worlds of a generation."""
         worlds = generation * self.worlds + np.arange(self.worlds)
         return Ask(params, evaluate.seed_of(seed, "tune"), worlds)
 
-    def validate(self, params: RPSParams, seed: int) -> Ask:
+    def validate(self, params: Params, seed: int) -> Ask:
         """Candidates with leaves (P,) in the worlds for validation."""
         return Ask(params, evaluate.seed_of(seed, "validate"), np.arange(self.validation))
 
@@ -99,7 +100,7 @@ def open_run(folder: Path, tuner: Tuner) -> Path:
     setting = asdict(course.setting) | {"rules": course.setting.rules._asdict()}
     configuration = {
         "tuned": space.names,
-        "base": {name: float(value) for name, value in space.base._asdict().items()},
+        "base": strategies.recorded(space.base),
         "course": asdict(course) | {"setting": setting},
     }
     return run_folder.claim(folder, configuration | tuner.options)
@@ -111,7 +112,7 @@ def tune(
     *,
     report: Callable[[int, Progress], Any] = lambda generation, progress: None,
     **shape: Any,
-) -> RPSParams:
+) -> Params:
     """Run a tuner to its end, in a folder that `open_run` opened.
 
     Every generation is a part of the run: the vectors proposed, what the tuner was told, and its

@@ -3,48 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from rps_jax import errors
-from rps_jax.control.law import RPSParams
+from rps_jax.control import strategies
+from rps_jax.control.bounds import Bound
+from rps_jax.control.law import BOUNDS, RPSParams
+from rps_jax.control.strategies import Params
+
+SUBSETS = {"logistic": ("eta", "zeta", "beta", "k"), "full": tuple(BOUNDS)}  # of RPS
 
 
-class Bound(NamedTuple):
-    """The interval in which a parameter is tuned."""
-
-    low: float
-    high: float
-    log: bool = False  # evenly in its logarithm
-    of: str = ""  # as a share of this other parameter
-
-
-# v_max, omega_max, v_approach and d_success belong to the robot and the task, not to the law.
-BOUNDS = {
-    "eta": Bound(1, 100, log=True),  # [1]
-    "zeta": Bound(-2, 5),  # [1]
-    "beta": Bound(0.01, 0.3),  # [m]
-    "k": Bound(5, 500, log=True),  # [1/m]
-    "K_h": Bound(0.1, 5, log=True),  # [1]
-    "K_v": Bound(0.02, 2, log=True),  # [1/s]
-    "L": Bound(0.03, 1.5, log=True),  # [m]
-    "l_cr": Bound(0.1, 0.289),  # [m] the half width of the base is 0.29
-    "l_mr": Bound(0.02, 0.98, of="l_cr"),  # [1]
-    "a_r_max": Bound(1, 100, log=True),  # [1]
-    "d_th": Bound(0.02, 2, log=True),  # [m]
-    "gamma_max": Bound(0.5, 1.57),  # [rad]
-    "v_lost": Bound(0.001, 0.05, log=True),  # [m/s]
-}
-SUBSETS = {"logistic": ("eta", "zeta", "beta", "k"), "full": tuple(BOUNDS)}
-
-
-def expanded(names: Sequence[str]) -> tuple[str, ...]:
-    """The same names, with the members of a subset in its place."""
-    return tuple(name for text in names for name in SUBSETS.get(text, (text,)))
+def expanded(names: Sequence[str], base: Params = RPSParams()) -> tuple[str, ...]:
+    """The same names, with the members of a subset in its place: of `full`, all of the law's."""
+    own = isinstance(base, RPSParams)
+    subsets = SUBSETS if own else {"full": tuple(dict(strategies.of(base).bounds))}
+    return tuple(name for text in names for name in subsets.get(text, (text,)))
 
 
 @dataclass(frozen=True)
@@ -55,7 +34,7 @@ class Space:
     """
 
     names: tuple[str, ...] = SUBSETS["logistic"]
-    base: RPSParams = RPSParams()
+    base: Any = RPSParams()  # parameters of any strategy that has bounds
 
     def __post_init__(self) -> None:
         """Raises InputError for unknown or repeated names, or a base outside the bounds."""
@@ -63,9 +42,10 @@ class Space:
             raise errors.InputError(
                 f"tuned = {self.names} is not allowed: name each parameter once, at least one."
             )
+        base = strategies.numbers(self.base)
         for name in self.names:
-            bound = BOUNDS[errors.check_name("tuned parameter", name, BOUNDS)]
-            share = _share(bound, self.base, name)
+            bound = self._bounds[errors.check_name("tuned parameter", name, self._bounds)]
+            share = _share(bound, base, name)
             errors.check_finite(f"{name}, to be tuned", share, above=bound.low)
             if share >= bound.high:
                 raise errors.InputError(
@@ -73,42 +53,53 @@ class Space:
                     f"{bound.high:g}."
                 )
 
-    def vector(self, params: RPSParams) -> jax.Array:
-        """The vector (..., p) of parameters with leaves (...)."""
-        return jnp.stack([self._coordinate(params, name) for name in self.names], axis=-1)
+    @property
+    def _bounds(self) -> dict[str, Bound]:
+        return dict(strategies.of(self.base).bounds)
 
-    def _coordinate(self, params: RPSParams, name: str) -> jax.Array:
-        low, high, log, _ = bound = BOUNDS[name]
-        value = jnp.asarray(_share(bound, params, name), float)
+    def vector(self, params: Params) -> jax.Array:
+        """The vector (..., p) of parameters with leaves (...)."""
+        numbers = strategies.numbers(params)
+        return jnp.stack([self._coordinate(numbers, name) for name in self.names], axis=-1)
+
+    def _coordinate(self, numbers: Mapping[str, Any], name: str) -> jax.Array:
+        low, high, log, _ = bound = self._bounds[name]
+        value = jnp.asarray(_share(bound, numbers, name), float)
         if log:
             low, high, value = math.log(low), math.log(high), jnp.log(value)
         return jax.scipy.special.logit((value - low) / (high - low))
 
-    def params(self, vector: Any) -> RPSParams:
+    def params(self, vector: Any) -> Any:
         """The parameters of vectors (..., p): leaves (...)."""
-        vector = jnp.asarray(vector, float)
+        vector, bounds = jnp.asarray(vector, float), self._bounds
         filled = {
             name: jnp.broadcast_to(jnp.asarray(value, vector.dtype), vector.shape[:-1])
-            for name, value in self.base._asdict().items()
+            for name, value in strategies.numbers(self.base).items()
         }
-        for name in sorted(self.names, key=lambda name: bool(BOUNDS[name].of)):
-            low, high, log, of = BOUNDS[name]
+        for name in sorted(self.names, key=lambda name: bool(bounds[name].of)):
+            low, high, log, of = bounds[name]
             u = jax.nn.sigmoid(vector[..., self.names.index(name)])
             value = low * (high / low) ** u if log else low + (high - low) * u
             filled[name] = value * filled[of] if of else value
-        # A share of a tuned parameter that is itself fixed must not pass it.
-        filled["l_mr"] = jnp.minimum(filled["l_mr"], filled["l_cr"])
-        return RPSParams(**filled)
+        for name, bound in bounds.items():
+            if bound.of:  # a share of a tuned parameter that is itself fixed must not pass it
+                filled[name] = jnp.minimum(filled[name], filled[bound.of])
+        return strategies.changed(self.base, filled)
 
     def named(self, vector: Any) -> dict[str, float]:
-        """A vector's tuned parameters by name, and the others that differ from the paper's."""
+        """A vector's tuned parameters by name, and the others that differ from the usual ones."""
         found, usual = (
-            {name: float(f"{float(value):.7g}") for name, value in params._asdict().items()}
-            for params in (self.params(vector), RPSParams.paper())
+            {name: float(f"{float(value):.7g}") for name, value in numbers.items()}
+            for numbers in map(strategies.numbers, (self.params(vector), self._usual))
         )
         return {n: x for n, x in found.items() if n in self.names or x != usual[n]}
 
+    @property
+    def _usual(self) -> Params:
+        """The parameters by which the strategy is known; of RPS the paper's."""
+        kind = type(self.base)
+        return next(known for known in strategies.PARAMS.values() if type(known) is kind)
 
-def _share(bound: Bound, params: RPSParams, name: str) -> Any:
-    value = getattr(params, name)
-    return value / getattr(params, bound.of) if bound.of else value
+
+def _share(bound: Bound, numbers: Mapping[str, Any], name: str) -> Any:
+    return numbers[name] / numbers[bound.of] if bound.of else numbers[name]

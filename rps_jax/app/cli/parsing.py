@@ -147,6 +147,29 @@ def params_of(name: str) -> RPSParams:
     return law.check(RPSParams.paper()._replace(**_of_the_law(name)))
 
 
+def start_of(strategy: str, start: str) -> Params:
+    """Parameters of a strategy with which tuning begins: as known, or changed by a JSON file.
+
+    Of RPS as `params_of`; there `paper` and `tuned` are two sets.
+    """
+    from rps_jax.control import strategies
+    from rps_jax.record import files
+
+    _, params = strategies.named(strategy)
+    if strategy == "rps":
+        return params_of(start)
+    if not strategies.of(params).bounds:
+        known = [name for name, own in strategies.PARAMS.items() if strategies.of(own).bounds]
+        raise InputError(
+            f"strategy = {strategy} is not allowed: it has no bounds to tune within; "
+            f"{', '.join(known)} have."
+        )
+    values = {} if start == "paper" else files.read_json(Path(start))
+    given = {key: errors.check_number(f"{start} {key}", value) for key, value in values.items()}
+    changed = strategies.changed(params, given)
+    return strategies.of(changed).check(changed)
+
+
 def shard_of(text: str) -> Shard:
     """A share of a run, as K/N."""
     from rps_jax.runs.plan import Shard

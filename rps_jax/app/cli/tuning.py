@@ -118,6 +118,9 @@ class TuneOptions(Spread):
 class TuneES(TuneOptions):
     """Tune by evolution."""
 
+    strategy: str = "rps"
+    """What is tuned: rps, pursuit, force_push, dipole, or a law of a file that has bounds, as
+    my_law.py:MyParams; its own parameters are the start if that is paper."""
     algorithm: Literal["cma", "lra_cma", "sep_cma", "xnes"] = "cma"
     """cma adapts a full covariance; lra_cma adapts its learning rates to noisy scores as well;
     sep_cma keeps to the axes; xnes follows the natural gradient."""
@@ -139,7 +142,16 @@ class TuneES(TuneOptions):
 
         small = {"worlds": 32, "validation": 64, "population": 12, "generations": 8}
         how = self.quickly(**small, spread=1.0, slots=64) if self.quick else self
+        if self.strategy != "rps":
+            how = dataclasses.replace(how, tuned=self.tuned)
         how.tune(Search, Evolution)
+
+    def space(self) -> Space:
+        """The parameters that are tuned."""
+        from rps_jax.tuning.space import Space, expanded
+
+        base = parsing.start_of(self.strategy, self.start)
+        return Space(expanded(self.tuned, base), base)
 
 
 @dataclass(frozen=True)
