@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from rps_jax.analysis import tables as tables
     from rps_jax.analysis import video as video
     from rps_jax.control import law as law
+    from rps_jax.control.dipole import DipoleParams as DipoleParams
+    from rps_jax.control.force_push import ForcePushParams as ForcePushParams
     from rps_jax.control.law import Details as Details
     from rps_jax.control.law import Observation as Observation
     from rps_jax.control.law import RPSParams as RPSParams
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from rps_jax.control.law import Temperatures as Temperatures
     from rps_jax.control.law import Twist as Twist
     from rps_jax.control.law import step as step
+    from rps_jax.control.pursuit import PursuitParams as PursuitParams
     from rps_jax.control.strategies import Strategy as Strategy
     from rps_jax.control.strategies import register_strategy as register_strategy
     from rps_jax.errors import InputError as InputError
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
     from rps_jax.runs.push import replay as replay
     from rps_jax.runs.results import load as load
     from rps_jax.runs.sweep import sweep as sweep
+    from rps_jax.studies.ladder import ladder as ladder
     from rps_jax.studies.replication.table import table as table
     from rps_jax.trials.conditions import Conditions as Conditions
     from rps_jax.trials.env import PushEnv as PushEnv
@@ -70,6 +74,9 @@ _HOMES = {
         *("Details", "Observation", "RPSParams", "RPSState"),
         *("Temperatures", "Twist", "step"),
     ),
+    "control.dipole": ("DipoleParams",),
+    "control.force_push": ("ForcePushParams",),
+    "control.pursuit": ("PursuitParams",),
     "control.strategies": ("Strategy", "register_strategy"),
     "errors": ("InputError",),
     "geometry.footprint": ("Footprint",),
@@ -81,6 +88,7 @@ _HOMES = {
     "runs.results": ("load",),
     "runs.sweep": ("sweep",),
     "runs.models": ("models",),
+    "studies.ladder": ("ladder",),
     "studies.replication.table": ("table",),
     "trials.conditions": ("Conditions",),
     "trials.env": ("PushEnv",),

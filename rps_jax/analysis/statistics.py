@@ -168,6 +168,16 @@ def false_discovery(p: Sequence[float]) -> np.ndarray:
     return np.asarray(stats.false_discovery_control(p) if len(p) else [])
 
 
+def holm(p: Sequence[float]) -> np.ndarray:
+    """P-values (n,) of n tests adjusted so that the chance of any false finding is held (Holm)."""
+    values = np.asarray(p, float)
+    order = np.argsort(values, kind="stable")
+    factors = values.size - np.arange(values.size)
+    adjusted = np.empty_like(values)
+    adjusted[order] = np.minimum(np.maximum.accumulate(factors * values[order]), 1.0)
+    return adjusted
+
+
 def unexplained(found: Bins) -> float:
     """Variance [1] of the success rate over bins, less what binomial noise puts there.
 

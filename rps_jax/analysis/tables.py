@@ -140,6 +140,31 @@ def difference_table(results: xr.Dataset) -> list[list[str]]:
     return rows
 
 
+def against_table(results: xr.Dataset, reference: str) -> list[list[str]]:
+    """Header and one row for each arm: world by world against one of them, best first.
+
+    The p-values of McNemar's exact test are adjusted for as many tests as there are arms (Holm).
+    """
+    base = results.success.sel(arm=reference)
+    names = [str(arm) for arm in results.arm.values]
+    names.sort(key=lambda arm: -float(results.success.sel(arm=arm).mean()))
+    others = [arm for arm in names if arm != reference]
+    found = {arm: statistics.compare(base, results.success.sel(arm=arm)) for arm in others}
+    adjusted = dict(zip(others, statistics.holm([found[a].p for a in others]), strict=True))
+    failed = int((base.values == 0).sum())
+    wins = f"wins of the {failed} that {reference} loses"
+    rows = [["", "success", f"against {reference}", "p (Holm)", wins]]
+    for arm in names:
+        cells = ["", "", ""]
+        if arm != reference:
+            c = found[arm]
+            share = 100 * (c.gained - c.lost) / base.size
+            cells = [f"{share:+.2f} % (+{c.gained} -{c.lost})", f"{adjusted[arm]:.2g}"]
+            cells.append(str(c.gained))
+        rows.append([arm, _rate(results.success.sel(arm=arm).values > 0), *cells])
+    return rows
+
+
 def hardest_table(results: xr.Dataset, run: str, count: int = 10) -> list[list[str]]:
     """Header and one row for each of the hardest worlds, with the command that replays it."""
     names = [str(name) for name in results.object.values]

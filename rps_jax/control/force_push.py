@@ -43,6 +43,11 @@ class ForcePushParams(NamedTuple):
     v_approach: float | jax.Array = 0.01  # [m/s] forward speed before the first contact
     d_success: float | jax.Array = 0.05  # [m] target reached
 
+    @classmethod
+    def tuned(cls) -> ForcePushParams:
+        """Tuned by evolution in random worlds of boxes and cylinders."""
+        return cls()
+
 
 BOUNDS = {
     "k_theta": Bound(-2, 4),  # [1]

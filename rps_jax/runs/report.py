@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import xarray as xr
@@ -14,11 +15,16 @@ from rps_jax.runs.plan import Plan
 
 
 def write_report(
-    folder: Path, plan: Plan, results: xr.Dataset, models: xr.Dataset | None = None
+    folder: Path,
+    plan: Plan,
+    results: xr.Dataset,
+    models: xr.Dataset | None = None,
+    more: Sequence[Section] = (),
 ) -> Path:
     """Write `report.md`, `report.html` and the figure of a sweep; returns the path of the first.
 
-    `models` are outcomes of the same worlds on several models, (model, arm, world).
+    `models` are outcomes of the same worlds on several models, (model, arm, world). What a study
+    has to say beyond that is `more`, which then stands for the differences of all pairs.
     """
     intro = (
         f"{plan.worlds} worlds, seed {plan.setting.seed}, engine {plan.setting.engine}, "
@@ -33,7 +39,7 @@ def write_report(
     if lost := int((results.overflows.values > 0).sum()):
         failures += f" {lost} trials lost contacts for want of room: they are not to be trusted."
     hard = "Worlds in which most arms fail, and most distance is left."
-    sections = [Section("Success", failures, rates)]
+    sections = [Section("Success", failures, rates), *more]
     if models is not None:
         text = (
             "The same worlds on other grounds, cones and steps that can be defended. A rate's "
@@ -41,7 +47,7 @@ def write_report(
             "what another simulation would have."
         )
         sections.append(Section("Models", text, tables.models_table(models)))
-    if len(plan.arms) > 1:
+    if len(plan.arms) > 1 and not more:
         sections.append(
             Section("Differences, world by world", "", tables.difference_table(results))
         )

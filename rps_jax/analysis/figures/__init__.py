@@ -17,5 +17,5 @@ from rps_jax.analysis.figures.studies import (
     tolerance_curve,
     turning,
 )
-from rps_jax.analysis.figures.sweeps import failures, paired, success_curves
+from rps_jax.analysis.figures.sweeps import failures, ladder, paired, success_curves
 from rps_jax.analysis.figures.tuning import between_bounds, estimates, races, tuning_log

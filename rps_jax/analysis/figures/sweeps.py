@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +55,35 @@ def success_curves(results: xr.Dataset, path: Path, count: int = 6) -> Path:
     }
     lines = (_filled(f"{k}: {v}.", 60 * columns) for k, v in parts.items() if v)
     figure.supxlabel("\n".join(lines), fontsize=8, x=0.01, ha="left")
+    return save(figure, path)
+
+
+def ladder(results: xr.Dataset, senses: Mapping[str, str], path: Path) -> Path:
+    """Success of each law, grouped by what it is told, with Wilson's 95 % intervals."""
+    kinds = list(dict.fromkeys(senses.values()))
+    rates = {str(a): float(results.success.sel(arm=a).mean()) for a in results.arm.values}
+    order = sorted(rates, key=lambda arm: (-kinds.index(senses[arm]), rates[arm]))
+    figure = Figure(figsize=(7, 1.2 + 0.34 * len(order)), layout="constrained")
+    ax = figure.subplots()
+    for at, arm in enumerate(order):
+        won = results.success.sel(arm=arm).values > 0
+        low, high = statistics.wilson(int(won.sum()), won.size)
+        colour = f"C{kinds.index(senses[arm])}"
+        ax.plot([100 * low, 100 * high], [at, at], color=colour, lw=3, alpha=0.4)
+        ax.plot(100 * rates[arm], at, "o", color=colour)
+        ax.annotate(
+            f"{100 * rates[arm]:.1f}", (100 * rates[arm], at), (0, 6), fontsize=8,
+            textcoords="offset points", ha="center",
+        )  # fmt: skip
+    for kind in kinds:
+        ax.plot([], [], "o", color=f"C{kinds.index(kind)}", label=f"is told: {kind}")
+    ax.set_yticks(range(len(order)), order)
+    ax.set_ylim(-0.6, len(order) - 0.3)
+    ax.set_xlim(-3, 103)
+    ax.set_xlabel("success [%]")
+    ax.set_title(f"{results.sizes['world']:,} equal worlds for every law", fontsize=10)
+    ax.grid(axis="x", alpha=0.3)
+    ax.legend(fontsize=8, loc="best")
     return save(figure, path)
 
 

@@ -22,6 +22,7 @@ Command = (
     | Annotated[replicating.Hardware, tyro.conf.subcommand("hardware")]
     | Annotated[replicating.Paper, tyro.conf.subcommand("paper")]
     | Annotated[sweeping.Sweep, tyro.conf.subcommand("sweep")]
+    | Annotated[sweeping.Ladder, tyro.conf.subcommand("ladder")]
     | Annotated[sweeping.Merge, tyro.conf.subcommand("merge")]
     | Annotated[sweeping.Replay, tyro.conf.subcommand("replay")]
     | Annotated[looking.Film, tyro.conf.subcommand("film")]

@@ -6,7 +6,7 @@ import contextlib
 import errno
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,7 @@ from rps_jax.errors import InputError
 if TYPE_CHECKING:
     from xarray import Dataset
 
+    from rps_jax.analysis.report import Section
     from rps_jax.runs.plan import Plan
     from rps_jax.trials.setting import Timing
 
@@ -122,6 +123,7 @@ def tell_sweep(
     results: Dataset | None,
     timing: Timing | None = None,
     models: Dataset | None = None,
+    more: Callable[[Path, Plan, Dataset], Sequence[Section]] = lambda *_: (),
 ) -> None:
     """Print where the time of a sweep went, if it ran; then write and print its report."""
     from rps_jax.record import provenance
@@ -132,5 +134,5 @@ def tell_sweep(
     if results is None:
         print(f"run folder: {out}; when all shards are done: rps merge {out} --out {out}")
     else:
-        print(write_report(out, plan, results, models).read_text())
+        print(write_report(out, plan, results, models, more(out, plan, results)).read_text())
         print(f"run folder: {out}")

@@ -1,4 +1,4 @@
-"""The commands of random worlds: sweep, merge, replay."""
+"""The commands of random worlds: sweep, ladder, merge, replay."""
 
 from __future__ import annotations
 
@@ -104,6 +104,60 @@ class Sweep(Spread):
         if self.models and results is not None:
             models = _on_models(self.out, plan, results, shape)
         running.tell_sweep(self.out, plan, results, timing, models)
+
+
+@dataclass(frozen=True)
+class Ladder(Spread):
+    """Push with every law of the package in the same worlds, by what each law is told."""
+
+    domain: Domain = "wide"
+    laws: tuple[str, ...] = ()
+    """Laws: all by default, or some of nps, "rps paper", "rps tuned", pursuit, "pursuit tuned",
+    force_push, "force_push tuned", aps, dipole, "dipole tuned", and laws of files, as
+    my_law.py:MyParams."""
+    worlds: int | None = None
+    """Number of worlds; by default 1000, or the whole grid of a domain with listed targets."""
+    robot: str | None = None
+    """The robot: ideal, kairos (the paper's), ridgeback or mpo_500, or a JSON file of its limits.
+    By default the domain's, which is ideal but in the domain real."""
+    fidelity: Fidelity = "standard"
+    engine: Engine = "fused"
+    seed: int = 0
+    """Seed whose worlds for testing are taken."""
+    device: Device = "auto"
+    quick: bool = False
+    """Whether to take 96 worlds where no number is asked for: minutes on two cores."""
+    out: Path = Path("runs/ladder")
+    """Run folder; a run that was killed is continued there."""
+
+    def plan(self) -> Plan:
+        """What is run."""
+        from rps_jax.runs.evaluate import seed_of
+        from rps_jax.runs.plan import Plan
+        from rps_jax.studies import ladder
+        from rps_jax.trials.setting import Setting
+        from rps_jax.world.physics import preset
+
+        domain = parsing.domain_of(self.domain, (), self.robot)
+        usual = 96 if self.quick else domain.combinations if domain.targets else 1000
+        laws = ladder.rungs(self.laws or tuple(ladder.RUNGS))
+        seed = seed_of(self.seed, "test")
+        setting = Setting(preset(fidelity=self.fidelity), seed=seed, engine=self.engine)
+        return Plan(domain, usual if self.worlds is None else self.worlds, laws, setting)
+
+    def run(self) -> None:
+        """Run what is missing, then write and print the report."""
+        from rps_jax.runs import sweep
+        from rps_jax.studies import ladder
+        from rps_jax.trials.setting import progress_bar
+
+        plan, shape = self.plan(), self.shape()
+        running.choose_device(self.device)
+        plan.check_here()
+        running.use_cache()
+        with progress_bar(plan.trials, "ladder") as report:
+            timing, results = sweep.complete(self.out, plan, report=report, **shape)
+        running.tell_sweep(self.out, plan, results, timing, more=ladder.sections)
 
 
 def _on_models(out: Path, plan: Plan, results: Dataset, shape: dict[str, Any]) -> Dataset:

@@ -1,0 +1,101 @@
+"""The ladder of laws: equal worlds, what each is told, and how they compare."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from helpers import CYLINDERS, refusal, rps
+
+from rps_jax import ladder as climb
+from rps_jax.analysis import statistics, tables
+from rps_jax.control import strategies
+from rps_jax.control.law import RPSParams
+from rps_jax.errors import InputError
+from rps_jax.runs.results import load
+from rps_jax.studies import ladder
+from rps_jax.trials.trial import Rules
+
+
+def test_holms_adjustment_by_hand():
+    # Sorted 0.01, 0.03, 0.04 by 3, 2, 1: 0.03, 0.06, 0.04, which must not fall below 0.06.
+    np.testing.assert_allclose(statistics.holm([0.01, 0.04, 0.03]), [0.03, 0.06, 0.06])
+    np.testing.assert_allclose(statistics.holm([0.6, 0.9]), [1.0, 1.0])
+    assert statistics.holm([]).size == 0
+
+
+def results(**won):
+    success = xr.DataArray(
+        np.array(list(won.values()), np.int8), dims=("arm", "world"), coords={"arm": list(won)}
+    )
+    return xr.Dataset({"success": success})
+
+
+def test_laws_are_compared_with_one_of_them_world_by_world():
+    found = results(base=[1] * 12 + [0] * 8, better=[1] * 20, worse=[0] * 12 + [1] + [0] * 7)
+    header, *rows = tables.against_table(found, "base")
+    assert [row[0] for row in rows] == ["better", "base", "worse"]  # best first
+    assert header[-1] == "wins of the 8 that base loses"
+    better, base, worse = rows
+    # Exact McNemar: 8 to 0 is 2 / 2^8; 1 to 12 is 2 (1 + 13) / 2^13, doubled as the smaller one.
+    assert better[2:] == ["+40.00 % (+8 -0)", "0.0078", "8"]
+    assert worse[3:] == ["0.0068", "1"]
+    assert worse[2] == "-55.00 % (+1 -12)"
+    assert base[2:] == ["", "", ""]
+
+
+def test_every_rung_is_a_law_of_the_package_with_what_it_is_told():
+    told = ladder.senses(ladder.rungs())
+    assert len(told) >= 10
+    assert set(told.values()) == {"touch", "pose"}
+    assert {name for name in told if told[name] == "pose"} == {"aps", "dipole", "dipole tuned"}
+    for params in ladder.RUNGS.values():
+        assert strategies.of(params).check(params) is params
+    assert ladder.REFERENCE in ladder.RUNGS
+    assert ladder.RUNGS[ladder.REFERENCE] == RPSParams.tuned()
+
+
+@pytest.mark.parametrize(
+    ("laws", "words"),
+    [
+        (("rps",), "unknown law 'rps': choose from nps, rps paper"),
+        (("pursuit", "pursuit"), "pursuit"),
+        ((), "name each once, at least one"),
+        (("none.py:MyParams",), "none.py cannot be read"),
+    ],
+)
+def test_laws_that_are_not_there_are_refused(laws, words):
+    with pytest.raises(InputError, match=words):
+        ladder.rungs(laws)
+
+
+def test_every_law_meets_the_same_worlds_which_no_tuner_has_seen():
+    some = ("rps tuned", "pursuit", "dipole")
+    found = climb(CYLINDERS, 6, laws=some, engine="quasistatic", rules=Rules(horizon=20.0), slots=6)
+    assert found.success.dims == ("law", "world")
+    assert found.law.values.tolist() == list(some)
+    assert found.senses.values.tolist() == ["touch", "touch", "pose"]
+    assert found.mass.dims == ("world",)
+    again = climb(
+        CYLINDERS, 6, laws={"mine": RPSParams.tuned()}, engine="quasistatic",
+        rules=Rules(horizon=20.0), slots=6,
+    )  # fmt: skip
+    np.testing.assert_array_equal(again.time.sel(law="mine"), found.time.sel(law="rps tuned"))
+    np.testing.assert_array_equal(again.mass, found.mass)
+
+
+def test_the_command_reports_information_against_success(tmp_path, capsys):
+    out = tmp_path / "run"
+    asked = ["ladder", "--domain", "paper", "--worlds", 6, "--engine", "quasistatic"]
+    asked += ["--laws", "rps tuned", "pursuit", "--slots", 6, "--workers", 1, "--out", out]
+    assert rps(*asked) == 0
+    text = capsys.readouterr().out
+    for heading in ("Information against success", "Against rps tuned, world by world"):
+        assert f"## {heading}" in text
+    assert "by none" in text
+    assert (out / "ladder.png").stat().st_size > 10_000
+    assert load(out).success.sizes == {"arm": 2, "world": 6}
+
+
+def test_the_command_refuses_an_unknown_law(capsys):
+    assert "unknown law 'rsp'" in refusal(capsys, "ladder", "--laws", "rsp")
+    said = refusal(capsys, "tune", "es", "--strategy", "aps")
+    assert "it has no bounds to tune within" in said
