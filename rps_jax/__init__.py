@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rps_jax.control.law import Twist as Twist
     from rps_jax.control.law import step as step
     from rps_jax.control.pursuit import PursuitParams as PursuitParams
+    from rps_jax.control.rps_plus import RPSPlusParams as RPSPlusParams
     from rps_jax.control.strategies import Strategy as Strategy
     from rps_jax.control.strategies import register_strategy as register_strategy
     from rps_jax.errors import InputError as InputError
@@ -77,6 +78,7 @@ _HOMES = {
     "control.dipole": ("DipoleParams",),
     "control.force_push": ("ForcePushParams",),
     "control.pursuit": ("PursuitParams",),
+    "control.rps_plus": ("RPSPlusParams",),
     "control.strategies": ("Strategy", "register_strategy"),
     "errors": ("InputError",),
     "geometry.footprint": ("Footprint",),

@@ -7,12 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rps_jax.control import dipole, force_push, pursuit, strategies
+from rps_jax.control import dipole, force_push, law, pursuit, rps_plus, strategies
 from rps_jax.control.aps import TrackedObservation
 from rps_jax.control.dipole import DipoleParams
 from rps_jax.control.force_push import ForcePushParams
-from rps_jax.control.law import Observation, Twist
+from rps_jax.control.law import Observation, RPSParams, RPSState, Twist
 from rps_jax.control.pursuit import PursuitParams
+from rps_jax.control.rps_plus import RPSPlusParams
 from rps_jax.errors import InputError
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
@@ -62,16 +63,15 @@ def test_force_push_steers_by_where_the_contact_has_drifted():
     _, twist, _ = force_push.step(params, start, seen(touching=False))
     np.testing.assert_allclose(twist, (0.01, 0.0, 0.0), atol=1e-7)
 
-    # The path is laid from the first contact: no offset yet, only the bearing of the contact.
+    # The path is laid from the first contact: no offset, no drift, and the base faces along it.
     state, twist, details = force_push.step(params, start, seen((0.36, 0.12), (2.36, 0.12)))
-    angle = 1.3 * math.atan2(0.12, 0.36)
-    assert float(details.gamma) == pytest.approx(angle, abs=1e-6)
-    expected = (0.05 * math.cos(angle), 0.05 * math.sin(angle), 0.0)
-    np.testing.assert_allclose(twist, expected, atol=1e-6)
+    assert float(details.gamma) == pytest.approx(0.0, abs=1e-6)
+    np.testing.assert_allclose(twist, (0.05, 0.0, 0.0), atol=1e-6)
 
-    # 10 cm to the left of the path it goes farther out, which turns the object back in.
+    # A drift of 10 cm over lambda = 10 cm is 45 degrees; 10 cm to the left of the path the push
+    # goes farther out, which turns the object back in.
     state, _, details = force_push.step(params, state, seen((0.36, 0.22), (2.36, 0.12)))
-    angle = 1.3 * math.atan2(0.22, 0.36) + 0.5 * 0.1
+    angle = 1.3 * math.pi / 4 + 0.5 * 0.1
     assert float(details.gamma) == pytest.approx(angle, abs=1e-6)
 
     # A contact that is lost: back towards the path, 0.1 rad a step.
@@ -83,6 +83,17 @@ def test_force_push_steers_by_where_the_contact_has_drifted():
     assert float(details.gamma) == pytest.approx(-0.5 * 0.1, abs=1e-6)
 
 
+def test_force_push_forgets_a_drift_over_its_length_of_way():
+    params = ForcePushParams(k_y=0.0)
+    state, _, _ = force_push.step(params, force_push.init(params), seen((0.36, 0.0)))
+    _, _, details = force_push.step(params, state, seen((0.36, 0.1), robot=(0.1, 0.0)))
+    left = 0.1 * math.exp(-1)  # of the drift, after one lambda
+    assert float(details.gamma) == pytest.approx(1.3 * math.atan2(left, 0.1), abs=1e-6)
+    # A base that faces 0.2 rad to the left of the path feels its force there.
+    _, _, details = force_push.step(params, state, seen((0.36, 0.0), yaw=0.2))
+    assert float(details.gamma) == pytest.approx(1.3 * 0.2, abs=1e-6)
+
+
 def test_force_push_lays_its_path_anew_when_it_has_passed_the_target():
     params = ForcePushParams()
     state, _, _ = force_push.step(params, force_push.init(params), seen())
@@ -92,6 +103,46 @@ def test_force_push_lays_its_path_anew_when_it_has_passed_the_target():
     state, _, _ = force_push.step(params, state, seen(robot=(2.1, 0.0)))
     assert abs(float(state.theta_d)) == pytest.approx(math.pi)
     np.testing.assert_allclose(state.p_world_start, (2.46, 0.0), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("target", "expected"),
+    [
+        ((0.46, 0.05), (0.03, 0.0)),  # 10 cm ahead: K_v d
+        ((0.36, 0.15), (0.2 * 0.03, 0.03)),  # sideways, pressing
+        ((0.26, 0.05), (0.2 * 0.03, 0.0)),  # straight back: a skin cannot pull
+        ((0.36 + 0.06, 0.05 + 0.08), (0.018, 0.024)),  # to the left, 3-4-5
+    ],
+)
+def test_rps_plus_translates_near_its_target(target, expected):
+    own = RPSParams.tuned()._replace(K_v=0.3)
+    params = RPSPlusParams(own)
+    _, twist, _ = rps_plus.step(params, rps_plus.init(params), seen((0.36, 0.05), target))
+    np.testing.assert_allclose(twist, (*expected, 0.0), atol=1e-6)
+
+
+def test_rps_plus_is_the_law_elsewhere():
+    params = RPSPlusParams()
+    outside = [
+        seen((0.36, 0.05), (0.36 + 0.16, 0.05)),  # farther than d_near
+        seen((0.36, 0.05), (0.36 + 0.04, 0.05)),  # arrived
+        seen((0.36, 0.28), (0.46, 0.3)),  # realigning
+        seen(touching=False),
+    ]
+    for observation in outside:
+        start = RPSState.init(params.law)
+        for mine, theirs in zip(
+            jax.tree.leaves(rps_plus.step(params, start, observation)),
+            jax.tree.leaves(law.step_with_details(params.law, start, observation)),
+            strict=True,
+        ):
+            np.testing.assert_array_equal(mine, theirs)
+    never = params._replace(d_near=0.0)
+    near = seen((0.36, 0.05), (0.46, 0.1))
+    own = law.step_with_details(params.law, RPSState.init(params.law), near)
+    np.testing.assert_array_equal(
+        jnp.stack(rps_plus.step(never, rps_plus.init(never), near)[1]), jnp.stack(own[1])
+    )
 
 
 @pytest.mark.parametrize(
@@ -148,17 +199,21 @@ def test_a_law_keeps_within_the_bounds_of_the_base(name):
         for touching in (True, False):
             told = seen((0.36, 0.3 * y), (3 * x, 3 * far), (y, far), 3 * x, touching)
             v_x, v_y, omega = twist_of(name, told, (far, x))
-            assert math.hypot(v_x, v_y) <= params.v_max * (1 + 1e-6)
-            assert abs(omega) <= params.omega_max * (1 + 1e-6)
+            bounds = getattr(params, "law", params)
+            assert math.hypot(v_x, v_y) <= bounds.v_max * (1 + 1e-6)
+            assert abs(omega) <= bounds.omega_max * (1 + 1e-6)
 
 
 @pytest.mark.parametrize("name", RIVALS)
 def test_a_law_refuses_bounds_that_mean_nothing(name):
     strategy, params = strategies.RIVALS[name]
     assert strategy.check(params) is params
-    with pytest.raises(InputError, match=rf"{name}\.v_max"):
-        strategy.check(params._replace(v_max=-0.05))
-    assert jax.tree.leaves(strategies.restored(strategies.recorded(params))) == list(params)
+    wrong = strategies.changed(params, {list(strategies.numbers(params))[-1]: -0.05})
+    with pytest.raises(InputError, match=r"= -0\.05 is not allowed"):
+        strategy.check(wrong)
+    found = strategies.restored(strategies.recorded(params))
+    assert jax.tree.leaves(found) == jax.tree.leaves(params)
+    assert type(found) is type(params)
 
 
 @pytest.mark.parametrize("name", RIVALS)

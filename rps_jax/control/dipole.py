@@ -34,11 +34,6 @@ class DipoleParams(NamedTuple):
     omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
     d_success: float | jax.Array = 0.05  # [m] target reached
 
-    @classmethod
-    def tuned(cls) -> DipoleParams:
-        """Tuned by evolution in random worlds of boxes and cylinders."""
-        return cls()
-
 
 BOUNDS = {
     "K_h": Bound(0.02, 5, log=True),  # [1/s]

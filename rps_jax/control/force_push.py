@@ -6,12 +6,13 @@ where theta_f is the angle of the contact force and Delta how far the contact ha
 point that goes farther out turns the object back in. Where the contact is lost, theta_p tends to
 -k_y Delta, which leads back to the path, a little each step.
 
-A flat skin without friction feels its force along its normal, whatever the object does, so here
-the force's angle gives way to where the contact has drifted: theta_f is the bearing of the contact
-from the middle of the base. As in their experiments the base turns to face along the path, at
-k_omega. Our choices: the path is the straight line from the first contact to the target, and is
-laid anew when the contact has passed the target; since a skin cannot pull, the push is held within
-angle_max of the heading; the speed is the bound of RPS.
+A flat skin feels the force along its normal, which the base carries with it, and by friction aside
+of it, to where the contact drifts. So here theta_f is the base's heading, and the angle at which
+the contact has drifted over the skin: that of (lambda, l - l_mean), with l_mean the mean of l over
+the last length lambda of the base's way. As in their experiments the base turns to face along the
+path, at k_omega. Our choices: the path is the straight line from the first contact to the target,
+and is laid anew when the contact has passed the target; since a skin cannot pull, the push is held
+within angle_max of the heading; the speed is the bound of RPS.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from rps_jax.control.bounds import Bound
 from rps_jax.control.law import Details, Observation, Twist
 from rps_jax.geometry import planar
 
-_POSITIVE = ("angle_max", "v_max", "omega_max", "d_success")
+_POSITIVE = ("drift", "angle_max", "v_max", "omega_max", "d_success")
 
 
 class ForcePushParams(NamedTuple):
@@ -37,16 +38,12 @@ class ForcePushParams(NamedTuple):
     k_y: float | jax.Array = 0.5  # [rad/m] gain of the path
     k_omega: float | jax.Array = 1.0  # [1/s] gain of the heading
     converge: float | jax.Array = 0.1  # [rad] of theta_p in a step without contact, at most
+    drift: float | jax.Array = 0.1  # [m] lambda, the length of way over which drift is told
     angle_max: float | jax.Array = 1.2  # [rad] between push and heading, at most
     v_max: float | jax.Array = 0.05  # [m/s] speed of the contact, and bound on the base's
     omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
     v_approach: float | jax.Array = 0.01  # [m/s] forward speed before the first contact
     d_success: float | jax.Array = 0.05  # [m] target reached
-
-    @classmethod
-    def tuned(cls) -> ForcePushParams:
-        """Tuned by evolution in random worlds of boxes and cylinders."""
-        return cls()
 
 
 BOUNDS = {
@@ -54,6 +51,7 @@ BOUNDS = {
     "k_y": Bound(-2, 2),  # [rad/m]
     "k_omega": Bound(0.005, 2, log=True),  # [1/s]
     "converge": Bound(0.001, 1, log=True),  # [rad]
+    "drift": Bound(0.01, 1, log=True),  # [m]
     "angle_max": Bound(0.2, 1.57),  # [rad]
 }
 
@@ -65,6 +63,8 @@ class ForcePushState(NamedTuple):
     theta_d: jax.Array  # () [rad] the path's direction in the world
     theta_p: jax.Array  # () [rad] the last push's, from the path's
     p_robot_contact: jax.Array  # (2,) [m] the last contact
+    l_mean: jax.Array  # () [m] of l over the last of the way
+    p_world_robot: jax.Array  # (2,) [m] of the last step
     touched: jax.Array  # () bool
 
 
@@ -85,7 +85,7 @@ def init(params: ForcePushParams) -> ForcePushState:
     """Before any contact there is no path."""
     zero = jnp.zeros_like(jnp.asarray(params.v_max, float))
     two = jnp.zeros(2, zero.dtype)
-    return ForcePushState(two, zero, zero, two, jnp.zeros((), bool))
+    return ForcePushState(two, zero, zero, two, zero, two, jnp.zeros((), bool))
 
 
 def step(
@@ -106,7 +106,12 @@ def step(
 
     left = jnp.stack([-jnp.sin(theta_d), jnp.cos(theta_d)])
     offset = jnp.sum((p_world_contact - p_world_start) * left)  # [m] to the path's left
-    theta_f = planar.direction(contact)  # [rad] the contact's bearing, for the force's angle
+    way = planar.norm(seen.p_world_robot - state.p_world_robot)
+    kept = jnp.exp(-way / params.drift)
+    l_mean = contact[1] + kept * (state.l_mean - contact[1])
+    l_mean = jnp.where(state.touched, l_mean, contact[1])
+    drifted = jnp.stack([jnp.asarray(params.drift, contact.dtype), contact[1] - l_mean])
+    theta_f = planar.wrap(seen.yaw - theta_d) + planar.direction(drifted)
     pushed = (1 + params.k_theta) * theta_f + params.k_y * offset
     back = planar.wrap(-params.k_y * offset - state.theta_p)
     recovered = state.theta_p + jnp.clip(back, -params.converge, params.converge)
@@ -121,7 +126,8 @@ def step(
     touched = state.touched | touching
     ahead = Twist(params.v_approach, 0.0, 0.0)
     twist = jax.tree.map(lambda a, b: jnp.where(touched, a, b), push, ahead)
+    theta_p = jnp.where(touched, theta_p, 0.0)
     state = ForcePushState(
-        p_world_start, theta_d, jnp.where(touched, theta_p, 0.0), contact, touched
+        p_world_start, theta_d, theta_p, contact, l_mean, seen.p_world_robot, touched
     )
     return state, twist, Details.of(told)._replace(gamma=theta_p)

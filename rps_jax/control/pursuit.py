@@ -31,11 +31,6 @@ class PursuitParams(NamedTuple):
     v_approach: float | jax.Array = 0.01  # [m/s] forward speed without contact
     d_success: float | jax.Array = 0.05  # [m] target reached
 
-    @classmethod
-    def tuned(cls) -> PursuitParams:
-        """Tuned by evolution in random worlds of boxes and cylinders."""
-        return cls()
-
 
 BOUNDS = {
     "K_v": Bound(0.02, 2, log=True),  # [1/s]

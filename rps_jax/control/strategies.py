@@ -18,13 +18,14 @@ import jax
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.control import aps, dipole, force_push, law, pursuit
+from rps_jax.control import aps, dipole, force_push, law, pursuit, rps_plus
 from rps_jax.control.aps import APSParams, APSState
 from rps_jax.control.bounds import Bound
 from rps_jax.control.dipole import DipoleParams
 from rps_jax.control.force_push import ForcePushParams
 from rps_jax.control.law import Details, RPSParams, RPSState, Temperatures, Twist
 from rps_jax.control.pursuit import PursuitParams
+from rps_jax.control.rps_plus import RPSPlusParams
 
 # What a strategy is told: where the skin is touched (`law.Observation`), or the object's place and
 # size as well (`aps.TrackedObservation`). All know odometry and the target.
@@ -90,6 +91,7 @@ APS = Strategy(APSState.init, aps.aps_step, "pose", check=aps.check)
 PAPER: dict[str, Params] = {"rps": RPSParams.paper(), "nps": RPSParams.nps(), "aps": APSParams()}
 # Others of this package, likewise.
 RIVALS: dict[str, tuple[Strategy, Params]] = {
+    "rps_plus": (_of_module(rps_plus), RPSPlusParams()),
     "pursuit": (_of_module(pursuit), PursuitParams()),
     "force_push": (_of_module(force_push), ForcePushParams()),
     "dipole": (_of_module(dipole, "pose"), DipoleParams()),

@@ -20,6 +20,7 @@ from rps_jax.control.dipole import DipoleParams
 from rps_jax.control.force_push import ForcePushParams
 from rps_jax.control.law import RPSParams
 from rps_jax.control.pursuit import PursuitParams
+from rps_jax.control.rps_plus import RPSPlusParams
 from rps_jax.control.strategies import Params
 from rps_jax.engines import EngineName
 from rps_jax.robot.robot import Robot
@@ -36,13 +37,11 @@ RUNGS: dict[str, Params] = {
     "nps": RPSParams.nps(),
     "rps paper": RPSParams.paper(),
     REFERENCE: RPSParams.tuned(),
+    "rps_plus": RPSPlusParams(),
     "pursuit": PursuitParams(),
-    "pursuit tuned": PursuitParams.tuned(),
     "force_push": ForcePushParams(),
-    "force_push tuned": ForcePushParams.tuned(),
     "aps": APSParams(),
     "dipole": DipoleParams(),
-    "dipole tuned": DipoleParams.tuned(),
 }
 
 

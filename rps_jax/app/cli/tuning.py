@@ -119,8 +119,8 @@ class TuneES(TuneOptions):
     """Tune by evolution."""
 
     strategy: str = "rps"
-    """What is tuned: rps, pursuit, force_push, dipole, or a law of a file that has bounds, as
-    my_law.py:MyParams; its own parameters are the start if that is paper."""
+    """What is tuned: rps, rps_plus, pursuit, force_push, dipole, or a law of a file with bounds,
+    as my_law.py:MyParams; its own parameters are the start if that is paper."""
     algorithm: Literal["cma", "lra_cma", "sep_cma", "xnes"] = "cma"
     """cma adapts a full covariance; lra_cma adapts its learning rates to noisy scores as well;
     sep_cma keeps to the axes; xnes follows the natural gradient."""
