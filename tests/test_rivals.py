@@ -156,8 +156,24 @@ def test_rps_plus_is_the_law_elsewhere():
 )
 def test_the_dipole_leads_round_the_object(robot, yaw, expected):
     observation = tracked(seen(target=(3.0, 0.0), robot=robot, yaw=yaw, touching=False))
-    _, twist, _ = dipole.step(DipoleParams(aim_beyond=0.0), (), observation)
+    params = DipoleParams()
+    _, twist, _ = dipole.step(params, dipole.init(params), observation)
     np.testing.assert_allclose(twist, expected, atol=1e-6)
+
+
+def test_the_dipole_looks_along_the_path_and_lays_it_anew():
+    params = DipoleParams()
+    state, _, _ = dipole.step(params, dipole.init(params), tracked(seen(target=(3.0, 0.0))))
+    np.testing.assert_allclose(state.p_world_start, (1.0, 0.0))
+    # An object 1 m to the left of the path: 1 m ahead of its foot, 45 degrees to the right. The
+    # robot behind it on that line drives along it.
+    aside = tracked(seen(target=(3.0, 0.0), robot=(0.5, 1.5), yaw=-math.pi / 4), (1.0, 1.0))
+    state, twist, _ = dipole.step(params, state, aside)
+    np.testing.assert_allclose(twist, (0.05, 0.0, 0.0), atol=1e-6)
+    np.testing.assert_allclose(state.p_world_start, (1.0, 0.0))
+    for x, start in ((3.39, 1.0), (3.41, 3.41)):  # two radii of 0.2 m past the target
+        state, _, _ = dipole.step(params, state, tracked(seen(target=(3.0, 0.0)), (x, 0.0)))
+        assert float(state.p_world_start[0]) == pytest.approx(start)
 
 
 def twist_of(name, observation, thing):

@@ -151,16 +151,16 @@ def _learn(
     )
 
 
-def aim(beyond: float | jax.Array, observation: TrackedObservation) -> jax.Array:
-    """T (2,) [m]: `beyond` object radii past the target, seen from the contact or the object."""
+def _aim(params: APSParams, observation: TrackedObservation) -> jax.Array:
+    """T (2,) [m]: beyond the target, seen from the contact point, or else from the object."""
     seen = observation.touch
     angle = jnp.where(
         seen.in_contact,
         planar.direction(law.displacement(seen)),
         planar.direction(seen.p_world_target - observation.p_world_object),
     )
-    way = beyond * observation.r_object
-    return seen.p_world_target + way * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    beyond = params.aim_beyond * observation.r_object
+    return seen.p_world_target + beyond * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
 
 def aps_step(
@@ -172,7 +172,7 @@ def aps_step(
     so far away that it approaches.
     """
     seen = observation.touch
-    to_target = aim(params.aim_beyond, observation) - observation.p_world_object
+    to_target = _aim(params, observation) - observation.p_world_object
     from_object = seen.p_world_robot - observation.p_world_object
     a_OT = planar.direction(to_target)
     first = ~state.started

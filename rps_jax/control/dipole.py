@@ -6,8 +6,10 @@ object they lead straight on, beside it they lead back, so that the robot goes r
 plan. With theta the angle at the object from the target to the robot, the robot moves at 2 theta
 from the direction to the target (their Fig. 4). It needs what RPS does not: the object's place.
 
-Our choices, since their robot is round and the paper's rule asks for the contact point at the
-target: the base turns to face the object, and aims beyond the target as our APS does.
+As Heins and Schoellig (2024) use it, the robot aims at a point of a path that lies `lookahead`
+before the object. Our choices: the path is the straight line from where the object was first to the
+target and on, so that the contact point, too, passes the target; it is laid anew when the object
+has passed it by `beyond` radii; the base turns to face the object.
 """
 
 from __future__ import annotations
@@ -18,7 +20,6 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax import errors
-from rps_jax.control import aps
 from rps_jax.control.aps import TrackedObservation
 from rps_jax.control.bounds import Bound
 from rps_jax.control.law import Details, Twist
@@ -26,10 +27,11 @@ from rps_jax.geometry import planar
 
 
 class DipoleParams(NamedTuple):
-    """Parameters of the dipole field, which has none itself: all are ours."""
+    """Parameters about the dipole field, which has none itself; the lookahead is H. and S.'s."""
 
     K_h: float | jax.Array = 1.0  # [1/s] turning rate over heading error
-    aim_beyond: float | jax.Array = 1.0  # [1] object radii beyond the target; 0: as published
+    lookahead: float | jax.Array = 1.0  # [m] of the path before the object, to be aimed at
+    beyond: float | jax.Array = 2.0  # [1] object radii after which a target is passed
     v_max: float | jax.Array = 0.05  # [m/s] speed, the bound of RPS
     omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
     d_success: float | jax.Array = 0.05  # [m] target reached
@@ -37,8 +39,16 @@ class DipoleParams(NamedTuple):
 
 BOUNDS = {
     "K_h": Bound(0.02, 5, log=True),  # [1/s]
-    "aim_beyond": Bound(0, 2),  # [1]
+    "lookahead": Bound(0.05, 3, log=True),  # [m]
+    "beyond": Bound(0, 5),  # [1]
 }
+
+
+class DipoleState(NamedTuple):
+    """What the law remembers between two control steps."""
+
+    p_world_start: jax.Array  # (2,) [m] where the path begins
+    started: jax.Array  # () bool
 
 
 def check(params: DipoleParams) -> DipoleParams:
@@ -48,28 +58,38 @@ def check(params: DipoleParams) -> DipoleParams:
       InputError: a value is not a finite number, or is out of bounds.
     """
     for name in params._fields:
-        bounds = {"at_least": 0} if name == "aim_beyond" else {"above": 0}
+        bounds = {"at_least": 0} if name == "beyond" else {"above": 0}
         errors.check_finite(f"dipole.{name}", getattr(params, name), **bounds)
     return params
 
 
-def init(params: DipoleParams) -> tuple[()]:
-    """It remembers nothing."""
-    return ()
+def init(params: DipoleParams) -> DipoleState:
+    """Before the object was seen there is no path."""
+    return DipoleState(jnp.zeros(2, jnp.result_type(float)), jnp.zeros((), bool))
 
 
 def step(
-    params: DipoleParams, state: tuple[()], observation: TrackedObservation
-) -> tuple[tuple[()], Twist, Details]:
+    params: DipoleParams, state: DipoleState, observation: TrackedObservation
+) -> tuple[DipoleState, Twist, Details]:
     """One control step: along the field line through the robot, facing the object."""
-    seen = observation.touch
-    aim = aps.aim(params.aim_beyond, observation)
-    to_target = planar.direction(aim - observation.p_world_object)
-    from_object = seen.p_world_robot - observation.p_world_object
-    theta = planar.wrap(planar.direction(from_object) - to_target)
-    heading = to_target + 2 * theta - seen.yaw
+    seen, thing = observation.touch, observation.p_world_object
+
+    def along(start: jax.Array) -> jax.Array:
+        angle = planar.direction(seen.p_world_target - start)
+        return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+
+    past = jnp.sum((thing - seen.p_world_target) * along(state.p_world_start))
+    anew = ~state.started | (past > params.beyond * observation.r_object)
+    start = jnp.where(anew, thing, state.p_world_start)
+    way = along(start)
+    aim = start + (jnp.sum((thing - start) * way) + params.lookahead) * way
+
+    to_aim = planar.direction(aim - thing)
+    from_object = seen.p_world_robot - thing
+    theta = planar.wrap(planar.direction(from_object) - to_aim)
+    heading = to_aim + 2 * theta - seen.yaw
     error = planar.wrap(planar.direction(-from_object) - seen.yaw)
     twist = Twist(
         params.v_max * jnp.cos(heading), params.v_max * jnp.sin(heading), params.K_h * error
     ).within(params.v_max, params.omega_max)
-    return state, twist, Details.of(seen)
+    return DipoleState(start, jnp.ones_like(state.started)), twist, Details.of(seen)
