@@ -76,7 +76,7 @@ def test_a_film_shows_each_trial_in_its_tile_and_holds_the_end(make, tmp_path):
 
 def test_worlds_of_several_objects_keep_their_order(tmp_path):
     plan = plan_of("random_cylinder", "random_box")
-    takes = film.of_sweep(tmp_path, plan, "rps", "first", 3)
+    takes = film.of_sweep(tmp_path, plan, ["rps"], "first", (1, 3))
     assert [list(take.places) for take in takes] == [[0, 2], [1]]
     assert film._placed([take.labels for take in takes], takes) == [f"world {i}" for i in range(3)]
     assert [scene.family for scene in film._placed([t.scenes for t in takes], takes)] == [
@@ -84,9 +84,24 @@ def test_worlds_of_several_objects_keep_their_order(tmp_path):
     ]
 
 
+def test_several_laws_have_a_row_each_and_a_world_a_column(tmp_path):
+    one = plan_of("random_box", "random_cylinder")
+    plan = dataclasses.replace(one, arms={"one": RPSParams.paper(), "two": RPSParams.nps()})
+    takes = film.of_sweep(tmp_path, plan, ["two", "one"], "first", (2, 3))
+    assert film._placed([take.labels for take in takes], takes) == [
+        *(f"two, world {i}" for i in range(3)),
+        *(f"one, world {i}" for i in range(3)),
+    ]
+    film.rows_of(plan, ["two", "one"], (2, 3))
+    with pytest.raises(InputError, match="each has a row"):
+        film.rows_of(plan, ["two", "one"], (3, 2))
+    with pytest.raises(InputError, match="unknown arm 'three'"):
+        film.rows_of(plan, ["three"], (1, 3))
+
+
 def test_a_trial_that_has_ended_is_told_and_not_drawn_again(tmp_path):
     table(tmp_path)
-    takes, setting = Film(tmp_path).takes(2)
+    takes, setting = Film(tmp_path).takes((1, 2))
     (take,) = takes
     ((ended, first), *_, (_, before), (over, last)) = [
         shots for shots, _ in zip(film._shots(take, setting, 50), range(20), strict=False)
@@ -101,7 +116,7 @@ def test_a_trial_that_has_ended_is_told_and_not_drawn_again(tmp_path):
 
 def test_the_memory_of_a_film_does_not_grow_with_its_length(tmp_path):
     table(tmp_path)
-    takes, _ = Film(tmp_path).takes(1)
+    takes, _ = Film(tmp_path).takes((1, 1))
     tile = video.Tile(takes[0].scenes[0], (1.0, 1.0))
     shot = video.Shot(takes[0].part.worlds.qpos[0], np.zeros(2), "")
 
@@ -128,7 +143,7 @@ def test_tiles_are_as_large_as_fits(grid, size):
 
 def test_more_trials_than_places_are_refused(tmp_path):
     table(tmp_path)
-    takes, _ = Film(tmp_path).takes(2)
+    takes, _ = Film(tmp_path).takes((1, 2))
     tiles = [video.Tile(scene, (1.0, 1.0)) for scene in takes[0].scenes]
     with pytest.raises(InputError, match="grid = 1x1 is not allowed for 2 trials"):
         video.render_grid(tiles, [], tmp_path / "x.mp4", shape=(1, 1), size=(320, 180))

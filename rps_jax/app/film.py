@@ -72,21 +72,24 @@ def of_cases(cases: Sequence[Case], setting: Setting) -> list[Take]:
     return [Take(range(len(cases)), part, strategy, [one] * len(cases), labels)]
 
 
-def of_sweep(run: Path, plan: Plan, arm: str, which: str, count: int) -> list[Take]:
-    """The takes of worlds of a sweep.
+def of_sweep(
+    run: Path, plan: Plan, arms: Sequence[str], which: str, shape: tuple[int, int]
+) -> list[Take]:
+    """The takes of worlds of a sweep: of one arm, or a row of the grid for each of several.
 
     Args:
       run: its folder.
       plan: its plan.
-      arm: one of the plan's.
+      arms: some of the plan's; several meet the same worlds, one a column.
       which: `first`, those of the least index; `hardest`, as the report of the sweep has them.
-      count: how many, at most.
+      shape: rows and columns of the grid.
 
     Raises:
       InputError: an unknown choice, an engine that is not followed, or no results to choose by.
     """
     errors.check_name("which", which, WHICH)
     engines.get(plan.setting.engine).check_followed()
+    count = shape[0] * shape[1] if len(arms) == 1 else shape[1]
     index = np.arange(min(count, plan.worlds))
     if which == "hardest":
         index = statistics.hardest(files.read_results(run), count)
@@ -94,19 +97,32 @@ def of_sweep(run: Path, plan: Plan, arm: str, which: str, count: int) -> list[Ta
             raise InputError("which = hardest is not allowed: no trial of this run failed.")
     of_object = plan.domain.object_of(index)
     takes = []
-    for one in np.unique(of_object):
-        places = np.flatnonzero(of_object == one)
-        worlds = index[places]
-        takes.append(
-            Take(
-                [int(place) for place in places],
-                world_part(plan, list(plan.arms).index(arm), worlds),
-                strategies.of(plan.arms[arm]),
-                [scene_of(plan, int(i)) for i in worlds],
-                [f"world {i}" for i in worlds],
+    for row, arm in enumerate(arms):
+        said = f"{arm}, " if len(arms) > 1 else ""
+        for one in np.unique(of_object):
+            places = np.flatnonzero(of_object == one)
+            worlds = index[places]
+            takes.append(
+                Take(
+                    [row * shape[1] + int(place) for place in places],
+                    world_part(plan, list(plan.arms).index(arm), worlds),
+                    strategies.of(plan.arms[arm]),
+                    [scene_of(plan, int(i)) for i in worlds],
+                    [f"{said}world {i}" for i in worlds],
+                )
             )
-        )
     return takes
+
+
+def rows_of(plan: Plan, arms: Sequence[str], shape: tuple[int, int]) -> None:
+    """Raises InputError unless the arms are the plan's, each once, and there is a row for each."""
+    errors.check_each_once("arms", arms)
+    for arm in arms:
+        errors.check_name("arm", arm, plan.arms)
+    if len(arms) != shape[0]:
+        raise InputError(
+            f"grid = {shape[0]}x{shape[1]} is not allowed with {len(arms)} arms: each has a row."
+        )
 
 
 def default_speed(seconds: float) -> float:

@@ -33,8 +33,8 @@ class Film:
 
     folder: tyro.conf.Positional[Path]
     """Run folder of `rps table` or `rps sweep`."""
-    grid: str = "4x6"
-    """Rows and columns of the film."""
+    grid: str | None = None
+    """Rows and columns of the film; by default 4x6, or with --arms a row for each and 3 columns."""
     object: str = "box"
     """Object to film, of a table."""
     friction: Friction = "S1"
@@ -43,6 +43,8 @@ class Film:
     """Whether the first or the hardest worlds of a sweep are filmed."""
     arm: str | None = None
     """Which of a sweep's strategies with parameters; by default the first."""
+    arms: tuple[str, ...] = ()
+    """Several of them, side by side: a row of the film for each, a column for each world."""
     seconds: float | None = None
     """Simulated time that is filmed, at most [s]; by default until the last trial ends."""
     speed: float | None = None
@@ -60,7 +62,8 @@ class Film:
         from rps_jax.app import film
         from rps_jax.record import folder
 
-        shape = film.shape_of(self.grid)
+        usual = f"{len(self.arms)}x3" if self.arms else "4x6"
+        shape = film.shape_of(self.grid or usual)
         for name in ("seconds", "speed"):
             if getattr(self, name) is not None:
                 errors.check_finite(name, getattr(self, name), above=0, at_most=1e5)
@@ -69,7 +72,7 @@ class Film:
             raise InputError(f"out = {out} is a folder: name a file, as {out / 'film.mp4'}.")
         if self.out:
             folder.writable(out.parent)
-        takes, setting = self.takes(shape[0] * shape[1])
+        takes, setting = self.takes(shape)
         for what in video.check():
             if not what.ok:
                 raise InputError(what.mend)
@@ -91,8 +94,8 @@ class Film:
             )
         print(f"film: {out}")
 
-    def takes(self, count: int) -> tuple[list[Take], Setting]:
-        """The trials to film, at most so many, and what they share."""
+    def takes(self, shape: tuple[int, int]) -> tuple[list[Take], Setting]:
+        """The trials to film, at most as many as the grid has places, and what they share."""
         from rps_jax.app import film
         from rps_jax.record import folder
         from rps_jax.runs.push import chosen
@@ -102,7 +105,10 @@ class Film:
         if (self.folder / folder.MANIFEST).exists():
             plan, arm = chosen(self.folder, 0, self.arm)
             tell_followed(self.folder, plan)
-            return film.of_sweep(self.folder, plan, arm, self.which, count), plan.setting
+            if self.arms:
+                film.rows_of(plan, self.arms, shape)
+            arms = self.arms or (arm,)
+            return film.of_sweep(self.folder, plan, arms, self.which, shape), plan.setting
         table = _table_of(self.folder)
         for field, name in (
             ("objects", self.object),
@@ -112,7 +118,7 @@ class Film:
             errors.check_name(f"{field} of the run", name, getattr(table, field))
         conditions = table.conditions()
         arms = parsing.arms_of([self.strategy], table.params)
-        targets = (table.targets or paper.TARGETS)[:count]
+        targets = (table.targets or paper.TARGETS)[: shape[0] * shape[1]]
         cases = cases_of(arms, [self.object], [self.friction], targets, conditions)
         setting = conditions.setting()
         return film.of_cases(cases, setting), setting
