@@ -278,3 +278,9 @@ def test_what_a_domain_does_not_draw_is_known_and_not_told_as_drawn():
     assert ideal.idle == {"noise", "gain_spread", "dead_share"}
     table = draws.table(draws.draw(ideal, 0, np.arange(9)))
     assert {name for name, (values, _) in table.items() if not values.any()} == ideal.idle
+
+
+@pytest.mark.parametrize("mass", [(3, 10), 5.0, [3, 10, True]])
+def test_a_quantity_that_is_no_range_is_refused(mass):
+    with pytest.raises(InputError, match=r"domain mass = .* give a Range, as Range\(3, 10\)"):
+        replace(DOMAINS["wide"], mass=mass)

@@ -99,6 +99,10 @@ class Domain:
         for name, (least, most, unit) in ALLOWED.items():
             if (given := getattr(self, name)) is None:
                 continue
+            if not isinstance(given, Range):
+                raise InputError(
+                    f"domain {name} = {given!r} is not allowed: give a Range, as Range(3, 10)."
+                )
             low, high, log = given
             for side, value in (("low", low), ("high", high)):
                 errors.check_finite(
