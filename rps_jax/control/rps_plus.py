@@ -1,9 +1,9 @@
 """RPS+: the law of `law`, which translates near its target instead of turning.
 
-What the tuned law loses in `wide` it loses within arm's length: a wide object touches off the
-middle, Eq. 6 turns the base to face the target, the turn sweeps the contact sideways as fast as it
-drives on, and the base circles the target at 5 to 15 cm. A holonomic base need not turn: any
-velocity of the contact point can be had by translation.
+The tuned law loses most worlds of `wide` within arm's length of the target: wide objects touch off
+the middle of the base, Eq. 6 turns it to face the target while it drives on, and it circles the
+target at 5 to 15 cm. A holonomic base need not turn: any velocity of the contact point can be had
+by translation.
 
 Equations of our own, with C the contact point, d from C to the target T, theta* its direction,
 e = theta* - theta the heading error, and v* of Eq. 3 within v_max:
