@@ -33,7 +33,7 @@ from rps_jax.geometry import planar
 class RPSPlusParams(NamedTuple):
     """Parameters of RPS+; the defaults are the tuned ones."""
 
-    law: RPSParams = RPSParams.tuned()._replace(d_th=0.8)
+    law: RPSParams = RPSParams.tuned()
     d_near: float | jax.Array = 0.15  # [m] nearer than this it translates, P1
     press: float | jax.Array = 0.2  # [1] least share of the speed that goes forward, P2
 

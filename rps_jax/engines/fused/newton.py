@@ -27,7 +27,7 @@ from rps_jax.geometry.vectors import Vec
 from rps_jax.world.physics import Physics
 
 _ENOUGH = 1e-4  # [m/s^2] error of the acceleration with which the solver ends
-_FLAT = 0.5  # [1] of the slope at its start, with which a line search ends
+_FLAT = 1e-3  # [1] of the slope at its start, with which a line search ends
 _FAR = 1e9  # no upper bound of the line search
 
 
