@@ -57,7 +57,12 @@ BATCHED = {
     "mjx fast": Setting(physics=preset(fidelity="fast")),
     "mjx, MuJoCo's defaults": Setting(physics=_MUJOCOS_OWN),
 }
-IN_C = {"C in closed loop": "closed", "C, mj_step alone": "open"}
+# The second steps by MuJoCo's `rollout`; the third is how trials are run one after the other.
+IN_C = {
+    "C in closed loop": "closed",
+    "C, mj_step alone": "open",
+    "C, one trial at a time": "serial",
+}
 NAMES = (*BATCHED, *IN_C)
 
 
@@ -216,13 +221,14 @@ def batched(program: Program) -> Speed:
 
 
 def in_c(name: str, family: str, simulated: float = 2.0) -> Speed:
-    """Time C MuJoCo on all cores: in the closed loop of the law, or stepping alone."""
+    """Time C MuJoCo: on all cores in the closed loop of the law or stepping alone, or one trial."""
     physics = preset()
-    threads = os.cpu_count() or 1
-    worlds = 64 * threads
+    how = IN_C[name]
+    threads = 1 if how == "serial" else os.cpu_count() or 1
+    worlds = 1 if how == "serial" else 64 * threads
     setting, engine = Setting(engine="mujoco", physics=physics), engines.get("mujoco")
     stage, batch = _worlds(family, worlds, setting)
-    if IN_C[name] == "closed":
+    if how != "open":
         options = {"strategy": strategies.RPS, "threads": threads, "report": lambda *_: True}
         rules = Rules(horizon=simulated)
 
