@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rps_jax.control import law as law
     from rps_jax.control.dipole import DipoleParams as DipoleParams
     from rps_jax.control.force_push import ForcePushParams as ForcePushParams
+    from rps_jax.control.guided import GuidedParams as GuidedParams
     from rps_jax.control.law import Details as Details
     from rps_jax.control.law import Observation as Observation
     from rps_jax.control.law import RPSParams as RPSParams
@@ -45,6 +46,8 @@ if TYPE_CHECKING:
     from rps_jax.runs.push import replay as replay
     from rps_jax.runs.results import load as load
     from rps_jax.runs.sweep import sweep as sweep
+    from rps_jax.studies.ceiling import Search as Search
+    from rps_jax.studies.ceiling import ceiling as ceiling
     from rps_jax.studies.ladder import ladder as ladder
     from rps_jax.studies.replication.table import table as table
     from rps_jax.trials.conditions import Conditions as Conditions
@@ -77,6 +80,7 @@ _HOMES = {
     ),
     "control.dipole": ("DipoleParams",),
     "control.force_push": ("ForcePushParams",),
+    "control.guided": ("GuidedParams",),
     "control.pursuit": ("PursuitParams",),
     "control.rps_plus": ("RPSPlusParams",),
     "control.strategies": ("Strategy", "register_strategy"),
@@ -90,6 +94,7 @@ _HOMES = {
     "runs.results": ("load",),
     "runs.sweep": ("sweep",),
     "runs.models": ("models",),
+    "studies.ceiling": ("Search", "ceiling"),
     "studies.ladder": ("ladder",),
     "studies.replication.table": ("table",),
     "trials.conditions": ("Conditions",),

@@ -18,11 +18,12 @@ import jax
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.control import aps, dipole, force_push, law, pursuit, rps_plus
+from rps_jax.control import aps, dipole, force_push, guided, law, pursuit, rps_plus
 from rps_jax.control.aps import APSParams, APSState
 from rps_jax.control.bounds import Bound
 from rps_jax.control.dipole import DipoleParams
 from rps_jax.control.force_push import ForcePushParams
+from rps_jax.control.guided import GuidedParams
 from rps_jax.control.law import Details, RPSParams, RPSState, Temperatures, Twist
 from rps_jax.control.pursuit import PursuitParams
 from rps_jax.control.rps_plus import RPSPlusParams
@@ -95,6 +96,7 @@ RIVALS: dict[str, tuple[Strategy, Params]] = {
     "pursuit": (_of_module(pursuit), PursuitParams()),
     "force_push": (_of_module(force_push), ForcePushParams()),
     "dipole": (_of_module(dipole, "pose"), DipoleParams()),
+    "guided": (Strategy(guided.init, guided.step, check=guided.check), GuidedParams()),
 }
 PARAMS: dict[str, Params] = PAPER | {name: params for name, (_, params) in RIVALS.items()}
 STRATEGIES: dict[type, Strategy] = {RPSParams: RPS, APSParams: APS} | {

@@ -80,7 +80,7 @@ def drawn_worlds(domain: Domain, drawn: Draw, params: Params, setting: Setting) 
         "fields": own,
         "footprint": Footprint(*_any(drawn.solid.vertices, drawn.solid.radius)),
         "skin": _skin(domain, drawn),
-        "params": jax.tree.map(lambda value: np.full(count, value), params),
+        "params": jax.tree.map(lambda x: np.full((count, *np.shape(x)), x), params),
         "p_world_target": drawn.p_world_target,
         "shift": Shift(*_any(np.full(count, np.inf), np.zeros((count, 2)))),
         "qpos": _starts(drawn),

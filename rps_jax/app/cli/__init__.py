@@ -23,6 +23,7 @@ Command = (
     | Annotated[replicating.Paper, tyro.conf.subcommand("paper")]
     | Annotated[sweeping.Sweep, tyro.conf.subcommand("sweep")]
     | Annotated[sweeping.Ladder, tyro.conf.subcommand("ladder")]
+    | Annotated[sweeping.Ceiling, tyro.conf.subcommand("ceiling")]
     | Annotated[sweeping.Merge, tyro.conf.subcommand("merge")]
     | Annotated[sweeping.Replay, tyro.conf.subcommand("replay")]
     | Annotated[looking.Film, tyro.conf.subcommand("film")]

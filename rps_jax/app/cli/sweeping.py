@@ -1,4 +1,4 @@
-"""The commands of random worlds: sweep, ladder, merge, replay."""
+"""The commands of random worlds: sweep, ladder, ceiling, merge, replay."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from rps_jax import errors
 from rps_jax.app.cli import parsing, running
 from rps_jax.app.cli.options import Device, Engine, Fidelity, Physics, Spread, Strategies
 from rps_jax.app.cli.replicating import show
@@ -161,6 +162,56 @@ class Ladder(Spread):
         with progress_bar(plan.trials, "ladder") as report:
             timing, results = sweep.complete(self.out, plan, report=report, **shape)
         running.tell_sweep(self.out, plan, results, timing, more=ladder.sections)
+
+
+@dataclass(frozen=True)
+class Ceiling:
+    """Tell how many worlds of a sweep or a ladder can be won: a planner that knows them tries."""
+
+    folder: tyro.conf.Positional[Path]
+    """Run folder of the sweep or the ladder."""
+    lost_by: tuple[str, ...] = ("rps tuned",)
+    """Arms of it; worlds that they all lose are tried."""
+    sample: int = 300
+    """Number of worlds that are tried whoever won them: the first ones."""
+    samples: int = 64
+    """Trials of a world in each round."""
+    rounds: int = 12
+    """Rounds after which a world counts as not won."""
+    device: Device = "auto"
+    quick: bool = False
+    """Whether to try 4 worlds at most with 12 samples in 3 rounds: minutes on two cores."""
+    out: Path | None = None
+    """Run folder, continued if it was killed; by default RUN/ceiling."""
+    spread: Annotated[Spread, tyro.conf.arg(name="")] = Spread()
+
+    def run(self) -> None:
+        """Run what is missing, then write and print the report."""
+        from rps_jax.analysis.report import write_report
+        from rps_jax.record.files import read_results
+        from rps_jax.runs.plan import load_plan
+        from rps_jax.studies import ceiling
+        from rps_jax.trials.setting import progress_bar
+
+        errors.check_count("sample", self.sample, at_least=0, at_most=10_000_000)
+        plan, results = load_plan(self.folder), read_results(self.folder)
+        search = ceiling.Search(self.samples, self.rounds)
+        numbers, _ = ceiling.chosen(results, self.lost_by, self.sample)
+        if self.quick:
+            search, numbers = ceiling.Search(12, 3), numbers[:4]
+        running.choose_device(self.device)
+        mine = ceiling.planned(plan.domain, numbers, plan.setting)
+        out = self.folder / "ceiling" if self.out is None else self.out
+        running.use_cache()
+        with progress_bar(numbers.size * search.samples * search.rounds, "plan") as report:
+            shape = self.spread.shape() | {"report": report}
+            found = ceiling.complete(out, mine, numbers, search, **shape)
+            timing = report.timing
+        running.tell(timing)
+        print(", ".join(f"{name} {value}" for name, value in ceiling.told(found).items()))
+        sections = ceiling.sections(found, results, self.lost_by)
+        print(write_report(out, "Ceiling", f"Worlds of {self.folder}.", sections).read_text())
+        print(f"run folder: {out}")
 
 
 def _on_models(out: Path, plan: Plan, results: Dataset, shape: dict[str, Any]) -> Dataset:

@@ -1,0 +1,143 @@
+"""The ceiling: plans around the law, how they are searched, and what they prove."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import CYLINDERS, refusal, rps
+
+import rps_jax
+from rps_jax import GuidedParams, InputError, Observation, RPSParams, Rules, Search
+from rps_jax.control import guided, law
+from rps_jax.control.law import RPSState
+from rps_jax.record.checkpoint import Parts
+from rps_jax.studies import ceiling
+from rps_jax.trials.trial import Outcome
+
+SHORT = Rules(horizon=20.0)
+SMALL = Search(samples=6, rounds=3, window=10.0)
+
+
+def seen(touched=True):
+    place = jnp.array([0.4, 0.1])
+    return Observation(
+        jnp.zeros(2), jnp.zeros(()), place, jnp.asarray(touched), jnp.array([2.0, 0.5])
+    )
+
+
+def test_without_offsets_a_guided_law_is_the_law():
+    params, state = GuidedParams(), guided.init(GuidedParams())
+    alone = RPSState.init(params.law)
+    for touched in (False, True, True, False):
+        state, twist, _ = guided.step(params, state, seen(touched))
+        alone, expected, _ = law.step_with_details(params.law, alone, seen(touched))
+        assert [float(x) for x in twist] == [float(x) for x in expected]
+    assert int(state.steps) == 4
+
+
+def test_offsets_are_added_in_turn_and_bounded_and_end():
+    """G1 with bounds 0.05 m/s and 0.15 rad/s: the law drives on at 0.05 m/s untouched."""
+    plan = np.array([[-0.5, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    params = GuidedParams(RPSParams.paper(), plan, hold=2)
+    state, twists = guided.init(params), []
+    for _ in range(5):
+        state, twist, _ = guided.step(params, state, seen(False))
+        twists.append([float(x) for x in twist])
+    _, usual, _ = law.step_with_details(params.law, RPSState.init(params.law), seen(False))
+    usual = [float(x) for x in usual]
+    slower = [usual[0] - 0.5 * float(params.law.v_max), *usual[1:]]
+    np.testing.assert_allclose(twists[:2], [slower] * 2, rtol=1e-5, atol=1e-7)
+    turning = float(np.clip(usual[2] + params.law.omega_max, None, params.law.omega_max))
+    np.testing.assert_allclose(twists[2:4], [[*usual[:2], turning]] * 2, rtol=1e-5, atol=1e-7)
+    assert twists[4] == usual
+
+
+@pytest.mark.parametrize("offsets", [np.zeros(3), np.zeros((0, 3)), np.full((2, 3), np.inf)])
+def test_plans_that_mean_nothing_are_refused(offsets):
+    with pytest.raises(InputError, match="offsets"):
+        guided.check(GuidedParams(offsets=offsets))
+
+
+def test_costs_by_hand():
+    """A success costs its time; a failure 1, its miss, a tenth of the gap, and its early end."""
+    zero = np.zeros(4)
+    pose = np.zeros((4, 3))
+    away = pose.copy()
+    away[2, 0] = 2.0
+    outcome = Outcome(
+        success=np.array([True, False, False, False]), time=np.array([30.0, 300, 300, 150]),
+        min_distance=np.array([0.04, 0.5, np.inf, 0.5]), contact_lost_time=zero, path_length=zero,
+        mean_abs_l=zero, tipped=np.array([False, False, False, True]),
+        diverged=np.zeros(4, bool), stalled=np.zeros(4, bool), overflows=zero.astype(int),
+        base_pose=pose, object_pose=away,
+    )  # fmt: skip
+    np.testing.assert_allclose(ceiling.costs(outcome, Rules()), [0.1, 1.5, 6.2, 2.0])
+
+
+def test_weights_go_from_the_best_to_the_mean():
+    cost = np.array([[1.0, 2.0, 3.0]])
+    np.testing.assert_allclose(ceiling._weights(cost, 1e-3)[0], [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(ceiling._weights(cost, 1e6)[0], [1, 1, 1], rtol=1e-5)
+    spread = np.sqrt(2 / 3)
+    np.testing.assert_allclose(ceiling._weights(cost, 1.0)[0, 1], np.exp(-1 / spread))
+    np.testing.assert_allclose(ceiling._weights(np.ones((1, 3)), 0.2)[0], [1, 1, 1])
+
+
+def test_perturbations_belong_to_world_and_round_and_fill_one_window():
+    many = ceiling.perturbations(SMALL, 3, np.array([4, 9]), 1, np.array([300.0, 60.0]))
+    alone = ceiling.perturbations(SMALL, 3, np.array([9]), 1, np.array([60.0]))
+    np.testing.assert_array_equal(many[1], alone[0])
+    assert not many[:, :2].any()
+    # Window 10 s, knots of 5 s, in the second of three rounds: from 100 s and from 20 s on.
+    for row, first in ((0, 20), (1, 4)):
+        used = np.flatnonzero(many[row, 2:].any(axis=(0, 2)))
+        assert used.tolist() == [first, first + 1]
+    other = ceiling.perturbations(SMALL, 3, np.array([9]), 2, np.array([60.0]))
+    assert (other != alone).any()
+
+
+def test_a_search_goes_on_where_it_was_stopped_and_its_plans_win(tmp_path):
+    asked = {"search": SMALL, "split": "tune", "engine": "quasistatic", "rules": SHORT, "slots": 12}
+    whole = rps_jax.ceiling(CYLINDERS, 6, out=tmp_path / "run", **asked)
+    rounds = list(Parts(tmp_path / "run").found().values())
+    assert len(rounds) >= 2
+    rounds[-1].unlink()
+    again = rps_jax.ceiling(CYLINDERS, 6, out=tmp_path / "run", **asked)
+    assert again.identical(whole)
+    assert not whole.solved.all()  # or nothing was searched
+    assert set(whole.trials.values) <= {6, 12, 18}
+    assert (whole.cost.values[whole.solved.values == 0] > 1).all()
+    # Each best plan is a law like any other, and does in a sweep what it did in the search.
+    for world in whole.world.values[:2]:
+        mine = GuidedParams(offsets=whole.offsets.sel(world=world).values)
+        found = rps_jax.sweep(
+            CYLINDERS, {"plan": mine}, worlds=6, engine="quasistatic", rules=SHORT, slots=6
+        )
+        one = found.sel(arm="plan").isel(world=int(world))
+        assert int(one.success) == int(whole.solved.sel(world=world))
+        np.testing.assert_allclose(float(one.time), float(whole.time.sel(world=world)), atol=0.021)
+
+
+@pytest.mark.parametrize("worlds", [[1, 1], [-1], []])
+def test_worlds_that_are_none_are_refused(worlds):
+    with pytest.raises(InputError, match="worlds = "):
+        rps_jax.ceiling(CYLINDERS, worlds)
+
+
+def test_a_search_without_perturbations_is_refused():
+    with pytest.raises(InputError, match="samples = 2"):
+        Search(samples=2)
+
+
+def test_the_command_tries_what_a_law_loses(tmp_path, capsys):
+    run = tmp_path / "run"
+    asked = ["ladder", "--domain", "paper", "--worlds", 6, "--engine", "quasistatic"]
+    asked += ["--laws", "rps tuned", "pursuit", "--slots", 6, "--workers", 1, "--out", run]
+    assert rps(*asked) == 0
+    capsys.readouterr()
+    few = ["--sample", 2, "--samples", 3, "--rounds", 1, "--slots", 6, "--workers", 1]
+    assert rps("ceiling", run, "--lost-by", "pursuit", *few) == 0
+    text = capsys.readouterr().out
+    assert "Ceiling: a planner that knows the world" in text
+    assert "in the first 2 worlds" in text
+    assert (run / "ceiling" / "ceiling.nc").exists()
+    assert "unknown law 'rsp'" in refusal(capsys, "ceiling", run, "--lost-by", "rsp")
