@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from rps_jax.runs.sweep import sweep as sweep
     from rps_jax.studies.ceiling import Search as Search
     from rps_jax.studies.ceiling import ceiling as ceiling
+    from rps_jax.studies.failures.gallery import gallery as gallery
     from rps_jax.studies.ladder import ladder as ladder
     from rps_jax.studies.replication.table import table as table
     from rps_jax.trials.conditions import Conditions as Conditions
@@ -95,6 +96,7 @@ _HOMES = {
     "runs.sweep": ("sweep",),
     "runs.models": ("models",),
     "studies.ceiling": ("Search", "ceiling"),
+    "studies.failures.gallery": ("gallery",),
     "studies.ladder": ("ladder",),
     "studies.replication.table": ("table",),
     "trials.conditions": ("Conditions",),

@@ -3,6 +3,7 @@
 # ruff: noqa: F401
 
 from rps_jax.analysis.figures.law import hysteresis, profile, twist_field
+from rps_jax.analysis.figures.losses import losses
 from rps_jax.analysis.figures.paper import min_distance, one_trial, paths, stills, time_to_success
 from rps_jax.analysis.figures.studies import (
     agreement,

@@ -27,6 +27,7 @@ Command = (
     | Annotated[sweeping.Merge, tyro.conf.subcommand("merge")]
     | Annotated[sweeping.Replay, tyro.conf.subcommand("replay")]
     | Annotated[looking.Film, tyro.conf.subcommand("film")]
+    | Annotated[looking.Gallery, tyro.conf.subcommand("gallery")]
     | Annotated[looking.View, tyro.conf.subcommand("view")]
     | Annotated[tuning.Tune, tyro.conf.subcommand("tune")]
     | Annotated[looking.Doctor, tyro.conf.subcommand("doctor")]

@@ -1,4 +1,4 @@
-"""The commands to look with: film, view, doctor."""
+"""The commands to look with: film, gallery, view, doctor."""
 
 from __future__ import annotations
 
@@ -148,6 +148,42 @@ def _table_of(run: Path) -> Table:
 def _tuples(value: Any) -> Any:
     """JSON's lists as tuples."""
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """Draw maps of what an arm of a sweep lost, by kind, and say what each kind has in common."""
+
+    folder: tyro.conf.Positional[Path]
+    """Run folder of a sweep or a ladder."""
+    arm: str | None = None
+    """Which of its strategies with parameters; by default the first."""
+    each: int = 30
+    """Number of trials of each kind that are followed again and drawn, at most."""
+    out: Path | None = None
+    """Folder of what is made; by default RUN/gallery."""
+
+    def run(self) -> None:
+        """Follow the losses, draw them, and print the report."""
+        import numpy as np
+
+        from rps_jax.record.files import read_results
+        from rps_jax.runs.push import chosen
+        from rps_jax.studies.failures.gallery import gallery, kinds
+        from rps_jax.trials.setting import progress_bar
+
+        errors.check_count("each", self.each, at_most=200)
+        plan, name = chosen(self.folder, 0, self.arm)
+        tell_followed(self.folder, plan)
+        one = read_results(self.folder).sel(arm=name)
+        of_kind = kinds(one, float(plan.setting.rules.max_lost))
+        _, counts = np.unique(of_kind[of_kind != ""], return_counts=True)
+        running.use_cache()
+        with progress_bar(int(np.minimum(counts, self.each).sum()), "follow") as report:
+            gallery(self.folder, name, self.each, self.out, report=report)
+        out = self.out or self.folder / "gallery"
+        print((out / "report.md").read_text())
+        print(f"gallery: {out}")
 
 
 @dataclass(frozen=True)
