@@ -1,0 +1,96 @@
+"""What is proved of the law is searched for counterexamples, in a million states."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rps_jax import InputError, Observation, RPSParams
+from rps_jax.control import law, margins
+from rps_jax.control.law import RPSState
+
+COUNT = 1_000_000
+
+
+def states(seed, params):
+    """Contacts in the critical region, on any object, and targets anywhere."""
+    random = np.random.default_rng(seed)
+    side = random.choice([-1.0, 1.0], COUNT)
+    l = side * random.uniform(float(params.l_cr) + 1e-4, 0.29, COUNT)  # noqa: E741
+    contact = np.stack([np.full(COUNT, 0.36), l], axis=-1)
+    length, bearing = random.uniform(0, 0.6, COUNT), random.uniform(-np.pi, np.pi, COUNT)
+    arm = length[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
+    c, mu = random.uniform(0.02, 0.5, COUNT), random.uniform(0.0, 2.0, COUNT)
+    target = random.uniform(-4, 4, (COUNT, 2))
+    return margins.Touch(contact, arm, c, mu), target
+
+
+def twists(params, touch, target):
+    def one(contact, target):
+        state = RPSState.init(params)
+        seen = Observation(jnp.zeros(2), jnp.zeros(()), contact, jnp.ones((), bool), target)
+        _, twist, details = law.step_with_details(params, state, seen)
+        return jnp.stack(twist), details.realigning, details.distance
+
+    found = jax.jit(jax.vmap(one))(touch.p_robot_contact, target)
+    return [np.asarray(leaf, float) for leaf in found]
+
+
+@pytest.mark.parametrize("params", [RPSParams.paper(), RPSParams.tuned()], ids=["paper", "tuned"])
+def test_a_contact_in_the_critical_region_moves_back_wherever_t4_holds(params):
+    touch, target = states(0, params)
+    twist, realigning, distance = twists(params, touch, target)
+    far = distance > params.d_success
+    assert realigning[far].all()
+    assert np.abs(twist[far, 2]).max() < 1e-4  # [rad/s] Eq. 10, but for rounding
+    arm = np.linalg.norm(touch.p_robot_arm, axis=-1) / touch.c
+    holds = margins.stays(params, touch.mu, arm) & far
+    assert 0.2 * COUNT < holds.sum() < far.sum()  # it is neither empty nor all
+    outwards = margins.drift(twist, touch) * np.sign(touch.p_robot_contact[:, 1])
+    assert (outwards[holds] < 0).all()
+
+
+def test_without_t4_a_contact_may_move_outwards():
+    """With a slope of 1 instead of 10 the condition fails, and counterexamples are found."""
+    params = RPSParams.paper()._replace(a_r_max=1.0)
+    touch, target = states(1, params)
+    twist, _, distance = twists(params, touch, target)
+    far = distance > params.d_success
+    arm = np.linalg.norm(touch.p_robot_arm, axis=-1) / touch.c
+    below = np.arctan(touch.mu) + np.arcsin(arm**2 / (2 + arm**2)) < np.pi / 2
+    outwards = margins.drift(twist, touch) * np.sign(touch.p_robot_contact[:, 1])
+    holds = margins.stays(params, touch.mu, arm) & far
+    assert (outwards[holds] < 1e-9).all()
+    assert (outwards[below & ~holds] > 1e-4).sum() > 100
+    # The bound is nearly reached: some of what breaks it does so by less than two degrees.
+    slope = margins.steepest(touch.mu, arm)
+    assert (np.degrees(np.arctan(slope[outwards > 1e-6])) < 47).any()
+
+
+def test_the_drift_by_hand():
+    """A point ahead of the centre of friction: A = 1 along x and 1 + r^2 / c^2 across."""
+
+    def of(v_y, mu):
+        touch = margins.Touch(
+            np.array([0.36, 0.1]), np.array([-0.3, 0.0]), np.array(0.3), np.array(mu)
+        )
+        return float(margins.drift(np.array([0.02, v_y, 0.0]), touch))
+
+    # Sticking needs a force of slope (v_y / 2) / v_x: at mu = 0.5 up to v_y = v_x.
+    assert of(0.019, 0.5) == 0.0
+    # Beyond, it slips: w_y = 2 mu w_x = 0.02, and the base goes on at 0.05.
+    np.testing.assert_allclose(of(0.05, 0.5), 0.02 - 0.05)
+    # Without friction the point is only pushed ahead.
+    np.testing.assert_allclose(of(0.05, 0.0), -0.05)
+    assert np.isnan(margins.drift(np.array([-0.02, 0.0, 0.0]), margins.Touch(
+        np.array([0.36, 0.1]), np.array([-0.3, 0.0]), np.array(0.3), np.array(0.5)
+    )))  # fmt: skip
+
+
+def test_the_cone_of_motions_by_hand():
+    # r = 0: Coulomb's cone. mu = 0 and r^2 = 2 c^2: asin(2 / 4) = 30 degrees.
+    np.testing.assert_allclose(margins.steepest(0.75, 0.0), 0.75)
+    np.testing.assert_allclose(margins.steepest(0.0, np.sqrt(2)), np.tan(np.pi / 6))
+    assert np.isinf(margins.steepest(1.0, 4.0))
+    with pytest.raises(InputError, match=r"mu = -0\.1"):
+        margins.steepest(-0.1, 0.0)
