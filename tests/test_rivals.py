@@ -124,25 +124,66 @@ def test_rps_plus_translates_near_its_target(target, expected):
 def test_rps_plus_is_the_law_elsewhere():
     params = RPSPlusParams()
     outside = [
-        seen((0.36, 0.05), (0.36 + 0.16, 0.05)),  # farther than d_near
+        seen((0.36, 0.05), (0.36 + 0.26, 0.05)),  # farther than d_near
         seen((0.36, 0.05), (0.36 + 0.04, 0.05)),  # arrived
-        seen((0.36, 0.28), (0.46, 0.3)),  # realigning
+        seen((0.36, 0.28), (2.46, 0.3)),  # realigning
         seen(touching=False),
     ]
     for observation in outside:
-        start = RPSState.init(params.law)
-        for mine, theirs in zip(
-            jax.tree.leaves(rps_plus.step(params, start, observation)),
-            jax.tree.leaves(law.step_with_details(params.law, start, observation)),
-            strict=True,
+        mine = rps_plus.step(params, rps_plus.init(params), observation)
+        theirs = law.step_with_details(params.law, RPSState.init(params.law), observation)
+        for a, b in zip(
+            jax.tree.leaves((mine[0].law, *mine[1:])), jax.tree.leaves(theirs), strict=True
         ):
-            np.testing.assert_array_equal(mine, theirs)
+            np.testing.assert_array_equal(a, b)
     never = params._replace(d_near=0.0)
     near = seen((0.36, 0.05), (0.46, 0.1))
     own = law.step_with_details(params.law, RPSState.init(params.law), near)
     np.testing.assert_array_equal(
         jnp.stack(rps_plus.step(never, rps_plus.init(never), near)[1]), jnp.stack(own[1])
     )
+
+
+def test_rps_plus_translates_near_its_target_even_while_it_realigns():
+    params = RPSPlusParams(RPSParams.tuned()._replace(K_v=0.3))
+    _, twist, details = rps_plus.step(
+        params, rps_plus.init(params), seen((0.36, 0.28), (0.46, 0.28))
+    )
+    assert bool(details.realigning)
+    np.testing.assert_allclose(twist, (0.03, 0.0, 0.0), atol=1e-6)
+
+
+def test_rps_plus_searches_where_it_lost_the_object():
+    """P3 with v_max = 0.05 m/s: ahead 0.035 and aside 0.025, or turning at 0.15 rad/s at most."""
+    params = RPSPlusParams(n_lost=3)
+    state = rps_plus.init(params)
+    state, _, _ = rps_plus.step(params, state, seen((0.36, -0.2), (3.0, 0.0)))
+    np.testing.assert_allclose(state.p_world_felt, (0.36, -0.2), atol=1e-6)
+    gone = seen(target=(3.0, 0.0), touching=False)
+    for n in (1, 2, 3):
+        before = law.step_with_details(params.law, state.law, gone)[1]
+        state, twist, _ = rps_plus.step(params, state, gone)
+        assert int(state.lost) == n
+        np.testing.assert_array_equal(jnp.stack(twist), jnp.stack(before))
+    # The place bears atan2(-0.2, 0.36), off the front, 0.41 m away: it only goes to the right.
+    state, twist, _ = rps_plus.step(params, state, gone)
+    np.testing.assert_allclose(twist, (0.0, -0.025, 0.0), atol=1e-6)
+    # From 0.5 m behind, it bears -0.23 rad: ahead, to the right, and turning right.
+    behind = seen(robot=(-0.5, 0.0), target=(3.0, 0.0), touching=False)
+    state, twist, _ = rps_plus.step(params, state, behind)
+    np.testing.assert_allclose(twist, (0.035, -0.025, -0.15), atol=1e-6)
+    # Felt again, the search has ended.
+    state, _, _ = rps_plus.step(params, state, seen((0.36, 0.0), (3.0, 0.0)))
+    assert int(state.lost) == 0
+
+
+def test_rps_plus_does_not_search_what_it_never_felt():
+    params = RPSPlusParams(n_lost=0)
+    state = rps_plus.init(params)
+    for _ in range(3):
+        state, twist, _ = rps_plus.step(params, state, seen(touching=False))
+    assert int(state.lost) == 0
+    np.testing.assert_allclose(twist, (params.law.v_approach, 0.0, 0.0), atol=1e-7)
 
 
 @pytest.mark.parametrize(
