@@ -1,10 +1,10 @@
 """RPS+: the law of `law`, which translates near its target, and searches a contact that it lost.
 
-The tuned law loses worlds in two ways that touch alone can mend. (A third mend is a number: it
-approaches at 0.03 m/s, where the paper creeps at 0.01 m/s after objects that slide away.) Within arm's length of the target
+The tuned law loses worlds in two ways that touch alone can mend. Within arm's length of the target
 Eq. 6 turns the base to face the target while it drives on, and a wide object that touches off the
 middle, or a realignment, carries it round the target. And a contact that is lost it takes for felt:
-it drives on as if the object were there.
+it drives on as if the object were there. A third mend is a number: RPS+ approaches at 0.03 m/s,
+where the paper creeps at 0.01 m/s after objects that may slide away.
 
 A holonomic base need not turn: any velocity of the contact point can be had by translation. With C
 the contact point (while none is felt, where the skin was touched last), d from C to the target T,
