@@ -84,6 +84,16 @@ def test_worlds_of_several_objects_keep_their_order(tmp_path):
     ]
 
 
+def test_worlds_are_filmed_by_their_indices(tmp_path):
+    plan = plan_of("random_cylinder", "random_box")
+    chosen = film.worlds_of(plan, (2, 1))
+    takes = film.of_sweep(tmp_path, plan, ["rps"], chosen, (1, 3))
+    assert film._placed([take.labels for take in takes], takes) == ["world 2", "world 1"]
+    for wrong in ((1, 1), (-1,), (plan.worlds,)):
+        with pytest.raises(InputError, match="worlds"):
+            film.worlds_of(plan, wrong)
+
+
 def test_several_laws_have_a_row_each_and_a_world_a_column(tmp_path):
     one = plan_of("random_box", "random_cylinder")
     plan = dataclasses.replace(one, arms={"one": RPSParams.paper(), "two": RPSParams.nps()})

@@ -72,8 +72,20 @@ def of_cases(cases: Sequence[Case], setting: Setting) -> list[Take]:
     return [Take(range(len(cases)), part, strategy, [one] * len(cases), labels)]
 
 
+def worlds_of(plan: Plan, worlds: Sequence[int]) -> Sequence[int]:
+    """The same indices, if the plan has these worlds; otherwise an InputError."""
+    errors.check_each_once("worlds", worlds)
+    for world in worlds:
+        errors.check_count("worlds", world, at_least=0, at_most=plan.worlds - 1)
+    return worlds
+
+
 def of_sweep(
-    run: Path, plan: Plan, arms: Sequence[str], which: str, shape: tuple[int, int]
+    run: Path,
+    plan: Plan,
+    arms: Sequence[str],
+    which: str | Sequence[int],
+    shape: tuple[int, int],
 ) -> list[Take]:
     """The takes of worlds of a sweep: of one arm, or a row of the grid for each of several.
 
@@ -81,17 +93,20 @@ def of_sweep(
       run: its folder.
       plan: its plan.
       arms: some of the plan's; several meet the same worlds, one a column.
-      which: `first`, those of the least index; `hardest`, as the report of the sweep has them.
+      which: `first`, those of the least index; `hardest`, as the report of the sweep has them;
+        or their indices.
       shape: rows and columns of the grid.
 
     Raises:
       InputError: an unknown choice, an engine that is not followed, or no results to choose by.
     """
-    errors.check_name("which", which, WHICH)
     engines.get(plan.setting.engine).check_followed()
     count = shape[0] * shape[1] if len(arms) == 1 else shape[1]
-    index = np.arange(min(count, plan.worlds))
-    if which == "hardest":
+    if not isinstance(which, str):
+        index = np.asarray(which[:count], int)
+    elif errors.check_name("which", which, WHICH) == "first":
+        index = np.arange(min(count, plan.worlds))
+    else:
         index = statistics.hardest(files.read_results(run), count)
         if not index.size:
             raise InputError("which = hardest is not allowed: no trial of this run failed.")

@@ -41,6 +41,8 @@ class Film:
     strategy: Strategy = "rps"
     which: Literal["first", "hardest"] = "first"
     """Whether the first or the hardest worlds of a sweep are filmed."""
+    worlds: tuple[int, ...] = ()
+    """Indices of the worlds of a sweep that are filmed, instead of --which."""
     arm: str | None = None
     """Which of a sweep's strategies with parameters; by default the first."""
     arms: tuple[str, ...] = ()
@@ -108,7 +110,8 @@ class Film:
             if self.arms:
                 film.rows_of(plan, self.arms, shape)
             arms = self.arms or (arm,)
-            return film.of_sweep(self.folder, plan, arms, self.which, shape), plan.setting
+            which = film.worlds_of(plan, self.worlds) if self.worlds else self.which
+            return film.of_sweep(self.folder, plan, arms, which, shape), plan.setting
         table = _table_of(self.folder)
         for field, name in (
             ("objects", self.object),
