@@ -88,6 +88,7 @@ def test_the_command_reports_information_against_success(tmp_path, capsys):
     asked += ["--laws", "rps tuned", "pursuit", "--slots", 6, "--workers", 1, "--out", out]
     assert rps(*asked) == 0
     text = capsys.readouterr().out
+    assert "## Models" not in text
     for heading in ("Information against success", "Against rps tuned, world by world"):
         assert f"## {heading}" in text
     assert "by none" in text

@@ -126,6 +126,9 @@ class Ladder(Spread):
     seed: int = 0
     """Seed whose worlds for testing are taken."""
     device: Device = "auto"
+    models: bool = False
+    """Whether to run the same worlds on other grounds, cones and steps and in the quasi-static
+    model, too, and to report how much the rates hang on these."""
     quick: bool = False
     """Whether to take 64 worlds where no number is asked for, of two kinds of objects at most:
     minutes on two cores."""
@@ -161,7 +164,10 @@ class Ladder(Spread):
         running.use_cache()
         with progress_bar(plan.trials, "ladder") as report:
             timing, results = sweep.complete(self.out, plan, report=report, **shape)
-        running.tell_sweep(self.out, plan, results, timing, more=ladder.sections)
+        models = None
+        if self.models and results is not None:
+            models = _on_models(self.out, plan, results, shape)
+        running.tell_sweep(self.out, plan, results, timing, models, ladder.sections)
 
 
 @dataclass(frozen=True)
