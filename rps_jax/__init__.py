@@ -69,6 +69,8 @@ if TYPE_CHECKING:
     from rps_jax.world.objects import register_object as register_object
     from rps_jax.world.physics import PHYSICS as PHYSICS
     from rps_jax.world.physics import Physics as Physics
+    from rps_jax.world.points import points_of as points_of
+    from rps_jax.world.points import worlds_at as worlds_at
     from rps_jax.world.scene import FRICTION as FRICTION
     from rps_jax.world.scene import Friction as Friction
 
@@ -108,6 +110,7 @@ _HOMES = {
     "world.domain": ("DOMAINS", "Domain", "Range"),
     "world.objects": ("OBJECTS", "register_object"),
     "world.physics": ("PHYSICS", "Physics"),
+    "world.points": ("points_of", "worlds_at"),
     "world.scene": ("FRICTION", "Friction"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}

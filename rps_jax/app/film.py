@@ -110,7 +110,7 @@ def of_sweep(
         index = statistics.hardest(files.read_results(run), count)
         if not index.size:
             raise InputError("which = hardest is not allowed: no trial of this run failed.")
-    of_object = plan.domain.object_of(index)
+    of_object = plan.object_of(index)
     takes = []
     for row, arm in enumerate(arms):
         said = f"{arm}, " if len(arms) > 1 else ""

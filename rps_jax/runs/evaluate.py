@@ -27,9 +27,11 @@ from rps_jax.trials.results import UNITS
 from rps_jax.trials.setting import Report, Setting, Timing, unheard
 from rps_jax.trials.trial import Outcome, Rules
 from rps_jax.trials.worlds import drawn_worlds, remembered_steps
+from rps_jax.world import points
 from rps_jax.world.domain import Domain, named
-from rps_jax.world.draws import draw, table
+from rps_jax.world.draws import Draw, table
 from rps_jax.world.physics import Fidelity, PhysicsName, preset
+from rps_jax.world.points import Points
 
 Split = Literal["tune", "validate", "test"]
 
@@ -46,7 +48,7 @@ def seed_of(seed: int, split: Split) -> int:
 def evaluate(
     params: Params,
     domain: Domain | str = "wide",
-    worlds: int = 256,
+    worlds: int | xr.Dataset | np.ndarray = 256,
     seed: int = 0,
     split: Split = "tune",
     *,
@@ -69,8 +71,9 @@ def evaluate(
       params: parameters of any registered strategy, a pytree whose leaves are all (P, ...): one
         entry for each of P candidates.
       domain: ranges of what differs between worlds, or their name in `DOMAINS`.
-      worlds: how many each candidate meets, of indices 0, 1, ...
-      seed: of the worlds.
+      worlds: how many each candidate meets, of indices 0, 1, ...; or points of the unit cube, as
+        `worlds_at` has them.
+      seed: of the worlds, unless they are points.
       split: what the worlds are for; those of two splits differ, whatever the seeds.
       engine: what steps them.
       physics: how friction is modelled.
@@ -101,12 +104,13 @@ def evaluate(
       (4,)
     """
     domain = named(domain, robot)
-    errors.check_count("worlds", worlds, at_most=10_000_000)
+    count, at = points.asked(domain, worlds)
+    errors.check_count("worlds", count, at_most=10_000_000)
     errors.check_count("seed", seed, at_least=0, at_most=2**30)
     setting = Setting(preset(physics, fidelity), rules, engine=engine)
     engines.get(engine).check(domain.families)
     batch.check_shape(slots, workers)
-    ask = Ask(_checked(params), seed_of(seed, split), np.arange(worlds))
+    ask = Ask(_checked(params), seed_of(seed, split), np.arange(count), at)
     shape = {"slots": slots, "workers": workers}
     (answer,), _ = try_out([ask], [domain], setting, objective, report=report, **shape)
     variables: dict[str, Any] = {
@@ -156,14 +160,14 @@ def _checked(params: Params) -> Params:
 
 def _drawn(domain: Domain, ask: Ask) -> dict[str, Any]:
     """Coordinates of the worlds of an ask: their indices, objects, and what was drawn."""
-    which = domain.object_of(ask.worlds)
+    which = ask.object_of(domain)
     columns: dict[str, Any] = {
         "world": ask.worlds,
         "object": ("world", np.array(domain.objects)[which]),
     }
     for thing in np.unique(which):
         rows = np.flatnonzero(which == thing)
-        drawn = draw(domain, ask.seed, ask.worlds[rows])
+        drawn = ask.draw(domain, rows)
         for name, (values, unit) in table(drawn).items():
             empty = ("world", np.empty(which.size), {"units": unit})
             columns.setdefault(name, empty)[1][rows] = values
@@ -179,11 +183,20 @@ class Ask(NamedTuple):
     params: Params  # leaves (P, ...)
     seed: int  # of the worlds
     worlds: np.ndarray  # (W,) their indices, in each of the D domains
+    points: Points | None = None  # of the unit cube at which the worlds lie; None: drawn ones
 
     @property
     def candidates(self) -> int:
         """How many candidates there are, P."""
         return jax.tree.leaves(self.params)[0].shape[0]
+
+    def object_of(self, domain: Domain) -> np.ndarray:
+        """Which of a domain's objects each of the worlds (W,) has."""
+        return domain.object_of(points.cases(domain, self.points, self.worlds))
+
+    def draw(self, domain: Domain, rows: np.ndarray) -> Draw:
+        """Some of the worlds (W,), all of one object."""
+        return points.draw(domain, self.seed, self.points, self.worlds[rows])
 
 
 class Answer(NamedTuple):
@@ -253,10 +266,10 @@ def parts(
 ) -> Iterator[tuple[Part, np.ndarray, np.ndarray]]:
     """Worlds of an ask by domain and object, their columns, and the targets' distances [m]."""
     for d, one in enumerate(domains):
-        which = one.object_of(ask.worlds)
+        which = ask.object_of(one)
         for thing in np.unique(which):
             rows = np.flatnonzero(which == thing)
-            drawn = draw(one, ask.seed, ask.worlds[rows])
+            drawn = ask.draw(one, rows)
             part = drawn_worlds(one, drawn, RPSParams(), setting)
             yield part, d * ask.worlds.size + rows, np.linalg.norm(drawn.p_world_target, axis=1)
 

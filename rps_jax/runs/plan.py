@@ -29,10 +29,11 @@ from rps_jax.trials.batch import Part
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.trials.worlds import drawn_scene, drawn_worlds
-from rps_jax.world import domain, draws
+from rps_jax.world import domain, draws, points
 from rps_jax.world.domain import Domain
 from rps_jax.world.draws import Draw
 from rps_jax.world.physics import Physics
+from rps_jax.world.points import Points
 from rps_jax.world.scene import Scene
 
 Kind = tuple[Any, ...]  # of a part: the object's number, and the form of the arm's parameters
@@ -40,13 +41,14 @@ Kind = tuple[Any, ...]  # of a part: the object's number, and the form of the ar
 
 @dataclass(frozen=True)
 class Plan:
-    """What is run: every arm in the worlds 0 to `worlds` - 1 of a domain."""
+    """What is run: every arm in the worlds 0 to `worlds` - 1 of a domain, or of its `points`."""
 
     domain: Domain
     worlds: int
     arms: Mapping[str, Params]
     setting: Setting = Setting()  # its seed draws the worlds, too
     part: int = 1024  # trials of a part, at most
+    points: Points | None = None  # of the unit cube at which the worlds lie; None: drawn ones
 
     def __post_init__(self) -> None:
         """Raises InputError for no worlds, no arms, or parameters that mean nothing."""
@@ -56,6 +58,8 @@ class Plan:
             raise InputError("arms = {} is not allowed: name at least one strategy.")
         for params in self.arms.values():
             strategies.of(params).check(params)
+        if self.points is not None and len(self.points.u) != self.worlds:
+            raise InputError(f"worlds = {self.worlds} is not allowed: {len(self.points.u)} points.")
 
     def check_here(self) -> None:
         """Raises InputError unless the engine can step these worlds on this machine."""
@@ -82,15 +86,20 @@ class Plan:
         """How many trials one shard has."""
         return sum(numbers.size for numbers in share(self, shard).values())
 
+    def object_of(self, index: np.ndarray) -> np.ndarray:
+        """Which of the domain's objects the worlds `index` have."""
+        return self.domain.object_of(points.cases(self.domain, self.points, index))
+
     @functools.cached_property
     def blocks(self) -> int:
         """Parts of one arm and one object, at most."""
-        return math.ceil(self.worlds_of(0).size / self.part)
+        of_objects = np.bincount(self.object_of(np.arange(self.worlds)))
+        return math.ceil(of_objects.max() / self.part)
 
     def worlds_of(self, which: int) -> np.ndarray:
         """Indices of the worlds with the object `which` of the domain, in order."""
         every = np.arange(self.worlds)
-        return every[self.domain.object_of(every) == which]
+        return every[self.object_of(every) == which]
 
     @functools.cached_property
     def parts(self) -> dict[int, np.ndarray]:
@@ -135,6 +144,8 @@ class Plan:
             "engine": self.setting.engine,
             "part": self.part,
         }
+        if self.points is not None:
+            whole["points"] = self.points.digest
         return whole
 
 
@@ -157,7 +168,10 @@ def open_run(folder: Path, plan: Plan) -> Path:
     Raises:
       InputError: it cannot be written, or holds a run of another configuration.
     """
-    return run_folder.claim(folder, plan.configuration())
+    run_folder.claim(folder, plan.configuration())
+    if plan.points is not None:
+        plan.points.write(folder, plan.domain)
+    return folder
 
 
 def load_plan(folder: Path) -> Plan:
@@ -182,6 +196,8 @@ def load_plan(folder: Path) -> Plan:
         )
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise files.corrupt(folder / run_folder.MANIFEST, error) from error
+    if "points" in found:
+        plan = dataclasses.replace(plan, points=Points.read(folder, str(found["points"])))
     # What an older version did not write down would else be what this one does by default.
     if (now := json.loads(json.dumps(plan.configuration()))) != found:
         raise InputError(
@@ -199,7 +215,7 @@ def share(plan: Plan, shard: Shard) -> dict[int, np.ndarray]:
 
 def draw(plan: Plan, index: Any) -> Draw:
     """What is drawn for worlds of one object, by their indices."""
-    return draws.draw(plan.domain, plan.setting.seed, index)
+    return points.draw(plan.domain, plan.setting.seed, plan.points, index)
 
 
 def scene_of(plan: Plan, index: int) -> Scene:
@@ -210,7 +226,7 @@ def scene_of(plan: Plan, index: int) -> Scene:
 def title_of(plan: Plan, index: int) -> str:
     """What one world is, in words."""
     drawn = draws.table(draw(plan, [index]))
-    name = plan.domain.objects[int(plan.domain.object_of(np.asarray(index)))].replace("_", " ")
+    name = plan.domain.objects[int(plan.object_of(np.asarray(index)))].replace("_", " ")
     value = {key: float(values[0]) for key, (values, _) in drawn.items()}
     return (
         f"world {index}: {name}, {value['mass']:.1f} kg, $\\mu$ ground "

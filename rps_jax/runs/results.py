@@ -131,7 +131,7 @@ def dataset(plan: Plan, contents: Mapping[int, bytes]) -> xr.Dataset:
       InputError: a part was made by another version of this code.
     """
     every = np.arange(plan.worlds)
-    columns = {"which_object": xr.Variable("world", plan.domain.object_of(every).astype(np.int16))}
+    columns = {"which_object": xr.Variable("world", plan.object_of(every).astype(np.int16))}
     for name, (unit, meaning) in UNITS.items():
         dims = ("arm", "world", "pose") if name.endswith("pose") else ("arm", "world")
         shape = (len(plan.arms), plan.worlds, 3)[: len(dims)]

@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
 from rps_jax.control import strategies
@@ -36,6 +37,7 @@ from rps_jax.trials import batch
 from rps_jax.trials.batch import Job, Part
 from rps_jax.trials.setting import Progress, Report, Setting, Timing, unheard
 from rps_jax.trials.trial import Rules
+from rps_jax.world import points
 from rps_jax.world.domain import Domain, named
 from rps_jax.world.draws import table
 from rps_jax.world.physics import Fidelity, PhysicsName, preset
@@ -46,7 +48,7 @@ _AHEAD = 16384  # worlds of a kind that are made before they are asked for, abou
 def sweep(
     domain: Domain | str,
     arms: Mapping[str, Params],
-    worlds: int = 1000,
+    worlds: int | xr.Dataset | np.ndarray = 1000,
     seed: int = 0,
     engine: EngineName = "fused",
     out: str | Path | None = None,
@@ -65,8 +67,8 @@ def sweep(
     Args:
       domain: ranges of what differs between worlds, or their name in `DOMAINS`.
       arms: names and parameters of any strategies.
-      worlds: how many, of indices 0, 1, ...
-      seed: of the worlds.
+      worlds: how many, of indices 0, 1, ...; or points of the unit cube, as `worlds_at` has them.
+      seed: of the worlds, unless they are points.
       engine: what steps them.
       out: run folder, in which a sweep that was killed is continued; None keeps all in memory.
       physics: how friction is modelled.
@@ -93,7 +95,9 @@ def sweep(
       {'arm': 2, 'world': 4}
     """
     setting = Setting(preset(physics, fidelity), rules, seed, engine)
-    plan = Plan(named(domain, robot), worlds, arms, setting, part)
+    chosen = named(domain, robot)
+    count, at = points.asked(chosen, worlds)
+    plan = Plan(chosen, count, arms, setting, part, at)
     plan.check_here()
     shape = {"slots": slots, "workers": workers, "report": report}
     return whole(plan, None if out is None else Path(out), **shape)

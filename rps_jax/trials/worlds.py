@@ -69,7 +69,7 @@ def _family_of(model: mjx.Model) -> str:
 
 def drawn_worlds(domain: Domain, drawn: Draw, params: Params, setting: Setting) -> Part:
     """The worlds of a draw as a part of a job, all with the same parameters."""
-    family = domain.family_of(drawn.number[0])
+    family = domain.family_of(drawn.case[0])
     count, dtype = drawn.number.size, jnp.zeros(()).dtype
     engine, robots = engines.get(setting.engine), drawn.robot
     engine.check_robot(robots)
@@ -133,12 +133,12 @@ def _odometry(domain: Domain, drawn: Draw, period: float) -> Odometry:
 
 def drawn_scene(domain: Domain, drawn: Draw, physics: Physics, i: int) -> Scene:
     """The compiled scene of the i-th world of a draw, for pictures: with its looks, if it has."""
-    index = int(drawn.number[i])
-    name = domain.objects[int(domain.object_of(drawn.number[i]))]
+    case = int(drawn.case[i])
+    name = domain.objects[int(domain.object_of(drawn.case[i]))]
     if name in RANDOM:
         robots = drawn.robot
         return scene.of_solid(
-            domain.family_of(index), drawn.solid, drawn.friction, physics, i, robots
+            domain.family_of(case), drawn.solid, drawn.friction, physics, i, robots
         )
     ground, robot = (float(leaf[i]) for leaf in drawn.friction)
     return scene.load(name, physics, Friction(ground, robot), robot=domain.robot)

@@ -27,6 +27,7 @@ class Draw(NamedTuple):
     """Worlds of one object or shape family, as drawn; leaves lead with their number, n."""
 
     number: np.ndarray  # (n,) their indices
+    case: np.ndarray  # (n,) indices that have their object, and their friction and target of a list
     solid: Solid
     friction: Friction  # (n,) each
     lateral: np.ndarray  # (n,) [m]
@@ -46,7 +47,7 @@ class Draw(NamedTuple):
 
 
 # Which random number of a world is what; a new quantity goes to the end.
-_USES = (
+USES = (
     *("mass", "size", "aspect", "height", "com_offset", "com_bearing"),
     *("friction_ground", "friction_robot", "lateral", "yaw", "gap", "distance", "bearing"),
     *("noise", "gain_spread", "dead_share", "pose_noise", "yaw_noise", "pose_latency"),
@@ -70,8 +71,8 @@ def draw(domain: Domain, seed: int, index: ArrayLike) -> Draw:
 
 
 def drawn_at(domain: Domain, index: np.ndarray, numbers: np.ndarray) -> Draw:
-    """Worlds of the same object, from their random numbers (n, _COLUMNS)."""
-    u = dict(zip(_USES, numbers.T, strict=False))
+    """Worlds of the same object, from their random numbers (n, at least those of `USES`)."""
+    u = dict(zip(USES, numbers.T, strict=False))
     name = domain.objects[int(domain.object_of(index[0]))]
     ranges = {name: getattr(domain, name) for name in ALLOWED if name in u}
     at = {name: one.at(u[name]) for name, one in ranges.items() if one is not None}
@@ -83,6 +84,7 @@ def drawn_at(domain: Domain, index: np.ndarray, numbers: np.ndarray) -> Draw:
     key = [np.floor(u[name] * 2**32).astype(np.uint32) for name in ("key_0", "key_1")]
     return Draw(
         number=index,
+        case=index,
         solid=_solid(name, at, u),
         friction=_friction(domain, index, at),
         p_world_target=_targets(domain, index, at),

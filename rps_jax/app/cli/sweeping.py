@@ -47,6 +47,9 @@ class Sweep(Spread):
     changes to the paper's, as {"L": 0.3}."""
     worlds: int | None = None
     """Number of worlds; by default 1000, or the whole grid of a domain with listed targets."""
+    points: Path | None = None
+    """Points of the domain's unit cube at which the worlds lie, instead of drawn ones: a NetCDF file
+    of what rps_jax.worlds_at returned, as points.nc of a run folder."""
     robot: str | None = None
     """The robot: ideal, kairos (the paper's), ridgeback or mpo_500, or a JSON file of its limits.
     By default the domain's, which is ideal but in the domain real."""
@@ -73,9 +76,11 @@ class Sweep(Spread):
 
     def plan(self) -> Plan:
         """What is run."""
+        from rps_jax.record import files
         from rps_jax.runs.plan import Plan
         from rps_jax.trials.setting import Setting
         from rps_jax.trials.trial import Rules
+        from rps_jax.world import points
         from rps_jax.world.physics import preset
 
         domain = parsing.domain_of(self.domain, self.change, self.robot)
@@ -83,7 +88,12 @@ class Sweep(Spread):
         arms = parsing.sweep_arms(self.strategies, self.params)
         physics = preset(self.physics, self.fidelity)
         setting = Setting(physics, Rules(horizon=self.horizon), self.seed, self.engine)
-        return Plan(domain, every if self.worlds is None else self.worlds, arms, setting, self.part)
+        count, at = every if self.worlds is None else self.worlds, None
+        if self.points is not None:
+            if self.worlds is not None:
+                raise InputError("worlds is not allowed with points: the file says how many.")
+            count, at = points.asked(domain, files.read(self.points))
+        return Plan(domain, count, arms, setting, self.part, at)
 
     def run(self) -> None:
         """Run what is missing, then write and print the report."""
