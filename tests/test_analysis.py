@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import xarray as xr
+from scipy import stats
 
 from rps_jax.analysis import figures, report, statistics, tables
 from rps_jax.analysis.figures import paper, studies, style, sweeps
@@ -229,3 +230,49 @@ def test_a_report_is_one_html_file_that_needs_no_other(tmp_path):
     assert "dot.png" not in page
     assert "A &lt;title&gt;" in page
     assert "![Numbers](dot.png)" in (tmp_path / "report.md").read_text()
+
+
+# --- bounds that hold ----------------------------------------------------------------------
+
+
+def test_exact_bounds_by_hand():
+    # No failure in n worlds: the upper end solves (1 - p)^n = 0.025.
+    low, high = statistics.clopper_pearson(0, 50)
+    assert low == 0
+    assert high == pytest.approx(1 - 0.025 ** (1 / 50))
+    assert statistics.clopper_pearson(50, 50) == pytest.approx((1 - high, 1))
+    assert statistics.clopper_pearson(0, 0) == (0, 1)
+    # One-sided, and for the best of ten: (1 - p)^n = 0.05 and 0.005.
+    assert statistics.fails_at_most(0, 50) == pytest.approx(1 - 0.05 ** (1 / 50))
+    assert statistics.fails_at_most(0, 50, 10) == pytest.approx(1 - 0.005 ** (1 / 50))
+
+
+def test_the_exact_interval_covers_rare_rates_where_wilsons_does_not():
+    p, n = 0.003, 100
+    chance = stats.binom.pmf(np.arange(n + 1), n, p)
+    covered = {
+        of: sum(c for k, c in enumerate(chance) if of(k, n)[0] <= p <= of(k, n)[1])
+        for of in (statistics.wilson, statistics.clopper_pearson)
+    }
+    assert covered[statistics.clopper_pearson] >= 0.95
+    assert statistics.clopper_pearson(7, 100)[0] < statistics.wilson(7, 100)[0]
+
+
+def test_the_bound_of_the_best_of_many_holds_where_the_plain_one_fails():
+    """Twenty candidates that all fail in a tenth of the worlds; the luckiest is picked."""
+    rng = np.random.default_rng(0)
+    least = rng.binomial(200, 0.1, (2000, 20)).min(axis=1)
+    bound = {n: [statistics.fails_at_most(k, 200, n) >= 0.1 for k in least] for n in (1, 20)}
+    assert np.mean(bound[20]) >= 0.95
+    assert np.mean(bound[1]) < 0.6
+
+
+def test_the_interval_of_cvar_covers():
+    """Of an exponential law the CVaR of the tail t is 1 - log t."""
+    rng = np.random.default_rng(0)
+    ends = np.array([statistics.cvar_interval(rng.exponential(size=400), 0.05) for _ in range(400)])
+    truth = 1 - np.log(0.05)
+    assert np.mean((ends[:, 0] <= truth) & (truth <= ends[:, 1])) > 0.9
+    one = statistics.cvar_interval(np.arange(10.0), 0.05)
+    assert one == (0, np.inf)  # of a single value nothing is known
+    assert statistics.cvar_interval(np.zeros(100)) == (0, 0)

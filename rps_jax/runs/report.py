@@ -26,15 +26,17 @@ def write_report(
     `models` are outcomes of the same worlds on several models, (model, arm, world). What a study
     has to say beyond that is `more`, which then stands for the differences of all pairs.
     """
+    source = f"seed {plan.setting.seed}" if plan.points is None else "points of the unit cube"
     intro = (
-        f"{plan.worlds} worlds, seed {plan.setting.seed}, engine {plan.setting.engine}, "
+        f"{plan.worlds} worlds, {source}, engine {plan.setting.engine}, "
         f"{1000 * plan.setting.physics.timestep:g} ms steps; every arm meets the same worlds. "
-        f"Intervals: Wilson 95 %.\n\n{provenance.told(folder)}"
+        f"Intervals: Wilson 95 %; bounds of failures: Clopper-Pearson 95 %.\n\n{provenance.told(folder)}"
     )
     rates = tables.success_table(results, float(plan.setting.rules.max_lost))
     failures = (
         "CVaR: mean over the worst 5 % of worlds of the least distance between contact point and "
-        "target; of an object that was never touched, the whole way."
+        "target; of an object that was never touched, the whole way. "
+        f"{statistics.NOT_PROMISED}"
     )
     if lost := int((results.overflows.values > 0).sum()):
         failures += f" {lost} trials lost contacts for want of room: they are not to be trusted."
