@@ -30,7 +30,8 @@ def write_report(
     intro = (
         f"{plan.worlds} worlds, {source}, engine {plan.setting.engine}, "
         f"{1000 * plan.setting.physics.timestep:g} ms steps; every arm meets the same worlds. "
-        f"Intervals: Wilson 95 %; bounds of failures: Clopper-Pearson 95 %.\n\n{provenance.told(folder)}"
+        f"Intervals: Wilson 95 %; bounds of failures: Clopper-Pearson 95 %.\n\n"
+        f"{provenance.told(folder)}"
     )
     rates = tables.success_table(results, float(plan.setting.rules.max_lost))
     failures = (

@@ -48,8 +48,8 @@ class Sweep(Spread):
     worlds: int | None = None
     """Number of worlds; by default 1000, or the whole grid of a domain with listed targets."""
     points: Path | None = None
-    """Points of the domain's unit cube at which the worlds lie, instead of drawn ones: a NetCDF file
-    of what rps_jax.worlds_at returned, as points.nc of a run folder."""
+    """Points of the domain's unit cube at which the worlds lie, instead of drawn ones: a NetCDF
+    file of what rps_jax.worlds_at returned, as points.nc of a run folder."""
     robot: str | None = None
     """The robot: ideal, kairos (the paper's), ridgeback or mpo_500, or a JSON file of its limits.
     By default the domain's, which is ideal but in the domain real."""
