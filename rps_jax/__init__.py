@@ -49,6 +49,12 @@ if TYPE_CHECKING:
     from rps_jax.studies.ceiling import Search as Search
     from rps_jax.studies.ceiling import ceiling as ceiling
     from rps_jax.studies.failures.gallery import gallery as gallery
+    from rps_jax.studies.failures.attack import Hunt as Hunt
+    from rps_jax.studies.failures.attack import attack as attack
+    from rps_jax.studies.failures.rare import Splitting as Splitting
+    from rps_jax.studies.failures.rare import rare as rare
+    from rps_jax.studies.failures.regress import regress as regress
+    from rps_jax.studies.failures.sobol import sensitivity as sensitivity
     from rps_jax.studies.ladder import ladder as ladder
     from rps_jax.studies.replication.table import table as table
     from rps_jax.trials.conditions import Conditions as Conditions
@@ -99,6 +105,10 @@ _HOMES = {
     "runs.models": ("models",),
     "studies.ceiling": ("Search", "ceiling"),
     "studies.failures.gallery": ("gallery",),
+    "studies.failures.attack": ("Hunt", "attack"),
+    "studies.failures.rare": ("Splitting", "rare"),
+    "studies.failures.regress": ("regress",),
+    "studies.failures.sobol": ("sensitivity",),
     "studies.ladder": ("ladder",),
     "studies.replication.table": ("table",),
     "trials.conditions": ("Conditions",),

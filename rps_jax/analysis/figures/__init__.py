@@ -2,6 +2,7 @@
 
 # ruff: noqa: F401
 
+from rps_jax.analysis.figures.failures import archive, interactions, search, sobol, splitting
 from rps_jax.analysis.figures.law import hysteresis, profile, twist_field
 from rps_jax.analysis.figures.losses import losses
 from rps_jax.analysis.figures.paper import min_distance, one_trial, paths, stills, time_to_success

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import tyro
 
-from rps_jax.app.cli import looking, replicating, sweeping, tuning
+from rps_jax.app.cli import failing, looking, replicating, sweeping, tuning
 from rps_jax.app.cli.running import guarded
 
 Command = (
@@ -29,6 +29,10 @@ Command = (
     | Annotated[looking.Film, tyro.conf.subcommand("film")]
     | Annotated[looking.Gallery, tyro.conf.subcommand("gallery")]
     | Annotated[looking.View, tyro.conf.subcommand("view")]
+    | Annotated[failing.Sensitivity, tyro.conf.subcommand("sensitivity")]
+    | Annotated[failing.Rare, tyro.conf.subcommand("rare")]
+    | Annotated[failing.Attack, tyro.conf.subcommand("attack")]
+    | Annotated[failing.Regress, tyro.conf.subcommand("regress")]
     | Annotated[tuning.Tune, tyro.conf.subcommand("tune")]
     | Annotated[looking.Doctor, tyro.conf.subcommand("doctor")]
 )
