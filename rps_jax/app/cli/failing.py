@@ -199,7 +199,7 @@ class Rare(Failing):
 
         how = self if not self.quick else dataclasses.replace(self, particles=200, groups=4)
         splitting = rare.Splitting(how.particles, how.groups, self.share, beyond=self.beyond)
-        domain, (name, params), setting = self.ranges(), self.law(), self.setting()
+        domain, (_, params), setting = self.ranges(), self.law(), self.setting()
         errors.check_count("brute", self.brute, at_least=0, at_most=1_000_000_000)
         shape = self.shape()
         if self.quick:
@@ -323,8 +323,8 @@ class Attack(Failing):
         cells = found.margin.size
         text = (
             f"{int(found.failing[-1])} of {cells} cells hold a failure, after "
-            f"{int(found.trials[-1]):,} worlds and {float(found.simulated[-1]):,.0f} s of simulated "
-            f"time: {gain['search']:.2f} an hour. {found.attrs['drawn_trials']} trials of drawn "
+            f"{int(found.trials[-1]):,} trials and {float(found.simulated[-1]):,.0f} s of "
+            f"simulated time: {gain['search']:.2f} an hour. {found.attrs['drawn_trials']} trials of drawn "
             f"worlds found {found.attrs['drawn_failing']}: {gain['drawn']:.2f} an hour. So the "
             f"search finds {gain['times']:.1f} times as many, and at least "
             f"{gain['times_low']:.1f} times (95 %)."

@@ -4,8 +4,9 @@ An archive has a cell for each small range of three quantities, and of each obje
 in a cell stands the severest trial that was met there. Emitters propose worlds: some follow
 CMA-ME or CMA-MAE (Fontaine and Nikolaidis, 2020 and 2023) towards where the archive improves, some
 mix elites along lines between them (Vassiliades and Mouret, 2018). Into their archives only near
-misses and failures are let, and failures alone when there are enough of these. They move in the normal quantiles of what the domain draws from
-ranges; of the others, noise and corners of prisms, every world has its own, by chance.
+misses and failures are let, and failures alone when there are enough of these. They move in the
+normal quantiles of what the domain draws from ranges; of the others, noise and corners of prisms,
+every world has its own, by chance.
 """
 
 from __future__ import annotations

@@ -204,7 +204,8 @@ def rare(
     Example:
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=1.0)
-      >>> few, setting = rps_jax.Splitting(40, groups=2), rps_jax.Setting(rules=rules, engine="fused")
+      >>> few = rps_jax.Splitting(40, groups=2)
+      >>> setting = rps_jax.Setting(rules=rules, engine="fused")
       >>> found = rps_jax.rare(rps_jax.RPSParams.paper(), drums, how=few, setting=setting)
       >>> float(found.p)  # within a second no push is done
       1.0
@@ -267,8 +268,9 @@ def table(found: xr.Dataset, against: Estimate | None = None) -> list[list[str]]
 
     for i in range(found.sizes["repetition"]):
         one = found.isel(repetition=i)
-        values = [float(one[name]) for name in ("p", "low", "high", "variation")]
-        rows.append(row(f"splitting, {i + 1}", Estimate(*values, int(one.trials))))
+        p, low, high, variation = (float(one[name]) for name in Estimate._fields[:4])
+        each = Estimate(p, low, high, variation, int(one.trials))
+        rows.append(row(f"splitting, {i + 1}", each))
     if found.sizes["repetition"] > 1:
         whole = joined(found.p.values, int(found.trials.sum()))
         rows.append(row("splitting, all", whole))

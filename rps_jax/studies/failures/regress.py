@@ -128,7 +128,7 @@ def changes(found: xr.Dataset, arm: str, law: str, rules: Rules = Rules()) -> li
     for world in np.argsort(before - now, kind="stable"):
         if (now[world] < 1) != (before[world] < 1):
             thing = names[int(found.which_object[world])].replace("_", " ")
-            rows.append([str(world), thing, _told(before[world]), _told(now[world])])
+            rows.append([str(world), thing, _told(float(before[world])), _told(float(now[world]))])
     return rows
 
 
