@@ -48,9 +48,9 @@ if TYPE_CHECKING:
     from rps_jax.runs.sweep import sweep as sweep
     from rps_jax.studies.ceiling import Search as Search
     from rps_jax.studies.ceiling import ceiling as ceiling
-    from rps_jax.studies.failures.gallery import gallery as gallery
     from rps_jax.studies.failures.attack import Hunt as Hunt
     from rps_jax.studies.failures.attack import attack as attack
+    from rps_jax.studies.failures.gallery import gallery as gallery
     from rps_jax.studies.failures.rare import Splitting as Splitting
     from rps_jax.studies.failures.rare import rare as rare
     from rps_jax.studies.failures.regress import regress as regress

@@ -324,8 +324,9 @@ class Attack(Failing):
         text = (
             f"{int(found.failing[-1])} of {cells} cells hold a failure, after "
             f"{int(found.trials[-1]):,} trials and {float(found.simulated[-1]):,.0f} s of "
-            f"simulated time: {gain['search']:.2f} an hour. {found.attrs['drawn_trials']} trials of drawn "
-            f"worlds found {found.attrs['drawn_failing']}: {gain['drawn']:.2f} an hour. So the "
+            f"simulated time: {gain['search']:.2f} an hour. {found.attrs['drawn_trials']} trials "
+            f"of drawn worlds found {found.attrs['drawn_failing']}: {gain['drawn']:.2f} an hour. "
+            "So the "
             f"search finds {gain['times']:.1f} times as many, and at least "
             f"{gain['times_low']:.1f} times (95 %)."
         )
