@@ -18,7 +18,11 @@ if TYPE_CHECKING:
     from rps_jax.control.dipole import DipoleParams as DipoleParams
     from rps_jax.control.force_push import ForcePushParams as ForcePushParams
     from rps_jax.control.guided import GuidedParams as GuidedParams
+    from rps_jax.control.force_push_published import (
+        PublishedForcePushParams as PublishedForcePushParams,
+    )
     from rps_jax.control.law import Details as Details
+    from rps_jax.control.law import LoadedObservation as LoadedObservation
     from rps_jax.control.law import Observation as Observation
     from rps_jax.control.law import RPSParams as RPSParams
     from rps_jax.control.law import RPSState as RPSState
@@ -33,6 +37,7 @@ if TYPE_CHECKING:
     from rps_jax.geometry import footprint as footprint
     from rps_jax.geometry import planar as planar
     from rps_jax.geometry.footprint import Footprint as Footprint
+    from rps_jax.robot.load_cell import LoadCell as LoadCell
     from rps_jax.robot.robot import ROBOTS as ROBOTS
     from rps_jax.robot.robot import Robot as Robot
     from rps_jax.robot.shell import Boards as Boards
@@ -84,17 +89,19 @@ __version__ = "0.2.0"
 
 _HOMES = {
     "control.law": (
-        *("Details", "Observation", "RPSParams", "RPSState"),
+        *("Details", "LoadedObservation", "Observation", "RPSParams", "RPSState"),
         *("Temperatures", "Twist", "step"),
     ),
     "control.dipole": ("DipoleParams",),
     "control.force_push": ("ForcePushParams",),
     "control.guided": ("GuidedParams",),
+    "control.force_push_published": ("PublishedForcePushParams",),
     "control.pursuit": ("PursuitParams",),
     "control.rps_plus": ("RPSPlusParams",),
     "control.strategies": ("Strategy", "register_strategy"),
     "errors": ("InputError",),
     "geometry.footprint": ("Footprint",),
+    "robot.load_cell": ("LoadCell",),
     "robot.robot": ("ROBOTS", "Robot"),
     "robot.shell": ("Boards",),
     "robot.skin": ("CapacitiveSkin", "IdealSkin", "SmoothSkin"),

@@ -64,7 +64,7 @@ def program(family, physics):
     @jax.jit
     def run(body, state, steps):
         twist = tuple(jnp.full(state[0].shape[0], x) for x in TWIST)
-        push = lambda _, now: fused.drive(body, now, twist, physics)  # noqa: E731
+        push = lambda _, now: fused.drive(body, now, twist, physics).motion  # noqa: E731
         return jax.lax.fori_loop(0, steps, push, Motion(*state))
 
     return run

@@ -45,7 +45,8 @@ def test_laws_are_compared_with_one_of_them_world_by_world():
 def test_every_rung_is_a_law_of_the_package_with_what_it_is_told():
     told = ladder.senses(ladder.rungs())
     assert len(told) >= 8
-    assert set(told.values()) == {"touch", "pose"}
+    assert set(told.values()) == {"touch", "force", "pose"}
+    assert [name for name in told if told[name] == "force"] == ["force_push_published"]
     assert {name for name in told if told[name] == "pose"} == {"aps", "dipole"}
     for params in ladder.RUNGS.values():
         assert strategies.of(params).check(params) is params

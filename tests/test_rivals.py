@@ -7,11 +7,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rps_jax.control import dipole, force_push, law, pursuit, rps_plus, strategies
+from rps_jax.control import (
+    dipole,
+    force_push,
+    force_push_published,
+    law,
+    pursuit,
+    rps_plus,
+    strategies,
+)
 from rps_jax.control.aps import TrackedObservation
 from rps_jax.control.dipole import DipoleParams
 from rps_jax.control.force_push import ForcePushParams
-from rps_jax.control.law import Observation, RPSParams, RPSState, Twist
+from rps_jax.control.force_push_published import PublishedForcePushParams
+from rps_jax.control.law import LoadedObservation, Observation, RPSParams, RPSState, Twist
 from rps_jax.control.pursuit import PursuitParams
 from rps_jax.control.rps_plus import RPSPlusParams
 from rps_jax.errors import InputError
@@ -33,6 +42,11 @@ def seen(contact=(0.36, 0.0), target=(2.36, 0.0), robot=(0.0, 0.0), yaw=0.0, tou
 
 def tracked(observation, thing=(1.0, 0.0), radius=0.2):
     return TrackedObservation(observation, jnp.array(thing), jnp.asarray(radius), 0.02)
+
+
+def loaded(observation, force=(-20.0, 0.0)):
+    """The force is that of the object on the base, in the base's frame."""
+    return LoadedObservation(observation, jnp.array(force), 0.02)
 
 
 def test_a_twist_moves_a_point_of_the_base_as_asked():
@@ -103,6 +117,69 @@ def test_force_push_lays_its_path_anew_when_it_has_passed_the_target():
     state, _, _ = force_push.step(params, state, seen(robot=(2.1, 0.0)))
     assert abs(float(state.theta_d)) == pytest.approx(math.pi)
     np.testing.assert_allclose(state.p_world_start, (2.46, 0.0), atol=1e-6)
+
+
+def test_the_published_force_push_steers_by_the_angle_of_the_force():
+    """theta_p = 1.3 theta_f + 0.5 Delta, and the contact moves at 0.05 m/s along it."""
+    params, step = PublishedForcePushParams(), force_push_published.step
+    start = force_push_published.init(params)
+    _, twist, _ = step(params, start, loaded(seen(touching=False)))
+    np.testing.assert_allclose(twist, (0.01, 0.0, 0.0), atol=1e-7)
+
+    # Touched, but no force: along the path.
+    at = seen((0.36, 0.12), (2.36, 0.12))
+    state, twist, _ = step(params, start, loaded(at, (0.0, 0.9)))
+    np.testing.assert_allclose(twist, (0.05, 0.0, 0.0), atol=1e-7)
+
+    # The object pushes back along (-4, -3): the base pushes it 36.87 degrees to the left.
+    state, twist, details = step(params, state, loaded(at, (-16.0, -12.0)))
+    angle = 1.3 * math.atan2(3, 4)
+    assert float(details.gamma) == pytest.approx(angle, abs=1e-6)
+    np.testing.assert_allclose(
+        twist, (0.05 * math.cos(angle), 0.05 * math.sin(angle), 0.0), atol=1e-6
+    )
+
+    # 10 cm to the left of the path the push goes farther out.
+    left = seen((0.36, 0.22), (2.36, 0.12))
+    state, _, details = step(params, state, loaded(left, (-16.0, -12.0)))
+    assert float(details.gamma) == pytest.approx(angle + 0.05, abs=1e-6)
+
+    # No force any more: back to -0.5 Delta, by 10 rad/s in each 0.02 s.
+    state, _, details = step(params, state, loaded(left, (0.0, 0.0)))
+    assert float(details.gamma) == pytest.approx(angle + 0.05 - 0.2, abs=1e-6)
+    for _ in range(10):
+        state, _, details = step(params, state, loaded(left, (-0.6, 0.6)))
+    assert float(details.gamma) == pytest.approx(-0.05, abs=1e-6)
+
+
+def test_the_published_force_push_gives_way_to_a_large_force():
+    """Of 70 N it gives way to 20: 0.0015 * 20 = 0.03 m/s. Of 90 N it goes back at 0.01 m/s."""
+    params, step = PublishedForcePushParams(), force_push_published.step
+    state, _, _ = step(params, force_push_published.init(params), loaded(seen()))
+    for force, speed in ((50.0, 0.05), (70.0, 0.02), (90.0, -0.01), (1e4, -0.05)):
+        _, twist, _ = step(params, state, loaded(seen(), (-force, 0.0)))
+        np.testing.assert_allclose(twist, (speed, 0.0, 0.0), atol=1e-6)
+    v = force_push_published.yielding(params, jnp.array([0.03, 0.0]), jnp.array([0.0, 70.0]))
+    np.testing.assert_allclose(v, (0.03, -0.03), atol=1e-6)
+
+
+def test_the_published_force_push_turns_to_face_along_its_path():
+    # It yields by 0.01 m/s of its 0.2, so that its turn stays within its bound.
+    params = PublishedForcePushParams(v_max=0.2, f_max=0.0, k_f=0.0005)
+    step = force_push_published.step
+    state, _, _ = step(params, force_push_published.init(params), loaded(seen()))
+    turned = seen((0.36, 0.0), (2.36, 0.0), yaw=0.1)
+    _, twist, details = step(params, state, loaded(turned, (-20.0, 0.0)))
+    # The force on the object is along the base's heading: 0.1 rad; the contact has moved with it.
+    offset = 0.36 * math.sin(0.1)
+    angle = 1.3 * 0.1 + 0.5 * offset
+    assert float(details.gamma) == pytest.approx(angle, abs=1e-6)
+    forward, aside = 0.2 * math.cos(angle - 0.1) - 0.01, 0.2 * math.sin(angle - 0.1)
+    np.testing.assert_allclose(twist, (forward, aside + 0.1 * 0.36, -0.1), atol=1e-6)
+    # 10 cm past the target the path is laid anew, back.
+    past = seen((0.36, 0.0), (0.26, 0.0))
+    state, _, _ = step(params, state, loaded(past))
+    assert abs(float(state.theta_d)) == pytest.approx(math.pi)
 
 
 @pytest.mark.parametrize(
@@ -217,10 +294,15 @@ def test_the_dipole_looks_along_the_path_and_lays_it_anew():
         assert float(state.p_world_start[0]) == pytest.approx(start)
 
 
-def twist_of(name, observation, thing):
+def twist_of(name, observation, thing, force=(-20.0, 5.0)):
     strategy, params = strategies.RIVALS[name]
     state = strategy.init(params)
-    told = tracked(observation, thing) if strategy.senses == "pose" else observation
+    tellings = {
+        "touch": observation,
+        "force": loaded(observation, force),
+        "pose": tracked(observation, thing),
+    }
+    told = tellings[strategy.senses]
     for _ in range(2):  # the second step remembers the first
         state, twist, _ = strategy.step(params, state, told)
     return np.asarray(jnp.stack(twist))
@@ -236,7 +318,10 @@ def test_a_law_is_the_same_in_a_mirror_and_in_any_frame(name):
         plain = twist_of(name, seen(contact, 2 * target, robot, yaw), thing)
         flip = np.array([1.0, -1.0])
         mirrored = twist_of(
-            name, seen(contact * flip, 2 * target * flip, robot * flip, -yaw), thing * flip
+            name,
+            seen(contact * flip, 2 * target * flip, robot * flip, -yaw),
+            thing * flip,
+            (-20.0, -5.0),
         )
         np.testing.assert_allclose(mirrored, plain * [1, -1, -1], atol=1e-5)
         c, s = math.cos(turn), math.sin(turn)
@@ -274,7 +359,7 @@ def test_a_law_refuses_bounds_that_mean_nothing(name):
     assert type(found) is type(params)
 
 
-@pytest.mark.parametrize("name", RIVALS)
+@pytest.mark.parametrize("name", [x for x in RIVALS if x != "force_push_published"])
 def test_a_law_pushes_a_box_straight_on(name):
     _, params = strategies.RIVALS[name]
     setting = Setting(engine="quasistatic", rules=Rules(horizon=60.0))
@@ -282,3 +367,22 @@ def test_a_law_pushes_a_box_straight_on(name):
     outcome, _ = pushes.run([box], setting, slots=1, workers=1)
     assert outcome.success[0]
     assert 10 < outcome.time[0] < 40
+
+
+def test_before_a_box_on_its_flat_skin_the_published_force_push_amplifies_what_it_feels():
+    """The box cannot turn about a line of contact, and slides as it is pushed: against the force.
+
+    So theta_f is the last theta_p, which (1 + k_theta) makes larger, up to the cone of the skin's
+    friction: 1.3 atan(0.35) = 0.44 rad. With k_theta = -1 the same base goes straight on.
+    """
+    setting = Setting(engine="fused", rules=Rules(horizon=20.0))
+    ends = []
+    for k_theta in (0.3, -1.0):
+        params = PublishedForcePushParams(k_theta=k_theta, k_y=0.0)
+        box = Case("box", FRICTION["S1"], (1.6, 0.0), params, mass=10.0)
+        outcome, _ = pushes.run([box], setting, slots=1, workers=1)
+        x, y, yaw = outcome.base_pose[0]
+        ends.append(abs(math.atan2(y, x)))
+        assert abs(yaw) < 0.01
+    assert 0.3 < ends[0] < 0.45
+    assert ends[1] < 0.02

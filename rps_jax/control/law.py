@@ -156,6 +156,14 @@ class Observation(NamedTuple):
     p_world_target: jax.Array  # (2,) [m]
 
 
+class LoadedObservation(NamedTuple):
+    """What a law that feels a force may know besides."""
+
+    touch: Observation
+    f_robot: jax.Array  # (2,) [N] of the object on the base, in its frame: see `robot.load_cell`
+    period: float | jax.Array  # () [s] since the last step
+
+
 class Twist(NamedTuple):
     """Commanded velocity of the base, in the robot frame."""
 

@@ -18,19 +18,22 @@ import jax
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.control import aps, dipole, force_push, guided, law, pursuit, rps_plus
+from rps_jax.control import aps, dipole, force_push, force_push_published, guided, law, pursuit, rps_plus
 from rps_jax.control.aps import APSParams, APSState
 from rps_jax.control.bounds import Bound
 from rps_jax.control.dipole import DipoleParams
 from rps_jax.control.force_push import ForcePushParams
 from rps_jax.control.guided import GuidedParams
+from rps_jax.control.force_push_published import PublishedForcePushParams
 from rps_jax.control.law import Details, RPSParams, RPSState, Temperatures, Twist
 from rps_jax.control.pursuit import PursuitParams
 from rps_jax.control.rps_plus import RPSPlusParams
+from rps_jax.robot.load_cell import LoadCell
 
-# What a strategy is told: where the skin is touched (`law.Observation`), or the object's place and
-# size as well (`aps.TrackedObservation`). All know odometry and the target.
-Senses = Literal["touch", "pose"]
+# What a strategy is told: where the skin is touched (`law.Observation`), the contact's force as
+# well (`law.LoadedObservation`), or the object's place and size (`aps.TrackedObservation`). All
+# know odometry and the target.
+Senses = Literal["touch", "force", "pose"]
 
 
 def numbers(params: Any) -> dict[str, Any]:
@@ -75,6 +78,7 @@ class Strategy(NamedTuple):
     smooth: bool = False  # is told the weight of a contact; others whether there is one
     check: Callable[[Any], Any] = check_finite  # raises InputError for params that mean nothing
     bounds: tuple[tuple[str, Bound], ...] = ()  # of the parameters that `rps tune es` may tune
+    cell: LoadCell = LoadCell()  # by which one is told a force
 
 
 def _of_module(module: ModuleType, senses: Senses = "touch") -> Strategy:
@@ -95,6 +99,7 @@ RIVALS: dict[str, tuple[Strategy, Params]] = {
     "rps_plus": (_of_module(rps_plus), RPSPlusParams()),
     "pursuit": (_of_module(pursuit), PursuitParams()),
     "force_push": (_of_module(force_push), ForcePushParams()),
+    "force_push_published": (_of_module(force_push_published, "force"), PublishedForcePushParams()),
     "dipole": (_of_module(dipole, "pose"), DipoleParams()),
     "guided": (Strategy(guided.init, guided.step, check=guided.check), GuidedParams()),
 }

@@ -42,6 +42,9 @@ class Driven(NamedTuple):
 
     motion: Motion
     overflowed: Any = None  # (B,) bool: contacts were lost; None: this engine loses none
+    # (B, 3) [N, N, N m] what the object does to the base, about the base's origin and in its frame,
+    # the mean over the physics steps of the period; None: nobody asked.
+    force: Any = None
 
 
 class Stage(Protocol):
@@ -54,11 +57,13 @@ class Stage(Protocol):
         twists: Twist,
         physics: Physics,
         robot: Robot | None = None,
+        force: bool = False,
     ) -> Driven:
         """Step a batch of worlds with these fields (B, ...) for one control period.
 
         The base is a velocity source at `twists` (B,) [m/s, m/s, rad/s], in its own frame; with a
         `robot` (B,) it is a body that its drive pushes towards these, as `robot.drive.push` says.
+        With `force`, which is static, it also tells `Driven.force`.
         """
         ...
 
@@ -71,6 +76,7 @@ class Stepper(Protocol):
     warmstart: np.ndarray  # (n, 9)
 
     integral: np.ndarray | None  # (n, 3)
+    force: np.ndarray  # (n, 3) of the last period, as in `Driven`
 
     def drive(self, which: np.ndarray, twist: np.ndarray, substeps: int) -> None:
         """Step the worlds `which` (m,) with the base held at `twist` (m, 3) in its own frame.
@@ -94,6 +100,7 @@ class Engine(abc.ABC):
     modes: ClassVar[tuple[Mode, ...]] = ()  # in which it can be differentiated
     newton: ClassVar[bool] = True  # it solves as `Physics` says: by so many iterations
     forces: ClassVar[bool] = True  # a contact can slow and stop the base
+    tells_force: ClassVar[bool] = True  # it tells the force of a contact
 
     def check(self, families: Iterable[str] = ()) -> None:
         """Raises InputError unless this machine can step worlds of these shape families."""
@@ -126,6 +133,14 @@ class Engine(abc.ABC):
             raise errors.InputError(
                 f"engine = {self.name} is not allowed for a robot with a limited force: its base "
                 "follows every twist; choose fused, mjx or mujoco."
+            )
+
+    def check_senses(self, senses: str) -> None:
+        """Raises InputError unless the engine tells what a strategy senses."""
+        if senses == "force" and not self.tells_force:
+            raise errors.InputError(
+                f"engine = {self.name} is not allowed for a strategy that is told the contact's "
+                "force, which it does not tell: choose fused, mjx or mujoco."
             )
 
     def check_followed(self) -> None:

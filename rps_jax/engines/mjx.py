@@ -30,7 +30,7 @@ from rps_jax.engines.mjx_colliders import (
     smooth,
     solver,
 )
-from rps_jax.geometry import solid
+from rps_jax.geometry import planar, solid
 from rps_jax.geometry.solid import Solid
 from rps_jax.robot import drive as drives
 from rps_jax.robot.robot import Robot
@@ -69,6 +69,7 @@ class MJXStage(NamedTuple):
         twists: Twist,
         physics: Physics,
         robot: Robot | None = None,
+        force: bool = False,
     ) -> Driven:
         """Step a batch for one control period.
 
@@ -77,11 +78,13 @@ class MJXStage(NamedTuple):
         """
         step = jax.vmap(partial(self._step, timestep=physics.timestep))
 
-        def one(state: Motion, _: None) -> tuple[Motion, None]:
+        def one(state: Motion, _: None) -> tuple[Motion, jax.Array | None]:
             # Batched inside of the loop: a loop that is batched is traced anew.
-            return step(fields, state, twists, robot), None
+            after, felt = step(fields, state, twists, robot)
+            return after, felt if force else None
 
-        return Driven(jax.lax.scan(one, motion, length=physics.substeps)[0])
+        after, felt = jax.lax.scan(one, motion, length=physics.substeps)
+        return Driven(after, force=None if felt is None else felt.mean(axis=0))
 
     def _step(
         self,
@@ -90,7 +93,8 @@ class MJXStage(NamedTuple):
         twist: Twist,
         robot: Robot | None,
         timestep: float,
-    ) -> Motion:
+    ) -> tuple[Motion, jax.Array]:
+        """A world after one step, and the wrench (3,) of its object on its base, in its frame."""
         model, (qpos, qvel, warmstart, integral) = apply(self.model, fields), state
         data = self.data
         if robot is None:
@@ -103,7 +107,9 @@ class MJXStage(NamedTuple):
         data = data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
         with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
             data = step(model, data, self.colliders)
-        return Motion(data.qpos, data.qvel, data.qacc_warmstart, integral)
+        felt = data.qfrc_constraint[JOINTS.base]  # of the contacts alone: the drive is applied
+        felt = felt.at[:2].set(planar.rotate(-qpos[2], felt[:2]))
+        return Motion(data.qpos, data.qvel, data.qacc_warmstart, integral), felt
 
 
 def step(model: mjx.Model, data: mjx.Data, colliders: Colliders = Colliders()) -> mjx.Data:

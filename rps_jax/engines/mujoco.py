@@ -29,6 +29,12 @@ def _as_it_goes(model: mujoco.MjModel) -> mujoco.MjModel:
     return model
 
 
+def _in_base(wrench: np.ndarray, turn: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Wrenches (n, 3) along the world's axes in the base's frame, of headings' (cos, sin) (n,)."""
+    (x, y, torque), (c, s) = wrench.T, turn
+    return np.stack([c * x + s * y, c * y - s * x, torque], axis=1)
+
+
 class Batch:
     """Worlds stepped by C MuJoCo on a pool of threads: (time, qpos, qvel) of each, in double."""
 
@@ -55,6 +61,8 @@ class Batch:
         self.warmstart = np.zeros((len(models), nv))
         self._robots = robots
         self.integral = None if robots is None else np.zeros((len(models), 3))
+        self.force = np.zeros((len(models), 3))
+        self._inertia = np.array([model.dof_M0[JOINTS.base] for model in models])
         self._timestep = models[0].opt.timestep
         self._data = [mujoco.MjData(models[0]) for _ in range(threads)]
         self._pool = rollout.Rollout(nthread=threads)
@@ -89,6 +97,10 @@ class Batch:
         before_last = after[:, -2] if substeps > 1 else state
         # Euler's rule gives back the acceleration, with which the next step starts.
         difference = after[:, -1, 1 + nq :] - before_last[:, 1 + nq :]
+        # Nothing but contact changes the velocity of the base, if by little: that is its force.
+        gained = after[:, -1, 1 + nq :][:, JOINTS.base] - state[:, 1 + nq :][:, JOINTS.base]
+        felt = self._inertia[which] * gained / (substeps * self._timestep)
+        self.force[which] = _in_base(felt, (c, s))
         self.state[which], self.warmstart[which] = after[:, -1], difference / self._timestep
 
     def _push(self, which: np.ndarray, twist: np.ndarray, substeps: int) -> None:
@@ -99,6 +111,7 @@ class Batch:
         state, warmstart = self.state[which], self.warmstart[which]
         integral, nq = tuple(self.integral[which].T), self.qpos.shape[1]
         applied = np.zeros((len(which), 1, self.qvel.shape[1]))
+        felt = np.zeros((len(which), 3))
         for _ in range(substeps):
             yaw, qvel = state[:, 1 + JOINTS.base.start + 2], state[:, 1 + nq :]
             turn, base = (np.cos(yaw), np.sin(yaw)), tuple(qvel[:, JOINTS.base].T)
@@ -115,9 +128,12 @@ class Batch:
             )
             after = np.asarray(after)[:, -1]
             warmstart = (after[:, 1 + nq :] - qvel) / dt
+            of_contact = self._inertia[which] * warmstart[:, JOINTS.base] - np.stack(force, axis=1)
+            felt += _in_base(of_contact, turn) / substeps
             state = after
         self.state[which], self.warmstart[which] = state, warmstart
         self.integral[which] = np.stack(integral, axis=1)
+        self.force[which] = felt
 
     def close(self) -> None:
         """End the threads, and let MuJoCo warn again."""

@@ -114,6 +114,7 @@ class Quasistatic:
         twists: Twist,
         physics: Physics,
         robot: Robot | None = None,
+        force: bool = False,
     ) -> Driven:
         """Step a batch for one control period; height and tilt of the object stay.
 
@@ -273,6 +274,7 @@ class QuasistaticEngine(Engine):
     modes = ("forward", "reverse")
     newton = False  # but by its own rule
     forces = False
+    tells_force = False  # only its direction is known, and not the weight that it slides
 
     def stage_of_scenes(self, scenes: Sequence[Scene], which: np.ndarray) -> tuple[Any, Any]:
         """Stage and fields of worlds in scenes of one shape family."""

@@ -91,6 +91,7 @@ class WarpStage(NamedTuple):
         twists: Twist,
         physics: Physics,
         robot: Robot | None = None,
+        force: bool = False,
     ) -> Driven:
         """Step a batch for one control period, in float32 whatever the precision of its states."""
         narrow = jax.tree.map(lambda x: x.astype(jnp.float32), (fields, *motion[:3], twists))
@@ -107,6 +108,7 @@ class Warp(Engine):
 
     name = "warp"
     forces = False
+    tells_force = False
     shapes = ("box", "cylinder")
 
     def check(self, families: Iterable[str] = ()) -> None:

@@ -19,6 +19,7 @@ from rps_jax.geometry import planar
 from rps_jax.robot.robot import Robot
 
 STALLED = 0.1  # [1] of the speed aimed at, below which a base stands still
+_STALL = 1.0  # [s] for which a base has stood still that is said to have stalled
 _MOVING = 1e-3  # [m/s] below which nothing is aimed at
 Triple = tuple[Any, Any, Any]
 
@@ -122,3 +123,8 @@ def stalled(drive: Drive, qvel: jax.Array) -> Drive:
     wanted = planar.norm(drive.aim[:2])
     stands = (planar.norm(qvel[:2]) < STALLED * wanted) & (wanted > _MOVING)
     return drive._replace(stalled=jnp.where(stands, drive.stalled + 1, 0))
+
+
+def has_stalled(drive: Drive | None, period: float) -> Any:
+    """Whether () a base has stood still for a while by now; `period` [s] is of the control loop."""
+    return False if drive is None else drive.stalled * period >= _STALL

@@ -109,6 +109,7 @@ def evaluate(
     errors.check_count("seed", seed, at_least=0, at_most=2**30)
     setting = Setting(preset(physics, fidelity), rules, engine=engine)
     engines.get(engine).check(domain.families)
+    engines.get(engine).check_senses(strategies.of(params).senses)
     batch.check_shape(slots, workers)
     ask = Ask(_checked(params), seed_of(seed, split), np.arange(count), at)
     shape = {"slots": slots, "workers": workers}

@@ -66,6 +66,8 @@ class Plan:
         engine = engines.get(self.setting.engine)
         engine.check(self.domain.families)
         engine.check_robot(self.domain.weakest)
+        for params in self.arms.values():
+            engine.check_senses(strategies.of(params).senses)
 
     @property
     def works(self) -> bool:

@@ -38,7 +38,13 @@ class Unmoved(NamedTuple):
     """An engine without physics: the base goes, the object stays. What is left is the law's."""
 
     def drive(
-        self, fields: Any, motion: Motion, twists: Twist, physics: Physics, robot: Any = None
+        self,
+        fields: Any,
+        motion: Motion,
+        twists: Twist,
+        physics: Physics,
+        robot: Any = None,
+        force: bool = False,
     ) -> Driven:
         """Step a batch for one control period."""
         turn = jax.vmap(lambda twist, yaw: twist.in_world(yaw))

@@ -1,7 +1,7 @@
 """A ladder of laws: every law of the package in the same worlds, by what it is told.
 
 A rung is a law with its parameters: its authors' own, or tuned here. On the first rungs a law is
-told only where its skin is touched, on the next also where the object is.
+told only where its skin is touched, on the next also with which force, then where the object is.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from rps_jax.control import strategies
 from rps_jax.control.aps import APSParams
 from rps_jax.control.dipole import DipoleParams
 from rps_jax.control.force_push import ForcePushParams
+from rps_jax.control.force_push_published import PublishedForcePushParams
 from rps_jax.control.law import RPSParams
 from rps_jax.control.pursuit import PursuitParams
 from rps_jax.control.rps_plus import RPSPlusParams
@@ -40,6 +41,7 @@ RUNGS: dict[str, Params] = {
     "rps_plus": RPSPlusParams(),
     "pursuit": PursuitParams(),
     "force_push": ForcePushParams(),
+    "force_push_published": PublishedForcePushParams(),
     "aps": APSParams(),
     "dipole": DipoleParams(),
 }
@@ -136,8 +138,8 @@ def sections(folder: Path, plan: Plan, results: xr.Dataset) -> list[Section]:
     told = senses(plan.arms)
     picture = figures.ladder(results, told, folder / "ladder.png")
     text = (
-        "Laws by what they are told: `touch` is where the skin is touched, `pose` also where the "
-        "object is and how large."
+        "Laws by what they are told: `touch` is where the skin is touched, `force` also the "
+        "contact's force, and `pose` where the object is and how large."
     )
     found = [Section("Information against success", text, (), picture)]
     if REFERENCE in plan.arms and len(plan.arms) > 1:

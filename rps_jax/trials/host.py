@@ -65,7 +65,8 @@ def run(
                 batch.drive(going, np.stack(twist, axis=1)[going].astype(float), physics.substeps)
             after = Motion(batch.qpos, batch.qvel, batch.warmstart, batch.integral)
             motion = jax.tree.map(lambda x: x.astype(dtype), after)
-            trials = _settle(trials, told, Driven(motion))
+            felt = batch.force.astype(dtype) if strategy.senses == "force" else None
+            trials = _settle(trials, told, Driven(motion, force=felt))
             passes += 1
             if passes % _LOOK == 0 or not going.size:
                 done, steps = np.asarray(trials.done), int(np.asarray(trials.steps).sum())

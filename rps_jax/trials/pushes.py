@@ -124,6 +124,7 @@ def build(
     """
     for case in cases:
         engines.get(setting.engine).check_robot(case.robot)
+        engines.get(setting.engine).check_senses(strategies.of(case.params).senses)
     scenes, which = _scenes(cases, setting.physics)
     stage, fields = engines.get(setting.engine).stage_of_scenes(scenes, which)
     starts = [_start_of(case, scenes[i]) for case, i in zip(cases, which, strict=True)]

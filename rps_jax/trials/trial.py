@@ -17,15 +17,16 @@ import jax.numpy as jnp
 from rps_jax import errors
 from rps_jax.control import law
 from rps_jax.control.aps import TrackedObservation
-from rps_jax.control.law import Details, Observation, Twist
+from rps_jax.control.law import Details, LoadedObservation, Observation, Twist
 from rps_jax.control.strategies import RPS, Params, Strategy
 from rps_jax.engines.base import Driven, Motion, Stage
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.geometry.footprint import Footprint
-from rps_jax.robot import base, drive
+from rps_jax.robot import base, drive, load_cell
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.drive import Drive
+from rps_jax.robot.load_cell import Load
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import NONE, Reading, Skin, SkinState, SmoothReading
 from rps_jax.world.physics import Physics
@@ -34,7 +35,6 @@ from rps_jax.world.scene import JOINTS
 # A world is a runaway beyond these, far outside anything a base at 0.05 m/s can cause.
 _MAX_SPEED = 20.0  # [m/s], [rad/s]
 _MAX_DISTANCE = 100.0  # [m]
-_STALL = 1.0  # [s] for which a base has stood still that is said to have stalled
 
 
 class Rules(NamedTuple):
@@ -97,6 +97,7 @@ class Trial(NamedTuple):
     diverged: jax.Array  # () bool
     overflows: jax.Array  # () int32 control steps in which contacts were lost for want of room
     drive: Drive | None = None  # of a robot with limits
+    load: Load | None = None  # of a strategy that is told the contact's force
 
 
 class Snapshot(NamedTuple):
@@ -168,6 +169,7 @@ def start(world: World, strategy: Strategy = RPS) -> Trial:
         diverged=false,
         overflows=zero,
         drive=None if world.robot is None else drive.start(world.qpos),
+        load=load_cell.start(world.qpos) if strategy.senses == "force" else None,
     )
 
 
@@ -276,8 +278,7 @@ def decide(
 ) -> tuple[Trial, Twist, Snapshot]:
     """What happens between two control periods of one world: sense, judge, decide.
 
-    Returns the trial as it will be driven on, or ended; the twist that the base carries out; and
-    what was seen.
+    Returns the trial as it is driven on, or ended; the twist carried out; and what was seen.
     """
     period = physics.control_period
     told, seen = observe(world, trial, physics=physics, rules=rules)
@@ -288,6 +289,9 @@ def decide(
         observation = TrackedObservation(
             observation, object_pose(told.qpos)[0], fp.circumradius(world.footprint), period
         )
+    if told.load is not None:
+        felt, force = strategy.cell.read(told.load, world.key, told.steps, period)
+        told, observation = told._replace(load=felt), LoadedObservation(observation, force, period)
     state, twist, details = strategy.step(world.params, trial.strategy, observation)
     snapshot = Snapshot(trial.steps * period, told.qpos, seen.reading, twist, details, trial.done)
     told, twist = execute(world, told._replace(strategy=state), twist, period)
@@ -299,7 +303,7 @@ def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
 
     A trial that had ended `before` comes back as it was.
     """
-    (qpos, qvel, warmstart, integral), overflowed = driven
+    (qpos, qvel, warmstart, integral), overflowed, force = driven
     sane = (
         jnp.all(jnp.isfinite(qpos))
         & jnp.all(jnp.abs(qvel) < _MAX_SPEED)
@@ -317,6 +321,7 @@ def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
         path_length=told.path_length + planar.norm(qpos[:2] - told.qpos[:2]),
         steps=told.steps + 1,
         drive=now,
+        load=told.load and told.load._replace(wrench=force),
     )
     stopped = told._replace(done=jnp.ones((), bool), diverged=~told.done & ~sane)
     return select(before.done, before, select(told.done | ~sane, stopped, moved))
@@ -334,7 +339,8 @@ def control_step(
     """One pass of the loop of a batch of worlds. One that has ended comes back as it is."""
     think = partial(decide, physics=physics, rules=rules, strategy=strategy)
     told, twists, snapshots = jax.vmap(think)(worlds, trials)
-    driven = stage.drive(worlds.fields, motion(told), twists, physics, pushing(worlds))
+    asked = strategy.senses == "force"
+    driven = stage.drive(worlds.fields, motion(told), twists, physics, pushing(worlds), asked)
     return jax.vmap(settle)(trials, told, driven), snapshots
 
 
@@ -369,17 +375,11 @@ def outcome(trial: Trial, period: float) -> Outcome:
         ),
         tipped=trial.tipped,
         diverged=trial.diverged,
-        stalled=_stalled(trial, period),
+        stalled=drive.has_stalled(trial.drive, period) & ~trial.success & ~trial.diverged,
         overflows=trial.overflows,
         base_pose=trial.qpos[..., JOINTS.base],
         object_pose=pose.reshape(*trial.qpos.shape[:-1], 3),
     )
-
-
-def _stalled(trial: Trial, period: float) -> jax.Array:
-    if trial.drive is None:
-        return jnp.zeros_like(trial.success)
-    return (trial.drive.stalled * period >= _STALL) & ~trial.success & ~trial.diverged
 
 
 @partial(jax.jit, static_argnames=("strategy",))

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from rps_jax import engines
+from rps_jax.control import strategies
 from rps_jax.control.strategies import Params
 from rps_jax.engines.mjx import apply
 from rps_jax.engines.mjx_colliders import mjx
@@ -73,6 +74,7 @@ def drawn_worlds(domain: Domain, drawn: Draw, params: Params, setting: Setting) 
     count, dtype = drawn.number.size, jnp.zeros(()).dtype
     engine, robots = engines.get(setting.engine), drawn.robot
     engine.check_robot(robots)
+    engine.check_senses(strategies.of(params).senses)
     stage, own = engine.stage_of_solids(
         family, drawn.solid, drawn.friction, setting.physics, robots
     )

@@ -99,6 +99,7 @@ class TuneOptions(Spread):
     def tune(self, search: Callable[..., Tuner], kind: Any) -> None:
         """Run a tuner that is made of a dataclass with some of these options."""
         from rps_jax import engines
+        from rps_jax.control import strategies
         from rps_jax.tuning import run
 
         space, course, shape = self.space(), self.course(), self.shape()
@@ -107,6 +108,7 @@ class TuneOptions(Spread):
         running.choose_device(self.device)
         families = [family for one in course.domains for family in one.families]
         engines.get(self.engine).check(families)
+        engines.get(self.engine).check_senses(strategies.of(space.base).senses)
         tuner = search(how, space, course)
         out = run.open_run(self.out, tuner)
         with _watched(out, tuner.generations) as report:
@@ -119,8 +121,8 @@ class TuneES(TuneOptions):
     """Tune by evolution."""
 
     strategy: str = "rps"
-    """What is tuned: rps, rps_plus, pursuit, force_push, dipole, or a law of a file with bounds,
-    as my_law.py:MyParams; its own parameters are the start if that is paper."""
+    """What is tuned: rps, rps_plus, pursuit, force_push, force_push_published, dipole, or a law of
+    a file with bounds, as my_law.py:MyParams; its own parameters are the start if that is paper."""
     algorithm: Literal["cma", "lra_cma", "sep_cma", "xnes"] = "cma"
     """cma adapts a full covariance; lra_cma adapts its learning rates to noisy scores as well;
     sep_cma keeps to the axes; xnes follows the natural gradient."""

@@ -33,9 +33,10 @@ class FusedStage(NamedTuple):
         twists: Twist,
         physics: Physics,
         robot: Robot | None = None,
+        force: bool = False,
     ) -> Driven:
         """Step a batch for one control period."""
-        return Driven(step.drive(fields, motion, twists, physics, robot))
+        return step.drive(fields, motion, twists, physics, robot, force)
 
 
 class Fused(Engine):

@@ -71,6 +71,8 @@ class State(NamedTuple):
     a: Vec  # [m/s^2] last acceleration, from which the solver starts
     alpha: Vec  # [rad/s^2]
     pushed: Pushed | None = None  # a base whose force is limited
+    # [N, N, N m] of the object on the base, in the base's frame, summed over steps, if asked for
+    felt: Vec | None = None
 
 
 class Pushed(NamedTuple):

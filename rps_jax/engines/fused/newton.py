@@ -220,6 +220,32 @@ def _on_base(arm: tuple[Any, Any], f: Vec) -> Vec:
     return f[0], f[1], sp.minus(sp.mul(arm[0], f[1]), sp.mul(arm[1], f[0]))
 
 
+def felt_by_base(
+    contact: Contact,
+    arm: tuple[Any, Any],
+    a: Vec,
+    alpha: Vec,
+    b: Vec | None,
+    turn: tuple[Any, Any],
+    physics: Physics,
+) -> Vec:
+    """What the object does to the base [N, N, N m], about the base's origin and in its frame.
+
+    Args:
+      contact: points of the object with the base.
+      arm: (C, ...) [m] to them from the base's origin, in the world's axes.
+      a: [m/s^2] solution: the acceleration of the object's centre of mass.
+      alpha: [rad/s^2] and its angular acceleration.
+      b: of a base that is not held; None of one that is.
+      turn: cosine and sine of the base's heading.
+      physics: whose cone it is.
+    """
+    force, _ = contact_force(contact, sp.add(_rows(contact, a, alpha, b), contact.bias), physics)
+    x, y, torque = _sums(_on_base(arm, sp.combine(force, (contact.n, contact.t, contact.s))))
+    c, s = turn
+    return -(c * x + s * y), -(c * y - s * x), -torque  # on the object, and so against the base
+
+
 def _sums(vector: Vec) -> Vec:
     return sp.total(vector[0]), sp.total(vector[1]), sp.total(vector[2])
 

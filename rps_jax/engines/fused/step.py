@@ -21,9 +21,9 @@ import numpy as np
 from jax.experimental import pallas
 from jax.experimental.pallas import triton
 
-from rps_jax.engines.base import Motion
+from rps_jax.engines.base import Driven, Motion
 from rps_jax.engines.fused.contacts import Body, Corners, Pushed, State, on_base, on_ground
-from rps_jax.engines.fused.newton import Base, accelerations
+from rps_jax.engines.fused.newton import Base, accelerations, felt_by_base
 from rps_jax.geometry import vectors as sp
 from rps_jax.geometry.vectors import Vec
 from rps_jax.robot import drive as drives
@@ -68,8 +68,8 @@ def _split(array: jax.Array, at: slice = slice(None)) -> Any:
     return tuple(array[..., i] for i in range(array.shape[-1]))[at]
 
 
-def enter(body: Body, motion: Motion, robot: Robot | None = None) -> State:
-    """The state of worlds as MuJoCo holds them."""
+def enter(body: Body, motion: Motion, robot: Robot | None = None, force: bool = False) -> State:
+    """The state of worlds as MuJoCo holds them; with `force`, that on the base is summed up."""
     qpos, qvel, warmstart, integral = motion
     free, spin = _split(qpos, JOINTS.object), _split(qvel, slice(6, 9))
     com, axes = _split(body.p_object_com), _split(body.q_object_body)
@@ -86,6 +86,7 @@ def enter(body: Body, motion: Motion, robot: Robot | None = None) -> State:
         pushed=None
         if robot is None
         else Pushed(_split(qvel, JOINTS.base), _split(warmstart, JOINTS.base), _split(integral)),
+        felt=_split(jnp.zeros_like(qpos[..., JOINTS.base])) if force else None,
     )
 
 
@@ -130,6 +131,13 @@ def step(
         b: Any
         a, alpha, b = accelerations(body, state, m, contacts, physics, base)
         pushed = Pushed(sp.add(pushed.v, sp.scale(dt, b)), b, integral)
+    felt = state.felt
+    if felt is not None:
+        apart = (state.p[0] - state.base[0], state.p[1] - state.base[1])
+        arm = (contacts[1].r[0] + apart[0], contacts[1].r[1] + apart[1])
+        turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+        b = None if pushed is None else pushed.a
+        felt = sp.add(felt, felt_by_base(contacts[1], arm, a, alpha, b, turn, physics))
     v = sp.add(state.v, sp.scale(dt, a))
     w = sp.add(state.w, sp.scale(dt, sp.to_body(m, alpha)))
     angle = sp.scale(dt, w)
@@ -150,18 +158,24 @@ def step(
         base = sp.add(state.base, sp.scale(dt, pushed.v))
     p = sp.add(state.p, sp.scale(dt, v))
     q = tuple(x * length for x in q)
-    return State(base, p, q, v, w, a, alpha, pushed)  # type: ignore[arg-type]
+    return State(base, p, q, v, w, a, alpha, pushed, felt)  # type: ignore[arg-type]
 
 
 def drive(
-    body: Body, motion: Motion, twist: Vec, physics: Physics, robot: Robot | None = None
-) -> Motion:
+    body: Body,
+    motion: Motion,
+    twist: Vec,
+    physics: Physics,
+    robot: Robot | None = None,
+    force: bool = False,
+) -> Driven:
     """One control period of a batch of worlds (B,) at `twist` (B,), with robots (B,) if limited.
 
     On an NVIDIA GPU it is one kernel; elsewhere, and where it is differentiated, XLA compiles it.
     """
-    state = _period(physics, spread(body), enter(body, motion, robot), twist, robot)
-    return leave(body, state, twist)
+    state = _period(physics, spread(body), enter(body, motion, robot, force), twist, robot)
+    felt = state.felt and jnp.stack(state.felt, axis=-1) / physics.substeps
+    return Driven(leave(body, state, twist), force=felt)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))

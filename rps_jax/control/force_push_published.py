@@ -1,0 +1,164 @@
+"""Force Push as published, by the contact's force: the law of Heins and Schoellig.
+
+"Force Push: Robust Single-Point Pushing with Force Feedback" (IEEE RA-L 9, 2024) pushes an object
+with one point along a path. With theta_d the path's direction, theta_f the angle of the contact
+force on the object from it and Delta how far the contact is to the path's left, the point moves at
+
+    theta_p = (1 + k_theta) theta_f + k_y Delta        (`steered`)
+
+from the path. A force below f_min is no contact; then theta_p tends to -k_y Delta, back to the
+path, at a bounded rate. An admittance takes k_f of what a force exceeds f_max by off the velocity
+(`yielding`). Written from the paper's equations and read beside its authors' code.
+
+Our base is not a point, and our choices are these. The point that is moved is the contact as the
+skin tells it. The path is the straight line from the first touch to the target, and is laid anew
+when the contact has passed the target. Before the touch the base goes straight ahead; after it,
+until a force is felt, along the path, as theirs. As in their experiments the base turns to face
+along the path, at k_omega; theirs trades that against its speed in a quadratic program. The speed
+is the bound of RPS, half of theirs, and so k_f is half of theirs. A step of ours is two of theirs,
+so `converge` is a rate. Without their first second of acceleration.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rps_jax import errors
+from rps_jax.control import law
+from rps_jax.control.bounds import Bound
+from rps_jax.control.law import Details, LoadedObservation, Twist
+from rps_jax.geometry import planar
+
+_POSITIVE = ("v_max", "omega_max", "d_success")
+
+
+class PublishedForcePushParams(NamedTuple):
+    """Parameters of Force Push: its authors', of their experiments, f_min of their simulations."""
+
+    k_theta: float | jax.Array = 0.3  # [1] gain of the force's angle, beyond 1
+    k_y: float | jax.Array = 0.5  # [rad/m] gain of the path; 0.1 in their simulations
+    k_omega: float | jax.Array = 1.0  # [1/s] gain of the heading
+    converge: float | jax.Array = 10.0  # [rad/s] of theta_p without a force, at most
+    f_min: float | jax.Array = 1.0  # [N] a lesser force is none; 5 N in their experiments
+    f_max: float | jax.Array = 50.0  # [N] beyond which the base gives way
+    k_f: float | jax.Array = 0.0015  # [m/s/N] by so much; 0.003 at their speed of 0.1 m/s
+    v_max: float | jax.Array = 0.05  # [m/s] speed of the contact, and bound on the base's
+    omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
+    v_approach: float | jax.Array = 0.01  # [m/s] forward speed before the first touch
+    d_success: float | jax.Array = 0.05  # [m] target reached
+
+
+BOUNDS = {
+    "k_theta": Bound(-2, 4),  # [1]
+    "k_y": Bound(-2, 2),  # [rad/m]
+    "k_omega": Bound(0.005, 2, log=True),  # [1/s]
+    "converge": Bound(0.1, 100, log=True),  # [rad/s]
+    "f_min": Bound(0.1, 20, log=True),  # [N]
+    "f_max": Bound(10, 1000, log=True),  # [N]
+    "k_f": Bound(1e-5, 0.02, log=True),  # [m/s/N]
+}
+
+
+class PublishedForcePushState(NamedTuple):
+    """What the law remembers between two control steps."""
+
+    p_world_start: jax.Array  # (2,) [m] where the path begins
+    theta_d: jax.Array  # () [rad] the path's direction in the world
+    theta_p: jax.Array  # () [rad] the last push's, from the path's
+    p_robot_contact: jax.Array  # (2,) [m] the last contact
+    touched: jax.Array  # () bool: the skin has felt the object
+    pushed: jax.Array  # () bool: and the force sensor has
+
+
+def check(params: PublishedForcePushParams) -> PublishedForcePushParams:
+    """The same parameters, if scalars that mean something.
+
+    Raises:
+      InputError: a value is not a finite number, or is out of bounds.
+    """
+    for name in params._fields:
+        bounds = {} if name in ("k_theta", "k_y") else {"at_least": 0}
+        bounds = {"above": 0} if name in _POSITIVE else bounds
+        errors.check_finite(f"force_push_published.{name}", getattr(params, name), **bounds)
+    return params
+
+
+def init(params: PublishedForcePushParams) -> PublishedForcePushState:
+    """Before any contact there is no path."""
+    zero = jnp.zeros_like(jnp.asarray(params.v_max, float))
+    two, false = jnp.zeros(2, zero.dtype), jnp.zeros((), bool)
+    return PublishedForcePushState(two, zero, zero, two, false, false)
+
+
+def steered(
+    params: PublishedForcePushParams,
+    theta_p: jax.Array,
+    f_world: jax.Array,
+    theta_d: jax.Array,
+    offset: jax.Array,
+    period: float | jax.Array,
+) -> jax.Array:
+    """The push's angle () [rad] from the path's direction.
+
+    Args:
+      params: k_theta, k_y, f_min and converge.
+      theta_p: () [rad] of the last step.
+      f_world: (2,) [N] of the base on the object.
+      theta_d: () [rad] the path's direction in the world.
+      offset: () [m] of the contact, to the path's left.
+      period: () [s] since the last step.
+    """
+    theta_f = planar.wrap(planar.direction(f_world) - theta_d)
+    pushed = (1 + params.k_theta) * theta_f + params.k_y * offset
+    most = params.converge * period
+    back = theta_p + jnp.clip(planar.wrap(-params.k_y * offset - theta_p), -most, most)
+    return planar.wrap(jnp.where(planar.norm(f_world) >= params.f_min, pushed, back))
+
+
+def yielding(params: PublishedForcePushParams, v_world: jax.Array, f_world: jax.Array) -> jax.Array:
+    """The contact's velocity (2,) [m/s] where a force (2,) [N] on the object is too large."""
+    size = planar.norm(f_world)
+    over = jnp.maximum(size - params.f_max, 0.0)
+    v_world = v_world - params.k_f * over * f_world / jnp.maximum(size, 1e-9)
+    return v_world * jnp.minimum(1.0, params.v_max / jnp.maximum(planar.norm(v_world), 1e-9))
+
+
+def step(
+    params: PublishedForcePushParams,
+    state: PublishedForcePushState,
+    observation: LoadedObservation,
+) -> tuple[PublishedForcePushState, Twist, Details]:
+    """One control step. Before the first touch it goes straight ahead."""
+    seen = observation.touch
+    touching = jnp.asarray(seen.in_contact)
+    contact = jnp.where(touching, seen.p_robot_contact, state.p_robot_contact)
+    told = seen._replace(p_robot_contact=contact)
+    d = law.displacement(told)
+    p_world_contact = seen.p_world_target - d
+    f_world = -planar.rotate(seen.yaw, observation.f_robot)  # on the object
+
+    along = jnp.stack([jnp.cos(state.theta_d), jnp.sin(state.theta_d)])
+    passed = state.touched & touching & (jnp.sum(d * along) < 0)
+    anew = (touching & ~state.touched) | passed
+    p_world_start = jnp.where(anew, p_world_contact, state.p_world_start)
+    theta_d = jnp.where(anew, planar.direction(d), state.theta_d)
+    touched = state.touched | touching
+    pushed = touched & (state.pushed | (planar.norm(f_world) >= params.f_min))
+
+    left = jnp.stack([-jnp.sin(theta_d), jnp.cos(theta_d)])
+    offset = jnp.sum((p_world_contact - p_world_start) * left)
+    theta_p = steered(params, state.theta_p, f_world, theta_d, offset, observation.period)
+    theta_p = jnp.where(pushed, theta_p, 0.0)
+    angle = theta_d + theta_p
+    v_world = params.v_max * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    v_robot = planar.rotate(-seen.yaw, yielding(params, v_world, f_world))
+    turn = params.k_omega * planar.wrap(theta_d - seen.yaw)
+    omega = jnp.clip(turn, -params.omega_max, params.omega_max)
+    push = Twist.moving(contact, v_robot, omega).within(params.v_max, params.omega_max)
+    ahead = Twist(params.v_approach, 0.0, 0.0)
+    twist = jax.tree.map(lambda a, b: jnp.where(touched, a, b), push, ahead)
+    state = PublishedForcePushState(p_world_start, theta_d, theta_p, contact, touched, pushed)
+    return state, twist, Details.of(told)._replace(gamma=theta_p)

@@ -1,0 +1,214 @@
+"""The contact's force: what engines tell of it, and what a load cell makes of that."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import refusal
+
+from rps_jax import engines
+from rps_jax.control import strategies
+from rps_jax.control.force_push_published import PublishedForcePushParams
+from rps_jax.control.law import Twist
+from rps_jax.engines.base import Motion
+from rps_jax.engines.fused import step as fused
+from rps_jax.errors import InputError
+from rps_jax.geometry.solid import GRAVITY
+from rps_jax.robot import load_cell
+from rps_jax.robot.load_cell import LoadCell
+from rps_jax.robot.robot import Robot
+from rps_jax.trials import pushes, trial
+from rps_jax.trials.pushes import Case
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+from rps_jax.world import scene
+from rps_jax.world.physics import Physics
+from rps_jax.world.scene import FRICTION, JOINTS, Friction
+
+STANDARD = Physics()
+AHEAD, TURNING = (0.05, 0.0, 0.0), (0.05, 0.01, 0.05)  # [m/s, m/s, rad/s]
+WEIGHT = 20 * GRAVITY  # [N] of the box
+S1, SLIPPERY = FRICTION["S1"], Friction(1e-4, 0.35)
+
+
+@functools.cache
+def pushed(engine, twist=AHEAD, seconds=2.0, friction=S1, robot=Robot(), yaw=0.0, lateral=0.0):
+    """Forces (T, 3) on the base, in its frame, positions (T, 10) and velocities (T, 9) after."""
+    at = scene.load("box", STANDARD, friction, robot=robot)
+    start = scene.initial_qpos(at, gap=0.0, yaw=yaw)[None]
+    start[0, 4] += lateral
+    stage, fields = engines.get(engine).stage_of_scenes([at], np.zeros(1, int))
+    robots = jax.tree.map(lambda x: np.asarray(x, float)[None], robot) if robot.driven else None
+    count = round(seconds / STANDARD.control_period)
+    if engine == "mujoco":
+        batch = engines.get(engine).stepper(stage, start, 1, robots)
+        seen = []
+        for _ in range(count):
+            batch.drive(np.zeros(1, int), np.array([twist]), STANDARD.substeps)
+            seen.append([x[0].copy() for x in (batch.force, batch.qpos, batch.qvel)])
+        batch.close()
+        return tuple(map(np.array, zip(*seen, strict=True)))
+    still = jnp.zeros((1, 9))
+    twists = Twist(*jnp.asarray(twist, float)[:, None])
+    fields, robots = jax.tree.map(lambda x: jnp.asarray(x, float), (fields, robots))
+
+    @jax.jit
+    def run(now):
+        def body(now, _):
+            driven = stage.drive(fields, now, twists, STANDARD, robots, True)
+            now = driven.motion
+            return now, (driven.force[0], now.qpos[0], now.qvel[0])
+
+        return jax.lax.scan(body, now, length=count)[1]
+
+    integral = None if robots is None else jnp.zeros((1, 3))
+    return tuple(map(np.asarray, run(Motion(jnp.asarray(start, float), still, still, integral))))
+
+
+@pytest.mark.parametrize("engine", ["fused", "mjx", "mujoco"])
+def test_a_box_pushed_straight_ahead_pushes_back_with_the_friction_of_its_weight(engine):
+    """Within some per cent: sliding friction of MuJoCo's soft ground lifts what slides."""
+    force, _, _ = pushed(engine)
+    steady = force[50:].mean(axis=0)
+    np.testing.assert_allclose(steady, (-0.3 * WEIGHT, 0.0, 0.0), atol=0.05 * 0.3 * WEIGHT)
+
+
+def test_a_base_of_limited_force_feels_the_object_and_not_its_own_drive():
+    strong = Robot(force_max=400.0)
+    for engine in ("fused", "mujoco"):
+        force, _, _ = pushed(engine, robot=strong)
+        np.testing.assert_allclose(force[50:].mean(axis=0)[0], -0.3 * WEIGHT, rtol=0.05)
+
+
+@pytest.mark.parametrize("engine", ["fused", "mujoco"])
+def test_on_ground_without_friction_a_push_is_the_momentum_that_the_box_gains(engine):
+    """Newton's third law: the impulse on the base is minus m v; at constant speed, nothing.
+
+    What friction there is, of 1e-4, takes 2 % of it.
+    """
+    force, _, qvel = pushed(engine, friction=SLIPPERY)
+    impulse = force.sum(axis=0) * STANDARD.control_period
+    gained = 20.0 * qvel[-1][JOINTS.object.start]
+    assert gained > 0.9 * 20 * 0.05
+    given = gained + 1e-4 * WEIGHT * 2.0
+    np.testing.assert_allclose(impulse[:2], (-given, 0.0), atol=0.003 * gained)
+    np.testing.assert_allclose(force[-20:], 0.0, atol=1e-3)
+
+
+def test_the_fused_engine_tells_the_force_of_c_mujoco():
+    """Over a push of a corner that turns, step by step and in the mean."""
+    (ours, here, _), (theirs, there, _) = (
+        pushed(engine, TURNING, yaw=0.3, lateral=0.05) for engine in ("fused", "mujoco")
+    )
+    np.testing.assert_allclose(here[-1], there[-1], atol=2e-3)
+    size = np.hypot(*theirs[25:, :2].mean(axis=0))
+    assert size > 20
+    np.testing.assert_allclose(ours[25:].mean(axis=0), theirs[25:].mean(axis=0), atol=0.03 * size)
+
+
+def test_the_kernel_tells_the_force_that_xla_tells():
+    at = scene.load("box", STANDARD, S1)
+    qpos = np.repeat(scene.initial_qpos(at, gap=-0.0005)[None], 3, axis=0)
+    qpos[:, 4] += (0.0, 0.05, -0.1)
+    qpos[:, 5] -= 0.0005
+    body = fused.body(at.physics, np.asarray(at.footprint.vertices))
+    bodies = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x, float)[None], 3, axis=0), body)
+    still = jnp.zeros((3, 9))
+    motion = Motion(jnp.asarray(qpos, float), still, still)
+    given = fused.spread(bodies), fused.enter(bodies, motion, force=True)
+    twist = tuple(jnp.full(3, x) for x in TURNING)
+    inside = functools.partial(fused.in_a_kernel, physics=STANDARD, interpret=True)
+    plain = functools.partial(fused.in_xla, physics=STANDARD)
+    felt, expected = (np.array(jax.jit(f)(*given, twist).felt) for f in (inside, plain))
+    assert np.all(expected[0] < -1)
+    np.testing.assert_allclose(felt, expected, rtol=1e-3, atol=1e-2)
+
+
+def test_who_does_not_ask_is_told_no_force():
+    at = scene.load("box", STANDARD, S1)
+    stage, fields = engines.get("fused").stage_of_scenes([at], np.zeros(1, int))
+    still = jnp.zeros((1, 9))
+    motion = Motion(jnp.asarray(scene.initial_qpos(at)[None], float), still, still)
+    fields = jax.tree.map(lambda x: jnp.asarray(x, float), fields)
+    twists = Twist(*(jnp.zeros(1),) * 3)
+
+    def program(force):
+        return jax.make_jaxpr(lambda m: stage.drive(fields, m, twists, STANDARD, None, force))(
+            motion
+        )
+
+    assert len(program(False).out_avals) == 3
+    assert len(program(True).out_avals) == 4
+
+
+def told(cell, forces, period=0.02):
+    key, load = jnp.array([1, 2], jnp.uint32), load_cell.start(jnp.zeros(1))
+    seen = []
+    for i, force in enumerate(forces):
+        load = load._replace(wrench=jnp.array([*force, 0.0]))
+        load, reading = cell.read(load, key, jnp.asarray(i), period)
+        seen.append(reading)
+    return np.array(seen)
+
+
+def test_a_load_cell_follows_a_step_with_its_time_constant():
+    seen = told(LoadCell(noise=0.0, threshold=0.0), [(-30.0, 10.0)] * 5)
+    share = 1 - np.exp(-0.02 * np.arange(1, 6) / 0.05)
+    np.testing.assert_allclose(seen, share[:, None] * (-30.0, 10.0), rtol=1e-5)
+
+
+def test_a_load_cell_tells_nothing_below_its_threshold():
+    seen = told(LoadCell(noise=0.0, threshold=5.0), [(-3.0, 4.2)] * 20)
+    size = np.hypot(*((1 - np.exp(-0.4 * np.arange(1, 21)))[:, None] * (-3.0, 4.2)).T)
+    np.testing.assert_array_equal(np.hypot(*seen.T) > 0, size >= 5)
+    assert 0 < np.count_nonzero(seen[:, 0]) < 20
+
+
+def test_the_noise_of_a_load_cell_is_filtered_too():
+    """Of white noise of 1 N a low-pass of share a leaves sqrt(a / (2 - a)) N."""
+    cell = LoadCell(noise=1.0, threshold=0.0)
+    period, count = 0.02, 400
+    seen = told(cell, [(0.0, 0.0)] * count, period)[20:]
+    share = 1 - np.exp(-period / cell.time_constant)
+    np.testing.assert_allclose(seen.std(axis=0), np.sqrt(share / (2 - share)), rtol=0.15)
+    assert abs(np.corrcoef(seen.T)[0, 1]) < 0.2
+
+
+@pytest.mark.parametrize("name", ["noise", "time_constant", "threshold"])
+def test_a_load_cell_refuses_what_no_sensor_has(name):
+    with pytest.raises(InputError, match=name):
+        LoadCell(**{name: -1.0}).check()
+
+
+@pytest.mark.parametrize("engine", ["fused", "mujoco"])
+def test_a_law_is_told_the_force_of_the_push_it_makes(engine):
+    """Straight on: what the law is told is what the box of 10 kg takes to slide."""
+    params = PublishedForcePushParams(k_theta=-1.0, k_y=0.0)
+    case = Case("box", FRICTION["S1"], (1.6, 0.0), params, gap=0.0, mass=10.0)
+    setting = Setting(engine=engine, rules=Rules(horizon=4.0))
+    if engine == "mujoco":
+        outcome, _ = pushes.run([case], setting, workers=1)
+        assert outcome.base_pose[0][0] == pytest.approx(0.2, rel=0.1)  # 0.05 m/s: it was felt
+        return
+    stage, worlds = pushes.build([case], setting)
+    strategy = strategies.of(params)
+    trials = trial.start_all(worlds, np.ones(1, bool), strategy=strategy)
+    trials, _ = trial.record(
+        stage, worlds, trials, physics=setting.physics, strategy=strategy, steps=200
+    )
+    np.testing.assert_allclose(trials.load.wrench[0, 0], -0.3 * 10 * GRAVITY, rtol=0.1)
+    np.testing.assert_allclose(trials.load.signal[0, 0], -0.3 * 10 * GRAVITY, rtol=0.1)
+
+
+def test_engines_that_tell_no_force_refuse_laws_that_ask_for_it(capsys):
+    words = "engine = quasistatic is not allowed for a strategy that is told the contact's force"
+    with pytest.raises(InputError, match=words):
+        pushes.build([Case("box", S1, (2.0, 0.0), PublishedForcePushParams())], Setting(
+            engine="quasistatic"
+        ))  # fmt: skip
+    asked = ("ladder", "--laws", "force_push_published", "--engine", "quasistatic")
+    assert words in refusal(capsys, *asked)
+    tune = ("tune", "es", "--strategy", "force_push_published", "--engine", "quasistatic")
+    assert words in refusal(capsys, *tune)
