@@ -15,12 +15,7 @@ if TYPE_CHECKING:
     from rps_jax.analysis import tables as tables
     from rps_jax.analysis import video as video
     from rps_jax.control import law as law
-    from rps_jax.control.dipole import DipoleParams as DipoleParams
-    from rps_jax.control.force_push import ForcePushParams as ForcePushParams
     from rps_jax.control.guided import GuidedParams as GuidedParams
-    from rps_jax.control.force_push_published import (
-        PublishedForcePushParams as PublishedForcePushParams,
-    )
     from rps_jax.control.law import Details as Details
     from rps_jax.control.law import LoadedObservation as LoadedObservation
     from rps_jax.control.law import Observation as Observation
@@ -29,7 +24,12 @@ if TYPE_CHECKING:
     from rps_jax.control.law import Temperatures as Temperatures
     from rps_jax.control.law import Twist as Twist
     from rps_jax.control.law import step as step
-    from rps_jax.control.pursuit import PursuitParams as PursuitParams
+    from rps_jax.control.rivals.dipole import DipoleParams as DipoleParams
+    from rps_jax.control.rivals.force_push import ForcePushParams as ForcePushParams
+    from rps_jax.control.rivals.force_push_published import (
+        PublishedForcePushParams as PublishedForcePushParams,
+    )
+    from rps_jax.control.rivals.pursuit import PursuitParams as PursuitParams
     from rps_jax.control.rps_plus import RPSPlusParams as RPSPlusParams
     from rps_jax.control.strategies import Strategy as Strategy
     from rps_jax.control.strategies import register_strategy as register_strategy
@@ -92,11 +92,11 @@ _HOMES = {
         *("Details", "LoadedObservation", "Observation", "RPSParams", "RPSState"),
         *("Temperatures", "Twist", "step"),
     ),
-    "control.dipole": ("DipoleParams",),
-    "control.force_push": ("ForcePushParams",),
+    "control.rivals.dipole": ("DipoleParams",),
+    "control.rivals.force_push": ("ForcePushParams",),
     "control.guided": ("GuidedParams",),
-    "control.force_push_published": ("PublishedForcePushParams",),
-    "control.pursuit": ("PursuitParams",),
+    "control.rivals.force_push_published": ("PublishedForcePushParams",),
+    "control.rivals.pursuit": ("PursuitParams",),
     "control.rps_plus": ("RPSPlusParams",),
     "control.strategies": ("Strategy", "register_strategy"),
     "errors": ("InputError",),

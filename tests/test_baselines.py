@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rps_jax import errors
-from rps_jax.control import aps
-from rps_jax.control.aps import APSParams, APSState, TrackedObservation
 from rps_jax.control.law import Observation
+from rps_jax.control.rivals import aps
+from rps_jax.control.rivals.aps import APSParams, APSState, TrackedObservation
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting

@@ -10,8 +10,8 @@ from helpers import refusal
 
 from rps_jax import engines
 from rps_jax.control import strategies
-from rps_jax.control.force_push_published import PublishedForcePushParams
 from rps_jax.control.law import Twist
+from rps_jax.control.rivals.force_push_published import PublishedForcePushParams
 from rps_jax.engines.base import Motion
 from rps_jax.engines.fused import step as fused
 from rps_jax.errors import InputError

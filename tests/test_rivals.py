@@ -7,21 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rps_jax.control import (
-    dipole,
-    force_push,
-    force_push_published,
-    law,
-    pursuit,
-    rps_plus,
-    strategies,
-)
-from rps_jax.control.aps import TrackedObservation
-from rps_jax.control.dipole import DipoleParams
-from rps_jax.control.force_push import ForcePushParams
-from rps_jax.control.force_push_published import PublishedForcePushParams
+from rps_jax.control import law, rps_plus, strategies
 from rps_jax.control.law import LoadedObservation, Observation, RPSParams, RPSState, Twist
-from rps_jax.control.pursuit import PursuitParams
+from rps_jax.control.rivals import dipole, force_push, force_push_published, pursuit
+from rps_jax.control.rivals.aps import TrackedObservation
+from rps_jax.control.rivals.dipole import DipoleParams
+from rps_jax.control.rivals.force_push import ForcePushParams
+from rps_jax.control.rivals.force_push_published import PublishedForcePushParams
+from rps_jax.control.rivals.pursuit import PursuitParams
 from rps_jax.control.rps_plus import RPSPlusParams
 from rps_jax.errors import InputError
 from rps_jax.trials import pushes

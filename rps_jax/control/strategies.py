@@ -18,15 +18,16 @@ import jax
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.control import aps, dipole, force_push, force_push_published, guided, law, pursuit, rps_plus
-from rps_jax.control.aps import APSParams, APSState
+from rps_jax.control import guided, law, rps_plus
 from rps_jax.control.bounds import Bound
-from rps_jax.control.dipole import DipoleParams
-from rps_jax.control.force_push import ForcePushParams
 from rps_jax.control.guided import GuidedParams
-from rps_jax.control.force_push_published import PublishedForcePushParams
 from rps_jax.control.law import Details, RPSParams, RPSState, Temperatures, Twist
-from rps_jax.control.pursuit import PursuitParams
+from rps_jax.control.rivals import aps, dipole, force_push, force_push_published, pursuit
+from rps_jax.control.rivals.aps import APSParams, APSState
+from rps_jax.control.rivals.dipole import DipoleParams
+from rps_jax.control.rivals.force_push import ForcePushParams
+from rps_jax.control.rivals.force_push_published import PublishedForcePushParams
+from rps_jax.control.rivals.pursuit import PursuitParams
 from rps_jax.control.rps_plus import RPSPlusParams
 from rps_jax.robot.load_cell import LoadCell
 

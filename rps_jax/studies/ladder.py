@@ -15,12 +15,12 @@ from rps_jax import errors
 from rps_jax.analysis import figures, tables
 from rps_jax.analysis.report import Section
 from rps_jax.control import strategies
-from rps_jax.control.aps import APSParams
-from rps_jax.control.dipole import DipoleParams
-from rps_jax.control.force_push import ForcePushParams
-from rps_jax.control.force_push_published import PublishedForcePushParams
 from rps_jax.control.law import RPSParams
-from rps_jax.control.pursuit import PursuitParams
+from rps_jax.control.rivals.aps import APSParams
+from rps_jax.control.rivals.dipole import DipoleParams
+from rps_jax.control.rivals.force_push import ForcePushParams
+from rps_jax.control.rivals.force_push_published import PublishedForcePushParams
+from rps_jax.control.rivals.pursuit import PursuitParams
 from rps_jax.control.rps_plus import RPSPlusParams
 from rps_jax.control.strategies import Params
 from rps_jax.engines import EngineName

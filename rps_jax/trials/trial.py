@@ -16,8 +16,8 @@ import jax.numpy as jnp
 
 from rps_jax import errors
 from rps_jax.control import law
-from rps_jax.control.aps import TrackedObservation
 from rps_jax.control.law import Details, LoadedObservation, Observation, Twist
+from rps_jax.control.rivals.aps import TrackedObservation
 from rps_jax.control.strategies import RPS, Params, Strategy
 from rps_jax.engines.base import Driven, Motion, Stage
 from rps_jax.geometry import footprint as fp

@@ -28,9 +28,9 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import engines, errors
-from rps_jax.control import force_push_published as force_push
-from rps_jax.control.force_push_published import PublishedForcePushParams
 from rps_jax.control.law import Details, LoadedObservation, Twist
+from rps_jax.control.rivals import force_push_published as force_push
+from rps_jax.control.rivals.force_push_published import PublishedForcePushParams
 from rps_jax.control.strategies import Strategy
 from rps_jax.engines import EngineName
 from rps_jax.geometry import planar, solid

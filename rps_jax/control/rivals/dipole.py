@@ -20,9 +20,9 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax import errors
-from rps_jax.control.aps import TrackedObservation
 from rps_jax.control.bounds import Bound
 from rps_jax.control.law import Details, Twist
+from rps_jax.control.rivals.aps import TrackedObservation
 from rps_jax.geometry import planar
 
 
