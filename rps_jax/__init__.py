@@ -71,6 +71,9 @@ if TYPE_CHECKING:
     from rps_jax.trials.trial import Outcome as Outcome
     from rps_jax.trials.trial import Rules as Rules
     from rps_jax.tuning import gradients as gradients
+    from rps_jax.tuning.learn import Lessons as Lessons
+    from rps_jax.tuning.learn import learn as learn
+    from rps_jax.tuning.ppo import PPO as PPO
     from rps_jax.tuning.space import Space as Space
     from rps_jax.world import paper as paper
     from rps_jax.world.domain import DOMAINS as DOMAINS
@@ -123,6 +126,8 @@ _HOMES = {
     "trials.pushes": ("Case",),
     "trials.setting": ("Progress", "Setting", "progress_bar"),
     "trials.trial": ("Outcome", "Rules"),
+    "tuning.learn": ("Lessons", "learn"),
+    "tuning.ppo": ("PPO",),
     "tuning.space": ("Space",),
     "world.domain": ("DOMAINS", "Domain", "Range"),
     "world.objects": ("OBJECTS", "register_object"),

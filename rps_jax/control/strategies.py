@@ -22,6 +22,7 @@ from rps_jax.control import guided, law, rps_plus
 from rps_jax.control.bounds import Bound
 from rps_jax.control.guided import GuidedParams
 from rps_jax.control.law import Details, RPSParams, RPSState, Temperatures, Twist
+from rps_jax.control.learned import policy
 from rps_jax.control.rivals import aps, dipole, force_push, force_push_published, pursuit
 from rps_jax.control.rivals.aps import APSParams, APSState
 from rps_jax.control.rivals.dipole import DipoleParams
@@ -31,10 +32,11 @@ from rps_jax.control.rivals.pursuit import PursuitParams
 from rps_jax.control.rps_plus import RPSPlusParams
 from rps_jax.robot.load_cell import LoadCell
 
-# What a strategy is told: where the skin is touched (`law.Observation`), the contact's force as
-# well (`law.LoadedObservation`), or the object's place and size (`aps.TrackedObservation`). All
-# know odometry and the target.
-Senses = Literal["touch", "force", "pose"]
+# What a strategy is told: where the skin is touched (`law.Observation`), what each taxel answers as
+# well (`learned.observation.TaxelObservation`), the contact's force as well
+# (`law.LoadedObservation`), or the object's place and size (`aps.TrackedObservation`). All know
+# odometry and the target.
+Senses = Literal["touch", "taxels", "force", "pose"]
 
 
 def numbers(params: Any) -> dict[str, Any]:
@@ -88,6 +90,13 @@ def _of_module(module: ModuleType, senses: Senses = "touch") -> Strategy:
     return Strategy(module.init, module.step, senses, check=module.check, bounds=bounds)
 
 
+def _of_policy(content: bytes, source: Any) -> tuple[str, Strategy, Params]:
+    """What a policy's file holds, as a strategy: its label, the strategy and its parameters."""
+    found = policy.decoded(content, source)
+    strategy = Strategy(*policy.functions(found), "taxels", check=policy.check)
+    return policy.label(found), strategy, policy.parameters(found)
+
+
 Params = RPSParams | APSParams | Any  # a pytree of numbers, of a class in STRATEGIES
 RPS = Strategy(
     RPSState.init, law.step_with_details, check=law.check, bounds=tuple(law.BOUNDS.items())
@@ -103,7 +112,7 @@ RIVALS: dict[str, tuple[Strategy, Params]] = {
     "force_push_published": (_of_module(force_push_published, "force"), PublishedForcePushParams()),
     "dipole": (_of_module(dipole, "pose"), DipoleParams()),
     "guided": (Strategy(guided.init, guided.step, check=guided.check), GuidedParams()),
-}
+} | {name: _of_policy(path.read_bytes(), path)[1:] for name, path in policy.SHIPPED.items()}
 PARAMS: dict[str, Params] = PAPER | {name: params for name, (_, params) in RIVALS.items()}
 STRATEGIES: dict[type, Strategy] = {RPSParams: RPS, APSParams: APS} | {
     type(params): strategy for strategy, params in RIVALS.values()
@@ -203,13 +212,16 @@ def _is_number(leaf: Any) -> bool:
 
 
 def named(text: str) -> tuple[str, Params]:
-    """A strategy's name and parameters, by its name or as `my_law.py:MyParams`.
+    """A strategy's name and parameters: by its name, as `my_law.py:MyParams`, or of `policy.npz`.
 
-    The file is run; it must register the strategy whose parameters are of that class.
+    A file of Python is run; it must register the strategy whose parameters are of that class.
 
     Raises:
-      InputError: there is no such strategy, file or class, or the file does not register it.
+      InputError: there is no such strategy, file or class, the file does not register it, or it
+        is no policy.
     """
+    if text.endswith(".npz"):
+        return _learned(Path(text))
     path, _, kind = text.rpartition(":")
     if not path.endswith(".py"):
         return text, PARAMS[errors.check_name("strategy", text, PARAMS)]
@@ -229,6 +241,17 @@ def named(text: str) -> tuple[str, Params]:
     )
 
 
+def _learned(path: Path) -> tuple[str, Params]:
+    """Name and parameters of a learned law's file, registered by a name of its own."""
+    content = _read(path)
+    name, strategy, params = _of_policy(content, path)
+    if name not in PARAMS:
+        register_strategy(name, strategy, params)
+    found, digest = PARAMS[name], hashlib.sha256(content).hexdigest()[:16]
+    _SOURCES[type(found)] = {"file": str(path.resolve()), "digest": digest}
+    return name, found
+
+
 def _registered(module: str, kind: str) -> tuple[str, Params] | None:
     """Name and parameters of the strategy whose parameters are of a class of a module."""
     own = getattr(sys.modules.get(module), kind, None)
@@ -240,7 +263,8 @@ def _read(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise errors.InputError(
-            f"strategy = {path} cannot be read ({error.strerror}): give FILE.py:CLASS."
+            f"strategy = {path} cannot be read ({error.strerror}): give FILE.py:CLASS or "
+            "a policy's FILE.npz."
         ) from error
 
 
@@ -281,7 +305,7 @@ def restored(values: Mapping[str, Any]) -> Params:
     left = dict(values)
     kind, file, digest = (left.pop(key, None) for key in ("strategy", "file", "digest"))
     if file:
-        _, found = named(f"{file}:{kind}")
+        _, found = named(file if file.endswith(".npz") else f"{file}:{kind}")
         if _SOURCES[type(found)]["digest"] != digest:
             raise errors.InputError(
                 f"strategy = {file} is not what it was when the run was made: restore the file."

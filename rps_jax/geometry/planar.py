@@ -83,3 +83,9 @@ def yaw_of_quaternion(quaternion: jax.Array) -> jax.Array:
     """Heading (...) [rad] of unit quaternions (..., 4), scalar first."""
     w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
     return direction(jnp.stack([1 - 2 * (y * y + z * z), 2 * (w * z + x * y)], axis=-1))
+
+
+def upright(quaternion: jax.Array) -> jax.Array:
+    """Cosine (...) of the tilt of unit quaternions (..., 4), scalar first."""
+    _, x, y, _ = jnp.moveaxis(quaternion, -1, 0)
+    return 1 - 2 * (x * x + y * y)

@@ -308,6 +308,18 @@ class SmoothSkin(NamedTuple):
         return self.sensor.sense_smoothly(state, footprint, period, self.temperature)
 
 
+def signals(skin: Skin, state: SkinState, footprint: Footprint) -> jax.Array:
+    """What the taxels of a skin tell (T,) [1], filtered; 0 of one that is dead.
+
+    For a skin without taxels: what perfect ones on its boards would answer at once to a footprint
+    placed in the robot frame.
+    """
+    if state.signal.size:
+        return jnp.where(state.alive, state.signal, 0.0)
+    perfect = CapacitiveSkin(shell=skin.shell)
+    return perfect._scan(perfect.init(state.key), footprint)[1]
+
+
 def own(sensor: Any) -> list[str]:
     """Names of the numbers of a sensor itself; where it feels is the robot's."""
     return [name for name in sensor._fields if name != "shell"]

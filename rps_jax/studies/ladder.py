@@ -16,6 +16,7 @@ from rps_jax.analysis import figures, tables
 from rps_jax.analysis.report import Section
 from rps_jax.control import strategies
 from rps_jax.control.law import RPSParams
+from rps_jax.control.learned import policy
 from rps_jax.control.rivals.aps import APSParams
 from rps_jax.control.rivals.dipole import DipoleParams
 from rps_jax.control.rivals.force_push import ForcePushParams
@@ -44,11 +45,11 @@ RUNGS: dict[str, Params] = {
     "force_push_published": PublishedForcePushParams(),
     "aps": APSParams(),
     "dipole": DipoleParams(),
-}
+} | {name: strategies.PARAMS[name] for name in policy.SHIPPED}
 
 
 def rungs(names: Sequence[str] = tuple(RUNGS)) -> dict[str, Params]:
-    """Laws by their names in `RUNGS`, or of a file, as `my_law.py:MyParams`.
+    """Laws by their names in `RUNGS`, or of a file: `my_law.py:MyParams` or `policy.npz`.
 
     Raises:
       InputError: none is asked for, one twice, or one that is unknown.
@@ -56,7 +57,7 @@ def rungs(names: Sequence[str] = tuple(RUNGS)) -> dict[str, Params]:
     errors.check_each_once("laws", names)
     found = {}
     for name in names:
-        if ".py:" in name:
+        if ".py:" in name or name.endswith(".npz"):
             own, params = strategies.named(name)
             found[own] = params
         else:
@@ -138,8 +139,9 @@ def sections(folder: Path, plan: Plan, results: xr.Dataset) -> list[Section]:
     told = senses(plan.arms)
     picture = figures.ladder(results, told, folder / "ladder.png")
     text = (
-        "Laws by what they are told: `touch` is where the skin is touched, `force` also the "
-        "contact's force, and `pose` where the object is and how large."
+        "Laws by what they are told: `touch` is where the skin is touched, `taxels` also what each "
+        "taxel answers, `force` also the contact's force, and `pose` also where the object is and "
+        "how large."
     )
     found = [Section("Information against success", text, (), picture)]
     if REFERENCE in plan.arms and len(plan.arms) > 1:

@@ -26,8 +26,10 @@ from rps_jax import engines, errors
 from rps_jax.analysis import video
 from rps_jax.control import law, strategies
 from rps_jax.control.law import RPSParams, Twist
+from rps_jax.control.learned.observation import TaxelObservation
 from rps_jax.engines.base import Driven, Motion, Stage
 from rps_jax.engines.mjx_colliders import mjx
+from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.robot.robot import Robot
 from rps_jax.trials import trial
@@ -49,6 +51,9 @@ class Reward(NamedTuple):
     )
     no_contact: float = 0.05  # [1/s] cost of being out of contact: that of progress at 5 cm/s
     success: float = 1.0  # [1] for arriving, once
+    # Of what the law is not told, for loops that ask for it.
+    object: float = 0.0  # [1/m] that the outline of the object is nearer to the target than before
+    behind: float = 0.0  # [1] that target and object are seen nearer to one direction: the cosine
 
 
 @jax.tree_util.register_dataclass
@@ -61,7 +66,8 @@ class State:
     reward: jax.Array  # () [1]
     done: jax.Array  # () [1] 0 or 1
     metrics: dict[str, jax.Array]  # () each
-    info: dict[str, Any]  # `world`: the World; `index`: its number in the domain
+    # `world`: the World; `index`: its number in the domain; `told`: the TaxelObservation.
+    info: dict[str, Any]
 
     def replace(self, **changes: Any) -> State:
         """The state with other values."""
@@ -115,13 +121,22 @@ class PushEnv:
     def reset(self, rng: jax.Array) -> State:
         """A world by chance, at its start, from a key."""
         key_world, key = jax.random.split(rng)
-        row = jax.random.randint(key_world, (), 0, self.worlds)
-        world = rows(self._part.worlds, row)._replace(key=jax.random.key_data(key))
+        index = jax.random.randint(key_world, (), 0, self.worlds)
+        world = rows(self.table, index)
+        return self.begin(world._replace(key=jax.random.key_data(key)), index)
+
+    @property
+    def table(self) -> World:
+        """All its worlds, as leaves (worlds, ...)."""
+        return self._part.worlds
+
+    def begin(self, world: World, index: jax.Array) -> State:
+        """A world, of the index or one that was made of it, at its start."""
         before = trial.start(world)
         never_felt = jnp.full_like(before.min_distance, jnp.inf)
         now, seen = self._observe(world, before._replace(strategy=never_felt))
         nothing = jnp.zeros_like(now.min_distance)
-        info = {"world": world, "index": jnp.asarray(self._part.numbers)[row]}
+        info = {"world": world, "index": index, "told": self._told(world, now, seen)}
         return State(now, _obs(now, seen), nothing, nothing, _metrics(now, seen, nothing), info)
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -139,12 +154,15 @@ class PushEnv:
             - self.weights.no_contact * self.dt * ~seen.reading.in_contact
             + self.weights.success * now.success
         )
+        for weight, gain in zip(self.weights[3:], self._gains(world, before, now), strict=True):
+            reward += weight * gain if weight else 0.0
         return state.replace(
             data=now,
             obs=_obs(now, seen),
             reward=jnp.where(gone, 0.0, reward),
             done=now.done.astype(reward.dtype),
             metrics=state.metrics | _metrics(now, seen, jnp.where(gone, 0.0, progress)),
+            info=state.info | {"told": self._told(world, now, seen)},
         )
 
     def twist(self, action: jax.Array) -> Twist:
@@ -153,6 +171,19 @@ class PushEnv:
         wanted = Twist(v_max * action[0], v_max * action[1], omega_max * action[2])
         return law.saturate(self.params, wanted)
 
+    def _gains(self, world: World, before: Trial, now: Trial) -> tuple[jax.Array, jax.Array]:
+        """By how much a step brought the object nearer [m], and the base behind it [1]."""
+
+        def of(state: Trial) -> tuple[jax.Array, jax.Array]:
+            p_object, _ = trial.object_pose(state.qpos)
+            away = planar.norm(world.p_world_target - p_object) - fp.circumradius(world.footprint)
+            ways = p_object - state.qpos[:2], world.p_world_target - state.qpos[:2]
+            lengths = jnp.maximum(planar.norm(ways[0]) * planar.norm(ways[1]), 1e-6)
+            return jnp.maximum(away, 0.0), jnp.dot(*ways) / lengths
+
+        (far, apart), (near, together) = of(before), of(now)
+        return far - near, together - apart
+
     def _observe(self, world: World, before: Trial) -> tuple[Trial, Seen]:
         """Sense and judge, unless the trial has ended."""
         physics, rules = self.setting.physics, self.setting.rules
@@ -160,6 +191,11 @@ class PushEnv:
         felt = jnp.where(seen.reading.in_contact, seen.distance, before.strategy)
         told = told._replace(strategy=felt)
         return jax.tree.map(lambda a, b: jnp.where(before.done, a, b), before, told), seen
+
+    def _told(self, world: World, now: Trial, seen: Seen) -> TaxelObservation:
+        """What a law that senses taxels is told."""
+        felt = world.skin, now.skin, trial.outline(world, now.qpos)
+        return TaxelObservation.of(seen.observation, seen.reading, *felt, jnp.asarray(self.dt))
 
     # --- what it is made of ---
 

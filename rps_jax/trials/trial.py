@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from rps_jax import errors
 from rps_jax.control import law
 from rps_jax.control.law import Details, LoadedObservation, Observation, Twist
+from rps_jax.control.learned.observation import TaxelObservation
 from rps_jax.control.rivals.aps import TrackedObservation
 from rps_jax.control.strategies import RPS, Params, Strategy
 from rps_jax.engines.base import Driven, Motion, Stage
@@ -134,12 +135,6 @@ def object_pose(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
     return free[:2], planar.yaw_of_quaternion(free[3:])
 
 
-def _upright(qpos: jax.Array) -> jax.Array:
-    """Cosine () of the object's tilt."""
-    _, x, y, _ = qpos[JOINTS.object][3:]
-    return 1 - 2 * (x * x + y * y)
-
-
 def p_world_contact(seen: Snapshot) -> jax.Array:
     """Contact points of snapshots (T, ...) in the world, (T, 2) [m]; NaN without contact."""
     point = seen.qpos[:, :2] + planar.rotate(seen.qpos[:, 2], seen.reading.p_robot_contact)
@@ -235,7 +230,7 @@ def observe(
     touch = reading.contact_type != NONE
     lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
     success = touch & (distance < world.params.d_success)
-    tipped = _upright(trial.qpos) < jnp.cos(rules.max_tilt)
+    tipped = planar.upright(trial.qpos[JOINTS.object][3:]) < jnp.cos(rules.max_tilt)
     over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost) | tipped
     told = trial._replace(
         skin=skin,
@@ -289,6 +284,9 @@ def decide(
         observation = TrackedObservation(
             observation, object_pose(told.qpos)[0], fp.circumradius(world.footprint), period
         )
+    if strategy.senses == "taxels":
+        skin = world.skin, told.skin, outline(world, told.qpos)
+        observation = TaxelObservation.of(observation, seen.reading, *skin, period)
     if told.load is not None:
         felt, force = strategy.cell.read(told.load, world.key, told.steps, period)
         told, observation = told._replace(load=felt), LoadedObservation(observation, force, period)

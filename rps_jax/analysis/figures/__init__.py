@@ -20,4 +20,10 @@ from rps_jax.analysis.figures.studies import (
     turning,
 )
 from rps_jax.analysis.figures.sweeps import failures, ladder, paired, success_curves
-from rps_jax.analysis.figures.tuning import between_bounds, estimates, races, tuning_log
+from rps_jax.analysis.figures.tuning import (
+    between_bounds,
+    estimates,
+    learning_curve,
+    races,
+    tuning_log,
+)

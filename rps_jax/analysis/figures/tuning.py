@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rps_jax.analysis.figures.style import save
@@ -109,4 +111,45 @@ def estimates(
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("gradient [m]")
     axes[0].legend(fontsize=8)
+    return save(figure, path)
+
+
+def learning_curve(curve: xr.Dataset, path: Path) -> Path:
+    """How a law was learned: successes and rewards against both clocks, and the algorithm's state.
+
+    The curves of single updates are drawn thin; thick ones are means over 1/40 of the run.
+    """
+    figure = Figure(figsize=(10, 5.6), layout="constrained")
+    axes = figure.subplots(2, 2)
+    minutes, simulated = curve.time.values / 60, curve.simulated.values
+    width = max(1, curve.sizes["update"] // 40)
+
+    def draw(ax: Axes, x: np.ndarray, name: str, scale: float, colour: str, label: str) -> None:
+        values = scale * curve[name].values
+        mean = curve[name].rolling(update=width, min_periods=1, center=True).mean().values
+        ax.plot(x, values, color=colour, lw=0.6, alpha=0.35)
+        ax.plot(x, scale * mean, color=colour, lw=1.6, label=label)
+
+    judged = np.isfinite(curve.validation.values)
+    clocks = ((minutes, "wall clock, with compilation [min]"), (simulated, "simulated time [s]"))
+    for ax, (x, label) in zip(axes[0], clocks, strict=True):
+        draw(ax, x, "success", 100, "C0", "trials that ended, with noise, at the level below")
+        ax.plot(x, 100 * curve.level, "k:", lw=1, label="level of the curriculum")
+        ax.plot(
+            x[judged], 100 * curve.validation.values[judged], "C3o-", ms=4,
+            label="validation: the domain itself, no noise",
+        )  # fmt: skip
+        ax.set(xlabel=label, ylabel="success, level [%]", ylim=(-3, 103))
+        ax.grid(alpha=0.3)
+    axes[0, 0].legend(fontsize=7, loc="lower right")
+    draw(axes[1, 0], minutes, "earned", 1, "C2", "rewards of a trial")
+    axes[1, 0].set(xlabel=clocks[0][1], ylabel="rewards of a trial that ended [1]")
+    axes[1, 0].grid(alpha=0.3)
+    ax = axes[1, 1]
+    ax.plot(simulated, curve.spread, label="standard deviation of the actions")
+    ax.plot(simulated, 100 * curve.learning_rate, label="100 learning rates")
+    ax.plot(simulated, curve.touching, label="share of decisions in contact")
+    ax.set(xlabel=clocks[1][1], ylabel="[1]")
+    ax.grid(alpha=0.3)
+    ax.legend(fontsize=7)
     return save(figure, path)

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import tyro
 
-from rps_jax.app.cli import failing, looking, replicating, sweeping, tuning
+from rps_jax.app.cli import failing, learning, looking, replicating, sweeping, tuning
 from rps_jax.app.cli.running import guarded
 
 Command = (
@@ -34,6 +34,7 @@ Command = (
     | Annotated[failing.Attack, tyro.conf.subcommand("attack")]
     | Annotated[failing.Regress, tyro.conf.subcommand("regress")]
     | Annotated[tuning.Tune, tyro.conf.subcommand("tune")]
+    | Annotated[learning.Learn, tyro.conf.subcommand("learn")]
     | Annotated[looking.Doctor, tyro.conf.subcommand("doctor")]
 )
 

@@ -1,0 +1,164 @@
+"""What a learned law is told, what it keeps of it, and the numbers that its network sees.
+
+A law that senses `taxels` is told the signal of every taxel beside what RPS is told. Between two
+control steps it remembers where it last felt the object, by odometry.
+
+The numbers of a network are of order 1: lengths are on logarithmic or tanh scales, directions are
+unit vectors. A world that is mirrored at the robot's axis, y to -y, gives the mirrored numbers.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rps_jax.control import law
+from rps_jax.control.law import Observation, Twist
+from rps_jax.geometry import planar
+from rps_jax.geometry.footprint import Footprint
+from rps_jax.robot import skin as skins
+from rps_jax.robot.skin import LINE, NONE, Reading, Skin, SkinState, SmoothReading
+
+_BASE = 0.36  # [m] scale of places on the base
+_NEAR, _FAR = 0.05, 3.0  # [m] distances that are 0 and 1 on the logarithmic scale
+_CLOSE = 0.3  # [m] of the tanh scale of distances
+_WHILE = 5.0  # [s] of the tanh scale of the time since contact
+_DRIFT = 0.01  # [m] of the tanh scale of a contact's way on the base between two decisions
+
+
+class TaxelObservation(NamedTuple):
+    """What a law that senses taxels may know: what RPS knows, and what each taxel answers."""
+
+    touch: Observation  # `in_contact` is () bool
+    signal: jax.Array  # (T,) [1] filtered relative change of capacitance; 0 of a dead taxel
+    line: jax.Array  # () bool: the contact is a line, longer than a point
+    period: float | jax.Array  # () [s] since the last control step
+
+    @classmethod
+    def of(
+        cls,
+        touch: Observation,
+        reading: Reading | SmoothReading,
+        skin: Skin,
+        state: SkinState,
+        placed: Footprint,
+        period: float | jax.Array,
+    ) -> TaxelObservation:
+        """What is told of a reading, for an object's outline `placed` in the robot frame.
+
+        A skin without taxels tells what perfect ones on the same boards would answer.
+        """
+        return cls(
+            touch._replace(in_contact=reading.contact_type != NONE),
+            skins.signals(skin, state, placed),
+            reading.contact_type == LINE,
+            period,
+        )
+
+
+class Felt(NamedTuple):
+    """What is remembered of touch, with odometry."""
+
+    p_world_contact: jax.Array  # (2,) [m] where the object was last touched
+    touched: jax.Array  # () bool: it was at least once
+    since: jax.Array  # () [s] since then
+    in_contact: jax.Array  # () bool: it is touched now
+    p_robot_before: jax.Array  # (2,) [m] the contact at the last decision
+    before: jax.Array  # () bool: there was one
+
+    @classmethod
+    def nothing(cls, dtype: jax.typing.DTypeLike = float) -> Felt:
+        """Before anything was felt."""
+        zero, no = jnp.zeros((), dtype), jnp.zeros((), bool)
+        return cls(jnp.zeros(2, dtype), no, zero, no, jnp.zeros(2, dtype), no)
+
+    def follow(self, seen: TaxelObservation) -> Felt:
+        """The memory after one more control step."""
+        touch = seen.touch
+        there = touch.p_world_robot + planar.rotate(touch.yaw, touch.p_robot_contact)
+        return self._replace(
+            p_world_contact=jnp.where(touch.in_contact, there, self.p_world_contact),
+            touched=self.touched | touch.in_contact,
+            since=jnp.where(touch.in_contact, 0.0, self.since + seen.period),
+            in_contact=touch.in_contact,
+        )
+
+    def decided(self, seen: TaxelObservation) -> Felt:
+        """The memory after a decision."""
+        return self._replace(p_robot_before=self.p_robot_contact(seen), before=self.in_contact)
+
+    def p_robot_contact(self, seen: TaxelObservation) -> jax.Array:
+        """The last contact (2,) [m], in the robot frame as it is now; 0 before any."""
+        away = self.p_world_contact - seen.touch.p_world_robot
+        there = jnp.where(
+            seen.touch.in_contact, seen.touch.p_robot_contact, planar.rotate(-seen.touch.yaw, away)
+        )
+        return jnp.where(self.touched, there, 0.0)
+
+
+def _way(p_robot: jax.Array) -> list[jax.Array]:
+    """A way (2,) [m] as a direction, and its length on two scales."""
+    length = planar.norm(p_robot)
+    direction = p_robot / jnp.maximum(length, 1e-6)
+    scaled = jnp.log(jnp.maximum(length, _NEAR / 2) / _NEAR) / np.log(_FAR / _NEAR)
+    return [direction, scaled[None], jnp.tanh(length / _CLOSE)[None]]
+
+
+# Signs under the mirror of all that `features` gives after the taxels.
+_SIGNS = np.array(
+    [1, 1, 1, 1]  # contact, line, touched, since
+    + [1, -1]  # place of the contact
+    + [1, -1, 1, 1] * 2  # ways from the contact and from the base to the target
+    + [1, -1]  # drift
+    + [1, -1, -1],  # action
+    np.float32,
+)
+
+
+def size(taxels: int) -> int:
+    """How many numbers `features` gives for a skin of so many taxels."""
+    return taxels + _SIGNS.size
+
+
+def features(felt: Felt, action: jax.Array, seen: TaxelObservation) -> jax.Array:
+    """The numbers (F,) that a network sees at a decision.
+
+    Args:
+      felt: what is remembered, after it has followed `seen`.
+      action: (3,) [1] the last one.
+      seen: what is told.
+    """
+    touch = seen.touch
+    contact = felt.p_robot_contact(seen)
+    d = law.displacement(touch._replace(p_robot_contact=contact))
+    base = law.displacement(touch._replace(p_robot_contact=jnp.zeros_like(contact)))
+    drift = jnp.tanh((contact - felt.p_robot_before) / _DRIFT)
+    kept = touch.in_contact & felt.before
+    flags = jnp.stack([touch.in_contact, seen.line & touch.in_contact, felt.touched])
+    return jnp.concatenate(
+        [
+            jnp.arcsinh(seen.signal),
+            flags.astype(contact.dtype),
+            jnp.tanh(felt.since / _WHILE)[None],
+            jnp.clip(contact / _BASE, -3.0, 3.0),
+            *_way(planar.rotate(-touch.yaw, d)),
+            *_way(planar.rotate(-touch.yaw, base)),
+            jnp.where(kept, drift, 0.0),
+            action,
+        ]
+    )
+
+
+def mirrored(numbers: jax.Array) -> jax.Array:
+    """The numbers (..., F) of the mirrored world: the strip of taxels runs the other way."""
+    count = numbers.shape[-1] - _SIGNS.size
+    signs = jnp.asarray(_SIGNS, numbers.dtype)
+    return jnp.concatenate([numbers[..., :count][..., ::-1], numbers[..., count:] * signs], -1)
+
+
+def executed(action: jax.Array) -> jax.Array:
+    """An action (..., 3) [1] as it is carried out: a share of the greatest twist, within 1."""
+    return jnp.stack(Twist(*jnp.moveaxis(action, -1, 0)).within(1.0, 1.0), axis=-1)
