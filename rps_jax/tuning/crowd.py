@@ -65,18 +65,12 @@ def network_of(ppo: PPO, envs: Sequence[PushEnv]) -> Network:
     """The network for these environments.
 
     Raises:
-      InputError: their skins have different numbers of taxels, or an action is shorter than a
-        control step.
+      InputError: their skins have different numbers of taxels.
     """
     counts = {env.observation_size - 2 for env in envs}
     if len(counts) > 1:
         raise errors.InputError(
             f"domains with skins of {sorted(counts)} taxels are not allowed: learn in one of them."
-        )
-    if ppo.hold < 0.999 * envs[0].dt:
-        raise errors.InputError(
-            f"hold = {ppo.hold:g} s is not allowed: an action lasts for a control step at least, "
-            f"{envs[0].dt:g} s."
         )
     return Network(ppo.network, ppo.width, counts.pop(), ppo.hold).check()
 
@@ -121,12 +115,16 @@ def _anew(
         own = jnp.where((u < 0.2) & (level < 1), 5 * u, 1.0) * level
         world = eased(rows(table, index), own)
         state = env.begin(world._replace(key=jax.random.key_data(noise)), index)
-        memory = Memory.init(network, state.obs.dtype)
-        felt = memory.felt.follow(state.info["told"])
-        return state, memory._replace(felt=felt)
+        return state, _first_felt(network, state)
 
     states, memory = jax.vmap(one)(jax.random.split(key, count))
     return Crowd(states, memory, jnp.ones(count, bool), jnp.zeros(count))
+
+
+def _first_felt(network: Network, state: State) -> Memory:
+    """What the law remembers at a start, which it has sensed."""
+    memory = Memory.init(network, state.obs.dtype)
+    return memory._replace(felt=memory.felt.follow(state.info["told"]))
 
 
 def _private(env: PushEnv, state: State) -> jax.Array:
@@ -284,15 +282,12 @@ def _graded(ppo: PPO, learner: Learner, ended: jax.Array, won: jax.Array) -> Lea
     return learner._replace(level=level, ended=ended, won=won)
 
 
-def outcomes(
-    network: Network, env: PushEnv, table: World, actor: Weights
-) -> tuple[jax.Array, jax.Array]:
-    """Success (N,) bool and time (N,) [s] of the law, without noise, in all worlds of `env`."""
+def pushed(network: Network, env: PushEnv, table: World, actor: Weights) -> State:
+    """The states (N,) in which the law, without noise, leaves all worlds of an environment."""
 
     def one(index: jax.Array) -> tuple[State, Memory]:
         state = env.begin(rows(table, index), index)
-        memory = Memory.init(network, state.obs.dtype)
-        return state, memory._replace(felt=memory.felt.follow(state.info["told"]))
+        return state, _first_felt(network, state)
 
     states, memory = jax.vmap(one)(jnp.arange(env.worlds))
     crowd = Crowd(states, memory, jnp.ones(env.worlds, bool), jnp.zeros(env.worlds))
@@ -305,19 +300,15 @@ def outcomes(
     def some_run(crowd: Crowd) -> jax.Array:
         return ~jnp.all(crowd.states.data.done)
 
-    data = jax.lax.while_loop(some_run, on, crowd).states.data
-    return data.success, data.steps * env.dt
+    return jax.lax.while_loop(some_run, on, crowd).states
 
 
 def examine(
-    ppo: PPO,
-    network: Network,
-    envs: Sequence[PushEnv],
-    tables: Sequence[World],
-    actor: Weights,
+    network: Network, envs: Sequence[PushEnv], tables: Sequence[World], actor: Weights
 ) -> tuple[jax.Array, jax.Array]:
-    """`outcomes` in the worlds of several environments, one after another."""
-    del ppo
-    each = [outcomes(network, env, table, actor) for env, table in zip(envs, tables, strict=True)]
-    success, took = (jnp.concatenate(parts) for parts in zip(*each, strict=True))
-    return success, took
+    """Success (N,) bool and time (N,) [s] of the law in all worlds, one environment by one."""
+    each = [
+        pushed(network, env, table, actor).data for env, table in zip(envs, tables, strict=True)
+    ]
+    took = [data.steps * env.dt for data, env in zip(each, envs, strict=True)]
+    return jnp.concatenate([data.success for data in each]), jnp.concatenate(took)

@@ -88,6 +88,7 @@ class Lessons:
         self.rules.check()
         for one in self.domains:
             alone = replace(one, objects=self.objects)
+            errors.check_name("skin of a domain to learn in", one.skin, ("capacitive",))
             engines.get(self.engine).check(alone.families)
         engines.get(self.engine).check_followed()
 
@@ -168,6 +169,11 @@ def learn(
         raise errors.InputError(
             f"batches = {how.batches} is not allowed: there are but {count} worlds."
         )
+    if how.hold < 0.999 * (period := preset(fidelity=lessons.fidelity).control_period):
+        raise errors.InputError(
+            f"hold = {how.hold:g} s is not allowed: an action lasts for a control step at least, "
+            f"{period:g} s."
+        )
     began = time.perf_counter()
     folder = run_folder.claim(Path(out), {"how": asdict(how), "lessons": _as_json(lessons)})
     with run_folder.hold(folder):
@@ -187,6 +193,14 @@ class _Best(NamedTuple):
     actor: Weights | None = None
 
 
+def _compiled(
+    function: Callable[..., Any], envs: Sequence[PushEnv], last: Any, *, donate: bool = False
+) -> Any:
+    """A function of the worlds of environments and something that it may write to."""
+    program = jax.jit(function, donate_argnums=(1,) if donate else ())
+    return program.lower([env.table for env in envs], last).compile()
+
+
 class _Run:
     """A learning run under way, in its folder."""
 
@@ -201,7 +215,8 @@ class _Run:
         self.best, self.compile, self._kept = _Best(), 0.0, 0
         self._restore()
         with self._compiling():
-            self._update = self._compiled(crowd.update, self._envs, self.learner, donate=True)
+            update = partial(crowd.update, how, self.network, self._envs)
+            self._update = _compiled(update, self._envs, self.learner, donate=True)
 
     @property
     def spent(self) -> float:
@@ -253,19 +268,11 @@ class _Run:
         yield
         self.compile += time.perf_counter() - began
 
-    def _compiled(
-        self, function: Callable[..., Any], envs: Sequence[PushEnv], last: Any, *, donate: bool
-    ) -> Any:
-        own = partial(function, self.how, self.network, envs)
-        program = jax.jit(own, donate_argnums=(1,) if donate else ())
-        return program.lower([env.table for env in envs], last).compile()
-
     def _judge(self) -> Any:
         """The program that tries a law in the worlds for validation."""
         with self._compiling():
-            return self._compiled(
-                crowd.examine, self._exams, self.learner.student.smoothed, donate=False
-            )
+            examine = partial(crowd.examine, self.network, self._exams)
+            return _compiled(examine, self._exams, self.learner.student.smoothed)
 
     def _validate(self, judge: Any) -> float:
         """Try the law; returns how long that took [s]."""

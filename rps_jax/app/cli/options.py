@@ -76,11 +76,19 @@ Friction = Annotated[
 ]
 Strategy = Annotated[
     str,
-    tyro.conf.arg(help="What decides: rps, nps, aps, or a law of a file, as my_law.py:MyParams."),
+    tyro.conf.arg(
+        help=(
+            "What decides: rps, nps, aps, or a law of a file, as my_law.py:MyParams or policy.npz."
+        )
+    ),
 ]
 Strategies = Annotated[
     tuple[str, ...],
-    tyro.conf.arg(help="What decides: rps, nps, aps, and laws of files, as my_law.py:MyParams."),
+    tyro.conf.arg(
+        help=(
+            "What decides: rps, nps, aps, and laws of files, as my_law.py:MyParams or policy.npz."
+        )
+    ),
 ]
 
 
