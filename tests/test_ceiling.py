@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 from helpers import CYLINDERS, refusal, rps
 
 import rps_jax
@@ -126,6 +127,17 @@ def test_worlds_that_are_none_are_refused(worlds):
 def test_a_search_without_perturbations_is_refused():
     with pytest.raises(InputError, match="samples = 2"):
         Search(samples=2)
+
+
+def test_the_first_worlds_and_what_all_named_laws_lose_are_chosen():
+    won = np.array([[0, 0, 1, 0, 0], [1, 0, 1, 0, 1]])
+    found = xr.Dataset({"success": (("arm", "world"), won)}, {"arm": ["a", "b"]})
+    every, lost = ceiling.chosen(found, ["a", "b"], 1)
+    assert (every.tolist(), lost.tolist()) == ([0, 1, 3], [1, 3])
+    every, lost = ceiling.chosen(found, ["a"], 0, most=2)
+    assert (every.tolist(), lost.tolist()) == ([0, 1], [0, 1])
+    with pytest.raises(InputError, match="unknown law 'c'"):
+        ceiling.chosen(found, ["c"], 0)
 
 
 def test_the_command_tries_what_a_law_loses(tmp_path, capsys):

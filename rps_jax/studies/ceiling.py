@@ -349,9 +349,11 @@ def _parts(
 
 
 def chosen(
-    results: xr.Dataset, lost_by: Sequence[str], sample: int
+    results: xr.Dataset, lost_by: Sequence[str], sample: int, most: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Worlds of a sweep (arm, world): the first `sample`, and all that some arms all lose.
+    """Worlds of a sweep (arm, world): the first `sample`, and those that some arms all lose.
+
+    Of the latter the first `most`, or all; they are returned alone, too.
 
     Raises:
       InputError: an arm is unknown.
@@ -360,14 +362,15 @@ def chosen(
     for name in lost_by:
         errors.check_name("law", name, arms)
     lost = (results.success.sel(arm=list(lost_by)).values == 0).all(axis=0)
-    first = np.arange(results.sizes["world"]) < sample
-    return np.flatnonzero(lost | first), np.flatnonzero(lost)
+    found = np.flatnonzero(lost)[:most]
+    return np.union1d(found, np.arange(min(sample, lost.size))).astype(int), found
 
 
 def sections(found: xr.Dataset, results: xr.Dataset, lost_by: Sequence[str]) -> list[Section]:
     """What a report says of a search in worlds of a sweep (arm, world)."""
     solved = dict(zip(found.world.values.tolist(), found.solved.values.tolist(), strict=True))
     lost = (results.success.sel(arm=list(lost_by)).values == 0).all(axis=0)
+    lost &= np.isin(np.arange(lost.size), found.world.values)  # those that were tried
     table = [["object", "worlds lost", "won by the planner", "by another law alone", "by nobody"]]
     any_law = (results.success.values > 0).any(axis=0)
     kinds = statistics.worlds_by_object(results) | {"all": np.ones_like(lost)}

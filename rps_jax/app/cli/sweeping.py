@@ -191,6 +191,8 @@ class Ceiling:
     """Arms of it; worlds that they all lose are tried."""
     sample: int = 300
     """Number of worlds that are tried whoever won them: the first ones."""
+    most: int | None = None
+    """Number of lost worlds that are tried: the first of them; by default all."""
     samples: int = 64
     """Trials of a world in each round."""
     rounds: int = 12
@@ -211,9 +213,11 @@ class Ceiling:
         from rps_jax.trials.setting import progress_bar
 
         errors.check_count("sample", self.sample, at_least=0, at_most=10_000_000)
+        if self.most is not None:
+            errors.check_count("most", self.most, at_most=10_000_000)
         plan, results = load_plan(self.folder), read_results(self.folder)
         search = ceiling.Search(self.samples, self.rounds)
-        numbers, _ = ceiling.chosen(results, self.lost_by, self.sample)
+        numbers, _ = ceiling.chosen(results, self.lost_by, self.sample, self.most)
         if self.quick:
             search, numbers = ceiling.Search(12, 3), numbers[:4]
         running.choose_device(self.device)
