@@ -240,7 +240,6 @@ def test_commands_refuse_bad_policies_before_anything_compiles(tmp_path, capsys,
     )
     assert "cannot be read (No such file or directory)" in said
     for options, words in {
-        "--network cnn": "cnn",
         "--domain wid": "did you mean 'wide'",
         "--domain paper": "skin of a domain to learn in 'ideal'",
         "--hold 0.001": "hold = 0.001 s is not allowed",

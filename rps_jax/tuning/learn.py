@@ -159,9 +159,23 @@ def learn(
     """
     several = [domain] if isinstance(domain, Domain | str) else list(domain)
     lessons = replace(lessons, domains=tuple(domains.named(one) for one in several))
+    errors.check_finite("every", every, above=0, at_most=1e4)
+    began = time.perf_counter()
+    folder = open_run(Path(out), how, lessons, minutes, updates)
+    with run_folder.hold(folder):
+        provenance.sign(folder)
+        run = _Run(folder, how, lessons, began)
+        return run.through(60 * minutes, updates, 60 * every, watch)
+
+
+def open_run(folder: Path, how: PPO, lessons: Lessons, minutes: float, updates: int) -> Path:
+    """The folder of a run; one that holds a run must hold this one, but for its length.
+
+    Raises:
+      InputError: it cannot be written, holds another run, or nothing can be learned in this way.
+    """
     errors.check_finite("minutes", minutes, at_least=0, at_most=1e5)
     errors.check_count("updates", updates, at_least=0, at_most=10**9)
-    errors.check_finite("every", every, above=0, at_most=1e4)
     if not (minutes or updates):
         raise errors.InputError("minutes = 0 is not allowed without updates: give one of them.")
     count = how.worlds * len(lessons.domains) * len(lessons.objects)
@@ -174,12 +188,7 @@ def learn(
             f"hold = {how.hold:g} s is not allowed: an action lasts for a control step at least, "
             f"{period:g} s."
         )
-    began = time.perf_counter()
-    folder = run_folder.claim(Path(out), {"how": asdict(how), "lessons": _as_json(lessons)})
-    with run_folder.hold(folder):
-        provenance.sign(folder)
-        run = _Run(folder, how, lessons, began)
-        return run.through(60 * minutes, updates, 60 * every, watch)
+    return run_folder.claim(folder, {"how": asdict(how), "lessons": _as_json(lessons)})
 
 
 def _as_json(lessons: Lessons) -> dict[str, Any]:

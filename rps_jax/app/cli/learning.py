@@ -74,7 +74,7 @@ class Learn:
 
     def run(self) -> None:
         """Learn, then print what was learned and where the time went."""
-        from rps_jax.tuning.learn import Lessons, learn
+        from rps_jax.tuning.learn import Lessons, learn, open_run
         from rps_jax.tuning.ppo import PPO
 
         asked = self._quickly() if self.quick else self
@@ -87,6 +87,7 @@ class Learn:
         several = tuple(parsing.domain_of(text) for text in asked.domain)
         lessons = of(Lessons, domains=several)
         running.choose_device(asked.device)
+        open_run(asked.out, how, lessons, asked.minutes, asked.updates)
         running.use_cache()
         with _watched(asked.minutes, asked.updates) as watch:
             curve = learn(
