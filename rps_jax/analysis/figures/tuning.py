@@ -121,7 +121,7 @@ def learning_curve(curve: xr.Dataset, path: Path) -> Path:
     """
     figure = Figure(figsize=(10, 5.6), layout="constrained")
     axes = figure.subplots(2, 2)
-    minutes, simulated = curve.time.values / 60, curve.simulated.values
+    minutes, simulated = curve.time.values / 60, curve.simulated.values / 3600
     width = max(1, curve.sizes["update"] // 40)
 
     def draw(ax: Axes, x: np.ndarray, name: str, scale: float, colour: str, label: str) -> None:
@@ -131,7 +131,10 @@ def learning_curve(curve: xr.Dataset, path: Path) -> Path:
         ax.plot(x, scale * mean, color=colour, lw=1.6, label=label)
 
     judged = np.isfinite(curve.validation.values)
-    clocks = ((minutes, "wall clock, with compilation [min]"), (simulated, "simulated time [s]"))
+    clocks = (
+        (minutes, "wall clock, with compilation [min]"),
+        (simulated, "simulated time, summed over worlds [h]"),
+    )
     for ax, (x, label) in zip(axes[0], clocks, strict=True):
         draw(ax, x, "success", 100, "C0", "trials that ended, with noise, at the level below")
         ax.plot(x, 100 * curve.level, "k:", lw=1, label="level of the curriculum")
