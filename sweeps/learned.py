@@ -90,8 +90,8 @@ def main(options: Options) -> None:
         "commit": last["commit"],
         "date": last["time"][:10],
         "note": "Validation: worlds of the domain that no update has met, by the rules of the "
-        "paper, without noise in the actions; of each run the law that did best there, which flatters "
-        "it. The interval is Wilson's.",
+        "paper, without noise in the actions; of each run the law that did best there, which "
+        "flatters it. The interval is Wilson's.",
         "columns": list(COLUMNS),
         "rows": rows,
     }
