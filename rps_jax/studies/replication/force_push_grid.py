@@ -5,6 +5,7 @@ x axis with one point, at 0.1 m/s for 300 s from the first contact: 3 moments of
 frictions, 3 lateral offsets of the slider, 3 of its angles and 3 points of contact. A push fails
 whose point is 2 m from the slider's middle, or feels less than 1 N for 20 s. This is the grid of
 their script `pyb_simulation_many.py`, with `control.force_push_published` for their controller.
+Beside it stands the open loop of their experiments, which is back to the path by -k_y Delta alone.
 
 What differs from theirs: MuJoCo's equations for PyBullet's, in steps of 5 ms for 1 ms. A square
 base of 2 cm that never turns for a sphere of radius 5 cm on two prismatic joints; its contact spans
@@ -50,6 +51,8 @@ from rps_jax.world.scene import JOINTS, Friction
 
 SliderName = Literal["box", "cylinder"]
 SLIDERS: tuple[SliderName, ...] = get_args(SliderName)
+LawName = Literal["force_push", "open_loop"]
+LAWS: tuple[LawName, ...] = get_args(LawName)
 # Their controller, of their simulations: a gain k_y of 0.1 and their full speed.
 PARAMS = PublishedForcePushParams(k_y=0.1, k_omega=0.0, k_f=0.003, v_max=0.1, d_success=1e-6)
 INERTIAS = ("half", "even", "greatest")  # of a slider that is even, and with its mass at the edge
@@ -81,8 +84,8 @@ class Following(NamedTuple):
     longest: jax.Array  # () [s] without a force, the longest time
 
 
-def follow(duration: float = DURATION) -> Strategy:
-    """Their controller of a point that is the base's origin, along the world's x axis.
+def follow(law: LawName = "force_push", duration: float = DURATION) -> Strategy:
+    """A law of a point that is the base's origin, along the world's x axis.
 
     The point stands still from `duration` [s] after the first contact on.
     """
@@ -100,7 +103,10 @@ def follow(duration: float = DURATION) -> Strategy:
         pushed = state.pushed | felt
         zero = jnp.zeros_like(seen.yaw)
         offset = seen.p_world_robot[1]
-        theta_p = force_push.steered(params, state.theta_p, f_world, zero, offset, period)
+        if law == "force_push":
+            theta_p = force_push.steered(params, state.theta_p, f_world, zero, offset, period)
+        else:
+            theta_p = -params.k_y * offset
         theta_p = jnp.where(pushed, theta_p, 0.0)
         v_world = params.v_max * jnp.stack([jnp.cos(theta_p), jnp.sin(theta_p)])
         v_robot = planar.rotate(-seen.yaw, force_push.yielding(params, v_world, f_world))
@@ -205,6 +211,7 @@ def worlds(
 
 
 def run(
+    laws: Sequence[LawName] = LAWS,
     sliders: Sequence[SliderName] = SLIDERS,
     engine: EngineName = "fused",
     out: Path | None = None,
@@ -214,27 +221,31 @@ def run(
     physics: Physics = PHYSICS,
     report: Report = unheard,
 ) -> xr.Dataset:
-    """Push every slider through the whole grid.
+    """Push every slider through the whole grid by every law.
 
     Args:
+      laws: force_push, open_loop.
       sliders: box, cylinder.
       engine: what steps them, of those that tell the contact's force to a compiled program.
-      out: folder of the sliders' results, where those that are there are not run again; None
-        keeps all in memory.
+      out: folder of the results of each law and slider, where those that are there are not run
+        again; None keeps all in memory.
       duration: [s] from the first contact.
       params: of the controller.
       physics: of the worlds; its control period is the controller's.
       report: called after every 10 s that were simulated.
 
     Returns:
-      Over (slider, inertia, friction, lateral, angle, contact): `success` by their criterion;
+      Over (law, slider, inertia, friction, lateral, angle, contact): `success` by their criterion;
       `silent` [s], the longest time without a force; `apart` [m], the farthest the pusher was from
       the slider's middle; `deviation` [m] of the slider from the path at the end; and
       `completion` [1], the way along the path that was made good, of an ideal pusher's.
 
     Raises:
-      InputError: a slider or an engine is not allowed.
+      InputError: a law, a slider or an engine is not allowed, or `out` holds another run.
     """
+    errors.check_each_once("laws", laws)
+    for law in laws:
+        errors.check_name("law", law, LAWS)
     errors.check_each_once("sliders", sliders)
     for slider in sliders:
         errors.check_name("slider", slider, SLIDERS)
@@ -246,22 +257,36 @@ def run(
     chosen.check_followed()
     chosen.check_physics(physics)
     found, before = [], Progress(0, 0.0)
-    for slider in sliders:
-        path = None if out is None else out / f"{slider}.nc"
-        if path is None or not path.exists():
-            one, before = _run(slider, engine, duration, params, physics, report, before)
-            if path is not None:
-                files.write_results(path, one)
-        else:
-            with xr.open_dataset(path) as opened:
-                one = opened.load()
-            before = Progress(before.finished + one.success.size, before.simulated)
-        found.append(one)
-    every: Any = xr.concat(found, xr.IndexVariable("slider", list(sliders)))
+    for law in laws:
+        of_law = []
+        for slider in sliders:
+            path = None if out is None else out / f"{law}_{slider}.nc"
+            if path is not None and path.exists():
+                one = xr.load_dataset(path)
+                _check_same(path, one, engine, duration)
+                before = Progress(before.finished + one.success.size, before.simulated)
+            else:
+                one, before = _run(law, slider, engine, duration, params, physics, report, before)
+                if path is not None:
+                    files.write_results(path, one)
+            of_law.append(one)
+        found.append(xr.concat(of_law, xr.IndexVariable("slider", list(sliders))))
+    every: Any = xr.concat(found, xr.IndexVariable("law", list(laws)))
     return every
 
 
+def _check_same(path: Path, found: xr.Dataset, engine: str, duration: float) -> None:
+    """Raises InputError if a file holds the results of another run."""
+    if (found.attrs.get("engine"), found.attrs.get("duration")) != (engine, duration):
+        raise errors.InputError(
+            f"out = {path.parent} is not allowed: {path.name} is of the engine "
+            f"{found.attrs.get('engine')} and {found.attrs.get('duration')} s, not of {engine} and "
+            f"{duration:g} s; name another folder."
+        )
+
+
 def _run(
+    law: LawName,
     slider: SliderName,
     engine: EngineName,
     duration: float,
@@ -270,8 +295,8 @@ def _run(
     report: Report,
     before: Progress,
 ) -> tuple[xr.Dataset, Progress]:
-    """The results of one slider, and how far the whole run is then."""
-    grid, strategy = cells(), follow(duration)
+    """The results of one law and slider, and how far the whole run is then."""
+    grid, strategy = cells(), follow(law, duration)
     stage, batch = worlds(slider, grid, engine, params, physics)
     period, count = physics.control_period, grid.angle.size
     horizon = duration + 2 * _BEHIND / float(params.v_max)
@@ -311,6 +336,7 @@ def _run(
             for name, column in columns.items()
         },
         {name: list(value) for name, value in values.items()},
+        {"engine": engine, "duration": duration},
     )
     done = Progress(before.finished + count, before.simulated + steps * period * count, waited)
     report(done)
@@ -318,23 +344,19 @@ def _run(
 
 
 def table(found: xr.Dataset) -> list[list[str]]:
-    """Header and a row for each slider and friction: successes, way made good, deviation."""
-    rows = [["slider", "contact friction", "success", "completion", "deviation at the end"]]
-    for slider in map(str, found.slider.values):
-        for friction in (*FRICTIONS, None):
-            one = found.sel(slider=slider)
-            one = one if friction is None else one.sel(friction=friction)
-            won, count = int(one.success.sum()), one.success.size
-            off = np.abs(one.deviation.values)
-            way = one.completion.values
-            ways = [100 * float(x) for x in (np.median(way), way.min(), way.max())]
-            rows.append(
-                [
-                    slider,
-                    "all" if friction is None else f"{friction:g}",
-                    f"{won} of {count}",
-                    "{:.1f} % ({:.1f} to {:.1f})".format(*ways),
-                    f"{np.median(off):.2f} m (at most {off.max():.2f})",
-                ]
-            )
+    """Header and a row for each law and slider: successes, way made good, deviation."""
+    rows = [["law", "slider", "success", "by contact friction", "completion", "deviation"]]
+    for law, slider in itertools.product(found.law.values, found.slider.values):
+        one = found.sel(law=law, slider=slider)
+        off, way = np.abs(one.deviation.values), 100 * one.completion.values
+        rows.append(
+            [
+                str(law),
+                str(slider),
+                f"{int(one.success.sum())} of {one.success.size}",
+                ", ".join(str(int(one.success.sel(friction=mu).sum())) for mu in FRICTIONS),
+                f"{np.median(way):.1f} % (least {way.min():.1f})",
+                f"{np.median(off):.2f} m (most {off.max():.2f})",
+            ]
+        )
     return rows

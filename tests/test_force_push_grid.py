@@ -1,0 +1,74 @@
+"""Force Push on its authors' ground: their grid, and what their law makes of it."""
+
+import math
+
+import numpy as np
+import pytest
+
+from rps_jax.control.strategies import check_finite
+from rps_jax.errors import InputError
+from rps_jax.studies.replication import force_push_grid as grid
+
+
+def test_the_grid_is_that_of_their_script():
+    every = grid.cells()
+    assert every.angle.size == 3**5 == 243
+    assert len(set(zip(*every, strict=True))) == 243
+    assert check_finite(grid.PARAMS) is grid.PARAMS
+
+
+def test_the_moments_of_inertia_by_hand():
+    """An even plate of 1 kg and 1 m: 1/6 and 1/8 kg m^2; at the edge: 1/2 and 1/4."""
+    box, drum = grid.moments("box"), grid.moments("cylinder")
+    np.testing.assert_allclose(box[:, 2], (1 / 12, 1 / 6, 1 / 2))
+    np.testing.assert_allclose(drum[:, 2], (1 / 16, 1 / 8, 1 / 4))
+    np.testing.assert_allclose(box[1, :2], (1 + 0.12**2) / 12)
+    np.testing.assert_allclose(drum[1, :2], (3 * 0.5**2 + 0.12**2) / 12)
+    np.testing.assert_allclose(drum[2, :2], (6 * 0.5**2 + 0.12**2) / 12)
+
+
+def test_the_pusher_starts_behind_the_point_that_it_will_meet():
+    every = grid.cells()
+    for slider in grid.SLIDERS:
+        qpos = grid.starts(slider, every)
+        away = qpos[:, :2] + (0.5, 0.0) - qpos[:, 3:5]  # from the middle to the point of contact
+        if slider == "cylinder":
+            np.testing.assert_allclose(np.hypot(*away.T), 0.5)
+            continue
+        c, s = np.cos(every.angle), np.sin(every.angle)
+        np.testing.assert_allclose(c * away[:, 0] + s * away[:, 1], -0.5)
+        np.testing.assert_allclose(-s * away[:, 0] + c * away[:, 1], every.contact, atol=1e-12)
+    yaw = 2 * np.arctan2(qpos[:, 9], qpos[:, 6])
+    np.testing.assert_allclose(np.unique(yaw.round(9)), np.round((-math.pi / 8, 0, math.pi / 8), 9))
+
+
+def test_their_law_brings_every_box_back_to_the_path_and_the_open_loop_loses_most(tmp_path):
+    """In 60 s, 6 m of path, from up to 0.4 m beside it."""
+    found = grid.run(sliders=("box",), duration=60.0, out=tmp_path)
+    theirs, alone = (found.sel(law=law, slider="box") for law in grid.LAWS)
+    assert int(theirs.success.sum()) == 243
+    assert int(alone.success.sum()) < 30
+    assert float(theirs.completion.min()) > 0.75
+    assert float(abs(theirs.deviation).max()) < 1.0 < float(theirs.apart.max()) < 1.2
+    assert float(alone.completion.median()) < 0.3
+    _, row, _ = grid.table(found)
+    assert row[:4] == ["force_push", "box", "243 of 243", "81, 81, 81"]
+    again = grid.run(sliders=("box",), duration=60.0, out=tmp_path)  # read, not run
+    np.testing.assert_array_equal(again.completion, found.completion)
+    with pytest.raises(InputError, match="name another folder"):
+        grid.run(sliders=("box",), duration=50.0, out=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"laws": ("none",)}, "unknown law 'none'"),
+        ({"sliders": ("prism",)}, "unknown slider 'prism'"),
+        ({"duration": 0.0}, "duration"),
+        ({"engine": "quasistatic"}, "is told the contact's force"),
+        ({"engine": "mujoco"}, "follow a trial with mjx"),
+    ],
+)
+def test_what_the_grid_cannot_run_is_refused(given, words):
+    with pytest.raises(InputError, match=words):
+        grid.run(**given)
