@@ -324,21 +324,21 @@ class Attack(Failing):
         text = (
             f"{int(found.failing[-1])} of {cells} cells hold a failure, after "
             f"{int(found.trials[-1]):,} trials and {float(found.simulated[-1]):,.0f} s of "
-            f"simulated time: {gain['search']:.2f} an hour. {found.attrs['drawn_trials']} trials "
-            f"of drawn worlds found {found.attrs['drawn_failing']}: {gain['drawn']:.2f} an hour. "
-            "So the "
-            f"search finds {gain['times']:.1f} times as many, and at least "
+            f"simulated time: {gain['search']:.2f} an hour. "
+            f"{found.attrs['drawn_trials']:,} trials of drawn worlds found "
+            f"{found.attrs['drawn_failing']}: {gain['drawn']:.2f} an hour. So the search finds "
+            f"{gain['times']:.1f} times as many, and at least "
             f"{gain['times_low']:.1f} times (95 %)."
         )
         margin = "Severity less 1: above 0 a failure, by so many metres; below 0 a success."
         sections = [Section("Failing cells", text, (), rise), Section("Margins", margin, (), maps)]
         if found.sizes["elite"]:
-            sections += self.elites(found, domain, params, shape)
+            sections += self.elites(found, domain, (name, params), shape)
         what = f"axes {', '.join(self.axes)}, {self.repeats} noises each."
         _tell(self.out, "A search for failures", self.intro(self.out, what), sections)
 
     def elites(
-        self, found: Dataset, domain: Ranges, params: Params, shape: dict[str, Any]
+        self, found: Dataset, domain: Ranges, law: tuple[str, Params], shape: dict[str, Any]
     ) -> list[Section]:
         """The check in C MuJoCo, and the worst elites as a sweep of their own."""
         import numpy as np
@@ -354,7 +354,7 @@ class Attack(Failing):
         from rps_jax.world import points
         from rps_jax.world.physics import preset
 
-        sections = []
+        sections, (name, params) = [], law
         if self.check:
             fine = Setting(preset(self.physics, "reference"), Rules(horizon=self.horizon),
                            engine="mujoco")  # fmt: skip
@@ -372,7 +372,7 @@ class Attack(Failing):
             )
             sections.append(Section("Do they fail elsewhere, too", text))
         at = points.checked(domain, found.u.values[: self.worst])
-        plan = Plan(domain, len(at.u), {"law": params}, self.setting(), points=at)
+        plan = Plan(domain, len(at.u), {name: params}, self.setting(), points=at)
         with progress_bar(plan.trials, "worst") as report:
             _, results = sweep.complete(self.out / "worlds", plan, report=report, **shape)
         assert results is not None  # it is the whole

@@ -35,9 +35,9 @@ Aim = Literal["distance", "time"]
 AXES = ("size", "com_offset", "friction_robot")
 _EDGE = 1e-6  # least distance of a coordinate to the ends of its range
 _RATE = 0.1  # [1] learning rate of the archive's thresholds, of CMA-MAE
-_ISO, _LINE, _SPREAD = 0.08, 0.05, 0.15  # [1] steps of the emitters, in normal quantiles
+_ISO, _LINE, _SPREAD = 0.2, 0.1, 0.3  # [1] steps of the emitters, in normal quantiles
 _FAR = 4.0  # [1] how much farther than the others the archive's axes move
-_NEAR = 0.05  # [1] share of the first worlds whose severity lets a world into an archive
+_NEAR = 0.1  # [1] share of the first worlds whose severity lets a world into an archive
 _ENOUGH = 12  # failing cells of an object, from which on only failures are let in
 
 
@@ -254,10 +254,11 @@ class _Search:
         if self.object_at is not None:
             u[:, self.object_at] = (which + 0.5) / self.objects
         found = self.probe(u)
-        for _ in range(self.hunt.repeats - 1):
+        # One other noise sorts out most failures by chance; the rest are tried all at once.
+        for times in (min(1, self.hunt.repeats - 1), self.hunt.repeats - 2):
             rows = np.flatnonzero(found.success.values == 0)
-            if rows.size:
-                self._repeat(found, rows)
+            if rows.size and times > 0:
+                self._repeat(found, rows, times)
         worth = found.severity.values
         if self.hunt.aim == "time":
             failed = found.success.values == 0
@@ -265,15 +266,17 @@ class _Search:
         archive.add(which, found, worth)
         return found, worth
 
-    def _repeat(self, found: xr.Dataset, rows: np.ndarray) -> None:
-        """Try some worlds with other noise; the least severe trial is what was found of each."""
-        u = found.u.values[rows]
-        u[:, self.noise] = self.rng.random((rows.size, self.noise.size))
+    def _repeat(self, found: xr.Dataset, rows: np.ndarray, times: int) -> None:
+        """Try some worlds with other noises; the least severe trial is what was found of each."""
+        u = np.tile(found.u.values[rows], (times, 1))
+        u[:, self.noise] = self.rng.random((len(u), self.noise.size))
         other = self.probe(u)
         found.attrs["wall"] = float(found.attrs["wall"]) + float(other.attrs["wall"])
-        milder = other.severity.values < found.severity.values[rows]
-        for name, values in found.items():
-            values.values[rows[milder]] = other[name].values[milder]
+        for i in range(times):
+            part = other.isel(world=slice(i * rows.size, (i + 1) * rows.size))
+            milder = part.severity.values < found.severity.values[rows]
+            for name, values in found.items():
+                values.values[rows[milder]] = part[name].values[milder]
 
     def _scheduler(self, which: int, archive: _Archive, bar: float) -> Any:
         """New emitters for one object, whose archive holds the elites from a severity on."""
