@@ -89,18 +89,23 @@ def _held(out: Path, device: str) -> Iterator[None]:
 
 
 @contextmanager
-def _counted(what: str, total: int | None) -> Iterator[Report]:
-    """A bar over trials, of which it need not be known how many there will be."""
+def _counted(what: str) -> Iterator[Report]:
+    """A bar over trials, of which it is not known how many there will be; it begins with them."""
     from tqdm import tqdm
 
-    with tqdm(total=total, unit="trial", desc="compile", mininterval=0.5) as bar:
+    bars: list[tqdm] = []
 
-        def show(progress: Any) -> None:
-            bar.set_description(what, refresh=False)
-            bar.set_postfix_str(f"{progress.simulated:.0f} s simulated", refresh=False)
-            bar.update(progress.finished - bar.n)
+    def show(progress: Any) -> None:
+        if not bars:
+            bars.append(tqdm(unit="trial", desc=what, mininterval=0.5))
+        bars[0].set_postfix_str(f"{progress.simulated:.0f} s simulated", refresh=False)
+        bars[0].update(progress.finished - bars[0].n)
 
+    try:
         yield show
+    finally:
+        for bar in bars:
+            bar.close()
 
 
 def _tell(out: Path, title: str, intro: str, sections: Sequence[Section]) -> None:
@@ -206,7 +211,7 @@ class Rare(Failing):
             domain = dataclasses.replace(domain, objects=domain.objects[:1])
         against = None
         with _held(self.out, self.device):
-            with _counted("rare", None) as report:
+            with _counted("rare") as report:
                 found = rare.rare(
                     params, domain, self.seed, splitting, self.out,
                     repetitions=self.repetitions, setting=setting, report=report, **shape,
@@ -310,7 +315,7 @@ class Attack(Failing):
         errors.check_count("worst", self.worst, at_most=100_000)
         hunt.check(domain)
         with _held(self.out, self.device):
-            with _counted("attack", None) as report:
+            with _counted("attack") as report:
                 found = attack.attack(
                     params, domain, self.seed, hunt, self.out,
                     setting=setting, report=report, **shape,

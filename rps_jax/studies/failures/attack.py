@@ -67,7 +67,7 @@ class Hunt:
     """Number of drawn worlds beside it, with which it is compared."""
 
     def check(self, domain: Domain) -> None:
-        """Raises InputError for numbers that mean nothing, or axes that the domain lacks."""
+        """Raises InputError for what means nothing, axes that the domain lacks, or no pyribs."""
         if len(self.axes) != 3:
             raise InputError(f"axes = {self.axes} is not allowed: name three quantities.")
         errors.check_each_once("axes", self.axes)
@@ -81,6 +81,7 @@ class Hunt:
         errors.check_finite("minutes", self.minutes, above=0, at_most=1e5)
         errors.check_count("repeats", self.repeats, at_most=100)
         errors.check_count("drawn", self.drawn, at_most=10_000_000)
+        need("ribs", "ribs")
 
 
 class _Archive:
@@ -161,7 +162,6 @@ def attack(
     probe = Probe(
         domain, params, setting, None if out is None else Path(out), slots, workers, report
     )
-    need("ribs", "ribs")
     if probe.folder is not None:
         how = {k: v for k, v in asdict(hunt).items() if k not in ("minutes", "generations")}
         asked = {"study": "attack", "seed": seed, "hunt": how}

@@ -36,6 +36,7 @@ from rps_jax.world import points
 from rps_jax.world.domain import Domain
 from rps_jax.world.points import Points
 
+_SLOTS = 64  # of a program, at least
 _KEPT = ("success", "time", "min_distance", "contact_lost_time")
 
 
@@ -81,7 +82,7 @@ def need(module: str, package: str) -> ModuleType:
 class Probe:
     """Tries one law at points, and keeps what came of each call in a run folder, if it has one.
 
-    Each shape family has one program of a fixed number of slots, whatever the number of points.
+    Each shape family has a program of 64 slots, one of 256 and so on, for any number of points.
     Whoever asks for the same points in the same order after being killed is answered from the
     folder: a search then goes on as if it had never been stopped.
     """
@@ -168,14 +169,8 @@ class Probe:
         def made() -> Iterator[Part]:
             yield drawn_worlds(self.domain, drawn, self.params, self.setting)
 
-        # As many slots whatever the number of points: another number would be another program.
-        engine = engines.get(self.setting.engine)
-        slots = self.slots or min(256, engine.slots(jax_backend()))
-        return Job(strategies.of(self.params), max(slots, rows.size), made())
-
-
-def jax_backend() -> str:
-    """The kind of device that JAX steps worlds on."""
-    import jax
-
-    return jax.default_backend()
+        # Few different sizes, since each is a program of its own: powers of four.
+        size = _SLOTS
+        while size < rows.size:
+            size *= 4
+        return Job(strategies.of(self.params), size, made())
