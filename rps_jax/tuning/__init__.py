@@ -1,4 +1,5 @@
-"""Tuning the law: a space of its parameters, searched by evolution or by gradients.
+"""Tuning the law: a space of its parameters, searched by evolution or by gradients; and learning.
 
-`run` drives every tuner in a folder that can be killed and continued.
+`run` drives every tuner in a folder that can be killed and continued. `learn` does the same for a
+law that is learned from touch: `crowd` is what happens in its worlds, `ppo` the algorithm.
 """

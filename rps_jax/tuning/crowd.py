@@ -75,22 +75,21 @@ def network_of(ppo: PPO, envs: Sequence[PushEnv]) -> Network:
     return Network(ppo.network, ppo.width, counts.pop(), ppo.hold).check()
 
 
-def begin(ppo: PPO, network: Network, envs: Sequence[PushEnv]) -> Learner:
+def begin(ppo: PPO, network: Network, envs: Sequence[PushEnv], tables: Sequence[World]) -> Learner:
     """A learner that has learned nothing, with every trial at a moment of its own."""
     key, first, *own = jax.random.split(jax.random.PRNGKey(ppo.seed), 2 + len(envs))
     level = jnp.asarray(ppo.level, float)
     crowds = []
-    for env, one in zip(envs, own, strict=True):
+    for env, table, one in zip(envs, tables, own, strict=True):
         one, late = jax.random.split(one)
-        crowd = _anew(network, env, env.table, level, one, ppo.worlds)
+        crowd = _anew(network, env, table, level, one, ppo.worlds)
         most = int(float(env.setting.rules.horizon) / env.dt)
         steps = jax.random.randint(late, (ppo.worlds,), 0, most)
         states = crowd.states.replace(data=crowd.states.data._replace(steps=steps))
         crowds.append(crowd._replace(states=states))
     zero = jnp.zeros(())
     student = Student.init(ppo, network, first)
-    learner = Learner(student, level, zero, zero, key, tuple(crowds))
-    return jax.tree.map(jnp.copy, learner)  # no two share memory, which updates write to
+    return Learner(student, level, zero, zero, key, tuple(crowds))
 
 
 def eased(world: World, level: jax.Array) -> World:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
@@ -29,8 +30,9 @@ from rps_jax.record.checkpoint import Parts
 from rps_jax.runs.evaluate import seed_of
 from rps_jax.trials.env import PushEnv, Reward
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
+from rps_jax.trials.trial import Rules, World
 from rps_jax.tuning import crowd
+from rps_jax.tuning.crowd import Learner
 from rps_jax.tuning.ppo import PPO
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import Domain
@@ -202,14 +204,6 @@ class _Best(NamedTuple):
     actor: Weights | None = None
 
 
-def _compiled(
-    function: Callable[..., Any], envs: Sequence[PushEnv], last: Any, *, donate: bool = False
-) -> Any:
-    """A function of the worlds of environments and something that it may write to."""
-    program = jax.jit(function, donate_argnums=(1,) if donate else ())
-    return program.lower([env.table for env in envs], last).compile()
-
-
 class _Run:
     """A learning run under way, in its folder."""
 
@@ -219,13 +213,37 @@ class _Run:
         self._envs = lessons.environments(how.seed)
         self._exams = lessons.examinations(how.seed)
         self.network = crowd.network_of(how, self._envs)
-        self.learner = crowd.begin(how, self.network, self._envs)
         self.curve: list[Told] = []
         self.best, self.compile, self._kept = _Best(), 0.0, 0
+        begin = self._programs()
+        # A copy: no two leaves may share memory, which updates write to.
+        self.learner: Learner = jax.tree.map(jnp.copy, begin(self._tables(self._envs)))
         self._restore()
-        with self._compiling():
-            update = partial(crowd.update, how, self.network, self._envs)
-            self._update = _compiled(update, self._envs, self.learner, donate=True)
+
+    def _programs(self) -> Any:
+        """Compile all programs side by side; returns the one that begins."""
+        began, envs = time.perf_counter(), self._envs
+        tables, theirs = self._tables(envs), self._tables(self._exams)
+        begin = partial(crowd.begin, self.how, self.network, envs)
+        update = partial(crowd.update, self.how, self.network, envs)
+        examine = partial(crowd.examine, self.network, self._exams)
+        learner = jax.eval_shape(begin, tables)
+        with ThreadPoolExecutor(3) as pool:
+            waiting = [
+                pool.submit(lambda f, *shapes: f.lower(*shapes).compile(), *each)
+                for each in (
+                    (jax.jit(update, donate_argnums=1), tables, learner),
+                    (jax.jit(examine), theirs, learner.student.smoothed),
+                    (jax.jit(begin), tables),
+                )
+            ]
+            self._update, self._examine, begin = (one.result() for one in waiting)
+        self.compile += time.perf_counter() - began
+        return begin
+
+    @staticmethod
+    def _tables(envs: Sequence[PushEnv]) -> list[World]:
+        return [env.table for env in envs]
 
     @property
     def spent(self) -> float:
@@ -234,9 +252,9 @@ class _Run:
 
     def through(self, seconds: float, updates: int, every: float, watch: Watch) -> xr.Dataset:
         """Learn until the time is spent, or the updates are made."""
-        judge, reserve = None, 0.0  # [s] for the last validation
+        reserve = 0.0  # [s] for the last validation
         kept = judged = self.spent
-        tables = [env.table for env in self._envs]
+        tables = self._tables(self._envs)
 
         def over() -> bool:
             late = seconds and self.spent + reserve >= seconds
@@ -246,13 +264,12 @@ class _Run:
             self.learner, told = self._update(tables, self.learner)
             watch(self._note({name: float(x) for name, x in jax.device_get(told).items()}))
             if self.spent - kept > every and not over():
-                if judge is None or self.spent - judged > _SPARE * reserve:
-                    judge = judge or self._judge()
-                    reserve, judged = self._validate(judge), self.spent
+                if self.spent - judged > _SPARE * reserve:
+                    reserve, judged = self._validate(), self.spent
                 self.keep()
                 kept = self.spent
         if self.curve and np.isnan(self.curve[-1]["validation"]):
-            self._validate(judge or self._judge())
+            self._validate()
         self.keep()
         return self.finish()
 
@@ -269,25 +286,11 @@ class _Run:
         self.curve.append({name: told[name] for name in UNITS})
         return self.curve[-1]
 
-    # --- programs ---
-
-    @contextlib.contextmanager
-    def _compiling(self) -> Iterator[None]:
-        began = time.perf_counter()
-        yield
-        self.compile += time.perf_counter() - began
-
-    def _judge(self) -> Any:
-        """The program that tries a law in the worlds for validation."""
-        with self._compiling():
-            examine = partial(crowd.examine, self.network, self._exams)
-            return _compiled(examine, self._exams, self.learner.student.smoothed)
-
-    def _validate(self, judge: Any) -> float:
+    def _validate(self) -> float:
         """Try the law; returns how long that took [s]."""
         began = time.perf_counter()
         actor = self.learner.student.smoothed
-        success, took = jax.device_get(judge([env.table for env in self._exams], actor))
+        success, took = jax.device_get(self._examine(self._tables(self._exams), actor))
         self.curve[-1]["validation"] = rate = float(np.mean(success))
         if success.any():
             self.curve[-1]["validation_time"] = float(np.mean(took[success]))
@@ -346,7 +349,8 @@ class _Run:
             )
         own = [jax.device_put(leaf) for leaf in leaves]
         self.learner = jax.tree.unflatten(jax.tree.structure(self.learner), own)
-        self.curve, self.compile, self._before = note["curve"], note["compile"], note["spent"]
+        self.curve, self._before = note["curve"], note["spent"]
+        self.compile += note["compile"]
         self.best, self._kept = _Best(note["best"], best or None), int(name[-1])
 
     def finish(self) -> xr.Dataset:
