@@ -88,12 +88,15 @@ class Found(NamedTuple):
     severity: np.ndarray  # (n,)
 
 
-def joined(groups: np.ndarray, trials: int) -> Estimate:
-    """The mean of groups' estimates, with Student's interval, even in the logarithm."""
+def joined(groups: np.ndarray, trials: int, least: float = 0.0) -> Estimate:
+    """The mean of groups' estimates, with Student's interval, even in the logarithm.
+
+    A few groups agree by luck now and then, so the coefficient of variation is at least `least`.
+    """
     p, count = float(groups.mean()), groups.size
     if p == 0:
         return Estimate(0.0, 0.0, 1.0, float("inf"), trials)
-    variation = float(groups.std(ddof=1)) / p / np.sqrt(count)
+    variation = max(least, float(groups.std(ddof=1)) / p / np.sqrt(count))
     reach = variation * float(stats.t.ppf(0.975, count - 1))
     return Estimate(p, p * np.exp(-reach), min(1.0, p * np.exp(reach)), variation, trials)
 
@@ -111,6 +114,7 @@ def split(score: Severity, kinds: Sequence[str], how: Splitting, seed: int = 0) 
     noise = np.array([kind == "noise" for kind in kinds])
     shape = (how.groups, how.particles // how.groups)
     trials, step, levels = 0, 0.6, []
+    least = 0.0  # squared variation of independent worlds, which chains cannot have less of
 
     def ask(z: np.ndarray) -> np.ndarray:
         nonlocal trials
@@ -125,6 +129,7 @@ def split(score: Severity, kinds: Sequence[str], how: Splitting, seed: int = 0) 
         if level >= how.level or (s >= level).all():
             break
         levels.append(level)
+        least += _variation(s >= level)
         p *= (s >= level).mean(axis=1)
         starts = [_chosen(one >= level, round(how.share * shape[1]), rng) for one in s]
         z_now = np.stack([one[at] for one, at in zip(z, starts, strict=True)])
@@ -141,7 +146,16 @@ def split(score: Severity, kinds: Sequence[str], how: Splitting, seed: int = 0) 
         z, s = (np.concatenate(some, axis=1)[:, : shape[1]] for some in (zs, ss))
     p *= (s >= how.level).mean(axis=1)
     failed = (s >= how.level) & (p > 0)[:, None]
-    return Found(joined(p, trials), p, [*levels, how.level], _uniform(z[failed]), s[failed])
+    least += _variation(s >= how.level)
+    return Found(
+        joined(p, trials, least**0.5), p, [*levels, how.level], _uniform(z[failed]), s[failed]
+    )
+
+
+def _variation(reached: np.ndarray) -> float:
+    """Squared coefficient of variation of a rate from so many independent worlds."""
+    rate = max(float(reached.mean()), 1 / reached.size)
+    return (1 - rate) / rate / reached.size
 
 
 def _uniform(z: np.ndarray) -> np.ndarray:
