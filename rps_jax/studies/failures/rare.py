@@ -221,8 +221,8 @@ def rare(
       >>> few = rps_jax.Splitting(40, groups=2)
       >>> setting = rps_jax.Setting(rules=rules, engine="fused")
       >>> found = rps_jax.rare(rps_jax.RPSParams.paper(), drums, how=few, setting=setting)
-      >>> float(found.p)  # within a second no push is done
-      1.0
+      >>> found.p.values.tolist()  # within a second no push is done
+      [1.0]
     """
     errors.check_count("repetitions", repetitions, at_most=10_000)
     errors.check_count("seed", seed, at_least=0, at_most=2**30)
