@@ -259,7 +259,10 @@ def outcomes(blocks, won):
 def test_the_quantity_that_decides_takes_all_the_blame():
     blocks = sobol.design(DOMAINS["wide"], 8192)
     assert blocks.factors[-1] == "shape"
-    assert {"noise", "object", "mass", "com_bearing"} <= set(blocks.factors)
+    assert {"noise", "key", "object", "mass", "com_bearing"} <= set(blocks.factors)
+    assert blocks.groups.count("key") == 2  # both numbers of it
+    assert blocks.groups.count("noise") == 1  # of the skin
+    assert len(blocks.factors) == 23 + 1 + 2  # ranges, the object, corners and the key
     assert (blocks.base, blocks.worlds) == (256, 256 * (len(blocks.factors) + 2))
     column = blocks.groups.index("mass")
     found = sobol.analysed(blocks, outcomes(blocks, blocks.u()[:, column] < 0.8))
@@ -276,6 +279,11 @@ def test_the_quantity_that_decides_takes_all_the_blame():
     assert sobol.said(found, "gap").startswith("No cost of gap is seen")
     assert "draws no robot_force" in sobol.said(found, "robot_force")
     assert sobol.table(found)[1][0] == "mass of the object"
+    assert sobol.reliable(found).startswith("Trials fail at ")
+    assert "run more worlds" not in sobol.reliable(found)
+    never = sobol.analysed(blocks, outcomes(blocks, np.ones(blocks.worlds, bool)))
+    assert sobol.reliable(never).endswith("run more worlds.")
+    assert (never.total.sel(output="success") == 0).all()
 
 
 def test_two_quantities_that_only_matter_together_have_totals_alone():

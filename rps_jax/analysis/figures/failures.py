@@ -21,24 +21,34 @@ def _said(name: str) -> str:
     return statistics.DRAWN.get(name, words(name))
 
 
-def sobol(found: xr.Dataset, order: Sequence[str], outputs: Mapping[str, str], path: Path) -> Path:
-    """Indices of first and total order with their intervals, the greatest on top."""
-    order = list(order)[::-1]
+def sobol(
+    found: xr.Dataset, order: Mapping[str, str], outputs: Mapping[str, str], path: Path
+) -> Path:
+    """Indices of first and total order with their intervals, the greatest on top.
+
+    Args:
+      found: what `sensitivity` returned.
+      order: factors in words, by name, the greatest first.
+      outputs: what is explained, in words.
+      path: of the PNG.
+    """
+    order = dict(list(order.items())[::-1])
     figure = Figure(figsize=(11, 1.4 + 0.24 * len(order)), layout="constrained")
     axes = figure.subplots(1, len(outputs), sharey=True)
     place = np.arange(len(order))
     for ax, (output, said) in zip(axes, outputs.items(), strict=True):
-        one = found.sel(output=output, factor=order)
+        one = found.sel(output=output, factor=list(order))
         for which, shift, colour in (("total", 0.15, "C3"), ("first", -0.15, "C0")):
             ax.errorbar(
                 one[which], place + shift, xerr=one[f"{which}_reach"], fmt="o", ms=4,
                 capsize=2, lw=1.2, color=colour, label=f"{which} order",
             )  # fmt: skip
         ax.axvline(0, color="0.6", lw=0.8)
+        ax.set_xlim(-0.35, 1.35)  # what reaches beyond is not known at all
         ax.set_title(f"variance of {said}", fontsize=10)
         ax.set_xlabel("share of the variance [1]")
         ax.grid(axis="x", alpha=0.3)
-    axes[0].set_yticks(place, [_said(name) for name in order], fontsize=8)
+    axes[0].set_yticks(place, list(order.values()), fontsize=8)
     axes[-1].legend(fontsize=8, loc="lower right")
     figure.suptitle(f"Sobol indices with intervals of 95 %, {found.sizes['world']:,} worlds")
     return save(figure, path)
@@ -52,7 +62,7 @@ def interactions(
     Args:
       u: (n, k) coordinates of worlds in the unit cube.
       failed: (n,) 0 or 1.
-      names: (k,) of the quantities.
+      names: (k,) of the quantities, in words.
       title: of the figure.
       path: of the PNG.
     """
@@ -81,9 +91,9 @@ def interactions(
             ax.set_xticks([])
             ax.set_yticks([])
             if row == count - 2:
-                ax.set_xlabel(_said(names[column]).replace(" of the ", "\nof the "), fontsize=8)
+                ax.set_xlabel(names[column].replace(" of the ", "\nof the "), fontsize=8)
             if column == 0:
-                ax.set_ylabel(_said(names[row + 1]).replace(" of the ", "\nof the "), fontsize=8)
+                ax.set_ylabel(names[row + 1].replace(" of the ", "\nof the "), fontsize=8)
     if image is not None:
         figure.colorbar(image, ax=axes, label="failures [%]", shrink=0.6)
     figure.suptitle(f"{title}\neach range from its low (left, below) to its high end", fontsize=10)

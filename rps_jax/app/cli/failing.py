@@ -149,12 +149,17 @@ class Sensitivity(Failing):
         found = sobol.analysed(blocks, labelled(results))
         files.write_results(self.out / "sobol.nc", found)
         order = sobol.ranked(found)
-        picture = figures.sobol(found, order, sobol.OUTPUTS, self.out / "sobol.png")
+        said = {one: sobol.in_words(one) for one in order}
+        picture = figures.sobol(found, said, sobol.OUTPUTS, self.out / "sobol.png")
         drawn = [one for one in order if one in found.quantity.values][:5]
         failed = found.success.values == 0
         title = f"{name}, {self.domain}: failures over pairs of quantities, {failed.size:,} worlds"
         pairs = figures.interactions(
-            found.u.sel(quantity=drawn).values, failed, drawn, title, self.out / "interactions.png"
+            found.u.sel(quantity=drawn).values,
+            failed,
+            [said[one] for one in drawn],
+            title,
+            self.out / "interactions.png",
         )
         what = (
             f"{blocks.worlds:,} worlds, {blocks.base} for each of {len(blocks.factors)} quantities "
@@ -163,7 +168,8 @@ class Sensitivity(Failing):
         text = (
             "The first index is the share of the variance that a quantity explains alone, the "
             "total one what goes with it and all its interactions; noise and the corners of "
-            "prisms are one quantity each. Intervals are bootstrapped, of 95 %."
+            "prisms are one quantity each. Intervals are bootstrapped, of 95 %. "
+            f"{sobol.reliable(found)}"
         )
         sections = [
             Section("Which quantity is to blame", text, sobol.table(found), picture),

@@ -34,8 +34,16 @@ OUTPUTS = {
     "time": "time until the trial's end",
     "left": "least distance to the target",
 }
-_TOGETHER = ("shape", "noise")  # kinds of quantities that are one factor each
+# Kinds of quantities that are one factor each, and its name: "noise" is a quantity, of the skin.
+_TOGETHER = {"shape": "shape", "noise": "key"}
+_WORDS = {
+    "shape": "corners of prisms",
+    "key": "key of all noise",
+    "com_bearing": "bearing of the centre of mass",
+}
+_ENOUGH = 30  # base points at which a trial fails, for indices that mean something
 _RESAMPLES = 1000
+_NOTHING = 0.05  # [1] a total index that is not worth a word
 
 
 @dataclass(frozen=True)
@@ -81,7 +89,7 @@ def design(domain: Domain, worlds: int, seed: int = 0, apart: bool = False) -> D
       InputError: so few worlds have no design.
     """
     every = points.quantities(domain)
-    groups = tuple(one.kind if one.kind in _TOGETHER and not apart else one.name for one in every)
+    groups = tuple(one.name if apart else _TOGETHER.get(one.kind, one.name) for one in every)
     factors = tuple(dict.fromkeys(groups))
     errors.check_count("worlds", worlds, at_most=100_000_000)
     least = 4 * (len(factors) + 2)
@@ -198,8 +206,27 @@ def table(found: xr.Dataset) -> list[list[str]]:
             one = found.sel(output=what, factor=name)
             cells += [f"{one.first:.2f} ± {one.first_reach:.2f}"]
             cells += [f"{one.total:.2f} ± {one.total_reach:.2f}"]
-        rows.append([statistics.DRAWN.get(name, name.replace("_", " ")), *cells])
+        rows.append([in_words(name), *cells])
     return rows
+
+
+def in_words(name: str) -> str:
+    """What a factor is."""
+    return statistics.DRAWN.get(name) or _WORDS.get(name, name.replace("_", " "))
+
+
+def failing(found: xr.Dataset) -> int:
+    """At how many base points the trial of either of the two base samples fails."""
+    blocks = found.success.values.reshape(found.attrs["base"], -1)[:, [0, -1]]
+    return int((blocks == 0).any(axis=1).sum())
+
+
+def reliable(found: xr.Dataset) -> str:
+    """Whether there are failures enough, in a sentence."""
+    told = f"Trials fail at {failing(found)} of {found.attrs['base']} base points"
+    if failing(found) < _ENOUGH:
+        return f"{told}, too few for indices of success to mean anything: run more worlds."
+    return f"{told}."
 
 
 def cost(found: xr.Dataset, name: str) -> tuple[float, float, float]:
@@ -238,4 +265,6 @@ def said(found: xr.Dataset, name: str = "mass") -> str:
         return f"More {name} costs success: {numbers}."
     if low > 0:
         return f"More {name} helps: {numbers}."
+    if float(one.total - one.total_reach) > _NOTHING and failing(found) >= _ENOUGH:
+        return f"On average {name} costs nothing, but together with others it matters: {numbers}."
     return f"No cost of {name} is seen in {found.sizes['world']:,} worlds: {numbers}."
