@@ -334,12 +334,10 @@ class Attack(Failing):
         cells = found.margin.size
         text = (
             f"{int(found.failing[-1])} of {cells} cells hold a failure, after "
-            f"{int(found.trials[-1]):,} trials and {float(found.simulated[-1]):,.0f} s of "
-            f"simulated time: {gain['search']:.2f} an hour. "
-            f"{found.attrs['drawn_trials']:,} trials of drawn worlds found "
-            f"{found.attrs['drawn_failing']}: {gain['drawn']:.2f} an hour. So the search finds "
-            f"{gain['times']:.1f} times as many, and at least "
-            f"{gain['times_low']:.1f} times (95 %)."
+            f"{int(found.trials[-1]):,} trials and {float(found.simulated[-1]):,.0f} s of time: "
+            f"{gain['search']:.2f} an hour. {found.attrs['drawn_trials']:,} trials of drawn worlds "
+            f"found {found.attrs['drawn_failing']}: {gain['drawn']:.2f} an hour. The search finds "
+            f"{gain['times']:.1f} times as many, at least {gain['times_low']:.1f} times (95 %)."
         )
         margin = "Severity less 1: above 0 a failure, by so many metres; below 0 a success."
         sections = [Section("Failing cells", text, (), rise), Section("Margins", margin, (), maps)]
