@@ -9,6 +9,7 @@ from rps_jax import ladder as climb
 from rps_jax.analysis import statistics, tables
 from rps_jax.control import strategies
 from rps_jax.control.law import RPSParams
+from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
 from rps_jax.runs.results import load
 from rps_jax.studies import ladder
@@ -45,7 +46,8 @@ def test_laws_are_compared_with_one_of_them_world_by_world():
 def test_every_rung_is_a_law_of_the_package_with_what_it_is_told():
     told = ladder.senses(ladder.rungs())
     assert len(told) >= 8
-    assert set(told.values()) == {"touch", "force", "pose"}
+    assert set(told.values()) == {"touch", "taxels", "force", "pose"}
+    assert {name for name in told if told[name] == "taxels"} == set(policy.SHIPPED)
     assert [name for name in told if told[name] == "force"] == ["force_push_published"]
     assert {name for name in told if told[name] == "pose"} == {"aps", "dipole"}
     for params in ladder.RUNGS.values():

@@ -9,6 +9,7 @@ import pytest
 
 from rps_jax.control import law, rps_plus, strategies
 from rps_jax.control.law import LoadedObservation, Observation, RPSParams, RPSState, Twist
+from rps_jax.control.learned.observation import TaxelObservation
 from rps_jax.control.rivals import dipole, force_push, force_push_published, pursuit
 from rps_jax.control.rivals.aps import TrackedObservation
 from rps_jax.control.rivals.dipole import DipoleParams
@@ -287,6 +288,13 @@ def test_the_dipole_looks_along_the_path_and_lays_it_anew():
         assert float(state.p_world_start[0]) == pytest.approx(start)
 
 
+def answered(observation):
+    """With what 42 taxels in a row answer to a touch at its place."""
+    along = jnp.linspace(-0.5, 0.5, 42)
+    signal = 0.3 * jnp.exp(-(((along - observation.p_robot_contact[1]) / 0.05) ** 2))
+    return TaxelObservation(observation, signal, jnp.asarray(False), 0.01)
+
+
 def twist_of(name, observation, thing, force=(-20.0, 5.0)):
     strategy, params = strategies.RIVALS[name]
     state = strategy.init(params)
@@ -294,6 +302,7 @@ def twist_of(name, observation, thing, force=(-20.0, 5.0)):
         "touch": observation,
         "force": loaded(observation, force),
         "pose": tracked(observation, thing),
+        "taxels": answered(observation),
     }
     told = tellings[strategy.senses]
     for _ in range(2):  # the second step remembers the first

@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from matplotlib.axis import Axis
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 
 from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import save, words
 
-_BINS = 4  # of each quantity of a map of interactions
+_BINS = 4  # of each range of a map of interactions
 
 
 def _said(name: str) -> str:
@@ -55,7 +56,12 @@ def sobol(
 
 
 def interactions(
-    u: np.ndarray, failed: np.ndarray, names: Sequence[str], title: str, path: Path
+    u: np.ndarray,
+    failed: np.ndarray,
+    names: Sequence[str],
+    choices: Mapping[str, Sequence[str]],
+    title: str,
+    path: Path,
 ) -> Path:
     """Failures over each pair of quantities, their ranges in equal parts.
 
@@ -63,19 +69,21 @@ def interactions(
       u: (n, k) coordinates of worlds in the unit cube.
       failed: (n,) 0 or 1.
       names: (k,) of the quantities, in words.
+      choices: what is chosen from, of those that are no ranges, by their names in words.
       title: of the figure.
       path: of the PNG.
     """
     count = len(names)
     figure = Figure(figsize=(1.5 + 2 * (count - 1), 1.6 + 1.8 * (count - 1)), layout="constrained")
     axes = figure.subplots(count - 1, count - 1, squeeze=False)
-    at = np.minimum((u * _BINS).astype(int), _BINS - 1)
+    bins = [len(choices[name]) if name in choices else _BINS for name in names]
+    at = np.minimum((u * bins).astype(int), np.asarray(bins) - 1)
     rates, image = {}, None
     for i, j in combinations(range(count), 2):
-        cell = at[:, j] * _BINS + at[:, i]
-        of = np.bincount(cell, minlength=_BINS**2)
-        bad = np.bincount(cell, failed, minlength=_BINS**2)
-        rates[i, j] = (100 * bad / np.maximum(of, 1)).reshape(_BINS, _BINS)
+        cell, shape = at[:, j] * bins[i] + at[:, i], (bins[j], bins[i])
+        of = np.bincount(cell, minlength=bins[i] * bins[j])
+        bad = np.bincount(cell, failed, minlength=bins[i] * bins[j])
+        rates[i, j] = (100 * bad / np.maximum(of, 1)).reshape(shape)
     most = max(float(rate.max()) for rate in rates.values()) or 1.0
     for row in range(count - 1):
         for column in range(count - 1):
@@ -84,20 +92,29 @@ def interactions(
                 ax.axis("off")
                 continue
             rate = rates[column, row + 1]
-            image = ax.imshow(rate, origin="lower", vmin=0, vmax=most, cmap="magma_r")
+            image = ax.imshow(
+                rate, origin="lower", vmin=0, vmax=most, cmap="magma_r", aspect="auto"
+            )
             for (y, x), value in np.ndenumerate(rate):
                 ink = "white" if value > 0.55 * most else "black"
                 ax.text(x, y, f"{value:.0f}", ha="center", va="center", fontsize=7, color=ink)
-            ax.set_xticks([])
-            ax.set_yticks([])
-            if row == count - 2:
-                ax.set_xlabel(names[column].replace(" of the ", "\nof the "), fontsize=8)
-            if column == 0:
-                ax.set_ylabel(names[row + 1].replace(" of the ", "\nof the "), fontsize=8)
+            across, up = names[column], names[row + 1]
+            below, left = row == count - 2, column == 0
+            _mark(ax.xaxis, choices.get(across, ()) if below else ())
+            _mark(ax.yaxis, choices.get(up, ()) if left else ())
+            if below:
+                ax.set_xlabel(across.replace(" of the ", "\nof the "), fontsize=8)
+            if left:
+                ax.set_ylabel(up.replace(" of the ", "\nof the "), fontsize=8)
     if image is not None:
         figure.colorbar(image, ax=axes, label="failures [%]", shrink=0.6)
     figure.suptitle(f"{title}\neach range from its low (left, below) to its high end", fontsize=10)
     return save(figure, path)
+
+
+def _mark(axis: Axis, choices: Sequence[str]) -> None:
+    """The choices at their cells; no marks of a range."""
+    axis.set_ticks(range(len(choices)), choices, fontsize=7)
 
 
 def archive(found: xr.Dataset, axes_: Sequence[str], title: str, path: Path) -> Path:

@@ -137,7 +137,8 @@ class Sensitivity(Failing):
         from rps_jax.studies.failures import sobol
         from rps_jax.trials.setting import progress_bar
 
-        blocks = sobol.design(self.ranges(), self.worlds, self.seed, self.apart)
+        domain = self.ranges()
+        blocks = sobol.design(domain, self.worlds, self.seed, self.apart)
         name, params = self.law()
         plan, shape = sobol.plan_of(blocks, params, self.setting()), self.shape()
         running.choose_device(self.device)
@@ -158,13 +159,12 @@ class Sensitivity(Failing):
             found.u.sel(quantity=drawn).values,
             failed,
             [said[one] for one in drawn],
+            {sobol.in_words("object"): [one.removeprefix("random_") for one in domain.objects]},
             title,
             self.out / "interactions.png",
         )
-        what = (
-            f"{blocks.worlds:,} worlds, {blocks.base} for each of {len(blocks.factors)} quantities "
-            f"and two more; {int(failed.sum())} fail."
-        )
+        each = f"{blocks.base} for each of {len(blocks.factors)} quantities and two more"
+        what = f"{blocks.worlds:,} worlds, {each}; {int(failed.sum())} fail."
         text = (
             "The first index is the share of the variance that a quantity explains alone, the "
             "total one what goes with it and all its interactions; noise and the corners of "
