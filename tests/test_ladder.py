@@ -63,11 +63,28 @@ def test_every_rung_is_a_law_of_the_package_with_what_it_is_told():
         (("pursuit", "pursuit"), "pursuit"),
         ((), "name each once, at least one"),
         (("none.py:MyParams",), "none.py cannot be read"),
+        (("pursuit=none.json",), "none.json"),
+        (("persuit=none.json",), "unknown law 'persuit'"),
     ],
 )
 def test_laws_that_are_not_there_are_refused(laws, words):
     with pytest.raises(InputError, match=words):
         ladder.rungs(laws)
+
+
+def test_a_law_may_have_the_values_of_a_file(tmp_path):
+    mine = tmp_path / "eager.json"
+    mine.write_text('{"press": 0.5}')
+    found = ladder.rungs(("pursuit", f"pursuit={mine}"))
+    assert found["eager"] == ladder.RUNGS["pursuit"]._replace(press=0.5)
+    assert ladder.senses(found) == {"pursuit": "touch", "eager": "touch"}
+    mine.write_text('{"presses": 0.5}')
+    with pytest.raises(InputError, match="presses"):
+        ladder.rungs((f"pursuit={mine}",))
+    for laws in ((f"pursuit={mine}", f"force_push={mine}"), (f"pursuit={mine}",) * 2):
+        mine.write_text("{}")
+        with pytest.raises(InputError, match="eager"):
+            ladder.rungs(laws)
 
 
 def test_every_law_meets_the_same_worlds_which_no_tuner_has_seen():

@@ -64,6 +64,17 @@ def changed(params: Any, changes: Mapping[str, Any]) -> Any:
     return jax.tree.unflatten(jax.tree.structure(params), leaves)
 
 
+def with_values(params: Params, values: Mapping[str, Any], source: str) -> Params:
+    """The parameters with values that somebody gave, checked by their law.
+
+    Raises:
+      InputError: one of them, which came from `source`, is unknown, no number, or not allowed.
+    """
+    given = {key: errors.check_number(f"{source} {key}", value) for key, value in values.items()}
+    found = changed(params, given)
+    return of(found).check(found)
+
+
 def check_finite(params: Any) -> Any:
     """The same parameters, if all their leaves are finite numbers; otherwise an InputError."""
     for name, leaf in numbers(params).items():

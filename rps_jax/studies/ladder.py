@@ -25,6 +25,7 @@ from rps_jax.control.rivals.pursuit import PursuitParams
 from rps_jax.control.rps_plus import RPSPlusParams
 from rps_jax.control.strategies import Params
 from rps_jax.engines import EngineName
+from rps_jax.record import files
 from rps_jax.robot.robot import Robot
 from rps_jax.runs import sweep
 from rps_jax.runs.evaluate import seed_of
@@ -51,18 +52,31 @@ RUNGS: dict[str, Params] = {
 def rungs(names: Sequence[str] = tuple(RUNGS)) -> dict[str, Params]:
     """Laws by their names in `RUNGS`, or of a file: `my_law.py:MyParams` or `policy.npz`.
 
+    A law with other values is `pursuit=FILE`, where the file holds JSON, as `rps tune es` writes
+    it, of what differs from that rung; it is called by the file's name without its ending.
+
     Raises:
-      InputError: none is asked for, one twice, or one that is unknown.
+      InputError: none is asked for, one twice, or one that is unknown or cannot be read.
     """
     errors.check_each_once("laws", names)
-    found = {}
+    found: dict[str, Params] = {}
     for name in names:
-        if ".py:" in name or name.endswith(".npz"):
-            own, params = strategies.named(name)
-            found[own] = params
-        else:
-            found[name] = RUNGS[errors.check_name("law", name, RUNGS)]
+        own, params = _rung(name)
+        if own in found:
+            raise errors.InputError(f"laws = {' '.join(names)} are not allowed: two are {own}.")
+        found[own] = params
     return found
+
+
+def _rung(text: str) -> tuple[str, Params]:
+    """The name and the parameters of one of them."""
+    if ".py:" in text or text.endswith(".npz"):
+        return strategies.named(text)
+    name, other, file = text.partition("=")
+    params = RUNGS[errors.check_name("law", name, RUNGS)]
+    if not other:
+        return name, params
+    return Path(file).stem, strategies.with_values(params, files.read_json(Path(file)), file)
 
 
 def senses(laws: Mapping[str, Params]) -> dict[str, str]:
@@ -93,7 +107,8 @@ def ladder(
       domain: ranges of what differs between worlds, or their name in `DOMAINS`.
       worlds: how many, of indices 0, 1, ...
       seed: whose worlds for testing are taken, which no tuner has seen.
-      laws: names of `RUNGS`, or laws of files; or parameters by names of one's own.
+      laws: names of `RUNGS`, or laws of files, as `rungs` reads them; or parameters by names of
+        one's own.
       engine: what steps them.
       out: run folder, in which a run that was killed is continued; None keeps all in memory.
       physics: how friction is modelled.

@@ -165,9 +165,7 @@ def start_of(strategy: str, start: str) -> Params:
             f"{', '.join(known)} have."
         )
     values = {} if start == "paper" else files.read_json(Path(start))
-    given = {key: errors.check_number(f"{start} {key}", value) for key, value in values.items()}
-    changed = strategies.changed(params, given)
-    return strategies.of(changed).check(changed)
+    return strategies.with_values(params, values, start)
 
 
 def shard_of(text: str) -> Shard:

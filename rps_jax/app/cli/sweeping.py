@@ -125,8 +125,8 @@ class Ladder(Spread):
     domain: Domain = "wide"
     laws: tuple[str, ...] = ()
     """Laws: all by default, or some of nps, "rps paper", "rps tuned", rps_plus, pursuit,
-    force_push, force_push_published, aps, dipole, and laws of files, as my_law.py:MyParams or
-    policy.npz."""
+    force_push, force_push_published, aps, dipole, learned_gru, learned_mlp, and laws of files, as
+    my_law.py:MyParams or policy.npz; pursuit=mine.json is pursuit with the values of a file."""
     worlds: int | None = None
     """Number of worlds; by default 1000, or the whole grid of a domain with listed targets."""
     robot: str | None = None
