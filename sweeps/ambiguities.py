@@ -17,6 +17,7 @@ from rps_jax import errors
 from rps_jax.analysis import figures, tables
 from rps_jax.app.cli.options import StudyOptions
 from rps_jax.app.cli.running import guarded
+from rps_jax.control.strategies import PARAMS
 from rps_jax.record import files
 from rps_jax.studies import study
 from rps_jax.studies.replication import ambiguity
@@ -35,6 +36,8 @@ class Options(StudyOptions):
     """The ingredients of the paper's simulator, with all three strategies."""
     curve: bool = False
     """Skin tolerances and behaviours on loss of contact."""
+    strategies: tuple[str, ...] = ()
+    """Laws; by default rps, and with --gazebo also nps and aps."""
     out: Path = Path("runs/ambiguities")
     """Run folder; a run that was killed is continued there."""
 
@@ -51,7 +54,9 @@ def main(options: Options) -> None:
     names = options.readings or tuple(known)
     if not options.curve:
         names = tuple(dict.fromkeys([ambiguity.DEFAULT, *names]))
-    strategies = paper.STRATEGIES if options.gazebo else ("rps",)
+    strategies = options.strategies or (paper.STRATEGIES if options.gazebo else ("rps",))
+    for name in strategies:
+        errors.check_name("strategy", name, PARAMS)
     grid = study.Grid(strategies=strategies, targets=options.targets())
     with options.opened() as out, progress_bar(len(names) * grid.size) as report:
         results = study.run(
@@ -59,9 +64,9 @@ def main(options: Options) -> None:
         )
     files.write_results(out / "results.nc", results)
     found = [study.rows(results, names[0], strategy) for strategy in strategies]
-    if options.gazebo and "paper_gazebo" in names:
+    if options.gazebo and "paper_gazebo" in names and set(strategies) <= set(paper.STRATEGIES):
         found.append(ambiguity.cells(results))
-    if options.curve and not options.readings:
+    if options.curve and not options.readings and "rps" in strategies:
         curve = ambiguity.by_tolerance(results, ambiguity.TOLERANCES)
         trials = grid.size // len(PAPER_OBJECTS)
         figures.tolerance_curve(curve, trials, out / "tolerance.png")

@@ -7,6 +7,9 @@ import xarray as xr
 
 from rps_jax import errors
 from rps_jax.control.law import RPSParams
+from rps_jax.control.rivals.aps import APSParams
+from rps_jax.control.rivals.pursuit import PursuitParams
+from rps_jax.control.rps_plus import RPSPlusParams
 from rps_jax.engines import mujoco as c_mujoco
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Parts
@@ -32,6 +35,16 @@ CONDITIONS = {
     "slow": Condition("slow", SHORT, params={"v_max": 0.001}),
     "thin": Condition("thin skin", SHORT, case={"skin": IdealSkin(0.001)}),
 }
+
+
+def test_a_condition_changes_rps_wherever_it_is_part_of_a_law():
+    condition = Condition("slow", SHORT, params={"v_max": 0.001})
+    grid = GRID._replace(strategies=("rps", "rps_plus", "aps", "pursuit"))
+    rps, plus, aps, pursuit = (case.params for case in condition.cases(grid)[:: len(NEAR)])
+    assert rps == RPSParams.paper()._replace(v_max=0.001)
+    assert plus.law == RPSPlusParams().law._replace(v_max=0.001)
+    assert plus._replace(law=RPSPlusParams().law) == RPSPlusParams()
+    assert (aps, pursuit) == (APSParams(), PursuitParams())
 
 
 @pytest.fixture(scope="module")

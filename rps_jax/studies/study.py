@@ -17,6 +17,9 @@ import numpy as np
 import xarray as xr
 
 from rps_jax.analysis import statistics
+from rps_jax.control import strategies
+from rps_jax.control.law import RPSParams
+from rps_jax.control.strategies import Params
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Parts
@@ -56,15 +59,12 @@ class Condition:
 
     what: str
     setting: Setting = Setting()
-    params: Mapping[str, float] = field(default_factory=dict)  # of RPS and NPS
+    params: Mapping[str, float] = field(default_factory=dict)  # of RPS, also within other laws
     case: Mapping[str, Any] = field(default_factory=dict)  # skin, gap, rear, bearing, ...
 
     def cases(self, grid: Grid) -> list[Case]:
         """The trials of a grid under this condition."""
-        changed = {
-            name: paper.PARAMS[name]._replace(**(self.params if name != "aps" else {}))
-            for name in grid.strategies
-        }
+        changed = {name: self._changed(strategies.PARAMS[name]) for name in grid.strategies}
         return [
             Case(name, friction, target, changed[strategy], **self.case)
             for strategy in grid.strategies
@@ -72,6 +72,15 @@ class Condition:
             for friction in grid.friction.values()
             for target in grid.targets
         ]
+
+    def _changed(self, params: Params) -> Params:
+        """Parameters of RPS, or of a law that has RPS within, with the changes; others as is."""
+        if isinstance(params, RPSParams):
+            return params._replace(**self.params)
+        within = getattr(params, "law", None)
+        if isinstance(within, RPSParams):
+            return params._replace(law=within._replace(**self.params))
+        return params
 
 
 def run(
