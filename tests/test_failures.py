@@ -84,6 +84,22 @@ def test_splitting_is_unbiased_and_its_interval_covers():
     assert np.mean([one.variation for one in found]) == pytest.approx(p.std() / 0.01, rel=0.35)
 
 
+def test_several_splittings_side_by_side_are_what_each_is_alone():
+    score, kinds = beyond(0.01, 6)
+    sizes, seeds = Splitting(200, 4, share=0.5), range(3)
+    asked = []
+
+    def counted(u):
+        asked.append(len(u))
+        return score(u)
+
+    found = rare.together(counted, [rare.steps(kinds, sizes, seed) for seed in seeds])
+    alone = [rare.split(score, kinds, sizes, seed) for seed in seeds]
+    assert [one.estimate for one in found] == [one.estimate for one in alone]
+    assert asked[:2] == [600, 300]
+    assert len(asked) == max(len(one.levels) for one in alone)
+
+
 def test_one_in_a_hundred_thousand_takes_a_twentieth_of_the_worlds():
     score, kinds = beyond(1e-5, 18)
     found = [rare.split(score, kinds, Splitting(18_000, 20), seed).estimate for seed in range(8)]

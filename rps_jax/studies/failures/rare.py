@@ -14,7 +14,7 @@ failure that no group has met is in no interval.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -48,7 +48,7 @@ class Splitting:
     """Number of groups that share nothing but the levels; their spread is the interval."""
     share: float = 0.2
     """[1] Share of the worlds that reach the next level, whose chains begin in them."""
-    levels: int = 12
+    levels: int = 30
     """Number of levels after which it gives up, and says 0 if nothing has failed."""
     beyond: float = 0.0
     """[m] A failure counts if it missed the target by more than this; 0 counts all failures."""
@@ -88,6 +88,9 @@ class Found(NamedTuple):
     severity: np.ndarray  # (n,)
 
 
+Steps = Generator[np.ndarray, np.ndarray, Found]
+
+
 def joined(groups: np.ndarray, trials: int, least: float = 0.0) -> Estimate:
     """The mean of groups' estimates, with Student's interval, even in the logarithm.
 
@@ -110,19 +113,42 @@ def split(score: Severity, kinds: Sequence[str], how: Splitting, seed: int = 0) 
       how: sizes, and the level.
       seed: of the points and moves.
     """
+    (found,) = together(score, [steps(kinds, how, seed)])
+    return found
+
+
+def together(score: Severity, every: Sequence[Steps]) -> list[Found]:
+    """Several of them side by side, which are asked for one batch of all of them at a time."""
+    found: dict[int, Found] = {}
+    asked = dict(enumerate(map(next, every)))
+    while asked:
+        told = score(np.concatenate(list(asked.values())))
+        ends = np.cumsum([len(u) for u in asked.values()])[:-1]
+        for i, s in zip(list(asked), np.split(told, ends), strict=True):
+            try:
+                asked[i] = every[i].send(s)
+            except StopIteration as end:
+                del asked[i]
+                found[i] = end.value
+    return [found[i] for i in sorted(found)]
+
+
+def steps(kinds: Sequence[str], how: Splitting, seed: int) -> Steps:
+    """Subset simulation, which asks for the severities (n,) of points (n, q) as it goes on."""
     rng = np.random.Generator(np.random.Philox(key=seed))
     noise = np.array([kind == "noise" for kind in kinds])
     shape = (how.groups, how.particles // how.groups)
     trials, step, levels = 0, 0.6, []
     least = 0.0  # squared variation of independent worlds, which chains cannot have less of
 
-    def ask(z: np.ndarray) -> np.ndarray:
+    def ask(z: np.ndarray) -> Generator[np.ndarray, np.ndarray, np.ndarray]:
         nonlocal trials
         trials += z[..., 0].size
-        return score(_uniform(z.reshape(-1, z.shape[-1]))).reshape(z.shape[:-1])
+        told = yield _uniform(z.reshape(-1, z.shape[-1]))
+        return told.reshape(z.shape[:-1])
 
     z = rng.standard_normal((*shape, len(kinds)))
-    s, p = ask(z), np.ones(how.groups)
+    s, p = (yield from ask(z)), np.ones(how.groups)
     for _ in range(how.levels):
         # One level for all groups, which is nearly independent of each; it must be passed.
         level = float(np.sort(s, axis=None)[-max(2, round(how.share * s.size))])
@@ -137,7 +163,7 @@ def split(score: Severity, kinds: Sequence[str], how: Splitting, seed: int = 0) 
         zs, ss = [z_now], [s_now]
         while sum(one.shape[1] for one in ss) < shape[1]:
             moved = _moved(z_now, step, noise, rng)
-            s_moved = ask(moved)
+            s_moved = yield from ask(moved)
             ok = s_moved >= level
             z_now, s_now = np.where(ok[..., None], moved, z_now), np.where(ok, s_moved, s_now)
             step = float(np.clip(step * np.exp(ok.mean() - _ACCEPTED), 0.02, 1.0))
@@ -202,7 +228,7 @@ def rare(
       seed: of the points and moves; they are points of their own, of no split.
       how: sizes, and what counts as a failure.
       out: run folder, in which a run that was killed is continued; None keeps all in memory.
-      repetitions: how often all of it is done, each time with other points.
+      repetitions: how often all of it is done, side by side, each with points of its own.
       setting: physics, engine and rules.
       slots: worlds stepped at once by a worker, in each shape family.
       workers: host threads; by default as suits engine and device.
@@ -233,11 +259,10 @@ def rare(
         asked = {"study": "rare", "seed": seed, "how": asdict(how), "repetitions": repetitions}
         run_folder.claim(folder, asked | probe.configuration())
     kinds = [one.kind for one in points.quantities(domain)]
-    every = []
-    for repetition in range(repetitions):
-        key = seed_of(seed, "tune") * 10_000 + repetition
-        every.append(split(lambda u: probe(u).severity.values, kinds, how, key))
-    return _labelled(domain, every)
+    first = seed_of(seed, "tune") * 10_000
+    every = [steps(kinds, how, first + repetition) for repetition in range(repetitions)]
+    found = together(lambda u: probe(u).severity.values, every)
+    return _labelled(domain, found)
 
 
 def _labelled(domain: Domain, every: Sequence[Found]) -> xr.Dataset:
