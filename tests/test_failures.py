@@ -30,10 +30,15 @@ BRIEF = Setting(rules=RULES, engine="quasistatic")
 
 
 def test_severity_by_hand():
-    won = severity([1, 1, 1], [5.0, 2.0, 10.0], [0.05] * 3, [0.0, 4.0, 0.0], RULES)
+    still = [0.0, 0.002, 0.001]
+    won = severity([1, 1, 1], [5.0, 2.0, 10.0], [0.05] * 3, [0.0, 4.0, 0.0], still, RULES)
     np.testing.assert_allclose(won, [0.5, 0.8, 1.0])
     assert (won < 1).all()  # a success at the last moment is still one
-    failed = severity([0, 0], [10.0, 3.0], [0.3, 0.0], [0.0, 5.0], RULES)
+    # 2 mrad to pi / 4 is a factor of 392.7; its root is half way.
+    leaning = severity([1, 1], [1.0, 1.0], [0.05] * 2, [0.0] * 2, [0.002 * 392.7**0.5, 0.79], RULES)
+    np.testing.assert_allclose(leaning, [0.5, 1.0], rtol=1e-4)
+    assert (leaning < 1).all()
+    failed = severity([0, 0], [10.0, 3.0], [0.3, 0.0], [0.0, 5.0], [0.9, 0.0], RULES)
     np.testing.assert_allclose(failed, [1.3, 1.0])
 
 
@@ -152,7 +157,7 @@ def made_up(self, at):
     won = deep < 0
     time = np.where(won, 80 * np.exp(np.minimum(deep, 0)), 300.0)
     left = np.where(won, 0.05, 0.05 + np.maximum(deep, 0))
-    bad = severity(won, time, left, np.zeros(len(won)), self.setting.rules)
+    bad = severity(won, time, left, *np.zeros((2, len(won))), self.setting.rules)
     columns = {"success": won * 1.0, "time": time, "left": left, "severity": bad}
     found = {name: ("world", values) for name, values in columns.items()}
     return xr.Dataset({"u": (("world", "quantity"), at.u), **found}, attrs={"wall": 0.1})
@@ -366,6 +371,7 @@ def test_gains_and_losses_by_hand():
             "time": (("arm", "world"), np.full((1, 4), 30.0)),
             "min_distance": (("arm", "world"), np.array([[0.05, 0.25, 0.05, 0.5]])),
             "contact_lost_time": (("arm", "world"), np.zeros((1, 4))),
+            "tilt": (("arm", "world"), np.zeros((1, 4))),
             "distance": ("world", np.ones(4)),
             "which_object": ("world", [0, 0, 1, 1]),
             "known_success": (("law", "world"), known),

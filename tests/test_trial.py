@@ -196,6 +196,7 @@ def test_an_object_that_leans_too_far_has_fallen_over_and_ends_its_trial():
     trials = trial.start_all(worlds, jnp.ones(SLOTS, bool))
     seen = jax.vmap(lambda w, t: trial.observe(w, t, physics=preset())[0])(worlds, trials)
     assert seen.tipped.tolist() == seen.done.tolist() == [False, False, True, True]
+    np.testing.assert_array_equal(seen.tipped, seen.tilt > Rules().max_tilt)
     assert not seen.success.any()
     late = jax.vmap(lambda w, t: trial.observe(w, t, physics=preset(), rules=Rules(max_tilt=3))[0])
     assert not late(worlds, trials).tipped.any()

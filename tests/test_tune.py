@@ -119,7 +119,7 @@ class TestObjective:
     def test_a_trial_without_contact_missed_by_the_whole_way(self):
         never, near = np.array([np.inf]), np.array([0.2])
         zero = np.zeros(1)
-        outcome = Outcome(zero, zero, never, *[zero] * 9)
+        outcome = Outcome(zero, zero, never, *[zero] * 10)
         for least, missed in ((never, 0.5), (near, 0.2)):
             found = Objective().scores(outcome._replace(min_distance=least), np.full(1, 0.5), RULES)
             assert found == pytest.approx(1 + 0.5 * missed)
@@ -232,7 +232,7 @@ def pretend(asks, domains, setting, objective, **_):
     for ask in asks:
         value = (np.asarray(ask.params.L) - 0.4) ** 2 + (np.asarray(ask.params.K_h) - 0.6) ** 2
         scores = value[:, None] + 1e-3 * np.sin(ask.worlds + ask.seed)
-        answers.append(Answer(Outcome(scores < 0.05, *[scores] * 11), scores))
+        answers.append(Answer(Outcome(scores < 0.05, *[scores] * 12), scores))
     return answers, Timing(0.0, 1.0, 1.0)
 
 

@@ -85,7 +85,7 @@ def yaw_of_quaternion(quaternion: jax.Array) -> jax.Array:
     return direction(jnp.stack([1 - 2 * (y * y + z * z), 2 * (w * z + x * y)], axis=-1))
 
 
-def upright(quaternion: jax.Array) -> jax.Array:
-    """Cosine (...) of the tilt of unit quaternions (..., 4), scalar first."""
+def tilt(quaternion: jax.Array) -> jax.Array:
+    """Angle (...) [rad] between the vertical and its image under unit quaternions (..., 4)."""
     _, x, y, _ = jnp.moveaxis(quaternion, -1, 0)
-    return 1 - 2 * (x * x + y * y)
+    return 2 * jnp.arcsin(jnp.minimum(norm(jnp.stack([x, y], axis=-1)), 1.0))

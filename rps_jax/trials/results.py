@@ -21,6 +21,7 @@ UNITS = {
     "contact_lost_time": ("s", "time without contact after the first touch"),
     "path_length": ("m", "length of the base's way"),
     "mean_abs_l": ("m", "mean |l| while in contact, the paper's D"),
+    "tilt": ("rad", "greatest tilt of the object"),
     "tipped": ("1", "the object fell over"),
     "diverged": ("1", "physics became NaN or ran away"),
     "stalled": ("1", "it ended with the base standing still, for want of force"),

@@ -94,6 +94,7 @@ class Trial(NamedTuple):
     path_length: jax.Array  # () [m] of the base's way
     done: jax.Array  # () bool
     success: jax.Array  # () bool
+    tilt: jax.Array  # () [rad] greatest tilt of the object so far
     tipped: jax.Array  # () bool: the object has fallen over
     diverged: jax.Array  # () bool
     overflows: jax.Array  # () int32 control steps in which contacts were lost for want of room
@@ -121,6 +122,7 @@ class Outcome(NamedTuple):
     contact_lost_time: jax.Array  # () [s]
     path_length: jax.Array  # () [m] of the base's way
     mean_abs_l: jax.Array  # () [m] the paper's D; NaN if never touched
+    tilt: jax.Array  # () [rad] greatest tilt of the object
     tipped: jax.Array  # () bool: the object has fallen over
     diverged: jax.Array  # () bool
     stalled: jax.Array  # () bool: it ended with the base standing still against the object
@@ -160,6 +162,7 @@ def start(world: World, strategy: Strategy = RPS) -> Trial:
         path_length=jnp.zeros_like(world.qpos[0]),
         done=false,
         success=false,
+        tilt=jnp.zeros_like(world.qpos[0]),
         tipped=false,
         diverged=false,
         overflows=zero,
@@ -230,7 +233,8 @@ def observe(
     touch = reading.contact_type != NONE
     lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
     success = touch & (distance < world.params.d_success)
-    tipped = planar.upright(trial.qpos[JOINTS.object][3:]) < jnp.cos(rules.max_tilt)
+    tilt = planar.tilt(trial.qpos[JOINTS.object][3:])
+    tipped = tilt > rules.max_tilt
     over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost) | tipped
     told = trial._replace(
         skin=skin,
@@ -242,6 +246,7 @@ def observe(
             touch, jnp.minimum(trial.min_distance, distance), trial.min_distance
         ),
         success=success & ~over,
+        tilt=jnp.maximum(trial.tilt, tilt),
         tipped=tipped,
         done=success | over,
     )
@@ -371,6 +376,7 @@ def outcome(trial: Trial, period: float) -> Outcome:
         mean_abs_l=jnp.where(
             trial.contact_steps > 0, trial.sum_abs_l / jnp.maximum(trial.contact_steps, 1), jnp.nan
         ),
+        tilt=trial.tilt,
         tipped=trial.tipped,
         diverged=trial.diverged,
         stalled=drive.has_stalled(trial.drive, period) & ~trial.success & ~trial.diverged,

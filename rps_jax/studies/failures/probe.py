@@ -2,11 +2,13 @@
 
 The severity of a trial is one number that is below 1 for a success and at least 1 for a failure:
 
-  success   the greater of time / horizon and time without contact / what the rules allow of it
+  success   the greatest of time / horizon, time without contact / what the rules allow of it, and
+            the tilt of the object between 2 mrad, which is every push's, and a fall, in logarithms
   failure   1 + the least distance of the contact point to the target [m]; never touched: the whole
 
-A slow push that nearly loses contact is close to failing, and a failure that missed by more is
-farther from succeeding. Severity less 1 is the margin by which the law failed.
+A slow push that nearly loses contact, or lifts a foot of the object, is close to failing, and a
+failure that missed by more is farther from succeeding. Severity less 1 is the margin by which the
+law failed.
 """
 
 from __future__ import annotations
@@ -37,10 +39,11 @@ from rps_jax.world.domain import Domain
 from rps_jax.world.points import Points
 
 _SLOTS = 64  # of a program, at least
-_KEPT = ("success", "time", "min_distance", "contact_lost_time")
+_KEPT = ("success", "time", "min_distance", "contact_lost_time", "tilt")
+_STILL = 0.002  # [rad] tilt that says nothing: half of all pushes tilt their object by more
 
 
-def severity(success: Any, took: Any, left: Any, lost: Any, rules: Rules) -> np.ndarray:
+def severity(success: Any, took: Any, left: Any, lost: Any, tilt: Any, rules: Rules) -> np.ndarray:
     """Severity (...) [1] of trials: below 1 for a success, 1 and more for a failure.
 
     Args:
@@ -48,11 +51,14 @@ def severity(success: Any, took: Any, left: Any, lost: Any, rules: Rules) -> np.
       took: (...) [s] until the trial's end.
       left: (...) [m] least distance to the target; of an object never touched, the whole way.
       lost: (...) [s] without contact.
+      tilt: (...) [rad] greatest tilt of the object.
       rules: when a trial ends.
     """
     took, lost = np.asarray(took, float), np.asarray(lost, float)
     slow = np.maximum(took / rules.horizon, lost / max(float(rules.max_lost), 1e-6))
-    won = np.minimum(slow, np.nextafter(1, 0))
+    leant = np.log(np.maximum(np.asarray(tilt, float), _STILL) / _STILL)
+    leant /= np.log(max(float(rules.max_tilt) / _STILL, 2.0))
+    won = np.minimum(np.maximum(slow, leant), np.nextafter(1, 0))
     return np.where(np.asarray(success) > 0, won, 1 + np.asarray(left, float))
 
 
@@ -61,7 +67,8 @@ def severity_of(results: xr.Dataset, rules: Rules) -> np.ndarray:
     near = results.min_distance.values
     left = np.where(np.isfinite(near), near, results.distance.values)
     lost = results.contact_lost_time.values
-    return severity(results.success.values, results.time.values, left, lost, rules)
+    told = results.success.values, results.time.values, left, lost, results.tilt.values
+    return severity(*told, rules)
 
 
 def need(module: str, package: str) -> ModuleType:
@@ -155,8 +162,8 @@ class Probe:
         batch.run(jobs, self.setting, collect=collect, **shape)
         near = found.pop("min_distance")
         found["left"] = np.where(np.isfinite(near), near, away)
-        told = (found["success"], found["time"], found["left"], found["contact_lost_time"])
-        found["severity"] = severity(*told, self.setting.rules)
+        told = [found[name] for name in ("success", "time", "left", "contact_lost_time", "tilt")]
+        found["severity"] = severity(*told, rules=self.setting.rules)
         columns = {name: ("world", values) for name, values in found.items()}
         wall = time.perf_counter() - began
         return xr.Dataset({"u": (("world", "quantity"), at.u), **columns}, attrs={"wall": wall})
