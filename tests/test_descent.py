@@ -11,6 +11,7 @@ import pytest
 
 from rps_jax.app import cli
 from rps_jax.control.law import RPSParams
+from rps_jax.control.rivals.pursuit import PursuitParams
 from rps_jax.errors import InputError
 from rps_jax.runs.evaluate import Answer
 from rps_jax.runs.objective import Objective
@@ -84,6 +85,12 @@ class TestDescent:
         thetas = search.propose()
         np.testing.assert_array_equal(thetas[0], space.vector(space.base))
         assert (np.abs(thetas[1:] - thetas[0]).max(axis=1) > 0.1).all()
+
+    def test_a_law_without_a_smooth_form_is_refused(self):
+        space = Space(("K_v",), PursuitParams())
+        with pytest.raises(InputError, match="no smooth law"):
+            Search(Descent(), space, Course())
+        Search(Descent(estimator="evolution"), space, Course())
 
     def test_steps_go_downhill_and_stay_within_the_clip(self):
         one = Descent(optimiser="sgd", learning_rate=0.5, clip=1.0, steps=10)

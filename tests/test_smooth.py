@@ -15,8 +15,10 @@ from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 
 from rps_jax import engines, errors
-from rps_jax.control import law, strategies
+from rps_jax.control import law, rps_plus, strategies
 from rps_jax.control.law import Observation, RPSParams, RPSState, Temperatures
+from rps_jax.control.rivals.pursuit import PursuitParams
+from rps_jax.control.rps_plus import RPSPlusParams
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.shell import HALF_LENGTH, HALF_WIDTH
@@ -595,3 +597,64 @@ def test_equal_temperatures_are_one_strategy():
         Temperatures(realign=0.01)
     )
     assert strategies.smooth_rps(COLD) is not strategies.smooth_rps()
+
+
+# --- RPS+ ----------------------------------------------------------------------------------
+
+
+def plus_moments(count=40):
+    """What RPS+ is told at moments by chance, in contact or not; every tenth begins anew."""
+    rng = np.random.default_rng(8)
+    for i in range(count):
+        x, y, far, side = rng.uniform(-1, 1, 4)
+        yield (
+            i % 10 == 0,
+            Observation(
+                0.1 * jnp.array([x, y]), jnp.asarray(2 * side), jnp.array([0.36, 0.3 * y]),
+                jnp.asarray(i % 10 < 4), jnp.array([0.5, 0.0]) + 0.3 * jnp.array([far, side]),
+            ),
+        )  # fmt: skip
+
+
+def test_without_heat_smooth_rps_plus_is_the_hard_one(monkeypatch):
+    monkeypatch.setattr(rps_plus, "_WARM", rps_plus._Warm(1e-6, 1e-6))
+    params = RPSPlusParams(n_lost=2.5)  # a count meets no threshold that is a count
+    hard, cold = strategies.of(params), strategies.smooth_rps_plus(COLD)
+    for anew, told in plus_moments():
+        if anew:
+            states = [hard.init(params), cold.init(params)]
+        weight = told._replace(in_contact=told.in_contact.astype(float))
+        (states[0], twist, _) = hard.step(params, states[0], told)
+        (states[1], mixed, _) = cold.step(params, states[1], weight)
+        np.testing.assert_allclose(jnp.stack(mixed), jnp.stack(twist), atol=1e-5)
+        assert float(states[1].lost) == pytest.approx(float(states[0].lost))
+
+
+@pytest.mark.parametrize("name", ["d_near", "press", "n_lost", "ahead", "aside"])
+def test_a_smooth_rps_plus_can_be_differentiated_by_its_own_parameters(name):
+    strategy = strategies.smooth_rps_plus()
+    slopes = []
+    with jax.enable_x64(True):
+
+        def driven(value):
+            params = RPSPlusParams(n_lost=2.0)._replace(**{name: value})
+            state, total = strategy.init(params), 0.0
+            for anew, told in plus_moments(20):
+                state = strategy.init(params) if anew else state
+                weight = told._replace(in_contact=told.in_contact.astype(float))
+                state, twist, _ = strategy.step(params, state, weight)
+                total = total + twist.v_x + 0.7 * twist.v_y + 0.1 * twist.omega
+            return total
+
+        base = float(getattr(RPSPlusParams(n_lost=2.0), name))
+        slope, step = float(jax.grad(driven)(base)), 1e-5
+        slopes = (driven(base + step) - driven(base - step)) / (2 * step)
+    assert abs(slope) > 1e-4
+    assert slope == pytest.approx(float(slopes), rel=1e-3)
+
+
+def test_only_rps_and_rps_plus_have_a_smooth_form():
+    assert strategies.smooth_of(RPSParams.tuned()) is strategies.smooth_rps()
+    assert strategies.smooth_of(RPSPlusParams()) is strategies.smooth_rps_plus()
+    with pytest.raises(errors.InputError, match="PursuitParams have no smooth law"):
+        strategies.smooth_of(PursuitParams())

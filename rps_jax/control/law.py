@@ -12,13 +12,13 @@ chose between is mixed by that weight, and the law is smooth; without them it is
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from rps_jax import errors
+from rps_jax.control import switches
 from rps_jax.control.bounds import Bound
 from rps_jax.geometry import planar
 
@@ -227,47 +227,7 @@ def check(params: RPSParams) -> RPSParams:
     return params
 
 
-_HARD: Any = Temperatures._make([None] * len(Temperatures._fields))
-
-# A switch is a bool, or in the smooth law a weight from 0 to 1.
-
-
-def _above(
-    x: jax.Array,
-    threshold: Any,
-    temperature: Any,
-    compare: Callable[[Any, Any], jax.Array] = operator.gt,
-) -> jax.Array:
-    """The switch `compare(x, threshold)`; smooth if there is a temperature."""
-    if temperature is None:
-        return compare(x, threshold)
-    return jax.nn.sigmoid((x - threshold) / temperature)
-
-
-def _below(x: jax.Array, threshold: Any, temperature: Any) -> jax.Array:
-    """The switch x < threshold; smooth if there is a temperature."""
-    if temperature is None:
-        return x < threshold
-    return jax.nn.sigmoid((threshold - x) / temperature)
-
-
-def _not(switch: jax.Array) -> jax.Array:
-    return ~switch if switch.dtype == bool else 1 - switch
-
-
-def _both(a: jax.Array, b: jax.Array) -> jax.Array:
-    return a & b if a.dtype == b.dtype == bool else a * b
-
-
-def _either(a: jax.Array, b: jax.Array) -> jax.Array:
-    return a | b if a.dtype == b.dtype == bool else jnp.maximum(a, b)
-
-
-def _choose(switch: jax.Array, yes: Any, no: Any) -> jax.Array:
-    """`yes` or `no`; of a weight, the mixture."""
-    if switch.dtype == bool:
-        return jnp.where(switch, yes, no)
-    return switch * yes + (1 - switch) * no
+HARD: Any = Temperatures._make([None] * len(Temperatures._fields))
 
 
 def _sgn(params: RPSParams, x: jax.Array, temperature: Any = None) -> jax.Array:
@@ -293,11 +253,11 @@ def adaptive_rate(
     temperatures: Temperatures | None = None,
 ) -> jax.Array:
     """Eq. 5: a_r (...) [1] from the lateral contact location l [m] and ||d|| [m]."""
-    soft = temperatures or _HARD
+    soft = temperatures or HARD
     logistic = jax.nn.sigmoid((jnp.abs(l) - params.beta) * params.k)
     a_r = (params.zeta + (params.eta - params.zeta) * logistic) * _sgn(params, l, soft.sgn)
-    far = _above(distance, params.d_th, soft.d_th)
-    return _choose(far, a_r, 0.0) * params.reactive
+    far = switches.above(distance, params.d_th, soft.d_th)
+    return switches.choose(far, a_r, 0.0) * params.reactive
 
 
 def linear_velocity(v_star: jax.Array, a_r: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -346,11 +306,11 @@ def _push(
     v_star = params.K_v * distance  # Eq. 3
     gamma = steering_angle(params, d, observation.yaw)
 
-    soft = temperatures or _HARD
-    realigning = _both(
-        _above(jnp.abs(l), l_th, soft.realign), jnp.asarray(params.reactive) > 0
+    soft = temperatures or HARD
+    realigning = switches.both(
+        switches.above(jnp.abs(l), l_th, soft.realign), jnp.asarray(params.reactive) > 0
     )  # Algorithm 1's switch into, and out of, the Realignment State
-    a_r = _choose(
+    a_r = switches.choose(
         realigning,
         params.a_r_max * _sgn(params, l, soft.sgn),
         adaptive_rate(params, l, distance, temperatures),
@@ -360,17 +320,17 @@ def _push(
     first = jnp.asarray(params.saturate_first) > 0
     forward = jnp.where(first, bounded.v_x, v_x)
     speed = jnp.where(first, jnp.minimum(v_star, params.v_max), v_star)
-    turning_speed = _choose(realigning, realignment_gain(params, l) * speed, forward)
+    turning_speed = switches.choose(realigning, realignment_gain(params, l) * speed, forward)
     omega = turning_speed / params.L * jnp.tan(gamma)  # Eq. 9 or 6
     twist = saturate(params, Twist(v_x, v_y, omega))
 
-    arrived = _below(distance, params.d_success, soft.arrive)
-    twist = jax.tree.map(lambda v: _choose(arrived, 0.0, v), twist)
-    new_l_th = _choose(realigning, params.l_mr, params.l_cr)
+    arrived = switches.below(distance, params.d_success, soft.arrive)
+    twist = jax.tree.map(lambda v: switches.choose(arrived, 0.0, v), twist)
+    new_l_th = switches.choose(realigning, params.l_mr, params.l_cr)
     return (
-        _choose(arrived, l_th, new_l_th),
+        switches.choose(arrived, l_th, new_l_th),
         twist,
-        Details(l, distance, a_r, gamma, _both(realigning, _not(arrived))),
+        Details(l, distance, a_r, gamma, switches.both(realigning, switches.inverse(arrived))),
     )
 
 
@@ -384,23 +344,23 @@ def step_with_details(
     in_contact = jnp.asarray(observation.in_contact)
     if temperatures is not None:
         in_contact = in_contact.astype(state.l_th.dtype)
-    soft = temperatures or _HARD
+    soft = temperatures or HARD
     # Without contact the location means nothing; the last one keeps every branch finite.
-    contact = _choose(in_contact, observation.p_robot_contact, state.p_robot_contact)
+    contact = switches.choose(in_contact, observation.p_robot_contact, state.p_robot_contact)
     told = observation._replace(p_robot_contact=contact)
     l_th, push, details = _push(params, state.l_th, told, temperatures)
-    kept = _both(state.touched, jnp.asarray(params.keep_contact) > 0)
+    kept = switches.both(state.touched, jnp.asarray(params.keep_contact) > 0)
     # A remembered contact near the target must not stop the robot: only a felt one arrives.
-    away = _above(details.distance, params.d_success, soft.arrive, operator.ge)
-    pushing = _either(in_contact, _both(kept, away))
-    ahead = Twist(_choose(state.touched, params.v_lost, params.v_approach), 0.0, 0.0)
-    twist = jax.tree.map(lambda a, b: _choose(pushing, a, b), push, ahead)
+    away = switches.above(details.distance, params.d_success, soft.arrive, operator.ge)
+    pushing = switches.either(in_contact, switches.both(kept, away))
+    ahead = Twist(switches.choose(state.touched, params.v_lost, params.v_approach), 0.0, 0.0)
+    twist = jax.tree.map(lambda a, b: switches.choose(pushing, a, b), push, ahead)
     state = RPSState(
-        l_th=_choose(pushing, l_th, state.l_th),
+        l_th=switches.choose(pushing, l_th, state.l_th),
         p_robot_contact=contact,
-        touched=_either(state.touched, in_contact),
+        touched=switches.either(state.touched, in_contact),
     )
-    return state, twist, details._replace(realigning=_both(details.realigning, pushing))
+    return state, twist, details._replace(realigning=switches.both(details.realigning, pushing))
 
 
 @jax.jit

@@ -30,19 +30,37 @@ in the world it felt the object last, and for how many steps it has not.
 
 from __future__ import annotations
 
+import operator
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from rps_jax import errors
-from rps_jax.control import law
+from rps_jax.control import law, switches
 from rps_jax.control.bounds import Bound
-from rps_jax.control.law import Details, Observation, RPSParams, RPSState, Twist
+from rps_jax.control.law import (
+    Details,
+    Observation,
+    RPSParams,
+    RPSState,
+    Temperatures,
+    Twist,
+)
 from rps_jax.geometry import planar
 
 FACING = 0.3  # [rad] P3's facing
 REACH = 0.45  # [m] P3's reach: the base's front is 0.36 m before its middle
+
+
+class _Warm(NamedTuple):
+    """How far switches of the smooth law reach that are not of lengths."""
+
+    facing: float = 0.03  # [rad] P3's |angle of p| < facing
+    lost: float = 5.0  # [1] control steps, n_lost
+
+
+_WARM = _Warm()
 
 
 class RPSPlusParams(NamedTuple):
@@ -60,13 +78,18 @@ class RPSPlusParams(NamedTuple):
         """[m] Target reached."""
         return self.law.d_success
 
+    @property
+    def v_max(self) -> float | jax.Array:
+        """[m/s] Bound on the speed."""
+        return self.law.v_max
+
 
 class RPSPlusState(NamedTuple):
     """What RPS+ remembers between two control steps."""
 
     law: RPSState
     p_world_felt: jax.Array  # (2,) [m] where the object was felt last
-    lost: jax.Array  # () int32 control steps since then
+    lost: jax.Array  # () int32 control steps since then; of the smooth law a float
 
 
 BOUNDS = {f"law.{name}": bound for name, bound in law.BOUNDS.items() if not bound.of} | {
@@ -93,10 +116,11 @@ def check(params: RPSPlusParams) -> RPSPlusParams:
     return params
 
 
-def init(params: RPSPlusParams) -> RPSPlusState:
+def init(params: RPSPlusParams, temperatures: Temperatures | None = None) -> RPSPlusState:
     """Before the first touch."""
-    state = RPSState.init(params.law)
-    return RPSPlusState(state, jnp.zeros_like(state.p_robot_contact), jnp.zeros((), jnp.int32))
+    state = RPSState.init(params.law, temperatures)
+    lost = jnp.zeros((), jnp.int32 if temperatures is None else state.l_th.dtype)
+    return RPSPlusState(state, jnp.zeros_like(state.p_robot_contact), lost)
 
 
 def translation(params: RPSPlusParams, d: jax.Array, yaw: jax.Array) -> Twist:
@@ -108,35 +132,60 @@ def translation(params: RPSPlusParams, d: jax.Array, yaw: jax.Array) -> Twist:
     return law.saturate(params.law, Twist(speed * forward, speed * jnp.sin(error), still))
 
 
-def search(params: RPSPlusParams, p_robot_felt: jax.Array, l: jax.Array) -> Twist:  # noqa: E741
+def search(
+    params: RPSPlusParams,
+    p_robot_felt: jax.Array,
+    l: jax.Array,  # noqa: E741
+    temperatures: Temperatures | None = None,
+) -> Twist:
     """P3: the twist back to where the object was felt, (2,) [m] from the base in its frame.
 
     `l` () [m] is the place on the skin where it was felt.
     """
+    soft = temperatures or law.HARD
     angle, v_max = planar.direction(p_robot_felt), jnp.asarray(params.law.v_max)
-    ahead = jnp.where(jnp.abs(angle) < FACING, params.ahead * v_max, 0.0)
-    turning = jnp.where(planar.norm(p_robot_felt) > REACH, angle, 0.0)
-    return law.saturate(params.law, Twist(ahead, params.aside * v_max * jnp.sign(l), turning))
+    faces = switches.below(jnp.abs(angle), FACING, temperatures and _WARM.facing)
+    ahead = switches.choose(faces, params.ahead * v_max, 0.0)
+    far = switches.above(planar.norm(p_robot_felt), REACH, soft.d_th)
+    side = jnp.sign(l) if temperatures is None else jnp.tanh(l / soft.sgn)
+    turning = switches.choose(far, angle, 0.0)
+    return law.saturate(params.law, Twist(ahead, params.aside * v_max * side, turning))
 
 
 def step(
-    params: RPSPlusParams, state: RPSPlusState, seen: Observation
+    params: RPSPlusParams,
+    state: RPSPlusState,
+    seen: Observation,
+    temperatures: Temperatures | None = None,
 ) -> tuple[RPSPlusState, Twist, Details]:
-    """One control step: the law's, or near the target P2, or after a loss P3."""
-    memory, twist, details = law.step_with_details(params.law, state.law, seen)
+    """One control step: the law's, or near the target P2, or after a loss P3.
+
+    With `temperatures` all switches are smooth, as those of the law are, and the twists mix.
+    """
+    soft = temperatures or law.HARD
+    memory, twist, details = law.step_with_details(params.law, state.law, seen, temperatures)
     contact, touching = memory.p_robot_contact, jnp.asarray(seen.in_contact)
+    if temperatures is not None:
+        touching = touching.astype(memory.l_th.dtype)
     p_world_contact = seen.p_world_robot + planar.rotate(seen.yaw, contact)
-    p_world_felt = jnp.where(touching, p_world_contact, state.p_world_felt)
-    lost = jnp.where(touching | ~memory.touched, 0, state.lost + 1)
+    p_world_felt = switches.choose(touching, p_world_contact, state.p_world_felt)
+    idle = switches.either(touching, switches.inverse(memory.touched))
+    lost = switches.choose(idle, 0, state.lost + 1)
     d = law.displacement(seen._replace(p_robot_contact=contact))
 
-    pushing = touching | (memory.touched & (params.law.keep_contact > 0))
-    near = pushing & (details.distance < params.d_near)  # P1
-    near &= details.distance >= params.law.d_success
+    kept = switches.both(memory.touched, jnp.asarray(params.law.keep_contact) > 0)
+    pushing = switches.either(touching, kept)
+    near = switches.both(pushing, switches.below(details.distance, params.d_near, soft.d_th))  # P1
+    away = switches.above(details.distance, params.law.d_success, soft.arrive, operator.ge)
     p_robot_felt = planar.rotate(-seen.yaw, p_world_felt - seen.p_world_robot)
     for condition, other in (
-        (near, translation(params, d, seen.yaw)),
-        (lost > params.n_lost, search(params, p_robot_felt, contact[1])),
+        (switches.both(near, away), translation(params, d, seen.yaw)),
+        (
+            switches.above(lost, params.n_lost, temperatures and _WARM.lost),
+            search(params, p_robot_felt, contact[1], temperatures),
+        ),
     ):
-        twist = jax.tree.map(lambda a, b, c=condition: jnp.where(c, a, b), other, twist)
+        twist = Twist(
+            *(switches.choose(condition, a, b) for a, b in zip(other, twist, strict=True))
+        )
     return RPSPlusState(memory, p_world_felt, lost), twist, details

@@ -151,6 +151,37 @@ def smooth_rps(temperatures: Temperatures = Temperatures()) -> Strategy:
     )
 
 
+@functools.cache
+def smooth_rps_plus(temperatures: Temperatures = Temperatures()) -> Strategy:
+    """RPS+ likewise, with its own switches smooth, too.
+
+    Raises:
+      InputError: a temperature is not a positive length.
+    """
+    temperatures.check()
+    return Strategy(
+        functools.partial(rps_plus.init, temperatures=temperatures),
+        functools.partial(rps_plus.step, temperatures=temperatures),
+        smooth=True,
+        check=rps_plus.check,
+    )
+
+
+def smooth_of(params: Params) -> Strategy:
+    """The smooth strategy that parameters of RPS or RPS+ belong to.
+
+    Raises:
+      InputError: they are of another law, of which there is no smooth form.
+    """
+    known = {RPSParams: smooth_rps, RPSPlusParams: smooth_rps_plus}
+    if type(params) not in known:
+        raise errors.InputError(
+            f"params of class {type(params).__name__} have no smooth law to be differentiated: "
+            "choose rps or rps_plus."
+        )
+    return known[type(params)]()
+
+
 def of(params: Params) -> Strategy:
     """The strategy that parameters belong to.
 

@@ -20,7 +20,7 @@ import optax
 
 from rps_jax import errors
 from rps_jax.control.law import RPSParams
-from rps_jax.control.strategies import smooth_rps
+from rps_jax.control.strategies import Params, smooth_of
 from rps_jax.robot.skin import CapacitiveSkin, SmoothSkin
 from rps_jax.runs import evaluate
 from rps_jax.runs.objective import Objective
@@ -105,7 +105,7 @@ class Descent:
 
 
 def soft_score(
-    seen: Snapshot, params: RPSParams, setting: Setting, objective: Objective, arrive: float
+    seen: Snapshot, params: Params, setting: Setting, objective: Objective, arrive: float
 ) -> jax.Array:
     """The objective's score () of a softened window's snapshots (T, ...), differentiable.
 
@@ -160,7 +160,8 @@ def scores_of(space: Space, course: Course, descent: Descent, stage: Any) -> gra
     A world is a pair (World, share of `within` after which its window begins). What leads to that
     is driven by the same parameters, and not differentiated.
     """
-    setting, strategy, physics = course.setting, smooth_rps(), preset(fidelity="fast")
+    strategy = smooth_of(space.base)
+    setting, physics = course.setting, preset(fidelity="fast")
 
     def cost(seen: Snapshot) -> jax.Array:
         return soft_score(seen, space.base, setting, course.objective, descent.arrive)
@@ -252,7 +253,13 @@ class Search:
     """
 
     def __init__(self, descent: Descent, space: Space, course: Course):
-        """Begin nothing yet."""
+        """Begin nothing yet.
+
+        Raises:
+          InputError: the law has no smooth form, and its derivatives are asked for.
+        """
+        if descent.estimator != "evolution":
+            smooth_of(space.base)
         self.descent, self.space, self.course = descent, space, course
         self.options = {"descent": asdict(replace(descent, budget=0.0))}
         self.generations, self.budget = descent.steps + 1, descent.budget

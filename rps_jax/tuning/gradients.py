@@ -25,8 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax.control import strategies
-from rps_jax.control.law import RPSParams
-from rps_jax.control.strategies import Strategy
+from rps_jax.control.strategies import Params, Strategy
 from rps_jax.geometry import planar
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.pushes import Case
@@ -179,7 +178,7 @@ def _repeated(worlds: Any, times: int) -> Any:
 
 def window(
     stage: Any,
-    params_of: Callable[[jax.Array], RPSParams],
+    params_of: Callable[[jax.Array], Params],
     cost: Callable[[Snapshot], jax.Array],
     *,
     physics: Physics,
@@ -216,14 +215,14 @@ def window(
 
 def distances(
     cases: Sequence[Case],
-    params_of: Callable[[jax.Array], RPSParams],
+    params_of: Callable[[jax.Array], Params],
     horizons: Sequence[float],
     setting: Setting = Setting(engine="quasistatic"),
 ) -> tuple[Scores, Any]:
     """How far from their targets pushes are after some times, under the smooth law.
 
     Args:
-      cases: pushes of one kind, with smooth skins.
+      cases: pushes of one kind and one law, RPS or RPS+, with smooth skins.
       params_of: parameters from theta (p,), differentiable.
       horizons: the times (H,) [s], in order.
       setting: what the pushes share; its engine has derivatives.
@@ -242,7 +241,7 @@ def distances(
       (2, 2)
     """
     stage, worlds = pushes.build(cases, setting)
-    strategy, physics = strategies.smooth_rps(), setting.physics
+    strategy, physics = strategies.smooth_of(cases[0].params), setting.physics
     at = np.round(np.asarray(horizons) / physics.control_period).astype(int)
 
     def left(seen: Snapshot) -> jax.Array:

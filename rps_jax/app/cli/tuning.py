@@ -31,6 +31,10 @@ class TuneOptions(Spread):
     tuned: tuple[str, ...] = ("full",)
     """Parameters to tune: names, or logistic (eta, zeta, beta, k), or full (all that are the
     law's, not the robot's speeds, the rules or the switches)."""
+    strategy: str = "rps"
+    """What is tuned: rps, rps_plus, pursuit, force_push, force_push_published, dipole, or a law of
+    a file with bounds, as my_law.py:MyParams; its own parameters are the start if that is paper.
+    Gradients are of rps and rps_plus."""
     start: str = "paper"
     """Parameters to begin with: paper, tuned, or a JSON file of changes, as {"L": 0.3}."""
     worlds: int = 512
@@ -60,7 +64,8 @@ class TuneOptions(Spread):
         """The parameters that are tuned."""
         from rps_jax.tuning.space import Space, expanded
 
-        return Space(expanded(self.tuned), parsing.params_of(self.start))
+        base = parsing.start_of(self.strategy, self.start)
+        return Space(expanded(self.tuned, base), base)
 
     def course(self) -> Course:
         """The worlds in which candidates are tried, and what is wanted of them there."""
@@ -92,6 +97,8 @@ class TuneOptions(Spread):
             "engine": "quasistatic",
             "horizon": 150.0,
         }
+        if self.strategy != "rps":  # whose parameters these are
+            del small["tuned"]
         default = type(self)()
         free = {name for name in small if getattr(self, name) == getattr(default, name)}
         return dataclasses.replace(self, **{name: small[name] for name in free})
@@ -120,9 +127,6 @@ class TuneOptions(Spread):
 class TuneES(TuneOptions):
     """Tune by evolution."""
 
-    strategy: str = "rps"
-    """What is tuned: rps, rps_plus, pursuit, force_push, force_push_published, dipole, or a law of
-    a file with bounds, as my_law.py:MyParams; its own parameters are the start if that is paper."""
     algorithm: Literal["cma", "lra_cma", "sep_cma", "xnes"] = "cma"
     """cma adapts a full covariance; lra_cma adapts its learning rates to noisy scores as well;
     sep_cma keeps to the axes; xnes follows the natural gradient."""
@@ -144,16 +148,7 @@ class TuneES(TuneOptions):
 
         small = {"worlds": 32, "validation": 64, "population": 12, "generations": 8}
         how = self.quickly(**small, spread=1.0, slots=64) if self.quick else self
-        if self.strategy != "rps":
-            how = dataclasses.replace(how, tuned=self.tuned)
         how.tune(Search, Evolution)
-
-    def space(self) -> Space:
-        """The parameters that are tuned."""
-        from rps_jax.tuning.space import Space, expanded
-
-        base = parsing.start_of(self.strategy, self.start)
-        return Space(expanded(self.tuned, base), base)
 
 
 @dataclass(frozen=True)
