@@ -64,6 +64,7 @@ def test_what_a_sweep_says_is_what_happened():
             "time": (("arm", "world"), np.array([[50.0, 300, 200, 9], [70, 80, 300, 300]])),
             "min_distance": (("arm", "world"), np.array([[0.04, 0.5, inf, 1], [0.04, 0.04, 1, 2]])),
             "contact_lost_time": (("arm", "world"), np.array([[0.0, 0, 0, 0], [0, 0, 151, 0]])),
+            "path_length": (("arm", "world"), np.array([[2.0, 9, 9, 9], [3, 4, 9, 9]])),
             "which_object": ("world", [0, 0, 1, 1]),
             "distance": ("world", [1.0, 2.0, 3.0, 1.0]),
         },
@@ -80,6 +81,7 @@ def test_what_a_sweep_says_is_what_happened():
     assert tables.difference_table(results)[1][1:4] == ["1", "0", "+25.00 %"]
     assert statistics.hardest(results).tolist() == [2, 3, 1]
     rates = tables.success_table(results, 150)
+    assert rates[2][rates[0].index("median path")] == "3.50 m"  # of b's successes
     assert rates[1][1].startswith("50.0 %")  # of a with the box
     assert rates[2][3].startswith("50.0 %")  # of b in all
     bins = statistics.bins(np.arange(16.0), np.arange(16) < 4, count=4)

@@ -70,7 +70,7 @@ def summary(results: xr.Dataset) -> str:
 
 
 def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
-    """Header and one row for each arm: success by object, distance left, time, failures.
+    """Header and one row for each arm: success by object, distance left, time, path, failures.
 
     The bound of the failures is exact; with several arms it holds for whichever is picked here.
     """
@@ -78,7 +78,8 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
     ways = [way for way in statistics.FAILURES if way != "stalled" or "stalled" in results]
     arms = results.sizes["arm"]
     bound = "fails at most" + f" (best of {arms})" * (arms > 1)
-    header = ["", *groups, "all", bound, "CVaR 5 % of distance", "median time", *ways]
+    header = ["", *groups, "all", bound, "CVaR 5 % of distance"]
+    header += ["median time", "median path", *ways]
     rows = [header]
     for arm in map(str, results.arm.values):
         one = results.sel(arm=arm)
@@ -92,6 +93,7 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
                 f"{100 * statistics.fails_at_most(int((~won).sum()), won.size, arms):.2g} %",
                 _cvar(statistics.left_over(one)),
                 f"{np.median(one.time.values[won]):.1f} s" if won.any() else "-",
+                f"{np.median(one.path_length.values[won]):.2f} m" if won.any() else "-",
                 *(str(int((kinds == i).sum())) for i in range(len(ways))),
             ]
         )
