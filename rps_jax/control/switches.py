@@ -49,3 +49,8 @@ def choose(switch: jax.Array, yes: Any, no: Any) -> jax.Array:
     if switch.dtype == bool:
         return jnp.where(switch, yes, no)
     return switch * yes + (1 - switch) * no
+
+
+def select(condition: jax.Array, yes: Any, no: Any) -> Any:
+    """One of two pytrees, by a condition () that may be traced."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

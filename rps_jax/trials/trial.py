@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax import errors
-from rps_jax.control import law
+from rps_jax.control import law, switches
 from rps_jax.control.law import Details, LoadedObservation, Observation, Twist
 from rps_jax.control.learned.observation import TaxelObservation
 from rps_jax.control.rivals.aps import TrackedObservation
@@ -327,7 +327,7 @@ def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
         load=told.load and told.load._replace(wrench=force),
     )
     stopped = told._replace(done=jnp.ones((), bool), diverged=~told.done & ~sane)
-    return select(before.done, before, select(told.done | ~sane, stopped, moved))
+    return switches.select(before.done, before, switches.select(told.done | ~sane, stopped, moved))
 
 
 def control_step(
@@ -356,11 +356,6 @@ def motion(trials: Trial) -> Motion:
 def pushing(worlds: World) -> Robot | None:
     """The bodies of the robots of worlds, if contact can slow and stop them."""
     return worlds.robot.body if worlds.robot is not None and worlds.robot.driven else None
-
-
-def select(condition: jax.Array, yes: Any, no: Any) -> Any:
-    """One of two pytrees, by a condition () that may be traced."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
 def outcome(trial: Trial, period: float) -> Outcome:

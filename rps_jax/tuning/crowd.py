@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax import errors
+from rps_jax.control import switches
 from rps_jax.control.learned import network as networks
 from rps_jax.control.learned import observation
 from rps_jax.control.learned.network import Memory, Network, Weights
@@ -216,7 +217,7 @@ def _decision(
     pairs = ppo_.pair(*(together(parts) for parts in zip(*told, strict=True)))
     verdicts = [_verdict(env, crowd) for env, crowd in zip(envs, went, strict=True)]
     tally, final = jax.tree.map(lambda *parts: together(parts), *verdicts)
-    pick = jax.vmap(trial.select)
+    pick = jax.vmap(switches.select)
     begun = tuple(
         pick(crowd.states.data.done, _anew(network, env, table, learner.level, at, count), crowd)
         for env, table, at, crowd in zip(envs, tables, starts, went, strict=True)

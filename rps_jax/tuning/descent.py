@@ -19,13 +19,14 @@ import numpy as np
 import optax
 
 from rps_jax import errors
+from rps_jax.control import switches
 from rps_jax.control.law import RPSParams
 from rps_jax.control.strategies import Params, smooth_of
 from rps_jax.robot.skin import CapacitiveSkin, SmoothSkin
 from rps_jax.runs import evaluate
 from rps_jax.runs.objective import Objective
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Snapshot, Trial, World, control_step, select, start_all
+from rps_jax.trials.trial import Snapshot, Trial, World, control_step, start_all
 from rps_jax.tuning import gradients
 from rps_jax.tuning.gradients import Estimate
 from rps_jax.tuning.run import Course, Told, TryOut, finite
@@ -186,7 +187,7 @@ def scores_of(space: Space, course: Course, descent: Descent, stage: Any) -> gra
 
         def one(i: jax.Array, trials: Trial) -> Trial:
             after, _ = control_step(stage, worlds, trials, physics=physics, strategy=strategy)
-            return jax.vmap(select)(i < late * steps(descent.within), after, trials)
+            return jax.vmap(switches.select)(i < late * steps(descent.within), after, trials)
 
         return jax.lax.fori_loop(0, steps(descent.within), one, first)
 
