@@ -345,7 +345,7 @@ def test_the_regression_set_is_small_hard_and_various():
     known = regress.worlds()
     assert known.u.shape == (200, len(points.names(DOMAINS["wide"])))
     assert regress.FILE.stat().st_size < 200_000
-    assert known.law.values.tolist() == ["paper", "tuned", "rps_plus"]
+    assert known.law.values.tolist() == ["paper", "tuned", "rps_plus", "learned_gru"]
     points.checked(DOMAINS["wide"], known)
     assert len(np.unique(known.u, axis=0)) == 200
     failed = known.success.values == 0

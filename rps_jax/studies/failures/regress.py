@@ -1,9 +1,9 @@
 """Worlds that were hard: what a new law wins and loses of them, in seconds.
 
 `regression.nc` holds 200 points of the unit cube of the domain `wide`: worlds in which the paper's
-law, the tuned one or RPS+ fails, or almost does, found by drawing and by `attack`; and how these
-laws did there. The worlds were picked because some law is bad in them. So a rate in them says
-nothing about rates elsewhere, and only differences between laws count.
+law, the tuned one, RPS+ or the learned GRU fails, or almost does, found by drawing and by `attack`;
+and how these laws did there. The worlds were picked because some law is bad in them. So a rate in
+them says nothing about rates elsewhere, and only differences between laws count.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def regress(
       >>> mine = {"mine": rps_jax.RPSParams.paper()}
       >>> found = rps_jax.regress(mine, worlds=3, setting=brief)
       >>> dict(found.known_success.sizes)
-      {'law': 3, 'world': 3}
+      {'law': 4, 'world': 3}
     """
     plan = plan_of(laws, setting, worlds)
     plan.check_here()
