@@ -409,7 +409,7 @@ class Regress(Spread):
     params: tuple[str, ...] = ("tuned",)
     """Sets of parameters of RPS: paper, tuned, or JSON files of changes, as {"L": 0.3}."""
     against: str = "tuned"
-    """Which of the file's laws the changes are told against: paper, tuned, rps_plus or learned_gru."""
+    """Law of the file that changes are told against: paper, tuned, rps_plus or learned_gru."""
     worlds: int | None = None
     """How many of the worlds; by default all."""
     fidelity: Fidelity = "standard"
