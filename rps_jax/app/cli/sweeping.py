@@ -141,8 +141,8 @@ class Ladder(Spread):
     """Whether to run the same worlds on other grounds, cones and steps and in the quasi-static
     model, too, and to report how much the rates hang on these."""
     quick: bool = False
-    """Whether to take 64 worlds where no number is asked for, of two kinds of objects at most:
-    minutes on two cores."""
+    """Whether to take 64 worlds where no number is asked for, of one kind of objects: minutes on
+    two cores."""
     out: Path = Path("runs/ladder")
     """Run folder; a run that was killed is continued there."""
 
@@ -157,7 +157,7 @@ class Ladder(Spread):
         domain = parsing.domain_of(self.domain, (), self.robot)
         usual = domain.combinations if domain.targets else 1000
         if self.quick:
-            usual, domain = 64, dataclasses.replace(domain, objects=domain.objects[:2])
+            usual, domain = 64, dataclasses.replace(domain, objects=domain.objects[:1])
         laws = ladder.rungs(self.laws or tuple(ladder.RUNGS))
         seed = seed_of(self.seed, "test")
         setting = Setting(preset(fidelity=self.fidelity), seed=seed, engine=self.engine)
