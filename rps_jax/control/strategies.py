@@ -142,13 +142,7 @@ def smooth_rps(temperatures: Temperatures = Temperatures()) -> Strategy:
     Raises:
       InputError: a temperature is not a positive length.
     """
-    temperatures.check()
-    return Strategy(
-        functools.partial(RPSState.init, temperatures=temperatures),
-        functools.partial(law.step_with_details, temperatures=temperatures),
-        smooth=True,
-        check=law.check,
-    )
+    return _smooth(RPSState.init, law.step_with_details, law.check, temperatures)
 
 
 @functools.cache
@@ -158,12 +152,20 @@ def smooth_rps_plus(temperatures: Temperatures = Temperatures()) -> Strategy:
     Raises:
       InputError: a temperature is not a positive length.
     """
+    return _smooth(rps_plus.init, rps_plus.step, rps_plus.check, temperatures)
+
+
+def _smooth(
+    init: Callable[..., Any],
+    step: Callable[..., Any],
+    check: Callable[[Any], Any],
+    temperatures: Temperatures,
+) -> Strategy:
+    """A law whose `init` and `step` take temperatures, with these."""
     temperatures.check()
+    warm = {"temperatures": temperatures}
     return Strategy(
-        functools.partial(rps_plus.init, temperatures=temperatures),
-        functools.partial(rps_plus.step, temperatures=temperatures),
-        smooth=True,
-        check=rps_plus.check,
+        functools.partial(init, **warm), functools.partial(step, **warm), smooth=True, check=check
     )
 
 
