@@ -10,13 +10,14 @@ from __future__ import annotations
 import abc
 import os
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.control.law import Twist
+from rps_jax.control.observation import Twist
+from rps_jax.geometry.arrays import Bool, Float
 from rps_jax.geometry.solid import Solid
 from rps_jax.robot.robot import Robot
 from rps_jax.world.objects import SHAPES
@@ -30,10 +31,10 @@ class Motion(NamedTuple):
     """Where the bodies of a batch of worlds are, and how they move."""
 
     # In the world: base x, y [m], yaw [rad]; object position [m] and quaternion, scalar first.
-    qpos: Any  # (B, 10)
+    qpos: Float[Any, "*B 10"]
     # Of these [m/s, rad/s]; the object's angular velocity is in its own frame.
-    qvel: Any  # (B, 9)
-    warmstart: Any  # (B, 9) [m/s^2, rad/s^2] last accelerations, for a solver
+    qvel: Float[Any, "*B 9"]
+    warmstart: Float[Any, "*B 9"]  # [m/s^2, rad/s^2] last accelerations, for a solver
     integral: Any = None  # (B, 3) [N, N, N m] of the drive of a base whose force is limited
 
 
@@ -41,12 +42,13 @@ class Driven(NamedTuple):
     """A batch after one control period."""
 
     motion: Motion
-    overflowed: Any = None  # (B,) bool: contacts were lost; None: this engine loses none
+    overflowed: Bool[Any, "*B"] | None = None  # contacts were lost; None: this engine loses none
     # (B, 3) [N, N, N m] what the object does to the base, about the base's origin and in its frame,
     # the mean over the physics steps of the period; None: nobody asked.
     force: Any = None
 
 
+@runtime_checkable
 class Stage(Protocol):
     """What all worlds of a batch share, and how they are stepped together."""
 
@@ -71,12 +73,11 @@ class Stage(Protocol):
 class Stepper(Protocol):
     """Worlds that are stepped on the host; its arrays can be written to."""
 
-    qpos: np.ndarray  # (n, 10) as in `Motion`
-    qvel: np.ndarray  # (n, 9)
-    warmstart: np.ndarray  # (n, 9)
-
-    integral: np.ndarray | None  # (n, 3)
-    force: np.ndarray  # (n, 3) of the last period, as in `Driven`
+    qpos: Float[np.ndarray, "n 10"]  # as in `Motion`
+    qvel: Float[np.ndarray, "n 9"]
+    warmstart: Float[np.ndarray, "n 9"]
+    integral: Float[np.ndarray, "n 3"] | None
+    force: Float[np.ndarray, "n 3"]  # of the last period, as in `Driven`
 
     def drive(self, which: np.ndarray, twist: np.ndarray, substeps: int) -> None:
         """Step the worlds `which` (m,) with the base held at `twist` (m, 3) in its own frame.
@@ -96,7 +97,7 @@ class Engine(abc.ABC):
     name: ClassVar[str]
     shapes: ClassVar[tuple[str, ...]] = SHAPES  # the shape families that it knows
     cones: ClassVar[tuple[str, ...]] = ("elliptic", "pyramidal")  # the friction that it knows
-    traced: ClassVar[bool] = True  # JAX steps it: its trials can be followed, viewed, learned in
+    traced: ClassVar[bool] = True  # JAX steps it: its trials can be viewed, and learned in
     modes: ClassVar[tuple[Mode, ...]] = ()  # in which it can be differentiated
     newton: ClassVar[bool] = True  # it solves as `Physics` says: by so many iterations
     forces: ClassVar[bool] = True  # a contact can slow and stop the base
@@ -136,19 +137,19 @@ class Engine(abc.ABC):
             )
 
     def check_senses(self, senses: str) -> None:
-        """Raises InputError unless the engine tells what a strategy senses."""
+        """Raises InputError unless the engine tells what a law senses."""
         if senses == "force" and not self.tells_force:
             raise errors.InputError(
-                f"engine = {self.name} is not allowed for a strategy that is told the contact's "
-                "force, which it does not tell: choose fused, mjx or mujoco."
+                f"engine = {self.name} is not allowed for a law that senses the contact's "
+                "force, which it does not compute: choose fused, mjx or mujoco."
             )
 
-    def check_followed(self) -> None:
-        """Raises InputError unless trials can be followed step by step on this machine."""
+    def check_traced(self) -> None:
+        """Raises InputError unless it works on this machine and JAX traces its steps."""
         self.check()
         if not self.traced:
             raise errors.InputError(
-                f"engine = {self.name} is not allowed: follow a trial with mjx, fused or "
+                f"engine = {self.name} is not allowed: JAX must trace it, as fused, mjx or "
                 "quasistatic."
             )
 
@@ -201,7 +202,7 @@ class Engine(abc.ABC):
         return (os.cpu_count() or 1) if backend == "cpu" else 1
 
     def levers(self, family: str) -> dict[str, Callable[[Any], Any]]:
-        """Changes of the stage that are worth timing, by name: see `studies.ablation`."""
+        """Changes of the stage that are worth timing, by name: see `sweeps/levers`."""
         return {}
 
     def contacts(self, stage: Any, corners: int) -> int:

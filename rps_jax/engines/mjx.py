@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.control.law import Twist
+from rps_jax.control.observation import Twist
 from rps_jax.engines.base import Driven, Engine, Mode, Motion, taken
 from rps_jax.engines.mjx_colliders import (
     OWN,

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.control.law import Twist
+from rps_jax.control.observation import Twist
 from rps_jax.engines.base import Driven, Engine, Motion, taken
 from rps_jax.engines.fused.contacts import Point, circle_and_rectangle, polygon_and_rectangle
 from rps_jax.geometry import planar, solid

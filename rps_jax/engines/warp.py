@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from rps_jax.control.law import Twist
+from rps_jax.control.observation import Twist
 from rps_jax.engines.base import Driven, Engine, Motion, taken
 from rps_jax.engines.mjx import apply, solids_by_template, stack
 from rps_jax.engines.mjx_colliders import mjx
@@ -123,8 +123,9 @@ class Warp(Engine):
             missing.append(f"no NVIDIA GPU, JAX runs on {jax.default_backend()}")
         if missing:
             raise InputError(
-                f"engine = warp is not there ({' and '.join(missing)}): pip install '.[cuda,warp]' "
-                "on a machine with an NVIDIA GPU, or choose mjx, fused, mujoco or quasistatic."
+                f"engine = warp is not there ({' and '.join(missing)}): pip install "
+                "'rps_jax[cuda,warp]' on a machine with an NVIDIA GPU, or choose mjx, fused, "
+                "mujoco or quasistatic."
             )
 
     def stage_of_scenes(self, scenes: Sequence[Scene], which: np.ndarray) -> tuple[Any, Any]:

@@ -8,28 +8,28 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from rps_jax.errors import InputError
 from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Array, Float, Scalar
 
 
 class Footprint(NamedTuple):
     """All points within `radius` of the convex hull of `vertices`, in the object's frame."""
 
-    vertices: jax.Array  # (N, 2) [m] counter-clockwise; N is static
-    radius: jax.Array  # () [m]
+    vertices: Float[Array, "*B N 2"]  # [m] counter-clockwise; N is static
+    radius: Float[Array, "*B"]  # [m]
 
 
-def rectangle(half_x: jax.Array | float, half_y: jax.Array | float) -> Footprint:
+def rectangle(half_x: Scalar, half_y: Scalar) -> Footprint:
     """Rectangle of sides 2 half_x by 2 half_y [m] about the origin."""
     signs = jnp.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
     return Footprint(signs * jnp.stack([jnp.asarray(half_x), jnp.asarray(half_y)]), jnp.zeros(()))
 
 
-def circle(radius: jax.Array | float) -> Footprint:
+def circle(radius: Scalar) -> Footprint:
     """Circle of the given radius [m] about the origin."""
     return Footprint(jnp.zeros((1, 2)), jnp.asarray(radius, float))
 
@@ -37,7 +37,13 @@ def circle(radius: jax.Array | float) -> Footprint:
 def polygon(vertices: np.ndarray | list) -> Footprint:
     """Convex polygon of vertices (N >= 3, 2) [m], counter-clockwise.
 
-    Raises InputError if they are not finite, not convex or not counter-clockwise.
+    Raises:
+      InputError: they are not finite, not convex or not counter-clockwise.
+
+    Example:
+      >>> import rps_jax
+      >>> rps_jax.polygon([(0.2, 0.0), (-0.1, 0.2), (-0.1, -0.2)]).vertices.shape
+      (3, 2)
     """
     points = np.asarray(vertices, float)
     if points.ndim != 2 or points.shape[0] < 3 or points.shape[1] != 2:
@@ -53,31 +59,33 @@ def polygon(vertices: np.ndarray | list) -> Footprint:
     return Footprint(jnp.asarray(points, float), jnp.zeros(()))
 
 
-def place(footprint: Footprint, position: jax.Array, yaw: jax.Array) -> Footprint:
-    """The footprint of an object at `position` (2,) [m] and `yaw` () [rad] in another frame."""
+def place(footprint: Footprint, position: Float[Array, "2"], yaw: Scalar) -> Footprint:
+    """The footprint of an object at `position` [m] and `yaw` [rad] in another frame."""
     return footprint._replace(vertices=planar.rotate(yaw, footprint.vertices) + position)
 
 
-def extent(footprint: Footprint, along: jax.Array) -> jax.Array:
-    """Support function: the furthest reach () [m] in the unit direction `along` (2,)."""
+def extent(footprint: Footprint, along: Float[Array, "2"]) -> Float[Array, ""]:
+    """Support function: the furthest reach [m] in the unit direction `along`."""
     return jnp.max(footprint.vertices @ along) + footprint.radius
 
 
-def circumradius(footprint: Footprint) -> jax.Array:
-    """Greatest distance () [m] of the outline from the object's origin."""
+def circumradius(footprint: Footprint) -> Float[Array, ""]:
+    """Greatest distance [m] of the outline from the object's origin."""
     return jnp.max(planar.norm(footprint.vertices)) + footprint.radius
 
 
-def _edges(footprint: Footprint) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Start points (N, 2), vectors (N, 2) and squared lengths (N,), never zero, of the edges."""
+def _edges(
+    footprint: Footprint,
+) -> tuple[Float[Array, "N 2"], Float[Array, "N 2"], Float[Array, " N"]]:
+    """Start points, vectors and squared lengths, never zero, of the edges."""
     start = footprint.vertices
     along = jnp.roll(start, -1, axis=0) - start
     length2 = jnp.sum(along * along, axis=-1)
     return start, along, jnp.where(length2 > 0, length2, 1.0)
 
 
-def signed_distance(footprint: Footprint, point: jax.Array) -> jax.Array:
-    """Distance (...) [m] of `point` (..., 2) [m] to the outline, negative inside."""
+def signed_distance(footprint: Footprint, point: Float[Array, "*P 2"]) -> Float[Array, "*P"]:
+    """Distance [m] of `point` [m] to the outline, negative inside."""
     start, along, length2 = _edges(footprint)
     nearest, inside = jnp.asarray(jnp.inf), ~jnp.all(along == 0)
     # Edge by edge and coordinate by coordinate: GPUs are slow at reducing axes this short. Squares,
@@ -97,11 +105,11 @@ def signed_distance(footprint: Footprint, point: jax.Array) -> jax.Array:
 
 
 def crossing(
-    footprint: Footprint, origin: jax.Array, along: jax.Array, tolerance: jax.Array | float
-) -> tuple[jax.Array, jax.Array]:
+    footprint: Footprint, origin: Float[Array, "2"], along: Float[Array, "2"], tolerance: Scalar
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """The interval of a line that lies within `tolerance` [m] of the footprint.
 
-    The line is origin (2,) [m] + s * along, `along` (2,) of unit length. Returns its ends
+    The line is origin [m] + s * along, `along` of unit length. Returns its ends
     (s_low, s_high) [m]; s_low > s_high (+inf, -inf) if the line stays clear.
 
     The neighbourhood of a convex polygon is convex, and bounded by arcs about the vertices and

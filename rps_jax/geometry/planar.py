@@ -11,8 +11,12 @@ import functools
 import jax
 import jax.numpy as jnp
 
+from rps_jax.geometry.arrays import Array, Float, Scalar
 
-def rotate(yaw: jax.Array, vector: jax.Array) -> jax.Array:
+
+def rotate(
+    yaw: Scalar | Float[Array, "*#B"], vector: Float[Array, "*#B 2"]
+) -> Float[Array, "... 2"]:
     """Turn planar vectors (..., 2) by `yaw` (...) [rad], counter-clockwise."""
     c, s = jnp.cos(yaw), jnp.sin(yaw)
     x, y = vector[..., 0], vector[..., 1]
@@ -33,7 +37,7 @@ def _scale(vector: jax.Array) -> jax.Array:
     return jax.lax.stop_gradient(jnp.minimum(largest, 1e37))
 
 
-def norm(vector: jax.Array) -> jax.Array:
+def norm(vector: Float[Array, "*B n"]) -> Float[Array, "*B"]:
     """Euclidean norm over the last axis: (..., n) -> (...).
 
     Scaled by the largest component, so squares neither overflow nor vanish in float32; the
@@ -46,7 +50,7 @@ def norm(vector: jax.Array) -> jax.Array:
     return jnp.where(is_zero, 0.0, scale * jnp.sqrt(functools.reduce(jnp.add, squares)))
 
 
-def direction(vector: jax.Array) -> jax.Array:
+def direction(vector: Float[Array, "*B 2"]) -> Float[Array, "*B"]:
     """Angle of planar vectors (..., 2) in [-pi, pi] [rad]; 0 with zero derivative at zero."""
     scale = _scale(vector)
     is_zero = scale == 0
@@ -57,20 +61,20 @@ def direction(vector: jax.Array) -> jax.Array:
     return jnp.arctan2(y, x)
 
 
-def wrap(angle: jax.Array) -> jax.Array:
-    """The same angle in [-pi, pi) [rad], the paper's unit circle S."""
+def wrap(angle: Float[Array, "*B"]) -> Float[Array, "*B"]:
+    """Wrap an angle into [-pi, pi) [rad], the paper's unit circle S."""
     wrapped = jnp.mod(angle + jnp.pi, 2 * jnp.pi) - jnp.pi
     # Rounding can return the excluded end.
     return jnp.where(wrapped >= jnp.pi, wrapped - 2 * jnp.pi, wrapped)
 
 
-def safe_sqrt(x: jax.Array) -> jax.Array:
+def safe_sqrt(x: Float[Array, "*B"]) -> Float[Array, "*B"]:
     """Square root of max(x, 0), with zero derivative where x <= 0."""
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
-def greatest(x: jax.Array) -> jax.Array:
+def greatest(x: Float[Array, " n"]) -> Float[Array, ""]:
     """The greatest () of x (n,), with the derivative of one entry.
 
     That of `jnp.max` is shared by the entries that equal it, and NaN where a compiler computes
@@ -79,13 +83,13 @@ def greatest(x: jax.Array) -> jax.Array:
     return x[jnp.argmax(x)]
 
 
-def yaw_of_quaternion(quaternion: jax.Array) -> jax.Array:
+def yaw_of_quaternion(quaternion: Float[Array, "*B 4"]) -> Float[Array, "*B"]:
     """Heading (...) [rad] of unit quaternions (..., 4), scalar first."""
     w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
     return direction(jnp.stack([1 - 2 * (y * y + z * z), 2 * (w * z + x * y)], axis=-1))
 
 
-def tilt(quaternion: jax.Array) -> jax.Array:
+def tilt(quaternion: Float[Array, "*B 4"]) -> Float[Array, "*B"]:
     """Angle (...) [rad] between the vertical and its image under unit quaternions (..., 4)."""
     _, x, y, _ = jnp.moveaxis(quaternion, -1, 0)
     return 2 * jnp.arcsin(jnp.minimum(norm(jnp.stack([x, y], axis=-1)), 1.0))

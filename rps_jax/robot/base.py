@@ -20,7 +20,7 @@ class Odometry(NamedTuple):
 
     pose_noise: float | jax.Array = 0.0  # () [m] standard deviation of each position reading
     yaw_noise: float | jax.Array = 0.0  # () [rad] and of each heading reading
-    pose_latency: float | jax.Array = 0.0  # () [s] age of the pose that the law is told
+    pose_latency: float | jax.Array = 0.0  # () [s] age of the pose that the law observes
     command_delay: float | jax.Array = 0.0  # () [s] until a twist is acted upon
     velocity_error: float | jax.Array = 0.0  # (3,) [1] of each component of the twist
     past: Any = np.zeros(0)  # (K,)
@@ -34,7 +34,7 @@ def believed(
     steps: jax.Array,
     period: float,
 ) -> tuple[jax.Array, jax.Array]:
-    """The last poses (K, 3) with `now` (3,) first, and the pose (3,) that the law is told.
+    """The last poses (K, 3) with `now` (3,) first, and the pose (3,) that the law observes.
 
     Args:
       odometry: what the base gets wrong.

@@ -20,6 +20,7 @@ from rps_jax import errors
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.record import files
+from rps_jax.record.options import with_changes
 from rps_jax.robot.shell import BOARDS, HALF_LENGTH, HALF_WIDTH, Boards, Shell
 
 
@@ -221,16 +222,24 @@ ROBOTS: dict[str, Robot] = {
 }
 
 
-def named(robot: Robot | str | Mapping[str, Any]) -> Robot:
-    """A robot by its name in `ROBOTS`, from a JSON file of numbers, or from names with numbers.
+RobotLike = Robot | str | Mapping[str, Any]  # or its text, see `named`
+
+
+def named(robot: RobotLike) -> Robot:
+    """Read a robot: itself, its name, as kairos, a JSON file, or names with numbers.
+
+    Changes may follow a name or a file, as `kairos,force_max=300`.
 
     Raises:
       InputError: no robot has this name, or the numbers are of none.
     """
     if isinstance(robot, str):
-        if not robot.endswith(".json"):
-            return ROBOTS[errors.check_name("robot", robot, ROBOTS)]
-        robot = files.read_json(Path(robot))
+        head, changes = with_changes("robot", robot)
+        if head.endswith(".json"):
+            robot = files.read_json(Path(head)) | changes
+        else:
+            usual = ROBOTS[errors.check_name("robot", head, ROBOTS)]
+            robot = {f.name: getattr(usual, f.name) for f in dataclasses.fields(Robot)} | changes
     if isinstance(robot, Mapping):
         for name in robot:
             errors.check_name("robot quantity", name, _FIELDS)
@@ -238,6 +247,10 @@ def named(robot: Robot | str | Mapping[str, Any]) -> Robot:
         if "boards" in read:
             read["boards"] = _boards(read["boards"])
         robot = Robot(**read)
+    if not isinstance(robot, Robot):
+        raise InputError(
+            f'robot = {robot!r} is not allowed: write names with numbers, as {{"force_max": 300}}.'
+        )
     robot.check()
     return robot
 

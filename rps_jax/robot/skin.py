@@ -12,7 +12,7 @@ are; the two extreme positions of a contact are its first and last along the she
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,9 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Array, Bool, Float, Int, Scalar
 from rps_jax.geometry.footprint import Footprint
+from rps_jax.record.options import with_changes
 from rps_jax.robot.shell import HALF_WIDTH, Shell
 
 _NODES = 16  # points on each row of boards of the smooth ideal sensor
@@ -34,23 +36,24 @@ NONE, POINT, LINE = 0, 1, 2  # contact types, Fig. 6c
 class Reading(NamedTuple):
     """What the skin tells the law."""
 
-    contact_type: jax.Array  # () int32: NONE, POINT or LINE
-    p_robot_contact: jax.Array  # (2,) [m] contact location in the robot frame; 0 if NONE
+    contact_type: Int[Array, "*B"]  # NONE, POINT or LINE
+    p_robot_contact: Float[Array, "*B 2"]  # [m] contact location in the robot frame; 0 if NONE
 
     @property
-    def in_contact(self) -> jax.Array:
-        """() bool."""
+    def in_contact(self) -> Bool[Array, "*B"]:
+        """Whether there is contact."""
         return self.contact_type != NONE
 
 
 class SmoothReading(NamedTuple):
     """What a smooth skin tells: a `Reading` whose contact is a weight."""
 
-    contact_type: jax.Array  # () int32: NONE up to a weight of 1/2, beyond it POINT or LINE
-    p_robot_contact: jax.Array  # (2,) [m] contact location in the robot frame, at any weight
-    in_contact: jax.Array  # () [1] weight of the contact, from 0 to 1
+    contact_type: Int[Array, "*B"]  # NONE up to a weight of 1/2, beyond it POINT or LINE
+    p_robot_contact: Float[Array, "*B 2"]  # [m] contact location in the robot frame, at any weight
+    in_contact: Float[Array, "*B"]  # [1] weight of the contact, from 0 to 1
 
 
+@runtime_checkable
 class Skin(Protocol):
     """A tactile sensor: a pytree of parameters with two pure functions."""
 
@@ -60,19 +63,19 @@ class Skin(Protocol):
         ...
 
     def on(self, shell: Shell) -> Skin:
-        """The same sensor on another shell."""
+        """Return this sensor on another shell."""
         ...
 
     def check(self) -> None:
         """Raises InputError for scalar parameters that mean nothing."""
         ...
 
-    def init(self, key: jax.Array) -> SkinState:
+    def init(self, key: Array) -> SkinState:
         """The sensor before it has felt anything; `key` draws its imperfections."""
         ...
 
     def sense(
-        self, state: SkinState, footprint: Footprint, period: float
+        self, state: SkinState, footprint: Footprint, period: Scalar
     ) -> tuple[SkinState, Reading | SmoothReading]:
         """One reading of a footprint placed in the robot frame, `period` [s] after the last."""
         ...
@@ -82,9 +85,9 @@ class SkinState(NamedTuple):
     """What a sensor carries from one reading to the next (empty for the ideal one)."""
 
     key: jax.Array  # noise of the readings to come
-    signal: jax.Array  # (T,) [1] filtered relative change of capacitance
-    gain: jax.Array  # (T,) [1] of each taxel
-    alive: jax.Array  # (T,) bool
+    signal: Float[Array, "*B T"]  # [1] filtered relative change of capacitance
+    gain: Float[Array, "*B T"]  # [1] of each taxel
+    alive: Bool[Array, "*B T"] | Float[Array, "*B 0"]  # of the ideal sensor empty
 
 
 class IdealSkin(NamedTuple):
@@ -108,15 +111,15 @@ class IdealSkin(NamedTuple):
         self.shell.check()
 
     def on(self, shell: Shell) -> IdealSkin:
-        """The same sensor on another shell."""
+        """Return this sensor on another shell."""
         return self._replace(shell=shell)
 
-    def init(self, key: jax.Array) -> SkinState:
+    def init(self, key: Array) -> SkinState:
         """No memory, no imperfections."""
         return SkinState(key, *(jnp.zeros(0),) * 3)
 
     def sense(
-        self, state: SkinState, footprint: Footprint, period: float
+        self, state: SkinState, footprint: Footprint, period: Scalar
     ) -> tuple[SkinState, Reading]:
         """The middle between the two ends of the contact interval; the period is unused."""
         del period
@@ -136,7 +139,7 @@ class IdealSkin(NamedTuple):
         return state, _reading(jnp.where(jnp.any(hits), kind, NONE), first[:2], last[:2])
 
     def sense_smoothly(
-        self, state: SkinState, footprint: Footprint, period: float, temperature: Any
+        self, state: SkinState, footprint: Footprint, period: Scalar, temperature: Any
     ) -> tuple[SkinState, SmoothReading]:
         """The reading if a point at signed distance x is active by its excess, tolerance - x.
 
@@ -204,10 +207,10 @@ class CapacitiveSkin(NamedTuple):
         self.shell.check()
 
     def on(self, shell: Shell) -> CapacitiveSkin:
-        """The same sensor on another shell."""
+        """Return this sensor on another shell."""
         return self._replace(shell=shell)
 
-    def init(self, key: jax.Array) -> SkinState:
+    def init(self, key: Array) -> SkinState:
         """Draws each taxel's gain and whether it is dead."""
         key, key_gain, key_dead = jax.random.split(key, 3)
         n = self.shell.count
@@ -215,8 +218,8 @@ class CapacitiveSkin(NamedTuple):
         alive = jax.random.uniform(key_dead, (n,)) >= self.dead_share
         return SkinState(key, jnp.zeros(n), gain, alive)
 
-    def compression(self, footprint: Footprint) -> jax.Array:
-        """How far the object presses into the foam (T, S) [m] at each sample of each taxel."""
+    def compression(self, footprint: Footprint) -> Float[Array, "T S"]:
+        """How far the object presses into the foam [m] at each sample of each taxel."""
         samples = jnp.asarray(self.shell.taxels(self.shell.samples), footprint.vertices.dtype)
         # One long axis: a processor's vectors are filled along the last.
         line = jnp.swapaxes(samples, 0, 1).reshape(-1, 2)
@@ -232,14 +235,16 @@ class CapacitiveSkin(NamedTuple):
         noise = self.noise * jax.random.normal(key_noise, change.shape, change.dtype)
         return state._replace(key=key), state.gain * change + noise
 
-    def _filtered(self, state: SkinState, raw: jax.Array, period: float) -> SkinState:
+    def _filtered(self, state: SkinState, raw: jax.Array, period: Scalar) -> SkinState:
         signal = state.signal + (1 - jnp.exp(-period / self.time_constant)) * (raw - state.signal)
         return state._replace(signal=signal)
 
-    def read(self, state: SkinState, raw: jax.Array, period: float) -> tuple[SkinState, Reading]:
+    def read(
+        self, state: SkinState, raw: Float[Array, " T"], period: Scalar
+    ) -> tuple[SkinState, Reading]:
         """One scan of a real skin, or of a simulated one, filtered and compared to the threshold.
 
-        `raw` (T,) [1] is each taxel's relative change of capacitance, in the order of
+        `raw` [1] is each taxel's relative change of capacitance, in the order of
         `Shell.taxels`, `period` [s] after the last scan.
         """
         state = self._filtered(state, raw, period)
@@ -250,13 +255,13 @@ class CapacitiveSkin(NamedTuple):
         return state, _reading(kind, first, last)
 
     def sense(
-        self, state: SkinState, footprint: Footprint, period: float
+        self, state: SkinState, footprint: Footprint, period: Scalar
     ) -> tuple[SkinState, Reading]:
         """One scan of all taxels, read."""
         return self.read(*self._scan(state, footprint), period)
 
     def sense_smoothly(
-        self, state: SkinState, footprint: Footprint, period: float, temperature: Any
+        self, state: SkinState, footprint: Footprint, period: Scalar, temperature: Any
     ) -> tuple[SkinState, SmoothReading]:
         """The reading if a taxel is active by its excess, signal - threshold.
 
@@ -289,7 +294,7 @@ class SmoothSkin(NamedTuple):
         return self.sensor.shell
 
     def on(self, shell: Shell) -> SmoothSkin:
-        """The same sensor on another shell."""
+        """Return this sensor on another shell."""
         return self._replace(sensor=self.sensor.on(shell))
 
     def check(self) -> None:
@@ -297,19 +302,19 @@ class SmoothSkin(NamedTuple):
         self.sensor.check()
         errors.check_finite("skin temperature", self.temperature, above=0, at_most=1)
 
-    def init(self, key: jax.Array) -> SkinState:
+    def init(self, key: Array) -> SkinState:
         """As of the sensor."""
         return self.sensor.init(key)
 
     def sense(
-        self, state: SkinState, footprint: Footprint, period: float
+        self, state: SkinState, footprint: Footprint, period: Scalar
     ) -> tuple[SkinState, SmoothReading]:
         """A smooth reading, by the rule of the sensor."""
         return self.sensor.sense_smoothly(state, footprint, period, self.temperature)
 
 
-def signals(skin: Skin, state: SkinState, footprint: Footprint) -> jax.Array:
-    """What the taxels of a skin tell (T,) [1], filtered; 0 of one that is dead.
+def signals(skin: Skin, state: SkinState, footprint: Footprint) -> Float[Array, " T"]:
+    """What the taxels of a skin tell [1], filtered; 0 of one that is dead.
 
     For a skin without taxels: what perfect ones on its boards would answer at once to a footprint
     placed in the robot frame.
@@ -333,6 +338,28 @@ SKINS: dict[SkinName, Skin] = {
     "capacitive": CapacitiveSkin(),
     "hardware": CapacitiveSkin(noise=0.05, gain_spread=0.1),  # noise a fifth of the threshold
 }
+
+
+SkinLike = str | Skin  # a sensor, or its text, see `named`
+
+
+def named(skin: SkinLike) -> Any:
+    """Read a skin: itself, or a name with changes, as `capacitive,foam=0.01`.
+
+    Raises:
+      InputError: unknown name or number, or a value that is not allowed.
+    """
+    if not isinstance(skin, str):
+        skin.check()
+        return skin
+    name, changes = with_changes("skin", skin)
+    usual: Any = SKINS[errors.check_name("skin", name, SKINS)]  # pyright: ignore
+    for field, value in changes.items():
+        errors.check_name(f"number of the skin {name}", field, own(usual))
+        errors.check_number(f"skin {field}", value)
+    found = usual._replace(**changes)
+    found.check()
+    return found
 
 
 def _first(excess: jax.Array) -> jax.Array:

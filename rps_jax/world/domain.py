@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from rps_jax import errors
 from rps_jax.errors import InputError
 from rps_jax.record import files
-from rps_jax.robot.robot import Robot
+from rps_jax.record.options import with_changes
+from rps_jax.robot.robot import Robot, RobotLike
 from rps_jax.robot.robot import named as named_robot
 from rps_jax.world import paper, scene
 from rps_jax.world.objects import FAMILIES, OBJECTS, PAPER_OBJECTS
@@ -35,8 +36,38 @@ class Range(NamedTuple):
         return self.low + u * (self.high - self.low)
 
 
-def _only(value: float) -> Range:
-    return Range(value, value)
+Part = Literal["object", "task", "skin", "base", "robot"]  # what a quantity is of
+_KEY = "quantity"
+
+
+class Quantity(NamedTuple):
+    """What a drawn quantity is, beside its range."""
+
+    column: int  # of a world's random numbers; a new quantity takes the next one that is free
+    unit: str
+    least: float  # which its range must not leave
+    most: float
+    words: str  # what it is called in reports; empty: it is in none
+    of: Part
+    sets: str = ""  # number of the skin, of odometry or of the robot that is drawn
+
+
+def drawn(
+    usual: Range | None,
+    column: int,
+    unit: str,
+    least: float,
+    most: float,
+    words: str,
+    of: Part = "object",
+    sets: str = "",
+) -> Any:
+    """Declare a drawn quantity: all that there is to say of it, see `Quantity`."""
+    about = Quantity(column, unit, least, most, words, of, sets)
+    return field(default=usual, metadata={_KEY: about})
+
+
+_POSITIVE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -45,42 +76,69 @@ class Domain:
 
     Worlds take the `objects` in turn. A domain with `frictions` or `targets` takes these in turn
     too, targets fastest, then friction, then objects, instead of drawing them.
+
+    A quantity is one field here. One that sets a number of the skin (`sets`, of taxels), of
+    odometry or of the robot needs nothing else anywhere.
     """
 
     # The object: a scene of `mjcf/` as it is, or a random one of a shape family.
     objects: tuple[str, ...] = ("random_box", "random_cylinder", "random_prism")
-    mass: Range = Range(3, 60, log=True)  # [kg]
-    size: Range = Range(0.1, 0.35)  # [m] half width, square root of half depth times half breadth
-    aspect: Range = Range(0.5, 2.0, log=True)  # [1] breadth over depth
-    height: Range = Range(0.3, 0.8)  # [m]
-    com_offset: Range = Range(0, 0.4)  # [1] of the way from the middle to the outline
-    friction_ground: Range = Range(0.1, 0.7)  # [1] object-ground
-    friction_robot: Range = Range(0.1, 0.8)  # [1] object-robot
+    mass: Range = drawn(Range(3, 60, log=True), 0, "kg", 0.1, 1e3, "mass of the object")
+    # Half width: the square root of half depth times half breadth.
+    size: Range = drawn(Range(0.1, 0.35), 1, "m", 0.03, 1.0, "half width of the object")
+    aspect: Range = drawn(Range(0.5, 2.0, log=True), 2, "1", 0.1, 10, "")  # breadth over depth
+    height: Range = drawn(Range(0.3, 0.8), 3, "m", 0.1, 2.0, "height of the object")
+    # Of the way from the middle to the outline.
+    com_offset: Range = drawn(Range(0, 0.4), 4, "1", 0, 0.75, "centre of mass off the middle")
+    friction_ground: Range = drawn(Range(0.1, 0.7), 6, "1", _POSITIVE, 10, "friction object-ground")
+    friction_robot: Range = drawn(Range(0.1, 0.8), 7, "1", _POSITIVE, 10, "friction object-robot")
     frictions: tuple[Friction, ...] = ()
-    # The task.
-    lateral: Range = Range(-0.12, 0.12)  # [m] of the object's middle, left of the robot's axis
-    yaw: Range = Range(-0.6, 0.6)  # [rad] of the object, counter-clockwise
-    gap: Range = Range(0, 0.05)  # [m] between base and object
-    distance: Range = Range(1, 3)  # [m] of the target from the start
-    bearing: Range = Range(-math.pi, math.pi)  # [rad] of the target, counter-clockwise from ahead
+    # The task: where object and target are at the start, seen from the base.
+    lateral: Range = drawn(Range(-0.12, 0.12), 8, "m", -0.5, 0.5, "lateral offset", "task")
+    yaw: Range = drawn(Range(-0.6, 0.6), 9, "rad", -math.pi, math.pi, "yaw of the object", "task")
+    gap: Range = drawn(Range(0, 0.05), 10, "m", 0, 1, "gap at the start", "task")
+    distance: Range = drawn(Range(1, 3), 11, "m", 0.7, 20, "distance of the target", "task")
+    bearing: Range = drawn(
+        Range(-math.pi, math.pi), 12, "rad", -math.pi, math.pi, "bearing of the target", "task"
+    )
     targets: tuple[tuple[float, float], ...] = ()  # [m]
     # The skin: ideal, or 42 capacitive taxels with these imperfections.
     skin: str = "capacitive"
-    noise: Range = Range(0, 0.05)  # [1] of each raw reading, as a change of capacitance
-    gain_spread: Range = Range(0, 0.1)  # [1] of the taxels' gains
-    dead_share: Range = Range(0, 0.05)  # [1] probability that a taxel never answers
+    # Of each raw reading, as a change of capacitance.
+    noise: Range = drawn(Range(0, 0.05), 13, "1", 0, 1, "noise of the skin", "skin", "noise")
+    gain_spread: Range = drawn(
+        Range(0, 0.1), 14, "1", 0, 1, "spread of the taxels' gains", "skin", "gain_spread"
+    )
+    dead_share: Range = drawn(Range(0, 0.05), 15, "1", 0, 1, "dead taxels", "skin", "dead_share")
     # The base: where it believes it is, and how it does what it is told.
-    pose_noise: Range = Range(0, 0.005)  # [m] of each position reading
-    yaw_noise: Range = Range(0, 0.01)  # [rad] of each heading reading
-    pose_latency: Range = Range(0, 0.1)  # [s] age of the pose that the law is told
-    command_delay: Range = Range(0, 0.1)  # [s] until a twist is acted upon
-    velocity_error: Range = Range(-0.03, 0.03)  # [1] of each component of the twist, all trial long
+    pose_noise: Range = drawn(
+        Range(0, 0.005), 16, "m", 0, 1, "noise of the position", "base", "pose_noise"
+    )
+    yaw_noise: Range = drawn(
+        Range(0, 0.01), 17, "rad", 0, 1, "noise of the heading", "base", "yaw_noise"
+    )
+    pose_latency: Range = drawn(
+        Range(0, 0.1), 18, "s", 0, 1, "latency of the pose", "base", "pose_latency"
+    )
+    command_delay: Range = drawn(
+        Range(0, 0.1), 19, "s", 0, 1, "delay of the command", "base", "command_delay"
+    )
+    # Of each component of the twist, all trial long: columns 20, 21 and 22.
+    velocity_error: Range = drawn(Range(-0.03, 0.03), 20, "1", -0.9, 0.9, "", "base")
     # The robot, and what of it differs between worlds; None: as the robot has it.
     robot: Robot = Robot()
-    robot_force: Range | None = None  # [N] of the drive, at most
-    robot_traction: Range | None = None  # [1] of the wheels
-    robot_lag: Range | None = None  # [s] with which a twist is followed
-    robot_acceleration: Range | None = None  # [m/s^2] at most, of the wheels when turning, too
+    robot_force: Range | None = drawn(
+        None, 35, "N", 1, 1e5, "greatest force of the robot", "robot", "force_max"
+    )
+    robot_traction: Range | None = drawn(
+        None, 36, "1", _POSITIVE, 5, "traction of the robot's wheels", "robot", "traction"
+    )
+    robot_lag: Range | None = drawn(None, 37, "s", 0, 5, "lag of the robot", "robot", "lag")
+    # Of the wheels when turning, too.
+    robot_acceleration: Range | None = drawn(
+        None, 38, "m/s^2", _POSITIVE, 100, "greatest acceleration of the robot", "robot",
+        "acceleration_max",
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         """Raises InputError for ranges that are empty or leave what is possible."""
@@ -96,7 +154,7 @@ class Domain:
         self.robot.check()
         for target in self.targets:
             scene.check_target(target, self.robot.shell)
-        for name, (least, most, unit) in ALLOWED.items():
+        for name, about in QUANTITIES.items():
             if (given := getattr(self, name)) is None:
                 continue
             if not isinstance(given, Range):
@@ -106,7 +164,11 @@ class Domain:
             low, high, log = given
             for side, value in (("low", low), ("high", high)):
                 errors.check_finite(
-                    f"domain {name} ({side})", value, at_least=least, at_most=most, unit=unit
+                    f"domain {name} ({side})",
+                    value,
+                    at_least=about.least,
+                    at_most=about.most,
+                    unit=about.unit,
                 )
             if low > high or (log and low <= 0):
                 raise InputError(
@@ -123,8 +185,8 @@ class Domain:
     @property
     def weakest(self) -> Robot:
         """The robot with the least force and traction of what is drawn of it."""
-        drawn = {"force_max": self.robot_force, "traction": self.robot_traction}
-        return replace(self.robot, **{of: r.low for of, r in drawn.items() if r is not None})
+        ranges = {"force_max": self.robot_force, "traction": self.robot_traction}
+        return replace(self.robot, **{of: r.low for of, r in ranges.items() if r is not None})
 
     @property
     def combinations(self) -> int:
@@ -140,13 +202,13 @@ class Domain:
         """Ranges of which nothing is drawn, since something else says what they would."""
         found = set()
         if not set(self.objects) & set(RANDOM):
-            found |= {"mass", "size", "aspect", "height", "com_offset"}
+            found |= set(of("object")) - {"friction_ground", "friction_robot"}
         if self.frictions:
             found |= {"friction_ground", "friction_robot"}
         if self.targets:
             found |= {"distance", "bearing"}
         if self.skin == "ideal":
-            found |= set(OF_TAXELS)
+            found |= set(of("skin"))
         return frozenset(found)
 
     @property
@@ -160,49 +222,30 @@ class Domain:
 
 
 RANDOM = {"random_box": "box", "random_cylinder": "cylinder", "random_prism": "prism"}
-OF_THE_BASE = ("pose_noise", "yaw_noise", "pose_latency", "command_delay", "velocity_error")
-# Ranges of the robot's limits, and which they are.
-OF_THE_ROBOT = {
-    "robot_force": "force_max",
-    "robot_traction": "traction",
-    "robot_lag": "lag",
-    "robot_acceleration": "acceleration_max",
+QUANTITIES: dict[str, Quantity] = {
+    one.name: one.metadata[_KEY] for one in fields(Domain) if _KEY in one.metadata
 }
-_POSITIVE = 1e-3
-# What a range must not leave.
-ALLOWED = {
-    "mass": (0.1, 1e3, "kg"),
-    "size": (0.03, 1.0, "m"),
-    "aspect": (0.1, 10, "1"),
-    "height": (0.1, 2.0, "m"),
-    "com_offset": (0, 0.75, "1"),
-    "friction_ground": (_POSITIVE, 10, "1"),
-    "friction_robot": (_POSITIVE, 10, "1"),
-    "lateral": (-0.5, 0.5, "m"),
-    "yaw": (-math.pi, math.pi, "rad"),
-    "gap": (0, 1, "m"),
-    "distance": (0.7, 20, "m"),
-    "bearing": (-math.pi, math.pi, "rad"),
-    "noise": (0, 1, "1"),
-    "gain_spread": (0, 1, "1"),
-    "dead_share": (0, 1, "1"),
-    "pose_noise": (0, 1, "m"),
-    "yaw_noise": (0, 1, "rad"),
-    "pose_latency": (0, 1, "s"),
-    "command_delay": (0, 1, "s"),
-    "velocity_error": (-0.9, 0.9, "1"),
-    "robot_force": (1, 1e5, "N"),
-    "robot_traction": (_POSITIVE, 5, "1"),
-    "robot_lag": (0, 5, "s"),
-    "robot_acceleration": (_POSITIVE, 100, "m/s^2"),
+
+
+def of(*parts: Part) -> tuple[str, ...]:
+    """Names of the quantities of some parts of a world."""
+    return tuple(name for name, about in QUANTITIES.items() if about.of in parts)
+
+
+# The velocity error is drawn three times.
+ERRORS = {"v_x_error": "error of v_x", "v_y_error": "error of v_y", "omega_error": "error of omega"}
+# What a table of worlds has, and its name in words.
+WORDS: dict[str, str] = {
+    **{name: about.words for name, about in QUANTITIES.items() if about.words},
+    "corners": "corners of the object",
+    **ERRORS,
 }
-RANGES = tuple(ALLOWED)
-UNITS = {
-    **dict.fromkeys(("lateral", "gap", "pose_noise"), "m"),
-    **dict.fromkeys(("yaw", "yaw_noise"), "rad"),
-    **dict.fromkeys(("noise", "gain_spread", "dead_share"), "1"),
-    **dict.fromkeys(("pose_latency", "command_delay"), "s"),
-}
+
+
+def _only(value: float) -> Range:
+    return Range(value, value)
+
+
 PERFECT: dict[str, Any] = {
     **dict.fromkeys(
         ("noise", "gain_spread", "dead_share", "pose_noise", "yaw_noise", "pose_latency"), _only(0)
@@ -260,39 +303,55 @@ DOMAINS = {
 }
 
 
-OF_TAXELS = ("noise", "gain_spread", "dead_share")  # which an ideal skin has not
+DomainLike = Domain | str  # or its text, see `named`
 
 
-def named(domain: Domain | str, robot: Robot | str | None = None) -> Domain:
-    """A domain by its name in `DOMAINS`, or from a JSON file of ranges; a domain is itself.
+def named(domain: DomainLike, robot: RobotLike | None = None) -> Domain:
+    """Read a domain: itself, its name, as wide, or a JSON file of ranges.
 
-    With a robot, its worlds have that one, but for what the domain draws of it.
+    Changes may follow a name or a file, as `wide,mass=3:10,objects=random_box`. With a robot, its
+    worlds have that one, but for what the domain draws of it.
 
     Raises:
-      InputError: no domain has this name, or the file is no domain.
+      InputError: no domain has this name, the file is no domain, or a change is not allowed.
     """
     if robot is not None:
         return replace(named(domain), robot=named_robot(robot))
     if isinstance(domain, Domain):
         return domain
-    if domain.endswith(".json"):
-        return from_json(files.read_json(Path(domain)))
-    return DOMAINS[errors.check_name("domain", domain, DOMAINS)]
+    if not isinstance(domain, str):
+        raise InputError(f"domain = {domain!r} is not allowed: give a name or a Domain.")
+    head, changes = with_changes("domain", domain)
+    if head.endswith(".json"):
+        found = from_json(files.read_json(Path(head)))
+    else:
+        found = DOMAINS[errors.check_name("domain", head, DOMAINS)]
+    for name in changes:
+        errors.check_name("domain quantity", name, [one.name for one in fields(Domain)])
+        if name in found.idle:
+            raise InputError(
+                f"domain = {domain} is not allowed: its objects, frictions, targets or skin leave "
+                f"no {name} to draw."
+            )
+    return replace(found, **_from_json(changes, found))
 
 
-def _names(values: list[str]) -> tuple[str, ...]:
-    if isinstance(values, str):
+def _names(values: Any) -> tuple[str, ...]:
+    if not isinstance(values, list | tuple) or not all(isinstance(one, str) for one in values):
         raise TypeError("one name, not a list")
     return tuple(values)
 
 
-def _range(name: str, values: Any) -> Range:
+def _range(usual: Range | None, values: Any) -> Range:
+    if isinstance(values, float | int) and not isinstance(values, bool):
+        values = [values, values]
     if not isinstance(values, list | tuple):
         raise TypeError("no list")
     low, high, *log = values
     if len(log) > 1 or not all(isinstance(one, bool) for one in log):
         raise ValueError("more than low, high, and whether evenly in the logarithm")
-    usual = getattr(DOMAINS["wide"], name)
+    if isinstance(low, str) or isinstance(high, str):
+        raise TypeError("texts")
     return Range(float(low), float(high), *(log or [usual is not None and usual.log]))
 
 
@@ -313,20 +372,28 @@ _FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
 
 
 def from_json(values: dict[str, Any]) -> Domain:
-    """The domain that was written as JSON by `dataclasses.asdict`.
+    """Read the domain that `dataclasses.asdict` wrote as JSON.
 
     Raises:
       InputError: a name or a value is not of a domain.
     """
+    return Domain(**_from_json(values, DOMAINS["wide"]))
+
+
+def _from_json(values: Mapping[str, Any], usual: Domain) -> dict[str, Any]:
+    """Fields of a domain; a range whose scale is not told has that of the usual domain."""
     given = {}
     known = {f.name: f for f in fields(Domain)}
     for name, value in values.items():
         errors.check_name("domain quantity", name, known)
-        if value is None and name in OF_THE_ROBOT:
+        if value is None and name in QUANTITIES and QUANTITIES[name].of == "robot":
             continue
-        read, form = _FORMS.get(name, (partial(_range, name), "low and high, as [0.1, 0.5]"))
+        if name == "objects" and isinstance(value, str):
+            value = [value]  # the only one of a text
+        ranged = partial(_range, getattr(usual, name))
+        read, form = _FORMS.get(name, (ranged, "low and high, as [0.1, 0.5]"))
         try:
             given[name] = read(value)
         except (TypeError, ValueError, OverflowError) as error:
             raise InputError(f"domain {name} = {value} is not allowed: write {form}.") from error
-    return Domain(**given)
+    return given

@@ -17,10 +17,10 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.solid import SIDES, Solid
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
-from rps_jax.world.domain import ALLOWED, OF_TAXELS, OF_THE_ROBOT, RANDOM, UNITS, Domain
+from rps_jax.world.domain import ERRORS, QUANTITIES, RANDOM, Domain, of
 from rps_jax.world.scene import Friction
 
-_COLUMNS = 64  # random numbers of a world, more than are used, so that new ones change no old ones
+COLUMNS = 64  # random numbers of a world, more than are used, so that new ones change no old ones
 
 
 class Draw(NamedTuple):
@@ -30,30 +30,29 @@ class Draw(NamedTuple):
     case: np.ndarray  # (n,) indices that have their object, and their friction and target of a list
     solid: Solid
     friction: Friction  # (n,) each
-    lateral: np.ndarray  # (n,) [m]
-    yaw: np.ndarray  # (n,) [rad]
-    gap: np.ndarray  # (n,) [m]
+    at: dict[str, np.ndarray]  # (n,) of each quantity of the domain, in its unit
     p_world_target: np.ndarray  # (n, 2) [m]
-    noise: np.ndarray  # (n,) [1]
-    gain_spread: np.ndarray  # (n,) [1]
-    dead_share: np.ndarray  # (n,) [1]
-    pose_noise: np.ndarray  # (n,) [m]
-    yaw_noise: np.ndarray  # (n,) [rad]
-    pose_latency: np.ndarray  # (n,) [s]
-    command_delay: np.ndarray  # (n,) [s]
     velocity_error: np.ndarray  # (n, 3) [1]
     robot: Robot  # (n,) each
     key: np.ndarray  # (n, 2) uint32, of all that is drawn while the world runs
 
 
-# Which random number of a world is what; a new quantity goes to the end.
-USES = (
-    *("mass", "size", "aspect", "height", "com_offset", "com_bearing"),
-    *("friction_ground", "friction_robot", "lateral", "yaw", "gap", "distance", "bearing"),
-    *("noise", "gain_spread", "dead_share", "pose_noise", "yaw_noise", "pose_latency"),
-    *("command_delay", "v_x_error", "v_y_error", "omega_error", "key_0", "key_1", "sides", "turn"),
-    *(f"corner_{i}" for i in range(SIDES)),
-    *OF_THE_ROBOT,
+# Random numbers of a world that are drawn from no range of their own.
+_OTHERS = {
+    "com_bearing": 5,
+    **{name: 20 + i for i, name in enumerate(ERRORS)},
+    **{"key_0": 23, "key_1": 24, "sides": 25, "turn": 26},
+    **{f"corner_{i}": 27 + i for i in range(SIDES)},
+}
+# Which random number of a world is what, in the order of the columns.
+USES: dict[str, int] = dict(
+    sorted(
+        {
+            **{name: one.column for name, one in QUANTITIES.items() if name != "velocity_error"},
+            **_OTHERS,
+        }.items(),
+        key=lambda item: item[1],
+    )
 )
 
 
@@ -71,40 +70,38 @@ def draw(domain: Domain, seed: int, index: ArrayLike) -> Draw:
 
 
 def drawn_at(domain: Domain, index: np.ndarray, numbers: np.ndarray) -> Draw:
-    """Worlds of the same object, from their random numbers (n, at least those of `USES`)."""
-    u = dict(zip(USES, numbers.T, strict=False))
+    """Worlds of the same object, from their random numbers (n, columns)."""
+    u = {name: numbers[:, column] for name, column in USES.items()}
     name = domain.objects[int(domain.object_of(index[0]))]
-    ranges = {name: getattr(domain, name) for name in ALLOWED if name in u}
+    ranges = {name: getattr(domain, name) for name in QUANTITIES if name in u}
     at = {name: one.at(u[name]) for name, one in ranges.items() if one is not None}
     if domain.skin == "ideal":
-        at |= {name: np.zeros(index.size) for name in OF_TAXELS}
-    error = [
-        domain.velocity_error.at(u[name]) for name in ("v_x_error", "v_y_error", "omega_error")
-    ]
+        at |= {name: np.zeros(index.size) for name in of("skin") if name in at}
+    error = [domain.velocity_error.at(u[name]) for name in ERRORS]
     key = [np.floor(u[name] * 2**32).astype(np.uint32) for name in ("key_0", "key_1")]
     return Draw(
         number=index,
         case=index,
         solid=_solid(name, at, u),
         friction=_friction(domain, index, at),
+        at=at,
         p_world_target=_targets(domain, index, at),
         velocity_error=np.stack(error, axis=-1),
         robot=_robots(domain.robot, at, index.size),
         key=np.stack(key, axis=-1),
-        **{name: at[name] for name in Draw._fields if name in at},
     )
 
 
 def numbers_of(seed: int, index: np.ndarray) -> np.ndarray:
-    """Random numbers (n, _COLUMNS) in [0, 1): those of each index, however it is asked for."""
-    rows = np.empty((index.size, _COLUMNS))
+    """Random numbers (n, COLUMNS) in [0, 1): those of each index, however it is asked for."""
+    rows = np.empty((index.size, COLUMNS))
     order = np.argsort(index)
     far = np.flatnonzero(np.diff(index[order]) > 100) + 1
     for near in np.split(order, far):
         first, last = int(index[near[0]]), int(index[near[-1]])
         # Philox counts in steps of four numbers.
-        bits = np.random.Philox(key=seed).advance(first * _COLUMNS // 4)
-        block = np.random.Generator(bits).random((last - first + 1, _COLUMNS))
+        bits = np.random.Philox(key=seed).advance(first * COLUMNS // 4)
+        block = np.random.Generator(bits).random((last - first + 1, COLUMNS))
         rows[near] = block[index[near] - first]
     return rows
 
@@ -141,7 +138,7 @@ def _polygons(depth: np.ndarray, breadth: np.ndarray, u: dict[str, np.ndarray]) 
 
 def _robots(robot: Robot, at: dict[str, np.ndarray], count: int) -> Robot:
     """The robots (count,) of worlds, with what was drawn of them."""
-    own = {name: at[drawn] for drawn, name in OF_THE_ROBOT.items() if drawn in at}
+    own = {QUANTITIES[name].sets: at[name] for name in of("robot") if name in at}
     if (linear := own.get("acceleration_max")) is not None:
         own["acceleration_max"] = np.stack([linear, linear / robot.arm], axis=-1)
 
@@ -176,27 +173,31 @@ def table(drawn: Draw) -> dict[str, tuple[np.ndarray, str]]:
     away = np.linalg.norm(shape.p_object_com, axis=1)
     toward = shape.p_object_com[:, :2] / np.maximum(away, 1e-12)[:, None]
     x, y = drawn.p_world_target.T
-    errors_ = zip(("v_x_error", "v_y_error", "omega_error"), drawn.velocity_error.T, strict=True)
-    return {
-        "mass": (shape.mass, "kg"),
-        "size": (np.sqrt(solid.area(shape)) / 2, "m"),
-        "height": (shape.height, "m"),
-        "corners": (solid.corners(shape), "1"),
-        "com_offset": (away / solid.reach(shape.vertices, shape.radius, toward), "1"),
-        "friction_ground": (drawn.friction.ground, "1"),
-        "friction_robot": (drawn.friction.robot, "1"),
-        "distance": (np.hypot(x, y), "m"),
-        "bearing": (np.arctan2(y, x), "rad"),
-        **{name: (getattr(drawn, name), unit) for name, unit in UNITS.items()},
-        **{name: (values, "1") for name, values in errors_},
-        **_limits(drawn.robot),
+    derived = {
+        "mass": shape.mass,
+        "size": np.sqrt(solid.area(shape)) / 2,
+        "height": shape.height,
+        "com_offset": away / solid.reach(shape.vertices, shape.radius, toward),
+        "friction_ground": drawn.friction.ground,
+        "friction_robot": drawn.friction.robot,
+        "distance": np.hypot(x, y),
+        "bearing": np.arctan2(y, x),
     }
-
-
-def _limits(robots: Robot) -> dict[str, tuple[np.ndarray, str]]:
-    """Limits of robots (n,) that differ between worlds, or any number at all of one world."""
     found = {}
-    for name, limit in OF_THE_ROBOT.items():
-        if (values := getattr(robots, limit)) is not None:
-            found[name] = (values.reshape(len(values), -1)[:, 0], ALLOWED[name][2])
+    for name, about in QUANTITIES.items():
+        if about.of == "robot":
+            values = _limit(drawn.robot, about.sets)
+        else:
+            values = derived.get(name, drawn.at.get(name))
+        if about.words and values is not None:
+            found[name] = (values, about.unit)
+    found["corners"] = (solid.corners(shape), "1")
+    for name, values in zip(ERRORS, drawn.velocity_error.T, strict=True):
+        found[name] = (values, "1")
     return found
+
+
+def _limit(robots: Robot, name: str) -> np.ndarray | None:
+    """A limit of robots (n,), of one that has it; of several numbers the first."""
+    values = getattr(robots, name)
+    return None if values is None else values.reshape(len(values), -1)[:, 0]

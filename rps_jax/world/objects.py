@@ -19,6 +19,7 @@ from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import SIDES, Solid
+from rps_jax.record import files
 
 FAMILIES = {
     "box": "box",
@@ -61,6 +62,27 @@ def path_of(name: str) -> Path:
     return REGISTERED[name].path if name in REGISTERED else mjcf_folder() / f"{name}.xml"
 
 
+def named(text: str) -> str:
+    """Read an object's text: its name, or the path of an MJCF file, which is then registered.
+
+    Raises:
+      InputError: the file cannot be read, or is no object.
+    """
+    if not isinstance(text, str) or not text.endswith(".xml"):
+        return text
+    path = Path(text).absolute()
+    name = path.stem if path.stem not in _BUILT_IN else str(path)
+    if REGISTERED.get(name, (None,))[0] != path:
+        try:
+            files.content_of(path, "xml")
+        except OSError as error:
+            raise InputError(
+                f"object = {text} cannot be read ({error.strerror}): give an MJCF file."
+            ) from error
+        register_object(name, path)
+    return name
+
+
 def read(path: Path) -> mujoco.MjSpec:
     """An MJCF file, wherever it is; `base.xml` is that of `mjcf_folder`."""
     base = (mjcf_folder() / "base.xml").read_bytes()
@@ -99,8 +121,8 @@ def register_object(name: str, path: str | Path, footprint: Footprint | None = N
       ... </mujoco>'''
       >>> _ = Path("crate.xml").write_text(crate)
       >>> rps_jax.register_object("crate", "crate.xml")
-      >>> "crate" in rps_jax.OBJECTS
-      True
+      >>> rps_jax.Case("crate", "S1", (2.0, 0.0), "rps").object
+      'crate'
     """
     if name in _BUILT_IN:
         raise InputError(

@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from rps_jax.control.strategies import PAPER as PARAMS
-
 TARGETS = tuple(
     (float(x), float(y)) for x in (2, 1, 0, -1, -2) for y in (2, 1, 0, -1, -2) if (x, y) != (0, 0)
 )  # [m] Sec. III-B: a grid of 1 m, without the robot's place
 
-STRATEGIES = tuple(PARAMS)
+FEW_TARGETS = ((2.0, 0.0), (1.0, 1.0), (0.0, -2.0), (-2.0, 1.0))  # of them, for a first look
+
+LAWS = ("rps", "nps", "aps")
 SKIN = {"default": "ideal", "paper_gazebo": "thin"}  # that goes with each physics
 
-# Table II: successes of 24, keyed by strategy, object and friction set.
+# Table II: successes of 24, keyed by law, object and friction set.
 TABLE_II = {
     ("rps", "box", "S1"): 23,
     ("rps", "box", "S2"): 24,
@@ -63,3 +63,40 @@ HARDWARE_RESULTS = {
     "hardware_box": HardwareResult(8, 0.032, 89.0),
     "hardware_cylinder": HardwareResult(8, 0.059, 88.0),
 }
+
+# What is open, our reading, and why: physics or the text, not the score.
+CHOICES = (
+    (
+        "tangent beyond a quarter turn",
+        "gamma within +-1.56 rad",
+        "as printed the robot turns away from targets behind it, which the paper reaches",
+    ),
+    (
+        "l_mr",
+        "0.15 m",
+        "the paper's trial realigns well into the middle; from 0.05 to 0.20 m nothing changes",
+    ),
+    ("a_r_max", "10", "the text calls it the maximal rate, and eta is the most Eq. 5 gives"),
+    (
+        "saturation",
+        "omega from the unsaturated velocity, (v_x, v_y) scaled as a vector",
+        "the text saturates the computed velocities before they are commanded, and only scaling "
+        "keeps the direction that Eqs. 1-2 ask for",
+    ),
+    ("control period", "20 ms", "the skin's 50 ms filter cannot use more"),
+    (
+        "loss of contact",
+        "ahead at 0.01 m/s",
+        "the one behaviour without contact that the paper reports",
+    ),
+    ("150 s without contact", "in all, after the first touch", "stricter than at a stretch"),
+    ("length of the base", "0.725 m", "42 equal taxels over three sides of a front of 58 cm"),
+    (
+        "simulated skin",
+        "ideal, 6 mm",
+        "foam yields by millimetres; a rigid sensor is `thin`, the hardware's `capacitive`",
+    ),
+    ("rear left corner", "nearest the robot", "rear as seen along the push"),
+    ("initial gap", "2 cm", "Fig. 6 begins with a short approach at 0.01 m/s"),
+    ("sgn(0)", "0", "a centred contact asks for no lateral motion"),
+)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 from rps_jax import errors
+from rps_jax.record.options import with_changes
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,7 @@ PHYSICS = {
 
 
 PhysicsName = Literal["default", "paper_gazebo"]
+PhysicsLike = str | Physics  # or its text, see `named`
 Fidelity = Literal["reference", "standard", "fast"]
 
 
@@ -95,3 +97,28 @@ def preset(name: PhysicsName = "default", fidelity: Fidelity = "standard") -> Ph
     """
     errors.check_name("physics", name, PHYSICS)
     return PHYSICS[name][errors.check_name("fidelity", fidelity, PHYSICS[name])]
+
+
+def named(physics: PhysicsLike, fidelity: Fidelity = "standard") -> Physics:
+    """Read a physics: itself, or a name with changes, as `default,timestep=0.005`.
+
+    Raises:
+      InputError: unknown name, fidelity or field, or a value that is not allowed.
+    """
+    if isinstance(physics, Physics):
+        return physics
+    if not isinstance(physics, str):
+        raise errors.InputError(f"physics = {physics!r} is not allowed: give a name or a Physics.")
+    name, changes = with_changes("physics", physics)
+    errors.check_name("physics", name, PHYSICS)
+    usual = preset(name, fidelity)  # pyright: ignore[reportArgumentType]
+    for field, value in changes.items():
+        errors.check_name("field of physics", field, [one.name for one in fields(Physics)])
+        if isinstance(getattr(usual, field), int) and isinstance(value, float):
+            changes[field] = int(value) if value == int(value) else value
+        elif isinstance(value, list):
+            changes[field] = tuple(value)
+    try:
+        return replace(usual, **changes)
+    except TypeError as error:
+        raise errors.InputError(f"physics = {physics} is not allowed ({error}).") from error

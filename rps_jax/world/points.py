@@ -23,12 +23,11 @@ from rps_jax.geometry.solid import SIDES
 from rps_jax.record import files
 from rps_jax.robot.robot import Robot
 from rps_jax.world import draws
-from rps_jax.world.domain import ALLOWED, RANDOM, Domain, Range, named
+from rps_jax.world.domain import ERRORS, QUANTITIES, RANDOM, Domain, Range, named
 from rps_jax.world.draws import Draw
 
 Kind = Literal["range", "choice", "shape", "noise"]
 FILE = "points.nc"  # of a run folder whose worlds are points
-_ERRORS = ("v_x_error", "v_y_error", "omega_error")
 _OF_PRISMS = ("sides", "turn", *(f"corner_{i}" for i in range(SIDES)))
 _TURN = Range(0, 2 * np.pi)
 _MOST = 100_000_000
@@ -67,9 +66,10 @@ def _quantities(domain: Domain) -> Iterator[Quantity]:
         elif name.startswith("key_"):
             yield Quantity(name, "noise", Range(0, 1), "1")
         else:
-            of = getattr(domain, "velocity_error" if name in _ERRORS else name)
+            of = getattr(domain, "velocity_error" if name in ERRORS else name)
             if name not in idle and of is not None and of.low < of.high:
-                yield Quantity(name, "range", of, ALLOWED[name][2] if name in ALLOWED else "1")
+                unit = QUANTITIES[name].unit if name in QUANTITIES else "1"
+                yield Quantity(name, "range", of, unit)
 
 
 def names(domain: Domain, *kinds: Kind) -> tuple[str, ...]:
@@ -84,7 +84,7 @@ def check_drawn(field: str, name: str, domain: Domain) -> str:
       InputError: there is none, or the domain draws none from it.
     """
     drawn = names(domain, "range")
-    known = (*ALLOWED, *_ERRORS, "com_bearing")
+    known = (*QUANTITIES, *ERRORS, "com_bearing")
     if name in known and name not in drawn:
         raise InputError(
             f"{field} = {name} is not allowed: this domain does not draw it, but "
@@ -132,9 +132,9 @@ class Points:
         which = domain.object_of(cases)
         if (which != which[0]).any():
             raise ValueError("worlds of several objects cannot be batched")
-        numbers = np.full((index.size, len(draws.USES)), 0.5)
+        numbers = np.full((index.size, draws.COLUMNS), 0.5)
         own = [i for i, name in enumerate(names(domain)) if name in draws.USES]
-        at = [draws.USES.index(name) for name in names(domain) if name in draws.USES]
+        at = [draws.USES[name] for name in names(domain) if name in draws.USES]
         numbers[:, at] = self.u[index][:, own]
         return draws.drawn_at(domain, cases, numbers)._replace(number=index)
 
@@ -142,7 +142,7 @@ class Points:
         """Keep the points in a run folder, if it does not hold them already."""
         path = folder / FILE
         try:
-            if path.exists() and Points(files.read(path).u.values) == self:
+            if path.exists() and Points(_numbers(path)) == self:
                 return path
         except InputError:  # it is damaged
             pass
@@ -157,10 +157,16 @@ class Points:
         """
         if not (folder / FILE).exists():
             raise InputError(f"run = {folder} lacks its {FILE}: run the same command again.")
-        found = Points(files.read(folder / FILE).u.values)
+        found = Points(_numbers(folder / FILE))
         if found.digest != digest:
             raise files.corrupt(folder / FILE, "its points are not those of the run")
         return found
+
+
+def _numbers(path: Path) -> np.ndarray:
+    """The points (n, q) of a file."""
+    found = files.check_columns(files.read(path), path, {"u": ("world", "quantity")}, {})
+    return found.u.values
 
 
 def _counts(domain: Domain) -> tuple[int, int, int]:
@@ -177,11 +183,11 @@ def checked(domain: Domain, u: Any) -> Points:
     every = names(domain)
     if isinstance(u, xr.Dataset):
         if "u" not in u or "quantity" not in u.coords:
-            raise InputError("worlds are not allowed: the dataset has no u (world, quantity).")
+            raise InputError("points are not allowed: the dataset has no u (world, quantity).")
         theirs = tuple(map(str, u.quantity.values))
         if theirs != every or u.attrs.get("domain", _told(domain)) != _told(domain):
             raise InputError(
-                "worlds are not allowed: their points are of another domain; give that domain."
+                "points are not allowed: they are of another domain; give that domain."
             )
         u = u.u.values
     try:
@@ -230,7 +236,7 @@ def points_of(domain: Domain | str, index: ArrayLike, seed: int = 0) -> np.ndarr
     """The points (n, q) of the unit cube at which drawn worlds lie.
 
     Args:
-      domain: ranges of what differs between worlds, or their name in `DOMAINS`.
+      domain: ranges of what differs between worlds, or their name, as wide.
       index: (n,) of the worlds.
       seed: of the worlds, as of `sweep`.
 
@@ -241,14 +247,15 @@ def points_of(domain: Domain | str, index: ArrayLike, seed: int = 0) -> np.ndarr
       InputError: an argument is not allowed.
 
     Example:
-      >>> import rps_jax
-      >>> rps_jax.points_of("wide", [0, 1, 2]).shape
+      >>> from rps_jax.world.points import points_of
+      >>> points_of("wide", [0, 1, 2]).shape
       (3, 36)
     """
     domain = named(domain)
     errors.check_count("seed", seed, at_least=0, at_most=2**32 - 1)
     index = np.atleast_1d(np.asarray(index, np.int64))
-    numbers = dict(zip(draws.USES, draws.numbers_of(seed, index).T, strict=False))
+    every = draws.numbers_of(seed, index)
+    numbers = {name: every[:, column] for name, column in draws.USES.items()}
     objects, frictions, targets = _counts(domain)
     of_lists = {
         "object": (domain.object_of(index) + 0.5) / objects,
@@ -261,7 +268,7 @@ def points_of(domain: Domain | str, index: ArrayLike, seed: int = 0) -> np.ndarr
 def worlds_at(
     domain: Domain | str, u: ArrayLike | xr.Dataset, *, robot: Robot | str | None = None
 ) -> xr.Dataset:
-    """The worlds at points of the unit cube, which `sweep` and `evaluate` take as their worlds.
+    """The worlds at points of the unit cube, which `sweep` and `evaluate` take as `points`.
 
     A quantity is at `low + u (high - low)`, or at `low (high / low)^u` where its range is even in
     the logarithm. Kinds of quantities are `range`; `choice`, of the object, friction or target from
@@ -269,9 +276,9 @@ def worlds_at(
     while a world runs, so that neighbours in it have nothing in common.
 
     Args:
-      domain: ranges of what differs between worlds, or their name in `DOMAINS`.
+      domain: ranges of what differs between worlds, or their name, as wide.
       u: (n, q) in [0, 1), a row a world, a column for each quantity of the domain, in order.
-      robot: by its name in `ROBOTS`, or a JSON file's; None: the domain's.
+      robot: by its name, as kairos, or a JSON file's; None: the domain's.
 
     Returns:
       `u` (world, quantity); for each quantity its `low`, `high`, `log`, `unit` and `kind`; and
@@ -283,14 +290,16 @@ def worlds_at(
     Example:
       >>> import numpy as np
       >>> import rps_jax
+      >>> from rps_jax.world.points import points_of
       >>> drums = rps_jax.Domain(("random_cylinder",))
-      >>> u = rps_jax.points_of(drums, np.arange(4))
+      >>> u = points_of(drums, np.arange(4))
       >>> worlds = rps_jax.worlds_at(drums, u)
       >>> float(worlds.high.sel(quantity="mass"))
       60.0
-      >>> arms, rules = {"rps": rps_jax.RPSParams.paper()}, rps_jax.Rules(horizon=2.0)
-      >>> found = rps_jax.sweep(drums, arms, worlds=worlds, rules=rules)
-      >>> bool((found.mass == rps_jax.sweep(drums, arms, worlds=4, rules=rules).mass).all())
+      >>> setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
+      >>> found = rps_jax.sweep("rps", drums, points=worlds, setting=setting)
+      >>> drawn = rps_jax.sweep("rps", drums, worlds=4, setting=setting)
+      >>> bool((found.mass == drawn.mass).all())
       True
     """
     domain = named(domain, robot)

@@ -74,7 +74,7 @@ def load(
     """Compile a scene.
 
     Args:
-      name: one of `OBJECTS`.
+      name: of an object, as `rps_jax.world.objects.OBJECTS` has them.
       physics: how it will be stepped.
       friction: coefficients of its two contacts.
       rear: which side the nonuniform box's load stands on, nearest the robot or farthest; the
@@ -243,7 +243,7 @@ def check(friction: Friction, mass: float | None) -> None:
     for side, value in friction._asdict().items():
         errors.check_finite(f"friction {side}", value, above=0, at_most=10)
     if mass is not None:
-        errors.check_finite("mass", mass, above=0, at_most=1e4, unit="kg")
+        errors.check_finite("mass", mass, at_least=1e-3, at_most=1e4, unit="kg")
 
 
 def check_target(p_world_target: tuple[float, float], shell: Shell = Shell()) -> None:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from rps_jax.control.law import Twist
+from rps_jax.control.observation import Twist
 from rps_jax.engines.base import Driven, Engine, Motion, taken
 from rps_jax.engines.fused import step
 from rps_jax.engines.fused.contacts import Body
@@ -40,7 +40,7 @@ class FusedStage(NamedTuple):
 
 
 class Fused(Engine):
-    """The same equations as MJX's, specialised: the fastest on every device."""
+    """MJX's equations, specialised to these scenes: the fastest engine on every device."""
 
     name = "fused"
     modes = ("forward",)

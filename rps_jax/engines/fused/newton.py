@@ -69,7 +69,7 @@ def contact_force(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tupl
 
 
 def _pyramid(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tuple[Any, ...]]:
-    """The same of four frictionless edges n +- friction t, n +- friction s."""
+    """Compute these of four frictionless edges n +- friction t, n +- friction s."""
     f = contact.friction
     d = contact.d * physics.impratio / (2 * f * f * (1 + f * f))
     up_t, down_t = x[0] + f * x[1], x[0] - f * x[1]
@@ -338,7 +338,7 @@ def _slope_of_ellipse(line: _Line, x: Any) -> tuple[Any, Any]:
 
 
 def _slope_of_pyramid(lines: tuple[Contact, Vec, Vec], x: Any, physics: Physics) -> tuple[Any, Any]:
-    """The same of the friction pyramid."""
+    """Compute these of the friction pyramid."""
     c, start, pace = lines
     force, k = _pyramid(c, sp.add(start, sp.scale(x, pace)), physics)
     nn, nt, ns, tt, _, ss = k

@@ -1,0 +1,103 @@
+"""On which device worlds are stepped, and where its compiled programs are kept between runs."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+from typing import Literal
+
+from rps_jax.errors import InputError
+
+Device = Literal["auto", "cpu", "gpu"]
+
+
+def be_deterministic() -> None:
+    """Ask XLA for GPU sums in a fixed order: the same command must give the same results."""
+    flag = "--xla_gpu_deterministic_ops"
+    flags = os.environ.get("XLA_FLAGS", "")
+    if flag not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {flag}=true".strip()
+
+
+def cache_folder() -> Path:
+    """Where compiled programs are kept between runs: $RPS_CACHE, else the user's cache."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(os.environ.get("RPS_CACHE") or Path(base) / "rps_jax")
+
+
+def use_cache(folder: str | Path | None = None) -> Path | None:
+    """Keep compiled programs between processes, so that each compiles once on a machine.
+
+    The command line does this by itself. A library call does it if the environment variable
+    RPS_CACHE names a folder.
+
+    Args:
+      folder: where they are kept; by default $RPS_CACHE, else `rps_jax` in the user's cache.
+
+    Returns:
+      The folder, or None if it cannot be written: a run needs no cache.
+
+    Example:
+      >>> import rps_jax
+      >>> folder = rps_jax.use_cache("programs")
+      >>> folder.name
+      'programs'
+    """
+    import jax
+
+    where = cache_folder() if folder is None else Path(folder)
+    try:
+        where.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    jax.config.update("jax_compilation_cache_dir", str(where))
+    # Many programs of ours are small, and compile in less than JAX thinks worth keeping.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    os.environ.setdefault("WARP_CACHE_PATH", str(where / "warp"))
+    return where
+
+
+def use_cache_if_asked() -> None:
+    """Keep compiled programs if RPS_CACHE is set and no other cache is in use."""
+    import jax
+
+    if os.environ.get("RPS_CACHE") and not jax.config.jax_compilation_cache_dir:
+        use_cache()
+
+
+def kind() -> str:
+    """What JAX computes on, in words."""
+    import jax
+
+    return jax.devices()[0].device_kind
+
+
+def choose(name: Device) -> None:
+    """Have JAX use this kind of device.
+
+    Raises:
+      InputError: there is no such device.
+    """
+    import jax
+
+    if name == "auto":
+        try:
+            jax.devices()
+        except (RuntimeError, AssertionError) as error:  # whichever JAX raises
+            asked = jax.config.jax_platforms
+            raise InputError(
+                f"JAX_PLATFORMS = {asked} is not there: name a device that is, or none."
+            ) from error
+        return
+    before = jax.config.jax_platforms
+    jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[name])
+    with contextlib.suppress(RuntimeError, AssertionError):  # whichever JAX raises
+        if jax.default_backend() == name:
+            return
+    jax.config.update("jax_platforms", before)
+    raise InputError(
+        f"device = {name} is not there: install rps_jax[cuda] on a machine with an NVIDIA GPU, or "
+        "choose cpu."
+    )

@@ -1,0 +1,150 @@
+"""Traced programs, kept between processes beside XLA's compiled ones, so that none is traced twice.
+
+XLA's cache spares a process the compilation; tracing and lowering, which are Python, it does not
+spare. So a program is also kept as StableHLO, as `jax.export` writes it, under a key of all that it
+depends on: versions, this package's source, the device, shapes and static settings. An entry is
+verified before it is used; one that is damaged is dropped with one line, and traced again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import os
+import warnings
+from collections.abc import Callable, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax import export
+
+from rps_jax.control.base import Law
+from rps_jax.record import files
+
+MOST = 512 * 2**20  # bytes that are kept; the entries that were not used for longest go first
+_DIGEST = hashlib.sha256().digest_size
+# Calls of kernels, which `jax.export` does not promise to other versions: the key has the versions.
+_KERNELS = [
+    export.DisabledSafetyCheck.custom_call(name)
+    for name in ("__gpu$xla.gpu.triton", "triton_kernel_call")
+]
+
+
+def compiled(
+    function: Callable[..., Any],
+    arguments: Sequence[Any],
+    result: Any,
+    *,
+    donate: int,
+    static: Sequence[Any],
+) -> Callable[..., Any]:
+    """Compile a function for arguments of these shapes, from what was kept of it if there is.
+
+    Args:
+      function: pure; it may depend on nothing but its arguments and `static`.
+      arguments: pytrees of `jax.ShapeDtypeStruct`.
+      result: a pytree with the structure of what the function returns.
+      donate: position of the argument whose memory may be used again.
+      static: what else it depends on; each with a `repr` that says all of it.
+
+    Returns:
+      The compiled function. It is the same program whether it was kept or not.
+    """
+    leaves, tree = jax.tree.flatten(tuple(arguments))
+    sizes = [jax.tree.structure(one).num_leaves for one in arguments]
+    first = sum(sizes[:donate])
+    donated = tuple(range(first, first + sizes[donate]))
+
+    def flat(*given: Any) -> list[Any]:
+        return jax.tree.leaves(function(*jax.tree.unflatten(tree, given)))
+
+    kept = _kept(repr((str(tree), [(x.shape, str(x.dtype)) for x in leaves], donated, static)))
+    exported = None if kept is None else _read(kept, leaves)
+    if exported is None:
+        lowered = export.export(jax.jit(flat, donate_argnums=donated), disabled_checks=_KERNELS)
+        exported = lowered(*leaves)
+        if kept is not None:
+            _write(kept, exported)
+    program = jax.jit(exported.call, donate_argnums=donated).lower(*leaves).compile()
+    outcome = jax.tree.structure(result)
+    return lambda *given: jax.tree.unflatten(outcome, program(*jax.tree.leaves(given)))
+
+
+def identity(law: Law) -> str | None:
+    """What says in any process which law this is; None if nothing does.
+
+    A law of this package whose functions stand at the top of their modules is said by their names;
+    its source is a part of every key.
+    """
+    names = []
+    for function in (law.init, law.step):
+        module, name = getattr(function, "__module__", ""), getattr(function, "__qualname__", "<")
+        if not module.startswith("rps_jax.") or "<" in name:
+            return None
+        names.append(f"{module}.{name}")
+    return repr((names, law.senses, law.temperatures, law.smooth, law.cell))
+
+
+@functools.cache
+def _source() -> str:
+    """Digest of this package's source and of the versions that make a program of it."""
+    versions = [metadata.version(name) for name in ("jax", "jaxlib", "numpy")]
+    told = hashlib.sha256(repr(versions).encode())
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+        told.update(path.read_bytes())
+    return told.hexdigest()
+
+
+def _kept(told: str) -> Path | None:
+    """Where a program is kept of which this says all; None if nowhere.
+
+    An address in memory, or what was left out of a long array, says nothing.
+    """
+    folder = jax.config.jax_compilation_cache_dir
+    if not folder or " at 0x" in told or "..." in told:
+        return None
+    device = jax.devices()[0]
+    flags = [jax.config.jax_enable_x64, jax.config.jax_default_matmul_precision]
+    where = [device.platform, device.device_kind, os.environ.get("XLA_FLAGS", ""), flags]
+    key = hashlib.sha256(repr((_source(), where, told)).encode()).hexdigest()
+    return Path(folder) / "traced" / key
+
+
+def _read(path: Path, leaves: Sequence[Any]) -> export.Exported | None:
+    """A program that was kept, if it is whole and of these arguments."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    body = content[_DIGEST:]
+    try:
+        if hashlib.sha256(body).digest() != content[:_DIGEST]:
+            raise ValueError("its checksum differs")
+        found = export.deserialize(bytearray(body))
+        if [(x.shape, x.dtype) for x in found.in_avals] != [(x.shape, x.dtype) for x in leaves]:
+            raise ValueError("it is of other shapes")
+    except Exception as error:  # whatever a damaged file leads to
+        warnings.warn(f"{path} is dropped, and traced again: {error}", stacklevel=2)
+        with contextlib.suppress(OSError):
+            path.unlink()
+        return None
+    with contextlib.suppress(OSError):
+        os.utime(path)
+    return found
+
+
+def _write(path: Path, exported: export.Exported) -> None:
+    """Keep a program, and drop what was not used for longest; a run needs neither."""
+    with contextlib.suppress(OSError, ValueError):
+        body = bytes(exported.serialize())
+        path.parent.mkdir(parents=True, exist_ok=True)
+        files.write_bytes(path, hashlib.sha256(body).digest() + body)
+        every = sorted(path.parent.iterdir(), key=lambda one: -one.stat().st_mtime)
+        total = 0
+        for one in every:
+            total += one.stat().st_size
+            if total > MOST:
+                one.unlink()
