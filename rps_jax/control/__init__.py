@@ -1,6 +1,6 @@
-"""What decides: the paper's law, its baselines, and strategies of one's own.
+"""What decides: the paper's law, its rivals, laws learned from touch, and laws of one's own.
 
-`law` is the Reactive Pushing Strategy, `rps_plus` a law of our own, `rivals` the laws that both are
-compared with, `learned` what is learned from touch, and `strategies` finds a strategy by its name,
-by its parameters or in a user's file. Nothing here knows MuJoCo.
+`base` says what a law is and `observation` what it observes and commands. Each file of `laws` is
+one law; `learned` has those that were learned, and `registry` finds a law by its text. Nothing
+here knows MuJoCo.
 """

@@ -37,7 +37,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rps_jax import errors
-from rps_jax.control.law import RPSParams
+from rps_jax.control.laws.rps import RPSParams
 
 
 class Touch(NamedTuple):

@@ -51,6 +51,6 @@ def choose(switch: jax.Array, yes: Any, no: Any) -> jax.Array:
     return switch * yes + (1 - switch) * no
 
 
-def select(condition: jax.Array, yes: Any, no: Any) -> Any:
-    """One of two pytrees, by a condition () that may be traced."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+def select(switch: jax.Array, yes: Any, no: Any) -> Any:
+    """`choose` between the leaves of two pytrees."""
+    return jax.tree.map(lambda a, b: choose(switch, a, b), yes, no)

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.control.law import Details, Twist
-from rps_jax.control.learned import observation
-from rps_jax.control.learned.observation import Felt, TaxelObservation
+from rps_jax.control.learned import features
+from rps_jax.control.learned.features import Felt
+from rps_jax.control.observation import Details, TaxelObservation, Twist
 
 Kind = Literal["mlp", "gru"]
 Weights = dict[str, Any]  # by name, float32
@@ -46,7 +46,7 @@ class Network(NamedTuple):
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shapes of the weights, by name."""
-        size, n = observation.size(self.taxels), self.width
+        size, n = features.size(self.taxels), self.width
         second = _dense("second", n, n) if self.kind == "mlp" else _gru("memory", n)
         return _dense("first", size, n) | second | _dense("action", n, 3)
 
@@ -114,7 +114,7 @@ def start(
 
 def paired(numbers: jax.Array) -> jax.Array:
     """Numbers (..., F) and those of the mirrored world, (..., 2, F)."""
-    return jnp.stack([numbers, observation.mirrored(numbers)], axis=-2)
+    return jnp.stack([numbers, features.mirrored(numbers)], axis=-2)
 
 
 def dense(weights: Weights, name: str, pair: jax.Array) -> jax.Array:
@@ -157,7 +157,7 @@ def decide(
 
     The memory has followed `seen`; its action is still the last one.
     """
-    numbers = observation.features(memory.felt, memory.action, seen)
+    numbers = features.features(memory.felt, memory.action, seen)
     hidden, mean = network.apply(weights, memory.hidden, numbers)
     return memory._replace(felt=memory.felt.decided(seen), hidden=hidden), mean
 
@@ -176,13 +176,13 @@ def step(
             "choose a robot with the boards that it was learned with."
         )
     memory = memory._replace(felt=memory.felt.follow(seen))
-    due = memory.waiting < 0.5 * seen.period
+    due = memory.waiting < 0.5 * seen.touch.period
     told, mean = decide(network, weights, memory, seen)
-    told = told._replace(action=observation.executed(mean))
+    told = told._replace(action=features.executed(mean))
     told = told._replace(waiting=jnp.full_like(memory.waiting, network.hold))
     after = jax.tree.map(partial(jnp.where, due), told, memory)
     scale = jnp.stack([params.v_max, params.v_max, params.omega_max])
     twist = Twist(*(scale * after.action))
     contact = after.felt.p_robot_contact(seen)
     details = Details.of(seen.touch._replace(p_robot_contact=contact))
-    return after._replace(waiting=after.waiting - seen.period), twist, details
+    return after._replace(waiting=after.waiting - seen.touch.period), twist, details

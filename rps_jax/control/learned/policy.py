@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import zipfile
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -19,9 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rps_jax import errors
+from rps_jax.control.base import Law
 from rps_jax.control.learned import network as networks
 from rps_jax.control.learned.network import Memory, Network, Weights
 from rps_jax.errors import InputError
+from rps_jax.record import files
 
 FORMAT, VERSION = "rps_jax policy", 1
 SHIPPED = {path.stem: path for path in sorted(Path(__file__).parent.glob("learned_*.npz"))}
@@ -67,13 +68,12 @@ def decoded(content: bytes, source: Any) -> Policy:
         version, or its weights are not those of its network.
     """
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        arrays = files.arrays_of(content)
         digest = str(arrays.pop("digest"))
-        about = json.loads(str(arrays["about"]))
+        about = files.parsed(str(arrays["about"]))
         if about["format"] != FORMAT:
             raise ValueError(f"its format is {about['format']}")
-    except (ValueError, KeyError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:
+    except (ValueError, KeyError, TypeError) as error:
         reason = " ".join(str(error).split()).strip("'\".")
         raise InputError(
             f"policy = {source} is not allowed: it is no policy that can be read ({reason}); give "
@@ -89,7 +89,13 @@ def decoded(content: bytes, source: Any) -> Policy:
             f"policy = {source} is corrupt: its content is not what its digest says; restore it."
         )
     del arrays["about"]
-    return Policy(_network(about, arrays, source), arrays, _task(about, source), about["learned"])
+    learned = about.get("learned")
+    if not isinstance(learned, dict):
+        raise InputError(
+            f"policy = {source} is not allowed: its note on how it was learned is {learned!r}, and "
+            "must be names with values."
+        )
+    return Policy(_network(about, arrays, source), arrays, _task(about, source), learned)
 
 
 def _digest(arrays: Mapping[str, np.ndarray]) -> str:
@@ -165,7 +171,17 @@ def functions(policy: Policy) -> tuple[Any, Any]:
 
 
 def check(params: Any) -> Any:
-    """The same parameters, if they are positive and finite; otherwise an InputError."""
+    """Return the parameters if they are positive and finite; otherwise raise InputError."""
     for name in params._fields:
         errors.check_finite(f"learned.{name}", getattr(params, name), above=0)
     return params
+
+
+def law_of(content: bytes, source: Any) -> tuple[str, Law, Any]:
+    """Read a policy's file as a law: its label, the law and its parameters.
+
+    Raises:
+      InputError: as `decoded`.
+    """
+    found = decoded(content, source)
+    return label(found), Law(*functions(found), "taxels", check=check), parameters(found)

@@ -19,12 +19,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rps_jax import errors
-from rps_jax.control import law
-from rps_jax.control.law import Details, Observation, RPSParams, RPSState, Twist
+from rps_jax.control.base import Law, documented
+from rps_jax.control.laws import rps
+from rps_jax.control.laws.rps import RPSParams, RPSState
+from rps_jax.control.observation import Details, Observation, Twist
 
 KNOTS = 60  # offsets of a plan, by default
 
 
+@documented
 class GuidedParams(NamedTuple):
     """The parameters of the law, and the plan."""
 
@@ -46,12 +49,12 @@ class GuidedState(NamedTuple):
 
 
 def check(params: GuidedParams) -> GuidedParams:
-    """The same parameters, if they mean something.
+    """Return the parameters if they mean something.
 
     Raises:
-      InputError: as `law.check`, or for offsets that are no (J, 3) numbers, or held for no step.
+      InputError: as `rps.check`, or for offsets that are no (J, 3) numbers, or held for no step.
     """
-    law.check(params.law)
+    rps.check(params.law)
     errors.check_finite("guided.hold", params.hold, at_least=1)
     shape = np.shape(params.offsets)
     if len(shape) != 2 or shape[1] != 3 or not shape[0]:
@@ -72,14 +75,18 @@ def step(
     params: GuidedParams, state: GuidedState, seen: Observation
 ) -> tuple[GuidedState, Twist, Details]:
     """One control step: the law's twist and G1."""
-    memory, twist, details = law.step_with_details(params.law, state.law, seen)
+    memory, twist, details = rps.step_with_details(params.law, state.law, seen)
     offsets = jnp.asarray(params.offsets)
     which = jnp.floor(state.steps / params.hold).astype(jnp.int32)
     now = offsets[jnp.minimum(which, offsets.shape[0] - 1)]
     now = jnp.where(which < offsets.shape[0], now, 0.0)
     v_max, omega_max = params.law.v_max, params.law.omega_max
     by = Twist(v_max * now[0], v_max * now[1], omega_max * now[2])
-    led = law.saturate(params.law, Twist(*(a + b for a, b in zip(twist, by, strict=True))))
+    led = rps.saturate(params.law, Twist(*(a + b for a, b in zip(twist, by, strict=True))))
     alone = jnp.all(now == 0)
     twist = jax.tree.map(lambda a, b: jnp.where(alone, a, b), twist, led)
     return GuidedState(memory, state.steps + 1), twist, details
+
+
+LAW = Law(init, step, check=check)
+PRESETS = {"_guided": GuidedParams()}  # not offered: `rps ceiling` makes its plans

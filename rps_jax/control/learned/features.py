@@ -1,6 +1,6 @@
-"""What a learned law is told, what it keeps of it, and the numbers that its network sees.
+"""What a learned law observes, what it keeps of it, and the numbers that its network sees.
 
-A law that senses `taxels` is told the signal of every taxel beside what RPS is told. Between two
+A law that senses `taxels` observes the signal of every taxel beside what RPS observes. Between two
 control steps it remembers where it last felt the object, by odometry.
 
 The numbers of a network are of order 1: lengths are on logarithmic or tanh scales, directions are
@@ -15,8 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax.control import law
-from rps_jax.control.law import Observation, Twist
+from rps_jax.control.observation import Observation, TaxelObservation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot import skin as skins
@@ -29,34 +28,22 @@ _WHILE = 5.0  # [s] of the tanh scale of the time since contact
 _DRIFT = 0.01  # [m] of the tanh scale of a contact's way on the base between two decisions
 
 
-class TaxelObservation(NamedTuple):
-    """What a law that senses taxels may know: what RPS knows, and what each taxel answers."""
+def observed(
+    touch: Observation,
+    reading: Reading | SmoothReading,
+    skin: Skin,
+    state: SkinState,
+    placed: Footprint,
+) -> TaxelObservation:
+    """What a law observes that senses taxels, of an object's outline `placed` in the robot frame.
 
-    touch: Observation  # `in_contact` is () bool
-    signal: jax.Array  # (T,) [1] filtered relative change of capacitance; 0 of a dead taxel
-    line: jax.Array  # () bool: the contact is a line, longer than a point
-    period: float | jax.Array  # () [s] since the last control step
-
-    @classmethod
-    def of(
-        cls,
-        touch: Observation,
-        reading: Reading | SmoothReading,
-        skin: Skin,
-        state: SkinState,
-        placed: Footprint,
-        period: float | jax.Array,
-    ) -> TaxelObservation:
-        """What is told of a reading, for an object's outline `placed` in the robot frame.
-
-        A skin without taxels tells what perfect ones on the same boards would answer.
-        """
-        return cls(
-            touch._replace(in_contact=reading.contact_type != NONE),
-            skins.signals(skin, state, placed),
-            reading.contact_type == LINE,
-            period,
-        )
+    A skin without taxels answers as perfect ones on the same boards would.
+    """
+    return TaxelObservation(
+        touch._replace(in_contact=reading.contact_type != NONE),
+        skins.signals(skin, state, placed),
+        reading.contact_type == LINE,
+    )
 
 
 class Felt(NamedTuple):
@@ -82,7 +69,7 @@ class Felt(NamedTuple):
         return self._replace(
             p_world_contact=jnp.where(touch.in_contact, there, self.p_world_contact),
             touched=self.touched | touch.in_contact,
-            since=jnp.where(touch.in_contact, 0.0, self.since + seen.period),
+            since=jnp.where(touch.in_contact, 0.0, self.since + seen.touch.period),
             in_contact=touch.in_contact,
         )
 
@@ -129,12 +116,12 @@ def features(felt: Felt, action: jax.Array, seen: TaxelObservation) -> jax.Array
     Args:
       felt: what is remembered, after it has followed `seen`.
       action: (3,) [1] the last one.
-      seen: what is told.
+      seen: what it observes.
     """
     touch = seen.touch
     contact = felt.p_robot_contact(seen)
-    d = law.displacement(touch._replace(p_robot_contact=contact))
-    base = law.displacement(touch._replace(p_robot_contact=jnp.zeros_like(contact)))
+    d = displacement(touch._replace(p_robot_contact=contact))
+    base = displacement(touch._replace(p_robot_contact=jnp.zeros_like(contact)))
     drift = jnp.tanh((contact - felt.p_robot_before) / _DRIFT)
     kept = touch.in_contact & felt.before
     flags = jnp.stack([touch.in_contact, seen.line & touch.in_contact, felt.touched])

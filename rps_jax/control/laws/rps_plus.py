@@ -1,4 +1,4 @@
-"""RPS+: the law of `law`, which translates near its target, and searches a contact that it lost.
+"""RPS+: the law of `rps`, which translates near its target, and searches a contact that it lost.
 
 The tuned law loses worlds in two ways that touch alone can mend. Within arm's length of the target
 Eq. 6 turns the base to face the target while it drives on, and a wide object that touches off the
@@ -31,23 +31,19 @@ in the world it felt the object last, and for how many steps it has not.
 from __future__ import annotations
 
 import operator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from rps_jax import errors
-from rps_jax.control import law, switches
-from rps_jax.control.bounds import Bound
-from rps_jax.control.law import (
-    Details,
-    Observation,
-    RPSParams,
-    RPSState,
-    Temperatures,
-    Twist,
-)
+from rps_jax.control import switches
+from rps_jax.control.base import Bound, Law, documented
+from rps_jax.control.laws import rps
+from rps_jax.control.laws.rps import RPSParams, RPSState, Temperatures
+from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Scalar
 
 FACING = 0.3  # [rad] P3's facing
 REACH = 0.45  # [m] P3's reach: the base's front is 0.36 m before its middle
@@ -63,10 +59,11 @@ class _Warm(NamedTuple):
 _WARM = _Warm()
 
 
+@documented
 class RPSPlusParams(NamedTuple):
     """Parameters of RPS+; those of the law are the tuned ones, but for a faster approach."""
 
-    law: RPSParams = RPSParams.tuned()._replace(v_approach=0.03)
+    law: RPSParams = RPSParams.tuned()._replace(v_approach=0.03)  # of Eqs. 1-10
     d_near: float | jax.Array = 0.25  # [m] nearer than this it translates, P1
     press: float | jax.Array = 0.2  # [1] least share of the speed that goes forward, P2
     n_lost: float | jax.Array = 100  # [1] control steps without contact before P3: 2 s
@@ -74,12 +71,12 @@ class RPSPlusParams(NamedTuple):
     aside: float | jax.Array = 0.5  # [1] share of v_max with which it searches to the side, P3
 
     @property
-    def d_success(self) -> float | jax.Array:
+    def d_success(self) -> Any:
         """[m] Target reached."""
         return self.law.d_success
 
     @property
-    def v_max(self) -> float | jax.Array:
+    def v_max(self) -> Any:
         """[m/s] Bound on the speed."""
         return self.law.v_max
 
@@ -92,8 +89,8 @@ class RPSPlusState(NamedTuple):
     lost: jax.Array  # () int32 control steps since then; of the smooth law a float
 
 
-BOUNDS = {f"law.{name}": bound for name, bound in law.BOUNDS.items() if not bound.of} | {
-    "law.l_mr": law.BOUNDS["l_mr"]._replace(of="law.l_cr"),
+BOUNDS = {f"law.{name}": bound for name, bound in rps.BOUNDS.items() if not bound.of} | {
+    "law.l_mr": rps.BOUNDS["l_mr"]._replace(of="law.l_cr"),
     "d_near": Bound(0.05, 1, log=True),  # [m]
     "press": Bound(0, 1),  # [1]
     "n_lost": Bound(10, 2000, log=True),  # [1]
@@ -103,12 +100,12 @@ BOUNDS = {f"law.{name}": bound for name, bound in law.BOUNDS.items() if not boun
 
 
 def check(params: RPSPlusParams) -> RPSPlusParams:
-    """The same parameters, if scalars that mean something.
+    """Return the parameters if they are scalars that mean something.
 
     Raises:
       InputError: as `law.check`, or for a length, share or count that is negative.
     """
-    law.check(params.law)
+    rps.check(params.law)
     errors.check_finite("rps_plus.d_near", params.d_near, at_least=0)
     errors.check_finite("rps_plus.n_lost", params.n_lost, at_least=0)
     for name in ("press", "ahead", "aside"):
@@ -123,13 +120,13 @@ def init(params: RPSPlusParams, temperatures: Temperatures | None = None) -> RPS
     return RPSPlusState(state, jnp.zeros_like(state.p_robot_contact), lost)
 
 
-def translation(params: RPSPlusParams, d: jax.Array, yaw: jax.Array) -> Twist:
+def translation(params: RPSPlusParams, d: jax.Array, yaw: Scalar) -> Twist:
     """P2: the twist that takes the contact straight along d (2,) [m] of the world."""
     error = planar.wrap(planar.direction(d) - yaw)
     speed = params.law.K_v * planar.norm(d)
     forward = jnp.maximum(jnp.cos(error), params.press)
     still = jnp.zeros_like(error)
-    return law.saturate(params.law, Twist(speed * forward, speed * jnp.sin(error), still))
+    return rps.saturate(params.law, Twist(speed * forward, speed * jnp.sin(error), still))
 
 
 def search(
@@ -142,14 +139,14 @@ def search(
 
     `l` () [m] is the place on the skin where it was felt.
     """
-    soft = temperatures or law.HARD
+    soft = temperatures or rps.HARD
     angle, v_max = planar.direction(p_robot_felt), jnp.asarray(params.law.v_max)
     faces = switches.below(jnp.abs(angle), FACING, temperatures and _WARM.facing)
     ahead = switches.choose(faces, params.ahead * v_max, 0.0)
     far = switches.above(planar.norm(p_robot_felt), REACH, soft.d_th)
     side = jnp.sign(l) if temperatures is None else jnp.tanh(l / soft.sgn)
     turning = switches.choose(far, angle, 0.0)
-    return law.saturate(params.law, Twist(ahead, params.aside * v_max * side, turning))
+    return rps.saturate(params.law, Twist(ahead, params.aside * v_max * side, turning))
 
 
 def step(
@@ -162,8 +159,8 @@ def step(
 
     With `temperatures` all switches are smooth, as those of the law are, and the twists mix.
     """
-    soft = temperatures or law.HARD
-    memory, twist, details = law.step_with_details(params.law, state.law, seen, temperatures)
+    soft = temperatures or rps.HARD
+    memory, twist, details = rps.step_with_details(params.law, state.law, seen, temperatures)
     contact, touching = memory.p_robot_contact, jnp.asarray(seen.in_contact)
     if temperatures is not None:
         touching = touching.astype(memory.l_th.dtype)
@@ -171,7 +168,7 @@ def step(
     p_world_felt = switches.choose(touching, p_world_contact, state.p_world_felt)
     idle = switches.either(touching, switches.inverse(memory.touched))
     lost = switches.choose(idle, 0, state.lost + 1)
-    d = law.displacement(seen._replace(p_robot_contact=contact))
+    d = displacement(seen._replace(p_robot_contact=contact))
 
     kept = switches.both(memory.touched, jnp.asarray(params.law.keep_contact) > 0)
     pushing = switches.either(touching, kept)
@@ -185,7 +182,9 @@ def step(
             search(params, p_robot_felt, contact[1], temperatures),
         ),
     ):
-        twist = Twist(
-            *(switches.choose(condition, a, b) for a, b in zip(other, twist, strict=True))
-        )
+        twist = switches.select(condition, other, twist)
     return RPSPlusState(memory, p_world_felt, lost), twist, details
+
+
+LAW = Law(init, step, check=check, bounds=tuple(BOUNDS.items()), temperatures=Temperatures())
+PRESETS = {"rps_plus": RPSPlusParams()}

@@ -19,13 +19,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax import errors
-from rps_jax.control.bounds import Bound
-from rps_jax.control.law import Details, Twist
-from rps_jax.control.rivals.aps import TrackedObservation
+from rps_jax.control.base import Bound, Law, check_signs, documented
+from rps_jax.control.observation import Details, PoseObservation, Twist
 from rps_jax.geometry import planar
 
 
+@documented
 class DipoleParams(NamedTuple):
     """Parameters about the dipole field, which has none itself; the lookahead is H. and S.'s."""
 
@@ -52,15 +51,12 @@ class DipoleState(NamedTuple):
 
 
 def check(params: DipoleParams) -> DipoleParams:
-    """The same parameters, if scalars that mean something.
+    """Return the parameters if they are scalars that mean something.
 
     Raises:
       InputError: a value is not a finite number, or is out of bounds.
     """
-    for name in params._fields:
-        bounds = {"at_least": 0} if name == "beyond" else {"above": 0}
-        errors.check_finite(f"dipole.{name}", getattr(params, name), **bounds)
-    return params
+    return check_signs("dipole", params, ("K_h", "lookahead", "v_max", "omega_max", "d_success"))
 
 
 def init(params: DipoleParams) -> DipoleState:
@@ -69,7 +65,7 @@ def init(params: DipoleParams) -> DipoleState:
 
 
 def step(
-    params: DipoleParams, state: DipoleState, observation: TrackedObservation
+    params: DipoleParams, state: DipoleState, observation: PoseObservation
 ) -> tuple[DipoleState, Twist, Details]:
     """One control step: along the field line through the robot, facing the object."""
     seen, thing = observation.touch, observation.p_world_object
@@ -93,3 +89,7 @@ def step(
         params.v_max * jnp.cos(heading), params.v_max * jnp.sin(heading), params.K_h * error
     ).within(params.v_max, params.omega_max)
     return DipoleState(start, jnp.ones_like(state.started)), twist, Details.of(seen)
+
+
+LAW = Law(init, step, "pose", check=check, bounds=tuple(BOUNDS.items()))
+PRESETS = {"dipole": DipoleParams()}

@@ -26,15 +26,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax import errors
-from rps_jax.control import law
-from rps_jax.control.bounds import Bound
-from rps_jax.control.law import Details, LoadedObservation, Twist
+from rps_jax.control.base import Bound, Law, check_signs, documented
+from rps_jax.control.observation import Details, ForceObservation, Twist, displacement
 from rps_jax.geometry import planar
 
 _POSITIVE = ("v_max", "omega_max", "d_success")
 
 
+@documented
 class PublishedForcePushParams(NamedTuple):
     """Parameters of Force Push: its authors', of their experiments, f_min of their simulations."""
 
@@ -74,16 +73,12 @@ class PublishedForcePushState(NamedTuple):
 
 
 def check(params: PublishedForcePushParams) -> PublishedForcePushParams:
-    """The same parameters, if scalars that mean something.
+    """Return the parameters if they are scalars that mean something.
 
     Raises:
       InputError: a value is not a finite number, or is out of bounds.
     """
-    for name in params._fields:
-        bounds = {} if name in ("k_theta", "k_y") else {"at_least": 0}
-        bounds = {"above": 0} if name in _POSITIVE else bounds
-        errors.check_finite(f"force_push_published.{name}", getattr(params, name), **bounds)
-    return params
+    return check_signs("force_push_published", params, _POSITIVE, ("k_theta", "k_y"))
 
 
 def init(params: PublishedForcePushParams) -> PublishedForcePushState:
@@ -129,14 +124,14 @@ def yielding(params: PublishedForcePushParams, v_world: jax.Array, f_world: jax.
 def step(
     params: PublishedForcePushParams,
     state: PublishedForcePushState,
-    observation: LoadedObservation,
+    observation: ForceObservation,
 ) -> tuple[PublishedForcePushState, Twist, Details]:
     """One control step. Before the first touch it goes straight ahead."""
     seen = observation.touch
     touching = jnp.asarray(seen.in_contact)
     contact = jnp.where(touching, seen.p_robot_contact, state.p_robot_contact)
     told = seen._replace(p_robot_contact=contact)
-    d = law.displacement(told)
+    d = displacement(told)
     p_world_contact = seen.p_world_target - d
     f_world = -planar.rotate(seen.yaw, observation.f_robot)  # on the object
 
@@ -150,7 +145,7 @@ def step(
 
     left = jnp.stack([-jnp.sin(theta_d), jnp.cos(theta_d)])
     offset = jnp.sum((p_world_contact - p_world_start) * left)
-    theta_p = steered(params, state.theta_p, f_world, theta_d, offset, observation.period)
+    theta_p = steered(params, state.theta_p, f_world, theta_d, offset, seen.period)
     theta_p = jnp.where(pushed, theta_p, 0.0)
     angle = theta_d + theta_p
     v_world = params.v_max * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
@@ -162,3 +157,7 @@ def step(
     twist = jax.tree.map(lambda a, b: jnp.where(touched, a, b), push, ahead)
     state = PublishedForcePushState(p_world_start, theta_d, theta_p, contact, touched, pushed)
     return state, twist, Details.of(told)._replace(gamma=theta_p)
+
+
+LAW = Law(init, step, "force", check=check, bounds=tuple(BOUNDS.items()))
+PRESETS = {"force_push_published": PublishedForcePushParams()}

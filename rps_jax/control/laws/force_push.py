@@ -22,15 +22,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax import errors
-from rps_jax.control import law
-from rps_jax.control.bounds import Bound
-from rps_jax.control.law import Details, Observation, Twist
+from rps_jax.control.base import Bound, Law, check_signs, documented
+from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 
 _POSITIVE = ("drift", "angle_max", "v_max", "omega_max", "d_success")
 
 
+@documented
 class ForcePushParams(NamedTuple):
     """Parameters of Force Push; the gains are its authors', in their experiments."""
 
@@ -69,16 +68,12 @@ class ForcePushState(NamedTuple):
 
 
 def check(params: ForcePushParams) -> ForcePushParams:
-    """The same parameters, if scalars that mean something.
+    """Return the parameters if they are scalars that mean something.
 
     Raises:
       InputError: a value is not a finite number, or is out of bounds.
     """
-    for name in params._fields:
-        bounds = {} if name in ("k_theta", "k_y") else {"at_least": 0}
-        bounds = {"above": 0} if name in _POSITIVE else bounds
-        errors.check_finite(f"force_push.{name}", getattr(params, name), **bounds)
-    return params
+    return check_signs("force_push", params, _POSITIVE, free=("k_theta", "k_y"))
 
 
 def init(params: ForcePushParams) -> ForcePushState:
@@ -95,7 +90,7 @@ def step(
     touching = jnp.asarray(seen.in_contact)
     contact = jnp.where(touching, seen.p_robot_contact, state.p_robot_contact)
     told = seen._replace(p_robot_contact=contact)
-    d = law.displacement(told)
+    d = displacement(told)
     p_world_contact = seen.p_world_target - d
 
     along = jnp.stack([jnp.cos(state.theta_d), jnp.sin(state.theta_d)])
@@ -131,3 +126,7 @@ def step(
         p_world_start, theta_d, theta_p, contact, l_mean, seen.p_world_robot, touched
     )
     return state, twist, Details.of(told)._replace(gamma=theta_p)
+
+
+LAW = Law(init, step, check=check, bounds=tuple(BOUNDS.items()))
+PRESETS = {"force_push": ForcePushParams()}

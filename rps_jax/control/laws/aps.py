@@ -19,13 +19,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax import errors
-from rps_jax.control import law
-from rps_jax.control.law import Details, Observation, Twist
+from rps_jax.control.base import Law, check_signs, documented
+from rps_jax.control.observation import Details, PoseObservation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.robot.shell import HALF_LENGTH
 
 
+@documented
 class APSParams(NamedTuple):
     """Parameters of APS; those marked * are ours, where the publication is silent."""
 
@@ -75,26 +75,14 @@ class APSState(NamedTuple):
         )
 
 
-class TrackedObservation(NamedTuple):
-    """What APS may know: what RPS knows, and where and how large the object is."""
-
-    touch: Observation
-    p_world_object: jax.Array  # (2,) [m]
-    r_object: jax.Array  # () [m] radius of the object's outline
-    period: float | jax.Array  # () [s] since the last step
-
-
 def check(params: APSParams) -> APSParams:
-    """The same parameters, if scalars that mean something.
+    """Return the parameters if they are scalars that mean something.
 
     Raises:
       InputError: a value is not a finite number, or is out of bounds.
     """
     positive = ("alpha_variance", "alpha_count", "v_max", "omega_max", "d_success")
-    for name in params._fields:
-        bounds = {"above": 0} if name in positive else {"at_least": 0}
-        errors.check_finite(f"aps.{name}", getattr(params, name), **bounds)
-    return params
+    return check_signs("aps", params, positive)
 
 
 def predictive(params: APSParams, state: APSState) -> tuple[jax.Array, jax.Array]:
@@ -151,20 +139,20 @@ def _learn(
     )
 
 
-def _aim(params: APSParams, observation: TrackedObservation) -> jax.Array:
+def _aim(params: APSParams, observation: PoseObservation) -> jax.Array:
     """T (2,) [m]: beyond the target, seen from the contact point, or else from the object."""
     seen = observation.touch
     angle = jnp.where(
         seen.in_contact,
-        planar.direction(law.displacement(seen)),
+        planar.direction(displacement(seen)),
         planar.direction(seen.p_world_target - observation.p_world_object),
     )
     beyond = params.aim_beyond * observation.r_object
     return seen.p_world_target + beyond * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
 
-def aps_step(
-    params: APSParams, state: APSState, observation: TrackedObservation
+def step(
+    params: APSParams, state: APSState, observation: PoseObservation
 ) -> tuple[APSState, Twist, Details]:
     """One control step of APS.
 
@@ -189,7 +177,7 @@ def aps_step(
     heading = heading - jnp.where(near, correction, 0.0) + a_OT - seen.yaw
 
     yaw_error = planar.wrap(planar.direction(-from_object) - seen.yaw)
-    rate = jnp.where(first, 0.0, planar.wrap(yaw_error - state.yaw_error) / observation.period)
+    rate = jnp.where(first, 0.0, planar.wrap(yaw_error - state.yaw_error) / seen.period)
     omega = params.K_p * yaw_error + params.K_d * rate
     speed = jnp.maximum(params.v_max / (1 + jnp.abs(state.gamma_mean)), params.v_min)
     speed = jnp.where(jnp.abs(yaw_error) > params.yaw_error_max, 0.0, speed)
@@ -200,3 +188,7 @@ def aps_step(
     )
     details = Details.of(seen)._replace(gamma=state.gamma)
     return state._replace(alpha=alpha, yaw_error=yaw_error), twist, details
+
+
+LAW = Law(APSState.init, step, "pose", check=check)
+PRESETS = {"aps": APSParams()}

@@ -13,13 +13,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax import errors
-from rps_jax.control import law
-from rps_jax.control.bounds import Bound
-from rps_jax.control.law import Details, Observation, Twist
+from rps_jax.control.base import Bound, Law, check_signs, documented
+from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 
 
+@documented
 class PursuitParams(NamedTuple):
     """Parameters of pursuit; the bounds are those of RPS."""
 
@@ -40,15 +39,12 @@ BOUNDS = {
 
 
 def check(params: PursuitParams) -> PursuitParams:
-    """The same parameters, if scalars that mean something.
+    """Return the parameters if they are scalars that mean something.
 
     Raises:
       InputError: a value is not a finite number, or is out of bounds.
     """
-    for name in params._fields:
-        bounds = {"at_least": 0} if name in ("press", "v_approach") else {"above": 0}
-        errors.check_finite(f"pursuit.{name}", getattr(params, name), **bounds)
-    return params
+    return check_signs("pursuit", params, ("K_v", "K_h", "v_max", "omega_max", "d_success"))
 
 
 def init(params: PursuitParams) -> tuple[()]:
@@ -65,7 +61,7 @@ def step(
     keeps pressing on the object while it turns. Without contact it goes straight ahead.
     """
     contact = jnp.where(seen.in_contact, seen.p_robot_contact, 0.0)
-    d = law.displacement(seen._replace(p_robot_contact=contact))
+    d = displacement(seen._replace(p_robot_contact=contact))
     error = planar.wrap(planar.direction(d) - seen.yaw)
     speed = jnp.minimum(params.K_v * planar.norm(d), params.v_max)
     v_contact = speed * jnp.stack([jnp.maximum(jnp.cos(error), params.press), jnp.sin(error)])
@@ -75,3 +71,7 @@ def step(
     twist = jax.tree.map(lambda a, b: jnp.where(seen.in_contact, a, b), push, ahead)
     details = Details.of(seen._replace(p_robot_contact=contact))
     return state, twist, details._replace(gamma=error)
+
+
+LAW = Law(init, step, check=check, bounds=tuple(BOUNDS.items()))
+PRESETS = {"pursuit": PursuitParams()}

@@ -19,13 +19,13 @@ import jax.numpy as jnp
 
 from rps_jax import errors
 from rps_jax.control import switches
-from rps_jax.control.bounds import Bound
+from rps_jax.control.base import Bound, Law, documented
+from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
-
-# Inputs are held within this distance [m] so that no finite float32 overflows on the way.
-_WORLD_SIZE = 1e9
+from rps_jax.geometry.arrays import Array, Bool, Float
 
 
+@documented
 class RPSParams(NamedTuple):
     """Parameters of the law, all floats, all leaves of a pytree (any may be batched).
 
@@ -65,7 +65,7 @@ class RPSParams(NamedTuple):
 
     @classmethod
     def tuned(cls) -> RPSParams:
-        """Tuned by evolution in random worlds of boxes and cylinders (`sweeps/README.md` says how).
+        """Tuned by evolution in random worlds of boxes and cylinders (`sweeps/tuned` says how).
 
         Full speed until the target. Nearer than d_th it drives straight on or, beyond l_cr, almost
         purely sideways; Eq. 5 acts only farther away. A contact that is lost is acted upon as if it
@@ -134,9 +134,10 @@ class Temperatures(NamedTuple):
 class RPSState(NamedTuple):
     """What the law remembers between two control steps."""
 
-    l_th: jax.Array  # () [m] dynamic threshold: l_cr normally, l_mr while realigning
-    p_robot_contact: jax.Array  # (2,) [m] the last contact, in the robot frame
-    touched: jax.Array  # () bool: the skin has felt the object at least once; smooth: a weight
+    l_th: Float[Array, "*B"]  # [m] dynamic threshold: l_cr normally, l_mr while realigning
+    p_robot_contact: Float[Array, "*B 2"]  # [m] the last contact, in the robot frame
+    # The skin has felt the object at least once; smooth: a weight.
+    touched: Bool[Array, "*B"] | Float[Array, "*B"]
 
     @classmethod
     def init(cls, params: RPSParams, temperatures: Temperatures | None = None) -> RPSState:
@@ -146,69 +147,8 @@ class RPSState(NamedTuple):
         return cls(l_th, jnp.zeros(2, l_th.dtype), touched)
 
 
-class Observation(NamedTuple):
-    """What the law may know: odometry, touch and the target."""
-
-    p_world_robot: jax.Array  # (2,) [m]
-    yaw: jax.Array  # () [rad] heading of the robot in the world
-    p_robot_contact: jax.Array  # (2,) [m] contact location; ignored unless in_contact
-    in_contact: jax.Array  # () bool; for the smooth law also a weight from 0 to 1
-    p_world_target: jax.Array  # (2,) [m]
-
-
-class LoadedObservation(NamedTuple):
-    """What a law that feels a force may know besides."""
-
-    touch: Observation
-    f_robot: jax.Array  # (2,) [N] of the object on the base, in its frame: see `robot.load_cell`
-    period: float | jax.Array  # () [s] since the last step
-
-
-class Twist(NamedTuple):
-    """Commanded velocity of the base, in the robot frame."""
-
-    v_x: float | jax.Array  # () [m/s] forward
-    v_y: float | jax.Array  # () [m/s] left
-    omega: float | jax.Array  # () [rad/s] counter-clockwise
-
-    @classmethod
-    def moving(cls, p_robot: jax.Array, v_robot: jax.Array, omega: jax.Array) -> Twist:
-        """What moves the base's point `p_robot` (2,) [m] at `v_robot` (2,) [m/s], and turns it."""
-        return cls(v_robot[0] + omega * p_robot[1], v_robot[1] - omega * p_robot[0], omega)
-
-    def within(self, v_max: float | jax.Array, omega_max: float | jax.Array) -> Twist:
-        """(v_x, v_y) scaled as a vector to norm v_max [m/s], omega clipped to omega_max [rad/s]."""
-        v, most = jnp.stack([self.v_x, self.v_y], axis=-1), jnp.asarray(v_max)
-        v = v * (most / jnp.maximum(planar.norm(v), most))[..., None]
-        omega = jnp.clip(self.omega, -jnp.asarray(omega_max), omega_max)
-        return Twist(v[..., 0], v[..., 1], omega)
-
-    def in_world(self, yaw: jax.Array) -> jax.Array:
-        """Velocities (3,) [m/s, m/s, rad/s] in the world, of a base with the heading `yaw`."""
-        v_world = planar.rotate(yaw, jnp.stack([self.v_x, self.v_y]))
-        return jnp.stack([*v_world, jnp.asarray(self.omega)])
-
-
-class Details(NamedTuple):
-    """The quantities behind one twist, for plots and tests."""
-
-    l: jax.Array  # noqa: E741  () [m] lateral contact location, the paper's symbol
-    distance: jax.Array  # () [m] ||d||, contact point to target
-    a_r: jax.Array  # () [1] adaptive rate
-    gamma: jax.Array  # () [rad] steering angle
-    realigning: jax.Array  # () bool: in the Realignment State; smooth: a weight
-
-    @classmethod
-    def of(cls, observation: Observation) -> Details:
-        """Of a strategy that has neither an adaptive rate nor a steering angle: both are 0."""
-        distance = planar.norm(displacement(observation))
-        zero = jnp.zeros_like(distance)
-        l = observation.p_robot_contact[..., 1]  # noqa: E741
-        return cls(l, distance, zero, zero, zero > 0)
-
-
 def check(params: RPSParams) -> RPSParams:
-    """The same parameters, if scalars that mean something.
+    """Return the parameters if they are scalars that mean something.
 
     Raises:
       InputError: a value is not a number, negative where it must not be, or infinite (only
@@ -237,22 +177,13 @@ def _sgn(params: RPSParams, x: jax.Array, temperature: Any = None) -> jax.Array:
     return jnp.tanh(x / temperature)
 
 
-def displacement(observation: Observation) -> jax.Array:
-    """Eq. 4: d = p^W_T - (p^W_R + R^W_R p^R_C), from contact to target, (2,) [m] in the world."""
-    p_world_contact = observation.p_world_robot + planar.rotate(
-        observation.yaw, observation.p_robot_contact
-    )
-    d = observation.p_world_target - p_world_contact
-    return jnp.clip(d, -_WORLD_SIZE, _WORLD_SIZE)
-
-
 def adaptive_rate(
     params: RPSParams,
-    l: jax.Array,  # noqa: E741
-    distance: jax.Array,
+    l: Float[Array, "*B"],  # noqa: E741
+    distance: Float[Array, "*B"],
     temperatures: Temperatures | None = None,
-) -> jax.Array:
-    """Eq. 5: a_r (...) [1] from the lateral contact location l [m] and ||d|| [m]."""
+) -> Float[Array, "*B"]:
+    """Eq. 5: a_r [1] from the lateral contact location l [m] and ||d|| [m]."""
     soft = temperatures or HARD
     logistic = jax.nn.sigmoid((jnp.abs(l) - params.beta) * params.k)
     a_r = (params.zeta + (params.eta - params.zeta) * logistic) * _sgn(params, l, soft.sgn)
@@ -260,15 +191,19 @@ def adaptive_rate(
     return switches.choose(far, a_r, 0.0) * params.reactive
 
 
-def linear_velocity(v_star: jax.Array, a_r: jax.Array) -> tuple[jax.Array, jax.Array]:
+def linear_velocity(
+    v_star: float | Float[Array, "*B"], a_r: float | Float[Array, "*B"]
+) -> tuple[Float[Array, "*B"], Float[Array, "*B"]]:
     """Eqs. 1-2: (v_x, v_y) [m/s] of norm v_star [m/s] and slope v_y / v_x = a_r [1]."""
     a_r = jnp.asarray(a_r) * 1.0  # a float, of the width it came in
     length = planar.norm(jnp.stack([jnp.ones_like(a_r), a_r], axis=-1))
     return v_star / length, v_star * (a_r / length)
 
 
-def steering_angle(params: RPSParams, d: jax.Array, yaw: jax.Array) -> jax.Array:
-    """Eqs. 7-8: gamma = K_h (theta* - theta) [rad], theta* the direction of d (..., 2) [m].
+def steering_angle(
+    params: RPSParams, d: Float[Array, "*B 2"], yaw: float | Float[Array, "*B"]
+) -> Float[Array, "*B"]:
+    """Eqs. 7-8: gamma = K_h (theta* - theta) [rad], theta* the direction of d [m].
 
     The heading error is wrapped to [-pi, pi). The paper's tangent changes sign beyond pi / 2,
     where the robot would turn away from its target, so gamma is held within +-gamma_max.
@@ -277,7 +212,7 @@ def steering_angle(params: RPSParams, d: jax.Array, yaw: jax.Array) -> jax.Array
     return jnp.clip(gamma, -jnp.asarray(params.gamma_max), params.gamma_max)
 
 
-def realignment_gain(params: RPSParams, l: jax.Array) -> jax.Array:  # noqa: E741
+def realignment_gain(params: RPSParams, l: Float[Array, "*B"]) -> Float[Array, "*B"]:  # noqa: E741
     """Eq. 10: sigma = 1 - |l| / l_cr [1] of l [m], zero in the critical region."""
     return 1.0 - jnp.minimum(jnp.abs(l), params.l_cr) / params.l_cr
 
@@ -354,7 +289,7 @@ def step_with_details(
     away = switches.above(details.distance, params.d_success, soft.arrive, operator.ge)
     pushing = switches.either(in_contact, switches.both(kept, away))
     ahead = Twist(switches.choose(state.touched, params.v_lost, params.v_approach), 0.0, 0.0)
-    twist = jax.tree.map(lambda a, b: switches.choose(pushing, a, b), push, ahead)
+    twist = switches.select(pushing, push, ahead)
     state = RPSState(
         l_th=switches.choose(pushing, l_th, state.l_th),
         p_robot_contact=contact,
@@ -402,3 +337,17 @@ def step(
     """
     state, twist, _ = step_with_details(params, state, observation, temperatures)
     return state, twist
+
+
+LAW = Law(
+    RPSState.init,
+    step_with_details,
+    check=check,
+    bounds=tuple(BOUNDS.items()),
+    temperatures=Temperatures(),
+)
+PRESETS = {
+    "rps": RPSParams.paper(),
+    "rps_tuned": RPSParams.tuned(),
+    "nps": RPSParams.nps(),
+}

@@ -1,0 +1,102 @@
+"""What a law is: two pure functions, what it senses, and within which bounds it is tuned."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, TypeVar
+
+import jax
+import numpy as np
+
+from rps_jax import errors
+from rps_jax.control.observation import Details, Twist
+from rps_jax.robot.load_cell import LoadCell
+
+T = TypeVar("T")
+Params = Any  # a pytree of numbers, of a class of the law's own, with `d_success` [m]
+
+# What a law senses: where the skin is touched (`Observation`), what each taxel answers as well
+# (`TaxelObservation`), the contact's force as well (`ForceObservation`), or the object's place and
+# size (`PoseObservation`). All know odometry and the target.
+Senses = Literal["touch", "taxels", "force", "pose"]
+
+
+class Bound(NamedTuple):
+    """The interval in which a parameter is tuned."""
+
+    low: float
+    high: float
+    log: bool = False  # evenly in its logarithm
+    of: str = ""  # as a share of this other parameter
+
+
+def documented(kind: type[T]) -> type[T]:
+    """Give the fields of a NamedTuple the comments behind them as docstrings, for `help`."""
+    with contextlib.suppress(OSError):  # there is no source
+        text = Path(str(sys.modules[kind.__module__].__file__)).read_text("utf-8")
+        own = text.partition(f"\nclass {kind.__name__}(")[2].partition("\n\n\n")[0]
+        for name, comment in re.findall(r"^    (\w+): .*?  # (.+)$", own, re.MULTILINE):
+            getattr(kind, name).__doc__ = comment
+    return kind
+
+
+def numbers(params: Params) -> dict[str, Any]:
+    """Leaves of parameters by their place in the pytree, as `gains.k`."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(params)
+    return {jax.tree_util.keystr(at, simple=True, separator="."): leaf for at, leaf in leaves}
+
+
+def check_finite(params: Params) -> Params:
+    """Return the parameters if all their leaves are finite numbers.
+
+    Raises:
+      InputError: one is not.
+    """
+    for name, leaf in numbers(params).items():
+        for value in np.ravel(leaf):
+            errors.check_finite(name, value)
+    return params
+
+
+def check_signs(
+    law: str, params: Params, positive: Sequence[str], free: Sequence[str] = ()
+) -> Params:
+    """Return the parameters if they are finite scalars of the right signs.
+
+    Args:
+      law: its name, for the error.
+      params: of one level.
+      positive: names of those that must be above 0.
+      free: names of those of any sign; all others must not be negative.
+
+    Raises:
+      InputError: one is not such a number.
+    """
+    for name, value in params._asdict().items():
+        bounds = {} if name in free else {"at_least": 0}
+        bounds = {"above": 0} if name in positive else bounds
+        errors.check_finite(f"{law}.{name}", value, **bounds)
+    return params
+
+
+class Law(NamedTuple):
+    """A pushing law as two pure functions of one world.
+
+    It is static: a change compiles another program. The parameters of a law are a pytree of
+    numbers of a class of their own, which may be nested; the class selects the law. Their field or
+    property `d_success` [m] is the distance to the target at which a trial has succeeded.
+    """
+
+    init: Callable[[Any], Any]  # params -> memory
+    step: Callable[[Any, Any, Any], tuple[Any, Twist, Details]]  # params, memory, observation
+    senses: Senses = "touch"
+    check: Callable[[Any], Any] = check_finite  # raises InputError for params that mean nothing
+    bounds: tuple[tuple[str, Bound], ...] = ()  # of the parameters that may be tuned
+    # Of the smooth form: `init` and `step` then take them as `temperatures`. None: it has none.
+    temperatures: Any = None
+    smooth: bool = False  # it is that form, and observes the weight of a contact
+    cell: LoadCell = LoadCell()  # by which it senses a force

@@ -1,0 +1,395 @@
+"""Which laws there are: those of this package, those that were registered, and those of files.
+
+Every file of `control.laws` is a law of the package, and every shipped policy is one. One grammar
+of text names a law everywhere (`named`): `rps`, `rps_tuned`, `mine.py:P`, `policy.npz`, each with
+changes, as `rps,K_h=0.3` or `pursuit,mine.json`.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib
+import importlib.util
+import pkgutil
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+import jax
+import numpy as np
+
+from rps_jax import errors
+from rps_jax.control import laws, trying
+from rps_jax.control.base import Law, Params, Senses, numbers
+from rps_jax.control.learned import policy
+from rps_jax.errors import InputError
+from rps_jax.record import files
+
+LawLike = str | Any  # a law's text, or parameters of its class
+LawsLike = str | Any | Sequence[Any] | Mapping[str, Any]  # one or several of them, or with names
+
+LAWS: dict[str, Params] = {}  # parameters of all laws that are offered, by name
+_INNER: dict[str, Params] = {}  # those of the package that are not offered, likewise
+_OF: dict[type, Law] = {}  # by class of parameters
+_SOURCES: dict[type, dict[str, str]] = {}  # by class of parameters: the file it was loaded from
+
+
+def _find() -> None:
+    """Take the laws of the package and the policies that come with it."""
+    for found in pkgutil.iter_modules(laws.__path__):
+        module = importlib.import_module(f"{laws.__name__}.{found.name}")
+        for name, params in module.PRESETS.items():
+            _OF[type(params)] = module.LAW
+            (_INNER if name.startswith("_") else LAWS)[name] = params
+    for name, path in policy.SHIPPED.items():
+        _, law, params = policy.law_of(path.read_bytes(), path)
+        _OF[type(params)], LAWS[name] = law, params
+
+
+_find()
+_OWN = tuple(LAWS)
+
+
+# --- parameters ----------------------------------------------------------------------------
+
+
+def as_json(params: Params) -> dict[str, Any]:
+    """Numbers of parameters by their place, as JSON has them: floats, and lists of floats."""
+    return {name: np.asarray(leaf, float).tolist() for name, leaf in numbers(params).items()}
+
+
+def changed(params: Params, changes: Mapping[str, Any]) -> Params:
+    """Replace parameters at some places of the pytree, named as in `numbers`.
+
+    Raises:
+      InputError: there is no such place.
+    """
+    known = numbers(params)
+    for name in changes:
+        errors.check_name(f"parameter of {type(params).__name__}", name, known)
+    leaves = [changes.get(name, leaf) for name, leaf in known.items()]
+    return jax.tree.unflatten(jax.tree.structure(params), leaves)
+
+
+def law_of(params: Params) -> Law:
+    """Look up the law that parameters belong to, by their class.
+
+    Raises:
+      InputError: they belong to none.
+    """
+    kind = type(params)
+    if kind not in _OF:
+        known = ", ".join(known.__name__ for known in _OF)
+        raise InputError(
+            f"params of class {kind.__name__} belong to no law: give {known}, or register theirs "
+            "with register_law."
+        )
+    return _OF[kind]
+
+
+def of_class(kind: type) -> Law:
+    """Look up the law that a class of parameters belongs to."""
+    return _OF[kind]
+
+
+def checked(params: Params) -> Params:
+    """Return the parameters if their law can be traced and they mean something to it.
+
+    Raises:
+      InputError: they belong to no law, mean nothing, or its functions return something else than
+        a trial needs.
+    """
+    law = law_of(params)
+    trying.check_law(law.init, law.step, law.senses, params)
+    law.check(params)
+    return params
+
+
+def smooth_law(law: Law, temperatures: Any = None) -> Law:
+    """Smooth form of a law, for the derivatives of what it does.
+
+    Outcomes are judged as ever. With a `SmoothSkin` all that leads from the parameters to a
+    snapshot's twist is smooth, and what it saw of the contact, in `reading` and `details`.
+
+    Args:
+      law: one that has a smooth form.
+      temperatures: of its switches; None: its own.
+
+    Raises:
+      InputError: it has none, or a temperature is not a positive length.
+    """
+    if law.temperatures is None:
+        soft = [name for name, params in LAWS.items() if law_of(params).temperatures is not None]
+        raise InputError(
+            f"this law has no smooth form to be differentiated: choose {', '.join(soft)}."
+        )
+    return _smooth(law, law.temperatures if temperatures is None else temperatures)
+
+
+@functools.cache  # equal temperatures are one law, and so one compiled program
+def _smooth(law: Law, temperatures: Any) -> Law:
+    temperatures.check()
+    init, step = (functools.partial(f, temperatures=temperatures) for f in (law.init, law.step))
+    return law._replace(init=init, step=step, smooth=True)
+
+
+def register_law(name: str, law: Law, params: Params) -> None:
+    """Make a law of one's own known, to be used as `rps` is.
+
+    Args:
+      name: what it is called; registered again, it replaces what was called so.
+      law: its two functions, and what it is.
+      params: its parameters: a pytree of finite numbers (or arrays of them) of a class of its own,
+        as a NamedTuple, which may be nested, with a field or property `d_success` [m].
+
+    Raises:
+      InputError: the name is one of this package's, the parameters are not such, or their class is
+        that of another law.
+
+    Example:
+      >>> from typing import NamedTuple
+      >>> from rps_jax import Details, Law, Twist, register_law
+      >>> class Ahead(NamedTuple):
+      ...     v: float = 0.05  # [m/s]
+      ...     d_success: float = 0.05  # [m]
+      >>> def step(params, memory, seen):
+      ...     return memory, Twist(params.v, 0.0, 0.0), Details.of(seen)
+      >>> register_law("ahead", Law(lambda params: (), step), Ahead())
+    """
+    if not isinstance(name, str) or not isinstance(law, Law):
+        raise InputError(f"law {name!r} = {law!r} is not allowed: give a name and a Law.")
+    errors.check_name(f"senses of law '{name}'", law.senses, get_args(Senses))
+    if name in _OWN:
+        raise InputError(f"law name '{name}' is not allowed: {', '.join(_OWN)} are this package's.")
+    kind, leaves = type(params), jax.tree.leaves(params)
+    own = kind not in (dict, list, tuple) and leaves != [params]
+    if not own or not hasattr(params, "d_success") or not all(map(_is_number, leaves)):
+        raise InputError(
+            f"params = {params} of law '{name}' is not allowed: give a pytree of numbers of a "
+            "class of its own, as a NamedTuple, with a field or property d_success [m]."
+        )
+    errors.check_finite(f"d_success of law '{name}'", params.d_success, above=0, unit="m")
+    law.check(params)
+    for other, theirs in LAWS.items():
+        if other != name and type(theirs).__name__ == kind.__name__ and law_of(theirs) != law:
+            raise InputError(
+                f"params of law '{name}' are not allowed: their class {kind.__name__} is that of "
+                f"'{other}'; give them one with a name of its own."
+            )
+    before = LAWS.get(name)
+    LAWS[name], _OF[kind] = params, law
+    if before is not None and type(before) not in map(type, LAWS.values()):
+        del _OF[type(before)]
+
+
+def _is_number(leaf: Any) -> bool:
+    return np.issubdtype(np.asarray(leaf).dtype, np.number)
+
+
+# --- laws by their texts -------------------------------------------------------------------
+
+
+def named(text: str) -> tuple[str, Params]:
+    """Read a law's text: its label and its parameters.
+
+    A text is the name of a law, `FILE.py:CLASS` or a policy's `FILE.npz`, followed by any number of
+    changes, each `,NAME=VALUE` or `,FILE.json` with names and values, as `rps tune` writes them. A
+    file of Python is run; it must register the law whose parameters are of that class.
+
+    Raises:
+      InputError: there is no such law, file, class or parameter, or a value is not allowed.
+    """
+    head, *changes = str(text).split(",")
+    label, params = _known(head)
+    for change in changes:
+        name, equals, value = change.partition("=")
+        if equals:
+            new = {name: errors.check_number(f"{head} {name}", value, text=True)}
+        elif change.endswith(".json"):
+            new = {
+                key: errors.check_number(f"{change} {key}", one)
+                for key, one in files.read_json(Path(change)).items()
+            }
+        else:
+            raise InputError(
+                f"law = {text} is not allowed: write changes as name=value or file.json."
+            )
+        params = changed(params, new)
+        label += f",{change if equals else Path(change).stem}"
+    return label, params
+
+
+def _known(text: str) -> tuple[str, Params]:
+    """The label and the parameters of a law without changes."""
+    if text.endswith(".npz"):
+        return _learned(Path(text))
+    path, _, kind = text.rpartition(":")
+    if not path.endswith(".py"):
+        return text, LAWS[errors.check_name("law", text, LAWS)]
+    content = _read(Path(path))
+    digest = hashlib.sha256(content).hexdigest()[:16]
+    module = f"_rps_jax_{Path(path).stem}_{digest}"
+    # It is run again if something else was registered by its name since.
+    if (found := _registered(module, kind)) is None:
+        run_file(Path(path), module)
+        found = _registered(module, kind)
+    if found is not None:
+        _SOURCES[type(found[1])] = {"file": str(Path(path).resolve()), "digest": digest}
+        return found
+    raise InputError(
+        f"law = {text} is not allowed: {path} must define the class {kind or 'of parameters'} and "
+        "call rps_jax.register_law with parameters of it."
+    )
+
+
+def laws_of(asked: LawsLike, field: str = "laws") -> dict[str, Params]:
+    """Read one law or several: texts, parameters, or either with names of one's own.
+
+    Args:
+      asked: a text, parameters, a sequence of these, or names with them.
+      field: what it is called in errors.
+
+    Returns:
+      Parameters by label. Of parameters without a name the label is that of the law, with a number
+      if they are none of its presets.
+
+    Raises:
+      InputError: none is asked for, one twice, or one that is unknown or not allowed.
+    """
+    if isinstance(asked, Mapping):
+        found = {str(name): read_law(one)[1] for name, one in asked.items()}
+    else:
+        one = isinstance(asked, str) or type(asked) in _OF or not isinstance(asked, Sequence)
+        several = [asked] if one else list(asked)
+        pairs = [read_law(law, number + 1) for number, law in enumerate(several)]
+        labels = _apart([label for label, _ in pairs], several)
+        errors.check_each_once(field, several, labels)
+        found = dict(zip(labels, (params for _, params in pairs), strict=True))
+    if not found:
+        raise InputError(f"{field} = {asked} is not allowed: name at least one law.")
+    for params in found.values():
+        checked(params)
+    return found
+
+
+def read_law(law: LawLike, number: int = 1) -> tuple[str, Params]:
+    """Read one law: its label and its parameters."""
+    if isinstance(law, str):
+        return named(law)
+    law_of(law)
+    alike = [name for name, params in LAWS.items() if type(params) is type(law)]
+    for name in alike:
+        if numbers_equal(LAWS[name], law):
+            return name, law
+    return f"{alike[0] if alike else type(law).__name__}_{number}", law
+
+
+def numbers_equal(one: Params, other: Params) -> bool:
+    """Whether two sets of parameters of a class have equal numbers."""
+    mine, theirs = numbers(one), numbers(other)
+    return list(mine) == list(theirs) and all(
+        np.array_equal(mine[name], theirs[name]) for name in mine
+    )
+
+
+def _apart(labels: list[str], asked: Sequence[Any]) -> list[str]:
+    """Labels, with the whole text where two are alike."""
+    twice = {label for label in labels if labels.count(label) > 1}
+    return [
+        str(one) if label in twice and isinstance(one, str) else label
+        for label, one in zip(labels, asked, strict=True)
+    ]
+
+
+def _learned(path: Path) -> tuple[str, Params]:
+    """Name and parameters of a learned law's file, registered by a name of its own."""
+    content = _read(path)
+    name, law, params = policy.law_of(content, path)
+    kind = type(params).__name__  # it says the file's content: a copy is the law that is known
+    name = next((known for known, one in LAWS.items() if type(one).__name__ == kind), name)
+    if name not in LAWS:
+        register_law(name, law, params)
+    found, digest = LAWS[name], hashlib.sha256(content).hexdigest()[:16]
+    _SOURCES[type(found)] = {"file": str(path.resolve()), "digest": digest}
+    return name, found
+
+
+def _registered(module: str, kind: str) -> tuple[str, Params] | None:
+    """Name and parameters of the law whose parameters are of a class of a module."""
+    own = getattr(sys.modules.get(module), kind, None)
+    return next(((name, params) for name, params in LAWS.items() if type(params) is own), None)
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return files.content_of(path, "policy" if path.suffix == ".npz" else "python")
+    except OSError as error:
+        raise InputError(
+            f"law = {path} cannot be read ({error.strerror}): give FILE.py:CLASS or a policy's "
+            "FILE.npz."
+        ) from error
+
+
+def run_file(path: Path, name: str) -> Any:
+    """Run a user's file of Python as a module of this name.
+
+    Raises:
+      InputError: it raises something.
+    """
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except InputError:
+        del sys.modules[name]
+        raise
+    except (Exception, SystemExit) as error:  # whatever a user's file raises
+        del sys.modules[name]
+        raise InputError(
+            f"{path} cannot be run ({type(error).__name__}: {error}): mend the file."
+        ) from error
+    return module
+
+
+# --- laws in manifests ---------------------------------------------------------------------
+
+
+def recorded(params: Params) -> dict[str, Any]:
+    """Parameters as JSON, with the class that selects their law, and its file if it has one.
+
+    `restored` is the opposite.
+    """
+    kind = type(params)
+    return {"law": kind.__name__} | _SOURCES.get(kind, {}) | as_json(params)
+
+
+def restored(values: Mapping[str, Any]) -> Params:
+    """Read the parameters that `recorded` wrote.
+
+    Raises:
+      InputError: their class or a name in it is unknown, or their file is not what it was.
+    """
+    left = dict(values)
+    kind, file, digest = (left.pop(key, None) for key in ("law", "file", "digest"))
+    if file:  # it is compared before it is run
+        if hashlib.sha256(_read(Path(str(file)))).hexdigest()[:16] != digest:
+            raise InputError(
+                f"law = {file} is not what it was when the run was made: restore the file."
+            )
+        named(file if file.endswith(".npz") else f"{file}:{kind}")
+    known = {type(params).__name__: params for params in (_INNER | LAWS).values()}
+    like = known[errors.check_name("class of parameters", str(kind), known)]
+    if set(left) != set(numbers(like)):
+        raise InputError(
+            f"parameters of {kind} are {', '.join(numbers(like))}, and not {', '.join(left)}."
+        )
+    shaped = {
+        name: np.asarray(x, float) if np.ndim(x) else errors.check_number(name, x)
+        for name, x in left.items()
+    }
+    return changed(like, shaped)
