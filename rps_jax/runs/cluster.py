@@ -30,13 +30,15 @@ from types import ModuleType
 from typing import Any
 
 from rps_jax import engines
+from rps_jax.engines import device as devices
+from rps_jax.engines.device import Device
 from rps_jax.errors import InputError
 from rps_jax.record import folder as run_folder
 from rps_jax.record import provenance
 from rps_jax.runs import sweep
 from rps_jax.runs.board import Board, News
 from rps_jax.runs.sweep import Plan, Shard
-from rps_jax.trials.setting import Progress, Report, Timing, unheard
+from rps_jax.trials.progress import Progress, Report, Timing, unheard
 
 POLL = 0.5  # [s] between two looks at what the workers have done
 PATIENCE = 10.0  # [s] to reach a cluster
@@ -221,6 +223,28 @@ def run_on_cluster(
     ended = time.perf_counter()
     stepped = stepped or ended
     return Timing(stepped - began, ended - stepped, simulated)
+
+
+def on_cluster(address: str, device: Device) -> Callable[..., Timing]:
+    """What runs a plan on the workers of a cluster, each on this device."""
+    import jax
+
+    return functools.partial(
+        run_on_cluster,
+        address=address,
+        prepare=functools.partial(_prepare, device, bool(jax.config.jax_enable_x64)),
+        gpus=device != "cpu",
+    )
+
+
+def _prepare(device: Device, x64: bool) -> None:
+    """Make a worker's process compute as this one would."""
+    import jax
+
+    devices.be_deterministic()
+    jax.config.update("jax_enable_x64", x64)
+    devices.choose(device)
+    devices.use_cache()
 
 
 @contextlib.contextmanager

@@ -6,7 +6,7 @@ Worlds for tuning, validation and testing come from seeds that never meet.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,76 +14,63 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import engines, errors
-from rps_jax.control import strategies
-from rps_jax.control.law import RPSParams
-from rps_jax.control.strategies import Params
-from rps_jax.engines import EngineName
+from rps_jax.control import registry
+from rps_jax.control.base import Params
+from rps_jax.control.laws.rps import RPSParams
+from rps_jax.control.registry import LawLike
+from rps_jax.engines import device
 from rps_jax.errors import InputError
-from rps_jax.robot.robot import Robot
-from rps_jax.runs.objective import Objective
+from rps_jax.robot.robot import RobotLike
+from rps_jax.runs.question import Split, seed_of
 from rps_jax.trials import batch
 from rps_jax.trials.batch import Job, Part
+from rps_jax.trials.progress import Bar, Report, Timing, unheard, watched
 from rps_jax.trials.results import UNITS
-from rps_jax.trials.setting import Report, Setting, Timing, unheard
-from rps_jax.trials.trial import Outcome, Rules
+from rps_jax.trials.score import Objective
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Outcome
 from rps_jax.trials.worlds import drawn_worlds, remembered_steps
-from rps_jax.world import points
-from rps_jax.world.domain import Domain, named
+from rps_jax.world import points as points_
+from rps_jax.world.domain import Domain, DomainLike, named
 from rps_jax.world.draws import Draw, table
-from rps_jax.world.physics import Fidelity, PhysicsName, preset
 from rps_jax.world.points import Points
-
-Split = Literal["tune", "validate", "test"]
-
-
-def seed_of(seed: int, split: Split) -> int:
-    """The seed of the worlds of one split: no two splits of any seeds share a world.
-
-    The worlds of a domain that draws little, such as `paper`, hardly depend on the seed.
-    """
-    splits = get_args(Split)
-    return len(splits) * seed + splits.index(errors.check_name("split", split, splits))
 
 
 def evaluate(
-    params: Params,
-    domain: Domain | str = "wide",
-    worlds: int | xr.Dataset | np.ndarray = 256,
-    seed: int = 0,
-    split: Split = "tune",
+    law: LawLike | Sequence[LawLike],
+    domain: DomainLike = "wide",
+    worlds: int = 256,
     *,
-    engine: EngineName = "fused",
-    physics: PhysicsName = "default",
-    fidelity: Fidelity = "standard",
-    rules: Rules = Rules(),
-    robot: Robot | str | None = None,
+    points: xr.Dataset | np.ndarray | None = None,
+    split: Split = "tune",
     objective: Objective = Objective(),
+    robot: RobotLike | None = None,
+    setting: Setting = Setting(),
     slots: int | None = None,
     workers: int | None = None,
-    report: Report = unheard,
+    progress: bool | None = None,
+    report_to: Report | None = None,
 ) -> xr.Dataset:
-    """How candidates do in random worlds, all of them in the same ones.
+    """Score candidates, parameters of one law, in random worlds, all of them in the same ones.
 
     All candidates run through one compiled program for each shape family of the objects. A later
     call with as many candidates and worlds, of whatever values and seed, compiles nothing.
 
     Args:
-      params: parameters of any registered strategy, a pytree whose leaves are all (P, ...): one
-        entry for each of P candidates.
-      domain: ranges of what differs between worlds, or their name in `DOMAINS`.
-      worlds: how many each candidate meets, of indices 0, 1, ...; or points of the unit cube, as
-        `worlds_at` has them.
-      seed: of the worlds, unless they are points.
+      law: the candidates: parameters of a law, a pytree whose leaves are all (P, ...), one entry
+        for each of P candidates (`stack` makes one of several); or several laws of one class; or
+        one alone.
+      domain: ranges of what differs between worlds, by name, or a file's.
+      worlds: how many each candidate meets, of indices 0, 1, ...
+      points: points of the unit cube at which the worlds lie instead, as of `worlds_at`.
       split: what the worlds are for; those of two splits differ, whatever the seeds.
-      engine: what steps them.
-      physics: how friction is modelled.
-      fidelity: how finely the physics is solved.
-      rules: when a trial ends.
-      robot: by its name in `ROBOTS`, or a JSON file's; None: the domain's.
       objective: what scores a trial.
+      robot: by its name, as kairos, or a JSON file's; None: the domain's.
+      setting: engine, physics, fidelity, rules, and the seed of the worlds.
       slots: worlds stepped at once by a worker; by default as suits engine and device.
       workers: host threads; by default as suits engine and device.
-      report: called after every segment of the run.
+      progress: whether a bar shows the progress; by default in a terminal and in a notebook.
+      report_to: hears of the progress instead of a bar.
 
     Returns:
       Scores, of which less is better, and outcomes (candidate, world), and what was drawn (world)
@@ -93,27 +80,28 @@ def evaluate(
       InputError: an argument is not allowed.
 
     Example:
-      >>> import jax
       >>> import numpy as np
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
-      >>> same = jax.tree.map(lambda value: np.full(4, value), rps_jax.RPSParams.paper())
-      >>> four = same._replace(L=np.geomspace(0.1, 1, 4))
-      >>> found = rps_jax.evaluate(four, drums, worlds=2, rules=rules)
+      >>> four = rps_jax.stack([f"rps,L={length}" for length in (0.1, 0.2, 0.5, 1.0)])
+      >>> setting = rps_jax.Setting("quasistatic", rules=rules)
+      >>> found = rps_jax.evaluate(four, drums, 2, setting=setting)
       >>> found.score.mean("world").shape
       (4,)
     """
-    domain = named(domain, robot)
-    count, at = points.asked(domain, worlds)
+    ranges, params = named(domain, robot), candidates(law)
+    count, at = points_.asked(ranges, worlds if points is None else points)
     errors.check_count("worlds", count, at_most=10_000_000)
-    errors.check_count("seed", seed, at_least=0, at_most=2**30)
-    setting = Setting(preset(physics, fidelity), rules, engine=engine)
-    engines.get(engine).check(domain.families)
-    engines.get(engine).check_senses(strategies.of(params).senses)
+    errors.check_count("seed", setting.seed, at_least=0, at_most=2**30)
+    engines.get(setting.engine).check(ranges.families)
+    engines.get(setting.engine).check_senses(registry.law_of(params).senses)
     batch.check_shape(slots, workers)
-    ask = Ask(_checked(params), seed_of(seed, split), np.arange(count), at)
-    shape = {"slots": slots, "workers": workers}
-    (answer,), _ = try_out([ask], [domain], setting, objective, report=report, **shape)
+    ask = Ask(_checked(params), seed_of(setting.seed, split), np.arange(count), at)
+    device.use_cache_if_asked()
+    shown = watched() if progress is None else progress
+    with Bar("evaluate", ask.candidates * count, shown=shown and report_to is None) as bar:
+        shape = {"report": report_to or bar, "slots": slots, "workers": workers}
+        (answer,), _ = try_out([ask], [ranges], setting, objective, **shape)
     variables: dict[str, Any] = {
         "score": (("candidate", "world"), answer.score, {"units": "1", "long_name": "objective"})
     }
@@ -122,18 +110,59 @@ def evaluate(
         dims = ("candidate", "world", "pose")[: values.ndim]
         plain = values.astype(np.int8) if values.dtype == bool else values
         variables[name] = (dims, plain, {"units": unit, "long_name": meaning})
-    return xr.Dataset(variables, {"pose": ["x", "y", "yaw"]} | _drawn(domain, ask))
+    return xr.Dataset(variables, {"pose": ["x", "y", "yaw"]} | _drawn(ranges, ask))
+
+
+def stack(laws: Sequence[LawLike]) -> Params:
+    """Stack parameters of one law: candidates with leaves (P, ...), one entry for each.
+
+    Args:
+      laws: texts or parameters, all of one class.
+
+    Raises:
+      InputError: there is none, or they are of different classes or shapes.
+
+    Example:
+      >>> import rps_jax
+      >>> rps_jax.stack(["rps", "rps,K_h=0.3"]).K_h.tolist()
+      [1.0, 0.3]
+    """
+    several = [registry.read_law(law)[1] for law in laws]
+    kinds = {type(params).__name__ for params in several}
+    if len(kinds) != 1:
+        raise InputError(
+            f"laws of {len(kinds)} classes ({', '.join(sorted(kinds))}) are not allowed: stack "
+            "parameters of one law."
+        )
+    shapes = {tuple(map(np.shape, jax.tree.leaves(params))) for params in several}
+    if len(shapes) != 1:
+        raise InputError(f"laws of {len(shapes)} different shapes are not allowed: give one.")
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *several)
+
+
+def candidates(law: LawLike | Sequence[LawLike]) -> Params:
+    """Parameters with leaves (P, ...) of whatever names or holds candidates."""
+    if isinstance(law, str):
+        return stack([law])
+    if isinstance(law, list) or type(law) is tuple:
+        return stack(law)
+    like = next((p for p in registry.LAWS.values() if type(p) is type(law)), None)
+    alone = like is not None and all(
+        np.ndim(x) == np.ndim(y)
+        for x, y in zip(jax.tree.leaves(law), jax.tree.leaves(like), strict=True)
+    )
+    return stack([law]) if alone else law
 
 
 def _checked(params: Params) -> Params:
-    """The same parameters on the host.
+    """Bring parameters to the host.
 
     Raises:
-      InputError: they are not of several candidates of one strategy, or mean nothing.
+      InputError: they are not of several candidates of one law, or mean nothing.
     """
-    strategy, name = strategies.of(params), type(params).__name__
+    law, name = registry.law_of(params), type(params).__name__
     sizes = {}
-    for place, leaf in strategies.numbers(params).items():
+    for place, leaf in registry.numbers(params).items():
         field, values = f"{name}.{place}", np.asarray(leaf)
         if values.dtype.kind not in "biuf" or not values.ndim or not len(values):
             raise InputError(
@@ -153,7 +182,7 @@ def _checked(params: Params) -> Params:
     params = jax.tree.map(np.asarray, params)
     for p in range(count):
         try:
-            strategy.check(batch.rows(params, p))
+            law.check(batch.rows(params, p))
         except InputError as error:
             raise InputError(f"candidate {p}: {error}") from error
     return params
@@ -193,11 +222,11 @@ class Ask(NamedTuple):
 
     def object_of(self, domain: Domain) -> np.ndarray:
         """Which of a domain's objects each of the worlds (W,) has."""
-        return domain.object_of(points.cases(domain, self.points, self.worlds))
+        return domain.object_of(points_.cases(domain, self.points, self.worlds))
 
     def draw(self, domain: Domain, rows: np.ndarray) -> Draw:
         """Some of the worlds (W,), all of one object."""
-        return points.draw(domain, self.seed, self.points, self.worlds[rows])
+        return points_.draw(domain, self.seed, self.points, self.worlds[rows])
 
 
 class Answer(NamedTuple):
@@ -242,18 +271,8 @@ def try_out(
             leaves, tree = jax.tree.flatten(part.worlds)
             kind = (tree, *(leaf.shape[1:] for leaf in leaves))
             jobs.setdefault(kind, []).append(_Group(ask, part, first, width, column))
-    found: dict[str, np.ndarray] = {}
-
-    def collect(numbers: np.ndarray, outcome: Outcome) -> None:
-        for name, leaf in outcome._asdict().items():
-            if name not in found:
-                found[name] = np.empty((away.size, *leaf.shape[1:]), leaf.dtype)
-            found[name][numbers] = leaf
-
-    timing = batch.run(
-        [_job(groups) for groups in jobs.values()], setting, collect=collect, report=report, **shape
-    )
-    every = Outcome(**found)  # pyright: ignore[reportArgumentType]
+    jobs_ = [_job(groups) for groups in jobs.values()]
+    every, timing = batch.gathered(jobs_, setting, away.size, report=report, **shape)
     score = objective.scores(every, away, setting.rules)
     answers = []
     for width, count, end in zip(widths, counts, ends, strict=True):
@@ -302,4 +321,4 @@ def _job(groups: Sequence[_Group]) -> Job:
                 yield Part(first + p * width + column, worlds, part.stage)
 
     trials = sum(group.ask.candidates * group.column.size for group in groups)
-    return Job(strategies.of(groups[0].ask.params), trials, filled())
+    return Job(registry.law_of(groups[0].ask.params), trials, filled())

@@ -7,21 +7,21 @@ over models says what another simulation would have.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import xarray as xr
 
-from rps_jax.control.strategies import Params
+from rps_jax.analysis.report import Section
 from rps_jax.engines import EngineName
-from rps_jax.robot.robot import Robot
+from rps_jax.record import files
 from rps_jax.runs import sweep as sweeps
 from rps_jax.runs.plan import Plan
-from rps_jax.trials.setting import InTurn, Report, Setting, unheard
-from rps_jax.trials.trial import Rules
-from rps_jax.world.domain import Domain, named
+from rps_jax.runs.question import Run, call_of
+from rps_jax.runs.sweep import OfPlan
+from rps_jax.trials.progress import InTurn, Report, unheard
 from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
 
 _HALVED = replace(preset(), timestep=0.005)
@@ -67,51 +67,49 @@ def folder_of(out: Path, model: str) -> Path:
     return out / "models" / name
 
 
-def models(
-    domain: Domain | str,
-    arms: Mapping[str, Params],
-    worlds: int = 1000,
-    seed: int = 0,
-    engine: EngineName = "fused",
-    out: str | Path | None = None,
-    *,
-    rules: Rules = Rules(),
-    robot: Robot | str | None = None,
-    report: Report = unheard,
-    **shape: Any,
-) -> xr.Dataset:
-    """Every arm in the same random worlds, on every model.
-
-    Args:
-      domain: ranges of what differs between worlds, or their name in `DOMAINS`.
-      arms: names and parameters of any strategies.
-      worlds: how many, of indices 0, 1, ...
-      seed: of the worlds.
-      engine: what steps them.
-      out: run folder, in which a run that was killed is continued; None keeps all in memory.
-      rules: when a trial ends.
-      robot: by its name in `ROBOTS`, or a JSON file's; None: the domain's.
-      report: called after every segment of the run.
-      shape: `slots` and `workers` of `sweep`.
-
-    Returns:
-      Outcomes (model, arm, world), and what was drawn (world) as coordinates.
-
-    Raises:
-      InputError: an argument is not allowed, or `out` holds another run.
+@dataclass(frozen=True)
+class Models(OfPlan):
+    """Push with every law in the same random worlds on every model of the physics.
 
     Example:
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=1.0)
-      >>> arms = {"rps": rps_jax.RPSParams.paper()}
-      >>> found = rps_jax.models(drums, arms, worlds=2, rules=rules)
+      >>> found = rps_jax.models("rps", drums, worlds=2, setting=rps_jax.Setting(rules=rules))
       >>> found.sizes["model"]
       7
     """
-    setting = Setting(preset(), rules, seed, engine)
-    plan = Plan(named(domain, robot), worlds, arms, setting)
-    plan.check_here()
-    return complete(plan, None if out is None else Path(out), report=report, **shape)
+
+    TITLE: ClassVar[str] = "Random worlds on several models of the physics"
+    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 24}
+
+    def trials(self) -> int | None:
+        """How many trials there are on all models."""
+        return self.plan.trials * len(plans(self.plan))
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Outcomes (model, law, world), and what was drawn (world) as coordinates."""
+        return complete(self.plan, run.folder, **run.shape)
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """Rates on each model, and their range."""
+        return sweeps.spread(with_models(found.isel(model=0), found))
+
+
+models = call_of(Models)
+
+
+def with_models(found: xr.Dataset, every: xr.Dataset) -> xr.Dataset:
+    """Outcomes (law, world) with the success of the same worlds on every model beside them."""
+    success = every.success.assign_coords(model=every.model)
+    return found.assign(model_success=success.transpose("model", "law", "world"))
+
+
+def added(found: xr.Dataset, plan: Plan, run: Run) -> xr.Dataset:
+    """Outcomes of a plan, and beside them the success of the same worlds on every other model."""
+    every = complete(plan, run.folder, found, **run.shape)
+    if run.folder is not None:
+        files.write_results(run.folder / "models.nc", every)
+    return with_models(found, every)
 
 
 def complete(
@@ -122,7 +120,7 @@ def complete(
     report: Report = unheard,
     **shape: Any,
 ) -> xr.Dataset:
-    """What a run folder lacks of a sweep on every model, and the whole as (model, arm, world).
+    """What a run folder lacks of a sweep on every model, and the whole as (model, law, world).
 
     The sweep as it was asked for stands in the folder itself, the others in folders of their own
     in it. Its `own` results are not run or read again, if they are at hand.

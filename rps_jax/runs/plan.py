@@ -1,6 +1,6 @@
-"""What a sweep runs: every arm, a strategy with its parameters, in the same random worlds.
+"""What a sweep runs: every law, a law with its parameters, in the same random worlds.
 
-Trials are kept in parts, each of one arm and one object; parts of one kind are run by one compiled
+Trials are kept in parts, each of one law and one object; parts of one kind are run by one compiled
 program.
 """
 
@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import json
 import math
+import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,8 +21,8 @@ import jax
 import numpy as np
 
 from rps_jax import engines, errors
-from rps_jax.control import strategies
-from rps_jax.control.strategies import Params
+from rps_jax.control import registry
+from rps_jax.control.base import Params
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record import folder as run_folder
@@ -36,28 +37,28 @@ from rps_jax.world.physics import Physics
 from rps_jax.world.points import Points
 from rps_jax.world.scene import Scene
 
-Kind = tuple[Any, ...]  # of a part: the object's number, and the form of the arm's parameters
+Kind = tuple[Any, ...]  # of a part: the object's number, and the form of the law's parameters
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is run: every arm in the worlds 0 to `worlds` - 1 of a domain, or of its `points`."""
+    """What is run: every law in the worlds 0 to `worlds` - 1 of a domain, or of its `points`."""
 
     domain: Domain
     worlds: int
-    arms: Mapping[str, Params]
+    laws: Mapping[str, Params]
     setting: Setting = Setting()  # its seed draws the worlds, too
     part: int = 1024  # trials of a part, at most
     points: Points | None = None  # of the unit cube at which the worlds lie; None: drawn ones
 
     def __post_init__(self) -> None:
-        """Raises InputError for no worlds, no arms, or parameters that mean nothing."""
+        """Raises InputError for no worlds, no laws, or parameters that mean nothing."""
         errors.check_count("worlds", self.worlds, at_most=1_000_000_000)
         errors.check_count("part", self.part, at_most=1_000_000)
-        if not self.arms:
-            raise InputError("arms = {} is not allowed: name at least one strategy.")
-        for params in self.arms.values():
-            strategies.of(params).check(params)
+        if not self.laws:
+            raise InputError("laws = {} is not allowed: name at least one law.")
+        for params in self.laws.values():
+            registry.checked(params)
         if self.points is not None and len(self.points.u) != self.worlds:
             raise InputError(f"worlds = {self.worlds} is not allowed: {len(self.points.u)} points.")
 
@@ -66,8 +67,8 @@ class Plan:
         engine = engines.get(self.setting.engine)
         engine.check(self.domain.families)
         engine.check_robot(self.domain.weakest)
-        for params in self.arms.values():
-            engine.check_senses(strategies.of(params).senses)
+        for params in self.laws.values():
+            engine.check_senses(registry.law_of(params).senses)
 
     @property
     def works(self) -> bool:
@@ -81,8 +82,8 @@ class Plan:
 
     @property
     def trials(self) -> int:
-        """How many: trial a * worlds + i is of arm a in world i."""
-        return len(self.arms) * self.worlds
+        """How many: trial a * worlds + i is of law a in world i."""
+        return len(self.laws) * self.worlds
 
     def trials_of(self, shard: Shard) -> int:
         """How many trials one shard has."""
@@ -94,7 +95,7 @@ class Plan:
 
     @functools.cached_property
     def blocks(self) -> int:
-        """Parts of one arm and one object, at most."""
+        """Parts of one law and one object, at most."""
         of_objects = np.bincount(self.object_of(np.arange(self.worlds)))
         return math.ceil(of_objects.max() / self.part)
 
@@ -109,21 +110,21 @@ class Plan:
         found = {}
         for which in range(len(self.domain.objects)):
             of_object = self.worlds_of(which)
-            for arm in range(len(self.arms)):
+            for law in range(len(self.laws)):
                 for block in range(math.ceil(of_object.size / self.part)):
                     some = of_object[block * self.part : (block + 1) * self.part]
-                    number = (arm * len(self.domain.objects) + which) * self.blocks + block
-                    found[number] = arm * self.worlds + some
+                    number = (law * len(self.domain.objects) + which) * self.blocks + block
+                    found[number] = law * self.worlds + some
         return found
 
-    def arm_and_object(self, part: int) -> tuple[int, int]:
-        """Which arm a part is of, and which object."""
+    def law_and_object(self, part: int) -> tuple[int, int]:
+        """Which law a part is of, and which object."""
         return divmod(part // self.blocks, len(self.domain.objects))
 
     def kind(self, part: int) -> Kind:
         """Parts of a kind are run by one compiled program."""
-        arm, which = self.arm_and_object(part)
-        params = list(self.arms.values())[arm]
+        law, which = self.law_and_object(part)
+        params = list(self.laws.values())[law]
         return which, type(params), *map(np.shape, jax.tree.leaves(params))
 
     @functools.cached_property
@@ -139,9 +140,9 @@ class Plan:
         whole = {
             "domain": dataclasses.asdict(self.domain),
             "worlds": self.worlds,
-            "arms": {name: strategies.recorded(params) for name, params in self.arms.items()},
+            "laws": {name: registry.recorded(params) for name, params in self.laws.items()},
             "physics": dataclasses.asdict(self.setting.physics),
-            "rules": strategies.as_json(self.setting.rules),
+            "rules": registry.as_json(self.setting.rules),
             "seed": self.setting.seed,
             "engine": self.setting.engine,
             "part": self.part,
@@ -157,6 +158,18 @@ class Shard:
 
     number: int = 1
     of: int = 1
+
+    @classmethod
+    def named(cls, text: str) -> Shard:
+        """Read a share written as K/N.
+
+        Raises:
+          InputError: it is not written so, or is none.
+        """
+        found = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", str(text))
+        if not found:
+            raise InputError(f"shard = {text} is not allowed: write k/n, as 3/8.")
+        return cls(int(found[1]), int(found[2]))
 
     def __post_init__(self) -> None:
         """Raises InputError unless 1 <= number <= of."""
@@ -183,20 +196,17 @@ def load_plan(folder: Path) -> Plan:
       InputError: it holds none, or a corrupt one, or one of another version of this code.
     """
     found = run_folder.manifest(folder)
-    if "arms" not in found:
+    if "laws" not in found:
         raise InputError(f"run = {folder} is not of a sweep: give the folder of `rps sweep`.")
     try:
-        physics: dict[str, Any] = {
-            k: tuple(v) if isinstance(v, list) else v for k, v in found["physics"].items()
-        }
         plan = Plan(
             domain.from_json(found["domain"]),
             found["worlds"],
-            {name: strategies.restored(arm) for name, arm in found["arms"].items()},
-            Setting(Physics(**physics), Rules(**found["rules"]), found["seed"], found["engine"]),
+            {name: registry.restored(law) for name, law in found["laws"].items()},
+            setting_of(found),
             found["part"],
         )
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
+    except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
         raise files.corrupt(folder / run_folder.MANIFEST, error) from error
     if "points" in found:
         plan = dataclasses.replace(plan, points=Points.read(folder, str(found["points"])))
@@ -207,6 +217,15 @@ def load_plan(folder: Path) -> Plan:
             "use that version."
         )
     return plan
+
+
+def setting_of(found: Mapping[str, Any]) -> Setting:
+    """Read a setting as manifests have it; `question.setting_as_json` is the opposite."""
+    physics: dict[str, Any] = {
+        k: tuple(v) if isinstance(v, list) else v for k, v in found["physics"].items()
+    }
+    rules = Rules(**found["rules"])
+    return Setting(found["engine"], Physics(**physics), rules=rules, seed=found["seed"])
 
 
 def share(plan: Plan, shard: Shard) -> dict[int, np.ndarray]:
@@ -236,11 +255,11 @@ def title_of(plan: Plan, index: int) -> str:
     )
 
 
-def world_part(plan: Plan, arm: int, index: Any) -> Part:
-    """Worlds of one object, by their indices, with the parameters of an arm."""
-    return made(plan, arm, draw(plan, index))
+def world_part(plan: Plan, law: int, index: Any) -> Part:
+    """Worlds of one object, by their indices, with the parameters of a law."""
+    return made(plan, law, draw(plan, index))
 
 
-def made(plan: Plan, arm: int, drawn: Draw) -> Part:
-    """The worlds of a draw, with the parameters of an arm."""
-    return drawn_worlds(plan.domain, drawn, list(plan.arms.values())[arm], plan.setting)
+def made(plan: Plan, law: int, drawn: Draw) -> Part:
+    """The worlds of a draw, with the parameters of a law."""
+    return drawn_worlds(plan.domain, drawn, list(plan.laws.values())[law], plan.setting)

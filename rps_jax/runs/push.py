@@ -6,67 +6,95 @@ It is asked for by name (`push`), or is a world of a sweep again (`replay`).
 from __future__ import annotations
 
 import dataclasses
-import io
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+import functools
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import xarray as xr
 
 from rps_jax import engines, errors
-from rps_jax.control import strategies
-from rps_jax.control.strategies import Params
+from rps_jax.analysis.figures.style import Figure
+from rps_jax.analysis.report import Picture, Section
+from rps_jax.control import registry
+from rps_jax.control.base import Law
+from rps_jax.record import bag as bags
+from rps_jax.record import folder
+from rps_jax.record.bag import Step
+from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, load_plan, scene_of, title_of, world_part
+from rps_jax.runs.question import Pushes, Question, Run, call_of
 from rps_jax.trials import pushes, results
-from rps_jax.trials.conditions import Conditions, Which, arms_of
-from rps_jax.trials.pushes import Trace
-from rps_jax.trials.setting import Report, unheard
-from rps_jax.trials.trial import Outcome, p_world_contact
+from rps_jax.trials.batch import Part
+from rps_jax.trials.case import Case, Given
+from rps_jax.trials.progress import Bar
+from rps_jax.trials.pushes import Followed
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Outcome, object_pose, p_world_contact
+from rps_jax.world import paper
 from rps_jax.world.scene import Scene
 
 
-@dataclass(frozen=True)
-class Push:
+@dataclass(frozen=True, repr=False)
+class Trace:
     """One trial that was followed."""
 
-    trace: Trace  # arrays over time, (T, ...)
+    followed: Followed  # arrays over time, (T, ...)
     scene: Scene
     title: str
+    engine: str
+
+    def __repr__(self) -> str:
+        """What it was, and how it ended."""
+        title = self.title.replace("$\\mu$", "friction")
+        return f"<Trace of {title}: {self.told}>"
+
+    @property
+    def told(self) -> str:
+        """How it ended, in words."""
+        ended, (x, y) = self.outcome, self.followed.p_world_target
+        return (
+            f"target ({x:g}, {y:g}) m {'reached' if ended.success else 'not reached'} at "
+            f"{float(ended.time):.1f} s, least distance {float(ended.min_distance):.3f} m, contact "
+            f"lost for {float(ended.contact_lost_time):.1f} s"
+        )
 
     @property
     def outcome(self) -> Outcome:
         """The result of the trial, without a leading axis."""
-        return self.trace.outcome
+        return self.followed.outcome
 
     @property
     def data(self) -> xr.Dataset:
         """The trial over time: variables (time, ...), its outcome as scalars."""
-        return results.trace_dataset(self.trace)
+        return results.trace_dataset(self.followed)
 
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Fig. 6 of the paper as a picture, which Jupyter shows; with a path it is a PNG there."""
-        from PIL import Image
-
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw the trial as Fig. 6 of the paper does; with a path it is written there, too."""
         from rps_jax.analysis import figures
+        from rps_jax.analysis.report import save
 
-        file = io.BytesIO() if path is None else Path(path)
-        figures.one_trial(self.data, self.title, file)
-        return Image.open(file)
+        drawn = figures.one_trial(self.data, self.title)
+        if path is not None:
+            save(drawn, Path(path))
+        return drawn
 
-    def stills(self, path: str | Path, count: int = 6) -> Path:
-        """A PNG of some moments of the trial, side by side.
+    def stills(self, count: int = 6) -> Figure:
+        """Draw some moments of the trial side by side.
 
         Raises:
           VideoError: this machine cannot draw.
         """
         from rps_jax.analysis import figures, video
 
-        seen, target = self.trace.snapshots, np.array(self.trace.p_world_target)
+        seen, target = self.followed.snapshots, np.array(self.followed.p_world_target)
         shown = _evenly(len(seen.time), count)
         images = [video.snapshot(self.scene, seen.qpos[i], p_world_target=target) for i in shown]
-        return figures.stills(images, [f"{seen.time[i]:.0f} s" for i in shown], Path(path))
+        return figures.stills(images, [f"{seen.time[i]:.0f} s" for i in shown])
 
     def film(
         self,
@@ -77,7 +105,7 @@ class Push:
         size: tuple[int, int] = (960, 540),
         watch: Callable[[Iterable[Any]], Iterable[Any]] = iter,
     ) -> Path:
-        """An MP4 of the trial.
+        """Write an MP4 of the trial.
 
         Args:
           path: of the MP4.
@@ -93,13 +121,13 @@ class Push:
         from rps_jax.analysis import video
 
         check_length(seconds)
-        seen = self.trace.snapshots
+        seen = self.followed.snapshots
         shown = _evenly(len(seen.time), round(seconds * fps))
         video.render(
             self.scene,
             watch(seen.qpos[shown]),
             Path(path),
-            p_world_target=np.array(self.trace.p_world_target),
+            p_world_target=np.array(self.followed.p_world_target),
             p_world_contacts=np.asarray(p_world_contact(seen))[shown],
             fps=fps,
             size=size,
@@ -112,42 +140,204 @@ def check_length(seconds: float) -> None:
     errors.check_finite("film_length", seconds, above=0, at_most=600, unit="s")
 
 
-def push(
-    object: str = "box",
-    target: tuple[float, float] = (-2.0, 0.0),
-    friction: Which = "S1",
-    strategy: str | Params = "rps",
-    *,
-    report: Report = unheard,
-    **conditions: Any,
-) -> Push:
-    """One trial, followed from its start to its end.
+@dataclass(frozen=True)
+class FollowsOne(Question[Trace]):
+    """A question whose answer is one trial, followed over time."""
 
-    Args:
-      object: the object, by name.
-      target: x, y [m] in the world, where the base starts at the origin.
-      friction: a friction set of the paper's Table I, or coefficients ground, robot [1].
-      strategy: what decides, by name or by its parameters.
-      report: called now and then.
-      conditions: fields of `Conditions`, as `engine` or `mass`.
+    bag: str | Path | None = option(None, kw_only=True)
+    """MCAP file to write: the trial as messages of ROS 2, which Foxglove shows (extra bags)."""
 
-    Raises:
-      InputError: an argument is not allowed.
+    def check(self) -> None:
+        """Check that the bag can be written."""
+        if self.bag is not None:
+            bags.check()
+            folder.writable(Path(self.bag).parent)
+
+    def followed(self, part: Part, law: Law, setting: Setting, run: Run) -> Followed:
+        """Follow a world, and write its bag."""
+        if self.bag is None:
+            return pushes.follow_part(part, law, setting, report=run.report)[0]
+        period = setting.physics.control_period
+        (whole,) = pushes.follow_part(
+            part, recorded_law(law), setting, interval=period, report=run.report
+        )
+        details, seen = tuple(whole.snapshots.details)  # of `recorded_law`
+        whole = dataclasses.replace(whole, snapshots=whole.snapshots._replace(details=details))
+        about = {"law": json.dumps(registry.recorded(whole.params)), "period": str(period)}
+        bags.write(Path(self.bag), steps_of(whole, seen), about)
+        every = max(1, round(0.1 / period))
+        thin = jax.tree.map(lambda x: x[::every], whole.snapshots)
+        return dataclasses.replace(whole, snapshots=thin)
+
+    @property
+    def horizon(self) -> float:
+        """Time [s] after which the trial ends."""
+        raise NotImplementedError
+
+    def bar(self) -> Bar:
+        """A bar over simulated seconds."""
+        return Bar(self.name, self.horizon, "simulated", shown=self.shown)
+
+    def report(self, found: Trace, run: Run) -> Sequence[Section]:
+        """How it ended, and its figure."""
+        return [Section("The push", f"{found.told}.", (), Picture("trial", found.plot))]
+
+
+def recorded_law(law: Law) -> Law:
+    """The law whose details are joined by what it observed; one that senses touch observes taxels.
+
+    So a bag has the taxels, too.
+    """
+    touch = law.senses == "touch"
+
+    def step(params: Any, memory: Any, seen: Any) -> Any:
+        memory, twist, details = law.step(params, memory, seen.touch if touch else seen)
+        return memory, twist, (details, seen)
+
+    return law._replace(step=step, senses="taxels" if touch else law.senses)
+
+
+def steps_of(followed: Followed, seen: Any) -> Iterator[Step]:
+    """Steps of a bag of a trial that was followed, with its observations (T, ...)."""
+    snapshots, touch = followed.snapshots, seen.touch
+    beside = {"signal", "f_robot", "p_world_object", "r_object"} & set(seen._fields)
+    for i, time in enumerate(np.asarray(snapshots.time, float)):
+        thing, yaw = object_pose(snapshots.qpos[i])
+        yield Step(
+            float(time),
+            [*touch.p_world_robot[i], touch.yaw[i]],
+            touch.p_world_target[i],
+            int(snapshots.reading.contact_type[i]),
+            touch.p_robot_contact[i],
+            [np.broadcast_to(one, snapshots.time.shape)[i] for one in snapshots.twist],
+            object_pose=[*np.asarray(thing), float(yaw)],
+            **{name: getattr(seen, name)[i] for name in beside},
+        )
+
+
+def sensed(given: Given, setting: Setting) -> dict[str, Any]:
+    """What is given beside object, friction, target and law, as fields of `Case`."""
+    named = {one.name: getattr(given, one.name) for one in dataclasses.fields(Given)}
+    usual = paper.SKIN.get(setting.physics_name, "ideal")
+    return named | {"skin": given.skin or usual}
+
+
+@dataclass(frozen=True)
+class Push(Case, FollowsOne, Pushes[Trace]):
+    """Run one trial; draw the paper's Fig. 6 and film it.
 
     Example:
       >>> import rps_jax
-      >>> seen = rps_jax.push("cylinder", (1.0, 0.5), engine="quasistatic", horizon=3.0)
-      >>> seen.data.v_x.dims
+      >>> brief = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=3.0))
+      >>> trace = rps_jax.push("cylinder", target=(1.0, 0.5), setting=brief)
+      >>> trace.data.v_x.dims
       ('time',)
     """
-    chosen = Conditions.of(conditions)
-    setting = chosen.setting()
-    named = [strategy] if isinstance(strategy, str) else {"": strategy}
-    (params,) = arms_of(named).values()
-    case = chosen.case(object, friction, target, params)
-    engines.get(chosen.engine).check_followed()
-    (trace,) = pushes.follow([case], setting, report=report)
-    return Push(trace, pushes.scene_of(case, setting.physics), results.title_of(case))
+
+    # What compiles least: the other engines pay from some dozens of trials on.
+    setting: Setting = field(default=Setting(engine="mujoco"), kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Check the trial when it is asked for, and not before."""
+
+    @property
+    def horizon(self) -> float:
+        """Time [s] after which the trial ends."""
+        return float(self.setting.rules.horizon)
+
+    @property
+    def title(self) -> str:
+        """What is pushed."""
+        return self.case.title.replace("$\\mu$", "friction")
+
+    @property
+    def case(self) -> Case:
+        """The trial."""
+        own = {one.name: getattr(self, one.name) for one in dataclasses.fields(Case)}
+        return Case(**own | sensed(self, self.setting))
+
+    def check(self) -> None:
+        """Check the trial, and that its engine can be followed."""
+        super().check()
+        engine = engines.get(self.setting.engine)
+        engine.check()
+        engine.check_robot(self.case.base)
+
+    def answer(self, run: Run) -> Trace:
+        """Follow the trial."""
+        case, setting = self.case, self.setting
+        stage, worlds = pushes.build([case], setting)
+        part = Part(np.arange(1), worlds, stage)
+        followed = self.followed(part, registry.law_of(case.params), setting, run)
+        scene = pushes.scene_of(case, setting.physics)
+        return Trace(followed, scene, case.title, setting.engine)
+
+
+push = call_of(Push)
+
+
+@dataclass(frozen=True)
+class Replay(FollowsOne):
+    """Run one world of a sweep again; draw it as in the paper's Fig. 6 and film it.
+
+    Example:
+      >>> import tempfile
+      >>> import rps_jax
+      >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
+      >>> setting = rps_jax.Setting("quasistatic", rules=rules)
+      >>> with tempfile.TemporaryDirectory() as run:
+      ...     found = rps_jax.sweep("rps", drums, worlds=8, setting=setting, out=run)
+      ...     again = rps_jax.replay(run, 2)
+      >>> bool(again.outcome.success) == bool(found.success.sel(law="rps", world=2))
+      True
+    """
+
+    run: str | Path = option("", positional=True)
+    """Run folder of the sweep."""
+    world: int = option(0, 0, positional=True)
+    """Index of the world."""
+    law: str | None = None
+    """Which of the sweep's laws; by default the first."""
+
+    @property
+    def place(self) -> Path:
+        """A folder in that of the sweep."""
+        return Path(self.run) / f"replay-{self.world}"
+
+    @property
+    def horizon(self) -> float:
+        """Time [s] after which the trial ends."""
+        return float(self._chosen[0].setting.rules.horizon)
+
+    @functools.cached_property
+    def _chosen(self) -> tuple[Plan, str]:
+        return chosen(Path(self.run), self.world, self.law)
+
+    @property
+    def title(self) -> str:
+        """Which world is followed."""
+        return f"World {self.world} of {self.run}, {self._chosen[1]}"
+
+    def check(self) -> None:
+        """Check that the folder holds this world and law."""
+        super().check()
+        _ = self._chosen
+
+    def note(self) -> str:
+        """Whether another engine than the sweep's follows the world."""
+        return another_engine(Path(self.run))
+
+    def answer(self, run: Run) -> Trace:
+        """Follow the world."""
+        plan, name = self._chosen
+        part = world_part(plan, list(plan.laws).index(name), [self.world])
+        law = registry.law_of(plan.laws[name])
+        followed = self.followed(part, law, plan.setting, run)
+        title = f"{title_of(plan, self.world)}, {name}"
+        return Trace(followed, scene_of(plan, self.world), title, plan.setting.engine)
+
+
+replay = call_of(Replay)
 
 
 def _evenly(length: int, count: int) -> list[int]:
@@ -156,50 +346,26 @@ def _evenly(length: int, count: int) -> list[int]:
     return [round(i * (length - 1) / (count - 1)) for i in range(count)]
 
 
-def chosen(run: Path, world: int, arm: str | None = None) -> tuple[Plan, str]:
-    """The plan of a sweep, one of whose worlds can be followed, and the arm that is meant.
+def chosen(run: Path, world: int, law: str | None = None) -> tuple[Plan, str]:
+    """The plan of a sweep, one of whose worlds can be followed, and the law that is meant.
 
     An engine whose trials cannot be followed is replaced by the fused one.
 
     Raises:
-      InputError: the folder holds no sweep, or not this world or arm.
+      InputError: the folder holds no sweep, or not this world or law.
     """
     plan = load_plan(run)
-    name = errors.check_name("arm", arm or next(iter(plan.arms)), plan.arms)
-    errors.check_count("index", world, at_least=0, at_most=plan.worlds - 1)
+    name = errors.check_name("law of the run", law or next(iter(plan.laws)), plan.laws)
+    errors.check_count("world", world, at_least=0, at_most=plan.worlds - 1)
     if not engines.get(plan.setting.engine).traced:
         plan = dataclasses.replace(plan, setting=dataclasses.replace(plan.setting, engine="fused"))
-    engines.get(plan.setting.engine).check_followed()
+    engines.get(plan.setting.engine).check()
     return plan, name
 
 
-def replay(
-    run: str | Path, world: int, arm: str | None = None, *, report: Report = unheard
-) -> Push:
-    """One world of a sweep again, followed from its start to its end.
-
-    Args:
-      run: the run folder of the sweep.
-      world: index of the world.
-      arm: which of the sweep's arms; by default the first.
-      report: called now and then.
-
-    Raises:
-      InputError: the folder holds no sweep, or not this world or arm.
-
-    Example:
-      >>> import tempfile
-      >>> import rps_jax
-      >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
-      >>> arms = {"rps": rps_jax.RPSParams.paper()}
-      >>> with tempfile.TemporaryDirectory() as run:
-      ...     found = rps_jax.sweep(drums, arms, worlds=8, out=run, rules=rules)
-      ...     again = rps_jax.replay(run, 2)
-      >>> bool(again.outcome.success) == bool(found.success.sel(arm="rps", world=2))
-      True
-    """
-    plan, name = chosen(Path(run), world, arm)
-    part = world_part(plan, list(plan.arms).index(name), [world])
-    decides = strategies.of(plan.arms[name])
-    (trace,) = pushes.follow_part(part, decides, plan.setting, report=report)
-    return Push(trace, scene_of(plan, world), title_of(plan, world))
+def another_engine(run: Path) -> str:
+    """Tell that worlds of a sweep are followed in another engine than the sweep's, if so."""
+    theirs, ours = load_plan(run).setting.engine, chosen(run, 0)[0].setting.engine
+    if theirs == ours:
+        return ""
+    return f"Trials of the engine {theirs} cannot be followed: this is the engine {ours}."

@@ -14,8 +14,10 @@ from rps_jax.record import files
 from rps_jax.record import folder as run_folder
 from rps_jax.record.checkpoint import Parts
 from rps_jax.runs.plan import Plan, load_plan, open_run
+from rps_jax.runs.question import labelled
 from rps_jax.trials.results import UNITS
 from rps_jax.trials.trial import Outcome
+from rps_jax.world.domain import WORDS
 
 Keep = Callable[[int, bytes], Any]  # called with the number and the content of a part
 Columns = Mapping[str, tuple[np.ndarray, str]]  # what was drawn: values (n,) and unit, by name
@@ -125,47 +127,58 @@ def gather(plan: Plan, folders: Sequence[Path], out: Path) -> xr.Dataset:
 
 
 def dataset(plan: Plan, contents: Mapping[int, bytes]) -> xr.Dataset:
-    """All results of a plan, from the contents of all its parts: (arm, world), and (world) drawn.
+    """All results of a plan, from the contents of all its parts: (law, world), and (world) drawn.
 
     Raises:
       InputError: a part was made by another version of this code.
     """
     every = np.arange(plan.worlds)
-    columns = {"which_object": xr.Variable("world", plan.object_of(every).astype(np.int16))}
+    which = {"units": "1", "long_name": "index of the object in the coordinate object"}
+    objects = plan.object_of(every).astype(np.int16)
+    columns = {"which_object": xr.Variable("world", objects, which)}
     for name, (unit, meaning) in UNITS.items():
-        dims = ("arm", "world", "pose") if name.endswith("pose") else ("arm", "world")
-        shape = (len(plan.arms), plan.worlds, 3)[: len(dims)]
+        dims = ("law", "world", "pose") if name.endswith("pose") else ("law", "world")
+        shape = (len(plan.laws), plan.worlds, 3)[: len(dims)]
         values = np.zeros(shape, _TYPES.get(name, np.float32))
         columns[name] = xr.Variable(dims, values, {"units": unit, "long_name": meaning})
     for number, content in contents.items():
-        arm, _ = plan.arm_and_object(number)
-        part = files.decoded(content, f"part {number}")
+        law, _ = plan.law_and_object(number)
+        part = files.decoded(content, f"part {number}", own=True)
         drawn = [str(name) for name in part if name not in ("trial", *UNITS)]
-        lacking = {"trial", *UNITS} - set(part) | ({"drawn"} if not (arm or drawn) else set())
+        lacking = {"trial", *UNITS} - set(part) | ({"drawn"} if not (law or drawn) else set())
         if lacking:
             raise InputError(
                 f"part {number} of the run was made by another version (it lacks "
                 f"{', '.join(sorted(lacking))}): use that version."
             )
+        dims = {name: ("row", "pose")[: columns[name].ndim - 1] for name in UNITS}
+        dims |= dict.fromkeys(("trial", *drawn), ("row",))
+        trials = plan.parts[number]
+        files.check_columns(part, f"part {number}", dims, {"row": trials.size, "pose": 3})
+        if not np.array_equal(part.trial.values, trials):
+            raise files.corrupt(f"part {number}", "it holds other trials")
         world = part.trial.values % plan.worlds
         for name in UNITS:
-            columns[name].values[arm, world] = part[name].values
+            columns[name].values[law, world] = part[name].values
         for name in drawn:
             if name not in columns:
                 empty = np.zeros(plan.worlds, np.float32)
-                columns[name] = xr.Variable("world", empty, {"units": part[name].units})
+                unit = part[name].attrs.get("units", "1")
+                attrs = {"units": unit, "long_name": WORDS.get(name, name.replace("_", " "))}
+                columns[name] = xr.Variable("world", empty, attrs)
             columns[name].values[world] = part[name].values
     for column in columns.values():
         column.encoding["_FillValue"] = None  # every number is a result
-    names = {"arm": list(plan.arms), "object": list(plan.domain.objects), "world": every}
+    meanings = {
+        "law": (list(plan.laws), "what decides"),
+        "object": (list(plan.domain.objects), "name of the object"),
+        "world": (every, "index of the world"),
+    }
+    names = {
+        name: xr.Variable(name, values, {"long_name": meaning})
+        for name, (values, meaning) in meanings.items()
+    }
     return xr.Dataset(columns, names)
-
-
-def labelled(results: xr.Dataset) -> xr.Dataset:
-    """Results with names for the numbers of a pose, and what was drawn as coordinates of worlds."""
-    if "pose" in results.dims:
-        results = results.assign_coords(pose=["x", "y", "yaw"])
-    return results.set_coords([name for name in results if results[name].dims == ("world",)])
 
 
 def load(run: str | Path) -> xr.Dataset:
@@ -178,9 +191,9 @@ def load(run: str | Path) -> xr.Dataset:
       >>> import tempfile
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
-      >>> arms = {"rps": rps_jax.RPSParams.paper()}
+      >>> setting = rps_jax.Setting("quasistatic", rules=rules)
       >>> with tempfile.TemporaryDirectory() as run:
-      ...     made = rps_jax.sweep(drums, arms, worlds=8, out=run, rules=rules)
+      ...     made = rps_jax.sweep("rps", drums, worlds=8, setting=setting, out=run)
       ...     found = rps_jax.load(run)
       >>> found.equals(made)
       True

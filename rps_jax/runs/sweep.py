@@ -1,106 +1,251 @@
 """Many random worlds, in memory or in a run folder that can be killed and continued, and split.
 
-The design is paired: every arm (a strategy with its parameters) meets the same worlds. Trials are
-kept in parts: a part is one file, written whole as soon as its last trial has ended, named by the
-hash of its content. A part that is there is not run again.
+The design is paired: every law meets the same worlds. Trials are kept in parts: a part is one file,
+written whole as soon as its last trial has ended, named by the hash of its content. A part that is
+there is not run again.
 """
 
 from __future__ import annotations
 
 import functools
+import shlex
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
 
-from rps_jax.control import strategies
-from rps_jax.control.strategies import Params
-from rps_jax.engines import EngineName
+from rps_jax.analysis import figures, statistics, tables
+from rps_jax.analysis.report import Picture, Section
+from rps_jax.control import registry
+from rps_jax.control.registry import LawsLike
+from rps_jax.engines.device import Device
+from rps_jax.errors import InputError
+from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
-from rps_jax.record import provenance
 from rps_jax.record.checkpoint import Parts
-from rps_jax.robot.robot import Robot
+from rps_jax.record.options import option
 from rps_jax.runs.plan import Kind, Plan, Shard, draw, made, open_run, share
-from rps_jax.runs.results import (
-    Collector,
-    Keep,
-    dataset,
-    gather,
-    labelled,
-    name_of,
-)
+from rps_jax.runs.question import InDomain, OfLaws, Run, call_of, labelled
+from rps_jax.runs.results import UNITS, Collector, Keep, dataset, gather, name_of
 from rps_jax.trials import batch
 from rps_jax.trials.batch import Job, Part
-from rps_jax.trials.setting import Progress, Report, Setting, Timing, unheard
-from rps_jax.trials.trial import Rules
+from rps_jax.trials.progress import Progress, Report, Timing, unheard
 from rps_jax.world import points
-from rps_jax.world.domain import Domain, named
 from rps_jax.world.draws import table
-from rps_jax.world.physics import Fidelity, PhysicsName, preset
 
 _AHEAD = 16384  # worlds of a kind that are made before they are asked for, about
 
 
-def sweep(
-    domain: Domain | str,
-    arms: Mapping[str, Params],
-    worlds: int | xr.Dataset | np.ndarray = 1000,
-    seed: int = 0,
-    engine: EngineName = "fused",
-    out: str | Path | None = None,
-    *,
-    physics: PhysicsName = "default",
-    fidelity: Fidelity = "standard",
-    rules: Rules = Rules(),
-    robot: Robot | str | None = None,
-    part: int = 1024,
-    slots: int | None = None,
-    workers: int | None = None,
-    report: Report = unheard,
-) -> xr.Dataset:
-    """Every arm in the same random worlds.
+@dataclass(frozen=True)
+class OfPlan(InDomain[xr.Dataset], OfLaws[xr.Dataset]):
+    """A question that pushes with every law in the same worlds of a plan."""
 
-    Args:
-      domain: ranges of what differs between worlds, or their name in `DOMAINS`.
-      arms: names and parameters of any strategies.
-      worlds: how many, of indices 0, 1, ...; or points of the unit cube, as `worlds_at` has them.
-      seed: of the worlds, unless they are points.
-      engine: what steps them.
-      out: run folder, in which a sweep that was killed is continued; None keeps all in memory.
-      physics: how friction is modelled.
-      fidelity: how finely the physics is solved.
-      rules: when a trial ends.
-      robot: by its name in `ROBOTS`, or a JSON file's; None: the domain's.
-      part: trials of a part at most, which is what a sweep that is killed loses.
-      slots: worlds stepped at once by a worker; by default as suits engine and device.
-      workers: host threads; by default as suits engine and device.
-      report: called after every segment of the run.
+    worlds: int | None = option(None, 1, 1_000_000_000)
+    """Number of worlds, of indices 0, 1, ...; by default 1000, or the whole grid of a domain with
+    listed targets."""
+    part: int = option(1024, 1, 1_000_000, kw_only=True)
+    """Number of trials in a part: what is lost of each law and object when killed, at most."""
 
-    Returns:
-      Outcomes (arm, world), and what was drawn (world) as coordinates.
+    @functools.cached_property
+    def plan(self) -> Plan:
+        """What is run."""
+        usual = self.ranges.combinations if self.ranges.targets else 1000
+        count = usual if self.worlds is None else self.worlds
+        return Plan(self.ranges, count, self.chosen, self.setting, self.part)
 
-    Raises:
-      InputError: an argument is not allowed, or `out` holds another run.
+    def check(self) -> None:
+        """Check the plan, and that the engine can step its worlds here."""
+        self.check_engine(list(self.plan.laws.values()))
+
+    def trials(self) -> int | None:
+        """How many trials there are."""
+        return self.plan.trials
+
+    def configuration(self) -> dict[str, Any]:
+        """All that the results depend on, as JSON."""
+        return self.plan.configuration()
+
+    def answered(self, report: Report) -> xr.Dataset:
+        """Outcomes (law, world), and what was drawn (world) as coordinates."""
+        return self.answer(self.run_in(None if self.out is None else Path(self.out), report))
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Run what is missing of the plan."""
+        return whole(self.plan, run.folder, **run.shape)
+
+    def intro(self, found: xr.Dataset) -> str:
+        """What was asked."""
+        return intro_of(self.plan)
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """Rates, differences, what success depends on, and the hardest worlds."""
+        return report_of(self.plan, found, run.folder)
+
+
+def intro_of(plan: Plan) -> str:
+    """What a plan is, in words."""
+    source = f"seed {plan.setting.seed}" if plan.points is None else "points of the unit cube"
+    return (
+        f"{plan.worlds:,} worlds, {source}, engine {plan.setting.engine}, steps of "
+        f"{1000 * plan.setting.physics.timestep:g} ms; every law meets the same worlds. "
+        "Intervals: Wilson 95 %; bounds of failures: Clopper-Pearson 95 %."
+    )
+
+
+def report_of(plan: Plan, found: xr.Dataset, folder: Path | None) -> list[Section]:
+    """Rates, differences, what success depends on, and the hardest worlds of a plan."""
+    return [
+        rates(found, float(plan.setting.rules.max_lost)),
+        *differences(found),
+        *dependence(found),
+        hardest(found, folder),
+    ]
+
+
+def rates(found: xr.Dataset, max_lost: float) -> Section:
+    """Success of each law."""
+    text = (
+        "CVaR: mean over the worst 5 % of worlds of the least distance between contact point "
+        "and target; of an object that was never touched, the whole way. "
+        f"{statistics.NOT_PROMISED}"
+    )
+    if lost := int((found.overflows.values > 0).sum()):
+        text += f" {lost} trials lost contacts for want of room: they are not to be trusted."
+    return Section("Success", text, tables.success_table(found, max_lost))
+
+
+def differences(found: xr.Dataset) -> list[Section]:
+    """Laws against each other, world by world."""
+    if found.sizes["law"] < 2:
+        return []
+    return [Section("Differences, world by world", "", tables.difference_table(found))]
+
+
+def dependence(found: xr.Dataset) -> list[Section]:
+    """What success depends on."""
+    if not statistics.drawn(found):
+        return []
+    picture = Picture("success", functools.partial(figures.success_curves, found))
+    return [Section("Success against what was drawn", "", (), picture)]
+
+
+def hardest(found: xr.Dataset, folder: Path | None) -> Section:
+    """The worlds in which most laws fail."""
+    text = "Worlds in which most laws fail, and most distance is left."
+    run = "RUN" if folder is None else str(folder)
+    return Section("The hardest worlds", text, tables.hardest_table(found, run))
+
+
+@dataclass(frozen=True)
+class Sweep(OfPlan):
+    """Push in many random worlds, every law in the same ones; the run can be continued.
 
     Example:
       >>> import rps_jax
-      >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
-      >>> both = {"paper": rps_jax.RPSParams.paper(), "tuned": rps_jax.RPSParams.tuned()}
-      >>> found = rps_jax.sweep(drums, both, worlds=4, rules=rules)
-      >>> dict(found.success.sizes)
-      {'arm': 2, 'world': 4}
+      >>> setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
+      >>> laws = ("rps", "rps,v_max=0.03")
+      >>> found = rps_jax.sweep(laws, "wide,objects=random_box", worlds=4, setting=setting)
+      >>> dict(found.success.sizes), found.mass.dims
+      ({'law': 2, 'world': 4}, ('world',))
     """
-    setting = Setting(preset(physics, fidelity), rules, seed, engine)
-    chosen = named(domain, robot)
-    count, at = points.asked(chosen, worlds)
-    plan = Plan(chosen, count, arms, setting, part, at)
-    plan.check_here()
-    shape = {"slots": slots, "workers": workers, "report": report}
-    return whole(plan, None if out is None else Path(out), **shape)
+
+    TITLE: ClassVar[str] = "Sweep over random worlds"
+    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 64}
+
+    laws: LawsLike = ("rps", "nps", "aps")
+    points: str | Path | xr.Dataset | np.ndarray | None = field(default=None, kw_only=True)
+    """Points of the domain's unit cube at which the worlds lie, instead of drawn ones: what
+    rps_jax.worlds_at returned, or a NetCDF file of it, as points.nc of a run folder."""
+    models: bool = field(default=False, kw_only=True)
+    """Whether to run the same worlds on other grounds, cones and steps and in the quasi-static
+    model, too, and to report how much the rates hang on these."""
+    shard: str = field(default="1/1", kw_only=True)
+    """Share K/N of the run: the N shares are run apart, and joined by `rps merge`."""
+    ray: str | None = field(default=None, kw_only=True)
+    """Run on the workers of a Ray cluster: auto, its HOST:PORT, or local (all of this host). Each
+    worker claims a GPU, or else as many processors as workers, one by default."""
+    ray_device: Device = field(default="auto", kw_only=True)
+    """Device of the cluster's workers."""
+
+    @functools.cached_property
+    def plan(self) -> Plan:
+        """What is run."""
+        plan = super().plan
+        if self.points is None:
+            return plan
+        given = self.points
+        if isinstance(given, str | Path):
+            given = files.read(Path(given))
+        at = points.checked(self.ranges, given)
+        return Plan(self.ranges, len(at.u), self.chosen, self.setting, self.part, at)
+
+    @property
+    def share(self) -> Shard:
+        """The share of the plan that is run."""
+        return Shard.named(self.shard)
+
+    def check(self) -> None:
+        """Check what cannot be asked for together."""
+        if self.points is not None and self.worlds is not None:
+            raise InputError("worlds is not allowed with points: these say how many.")
+        if self.models and (self.ray or self.share.of > 1):
+            raise InputError("models is not allowed with ray or a shard: run it in one process.")
+        if self.out is None and (self.ray or self.share.of > 1):
+            raise InputError("out = None is not allowed with ray or a shard: name a run folder.")
+        if not self.ray:
+            super().check()
+
+    def trials(self) -> int | None:
+        """How many trials its share has."""
+        return self.plan.trials_of(self.share)
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Run what is missing; of a share alone, return its own trials (row)."""
+        if run.folder is None or (not self.ray and self.share.of == 1):
+            found = whole(self.plan, run.folder, **run.shape)
+        else:
+            by = run_missing
+            if self.ray:
+                from rps_jax.runs import cluster
+
+                by = cluster.on_cluster(self.ray, self.ray_device)
+            _, results = complete(run.folder, self.plan, self.share, by=by, **run.shape)
+            if results is None:
+                return own_trials(run.folder, self.plan, self.share)
+            found = labelled(results)
+        if self.models:
+            from rps_jax.runs import models
+
+            found = models.added(found, self.plan, run)
+        return found
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """Rates, their range over models, differences, dependence, and the hardest worlds."""
+        if "row" in found.dims:
+            text = f"When all shards are done: `rps merge {shlex.quote(str(self.out))} --out ...`."
+            return [Section(f"Share {self.shard}", text)]
+        first, *others = super().report(found, run)
+        return [first, *spread(found), *others]
+
+
+def spread(found: xr.Dataset) -> list[Section]:
+    """How much the rates hang on the model, if it was asked for."""
+    if "model_success" not in found:
+        return []
+    text = (
+        "The same worlds on other grounds, cones and steps that can be defended. A rate's interval "
+        "says what other worlds would have given; its range over the models says what another "
+        "simulation would have."
+    )
+    return [Section("Models", text, tables.models_table(found))]
+
+
+sweep = call_of(Sweep)
 
 
 def whole(plan: Plan, out: Path | None, *, report: Report = unheard, **shape: Any) -> xr.Dataset:
@@ -115,6 +260,25 @@ def whole(plan: Plan, out: Path | None, *, report: Report = unheard, **shape: An
         every.setdefault(plan.kind(number), []).append(number)
     work(plan, every, contents.__setitem__, report=report, **shape)
     return labelled(dataset(plan, contents))
+
+
+def own_trials(folder: Path, plan: Plan, shard: Shard) -> xr.Dataset:
+    """Outcomes (row) of a shard's own trials, with the law and the world of each."""
+    kept = Parts(folder).contents()
+    found = []
+    for number in share(plan, shard):
+        part = files.decoded(kept[name_of(number)], f"part {number}", own=True)
+        part = part.drop_vars([name for name in part if name not in ("trial", *UNITS)])
+        law, _ = plan.law_and_object(number)
+        rows = part.sizes["row"]
+        own = {
+            "law": ("row", [list(plan.laws)[law]] * rows),
+            "world": ("row", part.trial.values % plan.worlds),
+        }
+        found.append(part.drop_vars("trial").assign_coords(own))
+    whole = xr.concat(found, "row")
+    assert isinstance(whole, xr.Dataset)
+    return whole
 
 
 def run_missing(
@@ -132,7 +296,7 @@ def run_missing(
         provenance.sign(folder)
 
     def tell(progress: Progress) -> None:
-        report(Progress(before + progress.finished, progress.simulated))
+        report(replace(progress, finished=before + progress.finished))
 
     return work(plan, missing, functools.partial(store, folder), report=tell, **shape)
 
@@ -184,7 +348,7 @@ def work(
         parts = _made(plan, some, collector)
         if isinstance(some, Sequence):  # what is asked for elsewhere is asked for when it is needed
             parts = _ahead(parts, max(1, _AHEAD // plan.part))
-        jobs.append(Job(strategies.STRATEGIES[kind[1]], plan.sizes[kind], parts))
+        jobs.append(Job(registry.of_class(kind[1]), plan.sizes[kind], parts))
     return batch.run(jobs, plan.setting, collect=collector.collect, report=report, **shape)
 
 
@@ -202,17 +366,17 @@ def remaining(folder: Path, plan: Plan, shard: Shard) -> tuple[dict[Kind, list[i
 
 
 def _made(plan: Plan, numbers: Iterable[int], collector: Collector) -> Iterator[Part]:
-    """The worlds of parts, made one part at a time; the first arm's keep what was drawn."""
+    """The worlds of parts, made one part at a time; the first law's keep what was drawn."""
     for number in numbers:
-        trials, (arm, _) = plan.parts[number], plan.arm_and_object(number)
+        trials, (law, _) = plan.parts[number], plan.law_and_object(number)
         drawn = draw(plan, trials % plan.worlds)
-        if arm == 0:
+        if law == 0:
             collector.expect(number, table(drawn))
-        yield made(plan, arm, drawn)._replace(numbers=trials)
+        yield made(plan, law, drawn)._replace(numbers=trials)
 
 
 def _ahead(parts: Iterator[Part], count: int) -> Iterator[Part]:
-    """The same, so many of them made while what came before them runs."""
+    """Prefetch worlds: make `count` parts ahead while the ones before them run."""
     with ThreadPoolExecutor(1) as maker:
         coming = deque(maker.submit(next, parts, None) for _ in range(count))
         while (part := coming.popleft().result()) is not None:

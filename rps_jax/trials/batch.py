@@ -22,9 +22,11 @@ from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from rps_jax import engines, errors
-from rps_jax.control.strategies import Strategy
+from rps_jax.control.base import Law
+from rps_jax.engines import programs
 from rps_jax.trials import host, trial
-from rps_jax.trials.setting import Progress, Report, Setting, Timing, unheard
+from rps_jax.trials.progress import Progress, Report, Timing, unheard
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome, Rules, Trial, World
 from rps_jax.world.physics import Physics
 
@@ -45,7 +47,7 @@ class Part(NamedTuple):
 class Job(NamedTuple):
     """Trials of one kind: one compiled program runs them all."""
 
-    strategy: Strategy
+    law: Law
     trials: int  # at most; there are no more slots than that
     parts: Iterable[Part]  # of one stage, if JAX traces the engine
 
@@ -103,6 +105,32 @@ def run(
     warn_of_lost(shared.overflowed)
     total = time.perf_counter() - began
     return Timing(shared.compile, total - shared.compile, shared.simulated)
+
+
+def gathered(
+    jobs: Sequence[Job], setting: Setting, count: int, **shape: Any
+) -> tuple[Outcome, Timing]:
+    """Run every trial of every job, and gather the outcomes in the order of their numbers.
+
+    Args:
+      jobs: what to run, trials of the numbers 0 to `count` - 1.
+      setting: what they share.
+      count: how many trials there are.
+      shape: `slots`, `workers` and `report` of `run`.
+
+    Returns:
+      Outcomes as numpy arrays (count, ...); and the timing.
+    """
+    found: dict[str, np.ndarray] = {}
+
+    def collect(numbers: np.ndarray, outcome: Outcome) -> None:
+        for name, leaf in outcome._asdict().items():
+            if name not in found:
+                found[name] = np.empty((count, *leaf.shape[1:]), leaf.dtype)
+            found[name][numbers] = leaf
+
+    timing = run(jobs, setting, collect=collect, **shape)
+    return Outcome(**found), timing  # pyright: ignore[reportArgumentType]
 
 
 def warn_of_lost(count: int) -> None:
@@ -175,7 +203,7 @@ def _run_on_host(job: Job, setting: Setting, threads: int, shared: _Shared) -> N
             part.worlds,
             physics=setting.physics,
             rules=setting.rules,
-            strategy=job.strategy,
+            law=job.law,
             threads=max(1, threads),
             report=tell,
         )
@@ -188,7 +216,7 @@ class _Queue:
     """The waiting trials of one job, and the batches that can run them, the widest first."""
 
     def __init__(self, job: Job, setting: Setting, slots: int):
-        self.strategy = job.strategy
+        self.law = job.law
         self._parts = iter(job.parts)
         first = next(self._parts)
         self._waiting: Part | None = first  # what is left of it
@@ -197,8 +225,7 @@ class _Queue:
         widest = min(slots, -(-job.trials // devices))
         fewest = _FEWEST if jax.default_backend() != "cpu" else widest
         self.widths = [
-            _Width(job.strategy, setting, first, devices * each)
-            for each in _ever_fewer(widest, fewest)
+            _Width(job.law, setting, first, devices * each) for each in _ever_fewer(widest, fewest)
         ]
 
     def take(self, count: int) -> list[Part]:
@@ -222,11 +249,11 @@ def _ever_fewer(slots: int, fewest: int) -> Iterator[int]:
 class _Width:
     """A batch of so many slots on all devices of the host, and its program once compiled."""
 
-    def __init__(self, strategy: Strategy, setting: Setting, like: Part, slots: int):
+    def __init__(self, law: Law, setting: Setting, like: Part, slots: int):
         self.slots = slots
         self.stage = like.stage
         self.setting = setting
-        self._strategy = strategy
+        self._law = law
         self.sharding = None
         if jax.device_count() > 1:
             mesh = jax.make_mesh((jax.device_count(),), ("worlds",), (AxisType.Auto,))
@@ -250,23 +277,23 @@ class _Width:
 
     def start(self, worlds: World, live: np.ndarray) -> Trial:
         """New trials in all slots."""
-        return self.put(trial.start_all(worlds, live, strategy=self._strategy))
+        return self.put(trial.start_all(worlds, live, law=self._law))
 
     def refill(self, worlds: World, trials: Trial, fresh: np.ndarray) -> Trial:
         """New trials in the slots that are `fresh` (slots,)."""
-        return self.put(_refill(worlds, trials, fresh, strategy=self._strategy))
+        return self.put(_refill(worlds, trials, fresh, law=self._law))
 
     def _batched(self, leaf: Any) -> jax.ShapeDtypeStruct:
         shape = (self.slots, *leaf.shape[1:])
         return jax.ShapeDtypeStruct(shape, leaf.dtype, sharding=self.sharding)
 
     def _compile(self) -> Any:
-        start = partial(trial.start_all, strategy=self._strategy)
+        start = partial(trial.start_all, law=self._law)
         live = jax.ShapeDtypeStruct((self.slots,), bool)
         trials = jax.tree.map(self._batched, jax.eval_shape(start, self._worlds, live))
         stage, rules = jax.eval_shape(lambda: (self.stage, self.setting.rules))
         leaves, tree = jax.tree.flatten((stage, self._worlds, trials, rules))
-        return _compiled(self.setting.physics, self._strategy, self.sharding, tree, tuple(leaves))
+        return _compiled(self.setting.physics, self._law, self.sharding, tree, tuple(leaves))
 
 
 def _widths(queues: Sequence[_Queue]) -> list[_Width]:
@@ -280,7 +307,7 @@ def _slots_of(width: _Width) -> int:
 @functools.lru_cache(maxsize=32)
 def _compiled(
     physics: Physics,
-    strategy: Strategy,
+    law: Law,
     sharding: NamedSharding | None,
     tree: Any,
     leaves: tuple[jax.ShapeDtypeStruct, ...],
@@ -299,7 +326,7 @@ def _compiled(
             trials,
             physics=physics,
             rules=rules,
-            strategy=strategy,
+            law=law,
             steps=max(1, round(SEGMENT / physics.control_period)),
         )
         # Of the same program: one of its own would wait for the other workers' segments.
@@ -313,12 +340,19 @@ def _compiled(
             out_specs=P("worlds"),
             check_vma=False,
         )
-    program = jax.jit(advance, donate_argnums=2)
-    return program.lower(*jax.tree.unflatten(tree, leaves)).compile()
+    arguments = jax.tree.unflatten(tree, leaves)
+    who = programs.identity(law)
+    if sharding is None and who is not None:
+        trials = arguments[2]
+        names: tuple[Any, ...] = Outcome._fields  # any leaves: what counts is the structure
+        result = trials, (trials.steps, trials.done, Outcome(*names))
+        static = (physics, who, SEGMENT)
+        return programs.compiled(advance, arguments, result, donate=2, static=static)
+    return jax.jit(advance, donate_argnums=2).lower(*arguments).compile()
 
 
 def rows(tree: Any, which: Any) -> Any:
-    """The same rows of every leaf."""
+    """Take these rows of every leaf."""
     return jax.tree.map(lambda leaf: leaf[which], tree)
 
 
@@ -336,10 +370,10 @@ def _count(parts: Sequence[Part]) -> int:
     return sum(part.numbers.size for part in parts)
 
 
-@partial(jax.jit, static_argnames=("strategy",), donate_argnames=("trials",))
-def _refill(worlds: World, trials: Trial, fresh: jax.Array, *, strategy: Strategy) -> Trial:
+@partial(jax.jit, static_argnames=("law",), donate_argnames=("trials",))
+def _refill(worlds: World, trials: Trial, fresh: jax.Array, *, law: Law) -> Trial:
     """Start a new trial in the slots that are `fresh` (B,)."""
-    started = trial.start_all(worlds, jnp.ones_like(fresh), strategy=strategy)
+    started = trial.start_all(worlds, jnp.ones_like(fresh), law=law)
     pick = partial(jax.vmap(lambda f, a, b: jnp.where(f, a, b)), fresh)
     return jax.tree.map(pick, started, trials)
 

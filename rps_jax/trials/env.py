@@ -24,9 +24,11 @@ import numpy as np
 
 from rps_jax import engines, errors
 from rps_jax.analysis import video
-from rps_jax.control import law, strategies
-from rps_jax.control.law import RPSParams, Twist
-from rps_jax.control.learned.observation import TaxelObservation
+from rps_jax.control.base import check_finite
+from rps_jax.control.laws import rps
+from rps_jax.control.laws.rps import RPSParams
+from rps_jax.control.learned import features
+from rps_jax.control.observation import TaxelObservation, Twist
 from rps_jax.engines.base import Driven, Motion, Stage
 from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.geometry import footprint as fp
@@ -103,17 +105,17 @@ class PushEnv:
     domain: Domain = DOMAINS["wide"]
     params: RPSParams = RPSParams.paper()  # of which the bounds of the twist and d_success count
     setting: Setting = Setting(engine="fused")
-    robot: Robot | str | None = None  # by its name in `ROBOTS`; None: the domain's
+    robot: Robot | str | None = None  # by its name, as kairos; None: the domain's
     weights: Reward = Reward()
     worlds: int = 1024
 
     def __post_init__(self) -> None:
         """Draws the worlds: now, and not while a loop is traced."""
-        engines.get(self.setting.engine).check_followed()
+        engines.get(self.setting.engine).check_traced()
         errors.check_name("skin of an environment", self.domain.skin, ("capacitive",))
         errors.check_count("worlds", self.worlds, at_most=1_000_000)
-        law.check(self.params)
-        strategies.check_finite(self.weights)
+        rps.check(self.params)
+        check_finite(self.weights)
         self._drive  # noqa: B018
 
     # --- the loop ---
@@ -134,9 +136,9 @@ class PushEnv:
         """A world, of the index or one that was made of it, at its start."""
         before = trial.start(world)
         never_felt = jnp.full_like(before.min_distance, jnp.inf)
-        now, seen = self._observe(world, before._replace(strategy=never_felt))
+        now, seen = self._observe(world, before._replace(memory=never_felt))
         nothing = jnp.zeros_like(now.min_distance)
-        info = {"world": world, "index": index, "told": self._told(world, now, seen)}
+        info = {"world": world, "index": index, "observation": self._observation(world, now, seen)}
         return State(now, _obs(now, seen), nothing, nothing, _metrics(now, seen, nothing), info)
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -148,7 +150,7 @@ class PushEnv:
         moved = trial.settle(before, told, driven)
         now, seen = self._observe(world, moved)
         gone = moved.done  # it had ended before, or the physics ended it
-        progress = jnp.where(jnp.isfinite(before.strategy), before.strategy - now.strategy, 0.0)
+        progress = jnp.where(jnp.isfinite(before.memory), before.memory - now.memory, 0.0)
         reward = (
             self.weights.progress * progress
             - self.weights.no_contact * self.dt * ~seen.reading.in_contact
@@ -162,14 +164,14 @@ class PushEnv:
             reward=jnp.where(gone, 0.0, reward),
             done=now.done.astype(reward.dtype),
             metrics=state.metrics | _metrics(now, seen, jnp.where(gone, 0.0, progress)),
-            info=state.info | {"told": self._told(world, now, seen)},
+            info=state.info | {"observation": self._observation(world, now, seen)},
         )
 
     def twist(self, action: jax.Array) -> Twist:
         """The twist [m/s, m/s, rad/s] that an action (3,) asks for."""
         v_max, omega_max = self.params.v_max, self.params.omega_max
         wanted = Twist(v_max * action[0], v_max * action[1], omega_max * action[2])
-        return law.saturate(self.params, wanted)
+        return rps.saturate(self.params, wanted)
 
     def _gains(self, world: World, before: Trial, now: Trial) -> tuple[jax.Array, jax.Array]:
         """By how much a step brought the object nearer [m], and the base behind it [1]."""
@@ -188,14 +190,15 @@ class PushEnv:
         """Sense and judge, unless the trial has ended."""
         physics, rules = self.setting.physics, self.setting.rules
         told, seen = trial.observe(world, before, physics=physics, rules=rules)
-        felt = jnp.where(seen.reading.in_contact, seen.distance, before.strategy)
-        told = told._replace(strategy=felt)
+        felt = jnp.where(seen.reading.in_contact, seen.distance, before.memory)
+        told = told._replace(memory=felt)
         return jax.tree.map(lambda a, b: jnp.where(before.done, a, b), before, told), seen
 
-    def _told(self, world: World, now: Trial, seen: Seen) -> TaxelObservation:
+    def _observation(self, world: World, now: Trial, seen: Seen) -> TaxelObservation:
         """What a law that senses taxels is told."""
         felt = world.skin, now.skin, trial.outline(world, now.qpos)
-        return TaxelObservation.of(seen.observation, seen.reading, *felt, jnp.asarray(self.dt))
+        touch = seen.observation._replace(period=jnp.asarray(self.dt))
+        return features.observed(touch, seen.reading, *felt)
 
     # --- what it is made of ---
 

@@ -13,18 +13,18 @@ from typing import Any
 import jax
 import numpy as np
 
-from rps_jax.control.strategies import Strategy
+from rps_jax.control.base import Law
 from rps_jax.engines.base import Driven, Engine, Motion
 from rps_jax.trials import trial
-from rps_jax.trials.trial import Rules, Trial, World
+from rps_jax.trials.trial import Rules, Snapshot, Trial, World
 from rps_jax.world.physics import Physics
 
 _LOOK = 500  # control steps between two reports
 
 
-@partial(jax.jit, static_argnames=("physics", "strategy"))
+@partial(jax.jit, static_argnames=("physics", "law"))
 def _decide(worlds: World, trials: Trial, **options: Any):
-    return jax.vmap(partial(trial.decide, **options))(worlds, trials)[:2]
+    return jax.vmap(partial(trial.decide, **options))(worlds, trials)
 
 
 _settle = jax.jit(jax.vmap(trial.settle))
@@ -37,26 +37,29 @@ def run(
     *,
     physics: Physics,
     rules: Rules,
-    strategy: Strategy,
+    law: Law,
     threads: int,
     report: Callable[[np.ndarray, Trial, float], bool],
-) -> None:
-    """Run a batch of worlds to their ends.
+    watch: Callable[[int, Snapshot], Any] = lambda step, seen: None,
+) -> Trial:
+    """Run a batch of worlds to their ends, and return the trials.
 
-    `report(ended, trials, simulated)` is told now and then which trials (n,) have ended since, and
-    how many seconds were simulated, summed over all; it answers whether to go on.
+    `report(ended, trials, simulated)` hears now and then which trials (n,) have ended since, and
+    how many seconds were simulated, summed over all; it answers whether to go on. `watch` is handed
+    every control step, with what all trials looked like at its beginning.
     """
-    options = {"physics": physics, "rules": rules, "strategy": strategy}
+    options = {"physics": physics, "rules": rules, "law": law}
     count = len(worlds.qpos)
     host = jax.devices("cpu")[0]  # where the engine is
     worlds = jax.device_put(worlds, host)
-    trials = trial.start_all(worlds, np.ones(count, bool), strategy=strategy)
+    trials = trial.start_all(worlds, np.ones(count, bool), law=law)
     batch = engine.stepper(stage, np.asarray(trials.qpos, float), threads, trial.pushing(worlds))
     try:
         told_of = np.zeros(count, bool)
         before, passes, dtype = 0, 0, trials.qpos.dtype
         while not told_of.all():
-            told, twist = _decide(worlds, trials, **options)
+            told, twist, seen = _decide(worlds, trials, **options)
+            watch(passes, seen)
             going = np.flatnonzero(~np.asarray(told.done))
             # Only a hand that shifts the object moves it outside the engine.
             shifted = np.flatnonzero(np.any(np.asarray(told.qpos != trials.qpos), axis=1))
@@ -65,14 +68,15 @@ def run(
                 batch.drive(going, np.stack(twist, axis=1)[going].astype(float), physics.substeps)
             after = Motion(batch.qpos, batch.qvel, batch.warmstart, batch.integral)
             motion = jax.tree.map(lambda x: x.astype(dtype), after)
-            felt = batch.force.astype(dtype) if strategy.senses == "force" else None
+            felt = batch.force.astype(dtype) if law.senses == "force" else None
             trials = _settle(trials, told, Driven(motion, force=felt))
             passes += 1
             if passes % _LOOK == 0 or not going.size:
                 done, steps = np.asarray(trials.done), int(np.asarray(trials.steps).sum())
                 simulated = (steps - before) * physics.control_period
                 if not report(np.flatnonzero(done & ~told_of), trials, simulated):
-                    return
+                    return trials
                 told_of, before = done, steps
+        return trials
     finally:
         batch.close()

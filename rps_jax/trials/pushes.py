@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
@@ -13,64 +14,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import engines, errors
-from rps_jax.control import strategies
-from rps_jax.control.law import RPSParams
-from rps_jax.control.strategies import Params, Strategy
+from rps_jax import engines
+from rps_jax.control import registry
+from rps_jax.control.base import Law, Params
+from rps_jax.control.laws.rps import RPSParams
+from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.base import Odometry
-from rps_jax.robot.robot import Robot
 from rps_jax.robot.shell import Shell
-from rps_jax.robot.skin import IdealSkin, Skin
-from rps_jax.trials import trial
+from rps_jax.trials import batch, host, trial
 from rps_jax.trials.batch import SEGMENT, Job, Part, rows, warn_of_lost
-from rps_jax.trials.batch import run as _run
-from rps_jax.trials.setting import Progress, Report, Setting, Timing, unheard
+from rps_jax.trials.case import Case
+from rps_jax.trials.progress import Progress, Report, Timing, unheard
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome, Shift, Snapshot, World
 from rps_jax.world import scene
-from rps_jax.world.objects import FAMILIES, OBJECTS
+from rps_jax.world.objects import FAMILIES
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS, Friction, Scene, Side
+from rps_jax.world.scene import JOINTS, Scene
 
 
 @dataclass(frozen=True)
-class Case:
-    """One trial to run: all that may differ from world to world."""
-
-    object: str
-    friction: Friction
-    p_world_target: tuple[float, float]  # [m]
-    params: Params = RPSParams.paper()  # and with them the strategy
-    mass: float | None = None  # [kg] of the object; None: its own
-    skin: Skin = IdealSkin()
-    gap: float = 0.02  # [m] between base and object at the start; left open by the paper
-    rear: Side = "near"  # where the nonuniform box's load stands; left open by the paper
-    bearing: float = 0.0  # [rad] turns the whole trial, and so matters to a friction pyramid alone
-    shift: Shift = Shift()
-    robot: Robot = Robot()
-
-    def __post_init__(self) -> None:
-        """Raises InputError for anything that names or means no trial."""
-        errors.check_name("object", self.object, OBJECTS)
-        strategies.of(self.params).check(self.params)
-        scene.check(self.friction, self.mass)
-        self.skin.check()
-        errors.check_finite("gap", self.gap, at_least=0, at_most=1, unit="m")
-        errors.check_name("rear", self.rear, scene.SIDES)
-        errors.check_finite("bearing", self.bearing, at_least=-10, at_most=10, unit="rad")
-        errors.check_number("shift time", self.shift.time, at_least=0, unit="s")
-        for axis, value in zip("xy", self.shift.p_robot, strict=True):
-            errors.check_finite(f"shift {axis}", value, at_least=-5, at_most=5, unit="m")
-        self.robot.check()
-        scene.check_target(self.p_world_target, self.robot.shell)
-
-    @property
-    def sensor(self) -> Skin:
-        """The skin on the robot."""
-        return self.skin.on(self.robot.shell)
-
-
-@dataclass(frozen=True)
-class Trace:
+class Followed:
     """One trial, seen every `interval` [s]: arrays over time, (T, ...)."""
 
     snapshots: Snapshot
@@ -79,23 +43,24 @@ class Trace:
     p_world_target: tuple[float, float]  # [m]
     params: Params
     half: tuple[float, float]  # [m] half length and half width of the base
+    outline: np.ndarray  # (N, 2) [m] of the object in its own frame, closed
 
 
 def scene_of(case: Case, physics: Physics) -> Scene:
     """The scene that a case is run in."""
     return scene.load(
-        case.object,
+        case.object_name,
         physics,
-        case.friction,
+        case.contact,
         rear=case.rear,
         mass=case.mass,
-        robot=case.robot,
+        robot=case.base,
     )
 
 
 def _scenes(cases: Sequence[Case], physics: Physics) -> tuple[list[Scene], np.ndarray]:
     """The different scenes of cases, and which of them each case has, (len(cases),)."""
-    keys = [(c.object, c.friction, c.mass, c.rear, c.robot) for c in cases]
+    keys = [(c.object_name, c.contact, c.mass, c.rear, c.base) for c in cases]
     different = dict(zip(keys, cases, strict=True))
     order = {key: i for i, key in enumerate(different)}
     scenes = [scene_of(case, physics) for case in different.values()]
@@ -111,7 +76,7 @@ def _start_of(case: Case, at: Scene) -> tuple[np.ndarray, np.ndarray]:
     qpos[:3] = [*(turn @ qpos[:2]), qpos[2] + case.bearing]
     qpos[x : x + 2] = turn @ qpos[x : x + 2]
     qpos[x + 3 : x + 7] = [math.cos(case.bearing / 2), 0.0, 0.0, math.sin(case.bearing / 2)]
-    return qpos, turn @ np.array(case.p_world_target)
+    return qpos, turn @ np.array(case.target)
 
 
 def build(
@@ -123,8 +88,8 @@ def build(
     indices count from 0.
     """
     for case in cases:
-        engines.get(setting.engine).check_robot(case.robot)
-        engines.get(setting.engine).check_senses(strategies.of(case.params).senses)
+        engines.get(setting.engine).check_robot(case.base)
+        engines.get(setting.engine).check_senses(registry.law_of(case.params).senses)
     scenes, which = _scenes(cases, setting.physics)
     stage, fields = engines.get(setting.engine).stage_of_scenes(scenes, which)
     starts = [_start_of(case, scenes[i]) for case, i in zip(cases, which, strict=True)]
@@ -144,14 +109,18 @@ def build(
         qpos=_stack([qpos for qpos, _ in starts], dtype),
         key=jax.device_get(jax.vmap(partial(jax.random.fold_in, root))(numbers)),
         odometry=_stack([Odometry()] * len(cases), dtype),
-        robot=None if cases[0].robot.ideal else _stack([case.robot for case in cases], dtype),
+        robot=None if cases[0].base.ideal else _stack([case.base for case in cases], dtype),
     )
     return stage, world
 
 
 def kind(case: Case) -> Hashable:
-    """What decides which compiled program runs a case: family, strategy, sensor and robot."""
-    return FAMILIES[case.object], type(case.params), jax.tree.structure((case.sensor, case.robot))
+    """What decides which compiled program runs a case: family, law, sensor and robot."""
+    return (
+        FAMILIES[case.object_name],
+        type(case.params),
+        jax.tree.structure((case.sensor, case.base)),
+    )
 
 
 def _by_kind(cases: Sequence[Case]) -> list[list[int]]:
@@ -178,7 +147,7 @@ def _stack(trees: Sequence[Any], dtype: np.dtype, which: np.ndarray | None = Non
 
 def run(
     cases: Sequence[Case],
-    setting: Setting = Setting(),
+    setting: Setting = Setting(engine="mjx"),
     *,
     slots: int | None = None,
     workers: int | None = None,
@@ -203,52 +172,46 @@ def run(
         mine = [cases[i] for i in indices]
         stage, worlds = build(mine, setting, indices)
         part = Part(np.array(indices), worlds, stage)
-        jobs.append(Job(strategies.of(mine[0].params), len(mine), [part]))
-    order, found = [], []
-
-    def collect(numbers: np.ndarray, outcomes: Outcome) -> None:
-        order.append(numbers)
-        found.append(outcomes)
-
-    timing = _run(jobs, setting, slots=slots, workers=workers, collect=collect, report=report)
-    whole = jax.tree.map(lambda *parts: np.concatenate(parts), *found)
-    return rows(whole, np.argsort(np.concatenate(order))), timing
+        jobs.append(Job(registry.law_of(mine[0].params), len(mine), [part]))
+    return batch.gathered(jobs, setting, len(cases), slots=slots, workers=workers, report=report)
 
 
 def follow(
     cases: Sequence[Case],
-    setting: Setting = Setting(),
+    setting: Setting = Setting(engine="mjx"),
     *,
     interval: float = 0.1,
     report: Report = unheard,
-) -> list[Trace]:
+) -> list[Followed]:
     """Run trials of one kind to their ends and keep what they looked like every `interval` [s].
 
     Raises:
       InputError: the engine's trials cannot be followed on this machine.
     """
-    engines.get(setting.engine).check_followed()
+    engines.get(setting.engine).check()
     stage, worlds = build(cases, setting)
     part = Part(np.arange(len(cases)), worlds, stage)
-    strategy = strategies.of(cases[0].params)
-    return follow_part(part, strategy, setting, interval=interval, report=report)
+    law = registry.law_of(cases[0].params)
+    return follow_part(part, law, setting, interval=interval, report=report)
 
 
 def follow_part(
     part: Part,
-    strategy: Strategy,
+    law: Law,
     setting: Setting,
     *,
     interval: float = 0.1,
     report: Report = unheard,
-) -> list[Trace]:
+) -> list[Followed]:
     """`follow`, for worlds that are built."""
     period = setting.physics.control_period
     every = max(1, round(interval / period))
+    if not engines.get(setting.engine).traced:
+        return _followed(part, *_follow_on_host(part, law, setting, every, report))
     steps = every * max(1, round(SEGMENT / (every * period)))
     worlds = jax.device_put(part.worlds)
-    trials = trial.start_all(worlds, np.ones(part.numbers.size, bool), strategy=strategy)
-    options = {"physics": setting.physics, "rules": setting.rules, "strategy": strategy}
+    trials = trial.start_all(worlds, np.ones(part.numbers.size, bool), law=law)
+    options = {"physics": setting.physics, "rules": setting.rules, "law": law}
     began = time.perf_counter()
     program = trial.record.lower(
         part.stage, worlds, trials, **options, steps=steps, every=every
@@ -258,22 +221,74 @@ def follow_part(
     while not bool(trials.done.all()):
         trials, snapshots = program(part.stage, worlds, trials, rules=setting.rules)
         parts.append(jax.device_get(snapshots))
-        report(Progress(int(trials.done.sum()), float(trials.steps.sum()) * period))
+        done, simulated = int(trials.done.sum()), float(trials.steps.sum()) * period
+        report(Progress(done, simulated, compiled - began))
     whole = jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
     outcomes = jax.device_get(trial.outcome(trials, period))
-    warn_of_lost(int(np.count_nonzero(outcomes.overflows)))
     timing = Timing(compiled - began, time.perf_counter() - compiled, float(np.sum(outcomes.time)))
+    return _followed(part, whole, outcomes, timing)
+
+
+def _follow_on_host(
+    part: Part, law: Law, setting: Setting, every: int, report: Report
+) -> tuple[Snapshot, Outcome, Timing]:
+    """What `host.run` sees every so many control steps: (T, B, ...), outcomes and timing."""
+    seen: list[Snapshot] = []
+    total, began, compiled = 0.0, time.perf_counter(), 0.0
+
+    def watch(step: int, now: Snapshot) -> None:
+        nonlocal compiled
+        compiled = compiled or time.perf_counter() - began  # the first step is decided
+        if step % every == 0:
+            seen.append(jax.device_get(now))
+
+    def tell(_: np.ndarray, trials: trial.Trial, simulated: float) -> bool:
+        nonlocal total
+        total += simulated
+        report(Progress(int(trials.done.sum()), total, compiled))
+        return True
+
+    trials = host.run(
+        engines.get(setting.engine),
+        part.stage,
+        part.worlds,
+        physics=setting.physics,
+        rules=setting.rules,
+        law=law,
+        threads=1 if part.numbers.size == 1 else os.cpu_count() or 1,
+        report=tell,
+        watch=watch,
+    )
+    outcomes = jax.device_get(trial.outcome(trials, setting.physics.control_period))
+    ran = time.perf_counter() - began - compiled
+    timing = Timing(compiled, ran, float(np.sum(outcomes.time)))
+    return jax.tree.map(lambda *each: np.stack(each), *seen), outcomes, timing
+
+
+def _followed(part: Part, whole: Snapshot, outcomes: Outcome, timing: Timing) -> list[Followed]:
+    """What was seen (T, B, ...), trial by trial, each until its end."""
+    warn_of_lost(int(np.count_nonzero(outcomes.overflows)))
     return [
-        Trace(
+        Followed(
             rows(whole, (~whole.done[:, i], i)),
             rows(outcomes, i),
             timing,
             (float(part.worlds.p_world_target[i][0]), float(part.worlds.p_world_target[i][1])),
             rows(part.worlds.params, i),
             _half(rows(part.worlds.skin.shell, i)),
+            _outline(rows(part.worlds.footprint, i)),
         )
         for i in range(part.numbers.size)
     ]
+
+
+def _outline(shape: Footprint) -> np.ndarray:
+    """Outline (N, 2) [m] of a footprint, closed; a circle as a polygon."""
+    corners, radius = np.asarray(shape.vertices, float), float(shape.radius)
+    if radius > 0:
+        angle = np.linspace(0, 2 * np.pi, 49)
+        return corners[:1] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.concatenate([corners, corners[:1]])
 
 
 def _half(shell: Shell) -> tuple[float, float]:

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from rps_jax.control.law import RPSParams
+from rps_jax.control.laws.rps import RPSParams
 from rps_jax.trials import trial
-from rps_jax.trials.pushes import Case, Trace
+from rps_jax.trials.pushes import Followed
 from rps_jax.trials.trial import Outcome
 
-DIMS = ("strategy", "object", "friction", "target")
+DIMS = ("law", "object", "friction", "target")
 UNITS = {
     "success": ("1", "target reached within the rules"),
     "time": ("s", "simulated time at which the trial ended"),
@@ -33,13 +33,13 @@ UNITS = {
 
 def outcome_dataset(
     outcome: Outcome,
-    strategies: Sequence[str],
+    laws: Sequence[str],
     objects: Sequence[str],
     frictions: Sequence[str],
     targets: Sequence[tuple[float, float]],
 ) -> xr.Dataset:
     """Outcomes (S * O * F * T, ...) in this nesting order, as a Dataset labelled by `DIMS`."""
-    shape = (len(strategies), len(objects), len(frictions), len(targets))
+    shape = (len(laws), len(objects), len(frictions), len(targets))
     variables = {}
     for name, values in outcome._asdict().items():
         values = _plain(values)
@@ -51,7 +51,7 @@ def outcome_dataset(
     return xr.Dataset(
         variables,
         coords={
-            "strategy": list(strategies),
+            "law": list(laws),
             "object": list(objects),
             "friction": list(frictions),
             "target": np.arange(len(targets)),
@@ -68,7 +68,7 @@ def _plain(values: Any) -> np.ndarray:
     return values.astype(np.int8) if values.dtype == bool else values
 
 
-def trace_dataset(trace: Trace) -> xr.Dataset:
+def trace_dataset(trace: Followed) -> xr.Dataset:
     """One trial over time: variables (time, ...), and its outcome, target and thresholds alone."""
     seen = trace.snapshots
 
@@ -99,12 +99,6 @@ def trace_dataset(trace: Trace) -> xr.Dataset:
     for name, value in zip(("half_length", "half_width"), trace.half, strict=True):
         attrs = {"units": "m", "long_name": f"{name.replace('_', ' ')} of the base"}
         variables[name] = xr.Variable((), value, attrs)
+    attrs = {"units": "m", "long_name": "outline of the object in its own frame"}
+    variables["outline"] = xr.Variable(("corner", "axis"), trace.outline, attrs)
     return xr.Dataset(variables, coords={"time": ("time", seen.time, {"units": "s"})})
-
-
-def title_of(case: Case) -> str:
-    """What a case is, in words."""
-    return (
-        f"{case.object.replace('_', ' ')}, $\\mu$ ground {case.friction.ground:g}, "
-        f"robot {case.friction.robot:g}"
-    )

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import engines, errors
-from rps_jax.control import strategies
-from rps_jax.control.strategies import Strategy
+from rps_jax.control import registry
+from rps_jax.control.base import Law
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.skin import CapacitiveSkin
 from rps_jax.trials import pushes, trial
@@ -50,10 +50,10 @@ class Live:
       InputError: an engine that cannot be followed.
     """
 
-    def __init__(self, part: Part, strategy: Strategy, setting: Setting) -> None:
+    def __init__(self, part: Part, law: Law, setting: Setting) -> None:
         """The first world of a part, at its start."""
-        engines.get(setting.engine).check_followed()
-        self._stage, self._strategy, self._setting = part.stage, strategy, setting
+        engines.get(setting.engine).check_traced()
+        self._stage, self._law, self._setting = part.stage, law, setting
         self._first: World = rows(part.worlds, slice(1))
         self.past: list[Moment] = []
         self.reset()
@@ -62,7 +62,7 @@ class Live:
     def of_case(cls, case: Case, setting: Setting) -> Live:
         """The trial of a case."""
         stage, worlds = pushes.build([case], setting)
-        return cls(Part(np.arange(1), worlds, stage), strategies.of(case.params), setting)
+        return cls(Part(np.arange(1), worlds, stage), registry.law_of(case.params), setting)
 
     # --- what it is now ---
 
@@ -91,7 +91,7 @@ class Live:
     def reset(self) -> None:
         """Back to the start, and the target with it."""
         self._worlds = self._first
-        started = trial.start_all(self._worlds, np.ones(1, bool), strategy=self._strategy)
+        started = trial.start_all(self._worlds, np.ones(1, bool), law=self._law)
         self._now: Trial = jax.device_get(started)
         self.past.clear()
 
@@ -107,7 +107,7 @@ class Live:
                     some,
                     physics=self._setting.physics,
                     rules=self._setting.rules,
-                    strategy=self._strategy,
+                    law=self._law,
                 )
             )
             some -= int(kept[0].done[:some].sum())  # it ended before these
@@ -161,7 +161,7 @@ class Live:
         self._now = self._now._replace(done=ended, success=arrived, **changes)
 
 
-@partial(jax.jit, static_argnames=("physics", "strategy"))
+@partial(jax.jit, static_argnames=("physics", "law"))
 def _steps(
     stage: Any,
     worlds: World,
@@ -170,13 +170,13 @@ def _steps(
     *,
     physics: Physics,
     rules: Rules,
-    strategy: Strategy,
+    law: Law,
 ) -> tuple[Trial, tuple[Trial, Snapshot, jax.Array, jax.Array]]:
     """Up to CHUNK control steps of a world (1, ...), and what each was: rows (CHUNK, ...)."""
 
     def one(trials: Trial) -> tuple[Trial, Any]:
         after, seen = trial.control_step(
-            stage, worlds, trials, physics=physics, rules=rules, strategy=strategy
+            stage, worlds, trials, physics=physics, rules=rules, law=law
         )
         placed = jax.vmap(trial.outline)(worlds, seen.qpos)
         compression = jax.vmap(_compression)(worlds.skin, placed)

@@ -15,14 +15,22 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax import errors
-from rps_jax.control import law, switches
-from rps_jax.control.law import Details, LoadedObservation, Observation, Twist
-from rps_jax.control.learned.observation import TaxelObservation
-from rps_jax.control.rivals.aps import TrackedObservation
-from rps_jax.control.strategies import RPS, Params, Strategy
+from rps_jax.control import switches
+from rps_jax.control.base import Law, Params
+from rps_jax.control.laws import rps
+from rps_jax.control.learned import features
+from rps_jax.control.observation import (
+    Details,
+    ForceObservation,
+    Observation,
+    PoseObservation,
+    Twist,
+    displacement,
+)
 from rps_jax.engines.base import Driven, Motion, Stage
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Array, Bool, Float, Int, Scalar
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot import base, drive, load_cell
 from rps_jax.robot.base import Odometry
@@ -41,9 +49,12 @@ _MAX_DISTANCE = 100.0  # [m]
 class Rules(NamedTuple):
     """When a trial ends (Sec. III-B); of objects that fall over the paper says nothing."""
 
-    horizon: float | jax.Array = 300.0  # [s]
-    max_lost: float | jax.Array = 150.0  # [s] without contact, in all, after the first touch
-    max_tilt: float | jax.Array = math.pi / 4  # [rad] of an object that has not fallen over
+    horizon: Scalar = 300.0
+    """Time after which a trial has failed [s]."""
+    max_lost: Scalar = 150.0
+    """Time without contact, in all after the first touch, after which it has failed [s]."""
+    max_tilt: Scalar = math.pi / 4
+    """Tilt from which on an object has fallen over [rad]."""
 
     def check(self) -> None:
         """Raises InputError for times that are not positive and finite, or no tilt."""
@@ -55,8 +66,9 @@ class Rules(NamedTuple):
 class Shift(NamedTuple):
     """The object is moved by a hand during the push, as in the paper's video."""
 
-    time: float | jax.Array = jnp.inf  # () [s]
-    p_robot: tuple[float, float] | jax.Array = (0.0, 0.0)  # (2,) [m] how far, in the robot frame
+    time: float | Float[Array, "*B"] = jnp.inf  # [s]
+    # [m] how far, in the robot frame
+    p_robot: tuple[float, float] | Float[Array, "*B 2"] = (0.0, 0.0)
 
 
 class World(NamedTuple):
@@ -66,9 +78,9 @@ class World(NamedTuple):
     footprint: Footprint
     skin: Skin
     params: Params
-    p_world_target: jax.Array  # (2,) [m]
+    p_world_target: Float[Array, "*B 2"]  # [m]
     shift: Shift
-    qpos: jax.Array  # (10,) at the start, as in `Trial`
+    qpos: Float[Array, "*B 10"]  # at the start, as in `Trial`
     key: jax.Array  # of the imperfections of skin and odometry
     odometry: Odometry = Odometry()
     robot: Robot | None = None  # with limits; None follows every twist
@@ -78,79 +90,79 @@ class Trial(NamedTuple):
     """The running state of one world."""
 
     # In the world: base x, y [m], yaw [rad]; object position [m] and quaternion, scalar first.
-    qpos: jax.Array  # (10,)
+    qpos: Float[Array, "*B 10"]
     # Of these [m/s, rad/s]; the object's angular velocity is in its own frame.
-    qvel: jax.Array  # (9,)
-    warmstart: jax.Array  # (9,) [m/s^2, rad/s^2] last accelerations, for the solver
-    strategy: Any  # what the strategy remembers
+    qvel: Float[Array, "*B 9"]
+    warmstart: Float[Array, "*B 9"]  # [m/s^2, rad/s^2] last accelerations, for the solver
+    memory: Any  # what the law remembers
     skin: SkinState
-    poses: jax.Array  # (K, 3) [m, m, rad] of the base in the last steps, the latest first
-    twists: jax.Array  # (K, 3) [m/s, m/s, rad/s] commanded, likewise
-    steps: jax.Array  # () int32 control steps done
-    contact_steps: jax.Array  # () int32 of them in contact
-    lost_steps: jax.Array  # () int32 without contact after the first touch
-    sum_abs_l: jax.Array  # () [m] over the steps in contact
-    min_distance: jax.Array  # () [m] contact point to target; inf before the first touch
-    path_length: jax.Array  # () [m] of the base's way
-    done: jax.Array  # () bool
-    success: jax.Array  # () bool
-    tilt: jax.Array  # () [rad] greatest tilt of the object so far
-    tipped: jax.Array  # () bool: the object has fallen over
-    diverged: jax.Array  # () bool
-    overflows: jax.Array  # () int32 control steps in which contacts were lost for want of room
+    poses: Float[Array, "*B K 3"]  # [m, m, rad] of the base in the last steps, the latest first
+    twists: Float[Array, "*B K 3"]  # [m/s, m/s, rad/s] commanded, likewise
+    steps: Int[Array, "*B"]  # control steps done
+    contact_steps: Int[Array, "*B"]  # of them in contact
+    lost_steps: Int[Array, "*B"]  # without contact after the first touch
+    sum_abs_l: Float[Array, "*B"]  # [m] over the steps in contact
+    min_distance: Float[Array, "*B"]  # [m] contact point to target; inf before the first touch
+    path_length: Float[Array, "*B"]  # [m] of the base's way
+    done: Bool[Array, "*B"]
+    success: Bool[Array, "*B"]
+    tilt: Float[Array, "*B"]  # [rad] greatest tilt of the object so far
+    tipped: Bool[Array, "*B"]  # the object has fallen over
+    diverged: Bool[Array, "*B"]
+    overflows: Int[Array, "*B"]  # control steps in which contacts were lost for want of room
     drive: Drive | None = None  # of a robot with limits
-    load: Load | None = None  # of a strategy that is told the contact's force
+    load: Load | None = None  # of a law that senses the contact's force
 
 
 class Snapshot(NamedTuple):
     """What one control step saw and did."""
 
-    time: jax.Array  # () [s]
-    qpos: jax.Array  # (10,) as in `Trial`
+    time: Float[Array, "*B"]  # [s]
+    qpos: Float[Array, "*B 10"]  # as in `Trial`
     reading: Reading | SmoothReading
     twist: Twist  # [m/s, m/s, rad/s] commanded, robot frame
     details: Details
-    done: jax.Array  # () bool: the trial had ended
+    done: Bool[Array, "*B"]  # the trial had ended
 
 
 class Outcome(NamedTuple):
     """The result of one trial."""
 
-    success: jax.Array  # () bool
-    time: jax.Array  # () [s] at which it ended
-    min_distance: jax.Array  # () [m] contact point to target; inf if never touched
-    contact_lost_time: jax.Array  # () [s]
-    path_length: jax.Array  # () [m] of the base's way
-    mean_abs_l: jax.Array  # () [m] the paper's D; NaN if never touched
-    tilt: jax.Array  # () [rad] greatest tilt of the object
-    tipped: jax.Array  # () bool: the object has fallen over
-    diverged: jax.Array  # () bool
-    stalled: jax.Array  # () bool: it ended with the base standing still against the object
-    overflows: jax.Array  # () int32 control steps in which contacts were lost for want of room
-    base_pose: jax.Array  # (3,) [m, m, rad] in the world, at the end
-    object_pose: jax.Array  # (3,) [m, m, rad] likewise
+    success: Bool[Array, "*B"]
+    time: Float[Array, "*B"]  # [s] at which it ended
+    min_distance: Float[Array, "*B"]  # [m] contact point to target; inf if never touched
+    contact_lost_time: Float[Array, "*B"]  # [s]
+    path_length: Float[Array, "*B"]  # [m] of the base's way
+    mean_abs_l: Float[Array, "*B"]  # [m] the paper's D; NaN if never touched
+    tilt: Float[Array, "*B"]  # [rad] greatest tilt of the object
+    tipped: Bool[Array, "*B"]  # the object has fallen over
+    diverged: Bool[Array, "*B"]
+    stalled: Bool[Array, "*B"]  # it ended with the base standing still against the object
+    overflows: Int[Array, "*B"]  # control steps in which contacts were lost for want of room
+    base_pose: Float[Array, "*B 3"]  # [m, m, rad] in the world, at the end
+    object_pose: Float[Array, "*B 3"]  # [m, m, rad] likewise
 
 
-def object_pose(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Planar position (2,) [m] and yaw () [rad] of the object in the world."""
+def object_pose(qpos: Float[Array, "10"]) -> tuple[Float[Array, "2"], Float[Array, ""]]:
+    """Planar position [m] and yaw [rad] of the object in the world."""
     free = qpos[JOINTS.object]
     return free[:2], planar.yaw_of_quaternion(free[3:])
 
 
-def p_world_contact(seen: Snapshot) -> jax.Array:
-    """Contact points of snapshots (T, ...) in the world, (T, 2) [m]; NaN without contact."""
+def p_world_contact(seen: Snapshot) -> Float[Array, "T 2"]:
+    """Contact points of snapshots (T, ...) in the world [m]; NaN without contact."""
     point = seen.qpos[:, :2] + planar.rotate(seen.qpos[:, 2], seen.reading.p_robot_contact)
     return jnp.where((seen.reading.contact_type != NONE)[:, None], point, jnp.nan)
 
 
-def start(world: World, strategy: Strategy = RPS) -> Trial:
+def start(world: World, law: Law = rps.LAW) -> Trial:
     """The trial of a world before its first control step."""
     zero, false = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
     return Trial(
         qpos=world.qpos,
         qvel=jnp.zeros_like(world.qpos[:9]),
         warmstart=jnp.zeros_like(world.qpos[:9]),
-        strategy=strategy.init(world.params),
+        memory=law.init(world.params),
         skin=world.skin.init(world.key),
         poses=jnp.tile(world.qpos[JOINTS.base], (*world.odometry.past.shape, 1)),
         twists=jnp.zeros((*world.odometry.past.shape, 3), world.qpos.dtype),
@@ -167,7 +179,7 @@ def start(world: World, strategy: Strategy = RPS) -> Trial:
         diverged=false,
         overflows=zero,
         drive=None if world.robot is None else drive.start(world.qpos),
-        load=load_cell.start(world.qpos) if strategy.senses == "force" else None,
+        load=load_cell.start(world.qpos) if law.senses == "force" else None,
     )
 
 
@@ -180,8 +192,8 @@ def shifted(world: World, trial: Trial, period: float) -> Trial:
     return trial._replace(qpos=trial.qpos.at[x : x + 2].add(jnp.where(now, by, 0.0)))
 
 
-def outline(world: World, qpos: jax.Array) -> Footprint:
-    """The object's outline in the robot frame, where qpos (10,) has them both."""
+def outline(world: World, qpos: Float[Array, "10"]) -> Footprint:
+    """The object's outline in the robot frame, where qpos has them both."""
     p_world_robot, yaw = qpos[:2], qpos[2]
     p_world_object, object_yaw = object_pose(qpos)
     p_robot_object = planar.rotate(-yaw, p_world_object - p_world_robot)
@@ -191,7 +203,7 @@ def outline(world: World, qpos: jax.Array) -> Footprint:
 def sense(
     world: World, trial: Trial, period: float
 ) -> tuple[SkinState, Reading | SmoothReading, Observation]:
-    """The skin's reading of the object where it stands now, and what the law is told.
+    """Read the skin for the object where it stands now, and say what the law observes.
 
     `period` [s] is that of the control loop.
     """
@@ -199,7 +211,12 @@ def sense(
     placed = outline(world, trial.qpos)
     state, reading = world.skin.sense(trial.skin, placed, period)
     observation = Observation(
-        p_world_robot, yaw, reading.p_robot_contact, reading.in_contact, world.p_world_target
+        p_world_robot,
+        yaw,
+        reading.p_robot_contact,
+        reading.in_contact,
+        world.p_world_target,
+        period,
     )
     return state, reading, observation
 
@@ -209,7 +226,8 @@ class Seen(NamedTuple):
 
     reading: Reading | SmoothReading
     observation: Observation  # by where the base believes to be
-    distance: jax.Array  # () [m] contact point to target, by where it is; without contact, base's
+    # [m] contact point to target, by where it is; without contact, base's
+    distance: Float[Array, "*B"]
 
 
 def observe(
@@ -223,7 +241,7 @@ def observe(
     time = trial.steps * period
     trial = shifted(world, trial, period)
     skin, reading, observation = sense(world, trial, period)
-    distance = planar.norm(law.displacement(observation))
+    distance = planar.norm(displacement(observation))
     now = trial.qpos[JOINTS.base]
     poses, believed = base.believed(
         world.odometry, trial.poses, now, world.key, trial.steps, period
@@ -274,7 +292,7 @@ def decide(
     *,
     physics: Physics,
     rules: Rules = Rules(),
-    strategy: Strategy = RPS,
+    law: Law = rps.LAW,
 ) -> tuple[Trial, Twist, Snapshot]:
     """What happens between two control periods of one world: sense, judge, decide.
 
@@ -283,21 +301,21 @@ def decide(
     period = physics.control_period
     told, seen = observe(world, trial, physics=physics, rules=rules)
     observation: Any = seen.observation
-    if not strategy.smooth:
+    if not law.smooth:
         observation = observation._replace(in_contact=seen.reading.contact_type != NONE)
-    if strategy.senses == "pose":
-        observation = TrackedObservation(
-            observation, object_pose(told.qpos)[0], fp.circumradius(world.footprint), period
+    if law.senses == "pose":
+        observation = PoseObservation(
+            observation, object_pose(told.qpos)[0], fp.circumradius(world.footprint)
         )
-    if strategy.senses == "taxels":
+    if law.senses == "taxels":
         skin = world.skin, told.skin, outline(world, told.qpos)
-        observation = TaxelObservation.of(observation, seen.reading, *skin, period)
+        observation = features.observed(observation, seen.reading, *skin)
     if told.load is not None:
-        felt, force = strategy.cell.read(told.load, world.key, told.steps, period)
-        told, observation = told._replace(load=felt), LoadedObservation(observation, force, period)
-    state, twist, details = strategy.step(world.params, trial.strategy, observation)
+        felt, force = law.cell.read(told.load, world.key, told.steps, period)
+        told, observation = told._replace(load=felt), ForceObservation(observation, force)
+    state, twist, details = law.step(world.params, trial.memory, observation)
     snapshot = Snapshot(trial.steps * period, told.qpos, seen.reading, twist, details, trial.done)
-    told, twist = execute(world, told._replace(strategy=state), twist, period)
+    told, twist = execute(world, told._replace(memory=state), twist, period)
     return told, twist, snapshot
 
 
@@ -337,12 +355,12 @@ def control_step(
     *,
     physics: Physics,
     rules: Rules = Rules(),
-    strategy: Strategy = RPS,
+    law: Law = rps.LAW,
 ) -> tuple[Trial, Snapshot]:
     """One pass of the loop of a batch of worlds. One that has ended comes back as it is."""
-    think = partial(decide, physics=physics, rules=rules, strategy=strategy)
+    think = partial(decide, physics=physics, rules=rules, law=law)
     told, twists, snapshots = jax.vmap(think)(worlds, trials)
-    asked = strategy.senses == "force"
+    asked = law.senses == "force"
     driven = stage.drive(worlds.fields, motion(told), twists, physics, pushing(worlds), asked)
     return jax.vmap(settle)(trials, told, driven), snapshots
 
@@ -381,14 +399,14 @@ def outcome(trial: Trial, period: float) -> Outcome:
     )
 
 
-@partial(jax.jit, static_argnames=("strategy",))
-def start_all(worlds: World, live: jax.Array, strategy: Strategy = RPS) -> Trial:
-    """Trials of a batch of worlds; those not `live` (B,) are padding, ended from the start."""
-    trials = jax.vmap(partial(start, strategy=strategy))(worlds)
+@partial(jax.jit, static_argnames=("law",))
+def start_all(worlds: World, live: Bool[Array, " B"], law: Law = rps.LAW) -> Trial:
+    """Trials of a batch of worlds; those not `live` are padding, ended from the start."""
+    trials = jax.vmap(partial(start, law=law))(worlds)
     return trials._replace(done=~live)
 
 
-_STATIC = ("physics", "strategy", "steps")
+_STATIC = ("physics", "law", "steps")
 _UNASKED = 20  # control steps of a GPU between two looks at whether any trial runs, at most
 
 
@@ -400,11 +418,11 @@ def advance(
     *,
     physics: Physics,
     rules: Rules = Rules(),
-    strategy: Strategy = RPS,
+    law: Law = rps.LAW,
     steps: int,
 ) -> Trial:
     """Up to `steps` control steps of a batch of worlds; fewer if all of them end before."""
-    one = partial(control_step, stage, physics=physics, rules=rules, strategy=strategy)
+    one = partial(control_step, stage, physics=physics, rules=rules, law=law)
 
     def some_run(carry):
         count, trials = carry
@@ -432,12 +450,12 @@ def record(
     *,
     physics: Physics,
     rules: Rules = Rules(),
-    strategy: Strategy = RPS,
+    law: Law = rps.LAW,
     steps: int,
     every: int = 1,
 ) -> tuple[Trial, Snapshot]:
     """`steps` control steps of a batch, and every `every`-th snapshot (steps // every, B, ...)."""
-    one = partial(control_step, stage, physics=physics, rules=rules, strategy=strategy)
+    one = partial(control_step, stage, physics=physics, rules=rules, law=law)
 
     def body(trials, _):
         return one(worlds, trials)

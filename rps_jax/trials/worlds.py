@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from rps_jax import engines
-from rps_jax.control import strategies
-from rps_jax.control.strategies import Params
-from rps_jax.engines.mjx import apply
-from rps_jax.engines.mjx_colliders import mjx
+from rps_jax.control import registry
+from rps_jax.control.base import Params
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.base import Odometry
@@ -22,50 +18,11 @@ from rps_jax.robot.skin import CapacitiveSkin, IdealSkin, Skin
 from rps_jax.trials.batch import Part
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Shift, World
-from rps_jax.world import draws, scene
-from rps_jax.world.domain import DOMAINS, OF_THE_BASE, PERFECT, RANDOM, Domain
+from rps_jax.world import scene
+from rps_jax.world.domain import QUANTITIES, RANDOM, Domain, Range, of
 from rps_jax.world.draws import Draw
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction, Scene
-
-
-def domain_randomize(
-    model: mjx.Model, rng: jax.Array, domain: Domain = DOMAINS["wide"]
-) -> tuple[mjx.Model, mjx.Model]:
-    """Models of random objects for a loop of one's own, as mujoco_playground has them.
-
-    Args:
-      model: of a random object's scene, as `mjx.put_model(scene.shaped(...).physics)` gives it.
-      rng: keys (n, 2), one a world.
-      domain: ranges of the object's mass, size, centre of mass and friction.
-
-    Returns:
-      The model with its fields batched, (n, ...), and which of them are: 0, the others None, for
-      `jax.vmap(..., in_axes=(in_axes, ...))`. Not to be traced: it works on the host.
-    """
-    family = _family_of(model)
-    (name,) = [name for name, of in RANDOM.items() if of == family]
-    keys = np.asarray(rng, np.uint32).astype(object)
-    numbers = np.stack(
-        [draws.numbers_of(int(a) << 32 | int(b), np.zeros(1, int))[0] for a, b in keys]
-    )
-    alone = replace(domain, objects=(name,), frictions=(), targets=())
-    drawn = draws.drawn_at(alone, np.zeros(len(keys), int), numbers)
-    _, own = engines.get("mjx").stage_of_solids(family, drawn.solid, drawn.friction, Physics())
-    dtype = model.body_mass.dtype
-    batched = apply(model, {k: jnp.asarray(v, dtype) for k, v in own.items()})
-    in_axes = jax.tree_util.tree_map_with_path(
-        lambda path, _: 0 if jax.tree_util.keystr(path) in own else None, model
-    )
-    return batched, in_axes
-
-
-def _family_of(model: mjx.Model) -> str:
-    """The shape family of an MJX model's object."""
-    kinds = {int(kind) for kind in model.geom_type}
-    if int(mujoco.mjtGeom.mjGEOM_MESH) in kinds:
-        return "prism"
-    return "cylinder" if int(mujoco.mjtGeom.mjGEOM_CYLINDER) in kinds else "box"
 
 
 def drawn_worlds(domain: Domain, drawn: Draw, params: Params, setting: Setting) -> Part:
@@ -74,7 +31,7 @@ def drawn_worlds(domain: Domain, drawn: Draw, params: Params, setting: Setting) 
     count, dtype = drawn.number.size, jnp.zeros(()).dtype
     engine, robots = engines.get(setting.engine), drawn.robot
     engine.check_robot(robots)
-    engine.check_senses(strategies.of(params).senses)
+    engine.check_senses(registry.law_of(params).senses)
     stage, own = engine.stage_of_solids(
         family, drawn.solid, drawn.friction, setting.physics, robots
     )
@@ -105,32 +62,38 @@ def _skin(domain: Domain, drawn: Draw) -> Skin:
     full: Any = jax.tree.map(lambda value: np.full(count, value, float), plain)
     if isinstance(full, IdealSkin):
         return full.on(drawn.robot.shell)
-    return full.on(drawn.robot.shell)._replace(
-        noise=drawn.noise, gain_spread=drawn.gain_spread, dead_share=drawn.dead_share
-    )
+    own: dict[str, Any] = {
+        QUANTITIES[name].sets: drawn.at[name] for name in of("skin") if name in drawn.at
+    }
+    return full.on(drawn.robot.shell)._replace(**own)
 
 
 def _starts(drawn: Draw) -> np.ndarray:
     """Positions (n, 10) at the start: the base at the origin, the object before it."""
     qpos = np.zeros((drawn.number.size, 10))
-    front = drawn.robot.half_length + drawn.gap + solid.extent(drawn.solid, drawn.yaw)
-    half = drawn.yaw / 2
+    front = drawn.robot.half_length + drawn.at["gap"] + solid.extent(drawn.solid, drawn.at["yaw"])
+    half = drawn.at["yaw"] / 2
     zero = np.zeros_like(half)
-    place = [front, drawn.lateral, drawn.solid.height / 2, np.cos(half), zero, zero, np.sin(half)]
-    qpos[:, JOINTS.object] = np.stack(place, axis=-1)
+    place = [front, drawn.at["lateral"], drawn.solid.height / 2]
+    turn = [np.cos(half), zero, zero, np.sin(half)]
+    qpos[:, JOINTS.object] = np.stack(place + turn, axis=-1)
     return qpos
 
 
 def remembered_steps(domain: Domain, period: float) -> int:
     """How many control steps of `period` [s] the odometry of the domain's worlds looks back."""
-    if all(getattr(domain, name) == PERFECT[name] for name in OF_THE_BASE):
+    if all(getattr(domain, name) == Range(0, 0) for name in of("base")):
         return 0
     return 1 + round(max(domain.pose_latency.high, domain.command_delay.high) / period)
 
 
 def _odometry(domain: Domain, drawn: Draw, period: float) -> Odometry:
-    past = np.zeros((drawn.number.size, remembered_steps(domain, period)))
-    return Odometry(*_any(*(getattr(drawn, name) for name in OF_THE_BASE), past))
+    past: Any = np.zeros((drawn.number.size, remembered_steps(domain, period)))
+    own: dict[str, Any] = {
+        QUANTITIES[name].sets: drawn.at[name] for name in of("base") if name in drawn.at
+    }
+    error: Any = drawn.velocity_error
+    return Odometry(**own, velocity_error=error, past=past)
 
 
 def drawn_scene(domain: Domain, drawn: Draw, physics: Physics, i: int) -> Scene:

@@ -10,7 +10,7 @@ It is a number, or an array of them, such as scores after different times.
 Derivatives of chaotic worlds may be finite and yet say nothing: their variance shows it.
 
 `forward` and `reverse` differentiate every world. What they differentiate must be smooth:
-`strategies.smooth_rps` with a `skin.SmoothSkin`; and it misses what jumps all the same. `evolution`
+`registry.smooth_law` with a `skin.SmoothSkin`; and it misses what jumps all the same. `evolution`
 and `differences` need no derivative.
 """
 
@@ -24,11 +24,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax.control import strategies
-from rps_jax.control.strategies import Params, Strategy
+from rps_jax.control import registry
+from rps_jax.control.base import Law, Params
+from rps_jax.control.laws import rps
 from rps_jax.geometry import planar
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.pushes import Case
+from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Snapshot, Trial
 from rps_jax.world.physics import Physics
@@ -166,13 +167,13 @@ def combine(one: Estimate, other: Estimate) -> Estimate:
 
 
 def _for_each(theta: jax.Array, worlds: Any) -> jax.Array:
-    """The same theta (n, p) in each world."""
+    """Repeat theta in each world, (n, p)."""
     count = jax.tree.leaves(worlds)[0].shape[0]
     return jnp.broadcast_to(theta, (count, theta.size))
 
 
 def _repeated(worlds: Any, times: int) -> Any:
-    """The same worlds (n, ...) several times, (times n, ...)."""
+    """Repeat worlds (n, ...) several times, (times n, ...)."""
     return jax.tree.map(lambda x: jnp.concatenate([x] * times), worlds)
 
 
@@ -182,7 +183,7 @@ def window(
     cost: Callable[[Snapshot], jax.Array],
     *,
     physics: Physics,
-    strategy: Strategy = strategies.smooth_rps(),
+    law: Law = registry.smooth_law(rps.LAW),
     steps: int,
 ) -> Scores:
     """Scores of trials driven on for some control steps from where they are.
@@ -192,7 +193,7 @@ def window(
       params_of: parameters from theta (p,), differentiable.
       cost: () or (...) of the snapshots (steps, ...) of one trial, such as its mean distance.
       physics: how the worlds are stepped.
-      strategy: that the parameters belong to.
+      law: that the parameters belong to.
       steps: control steps.
 
     Returns:
@@ -205,7 +206,7 @@ def window(
 
         @partial(jax.checkpoint, prevent_cse=False)  # in reverse, memory of one state a step
         def one(trials: Trial, _: None) -> tuple[Trial, Snapshot]:
-            return trial.control_step(stage, worlds, trials, physics=physics, strategy=strategy)
+            return trial.control_step(stage, worlds, trials, physics=physics, law=law)
 
         _, seen = jax.lax.scan(one, trials, length=steps)
         return jax.vmap(cost, in_axes=1)(seen)
@@ -231,22 +232,25 @@ def distances(
       Scores (n, H) [m], compiled when first called, and the worlds that they take.
 
     Example:
-      >>> import rps_jax
-      >>> from rps_jax import Case, RPSParams, SmoothSkin, Space, gradients
+      >>> from rps_jax import RPSParams
+      >>> from rps_jax.robot.skin import SmoothSkin
+      >>> from rps_jax.trials.case import Case
+      >>> from rps_jax.tuning import gradients
+      >>> from rps_jax.tuning.space import Space
       >>> space = Space(("K_h", "L"))
-      >>> ahead = Case("box", rps_jax.FRICTION["S1"], (1.0, 1.0), skin=SmoothSkin(), gap=0.0)
+      >>> ahead = Case("box", "S1", (1.0, 1.0), skin=SmoothSkin(), gap=0.0)
       >>> scores, worlds = gradients.distances([ahead], space.params, [0.2, 0.4])
       >>> found = gradients.forward(scores, space.vector(RPSParams.paper()), worlds)
       >>> found.gradient.shape
       (2, 2)
     """
     stage, worlds = pushes.build(cases, setting)
-    strategy, physics = strategies.smooth_of(cases[0].params), setting.physics
+    law, physics = registry.smooth_law(registry.law_of(cases[0].params)), setting.physics
     at = np.round(np.asarray(horizons) / physics.control_period).astype(int)
 
     def left(seen: Snapshot) -> jax.Array:
         return seen.details.distance[at]
 
-    options: dict[str, Any] = {"physics": physics, "strategy": strategy, "steps": int(at[-1]) + 1}
+    options: dict[str, Any] = {"physics": physics, "law": law, "steps": int(at[-1]) + 1}
     scores = jax.jit(window(stage, params_of, left, **options))
-    return scores, (worlds, trial.start_all(worlds, np.ones(len(cases), bool), strategy=strategy))
+    return scores, (worlds, trial.start_all(worlds, np.ones(len(cases), bool), law=law))

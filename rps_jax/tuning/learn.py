@@ -2,46 +2,47 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 
 from rps_jax import engines, errors
-from rps_jax.analysis import figures
-from rps_jax.control.law import RPSParams
+from rps_jax.analysis.figures.style import Figure
+from rps_jax.analysis.report import Picture, Section
+from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.learned import policy as policies
 from rps_jax.control.learned.network import Weights
 from rps_jax.control.learned.policy import Policy
-from rps_jax.engines import EngineName
 from rps_jax.record import files, provenance
-from rps_jax.record import folder as run_folder
 from rps_jax.record.checkpoint import Parts
-from rps_jax.runs.evaluate import seed_of
+from rps_jax.record.options import option
+from rps_jax.runs.question import Pushes, Run, call_of, seed_of
 from rps_jax.trials.env import PushEnv, Reward
+from rps_jax.trials.progress import Bar, Progress, Report
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules, World
-from rps_jax.tuning import crowd
-from rps_jax.tuning.crowd import Learner
+from rps_jax.tuning import rollout
 from rps_jax.tuning.ppo import PPO
+from rps_jax.tuning.rollout import RunnerState
 from rps_jax.world import domain as domains
-from rps_jax.world.domain import Domain
-from rps_jax.world.physics import Fidelity, preset
+from rps_jax.world.domain import Domain, DomainLike
 
 REWARD = Reward(progress=0.5, no_contact=0.02, success=1.0, object=0.5, behind=0.5)
 _SPARE = 10  # times as long as a validation takes is learned between two
-Told = dict[str, float]  # of an update, by name
-Watch = Callable[[Told], object]  # called after every update
+Metrics = dict[str, float]  # of an update, by name
 
 UNITS = {
     "time": ("s", "wall clock since the run began, with compilation"),
@@ -51,11 +52,11 @@ UNITS = {
     "tipped": ("1", "of these, objects that fell over"),
     "lost": ("1", "of these, trials without contact for too long"),
     "earned": ("1", "rewards of a trial that ended, on average"),
-    "touching": ("1", "share of the decisions after which the object was touched"),
+    "touching": ("1", "share of the actions after which the object was touched"),
     "level": ("1", "level of the curriculum"),
-    "reward": ("1", "reward of a decision, on average"),
-    "value": ("1", "what the value function said, on average"),
-    "divergence": ("1", "divergence of the policies of the steps from the one that acted"),
+    "reward": ("1", "reward of an action, on average"),
+    "value": ("1", "value function, on average"),
+    "kl": ("1", "KL divergence of the policies of the steps from the one that acted"),
     "learning_rate": ("1", "learning rate"),
     "spread": ("1", "standard deviation of the actions"),
     "validation": ("1", "successes in the worlds for validation, without noise; NaN between"),
@@ -64,137 +65,175 @@ UNITS = {
 
 
 @dataclass(frozen=True)
-class Lessons:
-    """In which worlds a law is learned, and by which it is judged."""
+class Learn(PPO, Pushes[xr.Dataset]):
+    """Learn a law from touch by PPO, in random worlds for tuning; `policy.npz` then holds it.
 
-    domains: tuple[Domain, ...] = (domains.DOMAINS["wide"],)
-    objects: tuple[str, ...] = ("random_box", "random_cylinder", "random_prism")
-    """Shapes of the objects of these domains."""
-    drawn: int = 4096
-    """Number of random worlds of each shape and domain that are drawn, of which trials take one."""
-    validation: int = 128
-    """Number of worlds for validation of each shape and domain."""
-    horizon: float = 120.0
-    """Time after which a trial in which a law is learned ends [s]; it is judged by 300 s."""
-    max_lost: float = 30.0
-    """Time without contact after which it ends [s]; a law is judged by 150 s."""
-    fidelity: Fidelity = "fast"
-    engine: EngineName = "fused"
-
-    def __post_init__(self) -> None:
-        """Raises InputError for no domain, no objects, or numbers that mean nothing."""
-        errors.check_each_once("domains", self.domains)
-        errors.check_each_once("objects", self.objects)
-        for name in ("drawn", "validation"):
-            errors.check_count(name, getattr(self, name), at_most=1_000_000)
-        self.rules.check()
-        for one in self.domains:
-            alone = replace(one, objects=self.objects)
-            errors.check_name("skin of a domain to learn in", one.skin, ("capacitive",))
-            engines.get(self.engine).check(alone.families)
-        engines.get(self.engine).check_followed()
-
-    @property
-    def rules(self) -> Rules:
-        """When a trial in which a law is learned ends."""
-        return Rules(self.horizon, self.max_lost)
-
-    def environments(self, seed: int) -> list[PushEnv]:
-        """Those in which it is learned, of the worlds for tuning."""
-        return self._made(seed_of(seed, "tune"), self.rules, self.drawn)
-
-    def examinations(self, seed: int) -> list[PushEnv]:
-        """Those by which it is judged, of the worlds for validation, by the rules of the paper."""
-        return self._made(seed_of(seed, "validate"), Rules(), self.validation)
-
-    def _made(self, seed: int, rules: Rules, worlds: int) -> list[PushEnv]:
-        setting = Setting(preset(fidelity=self.fidelity), rules, seed, self.engine)
-        return [
-            PushEnv(name, one, RPSParams(), setting, weights=REWARD, worlds=worlds)
-            for one in self.domains
-            for name in self.objects
-        ]
-
-
-def learn(
-    domain: Domain | str | Sequence[Domain | str] = "wide",
-    out: str | Path = "runs/learn",
-    how: PPO = PPO(),
-    *,
-    minutes: float = 10.0,
-    updates: int = 0,
-    lessons: Lessons = Lessons(),
-    every: float = 1.0,
-    watch: Watch = lambda told: None,
-) -> xr.Dataset:
-    """Learn a law from touch, in random worlds for tuning; `policy.npz` then holds it.
-
-    Args:
-      domain: ranges of what differs between worlds, or their name in `DOMAINS`; or several.
-      out: run folder; a run that was killed is continued there.
-      how: the algorithm's numbers, and the network.
-      minutes: wall clock after which it ends [min], with compilation and validation, counted over
-        all processes that worked in the folder; 0 stands for no bound.
-      updates: number of updates after which it ends, likewise; 0 stands for no bound.
-      lessons: its objects, rules and engine; its domains are those above.
-      every: wall clock between two looks [min], at which the run is kept; at the first, and then
-        whenever it takes a tenth of the time at most, the law is tried in the worlds for
-        validation, and so it is at the end.
-      watch: called with the numbers of every update.
-
-    Returns:
-      The curve: what was found after each update (update), in the units of its attributes. Its
-      attributes `compile` and `run` [s] say where the wall clock went.
-
-    Raises:
-      InputError: an argument is not allowed, or `out` holds another run.
+    The answer is the curve: what was found after each update (update), in the units of its
+    attributes. Its attributes `compile` and `run` [s] say where the wall clock went.
 
     Example:
       >>> import rps_jax
-      >>> drums = rps_jax.Lessons(
-      ...     objects=("random_cylinder",), drawn=4, validation=2, engine="quasistatic"
-      ... )
-      >>> how = rps_jax.PPO("mlp", width=4, worlds=4, decisions=2, batches=1)
-      >>> curve = rps_jax.learn("wide", "drums", how, minutes=0, updates=1, lessons=drums)
+      >>> small = {"network": "mlp", "width": 4, "num_envs": 4, "num_steps": 2}
+      >>> small |= {"num_minibatches": 1, "drawn": 4, "validation": 2}
+      >>> drums, fast = "wide,objects=random_cylinder", rps_jax.Setting("quasistatic")
+      >>> curve = rps_jax.learn(drums, minutes=0, updates=1, **small, setting=fast, out="drums")
       >>> curve.success.dims, bool(curve.validation.notnull().all())
       (('update',), True)
     """
-    several = [domain] if isinstance(domain, Domain | str) else list(domain)
-    lessons = replace(lessons, domains=tuple(domains.named(one) for one in several))
-    errors.check_finite("every", every, above=0, at_most=1e4)
-    began = time.perf_counter()
-    folder = open_run(Path(out), how, lessons, minutes, updates)
-    with run_folder.hold(folder):
-        provenance.sign(folder)
-        run = _Run(folder, how, lessons, began)
-        return run.through(60 * minutes, updates, 60 * every, watch)
+
+    TITLE: ClassVar[str] = "A law, learned"
+    SMALL: ClassVar[Mapping[str, Any]] = {
+        "domain": ("wide,objects=random_box",),
+        "network": "mlp",
+        "width": 32,
+        "num_envs": 256,
+        "drawn": 1024,
+        "validation": 64,
+        "num_minibatches": 4,
+        "minutes": 5.0,
+    }
+
+    domain: Sequence[DomainLike] = ("wide",)
+    """Domains to learn in: wide, real, prisms, hostile, or JSON files of ranges; changes follow
+    each, as wide,objects=random_box."""
+    minutes: float = option(10.0, 0, 1e5, unit="min")
+    """Wall clock after which it ends [min], with compilation and validation, counted over all
+    processes that continued the run; 0 stands for no bound."""
+    updates: int = option(0, 0, 10**9)
+    """Number of updates after which it ends; 0 stands for no bound."""
+    drawn: int = option(4096, 1, 1_000_000)
+    """Number of random worlds of each shape and domain, of which every trial takes one."""
+    validation: int = option(128, 1, 1_000_000)
+    """Number of worlds for validation of each shape and domain."""
+    every: float = option(1.0, above=0, at_most=1e4, unit="min")
+    """Wall clock between two moments at which the run is kept [min]; at the first, and then
+    whenever it takes a tenth of the time at most, the law is tried in the worlds for validation,
+    and so it is at the end."""
+    setting: Setting = field(
+        default=Setting(fidelity="fast", rules=Rules(horizon=120.0, max_lost=30.0)), kw_only=True
+    )
+    out: Path | str | None = field(default="runs/learn", kw_only=True)
+    """Run folder, with `policy.npz`; a run that was killed is continued there."""
+
+    @functools.cached_property
+    def domains(self) -> tuple[Domain, ...]:
+        """The domains."""
+        one = isinstance(self.domain, str | Domain)
+        several: list[Any] = [self.domain] if one else list(self.domain)
+        return tuple(domains.named(text) for text in several)
+
+    def check(self) -> None:
+        """Check that something can be learned in this way."""
+        if self.out is None:
+            raise errors.InputError("out = None is not allowed: the policy is written there.")
+        if not (self.minutes or self.updates):
+            raise errors.InputError("minutes = 0 is not allowed without updates: give one of them.")
+        errors.check_each_once("domain", self.domains)
+        errors.check_count("seed", self.setting.seed, at_least=0, at_most=2**30)
+        engine = engines.get(self.setting.engine)
+        for one in self.domains:
+            errors.check_name("skin of a domain to learn in", one.skin, ("capacitive",))
+            engine.check(one.families)
+        engine.check_traced()
+        count = self.num_envs * sum(len(one.objects) for one in self.domains)
+        if self.num_minibatches > count:
+            raise errors.InputError(
+                f"num_minibatches = {self.num_minibatches} is not allowed: there are but {count} "
+                "worlds."
+            )
+        period = self.setting.physics.control_period
+        if self.hold < 0.999 * period:
+            raise errors.InputError(
+                f"hold = {self.hold:g} s is not allowed: an action lasts for a control step at "
+                f"least, {period:g} s."
+            )
+
+    def configuration(self) -> dict[str, Any]:
+        """All that the law depends on, but how long it is learned."""
+        found = super().configuration() | {"domain": [asdict(one) for one in self.domains]}
+        for name in ("minutes", "updates", "every"):
+            del found[name]
+        return found
+
+    def environments(self) -> list[PushEnv]:
+        """Those in which it is learned, of the worlds for tuning."""
+        return self._made(seed_of(self.setting.seed, "tune"), self.setting.rules, self.drawn)
+
+    def examinations(self) -> list[PushEnv]:
+        """Those by which it is judged, of the worlds for validation, by the rules of the paper."""
+        return self._made(seed_of(self.setting.seed, "validate"), Rules(), self.validation)
+
+    def _made(self, seed: int, rules: Rules, worlds: int) -> list[PushEnv]:
+        setting = replace(self.setting, rules=rules, seed=seed)
+        return [
+            PushEnv(name, one, RPSParams(), setting, weights=REWARD, worlds=worlds)
+            for one in self.domains
+            for name in one.objects
+        ]
+
+    def bar(self) -> Bar:
+        """A bar over wall clock or updates."""
+        if self.updates:
+            return Bar(self.name, self.updates, "updates", shown=self.shown)
+        return Bar(self.name, 60 * self.minutes, "clock", shown=self.shown)
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Learn."""
+        assert run.folder is not None
+        learning = _Learning(run.folder, self, run.report, time.perf_counter())
+        return learning.through(60 * self.minutes, self.updates, 60 * self.every)
+
+    def intro(self, found: xr.Dataset) -> str:
+        """What was asked."""
+        return (
+            f"{self.network.upper()} of {self.width} pairs of units, PPO in {self.num_envs} worlds "
+            f"of each shape; judged in the domain itself, without noise, by the paper's rules."
+        )
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """Validations, where the time went, and the curve."""
+        simulated = float(found.simulated[-1]) if found.sizes["update"] else 0.0
+        took = found.attrs["run"]
+        judged = found.validation.dropna("update")
+        text = (
+            f"Compile {found.attrs['compile']:.1f} s, run {took:.1f} s "
+            f"({simulated / max(took, 1e-9):.0f} simulated s per s). "
+            f"`{run.folder}/policy.npz` is a law by that name, of "
+            f"{100 * np.max(judged.values, initial=0.0):.1f} % in validation."
+        )
+        rows = [["update", "wall clock", "success in validation", "mean time", "curriculum"]]
+        for update, rate in zip(judged["update"].values, judged.values, strict=True):
+            at = found.sel(update=update)
+            rows.append(
+                [
+                    str(update),
+                    f"{float(at.time) / 60:.1f} min",
+                    f"{100 * rate:.1f} %",
+                    f"{float(at.validation_time):.0f} s",
+                    f"{100 * float(at.level):.0f} %",
+                ]
+            )
+        return [
+            Section("What was learned", text, rows, Picture("curve", partial(figure_of, found)))
+        ]
 
 
-def open_run(folder: Path, how: PPO, lessons: Lessons, minutes: float, updates: int) -> Path:
-    """The folder of a run; one that holds a run must hold this one, but for its length.
+learn = call_of(Learn)
+
+
+def _checked_note(note: Any) -> dict[str, Any]:
+    """What is kept of a run beside its numbers.
 
     Raises:
-      InputError: it cannot be written, holds another run, or nothing can be learned in this way.
+      ValueError: it is something else.
     """
-    errors.check_finite("minutes", minutes, at_least=0, at_most=1e5)
-    errors.check_count("updates", updates, at_least=0, at_most=10**9)
-    if not (minutes or updates):
-        raise errors.InputError("minutes = 0 is not allowed without updates: give one of them.")
-    count = how.worlds * len(lessons.domains) * len(lessons.objects)
-    if how.batches > count:
-        raise errors.InputError(
-            f"batches = {how.batches} is not allowed: there are but {count} worlds."
-        )
-    if how.hold < 0.999 * (period := preset(fidelity=lessons.fidelity).control_period):
-        raise errors.InputError(
-            f"hold = {how.hold:g} s is not allowed: an action lasts for a control step at least, "
-            f"{period:g} s."
-        )
-    return run_folder.claim(folder, {"how": asdict(how), "lessons": _as_json(lessons)})
-
-
-def _as_json(lessons: Lessons) -> dict[str, Any]:
-    return json.loads(json.dumps(asdict(lessons)))
+    for name in ("spent", "compile", "best"):
+        errors.check_number(name, note[name])
+    for metrics in note["curve"]:
+        for name in UNITS:
+            if not isinstance(metrics[name], float | int):
+                raise ValueError(f"{name} = {metrics[name]!r} is no number")
+    return note
 
 
 class _Best(NamedTuple):
@@ -204,40 +243,40 @@ class _Best(NamedTuple):
     actor: Weights | None = None
 
 
-class _Run:
+class _Learning:
     """A learning run under way, in its folder."""
 
-    def __init__(self, folder: Path, how: PPO, lessons: Lessons, began: float):
-        self.folder, self.how, self.lessons = folder, how, lessons
+    def __init__(self, folder: Path, how: Learn, report: Report, began: float):
+        self.folder, self.how, self.report = folder, how, report
         self._began, self._before = began, 0.0  # [s]
-        self._envs = lessons.environments(how.seed)
-        self._exams = lessons.examinations(how.seed)
-        self.network = crowd.network_of(how, self._envs)
-        self.curve: list[Told] = []
+        self._envs = how.environments()
+        self._exams = how.examinations()
+        self.network = rollout.network_of(how, self._envs)
+        self.curve: list[Metrics] = []
         self.best, self.compile, self._kept = _Best(), 0.0, 0
         begin = self._programs()
         # A copy: no two leaves may share memory, which updates write to.
-        self.learner: Learner = jax.tree.map(jnp.copy, begin(self._tables(self._envs)))
+        self.runner: RunnerState = jax.tree.map(jnp.copy, begin(self._tables(self._envs)))
         self._restore()
 
     def _programs(self) -> Any:
         """Compile all programs side by side; returns the one that begins."""
         began, envs = time.perf_counter(), self._envs
         tables, theirs = self._tables(envs), self._tables(self._exams)
-        begin = partial(crowd.begin, self.how, self.network, envs)
-        update = partial(crowd.update, self.how, self.network, envs)
-        examine = partial(crowd.examine, self.network, self._exams)
-        learner = jax.eval_shape(begin, tables)
+        begin = partial(rollout.begin, self.how, self.network, envs, seed=self.how.setting.seed)
+        update = partial(rollout.update, self.how, self.network, envs)
+        evaluate = partial(rollout.evaluate_policy, self.network, self._exams)
+        runner = jax.eval_shape(begin, tables)
         with ThreadPoolExecutor(3) as pool:
             waiting = [
                 pool.submit(lambda f, *shapes: f.lower(*shapes).compile(), *each)
                 for each in (
-                    (jax.jit(update, donate_argnums=1), tables, learner),
-                    (jax.jit(examine), theirs, learner.student.smoothed),
+                    (jax.jit(update, donate_argnums=1), tables, runner),
+                    (jax.jit(evaluate), theirs, runner.train.ema),
                     (jax.jit(begin), tables),
                 )
             ]
-            self._update, self._examine, begin = (one.result() for one in waiting)
+            self._update, self._evaluate, begin = (one.result() for one in waiting)
         self.compile += time.perf_counter() - began
         return begin
 
@@ -250,7 +289,7 @@ class _Run:
         """Wall clock [s] of this process and of those before it."""
         return self._before + time.perf_counter() - self._began
 
-    def through(self, seconds: float, updates: int, every: float, watch: Watch) -> xr.Dataset:
+    def through(self, seconds: float, updates: int, every: float) -> xr.Dataset:
         """Learn until the time is spent, or the updates are made."""
         reserve = 0.0  # [s] for the last validation
         kept = judged = self.spent
@@ -261,8 +300,9 @@ class _Run:
             return bool(late or (updates and len(self.curve) >= updates))
 
         while not over():
-            self.learner, told = self._update(tables, self.learner)
-            watch(self._note({name: float(x) for name, x in jax.device_get(told).items()}))
+            self.runner, metrics = self._update(tables, self.runner)
+            self._note({name: float(x) for name, x in jax.device_get(metrics).items()})
+            self._tell()
             if self.spent - kept > every and not over():
                 if self.spent - judged > _SPARE * reserve:
                     reserve, judged = self._validate(), self.spent
@@ -273,24 +313,28 @@ class _Run:
         self.keep()
         return self.finish()
 
-    def _note(self, told: Told) -> Told:
+    def _note(self, metrics: Metrics) -> None:
         """Add an update to the curve."""
-        ended = max(told["ended"], 1.0)
+        ended = max(metrics["ended"], 1.0)
         before = self.curve[-1]["simulated"] if self.curve else 0.0
-        worlds = self.how.worlds * len(self._envs)
-        told["success"] = told.pop("won") / ended if told["ended"] else float("nan")
-        told["earned"] = told["earned"] / ended if told["ended"] else float("nan")
-        told["simulated"] = before + worlds * self.how.decisions * self.how.hold
-        told["time"] = self.spent
-        told["validation"] = told["validation_time"] = float("nan")
-        self.curve.append({name: told[name] for name in UNITS})
-        return self.curve[-1]
+        worlds = self.how.num_envs * len(self._envs)
+        metrics["success"] = metrics.pop("won") / ended if metrics["ended"] else float("nan")
+        metrics["earned"] = metrics["earned"] / ended if metrics["ended"] else float("nan")
+        metrics["simulated"] = before + worlds * self.how.num_steps * self.how.hold
+        metrics["time"] = self.spent
+        metrics["validation"] = metrics["validation_time"] = float("nan")
+        self.curve.append({name: metrics[name] for name in UNITS})
+
+    def _tell(self) -> None:
+        """Tell how far it is."""
+        ended = int(sum(metrics["ended"] for metrics in self.curve))
+        self.report(Progress(ended, self.curve[-1]["simulated"], self.compile, len(self.curve)))
 
     def _validate(self) -> float:
         """Try the law; returns how long that took [s]."""
         began = time.perf_counter()
-        actor = self.learner.student.smoothed
-        success, took = jax.device_get(self._examine(self._tables(self._exams), actor))
+        actor = self.runner.train.ema
+        success, took = jax.device_get(self._evaluate(self._tables(self._exams), actor))
         self.curve[-1]["validation"] = rate = float(np.mean(success))
         if success.any():
             self.curve[-1]["validation_time"] = float(np.mean(took[success]))
@@ -308,15 +352,15 @@ class _Run:
             "updates": len(self.curve),
             "simulated": self.curve[-1]["simulated"] if self.curve else 0.0,
             "seconds": round(self.spent, 1),
-            "how": asdict(self.how),
+            "how": {one.name: getattr(self.how, one.name) for one in fields(PPO)},
             **{name: made[name] for name in ("command", "commit", "device", "packages")},
         }
-        actor = self.best.actor or jax.device_get(self.learner.student.smoothed)
+        actor = self.best.actor or jax.device_get(self.runner.train.ema)
         return Policy(self.network, actor, learned=how)
 
     def keep(self) -> None:
         """Write what continues the run, and the law as it is; two such files are kept in turn."""
-        leaves = jax.device_get(jax.tree.leaves(self.learner))
+        leaves = jax.device_get(jax.tree.leaves(self.runner))
         arrays: dict[str, Any] = {f"leaf_{i:04d}": leaf for i, leaf in enumerate(leaves)}
         for name, weight in (self.best.actor or {}).items():
             arrays[f"best_{name}"] = weight
@@ -332,39 +376,86 @@ class _Run:
         """Take up what was kept last, if it is sound."""
         found = []
         for name, content in Parts(self.folder).contents().items():
-            with np.load(io.BytesIO(content), allow_pickle=False) as file:
-                arrays = {key: file[key] for key in file.files}
-            note = json.loads(str(arrays.pop("note")))
+            path = Parts(self.folder).folder / name
+            try:
+                arrays = files.arrays_of(content)
+                note = _checked_note(files.parsed(str(arrays.pop("note"))))
+            except (ValueError, KeyError, TypeError) as error:
+                raise files.corrupt(path, error) from error
             found.append((len(note["curve"]), note["spent"], name, note, arrays))
         if not found:
             return
         *_, name, note, arrays = max(found, key=lambda one: one[:2])
         best = {k.removeprefix("best_"): v for k, v in arrays.items() if k.startswith("best_")}
         leaves = [arrays[key] for key in sorted(arrays) if key.startswith("leaf_")]
-        like = jax.tree.leaves(self.learner)
-        if [(x.shape, x.dtype) for x in leaves] != [(x.shape, x.dtype) for x in like]:
+        like = jax.tree.leaves(self.runner)
+        shapes = {key: value.shape for key, value in best.items()}
+        if [(x.shape, x.dtype) for x in leaves] != [(x.shape, x.dtype) for x in like] or (
+            best and shapes != self.network.shapes
+        ):
             raise errors.InputError(
                 f"run = {self.folder} cannot be continued: another version made it; choose "
                 "another folder."
             )
         own = [jax.device_put(leaf) for leaf in leaves]
-        self.learner = jax.tree.unflatten(jax.tree.structure(self.learner), own)
+        self.runner = jax.tree.unflatten(jax.tree.structure(self.runner), own)
         self.curve, self._before = note["curve"], note["spent"]
         self.compile += note["compile"]
         self.best, self._kept = _Best(note["best"], best or None), int(name[-1])
 
     def finish(self) -> xr.Dataset:
-        """The curve, which is also written, with its figure."""
+        """The curve."""
         variables = {
             name: (
                 "update",
-                [told[name] for told in self.curve],
+                [metrics[name] for metrics in self.curve],
                 {"units": unit, "long_name": words},
             )
             for name, (unit, words) in UNITS.items()
         }
         took = {"compile": self.compile, "run": self.spent - self.compile}
-        curve = xr.Dataset(variables, {"update": np.arange(len(self.curve)) + 1}, took)
-        files.write_results(self.folder / "curve.nc", curve)
-        figures.learning_curve(curve, self.folder / "curve.png")
-        return curve
+        return xr.Dataset(variables, {"update": np.arange(len(self.curve)) + 1}, took)
+
+
+def figure_of(curve: xr.Dataset) -> Figure:
+    """Draw how a law was learned: successes and rewards against both clocks, and PPO's own state.
+
+    The curves of single updates are drawn thin; thick ones are means over 1/40 of the run.
+    """
+    figure = Figure(figsize=(10, 5.6), layout="constrained")
+    axes = figure.subplots(2, 2)
+    minutes, simulated = curve.time.values / 60, curve.simulated.values / 3600
+    width = max(1, curve.sizes["update"] // 40)
+
+    def draw(ax: Axes, x: np.ndarray, name: str, scale: float, colour: str, label: str) -> None:
+        values = scale * curve[name].values
+        mean = curve[name].rolling(update=width, min_periods=1, center=True).mean().values
+        ax.plot(x, values, color=colour, lw=0.6, alpha=0.35)
+        ax.plot(x, scale * mean, color=colour, lw=1.6, label=label)
+
+    judged = np.isfinite(curve.validation.values)
+    clocks = (
+        (minutes, "wall clock, with compilation [min]"),
+        (simulated, "simulated time, summed over worlds [h]"),
+    )
+    for ax, (x, label) in zip(axes[0], clocks, strict=True):
+        draw(ax, x, "success", 100, "C0", "trials that ended, with noise, at the level below")
+        ax.plot(x, 100 * curve.level, "k:", lw=1, label="level of the curriculum")
+        ax.plot(
+            x[judged], 100 * curve.validation.values[judged], "C3o-", ms=4,
+            label="validation: the domain itself, no noise",
+        )  # fmt: skip
+        ax.set(xlabel=label, ylabel="success, level [%]", ylim=(-3, 103))
+        ax.grid(alpha=0.3)
+    axes[0, 0].legend(fontsize=7, loc="lower right")
+    draw(axes[1, 0], minutes, "earned", 1, "C2", "rewards of a trial")
+    axes[1, 0].set(xlabel=clocks[0][1], ylabel="rewards of a trial that ended [1]")
+    axes[1, 0].grid(alpha=0.3)
+    ax = axes[1, 1]
+    ax.plot(simulated, curve.spread, label="standard deviation of the actions")
+    ax.plot(simulated, 100 * curve.learning_rate, label="100 learning rates")
+    ax.plot(simulated, curve.touching, label="share of decisions in contact")
+    ax.set(xlabel=clocks[1][1], ylabel="[1]")
+    ax.grid(alpha=0.3)
+    ax.legend(fontsize=7)
+    return figure

@@ -1,72 +1,71 @@
-"""One loop for all tuners, in a run folder that can be killed and continued."""
+"""One loop for all tuners, part by part, so that a run can be killed and continued."""
 
 from __future__ import annotations
 
+import functools
 import io
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
+import xarray as xr
 
-from rps_jax import errors
-from rps_jax.control import strategies
-from rps_jax.control.strategies import Params
+from rps_jax import engines, errors
+from rps_jax.analysis import figures
+from rps_jax.analysis.report import Picture, Section
+from rps_jax.control import registry
+from rps_jax.control.base import Params
+from rps_jax.control.registry import LawLike
 from rps_jax.record import files
-from rps_jax.record import folder as run_folder
 from rps_jax.record.checkpoint import Parts
+from rps_jax.record.options import option
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Answer, Ask
-from rps_jax.runs.objective import Objective
-from rps_jax.trials.setting import Progress, Setting
-from rps_jax.tuning.space import Space
-from rps_jax.world.domain import DOMAINS, Domain
+from rps_jax.runs.question import OfLaw, Run, seed_of
+from rps_jax.trials.progress import Bar, Progress
+from rps_jax.trials.score import Objective
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+from rps_jax.tuning.space import Space, expanded
+from rps_jax.world import domain as worlds_
+from rps_jax.world.domain import DOMAINS, Domain, DomainLike
+
+Metrics = dict[str, np.ndarray]  # what was found out about a generation, by name
+TryOut = Callable[[list[Ask]], list[Answer]]  # in the worlds of a problem
 
 
 @dataclass(frozen=True)
-class Course:
-    """The worlds in which candidates are tried, and what is wanted of them there."""
+class Problem:
+    """The worlds in which candidates are tried, and what is minimised there."""
 
     domains: tuple[Domain, ...] = (DOMAINS["wide"],)
-    worlds: int = 512
-    """Number of worlds of a generation, in each domain."""
-    validation: int = 512
-    """Number of worlds for validation, in each domain."""
-    setting: Setting = Setting(engine="fused")
+    worlds: int = 512  # of a generation, in each domain
+    validation: int = 512  # worlds for validation, in each domain
+    setting: Setting = Setting()
     objective: Objective = Objective()
-
-    def __post_init__(self) -> None:
-        """Raises InputError for no domain or no worlds."""
-        if not self.domains:
-            raise errors.InputError("domains = () is not allowed: name at least one.")
-        errors.check_finite("worlds", self.worlds, at_least=1, at_most=1e7)
-        errors.check_finite("validation", self.validation, at_least=1, at_most=1e7)
 
     def ask(self, params: Params, seed: int, generation: int) -> Ask:
         """Candidates with leaves (P,) in the worlds of a generation."""
         worlds = generation * self.worlds + np.arange(self.worlds)
-        return Ask(params, evaluate.seed_of(seed, "tune"), worlds)
+        return Ask(params, seed_of(seed, "tune"), worlds)
 
     def validate(self, params: Params, seed: int) -> Ask:
         """Candidates with leaves (P,) in the worlds for validation."""
-        return Ask(params, evaluate.seed_of(seed, "validate"), np.arange(self.validation))
-
-
-Told = dict[str, np.ndarray]  # what was found out about a generation, by name
-TryOut = Callable[[list[Ask]], list[Answer]]  # in the worlds of a course
+        return Ask(params, seed_of(seed, "validate"), np.arange(self.validation))
 
 
 class Tuner(Protocol):
-    """A search whose state follows from what it has proposed and what it was told about that.
+    """A search whose state follows from what it has proposed and the metrics of that.
 
     Nothing is computed before it begins.
     """
 
     space: Space
-    course: Course
-    options: dict[str, Any]  # how it searches, apart from how long, by its name
+    problem: Problem
     generations: int  # after which it ends
     budget: float  # [s] simulated time after which no generation begins; 0: no bound
     best: np.ndarray  # (p,) the vector that validated best
@@ -76,98 +75,257 @@ class Tuner(Protocol):
         ...
 
     def propose(self) -> np.ndarray:
-        """The vectors (P, p) of the next generation; asked for once in each generation."""
+        """Vectors (P, p) of the next generation; asked for once in each generation."""
+        ...
+
+    def shapes(self, vectors: np.ndarray, generation: int) -> dict[str, tuple[int, ...]]:
+        """Shapes of the metrics of these vectors."""
         ...
 
     def judge(
         self, vectors: np.ndarray, generation: int, try_out: TryOut
-    ) -> tuple[Told, dict[str, Any]]:
-        """What trials tell about these vectors, and the tuner's entries in the log."""
+    ) -> tuple[Metrics, dict[str, Any]]:
+        """Metrics of these vectors from trials, and the tuner's entries in the log."""
         ...
 
-    def learn(self, vectors: np.ndarray, told: Told) -> None:
+    def update(self, vectors: np.ndarray, metrics: Metrics) -> None:
         """Go on to the next generation."""
         ...
 
 
-def open_run(folder: Path, tuner: Tuner) -> Path:
-    """The folder of a tuner's run; one that holds a run must hold this one, but for its length.
+@dataclass(frozen=True)
+class Tuning(OfLaw[xr.Dataset]):
+    """A question for better parameters of a law."""
 
-    Raises:
-      InputError: it cannot be written, or holds another run.
-    """
-    space, course = tuner.space, tuner.course
-    setting = asdict(course.setting) | {"rules": course.setting.rules._asdict()}
-    configuration = {
-        "tuned": space.names,
-        "base": strategies.recorded(space.base),
-        "course": asdict(course) | {"setting": setting},
+    SMALL: ClassVar[dict[str, Any]] = {
+        # Few parameters, those that matter most, since few trials tell no more; and cylinders on
+        # the quasi-static model, which compile and run fastest.
+        "tuned": ("K_h", "K_v", "l_cr", "d_th"),
+        "objects": ("random_cylinder",),
+        "setting.engine": "quasistatic",
+        "setting.rules": Rules(horizon=150.0),
+        "validation": 64,
+        "slots": 64,
     }
-    return run_folder.claim(folder, configuration | tuner.options)
+
+    law: LawLike = "rps"
+    """The law, with the parameters to begin with: its name, as rps, rps_tuned or rps_plus, or a
+    file's with bounds, as my_law.py:MyParams; changes follow, as rps,K_h=0.3 or rps,tuned.json.
+    Gradients are of laws with a smooth form, rps and rps_plus."""
+    domain: Sequence[DomainLike] = ("wide",)
+    """Domains to tune in: paper, hardware, wide, real, prisms, hostile, or JSON files of ranges;
+    changes follow each, as wide,mass=3:10."""
+    objects: tuple[str, ...] = ("random_box", "random_cylinder")
+    """Objects of these domains; random_prism is held out by default."""
+    tuned: tuple[str, ...] = ("full",)
+    """Parameters to tune: names, or logistic (eta, zeta, beta, k), or full (all that are the
+    law's, not the robot's speeds, the rules or the switches)."""
+    worlds: int = option(512, 1, 10_000_000)
+    """Number of worlds that each candidate meets, in each domain; every generation has its own."""
+    validation: int = option(512, 1, 10_000_000)
+    """Number of worlds for validation, in each domain."""
+    objective: Objective = Objective()
+    budget: float = option(0.0, 0, unit="s")
+    """Simulated time after which no generation begins [s]; 0 stands for no bound."""
+
+    @property
+    def title(self) -> str:
+        """Title of the report."""
+        return f"{self.label}, tuned"
+
+    @functools.cached_property
+    def space(self) -> Space:
+        """The parameters that are tuned."""
+        return Space(expanded(self.tuned, self.params), self.params)
+
+    @functools.cached_property
+    def problem(self) -> Problem:
+        """The worlds in which candidates are tried, and what is minimised there."""
+        one = isinstance(self.domain, str | Domain)
+        several: list[Any] = [self.domain] if one else list(self.domain)
+        domains = tuple(replace(worlds_.named(x), objects=self.objects) for x in several)
+        errors.check_each_once("domain", domains)
+        return Problem(domains, self.worlds, self.validation, self.setting, self.objective)
+
+    def tuner(self) -> Tuner:
+        """The search."""
+        raise NotImplementedError
+
+    def small(self) -> Mapping[str, Any]:
+        """Values of `quick`; which parameters matter is known of RPS alone."""
+        own = registry.LAWS["rps"]
+        alike = isinstance(self.params, type(own))
+        return {k: v for k, v in self.SMALL.items() if k != "tuned" or alike}
+
+    def check(self) -> None:
+        """Check the space, the search, and that the engine can step the worlds here."""
+        errors.check_count("seed", self.setting.seed, at_least=0, at_most=2**30)
+        known = [n for n, own in registry.LAWS.items() if registry.law_of(own).bounds]
+        if not registry.law_of(self.params).bounds:
+            raise errors.InputError(
+                f"law = {self.label} is not allowed: it has no bounds to tune within; "
+                f"{', '.join(known)} have."
+            )
+        engine = engines.get(self.setting.engine)
+        engine.check([family for one in self.problem.domains for family in one.families])
+        engine.check_senses(registry.law_of(self.space.base).senses)
+        self.tuner()
+
+    def configuration(self) -> dict[str, Any]:
+        """All that the answer depends on, but how long it is searched."""
+        found = self.described() | {"question": self.name, "tuned": self.space.names}
+        found["domain"] = [asdict(one) for one in self.problem.domains]
+        for name in ("budget", "generations"):
+            found.pop(name, None)
+        return found
+
+    def bar(self) -> Bar:
+        """A bar over generations."""
+        count = self.tuner().generations
+        return Bar(self.name.replace("_", " "), count, "generations", shown=self.shown)
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Tune."""
+        tuner = self.tuner()
+        log = tune(run.folder, tuner, report=run.report, slots=run.slots, workers=run.workers)
+        return labelled(log, tuner)
+
+    def intro(self, found: xr.Dataset) -> str:
+        """What was asked."""
+        names = ", ".join(self.space.names)
+        return (
+            f"{self.label}: {names}; {self.worlds} worlds of each generation and "
+            f"{self.validation} for validation, engine {self.setting.engine}."
+        )
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """What was found, where the time went, and the search over its generations."""
+        best = int(found.validation.argmin("generation"))
+        rate = 100 * found.validation_success.values
+        total = {name: float(found[name].sum()) for name in ("compile", "run", "simulated")}
+        grad = ""
+        if "differentiate" in found:
+            took = float(found["differentiate"].sum())  # `found.differentiate` is a method
+            grad = f", gradients {took:.1f} s with their compilation"
+        text = (
+            f"Validation: objective {float(found.validation[0]):.4f} and success {rate[0]:.1f} % "
+            f"at the start, {float(found.validation[best]):.4f} and {rate[best]:.1f} % after "
+            f"{best} of {found.sizes['generation']}. Compile {total['compile']:.1f} s, run "
+            f"{total['run']:.1f} s{grad}, {total['simulated']:.3g} s simulated."
+        )
+        if run.folder is not None:
+            text += f" The law with these parameters is `{self.label},{run.folder / TUNED}`."
+        rows = [["parameter", "start", "tuned"]]
+        start = registry.numbers(self.space.base)
+        for name, value in zip(found.parameter.values, found.tuned.values, strict=True):
+            rows.append([str(name), f"{float(start[str(name)]):.4g}", f"{float(value):.4g}"])
+        picture = Picture("tuning", partial(figures.search, found))
+        return [Section("What was found", text, rows, picture)]
+
+
+TUNED = "tuned.json"  # in a run folder: the parameters that validated best
+
+
+def labelled(log: Sequence[Mapping[str, Any]], tuner: Tuner) -> xr.Dataset:
+    """The log of a run (generation), and the parameters of each and at last (parameter)."""
+    names = list(tuner.space.names)
+    keys = [key for key in dict.fromkeys(k for line in log for k in line) if key != "params"]
+    columns: dict[str, Any] = {}
+    for key in keys:
+        values = [np.nan if line.get(key) is None else line[key] for line in log]
+        attrs = {"units": UNITS.get(key, "1")}
+        columns[key] = ("generation", np.array(values, float), attrs)
+    columns.pop("generation", None)
+    params = [[line["params"][name] for name in names] for line in log]
+    columns["params"] = (("generation", "parameter"), np.array(params, float))
+    best = registry.numbers(tuner.space.params(tuner.best))
+    columns["tuned"] = ("parameter", np.array([float(best[name]) for name in names]))
+    return xr.Dataset(columns, {"generation": np.arange(len(log)), "parameter": names})
+
+
+UNITS = {"compile": "s", "run": "s", "simulated": "s", "differentiate": "s"}
 
 
 def tune(
-    folder: Path,
+    folder: Path | None,
     tuner: Tuner,
     *,
-    report: Callable[[int, Progress], Any] = lambda generation, progress: None,
+    report: Callable[[Progress], Any] = lambda progress: None,
     **shape: Any,
-) -> Params:
-    """Run a tuner to its end, in a folder that `open_run` opened.
+) -> list[dict[str, Any]]:
+    """Run a tuner to its end, in a folder in which it can be continued, or in memory.
 
-    Every generation is a part of the run: the vectors proposed, what the tuner was told, and its
-    line of `log.jsonl`. What is there is not tried again: a tuner that is continued proposes the
-    same and is told the same, as if it had never been stopped. A part that is damaged is tried
+    Every generation is a part of the run: the vectors proposed, their metrics, and its line of
+    `log.jsonl`. What is there is not tried again: a tuner that is continued proposes what it did
+    and is given what it was, as if it had never been stopped. A part that is damaged is tried
     again. `compile` and `run` [s] of a line are the times of the trials, `simulated` [s] is all
-    simulated time. Returns what validated best, as `tuned.json` holds it.
+    simulated time. Returns the log; `tuner.best` is what validated best.
 
     Raises:
       InputError: the folder holds generations that this tuner does not propose.
     """
     tuner.begin()
-    parts, log = Parts(folder), []
-    kept = parts.found()
+    parts, log = None if folder is None else Parts(folder), []
+    kept = {} if parts is None else parts.found()
+    heard = _Total(report)
     while (name := f"{len(log):06d}") in kept or (
         len(log) < tuner.generations and not spent(log, tuner.budget)
     ):
         vectors = tuner.propose()
         if name in kept:
-            vectors, told, line = _restored(folder, kept[name], vectors)
+            vectors, metrics, line = _restored(tuner, kept[name], vectors, len(log))
         else:
-            told, line = _tried(tuner, vectors, len(log), report, shape)
-            parts.put(name, _encoded(vectors, told, line), ".npz")
-        tuner.learn(vectors, told)
+            metrics, line = _tried(tuner, vectors, len(log), heard, shape)
+            if parts is not None:
+                parts.put(name, _encoded(vectors, metrics, line), ".npz")
+        tuner.update(vectors, metrics)
         log.append(line)
-        if name not in kept:
+        heard.ended(len(log), line["simulated"])
+        if folder is not None and name not in kept:
             _write(folder, tuner, log)
-    _write(folder, tuner, log)
-    return tuner.space.params(tuner.best)
+    if folder is not None:
+        _write(folder, tuner, log)
+    return log
+
+
+class _Total:
+    """Progress of all generations from that of each."""
+
+    def __init__(self, report: Callable[[Progress], Any]):
+        self._report, self._done, self._simulated = report, 0, 0.0
+
+    def __call__(self, progress: Progress) -> None:
+        """Tell of a generation under way."""
+        simulated = self._simulated + progress.simulated
+        self._report(Progress(progress.finished, simulated, progress.compile, self._done))
+
+    def ended(self, done: int, simulated: float) -> None:
+        """Tell that so many generations are done."""
+        self._done, self._simulated = done, self._simulated + simulated
+        self._report(Progress(0, self._simulated, 0.0, done))
 
 
 def _tried(
     tuner: Tuner,
     vectors: np.ndarray,
     generation: int,
-    report: Callable[[int, Progress], Any],
+    report: Callable[[Progress], Any],
     shape: dict[str, Any],
-) -> tuple[Told, dict[str, Any]]:
-    """What a generation tells, and its line of the log."""
+) -> tuple[Metrics, dict[str, Any]]:
+    """The metrics of a generation, and its line of the log."""
     took = dict.fromkeys(("simulated", "compile", "run"), 0.0)
-    course = tuner.course
-    where = course.domains, course.setting, course.objective
+    problem = tuner.problem
+    where = problem.domains, problem.setting, problem.objective
 
     def try_out(asks: list[Ask]) -> list[Answer]:
-        def tell(progress: Progress) -> None:
-            report(generation, progress)
-
-        answers, timing = evaluate.try_out(asks, *where, report=tell, **shape)
+        answers, timing = evaluate.try_out(asks, *where, report=report, **shape)
         for name in took:
             took[name] += getattr(timing, name)
         return answers
 
-    told, line = tuner.judge(vectors, generation, try_out)
+    metrics, line = tuner.judge(vectors, generation, try_out)
     took["simulated"] += line.pop("simulated", 0.0)
-    return told, {"generation": generation} | line | took
+    return metrics, {"generation": generation} | line | took
 
 
 def spent(log: Sequence[dict[str, Any]], budget: float) -> bool:
@@ -182,33 +340,68 @@ def finite(value: Any) -> float | None:
 
 def read_log(folder: Path) -> list[dict[str, Any]]:
     """The lines of a run's log, one for each generation."""
-    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    path = folder / "log.jsonl"
+    content = files.content_of(path, "json")
+    try:
+        return [files.parsed(line) for line in content.splitlines()]
+    except ValueError as error:
+        raise files.corrupt(path, error) from error
 
 
 def _write(folder: Path, tuner: Tuner, log: Sequence[dict[str, Any]]) -> None:
-    files.write_json(folder / "tuned.json", tuner.space.named(tuner.best))
+    files.write_json(folder / TUNED, tuner.space.named(tuner.best))
     files.write_text(folder / "log.jsonl", "".join(json.dumps(line) + "\n" for line in log))
 
 
-def _encoded(vectors: np.ndarray, told: Told, line: dict[str, Any]) -> bytes:
+def _encoded(vectors: np.ndarray, metrics: Metrics, line: dict[str, Any]) -> bytes:
     """The file of a generation."""
     content = io.BytesIO()
-    own: dict[str, Any] = {f"told_{name}": value for name, value in told.items()}
+    own: dict[str, Any] = {f"metric_{name}": value for name, value in metrics.items()}
     np.savez(content, vectors=vectors, line=np.array(json.dumps(line)), **own)
     return content.getvalue()
 
 
+def _check_line(line: Any, names: Sequence[str]) -> None:
+    """Raises ValueError or KeyError unless this is a line of a log, with these parameters."""
+    if not (isinstance(line, dict) and isinstance(line["params"], dict)):
+        raise ValueError("its line holds no names with values")
+    numbers = {name: value for name, value in line.items() if name != "params"} | line["params"]
+    for name, value in numbers.items():
+        if value is not None:
+            errors.check_number(f"{name} of its line", value)
+    for name in ("simulated", "compile", "run", "validation", "validation_success", *names):
+        if numbers[name] is None and name != "validation":
+            raise ValueError(f"its line holds no {name}")
+
+
 def _restored(
-    folder: Path, path: Path, proposed: np.ndarray
-) -> tuple[np.ndarray, Told, dict[str, Any]]:
-    """The vectors of a generation that was tried before, what they told, and the log's line."""
-    with np.load(path, allow_pickle=False) as file:
-        vectors, line = file["vectors"], json.loads(str(file["line"]))
-        told = {n.removeprefix("told_"): file[n] for n in file.files if n.startswith("told_")}
+    tuner: Tuner, path: Path, proposed: np.ndarray, generation: int
+) -> tuple[np.ndarray, Metrics, dict[str, Any]]:
+    """The vectors of a generation that was tried before, their metrics, and the log's line.
+
+    Raises:
+      InputError: the file holds something else than this tuner would have written there.
+    """
+    content = files.content_of(path, "part")
+    try:
+        arrays = files.arrays_of(content)
+        line = files.parsed(str(arrays.pop("line")))
+        _check_line(line, tuner.space.names)
+    except (ValueError, KeyError) as error:
+        raise files.corrupt(path, error) from error
+    vectors = arrays.pop("vectors", np.empty(0))
+    metrics = {name.removeprefix("metric_"): values for name, values in arrays.items()}
+    shapes = {name: values.shape for name, values in metrics.items() if values.dtype.kind == "f"}
+    if shapes != tuner.shapes(proposed, generation):
+        raise files.corrupt(path, "its numbers are not those of a generation of this search")
     # Another machine may round otherwise, so the search goes on from what was tried.
-    if vectors.shape != proposed.shape or not np.allclose(vectors, proposed, rtol=1e-4, atol=1e-4):
+    if (
+        vectors.dtype.kind != "f"
+        or vectors.shape != proposed.shape
+        or not np.allclose(vectors, proposed, rtol=1e-4, atol=1e-4)
+    ):
         raise errors.InputError(
-            f"run = {folder} cannot be continued: its generation {line['generation']} is not what "
-            "this search proposes, so another version made it; choose another folder."
+            f"run = {path.parent.parent} cannot be continued: its generation {generation} is not "
+            "what this search proposes, so another version made it; choose another folder."
         )
-    return vectors, told, line
+    return vectors, metrics, line

@@ -11,18 +11,17 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax import errors
-from rps_jax.control import strategies
-from rps_jax.control.bounds import Bound
-from rps_jax.control.law import BOUNDS, RPSParams
-from rps_jax.control.strategies import Params
+from rps_jax.control import registry
+from rps_jax.control.base import Bound, Params
+from rps_jax.control.laws.rps import BOUNDS, RPSParams
 
 SUBSETS = {"logistic": ("eta", "zeta", "beta", "k"), "full": tuple(BOUNDS)}  # of RPS
 
 
 def expanded(names: Sequence[str], base: Params = RPSParams()) -> tuple[str, ...]:
-    """The same names, with the members of a subset in its place: of `full`, all of the law's."""
+    """Put the members of a subset in its place among names: of `full`, all of the law's."""
     own = isinstance(base, RPSParams)
-    subsets = SUBSETS if own else {"full": tuple(dict(strategies.of(base).bounds))}
+    subsets = SUBSETS if own else {"full": tuple(dict(registry.law_of(base).bounds))}
     return tuple(name for text in names for name in subsets.get(text, (text,)))
 
 
@@ -34,7 +33,7 @@ class Space:
     """
 
     names: tuple[str, ...] = SUBSETS["logistic"]
-    base: Any = RPSParams()  # parameters of any strategy that has bounds
+    base: Any = RPSParams()  # parameters of any law that has bounds
 
     def __post_init__(self) -> None:
         """Raises InputError for unknown or repeated names, or a base outside the bounds."""
@@ -42,7 +41,7 @@ class Space:
             raise errors.InputError(
                 f"tuned = {self.names} is not allowed: name each parameter once, at least one."
             )
-        base = strategies.numbers(self.base)
+        base = registry.numbers(self.base)
         for name in self.names:
             bound = self._bounds[errors.check_name("tuned parameter", name, self._bounds)]
             share = _share(bound, base, name)
@@ -55,11 +54,11 @@ class Space:
 
     @property
     def _bounds(self) -> dict[str, Bound]:
-        return dict(strategies.of(self.base).bounds)
+        return dict(registry.law_of(self.base).bounds)
 
     def vector(self, params: Params) -> jax.Array:
         """The vector (..., p) of parameters with leaves (...)."""
-        numbers = strategies.numbers(params)
+        numbers = registry.numbers(params)
         return jnp.stack([self._coordinate(numbers, name) for name in self.names], axis=-1)
 
     def _coordinate(self, numbers: Mapping[str, Any], name: str) -> jax.Array:
@@ -74,7 +73,7 @@ class Space:
         vector, bounds = jnp.asarray(vector, float), self._bounds
         filled = {
             name: jnp.broadcast_to(jnp.asarray(value, vector.dtype), vector.shape[:-1])
-            for name, value in strategies.numbers(self.base).items()
+            for name, value in registry.numbers(self.base).items()
         }
         for name in sorted(self.names, key=lambda name: bool(bounds[name].of)):
             low, high, log, of = bounds[name]
@@ -84,21 +83,21 @@ class Space:
         for name, bound in bounds.items():
             if bound.of:  # a share of a tuned parameter that is itself fixed must not pass it
                 filled[name] = jnp.minimum(filled[name], filled[bound.of])
-        return strategies.changed(self.base, filled)
+        return registry.changed(self.base, filled)
 
     def named(self, vector: Any) -> dict[str, float]:
         """A vector's tuned parameters by name, and the others that differ from the usual ones."""
         found, usual = (
             {name: float(f"{float(value):.7g}") for name, value in numbers.items()}
-            for numbers in map(strategies.numbers, (self.params(vector), self._usual))
+            for numbers in map(registry.numbers, (self.params(vector), self._usual))
         )
         return {n: x for n, x in found.items() if n in self.names or x != usual[n]}
 
     @property
     def _usual(self) -> Params:
-        """The parameters by which the strategy is known; of RPS the paper's."""
+        """The parameters by which the law is known; of RPS the paper's."""
         kind = type(self.base)
-        return next(known for known in strategies.PARAMS.values() if type(known) is kind)
+        return next(known for known in registry.LAWS.values() if type(known) is kind)
 
 
 def _share(bound: Bound, numbers: Mapping[str, Any], name: str) -> Any:

@@ -1,0 +1,386 @@
+"""What a question is: one declaration, of which call, command, manifest and run folder are made.
+
+A question is a frozen dataclass. Its fields are the options: their annotations are the types, the
+strings below them the help, and `option` holds their bounds. It has
+
+    answer(run)           the run, part by part, so that it resumes; returns labelled data
+    report(found, run)    the prose, tables and figures about them
+    check()               what the fields' types and bounds do not say
+
+    found = rps_jax.Rare("rps_tuned", "wide")()     # or rps_jax.rare("rps_tuned", "wide")
+    rps rare --law rps_tuned --domain wide          # from the shell
+    rps my_study.py --worlds 8                      # a question of one's own, from its file
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, ClassVar, Generic, Literal, NamedTuple, ParamSpec, Protocol, TypeVar
+
+import numpy as np
+import xarray as xr
+
+from rps_jax import engines, errors
+from rps_jax.analysis.report import Section
+from rps_jax.control import registry
+from rps_jax.control.base import Params
+from rps_jax.control.registry import LawLike, LawsLike
+from rps_jax.engines import device
+from rps_jax.record import files, folder, options, provenance
+from rps_jax.record.checkpoint import Parts
+from rps_jax.record.options import option
+from rps_jax.robot.robot import RobotLike
+from rps_jax.trials import batch
+from rps_jax.trials.progress import Bar, Report, Timing, watched
+from rps_jax.trials.setting import Setting
+from rps_jax.world import domain as domains
+from rps_jax.world.domain import Domain, DomainLike
+
+P = ParamSpec("P")
+T = TypeVar("T", covariant=True)
+Split = Literal["tune", "validate", "test"]
+
+
+def seed_of(seed: int, split: Split) -> int:
+    """Seed of the worlds of one split: no two splits of any seeds share a world.
+
+    The worlds of a domain that draws little, such as `paper`, hardly depend on the seed.
+    """
+    splits = ("tune", "validate", "test")
+    return len(splits) * seed + splits.index(errors.check_name("split", split, splits))
+
+
+class Run(NamedTuple):
+    """Where and how an answer is made."""
+
+    folder: Path | None  # of the run; None keeps all in memory
+    report: Report  # hears how far the run is
+    slots: int | None = None  # worlds stepped at once by a worker
+    workers: int | None = None  # host threads
+
+    @property
+    def parts(self) -> Parts | None:
+        """Finished parts of the run, if it has a folder."""
+        return None if self.folder is None else Parts(self.folder)
+
+    def part(self, name: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
+        """Labelled results of a part: those that are kept, or else made and kept."""
+        return make() if self.parts is None else self.parts.results(name, make)
+
+    @property
+    def shape(self) -> dict[str, Any]:
+        """Slots, workers and report, as what runs trials takes them."""
+        return {"slots": self.slots, "workers": self.workers, "report": self.report}
+
+
+class Asks(Protocol[T]):
+    """What can be asked for: called, it gives its answer."""
+
+    def __call__(self) -> T:
+        """Answer."""
+        ...
+
+
+def call_of(question: Callable[P, Asks[T]]) -> Callable[P, T]:
+    """Make a function of a question, with its fields as arguments, that returns its answer."""
+
+    @functools.wraps(question, assigned=("__module__", "__doc__"), updated=())
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        return question(*args, **kwargs)()
+
+    name = snake(question.__name__)
+    call.__name__ = call.__qualname__ = name
+    call.__doc__ = f"{question.__doc__}\n\nFields of `{question.__name__}` are its arguments.\n"
+    return call
+
+
+def snake(name: str) -> str:
+    """`TuneGradients` as `tune_gradients`."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Question(Generic[T]):
+    """What is asked; each subclass is one question."""
+
+    out: Path | str | None = None
+    """Run folder, in the shell by default runs/NAME; a run that was killed is continued there."""
+    progress: bool | None = option(None, kw_only=True, hidden=True)
+    """Whether a bar shows the progress; by default in a terminal and in a notebook."""
+    report_to: Report | None = option(None, kw_only=True, hidden=True)
+    """What hears of the progress instead of a bar."""
+
+    SMALL: ClassVar[Mapping[str, Any]] = {}  # values of `quick`, by the field's name
+    TITLE: ClassVar[str] = ""  # of the report
+
+    @property
+    def name(self) -> str:
+        """What it is called in the shell."""
+        return snake(type(self).__name__)
+
+    @property
+    def title(self) -> str:
+        """Title of the report."""
+        return self.TITLE or self.name.replace("_", " ").capitalize()
+
+    @property
+    def place(self) -> Path:
+        """Run folder of the shell, if no other is named."""
+        return Path("runs") / self.name
+
+    # --- what a subclass says ---
+
+    def check(self) -> None:
+        """Check what the fields' types and bounds do not say; raises InputError."""
+
+    def answer(self, run: Run) -> T:
+        """Run what is missing, and return labelled data."""
+        raise NotImplementedError
+
+    def report(self, found: Any, run: Run) -> Sequence[Section]:
+        """Prose, tables and figures about the answer."""
+        return ()
+
+    def intro(self, found: Any) -> str:
+        """First paragraph of the report."""
+        return ""
+
+    def small(self) -> Mapping[str, Any]:
+        """Values of `quick`, by the field's name, or OWNER.FIELD."""
+        return self.SMALL
+
+    def note(self) -> str:
+        """What the shell says before the run, if anything."""
+        return ""
+
+    def trials(self) -> int | None:
+        """How many trials there are, if that is known."""
+        return None
+
+    def configuration(self) -> dict[str, Any]:
+        """All that the answer depends on, as JSON."""
+        return {"question": self.name} | self.described()
+
+    # --- what is made of it ---
+
+    def __call__(self) -> T:
+        """Check, run what is missing, and return the answer.
+
+        Raises:
+          InputError: a field is not allowed, or `out` holds another run.
+        """
+        asked = self.asked()
+        asked.checked()
+        device.use_cache_if_asked()
+        if asked.report_to is not None:
+            return asked.answered(asked.report_to)
+        with asked.bar() as bar:
+            return asked.answered(bar)
+
+    def bar(self) -> Bar:
+        """A bar over the trials."""
+        return Bar(self.name, self.trials(), shown=self.shown)
+
+    @property
+    def shown(self) -> bool:
+        """Whether a bar shows the progress."""
+        return watched() if self.progress is None else self.progress
+
+    def asked(self) -> Any:
+        """What is asked in the end: with `quick`, small where nothing else was asked for."""
+        if not getattr(self, "quick", False):
+            return self
+        small, usual = {}, type(self)
+        for name, value in self.small().items():
+            owner, _, inner = name.partition(".")
+            now = getattr(self, owner)
+            if inner:
+                default = getattr(_default(usual, owner), inner)
+                if getattr(now, inner) == default:
+                    small[owner] = replace(small.get(owner, now), **{inner: value})
+            elif now == _default(usual, owner):
+                small[owner] = value
+        return replace(self, **small)
+
+    def checked(self) -> None:
+        """Raises InputError for what is not allowed, before anything is compiled or written."""
+        options.check_fields(self)
+        self.check()
+
+    def answered(self, report: Report) -> T:
+        """The answer, kept in the run folder if there is one."""
+        with self.opened() as out:
+            found = self.answer(self.run_in(out, report))
+            data = found if isinstance(found, xr.Dataset) else getattr(found, "data", None)
+            if out is not None and isinstance(data, xr.Dataset):
+                files.write_results(out / "results.nc", data)
+            return found
+
+    def run_in(self, out: Path | None, report: Report) -> Run:
+        """Where and how the answer is made."""
+        return Run(out, report)
+
+    @contextlib.contextmanager
+    def opened(self) -> Iterator[Path | None]:
+        """The run folder, new or to be continued, in use."""
+        if self.out is None:
+            yield None
+            return
+        out = folder.claim(Path(self.out), self.configuration())
+        with folder.hold(out):
+            provenance.sign(out)
+            yield out
+
+    def described(self) -> dict[str, Any]:
+        """Own fields as JSON, with laws by their parameters and a domain by its ranges."""
+        found: dict[str, Any] = {}
+        for one in fields(self):
+            if one.name in _NOT_ASKED:
+                continue
+            value = getattr(self, one.name)
+            if one.name == "law" and (params := getattr(self, "params", None)) is not None:
+                value = registry.recorded(params)
+            elif one.name == "laws" and isinstance(self, OfLaws):
+                value = {k: registry.recorded(v) for k, v in self.chosen.items()}
+            elif one.name == "domain" and isinstance(value, str | Domain):
+                value = dataclasses.asdict(domains.named(value))
+            elif one.name == "setting":
+                value = setting_as_json(value)
+            else:
+                value = options.described(value)
+            found[one.name] = value
+        return found
+
+
+_NOT_ASKED = ("out", "bag", "slots", "workers", "quick", "progress", "report_to", "device")
+
+
+def _default(kind: type, name: str) -> Any:
+    return next(one.default for one in fields(kind) if one.name == name)
+
+
+def setting_as_json(setting: Setting) -> dict[str, Any]:
+    """A setting as manifests have it."""
+    return {
+        "engine": setting.engine,
+        "physics": dataclasses.asdict(setting.physics),
+        "rules": registry.as_json(setting.rules),
+        "seed": setting.seed,
+    }
+
+
+# --- what many questions ask about ---------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pushes(Question[T]):
+    """A question that is answered by pushing in simulation."""
+
+    setting: Setting = Setting()
+    slots: int | None = option(None, 1, 10_000_000, kw_only=True)
+    """Number of worlds that one worker steps at once; by default as suits engine and device."""
+    workers: int | None = option(None, 1, 1024, kw_only=True)
+    """Number of host threads that drive worlds; by default as suits engine and device."""
+    quick: bool = False
+    """Whether to make a small run of minutes on two cores: what is not asked for becomes small."""
+
+    def run_in(self, out: Path | None, report: Report) -> Run:
+        """Where and how the answer is made."""
+        return Run(out, report, self.slots, self.workers)
+
+
+@dataclass(frozen=True)
+class OfLaw(Pushes[T]):
+    """A question about one law."""
+
+    law: LawLike = "rps_tuned"
+    """The law: its name, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
+    policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json."""
+
+    @functools.cached_property
+    def params(self) -> Params:
+        """Parameters of the law."""
+        return registry.checked(registry.read_law(self.law)[1])
+
+    @property
+    def label(self) -> str:
+        """What the law is called."""
+        return registry.read_law(self.law)[0]
+
+
+@dataclass(frozen=True)
+class OfLaws(Pushes[T]):
+    """A question about several laws, which all meet the same worlds."""
+
+    laws: LawsLike = ("rps", "rps_tuned")
+    """The laws: names, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
+    policy.npz; changes follow each, as rps,K_h=0.3 or rps,tuned.json."""
+
+    @functools.cached_property
+    def chosen(self) -> dict[str, Params]:
+        """Parameters of the laws, by label."""
+        return registry.laws_of(self.laws)
+
+
+@dataclass(frozen=True)
+class InDomain(Pushes[T]):
+    """A question about random worlds."""
+
+    domain: DomainLike = "wide"
+    """Ranges from which worlds are drawn: paper, hardware, wide, real (wide, but with limited
+    robots), prisms or hostile, or a JSON file of ranges. Changes follow, as wide,mass=3:10."""
+    robot: RobotLike | None = field(default=None, kw_only=True)
+    """The robot: ideal, kairos (the paper's), ridgeback or mpo_500, or a JSON file of its size,
+    boards and limits. By default the domain's, which is ideal but in the domain real."""
+
+    @functools.cached_property
+    def ranges(self) -> Domain:
+        """The domain, with the robot."""
+        return domains.named(self.domain, self.robot)
+
+    def described(self) -> dict[str, Any]:
+        """Own fields as JSON; the robot stands in the domain."""
+        found = super().described() | {"domain": dataclasses.asdict(self.ranges)}
+        del found["robot"]
+        return found
+
+    def check_engine(self, laws: Sequence[Params] = ()) -> None:
+        """Raises InputError unless the engine can step these worlds with these laws here."""
+        engine = engines.get(self.setting.engine)
+        engine.check(self.ranges.families)
+        engine.check_robot(self.ranges.weakest)
+        for params in laws:
+            engine.check_senses(registry.law_of(params).senses)
+        batch.check_shape(self.slots, self.workers)
+
+
+def told(timing: Timing, device: str) -> str:
+    """Where the time of a run went, in a line."""
+    rate = timing.simulated / max(timing.run, 1e-9)
+    return (
+        f"compile {timing.compile:.1f} s, run {timing.run:.1f} s ({rate:.0f} simulated s per s) on "
+        f"{device}"
+    )
+
+
+def labelled(results: xr.Dataset) -> xr.Dataset:
+    """Results with names for the numbers of a pose, and what was drawn as coordinates of worlds."""
+    if "pose" in results.dims:
+        results = results.assign_coords(pose=["x", "y", "yaw"])
+    return results.set_coords([name for name in results if results[name].dims == ("world",)])
+
+
+def name_of(domain: DomainLike) -> str:
+    """What a domain is called."""
+    return domain if isinstance(domain, str) else "of one's own"
+
+
+def count_of(mask: np.ndarray) -> int:
+    """How many are true."""
+    return int(np.count_nonzero(mask))

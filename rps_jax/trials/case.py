@@ -1,0 +1,145 @@
+"""One trial as it is asked for by name: what is pushed where, by which law, on which ground."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from rps_jax import errors
+from rps_jax.control import registry
+from rps_jax.control.base import Params
+from rps_jax.control.registry import LawLike
+from rps_jax.record.options import option
+from rps_jax.robot import robot as robots
+from rps_jax.robot import skin as skins
+from rps_jax.robot.robot import Robot, RobotLike
+from rps_jax.robot.skin import Skin, SkinLike
+from rps_jax.trials.trial import Shift
+from rps_jax.world import objects, scene
+from rps_jax.world.scene import FRICTION, Friction, Side
+
+FrictionLike = str | Friction | tuple[float, float]  # a friction set, or coefficients ground, robot
+
+
+@dataclass(frozen=True, kw_only=True)
+class Given:
+    """What is given beside object, friction, target and law, for one trial or for many."""
+
+    mass: float | None = None
+    """Mass of the object [kg]; by default its own."""
+    skin: SkinLike | None = None
+    """The skin: ideal is the paper's simulated contact sensor under foam, thin is one without foam,
+    capacitive has 42 taxels, and hardware adds noise and unequal gains to these. Changes follow, as
+    capacitive,foam=0.01. By default the physics chooses between ideal and thin."""
+    gap: float = 0.02
+    """Distance between base and object at the start [m]; left open by the paper."""
+    rear: Side = "near"
+    """Side of the nonuniform box on which its load stands, seen from the robot; left open by the
+    paper."""
+    robot: RobotLike = "ideal"
+    """The robot: ideal (it follows every twist at once, with any force), kairos (the paper's),
+    ridgeback or mpo_500, or a JSON file of its size, boards and limits. Changes follow, as
+    kairos,force_max=300."""
+
+
+@dataclass(frozen=True)
+class Case(Given):
+    """One trial to run: all that may differ from world to world.
+
+    Raises:
+      InputError: something names or means no trial.
+    """
+
+    object: str = "box"
+    """Object to push: its name, or an MJCF file of one's own, FILE.xml."""
+    friction: FrictionLike = "S1"
+    """Friction: a set of the paper's Table I (S1, S2), or coefficients GROUND,ROBOT."""
+    target: tuple[float, float] = (-2.0, 0.0)
+    """Target X Y [m] in the world, where the base starts at the origin."""
+    law: LawLike = "rps"
+    """The law: its name, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
+    policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json."""
+    bearing: float = option(0.0, -10, 10, unit="rad", kw_only=True, hidden=True)
+    """Angle by which the whole trial is turned [rad], which matters to a friction pyramid alone."""
+    shift: Shift = option(Shift(), kw_only=True, hidden=True)
+    """How the object is moved by a hand during the push."""
+
+    def __post_init__(self) -> None:
+        """Check all of it."""
+        errors.check_name("object", objects.named(self.object), objects.OBJECTS)
+        registry.checked(self.params)
+        scene.check(self.contact, self.mass)
+        skins.named(self.skin or "ideal")
+        errors.check_finite("gap", self.gap, at_least=0, at_most=1, unit="m")
+        errors.check_name("rear", self.rear, scene.SIDES)
+        errors.check_finite("bearing", self.bearing, at_least=-10, at_most=10, unit="rad")
+        errors.check_number("shift time", self.shift.time, at_least=0, unit="s")
+        for axis, value in zip("xy", self.shift.p_robot, strict=True):
+            errors.check_finite(f"shift {axis}", value, at_least=-5, at_most=5, unit="m")
+        scene.check_target(self.target, self.base.shell)
+
+    @cached_property
+    def object_name(self) -> str:
+        """Name of the object."""
+        return objects.named(self.object)
+
+    @cached_property
+    def params(self) -> Params:
+        """Parameters of the law."""
+        return registry.read_law(self.law)[1]
+
+    @cached_property
+    def contact(self) -> Friction:
+        """Coefficients of the two contacts."""
+        return friction_of(self.friction)
+
+    @cached_property
+    def base(self) -> Robot:
+        """The robot."""
+        robot = robots.named(self.robot)
+        robot.check()
+        return robot
+
+    @cached_property
+    def sensor(self) -> Skin:
+        """The skin on the robot."""
+        return skins.named(self.skin or "ideal").on(self.base.shell)
+
+    @property
+    def title(self) -> str:
+        """What is pushed on which ground, in words."""
+        return (
+            f"{self.object_name.replace('_', ' ')}, $\\mu$ ground {self.contact.ground:g}, "
+            f"robot {self.contact.robot:g}"
+        )
+
+
+def friction_of(friction: FrictionLike) -> Friction:
+    """Read the coefficients of a friction set by its name, or of a text `ground,robot`.
+
+    Raises:
+      InputError: they are not such.
+    """
+    if not isinstance(friction, str):
+        if not isinstance(friction, tuple | list) or len(friction) != 2:
+            raise errors.InputError(
+                f"friction = {friction!r} is not allowed: give a set's name, or ground and robot."
+            )
+        return Friction(*friction)
+    if "," not in friction:
+        return FRICTION[errors.check_name("friction set", friction, FRICTION)]
+    parts = friction.split(",")
+    if len(parts) != 2:
+        raise errors.InputError(
+            f"friction '{friction}' is not allowed: write S1, S2 or ground,robot."
+        )
+    ground, robot = (
+        errors.check_finite(f"friction {name}", value, above=0, at_most=10, text=True)
+        for name, value in zip(("ground", "robot"), parts, strict=True)
+    )
+    return Friction(ground, robot)
+
+
+def label_of(friction: FrictionLike) -> str:
+    """A friction set's name, or its coefficients."""
+    return friction if isinstance(friction, str) else ",".join(f"{value:g}" for value in friction)
