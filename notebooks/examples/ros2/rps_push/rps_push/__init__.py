@@ -1,0 +1,1 @@
+"""A pushing law on a robot: the controller without ROS."""

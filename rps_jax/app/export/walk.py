@@ -1,0 +1,212 @@
+"""Walks a jaxpr: nested calls are entered, constants are computed, and the rest is handed on.
+
+Values are NumPy arrays where they are constants, and otherwise what a `Target` makes of them. All
+that only moves numbers (slices, reshapes, stacks, gathers at constant places) is one operation of a
+target, `moved`: JAX itself moves the places of the numbers, and tells so where each one comes from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rps_jax.errors import InputError
+
+_MOST_STEPS = 256  # of a scan, which is unrolled
+# What only moves numbers, with how many operands are moved; those behind them are places.
+_MOVES = {
+    "broadcast_in_dim": 1,
+    "reshape": 1,
+    "squeeze": 1,
+    "expand_dims": 1,
+    "slice": 1,
+    "rev": 1,
+    "transpose": 1,
+    "split": 1,
+    "pad": 2,
+    "stack": None,
+    "concatenate": None,
+    "dynamic_slice": 1,
+    "dynamic_update_slice": 2,
+    "gather": 1,
+    "scatter": 1,  # its updates, the third operand, are moved as well
+}
+_SAME = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "pvary", "reduce_precision")
+
+
+class Target(Protocol):
+    """What a jaxpr is written for."""
+
+    def moved(self, values: Sequence[Any], places: np.ndarray, like: Any) -> Any:
+        """Take numbers of the values, laid end to end, at constant places."""
+        ...
+
+    def emit(self, name: str, values: Sequence[Any], params: Mapping[str, Any], out: Any) -> Any:
+        """Apply a primitive; `out` has the shape and the dtype of the result."""
+        ...
+
+
+def unsupported(name: str) -> InputError:
+    """The one sentence about an operation that cannot be written."""
+    return InputError(
+        f"the law cannot be exported: its operation `{name}` has no form outside of JAX here; "
+        "write it with arithmetic, comparisons, jnp.where and elementary functions."
+    )
+
+
+def traced(function: Callable[..., Any], *arguments: Any) -> tuple[Any, Any]:
+    """The jaxpr of a function in float64, and what it returns as shapes.
+
+    A target rounds to the numbers that it has; traced in float32, constants would be rounded twice.
+    """
+    with jax.enable_x64(True):
+        return jax.make_jaxpr(function, return_shape=True)(*arguments)
+
+
+def walk(closed: Any, arguments: Sequence[Any], target: Target) -> list[Any]:
+    """The results of a closed jaxpr of some arguments, as a target has them."""
+    with jax.enable_x64(True):
+        return _walk(closed.jaxpr, closed.consts, arguments, target)
+
+
+def is_constant(value: Any) -> bool:
+    """Whether a value is known already."""
+    return isinstance(value, np.ndarray) and value.dtype != object
+
+
+def _walk(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any], target: Target) -> list[Any]:
+    known: dict[Any, Any] = dict(zip(jaxpr.constvars, map(np.asarray, consts), strict=True))
+    known |= dict(zip(jaxpr.invars, arguments, strict=True))
+
+    def read(atom: Any) -> Any:
+        return np.asarray(atom.val, atom.aval.dtype) if hasattr(atom, "val") else known[atom]
+
+    for eqn in jaxpr.eqns:
+        found = _results(eqn, [read(atom) for atom in eqn.invars], target)
+        known |= dict(zip(eqn.outvars, found, strict=True))
+    return [read(atom) for atom in jaxpr.outvars]
+
+
+def _results(eqn: Any, values: list[Any], target: Target) -> Sequence[Any]:
+    """Results of one equation."""
+    name, params, outs = eqn.primitive.name, eqn.params, [one.aval for one in eqn.outvars]
+    for one in outs:
+        kind_of(one.dtype, name)
+    if name in _SAME:
+        return values
+    if all(map(is_constant, values)):
+        found = eqn.primitive.bind(*map(jnp.asarray, values), **params)
+        return [np.asarray(one) for one in (found if eqn.primitive.multiple_results else [found])]
+    if name == "cond":
+        return _chosen(values[0], params["branches"], values[1:], target)
+    if name == "scan":
+        return _unrolled(values, params, target)
+    inner = params.get("call_jaxpr", params.get("jaxpr"))
+    if inner is not None and name != "while":
+        closed = hasattr(inner, "consts")
+        consts = inner.consts if closed else ()
+        return _walk(inner.jaxpr if closed else inner, consts, values, target)
+    if name in _MOVES:
+        count = len(values) if _MOVES[name] is None else _MOVES[name]
+        which = (0, 2) if name == "scatter" else range(count)
+        if all(is_constant(v) for i, v in enumerate(values) if i not in which):
+            return _moved(eqn, values, list(which), target)
+    if len(outs) != 1:
+        raise unsupported(name)
+    return [target.emit(name, values, params, outs[0])]
+
+
+def _moved(eqn: Any, values: list[Any], which: list[int], target: Target) -> list[Any]:
+    """What a primitive makes of places, taken from the values."""
+    start, places = 0, list(values)
+    for i in which:
+        size = int(np.prod(np.shape(values[i])))
+        places[i] = np.arange(start, start + size).reshape(np.shape(values[i]))
+        start += size
+    found = eqn.primitive.bind(*map(jnp.asarray, places), **eqn.params)
+    several = found if eqn.primitive.multiple_results else [found]
+    sources = [values[i] for i in which]
+    return [
+        target.moved(sources, np.asarray(one), out.aval)
+        for one, out in zip(several, eqn.outvars, strict=True)
+    ]
+
+
+def _chosen(index: Any, branches: Sequence[Any], values: list[Any], target: Target) -> list[Any]:
+    """All branches of a `cond`, and of their results that of the index."""
+    every = [_walk(b.jaxpr, b.consts, values, target) for b in branches]
+    found = every[-1]
+    flag = jax.ShapeDtypeStruct((), np.dtype(bool))
+    for i in reversed(range(len(branches) - 1)):
+        low = target.emit("le", [index, np.asarray(i)], {}, flag)
+        outs = [branch.aval for branch in branches[i].jaxpr.outvars]
+        found = [
+            target.emit("select_n", [low, b, a], {}, out)
+            for a, b, out in zip(every[i], found, outs, strict=True)
+        ]
+    return found
+
+
+def _unrolled(values: list[Any], params: Mapping[str, Any], target: Target) -> list[Any]:
+    """A `scan`, step by step."""
+    if params["length"] > _MOST_STEPS:
+        raise unsupported(f"scan of {params['length']} steps")
+    body, fixed, carried = params["jaxpr"], params["num_consts"], params["num_carry"]
+    consts, carry = values[:fixed], values[fixed : fixed + carried]
+    columns = body.jaxpr.invars[fixed + carried :]
+    rows: list[Any] = [None] * params["length"]
+    order = range(params["length"])
+    for step in reversed(order) if params["reverse"] else order:
+        now = []
+        for values_of, var in zip(values[fixed + carried :], columns, strict=True):
+            size = int(np.prod(var.aval.shape))
+            places = (step * size + np.arange(size)).reshape(var.aval.shape)
+            constant = is_constant(values_of)
+            now.append(values_of[step] if constant else target.moved([values_of], places, var.aval))
+        found = _walk(body.jaxpr, body.consts, [*consts, *carry, *map(_array, now)], target)
+        carry, rows[step] = found[:carried], found[carried:]
+    stacked = []
+    for i, var in enumerate(body.jaxpr.outvars[carried:]):
+        shape = (params["length"], *var.aval.shape)
+        out = jax.ShapeDtypeStruct(shape, var.aval.dtype)
+        places = np.arange(np.prod(shape, dtype=int)).reshape(shape)
+        stacked.append(target.moved([row[i] for row in rows], places, out))
+    return [*carry, *stacked]
+
+
+def _array(value: Any) -> Any:
+    return np.asarray(value) if isinstance(value, np.generic) else value
+
+
+def kind_of(dtype: Any, name: str = "") -> str:
+    """`f`, `i` or `b`: a real number, a whole one, or a bool.
+
+    Raises:
+      InputError: it is none of these.
+    """
+    kind = np.dtype(dtype).kind if isinstance(dtype, np.dtype) else "?"
+    if kind not in "fib":
+        raise unsupported(f"{name} of {dtype}".strip())
+    return kind
+
+
+# Pairs of an associative operation, and the value that leaves the other as it is.
+REDUCTIONS: dict[str, str] = {
+    "reduce_sum": "add",
+    "reduce_prod": "mul",
+    "reduce_max": "max",
+    "reduce_min": "min",
+    "reduce_and": "and",
+    "reduce_or": "or",
+}
+CUMULATIVE: dict[str, str] = {
+    "cumsum": "add",
+    "cumprod": "mul",
+    "cummax": "max",
+    "cummin": "min",
+}
+COMPARISONS = ("lt", "le", "gt", "ge", "eq", "ne")

@@ -1,0 +1,114 @@
+"""Laws for robots and browsers: `rps export c`, `rps export js`, `rps export onnx`."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from rps_jax.app.export import program as programs
+from rps_jax.app.export.program import Program
+from rps_jax.control.registry import LawLike
+from rps_jax.errors import InputError
+from rps_jax.record import files, folder
+from rps_jax.record.options import option
+from rps_jax.robot.robot import RobotLike
+from rps_jax.robot.skin import SkinLike
+from rps_jax.runs.question import Question, Run, call_of
+
+
+@dataclass(frozen=True)
+class Export(Question[Path]):
+    """A law with its parameters, and the skin of a robot, in another language."""
+
+    law: LawLike = "rps_plus"
+    """The law: its name, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
+    policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json."""
+    robot: RobotLike = "ideal"
+    """The robot, whose boards the skin has: ideal, kairos (the paper's), ridgeback or mpo_500, or a
+    JSON file of its size, boards and limits."""
+    skin: SkinLike = "capacitive"
+    """The skin with taxels: capacitive, with changes, as capacitive,threshold=0.3."""
+    prefix: str = ""
+    """What all names begin with, a name of C; by default the law's."""
+    out: Path | str | None = option(None, kw_only=True)
+    """Folder that is written; by default runs/ and the command's name."""
+
+    @functools.cached_property
+    def program(self) -> Program:
+        """The law, traced."""
+        return programs.program(self.law, self.robot, self.skin)
+
+    @property
+    def named(self) -> str:
+        """What all names begin with."""
+        return self.prefix or programs.identifier(self.program.label)
+
+    def check(self) -> None:
+        """Check the law, the robot, the prefix and the folder."""
+        if self.prefix and programs.identifier(self.prefix) != self.prefix:
+            raise InputError(
+                f"prefix = {self.prefix} is not allowed: it must be a name of C, as my_law."
+            )
+        _ = self.program
+        folder.writable(Path(self.out or self.place))
+
+    @contextlib.contextmanager
+    def opened(self) -> Iterator[None]:
+        """No run folder."""
+        yield None
+
+    def texts(self) -> dict[str, str | bytes]:
+        """Contents of the files, by name."""
+        raise NotImplementedError
+
+    def answer(self, run: Run) -> Path:
+        """Write the files."""
+        out, texts = Path(self.out or self.place), self.texts()
+        for name, text in texts.items():
+            files.write_bytes(out / name, text if isinstance(text, bytes) else text.encode())
+        return out / next(iter(texts))
+
+
+@dataclass(frozen=True)
+class ExportC(Export):
+    """Write a law and a skin as one C99 header, with an example that measures itself."""
+
+    def texts(self) -> dict[str, str | bytes]:
+        """Header, example, CMake file and page."""
+        from rps_jax.app.export import c, folder
+
+        header = c.header(self.program, self.named)
+        return {f"{self.named}.h": header, **folder.files(self.program, self.named)}
+
+
+@dataclass(frozen=True)
+class ExportJs(Export):
+    """Write a law and a skin as one JavaScript module."""
+
+    def texts(self) -> dict[str, str | bytes]:
+        """The module."""
+        from rps_jax.app.export import js
+
+        return {f"{self.named}.mjs": js.module(self.program, self.named)}
+
+
+@dataclass(frozen=True)
+class ExportOnnx(Export):
+    """Write a law as ONNX, with named inputs and outputs and an explicit memory."""
+
+    batch: int | None = option(None, 1, 100_000, kw_only=True)
+    """How many worlds a model steps at once, along a first axis; by default one, without it."""
+
+    def texts(self) -> dict[str, str | bytes]:
+        """The models of the step and of the memory before it."""
+        from rps_jax.app.export import graph
+
+        return graph.models(self.program, self.named, self.batch)
+
+
+export_c = call_of(ExportC)
+export_js = call_of(ExportJs)
+export_onnx = call_of(ExportOnnx)

@@ -1,0 +1,382 @@
+"""Laws outside of JAX: what is written compiles without a warning, and does what JAX does."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import refusal, rps
+
+from rps_jax.app.export import c, folder, graph, js, program
+from rps_jax.control import registry
+from rps_jax.robot import robot as robots
+from rps_jax.robot.skin import SKINS
+from rps_jax.trials.case import Case
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+from sweeps.export.native import Native, agreement, observations, trial_errors
+
+STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"]
+SANE = ["-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
+LAWS = [
+    *("rps", "nps", "rps_plus", "aps", "pursuit", "dipole", "force_push", "force_push_published"),
+    *("learned_mlp", "learned_gru"),
+]
+OWN = '''"""A law that uses all that can be exported beyond arithmetic."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rps_jax import Details, Law, Twist, register_law
+
+
+class OwnParams(NamedTuple):
+    v: Any = 0.05  # [m/s]
+    gains: Any = np.array([[0.5, 1.0, 2.0], [0.1, 0.2, 0.3]])  # [1]
+    d_success: float = 0.05  # [m]
+
+
+class Memory(NamedTuple):
+    trace: Any  # (4,) [m]
+    count: Any  # () int32
+
+
+def init(params):
+    return Memory(jnp.zeros(4), jnp.zeros((), jnp.int32))
+
+
+def step(params, memory, seen):
+    l = seen.p_robot_contact[1]
+    place = memory.count % 3
+    gain = params.gains[jnp.int32(seen.in_contact), place]  # a row and a column, found as it runs
+    other = jnp.take(jnp.array([1.0, 2.0, 3.0]), place + 1, mode="clip")
+    trace = jnp.concatenate([memory.trace[1:], l[None]]).at[0].set(memory.trace[3])
+    smooth = jax.lax.scan(lambda s, x: (0.5 * s + x, s), 0.0, trace)[0]
+    side = jax.lax.cond(l > 0, lambda: 1.0, lambda: -1.0)
+    level = jax.lax.switch(place, [lambda: 0.0, lambda: 1.0, lambda: 4.0])
+    turn = jnp.argmax(jnp.abs(trace)) + jnp.cumsum(trace)[2] + jnp.expm1(smooth) + jnp.sum(trace**3)
+    forward = params.v * gain * jnp.round(other) / (1 + level)
+    return (
+        Memory(trace, memory.count + 1),
+        Twist(forward, 0.01 * side * jnp.max(jnp.abs(trace)), 0.1 * jnp.clip(turn, -1, 1)),
+        Details.of(seen),
+    )
+
+
+register_law("own", Law(init, step), OwnParams())
+'''
+
+
+@pytest.fixture
+def own(tmp_path, registries):
+    path = tmp_path / "own.py"
+    path.write_text(OWN)
+    return f"{path}:OwnParams"
+
+
+def compiled(compiler, source, *options):
+    binary = source.with_suffix(".run")
+    command = [compiler, *STRICT, *options, str(source), "-lm", "-o", str(binary)]
+    subprocess.run(command, check=True, capture_output=True, text=True)
+    return binary
+
+
+# --- C -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [name for name in LAWS if name not in ("nps", "learned_gru")])
+def test_a_law_in_c_does_what_it_does_in_jax(name, tmp_path):
+    found = agreement(name, "double", 10_000, tmp_path)
+    assert (found.inputs, found.unexplained) == (10_000, 0)
+    assert found.beyond == found.flips <= 10
+
+
+def test_a_law_in_c_does_what_it_does_in_jax_in_float(tmp_path):
+    """Differences beyond the tolerance are only where JAX's own twist is as uncertain."""
+    found = agreement("rps_plus", "float", 20_000, tmp_path)
+    assert (found.inputs, found.unexplained) == (20_000, 0)
+    assert found.beyond < 200
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LAWS)
+def test_a_law_in_c_does_what_it_does_in_jax_for_many_inputs(name, tmp_path):
+    for precision in ("float", "double"):
+        assert agreement(name, precision, 500_000, tmp_path).unexplained == 0
+
+
+def test_a_fault_in_c_is_found(tmp_path, monkeypatch):
+    """A constant that is another one in its eighth digit."""
+    right, header = "params->law_K_v * v", c.header(program.program("rps_plus"), "law")
+    assert right in header
+    wrong = header.replace(right, f"(law_real)1.0000001 * {right}")
+    monkeypatch.setattr(c, "header", lambda *_: wrong)
+    assert agreement("rps_plus", "double", 2_000, tmp_path).unexplained > 20
+
+
+@pytest.mark.parametrize("compiler", COMPILERS)
+@pytest.mark.parametrize("name", ["rps_plus", "learned_mlp"])
+def test_the_folder_compiles_without_a_warning_and_runs(name, compiler, tmp_path):
+    made = program.program(name, "kairos")
+    texts = {"law.h": c.header(made, "law"), **folder.files(made, "law")}
+    for file, text in texts.items():
+        (tmp_path / file).write_text(text)
+    (tmp_path / "main.c").write_text(texts["main.c"].replace("STEPS 200000", "STEPS 3000"))
+    for options in ([], ["-DLAW_DOUBLE"], SANE):
+        run = [str(compiled(compiler, tmp_path / "main.c", *options))]
+        said = subprocess.run(run, check=True, capture_output=True, text=True).stdout
+        assert re.match(r"3000 steps: median [\d.]+ us, 99.9th percentile [\d.]+ us\n", said)
+    assert "#include <math.h>" in texts["law.h"]
+    assert texts["law.h"].count("#include") == 1
+    assert not re.search(r"\b(malloc|calloc|realloc|alloca)\b", texts["law.h"])
+
+
+FUZZ = """
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+#include "law.h"
+static law_real odd(void) {
+  static const float some[] = {0, -0.0f, 1e-38f, 1e38f, -1e38f, 3e9f, -3e9f, 1, 0.3f};
+  int i = rand() % 40;
+  return i == 0 ? (law_real)NAN : i == 1 ? (law_real)INFINITY : i == 2 ? (law_real)-INFINITY
+       : (law_real)some[i % 9];
+}
+int main(void) {
+  law_params params = LAW_PARAMS;
+  law_skin_params skin_params = LAW_SKIN_PARAMS;
+  law_memory memory;
+  law_skin skin;
+  int codes[3] = {0, 0, 0};
+  law_init(&params, &memory);
+  law_skin_init(&skin);
+  for (int i = 0; i < 20000; i++) {
+    law_observation seen;
+    law_twist twist;
+    law_contact contact;
+    law_real taxels[LAW_TAXELS], numbers[sizeof seen / sizeof(law_real)];
+    law_memory before = memory;
+    int bad = 0;
+    for (unsigned k = 0; k < sizeof numbers / sizeof numbers[0]; k++) numbers[k] = odd();
+    memcpy(&seen, numbers, sizeof numbers); /* flags of any bits, too */
+    int code = law_step(&params, &memory, &seen, &twist);
+    codes[code]++;
+    if (!isfinite(twist.v_x) || !isfinite(twist.v_y) || !isfinite(twist.omega)) return 2;
+    if (code && (twist.v_x != 0 || twist.v_y != 0 || twist.omega != 0)) return 3;
+    if (code && memcmp(&before, &memory, sizeof memory)) return 4;
+    if (!isfinite(seen.yaw) && code != LAW_BAD_INPUT) return 5;
+    if (rand() % 50 == 0) memset(&memory, rand() % 256, sizeof memory);
+    for (int k = 0; k < LAW_TAXELS; k++) bad |= !isfinite(taxels[k] = rand() % 20 ? 1 : odd());
+    law_real period = rand() % 9 ? (law_real)0.01 : odd();
+    code = law_skin_step(&skin_params, &skin, taxels, period, &contact);
+    if (bad && (code != LAW_BAD_INPUT || contact.in_contact)) return 6;
+    for (int k = 0; k < LAW_TAXELS; k++) if (!isfinite(skin.signal[k])) return 7;
+  }
+  return codes[0] && codes[1] ? 0 : 8;
+}
+"""
+
+
+@pytest.mark.parametrize("name", ["rps_plus", "learned_mlp", "force_push_published", "own"])
+def test_what_is_not_finite_gives_a_zero_twist_and_nothing_undefined(name, tmp_path, own):
+    made = program.program(own if name == "own" else name)
+    (tmp_path / "law.h").write_text(c.header(made, "law"))
+    (tmp_path / "fuzz.c").write_text(FUZZ)
+    for compiler in COMPILERS:
+        binary = compiled(compiler, tmp_path / "fuzz.c", *SANE)
+        ran = subprocess.run([str(binary)], capture_output=True, text=True)
+        assert ran.returncode == 0, (ran.returncode, ran.stderr)
+
+
+def test_a_law_of_a_users_file_is_exported(own, tmp_path):
+    for precision in ("float", "double"):
+        found = agreement(own, precision, 5_000, tmp_path)
+        assert (found.inputs, found.unexplained, found.flips) == (5_000, 0, 0)
+
+
+@pytest.mark.parametrize("robot", ["ridgeback"])
+def test_the_skin_in_c_does_what_it_does_in_jax(robot, tmp_path):
+    native = Native(program.program("rps", robot), tmp_path, "float")
+    skin = SKINS["capacitive"].on(robots.named(robot).shell)
+    count, rng = skin.shell.count, np.random.default_rng(0)
+    state, worlds = skin.init(jax.random.PRNGKey(0)), 400
+    alive = rng.random((worlds, count)) > 0.1
+    read = jax.jit(jax.vmap(lambda s, a, x, p: skin.read(state._replace(signal=s, alive=a), x, p)))
+    mine = native.struct("skin", worlds)
+    mine["alive"], signal = alive, np.zeros((worlds, count), np.float32)
+    kinds = set()
+    for _ in range(30):
+        active = rng.random((worlds, count)) < rng.choice([0.0, 0.02, 0.1], (worlds, 1))
+        taxels = (active * rng.uniform(0, 2, active.shape)).astype(np.float32)
+        period = rng.uniform(0.001, 0.1, worlds).astype(np.float32)
+        after, reading = read(signal, alive, taxels, period)
+        contact, code = native.touch(mine, taxels, period)
+        assert not code.any()
+        np.testing.assert_allclose(mine["signal"], after.signal, rtol=1e-6, atol=1e-6)
+        near = (np.abs(np.asarray(after.signal) - 0.25) < 1e-5).any(-1)  # of the threshold
+        assert near.mean() < 0.05
+        same = ~near
+        np.testing.assert_array_equal(contact["contact_type"][same], reading.contact_type[same])
+        np.testing.assert_array_equal(contact["line"][same], reading.contact_type[same] == 2)
+        np.testing.assert_allclose(
+            contact["p_robot_contact"][same], reading.p_robot_contact[same], atol=1e-6
+        )
+        np.testing.assert_allclose(contact["signal"], np.where(alive, after.signal, 0), atol=1e-6)
+        kinds |= set(contact["contact_type"].tolist())
+        signal, mine["signal"] = np.asarray(after.signal), after.signal
+    assert kinds == {0, 1, 2}
+
+
+@pytest.mark.parametrize("name", ["rps_plus", pytest.param("learned_gru", marks=pytest.mark.slow)])
+def test_a_whole_trial_step_by_step(name, tmp_path):
+    """C remembers by itself; observations are those of the trial in JAX."""
+    case = Case("box", "S1", (-1.0, 0.5), law=name)
+    setting = Setting("quasistatic", rules=Rules(horizon=20.0))
+    errors = trial_errors(name, case, setting, tmp_path)
+    assert len(errors) > 900
+    # A step differs where a switch flips in one of the two; it must not last.
+    assert np.mean(errors > 2e-5) < 0.01
+    assert np.median(errors) < 1e-6
+
+
+# --- what cannot be exported, and the command ----------------------------------------------
+
+
+def test_an_operation_that_cannot_be_written_is_named(tmp_path, capsys, registries):
+    for operation, code in (
+        ("while", "jax.lax.while_loop(lambda x: x < 1, lambda x: x + l * l + 0.1, l)"),
+        ("sort", "jnp.sort(seen.p_robot_contact)[0]"),
+    ):
+        path = tmp_path / f"{operation}.py"
+        head, _, rest = OWN.partition("    place = ")
+        rest = rest[rest.index("    return (") :].replace(
+            "trace, memory.count", "memory.trace, 0 * memory.count"
+        )
+        rest = rest.replace(
+            "forward, 0.01 * side * jnp.max(jnp.abs(trace)), 0.1 * jnp.clip(turn, -1, 1)",
+            f"{code}, l, l",
+        )
+        path.write_text(head + rest)
+        for kind in ("c", "js", "onnx"):
+            said = refusal(capsys, "export", kind, "--law", f"{path}:OwnParams", "--out", tmp_path)
+            assert f"its operation `{operation}`" in said
+    said = refusal(capsys, "export", "c", "--law", "rps", "--skin", "ideal", "--out", tmp_path)
+    assert "name one with taxels" in said
+    said = refusal(capsys, "export", "c", "--law", "rps", "--prefix", "2 laws", "--out", tmp_path)
+    assert "prefix = 2 laws is not allowed" in said
+
+
+def test_the_command_writes_a_folder_with_the_chosen_parameters(tmp_path, capsys):
+    arguments = ["--law", "rps_plus,press=0.37", "--robot", "ridgeback", "--prefix", "mine"]
+    assert rps("export", "c", *arguments, "--out", tmp_path / "c") == 0
+    assert str(tmp_path / "c" / "mine.h") in capsys.readouterr().out
+    names = {path.name for path in (tmp_path / "c").iterdir()}
+    assert names == {"mine.h", "main.c", "CMakeLists.txt", "README.md"}
+    header = (tmp_path / "c" / "mine.h").read_text()
+    assert "(mine_real)0.37, /* press */" in header
+    assert "#define MINE_TAXELS 51" in header
+    assert "mine_real yaw; /* [rad] heading of the robot in the world */" in header
+    if shutil.which("cmake"):
+        for command in (["-B", "build"], ["--build", "build"]):
+            subprocess.run(["cmake", *command], cwd=tmp_path / "c", check=True, capture_output=True)
+        assert (tmp_path / "c" / "build" / "mine_example").exists()
+
+
+# --- JavaScript and ONNX -------------------------------------------------------------------
+
+NODE = """
+import { readFileSync } from "node:fs";
+import { params, init, step, skinInit, skinParams, skinStep } from "./law.mjs";
+const given = JSON.parse(readFileSync(process.argv[2]));
+let memory = init(params);
+const twists = given.map((seen) => {
+  const found = step(params, memory, seen);
+  memory = found.memory;
+  return [found.twist.v_x, found.twist.v_y, found.twist.omega, found.code];
+});
+const odd = step(params, memory, { ...given[0], yaw: NaN });
+const felt = skinStep(skinParams, skinInit(), Array(42).fill(0).fill(0.6, 15, 27), 1);
+console.log(JSON.stringify({ twists, odd, felt: felt.contact }));
+"""
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="Node.js is not there")
+@pytest.mark.parametrize("name", ["rps_plus", "learned_mlp", "own"])
+def test_javascript_does_what_c_does(name, tmp_path, own):
+    made = program.program(own if name == "own" else name)
+    native = Native(made, tmp_path, "double")
+    leaves = observations(made, np.random.default_rng(0), 300, np.float64)
+    seen = native.filled("observation", leaves, 300)
+    memory = native.begin(1)
+    wanted = np.concatenate([native.step(memory, seen[i : i + 1])[0] for i in range(300)])
+    names = [one.name for one in made.groups["observation"]]
+    rows = [dict(zip(names, (x[i].tolist() for x in leaves), strict=True)) for i in range(300)]
+    (tmp_path / "seen.json").write_text(json.dumps(rows))
+    (tmp_path / "law.mjs").write_text(js.module(made, "law"))
+    (tmp_path / "run.mjs").write_text(NODE)
+    ran = subprocess.run(
+        ["node", "run.mjs", "seen.json"], cwd=tmp_path, check=True, capture_output=True, text=True
+    )
+    found = json.loads(ran.stdout)
+    twists = np.array(found["twists"])
+    assert not twists[:, 3].any()
+    np.testing.assert_allclose(twists[:, :3], wanted, rtol=1e-9, atol=1e-12)
+    assert found["odd"]["code"] == 1
+    assert found["odd"]["twist"] == {"v_x": 0, "v_y": 0, "omega": 0}
+    assert found["felt"]["in_contact"] is True
+    np.testing.assert_allclose(found["felt"]["p_robot_contact"], [0.3625, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["rps_plus", "learned_mlp", "aps", "force_push_published"])
+def test_onnx_does_what_c_does(name, tmp_path):
+    onnx, runtime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
+    count, made = 200, program.program(name)
+    model = graph.models(made, "law", count)["law.onnx"]
+    session = runtime.InferenceSession(model, providers=["CPUExecutionProvider"])
+    about = {one.key: one.value for one in onnx.load_from_string(model).metadata_props}
+    assert json.loads(about["units"])["yaw"] == "[rad] heading of the robot in the world"
+    native, rng = Native(made, tmp_path, "float"), np.random.default_rng(0)
+    mine, start = native.begin(count), json.loads(about["memory_at_the_start"])
+    types = {one.name: one.type for one in session.get_inputs()}
+    of = {"tensor(float)": np.float32, "tensor(bool)": bool, "tensor(int32)": np.int32}
+    memory = {
+        key: np.broadcast_to(np.array(value, of[types[key]]), (count, *np.shape(value)))
+        for key, value in start.items()
+    }
+    names, fields = [one.name for one in session.get_outputs()], made.groups["observation"]
+    apart = []
+    for _ in range(20):
+        leaves = observations(made, rng, count, np.float32)
+        given = dict(zip((one.name for one in fields), leaves, strict=True))
+        known = {key: value for key, value in (given | memory).items() if key in types}
+        found = dict(zip(names, session.run(None, known), strict=True))
+        twist, _ = native.step(mine, native.filled("observation", leaves, count))
+        theirs = np.stack([found[key] for key in ("v_x", "v_y", "omega")], -1)
+        apart.append(np.abs(theirs - twist).max(-1))
+        memory = {key: found[f"next_{key}"] for key in memory}
+    apart = np.concatenate(apart)
+    assert np.mean(apart > 1e-5) < 0.02  # where a switch flips, and what follows from it
+    assert np.median(apart) < 1e-7
+
+
+def test_the_command_says_what_onnx_lacks(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    said = refusal(capsys, "export", "onnx", "--law", "rps", "--out", tmp_path)
+    assert "pip install 'rps_jax[export]'" in said
+
+
+def test_a_law_that_is_exported_is_not_rounded_on_the_way():
+    """Constants are those of float64, whatever JAX computes in elsewhere."""
+    assert jnp.zeros(()).dtype == jnp.float32
+    header = c.header(program.program(registry.LAWS["rps"]), "law")
+    assert "6.283185307179586" in header
+    assert jnp.zeros(()).dtype == jnp.float32
