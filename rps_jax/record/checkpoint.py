@@ -9,6 +9,7 @@ from pathlib import Path
 
 import xarray as xr
 
+from rps_jax.errors import InputError
 from rps_jax.record import files
 
 _DIGITS = 16  # of the digest in a file's name
@@ -58,11 +59,18 @@ class Parts:
         return path
 
     def results(self, name: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
-        """The labelled results of a part, which are made and put if it is not finished."""
+        """The labelled results of a part, which are made and put if it is not finished.
+
+        Raises:
+          InputError: the file of the part holds another one.
+        """
         if (content := self.get(name)) is None:
-            content = files.encoded(make())
+            content = files.encoded(make().assign_attrs(part=name))
             self.put(name, content)
-        return files.decoded(content, self.folder / name)
+        found = files.decoded(content, self.folder / name, own=True)
+        if found.attrs.pop("part", None) != name:
+            raise files.corrupt(self.folder / name, "it holds another part")
+        return found
 
     def _files(self, name: str | None = None) -> list[Path]:
         """Files of one part, or of all, by name, and of one name the newest first."""
@@ -90,8 +98,9 @@ def _name(path: Path) -> str:
 def _content(path: Path) -> bytes | None:
     """What was written into a file; None of one that is damaged, which is set aside, or gone."""
     with contextlib.suppress(FileNotFoundError):  # another process has set it aside
-        content = path.read_bytes()
-        if files.digest(content)[:_DIGITS] == path.stem.rpartition("-")[2]:
-            return content
+        with contextlib.suppress(InputError):  # no regular file, which is as good as damaged
+            content = files.content_of(path, "part")
+            if files.digest(content)[:_DIGITS] == path.stem.rpartition("-")[2]:
+                return content
         path.replace(path.with_name(f"{path.name}.corrupt"))
     return None

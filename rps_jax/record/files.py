@@ -16,13 +16,36 @@ import hashlib
 import io
 import json
 import os
-from collections.abc import Callable
+import stat
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 import xarray as xr
 
 from rps_jax.errors import InputError
+
+Kind = Literal["json", "python", "xml", "policy", "part", "results"]
+# [bytes] that a file of a kind may have. What is larger is none of ours, or the wrong file.
+MOST: dict[Kind, int] = {
+    "json": 2**26,
+    "python": 2**22,
+    "xml": 2**24,
+    "policy": 2**28,
+    "part": 2**33,
+    "results": 2**37,
+}
+_STRUCTURE = "structure"  # attribute of a NetCDF file
+_DEEPEST = 32  # levels of nested JSON
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
 
 
 def atomic(path: Path, write: Callable[[Path], Any]) -> Path:
@@ -33,6 +56,7 @@ def atomic(path: Path, write: Callable[[Path], Any]) -> Path:
     """
     partial = path.with_name(f".{path.stem}.partial{path.suffix}")
     try:
+        partial.unlink(missing_ok=True)  # a pipe of this name would block
         write(partial)
         with open(partial, "rb+") as file:
             os.fsync(file.fileno())
@@ -83,37 +107,216 @@ def digest(content: bytes) -> str:
 def encoded(results: xr.Dataset) -> bytes:
     """NetCDF 4, which depends on the results alone, not on when or where it is made.
 
-    It is made in memory, since HDF5 crashes the process when its disk is full.
+    It is made in memory, since HDF5 crashes the process when its disk is full. An attribute holds
+    the digest of its structure, by which `decoded` knows what somebody has edited.
     """
-    return bytes(results.to_netcdf(engine="h5netcdf"))
+    signed = results.assign_attrs({_STRUCTURE: _structure(results)})
+    return bytes(signed.to_netcdf(engine="h5netcdf"))
 
 
-def decoded(content: bytes, source: Any) -> xr.Dataset:
-    """The labelled results that `encoded` made into bytes.
+def _structure(results: xr.Dataset) -> str:
+    """Digest of the names, dimensions, sizes, kinds and units of all variables."""
+    told = [
+        (str(name), one.dims, one.shape, _kind(one), one.attrs.get("units", ""))
+        for name, one in sorted(results.variables.items(), key=lambda item: str(item[0]))
+    ]
+    return digest(repr(told).encode())[:16]
+
+
+def _kind(column: xr.Variable) -> str:
+    """The type of a variable's values; texts of any length are one type."""
+    return "text" if column.dtype.kind in "OUST" else column.dtype.str
+
+
+def content_of(path: Path, kind: Kind = "results") -> bytes:
+    """Read a regular file of bounded size; nothing else is opened, so that nothing blocks.
 
     Raises:
-      InputError: the bytes, which came from `source`, are something else.
+      OSError: it is not there, or cannot be read.
+      InputError: it is a folder, a pipe or a device, or larger than files of its kind are.
     """
     try:
-        return xr.load_dataset(io.BytesIO(content), engine="h5netcdf")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
+        _check_regular(path, os.stat(path).st_mode)
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{str(path)!r} is no path ({error}).") from error
+    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    with open(os.open(path, flags), "rb") as file:
+        status = os.fstat(file.fileno())
+        _check_regular(path, status.st_mode)
+        if status.st_size > MOST[kind]:
+            raise InputError(
+                f"{path} is too large: a {kind} file has at most {MOST[kind] / 2**20:.0f} MiB."
+            )
+        return file.read(status.st_size or 2**16)  # some files of the system tell no size
+
+
+def _check_regular(path: Path, mode: int) -> None:
+    if not stat.S_ISREG(mode):
+        what = _KINDS.get(stat.S_IFMT(mode), "no regular file")
+        raise InputError(f"{path} cannot be read (it is {what}): give a regular file.")
+
+
+def decoded(content: bytes, source: Any, *, own: bool = False) -> xr.Dataset:
+    """The labelled results that `encoded` made into bytes.
+
+    Args:
+      content: of a NetCDF 4 file.
+      source: where it came from, for the error.
+      own: whether only `encoded` can have made it, and so signed its structure.
+
+    Raises:
+      InputError: it is something else, or its structure is not what was signed.
+    """
+    try:
+        with xr.open_dataset(io.BytesIO(content), engine="h5netcdf") as found:
+            size = sum(variable.nbytes for variable in found.variables.values())
+            if size > 8 * len(content) + 2**20:  # HDF5 stores what was never written as nothing
+                raise ValueError(f"it claims {size} bytes of numbers")
+            found.load()
+    except Exception as error:  # whatever HDF5 raises on a file that is none, or is damaged
         raise corrupt(source, error) from error
+    signed = found.attrs.pop(_STRUCTURE, None)
+    if signed != _structure(found) and (own or signed is not None):
+        raise corrupt(source, "its names, sizes, types or units are not those that were written")
+    return found
 
 
-def read_bytes(path: Path) -> bytes:
+def check_columns(
+    results: xr.Dataset,
+    source: Any,
+    dims: Mapping[str, Sequence[str]],
+    sizes: Mapping[str, int],
+    units: Mapping[str, str] | None = None,
+) -> xr.Dataset:
+    """Return the results if they have these variables of numbers.
+
+    Args:
+      results: what was read.
+      source: where it came from.
+      dims: dimensions that each variable must have, by its name.
+      sizes: lengths that dimensions must have.
+      units: units that variables must have, where these are known.
+
+    Raises:
+      InputError: a variable is missing or of another kind; the sentence names it.
+    """
+    for name, wanted in dims.items():
+        if name not in results.variables:
+            raise corrupt(source, f"it lacks {name}")
+        column = results[name]
+        if column.dims != tuple(wanted):
+            raise corrupt(source, f"{name} has the dimensions {column.dims}, not {tuple(wanted)}")
+        if column.dtype.kind not in "biuf":
+            raise corrupt(source, f"{name} holds {column.dtype}, not numbers")
+        unit = None if units is None else units.get(name)
+        if unit is not None and column.attrs.get("units") != unit:
+            raise corrupt(source, f"{name} is in {column.attrs.get('units')}, not in {unit}")
+        for dim in wanted:
+            if dim in sizes and column.sizes[dim] != sizes[dim]:
+                raise corrupt(source, f"{dim} has the length {column.sizes[dim]}, not {sizes[dim]}")
+    return results
+
+
+def check_like(results: xr.Dataset, like: xr.Dataset, source: Any) -> xr.Dataset:
+    """Return the results if their variables, dimensions and kinds of numbers are those of others.
+
+    Raises:
+      InputError: a variable is missing, is too much or is of another kind; the sentence names it.
+    """
+    for name in {*like.variables, *results.variables}:
+        if name not in results.variables or name not in like.variables:
+            raise corrupt(source, f"it {'holds' if name in results.variables else 'lacks'} {name}")
+        mine, wanted = results[name], like[name]
+        if mine.dims != wanted.dims or mine.shape != wanted.shape:
+            raise corrupt(
+                source,
+                f"{name} has the dimensions {dict(mine.sizes)}, not {dict(wanted.sizes)}",
+            )
+        kinds = "biuf" if wanted.dtype.kind in "biuf" else "OUST"
+        if mine.dtype.kind not in kinds:
+            raise corrupt(source, f"{name} holds {mine.dtype}, not {wanted.dtype}")
+        if name in like.coords and not np.array_equal(mine.values, wanted.values):
+            raise corrupt(source, f"{name} is of another run")
+    return results
+
+
+def arrays_of(content: bytes) -> dict[str, np.ndarray]:
+    """The arrays of a NumPy archive (.npz) without pickled objects.
+
+    What the archive says of itself is compared with its size before anything is unpacked.
+
+    Raises:
+      ValueError: it is no such archive, or damaged.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            if sum(one.file_size for one in archive.infolist()) > MOST["part"]:
+                raise ValueError("it claims to hold more than such files do")
+            for one in archive.infolist():
+                if one.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    raise ValueError("it is compressed in an unusual way")
+                _check_member(archive, one)
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except ValueError:
+        raise
+    except Exception as error:  # whatever zipfile, zlib and NumPy raise on other content
+        raise ValueError(str(error) or type(error).__name__) from error
+
+
+def _check_member(archive: zipfile.ZipFile, one: zipfile.ZipInfo) -> None:
+    with archive.open(one) as file:
+        version = np.lib.format.read_magic(file)
+        reads = {(1, 0): np.lib.format.read_array_header_1_0}
+        read = reads.get(version, np.lib.format.read_array_header_2_0)
+        shape, _, dtype = read(file)
+        if dtype.hasobject:
+            raise ValueError(f"{one.filename} holds pickled objects")
+        size = dtype.itemsize * int(np.prod(shape, dtype=object))
+        if file.tell() + size != one.file_size:
+            raise ValueError(f"{one.filename} is not as long as it says")
+
+
+def read_bytes(path: Path, kind: Kind = "results") -> bytes:
     """The content of a file, compared with the checksum beside it, if there is one.
 
     Raises:
       InputError: the two differ.
     """
-    content, beside = path.read_bytes(), checksum(path)
+    content, beside = content_of(path, kind), checksum(path)
     with contextlib.suppress(FileNotFoundError):  # there is none
-        if beside.read_bytes().split(b" ")[0] != digest(content).encode():
-            if path.read_bytes() != content:  # another process has just written it anew
-                return read_bytes(path)
+        if content_of(beside, "json").split(b" ")[0] != digest(content).encode():
+            if content_of(path, kind) != content:  # another process has just written it anew
+                return read_bytes(path, kind)
             why = f"{beside.name} is of another content; delete that if the change was yours"
             raise corrupt(path, why)
     return content
+
+
+def parsed(content: bytes | str) -> Any:
+    """What JSON says, if it is not nested deeper than anything that people write.
+
+    Raises:
+      ValueError: it is no JSON.
+    """
+    try:
+        found = json.loads(content)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+    level, depth = [found], 0
+    while level:
+        depth += 1
+        if depth > _DEEPEST:
+            raise ValueError("it is nested too deeply")
+        level = [
+            inner
+            for one in level
+            if isinstance(one, dict | list)
+            for inner in (one.values() if isinstance(one, dict) else one)
+        ]
+    return found
 
 
 def noted(path: Path) -> dict[str, Any]:
@@ -123,14 +326,14 @@ def noted(path: Path) -> dict[str, Any]:
       InputError: there is no such file, or it is corrupt.
     """
     try:
-        content = read_bytes(path)
+        content = read_bytes(path, "json")
     except (FileNotFoundError, NotADirectoryError) as error:
         raise InputError(
             f"run = {path.parent} holds no {path.name}: give the folder of a run."
         ) from error
     try:
-        found = json.loads(content)
-    except (ValueError, RecursionError) as error:
+        found = parsed(content)
+    except ValueError as error:
         raise corrupt(path, error) from error
     if not isinstance(found, dict):
         raise corrupt(path, "it holds no names with values")
@@ -179,9 +382,11 @@ def read_json(path: Path) -> dict[str, Any]:
       InputError: it cannot be read, or holds something else.
     """
     try:
-        values = json.loads(path.read_text())
+        content = content_of(path, "json")
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}): give a JSON file.") from error
+    try:
+        values = parsed(content)
     except ValueError as error:
         raise InputError(f"{path} is not JSON ({error}).") from error
     if not isinstance(values, dict):

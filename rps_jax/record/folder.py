@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import reprlib
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,24 +17,30 @@ from rps_jax.errors import InputError
 from rps_jax.record import files
 
 MANIFEST = "manifest.json"  # of a run that can be continued
-CONFIG = "config.json"  # of one that cannot
 
 
-def prepare(folder: Path, *, overwrite: bool = False) -> Path:
-    """The folder of a new run, made if need be and tried for writing.
+def clear(folder: Path) -> None:
+    """Remove the run that a folder holds, if there is one, and nothing else.
 
     Raises:
-      InputError: it cannot be written, or holds a run already and `overwrite` is off.
+      InputError: it is in use, or cannot be removed.
     """
-    if (folder / MANIFEST).exists():
-        raise InputError(
-            f"out = {folder} holds a run that can be continued: choose another folder."
-        )
-    if (folder / CONFIG).exists() and not overwrite:
-        raise InputError(
-            f"out = {folder} already holds a run: choose another folder or pass --overwrite."
-        )
-    return writable(folder)
+    for inner in sorted(folder.rglob(MANIFEST)):  # runs in its folders, as of models
+        if inner.parent != folder:
+            clear(inner.parent)
+    if not (folder / MANIFEST).exists():
+        return
+    writable(folder)
+    with hold(folder):
+        try:
+            shutil.rmtree(folder / "parts", ignore_errors=True)
+            for name in (MANIFEST, "results.nc", "points.nc", "environment.json"):
+                for path in (folder / name, folder / f"{name}.sha256"):
+                    path.unlink(missing_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"out = {folder} cannot be removed ({error.strerror}): choose another folder."
+            ) from error
 
 
 def writable(folder: Path) -> Path:
@@ -60,8 +67,6 @@ def claim(folder: Path, wanted: dict[str, Any]) -> Path:
       InputError: it cannot be written, or holds a run of another configuration.
     """
     writable(folder)
-    if (folder / CONFIG).exists():
-        raise InputError(f"out = {folder} holds another run: choose another folder.")
     wanted = json.loads(json.dumps(wanted))
     with alone(folder):
         if not (folder / MANIFEST).exists():
@@ -69,7 +74,7 @@ def claim(folder: Path, wanted: dict[str, Any]) -> Path:
         elif (found := files.noted(folder / MANIFEST)) != wanted:
             raise InputError(
                 f"out = {folder} holds another run ({difference(found, wanted)}): choose another "
-                "folder, or ask for the same."
+                "folder, ask for the same, or pass --overwrite."
             )
     return folder
 

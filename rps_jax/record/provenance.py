@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
+import shlex
 import subprocess
 import sys
 import time
@@ -28,7 +29,7 @@ def environment() -> dict[str, Any]:
 
     device = jax.devices()[0]
     return {
-        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "command": _command(),
         "commit": commit(),
         "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         "python": platform.python_version(),
@@ -42,6 +43,14 @@ def environment() -> dict[str, Any]:
         "x64": bool(jax.config.jax_enable_x64),
         "packages": {name: _version(name) for name in _PACKAGES},
     }
+
+
+def _command() -> list[str]:
+    """Words of the command that runs, as it can be run again."""
+    program = Path(sys.argv[0])
+    if program.name in ("rps", "rps.exe") or program.parts[-2:] == ("rps_jax", "__main__.py"):
+        return ["rps", *sys.argv[1:]]
+    return ["python", sys.argv[0], *sys.argv[1:]] if program.suffix == ".py" else list(sys.argv)
 
 
 def sign(folder: Path, signed: Mapping[str, Any] | None = None) -> None:
@@ -87,7 +96,8 @@ def told(folder: Path) -> str:
     """What `sign` noted, in words."""
     try:
         last, *before = (
-            f"`{' '.join(one['command'])}`, commit {one['commit']}, {one['time']}, on "
+            f"`{shlex.join(one['command'])}`, rps_jax {one['packages']['rps_jax']}"
+            f"{', commit ' + one['commit'] if one['commit'] else ''}, {one['time']}, on "
             f"{one['device']['kind']} with {one['processors']} processors, jax "
             f"{one['packages']['jax']}, mujoco {one['packages']['mujoco']}"
             for one in reversed(_history(folder))

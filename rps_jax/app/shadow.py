@@ -1,0 +1,147 @@
+"""What another law would have commanded, beside what was commanded: a recorded bag, replayed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from rps_jax.analysis.figures.style import Figure
+from rps_jax.analysis.report import Picture, Section
+from rps_jax.control import registry
+from rps_jax.control.base import Law, Params
+from rps_jax.control.observation import (
+    ForceObservation,
+    Observation,
+    PoseObservation,
+    TaxelObservation,
+    Twist,
+)
+from rps_jax.errors import InputError
+from rps_jax.record import bag as bags
+from rps_jax.record.options import option
+from rps_jax.runs.question import Question, Run, call_of
+
+_UNITS = {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s"}
+_SENSED = {"taxels": ("signal",), "force": ("f_robot",), "pose": ("p_world_object", "r_object")}
+
+
+@dataclass(frozen=True)
+class Shadow(Question[xr.Dataset]):
+    """Feed a recorded bag to a law, and compare its twists with those that were commanded."""
+
+    file: str | Path = option("", positional=True)
+    """MCAP file with what a robot observed, as `rps push --bag` writes it."""
+    law: str | Any = "rps_plus"
+    """The law, by its name or its file, with changes, as rps_plus,mine.json."""
+
+    TITLE = "A law in the shadow of another"
+
+    @property
+    def params(self) -> Params:
+        """Parameters of the law."""
+        return registry.checked(registry.read_law(self.law)[1])
+
+    def check(self) -> None:
+        """Check the law, and that the file is there."""
+        _ = self.params
+        bags.check()
+        if not Path(self.file).is_file():
+            raise InputError(f"bag = {self.file} is not allowed: give an MCAP file.")
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Run the law over the bag."""
+        recorded = bags.read(Path(self.file))
+        params = self.params
+        twists = shadowed(registry.law_of(params), params, recorded)
+        both = np.stack([recorded["twist"], twists])
+        return xr.Dataset(
+            {
+                name: (("source", "time"), both[..., i], {"units": unit})
+                for i, (name, unit) in enumerate(_UNITS.items())
+            },
+            {"source": ["commanded", "law"], "time": recorded["time"]},
+            {"law": registry.read_law(self.law)[0]},
+        )
+
+    def report(self, found: Any, run: Run) -> Sequence[Section]:
+        """How far the law is from what was commanded."""
+        rows = [["", "root mean square", "greatest", "at time [s]"]]
+        for name, unit in _UNITS.items():
+            apart = np.abs(found[name].sel(source="law") - found[name].sel(source="commanded"))
+            worst, when = float(apart.max()), float(found.time[int(np.argmax(apart.values))])
+            mean = float(np.sqrt(np.mean(apart**2)))
+            rows.append([f"{name} [{unit}]", f"{mean:.2g}", f"{worst:.2g}", f"{when:.2f}"])
+        start, end = float(found.time[0]), float(found.time[-1])
+        text = (
+            f"{found.sizes['time']} commands in {end - start:.1f} s. The table has differences "
+            f"between what {found.attrs['law']} would have commanded and what was commanded, at "
+            "the same observations."
+        )
+        return [
+            Section(
+                "Beside what was commanded", text, rows, Picture("shadow", lambda: figure(found))
+            )
+        ]
+
+
+shadow = call_of(Shadow)
+
+
+def shadowed(law: Law, params: Params, recorded: dict[str, np.ndarray]) -> np.ndarray:
+    """Twists (N, 3) [m/s, m/s, rad/s] that a law would have commanded.
+
+    Raises:
+      InputError: the bag lacks what the law senses.
+    """
+    for name in _SENSED.get(law.senses, ()):
+        if name not in recorded:
+            raise InputError(
+                f"the bag has no {name}, which the law senses ({law.senses}): record it, or choose "
+                "another law."
+            )
+    given = {name: jnp.asarray(values, float) for name, values in recorded.items()}
+    touching = jnp.asarray(recorded["contact_type"] > 0)
+    pose = given["pose"]
+    touch = Observation(
+        pose[:, :2], pose[:, 2], given["p_robot_contact"], touching, given["target"],
+        given["period"],
+    )  # fmt: skip
+    seen: Any = touch
+    if law.senses == "taxels":
+        line = jnp.asarray(recorded["contact_type"] == 2)
+        seen = TaxelObservation(touch, given["signal"], line)
+    elif law.senses == "force":
+        seen = ForceObservation(touch, given["f_robot"])
+    elif law.senses == "pose":
+        seen = PoseObservation(touch, given["p_world_object"], given["r_object"])
+
+    @jax.jit
+    def whole(params: Any, seen: Any) -> jax.Array:
+        def one(memory: Any, now: Any) -> Any:
+            memory, twist, _ = law.step(params, memory, now)
+            return memory, jnp.stack([jnp.asarray(x, float) for x in Twist(*twist)])
+
+        return jax.lax.scan(one, law.init(params), seen)[1]
+
+    params = jax.tree.map(lambda x: jnp.asarray(x, float), params)
+    return np.asarray(whole(params, seen))
+
+
+def figure(found: xr.Dataset) -> Figure:
+    """The twists over time, one panel for each component."""
+    drawn = Figure(figsize=(9, 6), layout="constrained")
+    axes = drawn.subplots(3, 1, sharex=True)
+    for ax, (name, unit) in zip(axes, _UNITS.items(), strict=True):
+        ax.plot(found.time, found[name].sel(source="commanded"), lw=2.5, color="0.7")
+        ax.plot(found.time, found[name].sel(source="law"), lw=1, color="C0")
+        ax.set_ylabel(f"{name} [{unit}]")
+    axes[0].legend(["commanded", found.attrs["law"]], loc="upper right")
+    axes[-1].set_xlabel("time [s]")
+    return drawn

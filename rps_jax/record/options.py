@@ -1,0 +1,211 @@
+"""Options: fields of a dataclass that say once what they mean, what is allowed, and in what unit.
+
+A field's annotation is its type, the string below it is its help, and `option` holds its bounds.
+The command line, the checks and the manifests of runs are made from these declarations.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import functools
+import inspect
+import numbers
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+import numpy as np
+
+from rps_jax import errors
+
+_KEY = "option"
+
+
+class _Bounds(typing.NamedTuple):
+    """What is allowed of a number."""
+
+    at_least: float | None
+    at_most: float | None
+    above: float | None
+    unit: str
+    hidden: bool
+    positional: bool
+
+
+def option(
+    default: Any = dataclasses.MISSING,
+    at_least: float | None = None,
+    at_most: float | None = None,
+    *,
+    above: float | None = None,
+    unit: str = "",
+    kw_only: Any = dataclasses.MISSING,
+    hidden: bool = False,
+    positional: bool = False,
+) -> Any:
+    """Declare a field with bounds: of a number, or of each number of a tuple.
+
+    Args:
+      default: of the field.
+      at_least: least number allowed.
+      at_most: greatest number allowed.
+      above: number that it must exceed.
+      unit: of the number.
+      kw_only: whether it is named in calls.
+      hidden: whether the command line does not offer it.
+      positional: whether the command line has it without a flag.
+    """
+    bounds = _Bounds(at_least, at_most, above, unit, hidden, positional)
+    return dataclasses.field(default=default, metadata={_KEY: bounds}, kw_only=kw_only)
+
+
+def check_fields(asked: Any) -> None:
+    """Check the fields of a dataclass by their types and bounds.
+
+    Whole numbers are `int`, finite numbers `float`, closed choices `Literal`; each may be `None`
+    where the type says so. Fields of other types are left to their owner.
+
+    Raises:
+      InputError: one is not allowed.
+    """
+    types_ = typed_fields(type(asked))
+    for one in dataclasses.fields(asked):
+        _check(one.name, getattr(asked, one.name), types_[one.name], one.metadata.get(_KEY))
+
+
+def is_hidden(field: Any) -> bool:
+    """Whether the command line does not offer a field."""
+    bounds = field.metadata.get(_KEY)
+    return bounds is not None and bounds.hidden
+
+
+def is_positional(field: Any) -> bool:
+    """Whether the command line has a field without a flag."""
+    bounds = field.metadata.get(_KEY)
+    return bounds is not None and bounds.positional
+
+
+@functools.cache
+def typed_fields(kind: type) -> dict[str, Any]:
+    """Types of a dataclass's fields, by name."""
+    return typing.get_type_hints(kind)
+
+
+def _check(name: str, value: Any, kind: Any, bounds: _Bounds | None) -> None:
+    if get_origin(kind) in (typing.Union, types.UnionType):
+        if value is None and type(None) in get_args(kind):
+            return
+        inner = [one for one in get_args(kind) if one is not type(None)]
+        if len(inner) != 1:
+            return
+        (kind,) = inner
+    if get_origin(kind) is Literal:
+        errors.check_name(name, str(value), get_args(kind))
+    elif kind is int:
+        low, high = (bounds.at_least, bounds.at_most) if bounds else (None, None)
+        errors.check_count(
+            name,
+            value,
+            at_least=-(2**63) if low is None else int(low),
+            at_most=2**63 if high is None else int(high),
+        )
+    elif kind is float:
+        named = ("at_least", "at_most", "above", "unit")
+        given = {} if bounds is None else {k: getattr(bounds, k) for k in named}
+        errors.check_finite(name, value, **{k: v for k, v in given.items() if v is not None})
+    elif get_origin(kind) is tuple and bounds is not None:
+        for one in tuple(value or ()):
+            _check(name, one, get_args(kind)[0], bounds)
+
+
+@functools.cache
+def helps(kind: type) -> dict[str, str]:
+    """Strings below the fields of a dataclass (or named tuple) and of its bases, by field."""
+    found: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        if not (dataclasses.is_dataclass(base) or "_fields" in vars(base)):
+            continue
+        try:
+            tree = ast.parse(inspect.cleandoc("\n" + inspect.getsource(base)))
+        except (OSError, TypeError, SyntaxError):
+            continue
+        found |= _below_fields(tree.body[0])
+    return found
+
+
+def _below_fields(tree: Any) -> dict[str, str]:
+    found, name = {}, None
+    for node in tree.body:
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            name = node.target.id
+        elif name and isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            if isinstance(node.value.value, str):
+                found[name] = inspect.cleandoc(node.value.value)
+            name = None
+        else:
+            name = None
+    return found
+
+
+def described(value: Any) -> Any:
+    """JSON of a value: dataclasses and named tuples by their fields, arrays as lists.
+
+    Raises:
+      TypeError: it holds something that JSON has no form for.
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: described(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if hasattr(value, "_asdict"):
+        return {name: described(one) for name, one in value._asdict().items()}
+    if isinstance(value, Mapping):
+        return {str(name): described(one) for name, one in value.items()}
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, str | bool | None):
+        return value
+    if isinstance(value, numbers.Integral):
+        return int(value)
+    number: Any = value
+    if isinstance(value, numbers.Real) or getattr(value, "ndim", None) == 0:
+        return float(number)
+    if isinstance(value, tuple | list):
+        return [described(one) for one in value]
+    if hasattr(value, "tolist"):
+        return described(np.asarray(value).tolist())
+    raise TypeError(f"{type(value).__name__} cannot be described as JSON")
+
+
+# --- texts with changes --------------------------------------------------------------------
+
+
+def with_changes(kind: str, text: str) -> tuple[str, dict[str, Any]]:
+    """Split a text `NAME,FIELD=VALUE,...` into its name and its changes.
+
+    A value is a number, several of them with colons between, as 3:10, or a text.
+
+    Args:
+      kind: what is named, for the error.
+      text: as the command line has it.
+
+    Raises:
+      InputError: a change has no value.
+    """
+    head, *changes = text.split(",")
+    found = {}
+    for change in changes:
+        name, equals, value = change.partition("=")
+        if not (name and equals):
+            raise errors.InputError(f"{kind} = {text} is not allowed: write changes as name=value.")
+        parts = [_read(part) for part in value.split(":")]
+        found[name] = parts if len(parts) > 1 else parts[0]
+    return head, found
+
+
+def _read(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text

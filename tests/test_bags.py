@@ -1,0 +1,195 @@
+"""Bags: what is written is ROS 2 to others, gives every twist back, and odd files are refused."""
+
+import json
+import struct
+import sys
+
+import numpy as np
+import pytest
+import zstandard
+from helpers import SLOTS, refusal, rps
+
+import rps_jax
+from rps_jax.app.shadow import Shadow, shadow
+from rps_jax.record import bag
+from rps_jax.record.bag import Step
+from rps_jax.runs.push import push
+
+pytest.importorskip("mcap_ros2")
+BRIEF = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=6.0))
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    path = tmp_path_factory.mktemp("bag") / "push.mcap"
+    trace = push("cylinder", target=(-1.0, 0.5), law="rps_plus", bag=path, setting=BRIEF)
+    return path, trace
+
+
+@pytest.mark.parametrize("law", ["rps_plus", "learned_mlp", "aps"])
+def test_simulation_to_bag_to_law_gives_every_twist_back(law, tmp_path, recorded):
+    path = recorded[0]
+    if law != "rps_plus":
+        path = tmp_path / "push.mcap"
+        push("cylinder", target=(-1.0, 0.5), law=law, bag=path, setting=BRIEF)
+    found = shadow(path, law)
+    assert found.sizes == {"source": 2, "time": 301}
+    for name in ("v_x", "v_y", "omega"):
+        np.testing.assert_allclose(found[name][1], found[name][0], atol=1e-6)
+    assert float(np.abs(found.v_x).max()) > 0.005
+
+
+def test_a_law_that_senses_force_gives_its_twists_back(tmp_path):
+    path = tmp_path / "push.mcap"
+    setting = rps_jax.Setting("fused", rules=rps_jax.Rules(horizon=10.0))
+    push("box", target=(1.5, 0.2), law="force_push_published", bag=path, setting=setting)
+    found = shadow(path, "force_push_published")
+    for name in ("v_x", "v_y", "omega"):
+        np.testing.assert_allclose(found[name][1], found[name][0], atol=1e-6)
+    assert np.abs(bag.read(path)["f_robot"]).max() > 1
+
+
+def test_a_bag_does_not_change_the_trial(recorded):
+    path, trace = recorded
+    other = push("cylinder", target=(-1.0, 0.5), law="rps_plus", setting=BRIEF)
+    np.testing.assert_array_equal(trace.data.time, other.data.time)
+    for name in ("v_x", "l", "distance"):
+        np.testing.assert_allclose(trace.data[name], other.data[name], atol=1e-5)
+    read = bag.read(path)
+    np.testing.assert_allclose(read["twist"][::5, 0], trace.data.v_x, atol=1e-7)
+
+
+def test_another_law_commands_otherwise(recorded):
+    found = shadow(recorded[0], "rps_plus,law.v_approach=0.02")
+    assert float(np.abs(found.v_x[1] - found.v_x[0]).max()) == pytest.approx(0.01, abs=1e-4)
+
+
+def test_a_reader_that_we_did_not_write_opens_the_bag(recorded):
+    highlevel = pytest.importorskip("rosbags.highlevel")
+    from rosbags.typesys import Stores, get_typestore
+
+    path, trace = recorded
+    with highlevel.AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bags:
+        kinds = {one.topic: one.msgtype for one in bags.connections}
+        assert kinds["/odom"] == "nav_msgs/msg/Odometry"
+        assert kinds["/cmd_vel"] == "geometry_msgs/msg/TwistStamped"
+        assert kinds["/tf"] == "tf2_msgs/msg/TFMessage"
+        assert kinds["/target_marker"] == "visualization_msgs/msg/Marker"
+        counts = dict.fromkeys(kinds, 0)
+        for connection, _, raw in bags.messages():
+            message = bags.deserialize(raw, connection.msgtype)
+            counts[connection.topic] += 1
+            if connection.topic == "/odom" and counts["/odom"] == 251:
+                pose = message.pose.pose.position.x, message.pose.pose.position.y
+    assert counts["/odom"] == counts["/cmd_vel"] == counts["/taxels"] == 301
+    assert counts["/target_marker"] == 7
+    np.testing.assert_allclose(pose, trace.followed.snapshots.qpos[50, :2], atol=1e-7)
+
+
+def test_the_commands_write_and_shadow_a_bag(tmp_path, capsys, recorded):
+    arguments = ["--worlds", 2, "--laws", "rps_plus", "--engine", "quasistatic", "--horizon", 3]
+    run = tmp_path / "sweep"
+    assert rps("sweep", *arguments, "--slots", SLOTS, "--out", run) == 0
+    path = tmp_path / "world.mcap"
+    assert rps("replay", run, 1, "--bag", path, "--no-video", "--out", tmp_path / "replay") == 0
+    mine = tmp_path / "mine.json"
+    mine.write_text(json.dumps({"d_near": 0.3}))
+    out = tmp_path / "shadow"
+    assert rps("shadow", path, "--law", f"rps_plus,{mine}", "--out", out) == 0
+    said = capsys.readouterr().out
+    assert "151 commands in 3.0 s" in said
+    assert "omega [rad/s]" in said
+    assert (out / "shadow.png").exists()
+
+
+# --- files that are none -------------------------------------------------------------------
+
+
+def steps(count=3, **changes):
+    one = Step(0.0, (0, 0, 0), (1, 0), 1, (0.36, 0), (0.05, 0, 0))._replace(**changes)
+    return [one._replace(time=0.02 * i) for i in range(count)]
+
+
+def said_of(path):
+    with pytest.raises(rps_jax.InputError) as error:
+        bag.read(path)
+    assert str(error.value).count("\n") == 0
+    return str(error.value)
+
+
+def test_what_a_bag_keeps(tmp_path):
+    rows = [one._replace(pose=(1, 2, 2.5 * i)) for i, one in enumerate(steps(4, contact_type=2))]
+    found = bag.read(bag.write(tmp_path / "a.mcap", rows, {}))
+    np.testing.assert_allclose(found["pose"], [[1, 2, 2.5 * i] for i in range(4)], atol=1e-12)
+    np.testing.assert_allclose(found["period"], 0.02, atol=1e-9)
+    assert found["contact_type"].tolist() == [2] * 4
+    assert "signal" not in found
+
+
+def test_odd_files_are_refused_in_one_sentence(tmp_path, recorded):
+    content = recorded[0].read_bytes()
+    path = tmp_path / "odd.mcap"
+    for odd in (b"", b"no bag", content[: len(content) // 2], content[:8] + content[200:]):
+        path.write_bytes(odd)
+        assert "odd.mcap" in said_of(path)
+    assert "cannot be read" in said_of(tmp_path)  # a folder
+    bag.write(path, steps(1), {})
+    assert "at least two" in said_of(path)
+    bag.write(path, steps(pose=(float("nan"), 0, 0)), {})
+    assert "pose is not finite" in said_of(path)
+    bag.write(path, [], {})
+    assert "no messages on /odom, /target, /contact, /cmd_vel" in said_of(path)
+
+
+def test_damage_anywhere_is_refused_or_read(tmp_path):
+    """Any error of a reader becomes one sentence."""
+    whole = bag.write(tmp_path / "a.mcap", steps(30), {}).read_bytes()
+    rng, path, refused = np.random.default_rng(0), tmp_path / "b.mcap", 0
+    for _ in range(150):
+        odd = bytearray(whole)
+        for _ in range(4):
+            odd[rng.integers(len(odd))] = rng.integers(256)
+        path.write_bytes(odd)
+        try:
+            bag.read(path)
+        except rps_jax.InputError:
+            refused += 1
+    assert refused > 20
+
+
+def test_a_foreign_topic_of_another_type_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(bag.TOPICS, "/cmd_vel", "geometry_msgs/TwistStamped")
+    path = bag.write(tmp_path / "a.mcap", steps(), {})
+    monkeypatch.setitem(bag.TOPICS, "/target", "nav_msgs/Odometry")
+    assert "/target has geometry_msgs/msg/PointStamped for nav_msgs/Odometry" in said_of(path)
+
+
+def record(opcode, content):
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def test_what_is_huge_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
+    magic = bytes((137, 77, 67, 65, 80, 48, 13, 10))
+    header = record(1, struct.pack("<I", 4) + b"ros2" + struct.pack("<I", 0))
+    bomb = zstandard.compress(bytes(300 * 2**20), 19)
+    chunk = struct.pack("<QQQII", 0, 0, 300 * 2**20, 0, 4) + b"zstd"
+    chunk = record(6, chunk + struct.pack("<Q", len(bomb)) + bomb)
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(magic + header + chunk + magic)
+    assert path.stat().st_size < 10**6
+    assert "is not what it says" in said_of(path)
+    path.write_bytes(magic + header + struct.pack("<BQ", 5, 2**40) + bytes(1000))
+    assert "bomb.mcap" in said_of(path)
+    monkeypatch.setattr(bag, "_MOST_STEPS", 10)
+    assert "more than 10 commands" in said_of(bag.write(path, steps(12), {}))
+
+
+def test_what_a_bag_lacks_is_named(tmp_path, capsys, monkeypatch):
+    path = bag.write(tmp_path / "a.mcap", steps(), {})
+    for law, what in (("learned_mlp", "signal"), ("aps", "p_world_object")):
+        with pytest.raises(rps_jax.InputError, match=f"has no {what}, which the law senses"):
+            Shadow(path, law)()
+    assert "give an MCAP file" in refusal(capsys, "shadow", tmp_path / "none.mcap")
+    monkeypatch.setitem(sys.modules, "mcap_ros2.writer", None)
+    said = refusal(capsys, "push", "--bag", path, "--no-video", "--out", tmp_path / "push")
+    assert "pip install 'rps_jax[bags]'" in said
