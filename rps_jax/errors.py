@@ -5,12 +5,32 @@ from __future__ import annotations
 import difflib
 import math
 import numbers
+import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 
 class InputError(ValueError):
-    """Bad input: one sentence that names the field, its value and what is allowed."""
+    """Bad input: one sentence that names the field, its value and what is allowed.
+
+    Of a word of more than `_LONGEST` characters, as a value may be one, only its beginning stands
+    there; what cannot be printed is escaped.
+    """
+
+    def __init__(self, sentence: object) -> None:
+        """Say it."""
+        super().__init__(_readable(str(sentence)))
+
+
+_LONGEST = 200  # characters of a word; most paths are shorter
+_ENDLESS = re.compile(rf"(\S{{60}})\S{{{_LONGEST - 60},}}?([^\w\s]{{0,3}})(?!\S)")
+
+
+def _readable(sentence: str) -> str:
+    """A sentence without endless words, and without characters that a terminal would obey."""
+    short = _ENDLESS.sub(r"\1…\2", sentence)
+    plain = (c if c.isprintable() else ascii(c)[1:-1] for c in short)
+    return "".join(plain)
 
 
 def check_number(
@@ -21,8 +41,11 @@ def check_number(
     at_least: float = -math.inf,
     at_most: float = math.inf,
     unit: str = "",
+    text: bool = False,
 ) -> float:
     """`value` as a float if it is a number within bounds; infinite only where `at_most` says so.
+
+    A text is no number, unless one that says a number is allowed by `text`.
 
     Raises:
       InputError: it is NaN, not a number, or out of bounds.
@@ -36,7 +59,8 @@ def check_number(
         bounds.append(f"at most {at_most:g}")
     allowed = " and ".join(["a number", *bounds]) + (f" [{unit}]" if unit else "")
     try:
-        number = float(value)
+        odd = (isinstance(value, str) and not text) or "complex" in type(value).__name__
+        number = math.nan if odd else float(value)
     except (TypeError, ValueError, OverflowError):
         number = math.nan
     if math.isnan(number) or not (above < number and at_least <= number <= at_most):

@@ -2,10 +2,11 @@
 
     python sweeps/render_tables.py [--check]
 
-`sweeps/results/NAME.json` holds one table: the command, device, versions, commit and date that made
-it, its columns and its rows. A page shows it between `<!-- table: NAME -->` and `<!-- end -->`, and
-its commands between `<!-- command: NAME -->` and `<!-- end -->`. With `--check` nothing is written,
-and the exit code is 1 if a page differs from the data. Only the standard library is needed.
+`NAME.json` in `sweeps/results`, or in the `results` of a folder of `sweeps`, holds one table: the
+command, device, versions, commit and date that made it, its columns and its rows. A page shows it
+between `<!-- table: NAME -->` and `<!-- end -->`, and its commands between `<!-- command: NAME -->`
+and `<!-- end -->`. With `--check` nothing is written, and the exit code is 1 if a page differs from
+the data. Only the standard library is needed.
 
 A cell is a text, a number, a list of numbers (a rate and the ends of its interval), or null. The
 `format` of a column is applied to a number and to the first of a list, its `rest` to those that
@@ -21,15 +22,25 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-RESULTS = ROOT / "sweeps" / "results"
+SWEEPS = ROOT / "sweeps"
 KEYS = ("command", "device", "versions", "commit", "date", "columns", "rows")
 _BLOCK = re.compile(r"(<!-- (table|command): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _SKIPPED = {"runs", "build", "dist"}  # folders of the root that hold no pages of the repository
 
 
-def load(name: str, results: Path = RESULTS) -> dict[str, Any]:
-    """The data of a table; raises ValueError, with one sentence, if it is no such file."""
-    path = results / f"{name}.json"
+def data_files(root: Path = SWEEPS) -> dict[str, Path]:
+    """The data files of all tables by name; raises ValueError if two have the same name."""
+    found: dict[str, Path] = {}
+    for path in sorted(root.glob("**/results/*.json")):
+        if path.stem in found:
+            raise ValueError(f"{path} has the name of {found[path.stem]}: rename one of them.")
+        found[path.stem] = path
+    return found
+
+
+def load(name: str, root: Path = SWEEPS) -> dict[str, Any]:
+    """The data of a table; raises ValueError, with one sentence, if there is no such file."""
+    path = path_of(name, root)
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -45,7 +56,15 @@ def load(name: str, results: Path = RESULTS) -> dict[str, Any]:
     return data
 
 
-def table(data: dict[str, Any], results: Path = RESULTS) -> str:
+def path_of(name: str, root: Path = SWEEPS) -> Path:
+    """The data file of a table; raises ValueError if there is none."""
+    files = data_files(root)
+    if name not in files:
+        raise ValueError(f"{name}.json is in no folder `results` of {root}.")
+    return files[name]
+
+
+def table(data: dict[str, Any], root: Path = SWEEPS) -> str:
     """The Markdown table of some data."""
     lines = [[column["name"] for column in data["columns"]]]
     before: list[Any] = [None] * len(data["columns"])
@@ -53,34 +72,34 @@ def table(data: dict[str, Any], results: Path = RESULTS) -> str:
         texts = []
         for cell, column, above in zip(row, data["columns"], before, strict=True):
             merged = column.get("merge") and cell == above
-            texts.append("" if merged else _text(cell, column, results))
+            texts.append("" if merged else _text(cell, column, root))
         lines.append(texts)
         before = row
     lines.insert(1, ["---"] * len(data["columns"]))
     return "".join(f"| {' | '.join(texts)} |\n" for texts in lines)
 
 
-def _text(cell: Any, column: dict[str, Any], results: Path) -> str:
+def _text(cell: Any, column: dict[str, Any], root: Path) -> str:
     if cell is None:
         return ""
     if isinstance(cell, str):
         return cell
     if isinstance(cell, dict):
-        return _cited(cell, results)
+        return _cited(cell, root)
     first, *rest = cell if isinstance(cell, list) else [cell]
     text = column.get("format", "{}").format(first)
     return text + column.get("rest", "").format(*rest) if rest else text
 
 
-def _cited(cell: dict[str, Any], results: Path) -> str:
+def _cited(cell: dict[str, Any], root: Path) -> str:
     """The text of a cell of another table."""
-    data, first = load(cell["from"], results), cell["row"]
+    data, first = load(cell["from"], root), cell["row"]
     names = [column["name"] for column in data["columns"]]
     rows = [row for row in data["rows"] if row[: len(first)] == first]
     if len(rows) != 1 or cell["column"] not in names:
         raise ValueError(f"{cell} does not name one cell of {cell['from']}.json.")
     i = names.index(cell["column"])
-    return _text(rows[0][i], data["columns"][i], results)
+    return _text(rows[0][i], data["columns"][i], root)
 
 
 def caption(data: dict[str, Any], link: str) -> str:
@@ -96,16 +115,16 @@ def commands(data: dict[str, Any]) -> str:
     return "```bash\n" + "".join(f"{line}\n" for line in lines) + "```\n"
 
 
-def render(page: Path, results: Path = RESULTS) -> str:
+def render(page: Path, root: Path = SWEEPS) -> str:
     """The text of a page with all its blocks made anew from the data."""
 
     def block(found: re.Match[str]) -> str:
         begin, kind, name, end = found.groups()
-        data = load(name, results)
+        data = load(name, root)
         if kind == "command":
             return begin + commands(data) + end
-        link = Path(os.path.relpath(results / f"{name}.json", page.parent)).as_posix()
-        return begin + table(data, results) + caption(data, link) + end
+        link = Path(os.path.relpath(path_of(name, root), page.parent)).as_posix()
+        return begin + table(data, root) + caption(data, link) + end
 
     return _BLOCK.sub(block, page.read_text(encoding="utf-8"))
 
@@ -127,8 +146,8 @@ def main(arguments: list[str]) -> int:
         return 2
     stale = []
     try:
-        for path in RESULTS.glob("*.json"):
-            table(load(path.stem))
+        for name in data_files():
+            table(load(name))
         for page in pages():
             text = render(page)
             if text != page.read_text(encoding="utf-8"):

@@ -1,14 +1,18 @@
-"""A run's report: Markdown beside its pictures, and one HTML file that holds everything."""
+"""A run's report: sections of prose, tables and figures, as Markdown and as one HTML file."""
 
 from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Sequence
+import io
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import markdown
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image
 
 from rps_jax.analysis import tables
 from rps_jax.record import files
@@ -23,36 +27,69 @@ code { background: #f5f5f5; }
 """
 
 
+class Picture(NamedTuple):
+    """A figure of a report, drawn when it is asked for."""
+
+    name: str  # of its PNG, without the ending
+    draw: Callable[[], Figure | np.ndarray]  # or an image (height, width, 3) uint8
+
+    def png(self) -> bytes:
+        """The picture as a PNG file, equal for equal figures."""
+        drawn, file = self.draw(), io.BytesIO()
+        if isinstance(drawn, Figure):
+            drawn.savefig(file, dpi=150, metadata={"Software": None})
+        else:
+            Image.fromarray(drawn).save(file, "png")
+        return file.getvalue()
+
+    def _repr_png_(self) -> bytes:
+        """What Jupyter shows."""
+        return self.png()
+
+
 class Section(NamedTuple):
     """One heading of a report."""
 
     title: str
     text: str = ""  # Markdown
     table: Sequence[Sequence[str]] = ()  # header and rows
-    picture: Path | None = None
+    picture: Picture | None = None
+
+    def _repr_markdown_(self) -> str:
+        """What Jupyter shows: the words and the table."""
+        return "\n\n".join(self.lines)
+
+    @property
+    def lines(self) -> list[str]:
+        """Heading, words and table as Markdown."""
+        table = [tables.markdown(self.table)] if self.table else []
+        return [f"## {self.title}", *([self.text] if self.text else []), *table]
 
 
 def write_report(folder: Path, title: str, intro: str, sections: Sequence[Section]) -> Path:
-    """`report.md` and `report.html` in the folder; the latter needs no other file."""
-    texts = [f"# {title}", intro]
+    """Write `report.md` and `report.html`, which needs no other file; returns the first."""
+    texts, pictures = [f"# {title}", intro], {}
     for section in sections:
-        texts.append(f"## {section.title}")
-        if section.text:
-            texts.append(section.text)
-        if section.table:
-            texts.append(tables.markdown(section.table))
+        texts += section.lines
         if section.picture:
-            texts.append(f"![{section.title}]({section.picture.relative_to(folder)})")
-    text = "\n\n".join(texts) + "\n"
+            name = f"{section.picture.name}.png"
+            pictures[name] = section.picture.png()
+            files.write_bytes(folder / name, pictures[name])
+            texts.append(f"![{section.title}]({name})")
+    text = "\n\n".join(one for one in texts if one) + "\n"
     files.write_text(folder / "report.md", text)
     body = markdown.markdown(text, extensions=["tables"])
-    for section in sections:
-        if section.picture:
-            data = base64.b64encode(section.picture.read_bytes()).decode()
-            source = f'src="{section.picture.relative_to(folder)}"'
-            body = body.replace(source, f'src="data:image/png;base64,{data}"')
+    for name, content in pictures.items():
+        data = base64.b64encode(content).decode()
+        body = body.replace(f'src="{name}"', f'src="data:image/png;base64,{data}"')
     page = (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
         f"<style>{_STYLE}</style>{body}</html>\n"
     )
-    return files.write_text(folder / "report.html", page)
+    files.write_text(folder / "report.html", page)
+    return folder / "report.md"
+
+
+def save(figure: Any, path: Path) -> Path:
+    """Write a figure as a PNG, whole or not at all."""
+    return files.write_bytes(path, Picture(path.stem, lambda: figure).png())

@@ -7,45 +7,18 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 from scipy import stats
 
-# Of a sweep's results, what was drawn, and its name in words.
-DRAWN = {
-    "mass": "mass of the object",
-    "size": "half width of the object",
-    "height": "height of the object",
-    "corners": "corners of the object",
-    "com_offset": "centre of mass off the middle",
-    "friction_ground": "friction object-ground",
-    "friction_robot": "friction object-robot",
-    "distance": "distance of the target",
-    "bearing": "bearing of the target",
-    "lateral": "lateral offset",
-    "yaw": "yaw of the object",
-    "gap": "gap at the start",
-    "noise": "noise of the skin",
-    "gain_spread": "spread of the taxels' gains",
-    "dead_share": "dead taxels",
-    "pose_noise": "noise of the position",
-    "yaw_noise": "noise of the heading",
-    "pose_latency": "latency of the pose",
-    "command_delay": "delay of the command",
-    "v_x_error": "error of v_x",
-    "v_y_error": "error of v_y",
-    "omega_error": "error of omega",
-    "robot_force": "greatest force of the robot",
-    "robot_traction": "traction of the robot's wheels",
-    "robot_lag": "lag of the robot",
-    "robot_acceleration": "greatest acceleration of the robot",
-}
+from rps_jax.world.domain import WORDS
+
 FAILURES = ("never touched", "lost contact", "timeout", "fell over", "diverged", "stalled")
 _FIRST = ("diverged", "fell over", "stalled", "never touched", "lost contact")  # what counts first
 _TAIL = 0.05  # of the worlds are the worst
 # What no interval of a report promises.
 NOT_PROMISED = (
-    "Every interval here is about worlds drawn as these were. Neither it nor a conformal bound, "
-    "which holds on average over exchangeable worlds, promises anything about one given world, "
-    "about worlds from elsewhere, or about worlds that a search has picked."
+    "Every interval here is about worlds drawn as these were. It promises nothing about one given "
+    "world, about worlds from elsewhere, or about worlds that a search has picked."
 )
 
 
@@ -60,7 +33,7 @@ class Comparison(NamedTuple):
 
 
 class Bins(NamedTuple):
-    """Success of one arm against one quantity."""
+    """Success of one law against one quantity."""
 
     middle: np.ndarray  # (n,) of each bin: the median of its worlds
     won: np.ndarray  # (n,)
@@ -70,7 +43,7 @@ class Bins(NamedTuple):
 class Influence(NamedTuple):
     """How far success hangs on one quantity."""
 
-    name: str  # of `DRAWN`
+    name: str  # of `WORDS`
     variance: float  # [1] of the success rate over its bins, as of `unexplained`
     q: float  # [1] false discovery rate of the test that all bins have one rate
 
@@ -128,12 +101,12 @@ def worlds_by_object(results: xr.Dataset) -> dict[str, np.ndarray]:
 
 
 def drawn(results: xr.Dataset) -> list[str]:
-    """Names of those of `DRAWN` that differ between worlds."""
+    """Names of those quantities of `WORDS` that differ between worlds."""
 
     def differs(values: np.ndarray) -> bool:
         return np.unique(values[np.isfinite(values)]).size > 1
 
-    return [name for name in DRAWN if name in results and differs(results[name].values)]
+    return [name for name in WORDS if name in results and differs(results[name].values)]
 
 
 def cvar(values: np.ndarray, tail: float = _TAIL) -> float:
@@ -164,10 +137,21 @@ def cvar_interval(
     return float(mean * np.exp(-error / mean)), float(mean * np.exp(error / mean))
 
 
+def missed(min_distance: ArrayLike, way: ArrayLike) -> np.ndarray:
+    """How far (...) [m] trials missed their targets.
+
+    Args:
+      min_distance: (...) [m] least distance of the contact point to the target, infinite of a
+        trial that never touched its object.
+      way: (...) [m] what such a trial missed by: the target's distance from the start.
+    """
+    near = np.asarray(min_distance, float)
+    return np.where(np.isfinite(near), near, way)
+
+
 def left_over(one: xr.Dataset) -> np.ndarray:
-    """Least distance (worlds,) [m] of the contact to the target; never touched: the whole way."""
-    distance = one.min_distance.values.astype(float)
-    return np.where(np.isfinite(distance), distance, one.distance.values)
+    """How far (world,) [m] the trials of one law missed their targets."""
+    return missed(one.min_distance.values, one.distance.values)
 
 
 def failure(one: xr.Dataset, max_lost: float) -> np.ndarray:
@@ -188,10 +172,10 @@ def failure(one: xr.Dataset, max_lost: float) -> np.ndarray:
 
 
 def hardest(results: xr.Dataset, count: int = 10) -> np.ndarray:
-    """Worlds (count,) in which most arms fail, and among these the most distance is left."""
-    arms = [results.sel(arm=arm) for arm in results.arm.values]
-    failed = sum((one.success.values == 0).astype(float) for one in arms)
-    left = np.mean([left_over(one) for one in arms], axis=0)
+    """Worlds (count,) in which most laws fail, and among these the most distance is left."""
+    laws = [results.sel(law=law) for law in results.law.values]
+    failed = sum((one.success.values == 0).astype(float) for one in laws)
+    left = np.mean([left_over(one) for one in laws], axis=0)
     order = np.lexsort((-left, -np.asarray(failed)))
     return order[: min(count, int((np.asarray(failed) > 0).sum()))]
 
@@ -248,15 +232,15 @@ def unexplained(found: Bins) -> float:
 def influences(results: xr.Dataset) -> list[Influence]:
     """How far success hangs on each of `drawn`, the greatest spread first.
 
-    Each has the spread of the arm in which it is greatest, and the least q of all arms.
+    Each has the spread of the law in which it is greatest, and the least q of all laws.
     """
-    arms = results.arm.values
+    laws = results.law.values
     binned = {
-        name: [bins(results[name].values, results.success.sel(arm=arm).values > 0) for arm in arms]
+        name: [bins(results[name].values, results.success.sel(law=law).values > 0) for law in laws]
         for name in drawn(results)
     }
     q = false_discovery([one_rate(found) for each in binned.values() for found in each])
-    q = q.reshape(len(binned), len(arms))
+    q = q.reshape(len(binned), len(laws))
     found = [
         Influence(name, max(map(unexplained, each)), float(least))
         for (name, each), least in zip(binned.items(), q.min(axis=1), strict=True)

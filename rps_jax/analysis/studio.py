@@ -1,14 +1,19 @@
 """A MuJoCo scene before a camera: images, each with the paths of base and contact so far.
 
-MuJoCo reads the environment variable MUJOCO_GL when it is imported, so nothing here imports it
-before something is drawn: a command line calls `video.choose_gl` first of all.
+MuJoCo reads the environment variable MUJOCO_GL when it is imported. `choose_gl` makes that choice
+when something is first drawn, for every caller, also where MuJoCo was imported before.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import functools
+import importlib
 import itertools
 import math
+import os
+import sys
 import warnings
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -168,7 +173,23 @@ def _checked(name: str, values: ArrayLike, length: int) -> np.ndarray:
     return array
 
 
+@functools.cache
+def choose_gl() -> None:
+    """Draw through EGL on a Linux machine without a display, unless MUJOCO_GL says otherwise.
+
+    A machine that lacks the EGL library is left alone.
+    """
+    if sys.platform != "linux" or os.environ.get("MUJOCO_GL") or os.environ.get("DISPLAY"):
+        return
+    with contextlib.suppress(OSError):
+        ctypes.CDLL("libEGL.so.1")
+        os.environ["MUJOCO_GL"] = "egl"
+        if (chosen := sys.modules.get("mujoco.rendering.classic.gl_context")) is not None:
+            importlib.reload(chosen)
+
+
 def _import_mujoco() -> Any:
+    choose_gl()
     try:
         import mujoco
     except Exception as error:  # what a missing GL library raises depends on the library

@@ -11,6 +11,7 @@ import xarray as xr
 
 from rps_jax.analysis import statistics
 from rps_jax.world import paper
+from rps_jax.world.domain import WORDS
 
 
 def markdown(rows: Sequence[Sequence[str]]) -> str:
@@ -32,14 +33,14 @@ def table_ii(results: xr.Dataset) -> list[list[str]]:
     whole = np.array_equal(targets, paper.TARGETS)
     columns = [(str(o), str(f)) for o in results.object.values for f in results.friction.values]
     rows = [["", "", *(f"{o} {f}" for o, f in columns), "all"]]
-    for strategy in map(str, results.strategy.values):
-        success = results.success.sel(strategy=strategy)
+    for law in map(str, results.law.values):
+        success = results.success.sel(law=law)
         counts = [int(success.sel(object=o, friction=f).sum()) for o, f in columns]
         sizes = [trials] * len(columns)
         pairs = [*zip(counts, sizes, strict=True), (sum(counts), sum(sizes))]
         cells = [f"{n}/{of} {_percent(n, of)}" for n, of in pairs]
-        rows.append([strategy.upper(), "ours", *cells])
-        theirs = [paper.TABLE_II.get((strategy, o, f)) for o, f in columns]
+        rows.append([law.upper(), "ours", *cells])
+        theirs = [paper.TABLE_II.get((law, o, f)) for o, f in columns]
         if whole and None not in theirs:
             theirs = [n for n in theirs if n is not None]
             pairs = [*zip(theirs, sizes, strict=True), (sum(theirs), sum(sizes))]
@@ -53,12 +54,12 @@ def _percent(successes: int, trials: int) -> str:
 
 
 def summary(results: xr.Dataset) -> str:
-    """One line for each strategy: median time and D of the successes, losses, divergences."""
+    """One line for each law: median time and D of the successes, losses, divergences."""
     lines = []
-    for strategy in map(str, results.strategy.values):
-        part = results.sel(strategy=strategy)
+    for law in map(str, results.law.values):
+        part = results.sel(law=law)
         won = part.success.values.astype(bool)
-        line = f"{strategy.upper()}: {won.sum()} of {won.size} succeed"
+        line = f"{law.upper()}: {won.sum()} of {won.size} succeed"
         if won.any():
             time = part.time.values[won]
             line += (
@@ -70,27 +71,27 @@ def summary(results: xr.Dataset) -> str:
 
 
 def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
-    """Header and one row for each arm: success by object, distance left, time, path, failures.
+    """Header and one row for each law: success by object, distance left, time, path, failures.
 
-    The bound of the failures is exact; with several arms it holds for whichever is picked here.
+    The bound of the failures is exact; with several laws it holds for whichever is picked here.
     """
     groups = statistics.worlds_by_object(results)
     ways = [way for way in statistics.FAILURES if way != "stalled" or "stalled" in results]
-    arms = results.sizes["arm"]
-    bound = "fails at most" + f" (best of {arms})" * (arms > 1)
+    laws = results.sizes["law"]
+    bound = "fails at most" + f" (best of {laws})" * (laws > 1)
     header = ["", *groups, "all", bound, "CVaR 5 % of distance"]
     header += ["median time", "median path", *ways]
     rows = [header]
-    for arm in map(str, results.arm.values):
-        one = results.sel(arm=arm)
+    for law in map(str, results.law.values):
+        one = results.sel(law=law)
         won = one.success.values > 0
         kinds = statistics.failure(one, max_lost)
         rows.append(
             [
-                arm,
+                law,
                 *(_rate(won[mask]) for mask in groups.values()),
                 _rate(won),
-                f"{100 * statistics.fails_at_most(int((~won).sum()), won.size, arms):.2g} %",
+                _at_most(statistics.fails_at_most(int((~won).sum()), won.size, laws)),
                 _cvar(statistics.left_over(one)),
                 f"{np.median(one.time.values[won]):.1f} s" if won.any() else "-",
                 f"{np.median(one.path_length.values[won]):.2f} m" if won.any() else "-",
@@ -103,23 +104,30 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
 def _cvar(left: np.ndarray) -> str:
     """The mean over the worst worlds of the distance left, with its interval."""
     low, high = statistics.cvar_interval(left)
-    return f"{statistics.cvar(left):.2f} m [{low:.2f}, {high:.2f}]"
+    ends = f"[{low:.2f}, {high:.2f}]" if np.isfinite(high) else "(too few worlds for an interval)"
+    return f"{statistics.cvar(left):.2f} m {ends}"
+
+
+def _at_most(bound: float) -> str:
+    """An upper bound of a rate, with two digits where it is small."""
+    return f"{100 * bound:.{0 if bound > 0.1 else 2 if bound > 0.001 else 4}f} %"
 
 
 def models_table(results: xr.Dataset) -> list[list[str]]:
-    """Header and one row for each arm: its rate on every model, and from the least to the most.
+    """Header and one row for each law: its rate on every model, and from the least to the most.
 
-    Outcomes are (model, arm, world). The last column is the share of outcomes that are equal to
-    the first model's, at the least.
+    `model_success` is (model, law, world). The last column is the share of outcomes that are equal
+    to the first model's, at the least.
     """
-    names = list(map(str, results.model.values))
+    success = results.model_success
+    names = list(map(str, success.model.values))
     rows = [["", *names, "over all models", "outcomes equal to the first"]]
-    for arm in map(str, results.arm.values):
-        won = results.success.sel(arm=arm).values > 0
+    for law in map(str, success.law.values):
+        won = success.sel(law=law).values > 0
         rates = 100 * won.mean(axis=1)
         equal = 100 * (won == won[0]).mean(axis=1)[1:]
         least = f"{equal.min():.1f} % and more" if equal.size else "-"
-        rows.append([arm, *map(_rate, won), f"{rates.min():.1f} to {rates.max():.1f} %", least])
+        rows.append([law, *map(_rate, won), f"{rates.min():.1f} to {rates.max():.1f} %", least])
     return rows
 
 
@@ -127,19 +135,29 @@ def _rate(won: np.ndarray) -> str:
     return share(int(won.sum()), won.size)
 
 
+def percent(won: int, of: int) -> str:
+    """A rate in percent without its sign, with as many digits as so many trials can tell."""
+    return f"{100 * won / of:.{_digits(won, of)}f}"
+
+
+def _digits(won: int, of: int) -> int:
+    """Two above 99 % and below 1 % of a thousand trials and more, else one."""
+    return 2 if of >= 1000 and not 0.01 < won / of < 0.99 else 1
+
+
 def share(won: int, of: int) -> str:
     """A success rate with its Wilson 95 % interval."""
     if not of:
         return "-"
-    low, high = statistics.wilson(won, of)
-    return f"{100 * won / of:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+    ends = (f"{100 * end:.{_digits(won, of)}f}" for end in statistics.wilson(won, of))
+    return f"{percent(won, of)} % [{', '.join(ends)}]"
 
 
 def difference_table(results: xr.Dataset) -> list[list[str]]:
-    """Header and one row for each pair of arms, world by world, with McNemar's exact test."""
+    """Header and one row for each pair of laws, world by world, with McNemar's exact test."""
     rows = [["second against first", "gained", "lost", "difference", "McNemar p"]]
-    for first, second in combinations(map(str, results.arm.values), 2):
-        a, b = results.success.sel(arm=first), results.success.sel(arm=second)
+    for first, second in combinations(map(str, results.law.values), 2):
+        a, b = results.success.sel(law=first), results.success.sel(law=second)
         c = statistics.compare(a, b)
         share = 100 * (c.gained - c.lost) / a.size
         rows.append(
@@ -155,48 +173,48 @@ def difference_table(results: xr.Dataset) -> list[list[str]]:
 
 
 def against_table(results: xr.Dataset, reference: str) -> list[list[str]]:
-    """Header and one row for each arm: world by world against one of them, best first.
+    """Header and one row for each law: world by world against one of them, best first.
 
-    The p-values of McNemar's exact test are adjusted for as many tests as there are arms (Holm).
+    The p-values of McNemar's exact test are adjusted for as many tests as there are laws (Holm).
     """
-    base = results.success.sel(arm=reference)
-    names = [str(arm) for arm in results.arm.values]
-    names.sort(key=lambda arm: -float(results.success.sel(arm=arm).mean()))
-    others = [arm for arm in names if arm != reference]
-    found = {arm: statistics.compare(base, results.success.sel(arm=arm)) for arm in others}
+    base = results.success.sel(law=reference)
+    names = [str(law) for law in results.law.values]
+    names.sort(key=lambda law: -float(results.success.sel(law=law).mean()))
+    others = [law for law in names if law != reference]
+    found = {law: statistics.compare(base, results.success.sel(law=law)) for law in others}
     adjusted = dict(zip(others, statistics.holm([found[a].p for a in others]), strict=True))
     failed = int((base.values == 0).sum())
     wins = f"wins of the {failed} that {reference} loses"
     rows = [["", "success", f"against {reference}", "p (Holm)", wins]]
-    for arm in names:
+    for law in names:
         cells = ["", "", ""]
-        if arm != reference:
-            c = found[arm]
+        if law != reference:
+            c = found[law]
             share = 100 * (c.gained - c.lost) / base.size
-            cells = [f"{share:+.2f} % (+{c.gained} -{c.lost})", f"{adjusted[arm]:.2g}"]
+            cells = [f"{share:+.2f} % (+{c.gained} -{c.lost})", f"{adjusted[law]:.2g}"]
             cells.append(str(c.gained))
-        rows.append([arm, _rate(results.success.sel(arm=arm).values > 0), *cells])
+        rows.append([law, _rate(results.success.sel(law=law).values > 0), *cells])
     return rows
 
 
 def hardest_table(results: xr.Dataset, run: str, count: int = 10) -> list[list[str]]:
     """Header and one row for each of the hardest worlds, with the command that replays it."""
     names = [str(name) for name in results.object.values]
-    arms = [str(arm) for arm in results.arm.values]
-    rows = [["world", "object", *arms, "mass", "friction", "target", "replay"]]
+    laws = [str(law) for law in results.law.values]
+    rows = [["world", "object", *laws, "mass", "friction", "target", "replay"]]
     for world in statistics.hardest(results, count):
         one = results.isel(world=world)
         x = float(one.distance), float(np.degrees(one.bearing))
-        fails = next(arm for arm in arms if not int(one.success.sel(arm=arm)))
+        fails = next(law for law in laws if not int(one.success.sel(law=law)))
         rows.append(
             [
                 str(int(world)),
                 names[int(one.which_object)],
-                *(_told(one.sel(arm=arm)) for arm in arms),
+                *(_told(one.sel(law=law)) for law in laws),
                 f"{float(one.mass):.1f} kg",
                 f"{float(one.friction_ground):.2f}, {float(one.friction_robot):.2f}",
                 f"{x[0]:.1f} m at {x[1]:.0f} deg",
-                f"`rps replay {shlex.quote(run)} {int(world)} --arm {fails!r} --video`",
+                f"`rps replay {shlex.quote(run)} {int(world)} --law {shlex.quote(fails)}`",
             ]
         )
     return rows
@@ -209,13 +227,13 @@ def _told(trial: xr.Dataset) -> str:
     return f"fails, {100 * distance:.0f} cm off" if np.isfinite(distance) else "never touches"
 
 
-def influence_table(results: xr.Dataset, arm: str) -> list[list[str]]:
-    """Header and one row for each quantity that was drawn: the arm's worst and best bin.
+def influence_table(results: xr.Dataset, law: str) -> list[list[str]]:
+    """Header and one row for each quantity that was drawn: the law's worst and best bin.
 
     Those whose bins differ most come first: by a chi-squared test that all bins have one rate,
     false discoveries among the quantities held at 5 % (Benjamini-Hochberg) where q < 0.05.
     """
-    won = results.success.sel(arm=arm).values > 0
+    won = results.success.sel(law=law).values > 0
     binned = {
         name: statistics.bins(results[name].values, won) for name in statistics.drawn(results)
     }
@@ -230,14 +248,14 @@ def influence_table(results: xr.Dataset, arm: str) -> list[list[str]]:
             for n in (order[0], order[-1])
             for cell in (told[n], share(int(found.won[n]), int(found.of[n])))
         ]
-        rows.append([statistics.DRAWN[name], *ends, f"{q[i]:.2g}"])
+        rows.append([WORDS[name], *ends, f"{q[i]:.2g}"])
     return rows
 
 
 def agreement_table(found: Mapping[str, xr.Dataset]) -> list[list[str]]:
     """Header and one row for each engine: success, and outcomes equal to the first's, by object.
 
-    The results are those of one arm in the same worlds.
+    The results are those of one law in the same worlds.
     """
     base = next(iter(found.values()))
     groups = statistics.worlds_by_object(base)

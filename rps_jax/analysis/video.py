@@ -1,16 +1,10 @@
-"""Pictures of a trial: one image of a qpos, or a video of many.
-
-MuJoCo reads the environment variable MUJOCO_GL when it is imported, so nothing here imports it
-before something is drawn: a command line calls `choose_gl` first of all.
-"""
+"""Pictures of a trial: one image of a qpos, or a video of many."""
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import itertools
 import os
-import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -51,19 +45,6 @@ class Check(NamedTuple):
     what: str
     ok: bool
     mend: str  # how to mend it, one sentence; empty if `ok`
-
-
-def choose_gl() -> None:
-    """Set MUJOCO_GL to egl on a Linux machine without a display; call before MuJoCo is imported.
-
-    A variable that is set, and a machine that lacks the EGL library, are left alone: with egl
-    asked for and absent, MuJoCo could not even be imported.
-    """
-    if sys.platform != "linux" or os.environ.get("MUJOCO_GL") or os.environ.get("DISPLAY"):
-        return
-    with contextlib.suppress(OSError):
-        ctypes.CDLL("libEGL.so.1")
-        os.environ["MUJOCO_GL"] = "egl"
 
 
 def check() -> list[Check]:

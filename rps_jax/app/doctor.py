@@ -2,23 +2,41 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from rps_jax.analysis import video
+from rps_jax.engines import device
 from rps_jax.errors import InputError
 from rps_jax.record import folder as run_folder
 from rps_jax.record import provenance
+from rps_jax.record.options import option
+from rps_jax.runs.question import Question, call_of
+
+
+@dataclass(frozen=True)
+class Doctor(Question[str]):
+    """Print versions, devices and folders, and what does not work with its mend."""
+
+    out: Path | str | None = option(None, kw_only=True, hidden=True)
+
+    def in_shell(self) -> None:
+        """Print the report."""
+        print(report(device.cache_folder()))
+
+
+doctor = call_of(Doctor)
 
 
 def report(cache: Path) -> str:
     """Versions, devices, folders and the state of rendering, one line each."""
     checks = [("cache", *_writable(cache)), *video.check()]
     environment = provenance.environment()
-    device = environment["device"]
+    found = environment["device"]
     rows = {
         "python": f"{environment['python']} on {environment['platform']}",
         **{name: version or "not installed" for name, version in environment["packages"].items()},
-        "device": f"{device['count']} x {device['kind']} ({device['platform']}), "
+        "device": f"{found['count']} x {found['kind']} ({found['platform']}), "
         f"{environment['processors']} processors",
         "commit": environment["commit"] or "not in a checkout",
         "cached in": str(cache),

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 _PATH_STEP = 10  # moments between two points of a path
 _ROOT = "/push"
+TARGET = f"{_ROOT}/target"  # the control by which a hand moves the target
 _SIDES = 48  # facets of what is round
 _CAMERA = ((-2.7, -4.6, 3.7), (0.25, 0.1, 0.0))  # [m] where it stands, and what it looks at
 _FIELD = 0.75  # [rad] of view, upright
@@ -41,7 +42,7 @@ def furnish(server: ViserServer) -> None:
         brand_color=(8, 84, 80),
     )
     server.gui.main_panel.dock_right()
-    server.gui.set_panel_label("Reactive Pushing Strategy")
+    server.gui.set_panel_label("Reactive Pushing Law")
     server.initial_camera.position, server.initial_camera.look_at = _CAMERA
     server.initial_camera.fov = _FIELD
     server.scene.add_grid(
@@ -71,7 +72,7 @@ class Drawing:
         world.add_frame(_ROOT, show_axes=False)
         self.held = False  # whether a hand holds the target
         self.target = world.add_transform_controls(
-            f"{_ROOT}/target",
+            TARGET,
             scale=0.45,
             active_axes=(True, True, False),
             disable_rotations=True,

@@ -5,12 +5,14 @@ Neither the trials' pasts nor the pictures are kept, so memory does not grow wit
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -18,22 +20,146 @@ import numpy as np
 from rps_jax import engines, errors
 from rps_jax.analysis import statistics, video
 from rps_jax.analysis.video import Shot, Tile
-from rps_jax.control import strategies
-from rps_jax.control.strategies import Strategy
+from rps_jax.control import registry
+from rps_jax.control.base import Law
 from rps_jax.errors import InputError
-from rps_jax.record import files
+from rps_jax.record import files, folder
+from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, scene_of, world_part
+from rps_jax.runs.push import another_engine, chosen
+from rps_jax.runs.question import Question, Run, call_of
+from rps_jax.studies.table import table_of
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.batch import Part, rows
-from rps_jax.trials.pushes import Case
+from rps_jax.trials.case import Case
+from rps_jax.trials.progress import Bar, Progress
 from rps_jax.trials.setting import Setting
 from rps_jax.world.scene import Scene
 
-WHICH = ("first", "hardest")
 _MOST = 12  # rows, and columns
 _WHOLE = (1920, 1080)  # [px] that the grid is fitted into
 _LENGTH = 40  # [s] of a film at the default speed, at most
 _HELD = 1.0  # [s] that the end is held
+
+
+@dataclass(frozen=True)
+class Film(Question[Path]):
+    """Film many trials of a run side by side: the targets of a table, or worlds of a sweep."""
+
+    run: str | Path = option("", positional=True)
+    """Run folder of `rps table` or `rps sweep`."""
+    grid: str | None = None
+    """Rows and columns of the film; by default 4x6, or with --laws a row for each and 3 columns."""
+    object: str = "box"
+    """Object to film, of a table."""
+    friction: str = "S1"
+    """Friction to film, of a table: S1, S2, or GROUND,ROBOT as there."""
+    law: str | None = None
+    """Which of the run's laws; by default the first."""
+    laws: tuple[str, ...] = ()
+    """Several of a sweep's laws, side by side: a row of the film for each, a column for each
+    world."""
+    which: Literal["first", "hardest"] = "first"
+    """Whether the first or the hardest worlds of a sweep are filmed."""
+    worlds: tuple[int, ...] = option((), 0)
+    """Indices of the worlds of a sweep that are filmed, instead of --which."""
+    seconds: float | None = option(None, above=0, at_most=1e5, unit="s")
+    """Simulated time that is filmed, at most [s]; by default until the last trial ends."""
+    speed: float | None = option(None, above=0, at_most=1e5)
+    """Simulated seconds in a second of the film; by default the film lasts less than a minute."""
+    camera: Literal["oblique", "above"] = "oblique"
+    """From where the film is seen."""
+    out: Path | str | None = option(None, kw_only=True)
+    """The MP4 to write; by default RUN/film.mp4."""
+
+    @property
+    def place(self) -> Path:
+        """The MP4."""
+        return Path(self.run) / "film.mp4"
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return shape_of(self.grid or (f"{len(self.laws)}x3" if self.laws else "4x6"))
+
+    def note(self) -> str:
+        """Whether another engine than the run's is filmed."""
+        sweep = "laws" in folder.manifest(Path(self.run)) and not self._of_table
+        return another_engine(Path(self.run)) if sweep else ""
+
+    @property
+    def _of_table(self) -> bool:
+        return folder.manifest(Path(self.run)).get("question") == "table"
+
+    def check(self) -> None:
+        """Check the grid, the file, and what is filmed."""
+        out = Path(self.out or self.place)
+        if out.is_dir():
+            raise InputError(f"out = {out} is a folder: name a file, as {out / 'film.mp4'}.")
+        _ = self.shape
+        self.takes()
+        folder.writable(out.parent)
+        for what in video.check():
+            if not what.ok:
+                raise InputError(what.mend)
+
+    def bar(self) -> Bar:
+        """A bar over simulated time."""
+        seconds = min(float(self.takes()[1].rules.horizon), self.seconds or math.inf)
+        return Bar(self.name, seconds, "simulated", shown=self.shown)
+
+    @contextlib.contextmanager
+    def opened(self) -> Iterator[None]:
+        """No run folder."""
+        yield None
+
+    def answer(self, run: Run) -> Path:
+        """Run the trials again and film them."""
+        takes, setting = self.takes()
+        seconds = min(float(setting.rules.horizon), self.seconds or math.inf)
+        out = Path(self.out or self.place)
+        try:
+            shoot(
+                takes,
+                setting,
+                out,
+                shape=self.shape,
+                speed=self.speed or default_speed(seconds),
+                seconds=seconds,
+                camera=self.camera,
+                report=lambda simulated: run.report(Progress(0, simulated)),
+            )
+        except video.VideoError as error:
+            raise InputError(str(error)) from error
+        return out
+
+    def takes(self) -> tuple[list[Take], Setting]:
+        """The trials to film, at most as many as the grid has places, and what they share."""
+        run, shape = Path(self.run), self.shape
+        if not self._of_table:
+            plan, law = chosen(run, 0, self.law)
+            if self.laws:
+                rows_of(plan, self.laws, shape)
+            which = worlds_of(plan, self.worlds) if self.worlds else self.which
+            return of_sweep(run, plan, self.laws or (law,), which, shape), plan.setting
+        table = table_of(run)
+        law = self.law or next(iter(table.chosen))
+        for field, name, known in (
+            ("object", self.object, table.objects),
+            ("friction", self.friction, table.friction),
+            ("law", law, table.chosen),
+        ):
+            errors.check_name(f"{field} of the run", name, list(map(str, known)))
+        cases = [
+            one
+            for one in table.cases
+            if (one.object, one.friction) == (self.object, self.friction)
+            and one.law is table.chosen[law]
+        ]
+        return of_cases(cases[: shape[0] * shape[1]], table.setting), table.setting
+
+
+film = call_of(Film)
 
 
 class Take(NamedTuple):
@@ -41,7 +167,7 @@ class Take(NamedTuple):
 
     places: Sequence[int]  # in the grid, counted row by row
     part: Part
-    strategy: Strategy
+    law: Law
     scenes: Sequence[Scene]
     labels: Sequence[str]
 
@@ -63,17 +189,17 @@ def shape_of(grid: str) -> tuple[int, int]:
 
 def of_cases(cases: Sequence[Case], setting: Setting) -> list[Take]:
     """The takes of cases of one kind, labelled by their targets."""
-    engines.get(setting.engine).check_followed()
+    engines.get(setting.engine).check()
     stage, worlds = pushes.build(cases, setting)
     part = Part(np.arange(len(cases)), worlds, stage)
     one = pushes.scene_of(cases[0], setting.physics)
-    labels = [f"({x:g}, {y:g}) m" for x, y in (case.p_world_target for case in cases)]
-    strategy = strategies.of(cases[0].params)
-    return [Take(range(len(cases)), part, strategy, [one] * len(cases), labels)]
+    labels = [f"({x:g}, {y:g}) m" for x, y in (case.target for case in cases)]
+    law = registry.law_of(cases[0].params)
+    return [Take(range(len(cases)), part, law, [one] * len(cases), labels)]
 
 
 def worlds_of(plan: Plan, worlds: Sequence[int]) -> Sequence[int]:
-    """The same indices, if the plan has these worlds; otherwise an InputError."""
+    """Return the indices if the plan has these worlds; otherwise raise InputError."""
     errors.check_each_once("worlds", worlds)
     for world in worlds:
         errors.check_count("worlds", world, at_least=0, at_most=plan.worlds - 1)
@@ -83,16 +209,16 @@ def worlds_of(plan: Plan, worlds: Sequence[int]) -> Sequence[int]:
 def of_sweep(
     run: Path,
     plan: Plan,
-    arms: Sequence[str],
+    laws: Sequence[str],
     which: str | Sequence[int],
     shape: tuple[int, int],
 ) -> list[Take]:
-    """The takes of worlds of a sweep: of one arm, or a row of the grid for each of several.
+    """The takes of worlds of a sweep: of one law, or a row of the grid for each of several.
 
     Args:
       run: its folder.
       plan: its plan.
-      arms: some of the plan's; several meet the same worlds, one a column.
+      laws: some of the plan's; several meet the same worlds, one a column.
       which: `first`, those of the least index; `hardest`, as the report of the sweep has them;
         or their indices.
       shape: rows and columns of the grid.
@@ -100,11 +226,11 @@ def of_sweep(
     Raises:
       InputError: an unknown choice, an engine that is not followed, or no results to choose by.
     """
-    engines.get(plan.setting.engine).check_followed()
-    count = shape[0] * shape[1] if len(arms) == 1 else shape[1]
+    engines.get(plan.setting.engine).check()
+    count = shape[0] * shape[1] if len(laws) == 1 else shape[1]
     if not isinstance(which, str):
         index = np.asarray(which[:count], int)
-    elif errors.check_name("which", which, WHICH) == "first":
+    elif which == "first":
         index = np.arange(min(count, plan.worlds))
     else:
         index = statistics.hardest(files.read_results(run), count)
@@ -112,16 +238,16 @@ def of_sweep(
             raise InputError("which = hardest is not allowed: no trial of this run failed.")
     of_object = plan.object_of(index)
     takes = []
-    for row, arm in enumerate(arms):
-        said = f"{arm}, " if len(arms) > 1 else ""
+    for row, law in enumerate(laws):
+        said = f"{law}, " if len(laws) > 1 else ""
         for one in np.unique(of_object):
             places = np.flatnonzero(of_object == one)
             worlds = index[places]
             takes.append(
                 Take(
                     [row * shape[1] + int(place) for place in places],
-                    world_part(plan, list(plan.arms).index(arm), worlds),
-                    strategies.of(plan.arms[arm]),
+                    world_part(plan, list(plan.laws).index(law), worlds),
+                    registry.law_of(plan.laws[law]),
                     [scene_of(plan, int(i)) for i in worlds],
                     [f"{said}world {i}" for i in worlds],
                 )
@@ -129,14 +255,14 @@ def of_sweep(
     return takes
 
 
-def rows_of(plan: Plan, arms: Sequence[str], shape: tuple[int, int]) -> None:
-    """Raises InputError unless the arms are the plan's, each once, and there is a row for each."""
-    errors.check_each_once("arms", arms)
-    for arm in arms:
-        errors.check_name("arm", arm, plan.arms)
-    if len(arms) != shape[0]:
+def rows_of(plan: Plan, laws: Sequence[str], shape: tuple[int, int]) -> None:
+    """Raises InputError unless the laws are the plan's, each once, and there is a row for each."""
+    errors.check_each_once("laws", laws)
+    for law in laws:
+        errors.check_name("law", law, plan.laws)
+    if len(laws) != shape[0]:
         raise InputError(
-            f"grid = {shape[0]}x{shape[1]} is not allowed with {len(arms)} arms: each has a row."
+            f"grid = {shape[0]}x{shape[1]} is not allowed with {len(laws)} laws: each has a row."
         )
 
 
@@ -224,14 +350,14 @@ def _frames(
 def _shots(take: Take, setting: Setting, every: int) -> Iterator[tuple[bool, list[Shot]]]:
     """Whether all of a take's trials have ended, and what they show, each `every` steps."""
     worlds = jax.device_put(take.part.worlds)
-    trials = trial.start_all(worlds, np.ones(len(take.labels), bool), strategy=take.strategy)
+    trials = trial.start_all(worlds, np.ones(len(take.labels), bool), law=take.law)
     advance = partial(
         trial.record,
         take.part.stage,
         worlds,
         physics=setting.physics,
         rules=setting.rules,
-        strategy=take.strategy,
+        law=take.law,
         steps=every,
         every=every,
     )

@@ -7,6 +7,7 @@ the thread of `Page.run`; what a browser asks for waits in a queue until that th
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import math
 import queue
@@ -15,13 +16,25 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rps_jax import errors
-from rps_jax.app.drawing import Drawing, furnish
-from rps_jax.control import strategies
+from rps_jax import engines, errors
+from rps_jax.app.drawing import TARGET, Drawing, furnish
+from rps_jax.app.gate import Gate, check_guarded, updates_of
+from rps_jax.control import registry
+from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
+from rps_jax.record.options import option
+from rps_jax.runs.plan import Plan, scene_of, title_of, world_part
+from rps_jax.runs.push import Push as PushQuestion
+from rps_jax.runs.push import another_engine, chosen
+from rps_jax.runs.question import call_of
+from rps_jax.trials import pushes
+from rps_jax.trials.case import Case, label_of
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.stepper import CHUNK, Live
 from rps_jax.world import objects
 from rps_jax.world.scene import Scene
@@ -32,6 +45,11 @@ if TYPE_CHECKING:
 _TICK = 0.04  # [s] between two pictures
 _WORDS = 0.25  # [s] between two looks at the panel, which browsers are slow to lay out
 _BUDGET = 0.15  # [s] of simulation before the page is looked after again
+_DRAGGING = (
+    "TransformControlsUpdateMessage",
+    "TransformControlsDragStartMessage",
+    "TransformControlsDragEndMessage",
+)
 _CONTACTS = ("no contact", "point contact", "line contact")
 
 
@@ -43,13 +61,104 @@ class Push(NamedTuple):
     title: str
 
 
+@dataclass(frozen=True)
+class View(PushQuestion):
+    """Push in the browser: watch, drag the target, shove the object, push again."""
+
+    law: LawLike | None = None
+    """The law: its name, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
+    policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json. With a run, one of its laws, by
+    default the first."""
+    setting: Setting = field(default=Setting(), kw_only=True)
+    run: str | Path | None = option(None, positional=True, kw_only=True)
+    """Run folder of a sweep, to begin with one of its worlds; by default the options' push."""
+    world: int = option(0, 0, positional=True, kw_only=True)
+    """Index of the world in the sweep."""
+    host: str = field(default="127.0.0.1", kw_only=True)
+    """Address to serve the page on; by default to this machine alone."""
+    port: int = option(8080, 0, 65535, kw_only=True)
+    """Port to serve the page on; 0 takes any that is free."""
+    out: Path | str | None = option(None, kw_only=True, hidden=True)
+    quick: bool = option(False, kw_only=True, hidden=True)
+    slots: int | None = option(None, kw_only=True, hidden=True)
+    workers: int | None = option(None, kw_only=True, hidden=True)
+
+    @property
+    def _own(self) -> LawLike:
+        """The law of the options' push."""
+        return self.law if self.law is not None and self.run is None else "rps"
+
+    @property
+    def case(self) -> Case:
+        """The options' push."""
+        return dataclasses.replace(self, law=self._own, run=None)._case()
+
+    def _case(self) -> Case:
+        return super().case
+
+    def note(self) -> str:
+        """Whether another engine than the run's is shown."""
+        return "" if self.run is None else another_engine(Path(self.run))
+
+    def check(self) -> None:
+        """Check the push, or the world."""
+        super().check()
+        engines.get(self.setting.engine).check_traced()
+        if self.run is not None:
+            chosen(Path(self.run), self.world, self._label)
+
+    @property
+    def _label(self) -> str | None:
+        return None if self.law is None else str(self.law)
+
+    def in_shell(self) -> None:
+        """Serve the page until it is ended."""
+        law = self._own if isinstance(self._own, str) else "rps"
+        friction = self.friction if isinstance(self.friction, str) else label_of(self.friction)
+        asked = Asked(self.object, friction, law, self.target)
+        first = partial(self.push_of, asked)
+        if self.run is not None:
+            first = partial(_in_world, *chosen(Path(self.run), self.world, self._label), self.world)
+        page = open_page(self.host, self.port, asked, self.push_of)
+        print(f"page: {page.url} (Ctrl-C ends it)", flush=True)
+        try:
+            page.begin(first)
+            page.run()
+        except KeyboardInterrupt:
+            print("page closed.")
+        finally:
+            page.close()
+
+    def push_of(self, asked: Asked) -> Push:
+        """The push that the page asks for."""
+        given = {name: getattr(asked, name) for name in Asked._fields}
+        case = dataclasses.replace(self.case, **given)
+        title = (
+            f"{case.object_name.replace('_', ' ')}, friction ground {case.contact.ground:g}, robot "
+            f"{case.contact.robot:g}, {asked.law}"
+        )
+        scene = pushes.scene_of(case, self.setting.physics)
+        return Push(Live.of_case(case, self.setting), scene, title)
+
+
+view = call_of(View)
+
+
 class Asked(NamedTuple):
     """A push as the page asks for it."""
 
     object: str
     friction: str  # as on the command line
-    strategy: str
-    p_world_target: tuple[float, float]  # [m]
+    law: str  # as on the command line
+    target: tuple[float, float]  # [m]
+
+
+def _in_world(plan: Plan, law: str, index: int) -> Push:
+    """A world of a sweep."""
+    part = world_part(plan, list(plan.laws).index(law), [index])
+    live = Live(part, registry.law_of(plan.laws[law]), plan.setting)
+    title = title_of(plan, index).replace("$\\mu$", "friction")
+    return Push(live, scene_of(plan, index), f"{title}, {law}")
 
 
 # --- the page ------------------------------------------------------------------------------
@@ -58,11 +167,14 @@ class Asked(NamedTuple):
 class Page:
     """The panel, the clock and what the browser asks for."""
 
-    def __init__(self, server: ViserServer, asked: Asked, make: Callable[[Asked], Push]) -> None:
+    def __init__(
+        self, server: ViserServer, gate: Gate, asked: Asked, make: Callable[[Asked], Push]
+    ) -> None:
         """A page without a push.
 
         Args:
           server: of viser, new.
+          gate: what guards it; the page says which messages it lets through.
           asked: what the panel proposes at first.
           make: the push that is asked for; called in a thread of its own, it may raise InputError.
         """
@@ -78,7 +190,16 @@ class Page:
         self._playing, self._error = True, ""
         self._words_due = 0.0  # [s] when the panel is next brought up to date
         furnish(server)
-        self._build(asked)
+        inputs = {control._impl.uuid: control for control in self._build(asked)}
+        gate.admit(
+            {
+                "ViewerCameraMessage": lambda message: True,
+                "GuiUpdateMessage": lambda message: (
+                    message.uuid in inputs and updates_of(inputs[message.uuid], message.updates)
+                ),
+                **dict.fromkeys(_DRAGGING, lambda message: message.name == TARGET),
+            }
+        )
 
     @property
     def url(self) -> str:
@@ -89,7 +210,7 @@ class Page:
     def asked(self) -> Asked:
         """What the panel proposes now."""
         x, y = map(float, self._target.value)
-        return Asked(self._object.value, self._friction.value, self._strategy.value, (x, y))
+        return Asked(self._object.value, self._friction.value, self._law.value, (x, y))
 
     def begin(self, make: Callable[[], Push]) -> None:
         """Have another push made, and show it as soon as it is there."""
@@ -218,8 +339,8 @@ class Page:
 
         register(note)
 
-    def _build(self, asked: Asked) -> None:
-        """The panel."""
+    def _build(self, asked: Asked) -> tuple[Any, ...]:
+        """The panel; returns its controls."""
         gui = self._server.gui
         self._status = gui.add_markdown("")
         with gui.add_folder("Time"):
@@ -239,15 +360,19 @@ class Page:
             self._friction = gui.add_text(
                 "friction", asked.friction, hint="S1, S2 or ground,robot (as 0.25,0.4)"
             )
-            self._strategy = gui.add_dropdown(
-                "strategy", tuple(strategies.PARAMS), initial_value=asked.strategy
+            self._law = gui.add_dropdown(
+                "law",
+                tuple(dict.fromkeys((*registry.LAWS, asked.law))),
+                initial_value=asked.law,
             )
-            self._target = gui.add_vector2("target [m]", asked.p_world_target, step=0.1)
+            self._target = gui.add_vector2("target [m]", asked.target, step=0.1)
             self._again = gui.add_button("Push", color=(13, 148, 141))
         self._when(self._play.on_click, self._toggle)
         self._when(self._time.on_update, self._seek)
         self._when(shove.on_click, self._shove)
         self._when(self._again.on_click, self._ask)
+        shown = self._play, self._time, self._speed, self._size, self._way, shove, self._again
+        return *shown, self._object, self._friction, self._law, self._target
 
     def _toggle(self, event: Any) -> None:
         """Play or pause; at its end a push is played again."""
@@ -320,14 +445,21 @@ def open_page(host: str, port: int, asked: Asked, make: Callable[[Asked], Push])
     try:
         import viser
     except ImportError as error:
-        raise InputError("viser is not installed: run pip install '.[viz]'.") from error
+        raise InputError("viser is not installed: run pip install 'rps_jax[viz]'.") from error
     try:
         with socket.create_server((host, port)):  # viser would quietly take another port
             pass
-    except OSError as error:
-        reason = (error.strerror or str(error)).partition(" (")[0]
+    except (OSError, ValueError) as error:  # ValueError: a name that no encoding knows
+        reason = (getattr(error, "strerror", None) or str(error)).partition(" (")[0]
         raise InputError(
             f"host = {host}, port = {port} cannot be served on ({reason}): choose another port."
         ) from error
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints a panel
-        return Page(viser.ViserServer(host, port, verbose=False), asked, make)
+    gate = Gate(host)
+    with contextlib.redirect_stdout(io.StringIO()), gate.guarding():  # it prints a panel
+        server = viser.ViserServer(host, port, verbose=False)
+    try:
+        check_guarded(gate, host, server.get_port())
+    except BaseException:
+        server.stop()
+        raise
+    return Page(server, gate, asked, make)

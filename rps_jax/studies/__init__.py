@@ -1,5 +1,4 @@
-"""Questions with an answer: each file is one study, resumable, with its table.
+"""Questions that users ask of their own laws: each file is one, with its report and its figures.
 
-`study` runs the paper's trials under any conditions. The scripts in `sweeps/` and `rps paper` call
-these files, and a new study is one more of them.
+What this project asks of itself stands in folders of `sweeps`, outside the package.
 """

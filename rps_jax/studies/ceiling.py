@@ -16,167 +16,153 @@ the world can be won, and no number of rounds proves that it cannot.
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
 from rps_jax import errors
-from rps_jax.analysis import statistics
+from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.report import Section
-from rps_jax.control import strategies
-from rps_jax.control.guided import KNOTS, GuidedParams
-from rps_jax.control.law import RPSParams
-from rps_jax.engines import EngineName
+from rps_jax.control import registry
+from rps_jax.control.laws.guided import KNOTS, GuidedParams
+from rps_jax.control.laws.rps import RPSParams
 from rps_jax.record import files
-from rps_jax.record import folder as run_folder
 from rps_jax.record.checkpoint import Parts
-from rps_jax.robot.robot import Robot
-from rps_jax.runs.evaluate import Split, seed_of
-from rps_jax.runs.plan import Plan, draw
-from rps_jax.trials import batch
+from rps_jax.record.options import option
+from rps_jax.runs.plan import Plan, draw, load_plan
+from rps_jax.runs.question import InDomain, Run, call_of, count_of, seed_of
+from rps_jax.trials import batch, score
 from rps_jax.trials.batch import Job, Part
-from rps_jax.trials.setting import InTurn, Report, Setting, unheard
-from rps_jax.trials.trial import Outcome, Rules
+from rps_jax.trials.progress import InTurn, Report
+from rps_jax.trials.trial import Outcome
 from rps_jax.trials.worlds import drawn_worlds
-from rps_jax.world.domain import Domain, named
-from rps_jax.world.physics import Fidelity, PhysicsName, preset
 
 
 @dataclass(frozen=True)
-class Search:
-    """How plans are searched."""
+class Ceiling(InDomain[xr.Dataset]):
+    """Tell how many worlds can be won: a planner that knows them tries.
 
-    samples: int = 64
-    """Trials of a world in each round: the best plan, M2's, and perturbations of the best."""
-    rounds: int = 12
-    """Rounds, after which a world counts as not solved."""
-    window: float = 30.0
-    """Time that is perturbed at once [s]."""
-    spread: float = 0.6
-    """Standard deviation of a perturbation, in units of v_max, v_max and omega_max [1]."""
-    temperature: float = 0.2
-    """lambda of M1, in units of the standard deviation of the costs [1]."""
-    hold: float = 5.0
-    """Time between two knots of a plan [s]."""
-
-    def __post_init__(self) -> None:
-        """Raises InputError for a number that means nothing."""
-        errors.check_count("samples", self.samples, at_least=3, at_most=100_000)
-        errors.check_count("rounds", self.rounds, at_most=10_000)
-        errors.check_finite("window", self.window, above=0, unit="s")
-        errors.check_finite("spread", self.spread, above=0, at_most=10)
-        errors.check_finite("temperature", self.temperature, above=0)
-        errors.check_finite("hold", self.hold, above=0, unit="s")
-
-
-def ceiling(
-    domain: Domain | str = "wide",
-    worlds: int | Sequence[int] = 64,
-    seed: int = 0,
-    search: Search = Search(),
-    split: Split = "test",
-    engine: EngineName = "fused",
-    out: str | Path | None = None,
-    *,
-    physics: PhysicsName = "default",
-    fidelity: Fidelity = "standard",
-    rules: Rules = Rules(),
-    robot: Robot | str | None = None,
-    slots: int | None = None,
-    workers: int | None = None,
-    report: Report = unheard,
-) -> xr.Dataset:
-    """Which worlds a planner wins that knows them.
-
-    Args:
-      domain: ranges of what differs between worlds, or their name in `DOMAINS`.
-      worlds: how many, of indices 0, 1, ..., or their indices.
-      seed: of the worlds.
-      search: how plans are searched.
-      split: what the worlds are for, as in `evaluate`.
-      engine: what steps them, and with what the planner looks ahead.
-      out: run folder, in which a run that was killed is continued; None keeps all in memory.
-      physics: how friction is modelled.
-      fidelity: how finely the physics is solved.
-      rules: when a trial ends.
-      robot: by its name in `ROBOTS`, or a JSON file's; None: the domain's.
-      slots: worlds stepped at once by a worker; by default as suits engine and device.
-      workers: host threads; by default as suits engine and device.
-      report: called after every segment of the run.
-
-    Returns:
-      By world: `solved` [1], `alone` [1] (by the law without a plan), `time` [s] of the best plan,
-      `rounds` and `trials` that were spent, and the best plan, `offsets` (world, knot, axis) [1].
-
-    Raises:
-      InputError: an argument is not allowed, or `out` holds another run.
+    Worlds are those of a domain, kept for testing, or of a run. The answer holds, by world,
+    `solved` [1], `alone` [1] (by the law without a plan), `time` [s] of the best plan, `rounds` and
+    `trials` that were spent, and the best plan, `offsets` (world, knot, axis) [1].
 
     Example:
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
-      >>> short = rps_jax.Search(samples=4, rounds=1)
-      >>> found = rps_jax.ceiling(drums, 2, search=short, rules=rules)
+      >>> small = {"sample": 2, "samples": 4, "rounds": 1}
+      >>> found = rps_jax.ceiling(drums, **small, setting=rps_jax.Setting(rules=rules))
       >>> found.trials.values.tolist()
       [4, 4]
     """
-    setting = Setting(preset(physics, fidelity), rules, seed_of(seed, split), engine)
-    numbers = np.arange(worlds) if isinstance(worlds, int) else np.asarray(worlds, int)
-    plan = planned(named(domain, robot), numbers, setting)
-    shape = {"slots": slots, "workers": workers, "report": report}
-    return complete(None if out is None else Path(out), plan, numbers, search, **shape)
+
+    TITLE: ClassVar[str] = "Ceiling"
+    SMALL: ClassVar[Mapping[str, Any]] = {"sample": 2, "most": 2, "samples": 12, "rounds": 3}
+
+    run: str | Path | None = option(None, positional=True)
+    """Run folder of a sweep or a ladder, whose domain, worlds and setting are taken."""
+    sample: int = option(300, 0, 10_000_000)
+    """Number of worlds that are tried whoever won them: the first ones."""
+    lost_by: tuple[str, ...] = ("rps_tuned",)
+    """Laws of the run; worlds that they all lose are tried, too."""
+    most: int | None = option(None, 0, 10_000_000)
+    """Number of lost worlds that are tried: the first of them; by default all."""
+    samples: int = option(64, 3, 100_000)
+    """Number of trials of a world in each round: the best plan, M2's, and perturbations of the
+    best."""
+    rounds: int = option(12, 1, 10_000)
+    """Number of rounds, after which a world counts as not solved."""
+    window: float = option(30.0, above=0, unit="s")
+    """Time that is perturbed at once [s]."""
+    spread: float = option(0.6, above=0, at_most=10)
+    """Standard deviation of a perturbation, in units of v_max, v_max and omega_max [1]."""
+    temperature: float = option(0.2, above=0)
+    """lambda of M1, in units of the standard deviation of the costs [1]."""
+    hold: float = option(5.0, above=0, unit="s")
+    """Time between two knots of a plan [s]."""
+
+    @property
+    def place(self) -> Path:
+        """A folder in that of the run, if there is one."""
+        return super().place if self.run is None else Path(self.run) / "ceiling"
+
+    @functools.cached_property
+    def results(self) -> xr.Dataset | None:
+        """Outcomes (law, world) of the run."""
+        return None if self.run is None else files.read_results(Path(self.run))
+
+    @functools.cached_property
+    def numbers(self) -> np.ndarray:
+        """Indices of the worlds that are tried."""
+        if self.results is None:
+            return np.arange(self.sample)
+        lost = lost_worlds(self.results, self.lost_by)
+        first = np.arange(min(self.sample, self.results.sizes["world"]))
+        return np.union1d(lost[: self.most], first).astype(int)
+
+    @functools.cached_property
+    def plan(self) -> Plan:
+        """A plan that holds the worlds."""
+        law = {"guided": GuidedParams()}
+        count = int(self.numbers.max(initial=0)) + 1
+        if self.run is None:
+            seeded = replace(self.setting, seed=seed_of(self.setting.seed, "test"))
+            return Plan(self.ranges, count, law, seeded)
+        theirs = load_plan(Path(self.run))
+        return Plan(theirs.domain, count, law, theirs.setting, points=theirs.points)
+
+    def check(self) -> None:
+        """Check that there are worlds, and that the engine can step them here."""
+        if not self.numbers.size:
+            raise errors.InputError(
+                f"sample = {self.sample} is not allowed: no world would be tried."
+            )
+        replace(self, domain=self.plan.domain, setting=self.plan.setting, run=None).check_engine()
+
+    def trials(self) -> int | None:
+        """How many trials there are, at most."""
+        return self.numbers.size * self.samples * self.rounds
+
+    def configuration(self) -> dict[str, Any]:
+        """All that the answer depends on, as JSON."""
+        own = {name: getattr(self, name) for name in _SEARCH}
+        return {"ceiling": self.plan.configuration(), "worlds": self.numbers.tolist()} | own
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Search plans, round by round."""
+        return _rounds(run.parts, self.plan, self.numbers, self, **run.shape)
+
+    def intro(self, found: xr.Dataset) -> str:
+        """What was asked."""
+        where = "the domain, kept for testing" if self.run is None else str(self.run)
+        return f"{found.sizes['world']} worlds of {where}, {int(found.trials.sum()):,} trials."
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """How many were won, and by whom else."""
+        text = _sampled_told(found)
+        if self.results is None:
+            return [Section("A planner that knows the world", text)]
+        lost = " and ".join(self.lost_by)
+        text = f"In the worlds that {lost} lose, and in the first {self.sample}. {text}"
+        table = won_table(found, self.results, self.lost_by)
+        return [Section("A planner that knows the world", text, table)]
 
 
-def planned(domain: Domain, numbers: np.ndarray, setting: Setting) -> Plan:
-    """A plan that holds these worlds of a domain, checked for this machine.
+_SEARCH = ("samples", "rounds", "window", "spread", "temperature", "hold")  # fields of the search
 
-    Raises:
-      InputError: there is none, one is negative, or the machine cannot step them.
-    """
-    if not numbers.size or numbers.min() < 0 or np.unique(numbers).size < numbers.size:
-        raise errors.InputError(
-            f"worlds = {numbers.tolist()[:5]} are not allowed: give indices from 0, each once, at "
-            "least one."
-        )
-    plan = Plan(domain, int(numbers.max()) + 1, {"guided": GuidedParams()}, setting)
-    plan.check_here()
-    return plan
-
-
-def complete(
-    folder: Path | None,
-    plan: Plan,
-    numbers: np.ndarray,
-    search: Search,
-    *,
-    report: Report = unheard,
-    **shape: Any,
-) -> xr.Dataset:
-    """Run what a folder lacks of a search in worlds of a plan, round by round; all of it.
-
-    Raises:
-      InputError: the folder cannot be written, is in use, or holds another run.
-    """
-    if folder is None:
-        return _rounds(None, plan, numbers, search, report=report, **shape)
-    settings = {"search": dataclasses.asdict(search), "worlds": numbers.tolist()}
-    run_folder.claim(folder, {"ceiling": plan.configuration()} | settings)
-    with run_folder.hold(folder):
-        found = _rounds(Parts(folder), plan, numbers, search, report=report, **shape)
-        files.write_results(folder / "ceiling.nc", found)
-    return found
+ceiling = call_of(Ceiling)
 
 
 def _rounds(
     parts: Parts | None,
     plan: Plan,
     numbers: np.ndarray,
-    search: Search,
+    search: Ceiling,
     *,
     report: Report,
     **shape: Any,
@@ -195,7 +181,10 @@ def _rounds(
                 parts.put(f"round-{r:04d}", files.encoded(state))
         else:
             assert parts is not None
-            state = files.decoded(content, parts.folder)
+            source = parts.folder / f"round-{r:04d}"
+            state = files.check_like(
+                files.decoded(content, source, own=True), _start(numbers), source
+            )
         heard.ended(open_.size * search.samples)
     return state
 
@@ -222,7 +211,7 @@ def _start(numbers: np.ndarray) -> xr.Dataset:
 
 
 def _round(
-    state: xr.Dataset, plan: Plan, search: Search, r: int, report: Report, **shape: Any
+    state: xr.Dataset, plan: Plan, search: Ceiling, r: int, report: Report, **shape: Any
 ) -> xr.Dataset:
     """The state after one more round in the worlds that are not solved."""
     open_ = np.flatnonzero(state.solved.values == 0)
@@ -232,7 +221,7 @@ def _round(
     tried = best[:, None] + noise  # (W, K, J, 3)
     tried[:, 1] = state["mean"].values[open_]
     outcome = _tried(plan, numbers, tried, search, report, state.sizes["world"], **shape)
-    cost = costs(outcome, plan.setting.rules).reshape(open_.size, search.samples)
+    cost = score.plan_costs(outcome, plan.setting.rules).reshape(open_.size, search.samples)
     weights = _weights(cost, search.temperature)
     own = np.arange(search.samples) != 1  # M2's plan is no perturbation of the best
     moved: Any = np.einsum("wk,wkji->wji", weights * own, noise)
@@ -255,7 +244,7 @@ def _round(
 
 
 def perturbations(
-    search: Search, seed: int, worlds: np.ndarray, r: int, until: np.ndarray
+    search: Ceiling, seed: int, worlds: np.ndarray, r: int, until: np.ndarray
 ) -> np.ndarray:
     """The perturbations (W, K, J, 3) [1] of round r; those of samples 0 and 1 are zero.
 
@@ -273,23 +262,6 @@ def perturbations(
     return found
 
 
-def costs(outcome: Outcome, rules: Rules) -> np.ndarray:
-    """S (n,) [1] of trials: below 1 the time of a success, in horizons; above, how far it failed.
-
-    A failure costs 1, the least distance of the contact point to the target [m], 5 m if nothing
-    was touched, a tenth of the distance that is left between base and object [m], and if the object
-    fell over as much of the horizon as it fell early.
-    """
-    near = np.asarray(outcome.min_distance, float)
-    time = np.asarray(outcome.time, float) / float(rules.horizon)
-    apart = np.asarray(outcome.object_pose, float)[:, :2] - np.asarray(outcome.base_pose)[:, :2]
-    apart = np.minimum(np.nan_to_num(np.linalg.norm(apart, axis=1), nan=5.0), 5.0)
-    ended = np.asarray(outcome.tipped) | np.asarray(outcome.diverged)
-    missed = np.where(np.isfinite(near), np.minimum(near, 5.0), 5.0)
-    failed = 1 + missed + 0.1 * apart + ended * (1 - time)
-    return np.where(np.asarray(outcome.success), np.minimum(time, 1.0), failed)
-
-
 def _weights(cost: np.ndarray, temperature: float) -> np.ndarray:
     """M1 (W, K) [1]; equal if all costs are."""
     lambda_ = temperature * cost.std(axis=1, keepdims=True)
@@ -300,7 +272,7 @@ def _tried(
     plan: Plan,
     numbers: np.ndarray,
     offsets: np.ndarray,
-    search: Search,
+    search: Ceiling,
     report: Report,
     most: int,
     **shape: Any,
@@ -311,21 +283,12 @@ def _tried(
     """
     samples = offsets.shape[1]
     flat = offsets.reshape(-1, *offsets.shape[2:]).astype(jnp.zeros(()).dtype)
-    found: dict[str, np.ndarray] = {}
-
-    def collect(which: np.ndarray, outcome: Outcome) -> None:
-        for name, leaf in outcome._asdict().items():
-            if name not in found:
-                found[name] = np.empty((len(flat), *leaf.shape[1:]), leaf.dtype)
-            found[name][which] = leaf
-
-    guided = strategies.STRATEGIES[GuidedParams]
+    guided = registry.law_of(GuidedParams())
     jobs = [
         Job(guided, most * samples, parts)
         for parts in _parts(plan, numbers, flat, samples, search.hold)
     ]
-    batch.run(jobs, plan.setting, collect=collect, report=report, **shape)
-    return Outcome(**found)  # pyright: ignore[reportArgumentType]
+    return batch.gathered(jobs, plan.setting, len(flat), report=report, **shape)[0]
 
 
 def _parts(
@@ -345,32 +308,26 @@ def _parts(
         yield [Part(trials, worlds._replace(params=params), part.stage)]
 
 
-# --- the report of a ladder ------------------------------------------------------------------
+# --- beside a sweep or a ladder ------------------------------------------------------------
 
 
-def chosen(
-    results: xr.Dataset, lost_by: Sequence[str], sample: int, most: int | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Worlds of a sweep (arm, world): the first `sample`, and those that some arms all lose.
-
-    Of the latter the first `most`, or all; they are returned alone, too.
+def lost_worlds(results: xr.Dataset, lost_by: Sequence[str]) -> np.ndarray:
+    """Worlds of a sweep (law, world) that some laws all lose.
 
     Raises:
-      InputError: an arm is unknown.
+      InputError: a law is unknown.
     """
-    arms = results.arm.values.tolist()
+    laws = results.law.values.tolist()
     for name in lost_by:
-        errors.check_name("law", name, arms)
-    lost = (results.success.sel(arm=list(lost_by)).values == 0).all(axis=0)
-    found = np.flatnonzero(lost)[:most]
-    return np.union1d(found, np.arange(min(sample, lost.size))).astype(int), found
+        errors.check_name("law of the run", name, laws)
+    return np.flatnonzero((results.success.sel(law=list(lost_by)).values == 0).all(axis=0))
 
 
-def sections(found: xr.Dataset, results: xr.Dataset, lost_by: Sequence[str]) -> list[Section]:
-    """What a report says of a search in worlds of a sweep (arm, world)."""
+def won_table(found: xr.Dataset, results: xr.Dataset, lost_by: Sequence[str]) -> list[list[str]]:
+    """Header and a row for each object: who wins the worlds of a sweep that some laws lose."""
     solved = dict(zip(found.world.values.tolist(), found.solved.values.tolist(), strict=True))
-    lost = (results.success.sel(arm=list(lost_by)).values == 0).all(axis=0)
-    lost &= np.isin(np.arange(lost.size), found.world.values)  # those that were tried
+    lost = np.zeros(results.sizes["world"], bool)
+    lost[np.intersect1d(lost_worlds(results, lost_by), found.world.values)] = True
     table = [["object", "worlds lost", "won by the planner", "by another law alone", "by nobody"]]
     any_law = (results.success.values > 0).any(axis=0)
     kinds = statistics.worlds_by_object(results) | {"all": np.ones_like(lost)}
@@ -380,29 +337,16 @@ def sections(found: xr.Dataset, results: xr.Dataset, lost_by: Sequence[str]) -> 
         nobody = ~won & ~any_law[rows]
         counts = rows.size, won.sum(), (any_law[rows] & ~won).sum(), nobody.sum()
         table.append([name, *(f"{int(n):,}" for n in counts)])
-    sampled = _sampled(found)
-    wins = int(found.solved.values[sampled].sum())
-    low, high = statistics.wilson(wins, sampled.size) if sampled.size else (0.0, 1.0)
-    text = (
-        f"MPPI around the tuned law, which knows each world, in the worlds that "
-        f"{' and '.join(lost_by)} lose, and in the first {sampled.size} worlds, of which it wins "
-        f"{wins} ({100 * wins / max(1, sampled.size):.1f} % [{100 * low:.1f}, {100 * high:.1f}]). "
-        "What it wins can be won; what it loses may be."
-    )
-    return [Section("Ceiling: a planner that knows the world", text, table)]
+    return table
 
 
-def _sampled(found: xr.Dataset) -> np.ndarray:
-    """Rows of the worlds 0, 1, ... that follow one another."""
+def _sampled_told(found: xr.Dataset) -> str:
+    """How many of the first worlds were won, in sentences."""
     worlds = found.world.values
-    return np.flatnonzero(worlds == np.arange(worlds.size))
-
-
-def told(found: xr.Dataset) -> Mapping[str, float]:
-    """A search in numbers, for a line on the screen."""
-    return {
-        "worlds": found.sizes["world"],
-        "solved": int(found.solved.sum()),
-        "by the law alone": int(found.alone.sum()),
-        "trials": int(found.trials.sum()),
-    }
+    sampled = np.flatnonzero(worlds == np.arange(worlds.size))  # those that follow one another
+    wins, alone = (count_of(found[name].values[sampled] > 0) for name in ("solved", "alone"))
+    return (
+        f"MPPI around the tuned law, which knows each world, wins {wins} of the first "
+        f"{sampled.size} worlds ({tables.share(wins, sampled.size)}); {alone} of them are won by "
+        "the law without a plan. What the planner wins can be won; what it loses may be."
+    )

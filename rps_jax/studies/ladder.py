@@ -1,186 +1,155 @@
-"""A ladder of laws: every law of the package in the same worlds, by what it is told.
+"""A ladder of laws: every law of the package in the same worlds, by what it senses.
 
-A rung is a law with its parameters: its authors' own, or tuned here. On the first rungs a law is
-told only where its skin is touched, on the next also with which force, then where the object is.
+On the first rungs a law senses only where its skin is touched, on the next also with which force,
+then where the object is.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any, ClassVar, get_args
 
 import xarray as xr
 
-from rps_jax import errors
-from rps_jax.analysis import figures, tables
-from rps_jax.analysis.report import Section
-from rps_jax.control import strategies
-from rps_jax.control.law import RPSParams
-from rps_jax.control.learned import policy
-from rps_jax.control.rivals.aps import APSParams
-from rps_jax.control.rivals.dipole import DipoleParams
-from rps_jax.control.rivals.force_push import ForcePushParams
-from rps_jax.control.rivals.force_push_published import PublishedForcePushParams
-from rps_jax.control.rivals.pursuit import PursuitParams
-from rps_jax.control.rps_plus import RPSPlusParams
-from rps_jax.control.strategies import Params
-from rps_jax.engines import EngineName
-from rps_jax.record import files
-from rps_jax.robot.robot import Robot
-from rps_jax.runs import sweep
-from rps_jax.runs.evaluate import seed_of
+from rps_jax.analysis import statistics, tables
+from rps_jax.analysis.figures.style import Figure
+from rps_jax.analysis.report import Picture, Section
+from rps_jax.control import registry
+from rps_jax.control.base import Params, Senses
+from rps_jax.control.registry import LawsLike
 from rps_jax.runs.plan import Plan
-from rps_jax.trials.setting import Report, Setting, unheard
-from rps_jax.trials.trial import Rules
-from rps_jax.world.domain import Domain, named
-from rps_jax.world.physics import Fidelity, PhysicsName, preset
+from rps_jax.runs.question import Run, call_of, seed_of
+from rps_jax.runs.sweep import Sweep
 
-REFERENCE = "rps tuned"  # what the others are compared with
-RUNGS: dict[str, Params] = {
-    "nps": RPSParams.nps(),
-    "rps paper": RPSParams.paper(),
-    REFERENCE: RPSParams.tuned(),
-    "rps_plus": RPSPlusParams(),
-    "pursuit": PursuitParams(),
-    "force_push": ForcePushParams(),
-    "force_push_published": PublishedForcePushParams(),
-    "aps": APSParams(),
-    "dipole": DipoleParams(),
-} | {name: strategies.PARAMS[name] for name in policy.SHIPPED}
+REFERENCE = "rps_tuned"  # what the others are compared with
 
 
-def rungs(names: Sequence[str] = tuple(RUNGS)) -> dict[str, Params]:
-    """Laws by their names in `RUNGS`, or of a file: `my_law.py:MyParams` or `policy.npz`.
-
-    A law with other values is `pursuit=FILE`, where the file holds JSON, as `rps tune es` writes
-    it, of what differs from that rung; it is called by the file's name without its ending.
-
-    Raises:
-      InputError: none is asked for, one twice, or one that is unknown or cannot be read.
-    """
-    errors.check_each_once("laws", names)
-    found: dict[str, Params] = {}
-    for name in names:
-        own, params = _rung(name)
-        if own in found:
-            raise errors.InputError(f"laws = {' '.join(names)} are not allowed: two are {own}.")
-        found[own] = params
-    return found
+def every_law() -> tuple[str, ...]:
+    """Names of all laws that are known, by what they sense."""
+    order = get_args(Senses)
+    known = registry.LAWS
+    return tuple(sorted(known, key=lambda name: order.index(_senses(registry.LAWS[name]))))
 
 
-def _rung(text: str) -> tuple[str, Params]:
-    """The name and the parameters of one of them."""
-    if ".py:" in text or text.endswith(".npz"):
-        return strategies.named(text)
-    name, other, file = text.partition("=")
-    params = RUNGS[errors.check_name("law", name, RUNGS)]
-    if not other:
-        return name, params
-    return Path(file).stem, strategies.with_values(params, files.read_json(Path(file)), file)
+def _senses(params: Params) -> Senses:
+    return registry.law_of(params).senses
 
 
-def senses(laws: Mapping[str, Params]) -> dict[str, str]:
-    """What each law is told."""
-    return {name: strategies.of(params).senses for name, params in laws.items()}
+@dataclass(frozen=True)
+class Ladder(Sweep):
+    """Push with every law of the package in the same worlds, and compare by what each law senses.
 
-
-def ladder(
-    domain: Domain | str = "wide",
-    worlds: int = 1000,
-    seed: int = 0,
-    laws: Sequence[str] | Mapping[str, Params] = tuple(RUNGS),
-    engine: EngineName = "fused",
-    out: str | Path | None = None,
-    *,
-    physics: PhysicsName = "default",
-    fidelity: Fidelity = "standard",
-    rules: Rules = Rules(),
-    robot: Robot | str | None = None,
-    part: int = 1024,
-    slots: int | None = None,
-    workers: int | None = None,
-    report: Report = unheard,
-) -> xr.Dataset:
-    """Every law in the same random worlds.
-
-    Args:
-      domain: ranges of what differs between worlds, or their name in `DOMAINS`.
-      worlds: how many, of indices 0, 1, ...
-      seed: whose worlds for testing are taken, which no tuner has seen.
-      laws: names of `RUNGS`, or laws of files, as `rungs` reads them; or parameters by names of
-        one's own.
-      engine: what steps them.
-      out: run folder, in which a run that was killed is continued; None keeps all in memory.
-      physics: how friction is modelled.
-      fidelity: how finely the physics is solved.
-      rules: when a trial ends.
-      robot: by its name in `ROBOTS`, or a JSON file's; None: the domain's.
-      part: trials of a part at most, which is what a run that is killed loses.
-      slots: worlds stepped at once by a worker; by default as suits engine and device.
-      workers: host threads; by default as suits engine and device.
-      report: called after every segment of the run.
-
-    Returns:
-      Outcomes (law, world); what was drawn (world), and `senses` (law), as coordinates.
-
-    Raises:
-      InputError: an argument is not allowed, or `out` holds another run.
+    The worlds are kept for testing: no tuner has seen them. The answer holds outcomes (law, world),
+    and as coordinates what was drawn (world) and `senses` (law).
 
     Example:
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
-      >>> found = rps_jax.ladder(drums, 4, laws=("rps paper", "pursuit"), rules=rules)
+      >>> setting = rps_jax.Setting("quasistatic", rules=rules)
+      >>> found = rps_jax.ladder(("rps", "pursuit"), drums, worlds=4, setting=setting)
       >>> dict(found.success.sizes), found.senses.values.tolist()
       ({'law': 2, 'world': 4}, ['touch', 'touch'])
     """
-    arms = dict(laws) if isinstance(laws, Mapping) else rungs(laws)
-    setting = Setting(preset(physics, fidelity), rules, seed_of(seed, "test"), engine)
-    plan = Plan(named(domain, robot), worlds, arms, setting, part)
-    plan.check_here()
-    shape = {"slots": slots, "workers": workers, "report": report}
-    results = sweep.whole(plan, None if out is None else Path(out), **shape)
-    return by_law(results, arms)
+
+    TITLE: ClassVar[str] = "Laws in the same worlds"
+    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 64, "domain": "wide,objects=random_box"}
+
+    laws: LawsLike = ()
+    """The laws, by default every law of the package: names, as rps, rps_tuned or rps_plus, or a
+    file's, as my_law.py:MyParams or policy.npz; changes follow each, as rps,K_h=0.3 or
+    rps,tuned.json."""
+
+    @cached_property
+    def chosen(self) -> dict[str, Params]:
+        """Parameters of the laws, by label."""
+        asked = self.laws
+        return registry.laws_of(every_law() if isinstance(asked, tuple) and not asked else asked)
+
+    @cached_property
+    def plan(self) -> Plan:
+        """What is run: in the worlds for testing."""
+        plan = super().plan
+        seed = seed_of(self.setting.seed, "test")
+        return dataclasses.replace(plan, setting=dataclasses.replace(plan.setting, seed=seed))
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Push with every law."""
+        found = super().answer(run)
+        if "row" in found.dims:  # but a share of it
+            return found
+        senses = [_senses(self.chosen[str(law)]) for law in found.law.values]
+        return found.assign_coords(senses=("law", senses, {"long_name": "what the law senses"}))
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """What information is worth, beside what a sweep reports."""
+        usual = super().report(found, run)
+        return usual if "row" in found.dims else [*usual[:1], *_rungs(found), *usual[1:]]
 
 
-def by_law(results: xr.Dataset, laws: Mapping[str, Params]) -> xr.Dataset:
-    """The results of a sweep with a dimension `law`, and what each is told."""
-    told = senses(laws)
-    named_ = results.rename(arm="law")
-    return named_.assign_coords(senses=("law", [told[str(law)] for law in named_.law.values]))
+ladder = call_of(Ladder)
 
 
-def sections(folder: Path, plan: Plan, results: xr.Dataset) -> list[Section]:
-    """What the report of a ladder says beyond that of a sweep, with its figure in the folder."""
-    told = senses(plan.arms)
-    picture = figures.ladder(results, told, folder / "ladder.png")
+def _rungs(found: xr.Dataset) -> list[Section]:
+    """Success by what the laws sense, and against the reference."""
     text = (
-        "Laws by what they are told: `touch` is where the skin is touched, `taxels` also what each "
+        "Laws by what they sense: `touch` is where the skin is touched, `taxels` also what each "
         "taxel answers, `force` also the contact's force, and `pose` also where the object is and "
         "how large."
     )
-    found = [Section("Information against success", text, (), picture)]
-    if REFERENCE in plan.arms and len(plan.arms) > 1:
-        found.append(
-            Section(
-                f"Against {REFERENCE}, world by world",
-                _shared(results, told),
-                tables.against_table(results, REFERENCE),
-            )
-        )
-    return found
+    picture = Picture("ladder", partial(figure_of, found))
+    sections = [Section("Information against success", text, (), picture)]
+    if REFERENCE in found.law and found.sizes["law"] > 1:
+        title = f"Against {REFERENCE}, world by world"
+        rows = tables.against_table(found, REFERENCE)
+        sections.append(Section(title, _shared(found), rows))
+    return sections
 
 
-def _shared(results: xr.Dataset, told: Mapping[str, str]) -> str:
-    """How many of the failures of the reference any law of each kind wins, in a sentence."""
-    failed = results.success.sel(arm=REFERENCE).values == 0
+def _shared(found: xr.Dataset) -> str:
+    """How many failures of the reference any law of each kind wins, in a sentence."""
+    failed = found.success.sel(law=REFERENCE).values == 0
+    senses = dict(zip(map(str, found.law.values), map(str, found.senses.values), strict=True))
     parts = []
-    for kind in dict.fromkeys(told.values()):
-        others = [name for name in told if told[name] == kind and name != REFERENCE]
+    for kind in dict.fromkeys(senses.values()):
+        others = [name for name in senses if senses[name] == kind and name != REFERENCE]
         if others:
-            won = (results.success.sel(arm=others).values > 0).any(axis=0)
-            parts.append(
-                f"{int((won & failed).sum())} are won by some other law that is told {kind}"
-            )
-    won = (results.success.values > 0).any(axis=0)
+            won = (found.success.sel(law=others).values > 0).any(axis=0)
+            count = int((won & failed).sum())
+            parts.append(f"{count} are won by some other law that senses {kind}")
+    won = (found.success.values > 0).any(axis=0)
     parts.append(f"{int((~won).sum())} by none")
-    return f"Of the {int(failed.sum())} worlds that {REFERENCE} loses, {', '.join(parts)}."
+    worlds = f"{failed.sum()} worlds" if failed.sum() != 1 else "one world"
+    return f"Of the {worlds} that {REFERENCE} loses, {', '.join(parts)}."
+
+
+def figure_of(found: xr.Dataset) -> Figure:
+    """Draw the success of each law, grouped by what it senses, with Wilson's 95 % intervals."""
+    senses = dict(zip(map(str, found.law.values), map(str, found.senses.values), strict=True))
+    kinds = [kind for kind in get_args(Senses) if kind in senses.values()]
+    colours = {kind: f"C{i}" for i, kind in enumerate(get_args(Senses))}
+    rates = {law: float(found.success.sel(law=law).mean()) for law in senses}
+    order = sorted(rates, key=lambda law: (-kinds.index(senses[law]), rates[law]))
+    figure = Figure(figsize=(7, 1.2 + 0.34 * len(order)), layout="constrained")
+    ax = figure.subplots()
+    for at, law in enumerate(order):
+        won = found.success.sel(law=law).values > 0
+        low, high = statistics.wilson(int(won.sum()), won.size)
+        ax.plot([100 * low, 100 * high], [at, at], color=colours[senses[law]], lw=3, alpha=0.4)
+        ax.plot(100 * rates[law], at, "o", color=colours[senses[law]])
+        ax.annotate(
+            tables.percent(int(won.sum()), won.size), (100 * rates[law], at), (0, 6), fontsize=8,
+            textcoords="offset points", ha="center",
+        )  # fmt: skip
+    for kind in kinds:
+        ax.plot([], [], "o", color=colours[kind], label=f"senses {kind}")
+    ax.set_yticks(range(len(order)), order)
+    ax.set_ylim(-0.6, len(order) - 0.3)
+    ax.set_xlim(-3, 103)
+    ax.set_xlabel("success [%]")
+    ax.set_title(f"{found.sizes['world']:,} equal worlds for every law", fontsize=10)
+    ax.grid(axis="x", alpha=0.3)
+    ax.legend(fontsize=8, loc="best")
+    return figure

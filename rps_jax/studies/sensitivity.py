@@ -1,179 +1,418 @@
-"""What the law's parameters trade: each one alone, and success against time and the way driven."""
+"""Which quantity is to blame? Sobol indices of first and total order (SALib).
+
+The first-order index of a quantity is the share of the outcome's variance that it explains alone,
+the total index the share that goes when it alone is no longer varied, with all its interactions.
+Noise and the corners of prisms are one factor each: what they explain together. An outcome that is
+chaotic in a quantity has a large total index of it and a small first one.
+
+The blocks of Saltelli's design are worlds at points of the unit cube, and their trials a sweep.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations
+from pathlib import Path
+from typing import Any, ClassVar
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from matplotlib.axis import Axis
 
-from rps_jax.control.law import RPSParams
-from rps_jax.runs import evaluate
-from rps_jax.runs.evaluate import Ask, Split
-from rps_jax.trials.setting import Report, unheard
-from rps_jax.trials.trial import Outcome
-from rps_jax.tuning.run import Course
-from rps_jax.tuning.space import SUBSETS, Space
+from rps_jax import errors
+from rps_jax.analysis import statistics
+from rps_jax.analysis.figures.style import Figure
+from rps_jax.analysis.report import Picture, Section
+from rps_jax.errors import InputError
+from rps_jax.record import files
+from rps_jax.record.options import option
+from rps_jax.runs import sweep as sweeps
+from rps_jax.runs.plan import Plan
+from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, count_of, name_of, seed_of
+from rps_jax.studies.probe import need
+from rps_jax.trials.progress import Report
+from rps_jax.world import points
+from rps_jax.world.domain import WORDS, Domain
 
-_EDGE = 0.03  # how near to a parameter's bounds it is varied, as a share of the range
-
-
-class Aims(NamedTuple):
-    """What is wanted of parameters, (P,) each; worlds are those of all domains."""
-
-    success: np.ndarray  # [1] share
-    time: np.ndarray  # [s] median over the successes; NaN without any
-    path: np.ndarray  # [m] of the base, likewise
-
-
-def aims(outcome: Outcome) -> Aims:
-    """The aims of candidates by their outcomes (P, W)."""
-    won = np.asarray(outcome.success) > 0
-    with np.errstate(all="ignore"):
-        medians = [
-            np.array(
-                [np.median(x[w]) if w.any() else np.nan for x, w in zip(rows, won, strict=True)]
-            )
-            for rows in np.asarray((outcome.time, outcome.path_length), float)
-        ]
-    return Aims(won.mean(axis=1), *medians)
-
-
-def _try(
-    params: Any, course: Course, splits: Sequence[Split], seed: int, count: int, **run: Any
-) -> list[Outcome]:
-    """The outcomes (P, D * W) of candidates in the worlds of each split."""
-    asks = [Ask(params, evaluate.seed_of(seed, split), np.arange(count)) for split in splits]
-    answers, _ = evaluate.try_out(asks, course.domains, course.setting, course.objective, **run)
-    return [answer.outcome for answer in answers]
+OUTPUTS = {
+    "success": "success",
+    "time": "time until the trial's end",
+    "left": "least distance to the target",
+}
+# Kinds of quantities that are one factor each, and its name: "noise" is a quantity, of the skin.
+_TOGETHER = {"shape": "shape", "noise": "key"}
+_WORDS = {
+    "shape": "corners of prisms",
+    "key": "key of all noise",
+    "com_bearing": "bearing of the centre of mass",
+}
+_ENOUGH = 30  # base points at which a trial fails, for indices that mean something
+_RESAMPLES = 1000
+_NOTHING = 0.05  # [1] a total index that is not worth a word
 
 
-# --- one parameter at a time ---------------------------------------------------------------
+@dataclass(frozen=True)
+class Design:
+    """The worlds of Saltelli's design in a domain."""
+
+    domain: Domain
+    base: int  # number N of base points, a power of 2; there are N (factors + 2) worlds
+    factors: tuple[str, ...]
+    groups: tuple[str, ...]  # (q,) the factor of each quantity
+    seed: int = 0
+
+    @property
+    def worlds(self) -> int:
+        """How many worlds there are."""
+        return self.base * (len(self.factors) + 2)
+
+    def problem(self) -> dict[str, Any]:
+        """Describe the problem as SALib does."""
+        names = list(points.names(self.domain))
+        bounds = [[0.0, 1.0]] * len(names)
+        return {
+            "num_vars": len(names), "names": names, "bounds": bounds, "groups": list(self.groups)
+        }  # fmt: skip
+
+    def u(self) -> np.ndarray:
+        """The points (worlds, q), block by block of one base point."""
+        sample = need("SALib.sample.sobol", "SALib").sample
+        values = sample(self.problem(), self.base, calc_second_order=False, seed=self.seed)
+        return np.clip(values, 0, np.nextafter(1, 0))
 
 
-def lines(base: RPSParams, names: Sequence[str], count: int) -> RPSParams:
-    """Each parameter varied between its bounds, the others as in `base`: leaves (names, count)."""
-    u = jax.scipy.special.logit(jnp.linspace(_EDGE, 1 - _EDGE, count))
-    every = [Space((name,), base).params(u[:, None]) for name in names]
-    return jax.tree.map(lambda *x: jnp.stack(x), *every)
+def design(domain: Domain, worlds: int, seed: int = 0, apart: bool = False) -> Design:
+    """The greatest design of at most so many worlds.
 
+    Args:
+      domain: ranges of what differs between worlds.
+      worlds: at most.
+      seed: of the scrambling, of points of its own.
+      apart: whether each number of the noise and of a prism's corners is a factor of its own.
 
-def sensitivity(
-    sets: dict[str, RPSParams],
-    course: Course,
-    *,
-    names: Sequence[str] = SUBSETS["full"],
-    count: int = 9,
-    worlds: int = 1000,
-    seed: int = 0,
-    report: Report = unheard,
-    **shape: Any,
-) -> xr.Dataset:
-    """Success, time and way against each parameter alone, in worlds for validation.
-
-    Returns labelled results (set, parameter, step), with the parameter's `value` at each step.
+    Raises:
+      InputError: so few worlds have no design.
     """
-    shape_of = (len(sets), len(names), count)
-    grid = jax.tree.map(
-        lambda *x: jnp.stack(x), *(lines(one, names, count) for one in sets.values())
-    )
-    params = jax.tree.map(lambda leaf: leaf.reshape(-1), grid)
-    (found,) = _try(params, course, ("validate",), seed, worlds, report=report, **shape)
-    dims = ("set", "parameter", "step")
-    columns: dict[str, Any] = {
-        name: (dims, values.reshape(shape_of)) for name, values in aims(found)._asdict().items()
-    }
-    varied = [np.asarray(getattr(grid, name))[:, i] for i, name in enumerate(names)]
-    columns["value"] = (dims, np.stack(varied, axis=1))
-    return xr.Dataset(
-        columns,
-        {"set": list(sets), "parameter": list(names)},
-        {"worlds": found.success.shape[1]},
-    )
-
-
-# --- several aims at once ------------------------------------------------------------------
-
-
-def cloud(
-    sets: Sequence[RPSParams], names: Sequence[str], count: int, spread: float, seed: int
-) -> RPSParams:
-    """Candidates (len(sets) + count,): the sets, and others on the lines between them, and beside.
-
-    Each of these lies evenly somewhere between two of the sets, plus a normal step of standard
-    deviation `spread` in the coordinates of the bounded map. What is not among `names`, such as
-    switches, it has from the nearer of the two.
-    """
-    space = Space(tuple(names))
-    corners = jnp.stack([space.vector(params) for params in sets])
-    keys = jax.random.split(jax.random.key(seed), 4)
-    one, other = (jax.random.randint(key, (count,), 0, len(sets)) for key in keys[:2])
-    share = jax.random.uniform(keys[2], (count, 1))
-    middle = corners[one] + share * (corners[other] - corners[one])
-    steps = spread * jax.random.normal(keys[3], middle.shape, middle.dtype)
-    varied = space.params(jnp.concatenate([corners, middle + steps]))
-    nearer = jnp.where(share[:, 0] < 0.5, one, other)
-    whose = jnp.concatenate([jnp.arange(len(sets)), nearer])
-    taken = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x, float) for x in leaves]), *sets)
-    own = {name: getattr(taken, name)[whose] for name in taken._fields if name not in names}
-    return varied._replace(**own)
-
-
-def undominated(found: Aims) -> np.ndarray:
-    """Which candidates, a mask (P,), no other one beats in one aim without losing in another."""
-    costs = np.stack([-found.success, found.time, found.path], axis=1)
-    known = np.isfinite(costs).all(axis=1)
-    costs = np.where(np.isfinite(costs), costs, np.inf)
-    no_worse = (costs[:, None] <= costs[None]).all(axis=2)
-    better = (costs[:, None] < costs[None]).any(axis=2)
-    return np.asarray(known & ~(no_worse & better).any(axis=0))
-
-
-def front(
-    sets: dict[str, RPSParams],
-    course: Course,
-    *,
-    names: Sequence[str] = SUBSETS["full"],
-    candidates: int = 256,
-    spread: float = 0.5,
-    worlds: int = 1000,
-    seed: int = 0,
-    report: Report = unheard,
-    **shape: Any,
-) -> xr.Dataset:
-    """Candidates between and around sets of parameters, and which of them are undominated.
-
-    Who is on the front is decided in worlds for validation; its aims, (candidate,), are then
-    measured in worlds for testing, so that luck in the choice does not count.
-    """
-    params = cloud(list(sets.values()), names, candidates, spread, seed)
-    found, again = _try(params, course, ("validate", "test"), seed, worlds, report=report, **shape)
-    chosen = undominated(aims(found))
-    labels = [*sets, *(f"{i}" for i in range(candidates))]
-    columns: dict[str, Any] = {k: ("candidate", v) for k, v in aims(again)._asdict().items()}
-    columns["front"] = ("candidate", chosen)
-    columns |= {name: ("candidate", np.asarray(getattr(params, name))) for name in names}
-    return xr.Dataset(columns, {"candidate": labels}, {"worlds": again.success.shape[1]})
-
-
-def front_table(results: xr.Dataset) -> list[list[str]]:
-    """Header and a row for each candidate of the front and each set of parameters, by success."""
-    rows = [["", "success", "median time", "median way", "on the front"]]
-    labels = [str(label) for label in results.candidate.values]
-    named = np.array([not label.isdigit() for label in labels])
-    keep = np.flatnonzero(results.front.values | named)
-    for i in keep[np.argsort(-results.success.values[keep], kind="stable")]:
-        one = results.isel(candidate=int(i))
-        rows.append(
-            [
-                labels[i],
-                f"{100 * float(one.success):.1f} %",
-                f"{float(one.time):.1f} s",
-                f"{float(one.path):.2f} m",
-                "yes" if bool(one.front) else "no",
-            ]
+    every = points.quantities(domain)
+    groups = tuple(one.name if apart else _TOGETHER.get(one.kind, one.name) for one in every)
+    factors = tuple(dict.fromkeys(groups))
+    errors.check_count("worlds", worlds, at_most=100_000_000)
+    least = 4 * (len(factors) + 2)
+    if worlds < least:
+        raise InputError(
+            f"worlds = {worlds} is not allowed: {len(factors)} quantities need at least {least}."
         )
+    base = 2 ** int(np.log2(worlds / (len(factors) + 2)))
+    return Design(domain, base, factors, groups, seed_of(seed, "tune"))
+
+
+@dataclass(frozen=True)
+class Sensitivity(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
+    """Share the blame for failures among all quantities that are drawn, by Sobol indices.
+
+    The answer holds `first`, `total` and the half widths `first_reach`, `total_reach` of their
+    intervals of 95 % (output, factor), and outcomes (world) with the points `u` (world, quantity).
+
+    Example:
+      >>> import rps_jax
+      >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=1.0)
+      >>> setting = rps_jax.Setting("quasistatic", rules=rules)
+      >>> found = rps_jax.sensitivity("rps", drums, 128, setting=setting)
+      >>> found.total.dims
+      ('output', 'factor')
+    """
+
+    TITLE: ClassVar[str] = "Sensitivity of success"
+    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 256}
+
+    worlds: int = option(1024, 1, 100_000_000)
+    """Number of worlds, at most: a power of two for each quantity and two more."""
+    apart: bool = False
+    """Whether each number of the noise and of a prism's corners is a quantity of its own."""
+
+    @functools.cached_property
+    def design(self) -> Design:
+        """The worlds of Saltelli's design."""
+        return design(self.ranges, self.worlds, self.setting.seed, self.apart)
+
+    @functools.cached_property
+    def plan(self) -> Plan:
+        """The sweep of the design."""
+        at = points.checked(self.ranges, self.design.u())
+        return Plan(self.ranges, self.design.worlds, {"law": self.params}, self.setting, points=at)
+
+    def check(self) -> None:
+        """Check that there are worlds enough, the engine and SALib."""
+        self.check_engine([self.params])
+        _ = self.plan
+
+    def trials(self) -> int | None:
+        """How many trials there are."""
+        return self.plan.trials
+
+    def configuration(self) -> dict[str, Any]:
+        """All that the results depend on, as JSON."""
+        return self.plan.configuration()
+
+    def answered(self, report: Report) -> xr.Dataset:
+        """Run the worlds that are missing, and analyse them."""
+        out = None if self.out is None else Path(self.out)
+        results = sweeps.whole(
+            self.plan, out, slots=self.slots, workers=self.workers, report=report
+        )
+        found = analysed(self.design, results)
+        if out is not None:
+            files.write_results(out / "sobol.nc", found)
+        return found
+
+    def intro(self, found: xr.Dataset) -> str:
+        """What was asked."""
+        each = f"{self.design.base} for each of {len(self.design.factors)} quantities and two more"
+        return (
+            f"{self.label} in the domain {name_of(self.domain)}: {self.design.worlds:,} worlds, "
+            f"{each}; {count_of(found.success.values == 0)} fail."
+        )
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """Indices, whether mass costs anything, and pairs of quantities."""
+        order = ranked(found)
+        said_ = {one: in_words(one) for one in order}
+        drawn = [one for one in order if one in found.quantity.values][:5]
+        failed = found.success.values == 0
+        title = f"{self.label}, {name_of(self.domain)}: failures over pairs, {failed.size:,} worlds"
+        kinds = [one.removeprefix("random_") for one in self.ranges.objects]
+        pairs = partial(
+            interactions,
+            found.u.sel(quantity=drawn).values,
+            failed,
+            [said_[one] for one in drawn],
+            {in_words("object"): kinds},
+            title,
+        )
+        text = (
+            "The first index is the share of the variance that a quantity explains alone, the "
+            "total one what goes with it and all its interactions; noise and the corners of "
+            f"prisms are one quantity each. Intervals are bootstrapped, of 95 %. {reliable(found)}"
+        )
+        indices = Picture("sobol", partial(indices_figure, found, said_, OUTPUTS))
+        maps = Picture("interactions", pairs)
+        return [
+            Section("Which quantity is to blame", text, table(found), indices),
+            Section("Does mass cost anything", said(found)),
+            Section("Interactions of the first five", "", (), maps),
+        ]
+
+
+sensitivity = call_of(Sensitivity)
+
+
+def analysed(blocks: Design, results: xr.Dataset) -> xr.Dataset:
+    """Indices of a design whose sweep is done."""
+    analyze = need("SALib.analyze.sobol", "SALib").analyze
+    one = results.sel(law="law")
+    values = {
+        "success": one.success.values.astype(float),
+        "time": one.time.values.astype(float),
+        "left": statistics.left_over(one),
+    }
+    shape = (len(OUTPUTS), len(blocks.factors))
+    columns = {name: np.zeros(shape) for name in ("first", "first_reach", "total", "total_reach")}
+    for i, name in enumerate(OUTPUTS):
+        if np.ptp(values[name]) == 0:
+            continue  # nothing varies, and nothing explains it
+        told = analyze(
+            blocks.problem(), values[name], calc_second_order=False, seed=blocks.seed + 1,
+            num_resamples=200,
+        )  # fmt: skip
+        for column, key in (("first", "S1"), ("total", "ST")):
+            columns[column][i] = told[key]
+            columns[f"{column}_reach"][i] = told[f"{key}_conf"]
+    found: dict[str, Any] = {name: (("output", "factor"), v) for name, v in columns.items()}
+    found["u"] = (("world", "quantity"), blocks.u())
+    found |= {name: ("world", v) for name, v in values.items()}
+    coordinates = {
+        "output": list(OUTPUTS),
+        "factor": list(blocks.factors),
+        "quantity": list(points.names(blocks.domain)),
+    }
+    return xr.Dataset(found, coordinates, {"base": blocks.base})
+
+
+def ranked(found: xr.Dataset, output: str = "success") -> list[str]:
+    """The factors, by their total index for an output, the greatest first."""
+    total = found.total.sel(output=output)
+    return [str(name) for name in total.factor.values[np.argsort(-total.values, kind="stable")]]
+
+
+def table(found: xr.Dataset) -> list[list[str]]:
+    """Header and a row for each factor, by the total index of success."""
+    header = ["", *(f"{what}: {order}" for what in OUTPUTS for order in ("first", "total"))]
+    rows = [header]
+    for name in ranked(found):
+        cells = []
+        for what in OUTPUTS:
+            one = found.sel(output=what, factor=name)
+            cells += [f"{one.first:.2f} ± {one.first_reach:.2f}"]
+            cells += [f"{one.total:.2f} ± {one.total_reach:.2f}"]
+        rows.append([in_words(name), *cells])
     return rows
+
+
+def in_words(name: str) -> str:
+    """What a factor is."""
+    return WORDS.get(name) or _WORDS.get(name, name.replace("_", " "))
+
+
+def failing(found: xr.Dataset) -> int:
+    """At how many base points the trial of either of the two base samples fails."""
+    blocks = found.success.values.reshape(found.attrs["base"], -1)[:, [0, -1]]
+    return int((blocks == 0).any(axis=1).sum())
+
+
+def reliable(found: xr.Dataset) -> str:
+    """Whether there are failures enough, in a sentence."""
+    told = f"Trials fail at {failing(found)} of {found.attrs['base']} base points"
+    if failing(found) < _ENOUGH:
+        return f"{told}, too few for indices of success to mean anything: run more worlds."
+    return f"{told}."
+
+
+def cost(found: xr.Dataset, name: str) -> tuple[float, float, float]:
+    """Success in the upper third of a quantity's range less that in its lower third, with 95 %.
+
+    The interval resamples base points, since the worlds of one differ in one factor only.
+    """
+    at = found.u.sel(quantity=name).values
+    won = found.success.values
+    high, low = at >= 2 / 3, at < 1 / 3
+    blocks = np.arange(won.size) // (won.size // found.attrs["base"])
+    sums = np.stack(
+        [np.bincount(blocks, w, found.attrs["base"]) for w in (high * won, high, low * won, low)]
+    )
+    rng = np.random.default_rng(0)
+    drawn = rng.integers(0, sums.shape[1], (_RESAMPLES, sums.shape[1]))
+    a, b, c, d = sums[:, drawn].sum(axis=2)
+    spread = a / np.maximum(b, 1) - c / np.maximum(d, 1)
+    a, b, c, d = sums.sum(axis=1)
+    ends = np.quantile(spread, [0.025, 0.975])
+    return float(a / max(b, 1) - c / max(d, 1)), float(ends[0]), float(ends[1])
+
+
+def said(found: xr.Dataset, name: str = "mass") -> str:
+    """Whether a quantity costs success, in a sentence."""
+    if name not in found.factor.values:
+        return f"The domain draws no {name}."
+    difference, low, high = (100 * value for value in cost(found, name))
+    one = found.sel(output="success", factor=name)
+    numbers = (
+        f"between the lower and the upper third of its range success changes by {difference:+.1f} "
+        f"points [{low:+.1f}, {high:+.1f}], and its total index is {one.total:.2f} ± "
+        f"{one.total_reach:.2f}"
+    )
+    if high < 0:
+        return f"More {name} costs success: {numbers}."
+    if low > 0:
+        return f"More {name} helps: {numbers}."
+    if float(one.total - one.total_reach) > _NOTHING and failing(found) >= _ENOUGH:
+        return f"On average {name} costs nothing, but together with others it matters: {numbers}."
+    return f"No cost of {name} is seen in {found.sizes['world']:,} worlds: {numbers}."
+
+
+# --- figures -------------------------------------------------------------------------------
+
+_BINS = 4  # of each range of a map of interactions
+
+
+def indices_figure(
+    found: xr.Dataset, order: Mapping[str, str], outputs: Mapping[str, str]
+) -> Figure:
+    """Indices of first and total order with their intervals, the greatest on top.
+
+    Args:
+      found: what `sensitivity` returned.
+      order: factors in words, by name, the greatest first.
+      outputs: what is explained, in words.
+    """
+    order = dict(list(order.items())[::-1])
+    figure = Figure(figsize=(11, 1.4 + 0.24 * len(order)), layout="constrained")
+    axes = figure.subplots(1, len(outputs), sharey=True)
+    place = np.arange(len(order))
+    for ax, (output, said) in zip(axes, outputs.items(), strict=True):
+        one = found.sel(output=output, factor=list(order))
+        for which, shift, colour in (("total", 0.15, "C3"), ("first", -0.15, "C0")):
+            ax.errorbar(
+                one[which], place + shift, xerr=one[f"{which}_reach"], fmt="o", ms=4,
+                capsize=2, lw=1.2, color=colour, label=f"{which} order",
+            )  # fmt: skip
+        ax.axvline(0, color="0.6", lw=0.8)
+        ax.set_xlim(-0.35, 1.35)  # what reaches beyond is not known at all
+        ax.set_title(f"variance of {said}", fontsize=10)
+        ax.set_xlabel("share of the variance [1]")
+        ax.grid(axis="x", alpha=0.3)
+    axes[0].set_yticks(place, list(order.values()), fontsize=8)
+    axes[-1].legend(fontsize=8, loc="lower right")
+    figure.suptitle(f"Sobol indices with intervals of 95 %, {found.sizes['world']:,} worlds")
+    return figure
+
+
+def interactions(
+    u: np.ndarray,
+    failed: np.ndarray,
+    names: Sequence[str],
+    choices: Mapping[str, Sequence[str]],
+    title: str,
+) -> Figure:
+    """Failures over each pair of quantities, their ranges in equal parts.
+
+    Args:
+      u: (n, k) coordinates of worlds in the unit cube.
+      failed: (n,) 0 or 1.
+      names: (k,) of the quantities, in words.
+      choices: what is chosen from, of those that are no ranges, by their names in words.
+      title: of the figure.
+    """
+    count = len(names)
+    figure = Figure(figsize=(1.5 + 2 * (count - 1), 1.6 + 1.8 * (count - 1)), layout="constrained")
+    axes = figure.subplots(count - 1, count - 1, squeeze=False)
+    bins = [len(choices[name]) if name in choices else _BINS for name in names]
+    at = np.minimum((u * bins).astype(int), np.asarray(bins) - 1)
+    rates, image = {}, None
+    for i, j in combinations(range(count), 2):
+        cell, shape = at[:, j] * bins[i] + at[:, i], (bins[j], bins[i])
+        of = np.bincount(cell, minlength=bins[i] * bins[j])
+        bad = np.bincount(cell, failed, minlength=bins[i] * bins[j])
+        rates[i, j] = (100 * bad / np.maximum(of, 1)).reshape(shape)
+    most = max(float(rate.max()) for rate in rates.values()) or 1.0
+    for row in range(count - 1):
+        for column in range(count - 1):
+            ax = axes[row, column]
+            if column > row:
+                ax.axis("off")
+                continue
+            rate = rates[column, row + 1]
+            image = ax.imshow(
+                rate, origin="lower", vmin=0, vmax=most, cmap="magma_r", aspect="auto"
+            )
+            for (y, x), value in np.ndenumerate(rate):
+                ink = "white" if value > 0.55 * most else "black"
+                ax.text(x, y, f"{value:.0f}", ha="center", va="center", fontsize=7, color=ink)
+            across, up = names[column], names[row + 1]
+            below, left = row == count - 2, column == 0
+            _mark(ax.xaxis, choices.get(across, ()) if below else ())
+            _mark(ax.yaxis, choices.get(up, ()) if left else ())
+            if below:
+                ax.set_xlabel(across.replace(" of the ", "\nof the "), fontsize=8)
+            if left:
+                ax.set_ylabel(up.replace(" of the ", "\nof the "), fontsize=8)
+    if image is not None:
+        figure.colorbar(image, ax=axes, label="failures [%]", shrink=0.6)
+    figure.suptitle(f"{title}\neach range from its low (left, below) to its high end", fontsize=10)
+    return figure
+
+
+def _mark(axis: Axis, choices: Sequence[str]) -> None:
+    """The choices at their cells; no marks of a range."""
+    axis.set_ticks(range(len(choices)), choices, fontsize=7)

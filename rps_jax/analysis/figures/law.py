@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
-from rps_jax.analysis.figures.style import SHADES, save, shade
-from rps_jax.control import law
-from rps_jax.control.law import Details, Observation, RPSParams, RPSState, Twist
+from rps_jax.analysis.figures.style import SHADES, Figure, shade
+from rps_jax.control.laws import rps
+from rps_jax.control.laws.rps import RPSParams, RPSState
+from rps_jax.control.observation import Details, Observation, Twist
 from rps_jax.robot import shell
 
 
-def profile(params: RPSParams, path: Path) -> Path:
+def profile(params: RPSParams) -> Figure:
     """The logistic profile of Eq. 5 (in the paper's Fig. 3): a_r over the contact location."""
     l = jnp.linspace(-shell.HALF_WIDTH, shell.HALF_WIDTH, 401)  # noqa: E741
     far = jnp.asarray(2 * params.d_th)
-    a_r = jax.vmap(lambda l: law.adaptive_rate(params, l, far))(l)  # noqa: E741
+    a_r = jax.vmap(lambda l: rps.adaptive_rate(params, l, far))(l)  # noqa: E741
     figure = Figure(figsize=(5.5, 3.2), layout="constrained")
     ax = figure.subplots()
     ax.plot(l, a_r, color="C0")
@@ -32,7 +31,7 @@ def profile(params: RPSParams, path: Path) -> Path:
         ax.axvline(side * float(params.beta), color="0.6", lw=0.7, ls="--")
     ax.set(xlabel="contact location $l$ [m]", ylabel="adaptive rate $a_r$ [1]")
     ax.set_title("Eq. 5; dashed: $\\pm\\beta$; shaded: critical region", fontsize=9)
-    return save(figure, path)
+    return figure
 
 
 def _in_front(l: Any, error: Any, distance: Any) -> Observation:  # noqa: E741
@@ -41,18 +40,17 @@ def _in_front(l: Any, error: Any, distance: Any) -> Observation:  # noqa: E741
     contact = jnp.stack([jnp.full_like(place, shell.HALF_LENGTH), place], axis=-1)
     way = distance * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
     touched = jnp.ones(place.shape, bool)
-    return Observation(
-        jnp.zeros_like(contact), jnp.zeros_like(place), contact, touched, contact + way
-    )
+    still, period = jnp.zeros_like(place), jnp.full(place.shape, 0.02)
+    return Observation(jnp.zeros_like(contact), still, contact, touched, contact + way, period)
 
 
 @jax.jit
 def _twists(params: RPSParams, state: RPSState, seen: Observation) -> Twist:
     """The law's twists (n,), of one state, at observations (n, ...)."""
-    return jax.vmap(lambda one: law.step(params, state, one)[1])(seen)
+    return jax.vmap(lambda one: rps.step(params, state, one)[1])(seen)
 
 
-def twist_field(sets: Mapping[str, RPSParams], distance: float, path: Path) -> Path:
+def twist_field(sets: Mapping[str, RPSParams], distance: float) -> Figure:
     """The twist over contact location and heading error, a column for each set of parameters.
 
     Arrows are (v_x, v_y), forward upwards; the colour is omega. Above from outside the Realignment
@@ -94,10 +92,10 @@ def twist_field(sets: Mapping[str, RPSParams], distance: float, path: Path) -> P
         ax.set_ylabel("heading error [deg]")
     assert image is not None
     figure.colorbar(image, ax=axes, shrink=0.7).set_label(r"$\omega$ [rad/s]")
-    return save(figure, path)
+    return figure
 
 
-def hysteresis(sets: Mapping[str, RPSParams], ripple: float, path: Path) -> Path:
+def hysteresis(sets: Mapping[str, RPSParams], ripple: float) -> Figure:
     """A contact that wanders out to the edge and back, a column for each set of parameters.
 
     Above, over time, with a ripple [m] on its way; blue: Realignment State. Below, without one,
@@ -124,7 +122,7 @@ def hysteresis(sets: Mapping[str, RPSParams], ripple: float, path: Path) -> Path
     axes[0, 0].set_ylabel("$l$ [m]")
     axes[1, 0].set_ylabel("adaptive rate $a_r$ [1]")
     axes[1, 0].legend(fontsize=8)
-    return save(figure, path)
+    return figure
 
 
 @jax.jit
@@ -132,7 +130,7 @@ def _swept(params: RPSParams, l: jax.Array) -> Details:  # noqa: E741
     """The law, one step after the other, far from a target straight ahead: details (n,)."""
 
     def one(state: RPSState, seen: Observation) -> tuple[RPSState, Details]:
-        state, _, details = law.step_with_details(params, state, seen)
+        state, _, details = rps.step_with_details(params, state, seen)
         return state, details
 
     seen = _in_front(l, jnp.zeros_like(l), 2 * jnp.asarray(params.d_th))

@@ -2,76 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib import patches
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from rps_jax.analysis.figures.style import SHADES, File, base_patch, save, shade, words
+from rps_jax.analysis.figures.style import SHADES, Figure, base_patch, shade, words
 from rps_jax.robot import skin
 
 
-def min_distance(results: xr.Dataset, path: Path) -> Path:
-    """Fig. 5: least distance of contact to target, over the targets, mean of the friction sets.
-
-    Rows are strategies, columns objects; the number at a target counts the successes of its
-    trials, and the last column sums them over objects.
-    """
-    strategies, objects = (list(map(str, results[dim].values)) for dim in ("strategy", "object"))
-    columns = [*objects, "all"] if len(objects) > 1 else objects
-    figure = Figure(
-        figsize=(0.9 + 2.6 * len(columns), 0.9 + 2.5 * len(strategies)), layout="constrained"
-    )
-    axes = figure.subplots(len(strategies), len(columns), squeeze=False, sharex=True, sharey=True)
-    image = None
-    for row, strategy in zip(axes, strategies, strict=True):
-        for ax, column in zip(row, columns, strict=True):
-            part = results.sel(strategy=strategy)
-            part = part if column == "all" else part.sel(object=[column])
-            image = _map(ax, part)
-            won, of = int(part.success.sum()), part.success.size
-            name = "all objects" if column == "all" else words(column)
-            ax.set_title(f"{strategy.upper()}, {name}: {won}/{of}", fontsize=9)
-    for ax in axes[-1]:
-        ax.set_xlabel("x [m]")
-    for ax in axes[:, 0]:
-        ax.set_ylabel("y [m]")
-    assert image is not None
-    bar = figure.colorbar(image, ax=axes, shrink=0.8, extend="max")
-    bar.set_label("least distance of contact to target [m]")
-    return save(figure, path)
-
-
-def _map(ax: Axes, part: xr.Dataset):
-    """One panel: a coloured square and the count of successes at each target."""
-    # A trial that never touched has no least distance; it is drawn as the far end of the scale.
-    distance = part.min_distance.where(np.isfinite(part.min_distance), 3.0)
-    distance = distance.mean(("object", "friction")).values
-    count = part.success.sum(("object", "friction")).values
-    x, y = part.target_x.values, part.target_y.values
-    image = ax.scatter(
-        x, y, c=distance, s=420, marker="s", cmap="viridis_r", vmin=0.0, vmax=2.0, linewidths=0
-    )
-    for point in zip(x, y, distance, count, strict=True):
-        colour = "white" if point[2] > 1.0 else "black"
-        ax.annotate(
-            str(int(point[3])), point[:2], ha="center", va="center", fontsize=8, color=colour
-        )
-    ax.add_patch(base_patch(np.zeros(3), fill=True))
-    margin = 0.6
-    ax.set(
-        xlim=(x.min() - margin, x.max() + margin),
-        ylim=(y.min() - margin, y.max() + margin),
-        aspect="equal",
-    )
-    return image
-
-
-def time_to_success(results: xr.Dataset, strategy: str, path: Path) -> Path:
+def time_to_success(results: xr.Dataset, law: str) -> Figure:
     """Time of the successes over the target's distance, coloured by how far it lies off ahead."""
     distance = np.hypot(results.target_x.values, results.target_y.values)
     off = np.degrees(np.abs(np.arctan2(results.target_y.values, results.target_x.values)))
@@ -80,7 +23,7 @@ def time_to_success(results: xr.Dataset, strategy: str, path: Path) -> Path:
     axes = figure.subplots(1, len(objects), squeeze=False, sharey=True)[0]
     image = None
     for ax, name in zip(axes, objects, strict=True):
-        part = results.sel(strategy=strategy, object=name)
+        part = results.sel(law=law, object=name)
         for marker, friction in zip("osv^", map(str, part.friction.values), strict=False):
             one = part.sel(friction=friction)
             time = one.time.where(one.success == 1).values
@@ -93,10 +36,10 @@ def time_to_success(results: xr.Dataset, strategy: str, path: Path) -> Path:
     axes[0].legend(fontsize=8)
     assert image is not None
     figure.colorbar(image, ax=axes).set_label("target off straight ahead [deg]")
-    return save(figure, path)
+    return figure
 
 
-def one_trial(trace: xr.Dataset, title: str, path: File) -> File:
+def one_trial(trace: xr.Dataset, title: str) -> Figure:
     """Fig. 6: the path with contact points; velocities; l and a_r; contact type.
 
     Blue shade: Realignment State. Yellow: no contact. The trace is of one trial over time, with
@@ -132,17 +75,28 @@ def one_trial(trace: xr.Dataset, title: str, path: File) -> File:
     for ax in (velocity, place, kind):
         shade(ax, time, trace.realigning.values > 0.5, SHADES["realigning"])
         shade(ax, time, ~touching, SHADES["lost"])
+    bands = (("Realignment State", SHADES["realigning"]), ("no contact", SHADES["lost"]))
+    marks = [patches.Patch(color=colour, label=name) for name, colour in bands]
+    kind.legend(handles=marks, fontsize=8, loc="upper right", ncols=2)
     result = "reached" if trace.outcome_success else "not reached"
     x, y = trace.p_world_target.values
     figure.suptitle(
         f"{title}, target ({x:.3g}, {y:.3g}) m: {result} at {float(trace.outcome_time):.1f} s"
     )
-    return save(figure, path)
+    return figure
 
 
 def _half(trace: xr.Dataset) -> tuple[float, float]:
     """Half length and half width of the base [m]."""
     return float(trace.half_length), float(trace.half_width)
+
+
+def _object(trace: xr.Dataset, index: int) -> np.ndarray:
+    """Outline (N, 2) [m] of the object in the world at one moment."""
+    x, y, w, _, _, z = trace.qpos.values[index, [3, 4, 6, 7, 8, 9]]
+    yaw = 2 * np.arctan2(z, w)
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    return trace.outline.values @ turn.T + [x, y]
 
 
 def _path(ax: Axes, trace: xr.Dataset) -> None:
@@ -152,6 +106,10 @@ def _path(ax: Axes, trace: xr.Dataset) -> None:
     ax.plot(*trace.p_world_contact.values.T, ".", ms=1.5, color="C0", label="contact point")
     for index in np.linspace(0, len(pose) - 1, 7).astype(int):
         ax.add_patch(base_patch(pose[index], _half(trace), fill=False))
+        last = index == len(pose) - 1
+        name = "object" if last else None
+        shown = {"fc": "#e8c39e", "ec": "#8a5a2b", "alpha": 0.9 if last else 0.35}
+        ax.fill(*_object(trace, index).T, label=name, **shown)
     ax.plot(*target, "*", ms=14, color="C3", label="target")
     ax.add_patch(patches.Circle(target, float(trace.d_success), fill=False, color="C3"))
     ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
@@ -159,31 +117,7 @@ def _path(ax: Axes, trace: xr.Dataset) -> None:
     ax.legend(fontsize=8)
 
 
-def paths(traces: Mapping[str, Sequence[xr.Dataset]], path: Path) -> Path:
-    """Fig. 7: the ways of the base to every target, and the contact points at the end.
-
-    `traces` has a panel's title and its trials over time, as for `one_trial`.
-    """
-    figure = Figure(figsize=(5.2 * len(traces), 5), layout="constrained")
-    axes = figure.subplots(1, len(traces), squeeze=False, sharey=True)[0]
-    for ax, (name, rows) in zip(axes, traces.items(), strict=True):
-        ax.add_patch(base_patch(np.zeros(3), _half(rows[0]), fill=True))
-        for trace in rows:
-            (line,) = ax.plot(*trace.qpos.values[:, :2].T, lw=1.2)
-            ax.plot(*trace.p_world_target.values, "*", ms=12, color=line.get_color())
-            touching = trace.p_world_contact.dropna("time").values
-            if len(touching):
-                ax.plot(*touching[-1], "o", ms=5, mfc="white", color=line.get_color())
-        won = sum(bool(trace.outcome_success) for trace in rows)
-        ax.set(xlabel="x [m]", aspect="equal")
-        ax.set_title(f"{words(name)}: {won} of {len(rows)}", fontsize=10)
-        ax.grid(alpha=0.3)
-    axes[0].set_ylabel("y [m]")
-    figure.suptitle("lines: base; stars: targets; circles: last contact point", fontsize=9)
-    return save(figure, path)
-
-
-def stills(images: Sequence[np.ndarray], titles: Sequence[str], path: Path) -> Path:
+def stills(images: Sequence[np.ndarray], titles: Sequence[str]) -> Figure:
     """Figs. 1 and 4: pictures (height, width, 3), three in a row, with their titles."""
     rows = -(-len(images) // 3)
     figure = Figure(figsize=(12, 2.3 * rows), layout="constrained")
@@ -193,4 +127,58 @@ def stills(images: Sequence[np.ndarray], titles: Sequence[str], path: Path) -> P
     for ax, image, title in zip(axes, images, titles, strict=False):
         ax.imshow(image)
         ax.set_title(words(title), fontsize=9)
-    return save(figure, path)
+    return figure
+
+
+def min_distance(results: xr.Dataset) -> Figure:
+    """Draw Fig. 5: least distance of contact to target, over targets, mean of the friction sets.
+
+    Rows are laws, columns objects; the number at a target counts the successes of its
+    trials, and the last column sums them over objects.
+    """
+    laws, objects = (list(map(str, results[dim].values)) for dim in ("law", "object"))
+    columns = [*objects, "all"] if len(objects) > 1 else objects
+    figure = Figure(figsize=(0.9 + 2.6 * len(columns), 0.9 + 2.5 * len(laws)), layout="constrained")
+    axes = figure.subplots(len(laws), len(columns), squeeze=False, sharex=True, sharey=True)
+    image = None
+    for row, law in zip(axes, laws, strict=True):
+        for ax, column in zip(row, columns, strict=True):
+            part = results.sel(law=law)
+            part = part if column == "all" else part.sel(object=[column])
+            image = _map(ax, part)
+            won, of = int(part.success.sum()), part.success.size
+            name = "all objects" if column == "all" else words(column)
+            ax.set_title(f"{law.upper()}, {name}: {won}/{of}", fontsize=9)
+    for ax in axes[-1]:
+        ax.set_xlabel("x [m]")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("y [m]")
+    assert image is not None
+    bar = figure.colorbar(image, ax=axes, shrink=0.8, extend="max")
+    bar.set_label("least distance of contact to target [m]")
+    return figure
+
+
+def _map(ax: Axes, part: xr.Dataset) -> Any:
+    """One panel: a coloured square and the count of successes at each target."""
+    # A trial that never touched has no least distance; it is drawn as the far end of the scale.
+    distance = part.min_distance.where(np.isfinite(part.min_distance), 3.0)
+    distance = distance.mean(("object", "friction")).values
+    count = part.success.sum(("object", "friction")).values
+    x, y = part.target_x.values, part.target_y.values
+    image = ax.scatter(
+        x, y, c=distance, s=420, marker="s", cmap="viridis_r", vmin=0.0, vmax=2.0, linewidths=0
+    )
+    for point in zip(x, y, distance, count, strict=True):
+        colour = "white" if point[2] > 1.0 else "black"
+        ax.annotate(
+            str(int(point[3])), point[:2], ha="center", va="center", fontsize=8, color=colour
+        )
+    ax.add_patch(base_patch(np.zeros(3), fill=True))
+    margin = 0.6
+    ax.set(
+        xlim=(x.min() - margin, x.max() + margin),
+        ylim=(y.min() - margin, y.max() + margin),
+        aspect="equal",
+    )
+    return image

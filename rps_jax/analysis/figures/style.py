@@ -1,41 +1,39 @@
-"""What the figures have in common: how they are saved, colours, and parts of a panel."""
+"""What the figures have in common: colours, and parts of a panel."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import IO, TypeVar
+import io
 
 import numpy as np
-from matplotlib import patches
+from matplotlib import figure, patches
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from rps_jax.analysis import statistics
-from rps_jax.record import files
 from rps_jax.robot import shell
+from rps_jax.world.domain import WORDS
 
-File = TypeVar("File", bound=Path | IO[bytes])
 OBJECT_COLOURS = {"box": "C0", "cylinder": "C1", "nonuniform_box": "C2"}
 OBJECT_COLOURS |= {"hardware_box": "C0", "hardware_cylinder": "C1"}
 SHADES = {"realigning": "#bcd7f2", "lost": "#f8e3a1"}
 
 
-def save(figure: Figure, file: File) -> File:
-    """Write the figure, without a date, so that equal figures are equal; a path atomically."""
+class Figure(figure.Figure):
+    """A figure of matplotlib that Jupyter shows without `pyplot` and without its settings."""
 
-    def write(to: Path | IO[bytes]) -> None:
-        figure.savefig(to, dpi=150, metadata={"Software": None})
-
-    if isinstance(file, Path):
-        files.atomic(file, write)
-    else:
-        write(file)
-    return file
+    def _repr_png_(self) -> bytes:
+        file = io.BytesIO()
+        self.savefig(file, dpi=100, metadata={"Software": None})
+        return file.getvalue()
 
 
 def words(name: str) -> str:
     """A name as words."""
     return name.replace("_", " ")
+
+
+def quantity(name: str) -> str:
+    """A drawn quantity in words."""
+    return WORDS.get(name) or words(name)
 
 
 def base_patch(

@@ -1,24 +1,23 @@
-"""Random worlds: what success depends on, how the law fails, and one arm against another."""
+"""Random worlds: what success depends on, how the law fails, and one law against another."""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
-from matplotlib.figure import Figure
 
 from rps_jax.analysis import statistics
-from rps_jax.analysis.figures.style import save, success_rates, words
+from rps_jax.analysis.figures.style import Figure, success_rates, words
+from rps_jax.world.domain import WORDS
 
 
-def success_curves(results: xr.Dataset, path: Path, count: int = 6) -> Path:
-    """Success against the drawn quantities that matter first, one line an arm.
+def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
+    """Success against the drawn quantities that matter first, one line a law.
 
     Of all quantities these have the greatest standard deviation of the success rate over their
-    bins beyond what binomial noise explains, in the arm in which it is greatest. Below, the others
+    bins beyond what binomial noise explains, in the law in which it is greatest. Below, the others
     are named: those whose bins differ nevertheless by a chi-squared test (q < 0.05, as of
     `statistics.influences`), and those that are flat. Intervals are Wilson's, of 95 %.
     """
@@ -31,12 +30,12 @@ def success_curves(results: xr.Dataset, path: Path, count: int = 6) -> Path:
     for ax in axes.ravel()[len(shown) :]:
         ax.axis("off")
     for ax, one in zip(axes.ravel(), shown, strict=False):
-        for i, arm in enumerate(map(str, results.arm.values)):
-            won = results.success.sel(arm=arm).values > 0
+        for i, law in enumerate(map(str, results.law.values)):
+            won = results.success.sel(law=law).values > 0
             bins = statistics.bins(results[one.name].values, won)
-            success_rates(ax, bins.middle, bins.won, bins.of, color=f"C{i}", label=arm)
+            success_rates(ax, bins.middle, bins.won, bins.of, color=f"C{i}", label=law)
         unit = f" [{results[one.name].attrs['units']}]".removesuffix(" [1]")
-        ax.set_xlabel(f"{statistics.DRAWN[one.name]}{unit}", fontsize=9)
+        ax.set_xlabel(f"{WORDS[one.name]}{unit}", fontsize=9)
         chance = " (may be chance)" * _is_flat(one)
         ax.set_title(f"spread {_spread(one)}, q = {one.q:.1g}{chance}", fontsize=8)
         ax.grid(alpha=0.3)
@@ -49,42 +48,13 @@ def success_curves(results: xr.Dataset, path: Path, count: int = 6) -> Path:
     figure.suptitle(_filled(title, 42 * columns), fontsize=10)
     parts = {
         "Chosen for their spread": "the greatest standard deviation of success over the bins "
-        "beyond binomial noise, in the arm in which it is greatest",
+        "beyond binomial noise, in the law in which it is greatest",
         "Weaker": _names([o for o in others if not _is_flat(o)], spread=True),
         "Flat within the noise": _names([o for o in others if _is_flat(o)]),
     }
     lines = (_filled(f"{k}: {v}.", 60 * columns) for k, v in parts.items() if v)
     figure.supxlabel("\n".join(lines), fontsize=8, x=0.01, ha="left")
-    return save(figure, path)
-
-
-def ladder(results: xr.Dataset, senses: Mapping[str, str], path: Path) -> Path:
-    """Success of each law, grouped by what it is told, with Wilson's 95 % intervals."""
-    kinds = list(dict.fromkeys(senses.values()))
-    rates = {str(a): float(results.success.sel(arm=a).mean()) for a in results.arm.values}
-    order = sorted(rates, key=lambda arm: (-kinds.index(senses[arm]), rates[arm]))
-    figure = Figure(figsize=(7, 1.2 + 0.34 * len(order)), layout="constrained")
-    ax = figure.subplots()
-    for at, arm in enumerate(order):
-        won = results.success.sel(arm=arm).values > 0
-        low, high = statistics.wilson(int(won.sum()), won.size)
-        colour = f"C{kinds.index(senses[arm])}"
-        ax.plot([100 * low, 100 * high], [at, at], color=colour, lw=3, alpha=0.4)
-        ax.plot(100 * rates[arm], at, "o", color=colour)
-        ax.annotate(
-            f"{100 * rates[arm]:.1f}", (100 * rates[arm], at), (0, 6), fontsize=8,
-            textcoords="offset points", ha="center",
-        )  # fmt: skip
-    for kind in kinds:
-        ax.plot([], [], "o", color=f"C{kinds.index(kind)}", label=f"is told: {kind}")
-    ax.set_yticks(range(len(order)), order)
-    ax.set_ylim(-0.6, len(order) - 0.3)
-    ax.set_xlim(-3, 103)
-    ax.set_xlabel("success [%]")
-    ax.set_title(f"{results.sizes['world']:,} equal worlds for every law", fontsize=10)
-    ax.grid(axis="x", alpha=0.3)
-    ax.legend(fontsize=8, loc="best")
-    return save(figure, path)
+    return figure
 
 
 def _filled(text: str, width: int) -> str:
@@ -101,31 +71,31 @@ def _spread(one: statistics.Influence) -> str:
 
 def _names(found: Sequence[statistics.Influence], *, spread: bool = False) -> str:
     """Quantities in words, which no line break separates."""
-    names = (statistics.DRAWN[one.name] + f" ({_spread(one)})" * spread for one in found)
+    names = (WORDS[one.name] + f" ({_spread(one)})" * spread for one in found)
     return ", ".join(name.replace(" ", "\N{NO-BREAK SPACE}") for name in names)
 
 
-def failures(results: xr.Dataset, max_lost: float, path: Path) -> Path:
+def failures(results: xr.Dataset, max_lost: float) -> Figure:
     """Failures by their kind, a column for each object.
 
-    Above, the share of its worlds that each arm loses; below, how far from the target they end,
+    Above, the share of its worlds that each law loses; below, how far from the target they end,
     over the object's width.
     """
     groups = statistics.worlds_by_object(results)
-    arms = {str(name): results.sel(arm=name) for name in results.arm.values}
-    kinds = {name: statistics.failure(one, max_lost) for name, one in arms.items()}
+    laws = {str(name): results.sel(law=name) for name in results.law.values}
+    kinds = {name: statistics.failure(one, max_lost) for name, one in laws.items()}
     figure = Figure(figsize=(1 + 2.8 * len(groups), 5.2), layout="constrained")
     axes = figure.subplots(2, len(groups), squeeze=False, sharey="row")
     most = 1.0
     for (above, below), (name, mask) in zip(axes.T, groups.items(), strict=True):
-        under = np.zeros(len(arms))
+        under = np.zeros(len(laws))
         for i, kind in enumerate(statistics.FAILURES):
             share = np.array([100 * np.mean(found[mask] == i) for found in kinds.values()])
-            above.bar(list(arms), share, bottom=under, color=f"C{i}", label=kind)
+            above.bar(list(laws), share, bottom=under, color=f"C{i}", label=kind)
             under += share
             most = max(most, under.max())
-            for marker, (arm, one) in zip("ox+s", arms.items(), strict=False):
-                here = mask & (kinds[arm] == i)
+            for marker, (law, one) in zip("ox+s", laws.items(), strict=False):
+                here = mask & (kinds[law] == i)
                 width, left = results["size"].values[here], statistics.left_over(one)[here]
                 below.semilogy(width, left, marker, ms=4, color=f"C{i}")
         above.set_title(f"{words(name)}, {mask.sum()} worlds", fontsize=9)
@@ -135,18 +105,18 @@ def failures(results: xr.Dataset, max_lost: float, path: Path) -> Path:
     axes[0, 0].set(ylabel="worlds lost [%]", ylim=(0, 1.08 * most))
     axes[0, -1].legend(fontsize=8)
     axes[1, 0].set_ylabel("least distance to the target [m]")
-    marks = [f"{arm}: {mark}" for mark, arm in zip(("dot", "cross", "plus"), arms, strict=False)]
+    marks = [f"{law}: {mark}" for mark, law in zip(("dot", "cross", "plus"), laws, strict=False)]
     axes[1, 0].set_title(", ".join(marks), fontsize=8)
-    return save(figure, path)
+    return figure
 
 
-def paired(results: xr.Dataset, path: Path) -> Path:
-    """Time of the second arm over that of the first, world by world.
+def paired(results: xr.Dataset) -> Figure:
+    """Time of the second law over that of the first, world by world.
 
-    Worlds that one arm alone wins stand on the margin of the other, beyond the dashed line.
+    Worlds that one law alone wins stand on the margin of the other, beyond the dashed line.
     """
-    first, second = map(str, results.arm.values)
-    a, b = (results.sel(arm=arm) for arm in (first, second))
+    first, second = map(str, results.law.values)
+    a, b = (results.sel(law=law) for law in (first, second))
     won_a, won_b = a.success.values > 0, b.success.values > 0
     edge = 1.02 * float(results.time.max())
     x, y = np.where(won_a, a.time, 1.03 * edge), np.where(won_b, b.time, 1.03 * edge)
@@ -165,4 +135,4 @@ def paired(results: xr.Dataset, path: Path) -> Path:
     ax.set(xlabel=f"{first}: time to success [s]", ylabel=f"{second}: time to success [s]")
     ax.set_title(f"{won_a.size} worlds; won by neither: {neither}", fontsize=9)
     figure.legend(fontsize=8, loc="outside lower center", ncols=3)
-    return save(figure, path)
+    return figure

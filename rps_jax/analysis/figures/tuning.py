@@ -3,54 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from rps_jax.analysis.figures.style import save
+from rps_jax.analysis.figures.style import Figure
 
 
-def tuning_log(log: Sequence[Mapping], names: Sequence[str], path: Path) -> Path:
-    """Evolution, generation by generation: values, validation, and the mean's parameters."""
-    generation = [line["generation"] for line in log]
-
-    def of(key: str) -> np.ndarray:
-        return np.array([np.nan if line[key] is None else line[key] for line in log], float)
+def search(found: xr.Dataset) -> Figure:
+    """Draw a search by generation: values of candidates, validation, and its parameters."""
+    generation, names = found.generation.values, found.parameter.values
 
     columns = 4
     rows = 1 + -(-len(names) // columns)
     figure = Figure(figsize=(11, 2.6 + 1.7 * (rows - 1)), layout="constrained")
     grid = figure.add_gridspec(rows, columns, height_ratios=[1.6] + [1] * (rows - 1))
     ax = figure.add_subplot(grid[0, :2])
-    mean, spread = of("mean"), of("spread")
+    mean, spread = found["mean"].values, found["spread"].values
     ax.fill_between(generation, mean - spread, mean + spread, alpha=0.2, lw=0)
     ax.plot(generation, mean, label="candidates: mean, and their spread")
-    ax.plot(generation, of("best"), label="best candidate")
-    ax.plot(generation, of("base"), "k--", lw=1, label="parameters at the start, same worlds")
+    ax.plot(generation, found.best.values, label="best candidate")
+    ax.plot(generation, found.base.values, "k--", lw=1, label="the start, in the same worlds")
     ax.set(xlabel="generation", ylabel="objective [1]")
     ax.legend(fontsize=8)
     ax = figure.add_subplot(grid[0, 2:])
-    ax.plot(generation, of("validation"), "C2", label="objective")
+    ax.plot(generation, found.validation.values, "C2", label="objective")
     ax.margins(y=0.3)  # room for the legends
     ax.set(xlabel="generation", ylabel="mean on validation worlds [1]")
     ax.legend(loc="upper left", fontsize=8)
     twin = ax.twinx()
-    twin.plot(generation, 100 * of("validation_success"), "C3", label="success")
+    twin.plot(generation, 100 * found.validation_success.values, "C3", label="success")
     twin.margins(y=0.3)
     twin.set_ylabel("success [%]")
     twin.legend(loc="upper right", fontsize=8)
     for i, name in enumerate(names):
         ax = figure.add_subplot(grid[1 + i // columns, i % columns])
-        ax.plot(generation, [line["params"][name] for line in log])
-        ax.set_title(name, fontsize=9)
+        ax.plot(generation, found.params.values[:, i])
+        ax.set_title(str(name), fontsize=9)
         ax.tick_params(labelsize=7)
-    return save(figure, path)
+    return figure
 
 
-def races(runs: Mapping[str, Sequence[Mapping]], path: Path) -> Path:
+def races(runs: Mapping[str, Sequence[Mapping]]) -> Figure:
     """Tuners' runs side by side: the best validation so far against what was simulated before it.
 
     A run that continues another is the sum of both logs.
@@ -68,10 +62,10 @@ def races(runs: Mapping[str, Sequence[Mapping]], path: Path) -> Path:
     for ax, label in zip(axes, ("objective [1]", "success [%]"), strict=True):
         ax.set(xlabel="simulated [10$^6$ s]", ylabel=f"{label}, best mean so far")
     axes[0].legend(fontsize=8)
-    return save(figure, path)
+    return figure
 
 
-def between_bounds(places: Mapping[str, np.ndarray], names: Sequence[str], path: Path) -> Path:
+def between_bounds(places: Mapping[str, np.ndarray], names: Sequence[str]) -> Figure:
     """Where sets of parameters (p,) lie between the bounds of tuning, from 0 to 1."""
     figure = Figure(figsize=(6, 0.8 + 0.27 * len(names)), layout="constrained")
     ax = figure.subplots()
@@ -84,15 +78,14 @@ def between_bounds(places: Mapping[str, np.ndarray], names: Sequence[str], path:
     ax.set(xlim=(-0.02, 1.02), xlabel="place between the bounds of tuning [1]")
     ax.grid(alpha=0.3, axis="x")
     ax.legend(fontsize=8)
-    return save(figure, path)
+    return figure
 
 
 def estimates(
     horizons: Sequence[float],
     found: Mapping[str, tuple[np.ndarray, np.ndarray]],
     names: Sequence[str],
-    path: Path,
-) -> Path:
+) -> Figure:
     """Gradients (H, p) and their variances, by estimator, over horizons (H,) [s].
 
     Bars reach two standard errors to either side.
@@ -111,48 +104,4 @@ def estimates(
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("gradient [m]")
     axes[0].legend(fontsize=8)
-    return save(figure, path)
-
-
-def learning_curve(curve: xr.Dataset, path: Path) -> Path:
-    """How a law was learned: successes and rewards against both clocks, and the algorithm's state.
-
-    The curves of single updates are drawn thin; thick ones are means over 1/40 of the run.
-    """
-    figure = Figure(figsize=(10, 5.6), layout="constrained")
-    axes = figure.subplots(2, 2)
-    minutes, simulated = curve.time.values / 60, curve.simulated.values / 3600
-    width = max(1, curve.sizes["update"] // 40)
-
-    def draw(ax: Axes, x: np.ndarray, name: str, scale: float, colour: str, label: str) -> None:
-        values = scale * curve[name].values
-        mean = curve[name].rolling(update=width, min_periods=1, center=True).mean().values
-        ax.plot(x, values, color=colour, lw=0.6, alpha=0.35)
-        ax.plot(x, scale * mean, color=colour, lw=1.6, label=label)
-
-    judged = np.isfinite(curve.validation.values)
-    clocks = (
-        (minutes, "wall clock, with compilation [min]"),
-        (simulated, "simulated time, summed over worlds [h]"),
-    )
-    for ax, (x, label) in zip(axes[0], clocks, strict=True):
-        draw(ax, x, "success", 100, "C0", "trials that ended, with noise, at the level below")
-        ax.plot(x, 100 * curve.level, "k:", lw=1, label="level of the curriculum")
-        ax.plot(
-            x[judged], 100 * curve.validation.values[judged], "C3o-", ms=4,
-            label="validation: the domain itself, no noise",
-        )  # fmt: skip
-        ax.set(xlabel=label, ylabel="success, level [%]", ylim=(-3, 103))
-        ax.grid(alpha=0.3)
-    axes[0, 0].legend(fontsize=7, loc="lower right")
-    draw(axes[1, 0], minutes, "earned", 1, "C2", "rewards of a trial")
-    axes[1, 0].set(xlabel=clocks[0][1], ylabel="rewards of a trial that ended [1]")
-    axes[1, 0].grid(alpha=0.3)
-    ax = axes[1, 1]
-    ax.plot(simulated, curve.spread, label="standard deviation of the actions")
-    ax.plot(simulated, 100 * curve.learning_rate, label="100 learning rates")
-    ax.plot(simulated, curve.touching, label="share of decisions in contact")
-    ax.set(xlabel=clocks[1][1], ylabel="[1]")
-    ax.grid(alpha=0.3)
-    ax.legend(fontsize=7)
-    return save(figure, path)
+    return figure

@@ -1,54 +1,34 @@
-"""The command line: `rps table`, `rps push`, `rps sweep` and the others.
+"""The command line: `rps NAME` and `rps PATH` ask a question, and write its report.
 
-Every command is a thin face of a library call. Input is checked, and folders are tried, before
-anything compiles. Heavy modules are imported by the commands, so that `rps --help` answers at once
-and MuJoCo finds its rendering backend chosen.
+A question's fields are the options (`flags`), found by its file's text (`names`), so that
+`rps --help` imports neither JAX nor MuJoCo. Input is checked before anything compiles (`running`).
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import Annotated
 
-import tyro
-
-from rps_jax.app.cli import failing, learning, looking, replicating, sweeping, tuning
-from rps_jax.app.cli.running import guarded
-
-Command = (
-    Annotated[replicating.Table, tyro.conf.subcommand("table")]
-    | Annotated[replicating.Push, tyro.conf.subcommand("push")]
-    | Annotated[replicating.Hardware, tyro.conf.subcommand("hardware")]
-    | Annotated[replicating.Paper, tyro.conf.subcommand("paper")]
-    | Annotated[sweeping.Sweep, tyro.conf.subcommand("sweep")]
-    | Annotated[sweeping.Ladder, tyro.conf.subcommand("ladder")]
-    | Annotated[sweeping.Ceiling, tyro.conf.subcommand("ceiling")]
-    | Annotated[sweeping.Merge, tyro.conf.subcommand("merge")]
-    | Annotated[sweeping.Replay, tyro.conf.subcommand("replay")]
-    | Annotated[looking.Film, tyro.conf.subcommand("film")]
-    | Annotated[looking.Gallery, tyro.conf.subcommand("gallery")]
-    | Annotated[looking.View, tyro.conf.subcommand("view")]
-    | Annotated[failing.Sensitivity, tyro.conf.subcommand("sensitivity")]
-    | Annotated[failing.Rare, tyro.conf.subcommand("rare")]
-    | Annotated[failing.Attack, tyro.conf.subcommand("attack")]
-    | Annotated[failing.Regress, tyro.conf.subcommand("regress")]
-    | Annotated[tuning.Tune, tyro.conf.subcommand("tune")]
-    | Annotated[learning.Learn, tyro.conf.subcommand("learn")]
-    | Annotated[looking.Doctor, tyro.conf.subcommand("doctor")]
-)
+from rps_jax.app.cli import names, running
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point of `rps` and `python -m rps_jax`: exit code 0, or 2 for bad input."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    command = tyro.cli(
-        Command,  # pyright: ignore[reportArgumentType]
-        prog="rps",
-        args=arguments or ["--help"],
-        description="Pushing unknown objects by touch: the Reactive Pushing Strategy in MuJoCo.",
-    )
-    from rps_jax.analysis import video
+    """Run `rps` and `python -m rps_jax`; exit code 0, 2 for bad input, 130 if stopped."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words or words[0] in ("-h", "--help"):
+        return running.guarded(lambda: print(names.overview()))
+    if words[0] == "--version":
+        from rps_jax import __version__
 
-    video.choose_gl()
-    return guarded(command.run)
+        return running.guarded(lambda: print(f"rps_jax {__version__}"))
+    return running.guarded(lambda: _ask(words))
+
+
+def _ask(words: list[str]) -> None:
+    """Find the question, read its options, and answer it."""
+    from rps_jax.app.cli import flags
+
+    name, rest = names.split(words)
+    running.be_deterministic()
+    question = names.question_of(name)
+    running.carry_out(*flags.parse(question, name, rest))

@@ -1,36 +1,46 @@
-"""How a command runs: its device, its cache of programs, its exit code, and what it tells."""
+"""How a command runs: the question, its report, its exit code, and what it prints."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import errno
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rps_jax.errors import InputError
 
 if TYPE_CHECKING:
-    from xarray import Dataset
+    from rps_jax.app.cli.flags import Beside
+    from rps_jax.runs.push import Trace
+    from rps_jax.trials.progress import Bar
 
-    from rps_jax.analysis.report import Section
-    from rps_jax.runs.plan import Plan
-    from rps_jax.trials.setting import Timing
+_MEND = "make room, then run the same command again; what is done is kept"
+
+
+def be_deterministic() -> None:
+    """Make the numbers of a GPU not depend on the order in which its threads come."""
+    from rps_jax.engines import device
+
+    device.be_deterministic()
 
 
 def guarded(action: Callable[[], object]) -> int:
     """Run a command: exit code 0, or one sentence on the error stream and 2 (130: interrupted)."""
-    be_deterministic()
     try:
         action()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing more to say
+        return 0
     except InputError as error:
-        return _told(str(error))
+        return _told(error)
     except OSError as error:
-        mend = "make room, then run the same command again; what is done is kept"
-        hint = f": {mend}" if error.errno == errno.ENOSPC else ""
-        return _told(f"{error.filename or 'output'}: {error.strerror}{hint}.")
+        hint = f": {_MEND}" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
+        return _told(InputError(f"{error.filename or 'output'}: {error.strerror or error}{hint}."))
     except RuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
@@ -43,96 +53,107 @@ def guarded(action: Callable[[], object]) -> int:
     except KeyboardInterrupt:
         print("rps: interrupted.", file=sys.stderr)
         return 130
+    except SystemExit as end:  # of --help
+        return int(end.code or 0)
     return 0
 
 
-def _told(sentence: str) -> int:
+def _told(sentence: str | InputError) -> int:
     print(f"rps: error: {sentence}", file=sys.stderr)
     return 2
 
 
-def be_deterministic() -> None:
-    """Ask XLA for GPU sums in a fixed order: the same command must give the same results."""
-    flag = "--xla_gpu_deterministic_ops"
-    flags = os.environ.get("XLA_FLAGS", "")
-    if flag not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} {flag}=true".strip()
-
-
-def cache_folder() -> Path:
-    """Where compiled programs are kept between runs: $RPS_CACHE, else the user's cache."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(os.environ.get("RPS_CACHE") or Path(base) / "rps_jax")
-
-
-def use_cache() -> None:
-    """Keep compiled programs, if the folder can be written; a run needs no cache."""
-    import jax
-
-    try:
-        cache_folder().mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return
-    jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
-    os.environ.setdefault("WARP_CACHE_PATH", str(cache_folder() / "warp"))
-
-
-def choose_device(name: str) -> None:
-    """Have JAX use this kind of device.
+def carry_out(question: Any, beside: Beside) -> None:
+    """Check a question, answer it, and write and print its report.
 
     Raises:
-      InputError: there is no such device.
+      InputError: it is not allowed, or its run folder holds another run.
     """
-    import jax
+    from rps_jax.engines import device
+    from rps_jax.record import folder
 
-    if name == "auto":
-        try:
-            jax.devices()
-        except (RuntimeError, AssertionError) as error:  # whichever JAX raises
-            asked = jax.config.jax_platforms
-            raise InputError(
-                f"JAX_PLATFORMS = {asked} is not there: name a device that is, or none."
-            ) from error
+    device.choose("cpu" if getattr(question, "ray", None) else beside.device)
+    if question.out is None and not hasattr(question, "in_shell"):
+        question = dataclasses.replace(question, out=question.place)
+    asked = question.asked()
+    asked.checked()
+    check_film(beside)
+    if note := asked.note():
+        print(note)
+    device.use_cache()
+    if hasattr(asked, "in_shell"):
+        asked.in_shell()
         return
-    before = jax.config.jax_platforms
-    jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[name])
-    with contextlib.suppress(RuntimeError, AssertionError):  # whichever JAX raises
-        if jax.default_backend() == name:
+    if beside.overwrite:
+        folder.clear(Path(asked.out))
+    with asked.bar() as bar:
+        found = asked.answered(bar)
+        told = _timing(bar)
+        if isinstance(found, Path):
+            print(f"{asked.name}: {found}")
             return
-    jax.config.update("jax_platforms", before)
-    raise InputError(
-        f"device = {name} is not there: install rps_jax[cuda] on a machine with an NVIDIA GPU, or "
-        "choose cpu."
-    )
+        path = _report(asked, found, bar)
+    print(path.read_text(encoding="utf-8"))
+    if told:
+        print(told)
+    if beside.video and hasattr(found, "film"):
+        _film(found, Path(asked.out), beside.film_length)
+    if getattr(asked, "film", False):
+        _film_worst(Path(asked.out))
+    print(f"run folder: {asked.out}")
 
 
-def tell(timing: Timing, device: str | None = None) -> None:
-    """Print where the time of a run went."""
-    import jax
+def check_film(beside: Beside) -> None:
+    """Raises InputError for a length that no film can have."""
+    from rps_jax.runs.push import check_length
 
-    print(
-        f"compile {timing.compile:.1f} s, run {timing.run:.1f} s "
-        f"({timing.simulated / max(timing.run, 1e-9):.0f} simulated s per s) on "
-        f"{device or jax.devices()[0].device_kind}"
-    )
+    check_length(beside.film_length)
 
 
-def tell_sweep(
-    out: Path,
-    plan: Plan,
-    results: Dataset | None,
-    timing: Timing | None = None,
-    models: Dataset | None = None,
-    more: Callable[[Path, Plan, Dataset], Sequence[Section]] = lambda *_: (),
-) -> None:
-    """Print where the time of a sweep went, if it ran; then write and print its report."""
+def _timing(bar: Bar) -> str:
+    """Where the time went, if trials ran."""
+    from rps_jax.engines import device
+    from rps_jax.runs.question import told
+
+    if bar.timing.simulated <= 0 or bar.over == "clock":
+        return ""
+    return told(bar.timing, device.kind())
+
+
+def _report(asked: Any, found: Any, bar: Bar) -> Path:
+    """Write the report of an answer; returns its path."""
+    from rps_jax.analysis.report import write_report
     from rps_jax.record import provenance
-    from rps_jax.runs.report import write_report
 
-    if timing:
-        tell(timing, provenance.signed(out)["device"]["kind"])
-    if results is None:
-        print(f"run folder: {out}; when all shards are done: rps merge {out} --out {out}")
-    else:
-        print(write_report(out, plan, results, models, more(out, plan, results)).read_text())
-        print(f"run folder: {out}")
+    out = Path(asked.out)
+    bar.phase("report")
+    sections = asked.report(found, asked.run_in(out, bar))
+    parts = [asked.intro(found)]
+    with contextlib.suppress(InputError):
+        parts.append(provenance.told(out))
+    return write_report(out, asked.title, "\n\n".join(filter(None, parts)), sections)
+
+
+def _film(trace: Trace, out: Path, seconds: float) -> None:
+    """Stills and film of one trial."""
+    from tqdm import tqdm
+
+    from rps_jax.analysis import video
+    from rps_jax.analysis.report import save
+
+    def watch(frames: Any) -> Any:
+        return tqdm(frames, unit="frame", desc="film")
+
+    try:
+        save(trace.stills(), out / "stills.png")
+        print(f"film: {trace.film(out / 'push.mp4', seconds, watch=watch)}")
+    except video.VideoError as error:
+        print(f"no film: {error}")
+
+
+def _film_worst(out: Path) -> None:
+    """The worst twelve worlds of a search."""
+    from rps_jax.app.film import Film
+
+    if (out / "worlds").is_dir():
+        print(f"film: {Film(out / 'worlds', grid='3x4', which='hardest')()}")

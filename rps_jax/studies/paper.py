@@ -1,0 +1,144 @@
+"""All of the paper in one run folder: its tables, its figures, and its hardware experiments.
+
+What the paper leaves open is named in `world.paper.CHOICES`; what each reading changes is measured
+in `sweeps/ambiguities`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import ClassVar
+
+import numpy as np
+import xarray as xr
+
+from rps_jax.analysis import figures, video
+from rps_jax.analysis.report import Picture, Section
+from rps_jax.control.laws.rps import RPSParams
+from rps_jax.record import files
+from rps_jax.runs.push import Push
+from rps_jax.runs.question import Pushes, Run, call_of
+from rps_jax.studies import table
+from rps_jax.studies.hardware import Hardware
+from rps_jax.studies.table import Table
+from rps_jax.trials.progress import InTurn
+from rps_jax.trials.setting import Setting
+from rps_jax.world import paper as papers
+from rps_jax.world import scene
+from rps_jax.world.objects import PAPER_OBJECTS
+from rps_jax.world.scene import FRICTION
+
+
+@dataclass(frozen=True)
+class Paper(Pushes[xr.DataTree]):
+    """Reproduce the paper: Tables I and II, Figs. 3 to 7, and the hardware experiments.
+
+    The answer is a tree of `table` (law, object, friction, target), `trial` (time) and `hardware`,
+    as `rps_jax.table`, `rps_jax.push` and `rps_jax.hardware` return them. It takes some minutes.
+
+    Example:
+      >>> import rps_jax
+      >>> found = rps_jax.paper(quick=True)  # doctest: +SKIP
+      >>> found["table"].success.sum("target")  # doctest: +SKIP
+    """
+
+    TITLE: ClassVar[str] = "Pushing in the Dark, reproduced"
+
+    setting: Setting = field(default=Setting(engine="mjx"), kw_only=True)
+
+    @cached_property
+    def parts(self) -> tuple[Table, Push, Hardware]:
+        """The questions that it consists of."""
+        engine = replace(self.setting, engine="fused") if self.quick else self.setting
+        hardware = replace(self.setting, engine="fused")  # as fine, and many more trials
+        return (
+            Table(setting=engine),
+            Push(target=(-2.0, 0.0), setting=engine),
+            Hardware(setting=hardware, quick=self.quick).asked(),
+        )
+
+    def check(self) -> None:
+        """Check what it consists of."""
+        for part in self.parts:
+            part.check()
+
+    def trials(self) -> int | None:
+        """How many trials there are."""
+        return sum(part.trials() or 1 for part in self.parts)
+
+    def answer(self, run: Run) -> xr.DataTree:
+        """Answer its questions, one after the other."""
+        heard = InTurn(run.report)
+        run = run._replace(report=heard)
+        tables, push, hardware = self.parts
+        found = {"table": tables.answer(run)}
+        heard.ended(tables.trials() or 0)
+        found["trial"] = run.part("trial", lambda: push.answer(run).data)
+        heard.ended(1)
+        found["hardware"] = hardware.answer(run)
+        if run.folder is not None:
+            for name, one in found.items():
+                files.write_results(run.folder / f"{name}.nc", one)
+        return xr.DataTree.from_dict(found)
+
+    def intro(self, found: xr.DataTree) -> str:
+        """What was asked."""
+        return "The numbers of the paper *Pushing in the Dark* beside ours. Intervals: Wilson 95 %."
+
+    def report(self, found: xr.DataTree, run: Run) -> Sequence[Section]:
+        """All tables and figures."""
+        return [
+            *_setup(),
+            *table.sections(found["table"].to_dataset()),
+            _fig_6(found["trial"].to_dataset(), self.parts[1].case.title),
+            *self.parts[2].report(found["hardware"].to_dataset(), run),
+            _open(),
+        ]
+
+
+paper = call_of(Paper)
+
+
+def _setup() -> list[Section]:
+    """Table I, Fig. 3 and Fig. 4."""
+    rows = [["", *FRICTION]]
+    for i, name in enumerate(("object-ground", "object-robot")):
+        rows.append([name, *(f"{friction[i]:g}" for friction in FRICTION.values())])
+    profile = Picture("profile", partial(figures.profile, RPSParams.paper()))
+    return [
+        Section("Table I: friction", "As in the paper, by construction.", rows),
+        Section("Fig. 3: the adaptive rate", "", (), profile),
+        _objects(),
+    ]
+
+
+def _objects() -> Section:
+    try:
+        images = []
+        for name in PAPER_OBJECTS:
+            shown = scene.load(name)
+            at = scene.initial_qpos(shown)
+            images.append(video.snapshot(shown, at, p_world_target=np.array([2, 0])))
+    except video.VideoError as error:
+        return Section("Fig. 4: the objects", f"Not drawn: {error}")
+    picture = Picture("objects", partial(figures.stills, images, PAPER_OBJECTS))
+    return Section("Fig. 4: the objects", "", (), picture)
+
+
+def _fig_6(seen: xr.Dataset, title: str) -> Section:
+    reached = "reached" if int(seen.outcome_success) else "not reached"
+    text = f"The target is {reached} at {float(seen.outcome_time):.1f} s."
+    picture = Picture("trial", partial(figures.one_trial, seen, title))
+    return Section("Fig. 6: the box to (-2, 0) under S1", text, (), picture)
+
+
+def _open() -> Section:
+    """What the paper leaves open, and what we chose."""
+    rows = [["open", "our reading", "because"], *map(list, papers.CHOICES)]
+    text = (
+        "What another reading of each would change is measured in the project's study of "
+        "ambiguities, `sweeps/ambiguities`."
+    )
+    return Section("What the paper leaves open", text, rows)

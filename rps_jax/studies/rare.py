@@ -1,0 +1,377 @@
+"""How often does a law fail that rarely fails? Subset simulation over the unit cube.
+
+The probability of a severity of at least 1 is a product of probabilities that are not small: of a
+level that a fifth of all worlds reach, of the next one given that, and so on (Au and Beck, 2001;
+Cerou and Guyader's multilevel splitting is its near relative). Worlds beyond a level are found by
+Markov chains that begin in those worlds and move in the normal quantiles z of u, a random half of
+the coordinates at a time, by the preconditioned Crank-Nicolson step z' = sqrt(1 - b^2) z + b e,
+under which the normal law does not change; a move to below the level is refused.
+
+All is done by several groups that share nothing but the levels. Their mean is the estimate, and
+their spread is its interval: no assumption about how far the chains mix is needed, but a kind of
+failure that no group has met is in no interval.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import xarray as xr
+from scipy import stats
+
+from rps_jax import errors
+from rps_jax.analysis import statistics
+from rps_jax.analysis.figures.style import Figure
+from rps_jax.analysis.report import Picture, Section
+from rps_jax.record.options import option
+from rps_jax.runs import sweep as sweeps
+from rps_jax.runs.plan import Plan
+from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, count_of, name_of, seed_of
+from rps_jax.studies.probe import Probe
+from rps_jax.trials.progress import phase
+from rps_jax.trials.score import severity_of
+from rps_jax.world import points
+from rps_jax.world.domain import Domain
+
+Severity = Callable[[np.ndarray], np.ndarray]  # of points (n, q), (n,)
+_EDGE = 1e-9  # least distance of a coordinate to the ends of its range
+_ACCEPTED = 0.35  # share of moves that the step is adapted to
+
+
+class Estimate(NamedTuple):
+    """A probability, with its interval of 95 %."""
+
+    p: float  # [1]
+    low: float
+    high: float
+    variation: float  # [1] of the estimate: standard error over estimate
+    trials: int
+
+
+class Found(NamedTuple):
+    """What subset simulation came to."""
+
+    estimate: Estimate
+    groups: np.ndarray  # (groups,) [1] what each came to
+    levels: list[float]  # severities that were the levels, the last one that of the event
+    u: np.ndarray  # (n, q) worlds of the last levels that fail
+    severity: np.ndarray  # (n,)
+
+
+Steps = Generator[np.ndarray, np.ndarray, Found]
+
+
+def joined(groups: np.ndarray, trials: int, least: float = 0.0) -> Estimate:
+    """The mean of groups' estimates, with Student's interval, even in the logarithm.
+
+    A few groups agree by luck now and then, so the coefficient of variation is at least `least`.
+    """
+    p, count = float(groups.mean()), groups.size
+    if p == 0:
+        return Estimate(0.0, 0.0, 1.0, float("inf"), trials)
+    variation = max(least, float(groups.std(ddof=1)) / p / np.sqrt(count))
+    reach = variation * float(stats.t.ppf(0.975, count - 1))
+    return Estimate(p, p * np.exp(-reach), min(1.0, p * np.exp(reach)), variation, trials)
+
+
+def split(score: Severity, kinds: Sequence[str], how: Rare, seed: int = 0) -> Found:
+    """The probability that `score` of a uniform point reaches a level.
+
+    Args:
+      score: of points (n, q), asked for one batch of all groups at a time.
+      kinds: (q,) of the coordinates; those of noise are drawn anew or kept, not moved.
+      how: sizes, and the level.
+      seed: of the points and moves.
+    """
+    (found,) = together(score, [steps(kinds, how, seed)])
+    return found
+
+
+def together(score: Severity, every: Sequence[Steps]) -> list[Found]:
+    """Several of them side by side, which are asked for one batch of all of them at a time."""
+    found: dict[int, Found] = {}
+    asked = dict(enumerate(map(next, every)))
+    while asked:
+        told = score(np.concatenate(list(asked.values())))
+        ends = np.cumsum([len(u) for u in asked.values()])[:-1]
+        for i, s in zip(list(asked), np.split(told, ends), strict=True):
+            try:
+                asked[i] = every[i].send(s)
+            except StopIteration as end:
+                del asked[i]
+                found[i] = end.value
+    return [found[i] for i in sorted(found)]
+
+
+def steps(kinds: Sequence[str], how: Rare, seed: int) -> Steps:
+    """Subset simulation, which asks for the severities (n,) of points (n, q) as it goes on."""
+    rng = np.random.Generator(np.random.Philox(key=seed))
+    noise = np.array([kind == "noise" for kind in kinds])
+    shape = (how.groups, how.particles // how.groups)
+    trials, step, levels = 0, 0.6, []
+    least = 0.0  # squared variation of independent worlds, which chains cannot have less of
+
+    def ask(z: np.ndarray) -> Generator[np.ndarray, np.ndarray, np.ndarray]:
+        nonlocal trials
+        trials += z[..., 0].size
+        told = yield _uniform(z.reshape(-1, z.shape[-1]))
+        return told.reshape(z.shape[:-1])
+
+    z = rng.standard_normal((*shape, len(kinds)))
+    s, p = (yield from ask(z)), np.ones(how.groups)
+    for _ in range(how.levels):
+        # One level for all groups, which is nearly independent of each; it must be passed.
+        level = float(np.sort(s, axis=None)[-max(2, round(how.share * s.size))])
+        if level >= how.level or (s >= level).all():
+            break
+        levels.append(level)
+        least += _variation(s >= level)
+        p *= (s >= level).mean(axis=1)
+        starts = [_chosen(one >= level, round(how.share * shape[1]), rng) for one in s]
+        z_now = np.stack([one[at] for one, at in zip(z, starts, strict=True)])
+        s_now = np.stack([one[at] for one, at in zip(s, starts, strict=True)])
+        zs, ss = [z_now], [s_now]
+        while sum(one.shape[1] for one in ss) < shape[1]:
+            moved = _moved(z_now, step, noise, rng)
+            s_moved = yield from ask(moved)
+            ok = s_moved >= level
+            z_now, s_now = np.where(ok[..., None], moved, z_now), np.where(ok, s_moved, s_now)
+            step = float(np.clip(step * np.exp(ok.mean() - _ACCEPTED), 0.02, 1.0))
+            zs.append(z_now)
+            ss.append(s_now)
+        z, s = (np.concatenate(some, axis=1)[:, : shape[1]] for some in (zs, ss))
+    p *= (s >= how.level).mean(axis=1)
+    failed = (s >= how.level) & (p > 0)[:, None]
+    least += _variation(s >= how.level)
+    return Found(
+        joined(p, trials, least**0.5), p, [*levels, how.level], _uniform(z[failed]), s[failed]
+    )
+
+
+def _variation(reached: np.ndarray) -> float:
+    """Squared coefficient of variation of a rate from so many independent worlds."""
+    rate = max(float(reached.mean()), 1 / reached.size)
+    return (1 - rate) / rate / reached.size
+
+
+def _uniform(z: np.ndarray) -> np.ndarray:
+    """Points (n, q) of the cube at these normal quantiles."""
+    return np.clip(stats.norm.cdf(z), _EDGE, 1 - _EDGE)
+
+
+def _chosen(beyond: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """As many of the worlds `beyond` (n,) as chains begin, each as often as another."""
+    some = rng.permutation(np.flatnonzero(beyond))
+    # A group that has none goes on with worlds that no longer count: its product is 0.
+    return np.resize(some if some.size else np.arange(beyond.size), count)
+
+
+def _moved(z: np.ndarray, step: float, noise: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Moves of a random half of the coordinates; of the noise, all of it anew or none."""
+    fresh = rng.standard_normal(z.shape)
+    moved = np.where(rng.random(z.shape) < 0.5, np.sqrt(1 - step**2) * z + step * fresh, z)
+    again = rng.random((*z.shape[:-1], 1)) < 0.5 * step
+    return np.where(noise, np.where(again, fresh, z), moved)
+
+
+# --- of a law ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Rare(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
+    """Estimate how often a law fails that rarely fails, by subset simulation.
+
+    The answer holds `p` and its `low`, `high` and `variation`, and `trials` (repetition); `p_group`
+    (repetition, group); and failures that were met, `u` (failure, quantity) with their `severity`.
+
+    Example:
+      >>> import rps_jax
+      >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=1.0)
+      >>> setting = rps_jax.Setting("quasistatic", rules=rules)
+      >>> found = rps_jax.rare("rps", drums, particles=40, groups=2, setting=setting)
+      >>> found.p.values.tolist()  # within a second no push is done
+      [1.0]
+    """
+
+    TITLE: ClassVar[str] = "Rare failures"
+    SMALL: ClassVar[Mapping[str, Any]] = {
+        "particles": 200,
+        "groups": 4,
+        "domain": "wide,objects=random_box",
+    }
+
+    particles: int = option(1000, 1, 10_000_000)
+    """Number of worlds of a level, over all groups; a group should have a hundred."""
+    groups: int = option(10, 2, 10_000)
+    """Number of groups that share nothing but the levels; their spread is the interval."""
+    share: float = option(0.2, 0.05, 0.5)
+    """Share of the worlds that reach the next level, whose chains begin in them [1]."""
+    beyond: float = option(0.0, 0, 20, unit="m")
+    """A failure counts if it missed the target by more than this [m]; 0 counts all failures."""
+    levels: int = option(30, 1, 100)
+    """Number of levels after which it gives up, and says 0 if nothing has failed."""
+    repetitions: int = option(1, 1, 10_000)
+    """How often all of it is done, side by side, each time with points of its own."""
+    brute: int = option(0, 0, 1_000_000_000)
+    """Number of drawn worlds that it is compared with."""
+
+    def check(self) -> None:
+        """Check that the groups are large enough, and the engine."""
+        least = self.groups * 2 * round(1 / self.share)
+        errors.check_count("particles", self.particles, at_least=least, at_most=10_000_000)
+        errors.check_count("seed", self.setting.seed, at_least=0, at_most=2**30)
+        self.check_engine([self.params])
+
+    def configuration(self) -> dict[str, Any]:
+        """All that the answer depends on, but the drawn worlds beside it."""
+        found = super().configuration()
+        del found["brute"]
+        return found
+
+    @property
+    def level(self) -> float:
+        """Severity from which on a trial is what is looked for."""
+        return 1 + self.beyond
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Run the repetitions, and the drawn worlds they are compared with."""
+        domain, seed = self.ranges, self.setting.seed
+        probe = Probe(domain, self.params, self.setting, run.folder, **run.shape)
+        kinds = [one.kind for one in points.quantities(domain)]
+        first = seed_of(seed, "tune") * 10_000
+        every = [steps(kinds, self, first + i) for i in range(self.repetitions)]
+        found = _labelled(domain, together(lambda u: probe(u).severity.values, every))
+        return self._compared(found, run) if self.brute else found
+
+    def _compared(self, found: xr.Dataset, run: Run) -> xr.Dataset:
+        """The answer with the rate in drawn worlds, a sweep in the folder's `drawn`."""
+        seeded = replace(self.setting, seed=seed_of(self.setting.seed, "tune"))
+        plan = Plan(self.ranges, self.brute, {"law": self.params}, seeded, 4096)
+        phase(run.report, "drawn worlds")
+        folder = None if run.folder is None else run.folder / "drawn"
+        results = sweeps.whole(plan, folder, **run.shape)
+        failed = severity_of(results.sel(law="law"), self.setting.rules) >= self.level
+        told = brute(count_of(failed), failed.size)
+        values = {name: getattr(told, name) for name in Estimate._fields}
+        return found.assign({f"drawn_{name}": ((), value) for name, value in values.items()})
+
+    def intro(self, found: xr.Dataset) -> str:
+        """What was asked."""
+        what = "a failure is a trial that does not reach its target."
+        if self.beyond:
+            what = f"a failure misses the target by more than {self.beyond:g} m."
+        return f"{self.label} in the domain {name_of(self.domain)}: {what}"
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """The estimates, beside drawn worlds if there are any."""
+        text = (
+            "Intervals of 95 %: of the splitting from the spread of its groups, of drawn worlds by "
+            "Clopper and Pearson. The last column is the number of worlds over that of drawn "
+            "worlds with the same coefficient of variation. A kind of failure that no group has "
+            "met is in no interval."
+        )
+        against = drawn_of(found)
+        if against is not None and not against.p:
+            text += " None of the drawn worlds fails."
+        elif against is not None:
+            off = 100 * (float(found.p.mean()) / against.p - 1)
+            text += (
+                f" {covered(found, against.p)} of {self.repetitions} intervals hold the rate of "
+                f"the drawn worlds, and the mean of all is {off:+.1f} % off it."
+            )
+        picture = Picture("rare", partial(figure_of, found, against))
+        return [Section("How rare is a failure", text, table(found, against), picture)]
+
+
+rare = call_of(Rare)
+
+
+def drawn_of(found: xr.Dataset) -> Estimate | None:
+    """The estimate from drawn worlds, if it was asked for."""
+    if "drawn_p" not in found:
+        return None
+    p, low, high, variation = (float(found[f"drawn_{name}"]) for name in Estimate._fields[:4])
+    return Estimate(p, low, high, variation, int(found.drawn_trials))
+
+
+def _labelled(domain: Domain, every: Sequence[Found]) -> xr.Dataset:
+    estimates = [found.estimate for found in every]
+    columns: dict[str, Any] = {
+        name: ("repetition", [getattr(one, name) for one in estimates]) for name in Estimate._fields
+    }
+    deepest = max(len(found.levels) for found in every)
+    levels = np.full((len(every), deepest), np.nan)
+    for i, found in enumerate(every):
+        levels[i, : len(found.levels)] = found.levels
+    columns["p_group"] = (("repetition", "group"), np.stack([found.groups for found in every]))
+    columns["level"] = (("repetition", "depth"), levels)
+    u, severity = (np.concatenate([getattr(f, name) for f in every]) for name in ("u", "severity"))
+    columns["u"] = (("failure", "quantity"), u)
+    columns["severity"] = ("failure", severity)
+    return xr.Dataset(columns, {"quantity": list(points.names(domain))})
+
+
+def brute(failures: int, trials: int) -> Estimate:
+    """Estimate the probability from drawn worlds, with the interval of Clopper and Pearson."""
+    p = failures / trials
+    low, high = statistics.clopper_pearson(failures, trials)
+    variation = np.sqrt((1 - p) / (p * trials)) if failures else float("inf")
+    return Estimate(p, low, high, float(variation), trials)
+
+
+def worlds_needed(p: float, variation: float) -> float:
+    """How many drawn worlds give the probability `p` with this coefficient of variation."""
+    return (1 - p) / (p * variation**2) if p > 0 else float("inf")
+
+
+def table(found: xr.Dataset, against: Estimate | None = None) -> list[list[str]]:
+    """Header and a row for each repetition, all of them together, and drawn worlds beside them."""
+    rows = [["", "probability of failure", "95 %", "variation", "worlds", "share of drawn worlds"]]
+
+    def row(name: str, one: Estimate) -> list[str]:
+        known = one is not against and 0 < one.p < 1
+        share = one.trials / worlds_needed(one.p, one.variation) if known else float("nan")
+        ends = f"[{one.low:.2g}, {one.high:.2g}]"
+        said = f"{100 * share:.2g} %" if known else ""
+        return [name, f"{one.p:.3g}", ends, f"{one.variation:.2f}", f"{one.trials:,}", said]
+
+    for i in range(found.sizes["repetition"]):
+        one = found.isel(repetition=i)
+        p, low, high, variation = (float(one[name]) for name in Estimate._fields[:4])
+        each = Estimate(p, low, high, variation, int(one.trials))
+        rows.append(row(f"splitting, {i + 1}", each))
+    if found.sizes["repetition"] > 1:
+        whole = joined(found.p.values, int(found.trials.sum()))
+        rows.append(row("splitting, all", whole))
+    if against is not None:
+        rows.append(row("drawn worlds", against))
+    return rows
+
+
+def covered(found: xr.Dataset, p: float) -> int:
+    """In how many repetitions the interval holds `p`."""
+    return int(((found.low <= p) & (p <= found.high)).sum())
+
+
+def figure_of(found: xr.Dataset, against: Estimate | None) -> Figure:
+    """Estimates of every repetition with their intervals, and drawn worlds' behind them."""
+    figure = Figure(figsize=(6.5, 3.4), layout="constrained")
+    ax = figure.subplots()
+    place = np.arange(found.sizes["repetition"])
+    p = found.p.values
+    errors = np.abs(np.stack([p - found.low.values, found.high.values - p]))
+    ax.errorbar(place + 1, p, errors, fmt="o", ms=4, capsize=2, color="C3", label="splitting")
+    if against is not None:
+        ax.axhspan(against.low, against.high, color="C0", alpha=0.2, lw=0)
+        ax.axhline(against.p, color="C0", label="drawn worlds")
+    if (p > 0).all():
+        ax.set_yscale("log")
+    ax.set_xlabel("repetition")
+    ax.set_ylabel("probability of failure [1]")
+    ax.grid(alpha=0.3, axis="y")
+    ax.legend(fontsize=8)
+    return figure

@@ -1,0 +1,180 @@
+"""What the paper leaves open, one reading at a time; and whether its simulator lost its trials.
+
+All of it runs on the fused engine, the readings at 5 ms with the solver run to its end, so that no
+difference comes from the solver.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from scipy import stats
+
+from rps_jax.analysis import statistics
+from rps_jax.robot.robot import Robot
+from rps_jax.robot.skin import CapacitiveSkin, IdealSkin
+from rps_jax.trials.setting import Setting
+from rps_jax.world import paper
+from rps_jax.world.physics import PHYSICS, Physics
+from sweeps.shared import Condition
+
+DEFAULT = "default"
+_CONVERGED = replace(PHYSICS["default"]["standard"], timestep=0.005, iterations=30)
+_GAZEBO = PHYSICS["paper_gazebo"]["standard"]
+_CONE = replace(_GAZEBO, cone="elliptic")
+
+
+def _setting(physics: Physics = _CONVERGED, **changes: Any) -> Setting:
+    return Setting(physics=replace(physics, **changes), engine="fused")
+
+
+def _params(what: str, **params: float) -> Condition:
+    return Condition(what, _setting(), params=params)
+
+
+def _case(what: str, **case: Any) -> Condition:
+    return Condition(what, _setting(), case=case)
+
+
+READINGS = {
+    DEFAULT: Condition("the defaults", _setting()),
+    "tangent_as_printed": _params("tangent as printed (gamma_max = inf)", gamma_max=math.inf),
+    "gamma_max_1.4": _params("gamma_max 1.4 rad instead of 1.56", gamma_max=1.4),
+    "gamma_max_1": _params("gamma_max 1 rad", gamma_max=1.0),
+    "l_mr_5cm": _params("l_mr 0.05 m instead of 0.15", l_mr=0.05),
+    "l_mr_10cm": _params("l_mr 0.10 m", l_mr=0.10),
+    "l_mr_20cm": _params("l_mr 0.20 m", l_mr=0.20),
+    "a_r_max_5": _params("a_r_max 5 instead of 10", a_r_max=5.0),
+    "a_r_max_20": _params("a_r_max 20", a_r_max=20.0),
+    "saturate_first": _params("omega from the saturated velocity", saturate_first=1.0),
+    "clip_each": _params("v_x and v_y clipped one by one", clip_each=1.0),
+    "period_5ms": Condition("control period 5 ms instead of 20", _setting(control_period=0.005)),
+    "period_10ms": Condition("control period 10 ms", _setting(control_period=0.01)),
+    "period_50ms": Condition("control period 50 ms", _setting(control_period=0.05)),
+    "period_100ms": Condition("control period 100 ms", _setting(control_period=0.1)),
+    "drive_on_loss": _params("0.05 m/s instead of 0.01 after a loss", v_lost=0.05),
+    "keep_on_loss": _params("last contact acted upon after a loss", keep_contact=1.0),
+    "base_98cm": _case("base 0.978 m long instead of 0.725", robot=Robot(half_length=0.489)),
+    "base_58cm": _case("base 0.58 m long (square)", robot=Robot(half_length=0.29)),
+    "capacitive": _case("capacitive skin of 42 taxels", skin=CapacitiveSkin()),
+    "tolerance_10mm": _case("skin tolerance 10 mm instead of 6", skin=IdealSkin(0.010)),
+    "tolerance_3mm": _case("skin tolerance 3 mm", skin=IdealSkin(0.003)),
+    "tolerance_1mm": _case("skin tolerance 1 mm", skin=IdealSkin(0.001)),
+    "rear_far": _case("load on the far left corner", rear="far"),
+    "gap_0": _case("initial gap 0 instead of 2 cm", gap=0.0),
+    "gap_10cm": _case("initial gap 10 cm", gap=0.10),
+    "sgn_0": _params("sgn(0) = 1 instead of 0", sgn_0=1.0),
+}
+QUICK_READINGS = (DEFAULT, "tangent_as_printed", "drive_on_loss", "tolerance_1mm", "capacitive")
+
+_THIN = {"skin": IdealSkin(0.001)}
+
+
+def _gazebo(what: str, tolerance: float = 0.001, bearing: float = 0.0, **changes: Any) -> Condition:
+    return Condition(
+        what, _setting(_GAZEBO, **changes), case={"skin": IdealSkin(tolerance), "bearing": bearing}
+    )
+
+
+# What Gazebo may have done to the paper's trials: all together, then each ingredient alone.
+GAZEBO = {
+    DEFAULT: Condition("the defaults at 1 ms", _setting(_CONE)),
+    "paper_gazebo": _gazebo("`paper_gazebo`: pyramid, skin 1 mm"),
+    "pyramid": _gazebo("pyramid alone, skin 6 mm", 0.006),
+    "pyramid_turned": _gazebo("pyramid alone, turned by 45 degrees", 0.006, math.pi / 4),
+    "thin": Condition("skin 1 mm alone, isotropic", _setting(_CONE), case=_THIN),
+    "gazebo_turned": _gazebo("`paper_gazebo` turned by 45 degrees", bearing=math.pi / 4),
+    "thin_half": _gazebo("pyramid, skin 0.5 mm", 0.0005),
+    "thin_3mm": _gazebo("pyramid, skin 3 mm", 0.003),
+    "gazebo_drive": replace(
+        _gazebo("`paper_gazebo`, 0.05 m/s after a loss"), params={"v_lost": 0.05}
+    ),
+    "gazebo_2ms": _gazebo("`paper_gazebo` in steps of 2 ms", timestep=0.002),
+    "gazebo_5ms": _gazebo("`paper_gazebo` in steps of 5 ms", timestep=0.005),
+}
+QUICK_GAZEBO = (DEFAULT, "paper_gazebo")
+
+TOLERANCES = (0.5, 1, 2, 3, 4, 5, 6, 8, 10, 12, 15)  # [mm] of the skin
+QUICK_TOLERANCES = (1, 3, 6, 10)
+ON_LOSS = {
+    "creep": ("ahead at 0.01 m/s", {}),
+    "drive": ("ahead at 0.05 m/s", {"v_lost": 0.05}),
+    "keep": ("last contact kept", {"keep_contact": 1.0}),
+}
+
+
+def curve(tolerances: tuple[float, ...] = TOLERANCES) -> dict[str, Condition]:
+    """Conditions over skin tolerance [mm] and behaviour on loss."""
+    return {
+        f"{loss}_{mm:g}mm": Condition(
+            f"{mm:g} mm, {what}",
+            Setting(engine="fused"),
+            params=params,
+            case={"skin": IdealSkin(mm / 1000)},
+        )
+        for loss, (what, params) in ON_LOSS.items()
+        for mm in tolerances
+    }
+
+
+def by_tolerance(results: xr.Dataset, tolerances: tuple[float, ...]) -> xr.Dataset:
+    """The RPS trials of `curve`, (loss, tolerance, object): how many were `won`, and the mean time
+    `lost` without contact [s].
+    """
+    one = results.sel(law="rps")
+    measures = {
+        "won": one.success.sum(("friction", "target")),
+        "lost": one.contact_lost_time.mean(("friction", "target")),
+    }
+    return xr.Dataset(
+        {
+            name: (
+                ("loss", "tolerance", "object"),
+                np.stack(
+                    [
+                        values.sel(condition=[f"{loss}_{mm:g}mm" for mm in tolerances]).values
+                        for loss in ON_LOSS
+                    ]
+                ),
+            )
+            for name, values in measures.items()
+        },
+        coords={
+            "loss": list(ON_LOSS),
+            "what": ("loss", [what for what, _ in ON_LOSS.values()]),
+            "tolerance": list(tolerances),
+            "object": one.object,
+        },
+    )
+
+
+def cells(results: xr.Dataset, condition: str = "paper_gazebo") -> list[list[str]]:
+    """Header and the cells of Table II: ours, the paper's with its Wilson interval, in or out.
+
+    The last column is the p of Fisher's exact test that both have the same rate.
+    """
+    one = results.sel(condition=condition).success
+    trials = one.sizes["target"]
+    rows = [["cell", "ours", "paper", "95 % of the paper's", "inside", "Fisher p"]]
+    for law in map(str, one.law.values):
+        for name in map(str, one.object.values):
+            for friction in map(str, one.friction.values):
+                won = int(one.sel(law=law, object=name, friction=friction).sum())
+                theirs, of = paper.TABLE_II[law, name, friction], len(paper.TARGETS)
+                low, high = statistics.wilson(theirs, of)
+                table = [[won, trials - won], [theirs, of - theirs]]
+                rows.append(
+                    [
+                        f"{law.upper()} {name} {friction}",
+                        f"{won} of {trials}",
+                        f"{theirs} of {of}",
+                        f"{of * low:.1f}-{of * high:.1f}",
+                        "yes" if low <= won / trials <= high else "no",
+                        f"{stats.fisher_exact(table).pvalue:.2g}",
+                    ]
+                )
+    return rows

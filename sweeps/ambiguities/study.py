@@ -1,0 +1,118 @@
+"""What the paper leaves open: its 144 trials of RPS under one reading at a time.
+
+    rps sweeps/ambiguities --quick
+
+`--gazebo` tests instead whether the paper's simulator lost its trials, and `--curve` runs skin
+tolerances. The readings stand in `readings`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, ClassVar
+
+import xarray as xr
+
+from rps_jax import errors
+from rps_jax.analysis import figures
+from rps_jax.analysis.report import Picture, Section
+from rps_jax.control import registry
+from rps_jax.runs.question import Run, call_of
+from rps_jax.world import paper
+from rps_jax.world.objects import PAPER_OBJECTS
+from sweeps.ambiguities import readings
+from sweeps.shared import Condition, Grid, Trials, condition_rows, run_conditions
+
+
+@dataclass(frozen=True)
+class Ambiguities(Trials[xr.Dataset]):
+    """Run the paper's trials under each reading of what it leaves open, one at a time.
+
+    The answer holds outcomes (condition, law, object, friction, target).
+    """
+
+    TITLE: ClassVar[str] = "What the paper leaves open"
+    GROWS: ClassVar[tuple[str, ...]] = ("laws", "readings", "gazebo", "curve")
+
+    laws: tuple[str, ...] = ()
+    """Names of laws; by default rps, and with --gazebo also nps and aps."""
+    readings: tuple[str, ...] = ()
+    """Names of the readings; by default all."""
+    gazebo: bool = False
+    """Whether to run the ingredients of the paper's simulator instead, with all three laws."""
+    curve: bool = False
+    """Whether to run skin tolerances and behaviours on loss of contact instead."""
+    targets: tuple[tuple[float, float], ...] = paper.TARGETS
+    """Targets X Y [m], one pair after the other; by default the paper's 24."""
+
+    def small(self) -> Mapping[str, Any]:
+        """Few targets and readings."""
+        few = readings.QUICK_GAZEBO if self.gazebo else readings.QUICK_READINGS
+        if self.curve:
+            few = tuple(readings.curve(readings.QUICK_TOLERANCES))
+        return {"targets": paper.FEW_TARGETS, "readings": few}
+
+    @property
+    def known(self) -> dict[str, Condition]:
+        """The readings that can be asked for."""
+        known = readings.GAZEBO if self.gazebo else readings.READINGS
+        return readings.curve() if self.curve else known
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the readings, the defaults first."""
+        names = self.readings or tuple(self.known)
+        return names if self.curve else tuple(dict.fromkeys([readings.DEFAULT, *names]))
+
+    @property
+    def grid(self) -> Grid:
+        """Which trials."""
+        laws = self.laws or (paper.LAWS if self.gazebo else ("rps",))
+        return Grid(laws=laws, targets=self.targets)
+
+    def check(self) -> None:
+        """Check the names."""
+        super().check()
+        if self.gazebo and self.curve:
+            raise errors.InputError("gazebo and curve are not allowed together: choose one.")
+        for name in self.readings:
+            errors.check_name("reading", name, self.known)
+        for name in self.grid.laws:
+            errors.check_name("law", name, registry.LAWS)
+
+    def trials(self) -> int | None:
+        """How many trials there are."""
+        return len(self.names) * self.grid.size
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Run the readings that are missing."""
+        conditions = {name: self.known[name] for name in self.names}
+        return run_conditions(conditions, self.grid, run.folder, **run.shape)
+
+    def intro(self, found: xr.Dataset) -> str:
+        """What was asked."""
+        return (
+            f"{self.grid.size} trials in every row, in the fused engine. Differences: McNemar's "
+            "exact test, false discoveries held at 5 %."
+        )
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """Successes under each reading; the cells of Table II; the curve over tolerances."""
+        names, laws = self.names, self.grid.laws
+        sections = [
+            Section(f"Readings, {law.upper()}", "", condition_rows(found, names[0], law))
+            for law in laws
+        ]
+        if self.gazebo and "paper_gazebo" in names and set(laws) <= set(paper.LAWS):
+            sections.append(Section("Cells of Table II", "", readings.cells(found)))
+        if self.curve and not self.readings and "rps" in laws:
+            curve = readings.by_tolerance(found, readings.TOLERANCES)
+            trials = self.grid.size // len(PAPER_OBJECTS)
+            picture = Picture("tolerance", partial(figures.tolerance_curve, curve, trials))
+            sections.append(Section("Success over the skin's tolerance", "", (), picture))
+        return sections
+
+
+ambiguities = call_of(Ambiguities)

@@ -1,0 +1,128 @@
+"""Do the engines agree in random worlds?
+
+    rps sweeps/engines --worlds 90
+
+runs the same worlds in every engine that can run them here (MJX-Warp: on an NVIDIA GPU, and without
+prisms, as with `--objects random_box random_cylinder`), and compares outcomes with those of
+converged C MuJoCo. `rps sweep` runs one engine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar
+
+import xarray as xr
+
+from rps_jax import engines as engines_
+from rps_jax import errors
+from rps_jax.analysis import tables
+from rps_jax.analysis.report import Section
+from rps_jax.control import registry
+from rps_jax.control.registry import LawLike
+from rps_jax.record.options import option
+from rps_jax.runs import sweep as sweeps
+from rps_jax.runs.plan import Plan
+from rps_jax.runs.question import Run, call_of
+from rps_jax.trials.progress import InTurn
+from rps_jax.trials.setting import Setting
+from rps_jax.world import domain as domains
+from rps_jax.world.domain import DomainLike
+from rps_jax.world.physics import preset
+from sweeps.shared import Trials
+
+# The first is what the others are compared with.
+ENGINES = {
+    "C, reference": Setting(physics=preset(fidelity="reference"), engine="mujoco"),
+    "C, standard": Setting(physics=preset(), engine="mujoco"),
+    "fused, standard": Setting(physics=preset(), engine="fused"),
+    "fused, 5 ms": Setting(physics=replace(preset(), timestep=0.005), engine="fused"),
+    "fused, 2 ms": Setting(physics=replace(preset(), timestep=0.002), engine="fused"),
+    "fused, fast": Setting(physics=preset(fidelity="fast"), engine="fused"),
+    "quasistatic": Setting(physics=preset(), engine="quasistatic"),
+    "MJX, standard": Setting(physics=preset(), engine="mjx"),
+    "MJX-Warp, standard": Setting(physics=preset(), engine="warp"),
+}
+
+
+@dataclass(frozen=True)
+class Engines(Trials[xr.DataTree]):
+    """Tell whether the engines agree in random worlds, outcome by outcome.
+
+    The answer is a tree with the outcomes (world) of each engine.
+    """
+
+    TITLE: ClassVar[str] = "Do the engines agree in random worlds?"
+    SMALL: ClassVar[Mapping[str, Any]] = {
+        "worlds": 16,
+        "objects": ("random_cylinder",),
+        "engines": ("C, standard", "fused, standard"),
+    }
+    GROWS: ClassVar[tuple[str, ...]] = ("engines",)
+
+    law: LawLike = "rps"
+    """The law: its name, as rps or aps, or a file's; changes follow, as rps,K_h=0.3."""
+    domain: DomainLike = "wide"
+    """Ranges from which worlds are drawn: paper, hardware, wide, real, prisms or hostile, or a JSON
+    file of ranges; changes follow, as wide,mass=3:10."""
+    worlds: int = option(90, 1, 10_000_000)
+    """Number of worlds."""
+    objects: tuple[str, ...] = ()
+    """Objects to push, as random_box random_cylinder; by default the domain's."""
+    engines: tuple[str, ...] = ()
+    """Engines and physics by name, the first to be compared with; by default all that run here."""
+    part: int = option(256, 1, 1_000_000)
+    """Number of trials in a part: what is lost when killed, at most. C waits for the slowest of
+    each."""
+
+    @cached_property
+    def plans(self) -> dict[str, Plan]:
+        """What is run, by the engine's name."""
+        ranges = domains.named(self.domain)
+        ranges = replace(ranges, objects=self.objects or ranges.objects)
+        label, params = registry.read_law(self.law)
+        here = (n for n, s in ENGINES.items() if engines_.get(s.engine).works(ranges.families))
+        return {
+            name: Plan(ranges, self.worlds, {label: params}, ENGINES[name], self.part)
+            for name in self.engines or here
+        }
+
+    def check(self) -> None:
+        """Check the names, and that the engines can step these worlds here."""
+        super().check()
+        for name in self.engines:
+            errors.check_name("engines", name, ENGINES)
+        for plan in self.plans.values():
+            plan.check_here()
+
+    def trials(self) -> int | None:
+        """How many trials there are."""
+        return sum(plan.trials for plan in self.plans.values())
+
+    def configuration(self) -> dict[str, Any]:
+        """Nothing: the plan of each engine stands in its own folder."""
+        return {"question": self.name}
+
+    def answer(self, run: Run) -> xr.DataTree:
+        """Run what is missing in each engine."""
+        heard, found = InTurn(run.report), {}
+        shape = run._replace(report=heard).shape
+        for name, plan in self.plans.items():
+            folder = None if run.folder is None else run.folder / name.replace(", ", "_")
+            found[name] = sweeps.whole(plan, folder, **shape).isel(law=0)
+            heard.ended(plan.trials)
+        return xr.DataTree.from_dict(found)
+
+    def intro(self, found: xr.DataTree) -> str:
+        """What was asked."""
+        return f"The same {self.worlds} worlds in every engine. Intervals: Wilson 95 %."
+
+    def report(self, found: xr.DataTree, run: Run) -> Sequence[Section]:
+        """Outcomes equal to those of the first engine."""
+        each = {name: found[name].to_dataset() for name in self.plans}
+        return [Section("Equal outcomes", "", tables.agreement_table(each))]
+
+
+engines = call_of(Engines)

@@ -1,0 +1,215 @@
+"""Is the physics right? The paper's trials at many settings of the solver, against C MuJoCo.
+
+The reference is C MuJoCo run to convergence. Every row runs the same trials; what is compared is
+the outcome, trial by trial, and the object's place after the first 5 s.
+
+    rps sweeps/fidelity --quick
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, ClassVar
+
+import numpy as np
+import xarray as xr
+
+from rps_jax import engines, errors
+from rps_jax.analysis import statistics
+from rps_jax.analysis.report import Section
+from rps_jax.engines import EngineName
+from rps_jax.runs.question import Run, call_of
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+from rps_jax.world import paper
+from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
+from sweeps.shared import Condition, Grid, Trials, run_conditions
+
+REFERENCE = "reference"
+_EARLY = 5.0  # [s] after which the object's place is compared
+
+
+def _condition(engine: EngineName, base: Physics, what: str, **changes: Any) -> Condition:
+    return Condition(what, Setting(physics=replace(base, **changes), engine=engine))
+
+
+_c = partial(_condition, "mujoco", preset(fidelity="reference"))
+_mjx = partial(_condition, "mjx", preset())
+_fused = partial(_condition, "fused", preset())
+
+# C MuJoCo, converged, at several steps.
+IN_C = {
+    REFERENCE: _c("reference: C, 1 ms, elliptic"),
+    "c_2ms": _c("C, 2 ms", timestep=0.002),
+    "c_5ms": _c("C, 5 ms", timestep=0.005),
+    "c_10ms": _c("C, 10 ms", timestep=0.01),
+    "c_20ms": _c("C, 20 ms", timestep=0.02),
+}
+# MJX in float32, whose cost grows with its iterations.
+IN_MJX = {
+    "standard": _mjx("MJX `standard`"),
+    "fast": Condition("MJX `fast`", Setting(physics=preset(fidelity="fast"), engine="mjx")),
+    "mjx_20ms_4_6": _mjx("MJX, 20 ms, 4/6", timestep=0.02, iterations=4, ls_iterations=6),
+}
+# The same equations in the fused engine, float32: first as they are, then what the physics does.
+IN_FUSED = {
+    "fused_standard": _fused("fused, `standard`"),
+    "fused_fast": Condition(
+        "fused, `fast`", Setting(physics=preset(fidelity="fast"), engine="fused")
+    ),
+    "fused_20ms_4_6": _fused("fused, 20 ms, 4/6", timestep=0.02, iterations=4, ls_iterations=6),
+    "fused_5ms": _fused("fused, 5 ms", timestep=0.005),
+    "impratio_1": _fused("fused, impratio 1", impratio=1.0),
+    "impratio_100": _fused("fused, impratio 100", impratio=100.0),
+    "mujocos_ground": _fused("fused, MuJoCo's own ground contact", **MUJOCOS_GROUND),
+    "soft": _fused("fused, skin contact 60 ms (solref)", base_solref=(0.06, 1.0)),
+    "pyramid": _condition("fused", preset("paper_gazebo"), "fused, friction pyramid, 1 ms"),
+    "period_5ms": _fused("fused, control period 5 ms", control_period=0.005, timestep=0.005),
+    "period_10ms": _fused("fused, control period 10 ms", control_period=0.01),
+    "period_50ms": _fused("fused, control period 50 ms", control_period=0.05),
+    "drive_on_loss": replace(_fused("fused, 0.05 m/s after a loss"), params={"v_lost": 0.05}),
+    "keep_on_loss": replace(
+        _fused("fused, last contact kept on loss"), params={"keep_contact": 1.0}
+    ),
+}
+# Without inertia, in the plane.
+QUASISTATIC = {
+    "quasistatic": _condition("quasistatic", preset(), "quasi-static, 10 ms"),
+    "quasistatic_20ms": _condition("quasistatic", preset(), "quasi-static, 20 ms", timestep=0.02),
+}
+CONDITIONS = IN_C | IN_MJX | IN_FUSED | QUASISTATIC  # which every machine can run
+# On an NVIDIA GPU alone; a cylinder touches the base itself, not through a capsule.
+IN_WARP = {
+    "warp_standard": _condition("warp", preset(), "MJX-Warp `standard`"),
+    "warp_fast": _condition("warp", preset(fidelity="fast"), "MJX-Warp `fast`"),
+}
+QUICK = (REFERENCE, "fused_standard", "fused_fast")
+
+
+@dataclass(frozen=True)
+class Fidelity(Trials[xr.Dataset]):
+    """Tell how finely the physics must be solved: the paper's trials against converged C MuJoCo.
+
+    The answer holds outcomes (condition, law, object, friction, target), and `early_error` [m]: how
+    far the object is, 5 s after the start, from where it is in the reference, for RPS alone.
+    """
+
+    TITLE: ClassVar[str] = "Is the physics converged?"
+    SMALL: ClassVar[Mapping[str, Any]] = {"conditions": QUICK, "targets": paper.FEW_TARGETS}
+    GROWS: ClassVar[tuple[str, ...]] = ("conditions",)
+
+    conditions: tuple[str, ...] = tuple(CONDITIONS)
+    """Names of the settings, the reference always among them; by default all that run everywhere:
+    warp_standard and warp_fast (MJX-Warp) take an NVIDIA GPU."""
+    targets: tuple[tuple[float, float], ...] = paper.TARGETS
+    """Targets X Y [m], one pair after the other; by default the paper's 24."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the settings, with the reference."""
+        return tuple(dict.fromkeys([REFERENCE, *self.conditions]))
+
+    @property
+    def grid(self) -> Grid:
+        """Which trials."""
+        return Grid(laws=paper.LAWS, targets=self.targets)
+
+    def check(self) -> None:
+        """Check the names, and that their engines work here."""
+        super().check()
+        known = CONDITIONS | IN_WARP
+        for name in self.conditions:
+            condition = known[errors.check_name("condition", name, known)]
+            engines.get(condition.setting.engine).check()
+
+    def trials(self) -> int | None:
+        """How many trials there are, but for the short ones."""
+        return len(self.names) * self.grid.size
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Run the settings that are missing."""
+        chosen = {name: (CONDITIONS | IN_WARP)[name] for name in self.names}
+        results = run_conditions(chosen, self.grid, run.folder, **run.shape)
+        short = {name: _early(condition) for name, condition in chosen.items()}
+        of_rps = self.grid._replace(laws=("rps",))
+        folder = None if run.folder is None else run.folder / "early"
+        if folder is not None:
+            folder.mkdir(exist_ok=True)
+        early = run_conditions(short, of_rps, folder, slots=run.slots, workers=run.workers)
+        place = early.object_pose.sel(law="rps", pose=["x", "y"])
+        apart = ((place - place.sel(condition=REFERENCE)) ** 2).sum("pose")
+        results["early_error"] = np.sqrt(apart).drop_vars("law")
+        return results
+
+    def intro(self, found: xr.Dataset) -> str:
+        """What was asked."""
+        return (
+            f"{self.grid.size} trials in every row, compared one by one with those of C MuJoCo in "
+            "steps of 1 ms."
+        )
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """Successes, equal outcomes and costs of each setting."""
+        return [
+            Section("Settings of the solver against C MuJoCo", "", table(found)),
+            Section("Equal outcomes by law", "", by_law(found)),
+        ]
+
+
+fidelity = call_of(Fidelity)
+
+
+def _early(condition: Condition) -> Condition:
+    setting = replace(condition.setting, rules=Rules(horizon=_EARLY))
+    return replace(condition, setting=setting)
+
+
+def table(results: xr.Dataset) -> list[list[str]]:
+    """Header and one row for each condition.
+
+    The cost is wall clock for a simulated second of one world while the trials ran.
+    """
+    base = results.success.sel(condition=REFERENCE)
+    objects = [str(o) for o in results.object.values]
+    laws = [str(s) for s in results.law.values]
+    header = ["setting", *(f"{s.upper()} {o}" for s in laws for o in objects)]
+    header += ["equal outcomes", "95 %", "+/-", "McNemar p", "5 s error: median, 95 %", "cost"]
+    rows = [header]
+    for name in map(str, results.condition.values):
+        one = results.sel(condition=name)
+        counts = one.success.sum(("friction", "target"))
+        c = statistics.compare(base, one.success)
+        low, high = c.equal_interval
+        median, worst = np.quantile(one.early_error.values, (0.5, 0.95))
+        cost = float(one.run_time) / float(one.simulated)
+        rows.append(
+            [
+                str(one.what.values),
+                *(str(int(counts.sel(law=s, object=o))) for s in laws for o in objects),
+                f"{100 * c.equal:.1f} %",
+                f"{100 * low:.0f}-{100 * high:.0f} %",
+                f"+{c.gained} -{c.lost}",
+                f"{c.p:.2g}",
+                f"{1000 * median:.1f}, {1000 * worst:.1f} mm",
+                f"{1000 * cost:.3g} ms",
+            ]
+        )
+    return rows
+
+
+def by_law(results: xr.Dataset) -> list[list[str]]:
+    """Header and one row for each condition: share of equal outcomes for each law."""
+    base = results.success.sel(condition=REFERENCE)
+    laws = [str(s) for s in results.law.values]
+    rows = [["setting", *(s.upper() for s in laws)]]
+    for name in map(str, results.condition.values):
+        one = results.success.sel(condition=name)
+        shares = []
+        for s in laws:
+            c = statistics.compare(base.sel(law=s), one.sel(law=s))
+            low, high = c.equal_interval
+            shares.append(f"{100 * c.equal:.1f} % ({100 * low:.0f}-{100 * high:.0f})")
+        rows.append([str(results.what.sel(condition=name).values), *shares])
+    return rows

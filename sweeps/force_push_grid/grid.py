@@ -1,0 +1,300 @@
+"""Force Push on its authors' own ground: 243 pushes of each of their two sliders along a path.
+
+Heins and Schoellig (2024) push a box and a cylinder of 1 kg, 1 m wide and 0.12 m high, along the
+x axis with one point, at 0.1 m/s for 300 s from the first contact: 3 moments of inertia, 3 contact
+frictions, 3 lateral offsets of the slider, 3 of its angles and 3 points of contact. A push fails
+whose point is 2 m from the slider's middle, or feels less than 1 N for 20 s. This is the grid of
+their script `pyb_simulation_many.py`, with the law `force_push_published` for their controller.
+Beside it stands the open loop of their experiments, which is back to the path by -k_y Delta alone.
+
+What differs from theirs: MuJoCo's equations for PyBullet's, in steps of 5 ms for 1 ms. A square
+base of 2 cm that never turns for a sphere of radius 5 cm on two prismatic joints; its contact spans
+the heights 0.06 to 0.12 m where the sphere's is at 0.06 m. No friction of a contact is 0.001, since
+MuJoCo's cones need some. The slider stands on the points on which this package's engines stand
+solids: a box on its corners, a cylinder on three points of its rim.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from rps_jax import engines
+from rps_jax.control.base import Law
+from rps_jax.control.laws import force_push_published as force_push
+from rps_jax.control.laws.force_push_published import PublishedForcePushParams
+from rps_jax.control.observation import Details, ForceObservation, Twist
+from rps_jax.engines import EngineName
+from rps_jax.geometry import planar, solid
+from rps_jax.geometry.footprint import Footprint
+from rps_jax.geometry.solid import Solid
+from rps_jax.robot.base import Odometry
+from rps_jax.robot.load_cell import LoadCell
+from rps_jax.robot.robot import Robot
+from rps_jax.robot.shell import Boards
+from rps_jax.robot.skin import IdealSkin
+from rps_jax.trials import trial
+from rps_jax.trials.progress import Progress, Report, unheard
+from rps_jax.trials.trial import Rules, Shift, World
+from rps_jax.world.physics import Physics
+from rps_jax.world.scene import JOINTS, Friction
+
+SliderName = Literal["box", "cylinder"]
+SLIDERS: tuple[SliderName, ...] = get_args(SliderName)
+LawName = Literal["force_push", "open_loop"]
+LAWS: tuple[LawName, ...] = get_args(LawName)
+# Their controller, of their simulations: a gain k_y of 0.1 and their full speed.
+PARAMS = PublishedForcePushParams(k_y=0.1, k_omega=0.0, k_f=0.003, v_max=0.1, d_success=1e-6)
+INERTIAS = ("half", "even", "greatest")  # of a slider that is even, and with its mass at the edge
+FRICTIONS = (0.0, 0.5, 1.0)  # [1] of the contact
+LATERALS = (-0.4, 0.0, 0.4)  # [m] of the slider's middle, left of the path
+ANGLES = (-math.pi / 8, 0.0, math.pi / 8)  # [rad] of the slider, counter-clockwise
+CONTACTS = (-0.4, 0.0, 0.4)  # [m] along the slider's side, from its middle
+DIMS = ("inertia", "friction", "lateral", "angle", "contact")
+DURATION = 300.0  # [s] from the first contact
+GROUND = 0.25  # [1] friction of the slider with the ground
+PHYSICS = Physics(timestep=0.005, control_period=0.01)
+
+_MASS, _HALF, _HEIGHT = 1.0, 0.5, 0.12  # [kg, m, m] of both sliders
+_BEHIND = 0.5  # [m] of the pusher behind the point of contact, at the start
+_APART, _SILENT = 2.0, 20.0  # [m, s] at which a push has failed
+_LEAST_FRICTION = 1e-3  # [1]
+_POINT = 0.01  # [m] half length and width of the base
+_SEGMENT, _LOOK = 1000, 50  # control steps of a call of the program, and between two looks
+_ROBOT = Robot(_POINT, _POINT, (Boards("front", 1, 2 * _POINT / 3),))
+
+
+class Following(NamedTuple):
+    """What the controller remembers, and what its trial is judged by."""
+
+    theta_p: jax.Array  # () [rad] the last push's, from the path's
+    pushed: jax.Array  # () bool: a force has been felt
+    clock: jax.Array  # () [s] since then
+    silent: jax.Array  # () [s] without a force by now
+    longest: jax.Array  # () [s] without a force, the longest time
+
+
+def follow(law: LawName = "force_push", duration: float = DURATION) -> Law:
+    """A law of a point that is the base's origin, along the world's x axis.
+
+    The point stands still from `duration` [s] after the first contact on.
+    """
+
+    def init(params: PublishedForcePushParams) -> Following:
+        zero = jnp.zeros_like(jnp.asarray(params.v_max, float))
+        return Following(zero, jnp.zeros((), bool), zero, zero, zero)
+
+    def step(
+        params: PublishedForcePushParams, state: Following, observation: ForceObservation
+    ) -> tuple[Following, Twist, Details]:
+        seen = observation.touch
+        period = seen.period
+        f_world = -planar.rotate(seen.yaw, observation.f_robot)
+        felt = planar.norm(f_world) >= params.f_min
+        pushed = state.pushed | felt
+        zero = jnp.zeros_like(seen.yaw)
+        offset = seen.p_world_robot[1]
+        if law == "force_push":
+            theta_p = force_push.steered(params, state.theta_p, f_world, zero, offset, period)
+        else:
+            theta_p = -params.k_y * offset
+        theta_p = jnp.where(pushed, theta_p, 0.0)
+        v_world = params.v_max * jnp.stack([jnp.cos(theta_p), jnp.sin(theta_p)])
+        v_robot = planar.rotate(-seen.yaw, force_push.yielding(params, v_world, f_world))
+        going = state.clock < duration
+        v_robot = jnp.where(going, v_robot, 0.0)
+        silent = jnp.where(felt, 0.0, state.silent + period)
+        longest = jnp.where(going, jnp.maximum(state.longest, silent), state.longest)
+        clock = state.clock + jnp.where(pushed, period, 0.0)
+        state = Following(theta_p, pushed, clock, silent, longest)
+        return state, Twist(v_robot[0], v_robot[1], zero), Details.of(seen)
+
+    exact = LoadCell(noise=0.0, time_constant=0.05, threshold=0.0)
+    return Law(init, step, "force", check=force_push.check, cell=exact)
+
+
+def moments(slider: SliderName) -> np.ndarray:
+    """Moments of inertia (3, 3) [kg m^2] about x, y, z, in the order of `INERTIAS`."""
+    flat, up = _HALF**2, (_HEIGHT / 2) ** 2
+    if slider == "box":  # the greatest: eight points at its corners
+        most = np.array([flat + up, flat + up, 2 * flat])
+        even = most / 3
+    else:  # the greatest: a thin wall
+        even = np.array([flat / 4 + up / 3, flat / 4 + up / 3, flat / 2])
+        most = np.array([flat / 2 + up / 3, flat / 2 + up / 3, flat])
+    return _MASS * np.stack([even / 2, even, most])
+
+
+class Cells(NamedTuple):
+    """The grid, flat: (243,) each, inertia slowest and contact fastest, as theirs."""
+
+    inertia: np.ndarray  # which of `INERTIAS`
+    friction: np.ndarray  # [1]
+    lateral: np.ndarray  # [m]
+    angle: np.ndarray  # [rad]
+    contact: np.ndarray  # [m]
+
+
+def cells() -> Cells:
+    """Every combination."""
+    every = itertools.product(range(len(INERTIAS)), FRICTIONS, LATERALS, ANGLES, CONTACTS)
+    columns = (np.array(column) for column in zip(*every, strict=True))
+    return Cells(*columns)
+
+
+def starts(slider: SliderName, grid: Cells) -> np.ndarray:
+    """Positions (n, 10) at the start: the pusher behind the point of contact, along the path."""
+    at = np.stack([np.zeros_like(grid.lateral), grid.lateral], axis=-1)
+    if slider == "box":
+        c, s = np.cos(grid.angle), np.sin(grid.angle)
+        point = np.stack([-_HALF * c - grid.contact * s, -_HALF * s + grid.contact * c], axis=-1)
+    else:
+        turn = -grid.contact / _HALF
+        point = -_HALF * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    qpos = np.zeros((grid.angle.size, 10))
+    qpos[:, :2] = at + point - (_BEHIND, 0.0)
+    half = grid.angle / 2
+    zero = np.zeros_like(half)
+    place = [*at.T, zero + _HEIGHT / 2, np.cos(half), zero, zero, np.sin(half)]
+    qpos[:, JOINTS.object] = np.stack(place, axis=-1)
+    return qpos
+
+
+def worlds(
+    slider: SliderName,
+    grid: Cells,
+    engine: EngineName,
+    params: PublishedForcePushParams = PARAMS,
+    physics: Physics = PHYSICS,
+) -> tuple[Any, World]:
+    """Stage and worlds of some cells of the grid, on the host."""
+    count = grid.angle.size
+    half = np.full(count, _HALF)
+    box = slider == "box"
+    things = Solid(
+        vertices=solid.rectangles(half, half) if box else np.zeros((count, 1, 2)),
+        radius=np.zeros(count) if box else half,
+        height=np.full(count, _HEIGHT),
+        mass=np.full(count, _MASS),
+        p_object_com=np.zeros((count, 3)),
+        inertia=moments(slider)[grid.inertia],
+        q_object_body=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+    )
+    friction = Friction(np.full(count, GROUND), np.maximum(grid.friction, _LEAST_FRICTION))
+    stage, fields = engines.get(engine).stage_of_solids(slider, things, friction, physics, _ROBOT)
+
+    def same(tree: Any) -> Any:
+        return jax.tree.map(lambda x: np.repeat(np.asarray(x, float)[None], count, axis=0), tree)
+
+    world: Any = {
+        "fields": fields,
+        "footprint": Footprint(things.vertices, things.radius),  # type: ignore[arg-type]
+        "skin": same(IdealSkin().on(_ROBOT.shell)),
+        "params": same(params),
+        "p_world_target": np.tile([90.0, 0.0], (count, 1)),  # never reached
+        "shift": same(Shift()),
+        "qpos": starts(slider, grid),
+        "odometry": same(Odometry()),
+    }
+    dtype = jnp.zeros(()).dtype
+    narrow = jax.tree.map(lambda x: np.asarray(x, dtype), world)
+    return stage, World(**narrow, key=np.zeros((count, 2), np.uint32))  # type: ignore[arg-type]
+
+
+def pushed(
+    name: LawName,
+    slider: SliderName,
+    engine: EngineName = "fused",
+    duration: float = DURATION,
+    *,
+    params: PublishedForcePushParams = PARAMS,
+    physics: Physics = PHYSICS,
+    report: Report = unheard,
+) -> xr.Dataset:
+    """Push a slider through the whole grid by one law.
+
+    Args:
+      name: force_push, open_loop.
+      slider: box, cylinder.
+      engine: what steps them, of those that tell the contact's force to a compiled program.
+      duration: [s] from the first contact.
+      params: of the controller.
+      physics: of the worlds; its control period is the controller's.
+      report: called after every 10 s that were simulated.
+
+    Returns:
+      Over (inertia, friction, lateral, angle, contact): `success` by their criterion; `silent` [s],
+      the longest time without a force; `apart` [m], the farthest the pusher was from the slider's
+      middle; `deviation` [m] of the slider from the path at the end; and `completion` [1], the way
+      along the path that was made good, of an ideal pusher's.
+    """
+    grid, law = cells(), follow(name, duration)
+    stage, batch = worlds(slider, grid, engine, params, physics)
+    period, count = physics.control_period, grid.angle.size
+    horizon = duration + 2 * _BEHIND / float(params.v_max)
+    rules = Rules(horizon=2 * horizon, max_lost=1e6)
+    trials = trial.start_all(batch, np.ones(count, bool), law=law)
+    apart, steps, began = np.zeros(count), 0, time.perf_counter()
+    waited = 0.0
+    while steps * period < horizon:
+        options = {"physics": physics, "rules": rules, "law": law}
+        trials, seen = trial.record(stage, batch, trials, **options, steps=_SEGMENT, every=_LOOK)
+        away = np.asarray(seen.qpos[..., 3:5] - seen.qpos[..., :2])
+        apart = np.maximum(apart, np.hypot(*np.moveaxis(away, -1, 0)).max(axis=0))
+        if steps == 0:
+            waited += time.perf_counter() - began
+        steps += _SEGMENT
+        report(Progress(0, steps * period * count, waited))
+    memory: Following = jax.device_get(trials.memory)
+    end = np.asarray(trials.qpos)[:, JOINTS.object][:, :2].astype(float)
+    way = float(params.v_max) * duration
+    lost = (apart > _APART) | (memory.longest > _SILENT) | ~memory.pushed
+    lost |= np.asarray(trials.tipped | trials.diverged)
+    columns = {
+        "success": (~lost).astype(np.int8),
+        "silent": memory.longest.astype(float),
+        "apart": apart,
+        "deviation": end[:, 1],
+        "completion": 1 - np.hypot(end[:, 0] - way, end[:, 1]) / way,
+    }
+    shape = (len(INERTIAS), len(FRICTIONS), len(LATERALS), len(ANGLES), len(CONTACTS))
+    values: dict[str, Sequence[Any]] = dict(
+        zip(DIMS, (INERTIAS, FRICTIONS, LATERALS, ANGLES, CONTACTS), strict=True)
+    )
+    units = {"silent": "s", "apart": "m", "deviation": "m"}
+    one = xr.Dataset(
+        {
+            name: (DIMS, column.reshape(shape), {"units": units.get(name, "1")})
+            for name, column in columns.items()
+        },
+        {name: list(value) for name, value in values.items()},
+        {"engine": engine, "duration": duration},
+    )
+    return one
+
+
+def table(found: xr.Dataset) -> list[list[str]]:
+    """Header and a row for each law and slider: successes, way made good, deviation."""
+    rows = [["law", "slider", "success", "by contact friction", "completion", "deviation"]]
+    for law, slider in itertools.product(found.law.values, found.slider.values):
+        one = found.sel(law=law, slider=slider)
+        off, way = np.abs(one.deviation.values), 100 * one.completion.values
+        rows.append(
+            [
+                str(law),
+                str(slider),
+                f"{int(one.success.sum())} of {one.success.size}",
+                ", ".join(str(int(one.success.sel(friction=mu).sum())) for mu in FRICTIONS),
+                f"{np.median(way):.1f} % (least {way.min():.1f})",
+                f"{np.median(off):.2f} m (most {off.max():.2f})",
+            ]
+        )
+    return rows

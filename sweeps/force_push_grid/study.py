@@ -1,0 +1,96 @@
+"""Does our Force Push do on its authors' own ground what theirs did? 243 pushes of each slider.
+
+    rps sweeps/force_push_grid
+
+pushes the box and the cylinder of Heins and Schoellig (2024) along a straight path, by their law
+and in their open loop, from every start of their grid, which stands in `grid`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, ClassVar
+
+import xarray as xr
+
+from rps_jax import engines, errors
+from rps_jax.analysis.report import Section
+from rps_jax.control.laws import force_push_published
+from rps_jax.engines import EngineName
+from rps_jax.record.options import option
+from rps_jax.runs.question import Run, call_of
+from rps_jax.trials.progress import InTurn
+from sweeps.force_push_grid import grid
+from sweeps.shared import Study
+
+
+@dataclass(frozen=True)
+class ForcePushGrid(Study[xr.Dataset]):
+    """Push the sliders of Heins and Schoellig from every start of their grid, by their law.
+
+    The answer holds, over (law, slider, inertia, friction, lateral, angle, contact), `success` by
+    their criterion, `silent` [s], `apart` [m], `deviation` [m] and `completion` [1].
+    """
+
+    TITLE: ClassVar[str] = "Force Push on its authors' ground"
+    SMALL: ClassVar[Mapping[str, Any]] = {"duration": 60.0, "sliders": ("box",)}
+    GROWS: ClassVar[tuple[str, ...]] = ("laws", "sliders")
+
+    laws: tuple[grid.LawName, ...] = grid.LAWS
+    """Laws: force_push, and open_loop, which only goes back to the path."""
+    sliders: tuple[grid.SliderName, ...] = grid.SLIDERS
+    """Sliders: box, cylinder."""
+    duration: float = option(grid.DURATION, above=0, at_most=800, unit="s")  # 80 m of world
+    """Length of a push from its first contact on [s]."""
+    engine: EngineName = "fused"
+    """What steps the pushes, of the engines that tell the contact's force to a compiled program."""
+    quick: bool = False
+    """Whether to make a small run of minutes on two cores: what is not asked for becomes small."""
+
+    def check(self) -> None:
+        """Check the names, and that the engine can step such pushes here."""
+        errors.check_each_once("laws", self.laws)
+        for law in self.laws:
+            errors.check_name("law", law, grid.LAWS)
+        errors.check_each_once("sliders", self.sliders)
+        for slider in self.sliders:
+            errors.check_name("slider", slider, grid.SLIDERS)
+        force_push_published.check(grid.PARAMS)
+        engine = engines.get(self.engine)
+        engine.check(self.sliders)
+        engine.check_senses("force")
+        engine.check_followed()
+        engine.check_physics(grid.PHYSICS)
+
+    def trials(self) -> int | None:
+        """How many pushes there are."""
+        return len(self.laws) * len(self.sliders) * grid.cells().angle.size
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Push by the laws, and with the sliders, that are missing."""
+        heard, found = InTurn(run.report), []
+        for law in self.laws:
+            of_law = []
+            for slider in self.sliders:
+                push = partial(grid.pushed, law, slider, self.engine, self.duration, report=heard)
+                of_law.append(run.part(f"{law}_{slider}", push))
+                heard.ended(of_law[-1].success.size)
+            found.append(xr.concat(of_law, xr.IndexVariable("slider", list(self.sliders))))
+        every: Any = xr.concat(found, xr.IndexVariable("law", list(self.laws)))
+        return every
+
+    def intro(self, found: xr.Dataset) -> str:
+        """What was asked."""
+        return (
+            f"The grid of Heins and Schoellig (2024), {self.duration:g} s from the first contact "
+            f"on, engine {self.engine}."
+        )
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """How many pushes succeed by their criterion."""
+        return [Section("Pushes that succeed", "", grid.table(found))]
+
+
+force_push_grid = call_of(ForcePushGrid)

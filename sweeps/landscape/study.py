@@ -1,0 +1,138 @@
+"""What success depends on, and what it costs in time and in the way driven.
+
+    rps sweeps/landscape --worlds 510 --candidates 120
+
+varies each of the law's parameters alone, and looks for the undominated among candidates between
+and around sets of parameters. Both push with a few hundred candidates: for a GPU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any, ClassVar
+
+import xarray as xr
+
+from rps_jax import engines, errors
+from rps_jax.analysis import figures
+from rps_jax.analysis.figures.style import Figure
+from rps_jax.analysis.report import Picture, Section
+from rps_jax.control.laws.rps import BOUNDS, RPSParams
+from rps_jax.record.options import option
+from rps_jax.runs.question import OfLaws, Run, call_of
+from rps_jax.trials import batch
+from rps_jax.trials.progress import InTurn
+from rps_jax.tuning.run import Problem
+from rps_jax.tuning.space import SUBSETS
+from rps_jax.world import domain as domains
+from rps_jax.world.domain import Domain, DomainLike
+from sweeps.landscape import candidates
+
+
+@dataclass(frozen=True)
+class Landscape(OfLaws[xr.DataTree]):
+    """Vary each parameter of RPS alone, and find what success costs in time and way.
+
+    The answer is a tree: `alone` with success, time and way (set, parameter, step), and `front`
+    with those of candidates between the laws' parameters and around them (candidate).
+    """
+
+    TITLE: ClassVar[str] = "What each parameter does"
+    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 32, "values": 3, "candidates": 16}
+
+    domain: Sequence[DomainLike] = ("wide",)
+    """Domains: paper, hardware, wide, real, prisms or hostile, or JSON files of ranges; changes
+    follow each, as wide,mass=3:10."""
+    worlds: int = option(999, 2, 1_000_000)
+    """Number of worlds that each candidate meets, in each domain."""
+    values: int = option(9, 2, 1000)
+    """Number of values of each parameter."""
+    candidates: int = option(256, 2, 1_000_000)
+    """Number of candidates between and around the laws' parameters."""
+    spread: float = option(0.5, 0, 10)
+    """Standard deviation around, in units of the bounded map [1]."""
+
+    @cached_property
+    def problem(self) -> Problem:
+        """The worlds."""
+        one = isinstance(self.domain, str | Domain)
+        several: list[Any] = [self.domain] if one else list(self.domain)
+        return Problem(tuple(domains.named(x) for x in several), setting=self.setting)
+
+    def check(self) -> None:
+        """Check that the laws are RPS with parameters, and that the engine can step the worlds."""
+        for label, params in self.chosen.items():
+            if not isinstance(params, RPSParams):
+                raise errors.InputError(f"law = {label} is not allowed: give parameters of rps.")
+        engine = engines.get(self.setting.engine)
+        engine.check([family for one in self.problem.domains for family in one.families])
+        batch.check_shape(self.slots, self.workers)
+
+    @property
+    def _shares(self) -> tuple[int, int]:
+        """Trials of both halves."""
+        each = len(self.problem.domains) * self.worlds
+        varied = len(self.chosen) * len(SUBSETS["full"]) * self.values
+        return varied * each, 2 * (self.candidates + len(self.chosen)) * each
+
+    def trials(self) -> int | None:
+        """How many trials there are."""
+        return sum(self._shares)
+
+    def answer(self, run: Run) -> xr.DataTree:
+        """Vary each parameter, then try the candidates."""
+        heard, seed = InTurn(run.report), self.setting.seed
+        common = {"worlds": self.worlds, "seed": seed, **run._replace(report=heard).shape}
+        sets, problem = self.chosen, self.problem
+        first, _ = self._shares
+        alone = partial(candidates.alone, sets, problem, count=self.values, **common)
+        found = {"alone": run.part("alone", alone)}
+        heard.ended(first)
+        several = {"candidates": self.candidates, "spread": self.spread}
+        front = partial(candidates.front, sets, problem, **several, **common)
+        found["front"] = run.part("front", front)
+        return xr.DataTree.from_dict(found)
+
+    def intro(self, found: xr.DataTree) -> str:
+        """What was asked."""
+        return f"Every candidate meets the same {self.worlds:,} worlds of each domain."
+
+    def report(self, found: xr.DataTree, run: Run) -> Sequence[Section]:
+        """Success against each parameter, and the front."""
+        alone, front = (found[name].to_dataset() for name in ("alone", "front"))
+        log = [name for name, bound in BOUNDS.items() if bound.log]
+        lines = Picture("landscape", partial(figures.sensitivity, alone, log))
+        trade = Picture("front", partial(front_figure, front))
+        return [
+            Section("Success against each parameter", "", (), lines),
+            Section("Success, time and way", "", candidates.front_table(front), trade),
+        ]
+
+
+landscape = call_of(Landscape)
+
+
+def front_figure(results: xr.Dataset) -> Figure:
+    """Draw success against time and against the way driven, and mark the undominated."""
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    labels = [str(label) for label in results.candidate.values]
+    for ax, (field, label) in zip(
+        figure.subplots(1, 2, sharey=True),
+        {"time": "median time of a success [s]", "path": "median way of the base [m]"}.items(),
+        strict=True,
+    ):
+        x, y = results[field].values, 100 * results.success.values
+        ax.plot(x, y, ".", color="0.75", label="candidates")
+        chosen = results.front.values
+        ax.plot(x[chosen], y[chosen], "o", ms=5, color="C0", label="undominated")
+        for i, name in enumerate(labels):
+            if not name.isdigit():
+                ax.plot(x[i], y[i], "*", ms=12, color="C3")
+                ax.annotate(name, (x[i], y[i]), (6, -10), textcoords="offset points", fontsize=9)
+        ax.set_xlabel(label)
+        ax.grid(alpha=0.3)
+    figure.axes[0].set_ylabel("success [%]")
+    figure.axes[0].legend(fontsize=8, loc="lower right")
+    return figure

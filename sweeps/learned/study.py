@@ -1,0 +1,135 @@
+"""What the runs of `rps learn` found, as a published table and a figure of their curves.
+
+    rps sweeps/learned runs/mlp runs/gru --device "one H200"
+
+writes `results/learned.json` of this folder, one row for each run, which
+`sweeps/render_tables.py` shows on its page.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import xarray as xr
+
+from rps_jax import errors
+from rps_jax.analysis import statistics
+from rps_jax.analysis.report import Picture, Section
+from rps_jax.record import files, provenance
+from rps_jax.record import folder as run_folder
+from rps_jax.record.options import option
+from rps_jax.runs.question import Run, call_of
+from rps_jax.tuning import learn
+from sweeps.shared import Study, publish
+
+RESULTS = Path(__file__).parent / "results"
+COLUMNS = (
+    {"name": "network"},
+    {"name": "device"},
+    {"name": "objects"},
+    {"name": "worlds at once", "format": "{:,}"},
+    {"name": "updates", "format": "{:,}"},
+    {"name": "simulated", "format": "{:,.0f} h"},
+    {"name": "compilation", "format": "{:.0f} s"},
+    {"name": "in all", "format": "{:.1f} min"},
+    {"name": "success in validation", "format": "{:.1f} %", "rest": " [{:.1f}, {:.1f}] of {:,}"},
+    {"name": "time of a success", "format": "{:.0f} s"},
+)
+
+
+@dataclass(frozen=True)
+class Learned(Study[list[list[Any]]]):
+    """Publish what runs of `rps learn` found: a row of the table for each, and their curves.
+
+    The answer holds the rows.
+    """
+
+    TITLE: ClassVar[str] = "A law learned from touch"
+
+    runs: tuple[str, ...] = option((), positional=True)
+    """Run folders of `rps learn`."""
+    device: tuple[str, ...] = ("this machine",)
+    """What they ran on, in words: one for all, or one for each."""
+
+    @property
+    def devices(self) -> tuple[str, ...]:
+        """What each of them ran on."""
+        return self.device * (len(self.runs) if len(self.device) == 1 else 1)
+
+    def check(self) -> None:
+        """Check that there are runs, and a device for each."""
+        errors.check_each_once("runs", self.runs)
+        if not self.runs:
+            raise errors.InputError("runs = () is not allowed: name at least one run folder.")
+        if len(self.devices) != len(self.runs):
+            raise errors.InputError(
+                f"device = {self.device} is not allowed: give one for all runs, or one for each."
+            )
+
+    def answer(self, run: Run) -> list[list[Any]]:
+        """Gather the rows, and publish them."""
+        folders = [Path(one) for one in self.runs]
+        rows = [row(one, device) for one, device in zip(folders, self.devices, strict=True)]
+        publish(
+            RESULTS / "learned.json",
+            [provenance.signed(one) for one in folders],
+            "; ".join(dict.fromkeys(self.devices)),
+            COLUMNS,
+            rows,
+            "Validation: worlds of the domain that no update has met, by the rules of the paper, "
+            "without noise in the actions; of each run the law that did best there, which "
+            "flatters it. The interval is Wilson's.",
+        )
+        return rows
+
+    def intro(self, found: list[list[Any]]) -> str:
+        """Where the rows are."""
+        return f"{len(found)} rows of `results/learned.json`; now render the tables."
+
+    def report(self, found: list[list[Any]], run: Run) -> Sequence[Section]:
+        """The curve of each run."""
+        return [
+            Section(
+                str(folder),
+                picture=Picture(
+                    f"learned_{one[0].strip('`')}", partial(learn.figure_of, curve_of(Path(folder)))
+                ),
+            )
+            for folder, one in zip(self.runs, found, strict=True)
+        ]
+
+
+learned = call_of(Learned)
+
+
+def curve_of(folder: Path) -> xr.Dataset:
+    """What a run found out after each update."""
+    return files.read(folder / "results.nc")
+
+
+def row(folder: Path, device: str) -> list[Any]:
+    """The row of a run: its law is the one that validated best."""
+    curve, asked = curve_of(folder), run_folder.manifest(folder)
+    judged = curve.dropna("update", subset=["validation"])
+    rates = judged.validation.values
+    best = judged.isel(update=len(rates) - 1 - int(np.argmax(rates[::-1])))
+    objects = [name.removeprefix("random_") for one in asked["domain"] for name in one["objects"]]
+    tried, rate = asked["validation"] * len(objects), float(best.validation)
+    ends = statistics.wilson(round(rate * tried), tried)
+    return [
+        f"`{asked['network']}`",
+        device,
+        ", ".join(dict.fromkeys(objects)),
+        asked["num_envs"] * len(objects),
+        curve.sizes["update"],
+        float(curve.simulated[-1]) / 3600,
+        float(curve.attrs["compile"]),
+        float(curve.time[-1]) / 60,
+        [100 * rate, 100 * ends[0], 100 * ends[1], tried],
+        float(best.validation_time),
+    ]

@@ -1,0 +1,251 @@
+"""What is each choice for speed worth? One change at a time, timed beside the program as it is.
+
+A lever is a change of the physics, of what a step does, or of how the program is compiled. Some
+change outcomes: which of them may be had is for the study of fidelity to say, not for a clock.
+
+    rps sweeps/levers --program "fused standard" --worlds 64
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import xarray as xr
+
+from rps_jax import engines, errors
+from rps_jax.analysis import figures
+from rps_jax.analysis.report import Picture, Section
+from rps_jax.control.observation import Twist
+from rps_jax.engines.base import Driven, Motion
+from rps_jax.record.options import option
+from rps_jax.runs.question import Run, call_of
+from rps_jax.trials.progress import Progress
+from rps_jax.world.physics import Physics
+from sweeps import shared
+from sweeps.shared import Program, Study
+
+
+class Lever(NamedTuple):
+    """One change to a program of `shared.BATCHED`."""
+
+    physics: Mapping[str, Any] = {}  # fields of `Physics` to change
+    stage: Callable[[Any], Any] = lambda stage: stage
+    donated: bool = True
+    flags: dict[str, Any] | None = None  # of XLA
+    worlds: float = 1.0  # times as many
+
+
+class Unmoved(NamedTuple):
+    """An engine without physics: the base goes, the object stays. What is left is the law's."""
+
+    def drive(
+        self,
+        fields: Any,
+        motion: Motion,
+        twists: Twist,
+        physics: Physics,
+        robot: Any = None,
+        force: bool = False,
+    ) -> Driven:
+        """Step a batch for one control period."""
+        turn = jax.vmap(lambda twist, yaw: twist.in_world(yaw))
+        ahead = physics.control_period * turn(twists, motion.qpos[:, 2])
+        return Driven(motion._replace(qpos=motion.qpos.at[:, :3].add(ahead)))
+
+
+_OF_ALL = {
+    "no physics: law, skin, rules": Lever(stage=lambda _: Unmoved()),
+    "steps of 5 ms": Lever({"timestep": 0.005}),
+    "steps of 20 ms": Lever({"timestep": 0.02}),
+    "a decision in 10 ms": Lever({"control_period": 0.01}),
+    "a decision in 40 ms": Lever({"control_period": 0.04}),
+    "a quarter of the worlds": Lever(worlds=0.25),
+    "four times the worlds": Lever(worlds=4.0),
+    "state not donated": Lever(donated=False),
+}
+_OF_SOLVERS = {
+    "friction pyramid": Lever({"cone": "pyramidal"}),
+    "4 solver iterations": Lever({"iterations": 4}),
+    "16 solver iterations": Lever({"iterations": 16}),
+    "5 line-search steps": Lever({"ls_iterations": 5}),
+    "20 line-search steps": Lever({"ls_iterations": 20}),
+}
+_FLAGS = {
+    "cpu": {
+        "XLA: older emitters": {"xla_cpu_use_fusion_emitters": False},
+        "XLA: vectors of 128 bits": {"xla_cpu_prefer_vector_width": 128},
+        "XLA: LLVM's level 1": {"xla_backend_optimization_level": 1},
+    },
+    "gpu": {
+        "XLA: no command buffers": {"xla_gpu_enable_command_buffer": ""},
+        "XLA: loops double-buffered": {"xla_gpu_enable_while_loop_double_buffering": True},
+        "XLA: no autotuning": {"xla_gpu_autotune_level": 0},
+    },
+}
+
+
+def levers_of(name: str, family: str) -> dict[str, Lever]:
+    """All that can be changed about one of `shared.BATCHED` on this machine."""
+    engine = engines.get(shared.BATCHED[name].engine)
+    found = _OF_ALL | (_OF_SOLVERS if engine.newton else {})
+    found |= {what: Lever(stage=change) for what, change in engine.levers(family).items()}
+    flags = _FLAGS.get(jax.default_backend(), {})
+    return found | {what: Lever(flags=values) for what, values in flags.items()}
+
+
+class Gain(NamedTuple):
+    """What a lever does to a program."""
+
+    name: str
+    family: str
+    lever: str
+    worlds: int
+    compile: float  # [s] tracing too
+    memory: float  # [bytes]
+    rate: float  # simulated s per s of wall clock
+    times: float  # as fast as the program without it, timed beside it
+
+
+@dataclass(frozen=True)
+class Levers(Study[xr.Dataset]):
+    """Tell what each choice for speed is worth: one change at a time, timed beside the program.
+
+    The answer holds, for each lever, how many times as fast the program is with it, `times` [1].
+    """
+
+    TITLE: ClassVar[str] = "What each choice for speed is worth"
+
+    program: str = "mjx standard"
+    """Engine and fidelity, as those of `rps sweeps/speed`."""
+    family: Literal["box", "cylinder", "prism"] = "box"
+    """Family of the objects: box, cylinder or prism."""
+    worlds: int = option(24, 4, 10_000_000)
+    """Number of worlds of the batch."""
+    simulated: float = option(2.0, 0.04, 60, unit="s")
+    """Time of each world that is stepped at a go [s]."""
+    goes: int = option(5, 1, 1000)
+    """Number of goes of each program."""
+    at_once: int = option(1, 1, 1024)
+    """Programs compiled side by side; what compiling takes is that of a program alone only if 1."""
+
+    def check(self) -> None:
+        """Check the program, and that its engine has these objects here."""
+        errors.check_name("program", self.program, shared.BATCHED)
+        engines.get(shared.BATCHED[self.program].engine).check([self.family])
+
+    def trials(self) -> int | None:
+        """How many programs there are."""
+        return 1 + len(levers_of(self.program, self.family))
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Pull every lever."""
+        how = {"simulated": self.simulated, "goes": self.goes, "at_once": self.at_once}
+        gains: list[Gain] = []
+        for gain in measure(self.program, self.family, self.worlds, **how):
+            gains.append(gain)
+            run.report(Progress(len(gains), 0.0))
+        columns: dict[str, Any] = {
+            name: ("lever", [getattr(gain, name) for gain in gains])
+            for name in ("worlds", "compile", "memory", "rate", "times")
+        }
+        return xr.Dataset(columns, {"lever": [gain.lever for gain in gains]})
+
+    def intro(self, found: xr.Dataset) -> str:
+        """Where it was measured."""
+        return shared.machine()
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """How many times as fast each lever makes the program."""
+        title = f"{self.program}, {self.family}"
+        times = dict(zip(map(str, found.lever.values), map(float, found.times), strict=True))
+        gains = [
+            Gain(
+                self.program,
+                self.family,
+                str(one.lever.item()),
+                *(one[name].item() for name in ("worlds", "compile", "memory", "rate", "times")),
+            )
+            for one in (found.sel(lever=name) for name in found.lever.values)
+        ]
+        picture = Picture("levers", partial(figures.levers, times, title))
+        return [Section(title, "", table(gains), picture)]
+
+
+levers = call_of(Levers)
+
+
+AS_IT_IS = "as it is"
+
+
+def measure(
+    name: str,
+    family: str,
+    worlds: int,
+    *,
+    simulated: float = 2.0,
+    goes: int = 5,
+    at_once: int = 1,
+) -> Iterator[Gain]:
+    """Pull every lever of one of `shared.BATCHED` in turn, first none.
+
+    Program and program with a lever are timed in turns, `goes` times each, since a machine that
+    others use is now faster, now slower; the gain is the median of the ratios.
+
+    Args:
+      name: of `shared.BATCHED`.
+      family: of its worlds.
+      worlds: how many, but for the levers that change that.
+      simulated: [s] at a go.
+      goes: of each.
+      at_once: programs compiled side by side; what one takes is its own only if 1.
+    """
+    wanted = {AS_IT_IS: Lever()} | levers_of(name, family)
+    calls = [partial(_traced, name, family, worlds, lever, simulated) for lever in wanted.values()]
+    usual = None
+    for what, program in zip(wanted, shared.side_by_side(calls, at_once), strict=True):
+        usual = usual or program
+        yield _gain(what, usual, program, goes)
+
+
+def _traced(
+    name: str, family: str, worlds: int, lever: Lever, simulated: float
+) -> Callable[[], Program]:
+    setting = shared.BATCHED[name]
+    changed = replace(setting, physics=replace(setting.physics, **lever.physics))
+    count = max(1, round(worlds * lever.worlds))
+    how = {"stage": lever.stage, "donated": lever.donated, "flags": lever.flags}
+    return shared.traced(name, changed, family, count, simulated=simulated, **how)
+
+
+def _rate(program: Program) -> float:
+    """Simulated s per s of wall clock of one go from the start."""
+    start = jax.block_until_ready(jax.tree.map(jnp.copy, program.start))
+    began = time.perf_counter()
+    jax.block_until_ready(program.go(start))
+    return program.worlds * program.simulated / (time.perf_counter() - began)
+
+
+def _gain(what: str, usual: Program, p: Program, goes: int) -> Gain:
+    """The first go of each is not counted."""
+    rates = [(_rate(usual), _rate(p)) for _ in range(goes + 1)][1:]
+    rate = statistics.median(after for _, after in rates)
+    times = statistics.median(after / before for before, after in rates)
+    return Gain(p.name, p.family, what, p.worlds, p.compile, p.memory, rate, times)
+
+
+def table(gains: Sequence[Gain]) -> list[list[str]]:
+    """Header, and one row for each lever."""
+    rows = [["what", "family", "lever", "worlds", "simulated s/s", "times", "compile", "memory"]]
+    for g in gains:
+        rows.append(
+            [g.name, g.family, g.lever, f"{g.worlds}", f"{g.rate:,.0f}", f"{g.times:.2f}",
+             f"{g.compile:.1f} s", f"{g.memory / 2**20:,.1f} MiB"]
+        )  # fmt: skip
+    return rows

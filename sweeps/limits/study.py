@@ -1,0 +1,340 @@
+"""What a robot's limits cost a law: force, lag, acceleration, the base's size, the skin's pitch.
+
+Every robot meets the same worlds as the ideal base, so that a loss is a paired difference. Force,
+lag and acceleration are drawn, a different one for each world; sizes and pitches are taken in turn.
+
+    rps sweeps/limits --worlds 2000
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import xarray as xr
+from scipy import optimize
+
+from rps_jax import errors
+from rps_jax.analysis import statistics, tables
+from rps_jax.analysis.figures.style import Figure, success_rates
+from rps_jax.analysis.report import Picture, Section
+from rps_jax.control.base import Params
+from rps_jax.geometry.solid import GRAVITY
+from rps_jax.record.options import option
+from rps_jax.robot.robot import Robot
+from rps_jax.robot.shell import BOARDS, HALF_WIDTH
+from rps_jax.runs import sweep as sweeps
+from rps_jax.runs.question import OfLaws, Run, call_of
+from rps_jax.runs.sweep import Sweep
+from rps_jax.trials import pushes
+from rps_jax.trials.case import Case
+from rps_jax.trials.progress import InTurn
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+from rps_jax.world.domain import Domain, DomainLike, Range, named
+
+LOSSES = (0.01, 0.10)  # [1] of success, whose limits are looked for
+_RESAMPLES = 200  # of a bootstrap
+# Of whose turns a figure is drawn.
+TURNING = {
+    "no limit": Robot(),
+    "1 rad/s² (1 m/s²)": Robot(acceleration_max=(1.0, 1.0)),
+    "0.2 rad/s² (0.1 m/s²)": Robot(acceleration_max=(0.1, 0.2)),
+    "lag 0.3 s": Robot(lag=0.3),
+}
+
+
+@dataclass(frozen=True)
+class Limit:
+    """One quantity that is varied."""
+
+    what: str  # with its unit
+    drawn: Mapping[str, Range] = field(default_factory=dict)  # ranges of a domain
+    robots: Mapping[float, Robot] = field(default_factory=dict)  # or each value's robot
+    value: Callable[[xr.Dataset], np.ndarray] = lambda found: np.zeros(0)  # (n,) of drawn worlds
+    harms: int = 0  # 1: the more the worse, -1: the less the worse, 0: neither
+    log: bool = False
+
+
+def _with_front(count: int) -> Robot:
+    """The paper's base with so many boards across its front, and as many for its sides."""
+    return Robot(
+        boards=tuple(replace(row, count=math.ceil(row.count * count / 4)) for row in BOARDS)
+    )
+
+
+LIMITS = {
+    "force": Limit(
+        "greatest force over the object's friction with the ground [1]",
+        {"robot_force": Range(10, 1000, log=True)},
+        value=lambda f: (f.robot_force / (f.friction_ground * f.mass * GRAVITY)).values,
+        harms=-1,
+        log=True,
+    ),
+    "lag": Limit(
+        "lag [s]", {"robot_lag": Range(0, 2)}, value=lambda f: f.robot_lag.values, harms=1
+    ),
+    "acceleration": Limit(
+        "greatest acceleration [m/s²]",
+        {"robot_acceleration": Range(0.005, 1, log=True)},
+        value=lambda f: f.robot_acceleration.values,
+        harms=-1,
+        log=True,
+    ),
+    "half_width": Limit(
+        "half width of the base [m]",
+        robots={half: Robot(half_width=half) for half in (0.15, 0.2, 0.25, HALF_WIDTH, 0.35, 0.45)},
+    ),
+    "pitch": Limit(
+        "pitch of the taxels of the front [mm]",
+        robots={1e3 * 2 * HALF_WIDTH / (3 * n): _with_front(n) for n in (8, 4, 3, 2, 1)},
+        harms=1,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Limits(OfLaws[xr.DataTree]):
+    """Tell what each limit of a robot costs a law: force, lag, acceleration, size, skin.
+
+    Every robot meets the worlds that the ideal base meets. The answer is a tree: for each limit its
+    `value` and the `world` (case), `success` with it and with the ideal base, `usual` (law, case).
+    """
+
+    TITLE: ClassVar[str] = "What each limit costs"
+    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 64}
+
+    domain: DomainLike = "wide"
+    """The worlds: paper, hardware, wide, prisms or hostile, or a JSON file of ranges; changes
+    follow, as wide,mass=3:10."""
+    limits: tuple[str, ...] = ("force", "lag", "acceleration", "half_width", "pitch")
+    """Names of the limits; by default all."""
+    worlds: int = option(2000, 1, 10_000_000)
+    """Number of worlds that every robot meets."""
+    setting: Setting = field(default=Setting(seed=11), kw_only=True)
+
+    def check(self) -> None:
+        """Check the names, and that the engine can step these worlds here."""
+        errors.check_each_once("limits", self.limits)
+        for name in self.limits:
+            errors.check_name("limit", name, LIMITS)
+        self._sweep("ideal", named(self.domain)).check()
+
+    def trials(self) -> int | None:
+        """How many trials there are."""
+        robots = 1 + sum(max(1, len(LIMITS[name].robots)) for name in self.limits)
+        return len(self.chosen) * self.worlds * robots
+
+    def configuration(self) -> dict[str, Any]:
+        """All that the parts of the answer depend on; more limits may be asked for later."""
+        found = super().configuration()
+        del found["limits"]
+        return found
+
+    def _sweep(self, part: str, ranges: Domain, robot: Robot | None = None) -> Sweep:
+        """A sweep in a folder of its own."""
+        return Sweep(
+            self.chosen,
+            ranges,
+            self.worlds,
+            robot=robot,
+            setting=self.setting,
+            out=None if self.out is None else Path(self.out) / part,
+        )
+
+    def answer(self, run: Run) -> xr.DataTree:
+        """Sweep with the ideal base and with every robot."""
+        base, heard = named(self.domain), InTurn(run.report)
+        shape = run._replace(report=heard).shape
+
+        def sweep(part: str, ranges: Domain, robot: Robot | None = None) -> xr.Dataset:
+            folder = None if run.folder is None else run.folder / part
+            found = sweeps.whole(self._sweep(part, ranges, robot).plan, folder, **shape)
+            heard.ended(len(self.chosen) * self.worlds)
+            return found
+
+        ideal, found = sweep("ideal", base), {}
+        for name in self.limits:
+            limit = LIMITS[name]
+            if limit.drawn:
+                parts = [sweep(name, replace(base, **limit.drawn))]
+                values = limit.value(parts[0])
+            else:
+                robots = limit.robots.values()
+                parts = [sweep(f"{name}_{i}", base, robot) for i, robot in enumerate(robots)]
+                values = np.repeat([float(value) for value in limit.robots], self.worlds)
+            success = np.concatenate([part.success.values for part in parts], axis=1)
+            found[name] = xr.Dataset(
+                {
+                    "success": (("law", "case"), success),
+                    "usual": (("law", "case"), np.tile(ideal.success.values, (1, len(parts)))),
+                },
+                {
+                    "law": list(self.chosen),
+                    "value": ("case", values, {"long_name": limit.what}),
+                    "world": ("case", np.tile(np.arange(self.worlds), len(parts))),
+                },
+                {"harms": limit.harms, "log": int(limit.log)},
+            )
+        return xr.DataTree.from_dict(found)
+
+    def intro(self, found: xr.DataTree) -> str:
+        """What was asked."""
+        return (
+            f"{self.worlds:,} worlds, seed {self.setting.seed}; every robot meets the same ones. "
+            "Intervals: of rates Wilson 95 %, of limits bootstrap 95 %."
+        )
+
+    def report(self, found: xr.DataTree, run: Run) -> Sequence[Section]:
+        """Where each law has lost so much, its success at each size, and what becomes of turns."""
+        each = {name: found[name].to_dataset() for name in self.limits}
+        picture = Picture("limits", partial(figure_of, each))
+        sections = [Section("Success over each limit", "", losses(each), picture)]
+        if len(sizes := successes(each)) > 1:
+            sections.append(Section("Success at each size", "", sizes))
+        params = next(iter(self.chosen.values()))
+        turns = Picture("turning", lambda: turning_figure(turning(TURNING, params)))
+        sections.append(Section("What becomes of the law's turns", "", (), turns))
+        return sections
+
+
+limits = call_of(Limits)
+
+
+def crossing(value: np.ndarray, lost: np.ndarray, level: float, harms: int) -> float:
+    """The value at which a law has lost `level` [1] of its success; NaN if it never has.
+
+    The losses (n,) of cases, each -1, 0 or 1, at values (n,) are made monotone by least squares:
+    rising with the value if `harms` is 1, falling if it is -1. At the harmless end, where the base
+    is ideal, nothing is lost: this is put in with the weight of a twentieth of the cases.
+    """
+    order = np.argsort(harms * value, kind="stable")
+    ideal = np.zeros(value.size // 20)
+    fitted = optimize.isotonic_regression(np.concatenate([ideal, lost[order]])).x[ideal.size :]
+    over = np.flatnonzero(fitted >= level)
+    return float(value[order][over[0]]) if over.size else math.nan
+
+
+def crossings(found: xr.Dataset, level: float, seed: int = 0) -> dict[str, tuple[float, ...]]:
+    """For each law `crossing` and its bootstrap 95 % interval; cases are drawn again."""
+    random, value = np.random.default_rng(seed), found.value.values
+    told = {}
+    for law in map(str, found.law.values):
+        lost = found.usual.sel(law=law).values - found.success.sel(law=law).values
+        again = []
+        for _ in range(_RESAMPLES):
+            some = random.integers(0, value.size, value.size)
+            again.append(crossing(value[some], lost[some], level, found.harms))
+        # A resample that never loses so much says that the limit may lie beyond what was tried.
+        beyond = float(value.max() if found.harms > 0 else value.min())
+        ends = np.percentile(np.nan_to_num(again, nan=beyond), [2.5, 97.5])
+        told[law] = (crossing(value, lost, level, found.harms), *map(float, ends))
+    return told
+
+
+def losses(found: Mapping[str, xr.Dataset]) -> list[list[str]]:
+    """Header and a row for each drawn limit and law: where it has lost each of `LOSSES`."""
+    rows = [["limit", "law", "ideal base", *(f"{100 * x:g} points lost at" for x in LOSSES)]]
+    for name in (name for name in found if LIMITS[name].drawn):
+        one, at = found[name], [crossings(found[name], level) for level in LOSSES]
+        for law in map(str, one.law.values):
+            usual = f"{100 * float(one.usual.sel(law=law).mean()):.1f} %"
+            rows.append([LIMITS[name].what, law, usual, *(_place(*each[law]) for each in at)])
+    return rows
+
+
+def _place(at: float, low: float, high: float) -> str:
+    return "nowhere" if math.isnan(at) else f"{at:.2g} [{low:.2g}, {high:.2g}]"
+
+
+def successes(found: Mapping[str, xr.Dataset]) -> list[list[str]]:
+    """Header and a row for each value of the sizes and pitches: every law's success there."""
+    laws = [str(law) for one in list(found.values())[:1] for law in one.law.values]
+    rows = [["quantity", "value", *laws]]
+    for name in (name for name in found if LIMITS[name].robots):
+        for value in np.unique(found[name].value.values):
+            here = found[name].success.values[:, found[name].value.values == value] > 0
+            rates = [tables.share(int(won.sum()), won.size) for won in here]
+            rows.append([LIMITS[name].what, f"{value:.3g}", *rates])
+    return rows
+
+
+def turning(
+    robots: Mapping[str, Robot],
+    params: Params,
+    seconds: float = 10.0,
+    *,
+    object: str = "box",
+    target: tuple[float, float] = (-2.0, 0.0),
+) -> xr.Dataset:
+    """What robots make of the turns that a law asks for in the first seconds of one push.
+
+    Args:
+      robots: by name.
+      params: of the law.
+      seconds: from the start.
+      object: what is pushed, by name.
+      target: where to [m].
+
+    Returns:
+      `asked` and `done` (robot, time) [rad/s]: the law's twist, and the base's own.
+    """
+    rows = []
+    for robot in robots.values():
+        case = Case(object, "S1", target, params, robot=robot)
+        setting = Setting("fused", rules=Rules(horizon=seconds))
+        period = setting.physics.control_period
+        (trace,) = pushes.follow([case], setting, interval=period)
+        seen = trace.snapshots
+        turns = np.diff(np.asarray(seen.qpos)[:, 2]) / period
+        rows.append([np.asarray(seen.twist.omega)[:-1], turns, np.asarray(seen.time)[:-1]])
+    asked, done, time = (np.stack(columns) for columns in zip(*rows, strict=True))
+    return xr.Dataset(
+        {"asked": (("robot", "time"), asked), "done": (("robot", "time"), done)},
+        {"robot": list(robots), "time": time[0]},
+    )
+
+
+def figure_of(found: Mapping[str, xr.Dataset]) -> Figure:
+    """Draw success over each limit of a robot, with 95 % intervals; dashed: the ideal base."""
+    columns = min(3, len(found))
+    rows = -(-len(found) // columns)
+    figure = Figure(figsize=(4 * columns, 3.2 * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
+    for ax in axes[len(found) :]:
+        ax.axis("off")
+    for ax, one in zip(axes, found.values(), strict=False):
+        for i, law in enumerate(map(str, one.law.values)):
+            seen = statistics.bins(one.value.values, one.success.sel(law=law).values > 0, 12)
+            success_rates(ax, seen.middle, seen.won, seen.of, color=f"C{i}", label=law)
+            usual = 100 * float(one.usual.sel(law=law).mean())
+            ax.axhline(usual, color=f"C{i}", lw=0.8, ls="--")
+        ax.set_xlabel(one.value.attrs["long_name"], fontsize=9)
+        ax.set_xscale("log" if one.attrs["log"] else "linear")
+        ax.grid(alpha=0.3)
+    for ax in axes[::columns]:
+        ax.set_ylabel("success [%]")
+    axes[0].legend(fontsize=8)
+    return figure
+
+
+def turning_figure(found: xr.Dataset) -> Figure:
+    """Draw the turning rate that a law asks for, and what each robot makes of it, over time."""
+    names = list(map(str, found.robot.values))
+    figure = Figure(figsize=(8, 1.7 * len(names)), layout="constrained")
+    axes = figure.subplots(len(names), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
+    for ax, name in zip(axes, names, strict=True):
+        one = found.sel(robot=name)
+        ax.step(one.time, one.asked, color="0.7", lw=1, where="post", label="asked by the law")
+        ax.plot(one.time, one.done, color="C0", lw=1.2, label="of the base")
+        ax.set_title(name, fontsize=9, loc="left")
+        ax.set_ylabel(r"$\omega$ [rad/s]")
+        ax.grid(alpha=0.3)
+    axes[-1].set_xlabel("time [s]")
+    axes[0].legend(fontsize=8, loc="lower right")
+    return figure

@@ -1,0 +1,127 @@
+"""The tuned law with one mend at a time, each of which a zero or its default leaves out.
+
+RPS+ has the mends that were kept; the others stand here so that nobody has to try them again.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rps_jax.control import registry
+from rps_jax.control.base import Law
+from rps_jax.control.laws import rps, rps_plus
+from rps_jax.control.laws.rps import RPSParams, RPSState
+from rps_jax.control.observation import Details, Observation, Twist, displacement
+from rps_jax.geometry import planar
+
+TUNED = RPSParams.tuned()
+
+
+class Mended(NamedTuple):
+    """The tuned law with mends, each of which a zero or its default leaves out."""
+
+    law: RPSParams = TUNED
+    d_near: float = 0.15  # [m] P1
+    press: float = 0.2  # [1] P2
+    over: float = 0.0  # [m] P1 also while it realigns, if |l| is less
+    flush: float = 0.0  # [1] share of omega_max with which the base turns flush while it realigns
+    edge: float = 0.17  # [m] of |l| from where it does
+    turn: float = 0.5  # [rad] at most
+    agree: float = 0.0  # [1] 1: only towards the target
+    forward: float = 0.2  # [1] share of v_max with which it presses meanwhile
+    n_lost: float = 1e9  # [1] control steps without contact before P3
+    ahead: float = 0.0  # [1] P3
+    aside: float = 0.0  # [1] P3
+
+    @property
+    def d_success(self) -> Any:
+        """[m] Target reached."""
+        return self.law.d_success
+
+
+class Memory(NamedTuple):
+    """What such a law remembers."""
+
+    law: RPSState
+    yaw: Any  # () [rad] when it last began to realign
+    realigning: Any  # () bool
+    lost: Any  # () control steps without contact
+    p_world_felt: Any  # (2,) [m]
+
+
+def init(params: Mended) -> Memory:
+    """Before the first touch."""
+    zero = jnp.zeros(())
+    return Memory(RPSState.init(params.law), zero, zero > 0, zero, jnp.zeros(2))
+
+
+def step(params: Mended, state: Memory, seen: Observation) -> tuple[Memory, Twist, Details]:
+    """One control step."""
+    memory, twist, details = rps.step_with_details(params.law, state.law, seen)
+    contact, l = memory.p_robot_contact, details.l  # noqa: E741
+    touching, realigning = jnp.asarray(seen.in_contact), details.realigning
+    d = displacement(seen._replace(p_robot_contact=contact))
+    error = planar.wrap(planar.direction(d) - seen.yaw)
+    yaw = jnp.where(realigning & ~state.realigning, seen.yaw, state.yaw)
+    near = (touching | memory.touched) & (~realigning | (jnp.abs(l) < params.over))
+    near &= (details.distance < params.d_near) & (details.distance >= params.law.d_success)
+    flush = touching & realigning & (params.flush > 0) & (jnp.abs(l) >= params.edge) & ~near
+    flush &= jnp.abs(planar.wrap(seen.yaw - yaw)) < params.turn
+    flush &= (params.agree == 0) | (jnp.sign(l) * error > 0.05)
+    omega = jnp.sign(l) * params.flush * params.law.omega_max
+    pressing = jnp.array([1.0, 0.0]) * params.forward * params.law.v_max
+    turning = rps.saturate(params.law, Twist.moving(contact, pressing, omega))
+    p_world = seen.p_world_robot + planar.rotate(seen.yaw, contact)
+    felt = jnp.where(touching, p_world, state.p_world_felt)
+    lost = jnp.where(touching, 0.0, state.lost + memory.touched)
+    p_robot_felt = planar.rotate(-seen.yaw, felt - seen.p_world_robot)
+    plus: Any = rps_plus.RPSPlusParams(
+        params.law, params.d_near, params.press, params.n_lost, params.ahead, params.aside
+    )
+    for condition, other in (
+        (flush, turning),
+        (near, rps_plus.translation(plus, d, seen.yaw)),
+        (lost > params.n_lost, rps_plus.search(plus, p_robot_felt, contact[1])),
+    ):
+        twist = jax.tree.map(lambda a, b, c=condition: jnp.where(c, a, b), other, twist)
+    return Memory(memory, yaw, realigning, lost, felt), twist, details
+
+
+FIRST = "P1, P2 outside the Realignment State"
+MENDS = {
+    FIRST: Mended(),
+    "the tuned law": Mended(d_near=0.0),
+    "P1 to 0.25 m": Mended(d_near=0.25),
+    "P1 to 0.4 m": Mended(d_near=0.4),
+    "P1 while realigning, |l| < 0.2 m": Mended(over=0.2),
+    "P1 while realigning, |l| < 0.25 m": Mended(over=0.25),
+    "P1 while realigning": Mended(over=0.3),
+    "P1 while realigning, |l| < 0.25 m, to 0.25 m": Mended(over=0.25, d_near=0.25),
+    "turn flush, 0.3, to 0.3 rad": Mended(flush=0.3, turn=0.3),
+    "turn flush, 0.3, to 0.8 rad": Mended(flush=0.3, turn=0.8),
+    "turn flush, 0.6, to 0.3 rad": Mended(flush=0.6, turn=0.3),
+    "turn flush, 0.6, to 0.8 rad": Mended(flush=0.6, turn=0.8),
+    "turn flush from 0.2 m": Mended(flush=0.6, edge=0.2),
+    "turn flush towards the target, 0.3": Mended(flush=0.3, agree=1.0, turn=3.0),
+    "turn flush towards the target, 0.6": Mended(flush=0.6, agree=1.0, turn=3.0),
+    "turn flush towards the target, 1": Mended(flush=1.0, agree=1.0, turn=3.0),
+    "approach at 0.03 m/s": Mended(law=TUNED._replace(v_approach=0.03)),
+    "approach at 0.05 m/s": Mended(law=TUNED._replace(v_approach=0.05)),
+    "d_th 0.8 m": Mended(law=TUNED._replace(d_th=0.8)),
+    "v_max 0.035 m/s": Mended(law=TUNED._replace(v_max=0.035)),
+    "P3 straight back after 2 s": Mended(n_lost=100, ahead=1.0),
+    "P3 straight back after 10 s": Mended(n_lost=500, ahead=1.0),
+    "P3 back and aside after 2 s": Mended(n_lost=100, ahead=0.7, aside=0.5),
+    "P1 while realigning to 0.25 m": Mended(over=0.3, d_near=0.25),
+    "that, and P3 back and aside": Mended(
+        over=0.3, d_near=0.25, n_lost=100, ahead=0.7, aside=0.5
+    ),
+    "that, and approach at 0.03 m/s": Mended(
+        TUNED._replace(v_approach=0.03), 0.25, over=0.3, n_lost=100, ahead=0.7, aside=0.5
+    ),
+}  # fmt: skip
+
+registry.register_law("mended", Law(init, step), Mended())

@@ -1,0 +1,328 @@
+"""How fast is it? Simulated seconds in a second of wall clock, by engine, shape family and batch.
+
+    rps sweeps/speed --worlds 64 512
+
+`rps sweeps/speed/costs.py` says where the time of a control step goes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import product
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import jax
+import mujoco
+import numpy as np
+import xarray as xr
+
+from rps_jax import engines, errors
+from rps_jax.analysis import figures
+from rps_jax.analysis.report import Picture, Section
+from rps_jax.control.laws import rps
+from rps_jax.control.laws.rps import RPSParams
+from rps_jax.record.options import option
+from rps_jax.runs.question import Run, call_of
+from rps_jax.trials import host
+from rps_jax.trials.batch import Job
+from rps_jax.trials.batch import run as run_batch
+from rps_jax.trials.progress import Progress
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+from rps_jax.trials.worlds import drawn_worlds
+from rps_jax.world import draws
+from rps_jax.world.domain import DOMAINS
+from rps_jax.world.physics import preset
+from rps_jax.world.scene import JOINTS
+from sweeps import shared
+from sweeps.shared import BATCHED, FAMILIES, Program, Study
+
+_SPEED = 0.05  # [m/s] at which C MuJoCo alone pushes
+_SLOW = ("mjx", "warp")  # engines whose batches are bounded
+# C MuJoCo on the processor, beside the programs of `BATCHED`.
+# The second steps by MuJoCo's `rollout`; the third is how trials are run one after the other.
+IN_C = {
+    "C in closed loop": "closed",
+    "C, mj_step alone": "open",
+    "C, one trial at a time": "serial",
+}
+NAMES = (*BATCHED, *IN_C)
+
+
+def here() -> tuple[str, ...]:
+    """Those of `NAMES` that this machine can run."""
+    return tuple(n for n in NAMES if n in IN_C or engines.get(BATCHED[n].engine).works())
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """How fast one program is."""
+
+    name: str
+    family: str
+    worlds: int
+    compile: float  # [s] tracing too
+    rate: float  # simulated s per s of wall clock
+    memory: float  # [bytes] of the program on its device; NaN for C
+    contacts: int  # points of one world: those a program looks into, those C has found
+    timestep: float  # [s]
+    iterations: int  # of the solver, at most
+    ls_iterations: int  # of its line search, at most
+
+
+@dataclass(frozen=True)
+class Speed(Study[xr.Dataset]):
+    """Tell how fast each engine is on this machine, by shape family and batch.
+
+    The answer holds simulated seconds in a second of wall clock, `rate` [1], of each measurement,
+    which is kept as soon as it is made.
+    """
+
+    TITLE: ClassVar[str] = "Speed"
+    SMALL: ClassVar[Mapping[str, Any]] = {
+        "names": ("C in closed loop", "fused standard", "quasistatic"),
+        "families": ("box",),
+        "worlds": (64,),
+        "refill": 0,
+    }
+    GROWS: ClassVar[tuple[str, ...]] = ("names", "families", "worlds", "mujocos", "at_once")
+
+    names: tuple[str, ...] = ()
+    """Engines and fidelities; by default all that this machine can run."""
+    families: tuple[Literal["box", "cylinder", "prism"], ...] = FAMILIES
+    """Families of the objects: box, cylinder, prism."""
+    worlds: tuple[int, ...] = option((64, 512), 1, 10_000_000)
+    """Numbers of worlds of a batch."""
+    mujocos: int = option(16384, 1, 10_000_000)
+    """Largest batch of MJX and MJX-Warp."""
+    at_once: int = option(1, 1, 1024)
+    """Programs compiled side by side; what compiling takes is that of a program alone only if 1."""
+    refill: int = option(64, 0, 1_000_000)
+    """Slots of each worker for the gain of refilling them; 0: not measured."""
+    rounds: int = option(4, 1, 1000)
+    """How many trials there are then for each slot."""
+    quick: bool = False
+    """Whether to make a small run of minutes: what is not asked for becomes small."""
+
+    @cached_property
+    def wanted(self) -> Sequence[tuple[str, str, int]]:
+        """Names, families and worlds (0 in C, as suits it), those in C first."""
+        names = self.names or here()
+        named = [pair for pair in product(names, self.families) if can(*pair)]
+        in_c = [(*pair, 0) for pair in named if pair[0] in IN_C]
+        batched = [(*pair, n) for pair in named if pair[0] in BATCHED for n in self.worlds]
+        slow = [name for name, one in BATCHED.items() if one.engine in _SLOW]
+        return in_c + [b for b in batched if b[0] not in slow or b[2] <= self.mujocos]
+
+    def check(self) -> None:
+        """Check the names, and that there is something to time."""
+        for name in self.names:
+            errors.check_name("name", name, NAMES)
+            if name in BATCHED:
+                engines.get(BATCHED[name].engine).check()
+        for family in self.families:
+            errors.check_name("family", family, FAMILIES)
+        if not self.wanted:
+            raise errors.InputError(
+                f"names = {self.names} with worlds = {self.worlds} leave nothing to time: MJX and "
+                f"MJX-Warp are timed up to --mujocos {self.mujocos} worlds."
+            )
+
+    def trials(self) -> int | None:
+        """How many measurements there are."""
+        return len(self.wanted)
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Make the measurements that are missing."""
+        if self.refill:
+            run.part("refilling", partial(_gain, self.refill, self.rounds))
+        missing = [w for w in self.wanted if run.parts is None or run.parts.get(_part(w)) is None]
+        done = len(self.wanted) - len(missing)
+        made = _measured(missing, self.at_once)
+        found = []
+        for one in self.wanted:
+            found.append(run.part(_part(one), lambda: _labelled(next(made))))
+            done += one in missing
+            run.report(Progress(done, 0.0))
+        whole: Any = xr.concat(found, "measurement")
+        return whole.drop_attrs()
+
+    def intro(self, found: xr.Dataset) -> str:
+        """Where it was measured."""
+        return shared.machine()
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """Speeds beside C MuJoCo's, and against the batch."""
+        names = [one.name for one in dataclasses.fields(Measurement)]
+        speeds = [
+            Measurement(**{name: row[name].item() for name in names})
+            for row in (found.isel(measurement=i) for i in range(found.sizes["measurement"]))
+        ]
+        points = [(s.family, s.name, s.worlds, s.rate) for s in speeds]
+        picture = Picture("throughput", partial(figures.throughput, points, tuple(IN_C)))
+        sections = [Section("Simulated seconds in a second", "", table(speeds), picture)]
+        if self.refill and run.parts is not None:
+            gain = run.part("refilling", partial(_gain, self.refill, self.rounds))
+            sections.append(Section("Refilled slots", _told(gain, self.refill, self.rounds)))
+        return sections
+
+
+speed = call_of(Speed)
+
+
+def _part(wanted: tuple[str, str, int]) -> str:
+    """Name of the part of a run folder that holds a measurement."""
+    name, family, worlds = wanted
+    return "_".join([re.sub(r"\W+", "_", name), family, str(worlds)])
+
+
+def _labelled(one: Measurement) -> xr.Dataset:
+    return xr.Dataset({name: ((), value) for name, value in dataclasses.asdict(one).items()})
+
+
+def _measured(wanted: Sequence[tuple[str, str, int]], at_once: int) -> Iterator[Measurement]:
+    """Measurements in their order, those in C first."""
+    for name, family, _ in (one for one in wanted if one[0] in IN_C):
+        yield in_c(name, family)
+    batched_ = [one for one in wanted if one[0] in BATCHED]
+    calls = [partial(shared.traced, n, BATCHED[n], *rest) for n, *rest in batched_]
+    for program in shared.side_by_side(calls, at_once):
+        yield batched(program)
+
+
+def _gain(slots: int, rounds: int) -> xr.Dataset:
+    return xr.Dataset({k: ((), v) for k, v in refilling(slots, rounds)._asdict().items()})
+
+
+def _told(gain: xr.Dataset, slots: int, rounds: int) -> str:
+    refilled, waiting = float(gain.refilled), float(gain.waiting)
+    return (
+        f"{slots} slots a worker and {rounds} trials in each: {refilled:,.0f} simulated s/s, "
+        f"{float(gain.trials):,.1f} trials/s; batches that wait for their slowest: {waiting:,.0f}; "
+        f"gain {refilled / waiting:.2f}."
+    )
+
+
+def can(name: str, family: str) -> bool:
+    """Whether this machine can run one of `NAMES` with a family."""
+    return name in IN_C or engines.get(BATCHED[name].engine).works([family])
+
+
+def _best(action: Callable[[], Any], goes: int = 4, enough: float = 5.0) -> float:
+    """Least wall clock [s] of some goes; of fewer, once `enough` seconds have been spent."""
+    times = []
+    while len(times) < goes and sum(times) < enough:
+        began = time.perf_counter()
+        action()
+        times.append(time.perf_counter() - began)
+    return min(times)
+
+
+def _contacts_in_c(model: mujoco.MjModel, qpos: np.ndarray, seconds: float = 2.0) -> int:
+    """Most points that C MuJoCo finds while a base pushes straight on."""
+    data, most = mujoco.MjData(model), 0
+    data.qpos[:] = qpos
+    for _ in range(round(seconds / model.opt.timestep)):
+        data.qvel[JOINTS.base] = [_SPEED, 0.0, 0.0]
+        mujoco.mj_step(model, data)
+        most = max(most, data.ncon)
+    return most
+
+
+def batched(program: Program) -> Measurement:
+    """Time a program."""
+    state = [program.start]
+
+    def once() -> None:
+        state[0] = jax.block_until_ready(program.go(state[0]))
+
+    once()  # in which MJX-Warp builds its kernels
+    rate = program.worlds * program.simulated / _best(once)
+    name, family, worlds, _, took, memory, contacts, physics, *_ = program
+    solver = physics.timestep, physics.iterations, physics.ls_iterations
+    return Measurement(name, family, worlds, took, rate, memory, contacts, *solver)
+
+
+def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
+    """Time C MuJoCo: on all cores in the closed loop of the law or stepping alone, or one trial."""
+    physics = preset()
+    how = IN_C[name]
+    threads = 1 if how == "serial" else os.cpu_count() or 1
+    worlds = 1 if how == "serial" else 64 * threads
+    setting, engine = Setting(engine="mujoco", physics=physics), engines.get("mujoco")
+    stage, batch = shared.timed_worlds(family, worlds, setting)
+    if how != "open":
+        options = {"law": rps.LAW, "threads": threads, "report": lambda *_: True}
+        rules = Rules(horizon=simulated)
+
+        def once() -> None:
+            host.run(engine, stage, batch, physics=physics, rules=rules, **options)
+
+    else:
+        stepper = engine.stepper(stage, np.asarray(batch.qpos, float), threads)
+        twist = np.tile([_SPEED, 0.0, 0.0], (worlds, 1))
+        once = partial(stepper.drive, np.arange(worlds), twist, round(simulated / physics.timestep))
+    once()  # compiles the law
+    rate = worlds * simulated / _best(once)
+    contacts = _contacts_in_c(stage[0], np.asarray(batch.qpos[0]))
+    solver = physics.timestep, physics.iterations, physics.ls_iterations
+    return Measurement(name, family, worlds, 0.0, rate, np.nan, contacts, *solver)
+
+
+class Refilling(NamedTuple):
+    """What refilling the slots of trials that ended is worth."""
+
+    refilled: float  # simulated s per s of wall clock
+    waiting: float  # the same, of batches that wait for their slowest
+    trials: float  # per s of wall clock, refilled
+
+
+def refilling(slots: int, rounds: int = 4) -> Refilling:
+    """Whole trials of RPS, with refilled slots and in batches that wait for their slowest.
+
+    Both run the same random boxes of the domain `wide`, `rounds` times as many as there are slots.
+    """
+    setting = BATCHED["fused standard"]
+    boxes = replace(DOMAINS["wide"], objects=("random_box",))
+    count = (
+        slots
+        * engines.get(setting.engine).workers(jax.default_backend())
+        * len(jax.local_devices())
+    )
+
+    def timed(groups: np.ndarray) -> tuple[float, float]:
+        timings = []
+        for group in groups:
+            drawn = draws.draw(boxes, 0, group)
+            part = drawn_worlds(boxes, drawn, RPSParams.paper(), setting)
+            job = Job(rps.LAW, group.size, [part])
+            timings.append(run_batch([job], setting, slots=slots, collect=lambda *_: None))
+        wall = sum(t.run for t in timings)
+        return sum(t.simulated for t in timings) / wall, groups.size / wall
+
+    numbers = np.arange(rounds * count)
+    timed(numbers[None, :count])  # compiles
+    refilled, trials = timed(numbers[None])
+    return Refilling(refilled, timed(numbers.reshape(rounds, count))[0], trials)
+
+
+def table(speeds: list[Measurement]) -> list[list[str]]:
+    """Header and one row for each measurement, compared with C MuJoCo in closed loop."""
+    base = {s.family: s.rate for s in speeds if s.name == "C in closed loop"}
+    rows = [["what", "family", "worlds", "dt", "iterations", "contacts", "compile", "simulated s/s",
+             "against C in closed loop", "memory"]]  # fmt: skip
+    for s in speeds:
+        memory = "" if np.isnan(s.memory) else f"{s.memory / 2**20:,.1f} MiB"
+        ratio = f"{s.rate / base[s.family]:.3g}" if s.family in base else ""
+        solver = f"{s.iterations}/{s.ls_iterations}"
+        rows.append(
+            [s.name, s.family, f"{s.worlds}", f"{1000 * s.timestep:g} ms", solver,
+             f"{s.contacts}", f"{s.compile:.1f} s", f"{s.rate:,.0f}", ratio, memory]
+        )  # fmt: skip
+    return rows
