@@ -1,18 +1,20 @@
-"""Shared by all tests: the processor, offscreen drawing, and a cache of compiled programs."""
+"""Shared by all tests: the processor, offscreen drawing, shapes that are checked, and a cache."""
 
 import os
 
 import pytest
+import shapes
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 
 def pytest_configure(config):
+    shapes.install()
     import jax
 
-    from rps_jax.analysis import video
+    from rps_jax.analysis import studio
 
-    video.choose_gl()
+    studio.choose_gl()
     cache = config.rootpath / ".jax_cache"
     os.environ.setdefault("RPS_CACHE", str(cache))  # of commands, also in processes of their own
     jax.config.update("jax_compilation_cache_dir", os.environ["RPS_CACHE"])

@@ -13,20 +13,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax.app import cli
-from rps_jax.control import strategies
-from rps_jax.control.law import RPSParams
+from rps_jax.control import registry
+from rps_jax.control.laws.rps import RPSParams
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.shell import HALF_LENGTH, HALF_WIDTH
 from rps_jax.runs import sweep
 from rps_jax.runs.plan import Plan
-from rps_jax.trials.pushes import Case
+from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
-from rps_jax.world import objects, paper
+from rps_jax.world import objects
 from rps_jax.world.domain import DOMAINS, Range
 from rps_jax.world.physics import preset
-from rps_jax.world.scene import FRICTION
 
 ROOT = Path(__file__).resolve().parent.parent
 PAPER = RPSParams.paper()
@@ -36,11 +35,8 @@ PAPER = RPSParams.paper()
 
 
 def rps(*arguments: Any) -> int:
-    """Exit code of a command; tyro ends the process for what it cannot read."""
-    try:
-        return cli.main([str(a) for a in arguments])
-    except SystemExit as end:
-        return end.code
+    """Exit code of a command."""
+    return cli.main([str(a) for a in arguments])
 
 
 def refusal(capsys, *arguments: Any) -> str:
@@ -62,7 +58,7 @@ def one_sentence(error: str) -> str:
 
 FAST = preset(fidelity="fast")
 # The fused engine, which compiles soonest of those that solve for contact.
-SHORT = Setting(FAST, Rules(horizon=20.0), engine="fused")
+SHORT = Setting("fused", FAST, rules=Rules(horizon=20.0))
 SLOTS = 8  # of all sweeps of this setting, so that they share their programs
 BOXES = replace(
     DOMAINS["wide"],
@@ -72,7 +68,7 @@ BOXES = replace(
     gap=Range(0, 0.01),
 )
 CYLINDERS = replace(BOXES, objects=("random_cylinder",))
-PLAN = Plan(BOXES, 20, {"rps": paper.PARAMS["rps"], "nps": paper.PARAMS["nps"]}, SHORT, part=7)
+PLAN = Plan(BOXES, 20, {"rps": registry.LAWS["rps"], "nps": registry.LAWS["nps"]}, SHORT, part=7)
 
 
 def case(
@@ -80,7 +76,7 @@ def case(
 ) -> Case:
     """A trial of the law; changes are fields of `Case` or of the law's parameters."""
     of_case = {k: changes.pop(k) for k in list(changes) if k in Case.__dataclass_fields__}
-    return Case(name, FRICTION[friction], target, PAPER._replace(**changes), **of_case)
+    return Case(name, friction, target, PAPER._replace(**changes), **of_case)
 
 
 def swept(folder: Path, plan: Plan = PLAN, **options: Any) -> Path:
@@ -97,8 +93,8 @@ def parts_of(folder: Path) -> dict[str, bytes]:
 
 @contextlib.contextmanager
 def temporary_names() -> Iterator[None]:
-    """Objects and strategies that are registered meanwhile are forgotten afterwards."""
-    tables = (objects.FAMILIES, objects.REGISTERED, strategies.PARAMS, strategies.STRATEGIES)
+    """Objects and laws that are registered meanwhile are forgotten afterwards."""
+    tables = (objects.FAMILIES, objects.REGISTERED, registry.LAWS, registry._OF)
     before = [dict(table) for table in tables]
     try:
         yield

@@ -6,26 +6,25 @@ import numpy as np
 import pytest
 
 from rps_jax import errors
-from rps_jax.control.law import Observation
-from rps_jax.control.rivals import aps
-from rps_jax.control.rivals.aps import APSParams, APSState, TrackedObservation
+from rps_jax.control.laws import aps
+from rps_jax.control.laws.aps import APSParams, APSState
+from rps_jax.control.observation import Observation, PoseObservation
 from rps_jax.trials import pushes
-from rps_jax.trials.pushes import Case
+from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
-from rps_jax.world.scene import FRICTION
 
 APS = APSParams()
 PLAIN = APS._replace(aim_beyond=0.0)  # as published: the object's centre to the target
 START = APSState.init(APS)
-aps_step = jax.jit(aps.aps_step)
+aps_step = jax.jit(aps.step)
 
 
 def seen(robot, yaw=0.0, obj=(0.0, 0.0), target=(2.0, 0.0), r_object=0.2):
     touch = Observation(
-        jnp.array(robot), jnp.array(yaw), jnp.zeros(2), jnp.array(False), jnp.array(target)
+        jnp.array(robot), jnp.array(yaw), jnp.zeros(2), jnp.array(False), jnp.array(target), 0.02
     )
-    return TrackedObservation(touch, jnp.array(obj), jnp.array(r_object), 0.02)
+    return PoseObservation(touch, jnp.array(obj), jnp.array(r_object))
 
 
 def twist_at(angle, distance=0.6, params=PLAIN, state=START, **world):
@@ -171,7 +170,7 @@ def test_it_turns_on_the_spot_until_it_faces_the_object():
 
 def test_it_reaches_targets_ahead_only_if_it_aims_beyond_them():
     def case(params):
-        return Case("box", FRICTION["S1"], (1.0, 0.0), params)
+        return Case("box", "S1", (1.0, 0.0), params)
 
     setting = Setting(engine="mujoco", rules=Rules(horizon=60.0))
     outcome, _ = pushes.run([case(APS), case(PLAIN)], setting)

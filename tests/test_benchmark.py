@@ -8,52 +8,55 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rps_jax.control.law import Twist
+from rps_jax.control.observation import Twist
 from rps_jax.engines import mjx_colliders
 from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.engines.quasistatic import Quasistatic
-from rps_jax.studies import ablation, benchmark, profile
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.pushes import Case
+from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.world import scene
 from rps_jax.world.physics import preset
 from rps_jax.world.scene import FRICTION
+from sweeps import shared
+from sweeps.levers import study as levers
+from sweeps.speed import costs
+from sweeps.speed import study as speeds
 
 
 def test_a_program_is_timed_and_compared_with_c_in_the_closed_loop():
-    setting = benchmark.BATCHED["quasistatic"]
-    program = benchmark.traced("quasistatic", setting, "cylinder", 2, simulated=0.1)()
+    setting = shared.BATCHED["quasistatic"]
+    program = shared.traced("quasistatic", setting, "cylinder", 2, simulated=0.1)()
     assert program.compile > 0
-    speed = benchmark.batched(program)
+    speed = speeds.batched(program)
     assert (speed.name, speed.family, speed.worlds) == ("quasistatic", "cylinder", 2)
     assert 0 < speed.rate < np.inf
     assert speed.memory > 2 * 40  # bytes: two worlds, of more than ten numbers each
 
     in_c = replace(speed, name="C in closed loop", rate=2.0, memory=np.nan)
-    header, first, second = benchmark.table([in_c, replace(speed, rate=5.0)])
+    header, first, second = speeds.table([in_c, replace(speed, rate=5.0)])
     ratio = header.index("against C in closed loop")
     assert (first[ratio], second[ratio]) == ("1", "2.5")
     assert first[-1] == ""
 
 
 def test_a_profile_charges_the_functions_that_asked():
-    found = profile.measure("quasistatic", "cylinder", 4, steps=5)
+    found = costs.measure("quasistatic", "cylinder", 4, steps=5)
     assert found.step > 0
     assert sum(cost.share for cost in found.costs) == pytest.approx(1.0)
     assert found.timed == pytest.approx(sum(cost.time for cost in found.costs))
     wheres = [cost.where for cost in found.costs]
     assert len(set(wheres)) == len(wheres)
-    for file in ("engines/quasistatic.py", "control/law.py", "trials/trial.py"):
+    for file in ("engines/quasistatic.py", "control/laws/rps.py", "trials/trial.py"):
         assert any(where.startswith(file) for where in wheres)
-    assert len(profile.table([found], most=3)) == 1 + 3
+    assert len(costs.table([found], most=3)) == 1 + 3
 
 
 def test_an_instruction_comes_from_the_innermost_function():
     text = """HloModule m
 
 FileNames
-1 "/somewhere/rps_jax/control/law.py"
+1 "/somewhere/rps_jax/control/laws/rps.py"
 2 "/somewhere/rps_jax/trials/trial.py"
 
 FunctionNames
@@ -76,44 +79,46 @@ ENTRY %main (a: f32[]) -> f32[] {
   %neg.4 = f32[] negate(%a), metadata={op_name="neg" stack_frame_id=7}
 }
 """
-    assert profile.sources(text) == {
-        "add.1": "control/law.py: step",
+    assert costs.sources(text) == {
+        "add.1": "control/laws/rps.py: step",
         "mul.3": "trials/trial.py: decide.think",
-        "neg.4": profile.ELSEWHERE,
+        "neg.4": costs.ELSEWHERE,
     }
 
 
 def test_every_measurement_is_of_an_engine_or_of_c():
-    assert not set(benchmark.BATCHED) & set(benchmark.IN_C)
-    assert benchmark.can("C in closed loop", "prism")
-    assert not benchmark.can("warp standard", "prism")  # whose worlds share a mesh's corners
+    assert not set(shared.BATCHED) & set(speeds.IN_C)
+    assert speeds.can("C in closed loop", "prism")
+    assert not speeds.can("warp standard", "prism")  # whose worlds share a mesh's corners
 
 
 def test_levers_are_timed_beside_the_program_as_it_is(monkeypatch):
     some = ("no physics: law, skin, rules", "four times the worlds", "state not donated")
-    every = ablation.levers("quasistatic", "cylinder")
-    monkeypatch.setattr(ablation, "levers", lambda *_: {name: every[name] for name in some})
-    gains = list(ablation.measure("quasistatic", "cylinder", 2, simulated=0.1, goes=1))
-    assert [gain.lever for gain in gains] == [ablation.AS_IT_IS, *some]
+    every = levers.levers_of("quasistatic", "cylinder")
+    monkeypatch.setattr(levers, "levers_of", lambda *_: {name: every[name] for name in some})
+    gains = list(levers.measure("quasistatic", "cylinder", 2, simulated=0.1, goes=1))
+    assert [gain.lever for gain in gains] == [levers.AS_IT_IS, *some]
     assert [gain.worlds for gain in gains] == [2, 2, 8, 2]
     assert all(0 < gain.times < np.inf for gain in gains)
-    assert len(ablation.table(gains)) == 1 + len(gains)
+    assert len(levers.table(gains)) == 1 + len(gains)
 
 
 def test_an_engine_has_the_levers_that_it_knows():
-    of_mjx, of_fused = (ablation.levers(f"{name} standard", "box") for name in ("mjx", "fused"))
+    of_mjx, of_fused = (levers.levers_of(f"{name} standard", "box") for name in ("mjx", "fused"))
     assert set(of_fused) < set(of_mjx)
     assert "4 solver iterations" in of_fused
-    assert "4 solver iterations" not in ablation.levers("quasistatic", "box")
-    of_cylinders = ablation.levers("mjx standard", "cylinder")
+    assert "4 solver iterations" not in levers.levers_of("quasistatic", "box")
+    of_cylinders = levers.levers_of("mjx standard", "cylinder")
     assert set(of_mjx) - set(of_cylinders) == {"MJX's own box collider"}
 
 
 def test_without_physics_the_base_goes_and_the_object_stays():
-    _, worlds = pushes.build([Case("box", FRICTION["S1"], (2.0, 0.0), gap=0)], Setting())
+    _, worlds = pushes.build(
+        [Case("box", FRICTION["S1"], (2.0, 0.0), gap=0)], Setting(engine="mjx")
+    )
     start = trial.motion(trial.start_all(worlds, np.ones(1, bool)))
     twists = Twist(*(np.full(1, x) for x in (0.05, 0.0, 0.0)))
-    driven = ablation.Unmoved().drive(worlds.fields, start, twists, preset())
+    driven = levers.Unmoved().drive(worlds.fields, start, twists, preset())
     moved = np.asarray(driven.motion.qpos - start.qpos)[0]
     np.testing.assert_allclose(moved, [0.05 * 0.02, *[0] * 9], atol=1e-9)
 
@@ -127,11 +132,11 @@ def test_a_program_is_traced_anew_for_each_lever():
             asked.append(args)
             return Quasistatic().drive(*args)
 
-    setting = benchmark.BATCHED["quasistatic"]
+    setting = shared.BATCHED["quasistatic"]
     counts = []
     for _ in range(2):
         options = {"simulated": 0.1, "stage": lambda _: Told()}
-        benchmark.traced("quasistatic", setting, "cylinder", 2, **options)
+        shared.traced("quasistatic", setting, "cylinder", 2, **options)
         counts.append(len(asked))
     assert counts[1] == 2 * counts[0] > 0
 

@@ -1,21 +1,29 @@
 """The ceiling: plans around the law, how they are searched, and what they prove."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import CYLINDERS, refusal, rps
+from helpers import CYLINDERS, refusal
+from helpers import rps as command
 
 import rps_jax
-from rps_jax import GuidedParams, InputError, Observation, RPSParams, Rules, Search
-from rps_jax.control import guided, law
-from rps_jax.control.law import RPSState
+from rps_jax import InputError, Observation, RPSParams, Rules, Setting
+from rps_jax.control.laws import guided, rps
+from rps_jax.control.laws.guided import GuidedParams
+from rps_jax.control.laws.rps import RPSState
 from rps_jax.record.checkpoint import Parts
+from rps_jax.runs.question import seed_of
 from rps_jax.studies import ceiling
+from rps_jax.studies.ceiling import Ceiling
+from rps_jax.trials import score
 from rps_jax.trials.trial import Outcome
 
-SHORT = Rules(horizon=20.0)
-SMALL = Search(samples=6, rounds=3, window=10.0)
+SHORT = Setting("quasistatic", rules=Rules(horizon=20.0))
+SIZES = {"samples": 6, "rounds": 3, "window": 10.0}
+SMALL = Ceiling(CYLINDERS, **SIZES)
 
 
 def seen(touched=True):
@@ -30,7 +38,7 @@ def test_without_offsets_a_guided_law_is_the_law():
     alone = RPSState.init(params.law)
     for touched in (False, True, True, False):
         state, twist, _ = guided.step(params, state, seen(touched))
-        alone, expected, _ = law.step_with_details(params.law, alone, seen(touched))
+        alone, expected, _ = rps.step_with_details(params.law, alone, seen(touched))
         assert [float(x) for x in twist] == [float(x) for x in expected]
     assert int(state.steps) == 4
 
@@ -43,7 +51,7 @@ def test_offsets_are_added_in_turn_and_bounded_and_end():
     for _ in range(5):
         state, twist, _ = guided.step(params, state, seen(False))
         twists.append([float(x) for x in twist])
-    _, usual, _ = law.step_with_details(params.law, RPSState.init(params.law), seen(False))
+    _, usual, _ = rps.step_with_details(params.law, RPSState.init(params.law), seen(False))
     usual = [float(x) for x in usual]
     slower = [usual[0] - 0.5 * float(params.law.v_max), *usual[1:]]
     np.testing.assert_allclose(twists[:2], [slower] * 2, rtol=1e-5, atol=1e-7)
@@ -71,7 +79,7 @@ def test_costs_by_hand():
         diverged=np.zeros(4, bool), stalled=np.zeros(4, bool), overflows=zero.astype(int),
         base_pose=pose, object_pose=away,
     )  # fmt: skip
-    np.testing.assert_allclose(ceiling.costs(outcome, Rules()), [0.1, 1.5, 6.2, 2.0])
+    np.testing.assert_allclose(score.plan_costs(outcome, Rules()), [0.1, 1.5, 6.2, 2.0])
 
 
 def test_weights_go_from_the_best_to_the_mean():
@@ -97,59 +105,64 @@ def test_perturbations_belong_to_world_and_round_and_fill_one_window():
 
 
 def test_a_search_goes_on_where_it_was_stopped_and_its_plans_win(tmp_path):
-    asked = {"search": SMALL, "split": "tune", "engine": "quasistatic", "rules": SHORT, "slots": 12}
-    whole = rps_jax.ceiling(CYLINDERS, 6, out=tmp_path / "run", **asked)
+    asked = SIZES | {"sample": 6, "setting": SHORT, "slots": 12, "out": tmp_path / "run"}
+    whole = rps_jax.ceiling(CYLINDERS, **asked)
     rounds = list(Parts(tmp_path / "run").found().values())
     assert len(rounds) >= 2
     rounds[-1].unlink()
-    again = rps_jax.ceiling(CYLINDERS, 6, out=tmp_path / "run", **asked)
+    again = rps_jax.ceiling(CYLINDERS, **asked)
     assert again.identical(whole)
     assert not whole.solved.all()  # or nothing was searched
     assert set(whole.trials.values) <= {6, 12, 18}
     assert (whole.cost.values[whole.solved.values == 0] > 1).all()
     # Each best plan is a law like any other, and does in a sweep what it did in the search.
-    for world in whole.world.values[:2]:
-        mine = GuidedParams(offsets=whole.offsets.sel(world=world).values)
-        found = rps_jax.sweep(
-            CYLINDERS, {"plan": mine}, worlds=6, engine="quasistatic", rules=SHORT, slots=6
-        )
-        one = found.sel(arm="plan").isel(world=int(world))
-        assert int(one.success) == int(whole.solved.sel(world=world))
-        np.testing.assert_allclose(float(one.time), float(whole.time.sel(world=world)), atol=0.021)
+    plans = {f"{i}": GuidedParams(offsets=whole.offsets.sel(world=i).values) for i in (0, 1)}
+    test = replace(SHORT, seed=seed_of(0, "test"))
+    found = rps_jax.sweep(plans, CYLINDERS, worlds=6, setting=test, slots=6)
+    for i in (0, 1):
+        one = found.sel(law=f"{i}").isel(world=i)
+        assert int(one.success) == int(whole.solved.sel(world=i))
+        np.testing.assert_allclose(float(one.time), float(whole.time.sel(world=i)), atol=0.021)
 
 
-@pytest.mark.parametrize("worlds", [[1, 1], [-1], []])
-def test_worlds_that_are_none_are_refused(worlds):
-    with pytest.raises(InputError, match="worlds = "):
-        rps_jax.ceiling(CYLINDERS, worlds)
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"sample": 0}, "sample = 0"),
+        ({"sample": -1}, "sample = -1"),
+        ({"samples": 2}, "samples = 2"),
+    ],
+)
+def test_searches_without_worlds_or_perturbations_are_refused(options, words):
+    with pytest.raises(InputError, match=words):
+        rps_jax.ceiling(CYLINDERS, **options)
 
 
-def test_a_search_without_perturbations_is_refused():
-    with pytest.raises(InputError, match="samples = 2"):
-        Search(samples=2)
-
-
-def test_the_first_worlds_and_what_all_named_laws_lose_are_chosen():
+def test_the_first_worlds_and_what_all_named_laws_lose_are_chosen(monkeypatch):
     won = np.array([[0, 0, 1, 0, 0], [1, 0, 1, 0, 1]])
-    found = xr.Dataset({"success": (("arm", "world"), won)}, {"arm": ["a", "b"]})
-    every, lost = ceiling.chosen(found, ["a", "b"], 1)
-    assert (every.tolist(), lost.tolist()) == ([0, 1, 3], [1, 3])
-    every, lost = ceiling.chosen(found, ["a"], 0, most=2)
-    assert (every.tolist(), lost.tolist()) == ([0, 1], [0, 1])
-    with pytest.raises(InputError, match="unknown law 'c'"):
-        ceiling.chosen(found, ["c"], 0)
+    found = xr.Dataset({"success": (("law", "world"), won)}, {"law": ["a", "b"]})
+    assert ceiling.lost_worlds(found, ["a", "b"]).tolist() == [1, 3]
+    monkeypatch.setattr(ceiling.files, "read_results", lambda path: found)
+
+    def numbers(*lost_by, **options):
+        return Ceiling(run="run", lost_by=lost_by, **options).numbers.tolist()
+
+    assert numbers("a", "b", sample=1) == [0, 1, 3]
+    assert numbers("a", sample=0, most=2) == [0, 1]
+    with pytest.raises(InputError, match="unknown law of the run 'c'"):
+        numbers("c", sample=0)
 
 
 def test_the_command_tries_what_a_law_loses(tmp_path, capsys):
     run = tmp_path / "run"
     asked = ["ladder", "--domain", "paper", "--worlds", 6, "--engine", "quasistatic"]
-    asked += ["--laws", "rps tuned", "pursuit", "--slots", 6, "--workers", 1, "--out", run]
-    assert rps(*asked) == 0
+    asked += ["--laws", "rps_tuned", "pursuit", "--slots", 6, "--workers", 1, "--out", run]
+    assert command(*asked) == 0
     capsys.readouterr()
     few = ["--sample", 2, "--samples", 3, "--rounds", 1, "--slots", 6, "--workers", 1]
-    assert rps("ceiling", run, "--lost-by", "pursuit", *few) == 0
+    assert command("ceiling", run, "--lost-by", "pursuit", *few) == 0
     text = capsys.readouterr().out
-    assert "Ceiling: a planner that knows the world" in text
-    assert "in the first 2 worlds" in text
-    assert (run / "ceiling" / "ceiling.nc").exists()
-    assert "unknown law 'rsp'" in refusal(capsys, "ceiling", run, "--lost-by", "rsp")
+    assert "A planner that knows the world" in text
+    assert "of the first 2 worlds" in text
+    assert (run / "ceiling" / "results.nc").exists()
+    assert "unknown law of the run 'rsp'" in refusal(capsys, "ceiling", run, "--lost-by", "rsp")

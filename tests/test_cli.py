@@ -9,16 +9,16 @@ import pytest
 import xarray as xr
 from helpers import refusal, rps
 
-from rps_jax.app.cli import parsing
-from rps_jax.app.cli.tuning import TuneES
-from rps_jax.errors import InputError
+import rps_jax
+from rps_jax.control import registry
 from rps_jax.record import files
 from rps_jax.trials.results import DIMS
+from rps_jax.tuning.evolution import TuneES
 from rps_jax.world import paper
 
 SMALL = [
     *("table", "--targets", "0.6", "0", "0.62", "0.03", "--horizon", "18", "--slots", "4"),
-    *("--objects", "box", "nonuniform_box", "--workers", "1", "--strategies", "rps", "nps"),
+    *("--objects", "box", "nonuniform_box", "--workers", "1", "--laws", "rps", "nps"),
 ]
 
 
@@ -34,27 +34,31 @@ def runs(tmp_path_factory):
 def test_a_table_run_leaves_a_labelled_run_folder(runs):
     results = files.read_results(runs[0])
     assert results.success.dims == DIMS
-    assert results.sizes == {"strategy": 2, "object": 2, "friction": 2, "target": 2, "pose": 3}
+    assert results.sizes == {"law": 2, "object": 2, "friction": 2, "target": 2, "pose": 3}
     assert list(results.object.values) == ["box", "nonuniform_box"]
     assert results.time.attrs["units"] == "s"
-    assert results.success.sel(strategy="rps", object="box").all()
+    assert results.success.sel(law="rps", object="box").all()
     assert (results.min_distance.where(results.success == 1).fillna(0) < 0.05).all()
-    config = json.loads((runs[0] / "config.json").read_text())
-    assert config["params"]["rps"]["eta"] == 10.0
-    assert config["params"]["nps"]["reactive"] == 0.0
+    config = json.loads((runs[0] / "manifest.json").read_text())
+    assert config["question"] == "table"
+    assert config["laws"]["rps"]["eta"] == 10.0
+    assert config["laws"]["nps"]["reactive"] == 0.0
     environment = json.loads((runs[0] / "environment.json").read_text())
     assert environment["packages"]["mujoco"] == "3.17.0"
     assert (runs[0] / "min_distance.png").stat().st_size > 10_000
-    assert "| RPS | ours" in (runs[0] / "table.txt").read_text()
+    report = (runs[0] / "report.md").read_text()
+    assert "| RPS | ours" in report
 
 
 def test_the_same_command_gives_the_same_results_bit_for_bit(runs):
     assert (runs[0] / "results.nc").read_bytes() == (runs[1] / "results.nc").read_bytes()
 
 
-def test_a_run_is_not_overwritten_unasked(runs, capsys):
+def test_another_run_is_not_written_over_it_unasked(runs, capsys):
     before = (runs[0] / "results.nc").read_bytes()
-    assert "--overwrite" in refusal(capsys, *SMALL, "--out", runs[0])
+    said = refusal(capsys, *SMALL, "--seed", 1, "--out", runs[0])
+    assert "holds another run (setting.seed = 0 there, 1 asked for)" in said
+    assert "--overwrite" in said
     assert (runs[0] / "results.nc").read_bytes() == before
 
 
@@ -76,7 +80,7 @@ def test_a_push_that_cannot_be_filmed_says_how_and_does_the_rest(tmp_path, capsy
     arguments = ("--engine", "fused", "--horizon", 18, "--out", out)
     assert rps("push", "--target", 0.6, 0, *arguments) == 0
     printed = capsys.readouterr().out
-    assert "no video: " in printed
+    assert "no film: " in printed
     assert "pip install imageio-ffmpeg" in printed
     assert (out / "trial.png").exists()
     assert not (out / "push.mp4").exists()
@@ -95,7 +99,7 @@ before = dict(os.environ)
 import rps_jax
 import jax
 from jax._src import xla_bridge
-rps_jax.RPSParams.paper(), rps_jax.Case, rps_jax.CapacitiveSkin, rps_jax.OBJECTS
+rps_jax.RPSParams.paper(), rps_jax.Robot, rps_jax.Domain, rps_jax.sweep
 assert not xla_bridge._backends, "a device was touched"
 assert dict(os.environ) == before, "flags were set"
 assert not jax.config.jax_compilation_cache_dir and not jax.config.jax_enable_x64
@@ -112,7 +116,7 @@ def test_importing_sets_no_flags_prints_nothing_and_touches_no_device(tmp_path):
 
 def test_the_papers_totals_and_targets():
     # 88.19, 15.97 and 5.56 % of 144 (Sec. III-B).
-    totals = [sum(n for (s, *_), n in paper.TABLE_II.items() if s == w) for w in paper.STRATEGIES]
+    totals = [sum(n for (s, *_), n in paper.TABLE_II.items() if s == w) for w in paper.LAWS]
     assert totals == [127, 23, 8]
     assert len(set(paper.TARGETS)) == 24
     assert np.abs(paper.TARGETS).max() == 2
@@ -120,16 +124,65 @@ def test_the_papers_totals_and_targets():
 
 def test_a_quick_run_makes_small_only_what_was_not_asked_for():
     asked = TuneES(quick=True, worlds=7, tuned=("logistic",))
-    quick = asked.quickly(worlds=16, population=10)
+    quick, small = asked.asked(), asked.small()
     assert (quick.worlds, quick.tuned) == (7, ("logistic",))
-    assert (quick.population, quick.engine, quick.horizon) == (10, "quasistatic", 150.0)
-    assert quick.generations == asked.generations
+    assert quick.population == small["population"] < TuneES().population
+    assert quick.setting.engine == small["setting.engine"]
+    assert TuneES().asked() == TuneES()
 
 
-def test_files_of_the_same_name_are_told_apart_by_their_folders():
-    runs = ("paper", "runs/es/tuned.json", "runs/grad/tuned.json")
-    assert parsing.labels_of("params", runs) == ["paper", "es/tuned", "grad/tuned"]
-    assert parsing.labels_of("params", runs[:2]) == ["paper", "tuned"]
-    for bad in ((), ("paper", "paper"), ("a/es/tuned.json", "b/es/tuned.json")):
-        with pytest.raises(InputError, match="name each once"):
-            parsing.labels_of("params", bad)
+def test_files_of_the_same_name_are_told_apart_by_their_folders(tmp_path):
+    texts = []
+    for folder, gain in {"es": 0.3, "grad": 0.4}.items():
+        path = tmp_path / folder / "tuned.json"
+        path.parent.mkdir()
+        path.write_text(json.dumps({"K_h": gain}))
+        texts.append(f"rps,{path}")
+    assert list(registry.laws_of(["rps", texts[0]])) == ["rps", "rps,tuned"]
+    assert list(registry.laws_of(["rps", *texts])) == ["rps", *texts]
+
+
+STUDY = """
+from dataclasses import dataclass
+import xarray as xr
+from rps_jax.runs.question import OfLaw, call_of
+from rps_jax.analysis.report import Section
+from rps_jax.record.options import option
+import rps_jax
+
+@dataclass(frozen=True)
+class Crowd(OfLaw[xr.Dataset]):
+    'Count what a law wins among drums.'
+
+    worlds: int = option(16, 1, 1000)
+    'Number of drums.'
+
+    def answer(self, run):
+        drums = rps_jax.Domain(("random_cylinder",))
+        return rps_jax.sweep(self.law, drums, self.worlds, setting=self.setting, progress=False)
+
+    def report(self, found, run):
+        return [Section("Drums", f"{int(found.success.sum())} of {self.worlds} were won.")]
+
+crowd = call_of(Crowd)
+"""
+BRIEF = ("--engine", "quasistatic", "--horizon", 2)
+
+
+def test_a_question_of_ones_own_is_one_file(tmp_path, capsys):
+    path = tmp_path / "my_study.py"
+    path.write_text(STUDY)
+    assert rps(path, "--worlds", 3, *BRIEF, "--law", "rps", "--out", tmp_path / "run") == 0
+    assert "0 of 3 were won" in capsys.readouterr().out
+    assert files.read_results(tmp_path / "run").sizes["world"] == 3
+    assert "worlds = 0 is not allowed" in refusal(capsys, path, "--worlds", 0)
+    assert rps(path, "--help") == 0
+    assert "Number of drums." in capsys.readouterr().out
+
+
+def test_a_command_is_the_call_of_its_question(tmp_path):
+    asked = ("--laws", "rps", "rps,K_h=0.3", "--worlds", 4, "--domain", "prisms", *BRIEF)
+    assert rps("sweep", *asked, "--out", tmp_path) == 0
+    setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
+    called = rps_jax.sweep(["rps", "rps,K_h=0.3"], "prisms", 4, setting=setting)
+    xr.testing.assert_identical(rps_jax.load(tmp_path), called)

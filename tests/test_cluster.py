@@ -1,6 +1,5 @@
 """Sweeps through Ray: whoever runs a part and whoever dies, results are those of one process."""
 
-import contextlib
 import json
 import os
 import random
@@ -13,19 +12,19 @@ import jax
 import pytest
 from helpers import PLAN, SLOTS, one_sentence, parts_of, rps, swept
 
-from rps_jax.app.cli import running
+from rps_jax.engines.device import use_cache
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.runs import cluster, sweep
 from rps_jax.runs.board import Board
-from rps_jax.trials import setting
+from rps_jax.trials.progress import Bar
 from rps_jax.world.domain import from_json
 
 NEAR = {"objects": ["random_cylinder"], "distance": [0.7, 0.8], "bearing": [-0.5, 0.5]}
 OF_NEAR = replace(PLAN, domain=from_json(NEAR))
 SWEEP = [
     *("sweep", "--fidelity", "fast", "--horizon", 20, "--worlds", 20),
-    *("--strategies", "rps", "nps", "--part", 7, "--slots", SLOTS),
+    *("--laws", "rps", "nps", "--part", 7, "--slots", SLOTS),
 ]
 
 
@@ -152,25 +151,20 @@ def opened(folder):
 def test_a_worker_killed_at_work_changes_nothing(domain, tmp_path, two_workers, monkeypatch):
     """SIGKILL after some of its trials; the parts are those of one process without Ray."""
     out, plan = opened(tmp_path / "run")
-    running.use_cache()
+    use_cache()
     plain = swept(tmp_path / "plain", plan)
     seen, killed = set(), []
 
-    @contextlib.contextmanager
-    def killing(trials, what):
-        assert trials == plan.trials
+    def killing(bar, progress):
+        assert bar._total == plan.trials
+        environment = json.loads((out / "environment.json").read_text())
+        pids = [worker["pid"] for worker in environment.get("workers", ())]
+        seen.update(pids)
+        if 0 < progress.finished < plan.trials and not killed:
+            killed.append(pids[0])
+            os.kill(pids[0], signal.SIGKILL)
 
-        def report(progress):
-            environment = json.loads((out / "environment.json").read_text())
-            pids = [worker["pid"] for worker in environment.get("workers", ())]
-            seen.update(pids)
-            if 0 < progress.finished < trials and not killed:
-                killed.append(pids[0])
-                os.kill(pids[0], signal.SIGKILL)
-
-        yield report
-
-    monkeypatch.setattr(setting, "progress_bar", killing)
+    monkeypatch.setattr(Bar, "__call__", killing)
     assert rps(*SWEEP, "--domain", domain, "--out", out, "--ray", "local") == 0
     assert killed
     workers = json.loads((out / "environment.json").read_text())["workers"]

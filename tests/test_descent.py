@@ -10,21 +10,17 @@ import numpy as np
 import pytest
 
 from rps_jax.app import cli
-from rps_jax.control.law import RPSParams
-from rps_jax.control.rivals.pursuit import PursuitParams
+from rps_jax.control.laws.rps import RPSParams
 from rps_jax.errors import InputError
 from rps_jax.runs.evaluate import Answer
-from rps_jax.runs.objective import Objective
+from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import descent, gradients
-from rps_jax.tuning.descent import Descent, Search
-from rps_jax.tuning.run import Course, read_log
-from rps_jax.tuning.space import SUBSETS, Space
-from rps_jax.world import domain
-from rps_jax.world.physics import preset
+from rps_jax.tuning.descent import TuneGrad
+from rps_jax.tuning.run import read_log
 
-SETTING = Setting(preset(), Rules(horizon=20.0, max_lost=10.0), engine="quasistatic")
+SETTING = Setting("quasistatic", rules=Rules(horizon=20.0, max_lost=10.0))
 OBJECTIVE = Objective(time=0.3, lost=0.1, miss=0.5)
 
 
@@ -75,40 +71,38 @@ class TestDescent:
             {"estimator": "backprop"}, {"optimiser": "sgdd"}, {"clip": 0.0}, {"pairs": 0},
             {"within": -1.0}, {"budget": float("nan")},
         ):  # fmt: skip
-            with pytest.raises(InputError):
-                Descent(**bad)
+            (name,) = bad
+            with pytest.raises(InputError, match=name):
+                TuneGrad("rps", **bad).checked()
 
     def test_the_first_start_is_the_base(self):
-        space = Space(SUBSETS["full"])
-        search = Search(Descent(starts=3), space, Course())
-        search.begin()
-        thetas = search.propose()
-        np.testing.assert_array_equal(thetas[0], space.vector(space.base))
+        one = TuneGrad("rps", starts=3)
+        tuner = one.tuner()
+        tuner.begin()
+        thetas = tuner.propose()
+        np.testing.assert_array_equal(thetas[0], one.space.vector(one.space.base))
         assert (np.abs(thetas[1:] - thetas[0]).max(axis=1) > 0.1).all()
 
     def test_a_law_without_a_smooth_form_is_refused(self):
-        space = Space(("K_v",), PursuitParams())
-        with pytest.raises(InputError, match="no smooth law"):
-            Search(Descent(), space, Course())
-        Search(Descent(estimator="evolution"), space, Course())
+        with pytest.raises(InputError, match="no smooth form"):
+            TuneGrad("pursuit", tuned=("K_v",)).tuner()
+        TuneGrad("pursuit", tuned=("K_v",), estimator="evolution").tuner()
 
     def test_steps_go_downhill_and_stay_within_the_clip(self):
-        one = Descent(optimiser="sgd", learning_rate=0.5, clip=1.0, steps=10)
-        rule = one.rule()
+        rule = TuneGrad("rps", optimiser="sgd", learning_rate=0.5, clip=1.0, steps=10).rule()
         change, _ = rule.update(jnp.array([30.0, 40.0]), rule.init(jnp.zeros(2)), jnp.zeros(2))
         np.testing.assert_allclose(change, [-0.3, -0.4], rtol=1e-6)
 
 
 def test_antithetic_steps_find_the_slope_of_the_objective():
     # value = 2 z_0 - z_1 in the coordinates of the map, the same in all worlds.
-    space = Space(("L", "K_h"))
+    one = TuneGrad("rps", tuned=("L", "K_h"), worlds=3, pairs=4000, setting=SETTING)
 
     def pretend(asks):
-        z = space.vector(asks[0].params)
+        z = one.space.vector(asks[0].params)
         return [Answer(None, np.asarray(2 * z[:, 0] - z[:, 1])[:, None] + np.zeros(3))]
 
-    course = Course((domain.DOMAINS["wide"],), 3, 3, SETTING)
-    found = descent.smoothed(jnp.zeros((2, 2)), space, course, Descent(pairs=4000), 0, pretend)
+    found = descent.smoothed(jnp.zeros((2, 2)), one, 0, pretend)
     np.testing.assert_allclose(found.gradient, [[2, -1], [2, -1]], atol=0.2)
     errors = np.abs(found.gradient - jnp.array([2.0, -1.0])) / jnp.sqrt(found.variance)
     assert (errors < 4).all()
@@ -120,13 +114,13 @@ def test_windows_begin_where_their_trials_are_by_then(monkeypatch):
     class Blank(NamedTuple):
         params: Any
 
-    monkeypatch.setattr(descent, "start_all", lambda worlds, live, strategy: jnp.zeros(live.size))
+    monkeypatch.setattr(descent, "start_all", lambda worlds, live, law: jnp.zeros(live.size))
     monkeypatch.setattr(descent, "control_step", lambda _, worlds, trials, **__: (trials + 1, None))
     monkeypatch.setattr(gradients, "window", lambda *_, **__: lambda thetas, starts: starts[1])
-    course = Course((domain.DOMAINS["wide"],), 3, 3, SETTING)
     late = jnp.array([0.0, 0.5, 1.0])
     for within, steps in ((10.0, [0, 250, 500]), (0.0, [0, 0, 0])):
-        scores = descent.scores_of(Space(("L", "K_h")), course, Descent(within=within), None)
+        how = TuneGrad("rps", tuned=("L", "K_h"), within=within, setting=SETTING).how
+        scores = descent.scores_of(how, None)
         np.testing.assert_array_equal(scores(jnp.zeros((3, 2)), (Blank(None), late)), steps)
 
 

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rps_jax.control.law import Details, RPSParams
-from rps_jax.control.strategies import Strategy
+from rps_jax.control.base import Law
+from rps_jax.control.laws.rps import RPSParams
+from rps_jax.control.observation import Details
 from rps_jax.errors import InputError
 from rps_jax.robot.shell import Shell
 from rps_jax.trials import env, trial
@@ -29,7 +30,7 @@ NEAR = replace(
     lateral=Range(-0.03, 0.03),
     com_offset=Range(0, 0),
     gap=Range(0.02, 0.02),
-    **{name: Range(0, 0) for name in domain.OF_THE_BASE},
+    **{name: Range(0, 0) for name in domain.of("base")},
 )
 COUNT, STEPS = 4, 50
 AHEAD, BACK = jnp.array([1.0, 0.0, 0.0]), jnp.array([-1.0, 0.0, 0.0])
@@ -37,7 +38,7 @@ PERIOD = FAST.control_period
 
 
 def made(**options):
-    setting = Setting(FAST, Rules(horizon=20.0), engine="fused")
+    setting = Setting("fused", FAST, rules=Rules(horizon=20.0))
     return PushEnv("random_cylinder", NEAR, setting=setting, worlds=6, **options)
 
 
@@ -119,7 +120,7 @@ def test_worlds_are_those_of_the_domain(pushing):
     drawn = draws.draw(replace(NEAR, objects=("random_cylinder",)), 0, index)
     np.testing.assert_allclose(state.info["world"].footprint.radius, drawn.solid.radius, rtol=1e-6)
     np.testing.assert_allclose(state.obs[:, 42:], drawn.p_world_target, rtol=1e-6)
-    np.testing.assert_allclose(state.data.qpos[:, 4], drawn.lateral, rtol=1e-6)
+    np.testing.assert_allclose(state.data.qpos[:, 4], drawn.at["lateral"], rtol=1e-6)
 
 
 def test_an_action_is_a_share_of_the_greatest_twist():
@@ -135,7 +136,7 @@ def test_a_push_earns_what_it_brings_nearer_less_the_time_without_contact(pushin
     touch = seen.metrics["in_contact"] > 0
     for i in won:
         end = int(np.argmax(seen.done[:, i]))
-        felt = seen.data.strategy[:, i]
+        felt = seen.data.memory[:, i]
         gained = felt[np.argmax(touch[:, i])] - felt[end]
         without = PERIOD * (~touch[: end + 1, i]).sum()
         assert seen.reward[:, i].sum() == pytest.approx(gained - 0.05 * without + 1, abs=1e-4)
@@ -160,7 +161,7 @@ def test_lost_contact_costs_and_counts_again_from_where_it_was_lost(pushing):
     np.testing.assert_allclose(away.reward[gone], -0.05 * PERIOD, rtol=1e-5)
     again = pushing.go(last(away), AHEAD, times=2)
     progress = np.concatenate([away.metrics["progress"], again.metrics["progress"]]).sum(axis=0)
-    lasting = there.data.strategy - last(again).data.strategy
+    lasting = there.data.memory - last(again).data.memory
     np.testing.assert_allclose(progress, lasting, atol=1e-5)
 
 
@@ -190,16 +191,14 @@ def test_an_action_that_is_no_number_ends_a_world_and_no_other(pushing):
 
 
 def test_it_moves_as_a_trial_that_is_driven_by_the_same_twist(pushing):
-    """A strategy that always says the same, in the loop of all other trials."""
+    """A law that always says the same, in the loop of all other trials."""
     push, state, action = pushing.env, pushing.start, jnp.array([0.8, 0.2, 0.3])
     mine = last(pushing.go(state, action))
     constant = push.twist(action)
-    dull = Strategy(
-        lambda params: (), lambda params, memory, seen: (memory, constant, Details.of(seen))
-    )
+    dull = Law(lambda params: (), lambda params, memory, seen: (memory, constant, Details.of(seen)))
     worlds = state.info["world"]
-    trials = trial.start_all(worlds, np.ones(mine.done.size, bool), strategy=dull)
-    options = {"physics": FAST, "rules": push.setting.rules, "strategy": dull}
+    trials = trial.start_all(worlds, np.ones(mine.done.size, bool), law=dull)
+    options = {"physics": FAST, "rules": push.setting.rules, "law": dull}
     alone = replace(NEAR, objects=(push.object,))
     drawn = draws.draw(alone, 0, np.arange(1))
     stage = drawn_worlds(alone, drawn, push.params, push.setting).stage
@@ -221,7 +220,7 @@ def test_a_batch_is_driven_as_one_and_not_world_by_world():
             sizes.append(jnp.shape(fields)[0])
             return fields + 0 * twists, motion, twists
 
-    drive = env.one_of_many(Stage(), Setting())  # type: ignore[arg-type]
+    drive = env.one_of_many(Stage(), Setting(engine="mjx"))  # type: ignore[arg-type]
     batch = jnp.arange(5.0)
     together = jax.vmap(drive, (0, 0, None))(batch, batch, jnp.array(2.0))
     np.testing.assert_array_equal(together[0], batch)

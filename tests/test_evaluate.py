@@ -1,4 +1,4 @@
-"""Candidates in random worlds: the same ones for all, one program, parameters of any strategy."""
+"""Candidates in random worlds: the same ones for all, one program, parameters of any law."""
 
 from dataclasses import replace
 from typing import Any, NamedTuple, get_args
@@ -8,13 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rps_jax.control import strategies
-from rps_jax.control.law import Details, RPSParams, Twist
-from rps_jax.control.strategies import Strategy
+from rps_jax.control import registry
+from rps_jax.control.base import Law
+from rps_jax.control.laws.rps import RPSParams
+from rps_jax.control.observation import Details, Twist
 from rps_jax.errors import InputError
 from rps_jax.runs import evaluate as room
 from rps_jax.runs.evaluate import Ask, Split, evaluate, seed_of
-from rps_jax.runs.objective import Objective
+from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning.space import Space
@@ -22,7 +23,13 @@ from rps_jax.world import draws
 from rps_jax.world.domain import DOMAINS, Range
 
 CYLINDERS = replace(DOMAINS["wide"], objects=("random_cylinder",))
-SHORT: Any = {"engine": "quasistatic", "rules": Rules(horizon=8.0), "slots": 6}
+BRIEF = Setting("quasistatic", rules=Rules(horizon=8.0))
+SHORT: Any = {"setting": BRIEF, "slots": 6}
+
+
+def seeded(seed):
+    """The same conditions, in other worlds."""
+    return SHORT | {"setting": replace(BRIEF, seed=seed)}
 
 
 def paper(count, **changes):
@@ -39,7 +46,7 @@ def test_no_two_splits_share_a_seed():
 class TestEvaluate:
     def test_results_are_labelled_as_those_of_a_sweep(self):
         both = replace(CYLINDERS, objects=("random_cylinder", "cylinder"))
-        found = evaluate(paper(2), both, 3, seed=4, split="test", **SHORT)
+        found = evaluate(paper(2), both, 3, split="test", **seeded(4))
         assert dict(found.sizes) == {"candidate": 2, "world": 3, "pose": 3}
         assert found.object.values.tolist() == ["random_cylinder", "cylinder", "random_cylinder"]
         for index in range(3):
@@ -49,7 +56,7 @@ class TestEvaluate:
                 assert found[name].attrs["units"] == unit
         assert found.time.attrs["units"] == "s"
         assert found.success.dtype == np.int8
-        expected = Objective().score(0.0, found.time, found.contact_lost_time, 0.0, SHORT["rules"])
+        expected = Objective().score(0.0, found.time, found.contact_lost_time, 0.0, BRIEF.rules)
         away = np.where(np.isfinite(found.min_distance), found.min_distance, found.distance)
         missed = 0.5 * np.minimum(away, 1.0)
         assert (found.success == 0).all()
@@ -59,7 +66,7 @@ class TestEvaluate:
         one = evaluate(paper(3), CYLINDERS, 4, **SHORT)
         before = len(compiled)
         L = np.array([0.1, 0.2, 0.4])
-        other = evaluate(paper(3, L=L), CYLINDERS, 4, seed=7, split="validate", **SHORT)
+        other = evaluate(paper(3, L=L), CYLINDERS, 4, split="validate", **seeded(7))
         assert len(compiled) == before
         assert (one.score != other.score).any()
 
@@ -71,34 +78,42 @@ class TestEvaluate:
 
     def test_splits_and_seeds_have_worlds_of_their_own(self):
         masses = [
-            evaluate(paper(1), CYLINDERS, 4, seed=seed, split=split, **SHORT).mass.values
+            evaluate(paper(1), CYLINDERS, 4, split=split, **seeded(seed)).mass.values
             for seed, split in ((0, "tune"), (0, "test"), (1, "tune"))
         ]
         assert len(np.unique(masses)) == 12
 
+    def test_candidates_are_named_one_by_one_or_alone(self):
+        alone, several = room.candidates("rps"), room.candidates(["rps", "rps,K_h=0.3"])
+        for one in (alone, room.candidates(RPSParams.paper())):
+            assert {np.shape(leaf) for leaf in one} == {(1,)}
+        np.testing.assert_allclose(several.K_h, [*alone.K_h, 0.3])
+        given = paper(3)
+        assert room.candidates(given) is given
+        with pytest.raises(InputError, match="2 classes"):
+            room.candidates(["rps", "pursuit"])
+
     @pytest.mark.parametrize(
         ("bad", "why"),
         [
-            ({"params": RPSParams.paper()}, "one for each candidate"),
-            ({"params": paper(0)}, "one for each candidate"),
-            ({"params": paper(3, L=np.ones(2))}, r"\.L of 2 are not allowed"),
-            ({"params": paper(3, L=np.array([1, np.nan, 1]))}, r"RPSParams\.L of a candidate"),
-            ({"params": paper(3, L=np.array([1, 1, np.inf]))}, "candidate 2: L = inf"),
-            ({"params": paper(3, l_mr=np.array([0.1, 0.3, 0.1]))}, "candidate 1: l_mr"),
-            ({"params": paper(2, L=np.array(["a", "b"]))}, "array of numbers"),
-            ({"params": (np.ones(3),)}, "belong to no strategy"),
+            ({"law": paper(0)}, "one for each candidate"),
+            ({"law": paper(3, L=np.ones(2))}, r"\.L of 2 are not allowed"),
+            ({"law": paper(3, L=np.array([1, np.nan, 1]))}, r"RPSParams\.L of a candidate"),
+            ({"law": paper(3, L=np.array([1, 1, np.inf]))}, "candidate 2: L = inf"),
+            ({"law": paper(3, l_mr=np.array([0.1, 0.3, 0.1]))}, "candidate 1: l_mr"),
+            ({"law": paper(2, L=np.array(["a", "b"]))}, "array of numbers"),
+            ({"law": (np.ones(3),)}, "belong to no law"),
             ({"split": "train"}, "choose from tune, validate, test"),
             ({"domain": "wild"}, "did you mean 'wide'"),
-            ({"engine": "fuse"}, "unknown engine"),
             ({"worlds": 0}, "worlds = 0"),
-            ({"seed": -1}, "seed = -1"),
+            (seeded(2**31), "seed = 2147483648"),
             ({"slots": 0}, "slots = 0"),
         ],
     )
     def test_bad_input_is_told_before_anything_compiles(self, bad, why, compiled):
         before = len(compiled)
         with pytest.raises(InputError, match=why) as caught:
-            evaluate(**{"params": paper(3), "worlds": 4} | SHORT | bad)
+            evaluate(**{"law": paper(3), "worlds": 4} | SHORT | bad)
         assert "\n" not in str(caught.value)
         assert len(compiled) == before
 
@@ -113,23 +128,23 @@ class Nested(NamedTuple):
 
 @pytest.fixture
 def nested():
-    """The strategy is forgotten after the test."""
-    tables = strategies.PARAMS, strategies.STRATEGIES
+    """The law is forgotten after the test."""
+    tables = registry.LAWS, registry._OF
     before = [dict(table) for table in tables]
 
     def step(params, state, observation):
         v = params.gains["v"] * jnp.sum(params.curve)
         return state, Twist(v, 0 * v, 0 * v), Details.of(observation)
 
-    own = Strategy(lambda params: (), step, check=lambda params: params)
-    strategies.register_strategy("nested", own, Nested({"v": 0.01}, np.ones(3)))
+    own = Law(lambda params: (), step, check=lambda params: params)
+    registry.register_law("nested", own, Nested({"v": 0.01}, np.ones(3)))
     yield
     for table, content in zip(tables, before, strict=True):
         table.clear()
         table.update(content)
 
 
-def test_any_registered_strategy_with_nested_parameters(nested):
+def test_any_registered_law_with_nested_parameters(nested):
     curve = np.array([[1, 0, 0], [0, 0, 2], [0, 0, 0]])
     params = Nested({"v": np.full(3, 0.01)}, curve, np.full(3, 0.05))
     prompt = replace(CYLINDERS, velocity_error=Range(0, 0), command_delay=Range(0, 0))
@@ -143,7 +158,7 @@ class TestSeveralAsks:
         faster, params = paper(2, v_approach=np.array([0.01, 0.05])), paper(2)
         hostile = replace(DOMAINS["hostile"], objects=("random_cylinder",))
         asks = [Ask(faster, 3, np.arange(3)), Ask(params, 3, np.arange(3))]
-        where = [CYLINDERS, hostile], Setting(rules=SHORT["rules"], engine="quasistatic")
+        where = [CYLINDERS, hostile], BRIEF
         (one, two), _ = room.try_out(asks, *where, Objective(), slots=6)
         assert one.score.shape == (2, 6)
         np.testing.assert_array_equal(one.score[0], two.score[0])

@@ -12,17 +12,18 @@ import pytest
 
 from rps_jax import engines
 from rps_jax.app import cli
-from rps_jax.control import strategies
-from rps_jax.control.law import Details, Observation, RPSParams, RPSState, step
-from rps_jax.control.strategies import Strategy
+from rps_jax.control import registry
+from rps_jax.control.base import Law
+from rps_jax.control.laws import rps
+from rps_jax.control.laws.rps import RPSParams, RPSState, step
+from rps_jax.control.observation import Details, Observation, Twist
 from rps_jax.errors import InputError
 from rps_jax.geometry.footprint import Footprint, circle, polygon, rectangle
 from rps_jax.record import files
 from rps_jax.robot.skin import POINT, CapacitiveSkin
 from rps_jax.runs.plan import Plan, load_plan, open_run, scene_of
 from rps_jax.trials import pushes
-from rps_jax.trials.pushes import Case
-from rps_jax.trials.results import title_of
+from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws, objects, scene
@@ -83,7 +84,7 @@ def test_a_hexagon_has_the_mass_of_its_geoms_and_the_outline_it_was_given(hexago
 
 def test_every_engine_has_the_same_hexagon(hexagon):
     solids, friction = scene.solid_of(hexagon), Friction(np.array([0.3]), np.array([0.35]))
-    physics = Setting().physics
+    physics = Setting(engine="mjx").physics
     for engine in ("fused", "mjx"):
         _, alone = engines.get(engine).stage_of_scenes([hexagon], np.zeros(1, int))
         _, drawn = engines.get(engine).stage_of_solids("prism", solids, friction, physics)
@@ -107,7 +108,7 @@ def test_an_object_of_the_paper_that_is_registered_anew_is_the_same_world(name, 
 
 def test_an_object_of_ones_own_may_be_of_a_domain(hexagon):
     """Its mass and outline are those of all worlds, and a replay has its looks."""
-    assert title_of(Case("hexagon", FRICTION["S1"], (2.0, 0.0))).startswith("hexagon, ")
+    assert Case("hexagon", FRICTION["S1"], (2.0, 0.0)).title.startswith("hexagon, ")
     own = Domain(objects=("hexagon",), friction_robot=Range(0.4, 0.5))
     drawn = draws.draw(own, 0, np.arange(5))
     assert (drawn.solid.mass == 12.0).all()
@@ -198,13 +199,13 @@ def test_the_papers_names_are_taken():
     for name in ("box", "prism"):
         with pytest.raises(InputError, match=f"object name '{name}' is not allowed"):
             objects.register_object(name, BOX)
-    with pytest.raises(InputError, match="strategy name 'rps' is not allowed"):
-        strategies.register_strategy("rps", strategies.RPS, RPSParams())
+    with pytest.raises(InputError, match="law name 'rps' is not allowed"):
+        registry.register_law("rps", rps.LAW, RPSParams())
     with pytest.raises(InputError, match=r"MuJoCo cannot compile .*nowhere.xml"):
         objects.register_object("mine", "nowhere.xml")
 
 
-# --- strategies of one's own ---------------------------------------------------------------
+# --- laws of one's own ---------------------------------------------------------------------
 
 
 def test_a_law_of_ones_own_runs_beside_the_law(capsys):
@@ -235,23 +236,25 @@ def test_an_optimiser_of_ones_own_needs_evaluate_alone(capsys):
 def test_registered_names_work_on_the_command_line(tmp_path, capsys, hexagon):
     example("own_law")  # registers p_control
     out = tmp_path / "table"
-    command = ["table", "--objects", "hexagon", "--strategies", "p_control", "--friction", "S1"]
+    command = ["table", "--objects", "hexagon", "--laws", "p_control", "--friction", "S1"]
     command += ["--targets", "2", "0", "--horizon", "4", "--engine", "mujoco", "--out", str(out)]
-    assert cli.main([*command, "--params", "p_control.v=0.02"]) == 0
+    command[command.index("p_control")] = "p_control,v=0.02"
+    assert cli.main(command) == 0
     assert "P_CONTROL" in capsys.readouterr().out
     results = files.read_results(out)
     assert results.object.values.tolist() == ["hexagon"]
     assert float(results.base_pose[0, 0, 0, 0, 0]) == pytest.approx(0.08, abs=0.002)
-    assert cli.main([*command, "--params", "p_control.w=1"]) == 2
-    assert "choose from p_control.v, p_control.gains.l" in capsys.readouterr().err
+    command[command.index("p_control,v=0.02")] = "p_control,w=1"
+    assert cli.main(command) == 2
+    assert "choose from v, gains.l" in capsys.readouterr().err
 
 
-def test_a_sweep_finds_a_registered_strategy_again(tmp_path):
+def test_a_sweep_finds_a_registered_law_again(tmp_path):
     kind = example("own_law")["PParams"]
     plan = Plan(Domain(), 3, {"p": kind(v=0.03)})
     open_run(tmp_path, plan)
     assert load_plan(tmp_path) == plan
-    strategies.PARAMS.pop("p_control")
+    registry.LAWS.pop("p_control")
     with pytest.raises(InputError, match="unknown class of parameters 'PParams'"):
         load_plan(tmp_path)
 
@@ -259,38 +262,38 @@ def test_a_sweep_finds_a_registered_strategy_again(tmp_path):
 LAW = EXAMPLES / "own_law.py"
 
 
-def test_a_law_of_a_file_runs_in_every_command_that_asks_for_strategies(tmp_path, capsys):
+def test_a_law_of_a_file_runs_in_every_command_that_asks_for_laws(tmp_path, capsys):
     name = f"{LAW}:PParams"
     short = ["--horizon", "0.5", "--engine", "mujoco"]
     table = ["table", "--objects", "box", "--friction", "S1", "--targets", "2", "0", *short]
-    assert cli.main([*table, "--strategies", "rps", name, "--out", str(tmp_path / "table")]) == 0
-    assert files.read_results(tmp_path / "table").strategy.values.tolist() == ["rps", "p_control"]
-    sweep = ["sweep", "--worlds", "2", "--strategies", name, "--out", str(tmp_path / "sweep")]
+    assert cli.main([*table, "--laws", "rps", name, "--out", str(tmp_path / "table")]) == 0
+    assert files.read_results(tmp_path / "table").law.values.tolist() == ["rps", "p_control"]
+    sweep = ["sweep", "--worlds", "2", "--laws", name, "--out", str(tmp_path / "sweep")]
     assert cli.main([*sweep, *short]) == 0
     plan = load_plan(tmp_path / "sweep")
-    assert strategies.as_json(plan.arms["p_control"])["gains.heading"] == 0.1
+    assert registry.as_json(plan.laws["p_control"])["gains.heading"] == 0.1
     capsys.readouterr()
 
 
 def test_a_run_made_with_a_file_knows_when_the_file_has_changed(tmp_path):
     law = tmp_path / "mine.py"
     law.write_text(LAW.read_text())
-    _, params = strategies.named(f"{law}:PParams")
-    kept = strategies.recorded(params)
-    assert strategies.restored(kept) == params
+    _, params = registry.named(f"{law}:PParams")
+    kept = registry.recorded(params)
+    assert registry.restored(kept) == params
     law.write_text(LAW.read_text().replace("0.15, 0.15", "0.1, 0.1"))
     with pytest.raises(InputError, match="is not what it was when the run was made"):
-        strategies.restored(kept)
+        registry.restored(kept)
 
 
 def test_a_file_is_run_again_if_another_law_took_its_name_since():
     """And a law that no file holds is not kept as if one did."""
     kinds = []
     for _ in range(2):
-        _, params = strategies.named(f"{LAW}:PParams")
+        _, params = registry.named(f"{LAW}:PParams")
         kinds.append(type(params))
         in_a_notebook = example("own_law")["PParams"]()  # registers p_control, too
-        assert "file" not in strategies.recorded(in_a_notebook)
+        assert "file" not in registry.recorded(in_a_notebook)
     assert kinds[0] is not kinds[1]
 
 
@@ -300,7 +303,7 @@ def test_a_file_is_run_again_if_another_law_took_its_name_since():
         (None, "cannot be read"),
         ("import nothing_of_this_name", "cannot be run"),
         ("x = 1", "must define the class PParams"),
-        ("class PParams: pass", "call rps_jax.register_strategy"),
+        ("class PParams: pass", "call rps_jax.register_law"),
     ],
 )
 def test_a_file_without_a_law_is_one_sentence(content, message, tmp_path):
@@ -308,28 +311,32 @@ def test_a_file_without_a_law_is_one_sentence(content, message, tmp_path):
     if content is not None:
         law.write_text(content)
     with pytest.raises(InputError, match=message):
-        strategies.named(f"{law}:PParams")
+        registry.named(f"{law}:PParams")
 
 
 def test_parameters_that_are_arrays_and_nested_are_kept_and_found_again(tmp_path):
     made = example("own_law")
     weights = made["PParams"](gains=made["Gains"](np.ones((2, 3)), np.arange(2.0)))
-    own = Strategy(lambda params: (), made["step"])
-    strategies.register_strategy("p_control", own, weights)
+
+    def step(params, memory, seen):
+        turn = jnp.sum(params.gains.l) + jnp.max(params.gains.heading)
+        return memory, Twist(params.v, 0.0, turn), Details.of(seen)
+
+    registry.register_law("p_control", Law(lambda params: (), step), weights)
     plan = Plan(Domain(), 3, {"p": weights._replace(v=0.03)})
     open_run(tmp_path, plan)
-    found = load_plan(tmp_path).arms["p"]
+    found = load_plan(tmp_path).laws["p"]
     assert jax.tree.map(np.shape, found) == jax.tree.map(np.shape, weights)
     np.testing.assert_array_equal(found.gains.l, weights.gains.l)
 
 
-def test_a_strategy_registered_again_replaces_the_old_one():
+def test_a_law_registered_again_replaces_the_old_one():
     """As when a cell of a notebook is run twice, and its class of parameters is made anew."""
     kinds = [example("own_law")["PParams"] for _ in range(2)]
-    assert kinds[0] not in strategies.STRATEGIES
-    assert type(strategies.PARAMS["p_control"]) is kinds[1]
-    strategies.register_strategy("slow", strategies.RPS, RPSParams(v_max=0.01))
-    assert strategies.of(strategies.PARAMS["slow"]) is strategies.RPS
+    assert kinds[0] not in registry._OF
+    assert type(registry.LAWS["p_control"]) is kinds[1]
+    registry.register_law("slow", rps.LAW, RPSParams(v_max=0.01))
+    assert registry.law_of(registry.LAWS["slow"]) is rps.LAW
 
 
 class Ahead(NamedTuple):
@@ -338,16 +345,18 @@ class Ahead(NamedTuple):
 
 
 def test_params_that_mean_nothing_are_refused():
-    own = Strategy(lambda params: (), lambda *_: None)
+    own = Law(lambda params: (), lambda *_: None)
     with pytest.raises(InputError, match="v = nan is not allowed"):
-        strategies.register_strategy("p", own, Ahead(v=float("nan")))
+        registry.register_law("p", own, Ahead(v=float("nan")))
     with pytest.raises(InputError, match=r"a field or property d_success"):
-        strategies.register_strategy("p", own, (1.0, 2.0))
+        registry.register_law("p", own, (1.0, 2.0))
     with pytest.raises(InputError, match="their class RPSParams is that of 'rps'"):
-        strategies.register_strategy("p", own, RPSParams())
-    with pytest.raises(InputError, match="params of class Ahead belong to no strategy"):
+        registry.register_law("p", own, RPSParams())
+    with pytest.raises(InputError, match="params of class Ahead belong to no law"):
         Case("box", FRICTION["S1"], (2.0, 0.0), Ahead())
-    details = Details.of(Observation(jnp.zeros(2), 0.0, jnp.array([0.3, 0.1]), True, jnp.ones(2)))
+    details = Details.of(
+        Observation(jnp.zeros(2), 0.0, jnp.array([0.3, 0.1]), jnp.array(True), jnp.ones(2))
+    )
     assert float(details.l) == pytest.approx(0.1)
     assert float(details.distance) == pytest.approx(np.hypot(0.7, 0.9))
 

@@ -10,20 +10,20 @@ from helpers import CYLINDERS, PAPER, refusal, rps
 from scipy import stats
 
 import rps_jax
-from rps_jax.control.rps_plus import RPSPlusParams
+from rps_jax.control.laws.rps_plus import RPSPlusParams
 from rps_jax.errors import InputError
 from rps_jax.record import files
-from rps_jax.studies.failures import attack, rare, regress, sobol
-from rps_jax.studies.failures.attack import Hunt
-from rps_jax.studies.failures.probe import Probe, severity
-from rps_jax.studies.failures.rare import Splitting
+from rps_jax.studies import attack, rare, regress, sensitivity
+from rps_jax.studies.probe import Probe
+from rps_jax.studies.rare import Rare
+from rps_jax.trials.score import severity
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import points
 from rps_jax.world.domain import DOMAINS, Range
 
 RULES = Rules(horizon=10.0, max_lost=5.0)
-BRIEF = Setting(rules=RULES, engine="quasistatic")
+BRIEF = Setting("quasistatic", rules=RULES)
 
 
 # --- severity ------------------------------------------------------------------------------
@@ -43,10 +43,10 @@ def test_severity_by_hand():
 
 
 def test_a_probe_agrees_with_a_sweep_and_is_continued(tmp_path, monkeypatch):
-    u = rps_jax.points_of(CYLINDERS, np.arange(6))
+    u = points.points_of(CYLINDERS, np.arange(6))
     asked = Probe(CYLINDERS, PAPER, BRIEF, tmp_path, slots=4, workers=1)
     found = asked(u)
-    swept = rps_jax.sweep(CYLINDERS, {"law": PAPER}, u, engine="quasistatic", rules=RULES, slots=4)
+    swept = rps_jax.sweep({"law": PAPER}, CYLINDERS, points=u, setting=BRIEF, slots=4)
     np.testing.assert_allclose(found.time, swept.time[0], atol=0.3)
     np.testing.assert_array_equal(found.severity >= 1, swept.success[0] == 0)
     np.testing.assert_allclose(asked.simulated, found.time.sum())
@@ -59,7 +59,7 @@ def test_a_probe_agrees_with_a_sweep_and_is_continued(tmp_path, monkeypatch):
 
 
 def test_a_damaged_step_is_tried_again(tmp_path):
-    u = rps_jax.points_of(CYLINDERS, np.arange(2))
+    u = points.points_of(CYLINDERS, np.arange(2))
     before = Probe(CYLINDERS, PAPER, BRIEF, tmp_path, slots=4, workers=1)(u)
     (path,) = (tmp_path / "parts").iterdir()
     path.write_bytes(path.read_bytes()[:-1])
@@ -82,7 +82,10 @@ def beyond(p, kinds):
 
 def test_splitting_is_unbiased_and_its_interval_covers():
     score, kinds = beyond(0.01, 12)
-    found = [rare.split(score, kinds, Splitting(1000, 10), seed).estimate for seed in range(60)]
+    found = [
+        rare.split(score, kinds, Rare(particles=1000, groups=10), seed).estimate
+        for seed in range(60)
+    ]
     p = np.array([one.p for one in found])
     assert abs(p.mean() / 0.01 - 1) < 3 * p.std() / p.mean() / np.sqrt(60)
     assert np.mean([one.low <= 0.01 <= one.high for one in found]) >= 0.9
@@ -91,7 +94,7 @@ def test_splitting_is_unbiased_and_its_interval_covers():
 
 def test_several_splittings_side_by_side_are_what_each_is_alone():
     score, kinds = beyond(0.01, 6)
-    sizes, seeds = Splitting(200, 4, share=0.5), range(3)
+    sizes, seeds = Rare(particles=200, groups=4, share=0.5), range(3)
     asked = []
 
     def counted(u):
@@ -107,7 +110,10 @@ def test_several_splittings_side_by_side_are_what_each_is_alone():
 
 def test_one_in_a_hundred_thousand_takes_a_twentieth_of_the_worlds():
     score, kinds = beyond(1e-5, 18)
-    found = [rare.split(score, kinds, Splitting(18_000, 20), seed).estimate for seed in range(8)]
+    found = [
+        rare.split(score, kinds, Rare(particles=18_000, groups=20), seed).estimate
+        for seed in range(8)
+    ]
     p, trials = np.array([(one.p, one.trials) for one in found]).T
     assert p.std(ddof=1) / 1e-5 <= 0.2
     assert np.mean(p) == pytest.approx(1e-5, rel=0.15)
@@ -115,11 +121,15 @@ def test_one_in_a_hundred_thousand_takes_a_twentieth_of_the_worlds():
 
 
 def test_splitting_says_nothing_where_nothing_fails_or_everything():
-    never = rare.split(lambda u: 0.5 * u[:, 0], ["range"] * 3, Splitting(200, 4, levels=3))
+    never = rare.split(
+        lambda u: 0.5 * u[:, 0], ["range"] * 3, Rare(particles=200, groups=4, levels=3)
+    )
     assert (never.estimate.p, never.estimate.low, never.estimate.high) == (0, 0, 1)
-    always = rare.split(lambda u: 1 + u[:, 0], ["range"] * 3, Splitting(200, 4))
+    always = rare.split(lambda u: 1 + u[:, 0], ["range"] * 3, Rare(particles=200, groups=4))
     assert always.estimate.p == 1
     assert always.u.shape == (200, 3)
+    found = xr.Dataset({k: ("repetition", [v]) for k, v in always.estimate._asdict().items()})
+    assert rare.table(found)[1][1:] == ["1", "[1, 1]", "0.00", "200", ""]
 
 
 def test_estimates_by_hand():
@@ -135,8 +145,9 @@ def test_estimates_by_hand():
 
 
 def test_the_command_compares_splitting_with_drawn_worlds(tmp_path, capsys):
-    asked = ["rare", "--params", "paper", "--change", "distance=0.7,0.8", "--engine", "quasistatic"]
-    asked += ["--particles", 40, "--groups", 4, "--horizon", 20, "--brute", 30, "--quick"]
+    asked = ["rare", "--law", "rps", "--engine", "quasistatic"]
+    asked += ["--domain", "wide,objects=random_cylinder,distance=0.7:0.72,bearing=-0.3:0.3"]
+    asked += ["--particles", 40, "--groups", 4, "--horizon", 20, "--brute", 30]
     asked += ["--slots", 8, "--workers", 1, "--out", tmp_path / "run"]
     assert rps(*asked) == 0
     text = capsys.readouterr().out
@@ -165,17 +176,17 @@ def made_up(self, at):
 
 @pytest.fixture
 def made(monkeypatch):
-    """No trial is run."""
+    """No trial is run, nor kept to be replayed."""
     monkeypatch.setattr(Probe, "_try", made_up)
+    monkeypatch.setattr(attack.Attack, "_keep_worst", lambda *_: None)
 
 
-SMALL = Hunt(generations=12, batch=32, drawn=600, cells=8, repeats=1)
+SMALL = {"generations": 12, "batch": 32, "drawn": 600, "cells": 8, "repeats": 1, "check_again": 0}
 
 
 @pytest.mark.parametrize("algorithm", ["mixed", "cma_mae", "line", "cma_me"])
 def test_a_search_finds_many_times_the_failing_cells_of_drawn_worlds(made, algorithm):
-    hunt = replace(SMALL, algorithm=algorithm)
-    found = rps_jax.attack(PAPER, "wide", hunt=hunt)
+    found = rps_jax.attack("rps", "wide", **SMALL, algorithm=algorithm)
     assert found.margin.sizes == {"object": 3, "size": 8, "com_offset": 8, "friction_robot": 8}
     assert found.failing[-1] == (found.margin >= 0).sum() == found.sizes["elite"]
     gain = attack.yields(found)
@@ -192,20 +203,20 @@ def test_a_search_finds_many_times_the_failing_cells_of_drawn_worlds(made, algor
 
 
 def test_a_search_that_was_killed_goes_on_as_if_it_had_not_been(made, tmp_path, monkeypatch):
-    whole = rps_jax.attack(PAPER, "wide", hunt=SMALL)
-    rps_jax.attack(PAPER, "wide", hunt=replace(SMALL, generations=5), out=tmp_path)
+    whole = rps_jax.attack("rps", "wide", **SMALL)
+    rps_jax.attack("rps", "wide", **SMALL | {"generations": 5}, out=tmp_path)
     kept = sorted((tmp_path / "parts").iterdir())
     kept[3].write_bytes(b"damaged")
-    found = rps_jax.attack(PAPER, "wide", hunt=SMALL, out=tmp_path)
+    found = rps_jax.attack("rps", "wide", **SMALL, out=tmp_path)
     xr.testing.assert_identical(found.drop_attrs(), whole.drop_attrs())
     with pytest.raises(InputError, match="holds another run"):
-        rps_jax.attack(PAPER, "hostile", hunt=SMALL, out=tmp_path)
+        rps_jax.attack("rps", "hostile", **SMALL, out=tmp_path)
 
 
 def test_a_world_must_fail_whatever_the_noise(made):
     """A fifth of a severity hangs on the noise; with four trials few such worlds are left."""
-    once = rps_jax.attack(PAPER, "wide", hunt=SMALL)
-    often = rps_jax.attack(PAPER, "wide", hunt=replace(SMALL, repeats=4))
+    once = rps_jax.attack("rps", "wide", **SMALL)
+    often = rps_jax.attack("rps", "wide", **SMALL | {"repeats": 4})
     some = Probe(DOMAINS["wide"], PAPER, BRIEF)
     rng = np.random.default_rng(0)
 
@@ -223,7 +234,7 @@ def test_a_world_must_fail_whatever_the_noise(made):
         (("--axes", "size", "colour", "mass"), "unknown axes 'colour'"),
         (("--axes", "size", "mass"), "name three quantities"),
         (("--axes", "size", "mass", "mass"), "name each once"),
-        (("--change", "mass=5,5", "--axes", "size", "mass", "gap"), "does not draw it"),
+        (("--domain", "wide,mass=5", "--axes", "size", "mass", "gap"), "does not draw it"),
         (("--axes", "robot_force", "mass", "gap"), "does not draw it"),
         (("--minutes", "0"), "minutes = 0.0 is not allowed"),
         (("--domain", "paper"), "does not draw it"),
@@ -248,12 +259,12 @@ def test_a_missing_package_gets_one_sentence(asked, module, package, tmp_path, c
 def test_the_command_searches_checks_lists_and_draws(tmp_path, capsys):
     """A horizon that no push can keep: every cell that is met fails, in C MuJoCo too."""
     asked = ["attack", "--engine", "quasistatic", "--cells", 2, "--batch", 8, "--generations", 2]
-    asked += ["--drawn", 3, "--horizon", 1, "--check", 2, "--worst", 2, "--slots", 8]
+    asked += ["--drawn", 3, "--horizon", 1, "--check-again", 2, "--worst", 2, "--slots", 8]
     asked += ["--workers", 1, "--out", tmp_path / "run"]
     assert rps(*asked) == 0
     text = capsys.readouterr().out
     assert "2 of 2 elites" in text
-    assert f"rps replay {tmp_path / 'run' / 'worlds'} 0 --arm 'rps tuned'" in text
+    assert f"rps replay {tmp_path / 'run' / 'worlds'} 0 --law rps_tuned" in text
     assert {path.name for path in (tmp_path / "run").glob("*.png")} == {"archive.png", "search.png"}
     assert rps(*asked) == 0  # continued: the same again
     found = [said.split("## Failing cells")[1] for said in (text, capsys.readouterr().out)]
@@ -269,16 +280,16 @@ def outcomes(blocks, won):
     """Results of a design whose trials succeed where `won` (worlds,) says."""
     count = blocks.worlds
     columns = {
-        "success": (("arm", "world"), won.astype(np.int8)[None]),
-        "time": (("arm", "world"), np.where(won, 80.0, 300.0)[None]),
-        "min_distance": (("arm", "world"), np.where(won, 0.05, 0.5)[None]),
+        "success": (("law", "world"), won.astype(np.int8)[None]),
+        "time": (("law", "world"), np.where(won, 80.0, 300.0)[None]),
+        "min_distance": (("law", "world"), np.where(won, 0.05, 0.5)[None]),
         "distance": ("world", np.ones(count)),
     }
-    return xr.Dataset(columns, {"arm": ["law"], "world": np.arange(count)})
+    return xr.Dataset(columns, {"law": ["law"], "world": np.arange(count)})
 
 
 def test_the_quantity_that_decides_takes_all_the_blame():
-    blocks = sobol.design(DOMAINS["wide"], 8192)
+    blocks = sensitivity.design(DOMAINS["wide"], 8192)
     assert blocks.factors[-1] == "shape"
     assert {"noise", "key", "object", "mass", "com_bearing"} <= set(blocks.factors)
     assert blocks.groups.count("key") == 2  # both numbers of it
@@ -286,44 +297,44 @@ def test_the_quantity_that_decides_takes_all_the_blame():
     assert len(blocks.factors) == 23 + 1 + 2  # ranges, the object, corners and the key
     assert (blocks.base, blocks.worlds) == (256, 256 * (len(blocks.factors) + 2))
     column = blocks.groups.index("mass")
-    found = sobol.analysed(blocks, outcomes(blocks, blocks.u()[:, column] < 0.8))
-    assert sobol.ranked(found)[0] == "mass"
+    found = sensitivity.analysed(blocks, outcomes(blocks, blocks.u()[:, column] < 0.8))
+    assert sensitivity.ranked(found)[0] == "mass"
     first, total = (getattr(found, name).sel(output="success") for name in ("first", "total"))
     assert float(first.sel(factor="mass")) == pytest.approx(1, abs=0.2)
     assert float(total.sel(factor="mass")) == pytest.approx(1, abs=0.2)
     assert np.abs(total.drop_sel(factor="mass")).max() < 0.02
-    difference, low, high = sobol.cost(found, "mass")
+    difference, low, high = sensitivity.cost(found, "mass")
     # Of the upper third three fifths fail, of the lower none.
     assert difference == pytest.approx(-0.6, abs=0.05)
     assert low < difference < high < 0
-    assert sobol.said(found).startswith("More mass costs success")
-    assert sobol.said(found, "gap").startswith("No cost of gap is seen")
-    assert "draws no robot_force" in sobol.said(found, "robot_force")
-    assert sobol.table(found)[1][0] == "mass of the object"
-    assert sobol.reliable(found).startswith("Trials fail at ")
-    assert "run more worlds" not in sobol.reliable(found)
-    never = sobol.analysed(blocks, outcomes(blocks, np.ones(blocks.worlds, bool)))
-    assert sobol.reliable(never).endswith("run more worlds.")
+    assert sensitivity.said(found).startswith("More mass costs success")
+    assert sensitivity.said(found, "gap").startswith("No cost of gap is seen")
+    assert "draws no robot_force" in sensitivity.said(found, "robot_force")
+    assert sensitivity.table(found)[1][0] == "mass of the object"
+    assert sensitivity.reliable(found).startswith("Trials fail at ")
+    assert "run more worlds" not in sensitivity.reliable(found)
+    never = sensitivity.analysed(blocks, outcomes(blocks, np.ones(blocks.worlds, bool)))
+    assert sensitivity.reliable(never).endswith("run more worlds.")
     assert (never.total.sel(output="success") == 0).all()
 
 
 def test_two_quantities_that_only_matter_together_have_totals_alone():
     """Success where both are on the same side: first indices 0, totals 1 (the XOR of two)."""
-    blocks = sobol.design(DOMAINS["wide"], 16_384)
+    blocks = sensitivity.design(DOMAINS["wide"], 16_384)
     u = blocks.u()
     a, b = (u[:, blocks.groups.index(name)] > 0.5 for name in ("mass", "gap"))
-    found = sobol.analysed(blocks, outcomes(blocks, a == b)).sel(output="success")
+    found = sensitivity.analysed(blocks, outcomes(blocks, a == b)).sel(output="success")
     for name in ("mass", "gap"):
         assert float(found.first.sel(factor=name)) == pytest.approx(0, abs=0.1)
         assert float(found.total.sel(factor=name)) == pytest.approx(1, abs=0.1)
 
 
 def test_noise_and_shapes_are_told_apart_if_asked():
-    apart = sobol.design(DOMAINS["wide"], 8192, apart=True)
+    apart = sensitivity.design(DOMAINS["wide"], 8192, apart=True)
     assert {"key_0", "key_1", "sides", "corner_7"} <= set(apart.factors)
     assert len(apart.factors) == len(points.names(DOMAINS["wide"]))
     with pytest.raises(InputError, match=r"worlds = 50 is not allowed: 36 quantities need"):
-        sobol.design(DOMAINS["wide"], 50, apart=True)
+        sensitivity.design(DOMAINS["wide"], 50, apart=True)
 
 
 def test_the_command_of_sensitivity_draws_and_continues(tmp_path, capsys):
@@ -345,7 +356,7 @@ def test_the_regression_set_is_small_hard_and_various():
     known = regress.worlds()
     assert known.u.shape == (200, len(points.names(DOMAINS["wide"])))
     assert regress.FILE.stat().st_size < 200_000
-    assert known.law.values.tolist() == ["paper", "tuned", "rps_plus", "learned_gru"]
+    assert known.known.values.tolist() == ["rps", "rps_tuned", "rps_plus", "learned_gru"]
     points.checked(DOMAINS["wide"], known)
     assert len(np.unique(known.u, axis=0)) == 200
     failed = known.success.values == 0
@@ -358,7 +369,7 @@ def test_the_regression_set_is_small_hard_and_various():
 def test_a_law_of_the_file_wins_again_what_it_won():
     """Outcomes of hard worlds are chaotic: another processor may turn a few."""
     found = rps_jax.regress({"again": RPSPlusParams()}, worlds=6, slots=8)
-    known = found.known_success.sel(law="rps_plus")
+    known = found.known_success.sel(known="rps_plus")
     assert int((found.success[0] == known).sum()) >= 4
 
 
@@ -367,17 +378,17 @@ def test_gains_and_losses_by_hand():
     now = np.array([[1, 0, 1, 0]])
     found = xr.Dataset(
         {
-            "success": (("arm", "world"), now),
-            "time": (("arm", "world"), np.full((1, 4), 30.0)),
-            "min_distance": (("arm", "world"), np.array([[0.05, 0.25, 0.05, 0.5]])),
-            "contact_lost_time": (("arm", "world"), np.zeros((1, 4))),
-            "tilt": (("arm", "world"), np.zeros((1, 4))),
+            "success": (("law", "world"), now),
+            "time": (("law", "world"), np.full((1, 4), 30.0)),
+            "min_distance": (("law", "world"), np.array([[0.05, 0.25, 0.05, 0.5]])),
+            "contact_lost_time": (("law", "world"), np.zeros((1, 4))),
+            "tilt": (("law", "world"), np.zeros((1, 4))),
             "distance": ("world", np.ones(4)),
             "which_object": ("world", [0, 0, 1, 1]),
-            "known_success": (("law", "world"), known),
-            "known_severity": (("law", "world"), np.where(known, 0.3, 1.1)),
+            "known_success": (("known", "world"), known),
+            "known_severity": (("known", "world"), np.where(known, 0.3, 1.1)),
         },
-        {"arm": ["mine"], "law": ["a", "b"], "object": ["random_box", "random_prism"]},
+        {"law": ["mine"], "known": ["a", "b"], "object": ["random_box", "random_prism"]},
     )
     assert regress.table(found)[-1] == ["mine", "2 of 4", "+1 -1", "+2 -1", "1"]
     assert regress.changes(found, "mine", "a")[1:] == [
@@ -387,8 +398,8 @@ def test_gains_and_losses_by_hand():
 
 
 def test_the_worlds_of_the_set_are_far_from_each_other():
-    domain = replace(DOMAINS["prisms"], **{"mass": Range(3, 60)})
-    u = rps_jax.points_of(domain, np.arange(100))
+    domain = replace(DOMAINS["prisms"], mass=Range(3, 60))
+    u = points.points_of(domain, np.arange(100))
     twice = np.concatenate([u, u])
     bad = np.ones((2, 200))
     taken = regress.chosen(domain, twice, bad, 100, np.array([7]))
@@ -397,10 +408,11 @@ def test_the_worlds_of_the_set_are_far_from_each_other():
 
 
 def test_the_command_tells_what_got_better_and_worse(tmp_path, capsys):
-    asked = ["regress", "--params", "paper", "--worlds", 4, "--engine", "quasistatic"]
+    asked = ["regress", "--laws", "rps", "--worlds", 4, "--engine", "quasistatic"]
     assert rps(*asked, "--slots", 4, "--workers", 1, "--out", tmp_path / "run") == 0
     text = capsys.readouterr().out
     assert "rps_plus (file)" in text
     assert "simulated s per s" in text
-    assert "unknown against 'best'" in refusal(capsys, *asked, "--against", "best")
+    said = refusal(capsys, *asked, "--against", "best")
+    assert "invalid choice 'best' for argument '--against'. Expected one of ('rps'," in said
     assert "worlds = 201 is not allowed" in refusal(capsys, "regress", "--worlds", 201)

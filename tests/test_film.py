@@ -9,13 +9,13 @@ from helpers import decode, rps
 
 from rps_jax.analysis import video
 from rps_jax.app import film
-from rps_jax.app.cli.looking import Film
-from rps_jax.app.cli.replicating import Table
-from rps_jax.control.law import RPSParams
+from rps_jax.app.film import Film
+from rps_jax.control.laws.rps import RPSParams
 from rps_jax.errors import InputError
-from rps_jax.record import files
+from rps_jax.record import folder as run_folder
 from rps_jax.runs import sweep
 from rps_jax.runs.plan import Plan
+from rps_jax.studies.table import Table
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import DOMAINS
@@ -28,9 +28,9 @@ FPS = 12
 
 def table(folder):
     """A run of `rps table` over two targets, as far as a film reads it."""
-    asked = Table(objects=("box",), targets=((0.6, 0.0), (2.0, 2.0)), engine=ENGINE)
-    options = dataclasses.asdict(asked) | {"out": str(folder)}
-    files.write_json(folder / "config.json", {"options": options})
+    targets = [(0.6, 0.0), (2.0, 2.0)]
+    asked = Table(objects=("box",), targets=targets, setting=Setting(ENGINE))
+    run_folder.claim(folder, asked.configuration())
 
 
 def plan_of(*names):
@@ -96,7 +96,7 @@ def test_worlds_are_filmed_by_their_indices(tmp_path):
 
 def test_several_laws_have_a_row_each_and_a_world_a_column(tmp_path):
     one = plan_of("random_box", "random_cylinder")
-    plan = dataclasses.replace(one, arms={"one": RPSParams.paper(), "two": RPSParams.nps()})
+    plan = dataclasses.replace(one, laws={"one": RPSParams.paper(), "two": RPSParams.nps()})
     takes = film.of_sweep(tmp_path, plan, ["two", "one"], "first", (2, 3))
     assert film._placed([take.labels for take in takes], takes) == [
         *(f"two, world {i}" for i in range(3)),
@@ -105,13 +105,13 @@ def test_several_laws_have_a_row_each_and_a_world_a_column(tmp_path):
     film.rows_of(plan, ["two", "one"], (2, 3))
     with pytest.raises(InputError, match="each has a row"):
         film.rows_of(plan, ["two", "one"], (3, 2))
-    with pytest.raises(InputError, match="unknown arm 'three'"):
+    with pytest.raises(InputError, match="unknown law 'three'"):
         film.rows_of(plan, ["three"], (1, 3))
 
 
 def test_a_trial_that_has_ended_is_told_and_not_drawn_again(tmp_path):
     table(tmp_path)
-    takes, setting = Film(tmp_path).takes((1, 2))
+    takes, setting = Film(tmp_path, "1x2").takes()
     (take,) = takes
     ((ended, first), *_, (_, before), (over, last)) = [
         shots for shots, _ in zip(film._shots(take, setting, 50), range(20), strict=False)
@@ -126,7 +126,7 @@ def test_a_trial_that_has_ended_is_told_and_not_drawn_again(tmp_path):
 
 def test_the_memory_of_a_film_does_not_grow_with_its_length(tmp_path):
     table(tmp_path)
-    takes, _ = Film(tmp_path).takes((1, 1))
+    takes, _ = Film(tmp_path, "1x1").takes()
     tile = video.Tile(takes[0].scenes[0], (1.0, 1.0))
     shot = video.Shot(takes[0].part.worlds.qpos[0], np.zeros(2), "")
 
@@ -153,7 +153,7 @@ def test_tiles_are_as_large_as_fits(grid, size):
 
 def test_more_trials_than_places_are_refused(tmp_path):
     table(tmp_path)
-    takes, _ = Film(tmp_path).takes((1, 2))
+    takes, _ = Film(tmp_path, "1x2").takes()
     tiles = [video.Tile(scene, (1.0, 1.0)) for scene in takes[0].scenes]
     with pytest.raises(InputError, match="grid = 1x1 is not allowed for 2 trials"):
         video.render_grid(tiles, [], tmp_path / "x.mp4", shape=(1, 1), size=(320, 180))

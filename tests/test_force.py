@@ -9,9 +9,9 @@ import pytest
 from helpers import refusal
 
 from rps_jax import engines
-from rps_jax.control import strategies
-from rps_jax.control.law import Twist
-from rps_jax.control.rivals.force_push_published import PublishedForcePushParams
+from rps_jax.control import registry
+from rps_jax.control.laws.force_push_published import PublishedForcePushParams
+from rps_jax.control.observation import Twist
 from rps_jax.engines.base import Motion
 from rps_jax.engines.fused import step as fused
 from rps_jax.errors import InputError
@@ -193,22 +193,20 @@ def test_a_law_is_told_the_force_of_the_push_it_makes(engine):
         assert outcome.base_pose[0][0] == pytest.approx(0.2, rel=0.1)  # 0.05 m/s: it was felt
         return
     stage, worlds = pushes.build([case], setting)
-    strategy = strategies.of(params)
-    trials = trial.start_all(worlds, np.ones(1, bool), strategy=strategy)
-    trials, _ = trial.record(
-        stage, worlds, trials, physics=setting.physics, strategy=strategy, steps=200
-    )
+    law = registry.law_of(params)
+    trials = trial.start_all(worlds, np.ones(1, bool), law=law)
+    trials, _ = trial.record(stage, worlds, trials, physics=setting.physics, law=law, steps=200)
     np.testing.assert_allclose(trials.load.wrench[0, 0], -0.3 * 10 * GRAVITY, rtol=0.1)
     np.testing.assert_allclose(trials.load.signal[0, 0], -0.3 * 10 * GRAVITY, rtol=0.1)
 
 
 def test_engines_that_tell_no_force_refuse_laws_that_ask_for_it(capsys):
-    words = "engine = quasistatic is not allowed for a strategy that is told the contact's force"
+    words = "engine = quasistatic is not allowed for a law that senses the contact's force"
     with pytest.raises(InputError, match=words):
         pushes.build([Case("box", S1, (2.0, 0.0), PublishedForcePushParams())], Setting(
             engine="quasistatic"
         ))  # fmt: skip
     asked = ("ladder", "--laws", "force_push_published", "--engine", "quasistatic")
     assert words in refusal(capsys, *asked)
-    tune = ("tune", "es", "--strategy", "force_push_published", "--engine", "quasistatic")
+    tune = ("tune", "es", "--law", "force_push_published", "--engine", "quasistatic")
     assert words in refusal(capsys, *tune)

@@ -1,13 +1,15 @@
 """Force Push on its authors' ground: their grid, and what their law makes of it."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from rps_jax.control.strategies import check_finite
+from rps_jax.control.base import check_finite
 from rps_jax.errors import InputError
-from rps_jax.studies.replication import force_push_grid as grid
+from sweeps.force_push_grid import grid
+from sweeps.force_push_grid.study import ForcePushGrid
 
 
 def test_the_grid_is_that_of_their_script():
@@ -42,9 +44,12 @@ def test_the_pusher_starts_behind_the_point_that_it_will_meet():
     np.testing.assert_allclose(np.unique(yaw.round(9)), np.round((-math.pi / 8, 0, math.pi / 8), 9))
 
 
-def test_their_law_brings_every_box_back_to_the_path_and_the_open_loop_loses_most(tmp_path):
+def test_their_law_brings_every_box_back_to_the_path_and_the_open_loop_loses_most(
+    tmp_path, monkeypatch
+):
     """In 60 s, 6 m of path, from up to 0.4 m beside it."""
-    found = grid.run(sliders=("box",), duration=60.0, out=tmp_path)
+    asked = ForcePushGrid(sliders=("box",), duration=60.0, out=tmp_path)
+    found = asked()
     theirs, alone = (found.sel(law=law, slider="box") for law in grid.LAWS)
     assert int(theirs.success.sum()) == 243
     assert int(alone.success.sum()) < 30
@@ -53,10 +58,11 @@ def test_their_law_brings_every_box_back_to_the_path_and_the_open_loop_loses_mos
     assert float(alone.completion.median()) < 0.3
     _, row, _ = grid.table(found)
     assert row[:4] == ["force_push", "box", "243 of 243", "81, 81, 81"]
-    again = grid.run(sliders=("box",), duration=60.0, out=tmp_path)  # read, not run
+    monkeypatch.setattr(grid, "pushed", lambda *_, **__: pytest.fail("run again"))
+    again = asked()  # read, not run
     np.testing.assert_array_equal(again.completion, found.completion)
-    with pytest.raises(InputError, match="name another folder"):
-        grid.run(sliders=("box",), duration=50.0, out=tmp_path)
+    with pytest.raises(InputError, match=r"duration = 60\.0 there, 50\.0 asked for"):
+        replace(asked, duration=50.0)()
 
 
 @pytest.mark.parametrize(
@@ -65,10 +71,10 @@ def test_their_law_brings_every_box_back_to_the_path_and_the_open_loop_loses_mos
         ({"laws": ("none",)}, "unknown law 'none'"),
         ({"sliders": ("prism",)}, "unknown slider 'prism'"),
         ({"duration": 0.0}, "duration"),
-        ({"engine": "quasistatic"}, "is told the contact's force"),
+        ({"engine": "quasistatic"}, "senses the contact's force"),
         ({"engine": "mujoco"}, "follow a trial with mjx"),
     ],
 )
 def test_what_the_grid_cannot_run_is_refused(given, words):
     with pytest.raises(InputError, match=words):
-        grid.run(**given)
+        ForcePushGrid(**given)()

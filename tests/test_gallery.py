@@ -5,7 +5,7 @@ import xarray as xr
 from helpers import refusal, rps
 
 import rps_jax
-from rps_jax.studies.failures import gallery as galleries
+from rps_jax.studies import gallery as galleries
 
 
 def outcomes(**changed):
@@ -41,14 +41,14 @@ def test_what_losses_have_in_common_is_what_differs_from_all_worlds():
 
 def test_the_command_draws_each_kind_and_says_how_to_see_one_again(tmp_path, capsys):
     run = tmp_path / "run"
-    drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=1.0)
-    arms = {"mine": rps_jax.RPSParams.paper()}
-    rps_jax.sweep(drums, arms, 3, out=run, rules=rules, engine="quasistatic", slots=3)
+    brief = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=1.0))
+    drums, laws = rps_jax.Domain(("random_cylinder",)), {"mine law": "rps"}
+    rps_jax.sweep(laws, drums, 3, setting=brief, slots=3, out=run)
     assert rps("gallery", run, "--each", 2) == 0
     text = capsys.readouterr().out
     assert "never touched: 3 of 3" in text
-    assert f'rps replay {run} 0 --arm "mine" --video' in text
+    assert f"rps replay {run} 0 --law 'mine law'`" in text
     picture = run / "gallery" / "never_touched.png"
     assert picture.stat().st_size > 10_000
-    assert "unknown arm 'yours'" in refusal(capsys, "gallery", run, "--arm", "yours")
+    assert "unknown law of the run 'yours'" in refusal(capsys, "gallery", run, "--law", "yours")
     assert "each = 0" in refusal(capsys, "gallery", run, "--each", 0)

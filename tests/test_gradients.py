@@ -13,16 +13,16 @@ import pytest
 from hypothesis import strategies as st
 
 from rps_jax import engines, errors
-from rps_jax.control import strategies
-from rps_jax.control.law import RPSParams
+from rps_jax.control import registry
+from rps_jax.control.laws import rps
+from rps_jax.control.laws.rps import RPSParams
 from rps_jax.robot.skin import SmoothSkin
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.pushes import Case
+from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.tuning import gradients
 from rps_jax.tuning.gradients import Estimate
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import FRICTION
 
 THETA = jnp.array([0.5, -1.0, 2.0])
 STIFF = jnp.array([1.0, 2.0, 0.5])
@@ -244,10 +244,10 @@ def test_the_derivative_of_a_window_of_fused_trials_is_its_finite_difference():
     """A cylinder rolls along the base, in float32; one program gives scores and derivatives."""
     targets = ((1.0, -1.5), (2.0, 0.5), (-1.5, 1.0))
     skin, setting = SmoothSkin(), Setting(engine="fused")
-    cases = [Case("cylinder", FRICTION["S1"], t, skin=skin, gap=0.004) for t in targets]
+    cases = [Case("cylinder", "S1", t, skin=skin, gap=0.004) for t in targets]
     stage, worlds = pushes.build(cases, setting)
-    strategy = strategies.smooth_rps()
-    starts = (worlds, trial.start_all(worlds, np.ones(3, bool), strategy=strategy))
+    law = registry.smooth_law(rps.LAW)
+    starts = (worlds, trial.start_all(worlds, np.ones(3, bool), law=law))
     scores = gradients.window(stage, params_of, final_distance, physics=setting.physics, steps=50)
     along = jax.jit(lambda thetas, way: jax.jvp(lambda x: scores(x, starts), (thetas,), (way,)))
     theta, h = np.array([0.2, 1.0, 0.12, 0.04], np.float32), 0.01

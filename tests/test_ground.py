@@ -9,9 +9,8 @@ import xarray as xr
 from rps_jax.errors import InputError
 from rps_jax.geometry import solid
 from rps_jax.robot.shell import HALF_WIDTH
-from rps_jax.studies import ground
-from rps_jax.studies.ground import grounds, pushes, rigid
-from rps_jax.studies.ground.rigid import Pushed, Rounding
+from sweeps.ground import grounds, pushes, rigid
+from sweeps.ground.rigid import Pushed, Rounding
 
 MU, MU_ROBOT = 0.3, 0.35
 STEP = 1e-3  # [m] of way: what is looked at is its beginning
@@ -199,7 +198,7 @@ def test_a_study_is_labelled_kept_and_refuses_what_was_run_otherwise(tmp_path, m
     monkeypatch.setattr(grounds, "HEIGHTS", (0.06, 0.34))
     some = {"objects": ("box",), "offsets": (0.05, 0.12), "steps": 50}
     told = []
-    results = ground.run(("a", "b"), tmp_path, **some, report=told.append)
+    results = grounds.run(("a", "b"), tmp_path, **some, report=told.append)
     friction = len(grounds.FRICTIONS)
     sizes = {
         "ground": 2,
@@ -213,14 +212,14 @@ def test_a_study_is_labelled_kept_and_refuses_what_was_run_otherwise(tmp_path, m
     assert told[-1].finished == 4
     assert np.isfinite(results.error).all()
     monkeypatch.setattr(pushes, "in_mujoco", None)  # nothing is run again
-    xr.testing.assert_equal(results, ground.run(("a", "b"), tmp_path, **some))
-    header, first, *rows = ground.table(results, (0.2,))
+    xr.testing.assert_equal(results, grounds.run(("a", "b"), tmp_path, **some))
+    header, first, *rows = grounds.table(results, (0.2,))
     assert header[0] == "ground"
     assert first[0] == "rigid object"
     assert [row[0] for row in rows] == [one.what for one in few.values()]
     with pytest.raises(InputError, match="run with other options"):
-        ground.run(("a",), tmp_path, objects=("cylinder",), offsets=(0.05,))
+        grounds.run(("a",), tmp_path, objects=("cylinder",), offsets=(0.05,))
 
 
 def _at(one, speed):
-    return grounds.Ground(one.what, one.physics, (speed,))
+    return grounds.Kind(one.what, one.physics, (speed,))

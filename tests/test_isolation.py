@@ -24,8 +24,9 @@ BESIDE = (
     + """
 before = dict(collision_driver._COLLISION_FUNC)
 import rps_jax
-few = {"targets": [(1.0, 0.0)], "strategies": ["rps"], "friction": ["S1"], "horizon": 0.1}
-rps_jax.table(["cylinder"], **few, engine="mjx")
+few = {"targets": [(1.0, 0.0)], "objects": ["cylinder"], "friction": ["S1"]}
+setting = rps_jax.Setting("mjx", rules=rps_jax.Rules(horizon=0.1))
+rps_jax.table("rps", **few, setting=setting)
 assert collision_driver._COLLISION_FUNC == before
 print(others())
 """

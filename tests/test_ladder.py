@@ -1,4 +1,4 @@
-"""The ladder of laws: equal worlds, what each is told, and how they compare."""
+"""The ladder of laws: equal worlds, what each senses, and how they compare."""
 
 import numpy as np
 import pytest
@@ -7,13 +7,16 @@ from helpers import CYLINDERS, refusal, rps
 
 from rps_jax import ladder as climb
 from rps_jax.analysis import statistics, tables
-from rps_jax.control import strategies
-from rps_jax.control.law import RPSParams
+from rps_jax.control import registry
+from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
+from rps_jax.runs.question import seed_of
 from rps_jax.runs.results import load
 from rps_jax.studies import ladder
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
+from rps_jax.world import draws
 
 
 def test_holms_adjustment_by_hand():
@@ -25,7 +28,7 @@ def test_holms_adjustment_by_hand():
 
 def results(**won):
     success = xr.DataArray(
-        np.array(list(won.values()), np.int8), dims=("arm", "world"), coords={"arm": list(won)}
+        np.array(list(won.values()), np.int8), dims=("law", "world"), coords={"law": list(won)}
     )
     return xr.Dataset({"success": success})
 
@@ -43,80 +46,80 @@ def test_laws_are_compared_with_one_of_them_world_by_world():
     assert base[2:] == ["", "", ""]
 
 
-def test_every_rung_is_a_law_of_the_package_with_what_it_is_told():
-    told = ladder.senses(ladder.rungs())
-    assert len(told) >= 8
-    assert set(told.values()) == {"touch", "taxels", "force", "pose"}
-    assert {name for name in told if told[name] == "taxels"} == set(policy.SHIPPED)
-    assert [name for name in told if told[name] == "force"] == ["force_push_published"]
-    assert {name for name in told if told[name] == "pose"} == {"aps", "dipole"}
-    for params in ladder.RUNGS.values():
-        assert strategies.of(params).check(params) is params
-    assert ladder.REFERENCE in ladder.RUNGS
-    assert ladder.RUNGS[ladder.REFERENCE] == RPSParams.tuned()
+def test_every_rung_is_a_law_of_the_package_with_what_it_senses():
+    senses = {name: registry.law_of(registry.LAWS[name]).senses for name in ladder.every_law()}
+    assert set(senses) == set(registry.LAWS) == set(ladder.Ladder().chosen)
+    order = ["touch", "taxels", "force", "pose"]
+    assert list(dict.fromkeys(senses.values())) == order  # from what senses least
+    assert {name for name in senses if senses[name] == "taxels"} == set(policy.SHIPPED)
+    assert [name for name in senses if senses[name] == "force"] == ["force_push_published"]
+    assert {name for name in senses if senses[name] == "pose"} == {"aps", "dipole"}
+    for params in registry.LAWS.values():
+        assert registry.law_of(params).check(params) is params
+    assert registry.LAWS[ladder.REFERENCE] == RPSParams.tuned()
 
 
 @pytest.mark.parametrize(
     ("laws", "words"),
     [
-        (("rps",), "unknown law 'rps': choose from nps, rps paper"),
+        (("rsp",), "unknown law 'rsp': choose from .* rps_tuned"),
         (("pursuit", "pursuit"), "pursuit"),
-        ((), "name each once, at least one"),
+        ([], "name each once, at least one"),
+        ({}, "name at least one law"),
         (("none.py:MyParams",), "none.py cannot be read"),
-        (("pursuit=none.json",), "none.json"),
-        (("persuit=none.json",), "unknown law 'persuit'"),
+        (("pursuit,none.json",), "none.json"),
+        (("persuit,none.json",), "unknown law 'persuit'"),
     ],
 )
 def test_laws_that_are_not_there_are_refused(laws, words):
     with pytest.raises(InputError, match=words):
-        ladder.rungs(laws)
+        _ = ladder.Ladder(laws).chosen
 
 
 def test_a_law_may_have_the_values_of_a_file(tmp_path):
     mine = tmp_path / "eager.json"
     mine.write_text('{"press": 0.5}')
-    found = ladder.rungs(("pursuit", f"pursuit={mine}"))
-    assert found["eager"] == ladder.RUNGS["pursuit"]._replace(press=0.5)
-    assert ladder.senses(found) == {"pursuit": "touch", "eager": "touch"}
+    found = ladder.Ladder(("pursuit", f"pursuit,{mine}")).chosen
+    assert list(found) == ["pursuit", "pursuit,eager"]
+    assert found["pursuit,eager"] == registry.LAWS["pursuit"]._replace(press=0.5)
+    with pytest.raises(InputError, match="eager"):
+        _ = ladder.Ladder((f"pursuit,{mine}",) * 2).chosen
     mine.write_text('{"presses": 0.5}')
     with pytest.raises(InputError, match="presses"):
-        ladder.rungs((f"pursuit={mine}",))
-    for laws in ((f"pursuit={mine}", f"force_push={mine}"), (f"pursuit={mine}",) * 2):
-        mine.write_text("{}")
-        with pytest.raises(InputError, match="eager"):
-            ladder.rungs(laws)
+        _ = ladder.Ladder(f"pursuit,{mine}").chosen
 
 
 def test_every_law_meets_the_same_worlds_which_no_tuner_has_seen():
-    some = ("rps tuned", "pursuit", "dipole")
-    found = climb(CYLINDERS, 6, laws=some, engine="quasistatic", rules=Rules(horizon=20.0), slots=6)
+    some = ("rps_tuned", "pursuit", "dipole")
+    asked = {"setting": Setting("quasistatic", rules=Rules(horizon=20.0)), "slots": 6}
+    found = climb(some, CYLINDERS, 6, **asked)
     assert found.success.dims == ("law", "world")
     assert found.law.values.tolist() == list(some)
     assert found.senses.values.tolist() == ["touch", "touch", "pose"]
     assert found.mass.dims == ("world",)
-    again = climb(
-        CYLINDERS, 6, laws={"mine": RPSParams.tuned()}, engine="quasistatic",
-        rules=Rules(horizon=20.0), slots=6,
-    )  # fmt: skip
-    np.testing.assert_array_equal(again.time.sel(law="mine"), found.time.sel(law="rps tuned"))
+    index = np.arange(6)
+    drawn = draws.table(draws.draw(CYLINDERS, seed_of(0, "test"), index))
+    np.testing.assert_allclose(found.mass, drawn["mass"][0], rtol=1e-6)
+    again = climb({"mine": RPSParams.tuned()}, CYLINDERS, 6, **asked)
+    np.testing.assert_array_equal(again.time.sel(law="mine"), found.time.sel(law="rps_tuned"))
     np.testing.assert_array_equal(again.mass, found.mass)
 
 
 def test_the_command_reports_information_against_success(tmp_path, capsys):
     out = tmp_path / "run"
     asked = ["ladder", "--domain", "paper", "--worlds", 6, "--engine", "quasistatic"]
-    asked += ["--laws", "rps tuned", "pursuit", "--slots", 6, "--workers", 1, "--out", out]
+    asked += ["--laws", "rps_tuned", "pursuit", "--slots", 6, "--workers", 1, "--out", out]
     assert rps(*asked) == 0
     text = capsys.readouterr().out
     assert "## Models" not in text
-    for heading in ("Information against success", "Against rps tuned, world by world"):
+    for heading in ("Information against success", "Against rps_tuned, world by world"):
         assert f"## {heading}" in text
     assert "by none" in text
     assert (out / "ladder.png").stat().st_size > 10_000
-    assert load(out).success.sizes == {"arm": 2, "world": 6}
+    assert load(out).success.sizes == {"law": 2, "world": 6}
 
 
 def test_the_command_refuses_an_unknown_law(capsys):
     assert "unknown law 'rsp'" in refusal(capsys, "ladder", "--laws", "rsp")
-    said = refusal(capsys, "tune", "es", "--strategy", "aps")
+    said = refusal(capsys, "tune", "es", "--law", "aps")
     assert "it has no bounds to tune within" in said

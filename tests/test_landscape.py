@@ -4,14 +4,15 @@ import jax
 import numpy as np
 import pytest
 
-from rps_jax.control.law import BOUNDS, RPSParams
+from rps_jax.control.laws.rps import BOUNDS, RPSParams
 from rps_jax.runs import evaluate
-from rps_jax.runs.evaluate import Answer, seed_of
-from rps_jax.studies import sensitivity
-from rps_jax.studies.sensitivity import Aims
+from rps_jax.runs.evaluate import Answer
+from rps_jax.runs.question import seed_of
 from rps_jax.trials.trial import Outcome
-from rps_jax.tuning.run import Course
+from rps_jax.tuning.run import Problem
 from rps_jax.tuning.space import SUBSETS, Space
+from sweeps.landscape import candidates
+from sweeps.landscape.candidates import Aims
 
 FULL = SUBSETS["full"]
 SETS = {"paper": RPSParams.paper(), "tuned": RPSParams.tuned()}
@@ -28,7 +29,7 @@ def test_aims_by_hand():
         time=np.array([[10.0, 30, 20, 300], [300, 300, 300, 300]], np.float32),
         path_length=np.array([[1.0, 2, 6, 9], [9, 9, 9, 9]], np.float32),
     )
-    found = sensitivity.aims(outcome)
+    found = candidates.aims(outcome)
     assert found.success.tolist() == [0.75, 0.0]
     np.testing.assert_array_equal(found.time, [20, np.nan])
     np.testing.assert_array_equal(found.path, [2, np.nan])
@@ -42,12 +43,12 @@ def test_the_undominated_by_hand():
     )
     # The third is slower than the first, the fourth worse than the second in all, the fifth never
     # measured; the last equals the first, and neither beats the other.
-    assert sensitivity.undominated(found).tolist() == [True, True, False, False, False, True]
+    assert candidates.undominated(found).tolist() == [True, True, False, False, False, True]
 
 
 def test_a_line_varies_one_parameter_within_its_bounds_and_no_other():
     base = RPSParams.tuned()
-    grid = sensitivity.lines(base, FULL, 5)
+    grid = candidates.lines(base, FULL, 5)
     for i, name in enumerate(FULL):
         for other in RPSParams._fields:
             values = np.asarray(getattr(grid, other))[i]
@@ -63,7 +64,7 @@ def test_a_line_varies_one_parameter_within_its_bounds_and_no_other():
 
 
 def test_candidates_begin_with_the_sets_and_without_spread_lie_between_two_of_them():
-    found = sensitivity.cloud(list(SETS.values()), FULL, 30, 0.0, seed=3)
+    found = candidates.cloud(list(SETS.values()), FULL, 30, 0.0, seed=3)
     space = Space(FULL)
     z = space.vector(found)
     for i, params in enumerate(SETS.values()):
@@ -96,8 +97,8 @@ def pretended(monkeypatch):
     return asked
 
 
-def test_sensitivity_is_labelled_and_from_worlds_for_validation(pretended):
-    found = sensitivity.sensitivity(SETS, Course(), names=("L", "K_h"), count=3, worlds=8)
+def test_each_parameter_alone_is_labelled_and_from_worlds_for_validation(pretended):
+    found = candidates.alone(SETS, Problem(), names=("L", "K_h"), count=3, worlds=8)
     assert dict(found.sizes) == {"set": 2, "parameter": 2, "step": 3}
     assert [ask.seed for ask in pretended] == [seed_of(0, "validate")]
     one = found.sel(set="paper", parameter="L")
@@ -108,13 +109,13 @@ def test_sensitivity_is_labelled_and_from_worlds_for_validation(pretended):
 
 
 def test_the_front_is_chosen_in_worlds_for_validation_and_measured_in_those_for_testing(pretended):
-    found = sensitivity.front(SETS, Course(), candidates=6, worlds=8)
+    found = candidates.front(SETS, Problem(), candidates=6, worlds=8)
     assert [ask.seed for ask in pretended] == [seed_of(0, s) for s in ("validate", "test")]
     params = [jax.tree.map(np.asarray, ask.params) for ask in pretended]
     jax.tree.map(np.testing.assert_array_equal, *params)
     # All succeed alike and drive as far: the quickest alone is undominated.
     assert found.front.values.sum() == 1
     assert np.argmax(found.front.values) == np.argmin(found.L.values)
-    table = sensitivity.front_table(found)
+    table = candidates.front_table(found)
     assert {row[0] for row in table[1:]} >= {"paper", "tuned"}
     assert sum(row[-1] == "yes" for row in table) == 1

@@ -21,16 +21,18 @@ from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 
 from rps_jax import errors
-from rps_jax.control import law
-from rps_jax.control.law import Observation, RPSParams, RPSState, Twist
+from rps_jax.control.laws import rps
+from rps_jax.control.laws.rps import RPSParams, RPSState
+from rps_jax.control.observation import Observation, Twist, displacement
 
 PAPER = RPSParams.paper()
 FRONT = 0.3625  # [m] x of a contact on the front face
+PERIOD = 0.02  # [s] of the control loop
 UNBOUNDED = PAPER._replace(v_max=1e6, omega_max=1e6)  # shows the equations before saturation
 
 property_test = hypothesis.settings(max_examples=100, deadline=None)
-details_of = jax.jit(law.step_with_details)
-batch_details = jax.jit(jax.vmap(law.step_with_details))
+details_of = jax.jit(rps.step_with_details)
+batch_details = jax.jit(jax.vmap(rps.step_with_details))
 
 
 def observe(d, l=0.0, robot=(0.0, 0.0), yaw=0.0, in_contact=True) -> Observation:  # noqa: E741
@@ -43,6 +45,7 @@ def observe(d, l=0.0, robot=(0.0, 0.0), yaw=0.0, in_contact=True) -> Observation
         p_robot_contact=jnp.asarray((FRONT, l), float),
         in_contact=jnp.asarray(in_contact),
         p_world_target=jnp.asarray((contact[0] + d[0], contact[1] + d[1]), float),
+        period=jnp.asarray(PERIOD),
     )
 
 
@@ -51,7 +54,7 @@ def state_with(l_th: float) -> RPSState:
 
 
 def twist_of(params, observation, l_th=0.24) -> list[float]:
-    return [float(v) for v in law.step(params, state_with(l_th), observation)[1]]
+    return [float(v) for v in rps.step(params, state_with(l_th), observation)[1]]
 
 
 def random_worlds(seed: int, n: int = 256, dtype=np.float32):
@@ -66,6 +69,7 @@ def random_worlds(seed: int, n: int = 256, dtype=np.float32):
         contact.astype(dtype),
         np.ones(n, bool),
         rng.uniform(-3, 3, (n, 2)).astype(dtype),
+        np.full(n, PERIOD, dtype),
     )
     return jax.tree.map(jnp.asarray, (state, observation))
 
@@ -114,8 +118,8 @@ def test_the_initial_threshold_is_the_critical_one():
 
 
 def test_check_returns_valid_parameters_unchanged():
-    assert law.check(PAPER) is PAPER
-    assert law.check(RPSParams.nps()) == RPSParams.nps()
+    assert rps.check(PAPER) is PAPER
+    assert rps.check(RPSParams.nps()) == RPSParams.nps()
 
 
 BAD = [math.nan, -0.1, -math.inf, "much", None, (1.0, 2.0)]
@@ -128,7 +132,7 @@ MAY_BE_NEGATIVE = ("zeta",)
 )
 def test_check_names_the_parameter_that_is_not_a_number_or_is_negative(name, value):
     with pytest.raises(errors.InputError, match=rf"\b{name} = "):
-        law.check(PAPER._replace(**{name: value}))
+        rps.check(PAPER._replace(**{name: value}))
 
 
 MUST_BE_POSITIVE = ("K_h", "K_v", "L", "l_cr", "v_max", "omega_max", "d_success", "gamma_max")
@@ -137,27 +141,27 @@ MUST_BE_POSITIVE = ("K_h", "K_v", "L", "l_cr", "v_max", "omega_max", "d_success"
 @pytest.mark.parametrize("name", MUST_BE_POSITIVE)
 def test_check_names_the_parameter_that_must_not_be_zero(name):
     with pytest.raises(errors.InputError, match=rf"\b{name} = "):
-        law.check(PAPER._replace(**{name: 0.0}))
+        rps.check(PAPER._replace(**{name: 0.0}))
 
 
 @pytest.mark.parametrize("name", sorted(set(RPSParams._fields) - set(MUST_BE_POSITIVE)))
 def test_check_lets_the_other_parameters_be_zero(name):
-    law.check(PAPER._replace(**{name: 0.0}))
+    rps.check(PAPER._replace(**{name: 0.0}))
 
 
 @pytest.mark.parametrize("name", sorted(set(RPSParams._fields) - {"gamma_max"}))
 def test_check_names_the_parameter_that_is_infinite(name):
     with pytest.raises(errors.InputError, match=rf"\b{name} = "):
-        law.check(PAPER._replace(**{name: math.inf}))
+        rps.check(PAPER._replace(**{name: math.inf}))
 
 
 def test_check_allows_an_infinite_gamma_max_the_tangent_as_printed():
-    law.check(PAPER._replace(gamma_max=math.inf))
+    rps.check(PAPER._replace(gamma_max=math.inf))
 
 
 def test_check_holds_reactive_within_its_two_ends():
     with pytest.raises(errors.InputError, match=r"\breactive = "):
-        law.check(PAPER._replace(reactive=1.5))
+        rps.check(PAPER._replace(reactive=1.5))
 
 
 # The equations, one by one
@@ -179,19 +183,19 @@ def test_check_holds_reactive_within_its_two_ends():
 )
 def test_eq_5_gives_the_adaptive_rate_by_hand(l, expected):  # noqa: E741
     # The slope of the curve, at most eta k / 4 = 150 per metre, amplifies float32's rounding of l.
-    a_r = law.adaptive_rate(PAPER, jnp.float32(l), jnp.float32(1.0))
+    a_r = rps.adaptive_rate(PAPER, jnp.float32(l), jnp.float32(1.0))
     assert a_r == pytest.approx(expected, rel=5e-5, abs=1e-6)
 
 
 def test_eq_5_has_the_lower_asymptote_zeta_and_the_upper_asymptote_eta():
     params = PAPER._replace(zeta=2.0, beta=0.5, k=200.0)
-    a_r = law.adaptive_rate(params, jnp.array([0.01, 0.5, -0.99]), jnp.ones(3))
+    a_r = rps.adaptive_rate(params, jnp.array([0.01, 0.5, -0.99]), jnp.ones(3))
     np.testing.assert_allclose(a_r, [2.0, 6.0, -10.0], rtol=1e-5)
 
 
 def test_eq_5_switches_off_at_d_th_and_below():
     just_beyond = np.nextafter(np.float32(0.5), np.float32(1))
-    a_r = law.adaptive_rate(PAPER, jnp.full(3, 0.12), jnp.array([0.49, 0.5, just_beyond]))
+    a_r = rps.adaptive_rate(PAPER, jnp.full(3, 0.12), jnp.array([0.49, 0.5, just_beyond]))
     np.testing.assert_allclose(a_r, [0.0, 0.0, 5.0], rtol=1e-5)
 
 
@@ -207,7 +211,7 @@ def test_eq_5_switches_off_at_d_th_and_below():
     ],
 )
 def test_eqs_1_and_2_split_the_speed_by_the_slope(v_star, a_r, expected):
-    np.testing.assert_allclose(law.linear_velocity(v_star, a_r), expected, rtol=1e-6)
+    np.testing.assert_allclose(rps.linear_velocity(v_star, a_r), expected, rtol=1e-6)
 
 
 def test_eq_3_makes_the_speed_proportional_to_the_distance():
@@ -227,7 +231,7 @@ def test_eq_4_points_from_the_contact_to_the_target_in_the_world():
         jnp.array(True),
         jnp.array([3.0, 3.0]),
     )
-    np.testing.assert_allclose(law.displacement(observation), [1.1, 3.7], rtol=1e-6)
+    np.testing.assert_allclose(displacement(observation), [1.1, 3.7], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -242,22 +246,22 @@ def test_eq_4_points_from_the_contact_to_the_target_in_the_world():
     ],
 )
 def test_eq_7_is_the_gain_times_the_wrapped_heading_error(d, yaw, K_h, expected):
-    gamma = law.steering_angle(PAPER._replace(K_h=K_h), jnp.array(d), jnp.float32(yaw))
+    gamma = rps.steering_angle(PAPER._replace(K_h=K_h), jnp.array(d), jnp.float32(yaw))
     assert gamma == pytest.approx(expected, abs=2e-6)
 
 
 def test_gamma_is_held_within_gamma_max():
     errors_ = jnp.array([1.5, 1.57, 3.0, -1.57, -3.0])
     d = jnp.stack([jnp.cos(errors_), jnp.sin(errors_)], -1)
-    gamma = law.steering_angle(PAPER, d, jnp.zeros(5))
+    gamma = rps.steering_angle(PAPER, d, jnp.zeros(5))
     np.testing.assert_allclose(gamma, [1.5, 1.56, 1.56, -1.56, -1.56], rtol=1e-6)
-    as_printed = law.steering_angle(PAPER._replace(gamma_max=math.inf), d, jnp.zeros(5))
+    as_printed = rps.steering_angle(PAPER._replace(gamma_max=math.inf), d, jnp.zeros(5))
     np.testing.assert_allclose(as_printed, errors_, rtol=1e-6)
 
 
 def test_eq_9_falls_linearly_from_the_centre_to_the_critical_region():
     """From one to zero."""
-    sigma = law.realignment_gain(PAPER, jnp.array([0.0, 0.06, -0.12, 0.24, -0.24, 0.29, 9.0]))
+    sigma = rps.realignment_gain(PAPER, jnp.array([0.0, 0.06, -0.12, 0.24, -0.24, 0.29, 9.0]))
     np.testing.assert_allclose(sigma, [1.0, 0.75, 0.5, 0.0, 0.0, 0.0, 0.0], atol=1e-6)
 
 
@@ -351,8 +355,8 @@ def test_sgn_0_decides_where_a_centred_contact_goes():
 
 def after_a_loss(params, d=(1.2, -0.5)):
     """The state and twist one step after contact at l = 0.12, and the twist while it lasted."""
-    state, felt = law.step(params, RPSState.init(params), observe(d, l=0.12))
-    state, twist = law.step(params, state, observe(d, l=0.12, in_contact=False))
+    state, felt = rps.step(params, RPSState.init(params), observe(d, l=0.12))
+    state, twist = rps.step(params, state, observe(d, l=0.12, in_contact=False))
     return state, np.stack(twist), np.stack(felt)
 
 
@@ -444,10 +448,10 @@ def test_without_contact_the_contact_location_may_be_nan():
 
 def test_the_state_remembers_the_last_contact_and_that_there_was_one():
     state = RPSState.init(PAPER)
-    state, _ = law.step(PAPER, state, observe((1.0, 0.0), l=0.27, in_contact=False))
+    state, _ = rps.step(PAPER, state, observe((1.0, 0.0), l=0.27, in_contact=False))
     assert not state.touched
-    state, _ = law.step(PAPER, state, observe((1.0, 0.0), l=0.1))
-    state, _ = law.step(PAPER, state, observe((1.0, 0.0), l=0.27, in_contact=False))
+    state, _ = rps.step(PAPER, state, observe((1.0, 0.0), l=0.1))
+    state, _ = rps.step(PAPER, state, observe((1.0, 0.0), l=0.27, in_contact=False))
     assert state.touched
     np.testing.assert_allclose(state.p_robot_contact, [FRONT, 0.1], rtol=1e-6)
 
@@ -479,10 +483,11 @@ def test_a_mirrored_world_gives_the_mirrored_twist(seed):
         observation.p_robot_contact * flip,
         observation.in_contact,
         observation.p_world_target * flip,
+        observation.period,
     )
     after, twist, details = batch_details(params, state, observation)
     after_m, twist_m, details_m = batch_details(params, state, mirrored)
-    d = jax.vmap(law.displacement)(observation)
+    d = jax.vmap(displacement)(observation)
     error = np.arctan2(d[:, 1], d[:, 0]) - observation.yaw
     regular = np.abs(np.cos(error / 2)) > 1e-4  # at +-pi the law must choose a side
     assert regular.mean() > 0.9
@@ -528,7 +533,8 @@ def test_for_any_finite_input_the_twist_is_finite_and_within_bounds(seed):
     params = params._replace(gamma_max=jnp.asarray(rng.choice([1.56, np.inf], 256), jnp.float32))
     l_th = jnp.asarray(rng.choice([0.15, 0.24], 256), jnp.float32)
     state = RPSState(l_th, x[:, :2], rng.random(256) < 0.5)
-    observation = Observation(x[:, 2:4], x[:, 4], x[:, 5:7], rng.random(256) < 0.8, x[:, 7:9])
+    touching, period = rng.random(256) < 0.8, np.full(256, PERIOD, np.float32)
+    observation = Observation(x[:, 2:4], x[:, 4], x[:, 5:7], touching, x[:, 7:9], period)
     after, twist, details = batch_details(params, state, observation)
     chex.assert_tree_all_finite((after, twist, details))
     speed = np.hypot(np.float64(twist.v_x), np.float64(twist.v_y))
@@ -552,7 +558,7 @@ def test_the_farthest_target_is_driven_to_at_full_speed():
 @hypothesis.given(st.floats(-100, 100), st.floats(-100, 100), st.floats(-100, 100))
 def test_saturation_keeps_the_direction_and_what_is_within_bounds(v_x, v_y, omega):
     v_x, v_y, omega = map(np.float32, (v_x, v_y, omega))
-    out = law.saturate(PAPER, Twist(v_x, v_y, omega))
+    out = rps.saturate(PAPER, Twist(v_x, v_y, omega))
     speed = math.hypot(v_x, v_y)
     scale = min(1.0, 0.05 / speed) if speed > 0 else 1.0
     assert out.v_x == pytest.approx(v_x * scale, rel=1e-5, abs=1e-30)
@@ -570,7 +576,7 @@ def twist_vector(x, l_th):
     params, (p_world_robot, yaw, contact), target = unravel(x)
     observation = Observation(p_world_robot, yaw, contact, jnp.array(True), target)
     state = RPSState(l_th, jnp.zeros(2, x.dtype), jnp.array(True))
-    return jnp.stack(law.step_with_details(params, state, observation)[1])
+    return jnp.stack(rps.step_with_details(params, state, observation)[1])
 
 
 def flatten(params: RPSParams, observation: Observation) -> np.ndarray:
@@ -661,7 +667,7 @@ def test_without_contact_a_nan_location_does_no_harm_to_derivatives():
     observation = observation._replace(p_robot_contact=jnp.full(2, jnp.nan))
 
     def forward_speed(params):
-        return sum(law.step(params, RPSState.init(PAPER), observation)[1])
+        return sum(rps.step(params, RPSState.init(PAPER), observation)[1])
 
     gradient = jax.grad(forward_speed)(jax.tree.map(jnp.float32, PAPER))
     expected = jax.tree.map(jnp.zeros_like, gradient)._replace(v_approach=jnp.float32(1.0))
@@ -676,9 +682,9 @@ def test_a_batch_over_every_leaf_equals_a_loop_over_worlds():
     params = random_params(3, n)
     state, observation = random_worlds(4, n)
     observation = observation._replace(in_contact=jnp.arange(n) % 5 > 0)
-    batch = jax.jit(jax.vmap(law.step))(params, state, observation)
+    batch = jax.jit(jax.vmap(rps.step))(params, state, observation)
     one_by_one = [
-        law.step(*jax.tree.map(lambda v, i=i: v[i], (params, state, observation))) for i in range(n)
+        rps.step(*jax.tree.map(lambda v, i=i: v[i], (params, state, observation))) for i in range(n)
     ]
     loop = jax.tree.map(lambda *v: jnp.stack(v), *one_by_one)
     chex.assert_trees_all_close(batch, loop, rtol=1e-5, atol=1e-5)
@@ -687,7 +693,7 @@ def test_a_batch_over_every_leaf_equals_a_loop_over_worlds():
 def test_a_batch_over_the_parameters_alone_shares_the_world():
     params = random_params(5, 8)
     world = state_with(0.24), observe((1.2, -0.5), l=0.1)
-    _, twist = jax.vmap(law.step, in_axes=(0, None, None))(params, *world)
+    _, twist = jax.vmap(rps.step, in_axes=(0, None, None))(params, *world)
     shared = jax.tree.map(lambda v: jnp.broadcast_to(v, (8, *v.shape)), world)
     expected = batch_details(params, *shared)[1]
     chex.assert_trees_all_close(twist, expected, rtol=1e-5, atol=1e-6)
@@ -715,7 +721,7 @@ def test_float64_agrees_with_float32():
 def test_a_step_preserves_the_dtypes_of_the_state(x64, in_contact):
     with jax.enable_x64(x64):
         before = RPSState.init(PAPER)
-        after, twist = law.step(PAPER, before, observe((1.0, 0.2), 0.1, in_contact=in_contact))
+        after, twist = rps.step(PAPER, before, observe((1.0, 0.2), 0.1, in_contact=in_contact))
         kinds = [jax.tree.map(lambda v: (v.dtype, v.weak_type), s) for s in (before, after)]
         assert kinds[0] == kinds[1]
         assert {v.dtype for v in twist} == {jnp.zeros(()).dtype}
@@ -725,7 +731,7 @@ def test_float32_stays_float32_where_float64_is_enabled():
     before, observation = (jax.tree.map(lambda v: v[0], w) for w in random_worlds(8, 1))
     params = jax.tree.map(lambda v: v[0], random_params(8, 1))
     with jax.enable_x64(True):
-        after, twist = law.step(params, before, observation)
+        after, twist = rps.step(params, before, observation)
         assert after.l_th.dtype == after.p_robot_contact.dtype == jnp.float32
         assert {v.dtype for v in twist} == {np.dtype(np.float32)}
 
@@ -733,9 +739,18 @@ def test_float32_stays_float32_where_float64_is_enabled():
 def test_the_state_can_be_the_carry_of_a_scan():
     observations = jax.tree.map(lambda v: v[:16], random_worlds(9)[1])
     start = RPSState.init(PAPER)
-    last, twists = jax.lax.scan(partial(law.step, PAPER), start, observations)
+    last, twists = jax.lax.scan(partial(rps.step, PAPER), start, observations)
     state = start
     for i in range(16):
-        state, twist = law.step(PAPER, state, jax.tree.map(lambda v, i=i: v[i], observations))
+        state, twist = rps.step(PAPER, state, jax.tree.map(lambda v, i=i: v[i], observations))
     chex.assert_trees_all_close(last, state)
     chex.assert_trees_all_close(jax.tree.map(lambda v: v[-1], twists), twist, rtol=1e-5)
+
+
+def test_help_says_units_and_equations_of_every_parameter():
+    from rps_jax.control import registry
+
+    for params in {type(one) for one in registry.LAWS.values()}:
+        for name in params._fields if params.__module__.startswith("rps_jax.control.laws") else ():
+            assert "Alias for field" not in getattr(params, name).__doc__, (params, name)
+    assert RPSParams.K_h.__doc__ == "[1] heading gain, Eq. 7"

@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 from dataclasses import replace
 from functools import partial
 
@@ -9,26 +10,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import BOXES, refusal, rps
+from helpers import CYLINDERS, refusal, rps
 
-from rps_jax import InputError, Lessons, learn
+from rps_jax import InputError, learn
 from rps_jax import sweep as run_sweep
-from rps_jax.control import strategies
-from rps_jax.control.law import Observation
+from rps_jax.control import registry
+from rps_jax.control.learned import features
 from rps_jax.control.learned import network as networks
-from rps_jax.control.learned import observation
 from rps_jax.control.learned import policy as policies
+from rps_jax.control.learned.features import Felt
 from rps_jax.control.learned.network import Memory, Network
-from rps_jax.control.learned.observation import Felt, TaxelObservation
 from rps_jax.control.learned.policy import Policy
+from rps_jax.control.observation import Observation, TaxelObservation
 from rps_jax.record import files
 from rps_jax.runs.plan import Plan, load_plan, open_run
 from rps_jax.trials.env import PushEnv, Reward
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
-from rps_jax.tuning import crowd, ppo
-from rps_jax.tuning.ppo import PPO, Student, Took
-from rps_jax.world.physics import preset
+from rps_jax.tuning import ppo, rollout
+from rps_jax.tuning.ppo import PPO, TrainState, Transition
 
 SMALL = {"width": 6, "hold": 0.1}
 KINDS = ("mlp", "gru")
@@ -55,9 +55,10 @@ def seen_at(seed, mirror=False):
         side * np.array([0.36, rng.uniform(-0.2, 0.2)]),
         np.asarray(seed % 3 > 0),
         side * rng.uniform(-2, 2, 2),
+        0.02,
     )
     signal = signal[::-1] if mirror else signal
-    told = TaxelObservation(touch, signal, np.asarray(seed % 2 > 0), 0.02)
+    told = TaxelObservation(touch, signal, np.asarray(seed % 2 > 0))
     return jax.tree.map(jnp.asarray, told)
 
 
@@ -114,7 +115,7 @@ def test_a_contact_that_is_lost_is_remembered_where_it_was():
     felt = felt.follow(later)
     np.testing.assert_allclose(felt.p_robot_contact(later), [0.0, -0.5], atol=1e-6)
     assert float(felt.since) == pytest.approx(0.02)
-    numbers = observation.features(felt, jnp.zeros(3), later)[42:]
+    numbers = features.features(felt, jnp.zeros(3), later)[42:]
     # Not touched, no line, but once; where it was; 1 m to the target, which lies ahead of it.
     np.testing.assert_allclose(numbers[:3], [0, 0, 1])
     np.testing.assert_allclose(numbers[4:6], [0, -0.5 / 0.36], atol=1e-6)
@@ -145,22 +146,22 @@ def test_a_law_of_a_file_is_the_one_that_was_written(kind, tmp_path, registries)
         policy.task,
         policy.learned,
     )
-    name, params = strategies.named(str(tmp_path / "policy.npz"))
+    name, params = registry.named(str(tmp_path / "policy.npz"))
     assert name.startswith(f"learned_{kind}_")
-    strategy = strategies.of(params)
-    assert strategy.senses == "taxels"
+    law = registry.law_of(params)
+    assert law.senses == "taxels"
     before = jax.jit(partial(networks.step, policy.network, policy.weights))
-    told = strategy.init(params), Memory.init(policy.network)
+    told = law.init(params), Memory.init(policy.network)
     for seed in range(12):
         (mine, twist, _), (own, theirs, _) = (
             step(params, memory, seen_at(seed))
-            for step, memory in zip((jax.jit(strategy.step), before), told, strict=True)
+            for step, memory in zip((jax.jit(law.step), before), told, strict=True)
         )
         np.testing.assert_array_equal(np.array(twist), np.array(theirs))
         told = mine, own
-    again = strategies.recorded(params)
+    again = registry.recorded(params)
     assert again["file"] == str(tmp_path / "policy.npz")
-    assert strategies.restored(json.loads(json.dumps(again))) == params
+    assert registry.restored(json.loads(json.dumps(again))) == params
 
 
 def damaged(content, **changes):
@@ -227,7 +228,7 @@ def test_a_file_that_is_no_policy_gets_one_sentence(name, tmp_path):
     path = tmp_path / "policy.npz"
     path.write_bytes(spoil(path.read_bytes()))
     with pytest.raises(InputError, match=words) as error:
-        strategies.named(str(path))
+        registry.named(str(path))
     assert "\n" not in str(error.value)
 
 
@@ -235,18 +236,16 @@ def test_commands_refuse_bad_policies_before_anything_compiles(tmp_path, capsys,
     (tmp_path / "bad.npz").write_bytes(b"hello")
     said = refusal(capsys, "ladder", "--laws", tmp_path / "bad.npz", "--out", tmp_path / "run")
     assert "no policy that can be read" in said
-    said = refusal(
-        capsys, "sweep", "--strategies", tmp_path / "none.npz", "--out", tmp_path / "run"
-    )
+    said = refusal(capsys, "sweep", "--laws", tmp_path / "none.npz", "--out", tmp_path / "run")
     assert "cannot be read (No such file or directory)" in said
     for options, words in {
         "--domain wid": "did you mean 'wide'",
         "--domain paper": "skin of a domain to learn in 'ideal'",
         "--hold 0.001": "hold = 0.001 s is not allowed",
         "--minutes 0": "minutes = 0 is not allowed without updates",
-        "--objects ball": "unknown domain object 'ball'",
-        "--worlds 1 --batches 4": "batches = 4 is not allowed: there are but 3 worlds",
-        "--entropy nan": "entropy = nan",
+        "--domain wide,objects=ball": "unknown domain object 'ball'",
+        "--num-envs 1 --num-minibatches 4": "num_minibatches = 4 is not allowed: there are but 3",
+        "--ent-coef nan": "ent_coef = nan",
         "--engine mujoco": "engine = mujoco is not allowed",
     }.items():
         out = tmp_path / "learn"
@@ -258,10 +257,10 @@ def test_commands_refuse_bad_policies_before_anything_compiles(tmp_path, capsys,
 def test_a_run_of_a_policy_needs_its_file_as_it_was(tmp_path, registries):
     path = tmp_path / "policy.npz"
     written(path)
-    name, params = strategies.named(str(path))
-    setting = Setting(preset(fidelity="fast"), engine="fused")
-    open_run(tmp_path / "run", Plan(BOXES, 4, {name: params}, setting))
-    assert load_plan(tmp_path / "run").arms == {name: params}
+    name, params = registry.named(str(path))
+    setting = Setting("fused", fidelity="fast")
+    open_run(tmp_path / "run", Plan(CYLINDERS, 4, {name: params}, setting))
+    assert load_plan(tmp_path / "run").laws == {name: params}
     other = Policy(network_of("gru"), weights_of(network_of("gru"), seed=1))
     path.write_bytes(policies.encoded(other))
     with pytest.raises(InputError, match="is not what it was when the run was made"):
@@ -271,22 +270,22 @@ def test_a_run_of_a_policy_needs_its_file_as_it_was(tmp_path, registries):
 # --- the algorithm -------------------------------------------------------------------------
 
 
-def took(reward, value, after, ended, final):
-    """What happened in one world, of which the algorithm needs these (U,)."""
+def steps_of(reward, value, next_value, done, terminated):
+    """Transitions of one world, of which advantages need these (T,)."""
     blank = jnp.zeros((len(reward), 1))
-    columns = [jnp.asarray(x)[:, None] for x in (value, after, reward, ended, final)]
-    return Took(blank, blank, blank > 0, blank, blank, *columns)
+    columns = [jnp.asarray(x)[:, None] for x in (value, next_value, reward, done, terminated)]
+    return Transition(blank, blank, blank > 0, blank, blank, *columns)
 
 
 def test_advantages_by_hand():
-    """Discount 0.5, decay 0.5. The third trial ends by a success, the second by the clock.
+    """Gamma 0.5, lambda 0.5. The third trial ends by a success, the second by the clock.
 
     delta_4 = 1 - 3 = -2, nothing after it. delta_3 = 2 + 0.5 * 8 - 1 = 5, ended, so it stands
     alone. delta_2 = 0 + 0.5 * 1 - 2 = -1.5, and A_2 = -1.5 + 0.25 * 5 = -0.25. delta_1 =
     1 + 0.5 * 2 - 1 = 1, and A_1 = 1 + 0.25 * -0.25 = 0.9375.
     """
     found = ppo.advantages(
-        took(
+        steps_of(
             [1.0, 0.0, 2.0, 1.0],
             [1.0, 2.0, 1.0, 3.0],
             [2.0, 1.0, 8.0, 9.0],
@@ -305,35 +304,35 @@ def test_the_surrogate_is_that_of_the_paper():
     np.testing.assert_allclose(found, [2.0, 1.2, 0.5, -1.5, -0.8], rtol=1e-6)
 
 
-def batch(network, student, seed=0, decisions=5, worlds=4):
-    """Decisions by chance, as the student would have taken them."""
+def batch(network, state, seed=0, steps=5, worlds=4):
+    """Transitions by chance, as the policy would have made them."""
     rng = np.random.default_rng(seed)
-    size, extra = observation.size(network.taxels), ppo.PRIVATE_SIGNS.size
-    numbers = jnp.asarray(rng.normal(size=(decisions, worlds, size)), jnp.float32)
-    private = jnp.asarray(rng.normal(size=(decisions, worlds, extra)), jnp.float32)
-    fresh = jnp.asarray(rng.uniform(size=(decisions, worlds)) < 0.2)
+    size, extra = features.size(network.taxels), ppo.PRIVATE_SIGNS.size
+    numbers = jnp.asarray(rng.normal(size=(steps, worlds, size)), jnp.float32)
+    private = jnp.asarray(rng.normal(size=(steps, worlds, extra)), jnp.float32)
+    fresh = jnp.asarray(rng.uniform(size=(steps, worlds)) < 0.2)
     hidden = jnp.asarray(rng.normal(size=network.hidden((worlds,)).shape), jnp.float32)
-    zero = jnp.zeros((decisions, worlds))
-    some = Took(
-        numbers, private, fresh, jnp.zeros((decisions, worlds, 3)), *[zero] * 4, *[fresh] * 2
+    zero = jnp.zeros((steps, worlds))
+    some = Transition(
+        numbers, private, fresh, jnp.zeros((steps, worlds, 3)), *[zero] * 4, *[fresh] * 2
     )
-    mean = ppo.means(network, student.weights["actor"], hidden, some)
+    mean = ppo.means(network, state.weights["actor"], hidden, some)
     action = mean + 0.5 * jnp.asarray(rng.normal(size=mean.shape), mean.dtype)
-    log_prob = ppo.log_prob(action, mean, student.weights["log_std"])
+    log_prob = ppo.log_prob(action, mean, state.weights["log_std"])
     return hidden, some._replace(action=action, log_prob=log_prob)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_loss_of_the_policy_that_acted(kind):
     """Ratios are 1: the surrogate is the mean advantage, nothing is clipped, nothing diverges."""
-    how, network = PPO(kind, width=6, entropy=0.0), network_of(kind)
-    student = Student.init(how, network, jax.random.PRNGKey(0))
-    hidden, some = batch(network, student)
+    how, network = PPO(network=kind, width=6, ent_coef=0.0), network_of(kind)
+    state = TrainState.init(how, network, jax.random.PRNGKey(0))
+    hidden, some = batch(network, state)
     advantage = jnp.arange(20.0).reshape(5, 4)
-    value = networks.critic(student.weights["critic"], ppo.pair(some.numbers, some.private))
-    found, divergence = ppo.loss(how, network, student.weights, hidden, some, advantage, value + 2)
+    value = networks.critic(state.weights["critic"], ppo.critic_inputs(some.obs, some.private))
+    found, kl = ppo.loss(how, network, state.weights, hidden, some, advantage, value + 2)
     assert float(found) == pytest.approx(0.5 * 2**2 - 9.5, rel=1e-5)
-    assert float(divergence) == pytest.approx(0, abs=1e-6)
+    assert float(kl) == pytest.approx(0, abs=1e-6)
 
     def policy_alone(weights):
         return ppo.loss(how, network, weights, hidden, some, advantage, value)[0]
@@ -343,37 +342,40 @@ def test_the_loss_of_the_policy_that_acted(kind):
         mean = ppo.means(network, weights["actor"], hidden, some)
         return -jnp.mean(advantage * ppo.log_prob(some.action, mean, weights["log_std"]))
 
-    slope, expected = jax.grad(policy_alone)(student.weights), jax.grad(gradient)(student.weights)
+    slope, expected = jax.grad(policy_alone)(state.weights), jax.grad(gradient)(state.weights)
     for name in network.shapes:
         np.testing.assert_allclose(slope["actor"][name], expected["actor"][name], atol=2e-5)
 
 
 def test_the_value_of_a_mirrored_world_is_the_same():
-    how, network = PPO("mlp", width=6), network_of("mlp")
-    student = Student.init(how, network, jax.random.PRNGKey(0))
-    _, some = batch(network, student)
-    mirrored = ppo.pair(observation.mirrored(some.numbers), ppo.PRIVATE_SIGNS * some.private)
-    pairs = ppo.pair(some.numbers, some.private)
-    here, there = (networks.critic(student.weights["critic"], x) for x in (pairs, mirrored))
+    how, network = PPO(network="mlp", width=6), network_of("mlp")
+    state = TrainState.init(how, network, jax.random.PRNGKey(0))
+    _, some = batch(network, state)
+    mirrored = ppo.critic_inputs(features.mirrored(some.obs), ppo.PRIVATE_SIGNS * some.private)
+    pairs = ppo.critic_inputs(some.obs, some.private)
+    here, there = (networks.critic(state.weights["critic"], x) for x in (pairs, mirrored))
     np.testing.assert_allclose(here, there, atol=1e-6)
     assert np.std(here) > 0.01
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_best_in_one_step_is_learned(kind):
-    """Each decision is worth less the farther it is from an action that depends on what is seen."""
-    how = PPO(kind, width=6, epochs=4, batches=2, entropy=0.0, learning_rate=3e-3, divergence=0.02)
+    """Each action is worth less the farther it is from one that depends on what is seen."""
+    how = PPO(
+        network=kind, width=6, update_epochs=4, num_minibatches=2, ent_coef=0.0,
+        learning_rate=3e-3, target_kl=0.02,
+    )  # fmt: skip
     network = network_of(kind)
-    student = Student.init(how, network, jax.random.PRNGKey(0))
+    state = TrainState.init(how, network, jax.random.PRNGKey(0))
 
     def best(numbers):
         ahead, left = 0.8 * jnp.sign(numbers[..., 0] + numbers[..., 41]), numbers[..., 47]
         return jnp.stack([ahead, 0.5 * jnp.sign(left), 0 * left], axis=-1)
 
     @jax.jit
-    def on(student, key):
+    def on(state, key):
         key_seen, key_act, key_pass = jax.random.split(key, 3)
-        shape = (4, 64, observation.size(network.taxels))
+        shape = (4, 64, features.size(network.taxels))
         numbers = (
             jnp.zeros(shape).at[..., [0, 41, 47]].set(jax.random.normal(key_seen, (*shape[:2], 3)))
         )
@@ -381,22 +383,22 @@ def test_what_is_best_in_one_step_is_learned(kind):
         blank = jnp.zeros((*shape[:2], ppo.PRIVATE_SIGNS.size))
         zero = jnp.zeros(shape[:2])
         hidden = network.hidden((64,))
-        some = Took(numbers, blank, yes, jnp.zeros((4, 64, 3)), *[zero] * 4, yes, yes)
-        mean = ppo.means(network, student.weights["actor"], hidden, some)
+        some = Transition(numbers, blank, yes, jnp.zeros((4, 64, 3)), *[zero] * 4, yes, yes)
+        mean = ppo.means(network, state.weights["actor"], hidden, some)
         noise = jax.random.normal(key_act, mean.shape)
-        action = mean + jnp.exp(student.weights["log_std"]) * noise
+        action = mean + jnp.exp(state.weights["log_std"]) * noise
         some = some._replace(
             action=action,
-            log_prob=ppo.log_prob(action, mean, student.weights["log_std"]),
-            value=networks.critic(student.weights["critic"], ppo.pair(numbers, blank)),
+            log_prob=ppo.log_prob(action, mean, state.weights["log_std"]),
+            value=networks.critic(state.weights["critic"], ppo.critic_inputs(numbers, blank)),
             reward=-jnp.sum((action - best(numbers)) ** 2, axis=-1),
         )
         wrong = jnp.mean(jnp.sum((mean - best(numbers)) ** 2, axis=-1))
-        return ppo.improve(how, network, student, key_pass, hidden, some)[0], wrong
+        return ppo.update_policy(how, network, state, key_pass, hidden, some)[0], wrong
 
     wrong = []
     for key in jax.random.split(jax.random.PRNGKey(1), 150):
-        student, off = on(student, key)
+        state, off = on(state, key)
         wrong.append(float(off))
     assert wrong[0] == pytest.approx(0.8**2 + 0.5**2, rel=0.05)
     assert np.mean(wrong[-10:]) < 0.2 * wrong[0]
@@ -404,37 +406,32 @@ def test_what_is_best_in_one_step_is_learned(kind):
 
 # --- runs ----------------------------------------------------------------------------------
 
-TINY = PPO("gru", width=6, worlds=6, decisions=4, epochs=2, batches=2, hold=0.1)
-LESSONS = Lessons(objects=("random_box",), drawn=6, validation=3, horizon=4.0)
+TINY = {
+    "network": "gru", "width": 6, "num_envs": 6, "num_steps": 4, "update_epochs": 2,
+    "num_minibatches": 2, "hold": 0.1, "minutes": 0, "drawn": 6, "validation": 3,
+    "setting": Setting("quasistatic", fidelity="fast", rules=Rules(horizon=4.0, max_lost=30.0)),
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory):
     """A run of four updates: its folder and curve."""
     folder = tmp_path_factory.mktemp("learn") / "whole"
-    return folder, learn(BOXES, folder, TINY, minutes=0, updates=4, lessons=LESSONS)
+    return folder, learn(CYLINDERS, **TINY, updates=4, out=folder)
 
 
 def test_a_run_that_is_killed_and_continued_learns_the_same(learned, tmp_path):
     folder, whole = learned
     out = tmp_path / "parts"
 
-    def kill(told):
+    def kill(progress):
         raise KeyboardInterrupt
 
-    learn(BOXES, out, TINY, minutes=0, updates=2, lessons=LESSONS)
+    learn(CYLINDERS, **TINY, updates=2, out=out)
     with pytest.raises(KeyboardInterrupt):  # in the third update and before it is kept
-        learn(
-            BOXES,
-            out,
-            TINY,
-            minutes=0,
-            updates=9,
-            lessons=LESSONS,
-            watch=lambda t: kill(t) or kill(t),
-        )
-    again = learn(BOXES, out, TINY, minutes=0, updates=4, lessons=LESSONS)
-    for name in ("ended", "reward", "value", "divergence", "learning_rate", "spread", "simulated"):
+        learn(CYLINDERS, **TINY, updates=9, out=out, report_to=kill)
+    again = learn(CYLINDERS, **TINY, updates=4, out=out)
+    for name in ("ended", "reward", "value", "kl", "learning_rate", "spread", "simulated"):
         np.testing.assert_array_equal(again[name], whole[name], err_msg=name)
     mine, theirs = (policies.decoded((f / "policy.npz").read_bytes(), f) for f in (out, folder))
     for name in mine.weights:
@@ -448,8 +445,7 @@ def test_what_a_run_leaves(learned):
     assert np.isfinite(curve.validation.values[-1])
     assert np.isfinite(curve.reward).all()
     assert (curve.spread.values > 0).all()
-    assert files.read(folder / "curve.nc").identical(curve)
-    assert (folder / "curve.png").stat().st_size > 10_000
+    assert files.read_results(folder).identical(curve)
     policy = policies.decoded((folder / "policy.npz").read_bytes(), folder)
     assert policy.network == Network("gru", 6, 42, 0.1)
     assert policy.learned["updates"] == 4
@@ -457,27 +453,25 @@ def test_what_a_run_leaves(learned):
 
 def test_a_folder_of_another_run_and_damaged_parts(learned, tmp_path):
     folder, _ = learned
+    other = replace(TINY["setting"], seed=1)
     with pytest.raises(InputError, match="holds another run"):
-        learn(BOXES, folder, replace(TINY, seed=1), minutes=0, updates=4, lessons=LESSONS)
-    out = tmp_path / "run"
-    learn(BOXES, out, TINY, minutes=0, updates=1, lessons=LESSONS)
+        learn(CYLINDERS, **TINY | {"setting": other}, updates=4, out=folder)
+    out = shutil.copytree(folder, tmp_path / "run")
     (part,) = (out / "parts").iterdir()
     part.write_bytes(part.read_bytes()[:-1])
-    curve = learn(BOXES, out, TINY, minutes=0, updates=1, lessons=LESSONS)  # learned anew
+    curve = learn(CYLINDERS, **TINY, updates=1, out=out)  # learned anew
     assert curve.sizes == {"update": 1}
     assert len(list((out / "parts").glob("*.corrupt"))) == 1
 
 
 def test_in_a_sweep_the_law_does_what_it_does_in_its_environment(learned, registries):
     """The same worlds, the same actions, the same sensing: the same end."""
-    name, params = strategies.named(str(learned[0] / "policy.npz"))
-    rules = Rules(horizon=12.0)
-    alone = replace(BOXES, objects=("random_box",))
-    found = run_sweep(alone, {name: params}, worlds=4, seed=5, fidelity="fast", rules=rules)
+    name, params = registry.named(str(learned[0] / "policy.npz"))
+    setting = Setting("fused", fidelity="fast", rules=Rules(horizon=12.0), seed=5)
+    found = run_sweep({name: params}, CYLINDERS, worlds=4, setting=setting)
     policy = policies.decoded((learned[0] / "policy.npz").read_bytes(), "policy")
-    setting = Setting(preset(fidelity="fast"), rules, 5, "fused")
-    env = PushEnv("random_box", alone, setting=setting, worlds=4)
-    run = jax.jit(partial(crowd.pushed, policy.network, env))
+    env = PushEnv("random_cylinder", CYLINDERS, setting=setting, worlds=4)
+    run = jax.jit(partial(rollout.rollout, policy.network, env))
     states = run(env.table, policy.weights)
     np.testing.assert_array_equal(states.data.steps * env.dt, np.float32(found.time[0]))
     np.testing.assert_array_equal(states.data.success, found.success[0] > 0)
@@ -486,20 +480,20 @@ def test_in_a_sweep_the_law_does_what_it_does_in_its_environment(learned, regist
 
 
 def test_an_easier_world_has_its_target_nearer_and_more_ahead():
-    env = PushEnv("random_box", BOXES, setting=Setting(engine="fused"), worlds=3)
+    env = PushEnv("random_cylinder", CYLINDERS, setting=Setting(engine="fused"), worlds=3)
     world = jax.tree.map(lambda leaf: leaf[0], env.table)._replace(
         p_world_target=jnp.array([0.0, 2.0])
     )
-    half = crowd.eased(world, jnp.array(0.5)).p_world_target
+    half = rollout.eased(world, jnp.array(0.5)).p_world_target
     np.testing.assert_allclose(half, 1.4 * np.array([1, 1]) / np.sqrt(2), rtol=1e-6)
-    np.testing.assert_array_equal(crowd.eased(world, jnp.array(1.0)).p_world_target, [0.0, 2.0])
+    np.testing.assert_array_equal(rollout.eased(world, jnp.array(1.0)).p_world_target, [0.0, 2.0])
 
 
 def test_rewards_of_what_the_law_is_not_told():
     """Straight on behind an object: it comes nearer by what the base moves, and stays ahead."""
     env = PushEnv(
-        "random_cylinder", replace(BOXES, objects=("random_cylinder",)), worlds=3,
-        setting=Setting(preset(fidelity="fast"), engine="fused"),
+        "random_cylinder", CYLINDERS, worlds=3,
+        setting=Setting("fused", fidelity="fast"),
         weights=Reward(progress=0.0, no_contact=0.0, success=0.0, object=1.0, behind=0.0),
     )  # fmt: skip
     state = env.begin(jax.tree.map(lambda leaf: leaf[0], env.table), jnp.array(0))
@@ -520,12 +514,13 @@ def test_rewards_of_what_the_law_is_not_told():
 
 def test_the_command_learns_and_the_ladder_takes_what_it_leaves(tmp_path, capsys, registries):
     out = tmp_path / "learn"
-    asked = ["--domain", "wide", "--objects", "random_cylinder", "--network", "mlp"]
-    asked += ["--width", 4, "--worlds", 4, "--drawn", 4, "--validation", 2, "--decisions", 2]
-    asked += ["--batches", 1, "--minutes", 0, "--updates", 2, "--engine", "quasistatic"]
+    asked = ["--domain", "wide,objects=random_cylinder", "--network", "mlp"]
+    asked += ["--width", 4, "--num-envs", 4, "--drawn", 4, "--validation", 2, "--num-steps", 2]
+    asked += ["--num-minibatches", 1, "--minutes", 0, "--updates", 2, "--engine", "quasistatic"]
     assert rps("learn", *asked, "--out", out) == 0
     said = capsys.readouterr().out
-    assert "compile" in said
+    assert "Compile" in said
+    assert (out / "curve.png").stat().st_size > 10_000
     assert "success in validation" in said
     asked = ["ladder", "--domain", "paper", "--worlds", 2, "--engine", "quasistatic", "--slots", 2]
     asked += ["--laws", "pursuit", out / "policy.npz", "--workers", 1, "--out", tmp_path / "ladder"]

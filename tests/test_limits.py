@@ -9,11 +9,12 @@ from helpers import PAPER
 
 from rps_jax.errors import InputError
 from rps_jax.robot.robot import Robot
-from rps_jax.studies import limits
-from rps_jax.studies.limits import Limit, crossing
-from rps_jax.trials.setting import Progress
+from rps_jax.trials.progress import Progress
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import Domain, Range
+from sweeps.limits import study as limits
+from sweeps.limits.study import Limit, Limits, crossing
 
 VALUE = np.arange(1.0, 41.0)
 
@@ -41,8 +42,8 @@ def test_a_bootstrap_interval_holds_the_crossing():
     value = rng.uniform(0, 1, 400)
     success = (value < 0.5).astype(np.int8)[None]
     found = xr.Dataset(
-        {"success": (("arm", "case"), success), "usual": (("arm", "case"), np.ones_like(success))},
-        {"arm": ["rps"], "value": ("case", value)},
+        {"success": (("law", "case"), success), "usual": (("law", "case"), np.ones_like(success))},
+        {"law": ["rps"], "value": ("case", value)},
         {"harms": 1},
     )
     at, low, high = limits.crossings(found, 0.1)["rps"]
@@ -58,15 +59,16 @@ def test_every_robot_meets_the_worlds_of_the_ideal_one(monkeypatch):
     }
     monkeypatch.setattr(limits, "LIMITS", few)
     heard: list[Progress] = []
-    found = limits.run(
-        list(few),
+    asked = Limits(
         {"rps": PAPER},
+        Domain(("random_cylinder",)),
+        tuple(few),
         3,
-        domain=Domain(("random_cylinder",)),
-        rules=Rules(horizon=6.0),
-        report=heard.append,
+        setting=Setting(seed=0, rules=Rules(horizon=6.0)),
+        report_to=heard.append,
     )
-    assert heard[-1].finished == limits.count(list(few), 1, 3) == 9
+    found = asked()
+    assert heard[-1].finished == asked.trials() == 9
     one = found["half_width"]
     np.testing.assert_array_equal(one.success, one.usual)  # it is the ideal base itself
     np.testing.assert_array_equal(one.value, [usual] * 3)
@@ -83,4 +85,4 @@ def test_a_bounded_acceleration_makes_ramps_of_the_laws_turns():
 
 def test_an_unknown_limit_is_named():
     with pytest.raises(InputError, match="did you mean 'lag'"):
-        limits.run(["leg"], {"rps": PAPER}, 1)
+        Limits({"rps": PAPER}, limits=("leg",), worlds=1)()

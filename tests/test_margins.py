@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from rps_jax import InputError, Observation, RPSParams
-from rps_jax.control import law, margins
-from rps_jax.control.law import RPSState
+from rps_jax.control import margins
+from rps_jax.control.laws import rps
+from rps_jax.control.laws.rps import RPSState
 
 COUNT = 1_000_000
 
@@ -29,7 +30,7 @@ def twists(params, touch, target):
     def one(contact, target):
         state = RPSState.init(params)
         seen = Observation(jnp.zeros(2), jnp.zeros(()), contact, jnp.ones((), bool), target)
-        _, twist, details = law.step_with_details(params, state, seen)
+        _, twist, details = rps.step_with_details(params, state, seen)
         return jnp.stack(twist), details.realigning, details.distance
 
     found = jax.jit(jax.vmap(one))(touch.p_robot_contact, target)

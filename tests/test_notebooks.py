@@ -43,7 +43,7 @@ def test_there_are_five_of_them():
     assert [name[:2] for name in TEXTS] == ["01", "02", "03", "04", "05"]
 
 
-@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.py")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", TEXTS.values(), ids=lambda path: path.stem)
 def test_notebooks_import_the_package_and_nothing_below_it(path):
     assert set(imported(path)) == {"rps_jax"}
 

@@ -32,7 +32,7 @@ def test_tables_are_as_their_data(page):
 
 def test_every_table_is_shown_on_some_page():
     shown = set(re.findall(r"<!-- table: (\S+) -->", "".join(p.read_text() for p in PAGES)))
-    assert shown == {path.stem for path in TABLES["RESULTS"].glob("*.json")}
+    assert shown == set(TABLES["data_files"]())
 
 
 def test_a_table_follows_its_data_and_those_it_cites(tmp_path):
@@ -47,17 +47,24 @@ def test_a_table_follows_its_data_and_those_it_cites(tmp_path):
 
     def rendered(rows):
         for name, data in (("one", one | {"rows": rows}), ("two", two)):
-            (tmp_path / f"{name}.json").write_text(json.dumps(data))
+            folder = tmp_path / name / "results"
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / f"{name}.json").write_text(json.dumps(data))
         return TABLES["render"](page, tmp_path)
 
     text = rendered([["a", 1.0], ["a", [2.26, 3]]])
     assert "| a | 1.0 % |\n|  | 2.3 % [3] |\n" in text
     assert "| b | 1.0 % |" in text
     assert "Device: a core" in text
+    assert "(one/results/one.json)" in text
     with pytest.raises(ValueError, match=r"does not name one cell of one\.json"):
         rendered([["a", 1.5]])
     with pytest.raises(ValueError, match="has not one cell for each column"):
         rendered([["a"]])
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "one.json").write_text("{}")
+    with pytest.raises(ValueError, match=r"one\.json has the name of .*one\.json"):
+        rendered([["a", 1.0]])
 
 
 @pytest.mark.parametrize("page", PAGES, ids=named)

@@ -18,7 +18,8 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from rps_jax import engines
-from rps_jax.control.law import RPSParams
+from rps_jax.control.laws.rps import RPSParams
+from rps_jax.control.observation import Twist
 from rps_jax.engines.base import Motion
 from rps_jax.engines.mjx_colliders import collision, mjx
 from rps_jax.engines.mujoco import Batch
@@ -26,7 +27,7 @@ from rps_jax.geometry import planar
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules, Twist
+from rps_jax.trials.trial import Rules
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics, preset
 from rps_jax.world.scene import FRICTION, OBJECTS, Friction
@@ -407,7 +408,7 @@ def ends(physics, *bearings):
     """Where 6 s of the law leave the cylinder, for each bearing [degrees], turned back (3,)."""
     bearings = np.radians(bearings)
     cases = [Case("cylinder", Friction(0.05, 0.5), (0.4, 2.0), bearing=b) for b in bearings]
-    setting = Setting(physics, Rules(horizon=6.0), engine="mujoco")
+    setting = Setting(physics=physics, rules=Rules(horizon=6.0), engine="mujoco")
     poses = pushes.run(cases, setting, workers=1)[0].object_pose
     yaw = planar.wrap(jnp.asarray(poses[:, 2] - bearings))
     return np.column_stack([planar.rotate(jnp.asarray(-bearings), jnp.asarray(poses[:, :2])), yaw])
@@ -440,7 +441,7 @@ def test_a_world_that_runs_away_in_c_mujoco_ends_diverged_and_prints_nothing(
     """MuJoCo by itself would put it back to its start and go on."""
     monkeypatch.chdir(tmp_path)
     params = RPSParams.paper()._replace(v_approach=1e11)
-    setting = Setting(STANDARD, Rules(horizon=0.1), engine="mujoco")
+    setting = Setting(physics=STANDARD, rules=Rules(horizon=0.1), engine="mujoco")
     outcome, _ = pushes.run([Case("box", FRICTION["S1"], (2.0, 0.0), params)], setting)
     assert outcome.diverged.all()
     assert not outcome.success.any()

@@ -14,21 +14,27 @@ from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.runs.plan import load_plan
 from rps_jax.world import draws, points
-from rps_jax.world.domain import DOMAINS, Range
+from rps_jax.world.domain import DOMAINS, Range, of
 
-ARMS = {"rps": PAPER}
-SWEPT = {"rules": SHORT.rules, "fidelity": "fast", "slots": SLOTS}
+SWEPT = {"setting": SHORT, "slots": SLOTS}
+# Quantities that a world has in its solid, friction, target and robot, unless these are given.
+SHOWN = (*of("object", "robot"), "distance", "bearing")
+
+
+def used(drawn):
+    """What a world has of a draw."""
+    return drawn._replace(at={k: v for k, v in drawn.at.items() if k not in SHOWN})
 
 
 @pytest.mark.parametrize("name", DOMAINS)
 def test_a_drawn_world_is_the_same_world_at_its_point_bit_for_bit(name):
     domain, index = DOMAINS[name], np.arange(7, 300)
-    at = points.checked(domain, rps_jax.points_of(name, index, seed=5))
+    at = points.checked(domain, points.points_of(name, index, seed=5))
     which = domain.object_of(index)
     np.testing.assert_array_equal(domain.object_of(at.cases(domain, np.arange(293))), which)
     for thing in np.unique(which):
         rows = np.flatnonzero(which == thing)
-        drawn, again = draws.draw(domain, 5, index[rows]), at.draw(domain, rows)
+        drawn, again = used(draws.draw(domain, 5, index[rows])), used(at.draw(domain, rows))
         for a, b in zip(drawn, again._replace(number=index[rows], case=drawn.case), strict=True):
             assert jax.tree.all(jax.tree.map(np.array_equal, a, b))
 
@@ -36,7 +42,7 @@ def test_a_drawn_world_is_the_same_world_at_its_point_bit_for_bit(name):
 @pytest.mark.parametrize("name", ["wide", "real", "paper", "hostile", "hardware", "prisms"])
 def test_every_coordinate_of_a_domain_changes_some_world(name):
     domain = DOMAINS[name]
-    u = rps_jax.points_of(domain, np.arange(144))
+    u = points.points_of(domain, np.arange(144))
     for column, quantity in enumerate(points.quantities(domain)):
         other = u.copy()
         other[:, column] = (other[:, column] + 0.5) % 1
@@ -47,12 +53,12 @@ def test_every_coordinate_of_a_domain_changes_some_world(name):
 def _leaves(domain, u):
     at = points.checked(domain, u)
     which = domain.object_of(at.cases(domain, np.arange(len(u))))
-    drawn = [at.draw(domain, np.flatnonzero(which == thing)) for thing in np.unique(which)]
+    drawn = [used(at.draw(domain, np.flatnonzero(which == thing))) for thing in np.unique(which)]
     return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(drawn)])
 
 
 def test_a_quantity_is_where_its_range_says():
-    u = rps_jax.points_of("wide", [0, 1, 2])
+    u = points.points_of("wide", [0, 1, 2])
     names = points.names(DOMAINS["wide"])
     u[:, names.index("mass")] = 0.5  # evenly in the logarithm from 3 to 60 kg
     u[:, names.index("distance")] = 0.25  # evenly from 1 to 3 m
@@ -69,43 +75,43 @@ def test_a_quantity_is_where_its_range_says():
 
 
 def test_sweeps_and_evaluations_take_points_as_they_take_drawn_worlds(tmp_path):
-    u = rps_jax.points_of(CYLINDERS, np.arange(6), seed=3)
-    drawn = rps_jax.sweep(CYLINDERS, ARMS, 6, 3, **SWEPT)
+    u = points.points_of(CYLINDERS, np.arange(6), seed=3)
+    drawn = rps_jax.sweep("rps", CYLINDERS, 6, setting=replace(SHORT, seed=3), slots=SLOTS)
     kept = tmp_path / "run"
-    found = rps_jax.sweep(CYLINDERS, ARMS, u, out=kept, **SWEPT)
+    found = rps_jax.sweep("rps", CYLINDERS, points=u, out=kept, **SWEPT)
     xr.testing.assert_identical(found, drawn)
     assert load_plan(kept).points == points.Points(u)
     again = rps_jax.replay(kept, 4)
     assert int(again.outcome.success) == int(drawn.success[0, 4])
     reversed_ = rps_jax.worlds_at(CYLINDERS, u[::-1])
     some = jax.tree.map(lambda value: np.full(1, value), PAPER)
-    tried = rps_jax.evaluate(some, CYLINDERS, reversed_, **SWEPT)
+    tried = rps_jax.evaluate(some, CYLINDERS, points=reversed_, **SWEPT)
     np.testing.assert_allclose(tried.mass, drawn.mass.values[::-1], rtol=1e-6)
     np.testing.assert_allclose(tried.time[0], drawn.time[0, ::-1], atol=0.5)
     # A folder of other points, and one whose points were damaged.
     with pytest.raises(InputError, match="holds another run"):
-        rps_jax.sweep(CYLINDERS, ARMS, u[::-1], out=kept, **SWEPT)
+        rps_jax.sweep("rps", CYLINDERS, points=u[::-1], out=kept, **SWEPT)
     shutil.copy(kept / "points.nc", tmp_path / "good.nc")
     (kept / "points.nc").write_bytes(b"noise")
     with pytest.raises(InputError, match=r"points\.nc is corrupt"):
         rps_jax.replay(kept, 4)
-    xr.testing.assert_identical(rps_jax.sweep(CYLINDERS, ARMS, u, out=kept, **SWEPT), found)
+    xr.testing.assert_identical(rps_jax.sweep("rps", CYLINDERS, points=u, out=kept, **SWEPT), found)
     assert (kept / "points.nc").read_bytes() == (tmp_path / "good.nc").read_bytes()
 
 
 def test_objects_need_not_come_in_turn(tmp_path):
     both = replace(CYLINDERS, objects=("random_box", "random_cylinder"))
-    u = rps_jax.points_of(both, np.arange(5))
+    u = points.points_of(both, np.arange(5))
     u[:, 0] = [0.9, 0.9, 0.9, 0.9, 0.1]  # one box among cylinders
-    asked = {"engine": "quasistatic", "part": 2, **SWEPT}
-    found = rps_jax.sweep(both, ARMS, u, out=tmp_path, **asked)
+    asked = {"setting": replace(SHORT, engine="quasistatic"), "part": 2, "slots": SLOTS}
+    found = rps_jax.sweep("rps", both, points=u, out=tmp_path, **asked)
     assert found.which_object.values.tolist() == [1, 1, 1, 1, 0]
     assert (found.corners.values == [0, 0, 0, 0, 4]).all()
     assert (found.time.values > 0).all()
 
 
 def test_points_that_are_none_are_refused(tmp_path, capsys):
-    u = rps_jax.points_of("wide", np.arange(2))
+    u = points.points_of("wide", np.arange(2))
     for wrong, words in (
         (u[:, 1:], r"u of shape \(2, 35\) is not allowed: it must be \(n, 36\)"),
         (u[:0], "is not allowed"),
@@ -116,7 +122,7 @@ def test_points_that_are_none_are_refused(tmp_path, capsys):
         ([["a"]], "give an array"),
     ):
         with pytest.raises(InputError, match=words):
-            rps_jax.sweep("wide", ARMS, wrong)
+            rps_jax.sweep("rps", "wide", points=wrong)
     files.write_results(tmp_path / "some.nc", rps_jax.worlds_at("wide", u))
     said = refusal(capsys, "sweep", "--domain", "hostile", "--points", tmp_path / "some.nc")
     assert "of another domain" in said
@@ -126,7 +132,7 @@ def test_points_that_are_none_are_refused(tmp_path, capsys):
 
 
 def test_the_command_sweeps_points_and_can_be_continued(tmp_path, capsys):
-    u = rps_jax.points_of("paper", np.arange(0, 144, 48))
+    u = points.points_of("paper", np.arange(0, 144, 48))
     files.write_results(tmp_path / "some.nc", rps_jax.worlds_at("paper", u))
     asked = [
         "sweep",
@@ -137,7 +143,7 @@ def test_the_command_sweeps_points_and_can_be_continued(tmp_path, capsys):
         "--out",
         tmp_path / "r",
     ]
-    asked += ["--strategies", "rps", "--engine", "quasistatic", "--horizon", 5, "--slots", 2]
+    asked += ["--laws", "rps", "--engine", "quasistatic", "--horizon", 5, "--slots", 2]
     assert rps(*asked) == 0
     assert "3 worlds, points of the unit cube" in capsys.readouterr().out
     assert rps(*asked) == 0

@@ -7,9 +7,8 @@ import pytest
 import xarray as xr
 
 from rps_jax.errors import InputError
-from rps_jax.studies import gradient_quality
-from rps_jax.studies.gradient_quality import Study
-from rps_jax.tuning.space import Space
+from sweeps.gradients import study as gradients
+from sweeps.gradients.study import Gradients
 
 
 def estimates(gradients, variance=0.0, finite=1.0):
@@ -33,7 +32,7 @@ def test_the_measures_by_hand():
         "reverse": estimates([[4.0, 0.0], [0.0, 2.0]], variance=0.5, finite=0.75),
         "forward": estimates([[-1.0, 0.0], [-3.0, 0.0]]),
     }
-    judged = gradient_quality.judged(found, ("reverse", "forward")).isel(horizon=0)
+    judged = gradients.judged(found, ("reverse", "forward")).isel(horizon=0)
     one, other = (judged.sel(estimator=name) for name in ("reverse", "forward"))
     assert (float(one.cosine), float(one.least_cosine), float(one.greatest_cosine)) == (0.5, 0, 1)
     assert float(one.bias) == pytest.approx(0.5)
@@ -42,7 +41,7 @@ def test_the_measures_by_hand():
     assert float(other.cosine) == -1
     assert float(other.bias) == pytest.approx(2.0)
     assert float(judged.doubt) == pytest.approx(0.1)  # sqrt(0.02 + 0.02) / 2
-    rows = gradient_quality.table(gradient_quality.judged(found, ("reverse", "forward")))
+    rows = gradients.table(gradients.judged(found, ("reverse", "forward")))
     assert rows[1][:3] == ["reverse", "cosine", "0.50"]
     assert len(rows) == 1 + 2 * 4 + 1
 
@@ -56,12 +55,13 @@ def test_a_study_without_sense_is_refused():
         {"delta": 0.0},
     ):
         with pytest.raises(InputError):
-            Study(**bad)
+            Gradients(**bad).checked()
 
 
-SMALL = Study(
+SMALL = Gradients(
+    ("evolution",),
     object="random_cylinder",
-    space=Space(("K_h", "L")),
+    tuned=("K_h", "L"),
     horizons=(4.0, 8.0),
     worlds=2,
     repeats=2,
@@ -70,16 +70,23 @@ SMALL = Study(
 )
 
 
-def test_a_study_is_continued_and_is_of_one_kind(tmp_path):
+def test_a_study_is_continued_and_is_of_one_kind(tmp_path, monkeypatch):
     """On the quasi-static model, to compile little."""
     asked = []
-    results = gradient_quality.run(SMALL, tmp_path, ("evolution",), report=asked.append)
+    measured = gradients._measured
+
+    def noted(study, name, found):
+        asked.append(name)
+        return measured(study, name, found)
+
+    monkeypatch.setattr(gradients, "_measured", noted)
+    results = replace(SMALL, out=tmp_path)()
     assert asked == ["truth", "evolution"]
-    again = gradient_quality.run(SMALL, tmp_path, ("evolution",), report=asked.append)
+    again = replace(SMALL, out=tmp_path)()
     assert asked == ["truth", "evolution"]
     xr.testing.assert_identical(results, again)
     assert (results.finite == 1).all()
     assert (np.abs(results.cosine) <= 1 + 1e-6).all()
     assert (results.doubt > 0).all()
     with pytest.raises(InputError, match="seed = 0 there, 1 asked for"):
-        gradient_quality.run(replace(SMALL, seed=1), tmp_path, ("evolution",), report=asked.append)
+        replace(SMALL, seed=1, out=tmp_path)()

@@ -17,7 +17,9 @@ import pytest
 from scipy.optimize import nnls
 
 from rps_jax import engines
-from rps_jax.control.law import RPSParams
+from rps_jax.control import registry
+from rps_jax.control.laws.rps import RPSParams
+from rps_jax.control.observation import Twist
 from rps_jax.engines.base import Motion
 from rps_jax.engines.quasistatic import Contact, Problem, Quasistatic, Slider, solved
 from rps_jax.errors import InputError
@@ -29,7 +31,6 @@ from rps_jax.robot.robot import Robot
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Twist
 from rps_jax.world import objects, paper, scene
 from rps_jax.world.physics import Physics, preset
 from rps_jax.world.scene import FRICTION, OBJECTS
@@ -540,8 +541,8 @@ def test_every_scene_has_a_slider(name):
 def test_the_papers_grid_ends_as_in_the_other_engines():
     """RPS 144 of 144; NPS 25, as on converged C MuJoCo and on the fused engine."""
     cases = [
-        Case(name, FRICTION[friction], target, paper.PARAMS[strategy])
-        for strategy in ("rps", "nps")
+        Case(name, FRICTION[friction], target, registry.LAWS[law])
+        for law in ("rps", "nps")
         for name in objects.PAPER_OBJECTS
         for friction in FRICTION
         for target in paper.TARGETS
@@ -556,7 +557,7 @@ def test_the_papers_grid_ends_as_in_the_other_engines():
 @pytest.mark.parametrize(
     ("make", "field"),
     [
-        (lambda: Setting(preset("paper_gazebo"), engine="quasistatic"), "cone"),
+        (lambda: Setting(physics=preset("paper_gazebo"), engine="quasistatic"), "cone"),
         (lambda: Quasistatic(depth=0.0), "depth"),
         (lambda: Quasistatic(slip=2.0), "slip"),
         (lambda: Quasistatic(iterations=2), "iterations"),

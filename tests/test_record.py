@@ -22,8 +22,8 @@ from rps_jax.record import folder as run_folder
 from rps_jax.record.checkpoint import Parts
 
 RESULTS = xr.Dataset(
-    {"time": (("arm", "world"), np.linspace(0, 1, 200, dtype=np.float32).reshape(2, 100))},
-    {"arm": ["rps", "nps"]},
+    {"time": (("law", "world"), np.linspace(0, 1, 200, dtype=np.float32).reshape(2, 100))},
+    {"law": ["rps", "nps"]},
 )
 
 
@@ -180,7 +180,7 @@ def test_a_file_without_checksum_is_read(sound, tmp_path):
 
 def test_a_part_is_named_by_its_number_and_digest(tmp_path):
     """As every version names it, so that a sweep goes on that another version began."""
-    content = files.encoded(RESULTS)
+    content = files.encoded(RESULTS.assign_attrs(part="0000012"))
     digest = hashlib.sha256(content).hexdigest()[:16]
     (tmp_path / "parts").mkdir()
     (tmp_path / "parts" / f"0000012-{digest}.nc").write_bytes(content)

@@ -11,7 +11,7 @@ from helpers import PAPER, SHORT, refusal
 
 import rps_jax
 from rps_jax import engines
-from rps_jax.control.law import Twist
+from rps_jax.control.observation import Twist
 from rps_jax.engines.base import Motion
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
@@ -193,15 +193,16 @@ def test_a_trial_whose_base_stalls_says_so():
 def test_random_robots_are_drawn_last_and_change_no_other_number():
     index = np.arange(0, 30, 3)
     wide, real = (draws.draw(DOMAINS[name], 5, index) for name in ("wide", "real"))
-    for name in wide._fields:
-        if name != "robot":
-            jax.tree.map(np.testing.assert_array_equal, getattr(wide, name), getattr(real, name))
+    limits = set(domain.of("robot"))
+    assert set(real.at) - set(wide.at) == limits
+    same = real._replace(at={k: v for k, v in real.at.items() if k not in limits}, robot=None)
+    jax.tree.map(np.testing.assert_array_equal, wide._replace(robot=None), same)
     assert wide.robot.ideal
     assert real.robot.driven
     assert ((real.robot.force_max >= 150) & (real.robot.force_max <= 800)).all()
     assert real.robot.acceleration_max.shape == (10, 2)
     columns = draws.table(real)
-    assert set(columns) - set(draws.table(wide)) == set(domain.OF_THE_ROBOT)
+    assert set(columns) - set(draws.table(wide)) == limits
     fixed = replace(DOMAINS["wide"], robot=ROBOTS["kairos"])
     again = draws.draw(fixed, 5, index).robot
     np.testing.assert_array_equal(again.mass, 158.0)
@@ -217,17 +218,17 @@ def test_a_domain_with_robots_goes_through_json():
 
 
 def test_robots_are_named_in_the_library_and_in_files(tmp_path):
-    assert named("kairos") is ROBOTS["kairos"]
+    assert named("kairos") == ROBOTS["kairos"]
     path = tmp_path / "mine.json"
     path.write_text('{"mass": 50, "force_max": 120, "acceleration_max": [0.5, 1]}')
     mine = named(str(path))
     assert mine == Robot(mass=50, force_max=120, acceleration_max=(0.5, 1))
     found = rps_jax.sweep(
+        "rps",
         replace(DOMAINS["real"], objects=("random_cylinder",), robot_force=None),
-        {"rps": PAPER},
         worlds=3,
-        rules=Rules(horizon=1.0),
         robot=mine,
+        setting=Setting(rules=Rules(horizon=1.0)),
     )
     assert np.unique(found.robot_force) == 120
     assert "stalled" in found
@@ -264,7 +265,7 @@ def test_commands_refuse_robots_that_they_cannot_step(capsys, tmp_path):
 
 
 def test_an_ideal_robot_is_the_base_as_it_was():
-    setting = Setting(SHORT.physics, Rules(horizon=3.0), engine="fused")
+    setting = Setting(physics=SHORT.physics, rules=Rules(horizon=3.0), engine="fused")
     plain = pushes.run([Case("box", FRICTION["S1"], (1.0, 0.5), PAPER)], setting)[0]
     named = pushes.run(
         [Case("box", FRICTION["S1"], (1.0, 0.5), PAPER, robot=ROBOTS["ideal"])], setting

@@ -147,14 +147,14 @@ def test_worlds_by_template_equal_recompiled_ones(engine):
 
 def test_a_sweep_pushes_with_the_base_that_it_is_given():
     """A base is as wide as its boards: a narrow one loses objects that the usual one holds."""
-    arms, domain = {"rps": PAPER}, replace(DOMAINS["wide"], objects=("random_cylinder",))
-    wide, own = (
-        rps_jax.sweep(domain, arms, worlds=8, rules=Rules(horizon=20.0), robot=one)
-        for one in (None, Robot(half_length=0.5, half_width=0.2))
+    domain = replace(DOMAINS["wide"], objects=("random_cylinder",))
+    setting = Setting(rules=Rules(horizon=20.0))
+    wide, own, same = (
+        rps_jax.sweep("rps", domain, worlds=8, robot=one, setting=setting)
+        for one in (None, Robot(half_length=0.5, half_width=0.2), Robot())
     )
     assert (own.base_pose.values != wide.base_pose.values).any()
     assert np.isfinite(own.path_length).all()
-    same = rps_jax.sweep(domain, arms, worlds=8, rules=Rules(horizon=20.0), robot=Robot())
     np.testing.assert_array_equal(same.base_pose, wide.base_pose)
 
 

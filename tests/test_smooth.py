@@ -15,10 +15,12 @@ from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 
 from rps_jax import engines, errors
-from rps_jax.control import law, rps_plus, strategies
-from rps_jax.control.law import Observation, RPSParams, RPSState, Temperatures
-from rps_jax.control.rivals.pursuit import PursuitParams
-from rps_jax.control.rps_plus import RPSPlusParams
+from rps_jax.control import registry
+from rps_jax.control.laws import rps, rps_plus
+from rps_jax.control.laws.pursuit import PursuitParams
+from rps_jax.control.laws.rps import RPSParams, RPSState, Temperatures
+from rps_jax.control.laws.rps_plus import RPSPlusParams
+from rps_jax.control.observation import Observation
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.shell import HALF_LENGTH, HALF_WIDTH
@@ -34,6 +36,7 @@ WARM = Temperatures()
 COLD = Temperatures(1e-6, 1e-6, 1e-6, 1e-6)
 FRONT, SIDE = HALF_LENGTH, HALF_WIDTH  # [m] the front face is x = FRONT, the sides y = +-SIDE
 WORLDS = 256
+PERIOD = 0.02  # [s] of the control loop
 
 property_test = hypothesis.settings(max_examples=30, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -50,7 +53,8 @@ def observe(d, l=0.0, in_contact=1.0) -> Observation:  # noqa: E741
     """A robot at the origin, its contact at lateral location `l` and `d` from the target."""
     target = jnp.asarray((FRONT + d[0], l + d[1]), float)
     contact = jnp.asarray((FRONT, l), float)
-    return Observation(jnp.zeros(2), jnp.zeros(()), contact, jnp.asarray(in_contact, float), target)
+    weight, period = jnp.asarray(in_contact, float), jnp.asarray(PERIOD)
+    return Observation(jnp.zeros(2), jnp.zeros(()), contact, weight, target, period)
 
 
 def state_with(l_th: float = 0.24, touched: float = 1.0) -> RPSState:
@@ -60,7 +64,7 @@ def state_with(l_th: float = 0.24, touched: float = 1.0) -> RPSState:
 
 @jax.jit
 def one_step(state, observation):
-    return law.step_with_details(PAPER, state, observation, WARM)
+    return rps.step_with_details(PAPER, state, observation, WARM)
 
 
 def random_worlds(seed: int, dtype=np.float32):
@@ -85,6 +89,7 @@ def random_worlds(seed: int, dtype=np.float32):
         contact,
         rng.choice([0.0, 1.0], n, p=[0.2, 0.8]),
         rng.uniform(-2, 2, (n, 2)),
+        np.full(n, PERIOD),
     )
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), (params, state, observation))
 
@@ -93,12 +98,12 @@ def random_worlds(seed: int, dtype=np.float32):
 def hard(params, state, observation):
     state = state._replace(touched=state.touched > 0.5)
     observation = observation._replace(in_contact=observation.in_contact > 0.5)
-    return jax.vmap(law.step_with_details)(params, state, observation)
+    return jax.vmap(rps.step_with_details)(params, state, observation)
 
 
 @jax.jit
 def smooth(params, state, observation, temperatures):
-    one = jax.vmap(law.step_with_details, in_axes=(0, 0, 0, None))
+    one = jax.vmap(rps.step_with_details, in_axes=(0, 0, 0, None))
     return one(params, state, observation, temperatures)
 
 
@@ -161,7 +166,7 @@ def test_the_whole_law_comes_nearer_as_all_temperatures_fall(seed):
 
 def test_on_its_surface_a_switch_is_half_on():
     at_d_th, beyond = (
-        law.adaptive_rate(PAPER, jnp.float32(0.12), jnp.float32(d), WARM) for d in (0.5, 9.0)
+        rps.adaptive_rate(PAPER, jnp.float32(0.12), jnp.float32(d), WARM) for d in (0.5, 9.0)
     )
     assert at_d_th == pytest.approx(2.5, rel=1e-4)  # eta / 2 / 2
     assert beyond == pytest.approx(5.0, rel=1e-4)
@@ -186,7 +191,7 @@ def test_the_realignment_state_keeps_its_memory(side):
     def one(state, l):  # noqa: E741
         contact = jnp.stack([jnp.float32(FRONT), side * l])
         seen = observe((1.0, 0.3))._replace(p_robot_contact=contact)
-        state, _, details = law.step_with_details(PAPER, state, seen, WARM)
+        state, _, details = rps.step_with_details(PAPER, state, seen, WARM)
         return state, details.realigning
 
     _, weight = jax.jit(lambda ls: jax.lax.scan(one, state_with(), ls))(
@@ -204,7 +209,7 @@ def test_the_realignment_state_keeps_its_memory(side):
 
 def test_sgn_has_the_derivative_of_a_tanh_where_the_law_has_none():
     # Beside l = 0, a_r = 10 / (1 + e^7.2) tanh(l / 0.01) and e^7.2 = 1339.43: 0.746 per metre.
-    slope = jax.jit(jax.grad(law.adaptive_rate, argnums=1))
+    slope = jax.jit(jax.grad(rps.adaptive_rate, argnums=1))
     assert slope(PAPER, 0.0, 1.0, WARM) == pytest.approx(0.746027, rel=1e-3)
     # v* = 0.1 is scaled to 0.05, and v_y = 0.05 a_r for a small a_r.
     x, _ = ravel_pytree((PAPER, state_with(), observe((1.0, 0.0)), WARM))
@@ -277,7 +282,7 @@ _, unravel = ravel_pytree((PAPER, state_with(), observe((1.0, 0.0)), WARM))
 
 def after_one_step(x):
     """The twist and the state (7,) of flattened parameters, state, observation, temperatures."""
-    state, twist, _ = law.step_with_details(*unravel(x))
+    state, twist, _ = rps.step_with_details(*unravel(x))
     return jnp.concatenate([jnp.stack(twist), ravel_pytree(state)[0]])
 
 
@@ -340,7 +345,7 @@ def test_derivatives_agree_with_finite_differences():
 def test_a_smooth_step_preserves_the_dtypes_of_the_state(x64):
     with jax.enable_x64(x64):
         before = RPSState.init(PAPER, WARM)
-        after, twist = law.step(PAPER, before, observe((1.0, 0.2), 0.1), WARM)
+        after, twist = rps.step(PAPER, before, observe((1.0, 0.2), 0.1), WARM)
         assert jax.tree.map(lambda x: x.dtype, after) == jax.tree.map(lambda x: x.dtype, before)
         assert {x.dtype for x in twist} == {jnp.zeros(()).dtype}
 
@@ -349,7 +354,7 @@ def test_a_smooth_step_preserves_the_dtypes_of_the_state(x64):
 @pytest.mark.parametrize("value", [0.0, -0.01, math.nan, math.inf, "warm"])
 def test_a_temperature_that_is_no_positive_length_is_refused(name, value):
     with pytest.raises(errors.InputError, match=f"temperature {name} = "):
-        strategies.smooth_rps(WARM._replace(**{name: value}))
+        registry.smooth_law(rps.LAW, WARM._replace(**{name: value}))
 
 
 # The skin
@@ -551,7 +556,7 @@ def test_a_skin_that_is_not_warm_is_refused(value):
 # Whole trials, stepped by C MuJoCo, which needs no compiling
 
 
-def push(case: Case, strategy, horizon: float):
+def push(case: Case, law, horizon: float):
     """The trial of a case after `horizon` [s], or at its end."""
     setting = Setting(engine="mujoco", rules=Rules(horizon=horizon))
     models, worlds = pushes.build([case], setting)
@@ -562,7 +567,7 @@ def push(case: Case, strategy, horizon: float):
         return True
 
     options = {"physics": setting.physics, "rules": setting.rules, "threads": 1}
-    host.run(engines.get("mujoco"), models, worlds, strategy=strategy, report=report, **options)
+    host.run(engines.get("mujoco"), models, worlds, law=law, report=report, **options)
     return jax.tree.map(lambda x: np.asarray(x)[0], seen[-1])
 
 
@@ -571,8 +576,8 @@ def test_without_heat_a_smooth_trial_is_the_hard_one(name):
     """From before the first touch, through a turn towards a target at the side."""
     case = Case(name, FRICTION["S1"], (1.0, -1.5), gap=0.005)
     cold = replace(case, skin=SmoothSkin(IdealSkin(), 1e-6))
-    exact = push(case, strategies.RPS, 10.0)
-    got = push(cold, strategies.smooth_rps(COLD), 10.0)
+    exact = push(case, rps.LAW, 10.0)
+    got = push(cold, registry.smooth_law(rps.LAW, COLD), 10.0)
     assert abs(exact.qpos[2]) > 0.2  # it turned
     np.testing.assert_allclose(got.qpos, exact.qpos, atol=2e-3)
     assert got.contact_steps == pytest.approx(exact.contact_steps, abs=1)
@@ -580,23 +585,21 @@ def test_without_heat_a_smooth_trial_is_the_hard_one(name):
     assert got.min_distance == pytest.approx(exact.min_distance, abs=2e-3)
 
 
-@pytest.mark.parametrize(
-    "strategy", [strategies.RPS, strategies.smooth_rps()], ids=["hard", "smooth"]
-)
-def test_with_a_warm_skin_a_push_arrives(strategy):
+@pytest.mark.parametrize("law", [rps.LAW, registry.smooth_law(rps.LAW)], ids=["hard", "smooth"])
+def test_with_a_warm_skin_a_push_arrives(law):
     """By either law: a hard one is told whether there is contact."""
     case = Case("box", FRICTION["S1"], (0.7, 0.05), skin=SmoothSkin())
-    ended = push(case, strategy, 30.0)
+    ended = push(case, law, 30.0)
     assert ended.success
     assert ended.min_distance < 0.05
     assert ended.lost_steps == 0
 
 
-def test_equal_temperatures_are_one_strategy():
-    assert strategies.smooth_rps(Temperatures()) is strategies.smooth_rps(
-        Temperatures(realign=0.01)
-    )
-    assert strategies.smooth_rps(COLD) is not strategies.smooth_rps()
+def test_equal_temperatures_are_one_law():
+    own = registry.smooth_law(rps.LAW, Temperatures())
+    assert registry.smooth_law(rps.LAW, Temperatures(realign=0.01)) is own
+    assert registry.smooth_law(rps.LAW) is own
+    assert registry.smooth_law(rps.LAW, COLD) is not own
 
 
 # --- RPS+ ----------------------------------------------------------------------------------
@@ -619,7 +622,7 @@ def plus_moments(count=40):
 def test_without_heat_smooth_rps_plus_is_the_hard_one(monkeypatch):
     monkeypatch.setattr(rps_plus, "_WARM", rps_plus._Warm(1e-6, 1e-6))
     params = RPSPlusParams(n_lost=2.5)  # a count meets no threshold that is a count
-    hard, cold = strategies.of(params), strategies.smooth_rps_plus(COLD)
+    hard, cold = registry.law_of(params), registry.smooth_law(rps_plus.LAW, COLD)
     for anew, told in plus_moments():
         if anew:
             states = [hard.init(params), cold.init(params)]
@@ -631,18 +634,18 @@ def test_without_heat_smooth_rps_plus_is_the_hard_one(monkeypatch):
 
 
 def test_a_smooth_rps_plus_can_be_differentiated_by_its_own_parameters():
-    strategy, names = strategies.smooth_rps_plus(), ("d_near", "press", "n_lost", "ahead", "aside")
+    law, names = registry.smooth_law(rps_plus.LAW), ("d_near", "press", "n_lost", "ahead", "aside")
     start = RPSPlusParams(n_lost=2.0)
     with jax.enable_x64(True):
 
         @jax.jit
         def driven(values):
             params = start._replace(**dict(zip(names, values, strict=True)))
-            state, total = strategy.init(params), 0.0
+            state, total = law.init(params), 0.0
             for anew, told in plus_moments(10):
-                state = strategy.init(params) if anew else state
+                state = law.init(params) if anew else state
                 weight = told._replace(in_contact=told.in_contact.astype(float))
-                state, twist, _ = strategy.step(params, state, weight)
+                state, twist, _ = law.step(params, state, weight)
                 total = total + twist.v_x + 0.7 * twist.v_y + 0.1 * twist.omega
             return total
 
@@ -654,7 +657,11 @@ def test_a_smooth_rps_plus_can_be_differentiated_by_its_own_parameters():
 
 
 def test_only_rps_and_rps_plus_have_a_smooth_form():
-    assert strategies.smooth_of(RPSParams.tuned()) is strategies.smooth_rps()
-    assert strategies.smooth_of(RPSPlusParams()) is strategies.smooth_rps_plus()
-    with pytest.raises(errors.InputError, match="PursuitParams have no smooth law"):
-        strategies.smooth_of(PursuitParams())
+    assert registry.law_of(RPSParams.tuned()) is rps.LAW
+    assert registry.law_of(RPSPlusParams()) is rps_plus.LAW
+    smooth = [registry.smooth_law(law) for law in (rps.LAW, rps_plus.LAW)]
+    assert [law.smooth for law in smooth] == [True, True]
+    assert smooth[0] != smooth[1]
+    words = "this law has no smooth form .*: choose rps, rps_tuned, nps, rps_plus"
+    with pytest.raises(errors.InputError, match=words):
+        registry.smooth_law(registry.law_of(PursuitParams()))

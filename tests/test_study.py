@@ -5,20 +5,20 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import rps_jax
 from rps_jax import errors
-from rps_jax.control.law import RPSParams
-from rps_jax.control.rivals.aps import APSParams
-from rps_jax.control.rivals.pursuit import PursuitParams
-from rps_jax.control.rps_plus import RPSPlusParams
+from rps_jax.control import registry
+from rps_jax.control.laws.aps import APSParams
+from rps_jax.control.laws.pursuit import PursuitParams
+from rps_jax.control.laws.rps import RPSParams
+from rps_jax.control.laws.rps_plus import RPSPlusParams
 from rps_jax.engines import mujoco as c_mujoco
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Parts
 from rps_jax.robot.skin import IdealSkin
-from rps_jax.studies import fidelity, study
-from rps_jax.studies.replication import ambiguity, hardware
-from rps_jax.studies.study import Condition, Grid
+from rps_jax.studies import hardware
 from rps_jax.trials import pushes
-from rps_jax.trials.pushes import Case
+from rps_jax.trials.case import Case
 from rps_jax.trials.results import DIMS
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules, Shift
@@ -26,6 +26,10 @@ from rps_jax.world import paper, scene
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.physics import preset
 from rps_jax.world.scene import FRICTION
+from sweeps import shared
+from sweeps.ambiguities import readings
+from sweeps.fidelity import study as fidelity
+from sweeps.shared import Condition, Grid
 
 NEAR = ((0.6, 0.0), (0.62, 0.03))
 SHORT = Setting(engine="mujoco", rules=Rules(horizon=18.0))
@@ -39,7 +43,7 @@ CONDITIONS = {
 
 def test_a_condition_changes_rps_wherever_it_is_part_of_a_law():
     condition = Condition("slow", SHORT, params={"v_max": 0.001})
-    grid = GRID._replace(strategies=("rps", "rps_plus", "aps", "pursuit"))
+    grid = GRID._replace(laws=("rps", "rps_plus", "aps", "pursuit"))
     rps, plus, aps, pursuit = (case.params for case in condition.cases(grid)[:: len(NEAR)])
     assert rps == RPSParams.paper()._replace(v_max=0.001)
     assert plus.law == RPSPlusParams().law._replace(v_max=0.001)
@@ -50,16 +54,16 @@ def test_a_condition_changes_rps_wherever_it_is_part_of_a_law():
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("study")
-    study.run(CONDITIONS, GRID, path)
+    shared.run_conditions(CONDITIONS, GRID, path)
     return path
 
 
 def test_a_study_labels_its_conditions_and_compares_them(folder):
-    results = study.run(CONDITIONS, GRID, folder)
+    results = shared.run_conditions(CONDITIONS, GRID, folder)
     assert results.success.dims == ("condition", *DIMS)
     won = results.success.sum(DIMS).values
     np.testing.assert_array_equal(won, [2, 0, 2])
-    rows = study.rows(results, "default")
+    rows = shared.condition_rows(results, "default")
     assert [row[0] for row in rows] == ["reading", "the defaults", "slow", "thin skin"]
     assert rows[1][1:3] == ["2", "2 of 2"]
     assert rows[2][-1].startswith("+0 -2")
@@ -78,7 +82,7 @@ def test_a_study_continues_and_redoes_alone_what_is_corrupt(folder, monkeypatch)
         return run(cases, *args, **options)
 
     monkeypatch.setattr(pushes, "run", counted)
-    study.run(CONDITIONS, GRID, folder)
+    shared.run_conditions(CONDITIONS, GRID, folder)
     assert ran == CONDITIONS["thin"].cases(GRID)
     again = [files.decoded(content["thin"], "thin") for content in (before, parts.contents())]
     xr.testing.assert_identical(*(results.drop_attrs() for results in again))
@@ -88,7 +92,7 @@ def test_a_study_continues_and_redoes_alone_what_is_corrupt(folder, monkeypatch)
 def test_a_study_refuses_a_folder_of_other_conditions(folder):
     other = {"slow": Condition("slow", SHORT, params={"v_max": 0.002})}
     with pytest.raises(errors.InputError, match=r"slow.* was run with other options"):
-        study.run(other, GRID, folder)
+        shared.run_conditions(other, GRID, folder)
 
 
 def test_c_mujoco_driven_by_periods_matches_c_mujoco_driven_by_steps():
@@ -128,19 +132,17 @@ def test_a_shove_moves_the_object_along_the_front_of_the_robot():
 
 @pytest.mark.slow
 def test_the_hardware_experiments_cover_friction_targets_and_shoves():
-    base = Case("hardware_box", hardware.MIDDLE, (2.1, 0.0), skin=hardware.SKIN)
-    setting = Setting(engine="mujoco", rules=Rules(horizon=3.0))
-    results = hardware.run(base, setting)
+    setting = Setting(rules=Rules(horizon=3.0))
+    results = rps_jax.hardware(shifts=(0.1,), setting=setting)
     assert results.sizes["friction"] == len(paper.HARDWARE_GROUND) * len(paper.HARDWARE_ROBOT)
     assert results.sizes["target"] == 8
     assert (results.mean_abs_l < 0.29).any()  # it was touched
     rows = hardware.table(results)
     assert rows[1][1] == "0 of 96"
     assert "8 of 8" in rows[1]
-    shifted = hardware.disturb(base, setting, shifts=(0.1,))
-    assert shifted.success.shape == (2, 1, 2, 8)
+    assert results.recovered.shape == (2, 1, 2, 8)
     # All trials ended at 3 s, before the object was to be moved: none tells anything.
-    assert not hardware.recovered(shifted).of.any()
+    assert not results.counted.any()
 
 
 def test_the_hardware_targets_are_2_1_m_from_the_start():
@@ -150,14 +152,14 @@ def test_the_hardware_targets_are_2_1_m_from_the_start():
 
 
 def test_every_condition_is_a_study_that_could_run():
-    ours = fidelity.CONDITIONS, fidelity.IN_WARP, ambiguity.READINGS, ambiguity.GAZEBO
+    ours = fidelity.CONDITIONS, fidelity.IN_WARP, readings.READINGS, readings.GAZEBO
     for conditions in ours:
         for condition in conditions.values():
             assert len(condition.cases(Grid(targets=NEAR))) == 12
-    assert len(ambiguity.curve()) == 3 * len(ambiguity.TOLERANCES)
+    assert len(readings.curve()) == 3 * len(readings.TOLERANCES)
     assert set(fidelity.QUICK) <= set(fidelity.CONDITIONS)
-    assert set(ambiguity.QUICK_READINGS) <= set(ambiguity.READINGS)
-    assert set(ambiguity.QUICK_GAZEBO) <= set(ambiguity.GAZEBO)
+    assert set(readings.QUICK_READINGS) <= set(readings.READINGS)
+    assert set(readings.QUICK_GAZEBO) <= set(readings.GAZEBO)
 
 
 def test_the_cells_of_table_ii_are_judged_by_their_intervals():
@@ -168,12 +170,12 @@ def test_the_cells_of_table_ii_are_judged_by_their_intervals():
         {"success": (("condition", *DIMS), success)},
         coords={
             "condition": ["paper_gazebo"],
-            "strategy": list(paper.STRATEGIES),
+            "law": list(paper.LAWS),
             "object": list(PAPER_OBJECTS),
             "friction": ["S1", "S2"],
         },
     )
-    rows = {row[0]: row for row in ambiguity.cells(results)[1:]}
+    rows = {row[0]: row for row in readings.cells(results)[1:]}
     # Of 24: the paper's 24 gives 20.7-24, its 19 14.3-21.8, its 0 0-3.3, its 2 0.6-6.2.
     assert rows["RPS box S2"][3:5] == ["20.7-24.0", "yes"]
     assert rows["RPS cylinder S1"][3:5] == ["14.3-21.8", "no"]
@@ -185,7 +187,7 @@ def test_the_cells_of_table_ii_are_judged_by_their_intervals():
 
 
 def test_the_tolerance_curve_sums_each_behaviour_and_tolerance():
-    names = list(ambiguity.curve((1, 6)))
+    names = list(readings.curve((1, 6)))
     shape = (6, 1, 3, 2, 24)
     success = np.zeros(shape, np.int8)
     success[names.index("drive_6mm"), 0, 1] = 1
@@ -194,14 +196,14 @@ def test_the_tolerance_curve_sums_each_behaviour_and_tolerance():
             "success": (("condition", *DIMS), success),
             "contact_lost_time": (("condition", *DIMS), np.full(shape, 2.0)),
         },
-        coords={"condition": names, "strategy": ["rps"], "object": list(PAPER_OBJECTS)},
+        coords={"condition": names, "law": ["rps"], "object": list(PAPER_OBJECTS)},
     )
-    curve = ambiguity.by_tolerance(results, (1, 6))
+    curve = readings.by_tolerance(results, (1, 6))
     assert curve.won.sum() == 48
     assert curve.won.sel({"loss": "drive", "tolerance": 6, "object": "cylinder"}) == 48
     assert (curve.lost == 2.0).all()
 
 
-def test_the_papers_parameters_are_named_by_strategy():
-    assert paper.PARAMS["nps"] == RPSParams.nps()
-    assert tuple(paper.PARAMS) == ("rps", "nps", "aps")
+def test_the_papers_parameters_are_named_by_law():
+    assert registry.LAWS["nps"] == RPSParams.nps()
+    assert paper.LAWS == ("rps", "nps", "aps")

@@ -34,22 +34,22 @@ from helpers import (
     swept,
 )
 
-from rps_jax.analysis import statistics, tables
+from rps_jax.analysis import tables
 from rps_jax.app.cli import running
-from rps_jax.control import strategies
+from rps_jax.control.laws.rps import LAW
+from rps_jax.engines import device
 from rps_jax.errors import InputError
 from rps_jax.geometry import planar
 from rps_jax.record import files
 from rps_jax.runs import sweep
 from rps_jax.runs.plan import Shard, load_plan, open_run
-from rps_jax.runs.report import write_report
 from rps_jax.runs.results import merge
 from rps_jax.trials import batch, trial
 from rps_jax.trials.batch import Job
 from rps_jax.trials.trial import Rules
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import domain, draws
-from rps_jax.world.domain import Range
+from rps_jax.world.domain import WORDS, Range
 
 
 def outcomes(parts, setting=SHORT):
@@ -60,7 +60,7 @@ def outcomes(parts, setting=SHORT):
         for i, number in enumerate(numbers):
             found[int(number)] = row(ended, i)
 
-    job = Job(strategies.RPS, sum(p.numbers.size for p in parts), parts)
+    job = Job(LAW, sum(p.numbers.size for p in parts), parts)
     batch.run([job], setting, slots=SLOTS, workers=1, collect=collect)
     return found
 
@@ -91,7 +91,7 @@ def test_a_world_in_a_refilled_slot_ends_as_it_does_alone():
 def test_late_poses_and_late_commands_are_late_by_as_much(error):
     """Of a base that is told to turn: what is believed, and done, is what was n steps before."""
     steps, period = 3, SHORT.physics.control_period
-    still = replace(BOXES, **{name: Range(0, 0) for name in domain.OF_THE_BASE})
+    still = replace(BOXES, **{name: Range(0, 0) for name in domain.of("base")})
     late = replace(still, **{error: Range(steps * period, steps * period)})
     part = drawn_worlds(late, draws.draw(late, 0, [0]), PAPER, SHORT)
     world = row(part.worlds, 0)
@@ -115,7 +115,7 @@ def test_late_poses_and_late_commands_are_late_by_as_much(error):
 
 @pytest.mark.slow
 def test_a_base_that_errs_by_nothing_is_perfect():
-    nothing = {name: Range(0, 0) for name in domain.OF_THE_BASE}
+    nothing = {name: Range(0, 0) for name in domain.of("base")}
     perfect = replace(CYLINDERS, **nothing)
     assert made(np.arange(2)).worlds.odometry.past.shape[1] > 1
     drawn = draws.draw(perfect, 0, np.arange(6))
@@ -144,7 +144,7 @@ def test_flat_boxes_that_nothing_touches_stay_where_they_are():
 
 @pytest.mark.slow
 def test_a_faster_base_arrives_earlier():
-    perfect = {name: Range(0, 0) for name in domain.OF_THE_BASE}
+    perfect = {name: Range(0, 0) for name in domain.of("base")}
     quick = replace(CYLINDERS, **perfect, gap=Range(0.05, 0.05))
     times = []
     for error in (-0.5, 0.0):
@@ -158,9 +158,10 @@ _ON_TWO_DEVICES = """
 import sys, jax
 from pathlib import Path
 from helpers import swept
-from rps_jax.app.cli import running
+from rps_jax.engines import device
+from rps_jax.control.laws.rps import LAW
 
-running.use_cache()
+device.use_cache()
 assert jax.device_count() == 2
 programs, plain = [], jax.stages.Lowered.compile
 def noted(*given, **options):
@@ -203,16 +204,16 @@ def test_two_devices_find_what_one_finds_and_never_talk(whole, tmp_path):
 def test_results_hold_every_world_with_what_was_drawn(whole, tmp_path):
     merge([whole], tmp_path)
     results = files.read_results(tmp_path)
-    assert dict(results.sizes) == {"arm": 2, "world": 20, "pose": 3, "object": 1}
+    assert dict(results.sizes) == {"law": 2, "world": 20, "pose": 3, "object": 1}
     columns = draws.table(draws.draw(BOXES, 0, np.arange(20)))
     for name, (values, unit) in columns.items():
         np.testing.assert_allclose(results[name], values, rtol=1e-6)
         assert results[name].attrs["units"] == unit
-    assert set(statistics.DRAWN) == {*columns, *domain.OF_THE_ROBOT}
+    assert set(WORDS) == {*columns, *domain.of("robot")}
     again = outcomes([made(np.arange(20))])
     for i, one in again.items():
-        assert float(results.time.sel(arm="rps")[i]) == one.time
-        assert int(results.success.sel(arm="rps")[i]) == int(one.success)
+        assert float(results.time.sel(law="rps")[i]) == one.time
+        assert int(results.success.sel(law="rps")[i]) == int(one.success)
     json.dumps(load_plan(whole).configuration())
     assert load_plan(whole) == PLAN
 
@@ -228,7 +229,7 @@ KILLED = replace(
 
 
 def sweep_in_a_process(folder):
-    running.use_cache()
+    device.use_cache()
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     swept(folder, KILLED)
 
@@ -332,10 +333,9 @@ def test_the_report_of_one_world_tells_what_was_lost_and_how_to_see_it(whole, tm
     plan, results = merge([folder], folder)
     one = results.isel(world=[0])
     one.success[:], one.overflows[:] = [[1], [0]], [[0], [3]]
-    text = write_report(folder, plan, one).read_text()
+    text = str(sweep.report_of(plan, one, folder))
     assert "1 trials lost contacts for want of room: they are not to be trusted" in text
-    assert f"`rps replay '{folder}' 0 --arm 'nps' --video`" in text  # the arm that fails
-    assert not (folder / "success.png").exists()  # nothing was drawn but once
+    assert f"rps replay '{folder}' 0 --law nps" in text  # the law that fails
     assert tables.influence_table(one, "rps")[1:] == []
 
 
@@ -365,15 +365,15 @@ def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys):
     tuned.write_text(json.dumps({"L": 0.3}))
     drums.write_text(json.dumps({"objects": ["random_cylinder"], "distance": [1, 2]}))
     command = ["sweep", "--domain", drums, "--fidelity", "fast", "--worlds", 12, "--horizon", 6,
-               "--strategies", "rps", "--params", "paper", tuned, "--part", 5, "--slots", SLOTS,
+               "--laws", "rps", f"rps,{tuned}", "--part", 5, "--slots", SLOTS,
                "--out", run]  # fmt: skip
     assert rps(*command, "--shard", "1/2") == 0
     assert rps(*command, "--shard", "2/2") == 0
     assert rps("merge", run, "--out", run) == 0
     text = capsys.readouterr().out
-    assert "rps tuned against rps paper" in text
+    assert "rps,tuned against rps" in text
     results = files.read_results(run)
-    assert results.arm.values.tolist() == ["rps paper", "rps tuned"]
+    assert results.law.values.tolist() == ["rps", "rps,tuned"]
     assert rps("merge", run, "--out", tmp_path / "there") == 0
     for folder, name in product(("run", "there"), ("report.html", "report.md", "success.png")):
         assert (tmp_path / folder / name).exists()
@@ -382,7 +382,7 @@ def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys):
     error = refusal(capsys, "merge", run, "--out", other)
     assert "other holds another run (domain.objects = " in error
     assert not (other / "results.nc").exists()
-    assert rps("replay", run, 4, "--arm", "rps tuned") == 0
+    assert rps("replay", run, 4, "--law", "rps,tuned") == 0
     seen = files.read(run / "replay-4" / "results.nc")
     # Followed alone, in another batch than in the sweep.
     assert float(seen.outcome_time) == pytest.approx(float(results.time[1, 4]), abs=0.5)

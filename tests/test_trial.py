@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rps_jax import errors
-from rps_jax.control.law import RPSParams
+from rps_jax.control.laws.rps import RPSParams
 from rps_jax.engines.base import Driven
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import CapacitiveSkin
@@ -225,8 +225,9 @@ def test_before_the_first_touch_the_base_creeps_and_nothing_counts_as_lost(advan
     assert np.isinf(healthy.min_distance[0])
 
 
-def test_the_trace_of_a_trial_tells_the_same_story_as_its_outcome():
-    setting = replace(FUSED, rules=Rules(horizon=24.0))
+@pytest.mark.parametrize("engine", ["fused", "mujoco"])
+def test_the_trace_of_a_trial_tells_the_same_story_as_its_outcome(engine):
+    setting = replace(FUSED, engine=engine, rules=Rules(horizon=24.0))
     (trace,) = pushes.follow([case(skin=CapacitiveSkin())], setting, interval=0.1)
     seen, outcome = trace.snapshots, trace.outcome
     assert outcome.success
@@ -266,10 +267,10 @@ def test_a_case_that_means_nothing_is_refused(changes, field):
 @pytest.mark.parametrize(
     ("make", "field"),
     [
-        (lambda: Setting(rules=Rules(horizon=0.0)), "horizon"),
-        (lambda: Setting(rules=Rules(max_lost=float("nan"))), "max_lost"),
+        (lambda: Setting(rules=Rules(horizon=0.0), engine="mjx"), "horizon"),
+        (lambda: Setting(rules=Rules(max_lost=float("nan")), engine="mjx"), "max_lost"),
         (lambda: Setting(engine="ode"), "engine"),
-        (lambda: Setting(seed=-1), "seed"),
+        (lambda: Setting(seed=-1, engine="mjx"), "seed"),
     ],
 )
 def test_settings_that_mean_nothing_are_refused(make, field):

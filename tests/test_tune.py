@@ -1,27 +1,27 @@
 """Tuning: the bounded map, the objective, evolution, and runs that are continued."""
 
 import json
-import typing
 from typing import get_args
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import refusal
+from helpers import rps as command
 
-from rps_jax.app import cli
-from rps_jax.app.cli import tuning
-from rps_jax.control import law
-from rps_jax.control.law import BOUNDS, RPSParams
+from rps_jax.control.laws import rps
+from rps_jax.control.laws.rps import BOUNDS, RPSParams
 from rps_jax.errors import InputError
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Answer
-from rps_jax.runs.objective import Objective, Risk
-from rps_jax.trials.setting import Timing
+from rps_jax.runs.question import Run
+from rps_jax.trials.progress import Timing, unheard
+from rps_jax.trials.score import Objective
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome, Rules
-from rps_jax.tuning import descent, run
-from rps_jax.tuning.descent import Descent, Estimator
-from rps_jax.tuning.evolution import Algorithm, Evolution, Search
-from rps_jax.tuning.run import Course
+from rps_jax.tuning import run
+from rps_jax.tuning.descent import TuneGrad
+from rps_jax.tuning.evolution import Algorithm, TuneES
 from rps_jax.tuning.space import SUBSETS, Space
 
 FULL = Space(SUBSETS["full"])
@@ -51,7 +51,7 @@ class TestSpace:
         low = narrow.params(narrow.vector(paper._replace(l_cr=0.12)))
         written = narrow.named(narrow.vector(low))
         assert written == pytest.approx({"l_cr": 0.12, "l_mr": 0.12})
-        law.check(paper._replace(**written))
+        rps.check(paper._replace(**written))
         other = Space(("eta",), tuned)
         again = paper._replace(**other.named(other.vector(tuned)))
         np.testing.assert_allclose(again, tuned, rtol=1e-5)
@@ -145,7 +145,7 @@ def rosenbrock(x):
 
 def search(size=4, **options):
     """An evolution about the paper's parameters."""
-    one = Search(Evolution(**options), Space(SUBSETS["full"][:size]), Course())
+    one = TuneES("rps", tuned=SUBSETS["full"][:size], **options).tuner()
     one.begin()
     return one
 
@@ -158,7 +158,7 @@ class TestEvolution:
             candidates = one.propose()
             values = function(candidates)
             values[:bad] = np.nan
-            one.learn(candidates, {"values": values, "mean": one.mean, "validation": np.inf})
+            one.update(candidates, {"values": values, "mean": one.mean, "validation": np.inf})
             found.append(np.nanmin(values))
         return np.array(found)
 
@@ -177,12 +177,14 @@ class TestEvolution:
     def test_without_any_value_it_goes_on(self):
         assert np.isfinite(self.minimise(sphere, 3, bad=7, population=8)).all()
         one = search(population=8)
-        told = {"values": np.full(8, np.nan), "mean": one.mean, "validation": np.nan}
-        one.learn(one.propose(), told)
+        metrics = {"values": np.full(8, np.nan), "mean": one.mean, "validation": np.nan}
+        one.update(one.propose(), metrics)
         assert np.isfinite(one.propose()).all()
 
     def test_the_seed_makes_the_proposals(self):
-        one, same, other = (search(population=8, seed=seed).propose() for seed in (0, 0, 1))
+        one, same, other = (
+            search(population=8, setting=Setting(seed=seed)).propose() for seed in (0, 0, 1)
+        )
         np.testing.assert_array_equal(one, same)
         assert (one != other).all()
 
@@ -195,32 +197,24 @@ class TestEvolution:
     def test_a_stalled_search_begins_again_elsewhere_and_keeps_the_best(self):
         one = search(population=8, patience=2)
         for value in (1.0, 2.0, 3.0):
-            told = {"values": np.zeros(8), "mean": np.full(4, value), "validation": value}
-            one.learn(one.propose(), told)
+            metrics = {"values": np.zeros(8), "mean": np.full(4, value), "validation": value}
+            one.update(one.propose(), metrics)
         assert one.restarts == 1
         assert one.best.tolist() == [1.0] * 4
         assert np.abs(one.mean - one.base).max() > 0.3
 
     def test_bad_options_are_refused(self):
         with pytest.raises(InputError, match="choose from cma, lra_cma"):
-            Evolution(algorithm="CMA_ES")  # pyright: ignore[reportArgumentType]
+            TuneES("rps", algorithm="CMA_ES").checked()  # pyright: ignore[reportArgumentType]
         for bad in ({"population": 3}, {"spread": 0.0}, {"generations": 0}, {"prior": -1.0}):
-            with pytest.raises(InputError):
-                Evolution(**bad)
+            (name,) = bad
+            with pytest.raises(InputError, match=name):
+                TuneES("rps", **bad).checked()
 
     def test_algorithms_of_several_parameters_are_refused_for_one(self):
         with pytest.raises(InputError, match="for one parameter"):
             search(1, algorithm="xnes")
         assert np.isfinite(search(1, algorithm="cma").propose()).all()
-
-
-def test_the_command_line_lists_the_same_choices():
-    for kind, name, choices in (
-        (tuning.TuneES, "algorithm", Algorithm),
-        (tuning.TuneES, "risk", Risk),
-        (tuning.TuneGrad, "estimator", Estimator),
-    ):
-        assert typing.get_type_hints(kind)[name] == choices
 
 
 # --- runs ----------------------------------------------------------------------------------
@@ -236,24 +230,24 @@ def pretend(asks, domains, setting, objective, **_):
     return answers, Timing(0.0, 1.0, 1.0)
 
 
-SPACE, COURSE = Space(("L", "K_h")), Course(worlds=4, validation=4)
+SMALL = {"tuned": ("L", "K_h"), "worlds": 4, "validation": 4}
 
 
 def evolution(generations=6, **options):
-    return Search(Evolution(population=8, generations=generations, **options), SPACE, COURSE)
+    return TuneES("rps", population=8, generations=generations, **SMALL, **options).tuner()
 
 
-def descents(generations=6, **options):
+def descents(generations=6):
     """Antithetic steps, which need no more than what is pretended."""
-    own = Descent("evolution", steps=5, starts=2, pairs=3, **options)
-    tuner = descent.Search(own, SPACE, COURSE)
+    asked = TuneGrad("rps", estimator="evolution", steps=5, starts=2, pairs=3, **SMALL)
+    tuner = asked.tuner()
     tuner.generations = generations
     return tuner
 
 
 def tuned(folder, tuner):
-    run.open_run(folder, tuner)
-    return [float(x) for x in run.tune(folder, tuner)]
+    run.tune(folder, tuner)
+    return tuner.best.tolist()
 
 
 @pytest.fixture
@@ -309,7 +303,7 @@ class TestRuns:
 
     def test_generations_that_the_seed_does_not_propose_are_refused(self, tmp_path, pretended):
         tuned(tmp_path / "one", evolution(3))
-        tuned(tmp_path / "other", evolution(3, seed=1))
+        tuned(tmp_path / "other", evolution(3, setting=Setting(seed=1)))
         for path in (tmp_path / "one" / "parts").glob("000001*"):
             path.unlink()
         (foreign,) = (tmp_path / "other" / "parts").glob("000001*")
@@ -333,20 +327,29 @@ class TestRuns:
         assert found == {"L": pytest.approx(0.4, abs=0.03), "K_h": pytest.approx(0.6, abs=0.03)}
 
     def test_another_configuration_is_refused_with_the_difference(self, tmp_path, pretended):
-        tuned(tmp_path, evolution(1))
+        asked = SMALL | {"population": 8, "out": tmp_path}
+        first = TuneES("rps", **asked, generations=1)()
+        longer = TuneES("rps", **asked, generations=3)()  # of which the first is there
+        assert first.params.equals(longer.params[:1])
         with pytest.raises(InputError, match=r"spread = 0.5 there, 0.4 asked for"):
-            run.open_run(tmp_path, evolution(spread=0.4))
+            TuneES("rps", **asked, spread=0.4)()
         with pytest.raises(InputError, match="holds another run"):
-            run.open_run(tmp_path, descents())
+            TuneGrad("rps", **SMALL, estimator="evolution", out=tmp_path)()
+
+    def test_the_report_of_a_descent_tells_its_times_and_parameters(self, pretended):
+        asked = TuneGrad("rps", **SMALL, estimator="evolution", steps=2, starts=1, pairs=1)
+        (section,) = asked.report(asked(), Run(None, unheard))
+        assert "after" in section.text
+        assert "gradients 0.0 s with their compilation" in section.text
+        assert [name for name, *_ in section.table[1:]] == ["L", "K_h"]
 
 
 def test_the_command_line(tmp_path, capsys):
-    arguments = ["tune", "es", "--engine", "quasistatic", "--objects", "random_cylinder"]
-    arguments += ["--worlds", "2", "--validation", "2", "--population", "4", "--generations", "2"]
-    arguments += ["--horizon", "8", "--tuned", "L", "K_h", "--out", str(tmp_path / "run")]
-    assert cli.main([*arguments, "--slots", "6"]) == 0
+    asked = ["tune", "es", "--engine", "quasistatic", "--objects", "random_cylinder"]
+    asked += ["--worlds", 2, "--validation", 2, "--population", 4, "--generations", 2]
+    asked += ["--horizon", 8, "--tuned", "L", "K_h", "--slots", 6, "--out", tmp_path / "run"]
+    assert command(*asked) == 0
     assert set(json.loads((tmp_path / "run" / "tuned.json").read_text())) == {"L", "K_h"}
     assert (tmp_path / "run" / "tuning.png").stat().st_size > 10_000
-    assert "validation" in capsys.readouterr().out
-    assert cli.main([*arguments, "--seed", "1"]) == 2
-    assert "seed = 0 there, 1 asked for" in capsys.readouterr().err
+    assert "Validation: objective" in capsys.readouterr().out
+    assert "seed = 0 there, 1 asked for" in refusal(capsys, *asked, "--seed", 1)

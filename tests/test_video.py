@@ -11,11 +11,8 @@ import numpy as np
 import pytest
 
 from rps_jax import errors
-from rps_jax.analysis import video
-
-video.choose_gl()  # before anything imports MuJoCo
-
-from rps_jax.world import scene  # noqa: E402
+from rps_jax.analysis import studio, video
+from rps_jax.world import scene
 
 # imageio_ffmpeg's reader, used here alone, forks; JAX warns that its threads might then lock.
 pytestmark = pytest.mark.filterwarnings("ignore:os.fork")
@@ -204,5 +201,14 @@ def test_importing_the_module_changes_nothing() -> None:
 
 def test_a_choice_of_gl_already_made_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    video.choose_gl()
+    studio.choose_gl.__wrapped__()
     assert os.environ["MUJOCO_GL"] == "osmesa"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere MuJoCo needs no choice of GL")
+def test_without_a_display_it_can_draw_where_mujoco_was_imported_before() -> None:
+    code = "import mujoco; from rps_jax.analysis import video; print(video.check()[0].ok)"
+    environment = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY")}
+    command = [sys.executable, "-c", code]
+    told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert told.stdout == "True\n"

@@ -1,6 +1,9 @@
 """A push in the browser: the trial that can be disturbed, and the page as Chromium shows it."""
 
+import contextlib
+import http.client
 import io
+import json
 import math
 import os
 import shutil
@@ -8,16 +11,22 @@ import socket
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
+import viser
 from helpers import SHORT, case, refusal
 from PIL import Image
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
-from rps_jax.app import viewer
+from rps_jax.app import gate, viewer
+from rps_jax.control import learned
 from rps_jax.errors import InputError
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
@@ -50,6 +59,44 @@ def p_robot_object(seen):
     """Where the object is (2,) [m], in the robot's frame."""
     c, s = math.cos(seen.qpos[2]), math.sin(seen.qpos[2])
     return np.array([[c, s], [-s, c]]) @ (seen.qpos[3:5] - seen.qpos[:2])
+
+
+OWN = """
+from typing import NamedTuple
+
+import rps_jax
+from rps_jax import Details, Law, Twist
+
+
+class Ahead(NamedTuple):
+    v: float = 0.03
+    d_success: float = 0.05
+
+
+def step(params, memory, seen):
+    return memory, Twist(params.v, 0.0, 0.0), Details.of(seen)
+
+
+rps_jax.register_law("ahead", Law(lambda params: (), step), Ahead())
+"""
+
+
+@pytest.mark.parametrize(
+    "law", ["rps,K_h=0.3", "rps,tuned.json", "mine.py:Ahead,v=0.04", "policy.npz"]
+)
+def test_every_kind_of_law_is_shown_live(law, tmp_path, monkeypatch, registries):
+    """As the page asks for it: by name with changes, tuned, of a file of one's own, and learned."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tuned.json").write_text(json.dumps({"L": 0.3}))
+    (tmp_path / "mine.py").write_text(OWN)
+    shutil.copy(Path(learned.__file__).parent / "learned_mlp.npz", tmp_path / "policy.npz")
+    asked = viewer.Asked("cylinder", "S1", law, (0.6, 0.0))
+    shown = viewer.View(law=law, setting=replace(SETTING, engine="quasistatic"))
+    shown.checked()
+    push = shown.push_of(asked)
+    push.live.step(25)
+    assert law in push.title
+    assert push.live.past[-1].seen.qpos[0] > 0.002  # [m] it drives
 
 
 # --- the trial -----------------------------------------------------------------------------
@@ -159,7 +206,7 @@ def make(asked):
     friction = scene.FRICTION.get(asked.friction)
     if friction is None:
         raise InputError(f"unknown friction set '{asked.friction}': choose from S1, S2.")
-    case = Case(asked.object, friction, asked.p_world_target)
+    case = Case(asked.object, friction, asked.target)
     long = replace(SETTING, rules=Rules())
     return viewer.Push(Live.of_case(case, long), pushes.scene_of(case, long.physics), "A drum")
 
@@ -229,6 +276,101 @@ def test_the_page_plays_a_push_and_says_what_is_wrong(page, browser):
     until(lambda: "unknown friction set 'S3': choose from S1, S2." in text())
 
 
+# --- who is let in -------------------------------------------------------------------------
+
+
+def connected(page, **options):
+    """A websocket to the page, as its own script opens it unless something else is said."""
+    address = f"127.0.0.1:{page._server.get_port()}"
+    usual = {"origin": f"http://{address}", "subprotocols": [f"viser-v{viser.__version__}"]}
+    return connect(f"ws://{address}", **usual | options)
+
+
+def said(page, *messages):
+    """Send messages to the page, and wait until it has looked at them."""
+    with connected(page) as socket_:
+        for message in (CAMERA, *messages):
+            raw = message if isinstance(message, bytes | str) else msgspec.msgpack.encode(message)
+            socket_.send(raw)
+        before = page._size.value
+        after = 0.3 if before != 0.3 else 0.2
+        socket_.send(msgspec.msgpack.encode(value(page._size, after)))
+        deadline = time.monotonic() + 10
+        while page._size.value != after and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert page._size.value == after  # the connection is still good
+
+
+def value(control, new):
+    return {"type": "GuiUpdateMessage", "uuid": control._impl.uuid, "updates": {"value": new}}
+
+
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": [1.0, 0.0, 0.0, 0.0], "position": [0.0, 0.0, 1.0],
+    "fov": 1.0, "near": 0.1, "far": 100.0, "image_height": 100, "image_width": 100,
+    "look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 0.0, 1.0],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("origin", ["https://evil.example", "http://127.0.0.1:1", "null", None])
+def test_no_other_page_can_drive_it(page, origin):
+    with pytest.raises(InvalidStatus, match="403"):
+        connected(page, origin=origin)
+    connected(page).close()
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [("{}", 200), ("localhost:{1}", 200), ("rebound.example", 403), ("10.0.0.1:{1}", 403)],
+)
+def test_it_is_served_under_names_of_this_machine_alone(page, host, status):
+    """A name of another site that was pointed here (DNS rebinding) is not one."""
+    port = page._server.get_port()
+    line = http.client.HTTPConnection("127.0.0.1", port)
+    line.request("GET", "/", headers={"Host": host.format(f"127.0.0.1:{port}", port)})
+    assert line.getresponse().status == status
+
+
+def test_only_what_the_controls_offer_comes_through(page, capfd):
+    before = page.asked
+    infinite, huge = float("inf"), 1e300
+    said(
+        page,
+        value(page._law, "/some/path/evil.py:P"),
+        value(page._law, ["rps"]),
+        value(page._object, "crate"),
+        value(page._time, infinite),
+        value(page._speed, 1e6),
+        value(page._target, [infinite, 0.0]),
+        value(page._target, [0.0]),
+        value(page._friction, "1" * 10_000),
+        {"type": "GuiUpdateMessage", "uuid": page._speed._impl.uuid, "updates": {"removed": True}},
+        {"type": "GuiUpdateMessage", "uuid": "nobody", "updates": {"value": 1}},
+        CAMERA | {"fov": infinite},
+        CAMERA | {"position": [huge, 0, 0]},
+        CAMERA | {"position": [0]},
+        {"type": "ShareUrlRequest"},
+        {"type": "TransformControlsUpdateMessage", "name": "/push/target", "wxyz": [1, 0, 0, 0],
+         "position": [infinite, 0, 0]},
+        {"type": "Nothing"},
+        b"\xc1", b"", "a text", b"\x91" * 100_000,
+    )  # fmt: skip
+    assert page.asked == before
+    assert page._time.value == 0.0
+    assert page._speed.value == 5.0
+    assert page._server._share_tunnel is None
+    error = capfd.readouterr().err
+    assert error == "rps view: a message that the page does not send was dropped.\n"
+    said(page, value(page._law, "nps"), value(page._target, [1.0, 2.0]))
+    assert page.asked == before._replace(law="nps", target=(1.0, 2.0))
+
+
+def test_a_viser_that_is_not_guarded_is_not_served(monkeypatch):
+    monkeypatch.setattr(gate.Gate, "guarding", lambda self: contextlib.nullcontext())
+    with pytest.raises(InputError, match="cannot be kept to its own page"):
+        viewer.open_page("127.0.0.1", 0, ASKED, make)
+
+
 def test_a_port_that_is_taken_is_one_sentence(capsys):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
@@ -238,4 +380,4 @@ def test_a_port_that_is_taken_is_one_sentence(capsys):
 
 def test_without_viser_the_command_says_how_to_install_it(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert "viser is not installed: run pip install '.[viz]'." in refusal(capsys, "view")
+    assert "viser is not installed: run pip install 'rps_jax[viz]'." in refusal(capsys, "view")

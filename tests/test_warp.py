@@ -15,7 +15,7 @@ WANTED = [
     ("hardware",),
     ("sweep", "--domain", "paper"),
     ("tune", "es"),
-    ("tune", "compare", "--domain", "paper"),
+    ("compare", "--domain", "paper"),
 ]
 
 
@@ -38,7 +38,7 @@ def test_without_warp_lang_the_extra_is_named(monkeypatch):
     monkeypatch.setattr(mjx.warp, "WARP_INSTALLED", True)
     engines.get("warp").check(["box", "cylinder"])
     monkeypatch.setattr(mjx.warp, "WARP_INSTALLED", False)
-    with pytest.raises(InputError, match=r"\(no warp-lang\): pip install '\.\[cuda,warp\]'"):
+    with pytest.raises(InputError, match=r"\(no warp-lang\): pip install 'rps_jax\[cuda,warp\]'"):
         engines.get("warp").check()
 
 

@@ -17,7 +17,8 @@ import pytest
 from test_fused import FINE, STARTS, TWIST, in_c, start
 
 from rps_jax import engines
-from rps_jax.control.law import RPSParams, Twist
+from rps_jax.control.laws.rps import RPSParams
+from rps_jax.control.observation import Twist
 from rps_jax.engines import mjx as mjx_engine
 from rps_jax.engines import warp
 from rps_jax.engines.base import Driven, Motion
@@ -32,7 +33,7 @@ from rps_jax.world.objects import FAMILIES
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import FRICTION
 
-SHORT = Setting(FINE, Rules(horizon=0.1), engine="warp")
+SHORT = Setting(physics=FINE, rules=Rules(horizon=0.1), engine="warp")
 
 
 @pytest.fixture(scope="module", autouse=True)

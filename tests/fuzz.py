@@ -1,0 +1,783 @@
+"""Faults of many classes, thrown at the command line as a stranger or an enemy would.
+
+    python tests/fuzz.py                  # every class, as many cases as the published table has
+    python tests/fuzz.py values --most 500
+
+Nothing may end in a traceback, hang for more than 10 s, or give a wrong result.
+`tests/test_faults.py` runs a share of the cases in the suite.
+"""
+
+from __future__ import annotations
+
+import argparse
+import atexit
+import contextlib
+import dataclasses
+import functools
+import io
+import itertools
+import json
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+PATIENCE = 10.0  # [s] after which a command hangs
+
+
+class Case(NamedTuple):
+    """One fault: arguments of a command in a folder that was prepared."""
+
+    what: str
+    arguments: tuple[str, ...]
+
+
+class Found(NamedTuple):
+    """How a command took a fault."""
+
+    how: str  # refused, accepted, told, traceback, hang
+    text: str
+
+
+class Accepted(BaseException):
+    """The input was taken for good: worlds would be stepped now."""
+
+
+class Hang(BaseException):
+    """It took too long."""
+
+
+@contextlib.contextmanager
+def never_stepping() -> Iterator[None]:
+    """Commands stop where the first world would be stepped or the first program be compiled."""
+    from rps_jax.app import film
+    from rps_jax.trials import trial
+    from rps_jax.tuning import rollout
+
+    def stop(*_: Any, **__: Any) -> None:
+        raise Accepted
+
+    starts = ((trial, "start_all"), (rollout, "begin"), (film, "shoot"))
+    before = [(module, name, getattr(module, name)) for module, name in starts]
+    for module, name, _ in before:
+        setattr(module, name, stop)
+    try:
+        yield
+    finally:
+        for module, name, function in before:
+            setattr(module, name, function)
+
+
+def attempt(arguments: Sequence[str], patience: float = PATIENCE) -> Found:
+    """Run a command in this process."""
+    from rps_jax.app import cli
+
+    began, busy = time.monotonic(), time.process_time()
+
+    def late(*_: Any) -> None:
+        # On a crowded machine this process has had but a share of the time.
+        if time.process_time() - busy < patience and time.monotonic() - began < 4 * patience:
+            signal.setitimer(signal.ITIMER_REAL, patience / 2)
+            return
+        raise Hang
+
+    out, err = io.StringIO(), io.StringIO()
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, patience)
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            code = cli.main(list(arguments))
+    except SystemExit as end:
+        code = end.code
+    except Accepted:
+        return Found("accepted", "")
+    except Hang:
+        return Found("hang", "".join(traceback.format_exc().splitlines(True)[-8:]))
+    except BaseException:
+        return Found("traceback", traceback.format_exc())
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    if "Traceback (most recent call last)" in err.getvalue():
+        return Found("traceback", err.getvalue())
+    if code == 2:
+        return Found("refused" if _one_sentence(err.getvalue()) else "wordy", err.getvalue())
+    return Found("told", f"{code} {out.getvalue()[-300:]}{err.getvalue()[-300:]}")
+
+
+def _one_sentence(text: str) -> bool:
+    """One sentence of ours."""
+    last = [line for line in text.splitlines() if line.startswith("rps: error: ")]
+    return len(last) == 1 and text.rstrip().endswith(".") and len(last[0]) < 2000
+
+
+# --- bad values of options -----------------------------------------------------------------
+
+VALUES = (
+    *("", " ", "nan", "-nan", "inf", "-inf", "1e400", "-1e400", "1e-320", "-1", "0", "-0", "0.5"),
+    *("1e9", "1e308", "9" * 60, "-" + "9" * 60, "9" * 5000, "0x10", "1_000", "\u0661", "\u00b2"),
+    *("None", "null", "true", "[]", "{}", "()", "[[[[", "{]", "a=b", "=", "L=", "=1", "L=nan"),
+    *("L=1e400", "mass=3", "mass=3,nan", "mass=9,3", "mass=,", "1/0", "0/1", "2/1", "-1/3", "a/b"),
+    *("1/" + "9" * 60, "S1,S2", "0.3,0.3,0.3", "0,0", "nan,nan", "rps", "rps,rps", "RPS", "aps "),
+    *("nowhere.json", "nowhere.py:P", "nowhere.npz", ".json", ".py:", ".npz", ":", "..", "/", "."),
+    *("/dev/null", "/dev/zero", "/dev/zero.json", "/proc/self/mem", "/etc/passwd", "~", "$HOME"),
+    *(
+        "list.json",
+        "null.json",
+        "deep.json",
+        "text.json",
+        "binary.json",
+        "empty.json",
+        "number.json",
+    ),
+    *("big.json", "pipe.json", "pipe.npz", "pipe.py:P", "folder.json", "pipe", "folder.npz"),
+    *("broken.py:P", "syntax.py:P", "text.npz", "encrypted.npz", "zip.npz", "exit.py:P"),
+    *(
+        "\N{SNOWMAN}",
+        "\N{PILE OF POO}" * 40,
+        "\u202eabc",
+        "\x1b[31m",
+        "a\nb",
+        "x" * 4000,
+        "-",
+        "--",
+    ),
+    *(
+        "a b",
+        "'",
+        '"',
+        "\\",
+        "%s",
+        "{0}",
+        "`id`",
+        ";ls",
+        "&&",
+        "*",
+        "?",
+        "\t",
+        "--help",
+        "-1.5",
+        "+5",
+    ),
+)
+
+
+def furnish(folder: Path) -> None:
+    """Files that values name."""
+    (folder / "list.json").write_text("[1, 2]")
+    (folder / "null.json").write_text("null")
+    (folder / "number.json").write_text("7")
+    (folder / "deep.json").write_text("[" * 100_000)
+    (folder / "text.json").write_text("a note")
+    (folder / "binary.json").write_bytes(bytes(range(256)))
+    (folder / "empty.json").write_text("")
+    (folder / "big.json").write_text('{"a": ' + "9" * 10_000 + "}")
+    (folder / "broken.py").write_text("raise RuntimeError('broken')\n")
+    (folder / "syntax.py").write_text("def :\n")
+    (folder / "exit.py").write_text("import sys\nsys.exit(3)\n")
+    (folder / "text.npz").write_text("a note")
+    (folder / "zip.npz").write_bytes(b"PK\x05\x06" + bytes(18))
+    (folder / "encrypted.npz").write_bytes(encrypted())
+    for name in ("pipe", "pipe.json", "pipe.npz", "pipe.py"):
+        os.mkfifo(folder / name)
+    for name in ("folder.json", "folder.npz"):
+        (folder / name).mkdir()
+    small_run(folder / "run")
+
+
+def small_run(folder: Path, **changes: Any) -> None:
+    """A run folder of a sweep of few short trials."""
+    import rps_jax
+
+    drums = rps_jax.Domain(("random_cylinder",))
+    laws = {"rps": rps_jax.RPSParams.paper(), "rps tuned": rps_jax.RPSParams.tuned()}
+    setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
+    options = {"worlds": 12, "setting": setting, "out": folder, "part": 4, "progress": False}
+    rps_jax.sweep(laws, drums, **options | changes)
+
+
+def encrypted() -> bytes:
+    """An archive whose only member claims to be encrypted."""
+    import zipfile
+
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        archive.writestr("about.npy", b"secret")
+    raw = bytearray(content.getvalue())
+    for sign, at in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        raw[raw.index(sign) + at] |= 1
+    return bytes(raw)
+
+
+def commands() -> list[tuple[str, ...]]:
+    """Every command, as words."""
+    from rps_jax.app.cli import names
+
+    return [tuple(name.split()) for name in names.known()]
+
+
+def options(command: Sequence[str]) -> list[str]:
+    """Options of a command, without those that are no flags."""
+    from rps_jax.app.cli import flags, names
+    from rps_jax.record import options
+
+    kind = names.question_of(" ".join(command))
+    places = [one.name for one in dataclasses.fields(kind) if options.is_positional(one)]
+    every = [name for name, *_ in flags._flat(kind)[0]]
+    return [f"--{name.replace('_', '-')}" for name in every if name not in places]
+
+
+def values(seed: int = 0) -> Iterator[Case]:
+    """Every option of every command with every value, in an order by chance."""
+    every = [
+        Case(f"{' '.join(command)} {option} {value[:30]!r}", (*command, *needs, option, value))
+        for command in commands()
+        for option in options(command)
+        for needs in (NEEDS.get(command[0], ()),)
+        for value in VALUES
+        if not (option == "--out" and value in ("/", "..", "~"))  # which may be written
+    ]
+    random.Random(seed).shuffle(every)
+    yield from every
+
+
+# What a command needs beside the option that is tried.
+NEEDS = {
+    "replay": ("run", "0"),
+    "film": ("run",),
+    "gallery": ("run",),
+    "ceiling": ("run",),
+    "merge": ("run", "--out", "merged"),
+}
+
+
+# --- laws of one's own that are wrong ---------------------------------------------------------
+
+LAW = """
+import math, sys
+from functools import partial
+from typing import NamedTuple
+import jax, jax.numpy as jnp, numpy as np
+import rps_jax
+from rps_jax import Details, Twist
+{head}
+class {P}(NamedTuple):
+    v: float = 0.05
+    {field}
+    d_success: float = 0.05
+{before}
+def init({takes_init}):
+    {starts}
+    return {memory}
+def step({takes}):
+    here = seen.p_world_robot
+    {body}
+    return {returns}
+{register}
+"""
+USUAL = {
+    "head": "", "field": "", "before": "", "takes_init": "params", "starts": "pass",
+    "memory": "jnp.zeros(2)", "takes": "params, memory, seen", "body": "pass",
+    "returns": "memory, Twist(params.v, 0.0, 0.0), Details.of(seen)",
+    "register": "rps_jax.register_law('{name}', rps_jax.Law(init, step), {P}())",
+}  # fmt: skip
+TWIST = "memory, {}, Details.of(seen)"
+_WRONG: dict[str, Sequence[str]] = {
+    "returns": (
+        *("None", "'text'", "memory", "(memory, Twist(0.0, 0.0, 0.0))", "1.0", "{}", "[]", "()"),
+        *("memory, Twist(0.0, 0.0, 0.0), Details.of(seen), 1", "iter(())", "Twist(0.0, 0.0, 0.0)"),
+        *("memory, Twist(0.0, 0.0, 0.0), None", "memory, Twist(0.0, 0.0, 0.0), 'details'"),
+        *("memory, Twist(0.0, 0.0, 0.0), Details(0, 0, 0, 0, here)", "object()", "step", "seen"),
+        "memory, Twist(0.0, 0.0, 0.0), Details(None, None, None, None, None)",
+        "[memory, Twist(0.0, 0.0, 0.0), Details.of(seen)]",
+        "{'memory': memory}",
+        *map(TWIST.format, ("None", "'left'", "(0.0, 0.0)", "here", "0.0", "[0, 0, 0]", "{}")),
+        *map(TWIST.format, ("Twist(here, 0.0, 0.0)", "Twist('a', 0.0, 0.0)", "Twist(None, 0, 0)")),
+        *map(TWIST.format, ("Twist(1j, 0.0, 0.0)", "Twist(seen.in_contact, 0, 0)", "Twist")),
+        *map(TWIST.format, ("Twist(0.0, 0.0, jnp.zeros(1))", "jnp.zeros(3)", "seen")),
+        "jnp.concatenate([memory, here]), Twist(0.0, 0.0, 0.0), Details.of(seen)",
+        "memory[0], Twist(0.0, 0.0, 0.0), Details.of(seen)",
+        "None, Twist(0.0, 0.0, 0.0), Details.of(seen)",
+        "(memory, memory), Twist(0.0, 0.0, 0.0), Details.of(seen)",
+        "'memory', Twist(0.0, 0.0, 0.0), Details.of(seen)",
+        "memory > 0, Twist(0.0, 0.0, 0.0), Details.of(seen)",
+        "memory * 1j, Twist(0.0, 0.0, 0.0), Details.of(seen)",
+        "{'x': memory}, Twist(0.0, 0.0, 0.0), Details.of(seen)",
+        "memory.astype(int), Twist(0.0, 0.0, 0.0), Details.of(seen)",
+    ),
+    "body": (
+        *("if seen.in_contact: pass", "while seen.yaw > 0: pass", "float(seen.yaw)", "1 / 0"),
+        *("int(seen.yaw)", "bool(seen.in_contact)", "np.sin(seen.yaw)", "math.sin(seen.yaw)"),
+        *("np.asarray(here)", "seen.yaw.item()", "range(seen.yaw)", "here.tolist()", "here[9.0]"),
+        *("for i in range(seen.yaw): pass", "jnp.arange(seen.yaw)", "[1, 2][seen.yaw]", "nothing"),
+        *("seen.nothing", "params.nothing", "memory['a']", "memory.nothing", "raise ValueError"),
+        *("raise RuntimeError('a\\nb')", "assert False", "assert seen.in_contact", "step()"),
+        *("step(params, memory, seen)", "import nothing", "open('/nowhere')", "sys.exit(3)"),
+        *("here[0] = 1.0", "here + jnp.zeros(3)", "jnp.reshape(here, 5)", "here @ jnp.zeros(5)"),
+        *("here[seen.in_contact]", "jnp.zeros(seen.yaw)", "jax.lax.cond(here, None, None)"),
+        *("min(here)", "max(seen.yaw, 0.0)", "seen.in_contact and seen.yaw", "not seen.in_contact"),
+        *("sorted(here)", "sum(here, 'a')", "here.astype('nothing')", "jnp.linalg.inv(here)"),
+        *("jax.lax.scan(lambda c, x: (c, c, x), 0, here)", "jax.grad(lambda x: here)(1.0)"),
+        *(
+            "raise KeyboardInterrupt2",
+            "np.random.default_rng(seen.yaw)",
+            "jax.random.key(seen.yaw)",
+        ),
+        *("params.v = 3", "seen.yaw = 3", "(lambda: 1)(2)", "jnp.where(1, 2)", "f'{seen.yaw:.2f}'"),
+        *("print(float(seen.yaw))", "here.at[9].nothing(1)", "jnp.concatenate([here, seen.yaw])"),
+    ),
+    "starts": (
+        *("raise ValueError('no')", "1 / 0", "params.nothing", "if params.v > 0: pass", "nothing"),
+        *(
+            "float(params.v)",
+            "np.sin(params.v)",
+            "sys.exit(3)",
+            "assert False",
+            "jnp.zeros(params.v)",
+        ),
+    ),
+    "memory": (
+        *(
+            "'text'",
+            "object()",
+            "[1, 'a']",
+            "step",
+            "jnp.zeros",
+            "{'a': 'b'}",
+            "np.array([1, 'a'])",
+        ),
+        *("0", "np.zeros(2, int)", "[jnp.zeros(2)]", "None", "np.array([None])", "1j", "b'bytes'"),
+    ),
+    "field": (
+        *("gain: float = None", "gain: float = 1j", "gain: str = 'high'", "gain: list = [1, 'a']"),
+        *("gain: float = float('nan')", "gain: float = float('inf')", "gain: object = object()"),
+        *(
+            "gain: object = np.array([1, None])",
+            "gain: list = [[1, 2], [None]]",
+            "gain: object = len",
+        ),
+        *(
+            "gain: object = np.array(['a'])",
+            "gain: object = jnp.array([jnp.nan])",
+            "gain: bytes = b''",
+        ),
+    ),
+    "takes": ("", "params", "params, memory", "params, memory, seen, more", "*, params", "**seen"),
+    "takes_init": ("", "params, more", "*, params"),
+    "head": ("def :", "raise RuntimeError('head')", "import nothing", "sys.exit(3)", "1 / 0", "P"),
+    "register": (
+        *("", "rps_jax.register_law('{name}', rps_jax.Law(init, step), None)"),
+        "rps_jax.register_law('{name}', rps_jax.Law(init, step), 3.0)",
+        "rps_jax.register_law('{name}', rps_jax.Law(init, step), [1.0])",
+        "rps_jax.register_law('{name}', rps_jax.Law(init, step), {P})",
+        "rps_jax.register_law('{name}', None, {P}())",
+        "rps_jax.register_law('{name}', rps_jax.Law(None, None), {P}())",
+        "rps_jax.register_law('{name}', rps_jax.Law(init, 'step'), {P}())",
+        "rps_jax.register_law('{name}', rps_jax.Law(init, step, 'smell'), {P}())",
+        "rps_jax.register_law('{name}', rps_jax.Law(init, step, check=1), {P}())",
+        "rps_jax.register_law('{name}', rps_jax.Law(init, step, check=init), {P}())",
+        "rps_jax.register_law('rps', rps_jax.Law(init, step), {P}())",
+        "rps_jax.register_law(3, rps_jax.Law(init, step), {P}())",
+        "rps_jax.register_law('{name}', rps_jax.Law(init, step), rps_jax.RPSParams())",
+        "rps_jax.register_law('{name}')",
+        "{P}.d_success = None\nrps_jax.register_law('{name}', rps_jax.Law(init, step), {P}())",
+    ),
+}
+# Of these, what is a law all the same.
+_RIGHT = {
+    *(f"memory: {what}" for what in ("0", "1j", "None", "[jnp.zeros(2)]", "np.zeros(2, int)")),
+    "body: jax.random.key(seen.yaw)",
+    "register: rps_jax.register_law('{name}', rps_jax.Law(init, step, check=init), {P}())",
+}
+
+
+def wrong_laws() -> Iterator[tuple[str, str]]:
+    """What is wrong, and the file of the law."""
+    for number, (where, what) in enumerate((k, v) for k, vs in _WRONG.items() for v in vs):
+        parts = {k: v.replace("{name}", f"wrong_{number}") for k, v in USUAL.items()}
+        parts[where] = what.replace("{name}", f"wrong_{number}")
+        text = LAW
+        for key, part in parts.items():
+            text = text.replace(f"{{{key}}}", part)
+        yield f"{where}: {what}", text.replace("{P}", f"P{number}")
+
+
+def run_laws(most: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
+    """Wrong laws, each in a sweep that stops where worlds would be stepped."""
+    counts: Counter[str] = Counter()
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), never_stepping():
+        for number, (what, text) in enumerate(itertools.islice(wrong_laws(), most)):
+            file = Path(f"law_{number}.py")
+            file.write_text(text)
+            found = attempt(("sweep", "--laws", f"{file}:P{number}", "--worlds", "8"))
+            how = "right" if found.how == "accepted" and what in _RIGHT else found.how
+            counts[how] += 1
+            if how not in ("refused", "right") or LOUD:
+                tell(f"{how}: {what}\n{found.text[-1500:]}")
+            shutil.rmtree("runs", ignore_errors=True)
+    return counts
+
+
+LOUD = False
+
+
+# --- run folders that somebody edited or damaged ---------------------------------------------
+
+ODD: tuple[Any, ...] = (
+    *(None, True, -1, 0, 1.5, 10**30, float("inf"), float("nan"), "", "text", "1", [], {}, [[]]),
+    *([None], ["a", "b"], [1, 2, 3], {"a": 1}, "x" * 1000, [[[[[[[[0]]]]]]]]),
+)
+
+
+class Edit(NamedTuple):
+    """A change of one file of a run folder, consistent with its checksum unless it is damage."""
+
+    what: str
+    file: str
+    make: Callable[[Path], None]
+
+
+def places(tree: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Where in a JSON value something stands."""
+    inner = tree.items() if isinstance(tree, dict) else enumerate(tree)
+    for key, value in inner:
+        yield (*at, key)
+        if isinstance(value, dict | list) and len(at) < 5:
+            yield from places(value, (*at, key))
+
+
+def _changed(tree: Any, at: tuple[Any, ...], value: Any) -> Any:
+    """A JSON value with something else at a place; with `...` nothing stands there any more."""
+    tree = json.loads(json.dumps(tree))
+    one = tree
+    for key in at[:-1]:
+        one = one[key]
+    if value is ...:
+        del one[at[-1]]
+    else:
+        one[at[-1]] = value
+    return tree
+
+
+def _sign(path: Path) -> None:
+    """Make the checksum that of the content."""
+    import hashlib
+
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    beside = path.with_name(f"{path.name}.sha256")
+    if beside.exists():
+        beside.write_text(f"{digest}  {path.name}\n")
+    if path.parent.name == "parts":
+        name = path.stem.rpartition("-")[0]
+        path.rename(path.with_name(f"{name}-{digest[:16]}{path.suffix}"))
+
+
+def json_edits(path: Path, rng: random.Random, most: int) -> Iterator[Edit]:
+    """Other values at places of a JSON file."""
+    tree = json.loads(path.read_text())
+    every = [(at, value) for at in places(tree) for value in (*ODD, ...)]
+    for at, value in rng.sample(every, min(most, len(every))):
+
+        def make(file: Path, at: tuple[Any, ...] = at, value: Any = value) -> None:
+            file.write_text(json.dumps(_changed(tree, at, value)))
+            _sign(file)
+
+        where = ".".join(map(str, at))
+        yield Edit(f"{where} = {'nothing' if value is ... else repr(value)[:40]}", path.name, make)
+    for value in (None, [], 7, "text", [{}]):
+
+        def whole(file: Path, value: Any = value) -> None:
+            file.write_text(json.dumps(value))
+            _sign(file)
+
+        yield Edit(f"the whole = {value!r}", path.name, whole)
+
+
+def dataset_edits(path: Path, rng: random.Random, most: int) -> Iterator[Edit]:
+    """Other variables, shapes, types and units of a NetCDF file."""
+    import numpy as np
+    import xarray as xr
+
+    with xr.open_dataset(path, engine="h5netcdf") as lazy:
+        found = lazy.load()
+
+    def column(name: str, values: Any, dims: Any = None, **attrs: Any) -> Any:
+        old = found[name]
+        new = (dims or old.dims, values, old.attrs | attrs)
+        return found.drop_vars(name).assign({name: new})
+
+    changes: list[tuple[str, Callable[[], Any]]] = []
+    for name in map(str, found.variables):
+        one = found[name]
+
+        def change(what: str, make: Callable[[Any, str], Any], name: str = name) -> None:
+            changes.append((f"{name}: {what}", lambda: make(found[name], name)))
+
+        change("is missing", lambda one, name: found.drop_vars(name))
+        change("other units", lambda one, name: column(name, one.values, units="furlong"))
+        change("units are a number", lambda one, name: column(name, one.values, units=7))
+        change("texts", lambda one, name: column(name, one.values.astype(str)))
+        change("bytes", lambda one, name: column(name, one.values.astype("S8")))
+        change("another name", lambda one, name: found.rename({name: f"{name}_"}))
+        if one.dtype.kind in "fiu":
+            change("NaN", lambda one, name: column(name, np.full(one.shape, np.nan)))
+            change("huge", lambda one, name: column(name, np.full(one.shape, 1e300)))
+            change("a number", lambda one, name: column(name, 1.0, ()))
+            change("64 bits", lambda one, name: column(name, one.values.astype(complex).real))
+            change("complex", lambda one, name: column(name, one.values.astype(complex)))
+        if one.ndim:
+            change("one row less", lambda one, name: found.isel({one.dims[-1]: slice(1, None)}))
+            change(
+                "another axis",
+                lambda one, name: column(name, one.values[None], ("more", *one.dims)),
+            )
+            change(
+                "twice",
+                lambda one, name: column(
+                    name, np.concatenate([one.values, one.values]), ("more", *one.dims[1:])
+                ),
+            )
+    changes.append(("nothing in it", lambda: xr.Dataset()))
+    changes.append(("another dataset", lambda: xr.Dataset({"a": ("b", [1, 2])})))
+    for what, make in rng.sample(changes, min(most, len(changes))):
+
+        def write(file: Path, make: Callable[[], Any] = make) -> None:
+            try:
+                edited = make()
+                for one in edited.variables.values():
+                    one.encoding = {}
+                content = bytes(edited.to_netcdf(engine="h5netcdf", invalid_netcdf=True))
+            except Exception:  # xarray cannot write such a thing
+                content = b"not written"
+            file.write_bytes(content)
+            _sign(file)
+
+        yield Edit(what, path.name, write)
+
+
+def archive_edits(path: Path, rng: random.Random, most: int) -> Iterator[Edit]:
+    """Other arrays of a NumPy archive."""
+    import numpy as np
+
+    with np.load(path, allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    changes: list[tuple[str, dict[str, Any]]] = []
+    for name, one in arrays.items():
+        less = {k: v for k, v in arrays.items() if k != name}
+        changes += [
+            (f"{name} is missing", less),
+            (f"{name}: texts", arrays | {name: one.astype(str)}),
+            (f"{name}: flat", arrays | {name: one.ravel()[:1]}),
+            (f"{name}: another axis", arrays | {name: one[None]}),
+            (f"{name}: pickles", arrays | {name: np.array([{"a": 1}], object)}),
+            (f"{name}: structured", arrays | {name: np.zeros(2, "i4,f4")}),
+        ]
+        if one.dtype.kind in "fiu":
+            changes += [
+                (f"{name}: NaN", arrays | {name: np.full(one.shape, np.nan)}),
+                (f"{name}: other bits", arrays | {name: one.astype(np.float16)}),
+            ]
+        if one.dtype.kind == "U":
+            try:
+                tree = json.loads(str(one))
+            except ValueError:
+                continue
+            every = [(at, value) for at in places(tree) for value in (*ODD, ...)]
+            for at, value in rng.sample(every, min(40, len(every))):
+                told = json.dumps(_changed(tree, at, value))
+                changes.append((f"{name}.{at} = {value!r}"[:80], arrays | {name: np.array(told)}))
+    for what, content in rng.sample(changes, min(most, len(changes))):
+
+        def write(file: Path, content: dict[str, Any] = content) -> None:
+            np.savez(file, **content)
+            _sign(file)
+
+        yield Edit(what, path.name, write)
+
+
+def discard(*_: Any) -> None:
+    """What several actions return, for a lambda."""
+
+
+def damages(path: Path, rng: random.Random, most: int) -> Iterator[Edit]:
+    """Bytes that changed, and things that are no files."""
+    content = path.read_bytes()
+
+    def bytes_(what: str, new: bytes) -> Edit:
+        return Edit(what, path.name, lambda file: discard(file.write_bytes(new)))
+
+    def instead(what: str, make: Callable[[Path], Any]) -> Edit:
+        return Edit(what, path.name, lambda file: discard(file.unlink(), make(file)))
+
+    at = rng.randrange(max(1, len(content)))
+    flipped = content[:at] + bytes([content[at] ^ 1 << rng.randrange(8)]) + content[at + 1 :]
+    every = [
+        bytes_("empty", b""), bytes_(f"cut at {at}", content[:at]), bytes_("twice", content * 2),
+        bytes_(f"bit at {at}", flipped), bytes_("zeros", bytes(len(content))),
+        bytes_("random", rng.randbytes(len(content))), bytes_("HDF5 in name", b"\x89HDF\r\n\x1a\n"),
+        bytes_("zip in name", b"PK\x03\x04" + bytes(500)), bytes_("deep", b"[" * 100_000),
+        bytes_("text", b"a note\n"), bytes_("backwards", content[::-1]),
+        instead("is gone", lambda file: None), instead("a pipe", os.mkfifo),
+        instead("a folder", Path.mkdir),
+        instead("zeros for ever", lambda file: file.symlink_to("/dev/zero")),
+        instead("a circle", lambda file: file.symlink_to(file)),
+        instead("a link to nothing", lambda file: file.symlink_to("/nowhere")),
+        instead("memory", lambda file: file.symlink_to("/proc/self/mem")),
+    ]  # fmt: skip
+    yield from rng.sample(every, min(most, len(every)))
+
+
+@functools.cache
+def _furnished(learned: bool) -> tuple[Path, dict[str, list[tuple[str, ...]]]]:
+    """A folder with small runs, until this process ends, and the commands that read them."""
+    home = Path(tempfile.mkdtemp())
+    atexit.register(shutil.rmtree, home, ignore_errors=True)
+    with contextlib.chdir(home):
+        return home, furnish_runs(home, learned)
+
+
+def furnish_runs(folder: Path, learned: bool) -> dict[str, list[tuple[str, ...]]]:
+    """Small runs of several kinds, and the commands that read each of them.
+
+    A law is `learned` if it is worth the minute that this takes.
+    """
+    import rps_jax
+    from rps_jax.control.learned import policy
+    from rps_jax.world import points
+
+    (folder / "drums.json").write_text('{"objects": ["random_cylinder"]}')
+    drums = rps_jax.Domain(("random_cylinder",))
+    at = rps_jax.worlds_at(drums, points.points_of(drums, range(12)))
+    small_run(folder / "points", worlds=None, points=at)
+    (folder / "policy").mkdir()
+    shutil.copy(Path(policy.__file__).parent / "learned_mlp.npz", folder / "policy" / "policy.npz")
+    for command in (SWEEP, TUNE, LEARN)[: 3 if learned else 2]:
+        if (made := attempt(command, 300)).how != "told":
+            raise RuntimeError(f"rps {' '.join(command)} made no run ({made.how}): {made.text}")
+    return {
+        "sweep": [
+            ("merge", "sweep", "--out", "merged"), ("replay", "sweep", "0"), ("film", "sweep"),
+            ("gallery", "sweep", "--each", "1"), ("view", "sweep", "0"),
+            ("ceiling", "sweep", "--lost-by", "rps", "--sample", "1"), SWEEP,
+        ],
+        "points": [("merge", "points", "--out", "merged"), ("replay", "points", "0")],
+        "tune": [TUNE, ("push", "--law", "rps,tune/tuned.json")],
+        "policy": [("push", "--skin", "capacitive", "--law", "policy/policy.npz")],
+        **({"learn": [LEARN, ("export", "c", "--law", "learn/policy.npz")]} if learned else {}),
+    }  # fmt: skip
+
+
+SWEEP = (
+    *("sweep", "--domain", "drums.json", "--laws", "rps", "nps", "--worlds", "12"),
+    *("--engine", "quasistatic", "--horizon", "2", "--part", "4", "--out", "sweep"),
+)
+TUNE = (
+    *("tune", "es", "--quick", "--generations", "2", "--population", "4", "--worlds", "2"),
+    *("--validation", "2", "--horizon", "2", "--out", "tune", "--tuned", "K_h", "L"),
+)
+LEARN = (
+    *("learn", "--quick", "--updates", "1", "--minutes", "0", "--num-envs", "4", "--drawn", "4"),
+    *("--validation", "2", "--width", "4", "--num-steps", "2", "--num-minibatches", "1"),
+    *("--out", "learn", "--engine", "quasistatic", "--domain", "wide,objects=random_cylinder"),
+)
+
+
+def run_edits(most: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
+    """Edited and damaged run folders, each read by commands that stop where worlds are stepped."""
+    return _run_folders(most, seed, tell, (json_edits, dataset_edits, archive_edits))
+
+
+def run_damages(most: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
+    """Damaged run folders, likewise."""
+    return _run_folders(most, seed, tell, (damages,))
+
+
+def _run_folders(
+    most: int, seed: int, tell: Callable[[str], None], kinds: Sequence[Callable[..., Any]]
+) -> Counter[str]:
+    counts: Counter[str] = Counter()
+    rng = random.Random(seed)
+    readers = {".json": json_edits, ".nc": dataset_edits, ".npz": archive_edits}
+    home, reads = _furnished(learned=most >= 100)
+    with contextlib.chdir(home):
+        every = []
+        for name in reads:
+            for path in sorted(Path(name).rglob("*")):
+                own = damages if damages in kinds else readers.get(path.suffix)
+                if own in kinds and own and path.is_file() and not path.name.startswith("."):
+                    for edit in own(path, rng, max(4, most // 8)):
+                        every.append((name, path, edit))
+        with never_stepping():
+            for name, path, edit in rng.sample(every, min(most, len(every))):
+                shutil.move(name, f"{name}.sound")
+                shutil.copytree(f"{name}.sound", name)
+                edit.make(path)
+                command = rng.choice(reads[name])
+                found = attempt(command)
+                counts[found.how] += 1
+                if found.how in ("traceback", "hang", "wordy") or LOUD:
+                    what = f"{found.how}: {path}: {edit.what}: rps {' '.join(command)}"
+                    tell(f"{what}\n{found.text[-1800:]}")
+                shutil.rmtree(name)
+                shutil.move(f"{name}.sound", name)
+                for made in ("merged", "runs"):
+                    shutil.rmtree(made, ignore_errors=True)
+    return counts
+
+
+# --- the table -------------------------------------------------------------------------------
+
+
+def run_values(most: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
+    """Bad values, each in one command that stops where worlds would be stepped."""
+    counts: Counter[str] = Counter()
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        furnish(Path(folder))
+        with never_stepping():
+            for case in itertools.islice(values(seed), most):
+                found = attempt(case.arguments)
+                counts[found.how] += 1
+                if found.how in ("traceback", "hang", "wordy"):
+                    tell(f"{found.how}: rps {case.arguments}"[:400] + f"\n{found.text[-1500:]}")
+                for name in ("runs", "merged"):
+                    shutil.rmtree(name, ignore_errors=True)
+    return counts
+
+
+CLASSES = {
+    "values": (run_values, 6000),
+    "laws": (run_laws, 1000),
+    "edits": (run_edits, 800),
+    "damages": (run_damages, 500),
+}
+
+
+def main() -> int:
+    """Throw faults, tell what did not hold, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("classes", nargs="*", default=list(CLASSES), metavar="CLASS")
+    parser.add_argument("--most", type=int, help="cases of each class")
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    table = {}
+    for name in given.classes:
+        run, usual = CLASSES[name]
+        began = time.monotonic()
+        counts = run(given.most or usual, given.seed, lambda text: print(text, flush=True))
+        table[name] = dict(counts) | {"seconds": round(time.monotonic() - began)}
+        print(json.dumps({name: table[name]}), flush=True)
+    bad = sum(one.get(how, 0) for one in table.values() for how in ("traceback", "hang", "wordy"))
+    return int(bad > 0)
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    sys.exit(main())

@@ -1,0 +1,67 @@
+"""The checker of shapes and types, which the tests put between the calls of some modules.
+
+beartype looks into arguments and results, and `checked` into the fields of the records among
+them, too. A program is traced once and runs many times, and so is a call checked once.
+"""
+
+import functools
+import inspect
+import typing
+from typing import Any
+
+import jaxtyping
+from beartype import BeartypeConf, beartype
+from beartype.door import is_bearable
+
+MODULES = [
+    "rps_jax.control.laws",
+    "rps_jax.control.observation",
+    "rps_jax.geometry.footprint",
+    "rps_jax.geometry.planar",
+    "rps_jax.robot.skin",
+    "rps_jax.trials.trial",
+]
+CONF = BeartypeConf(is_pep484_tower=True)  # a whole number is a float
+
+
+def install():
+    """Check the calls of `MODULES`, which must not have been imported yet."""
+    jaxtyping.install_import_hook(MODULES, "shapes.checked")
+
+
+def checked(function):
+    """A function whose calls are checked; jaxtyping hands in one that does nothing else."""
+    inner, signature = beartype(conf=CONF)(function), inspect.signature(function)
+    typed = {name for name, one in signature.parameters.items() if one.annotation is not Any}
+
+    @functools.wraps(function)
+    def call(*args, **kwargs):
+        for name, value in signature.bind(*args, **kwargs).arguments.items():
+            for one in value if type(value) is tuple else (value,):
+                with jaxtyping.jaxtyped("context"):  # `*B` is of one record
+                    look(one if name in typed else None)
+        return inner(*args, **kwargs)
+
+    return call
+
+
+def look(value: Any) -> None:
+    """Raises TypeError if a record in a value has an array of another shape than it says."""
+    if not isinstance(value, tuple):
+        return
+    hints = shapes_of(type(value))
+    for i, field in enumerate(value):
+        name = value._fields[i] if hasattr(value, "_fields") else str(i)
+        if name in hints and not is_bearable(field, hints[name], conf=CONF):
+            kind = f"{getattr(field, 'dtype', type(field))}{list(getattr(field, 'shape', []))}"
+            raise TypeError(f"{type(value).__name__}.{name} is {kind} and not {hints[name]}")
+        look(field)
+
+
+@functools.cache
+def shapes_of(kind: type) -> dict[str, Any]:
+    """Types of the fields of a class of records that say a shape."""
+    if not kind.__module__.startswith("rps_jax."):
+        return {}
+    hints = typing.get_type_hints(kind)
+    return {name: hint for name, hint in hints.items() if "jaxtyping." in repr(hint)}

@@ -1,0 +1,103 @@
+"""The questions that are asked of this project: one a folder of `sweeps`, each with its page."""
+
+import json
+import re
+import shlex
+
+import pytest
+from helpers import ROOT, refusal
+
+from rps_jax.app.cli import flags, names
+
+SWEEPS = ROOT / "sweeps"
+FOLDERS = sorted(path.parent for path in SWEEPS.glob("*/README.md"))
+STUDIES = sorted(path.parent for path in SWEEPS.glob("*/study.py"))
+
+REFUSED = [
+    ("gradients", "--object box", "unknown object 'box'"),
+    ("gradients", "--horizons 2 1", r"horizons = \(2\.0, 1\.0\) is not allowed"),
+    ("gradients", "--estimators backward", "unknown estimator 'backward'"),
+    ("gradients", "--tuned v_max", "unknown tuned parameter 'v_max'"),
+    ("landscape", "--candidates 1", "candidates = 1 is not allowed"),
+    ("landscape", "--laws rps,tund.json", r"tund\.json cannot be read"),
+    ("landscape", "--laws pursuit", "law = pursuit is not allowed"),
+    ("landscape", "--domain wyde", "unknown domain 'wyde'"),
+    ("speed", "--families cone", "cone"),
+    ("speed", "--names fast", "unknown name 'fast'"),
+    ("speed", "--refill -1", "refill = -1 is not allowed"),
+    ("speed", "--at-once 0", "at_once = 0 is not allowed"),
+    ("speed", "--mujocos -4", "mujocos = -4 is not allowed"),
+    ("speed", "--names 'mjx fast' --worlds 65536", "leave nothing to time"),
+    ("speed/costs.py", "--names mjx", "unknown names 'mjx'"),
+    ("levers", "--program mjx", "unknown program 'mjx'"),
+    ("levers", "--family cone", "cone"),
+    ("levers", "--worlds 1", "worlds = 1 is not allowed"),
+    ("levers", "--simulated nan", "simulated = nan is not allowed"),
+    ("engines", "--objects cone", "unknown domain object 'cone'"),
+    ("engines", "--domain wyde", "unknown domain 'wyde'"),
+    ("engines", "--engines fast", "unknown engines 'fast'"),
+    ("fidelity", "--conditions fine", "unknown condition 'fine'"),
+    ("ambiguities", "--gazebo --curve", "gazebo and curve are not allowed together"),
+    ("ambiguities", "--readings none", "unknown reading 'none'"),
+    ("limits", "--limits leg", "did you mean 'lag'"),
+    ("mends", "--laws none", "unknown mend 'none'"),
+    ("ground", "--grounds our", "did you mean 'ours'"),
+    ("ground", "--worlds 0", "worlds = 0 is not allowed"),
+    ("learned", "run run", "runs"),
+    ("force_push_grid", "--duration 0", "duration"),
+]
+
+
+@pytest.mark.parametrize(("study", "options", "message"), REFUSED)
+def test_a_study_refuses_before_it_compiles(
+    study, options, message, tmp_path, compiled, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert re.search(message, refusal(capsys, SWEEPS / study, *shlex.split(options)))
+    assert not compiled
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("folder", STUDIES, ids=lambda folder: folder.name)
+def test_a_folder_asks_one_question_of_a_report(folder):
+    question = names.question_of(str(folder))
+    assert question.__doc__
+    assert question.TITLE
+    assert names.question_of(str(folder / "study.py")) is question
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_a_folder_has_a_page_that_says_first_what_was_found(folder):
+    lines = (folder / "README.md").read_text().splitlines()
+    assert len(lines) <= 180
+    assert lines[0].startswith("# ")
+    assert lines[2]
+    assert not lines[2].startswith(("<!--", "|", "#", "`"))
+    assert f"({folder.name}/README.md)" in (SWEEPS / "README.md").read_text()
+
+
+def test_the_index_is_short():
+    assert len((SWEEPS / "README.md").read_text().splitlines()) <= 80
+
+
+def published():
+    """Commands of `rps` in the data of all tables, but for those with a place to be filled."""
+    for path in sorted(SWEEPS.glob("**/results/*.json")):
+        commands = json.loads(path.read_text())["command"]
+        for line in [commands] if isinstance(commands, str) else commands:
+            if line.startswith("rps ") and not re.search(r"\$C|[A-Z]{3,}|\.\.\.", line):
+                yield pytest.param(line, id=f"{path.stem}: {line[:60]}")
+
+
+@pytest.mark.parametrize("line", list(published()))
+def test_a_published_command_can_still_be_asked(line, monkeypatch):
+    """Its options are known; what it names, as files, may have to be made first."""
+    monkeypatch.chdir(ROOT)
+    _, *words = shlex.split(line.replace("\\\n", " "), comments=True)
+    name, rest = names.split(words)
+    asked, _ = flags.parse(names.question_of(name), name, rest)
+    assert asked.name
+
+
+def test_commands_are_published():
+    assert len(list(published())) > 50

@@ -1,0 +1,73 @@
+"""The checker of shapes that the tests put between calls: it refuses what is wrong, where it is."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import TypeCheckError
+
+from rps_jax import Observation, RPSParams, Twist
+from rps_jax.control.laws import rps
+from rps_jax.control.laws.rps import RPSState
+from rps_jax.geometry import footprint as fp
+from rps_jax.geometry import planar
+from rps_jax.robot.skin import IdealSkin, SkinState
+from rps_jax.trials import trial
+
+PAPER = RPSParams.paper()
+SEEN = Observation(
+    jnp.zeros(2), jnp.zeros(()), jnp.array([0.36, 0.0]), jnp.array(True), jnp.array([2.0, 0.0])
+)
+TWO_OF_THREE = SkinState(
+    jax.random.key(0), jnp.zeros(3), jnp.zeros(2), jnp.ones(3, bool)
+)  # the gain of one taxel is missing
+
+
+def chain(error):
+    """What an error says, and those that led to it."""
+    return [str(error), *(chain(error.__context__) if error.__context__ else [])]
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"p_world_robot": jnp.zeros(3)}, "p_world_robot"),
+        ({"yaw": jnp.zeros(1)}, "yaw"),
+        ({"p_robot_contact": jnp.zeros((1, 2))}, "p_robot_contact"),
+        ({"in_contact": jnp.zeros((), int)}, "in_contact"),
+        ({"p_world_target": np.zeros(2, int)}, "p_world_target"),
+        ({"period": jnp.zeros(2)}, "period"),
+    ],
+)
+def test_a_law_is_given_no_observation_of_another_shape_or_kind(change, field):
+    state = RPSState.init(PAPER)
+    rps.step(PAPER, state, SEEN)
+    with pytest.raises(TypeCheckError, match="typechecking parameter 'observation'") as caught:
+        rps.step(PAPER, state, SEEN._replace(**change))
+    assert f"Observation.{field} is " in " ".join(chain(caught.value))
+
+
+def test_batched_worlds_are_single_ones_to_a_law():
+    """`jax.vmap` hides the axis; without it the law refuses the batch."""
+    batch = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 3), SEEN)
+    assert jax.vmap(rps.displacement)(batch).shape == (3, 2)
+    with pytest.raises(TypeCheckError, match="typechecking parameter 'observation'"):
+        rps.displacement(batch)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: planar.rotate(jnp.zeros(2), jnp.zeros((3, 2))),
+        lambda: planar.direction(jnp.zeros(3)),
+        lambda: planar.greatest(jnp.zeros((2, 2))),
+        lambda: fp.place(fp.circle(0.1), jnp.zeros(3), jnp.zeros(())),
+        lambda: fp.extent(fp.Footprint(jnp.zeros((4, 3)), jnp.zeros(())), jnp.zeros(2)),
+        lambda: rps.saturate(PAPER, Twist(jnp.zeros(2), jnp.zeros(3), jnp.zeros(2))),
+        lambda: trial.object_pose(jnp.zeros(9)),
+        lambda: IdealSkin().sense(TWO_OF_THREE, fp.circle(0.1), 0.02),
+    ],
+)
+def test_functions_refuse_arrays_that_do_not_go_together(call):
+    with pytest.raises(TypeCheckError, match="whilst checking the parameters"):
+        call()
