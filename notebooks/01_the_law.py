@@ -10,21 +10,15 @@
 # %% [markdown]
 # # The law, without a world
 #
-# The Reactive Pushing Strategy is a pure function. It is told where the skin is touched, where the
+# The Reactive Pushing Strategy is a pure function. It observes where the skin is touched, where the
 # base believes itself to be and where the target is, and it returns a twist of the base. Nothing
 # is pushed here; the function itself is drawn, with the paper's parameters.
 #
 # In all figures $l$ is the place of the contact along the front of the base, positive to the left.
 
 # %%
-import tempfile
-from pathlib import Path
-
-from IPython.display import Image
-
 from rps_jax import RPSParams, figures
 
-out = Path(tempfile.mkdtemp())
 paper = RPSParams.paper()
 
 # %% [markdown]
@@ -35,7 +29,7 @@ paper = RPSParams.paper()
 # contact.
 
 # %%
-Image(figures.profile(paper, out / "profile.png"))
+figures.profile(paper)
 
 # %% [markdown]
 # The curve has three regimes. Within some 5 cm of the middle $a_r$ is nearly zero, so the base
@@ -54,7 +48,7 @@ Image(figures.profile(paper, out / "profile.png"))
 
 # %%
 sets = {"paper": paper, "tangent as printed": paper._replace(gamma_max=float("inf"))}
-Image(figures.twist_field(sets, 2.0, out / "twist.png"))
+figures.twist_field(sets, 2.0)
 
 # %% [markdown]
 # The left column, from top to bottom:
@@ -84,7 +78,7 @@ Image(figures.twist_field(sets, 2.0, out / "twist.png"))
 
 # %%
 sets = {f"$l_{{mr}}$ = {l_mr} m": paper._replace(l_mr=l_mr) for l_mr in (0.05, 0.15, 0.24)}
-Image(figures.hysteresis(sets, 0.012, out / "hysteresis.png"))
+figures.hysteresis(sets, 0.012)
 
 # %% [markdown]
 # With one threshold (right) the state flickers while the ripple crosses it: five entries where

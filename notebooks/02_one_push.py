@@ -11,17 +11,13 @@
 # # One push
 #
 # This is the trial of the paper's Fig. 6: the box under the friction set S1, with its target 2 m
-# behind the robot. The fused engine steps it here; `rps push` runs the same trial in MJX.
+# behind the robot. The fused engine steps it here; `rps push` runs this trial in C MuJoCo.
 
 # %%
 import tempfile
 from pathlib import Path
 
-from rps_jax import video
-
-video.choose_gl()  # before MuJoCo is imported
-
-from IPython.display import Image, Video
+from IPython.display import Video
 
 import rps_jax
 
@@ -31,7 +27,8 @@ out = Path(tempfile.mkdtemp())
 # ## What the base did, and why
 
 # %%
-seen = rps_jax.push("box", target=(-2.0, 0.0), friction="S1", engine="fused")
+setting = rps_jax.Setting("fused")
+seen = rps_jax.push("box", target=(-2.0, 0.0), friction="S1", setting=setting, progress=False)
 seen.plot()
 
 # %%
@@ -64,10 +61,10 @@ print(
 # edge of the critical region, where $\sigma$ of Eq. 10 is zero on one side and turns the base on
 # the other.
 #
-# ## The same in pictures
+# ## The push in pictures
 
 # %%
-Image(seen.stills(out / "stills.png"))
+seen.stills()
 
 # %% [markdown]
 # In the second picture the base has gone round the corner of the box. In the third it stands

@@ -11,19 +11,15 @@
 # # The paper's trials, from a run folder
 #
 # The paper simulates 432 trials: three objects, two sets of friction, 24 targets and three
-# strategies. This notebook computes nothing; it reads what `rps table` left in `runs/table` (MJX,
+# laws. This notebook computes nothing; it reads what `rps table` left in `runs/table` (MJX,
 # two processors). Name another folder as `run` to read your own.
 
 # %%
-import tempfile
-from pathlib import Path
-
-from IPython.display import Image, Markdown
+from IPython.display import Markdown
 
 import rps_jax
 from rps_jax import figures, tables
 
-out = Path(tempfile.mkdtemp())
 run = "runs/table"
 results = rps_jax.load(run)
 
@@ -40,7 +36,7 @@ Markdown(tables.markdown(tables.table_ii(results)))
 # of its six cells: the cylinder under both sets of friction, and the nonuniform box under S1. The
 # baselines agree in total, 23 and 8 on both sides, and NPS agrees in every cell too. So the task
 # is as hard without reaction here as there, and only the trials that RPS lost there differ.
-# `sweeps/README.md` asks whether the paper's simulator lost them.
+# `sweeps/ambiguities` asks whether the paper's simulator lost them.
 
 # %%
 print(tables.summary(results))
@@ -52,7 +48,7 @@ print(tables.summary(results))
 # the least distance of the contact to the target, and the number counts successes.
 
 # %%
-Image(figures.min_distance(results, out / "maps.png"))
+figures.min_distance(results)
 
 # %% [markdown]
 # - NPS reaches targets ahead: all but two of its successes lie within 27 degrees of the first
@@ -65,7 +61,7 @@ Image(figures.min_distance(results, out / "maps.png"))
 # ## How long a success takes
 
 # %%
-Image(figures.time_to_success(results, "rps", out / "time.png"))
+figures.time_to_success(results, "rps")
 
 # %% [markdown]
 # Straight ahead (dark), a metre takes 20 s: the base does its 0.05 m/s all the way. A target
@@ -85,7 +81,7 @@ Image(figures.time_to_success(results, "rps", out / "time.png"))
 
 # %%
 distance = results.mean_abs_l.where(results.success == 1).mean("target")
-distance.to_series().unstack("strategy").round(3)
+distance.to_series().unstack("law").round(3)
 
 # %% [markdown]
 # RPS lets the contact wander to about 10 cm with a box and 8 cm with a cylinder. That is where Eq.
@@ -95,9 +91,8 @@ distance.to_series().unstack("strategy").round(3)
 #
 # ## What the paper leaves open, and what we chose
 #
-# Each choice is a parameter, so that another reading is one option away. `python
-# sweeps/ambiguities.py` runs the readings one by one: 24 of 27 give 144 of 144 (`sweeps/README.md`
-# has the table).
+# Each choice is a parameter, so that another reading is one option away. `rps sweeps/ambiguities`
+# runs the readings one by one: 24 of 27 give 144 of 144 (its page has the table).
 #
 # The law:
 #
@@ -110,7 +105,7 @@ distance.to_series().unstack("strategy").round(3)
 # - sgn(0) is 0 (`sgn_0`).
 # - A heading error of exactly $\pi$ is wrapped to $-\pi$, so the robot turns right
 #   (`planar.wrap`).
-# - Algorithm 1 prints $v_x$ twice; $(v_x, v_y, \omega)$ is meant (`law.step`).
+# - Algorithm 1 prints $v_x$ twice; $(v_x, v_y, \omega)$ is meant (`rps_jax.step`).
 # - When contact is lost during a push, the base drives straight on at 0.01 m/s, as before the
 #   first contact, and $l_{th}$ stays (`v_lost`, `keep_contact`).
 #
@@ -121,14 +116,14 @@ distance.to_series().unstack("strategy").round(3)
 # - $D$ is the mean over the control steps in contact (`Outcome.mean_abs_l`).
 # - An object that falls over ends the trial, as failed, once it leans by 45 degrees
 #   (`Rules.max_tilt`).
-# - The control period is 20 ms (`--control-period`).
+# - The control period is 20 ms (`--physics default,control_period=0.02`).
 #
 # Base and skin:
 #
 # - The base is 0.725 m long, with 12 taxels in front, 15 on the left and 15 on the right, of 48.3
 #   mm each (`Robot.half_length`, `Robot.boards`).
-# - The simulated contact sensor has a tolerance of 6 mm (`--skin-params tolerance=`), and what it
-#   feels is a point up to the length of one taxel (`point_length`).
+# - The simulated contact sensor has a tolerance of 6 mm (`--skin ideal,tolerance=0.006`), and what
+#   it feels is a point up to the length of one taxel (`point_length`).
 # - The capacitive skin has 10 mm of foam, a filter of 50 ms and a threshold of +25 % capacitance
 #   (`CapacitiveSkin`).
 #
@@ -145,10 +140,10 @@ distance.to_series().unstack("strategy").round(3)
 # APS:
 #
 # - It brings the contact point to the target: it aims one object radius beyond, since it is built
-#   for the centre (`aps.aim_beyond`).
-# - The radius of a rectangular robot is half its length (`aps.r_robot`).
-# - Its least speed is 0.01 m/s, and an object that moved by less than 1 mm has not moved
-#   (`aps.v_min`, `aps.min_motion`).
+#   for the centre (`aim_beyond`, as in `--law aps,aim_beyond=0`).
+# - The radius of a rectangular robot is half its length (`r_robot`).
+# - Its least speed is 0.01 m/s, and an object that moved by less than 1 mm has not moved (`v_min`,
+#   `min_motion`).
 #
 # Physics (`Physics`; `mjcf/README.md` gives the reasons):
 #

@@ -12,23 +12,19 @@
 #
 # The paper's grid is solved (`03_paper`); this notebook asks where the law ends. Worlds of the
 # domain `wide` differ in mass, size, shape, friction, centre of mass, start and target, and in the
-# faults of skin, odometry and drive. Both arms, the paper's parameters and `RPSParams.tuned()`,
+# faults of skin, odometry and drive. Both laws, the paper's parameters and `RPSParams.tuned()`,
 # meet the same worlds.
 #
 # This notebook computes nothing; it reads `runs/compare/wide`, the first 1000 of 10,000 worlds of
-# `rps tune compare --params paper tuned --domain wide hostile real --seed 4` (one H200). Name
+# `rps compare --laws rps rps_tuned --domain wide hostile real --seed 4` (one H200). Name
 # another folder as `run` to read a sweep of your own.
 
 # %%
-import tempfile
-from pathlib import Path
-
-from IPython.display import Image, Markdown
+from IPython.display import Markdown
 
 import rps_jax
 from rps_jax import figures, tables
 
-out = Path(tempfile.mkdtemp())
 run = "runs/compare/wide"
 results = rps_jax.load(run)
 max_lost = rps_jax.Rules().max_lost  # [s] without contact, which end a trial
@@ -49,7 +45,7 @@ Markdown(tables.markdown(tables.success_table(results, max_lost)))
 # ## How it fails
 
 # %%
-Image(figures.failures(results, max_lost, out / "failures.png"))
+figures.failures(results, max_lost)
 
 # %% [markdown]
 # There are two ways to fail, and the lower row tells them apart. With the paper's parameters all
@@ -66,7 +62,7 @@ Image(figures.failures(results, max_lost, out / "failures.png"))
 # each. The lines below the panels say how they were chosen, and name the others.
 
 # %%
-Image(figures.success_curves(results, out / "success.png"))
+figures.success_curves(results)
 
 # %% [markdown]
 # Even of these most are flat within their intervals, and where one of many curves dips once, chance
@@ -79,9 +75,9 @@ Markdown(tables.markdown(tables.influence_table(results, "paper")[:9]))
 # %% [markdown]
 # For the paper's parameters width matters: in the widest eighth, about 31 cm of half width, success
 # falls to four in five. The base itself has a half width of 29 cm. The number of corners matters as
-# well (a cylinder counts as 0). A run of 240,000 worlds (`sweeps/README.md`) finds more influences,
-# such as the centre of mass, dead taxels and friction at the robot, but here they do no more than
-# chance might.
+# well (a cylinder counts as 0). A run of 240,000 worlds (`sweeps/random_worlds`) finds more
+# influences, such as the centre of mass, dead taxels and friction at the robot, but here they do no
+# more than chance might.
 
 # %%
 Markdown(tables.markdown(tables.influence_table(results, "tuned")[:4]))
@@ -92,7 +88,7 @@ Markdown(tables.markdown(tables.influence_table(results, "tuned")[:4]))
 #
 # ## The hardest worlds
 #
-# The hardest worlds are those in which most arms fail, and among these those with the most
+# The hardest worlds are those in which most laws fail, and among these those with the most
 # distance left.
 
 # %%
@@ -100,7 +96,7 @@ Markdown(tables.markdown(tables.hardest_table(results, run)))
 
 # %% [markdown]
 # The command in the last column replays a world, draws it as in `02_one_push` and films it; run it
-# in this folder. Only the first two worlds are lost by both arms, and the tuned parameters bring
+# in this folder. Only the first two worlds are lost by both laws, and the tuned parameters bring
 # their objects to within 11 cm. In the others the paper's parameters lose the object far from its
 # target, mostly a target behind the robot (beyond 90 degrees), and the tuned ones arrive in 84 to
 # 231 s.

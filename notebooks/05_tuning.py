@@ -12,28 +12,36 @@
 #
 # The paper's parameters were chosen by hand. `RPSParams.tuned()` was found by evolution in three
 # runs of CMA-ES, a coarse one, a fine one, and one with robots that have limits, whose commands
-# stand in `sweeps/README.md`; `runs/coarse`, `runs/fine` and `runs/robots` hold their logs.
+# stand in `sweeps/tuned`; `runs/coarse`, `runs/fine` and `runs/robots` hold their logs.
 # `runs/compare/wide` has both sets of parameters in 1000 worlds that no tuner has seen. One switch
 # was added by hand to what the fine run found: when contact is lost, the tuned law acts upon the
 # last one (`keep_contact`). Only the section about gradients simulates anything.
 
 # %%
 import json
-import tempfile
 from pathlib import Path
 
 import jax
-from IPython.display import Image, Markdown
+import xarray as xr
+from IPython.display import Markdown
 
 import rps_jax
-from rps_jax import FRICTION, Case, RPSParams, SmoothSkin, Space, figures, gradients, paper, tables
-
-out = Path(tempfile.mkdtemp())
+from rps_jax import Case, RPSParams, SmoothSkin, Space, figures, gradients, tables
 
 
 def read_log(run):
     """What a tuner wrote down of each generation."""
     return [json.loads(line) for line in Path("runs", run, "log.jsonl").read_text().splitlines()]
+
+
+def labelled(log):
+    """Make labelled data of it: variables (generation), and the parameters."""
+    names = [name for name in log[0] if name not in ("generation", "params")]
+    columns = {name: ("generation", [line[name] for line in log]) for name in names}
+    params = [list(line["params"].values()) for line in log]
+    columns["params"] = (("generation", "parameter"), params)
+    labels = {"generation": range(len(log)), "parameter": list(log[0]["params"])}
+    return xr.Dataset(columns, labels)
 
 
 # %% [markdown]
@@ -46,7 +54,7 @@ def read_log(run):
 # %%
 log = read_log("coarse")
 names = tuple(log[0]["params"])
-Image(figures.tuning_log(log, names, out / "coarse.png"))
+figures.search(labelled(log))
 
 # %% [markdown]
 # In seven generations the objective on the validation worlds halves, from 0.31 to 0.15, and
@@ -63,7 +71,7 @@ Image(figures.tuning_log(log, names, out / "coarse.png"))
 # above.
 
 # %%
-Image(figures.tuning_log(read_log("fine"), names, out / "fine.png"))
+figures.search(labelled(read_log("fine")))
 
 # %% [markdown]
 # Validation falls from 0.164 to 0.117 at generation 7, whose mean was kept. The values jump from
@@ -79,7 +87,7 @@ Image(figures.tuning_log(read_log("fine"), names, out / "fine.png"))
 # force (the domain `real`).
 
 # %%
-Image(figures.tuning_log(read_log("robots"), names, out / "robots.png"))
+figures.search(labelled(read_log("robots")))
 
 # %% [markdown]
 # Validation falls from 0.100 to 0.085 in one generation, success there from 94.3 to 95.8 %, and
@@ -97,14 +105,14 @@ kept = json.loads(Path("runs/robots/tuned.json").read_text())
 assert kept == {name: getattr(sets["tuned"], name) for name in kept}
 space = Space(names)
 places = {label: jax.nn.sigmoid(space.vector(params)) for label, params in sets.items()}
-Image(figures.between_bounds(places, names, out / "bounds.png"))
+figures.between_bounds(places, names)
 
 # %% [markdown]
 # $K_v$, $a_r^{max}$, $K_h$ and $l_{cr}$ moved most; $\beta$ and $\gamma_{max}$ hardly moved. What
 # this means is easier to see in the twist (compare `01_the_law`), here 1 m from the target:
 
 # %%
-Image(figures.twist_field(sets, 1.0, out / "twist.png"))
+figures.twist_field(sets, 1.0)
 
 # %% [markdown]
 # The tuned law has all but given up Eq. 5, which acts only beyond $d_{th}$ = 1.53 m. Nearer to the
@@ -119,7 +127,7 @@ results = rps_jax.load("runs/compare/wide")
 Markdown(tables.markdown(tables.difference_table(results)))
 
 # %%
-Image(figures.paired(results, out / "paired.png"))
+figures.paired(results)
 
 # %% [markdown]
 # The tuned law wins 71 worlds that the paper's parameters lose and loses 6 that they win, which is
@@ -141,9 +149,8 @@ Image(figures.paired(results, out / "paired.png"))
 # %%
 names = ("L", "K_h", "K_v", "beta")
 space = Space(names)
-cases = [
-    Case("box", FRICTION["S1"], target, gap=0.004, skin=SmoothSkin()) for target in paper.TARGETS
-]
+targets = rps_jax.load("runs/table")[["target_x", "target_y"]].to_dataframe().to_numpy()
+cases = [Case("box", "S1", target, gap=0.004, skin=SmoothSkin()) for target in targets]
 horizons = (1.0, 3.0, 10.0)  # [s]
 distances, starts = gradients.distances(cases, space.params, horizons)  # of all three at once
 theta, key = space.vector(RPSParams.paper()), jax.random.key(0)
@@ -153,11 +160,11 @@ found = {
     "evolution": gradients.evolution(distances, theta, starts, key, sigma=0.15, pairs=4),
 }
 bars = {name: (one.gradient.T, one.variance.T) for name, one in found.items()}
-Image(figures.estimates(horizons, bars, names, out / "gradients.png"))
+figures.estimates(horizons, bars, names)
 
 # %% [markdown]
 # Bars are two standard errors over the targets, so they show how much targets differ as well as
-# how noisy an estimate is. Until 3 s derivatives and differences are the same; evolution agrees,
+# how noisy an estimate is. Until 3 s derivatives and differences are equal; evolution agrees,
 # with bars as wide or up to twice as wide. At 10 s this still holds for $K_h$, and nearly for $L$
 # and $K_v$. For $\beta$ the bars of the derivative are three times as wide as those of the
 # differences: in some worlds the derivative has grown far beyond what the parameter does. Rounding
@@ -167,9 +174,9 @@ Image(figures.estimates(horizons, bars, names, out / "gradients.png"))
 #
 # A success takes some 80 s. So derivatives are good for a short look ahead, and over whole trials
 # the law was tuned by evolution. This is one box, 24 worlds and four parameters, so it is a look
-# and not a benchmark; `sweeps/README.md` has the study.
+# and not a benchmark; `sweeps/gradients` has the study.
 #
-# ## The same, at equal cost
+# ## Gradients and evolution at equal cost
 #
 # So a gradient that is to tune the law looks at windows of 8 s, which begin anywhere in a trial;
 # what is left of the way after a window costs the time of driving it. `runs/race` holds the logs
@@ -180,11 +187,11 @@ Image(figures.estimates(horizons, bars, names, out / "gradients.png"))
 # %%
 logs = {name: read_log(f"race/{name}") for name in ("evolution", "gradient")}
 logs["gradient, then evolution"] = read_log("race/half") + read_log("race/hybrid")
-Image(figures.races(logs, out / "race.png"))
+figures.races(logs)
 
 # %% [markdown]
 # In one step, gradients come as far as evolution in its first generation, at equal cost; the best
 # parameters of both runs are about equally good in test worlds of `wide` (96.1 and 95.5 %;
-# `sweeps/README.md` has the table). Then gradients find nothing more and steer ever harder,
+# `sweeps/gradients` has the table). Then gradients find nothing more and steer ever harder,
 # perhaps because 8 s do not show what that does to the contact later. Evolution that starts where
 # they stopped, with a small spread, takes long before it finds better.

@@ -66,7 +66,7 @@ class Robot:
         return self._taxels, self.pose
 
     def command(self, twist: np.ndarray) -> None:
-        """Move as told for one period."""
+        """Move at a twist (3,) [m/s, m/s, rad/s] for one period."""
         c, s = np.cos(self.pose[2]), np.sin(self.pose[2])
         turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]], np.float32)
         self.pose = self.pose + np.float32(PERIOD) * turn @ twist

@@ -18,8 +18,9 @@ TALL = rps_jax.Domain(
 
 def main(worlds: int = 300, horizon: float = 300.0):
     """Success of the paper's and the tuned parameters, and by the width of the object."""
-    arms = {"paper": rps_jax.RPSParams.paper(), "tuned": rps_jax.RPSParams.tuned()}
-    found = rps_jax.sweep(TALL, arms, worlds=worlds, rules=rps_jax.Rules(horizon=horizon))
+    laws = {"paper": rps_jax.RPSParams.paper(), "tuned": rps_jax.RPSParams.tuned()}
+    setting = rps_jax.Setting(rules=rps_jax.Rules(horizon=horizon))
+    found = rps_jax.sweep(laws, TALL, worlds=worlds, setting=setting)
     print(found.success.mean("world").to_series())
     print(found.success.groupby_bins("size", 4).mean().to_pandas())
     return found

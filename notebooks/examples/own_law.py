@@ -1,7 +1,7 @@
 """A law of one's own in random worlds: a pure function from memory and touch to a twist.
 
 python notebooks/examples/own_law.py
-rps sweep --strategies rps notebooks/examples/own_law.py:PParams --worlds 1000
+rps sweep --laws rps notebooks/examples/own_law.py:PParams --worlds 1000
 """
 
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 import rps_jax
-from rps_jax import Details, Twist, law, planar
+from rps_jax import Details, Twist
 
 
 class Gains(NamedTuple):
@@ -26,20 +26,24 @@ class PParams(NamedTuple):
 def step(params, memory, seen):
     """The twist of one control step; memory is not needed here."""
     details = Details.of(seen)  # with the contact's lateral place l
-    error = planar.wrap(planar.direction(law.displacement(seen)) - seen.yaw)
+    cos, sin = jnp.cos(seen.yaw), jnp.sin(seen.yaw)
+    to_robot = jnp.array([[cos, sin], [-sin, cos]])
+    p_robot_target = to_robot @ (seen.p_world_target - seen.p_world_robot)
+    ahead, left = p_robot_target - seen.p_robot_contact
+    error = jnp.arctan2(left, ahead)
     turn = jnp.clip(params.gains.heading * error, -0.15, 0.15)
     omega = jnp.where(seen.in_contact, turn, 0.0)
     return memory, Twist(params.v, params.gains.l * details.l, omega), details
 
 
-rps_jax.register_strategy("p_control", rps_jax.Strategy(lambda params: (), step), PParams())
+rps_jax.register_law("p_control", rps_jax.Law(lambda params: (), step), PParams())
 
 
 def main(worlds: int = 300, horizon: float = 300.0):
-    """Success of the law and of this one in the same random worlds."""
-    arms = {"rps": rps_jax.RPSParams.paper(), "mine": PParams()}
-    rules = rps_jax.Rules(horizon=horizon)
-    found = rps_jax.sweep("wide", arms, worlds=worlds, rules=rules)
+    """Success of RPS and of this law in the same random worlds."""
+    laws = {"rps": rps_jax.RPSParams.paper(), "mine": PParams()}
+    setting = rps_jax.Setting(rules=rps_jax.Rules(horizon=horizon))
+    found = rps_jax.sweep(laws, "wide", worlds=worlds, setting=setting)
     print(found.success.mean("world").to_series())
     return found
 

@@ -52,8 +52,7 @@ def total(env: rps_jax.PushEnv, steps: int, weights: dict, key: jax.Array) -> ja
 
 def main(options: Options) -> list[float]:
     """Train; returns the mean return of each iteration."""
-    physics = rps_jax.PHYSICS["default"]["fast"]
-    env = rps_jax.PushEnv("random_box", setting=rps_jax.Setting(physics, engine="fused"))
+    env = rps_jax.PushEnv("random_box", setting=rps_jax.Setting("fused", fidelity="fast"))
     steps = round(options.seconds / env.dt)
     start = {"w": jnp.zeros((3, 44)), "b": jnp.zeros(3)}
     weights, unravel = ravel_pytree(start)
