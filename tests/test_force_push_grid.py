@@ -72,7 +72,7 @@ def test_their_law_brings_every_box_back_to_the_path_and_the_open_loop_loses_mos
         ({"sliders": ("prism",)}, "unknown slider 'prism'"),
         ({"duration": 0.0}, "duration"),
         ({"engine": "quasistatic"}, "senses the contact's force"),
-        ({"engine": "mujoco"}, "follow a trial with mjx"),
+        ({"engine": "mujoco"}, "JAX must trace it"),
     ],
 )
 def test_what_the_grid_cannot_run_is_refused(given, words):

@@ -97,11 +97,12 @@ class Film(Question[Path]):
         if out.is_dir():
             raise InputError(f"out = {out} is a folder: name a file, as {out / 'film.mp4'}.")
         _ = self.shape
-        self.takes()
+        folder.manifest(Path(self.run))
         folder.writable(out.parent)
         for what in video.check():
             if not what.ok:
                 raise InputError(what.mend)
+        self.takes()
 
     def bar(self) -> Bar:
         """A bar over simulated time."""

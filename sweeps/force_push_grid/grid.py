@@ -200,7 +200,7 @@ def worlds(
         "skin": same(IdealSkin().on(_ROBOT.shell)),
         "params": same(params),
         "p_world_target": np.tile([90.0, 0.0], (count, 1)),  # never reached
-        "shift": same(Shift()),
+        "shift": same(Shift(p_robot=jnp.zeros(2))),
         "qpos": starts(slider, grid),
         "odometry": same(Odometry()),
     }

@@ -61,7 +61,7 @@ class ForcePushGrid(Study[xr.Dataset]):
         engine = engines.get(self.engine)
         engine.check(self.sliders)
         engine.check_senses("force")
-        engine.check_followed()
+        engine.check_traced()
         engine.check_physics(grid.PHYSICS)
 
     def trials(self) -> int | None:

@@ -100,6 +100,8 @@ def _sentence(said: str, program: str) -> str:
     text = re.sub(r"\s+", " ", " ".join(kept)).strip().rstrip(".")
     if wrong := re.match(r"Error parsing (\S+): (.*)", text):
         name, why = wrong[1].strip("-").lower(), wrong[2]
+        if " is not allowed: " in why:  # a record's own sentence
+            return f"{why}."
         usage = next((line for line in lines[last:] if line.startswith(wrong[1])), why).upper()
         many = usage.count("INT") + usage.count("FLOAT") > 1
         whole = re.search(r"\bint\b", usage + why, re.IGNORECASE)
