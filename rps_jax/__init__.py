@@ -16,7 +16,7 @@ __version__ = "0.3.0.dev0"
 
 def _homes() -> dict[str, str]:
     """Modules of the public names, as `__init__.pyi` imports them."""
-    tree = ast.parse(Path(__file__).with_suffix(".pyi").read_text())
+    tree = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
     imports = (node for node in tree.body if isinstance(node, ast.ImportFrom))
     return {name.name: str(node.module) for node in imports for name in node.names}
 

@@ -360,7 +360,7 @@ def latency(name: str, where: Path) -> tuple[float, float]:
     """Median and 99.9th percentile [us] of a step of skin and law, by the exported example."""
     made, place = program.program(name), Path(tempfile.mkdtemp(dir=where))
     for file, text in {"law.h": c.header(made, "law"), **folder.files(made, "law")}.items():
-        (place / file).write_text(text)
+        (place / file).write_text(text, encoding="utf-8")
     command = ["gcc", "-std=c99", "-O2", str(place / "main.c"), "-lm", "-o", str(place / "main")]
     subprocess.run(command, check=True)
     ran = subprocess.run([str(place / "main")], check=True, capture_output=True, text=True)

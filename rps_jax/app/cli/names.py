@@ -41,7 +41,7 @@ def known() -> dict[str, Name]:
     found = {}
     for room in _ROOMS:
         for path in sorted((_PACKAGE / room).glob("*.py")):
-            text = path.read_text()
+            text = path.read_text(encoding="utf-8")
             for name, kind in _MAKES.findall(text):
                 module = f"rps_jax.{room}.{path.stem}"
                 found[_words(name)] = Name(room, module, kind, _summary(text, kind))

@@ -5,9 +5,12 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
+import io
 import os
+import signal
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +22,7 @@ if TYPE_CHECKING:
     from rps_jax.trials.progress import Bar
 
 _MEND = "make room, then run the same command again; what is done is kept"
+_stopped: list[bool] = []  # interrupts of this command
 
 
 def be_deterministic() -> None:
@@ -30,8 +34,12 @@ def be_deterministic() -> None:
 
 def guarded(action: Callable[[], object]) -> int:
     """Run a command: exit code 0, or one sentence on the error stream and 2 (130: interrupted)."""
+    for stream in (sys.stdout, sys.stderr):  # a terminal without UTF-8 shows `?`
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     try:
-        action()
+        with _interruptible():
+            action()
         sys.stdout.flush()
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing more to say
@@ -39,7 +47,7 @@ def guarded(action: Callable[[], object]) -> int:
     except InputError as error:
         return _told(error)
     except OSError as error:
-        hint = f": {_MEND}" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
+        hint = f": {_MEND}" if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) else ""
         return _told(InputError(f"{error.filename or 'output'}: {error.strerror or error}{hint}."))
     except RuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error):
@@ -56,6 +64,32 @@ def guarded(action: Callable[[], object]) -> int:
     except SystemExit as end:  # of --help
         return int(end.code or 0)
     return 0
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[None]:
+    """Remember an interrupt that comes while a module is imported, where it may be swallowed."""
+
+    def stop(*_: object) -> None:
+        _stopped.append(True)
+        raise KeyboardInterrupt
+
+    _stopped.clear()
+    usual = threading.current_thread() is threading.main_thread() and (
+        signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    )
+    if usual:
+        signal.signal(signal.SIGINT, stop)
+    try:
+        yield
+    finally:
+        if usual:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _go_on() -> None:
+    if _stopped:
+        raise KeyboardInterrupt
 
 
 def _told(sentence: str | InputError) -> int:
@@ -78,6 +112,7 @@ def carry_out(question: Any, beside: Beside) -> None:
     asked = question.asked()
     asked.checked()
     check_film(beside)
+    _go_on()
     if note := asked.note():
         print(note)
     device.use_cache()
@@ -87,6 +122,7 @@ def carry_out(question: Any, beside: Beside) -> None:
     if beside.overwrite:
         folder.clear(Path(asked.out))
     with asked.bar() as bar:
+        _go_on()
         found = asked.answered(bar)
         told = _timing(bar)
         if isinstance(found, Path):
