@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
 import math
 from collections.abc import Mapping
@@ -75,12 +77,13 @@ def module(program: Program, prefix: str) -> str:
         params=_values(groups["params"]),
         skin_params=_values(groups["skin_params"]),
     )
-    init = [*_computed(program.init, prefixes), f"  return {_object('memory', groups)};"]
+    tables: dict[bytes, str] = {}
+    init = [*_computed(program.init, prefixes, tables), f"  return {_object('memory', groups)};"]
     step = [
         "  if (!Object.values(seen).every(finite)) {",
         f"    return {{ code: 1, memory, twist: {_STILL} }};",
         "  }",
-        *_computed(program.step, prefixes | {"observation": "seen."}),
+        *_computed(program.step, prefixes | {"observation": "seen."}, tables),
         f"  const next = {_object('memory', groups)};",
         f"  const twist = {_object('twist', groups)};",
         "  if (!Object.values(twist).every(finite) || Object.values(next).some(nan)) {",
@@ -91,18 +94,61 @@ def module(program: Program, prefix: str) -> str:
     own = {"skin_params": "params.", "skin": "skin.", "taxels": "", "period": ""}
     skin = [
         "  if (!finite(taxels) || !finite(period)) return { code: 1, skin, contact: null };",
-        *_computed(program.skin_step, own, "contact_"),
+        *_computed(program.skin_step, own, tables, "contact_"),
         "  const next = { ...skin, signal: contact_skin_signal };",
         f"  const contact = {_object('contact', groups, 'contact_contact_')};",
         "  return { code: 0, skin: next, contact };",
     ]
     parts = [
         head,
+        weights(tables),
         *("export function init(params) {", *init, "}\n"),
         *("export function step(params, memory, seen) {", *step, "}\n"),
         *("export function skinStep(params, skin, taxels, period) {", *skin, "}\n"),
     ]
     return "\n".join(parts)
+
+
+def function(name: str, routine: Routine, tables: dict[bytes, str]) -> str:
+    """A routine as a function of its groups of fields; its weights join the tables."""
+    prefixes = {group: f"{group}." for group in routine.given}
+    found = ", ".join(f"{group}: {_object(group, routine.found)}" for group in routine.found)
+    return "\n".join(
+        [
+            f"function {name}({', '.join(routine.given)}) {{",
+            *_computed(routine, prefixes, tables, ""),
+            f"  return {{ {found} }};",
+            "}\n",
+        ]
+    )
+
+
+_UNPACKED = """\
+const unpacked = (text, Kind, columns) => {
+  const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  const all = new Kind(bytes.buffer);
+  return Array.from({ length: columns }, (_, j) => all.subarray(j * all.length / columns,
+    (j + 1) * all.length / columns));
+};
+"""
+
+
+def weights(tables: Mapping[bytes, str]) -> str:
+    """The matrices of functions as constants, in so few bytes as lose nothing."""
+    return "\n".join([_UNPACKED, *tables.values()]) if tables else ""
+
+
+def _table(key: bytes) -> str:
+    return f"w_{hashlib.sha256(key).hexdigest()[:8]}"
+
+
+def _packed(name: str, matrix: np.ndarray) -> str:
+    """The columns of a matrix as a constant."""
+    narrow = matrix.astype("<f4")
+    exact = bool(np.all(narrow == matrix))
+    kept, kind = (narrow, "Float32Array") if exact else (matrix.astype("<f8"), "Float64Array")
+    text = base64.b64encode(np.ascontiguousarray(kept.T).tobytes()).decode()
+    return f'const {name} = unpacked("{text}", {kind}, {matrix.shape[1]});'
 
 
 def _values(group: Group) -> str:
@@ -128,6 +174,7 @@ class _Writer(Writer):
     """One routine as lines of JavaScript."""
 
     forms = _FORMS
+    index = "let"
 
     def literal(self, value: object, kind: str) -> str:
         """A constant."""
@@ -154,18 +201,22 @@ class _Writer(Writer):
 
     def product(self, node: Node, indent: str) -> list[str]:
         """Statements of a product with a matrix."""
-        rows = json.dumps(self.target.tables[node.extra].T.tolist())
+        name = _table(node.extra)
         names = ", ".join(map(self.name, node.args))
         return [
             f"{indent}const x{node.number} = [{names}];",
-            f"{indent}{self.declared(node)} = {rows}.map(",
+            f"{indent}{self.declared(node)} = {name}.map(",
             f"{indent}  (w) => x{node.number}.reduce((s, x, i) => s + x * w[i], 0));",
         ]
 
 
-def _computed(routine: Routine, groups: Mapping[str, str], prefix: str = "") -> list[str]:
+def _computed(
+    routine: Routine, groups: Mapping[str, str], tables: dict[bytes, str], prefix: str = ""
+) -> list[str]:
     """The statements of a routine, and its results as named values."""
-    _, lines, results = computed(_Writer, routine, groups)
+    writer, lines, results = computed(_Writer, routine, groups)
+    for key, matrix in writer.target.tables.items():
+        tables[key] = _packed(_table(key), matrix)
     for group, field, names in results:
         array = np.array(names, object).reshape(field.shape).tolist()
         group = "skin" if group == "signal" else group
