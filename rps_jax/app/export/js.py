@@ -39,6 +39,14 @@ _FORMS = FORMS | {
     "i_of_b": "{0} ? 1 : 0",
 }
 
+HELPERS = """\
+const finite = (x) => (Array.isArray(x) ? x.every(finite) : Number.isFinite(Number(x)));
+const nan = (x) => (Array.isArray(x) ? x.some(nan) : Number.isNaN(Number(x)));
+const rint = (x) => (Math.abs(x % 1) === 0.5 ? 2 * Math.round(x / 2) : Math.round(x));
+const held = (x) => Math.min(2147483647, Math.max(-2147483648, x));
+const int = (x) => (Number.isNaN(x) ? 0 : Math.trunc(held(x)));
+"""
+
 _HEAD = """\
 // The law {label} with the skin of the robot {robot}, written by rps_jax {version}: do not edit.
 //
@@ -49,12 +57,7 @@ _HEAD = """\
 // A code that is not 0 (1: an input was not finite; 2: the law has no finite twist) comes with a
 // zero twist and the memory as it was.
 
-const finite = (x) => (Array.isArray(x) ? x.every(finite) : Number.isFinite(Number(x)));
-const nan = (x) => (Array.isArray(x) ? x.some(nan) : Number.isNaN(Number(x)));
-const rint = (x) => (Math.abs(x % 1) === 0.5 ? 2 * Math.round(x / 2) : Math.round(x));
-const held = (x) => Math.min(2147483647, Math.max(-2147483648, x));
-const int = (x) => (Number.isNaN(x) ? 0 : Math.trunc(held(x)));
-
+{helpers}
 export const TAXELS = {taxels};
 export const params = {params};
 export const skinParams = {skin_params};
@@ -72,6 +75,7 @@ def module(program: Program, prefix: str) -> str:
         label=program.label,
         robot=program.robot,
         version=__version__,
+        helpers=HELPERS,
         p=prefix,
         taxels=program.taxels,
         params=_values(groups["params"]),
@@ -152,13 +156,16 @@ def _packed(name: str, matrix: np.ndarray) -> str:
 
 
 def _values(group: Group) -> str:
-    lines = [f"  {one.name}: {_text(np.asarray(one.value).tolist())}," for one in group]
+    lines = [f"  {one.name}: {text(np.asarray(one.value).tolist())}," for one in group]
     return "\n".join(["{", *lines, "}"])
 
 
-def _text(value: object) -> str:
+def text(value: object) -> str:
+    """A value of numbers, texts, lists and mappings as JavaScript."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{json.dumps(k)}: {text(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list):
-        return "[" + ", ".join(map(_text, value)) + "]"
+        return "[" + ", ".join(map(text, value)) + "]"
     if isinstance(value, float) and not math.isfinite(value):
         return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
     return json.dumps(value)
@@ -178,7 +185,7 @@ class _Writer(Writer):
 
     def literal(self, value: object, kind: str) -> str:
         """A constant."""
-        return _text(value)
+        return text(value)
 
     def flag(self, name: str) -> str:
         """An input that is a bool."""

@@ -400,6 +400,8 @@ def ordered(outputs: Sequence[Node]) -> list[Node | Block]:
 
 def _conditional(nodes: list[Node], outputs: set[int]) -> Block | None:
     """The block of a condition, if there is one with a product of a matrix."""
+    if not any(node.op == "product" for node in nodes):
+        return None
     users: dict[int, list[Node]] = {}
     for node in nodes:
         for arg in node.args:
