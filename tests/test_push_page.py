@@ -12,61 +12,109 @@ from helpers import ROOT
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 
+from rps_jax.app.export.program import fields_of
 from rps_jax.engines.quasistatic import sliders
 from rps_jax.geometry import solid
-from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
+from rps_jax.trials.stepper import Live
 
 MAKE = runpy.run_path(str(ROOT / "docs" / "push" / "make.py"))
-RUN = """
-const push = new Push({ law: arguments[0], target: arguments[1] });
+WHOLE = """
+const push = new Push({ law: arguments[0], shape: arguments[1], target: [-2, 0] });
 while (push.step()) {}
-const rows = push.past.map((s) => [s.twist.v_x, s.twist.v_y, s.twist.omega]);
-return { rows, success: push.trial.success };
+return [push.trial.success, push.past.map((s) => [s.twist.v_x, s.twist.v_y, s.twist.omega])];
+"""
+EACH = """
+const push = new Push({ law: arguments[0], target: [-2, 0] });
+return arguments[1].map(([trial, memory]) => {
+  Object.assign(push, { trial, memory });
+  push.step();
+  const { twist } = push.seen;
+  return [twist.v_x, twist.v_y, twist.omega, ...push.trial.qpos];
+});
 """
 
 
-@contextlib.contextmanager
-def chromium(profile):
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
     binary, driver = shutil.which("chromium"), shutil.which("chromedriver")
     if not (binary and driver):
         lacking = "there is no Chromium: run `apt-get install -y chromium chromium-driver`"
         (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(lacking)
+    folder = tmp_path_factory.mktemp("push")
+    page = folder / "push.html"
+    page.write_text(MAKE["page"]())
+    assert page.stat().st_size < 3e6
     options = webdriver.ChromeOptions()
     options.binary_location = binary
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    for flag in ("--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={profile}"):
+    for flag in ("--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder}/p"):
         options.add_argument(flag)
     with webdriver.Chrome(options=options, service=Service(driver)) as browser:
-        yield browser
-
-
-def test_the_page_commands_every_twist_that_python_commands(tmp_path):
-    page = tmp_path / "push.html"
-    page.write_text(MAKE["page"]())
-    assert page.stat().st_size < 3e6
-    with jax.enable_x64(True):
-        case, setting = Case("box", "S1", (-2.0, 0.0), "rps"), Setting("quasistatic")
-        period = setting.physics.control_period
-        (followed,) = pushes.follow([case], setting, interval=period)
-    wanted = np.stack(followed.snapshots.twist, axis=-1)
-    assert wanted.dtype == np.float64
-    with chromium(tmp_path / "profile") as browser:
         browser.get(page.as_uri())
-        found = browser.execute_script(RUN, "rps", [-2, 0])
-        loads = browser.execute_script("return performance.getEntriesByType('resource').length")
+        yield browser
+        resources = "return performance.getEntriesByType('resource').length"
+        assert browser.execute_script(resources) == 0  # it asks nobody for anything
         assert not browser.get_log("browser")
-    assert found["success"]
-    assert loads == 0  # it asks nobody for anything
-    assert wanted.shape == (len(found["rows"]), 3)
-    assert len(wanted) > 3000
-    np.testing.assert_allclose(found["rows"], wanted, rtol=0, atol=1e-5)
+
+
+@contextlib.contextmanager
+def python_push(law):
+    """The paper's push to (-2, 0), in double precision."""
+    with jax.enable_x64(True):
+        live = Live.of_case(Case("box", "S1", (-2.0, 0.0), law), Setting("quasistatic"))
+        live.step(20_000)
+        assert live.done
+        yield live
+
+
+def twists(live):
+    return np.array([np.stack(one.seen.twist) for one in live.past])
+
+
+@pytest.mark.parametrize("law", ["rps_plus", "rps_tuned"])
+def test_a_whole_push_has_the_twists_of_python(law, browser):
+    with python_push(law) as live:
+        wanted = twists(live)
+    assert wanted.dtype == np.float64
+    success, found = browser.execute_script(WHOLE, law, "box")
+    assert success
+    assert len(found) == len(wanted) > 5000
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("law", ["rps", "learned_gru"])
+def test_from_every_state_of_a_push_comes_the_twist_of_python(law, browser):
+    """Where tan(gamma) is at its bound, the paper's law enlarges a difference fourfold a step.
+
+    So its pushes part from the last bit of a sine; what a step does with a state does not.
+    """
+    with python_push(law) as live:
+        wanted, every = twists(live), max(1, len(live.past) // 3000)
+        shown = range(0, len(live.past) - 1, every)
+        before = [live.past[i].before for i in shown]
+        own = named([one._replace(**MAKE["BY_HAND"]) for one in before])
+        states = list(zip(own, named([one.memory for one in before]), strict=True))
+        after = np.array([live.past[i + 1].seen.qpos for i in shown])
+    found = np.concatenate(
+        [browser.execute_script(EACH, law, states[i : i + 500]) for i in range(0, len(states), 500)]
+    )
+    np.testing.assert_allclose(found[:, :3], wanted[list(shown)], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(found[:, 3:], after, rtol=0, atol=1e-7)
+
+
+def named(trees):
+    """Leaves of pytrees by the names that the page gives them."""
+    names = [one.name for one in fields_of(trees[0])]
+    rows = [[np.asarray(x).tolist() for x in jax.tree.leaves(tree)] for tree in trees]
+    finite = [[1e300 if x == np.inf else x for x in row] for row in rows]  # as JSON has them
+    return [dict(zip(names, row, strict=True)) for row in finite]
 
 
 @pytest.mark.parametrize("corners", [1, 4, 6])
 def test_an_object_is_borne_as_in_the_package(corners):
-    """The page computes centre of mass and arm anew, when one slides what they depend on."""
+    """The page computes centre of mass and arm anew when one slides what they depend on."""
     rng = np.random.default_rng(0)
     offset, bearing = rng.uniform(0, 0.4, 20), rng.uniform(-3, 3, 20)
     size = rng.uniform(0.1, 0.4, 20)

@@ -18,7 +18,7 @@ import numpy as np
 
 from rps_jax import __version__
 from rps_jax.app.export import js, walk
-from rps_jax.app.export.program import Group, Routine, fields_of
+from rps_jax.app.export.program import Group, Routine, fields_of, identifier
 from rps_jax.control import registry, trying
 from rps_jax.control.learned import features
 from rps_jax.control.observation import TaxelObservation, Twist
@@ -186,14 +186,16 @@ def of_law(name: str) -> tuple[list[Routine], dict[str, Any]]:
     ]
     fields: Group = fields_of(params, values=params)
     values = {one.name: np.asarray(one.value, float).tolist() for one in fields}
-    usual = {name: (low, high, False) for name, (low, high) in TASK.items() if name in values}
     bounds = dict(law.bounds)
+    sliders = {}
+    for one in fields:
+        last = one.name.removeprefix("law_")
+        if last in TASK:
+            sliders[one.name] = [*TASK[last], False, one.about]
     for field, bound in bounds.items():
-        if field in values:
-            scale = bounds[bound.of].high if bound.of else 1.0
-            usual[field] = (bound.low * scale, bound.high * scale, bound.log)
-    about = {one.name: one.about for one in fields}
-    sliders = {key: [*value, about[key]] for key, value in usual.items()}
+        scale = bounds[bound.of].high if bound.of else 1.0
+        about = next(one.about for one in fields if one.name == identifier(field))
+        sliders[identifier(field)] = [bound.low * scale, bound.high * scale, bound.log, about]
     told = {"title": LAWS[name], "kind": kind, "params": values, "sliders": sliders}
     return routines, {label: told}
 
