@@ -144,6 +144,16 @@ def code(path: Path) -> str:
     return f"{head}# {path.name}\n\n```python\n{path.read_text('utf-8')}\n```\n"
 
 
+def listing(path: Path) -> str:
+    """What is in a folder that has no page."""
+    folders = [
+        f"[{one.name}]({one.name})" for one in path.iterdir() if (one / "README.md").exists()
+    ]
+    names = sorted({one.name for one in path.iterdir() if one.suffix in (".py", ".json", ".ipynb")})
+    links = [*(f"[{name}]({name})" for name in names), *folders]
+    return f"# {path.relative_to(ROOT)}\n\n" + "".join(f"- {link}\n" for link in links)
+
+
 def reference() -> dict[str, str]:
     """Pages made from docstrings and signatures, one a room."""
     rows = [f"- [`rps_jax.{room}`]({room}.md)" for room in ROOMS]
@@ -181,7 +191,7 @@ def on_files(files: Any, config: Any) -> Any:
             add(f"notebooks/{name}", content)
     add("push.html", runpy.run_path(str(ROOT / "docs" / "push" / "make.py"))["page"]())
     pages = [one for one in files.documentation_pages() if not one.src_uri.startswith("reference/")]
-    for page in pages:
+    for page in pages:  # to which listings are added
         for link in linked(page.content_string):
             path = ROOT / posixpath.normpath(posixpath.join(posixpath.dirname(page.src_uri), link))
             place = posixpath.join(
@@ -190,6 +200,11 @@ def on_files(files: Any, config: Any) -> Any:
             place = posixpath.normpath(place)
             if path.is_file():
                 add(place, code(path) if place.endswith(".py.md") else path.read_bytes())
+            elif (
+                path.is_dir() and not place.startswith("reference/") and place not in files.src_uris
+            ):
+                add(place, listing(path))
+                pages.append(files.get_file_from_path(place))
     return files
 
 
@@ -222,3 +237,13 @@ def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
 
     marked = r'<(div|span) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>'
     return re.sub(marked, math, html, flags=re.DOTALL)
+
+
+def on_post_build(config: Any) -> None:
+    """Have search without a server load its helper from the site itself."""
+    site = Path(config.site_dir)
+    for path in site.rglob("*.html"):
+        text = path.read_text("utf-8")
+        up = "../" * (len(path.relative_to(site).parts) - 1)
+        if (there := "https://unpkg.com/iframe-worker/shim") in text:
+            path.write_text(text.replace(there, f"{up}iframe-worker.js"), "utf-8")
