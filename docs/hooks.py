@@ -11,6 +11,7 @@ import posixpath
 import re
 import runpy
 from functools import cache
+from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -230,20 +231,8 @@ def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
     r"""Write equations as MathML, which needs no script: \(...\) in lines and \[...\] between."""
 
     def math(found: re.Match[str]) -> str:
-        text = re.sub(
-            r"&(amp|lt|gt);", lambda one: {"amp": "&", "lt": "<", "gt": ">"}[one[1]], found[2]
-        )
-        return convert(text, display="block" if found[1] == "div" else "inline")
+        text = found[2].replace("\\*", "*")  # as GitHub wants a star in an equation
+        return convert(unescape(text), display="block" if found[1] == "div" else "inline")
 
     marked = r'<(div|span) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>'
     return re.sub(marked, math, html, flags=re.DOTALL)
-
-
-def on_post_build(config: Any) -> None:
-    """Have search without a server load its helper from the site itself."""
-    site = Path(config.site_dir)
-    for path in site.rglob("*.html"):
-        text = path.read_text("utf-8")
-        up = "../" * (len(path.relative_to(site).parts) - 1)
-        if (there := "https://unpkg.com/iframe-worker/shim") in text:
-            path.write_text(text.replace(there, f"{up}iframe-worker.js"), "utf-8")
