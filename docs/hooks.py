@@ -14,9 +14,11 @@ from functools import cache
 from html import unescape
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import nbformat
 from latex2mathml.converter import convert
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parents[1]
@@ -28,7 +30,7 @@ ROOMS = (
 PARTS = {"rps_jax/law.md": "The law", "rps_jax/adding.md": "How to add ..."}
 # Pages by the tab they stand in; studies that no tab names stand in `Studies`.
 TABS: dict[str, list[Any]] = {
-    "Start": ["README.md", {"Push it yourself": "push.html"}, "gallery.md", "CHANGELOG.md"],
+    "Start": ["README.md", {"Push it yourself": "push.html"}, "docs/gallery.md", "CHANGELOG.md"],
     "The law": ["rps_jax/law.md", "notebooks/01_the_law.md", "notebooks/02_one_push.md"],
     "The paper": [
         *("notebooks/03_paper.md", "table", "hardware", "ambiguities"),
@@ -42,6 +44,16 @@ TABS: dict[str, list[Any]] = {
     "Physics": ["mjcf/README.md", "ground", "real_pushes", "fit", "engines", "fidelity"],
     "Studies": ["sweeps/README.md"],
     "Make it yours": ["rps_jax/README.md", "rps_jax/adding.md", "CONTRIBUTING.md"],
+}
+# Where types of other packages are explained.
+_XARRAY = "https://docs.xarray.dev/en/stable/generated/{}.html"
+_MUJOCO = "https://mujoco.readthedocs.io/en/stable/APIreference/APItypes.html#"
+ELSEWHERE = {
+    "jax.Array": "https://docs.jax.dev/en/latest/_autosummary/jax.Array.html",
+    "numpy.ndarray": "https://numpy.org/doc/stable/reference/generated/numpy.ndarray.html",
+    "pathlib.Path": "https://docs.python.org/3/library/pathlib.html#pathlib.Path",
+    **{f"xarray.{x}": _XARRAY.format(f"xarray.{x}") for x in ("Dataset", "DataArray", "DataTree")},
+    **{f"mujoco.{x}": _MUJOCO + x.lower() for x in ("MjModel", "MjData", "MjSpec")},
 }
 LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
 FENCE = re.compile(r"^( *)(```|~~~).*?^\1\2`*~* *$", re.MULTILINE | re.DOTALL)
@@ -60,9 +72,7 @@ def texts() -> dict[str, str]:
         *ROOT.glob("notebooks/**/README.md"),
         *ROOT.glob("docs/*.md"),
     ]
-    found = {
-        str(path.relative_to(ROOT)).removeprefix("docs/"): path.read_text("utf-8") for path in paths
-    }
+    found = {str(path.relative_to(ROOT)): path.read_text("utf-8") for path in paths}
     for place, title in PARTS.items():
         whole = found[f"{posixpath.dirname(place)}/README.md"]
         part = re.search(rf"^## {re.escape(title)}\n(.*?)(?=^## |\Z)", whole, re.M | re.S)
@@ -93,7 +103,9 @@ def led(link: str, page: str, files: Any) -> str:
     """Where a link of a page leads in the site, as seen from there."""
     path = posixpath.normpath(posixpath.join(posixpath.dirname(page), link))
     place = ROOT / path
-    if path.startswith("rps_jax/") and (place.is_dir() or place.suffix == ".py"):
+    if path == "docs/push/page.html":
+        path = "push.html"
+    elif path.startswith("rps_jax/") and (place.is_dir() or place.suffix == ".py"):
         parts = path.removesuffix(".py").removesuffix("/__init__").split("/")
         if len(parts) > 1 and parts[1] in ROOMS:
             path = f"reference/{parts[1]}.md"
@@ -234,5 +246,40 @@ def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
         text = found[2].replace("\\*", "*")  # as GitHub wants a star in an equation
         return convert(unescape(text), display="block" if found[1] == "div" else "inline")
 
+    def type_of(found: re.Match[str]) -> str:
+        there = ELSEWHERE.get(found[1])
+        return f'<a href="{there}" title="{found[1]}">{found[2]}</a>' if there else found[0]
+
+    html = re.sub(r'<span title="([\w.]+)">(\w+)</span>', type_of, html)
     marked = r'<(div|span) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>'
     return re.sub(marked, math, html, flags=re.DOTALL)
+
+
+def on_post_build(config: Any) -> None:
+    """Refuse a site with a dead link, or one that asks another host for anything."""
+    if wrong := faults(Path(config.site_dir)):
+        raise PluginError("\n".join(wrong))
+
+
+LOADS = re.compile(r"<(?:script|img|iframe|source|video|link)\b[^>]*?\b(?:src|href)=\"?([^\s\">]+)")
+LEADS = re.compile(r"\b(?:src|href)=\"?([^\s\">]+)")
+
+
+def faults(site: Path) -> list[str]:
+    """Sentences about loads from other hosts and dead links in the pages of a site."""
+    found = []
+    for path in sorted(site.rglob("*.html")):
+        text, page = path.read_text("utf-8"), path.relative_to(site)
+        text = re.sub(r"<(script|pre)\b([^>]*)>.*?</\1>", r"<\1\2>", text, flags=re.DOTALL)
+        loads = [one for one in LOADS.findall(text) if re.match(r"(https?:)?//", one)]
+        found += [f"{page} loads {one} from another host" for one in loads]
+        for one in LEADS.findall(text):
+            there = unquote(re.split(r"[?#]", one)[0])
+            if there and not re.match(r"[a-z]+:|/", one) and not (path.parent / there).exists():
+                found.append(f"{page} leads to {one}, which is not there")
+    for path in sorted(site.rglob("*.css")):
+        if there := re.findall(
+            r"(?:url\(|@import )[\"']?((?:https?:)?//[^)\"']*)", path.read_text("utf-8")
+        ):
+            found.append(f"{path.relative_to(site)} loads {there[0]} from another host")
+    return found

@@ -127,7 +127,7 @@ def _results(eqn: Any, values: list[Any], target: Target) -> Sequence[Any]:
         if all(is_constant(v) for i, v in enumerate(values) if i not in which):
             return _moved(eqn, values, list(which), target)
     if name == "scatter-add" and is_constant(values[1]) and params["unique_indices"]:
-        return [_added(eqn, *values, target)]
+        return [_added(eqn, values, target)]
     if len(outs) != 1:
         raise unsupported(name)
     return [target.emit(name, values, params, outs[0])]
@@ -149,8 +149,9 @@ def _moved(eqn: Any, values: list[Any], which: list[int], target: Target) -> lis
     ]
 
 
-def _added(eqn: Any, array: Any, at: Any, updates: Any, target: Target) -> Any:
+def _added(eqn: Any, values: list[Any], target: Target) -> Any:
     """What `.at[].add` makes at constant places: the array, and updates or zeros."""
+    array, at, updates = values
     out, size = eqn.outvars[0].aval, int(np.prod(np.shape(updates)))
     numbers = jnp.asarray(1 + np.arange(size).reshape(np.shape(updates)), out.dtype)
     nothing = jnp.zeros(np.shape(array), out.dtype)
