@@ -73,7 +73,7 @@ def twists(live):
     return np.array([np.stack(one.seen.twist) for one in live.past])
 
 
-@pytest.mark.parametrize("law", ["rps_plus", "rps_tuned"])
+@pytest.mark.parametrize("law", ["rps_plus", pytest.param("rps_tuned", marks=pytest.mark.slow)])
 def test_a_whole_push_has_the_twists_of_python(law, browser):
     with python_push(law) as live:
         wanted = twists(live)
@@ -84,7 +84,7 @@ def test_a_whole_push_has_the_twists_of_python(law, browser):
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("law", ["rps", "learned_gru"])
+@pytest.mark.parametrize("law", ["rps", pytest.param("learned_gru", marks=pytest.mark.slow)])
 def test_from_every_state_of_a_push_comes_the_twist_of_python(law, browser):
     """Where tan(gamma) is at its bound, the paper's law enlarges a difference fourfold a step.
 
