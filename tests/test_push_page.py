@@ -91,7 +91,7 @@ def test_from_every_state_of_a_push_comes_the_twist_of_python(law, browser):
     So its pushes part from the last bit of a sine; what a step does with a state does not.
     """
     with python_push(law) as live:
-        wanted, every = twists(live), max(1, len(live.past) // 3000)
+        wanted, every = twists(live), max(1, len(live.past) // 6000)
         shown = range(0, len(live.past) - 1, every)
         before = [live.past[i].before for i in shown]
         own = named([one._replace(**MAKE["BY_HAND"]) for one in before])
