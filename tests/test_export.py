@@ -61,9 +61,14 @@ def step(params, memory, seen):
     other = jnp.take(jnp.array([1.0, 2.0, 3.0]), place + 1, mode="clip")
     trace = jnp.concatenate([memory.trace[1:], l[None]]).at[0].set(memory.trace[3])
     smooth = jax.lax.scan(lambda s, x: (0.5 * s + x, s), 0.0, trace)[0]
+    # What is carried changes its places, which a loop must not do one after the other.
+    swapped = lambda i, s: (s[1], s[0] + i * l)
+    body = lambda i, s: jax.lax.fori_loop(0, 2, swapped, (s[1], 0.5 * s[0]))
+    low, high = jax.lax.fori_loop(0, 3, body, (l, smooth))
+    trace = trace.at[1:3].add(0.1 * low)
     side = jax.lax.cond(l > 0, lambda: 1.0, lambda: -1.0)
     level = jax.lax.switch(place, [lambda: 0.0, lambda: 1.0, lambda: 4.0])
-    turn = jnp.argmax(jnp.abs(trace)) + jnp.cumsum(trace)[2] + jnp.expm1(smooth) + jnp.sum(trace**3)
+    turn = jnp.argmax(jnp.abs(trace)) + jnp.cumsum(trace)[2] + jnp.expm1(high) + jnp.sum(trace**3)
     forward = params.v * gain * jnp.round(other) / (1 + level)
     return (
         Memory(trace, memory.count + 1),

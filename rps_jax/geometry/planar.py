@@ -51,7 +51,7 @@ def norm(vector: Float[Array, "*B n"]) -> Float[Array, "*B"]:
 
 
 def direction(vector: Float[Array, "*B 2"]) -> Float[Array, "*B"]:
-    """Angle of planar vectors (..., 2) in [-pi, pi] [rad]; 0 with zero derivative at zero."""
+    """Angle [rad] of planar vectors (..., 2) in [-pi, pi]; 0 with zero derivative at zero."""
     scale = _scale(vector)
     is_zero = scale == 0
     # Scaling changes no angle and keeps x*x + y*y, which the derivative divides by, in range.

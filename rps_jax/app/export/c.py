@@ -99,6 +99,7 @@ class _Writer(Writer):
     """One routine as lines of C."""
 
     forms = _FORMS
+    index = "int"
 
     def __init__(self, *arguments: Any):
         """Begin without tables."""

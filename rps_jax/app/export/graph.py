@@ -100,6 +100,9 @@ class Graph:
             whole = self.node("Gather", [whole, at], (places.size,), kind, axis=0)
         return self.shaped(whole, places.shape)
 
+    def repeated(self, once: Any, carry: Sequence[Any], length: int) -> None:
+        """Loops are unrolled."""
+
     def emit(self, name: str, values: Sequence[Any], params: Mapping[str, Any], out: Any) -> Tensor:
         """Apply a primitive."""
         x, shape, kind = [self.tensor(value) for value in values], out.shape, kind_of(out.dtype)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import heapq
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,6 +48,15 @@ class Block(NamedTuple):
     holds: bool
     nodes: list[Node]
     choices: list[Node]
+
+
+class Loop(NamedTuple):
+    """What is done again and again: numbers that are carried, and what becomes of them."""
+
+    length: int
+    carried: tuple[Node, ...]
+    results: tuple[Node, ...]
+    nodes: tuple[Node, ...]  # that depend on what is carried, in their order
 
 
 class Scalars:
@@ -125,6 +134,37 @@ class Scalars:
         for i, args in enumerate(zip(*spread, strict=True)):
             found.reshape(-1)[i] = self._one(name, args, params, kind)
         return found
+
+    def repeated(
+        self, once: Callable[[Sequence[Any]], list[Any]], carry: Sequence[Any], length: int
+    ) -> list[Any]:
+        """A loop as one node; what does not change in it is computed before it."""
+        starts = [self.array(value) for value in carry]
+        first, like = next(self._count), [one.reshape(-1) for one in starts]
+        carried = [
+            [self.node("carried", (), node.kind, (first, i, j)) for j, node in enumerate(nodes)]
+            for i, nodes in enumerate(like)
+        ]
+        shaped = [_shaped(mine, one.shape) for mine, one in zip(carried, starts, strict=True)]
+        found = [self.array(value).reshape(-1) for value in once(shaped)]
+        own = [node for nodes in carried for node in nodes]
+        results = [
+            self.node("copy", (node,), node.kind) if node in own and node is not mine else node
+            for node, mine in zip(itertools.chain(*found), own, strict=True)
+        ]
+        inside = {node.number for node in own}
+        nodes = []
+        for node in _needed(results):
+            if any(arg.number in inside for arg in node.args):
+                inside.add(node.number)
+                nodes.append(node)
+        free = [arg for node in nodes for arg in node.args] + results
+        free = {node.number: node for node in free if node.number not in inside}
+        args = [*itertools.chain(*like), *free.values()]
+        extra = Loop(length, tuple(own), tuple(results), tuple(nodes))
+        loop, place = self.node("loop", args, "array", extra), itertools.count()
+        parts = [[self.node("part", (loop,), n.kind, next(place)) for n in row] for row in carried]
+        return [_shaped(mine, one.shape) for mine, one in zip(parts, starts, strict=True)]
 
     def _one(self, name: str, args: Sequence[Node], params: Mapping[str, Any], kind: str) -> Node:
         """One number of an operation that works number by number."""
@@ -314,6 +354,24 @@ class Scalars:
         return [self.node("part", (product,), "f", j) for j in range(matrix.shape[1])]
 
 
+def _shaped(nodes: Sequence[Node], shape: tuple[int, ...]) -> np.ndarray:
+    found = np.empty(shape, object)
+    found.reshape(-1)[:] = nodes
+    return found
+
+
+def _needed(outputs: Iterable[Node]) -> list[Node]:
+    """Outputs and all that they need, each after what it needs."""
+    needed: dict[int, Node] = {}
+    waiting = list(outputs)
+    while waiting:
+        node = waiting.pop()
+        if node.number not in needed:
+            needed[node.number] = node
+            waiting += node.args
+    return [needed[number] for number in sorted(needed)]
+
+
 def _with_last(value: Any, axes: Sequence[int]) -> Any:
     kept = [i for i in range(value.ndim) if i not in axes]
     count = int(np.prod([value.shape[i] for i in axes]))
@@ -333,14 +391,7 @@ def ordered(outputs: Sequence[Node]) -> list[Node | Block]:
     Where a product with a matrix only matters under a condition, all that only matters then is a
     `Block`: a learned law decides five times a second, and its network waits until then.
     """
-    needed: dict[int, Node] = {}
-    waiting = list(outputs)
-    while waiting:
-        node = waiting.pop()
-        if node.number not in needed:
-            needed[node.number] = node
-            waiting += node.args
-    nodes = [needed[number] for number in sorted(needed)]
+    nodes = _needed(outputs)
     block = _conditional(nodes, {node.number for node in outputs})
     if block is None:
         return list(nodes)
@@ -349,6 +400,8 @@ def ordered(outputs: Sequence[Node]) -> list[Node | Block]:
 
 def _conditional(nodes: list[Node], outputs: set[int]) -> Block | None:
     """The block of a condition, if there is one with a product of a matrix."""
+    if not any(node.op == "product" for node in nodes):
+        return None
     users: dict[int, list[Node]] = {}
     for node in nodes:
         for arg in node.args:

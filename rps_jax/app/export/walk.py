@@ -7,6 +7,7 @@ target, `moved`: JAX itself moves the places of the numbers, and tells so where 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -49,6 +50,12 @@ class Target(Protocol):
         """Apply a primitive; `out` has the shape and the dtype of the result."""
         ...
 
+    def repeated(
+        self, once: Callable[[Sequence[Any]], list[Any]], carry: Sequence[Any], length: int
+    ) -> list[Any] | None:
+        """What `carry` is after a function of it was applied so often; None: unroll it."""
+        ...
+
 
 def unsupported(name: str) -> InputError:
     """The one sentence about an operation that cannot be written."""
@@ -75,7 +82,7 @@ def walk(closed: Any, arguments: Sequence[Any], target: Target) -> list[Any]:
 
 def is_constant(value: Any) -> bool:
     """Whether a value is known already."""
-    return isinstance(value, np.ndarray) and value.dtype != object
+    return isinstance(value, jax.Array) or (isinstance(value, np.ndarray) and value.dtype != object)
 
 
 def _walk(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any], target: Target) -> list[Any]:
@@ -94,13 +101,17 @@ def _walk(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any], target: T
 def _results(eqn: Any, values: list[Any], target: Target) -> Sequence[Any]:
     """Results of one equation."""
     name, params, outs = eqn.primitive.name, eqn.params, [one.aval for one in eqn.outvars]
-    for one in outs:
-        kind_of(one.dtype, name)
     if name in _SAME:
         return values
     if all(map(is_constant, values)):
         found = eqn.primitive.bind(*map(jnp.asarray, values), **params)
-        return [np.asarray(one) for one in (found if eqn.primitive.multiple_results else [found])]
+        several = found if eqn.primitive.multiple_results else [found]
+        return [
+            one if jnp.issubdtype(one.dtype, jax.dtypes.prng_key) else np.asarray(one)
+            for one in several
+        ]
+    for one in outs:
+        kind_of(one.dtype, name)
     if name == "cond":
         return _chosen(values[0], params["branches"], values[1:], target)
     if name == "scan":
@@ -115,6 +126,8 @@ def _results(eqn: Any, values: list[Any], target: Target) -> Sequence[Any]:
         which = (0, 2) if name == "scatter" else range(count)
         if all(is_constant(v) for i, v in enumerate(values) if i not in which):
             return _moved(eqn, values, list(which), target)
+    if name == "scatter-add" and is_constant(values[1]) and params["unique_indices"]:
+        return [_added(eqn, values, target)]
     if len(outs) != 1:
         raise unsupported(name)
     return [target.emit(name, values, params, outs[0])]
@@ -134,6 +147,17 @@ def _moved(eqn: Any, values: list[Any], which: list[int], target: Target) -> lis
         target.moved(sources, np.asarray(one), out.aval)
         for one, out in zip(several, eqn.outvars, strict=True)
     ]
+
+
+def _added(eqn: Any, values: list[Any], target: Target) -> Any:
+    """What `.at[].add` makes at constant places: the array, and updates or zeros."""
+    array, at, updates = values
+    out, size = eqn.outvars[0].aval, int(np.prod(np.shape(updates)))
+    numbers = jnp.asarray(1 + np.arange(size).reshape(np.shape(updates)), out.dtype)
+    nothing = jnp.zeros(np.shape(array), out.dtype)
+    places = eqn.primitive.bind(nothing, jnp.asarray(at), numbers, **eqn.params)
+    more = target.moved([np.zeros(1, out.dtype), updates], np.asarray(places, int), out)
+    return target.emit("add", [array, more], {}, out)
 
 
 def _chosen(index: Any, branches: Sequence[Any], values: list[Any], target: Target) -> list[Any]:
@@ -157,6 +181,11 @@ def _unrolled(values: list[Any], params: Mapping[str, Any], target: Target) -> l
         raise unsupported(f"scan of {params['length']} steps")
     body, fixed, carried = params["jaxpr"], params["num_consts"], params["num_carry"]
     consts, carry = values[:fixed], values[fixed : fixed + carried]
+    if len(values) == fixed + carried == fixed + len(body.jaxpr.outvars):  # as of `fori_loop`
+        once = functools.partial(_walk, body.jaxpr, body.consts, target=target)
+        repeated = target.repeated(lambda now: once([*consts, *now]), carry, params["length"])
+        if repeated is not None:
+            return repeated
     columns = body.jaxpr.invars[fixed + carried :]
     rows: list[Any] = [None] * params["length"]
     order = range(params["length"])

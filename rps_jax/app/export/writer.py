@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 from rps_jax.app.export.program import Field, Routine
-from rps_jax.app.export.scalars import UNARY, Block, Node, Scalars, ordered
+from rps_jax.app.export.scalars import UNARY, Block, Loop, Node, Scalars, ordered
 from rps_jax.app.export.walk import unsupported
 
 _FUNCTIONS = {*UNARY, "atan2", "pow", "rem", "round", "rint", "max", "min"}
@@ -14,6 +14,7 @@ _INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=",
 _INFIX |= {"ge": ">=", "eq": "==", "ne": "!=", "and": "&&", "or": "||", "xor": "!="}
 _INFIX |= {"iand": "&", "ior": "|", "ixor": "^"}
 FORMS = {name: f"{{0}} {sign} {{1}}" for name, sign in _INFIX.items()} | {
+    "copy": "{0}",
     "neg": "-{0}",
     "not": "!{0}",
     "inot": "~{0}",
@@ -27,6 +28,7 @@ class Writer:
     """One routine as lines of a language."""
 
     forms: ClassVar[Mapping[str, str]] = FORMS
+    index: ClassVar[str]  # how the number of a loop is declared
 
     def __init__(
         self,
@@ -72,6 +74,8 @@ class Writer:
             group, field, place = node.extra
             name = f"{self.groups[group]}{field}" + "".join(f"[{i}]" for i in place)
             return self.flag(name) if node.kind == "b" else name
+        if node.op == "part" and isinstance(node.args[0].extra, Loop):
+            return self.name(node.args[0].extra.carried[node.extra])
         if node.op == "part":
             return f"v{node.args[0].number}[{node.extra}]"
         return f"v{node.number}"
@@ -84,6 +88,25 @@ class Writer:
         if node.op in _FUNCTIONS:
             return self.called(node.op, ", ".join(names))
         raise unsupported(node.op)
+
+    def loop(self, node: Node, indent: str) -> list[str]:
+        """Statements of a loop, after which the numbers that it carries are its results."""
+        loop, i = node.extra, f"i{node.number}"
+        pairs = list(zip(loop.carried, loop.results, strict=True))
+        return [
+            *(
+                f"{indent}{self.declared(own, False)} = {self.name(start)};"
+                for own, start in zip(loop.carried, node.args, strict=False)
+            ),
+            f"{indent}for ({self.index} {i} = 0; {i} < {loop.length}; {i}++) {{",
+            *self.lines(loop.nodes, indent + "  "),
+            *(
+                f"{indent}  {self.name(own)} = {self.name(result)};"
+                for own, result in pairs
+                if own is not result
+            ),
+            f"{indent}}}",
+        ]
 
     def lines(self, items: Sequence[Node | Block], indent: str = "  ") -> list[str]:
         """The statements of nodes, in their order."""
@@ -100,6 +123,8 @@ class Writer:
                 for node in item.choices:
                     found.append(f"{indent}  v{node.number} = {self.name(node.args[yes])};")
                 found.append(f"{indent}}}")
+            elif isinstance(item.extra, Loop):
+                found += self.loop(item, indent)
             elif item.op == "product":
                 found += self.product(item, indent)
             elif item.op == "take":
