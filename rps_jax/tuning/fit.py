@@ -12,13 +12,11 @@ of the kind that was seen. All logs are of one robot that pushes one object on o
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any, ClassVar
 
 import jax
@@ -34,7 +32,6 @@ from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.options import option
-from rps_jax.runs.push import Trace
 from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, seed_of
 from rps_jax.trials import trial
 from rps_jax.trials.batch import rows
@@ -54,9 +51,10 @@ _TOGETHER = 64  # worlds of one object that are stepped at once
 SAMPLES = 2000
 UNDETERMINED = 0.8  # share of the prior's 90 % interval from which on nothing was learned
 # What is told of a world beside its quantities, of what may be told where they may not.
-DERIVED = {
+DERIVED: dict[str, tuple[str, tuple[str, ...], Callable[..., np.ndarray]]] = {
     "ground_force": ("N", ("friction_ground", "mass"), lambda a, b: _GRAVITY * a * b),
     "loop_delay": ("s", ("pose_latency", "command_delay"), lambda a, b: a + b),
+    "reaction_time": ("s", ("pose_latency", "command_delay", "robot_lag"), lambda *s: sum(s)),
 }
 _WORDS = {"ground_force": "friction of the ground on the object",
           "loop_delay": "latency of the pose and delay of the command"}  # fmt: skip
@@ -188,8 +186,8 @@ class Fit(InDomain[Fitted], OfLaw[Fitted]):
         """What was asked."""
         has = self.observed[1]
         return (
-            f"{len(self.given)} log(s), the first {self.bank.window:g} s of each at "
-            f"{1 / self.bank.interval:.3g} Hz, with {', '.join(has) or 'touch and odometry alone'}; "
+            f"Logs: {len(self.given)}, the first {self.bank.window:g} s of each at "
+            f"{1 / self.bank.interval:.3g} Hz, with {', '.join(has) or 'touch and odometry'}; "
             f"{self.worlds} worlds of the domain {self.domain}, law {self.label}, in closed loop."
         )
 
@@ -201,13 +199,14 @@ class Fit(InDomain[Fitted], OfLaw[Fitted]):
             f"{UNDETERMINED:.0%} of the prior's: the logs do not tell it, and its range stays as it "
             f"was. `rps sweep --domain {self.out}/fitted.json` pushes in the fitted domain."
         )
-        if (share := float(data.outside)) > 0.05:
+        if (beyond := float(data.outside)) > 0.05:
             text += (
-                f" {share:.0%} of the logs' statistics lie beyond those of 99.8 % of the domain's "
+                f" {beyond:.0%} of the logs' statistics lie beyond those of 99.8 % of the domain's "
                 "worlds: the logs are not of this domain, law or robot, and nothing here holds."
             )
         pairs = [["object", "probability"]]
-        pairs += [[str(o), f"{float(p):.2f}"] for o, p in zip(data.object, data.probability)]  # noqa: B905
+        share = data.probability.to_series()
+        pairs += [[str(name), f"{value:.2f}"] for name, value in share.items()]
         return [
             Section("Quantities", text, table(data), Picture("marginals", found.plot)),
             Section("Objects", "", pairs),
@@ -408,8 +407,9 @@ def fitted_domain(domain: Domain, data: xr.Dataset) -> Domain:
     """
     told = data.isel(quantity=np.flatnonzero(data.undetermined.values == 0))
     ends = {
-        str(q): (float(a), float(b)) for q, a, b in zip(told.quantity.values, told.low, told.high)
-    }  # noqa: B905, E501
+        str(name): (float(told.low[i]), float(told.high[i]))
+        for i, name in enumerate(told.quantity.values)
+    }
     changes: dict[str, Any] = {
         name: Range(*ends[name], getattr(domain, name).log) for name in ends if name in QUANTITIES
     }
@@ -438,7 +438,7 @@ def table(data: xr.Dataset) -> list[list[str]]:
         told = "undetermined" if one.undetermined else f"{float(one.shrinkage):.0%} narrower"
         found.append(
             [_told(str(name)), str(one.unit.values), f"{float(one['median']):.3g}", *ends, told]
-        )  # noqa: E501
+        )
     return found
 
 

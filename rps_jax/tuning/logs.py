@@ -18,6 +18,7 @@ A log is a trace, as `push` and `replay` return it or keep it in their run folde
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -176,11 +177,9 @@ def _check(found: dict[str, np.ndarray], name: str, shell: Shell) -> None:
             f"{name} has a row every {usual:g} s: give seconds, and a row every {_SLOWEST} s at "
             "least."
         )
-    if (worst := steps.argmax(), steps.max())[1] > max(5 * usual, _SLOWEST):
-        raise InputError(
-            f"{name} has a gap of {worst[1] if isinstance(worst, tuple) else steps.max():.2g} s "
-            f"at {time[worst]:.2f} s: cut the log there."
-        )
+    if (worst := float(steps.max())) > max(5 * usual, _SLOWEST):
+        when = float(time[steps.argmax()])
+        raise InputError(f"{name} has a gap of {worst:.2g} s at {when:.2f} s: cut the log there.")
     if time[-1] - time[0] < _SHORTEST:
         raise InputError(f"{name} lasts {time[-1] - time[0]:.1f} s: it must last {_SHORTEST:g} s.")
     for key, (most, told) in _MOST.items():
@@ -229,7 +228,6 @@ def length(given: Given) -> float:
 # --- what a log tells ----------------------------------------------------------------------
 
 _BLOCKS = 10
-_LAGS = np.array([0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8])  # [s]
 
 
 def mirrored(log: Log) -> Log:
@@ -271,21 +269,16 @@ def statistics(log: Log, interval: float) -> dict[str, np.ndarray]:
     ):
         put(name, _blocks(values, where))
     put("noise", _log(_jitter(np.concatenate([pose, log.twist], -1), valid)))
-    # What the base did of what it was told, at several lags.
-    told = _rotate(pose[..., 2], log.twist)
-    half, two = (max(1, round(s / interval)) for s in (0.5, 2.0))
-    for lag in _LAGS:
-        held = _later(told, max(0, round(lag / interval)))
-        way = interval * np.cumsum(held, axis=1)
-        for name, span in (("follow", half), ("share", two)):
-            did, want = _over(pose, span), _over(way, span)
-            both = valid[:, span:] & valid[:, :-span]
-            if name == "follow":
-                put(f"follow_{lag}", _log(_rms(did - want, both)))
-                continue
-            at = pose[:, :-span, 2]
-            did, want = _rotate(-at, did), _rotate(-at, want)
-            put(f"share_{lag}", _mean(did * want, both) / (_mean(want * want, both) + 1e-8))
+    # What the base did of what it was told, and how much later.
+    told, half = _rotate(pose[..., 2], log.twist), max(1, round(0.5 / interval))
+    way = interval * np.cumsum(told, axis=1)
+    for span in (half, 4 * half):
+        at, both = -pose[:, :-span, 2], valid[:, span:] & valid[:, :-span]
+        did, want, change = (_rotate(at, _over(x, span)) for x in (pose, way, told))
+        for axis in range(3):
+            of = slice(axis, axis + 1)
+            heard = np.concatenate([want[..., of], change[..., of]], -1)
+            put(f"follow_{span}_{axis}", _regression(heard, did[..., of], both))
     # How the contact moves on the base.
     place = log.p_robot_contact
     both = touch[:, half:] & touch[:, :-half] & (_over(np.cumsum(touch, 1), half) == half)
@@ -332,7 +325,7 @@ def statistics(log: Log, interval: float) -> dict[str, np.ndarray]:
         put("drift", _log(_mean(deviation[..., None], still)), "signal")
         put("level", np.sort(np.where(dead, -1, level), -1)[:, -8:], "signal")
         highest = np.sort(np.where(valid[..., None], log.signal, 0.0), -1)[..., -4:]
-        put("highest", _blocks(np.arcsinh(highest), touch), "signal")
+        put("highest", _blocks(np.arcsinh(highest[..., -1:]), touch), "signal")
         put("reach", _quantiles(highest[..., -1], touch), "signal")
     return found
 
@@ -352,11 +345,6 @@ def _relative(pose: np.ndarray, frame: np.ndarray) -> np.ndarray:
 def _over(values: np.ndarray, span: int) -> np.ndarray:
     """Change over `span` samples."""
     return values[:, span:] - values[:, :-span]
-
-
-def _later(values: np.ndarray, by: int) -> np.ndarray:
-    """Values (B, T, k), `by` samples later, with nothing before."""
-    return np.pad(values, ((0, 0), (by, 0), (0, 0)))[:, : values.shape[1]]
 
 
 def _mean(values: np.ndarray, where: np.ndarray) -> np.ndarray:
@@ -383,7 +371,7 @@ def _jitter(values: np.ndarray, where: np.ndarray) -> np.ndarray:
 def _blocks(values: np.ndarray, where: np.ndarray) -> np.ndarray:
     """Means (B, blocks * k) over equal shares of the time."""
     cuts = np.linspace(0, values.shape[1], _BLOCKS + 1).astype(int)
-    parts = [_mean(values[:, a:b], where[:, a:b]) for a, b in zip(cuts, cuts[1:], strict=False)]
+    parts = [_mean(values[:, a:b], where[:, a:b]) for a, b in pairwise(cuts)]
     return np.concatenate(parts, -1)
 
 

@@ -43,12 +43,12 @@ def _init(key: jax.Array, features: int, size: int) -> Any:
 
     keys, w = jax.random.split(key, 5), _WIDTH
     return {
-        "trunk": [(layer(keys[0], features, w), jnp.zeros(w)), (layer(keys[1], w, w), jnp.zeros(w))],
+        "trunk": [(layer(k, n, w), jnp.zeros(w)) for k, n in ((keys[0], features), (keys[1], w))],
         "head": [
             (layer(keys[2], size, w + size, w // 2), jnp.zeros((size, w // 2))),
             (0.01 * layer(keys[3], size, w // 2, BINS), jnp.zeros((size, BINS))),
         ],
-    }  # fmt: skip
+    }
 
 
 def _trunk(params: Any, x: jax.Array) -> jax.Array:

@@ -57,15 +57,15 @@ class Coverage(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     )
     """Ranges from which worlds are drawn, by name or as a JSON file; changes follow."""
     law: LawLike = "rps"
-    worlds: int = option(12288, 192, 1_000_000, kw_only=True)
+    worlds: int = option(8064, 192, 1_000_000, kw_only=True)
     """Number of worlds that are learned from."""
     logs: int = option(240, 24, 10_000, kw_only=True)
     """Number of worlds whose logs are fitted."""
     window: float = option(30.0, 5, 300, unit="s", kw_only=True)
     """Length of a log [s]."""
-    worth: int = option(24, 0, 1000, kw_only=True)
+    worth: int = option(16, 0, 1000, kw_only=True)
     """Number of worlds in which success and time are predicted."""
-    tasks: int = option(48, 8, 1000, kw_only=True)
+    tasks: int = option(32, 8, 1000, kw_only=True)
     """Number of pushes behind each of these."""
     setting: rps_jax.Setting = field(default=rps_jax.Setting("fused"), kw_only=True)
 
@@ -74,6 +74,11 @@ class Coverage(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         """Simulated worlds, with a row of the log in each control step."""
         law, period = registry.law_of(self.params), self.setting.physics.control_period
         return fit.Bank(self.ranges, law, self.params, self.setting, self.window, period)
+
+    @cached_property
+    def _networks(self) -> dict[tuple[str, ...], posterior.Posterior]:
+        """Trained networks, by the statistics that they see."""
+        return {}
 
     def check(self) -> None:
         """Check the law and the engine."""
@@ -97,9 +102,12 @@ class Coverage(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
 
     def _learned(self, kind: str, learned: xr.Dataset, run: Run) -> tuple[Any, list[str]]:
         names = fit.chosen(learned, KINDS.get(kind, ()))
-        phase(run.report, f"learn from {kind}")
-        one = learned.sel(statistic=names)
-        return posterior.train(one.u.values, one.statistics.values, self.setting.seed), names
+        if tuple(names) not in self._networks:
+            phase(run.report, f"learn from {kind}")
+            one = learned.sel(statistic=names)
+            made = posterior.train(one.u.values, one.statistics.values, self.setting.seed)
+            self._networks[tuple(names)] = made
+        return self._networks[tuple(names)], names
 
     def _fitted(self, kind: str, learned: xr.Dataset, held: xr.Dataset, run: Run) -> xr.Dataset:
         """Of each log and quantity: the rank of the truth, the width, and whether it is told."""
@@ -162,7 +170,7 @@ class Coverage(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         index, seed = np.arange(self.worth), seed_of(self.setting.seed, "test")
         at = points.points_of(self.ranges, index, seed)
         free = np.random.default_rng(self.setting.seed).random((self.tasks, len(task)))
-        asked = {"setting": self.setting, "progress": False}
+        asked = {"setting": self.setting, "progress": False, "slots": 8}
         phase(run.report, "predict")
 
         def of(found: xr.Dataset) -> np.ndarray:
@@ -170,7 +178,7 @@ class Coverage(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
             won = found.success.astype(bool)
             return np.stack([won.mean("world"), found.time.where(won).mean("world")], -1)
 
-        usual = of(rps_jax.sweep(_LAWS, self.ranges, 8 * self.tasks, **asked))
+        usual = of(rps_jax.sweep(_LAWS, self.ranges, 4 * self.tasks, **asked))
         found = []
         for world in index:
             u = np.repeat(at[world : world + 1], self.tasks, 0)
@@ -225,11 +233,11 @@ def coverage_rows(found: xr.Dataset) -> list[list[str]]:
         one = found.sel(kind=kind)
         holds, told = _holds(one), one.undetermined == 0
         each = holds.mean("log")
-        ends = [f"{100 * float(f):.1f} %" for f in (each.min(), each.max())]
-        rows.append([
-            kind, f"{100 * float(holds.mean()):.1f} %", f"{100 * float(holds.where(told).mean()):.1f} %",
-            ", ".join(ends), f"{100 * float(told.mean()):.0f} %", f"{float(one.object_told.mean()):.2f}",
-        ])  # fmt: skip
+        shares = (holds.mean(), holds.where(told).mean(), each.min(), each.max())
+        cells = [f"{100 * float(share):.1f} %" for share in shares]
+        right = f"{float(one.object_told.mean()):.2f}"
+        told_ = f"{100 * float(told.mean()):.0f} %"
+        rows.append([kind, *cells[:2], ", ".join(cells[2:]), told_, right])
     return rows
 
 
@@ -275,7 +283,7 @@ def figure(found: xr.Dataset) -> Figure:
         right.plot(100 * shrink[i], np.arange(len(names)) + 0.1 * (i - 2.5), "o", ms=4, label=kind)
     right.axvline(100 * (1 - fit.UNDETERMINED), color="0.6", lw=1, ls=":")
     right.set_yticks(range(len(names)), [fit._told(name) for name in names], fontsize=8)
-    right.set(xlabel="narrower than the prior's [%], mean over logs; left of the line: undetermined",
+    right.set(xlabel="narrower than the prior's [%], mean over logs (dotted: undetermined)",
               title="What logs tell")  # fmt: skip
     right.grid(axis="y", alpha=0.3)
     right.invert_yaxis()
