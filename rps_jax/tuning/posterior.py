@@ -8,7 +8,6 @@ are kept apart, and several are averaged. (Papamakarios and Murray 2016; autoreg
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,8 +19,8 @@ import optax
 BINS = 24  # of each coordinate
 _WIDTH = 96
 _MEMBERS = 3
-_BATCH = 128
-_EPOCHS = 60
+_BATCH = 256
+_EPOCHS = 40
 _PATIENCE = 8  # epochs without a better density before training ends
 
 
@@ -38,16 +37,18 @@ class Posterior(NamedTuple):
 
 
 def _init(key: jax.Array, features: int, size: int) -> Any:
-    def layer(key: jax.Array, *shape: int) -> jax.Array:
-        return jax.random.normal(key, shape) / np.sqrt(shape[-2])
+    def layer(key: jax.Array, fan: int, *shape: int) -> jax.Array:
+        return jax.random.normal(key, shape) / np.sqrt(fan)
 
-    keys, w = jax.random.split(key, 5), _WIDTH
+    keys, w, h = jax.random.split(key, 5), _WIDTH, _WIDTH // 2
     return {
-        "trunk": [(layer(k, n, w), jnp.zeros(w)) for k, n in ((keys[0], features), (keys[1], w))],
-        "head": [
-            (layer(keys[2], size, w + size, w // 2), jnp.zeros((size, w // 2))),
-            (0.01 * layer(keys[3], size, w // 2, BINS), jnp.zeros((size, BINS))),
+        "trunk": [
+            (layer(k, n, n, w), jnp.zeros(w)) for k, n in ((keys[0], features), (keys[1], w))
         ],
+        "seen": layer(keys[2], w, w, size, h),
+        "before": layer(keys[3], size, size, size, h),  # of coordinates, on later ones
+        "bias": jnp.zeros((size, h)),
+        "out": (0.01 * layer(keys[4], h, size, h, BINS), jnp.zeros((size, BINS))),
     }
 
 
@@ -57,12 +58,9 @@ def _trunk(params: Any, x: jax.Array) -> jax.Array:
     return x
 
 
-def _head(params: Any, d: Any, x: jax.Array, u: jax.Array) -> jax.Array:
-    """Log shares (..., BINS) of coordinate `d`, given those before it in `u` (..., D)."""
-    known = jnp.where(jnp.arange(u.shape[-1]) < d, 2 * u - 1, 0.0)
-    (w, b), (v, c) = params["head"]
-    hidden = jax.nn.silu(jnp.concatenate([x, known], -1) @ w[d] + b[d])
-    return jax.nn.log_softmax(hidden @ v[d] + c[d])
+def _mask(size: int) -> np.ndarray:
+    """Which coordinates (size, size, 1) come before which."""
+    return np.triu(np.ones((size, size), np.float32), 1)[..., None]
 
 
 def _loss(params: Any, x: jax.Array, u: jax.Array, key: jax.Array | None = None) -> jax.Array:
@@ -71,19 +69,17 @@ def _loss(params: Any, x: jax.Array, u: jax.Array, key: jax.Array | None = None)
         key, other = jax.random.split(key)
         x = x + 0.1 * jax.random.normal(key, x.shape)
         x = x * jax.random.bernoulli(other, 0.9, x.shape) / 0.9
-    every = jnp.arange(u.shape[-1])
-    x = _trunk(params, x)
-    shares = jax.vmap(_head, (None, 0, None, None), 1)(params, every, x, u)
+    size = u.shape[-1]
+    before = (params["before"] * _mask(size)).reshape(size, -1)
+    hidden = _trunk(params, x) @ params["seen"].reshape(_WIDTH, -1) + (2 * u - 1) @ before
+    hidden = jax.nn.silu(hidden.reshape(-1, *params["bias"].shape) + params["bias"])
+    out, bias = params["out"]
+    shares = jax.nn.log_softmax(jnp.einsum("ndh,dhk->ndk", hidden, out) + bias)
     at = jnp.minimum((u * BINS).astype(int), BINS - 1)[..., None]
     return -jnp.mean(jnp.sum(jnp.take_along_axis(shares, at, -1)[..., 0] + jnp.log(BINS), -1))
 
 
-def train(
-    u: np.ndarray,
-    statistics: np.ndarray,
-    seed: int = 0,
-    told: Callable[[int], object] = lambda epoch: None,
-) -> Posterior:
+def train(u: np.ndarray, statistics: np.ndarray, seed: int = 0) -> Posterior:
     """Train on worlds at `u` (n, D) of the cube with statistics (n, m, F), each seen in m ways."""
     rng = np.random.default_rng(seed)
     flat = statistics.reshape(-1, statistics.shape[-1])
@@ -100,45 +96,37 @@ def train(
     size, steps = len(own), max(1, len(own) // _BATCH)
     schedule = optax.cosine_decay_schedule(2e-3, _EPOCHS * steps, 0.02)
     optimiser = optax.adamw(schedule, weight_decay=1e-2)
-    keys = jax.random.split(jax.random.PRNGKey(seed), _MEMBERS)
-    params = jax.vmap(partial(_init, features=x.shape[-1], size=u.shape[-1]))(keys)
-    state = jax.vmap(optimiser.init)(params)
+    init = partial(_init, features=x.shape[-1], size=u.shape[-1])
+    own, uo = jnp.asarray(own), jnp.asarray(uo, jnp.float32)
 
     @jax.jit
-    def epoch(params: Any, state: Any, keys: jax.Array, own: Any, uo: Any) -> Any:
-        def member(params: Any, state: Any, key: jax.Array) -> Any:
-            def one(carry: Any, step: Any) -> Any:
-                params, state = carry
-                rows, key = step
-                grad = jax.grad(_loss)(params, own[rows], uo[rows], key)
-                change, state = optimiser.update(grad, state, params)
-                return (optax.apply_updates(params, change), state), None
+    def epoch(params: Any, state: Any, key: jax.Array) -> Any:
+        def one(carry: Any, step: Any) -> Any:
+            params, state = carry
+            rows, key = step
+            grad = jax.grad(_loss)(params, own[rows], uo[rows], key)
+            change, state = optimiser.update(grad, state, params)
+            return (optax.apply_updates(params, change), state), None
 
-            shuffled = jax.random.permutation(key, size)[: steps * _BATCH].reshape(steps, -1)
-            (params, state), _ = jax.lax.scan(
-                one, (params, state), (shuffled, jax.random.split(key, steps))
-            )
-            return params, state, _loss(params, *apart)
+        shuffled = jax.random.permutation(key, size)[: steps * _BATCH].reshape(steps, -1)
+        keys = jax.random.split(key, steps)
+        (params, state), _ = jax.lax.scan(one, (params, state), (shuffled, keys))
+        return params, state, _loss(params, *apart)
 
-        return jax.vmap(member)(params, state, keys)
-
-    best, best_loss, since = params, np.full(_MEMBERS, np.inf), 0
-    own, uo = jnp.asarray(own), jnp.asarray(uo)
-    for number in range(_EPOCHS):
-        keys = jax.vmap(lambda key: jax.random.split(key)[0])(keys)
-        params, state, loss = epoch(params, state, keys, own, uo)
-        better, since = np.asarray(loss) < best_loss, since + 1
-        if better.any():
-            since, best_loss = 0, np.where(better, loss, best_loss)
-            pick = jnp.asarray(better)
-            best = jax.tree.map(
-                lambda a, b, pick=pick: jnp.where(pick.reshape(-1, *[1] * (a.ndim - 1)), a, b),
-                params, best,
-            )  # fmt: skip
-        told(number + 1)
-        if since >= _PATIENCE:
-            break
-    return empty._replace(params=best)
+    members = []
+    for member in range(_MEMBERS):
+        key = jax.random.PRNGKey(seed * _MEMBERS + member)
+        params = best = init(key)
+        state, least, since = optimiser.init(params), np.inf, 0
+        for number in range(_EPOCHS):
+            params, state, loss = epoch(params, state, jax.random.fold_in(key, number))
+            since += 1
+            if float(loss) < least:
+                best, least, since = params, float(loss), 0
+            if since >= _PATIENCE:
+                break
+        members.append(best)
+    return empty._replace(params=jax.tree.map(lambda *leaves: jnp.stack(leaves), *members))
 
 
 def sample(posterior: Posterior, statistics: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
@@ -154,17 +142,18 @@ def sample(posterior: Posterior, statistics: np.ndarray, count: int, seed: int =
 @partial(jax.jit, static_argnames="count")
 def _drawn(params: Any, x: jax.Array, key: jax.Array, count: int) -> jax.Array:
     seen = jax.vmap(_trunk, (0, None))(params, x)  # (members, m, W)
-    size = params["head"][1][1].shape[1]
+    size = params["bias"].shape[1]
+    before = params["before"] * _mask(size)
 
     def one(d: Any, carry: Any) -> Any:
         u, key = carry
         key, pick, within, again = jax.random.split(key, 4)
-
-        def shares(params: Any, seen: jax.Array) -> jax.Array:  # (count, BINS) of one member
-            every = jnp.broadcast_to(seen, (count, seen.shape[-1]))
-            return _head(params, d, every, u)
-
-        each = jax.vmap(jax.vmap(shares, (None, 0)))(params, seen)  # (members, m, count, BINS)
+        known = jnp.einsum("cj,ejh->ech", 2 * u - 1, before[:, :, d]) + params["bias"][:, None, d]
+        hidden = jnp.einsum("emw,ewh->emh", seen, params["seen"][:, :, d])
+        hidden = jax.nn.silu(hidden[:, :, None] + known[:, None])  # (members, m, count, H)
+        out, bias = (x[:, d] for x in params["out"])
+        each = jnp.einsum("emch,ehk->emck", hidden, out) + bias[:, None, None]
+        each = jax.nn.log_softmax(each)
         log = jax.nn.logsumexp(each, 0) - jnp.log(len(each)) + jnp.log(BINS)
         product = jnp.sum(log, 0) - jnp.log(BINS)
         bins = jax.random.categorical(pick, product)
