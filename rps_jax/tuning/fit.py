@@ -264,7 +264,7 @@ class Bank:
         return xr.Dataset(
             {
                 "u": (("world", "quantity"), every[:, own]),
-                "statistics": (("world", "way", "statistic"), np.stack(ways, 1).astype(np.float32)),
+                "statistics": (("world", "way", "statistic"), np.float32(np.stack(ways, 1))),
             },
             {"quantity": list(coordinates(self.domain)), "statistic": names},
         )
