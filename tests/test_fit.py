@@ -4,7 +4,6 @@ import re
 
 import numpy as np
 import pytest
-
 from helpers import refusal, rps
 
 import rps_jax

@@ -294,8 +294,9 @@ def statistics(log: Log, interval: float) -> dict[str, np.ndarray]:
     if log.object_pose is not None:
         thing = log.object_pose
         seen = _relative(thing, log.pose)
-        put("seen", _blocks(np.concatenate([seen, np.cos(seen[..., 2:]), np.sin(seen[..., 2:])], -1),
-                            valid), "object_pose")  # fmt: skip
+        turn = seen[..., 2:]
+        whole = np.concatenate([seen, np.cos(turn), np.sin(turn)], -1)
+        put("seen", _blocks(whole, valid), "object_pose")
         away = np.linalg.norm(seen[..., :2] - place, axis=-1, keepdims=True)
         put("away", np.column_stack([_mean(away, touch), _rms(away, touch)]), "object_pose")
         on_it = _rotate(

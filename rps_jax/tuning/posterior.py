@@ -21,6 +21,7 @@ _WIDTH = 96
 _MEMBERS = 3
 _BATCH = 256
 _EPOCHS = 40
+_NOISE = 0.03  # of the statistics' spread, added in training
 _PATIENCE = 8  # epochs without a better density before training ends
 
 
@@ -66,9 +67,7 @@ def _mask(size: int) -> np.ndarray:
 def _loss(params: Any, x: jax.Array, u: jax.Array, key: jax.Array | None = None) -> jax.Array:
     """Mean over (n) of minus the log density of u (n, D) against the prior's."""
     if key is not None:  # noise keeps the networks from learning worlds by heart
-        key, other = jax.random.split(key)
-        x = x + 0.1 * jax.random.normal(key, x.shape)
-        x = x * jax.random.bernoulli(other, 0.9, x.shape) / 0.9
+        x = x + _NOISE * jax.random.normal(key, x.shape)
     size = u.shape[-1]
     before = (params["before"] * _mask(size)).reshape(size, -1)
     hidden = _trunk(params, x) @ params["seen"].reshape(_WIDTH, -1) + (2 * u - 1) @ before
