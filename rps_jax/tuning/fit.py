@@ -36,6 +36,7 @@ from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, seed_of
 from rps_jax.trials import trial
 from rps_jax.trials.batch import rows
 from rps_jax.trials.progress import Progress, phase
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import object_pose
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.tuning import logs as logs_
@@ -130,14 +131,7 @@ class Fit(InDomain[Fitted], OfLaw[Fitted]):
     def check(self) -> None:
         """Check the logs, the law and the engine."""
         self.check_engine([self.params])
-        engine = engines.get(self.setting.engine)
-        engine.check_traced()
-        engine.check_senses("force")
-        if self.bank.law.senses != "touch":
-            raise InputError(
-                f"law = {self.label} senses {self.bank.law.senses}: fit knows laws that sense "
-                "touch, as rps and rps_plus."
-            )
+        check_law(self.label, self.bank.law, self.setting)
         if len({one.exact for one in self.given}) > 1:
             raise InputError("logs of traces and of a robot's odometry are not allowed together.")
         for given in self.given:
@@ -227,7 +221,7 @@ class Bank:
     domain: Domain
     law: Law
     params: Any
-    setting: Any
+    setting: Setting
     window: float  # [s]
     interval: float  # [s]
     exact: bool = False  # logs have the pose where the base is, not where it believes to be
@@ -291,6 +285,17 @@ class Bank:
         pose = {"pose": exact} if self.exact else {}
         valid = kept.pop("done") < 0.5
         return Log(valid=valid, target=part.worlds.p_world_target, **(kept | pose))
+
+
+def check_law(label: str, law: Law, setting: Setting) -> None:
+    """Raises InputError unless logs of this law can be simulated in this setting."""
+    engines.get(setting.engine).check_traced()
+    engines.get(setting.engine).check_senses("force")
+    if law.senses != "touch":
+        raise InputError(
+            f"law = {label} senses {law.senses}: fit knows laws that sense touch, as rps and "
+            "rps_plus."
+        )
 
 
 def _telling(law: Law) -> Law:

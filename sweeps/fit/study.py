@@ -83,6 +83,7 @@ class Coverage(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     def check(self) -> None:
         """Check the law and the engine."""
         self.check_engine([self.params])
+        fit.check_law(self.label, registry.law_of(self.params), self.setting)
 
     def trials(self) -> int | None:
         """How many logs are simulated."""
