@@ -32,7 +32,7 @@ from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.options import option
-from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, seed_of
+from rps_jax.runs.question import InDomain, OfLaw, Pushes, Run, call_of, seed_of
 from rps_jax.trials import trial
 from rps_jax.trials.batch import rows
 from rps_jax.trials.progress import Progress, phase
@@ -55,9 +55,13 @@ UNDETERMINED = 0.8  # share of the prior's 90 % interval from which on nothing w
 DERIVED: dict[str, tuple[str, tuple[str, ...], Callable[..., np.ndarray]]] = {
     "ground_force": ("N", ("friction_ground", "mass"), lambda a, b: _GRAVITY * a * b),
     "loop_delay": ("s", ("pose_latency", "command_delay"), lambda a, b: a + b),
-    "reaction_time": ("s", ("pose_latency", "command_delay", "robot_lag"), lambda *s: sum(s)),
+    "reaction_time": (
+        "s",
+        ("pose_latency", "command_delay", "robot_lag"),
+        lambda a, b, c: a + b + c,
+    ),
 }
-_WORDS = {"ground_force": "friction of the ground on the object",
+_WORDS = {"ground_force": "friction force of the ground",
           "loop_delay": "latency of the pose and delay of the command"}  # fmt: skip
 
 
@@ -74,7 +78,17 @@ class Fitted:
 
 
 @dataclass(frozen=True)
-class Fit(InDomain[Fitted], OfLaw[Fitted]):
+class OfLogs(Pushes[Fitted]):
+    """A question about logs."""
+
+    logs: tuple[str | Any, ...] = option((), positional=True)
+    """Logs of one object on one floor: tables FILE.csv (time, x, y, yaw, contact_type, contact_x,
+    contact_y, v_x, v_y, omega, target_x, target_y and, if known, object_x, object_y, object_yaw,
+    force_x, force_y, taxel_0, ...), bags FILE.mcap, run folders of rps push, or traces."""
+
+
+@dataclass(frozen=True)
+class Fit(OfLaw[Fitted], InDomain[Fitted], OfLogs):
     """Fit a domain's ranges to logs of a robot: what of mass, friction, skin and drive they tell.
 
     The answer's `data` holds samples (sample, quantity) of the posterior, its 5, 50 and 95 %
@@ -93,10 +107,6 @@ class Fit(InDomain[Fitted], OfLaw[Fitted]):
     TITLE: ClassVar[str] = "A domain fitted to logs"
     SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 768, "window": 20.0}
 
-    logs: tuple[str | Any, ...] = option((), positional=True)
-    """Logs of one object on one floor: tables FILE.csv (time, x, y, yaw, contact_type, contact_x,
-    contact_y, v_x, v_y, omega, target_x, target_y and, if known, object_x, object_y, object_yaw,
-    force_x, force_y, taxel_0, ...), bags FILE.mcap, run folders of rps push, or traces."""
     law: LawLike = "rps"
     worlds: int = option(6144, 96, 1_000_000)
     """Number of worlds of the domain that are simulated."""
@@ -190,8 +200,8 @@ class Fit(InDomain[Fitted], OfLaw[Fitted]):
         data = found.data
         text = (
             "Median and 90 % interval. A quantity is undetermined if its interval is at least "
-            f"{UNDETERMINED:.0%} of the prior's: the logs do not tell it, and its range stays as it "
-            f"was. `rps sweep --domain {self.out}/fitted.json` pushes in the fitted domain."
+            f"{UNDETERMINED:.0%} of the prior's: the logs do not tell it, and its range stays as "
+            f"it was. `rps sweep --domain {self.out}/fitted.json` pushes in the fitted domain."
         )
         if (beyond := float(data.outside)) > 0.05:
             text += (
@@ -284,7 +294,7 @@ class Bank:
         exact = kept.pop("true_pose")
         pose = {"pose": exact} if self.exact else {}
         valid = kept.pop("done") < 0.5
-        return Log(valid=valid, target=part.worlds.p_world_target, **(kept | pose))
+        return Log(valid=valid, target=np.asarray(part.worlds.p_world_target), **(kept | pose))
 
 
 def check_law(label: str, law: Law, setting: Setting) -> None:
@@ -400,7 +410,7 @@ def summary(domain: Domain, u: np.ndarray) -> xr.Dataset:
     share = np.bincount(which, minlength=len(domain.objects)) / len(u)
     columns["probability"] = ("object", share)
     names = list(found)
-    coords = {"quantity": names, "other": names, "object": list(domain.objects)}
+    coords: dict[str, Any] = {"quantity": names, "other": names, "object": list(domain.objects)}
     coords["unit"] = ("quantity", [unit[k] for k in names])
     return xr.Dataset(columns, coords)
 

@@ -22,6 +22,9 @@ _MEMBERS = 3
 _BATCH = 256
 _EPOCHS = 40
 _NOISE = 0.03  # of the statistics' spread, added in training
+# What each observation after the first counts, since the networks' own errors multiply, too: found
+# in worlds for validation, see `sweeps/fit`.
+_FURTHER = 0.6
 _PATIENCE = 8  # epochs without a better density before training ends
 
 
@@ -81,21 +84,21 @@ def _loss(params: Any, x: jax.Array, u: jax.Array, key: jax.Array | None = None)
 def train(u: np.ndarray, statistics: np.ndarray, seed: int = 0) -> Posterior:
     """Train on worlds at `u` (n, D) of the cube with statistics (n, m, F), each seen in m ways."""
     rng = np.random.default_rng(seed)
-    flat = statistics.reshape(-1, statistics.shape[-1])
+    count, ways, features = statistics.shape
+    flat = statistics.reshape(-1, features)
     mean, scale = np.nanmean(flat, 0), np.nanstd(flat, 0) + 1e-6
     empty = Posterior(np.nan_to_num(mean), np.nan_to_num(scale, nan=1.0), None)
-    x = empty.seen(flat).reshape(statistics.shape).astype(np.float32)
-    order, kept = rng.permutation(len(u)), max(2, len(u) // 10)
-    ways = x.shape[1]
+    x = empty.seen(flat).reshape(count, ways, features).astype(np.float32)
+    order, kept = rng.permutation(count), max(2, count // 10)
     apart = (
-        jnp.asarray(x[order[:kept]].reshape(-1, x.shape[-1])),
+        jnp.asarray(x[order[:kept]].reshape(-1, features)),
         jnp.asarray(np.repeat(u[order[:kept]], ways, 0)),
     )
-    own, uo = x[order[kept:]].reshape(-1, x.shape[-1]), np.repeat(u[order[kept:]], ways, 0)
+    own, uo = x[order[kept:]].reshape(-1, features), np.repeat(u[order[kept:]], ways, 0)
     size, steps = len(own), max(1, len(own) // _BATCH)
     schedule = optax.cosine_decay_schedule(2e-3, _EPOCHS * steps, 0.02)
     optimiser = optax.adamw(schedule, weight_decay=1e-2)
-    init = partial(_init, features=x.shape[-1], size=u.shape[-1])
+    init = partial(_init, features=features, size=u.shape[-1])
     own, uo = jnp.asarray(own), jnp.asarray(uo, jnp.float32)
 
     @jax.jit
@@ -138,6 +141,11 @@ def sample(posterior: Posterior, statistics: np.ndarray, count: int, seed: int =
     return np.asarray(_drawn(posterior.params, x, jax.random.PRNGKey(seed), count))
 
 
+def _counted(observations: int) -> float:
+    """Power of each density in the product."""
+    return (1 + _FURTHER * (observations - 1)) / observations
+
+
 @partial(jax.jit, static_argnames="count")
 def _drawn(params: Any, x: jax.Array, key: jax.Array, count: int) -> jax.Array:
     seen = jax.vmap(_trunk, (0, None))(params, x)  # (members, m, W)
@@ -154,7 +162,7 @@ def _drawn(params: Any, x: jax.Array, key: jax.Array, count: int) -> jax.Array:
         each = jnp.einsum("emch,ehk->emck", hidden, out) + bias[:, None, None]
         each = jax.nn.log_softmax(each)
         log = jax.nn.logsumexp(each, 0) - jnp.log(len(each)) + jnp.log(BINS)
-        product = jnp.sum(log, 0) - jnp.log(BINS)
+        product = _counted(len(x)) * jnp.sum(log, 0) - jnp.log(BINS)
         bins = jax.random.categorical(pick, product)
         value = (bins + jax.random.uniform(within, (count,))) / BINS
         weight = jax.nn.logsumexp(product, -1)

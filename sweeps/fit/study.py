@@ -284,7 +284,7 @@ def figure(found: xr.Dataset) -> Figure:
         right.plot(100 * shrink[i], np.arange(len(names)) + 0.1 * (i - 2.5), "o", ms=4, label=kind)
     right.axvline(100 * (1 - fit.UNDETERMINED), color="0.6", lw=1, ls=":")
     right.set_yticks(range(len(names)), [fit._told(name) for name in names], fontsize=8)
-    right.set(xlabel="narrower than the prior's [%], mean over logs (dotted: undetermined)",
+    right.set(xlabel="how much narrower than the prior's [%], mean over logs",
               title="What logs tell")  # fmt: skip
     right.grid(axis="y", alpha=0.3)
     right.invert_yaxis()
