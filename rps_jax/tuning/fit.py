@@ -439,7 +439,8 @@ def fitted_domain(domain: Domain, data: xr.Dataset) -> Domain:
 # --- how it is told ------------------------------------------------------------------------
 
 
-def _told(name: str) -> str:
+def words(name: str) -> str:
+    """A quantity, or what is derived of some, in words."""
     return _WORDS.get(name) or quantity(name)
 
 
@@ -452,7 +453,7 @@ def table(data: xr.Dataset) -> list[list[str]]:
                 for k, m in (("low", "high"), ("prior_low", "prior_high"))]  # fmt: skip
         told = "undetermined" if one.undetermined else f"{float(one.shrinkage):.0%} narrower"
         found.append(
-            [_told(str(name)), str(one.unit.values), f"{float(one['median']):.3g}", *ends, told]
+            [words(str(name)), str(one.unit.values), f"{float(one['median']):.3g}", *ends, told]
         )
     return found
 
@@ -467,7 +468,7 @@ def _pairs(data: xr.Dataset) -> Iterator[tuple[str, str, str]]:
     for i, a in enumerate(names):
         for b in names[:i]:
             if abs(value := float(data.correlation.sel(quantity=a, other=b))) > 0.5:
-                yield _told(a), _told(b), f"{value:.2f}"
+                yield words(a), words(b), f"{value:.2f}"
 
 
 def marginals(data: xr.Dataset) -> Figure:
@@ -482,7 +483,7 @@ def marginals(data: xr.Dataset) -> Figure:
         ax.axvspan(float(one.prior_low), float(one.prior_high), color="0.88")
         flat = bool(one.undetermined)
         ax.hist(one["sample"], 40, density=True, color="0.6" if flat else "C0")
-        ax.set_title(_told(name) + (" (undetermined)" if flat else ""), fontsize=8)
+        ax.set_title(words(name) + (" (undetermined)" if flat else ""), fontsize=8)
         ax.set(yticks=[], xlabel=f"[{one.unit.values}]")
         ax.tick_params(labelsize=7)
     for ax in axes[len(names) :]:

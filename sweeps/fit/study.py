@@ -21,15 +21,19 @@ import xarray as xr
 
 import rps_jax
 from rps_jax.analysis.figures.style import Figure
-from rps_jax.analysis.report import Picture, Section
+from rps_jax.analysis.report import Picture, Section, save
 from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
+from rps_jax.record import provenance
 from rps_jax.record.options import option
 from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, seed_of
 from rps_jax.trials.progress import Progress, phase, unheard
 from rps_jax.tuning import fit, posterior
 from rps_jax.world import domain as domains
 from rps_jax.world import draws, points
+from sweeps.shared import publish
+
+_HERE = Path(__file__).parent
 
 KINDS: dict[str, tuple[str, ...]] = {  # of logs: what they have beside touch, odometry and commands
     "touch": (),
@@ -67,6 +71,8 @@ class Coverage(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     """Number of worlds in which success and time are predicted."""
     tasks: int = option(32, 8, 1000, kw_only=True)
     """Number of pushes behind each of these."""
+    machine: str = ""
+    """What it runs on, in words; with these the tables and the figure are published."""
     setting: rps_jax.Setting = field(default=rps_jax.Setting("fused"), kw_only=True)
 
     @cached_property
@@ -99,7 +105,10 @@ class Coverage(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         ]
         whole = xr.concat(found, "kind").assign_coords(kind=[*KINDS, FOUR])
         worth = run.part("worth", partial(self._worth, learned, held, run))
-        return xr.merge([whole, worth])
+        whole = xr.merge([whole, worth])
+        if self.machine and run.folder is not None:
+            self._publish(whole, run.folder)
+        return whole
 
     def _learned(self, kind: str, learned: xr.Dataset, run: Run) -> tuple[Any, list[str]]:
         names = fit.chosen(learned, KINDS.get(kind, ()))
@@ -204,22 +213,37 @@ class Coverage(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
 
     # --- how it is told ---
 
+    def _publish(self, found: xr.Dataset, folder: Path) -> None:
+        made = [provenance.signed(folder)]
+        for name, (head, *rows) in tables(found).items():
+            columns = [{"name": text} for text in head]
+            publish(_HERE / "results" / f"fit_{name}.json", made, self.machine, columns, rows)
+        save(figure(found), _HERE / "coverage.png")
+
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
         """Coverage by kind of log, by quantity, and what fitting is worth."""
-        rows = [["log", "90 % intervals hold the truth", "of told quantities", "least, greatest of "
-                 "a quantity", "told", "right object's probability"]]  # fmt: skip
-        rows += [list(row) for row in coverage_rows(found)]
-        each = [["quantity", *map(str, found.kind.values)], *quantity_rows(found)]
-        worth = [["law", "success from the domain", "from the fit", "time from the domain",
-                  "from the fit"], *worth_rows(found)]  # fmt: skip
+        told = tables(found)
         return [
-            Section("Coverage", "", rows, Picture("coverage", partial(figure, found))),
-            Section("By quantity", "Coverage, and how often it is told.", each),
-            Section("Worth", "Mean error of the prediction.", worth),
+            Section("Coverage", "", told["coverage"], Picture("coverage", partial(figure, found))),
+            Section("By quantity", "Coverage, and share of logs that tell it.", told["quantities"]),
+            Section("Worth", "Mean error of the prediction.", told["worth"]),
         ]
 
 
 coverage = call_of(Coverage)
+
+
+def tables(found: xr.Dataset) -> dict[str, list[list[str]]]:
+    """Header and rows of each table of the page."""
+    first = ["log", "90 % intervals hold the truth", "those of told quantities",
+             "least, greatest of a quantity", "told", "right object's probability"]  # fmt: skip
+    worth = ["law", "success, from the domain", "success, from the fit", "time, from the domain",
+             "time, from the fit"]  # fmt: skip
+    return {
+        "coverage": [first, *coverage_rows(found)],
+        "quantities": [["quantity", *map(str, found.kind.values)], *quantity_rows(found)],
+        "worth": [worth, *worth_rows(found)],
+    }
 
 
 def _holds(one: xr.Dataset) -> xr.DataArray:
@@ -250,7 +274,7 @@ def quantity_rows(found: xr.Dataset) -> list[list[str]]:
         holds, told = _holds(one).mean("log"), (one.undetermined == 0).mean("log")
         cells = [f"{100 * float(h):.0f} %, {100 * float(t):.0f} %"
                  for h, t in zip(holds, told, strict=True)]  # fmt: skip
-        rows.append([fit._told(name), *cells])
+        rows.append([fit.words(name), *cells])
     return rows
 
 
@@ -283,28 +307,9 @@ def figure(found: xr.Dataset) -> Figure:
     for i, kind in enumerate(map(str, found.kind.values)):
         right.plot(100 * shrink[i], np.arange(len(names)) + 0.1 * (i - 2.5), "o", ms=4, label=kind)
     right.axvline(100 * (1 - fit.UNDETERMINED), color="0.6", lw=1, ls=":")
-    right.set_yticks(range(len(names)), [fit._told(name) for name in names], fontsize=8)
+    right.set_yticks(range(len(names)), [fit.words(name) for name in names], fontsize=8)
     right.set(xlabel="how much narrower than the prior's [%], mean over logs",
               title="What logs tell")  # fmt: skip
     right.grid(axis="y", alpha=0.3)
     right.invert_yaxis()
     return drawn
-
-
-def publish(folder: Path, found: xr.Dataset) -> None:
-    """Write the data files of the page's tables."""
-    from rps_jax.record import provenance
-    from sweeps.shared import publish as write
-
-    here, made = Path(__file__).parent, [provenance.signed(folder)]
-    device = "two shared virtual cores of an AMD EPYC"
-    first = ["log", "90 % intervals hold the truth", "those of told quantities",
-             "least, greatest of a quantity", "told", "right object's probability"]  # fmt: skip
-    tables: dict[str, tuple[Sequence[str], Any]] = {
-        "coverage": (first, coverage_rows(found)),
-        "quantities": (["quantity", *map(str, found.kind.values)], quantity_rows(found)),
-        "worth": (["law", "success, from the domain", "from the fit", "time, from the domain",
-                   "from the fit "], worth_rows(found)),
-    }  # fmt: skip
-    for name, (head, rows) in tables.items():
-        write(here / "results" / f"{name}.json", made, device, [{"name": h} for h in head], rows)
