@@ -27,6 +27,7 @@ from rps_jax.studies.sensitivity import sensitivity as sensitivity
 from rps_jax.tuning.evolution import tune_es as tune_es
 from rps_jax.tuning.descent import tune_grad as tune_grad
 from rps_jax.tuning.learn import learn as learn
+from rps_jax.tuning.fit import fit as fit
 from rps_jax.tuning.space import Space as Space
 from rps_jax.trials.env import PushEnv as PushEnv
 

@@ -39,8 +39,8 @@ def told(notebook):
     ]
 
 
-def test_there_are_five_of_them():
-    assert [name[:2] for name in TEXTS] == ["01", "02", "03", "04", "05"]
+def test_there_are_six_of_them():
+    assert [name[:2] for name in TEXTS] == ["01", "02", "03", "04", "05", "06"]
 
 
 @pytest.mark.parametrize("path", TEXTS.values(), ids=lambda path: path.stem)

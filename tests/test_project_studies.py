@@ -45,6 +45,8 @@ REFUSED = [
     ("ground", "--worlds 0", "worlds = 0 is not allowed"),
     ("learned", "run run", "runs"),
     ("force_push_grid", "--duration 0", "duration"),
+    ("fit", "--logs 1", "logs = 1 is not allowed"),
+    ("fit", "--law aps", "fit knows laws that sense touch"),
 ]
 
 

@@ -110,6 +110,11 @@ class Domain:
         Range(0, 0.1), 14, "1", 0, 1, "spread of the taxels' gains", "skin", "gain_spread"
     )
     dead_share: Range = drawn(Range(0, 0.05), 15, "1", 0, 1, "dead taxels", "skin", "dead_share")
+    # None: as the skin has it.
+    foam: Range | None = drawn(None, 40, "m", 0.002, 0.05, "foam of the skin", "skin", "foam")
+    time_constant: Range | None = drawn(
+        None, 41, "s", _POSITIVE, 1, "time constant of the skin", "skin", "time_constant"
+    )
     # The base: where it believes it is, and how it does what it is told.
     pose_noise: Range = drawn(
         Range(0, 0.005), 16, "m", 0, 1, "noise of the position", "base", "pose_noise"
@@ -139,6 +144,7 @@ class Domain:
         None, 38, "m/s^2", _POSITIVE, 100, "greatest acceleration of the robot", "robot",
         "acceleration_max",
     )  # fmt: skip
+    robot_slip: Range | None = drawn(None, 42, "1", 0, 0.5, "slip of the wheels", "robot", "slip")
 
     def __post_init__(self) -> None:
         """Raises InputError for ranges that are empty or leave what is possible."""
@@ -386,7 +392,7 @@ def _from_json(values: Mapping[str, Any], usual: Domain) -> dict[str, Any]:
     known = {f.name: f for f in fields(Domain)}
     for name, value in values.items():
         errors.check_name("domain quantity", name, known)
-        if value is None and name in QUANTITIES and QUANTITIES[name].of == "robot":
+        if value is None and name in QUANTITIES and known[name].default is None:
             continue
         if name == "objects" and isinstance(value, str):
             value = [value]  # the only one of a text
