@@ -426,4 +426,5 @@ def publish(
         "columns": list(columns),
         "rows": list(rows),
     }
+    path.parent.mkdir(exist_ok=True)
     return files.write_text(path, json.dumps(data, indent=1) + "\n")
