@@ -1,0 +1,158 @@
+"""How often and how fast do the four laws push random objects home, and on which models?
+
+One sample a row: all laws meet the same worlds, and a panel of models the first of these.
+
+rps sweeps/headline --machine "one NVIDIA H200"
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import xarray as xr
+
+from rps_jax.analysis import statistics
+from rps_jax.analysis.report import Section
+from rps_jax.control import registry
+from rps_jax.record import provenance
+from rps_jax.record.options import option
+from rps_jax.runs import models, sweep
+from rps_jax.runs.plan import Plan
+from rps_jax.runs.question import Run, call_of, setting_as_json
+from rps_jax.trials.setting import Setting
+from rps_jax.world import domain as domains
+from sweeps.shared import Study, publish
+
+_HERE = Path(__file__).parent
+C = "C MuJoCo, this ground, 10 ms"
+
+
+@dataclass(frozen=True)
+class Headline(Study[xr.Dataset]):
+    """Push with four laws in worlds that nobody looked at, and in fewer on a panel of models."""
+
+    TITLE: ClassVar[str] = "The headline: four laws in random worlds"
+    SMALL: ClassVar[dict[str, Any]] = {"worlds": 24, "panel": 0, "in_c": 0}
+    GROWS: ClassVar[tuple[str, ...]] = ("domains", "machine", "panel", "in_c")
+
+    laws: tuple[str, ...] = ("rps", "rps_tuned", "rps_plus", "learned_gru")
+    """Laws that are compared."""
+    domains: tuple[str, ...] = ("wide", "real", "hostile")
+    """Domains from which worlds are drawn."""
+    worlds: int = option(10_000, 2, 10_000_000)
+    """Number of worlds of a domain."""
+    panel: int = option(2_000, 0, 10_000_000)
+    """How many of them are tried on each model of the panel; 0: none."""
+    in_c: int = option(500, 0, 10_000_000)
+    """How many of them are tried in C MuJoCo; 0: none."""
+    machine: str = ""
+    """What it runs on, in words; with these the table is published."""
+    setting: Setting = field(default=Setting("fused", seed=2311), kw_only=True)
+    quick: bool = False
+    """Whether to make a small run of a minute on two cores."""
+
+    def configuration(self) -> dict[str, Any]:
+        """All that the parts depend on, as JSON; a part has its domain, model and size besides."""
+        return {**super().configuration(), "setting": setting_as_json(self.setting)}
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Outcomes (domain, model, law, world); a world that a model did not meet is NaN."""
+        found = []
+        for name in self.domains:
+            for model, plan in self.plans(name).items():
+                safe = "".join(c if c.isalnum() else "_" for c in f"{name} {model}")
+                part = run.part(f"{safe}-{plan.worlds}", partial(_outcomes, plan, run))
+                found.append(part.expand_dims(domain=[name], model=[model]))
+        whole = xr.combine_by_coords(found, join="outer", combine_attrs="drop")
+        assert isinstance(whole, xr.Dataset)
+        whole = whole.sel(law=list(self.laws), domain=list(self.domains))
+        if self.machine and run.folder is not None:
+            columns = [{"name": "domain", "merge": True}, {"name": "law"}]
+            head, *rows = table(whole)
+            columns += [{"name": text} for text in head[2:]]
+            made = [provenance.signed(run.folder)]
+            publish(_HERE / "results" / "headline.json", made, self.machine, columns, rows)
+        return whole
+
+    def plans(self, name: str) -> dict[str, Plan]:
+        """What is run in a domain: on each model, the default's worlds first."""
+        laws = registry.laws_of(self.laws)
+        plan = Plan(domains.named(name), self.worlds, laws, self.setting, 4096)
+        found = {models.OWN: plan}
+        if self.panel:
+            small = replace(plan, worlds=min(self.panel, self.worlds))
+            found |= {k: v for k, v in models.plans(small).items() if k != models.OWN}
+        if self.in_c:
+            in_c = replace(plan.setting, engine="mujoco")
+            found[C] = replace(plan, worlds=min(self.in_c, self.worlds), setting=in_c)
+        return found
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """Rates with their intervals, their range over the models, and times."""
+        text = (
+            f"{self.worlds:,} worlds of seed {self.setting.seed}; every law meets the same ones. "
+            "Intervals: Wilson 95 %. Over models: least and greatest rate of a panel of grounds, "
+            "cones, steps and engines, each in the first of these worlds."
+        )
+        return [Section("Success", text, table(found)), Section("Models", "", panel_table(found))]
+
+
+headline = call_of(Headline)
+
+
+def _outcomes(plan: Plan, run: Run) -> xr.Dataset:
+    """Success (law, world), and the time of each trial [s]."""
+    found = sweep.whole(plan, None, report=run.report, slots=run.slots, workers=run.workers)
+    found = found[["success", "time"]].reset_coords(drop=True)
+    return found.assign(success=found.success.astype(np.float32))
+
+
+def rates(found: xr.Dataset, domain: str, law: str) -> dict[str, tuple[int, int]]:
+    """Successes and trials on each model that a domain knows."""
+    won = found.success.sel(domain=domain, law=law)
+    every = {str(m): won.sel(model=m).values for m in won.model.values}
+    return {
+        model: (int(np.nansum(one)), int(np.isfinite(one).sum()))
+        for model, one in every.items()
+        if np.isfinite(one).any()
+    }
+
+
+def table(found: xr.Dataset) -> list[list[Any]]:
+    """Header and rows: a law in a domain."""
+    rows: list[list[Any]] = [["domain", "law", "success", "over the models", "in C MuJoCo",
+                              "median time of a success"]]  # fmt: skip
+    for domain in found.domain.values:
+        for law in found.law.values:
+            by_model = rates(found, domain, law)
+            own = found.sel(domain=domain, law=law, model=models.OWN)
+            median = float(own.time.where(own.success == 1).median())
+            shares = [100 * won / of for won, of in by_model.values()]
+            spread = f"{min(shares):.1f} to {max(shares):.1f} %" if len(shares) > 1 else ""
+            in_c = _rate(*by_model[C]) if C in by_model else ""
+            cells = [_rate(*by_model[models.OWN]), spread, in_c, f"{median:.1f} s"]
+            rows.append([str(domain), str(law), *cells])
+    return rows
+
+
+def panel_table(found: xr.Dataset) -> list[list[str]]:
+    """Header and rows: the rate of a law in a domain on each model."""
+    names = [str(name) for name in found.model.values]
+    rows = [["domain", "law", *names]]
+    for domain in found.domain.values:
+        for law in found.law.values:
+            by_model = rates(found, domain, law)
+            told = [_rate(*by_model[name]) if name in by_model else "" for name in names]
+            rows.append([str(domain), str(law), *told])
+    return rows
+
+
+def _rate(won: int, of: int) -> str:
+    low, high = statistics.wilson(won, of)
+    digits = 2 if won > 0.99 * of else 1
+    return f"{100 * won / of:.{digits}f} % [{100 * low:.{digits}f}, {100 * high:.{digits}f}]"
