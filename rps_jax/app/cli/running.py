@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import dataclasses
 import errno
@@ -68,22 +69,34 @@ def guarded(action: Callable[[], object]) -> int:
 
 @contextlib.contextmanager
 def _interruptible() -> Iterator[None]:
-    """Remember an interrupt that comes while a module is imported, where it may be swallowed."""
+    """Remember an interrupt that comes while a module is imported, where it may be swallowed.
+
+    Where Python can raise nothing, as in a callback of its garbage collector, it comes again.
+    """
 
     def stop(*_: object) -> None:
         _stopped.append(True)
         raise KeyboardInterrupt
 
+    def again(unraisable: Any) -> None:
+        if isinstance(unraisable.exc_value, KeyboardInterrupt):
+            threading.Timer(0.05, _thread.interrupt_main).start()
+        else:
+            told(unraisable)
+
     _stopped.clear()
     usual = threading.current_thread() is threading.main_thread() and (
         signal.getsignal(signal.SIGINT) is signal.default_int_handler
     )
+    told = sys.unraisablehook
     if usual:
         signal.signal(signal.SIGINT, stop)
+        sys.unraisablehook = again
     try:
         yield
     finally:
         if usual:
+            sys.unraisablehook = told
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
