@@ -111,9 +111,9 @@ def test_traces_and_odometry_are_not_mixed_and_something_must_be_given(tmp_path)
     given = logs.read(trace, SHELL)
     assert given.exact
     assert given.columns["object_pose"].shape == (len(trace.data.time), 3)
-    # Of the object's start, 2 cm before the base: half length, gap and radius.
+    # Of the start, 2 cm before the base: its half length, the gap and the radius of the cylinder.
     x, y, yaw = given.columns["object_pose"][0]
-    assert (x, y, yaw) == pytest.approx((0.3625 + 0.02 + 0.15, 0.0, 0.0), abs=0.02)
+    assert (x, y, yaw) == pytest.approx((0.3625 + 0.02 + 0.25, 0.0, 0.0), abs=0.02)
 
 
 def test_contacts_are_made_of_taxels():

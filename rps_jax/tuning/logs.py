@@ -22,7 +22,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
+import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
@@ -108,7 +108,7 @@ def _of_trace(data: xr.Dataset, name: str) -> Given:
     if "qpos" not in data or "time" not in data.dims:
         raise InputError(f"{name} is not allowed: the run holds no trace of rps push or replay.")
     qpos, x = np.asarray(data.qpos.values, float), JOINTS.object.start
-    yaw = np.unwrap(np.asarray(jax.vmap(planar.yaw_of_quaternion)(qpos[:, x + 3 : x + 7])))
+    yaw = np.unwrap(np.asarray(planar.yaw_of_quaternion(jnp.asarray(qpos[:, x + 3 : x + 7]))))
     columns = {
         "time": data.time.values,
         "pose": qpos[:, :3],
