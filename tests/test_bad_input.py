@@ -12,7 +12,7 @@ from rps_jax.control import registry
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.engines import ENGINES
 from rps_jax.errors import InputError
-from rps_jax.record import files
+from rps_jax.record import files, provenance
 from rps_jax.record.folder import claim
 from rps_jax.runs import sweep
 from rps_jax.runs.plan import Plan
@@ -216,6 +216,7 @@ REPLAY = {
     "laws 0": "laws/manifest.json is corrupt",
     "physics 0": "physics/manifest.json is corrupt .timestep = -1 is not allowed",
     "older 0": "run = older was made by another version .rules.max_lost = 'nothing' there, 150",
+    "arms 0": "run = arms was made by rps_jax 0.2.0: use that version",
 }
 VIEW = {
     "--object sphere": "unknown object 'sphere': choose from box",
@@ -338,6 +339,7 @@ CHANGED_MANIFESTS = {
     "laws": {"laws": []},
     "physics": {"physics": {"timestep": -1}},
     "older": {"rules": {"horizon": 300.0}},
+    "arms": {"arms": {}},
 }
 
 
@@ -364,6 +366,7 @@ def folder(tmp_path_factory):
     for name, changes in CHANGED_MANIFESTS.items():
         (root / name).mkdir()
         (root / name / "manifest.json").write_text(json.dumps(good | changes))
+    provenance.sign(root / "arms", {"packages": {"rps_jax": "0.2.0"}})
     return root
 
 

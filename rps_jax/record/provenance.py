@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record import folder as run_folder
 
@@ -105,6 +106,15 @@ def told(folder: Path) -> str:
     except (KeyError, TypeError, AttributeError) as error:
         raise files.corrupt(folder / ENVIRONMENT, error) from error
     return f"Made by {'; before that by '.join([last, *before])}."
+
+
+def version(folder: Path) -> str:
+    """The version of this package that last made some of a run, in words."""
+    try:
+        found = signed(folder)["packages"]["rps_jax"]
+    except (InputError, KeyError, TypeError):
+        found = None
+    return f"rps_jax {found}" if isinstance(found, str) else "a version that it does not name"
 
 
 def _version(package: str) -> str | None:

@@ -24,7 +24,7 @@ from rps_jax import engines, errors
 from rps_jax.control import registry
 from rps_jax.control.base import Params
 from rps_jax.errors import InputError
-from rps_jax.record import files
+from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
 from rps_jax.trials.batch import Part
 from rps_jax.trials.setting import Setting
@@ -196,6 +196,9 @@ def load_plan(folder: Path) -> Plan:
       InputError: it holds none, or a corrupt one, or one of another version of this code.
     """
     found = run_folder.manifest(folder)
+    made = provenance.version(folder)
+    if "arms" in found or "strategies" in found:  # as 0.2.0 called them
+        raise InputError(f"run = {folder} was made by {made}: use that version.")
     if "laws" not in found:
         raise InputError(f"run = {folder} is not of a sweep: give the folder of `rps sweep`.")
     try:
@@ -213,8 +216,8 @@ def load_plan(folder: Path) -> Plan:
     # What an older version did not write down would else be what this one does by default.
     if (now := json.loads(json.dumps(plan.configuration()))) != found:
         raise InputError(
-            f"run = {folder} was made by another version ({run_folder.difference(found, now)}): "
-            "use that version."
+            f"run = {folder} was made by another version ({run_folder.difference(found, now)}), "
+            f"{made}: use that one."
         )
     return plan
 

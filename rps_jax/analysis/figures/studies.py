@@ -105,7 +105,13 @@ def sensitivity(results: xr.Dataset, log: Collection[str]) -> Figure:
             one = results.sel(set=which, parameter=name)
             won = np.round(one.success.values * of).astype(int)
             success_rates(
-                ax, one.value.values, won, np.full(won.size, of), color=f"C{i}", label=which
+                ax,
+                one.value.values,
+                won,
+                np.full(won.size, of),
+                beside=i,
+                color=f"C{i}",
+                label=which,
             )
         ax.set_xlabel(name, fontsize=9)
         ax.grid(alpha=0.3)

@@ -17,12 +17,14 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
     """Success against the drawn quantities that matter first, one line a law.
 
     Of all quantities these have the greatest standard deviation of the success rate over their
-    bins beyond what binomial noise explains, in the law in which it is greatest. Below, the others
-    are named: those whose bins differ nevertheless by a chi-squared test (q < 0.05, as of
-    `statistics.influences`), and those that are flat. Intervals are Wilson's, of 95 %.
+    bins beyond what binomial noise explains, in the law in which it is greatest; one that is flat
+    within the noise has no panel, unless all are. Below, the others are named: those whose bins
+    differ nevertheless by a chi-squared test (q < 0.05, as of `statistics.influences`), and those
+    that are flat. Intervals are Wilson's, of 95 %.
     """
     found = statistics.influences(results)
-    shown, others = found[:count], found[count:]
+    shown = [one for one in found[:count] if one.variance > 0 and not _is_flat(one)] or found[:1]
+    others = [one for one in found if one not in shown]
     columns = min(3, len(shown))
     rows = -(-len(shown) // columns)
     figure = Figure(figsize=(1 + 3.5 * columns, 1.6 + 2.5 * rows), layout="constrained")
@@ -33,7 +35,7 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
         for i, law in enumerate(map(str, results.law.values)):
             won = results.success.sel(law=law).values > 0
             bins = statistics.bins(results[one.name].values, won)
-            success_rates(ax, bins.middle, bins.won, bins.of, color=f"C{i}", label=law)
+            success_rates(ax, bins.middle, bins.won, bins.of, color=f"C{i}", label=law, beside=i)
         unit = f" [{results[one.name].attrs['units']}]".removesuffix(" [1]")
         ax.set_xlabel(f"{WORDS[one.name]}{unit}", fontsize=9)
         chance = " (may be chance)" * _is_flat(one)
