@@ -158,6 +158,8 @@ def test_curves_that_coincide_are_all_seen(drawn):
     results = random_worlds(np.stack([won, won]), mass=np.arange(400) * 1.0)
     figure = drawn(figures.success_curves, results)
     marks = [one.lines[0] for one in figure.axes[0].containers]
+    low, high = figure.axes[0].get_xlim()
+    assert low < 30 < 370 < high
     assert len({line.get_marker() for line in marks}) == 2
     first, second = (line.get_transform().transform((100.0, 50.0)) for line in marks)
     np.testing.assert_allclose((second - first) * 72 / figure.dpi, [2.5, 0], atol=1e-6)

@@ -71,5 +71,6 @@ def success_rates(
     moved = transforms.ScaledTranslation(
         2.5 * beside / 72, 0, ax.get_figure(root=True).dpi_scale_trans
     )
-    style = {"marker": "osD^v"[beside % 5], "transform": ax.transData + moved} | style
-    ax.errorbar(x, rate, errors, capsize=2, ms=4, lw=1.2, **style)
+    style = {"marker": "osD^v"[beside % 5]} | style
+    for drawn in ax.errorbar(x, rate, errors, capsize=2, ms=4, lw=1.2, **style).get_children():
+        drawn.set_transform(drawn.get_transform() + moved)
