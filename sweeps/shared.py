@@ -417,7 +417,7 @@ def publish(
     """
     last = made[-1]
     data = {
-        "command": [shlex.join(one["command"]) for one in made],
+        "command": [shlex.join(_placeless(one["command"])) for one in made],
         "device": device,
         "versions": {name: last["packages"][name] for name in _VERSIONS},
         "commit": last["commit"],
@@ -428,3 +428,9 @@ def publish(
     }
     path.parent.mkdir(exist_ok=True)
     return files.write_text(path, json.dumps(data, indent=1) + "\n")
+
+
+def _placeless(command: Sequence[str]) -> list[str]:
+    """Words of a command without its run folder, which is a place of one machine."""
+    words = iter(command)
+    return [word for word in words if word != "--out" or not next(words, None)]

@@ -8,6 +8,7 @@ import pytest
 from helpers import ROOT, refusal
 
 from rps_jax.app.cli import flags, names
+from sweeps.shared import publish
 
 SWEEPS = ROOT / "sweeps"
 FOLDERS = sorted(path.parent for path in SWEEPS.glob("*/README.md"))
@@ -45,6 +46,8 @@ REFUSED = [
     ("ground", "--worlds 0", "worlds = 0 is not allowed"),
     ("learned", "run run", "runs"),
     ("force_push_grid", "--duration 0", "duration"),
+    ("headline", "--domains wyde", "unknown domain 'wyde'"),
+    ("headline", "--laws none", "unknown law 'none'"),
     ("fit", "--logs 1", "logs = 1 is not allowed"),
     ("fit", "--law aps", "fit knows laws that sense touch"),
 ]
@@ -103,3 +106,16 @@ def test_a_published_command_can_still_be_asked(line, monkeypatch):
 
 def test_commands_are_published():
     assert len(list(published())) > 50
+
+
+def test_a_published_command_names_no_place_of_a_machine(tmp_path):
+    made = {
+        "command": ["rps", "sweeps/x", "--out", "/somewhere/of mine", "--logs", "3"],
+        "packages": dict.fromkeys(("rps_jax", "jax", "mujoco", "mujoco-mjx")),
+        "commit": None,
+        "time": "2026-01-01T00:00:00",
+    }
+    path = publish(tmp_path / "results" / "x.json", [made], "", [{"name": "what"}], [])
+    assert json.loads(path.read_text())["command"] == ["rps sweeps/x --logs 3"]
+    for path in SWEEPS.rglob("results/*.json"):
+        assert "--out /" not in path.read_text(), path

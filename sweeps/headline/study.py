@@ -56,6 +56,12 @@ class Headline(Study[xr.Dataset]):
     quick: bool = False
     """Whether to make a small run of a minute on two cores."""
 
+    def check(self) -> None:
+        """Check that the laws and the domains are known."""
+        registry.laws_of(self.laws)
+        for name in self.domains:
+            domains.named(name)
+
     def configuration(self) -> dict[str, Any]:
         """All that the parts depend on, as JSON; a part has its domain, model and size besides."""
         return {**super().configuration(), "setting": setting_as_json(self.setting)}
@@ -96,8 +102,13 @@ class Headline(Study[xr.Dataset]):
         """Rates with their intervals, their range over the models, and times."""
         text = (
             f"{self.worlds:,} worlds of seed {self.setting.seed}; every law meets the same ones. "
-            "Intervals: Wilson 95 %. Over models: least and greatest rate of a panel of grounds, "
-            "cones, steps and engines, each in the first of these worlds."
+            "Intervals: Wilson 95 %."
+        )
+        if found.sizes["model"] == 1:
+            return [Section("Success", text, table(found))]
+        text += (
+            " Over the models: least and greatest rate of a panel of grounds, cones, steps and "
+            "engines, each in the first of these worlds."
         )
         return [Section("Success", text, table(found)), Section("Models", "", panel_table(found))]
 
@@ -124,20 +135,25 @@ def rates(found: xr.Dataset, domain: str, law: str) -> dict[str, tuple[int, int]
 
 
 def table(found: xr.Dataset) -> list[list[Any]]:
-    """Header and rows: a law in a domain."""
-    rows: list[list[Any]] = [["domain", "law", "success", "over the models", "in C MuJoCo",
-                              "median time of a success"]]  # fmt: skip
-    for domain in found.domain.values:
-        for law in found.law.values:
-            by_model = rates(found, domain, law)
-            own = found.sel(domain=domain, law=law, model=models.OWN)
-            median = float(own.time.where(own.success == 1).median())
-            shares = [100 * won / of for won, of in by_model.values()]
-            spread = f"{min(shares):.1f} to {max(shares):.1f} %" if len(shares) > 1 else ""
-            in_c = _rate(*by_model[C]) if C in by_model else ""
-            cells = [_rate(*by_model[models.OWN]), spread, in_c, f"{median:.1f} s"]
-            rows.append([str(domain), str(law), *cells])
-    return rows
+    """Header and rows: a law in a domain; what no model of the panel told has no column."""
+    rows = [_row(found, str(domain), str(law)) for domain in found.domain.values
+            for law in found.law.values]  # fmt: skip
+    names = [name for name in rows[0] if any(row[name] for row in rows)]
+    return [names, *([row[name] for name in names] for row in rows)]
+
+
+def _row(found: xr.Dataset, domain: str, law: str) -> dict[str, str]:
+    by_model = rates(found, domain, law)
+    own = found.sel(domain=domain, law=law, model=models.OWN)
+    shares = [100 * won / of for won, of in by_model.values()]
+    return {
+        "domain": domain,
+        "law": law,
+        "success": _rate(*by_model[models.OWN]),
+        "over the models": f"{min(shares):.1f} to {max(shares):.1f} %" * (len(shares) > 1),
+        "in C MuJoCo": _rate(*by_model[C]) if C in by_model else "",
+        "median time of a success": f"{float(own.time.where(own.success == 1).median()):.1f} s",
+    }
 
 
 def panel_table(found: xr.Dataset) -> list[list[str]]:
