@@ -11,7 +11,7 @@ from helpers import PAPER, SLOTS, decode, rps
 import rps_jax
 from rps_jax.errors import InputError
 from rps_jax.record import files
-from rps_jax.world.domain import QUANTITIES, WORDS
+from rps_jax.world.domain import DOMAINS, QUANTITIES, WORDS
 
 LAWS = {"paper": PAPER, "slow": PAPER._replace(v_max=0.02)}
 # As the examples of the docstrings, so that all share one program.
@@ -49,10 +49,8 @@ def test_a_sweep_in_memory_is_the_same_as_one_in_a_folder(engine, domain, tmp_pa
 def test_what_was_drawn_is_a_coordinate_of_the_worlds(tmp_path):
     found = rps_jax.sweep(LAWS, DRUMS, worlds=4, **BRIEF)
     drawn = {name for name in found.coords if found[name].dims == ("world",)}
-    limits = {
-        name for name, one in QUANTITIES.items() if one.of == "robot"
-    }  # an ideal one has none
-    assert drawn == {"world", "which_object", *WORDS} - limits
+    undrawn = {name for name in QUANTITIES if getattr(DOMAINS["wide"], name) is None}
+    assert drawn == {"world", "which_object", *WORDS} - undrawn
     assert all(found[name].dims[:2] == ("law", "world") for name in found)
     heavy = found.where(found.mass > found.mass.median(), drop=True)
     assert heavy.world.size == 2

@@ -49,7 +49,7 @@ from rps_jax.trials.batch import Job
 from rps_jax.trials.trial import Rules
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import domain, draws
-from rps_jax.world.domain import WORDS, Range
+from rps_jax.world.domain import QUANTITIES, WORDS, Range
 
 
 def outcomes(parts, setting=SHORT):
@@ -209,7 +209,9 @@ def test_results_hold_every_world_with_what_was_drawn(whole, tmp_path):
     for name, (values, unit) in columns.items():
         np.testing.assert_allclose(results[name], values, rtol=1e-6)
         assert results[name].attrs["units"] == unit
-    assert set(WORDS) == {*columns, *domain.of("robot")}
+    undrawn = {name for name in QUANTITIES if getattr(BOXES, name) is None}
+    assert undrawn == {*domain.of("robot"), "foam", "time_constant"}
+    assert set(WORDS) == {*columns, *undrawn}
     again = outcomes([made(np.arange(20))])
     for i, one in again.items():
         assert float(results.time.sel(law="rps")[i]) == one.time

@@ -117,7 +117,7 @@ def _check(name: str, value: Any, kind: Any, bounds: _Bounds | None) -> None:
         given = {} if bounds is None else {k: getattr(bounds, k) for k in named}
         errors.check_finite(name, value, **{k: v for k, v in given.items() if v is not None})
     elif get_origin(kind) is tuple and bounds is not None:
-        for one in tuple(value or ()):
+        for one in value if isinstance(value, tuple | list) else (value,):
             _check(name, one, get_args(kind)[0], bounds)
 
 

@@ -215,7 +215,7 @@ class Domain:
             found |= {"distance", "bearing"}
         if self.skin == "ideal":
             found |= set(of("skin"))
-        return frozenset(found)
+        return frozenset(name for name in found if getattr(self, name) is not None)
 
     @property
     def families(self) -> tuple[str, ...]:

@@ -23,7 +23,7 @@ from rps_jax.geometry.solid import SIDES
 from rps_jax.record import files
 from rps_jax.robot.robot import Robot
 from rps_jax.world import draws
-from rps_jax.world.domain import ERRORS, QUANTITIES, RANDOM, Domain, Range, named
+from rps_jax.world.domain import ERRORS, QUANTITIES, RANDOM, Domain, Range, from_json, named
 from rps_jax.world.draws import Draw
 
 Kind = Literal["range", "choice", "shape", "noise"]
@@ -185,7 +185,8 @@ def checked(domain: Domain, u: Any) -> Points:
         if "u" not in u or "quantity" not in u.coords:
             raise InputError("points are not allowed: the dataset has no u (world, quantity).")
         theirs = tuple(map(str, u.quantity.values))
-        if theirs != every or u.attrs.get("domain", _told(domain)) != _told(domain):
+        told = from_json(json.loads(u.attrs.get("domain", _told(domain))))
+        if theirs != every or told != domain:
             raise InputError(
                 "points are not allowed: they are of another domain; give that domain."
             )
