@@ -75,10 +75,60 @@ print(rps_jax.__file__, found.success.size)
 """
 
 
-def test_an_engine_of_ones_own_is_one_file_and_one_line(tmp_path):
-    """It then works from Python and on the command line, which lists it."""
+QUANTITY = """    max_compression: Range | None = drawn(
+        None, 43, "1", 0.01, 0.99, "greatest compression", "skin", "max_compression"
+    )
+
+"""
+EVERYWHERE = """
+import rps_jax
+from rps_jax.studies.ladder import Ladder
+setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=0.5))
+found = rps_jax.sweep("straight,K_h=0.5", "wide,max_compression=0.3:0.9", worlds=8, setting=setting)
+drawn = found.max_compression
+assert drawn.attrs["units"] == "1" and drawn.attrs["long_name"] == "greatest compression"
+assert ((drawn >= 0.3) & (drawn <= 0.9)).all() and drawn.std() > 0.1, drawn
+assert "straight" in Ladder(domain="wide").chosen
+for ask in (lambda: rps_jax.sweep("strait", "wide", 1), lambda: rps_jax.attack("strait", "wide")):
+    try:
+        ask()
+    except rps_jax.InputError as error:
+        print(error)
+"""
+
+
+@pytest.fixture
+def copied(tmp_path):
+    """Run Python on a copy of the package, to which something was added."""
     shutil.copytree(PACKAGE, tmp_path / "rps_jax", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(ROOT / "mjcf", tmp_path / "mjcf")
+
+    def run(*arguments):
+        command, environment = (
+            [sys.executable, *arguments],
+            os.environ | {"PYTHONPATH": str(tmp_path)},
+        )
+        found = subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
+        assert found.returncode == 0, found.stderr
+        return found.stdout
+
+    return run
+
+
+def test_a_law_is_one_file_and_a_quantity_one_declaration(copied, tmp_path):
+    """Sweeps, ladders, attacks and errors know them with no other change."""
+    laws, domain = tmp_path / "rps_jax" / "control" / "laws", tmp_path / "rps_jax/world/domain.py"
+    law = (laws / "pursuit.py").read_text().replace("PursuitParams", "StraightParams")
+    (laws / "straight.py").write_text(law.replace('"pursuit"', '"straight"'))
+    text, after = domain.read_text(), "    def __post_init__(self) -> None:\n"
+    domain.write_text(text.replace(after, QUANTITY + after, 1))
+    assert copied("-c", EVERYWHERE).count("straight") == 2
+
+
+def test_an_engine_of_ones_own_is_one_file_and_one_line(copied, tmp_path):
+    """It then works from Python and on the command line, which lists it."""
     (tmp_path / "rps_jax" / "engines" / "dummy.py").write_text(DUMMY)
     registry = tmp_path / "rps_jax" / "engines" / "__init__.py"
     before = registry.read_text()
@@ -86,13 +136,5 @@ def test_an_engine_of_ones_own_is_one_file_and_one_line(tmp_path):
         before.replace('    "quasistatic",\n', '    "quasistatic",\n    "dummy",\n')
     )
     assert len(registry.read_text().splitlines()) == len(before.splitlines()) + 1
-    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
-
-    def run(*arguments):
-        command = [sys.executable, *arguments]
-        return subprocess.run(
-            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
-        )
-
-    assert run("-c", SWEEP).stdout.split() == [str(tmp_path / "rps_jax" / "__init__.py"), "1"]
-    assert "quasistatic,dummy}" in re.sub(r"\s", "", run("-m", "rps_jax", "sweep", "--help").stdout)
+    assert copied("-c", SWEEP).split() == [str(tmp_path / "rps_jax" / "__init__.py"), "1"]
+    assert "quasistatic,dummy}" in re.sub(r"\s", "", copied("-m", "rps_jax", "sweep", "--help"))
