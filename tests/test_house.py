@@ -124,7 +124,7 @@ def test_a_law_is_one_file_and_a_quantity_one_declaration(copied, tmp_path):
     (laws / "straight.py").write_text(law.replace('"pursuit"', '"straight"'))
     text, after = domain.read_text(), "    def __post_init__(self) -> None:\n"
     domain.write_text(text.replace(after, QUANTITY + after, 1))
-    assert copied("-c", EVERYWHERE).count("straight") == 2
+    assert copied("-c", EVERYWHERE).count("straight") == 4
 
 
 def test_an_engine_of_ones_own_is_one_file_and_one_line(copied, tmp_path):
