@@ -8,6 +8,8 @@ the data file of a published table.
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import json
 import os
 import shlex
@@ -25,6 +27,7 @@ import xarray as xr
 
 from rps_jax import engines
 from rps_jax.analysis import statistics
+from rps_jax.app.cli import flags, names
 from rps_jax.control import registry
 from rps_jax.control.base import Params
 from rps_jax.control.laws.rps import RPSParams
@@ -153,17 +156,17 @@ def run_conditions(
     missing = [name for name, results in found.items() if results is None]
     finished, simulated = grid.size * (len(found) - len(missing)), 0.0
     report(Progress(finished, simulated))
-    for names in _chunks(missing, conditions, grid):
-        cases = [case for name in names for case in conditions[name].cases(grid)]
+    for chunk in _chunks(missing, conditions, grid):
+        cases = [case for name in chunk for case in conditions[name].cases(grid)]
 
         def tell(progress: Progress, before=(finished, simulated)) -> None:
             report(Progress(before[0] + progress.finished, before[1] + progress.simulated))
 
         outcome, timing = pushes.run(
-            cases, conditions[names[0]].setting, slots=slots, workers=workers, report=tell
+            cases, conditions[chunk[0]].setting, slots=slots, workers=workers, report=tell
         )
         finished, simulated = finished + len(cases), simulated + timing.simulated
-        for i, name in enumerate(names):
+        for i, name in enumerate(chunk):
             rows = slice(i * grid.size, (i + 1) * grid.size)
             part = type(outcome)(*(values[rows] for values in outcome))
             results = outcome_dataset(
@@ -421,6 +424,7 @@ def publish(
         "device": device,
         "versions": {name: last["packages"][name] for name in _VERSIONS},
         "commit": last["commit"],
+        "digest": digest([_placeless(one["command"]) for one in made]),
         "date": last["time"][:10],
         **({"note": note} if note else {}),
         "columns": list(columns),
@@ -428,6 +432,41 @@ def publish(
     }
     path.parent.mkdir(exist_ok=True)
     return files.write_text(path, json.dumps(data, indent=1) + "\n")
+
+
+def digest(commands: Sequence[Sequence[str]]) -> str:
+    """What numbers hang on, in 16 letters: the questions, and the laws and domains they name.
+
+    It is made of declared values alone (parameters, ranges, physics, rules, seeds), so that it
+    lasts where code is only written anew, and changes where a default or a tuned law does.
+
+    Raises:
+      InputError: a command asks no question of today, or asks it in other words.
+    """
+    found = []
+    for program, *words in commands:
+        if program != "rps":
+            raise InputError(
+                f"command = {program} is not allowed: a digest is of rps NAME or PATH."
+            )
+        name, rest = names.split(words)
+        asked, _ = flags.parse(names.question_of(name), name, rest)
+        found.append(_declared(asked.asked().configuration()))
+    return hashlib.sha256(json.dumps(found, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _declared(value: Any) -> Any:
+    """A configuration, with the names of laws and domains followed by what they stand for."""
+    if isinstance(value, dict):
+        return {key: _declared(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_declared(one) for one in value]
+    if isinstance(value, str) and value in DOMAINS:
+        ranges = dataclasses.asdict(DOMAINS[value])
+        return [value, {name: one for name, one in ranges.items() if one is not None}]
+    if isinstance(value, str) and value in registry.LAWS:
+        return [value, registry.recorded(registry.LAWS[value])]
+    return value
 
 
 def _placeless(command: Sequence[str]) -> list[str]:

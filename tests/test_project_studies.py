@@ -8,7 +8,8 @@ import pytest
 from helpers import ROOT, refusal
 
 from rps_jax.app.cli import flags, names
-from sweeps.shared import publish
+from sweeps.publish.study import published as data_files
+from sweeps.shared import digest, publish
 
 SWEEPS = ROOT / "sweeps"
 FOLDERS = sorted(path.parent for path in SWEEPS.glob("*/README.md"))
@@ -48,6 +49,7 @@ REFUSED = [
     ("force_push_grid", "--duration 0", "duration"),
     ("headline", "--domains wyde", "unknown domain 'wyde'"),
     ("headline", "--laws none", "unknown law 'none'"),
+    ("publish", "--only nothing", "no data file has such a name"),
     ("fit", "--logs 1", "logs = 1 is not allowed"),
     ("fit", "--law aps", "fit knows laws that sense touch"),
 ]
@@ -110,12 +112,28 @@ def test_commands_are_published():
 
 def test_a_published_command_names_no_place_of_a_machine(tmp_path):
     made = {
-        "command": ["rps", "sweeps/x", "--out", "/somewhere/of mine", "--logs", "3"],
+        "command": ["rps", "sweep", "--out", "/somewhere/of mine", "--worlds", "3"],
         "packages": dict.fromkeys(("rps_jax", "jax", "mujoco", "mujoco-mjx")),
         "commit": None,
         "time": "2026-01-01T00:00:00",
     }
     path = publish(tmp_path / "results" / "x.json", [made], "", [{"name": "what"}], [])
-    assert json.loads(path.read_text())["command"] == ["rps sweeps/x --logs 3"]
+    assert json.loads(path.read_text())["command"] == ["rps sweep --worlds 3"]
     for path in SWEEPS.rglob("results/*.json"):
         assert "--out /" not in path.read_text(), path
+
+
+def test_a_number_that_hangs_on_what_has_changed_is_stale():
+    """A tuned law, a domain and a default count; the folder of a run does not."""
+    asked = ["rps", "sweep", "--domain", "wide", "--laws", "rps_tuned", "--worlds", "8"]
+    assert digest([asked]) == digest([[*asked, "--engine", "fused"]])
+    for changes in (["--laws", "rps"], ["--domain", "real"], ["--seed", "3"], ["--worlds", "9"]):
+        assert digest([asked]) != digest([[*asked, *changes]])
+
+
+def test_no_published_number_is_stale():
+    for path in data_files():
+        data = json.loads(path.read_text())
+        if "digest" in data:
+            commands = [shlex.split(one) for one in data["command"]]
+            assert digest(commands) == data["digest"], f"{path.name} is stale: make it anew"
