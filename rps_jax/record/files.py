@@ -70,8 +70,8 @@ def atomic(path: Path, write: Callable[[Path], Any]) -> Path:
 
 
 def write_text(path: Path, text: str) -> Path:
-    """A text file, whole or not at all."""
-    return write_bytes(path, text.encode())
+    """A text file in UTF-8, whole or not at all; names that are no UTF-8 keep their bytes."""
+    return write_bytes(path, text.encode(errors="surrogateescape"))
 
 
 def write_bytes(path: Path, content: bytes, *, checked: bool = False) -> Path:
