@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
-from rps_jax.analysis import statistics
+from rps_jax.analysis import tables
 from rps_jax.analysis.report import Section
 from rps_jax.control import registry
 from rps_jax.record import provenance
@@ -132,10 +132,10 @@ def table(found: xr.Dataset) -> list[list[Any]]:
             by_model = rates(found, domain, law)
             own = found.sel(domain=domain, law=law, model=models.OWN)
             median = float(own.time.where(own.success == 1).median())
-            shares = [100 * won / of for won, of in by_model.values()]
-            spread = f"{min(shares):.1f} to {max(shares):.1f} %" if len(shares) > 1 else ""
-            in_c = _rate(*by_model[C]) if C in by_model else ""
-            cells = [_rate(*by_model[models.OWN]), spread, in_c, f"{median:.1f} s"]
+            shares = [won / of for won, of in by_model.values()]
+            spread = tables.spread(shares) if len(shares) > 1 else ""
+            in_c = tables.share(*by_model[C]) if C in by_model else ""
+            cells = [tables.share(*by_model[models.OWN]), spread, in_c, f"{median:.1f} s"]
             rows.append([str(domain), str(law), *cells])
     return rows
 
@@ -147,12 +147,6 @@ def panel_table(found: xr.Dataset) -> list[list[str]]:
     for domain in found.domain.values:
         for law in found.law.values:
             by_model = rates(found, domain, law)
-            told = [_rate(*by_model[name]) if name in by_model else "" for name in names]
+            told = [tables.share(*by_model[name]) if name in by_model else "" for name in names]
             rows.append([str(domain), str(law), *told])
     return rows
-
-
-def _rate(won: int, of: int) -> str:
-    low, high = statistics.wilson(won, of)
-    digits = 2 if won > 0.99 * of else 1
-    return f"{100 * won / of:.{digits}f} % [{100 * low:.{digits}f}, {100 * high:.{digits}f}]"
