@@ -150,7 +150,7 @@ def test_images_are_drawn_where_they_are_asked_for(one):
 
 
 def test_what_means_nothing_is_refused(one, several):
-    with pytest.raises(InputError, match="hold = 0.001 is not allowed"):
+    with pytest.raises(InputError, match=r"hold = 0.001 is not allowed"):
         gym.Push(hold=0.001)
     with pytest.raises(InputError, match="num_envs = 0 is not allowed"):
         gym.PushVector(0)

@@ -1,6 +1,7 @@
 """The ladder of laws: equal worlds, what each senses, and how they compare."""
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from helpers import CYLINDERS, refusal, rps
@@ -117,6 +118,47 @@ def test_the_command_reports_information_against_success(tmp_path, capsys):
     assert "by none" in text
     assert (out / "ladder.png").stat().st_size > 10_000
     assert load(out).success.sizes == {"law": 2, "world": 6}
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_outcomes_are_a_long_table_for_others(kind, tmp_path):
+    if kind == "parquet":
+        pytest.importorskip("pyarrow")
+    setting = Setting("quasistatic", rules=Rules(horizon=2.0))
+    path = tmp_path / f"results.{kind}"
+    found = climb(("rps", "dipole"), CYLINDERS, 3, setting=setting, table=path)
+    table = pd.read_csv(path) if kind == "csv" else pd.read_parquet(path)
+    assert table.law.tolist() == ["rps"] * 3 + ["dipole"] * 3
+    assert table.world.tolist() == [0, 1, 2] * 2
+    assert set(table.object) == {"random_cylinder"}
+    for (law, world), row in table.set_index(["law", "world"]).iterrows():
+        one = found.sel(law=law, world=world)
+        for name in ("success", "time", "path_length", "mass", "friction_ground", "omega_error"):
+            assert row[name] == pytest.approx(float(one[name]), rel=1e-6), name
+        poses = row[["base_x", "base_y", "base_yaw", "object_x", "object_y", "object_yaw"]]
+        wanted = np.concatenate([one.base_pose, one.object_pose])
+        np.testing.assert_allclose(poses.astype(float), wanted, rtol=1e-5)
+        assert row.senses == str(one.senses.values)
+    told = pd.read_csv(tmp_path / "results.columns.csv", keep_default_na=False)
+    assert told.column.tolist() == list(table)
+    units = dict(zip(told.column, told.unit, strict=True))
+    assert (units["time"], units["mass"], units["base_yaw"], units["law"]) == ("s", "kg", "rad", "")
+    assert all(told.meaning)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"table": "results.xls"}, "name a file NAME.csv or NAME.parquet"),
+        ({"table": "nowhere/results.csv"}, "nowhere is no folder"),
+        ({"table": "r.csv", "shard": "1/2", "out": "run"}, "table is not allowed with a shard"),
+        ({"table": "results.parquet"}, "run pip install pyarrow, or name a .csv file"),
+    ],
+)
+def test_tables_that_cannot_be_written_are_refused(options, words, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=words):
+        climb("rps", **options)
 
 
 MINE = """

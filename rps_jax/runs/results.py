@@ -204,7 +204,8 @@ def long_table(found: xr.Dataset) -> pd.DataFrame:
                 columns[name.replace("pose", axis)] = (("law", "world"), *own)
         elif set(flat[name].dims) <= {"law", "world"}:
             columns[name] = flat[name]
-    whole = xr.Dataset(columns, {"law": found.law, "world": found.world})
+    names = {name: (name, found[name].values, found[name].attrs) for name in ("law", "world")}
+    whole = xr.Dataset(columns, names)
     whole["object"].attrs["long_name"] = "name of the object"
     made = whole.to_dataframe(dim_order=["law", "world"]).reset_index()
     told = {str(name): whole[name].attrs for name in made.columns}

@@ -32,7 +32,14 @@ from rps_jax.record.options import option
 from rps_jax.runs.plan import Kind, Plan, Shard, draw, made, open_run, share
 from rps_jax.runs.question import InDomain, OfLaws, Run, call_of, labelled
 from rps_jax.runs.results import (
-    UNITS, Collector, Keep, check_table, dataset, gather, name_of, write_table,
+    UNITS,
+    Collector,
+    Keep,
+    check_table,
+    dataset,
+    gather,
+    name_of,
+    write_table,
 )  # fmt: skip
 from rps_jax.trials import batch
 from rps_jax.trials.batch import Job, Part
