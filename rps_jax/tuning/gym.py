@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +44,8 @@ class _Worlds:
     """Worlds that are stepped together, as arrays of NumPy with the worlds along the first axis."""
 
     def __init__(self, count: int, domain: DomainLike, hold: float, options: Mapping[str, Any]):
-        self.env = PushEnv(domain=domains.named(domain), **{"weights": REWARD} | dict(options))
+        given: dict[str, Any] = {"weights": REWARD} | dict(options)
+        self.env = PushEnv(domain=domains.named(domain), **given)
         least = 0.999 * self.env.dt
         hold = errors.check_finite("hold", hold, at_least=least, at_most=1000, unit="s")
         self.count, self.period = count, max(1, round(hold / self.env.dt)) * self.env.dt
@@ -185,7 +186,7 @@ class PushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         num_envs: int = 1,
         render_mode: str | None = None,
         *,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        autoreset_mode: AutoresetMode | Literal["NextStep", "SameStep"] = "NextStep",
         domain: DomainLike = "wide",
         hold: float = 0.2,
         **options: Any,
@@ -193,7 +194,7 @@ class PushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Draw the worlds; nothing is compiled before the first reset."""
         self.num_envs = errors.check_count("num_envs", num_envs, at_most=1_000_000)
         modes = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
-        mode = getattr(autoreset_mode, "value", autoreset_mode)
+        mode = str(getattr(autoreset_mode, "value", autoreset_mode))
         errors.check_name("autoreset_mode", mode, [one.value for one in modes])
         self._worlds, self.render_mode = _Worlds(num_envs, domain, hold, options), render_mode
         self.metadata = self.metadata | {"autoreset_mode": AutoresetMode(mode)}
