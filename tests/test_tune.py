@@ -319,7 +319,8 @@ class TestRuns:
 
     def test_the_curve_is_a_table_that_grows_with_the_run(self, tmp_path, pretended):
         for done in (2, 6):
-            log = tuned(tmp_path, evolution(done))
+            tuned(tmp_path, evolution(done))
+            log = run.read_log(tmp_path)
             curve = pd.read_csv(tmp_path / "curve.csv", index_col="generation")
             assert curve.index.tolist() == list(range(done))
             for name in ("validation_success", "simulated"):
