@@ -10,7 +10,10 @@ from scipy import stats
 from rps_jax.analysis import figures, report, statistics, tables
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.analysis.statistics import Bins
+from rps_jax.runs.question import Run
 from rps_jax.studies import hardware
+from rps_jax.trials.progress import unheard
+from rps_jax.tuning import learn
 from rps_jax.world.domain import WORDS
 
 
@@ -95,6 +98,30 @@ def random_worlds(success, **drawn):
     columns |= {name: ("world", values, {"units": "kg"}) for name, values in drawn.items()}
     columns["success"] = (("law", "world"), success.astype(np.int8))
     return xr.Dataset(columns, coords={"law": list("ab")[: len(success)]})
+
+
+def test_rates_of_more_than_99_percent_have_two_decimals():
+    assert tables.share(143, 144) == "99.31 % [96.17, 99.88]"
+    assert tables.share(142, 144) == "98.6 % [95.1, 99.6]"
+    assert tables.share(99, 100) == "99.0 % [94.6, 99.8]"  # no more than 99 %
+    assert tables.share(24, 24) == "100.0 % [86.2, 100.0]"
+    assert tables.share(10_000, 10_000) == "100.00 % [99.96, 100.00]"  # so many can tell
+    assert tables.share(3, 1000) == "0.30 % [0.10, 0.88]"
+    assert tables.share(0, 0) == "-"
+    assert (tables.percent(0.9937), tables.percent(0.5)) == ("99.37", "50.0")
+    assert tables.spread([0.988, 0.994, 0.99]) == "98.80 to 99.40 %"
+    assert tables.spread([0.92, 0.94]) == "92.0 to 94.0 %"
+
+
+def test_a_validated_law_has_two_decimals_above_99_percent():
+    curve = xr.Dataset(
+        {name: ("update", [0.9937]) for name in learn.UNITS},
+        {"update": [7]},
+        {"compile": 1.0, "run": 2.0},
+    )
+    (told,) = learn.Learn().report(curve, Run(None, unheard))
+    assert "of 99.37 % in validation" in told.text
+    assert "99.37 %" in told.lines[-1]
 
 
 def test_what_success_depends_on_stands_first():

@@ -1,6 +1,7 @@
 """The ladder of laws: equal worlds, what each senses, and how they compare."""
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from helpers import CYLINDERS, refusal, rps
@@ -117,6 +118,97 @@ def test_the_command_reports_information_against_success(tmp_path, capsys):
     assert "by none" in text
     assert (out / "ladder.png").stat().st_size > 10_000
     assert load(out).success.sizes == {"law": 2, "world": 6}
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_outcomes_are_a_long_table_for_others(kind, tmp_path):
+    if kind == "parquet":
+        pytest.importorskip("pyarrow")
+    setting = Setting("quasistatic", rules=Rules(horizon=2.0))
+    path = tmp_path / f"results.{kind}"
+    found = climb(("rps", "dipole"), CYLINDERS, 3, setting=setting, table=path)
+    table = pd.read_csv(path) if kind == "csv" else pd.read_parquet(path)
+    assert table.law.tolist() == ["rps"] * 3 + ["dipole"] * 3
+    assert table.world.tolist() == [0, 1, 2] * 2
+    assert set(table.object) == {"random_cylinder"}
+    for (law, world), row in table.set_index(["law", "world"]).iterrows():
+        one = found.sel(law=law, world=world)
+        for name in ("success", "time", "path_length", "mass", "friction_ground", "omega_error"):
+            assert row[name] == pytest.approx(float(one[name]), rel=1e-6), name
+        poses = row[["base_x", "base_y", "base_yaw", "object_x", "object_y", "object_yaw"]]
+        wanted = np.concatenate([one.base_pose, one.object_pose])
+        np.testing.assert_allclose(poses.astype(float), wanted, rtol=1e-5)
+        assert row.senses == str(one.senses.values)
+    told = pd.read_csv(tmp_path / "results.columns.csv", keep_default_na=False)
+    assert told.column.tolist() == list(table)
+    units = dict(zip(told.column, told.unit, strict=True))
+    assert (units["time"], units["mass"], units["base_yaw"], units["law"]) == ("s", "kg", "rad", "")
+    assert all(told.meaning)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"table": "results.xls"}, "name a file NAME.csv or NAME.parquet"),
+        ({"table": "nowhere/results.csv"}, "nowhere is no folder"),
+        ({"table": "r.csv", "shard": "1/2", "out": "run"}, "table is not allowed with a shard"),
+        ({"table": "results.parquet"}, "run pip install pyarrow, or name a .csv file"),
+    ],
+)
+def test_tables_that_cannot_be_written_are_refused(options, words, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=words):
+        climb("rps", **options)
+
+
+MINE = """
+from typing import NamedTuple
+import rps_jax
+
+class {name}(NamedTuple):
+    v: float = 0.05
+    d_success: float = 0.05
+
+def step(params, memory, seen):
+    details = rps_jax.Details.of(seen)
+    return memory, rps_jax.Twist(params.v, 0.0, 0.0), details
+
+rps_jax.register_law("{name}", rps_jax.Law(lambda params: (), step), {name}())
+"""
+
+
+def test_a_law_of_ones_own_is_scored_in_the_ladders_worlds(tmp_path, capsys, registries):
+    mine, out = tmp_path / "mine.py", tmp_path / "score"
+    mine.write_text(MINE.format(name="Straight"))
+    asked = ["--domain", "wide,objects=random_cylinder", "--worlds", 6, "--engine", "quasistatic"]
+    asked += ["--slots", 6, "--workers", 1]
+    assert rps("score", f"{mine},v=0.04", *asked, "--out", out) == 0
+    text, found = capsys.readouterr().out, load(out)
+    assert found.law.values.tolist() == ["Straight,v=0.04", "rps", "rps_plus"]
+    won = found.success.values > 0
+    rates = [tables.share(int(one.sum()), 6) for one in won]
+    median = f"{np.median(found.time.values[0][won[0]]):.1f} s" if won[0].any() else "-"
+    place = "6 test worlds of wide,objects=random_cylinder, seed 0, quasistatic"
+    cells = ["Straight,v=0.04", rates[0], median, *rates[1:], place]
+    (line,) = (line for line in text.splitlines() if line.startswith("    | Straight"))
+    assert line.strip() == f"| {' | '.join(cells)} |"
+    header = text.splitlines()[text.splitlines().index(line) - 2]
+    assert header.strip() == "| law | success | median time | rps | rps_plus | worlds |"
+    assert rps("ladder", "--laws", "rps", "rps_plus", *asked, "--out", tmp_path / "ladder") == 0
+    same = load(tmp_path / "ladder")
+    np.testing.assert_array_equal(same.mass, found.mass)
+    np.testing.assert_array_equal(same.time, found.time.sel(law=same.law))
+
+
+def test_a_file_of_one_law_is_named_without_its_class(tmp_path, registries):
+    mine = tmp_path / "mine.py"
+    mine.write_text(MINE.format(name="Straight"))
+    assert registry.named(str(mine))[0] == registry.named(f"{mine}:Straight")[0] == "Straight"
+    assert list(ladder.Score("rps", ("rps", "rps_plus")).chosen) == ["rps", "rps_plus"]
+    mine.write_text(MINE.format(name="Straight") + MINE.format(name="Slow"))
+    assert registry.named(f"{mine}:Slow")[0] == "Slow"
+    with pytest.raises(InputError, match=r"name one as FILE.py:CLASS"):
+        registry.named(str(mine))
 
 
 def test_the_command_refuses_an_unknown_law(capsys):

@@ -9,6 +9,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 from helpers import CYLINDERS, refusal, rps
 
@@ -28,6 +29,7 @@ from rps_jax.trials.env import PushEnv, Reward
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import ppo, rollout
+from rps_jax.tuning.learn import UNITS
 from rps_jax.tuning.ppo import PPO, TrainState, Transition
 
 SMALL = {"width": 6, "hold": 0.1}
@@ -449,6 +451,16 @@ def test_what_a_run_leaves(learned):
     policy = policies.decoded((folder / "policy.npz").read_bytes(), folder)
     assert policy.network == Network("gru", 6, 42, 0.1)
     assert policy.learned["updates"] == 4
+
+
+def test_the_curve_is_a_table_that_pandas_reads(learned):
+    folder, curve = learned
+    table = pd.read_csv(folder / "curve.csv", index_col="update")
+    assert table.index.tolist() == curve["update"].values.tolist() == [1, 2, 3, 4]
+    assert list(table) == list(UNITS)
+    for name in table:
+        np.testing.assert_array_equal(table[name], curve[name], err_msg=name)
+    assert table.validation.isna().tolist() == [True, True, True, False]
 
 
 def test_a_folder_of_another_run_and_damaged_parts(learned, tmp_path):

@@ -5,6 +5,7 @@ from typing import get_args
 
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 from helpers import refusal
 from helpers import rps as command
@@ -276,7 +277,7 @@ class TestRuns:
             assert tuned(folder, tuner()) == whole
             each = 1 if tuner is evolution else 2  # and the last step of a descent only validates
             assert len(pretended) - asked == each * (6 - done) - (each - 1)
-            for name in ("log.jsonl", "tuned.json"):
+            for name in ("log.jsonl", "tuned.json", "curve.csv"):
                 one, other = ((tmp_path / run / name).read_text() for run in ("whole", f"{done}"))
                 assert one == other
         assert len(run.read_log(tmp_path / "whole")) == 6
@@ -315,6 +316,16 @@ class TestRuns:
         whole = tuned(tmp_path, evolution(6))
         assert tuned(tmp_path, evolution(2)) == whole
         assert len(run.read_log(tmp_path)) == 6
+
+    def test_the_curve_is_a_table_that_grows_with_the_run(self, tmp_path, pretended):
+        for done in (2, 6):
+            tuned(tmp_path, evolution(done))
+            log = run.read_log(tmp_path)
+            curve = pd.read_csv(tmp_path / "curve.csv", index_col="generation")
+            assert curve.index.tolist() == list(range(done))
+            for name in ("validation_success", "simulated"):
+                assert curve[name].tolist() == [line[name] for line in log]
+            assert curve["params.K_h"].tolist() == [line["params"]["K_h"] for line in log]
 
     def test_it_ends_when_its_budget_is_spent_and_goes_on_with_more(self, tmp_path, pretended):
         for budget, done in ((2.5, 3), (4.0, 4), (0.0, 6)):  # 1 s a generation

@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
 from rps_jax.analysis import statistics
 from rps_jax.world import paper
@@ -124,10 +125,10 @@ def models_table(results: xr.Dataset) -> list[list[str]]:
     rows = [["", *names, "over all models", "outcomes equal to the first"]]
     for law in map(str, success.law.values):
         won = success.sel(law=law).values > 0
-        rates = 100 * won.mean(axis=1)
+        rates = won.mean(axis=1)
         equal = 100 * (won == won[0]).mean(axis=1)[1:]
         least = f"{equal.min():.1f} % and more" if equal.size else "-"
-        rows.append([law, *map(_rate, won), f"{rates.min():.1f} to {rates.max():.1f} %", least])
+        rows.append([law, *map(_rate, won), spread(rates), least])
     return rows
 
 
@@ -135,14 +136,14 @@ def _rate(won: np.ndarray) -> str:
     return share(int(won.sum()), won.size)
 
 
-def percent(won: int, of: int) -> str:
-    """A rate in percent without its sign, with as many digits as so many trials can tell."""
+def percent(won: float, of: int = 1) -> str:
+    """A rate in percent without its sign: all reports print rates by this, or by `share`."""
     return f"{100 * won / of:.{_digits(won, of)}f}"
 
 
-def _digits(won: int, of: int) -> int:
-    """Two above 99 % and below 1 % of a thousand trials and more, else one."""
-    return 2 if of >= 1000 and not 0.01 < won / of < 0.99 else 1
+def _digits(won: float, of: int) -> int:
+    """Two above 99 %, and at both ends where a thousand trials and more can tell, else one."""
+    return 2 if 0.99 < won / of < 1 or (of >= 1000 and not 0.01 < won / of < 0.99) else 1
 
 
 def share(won: int, of: int) -> str:
@@ -151,6 +152,13 @@ def share(won: int, of: int) -> str:
         return "-"
     ends = (f"{100 * end:.{_digits(won, of)}f}" for end in statistics.wilson(won, of))
     return f"{percent(won, of)} % [{', '.join(ends)}]"
+
+
+def spread(rates: ArrayLike) -> str:
+    """The least and the greatest of some rates, as models of the physics give them."""
+    least, most = float(np.min(rates)), float(np.max(rates))
+    digits = max(_digits(least, 1), _digits(most, 1))
+    return f"{100 * least:.{digits}f} to {100 * most:.{digits}f} %"
 
 
 def difference_table(results: xr.Dataset) -> list[list[str]]:

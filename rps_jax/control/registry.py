@@ -196,7 +196,8 @@ def named(text: str) -> tuple[str, Params]:
 
     A text is the name of a law, `FILE.py:CLASS` or a policy's `FILE.npz`, followed by any number of
     changes, each `,NAME=VALUE` or `,FILE.json` with names and values, as `rps tune` writes them. A
-    file of Python is run; it must register the law whose parameters are of that class.
+    file of Python is run; it must register the law whose parameters are of that class, which need
+    not be named if it is the only one of the file.
 
     Raises:
       InputError: there is no such law, file, class or parameter, or a value is not allowed.
@@ -225,7 +226,7 @@ def _known(text: str) -> tuple[str, Params]:
     """The label and the parameters of a law without changes."""
     if text.endswith(".npz"):
         return _learned(Path(text))
-    path, _, kind = text.rpartition(":")
+    path, _, kind = (text, "", "") if text.endswith(".py") else text.rpartition(":")
     if not path.endswith(".py"):
         return text, LAWS[errors.check_name("law", text, LAWS)]
     content = _read(Path(path))
@@ -239,8 +240,9 @@ def _known(text: str) -> tuple[str, Params]:
         _SOURCES[type(found[1])] = {"file": str(Path(path).resolve()), "digest": digest}
         return found
     raise InputError(
-        f"law = {text} is not allowed: {path} must define the class {kind or 'of parameters'} and "
-        "call rps_jax.register_law with parameters of it."
+        f"law = {text} is not allowed: {path} must define "
+        f"{f'the class {kind}' if kind else 'one class of parameters (name one as FILE.py:CLASS)'} "
+        "and call rps_jax.register_law with parameters of it."
     )
 
 
@@ -317,9 +319,16 @@ def _learned(path: Path) -> tuple[str, Params]:
 
 
 def _registered(module: str, kind: str) -> tuple[str, Params] | None:
-    """Name and parameters of the law whose parameters are of a class of a module."""
-    own = getattr(sys.modules.get(module), kind, None)
-    return next(((name, params) for name, params in LAWS.items() if type(params) is own), None)
+    """Name and parameters of the law whose parameters are of a class of a module.
+
+    Without the name of a class they are of the one class there that has a law.
+    """
+    if kind:
+        own = {getattr(sys.modules.get(module), kind, None)}
+    else:
+        own = {type(params) for params in LAWS.values() if type(params).__module__ == module}
+    found = ((name, params) for name, params in LAWS.items() if type(params) in own)
+    return next(found, None) if len(own) == 1 else None
 
 
 def _read(path: Path) -> bytes:

@@ -12,6 +12,7 @@ unchecked, as are the files of older versions, which had none.
 from __future__ import annotations
 
 import contextlib
+import csv
 import hashlib
 import io
 import json
@@ -81,6 +82,16 @@ def write_bytes(path: Path, content: bytes, *, checked: bool = False) -> Path:
         line = f"{digest(content)}  {path.name}\n".encode()
         atomic(checksum(path), lambda partial: partial.write_bytes(line))
     return path
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
+    """A table with a header, which pandas reads: the names of all rows; None and NaN stay empty."""
+    text = io.StringIO()
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({k: v for k, v in row.items() if v == v} for row in rows)  # NaN is not itself
+    return write_text(path, text.getvalue())
 
 
 def write_json(path: Path, content: Any, *, checked: bool = False) -> Path:

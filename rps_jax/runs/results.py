@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from rps_jax.errors import InputError
@@ -179,6 +181,64 @@ def dataset(plan: Plan, contents: Mapping[int, bytes]) -> xr.Dataset:
         for name, (values, meaning) in meanings.items()
     }
     return xr.Dataset(columns, names)
+
+
+def long_table(found: xr.Dataset) -> pd.DataFrame:
+    """One row for each law and world: outcomes, and what was drawn, with units in `attrs`.
+
+    Args:
+      found: outcomes (law, world, ...) as a sweep or `load` returns them.
+
+    Returns:
+      Columns law, world, object, the outcomes (poses as base_x, base_y [m], base_yaw [rad], and so
+      on) and the drawn quantities. `attrs["columns"]` holds the unit and the meaning of each.
+    """
+    pose = {"x": "m", "y": "m", "yaw": "rad"}
+    flat = found.reset_coords().drop_vars(["which_object", "object", "pose"], errors="ignore")
+    columns: dict[str, Any] = {"object": ("world", found.object.values[found.which_object.values])}
+    for name in [str(name) for name in flat.data_vars]:
+        if flat[name].dims == ("law", "world", "pose"):
+            for i, (axis, unit) in enumerate(pose.items()):
+                words = f"{axis} of the {name.removesuffix('_pose')} in the world at the end"
+                own = flat[name].values[..., i], {"units": unit, "long_name": words}
+                columns[name.replace("pose", axis)] = (("law", "world"), *own)
+        elif set(flat[name].dims) <= {"law", "world"}:
+            columns[name] = flat[name]
+    names = {name: (name, found[name].values, found[name].attrs) for name in ("law", "world")}
+    whole = xr.Dataset(columns, names)
+    whole["object"].attrs["long_name"] = "name of the object"
+    made = whole.to_dataframe(dim_order=["law", "world"]).reset_index()
+    told = {str(name): whole[name].attrs for name in made.columns}
+    made.attrs["columns"] = {
+        name: [one.get("units", ""), one.get("long_name", name.replace("_", " "))]
+        for name, one in told.items()
+    }
+    return made
+
+
+def check_table(path: Path) -> None:
+    """Raises InputError unless a table can be written there: .csv, or .parquet with pyarrow."""
+    if path.suffix not in (".csv", ".parquet"):
+        raise InputError(f"table = {path} is not allowed: name a file NAME.csv or NAME.parquet.")
+    if path.suffix == ".parquet" and not importlib.util.find_spec("pyarrow"):
+        raise InputError(
+            f"table = {path} needs pyarrow, which is not installed: run pip install pyarrow, or "
+            "name a .csv file."
+        )
+    if not path.parent.is_dir():
+        raise InputError(f"table = {path} is not allowed: {path.parent} is no folder.")
+
+
+def write_table(found: xr.Dataset, path: Path) -> None:
+    """Write `long_table` as CSV or Parquet, and beside it NAME.columns.csv: units and meanings."""
+    made = long_table(found)
+    told = [[name, *words] for name, words in made.attrs.pop("columns").items()]
+    head = pd.DataFrame(told, columns=["column", "unit", "meaning"])
+    if path.suffix == ".parquet":
+        files.atomic(path, lambda partial: made.to_parquet(partial, index=False))
+    else:
+        files.atomic(path, lambda partial: made.to_csv(partial, index=False))
+    files.atomic(path.with_suffix(".columns.csv"), lambda one: head.to_csv(one, index=False))
 
 
 def load(run: str | Path) -> xr.Dataset:

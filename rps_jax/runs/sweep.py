@@ -31,7 +31,16 @@ from rps_jax.record.checkpoint import Parts
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Kind, Plan, Shard, draw, made, open_run, share
 from rps_jax.runs.question import InDomain, OfLaws, Run, call_of, labelled
-from rps_jax.runs.results import UNITS, Collector, Keep, dataset, gather, name_of
+from rps_jax.runs.results import (
+    UNITS,
+    Collector,
+    Keep,
+    check_table,
+    dataset,
+    gather,
+    name_of,
+    write_table,
+)  # fmt: skip
 from rps_jax.trials import batch
 from rps_jax.trials.batch import Job, Part
 from rps_jax.trials.progress import Progress, Report, Timing, unheard
@@ -171,6 +180,9 @@ class Sweep(OfPlan):
     worker claims a GPU, or else as many processors as workers, one by default."""
     ray_device: Device = field(default="auto", kw_only=True)
     """Device of the cluster's workers."""
+    table: Path | str | None = field(default=None, kw_only=True)
+    """File for a table with one row for each law and world: NAME.csv, or NAME.parquet (needs
+    pyarrow). NAME.columns.csv beside it tells units and meanings of the columns."""
 
     @functools.cached_property
     def plan(self) -> Plan:
@@ -193,6 +205,10 @@ class Sweep(OfPlan):
         """Check what cannot be asked for together."""
         if self.points is not None and self.worlds is not None:
             raise InputError("worlds is not allowed with points: these say how many.")
+        if self.table is not None:
+            if self.share.of > 1:
+                raise InputError("table is not allowed with a shard: it is of all worlds.")
+            check_table(Path(self.table))
         if self.models and (self.ray or self.share.of > 1):
             raise InputError("models is not allowed with ray or a shard: run it in one process.")
         if self.out is None and (self.ray or self.share.of > 1):
@@ -203,6 +219,13 @@ class Sweep(OfPlan):
     def trials(self) -> int | None:
         """How many trials its share has."""
         return self.plan.trials_of(self.share)
+
+    def answered(self, report: Report) -> xr.Dataset:
+        """Outcomes, written as a table, too, where that is asked for."""
+        found = super().answered(report)
+        if self.table is not None:
+            write_table(found, Path(self.table))
+        return found
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run what is missing; of a share alone, return its own trials (row)."""

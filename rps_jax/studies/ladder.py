@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, ClassVar, get_args
 
+import numpy as np
 import xarray as xr
 
 from rps_jax.analysis import statistics, tables
@@ -19,9 +20,10 @@ from rps_jax.analysis.figures.style import Figure
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.control.base import Params, Senses
-from rps_jax.control.registry import LawsLike
+from rps_jax.control.registry import LawLike, LawsLike
+from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Run, call_of, seed_of
+from rps_jax.runs.question import Run, call_of, name_of, seed_of
 from rps_jax.runs.sweep import Sweep
 
 REFERENCE = "rps_tuned"  # what the others are compared with
@@ -90,6 +92,70 @@ class Ladder(Sweep):
 
 
 ladder = call_of(Ladder)
+
+
+@dataclass(frozen=True)
+class _Own:
+    """A law of one's own."""
+
+    law: LawLike = option("", positional=True)
+    """The law: FILE.py, FILE.py:CLASS where the file registers several, policy.npz, or a law of the
+    package; changes follow, as my_law.py,gain=0.2."""
+
+
+@dataclass(frozen=True)
+class Score(Ladder, _Own):
+    """Score a law of one's own in the test worlds of the ladder, beside rps and rps_plus.
+
+    The worlds depend on domain, number and seed alone, so scores of several people compare. The
+    report has one line for a Markdown table; the answer is that of `rps_jax.ladder`.
+
+    Example:
+      >>> import rps_jax
+      >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
+      >>> setting = rps_jax.Setting("quasistatic", rules=rules)
+      >>> found = rps_jax.score("pursuit", domain=drums, worlds=4, setting=setting)
+      >>> found.law.values.tolist()
+      ['pursuit', 'rps', 'rps_plus']
+    """
+
+    TITLE: ClassVar[str] = "Score of a law"
+
+    laws: LawsLike = ("rps", "rps_plus")
+    """The laws beside it; changes follow each, as rps,K_h=0.3 or rps,tuned.json."""
+
+    @cached_property
+    def chosen(self) -> dict[str, Params]:
+        """Parameters of the law, then of those beside it, by label."""
+        label, params = registry.read_law(self.law)
+        others = registry.laws_of(self.laws)
+        return {label: registry.checked(params)} | {k: v for k, v in others.items() if k != label}
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """The line for a table, and what a sweep reports."""
+        usual = Sweep.report(self, found, run)
+        if "row" in found.dims:
+            return usual
+        head, own = self.line(found)
+        text = "To be pasted into a table in Markdown:\n\n"
+        lines = (head, ["---"] * len(head), own)
+        text += "\n".join(f"    | {' | '.join(row)} |" for row in lines)
+        return [Section("Score", text), *usual]
+
+    def line(self, found: xr.Dataset) -> list[list[str]]:
+        """Header and the row of the law: success, its median time, the others, and the worlds."""
+        won = found.success.values > 0
+        rates = [tables.share(int(one.sum()), one.size) for one in won]
+        own, *others = map(str, found.law.values)
+        took = found.time.values[0][won[0]]
+        median = f"{np.median(took):.1f} s" if took.size else "-"
+        drawn = f"seed {self.setting.seed}" if self.points is None else "given points"
+        worlds = f"{won.shape[1]:,} test worlds of {name_of(self.domain)}, {drawn}"
+        header = ["law", "success", "median time", *others, "worlds"]
+        return [header, [own, rates[0], median, *rates[1:], f"{worlds}, {self.setting.engine}"]]
+
+
+score = call_of(Score)
 
 
 def _rungs(found: xr.Dataset) -> list[Section]:

@@ -20,6 +20,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 
 from rps_jax import engines, errors
+from rps_jax.analysis import tables
 from rps_jax.analysis.figures.style import Figure
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.laws.rps import RPSParams
@@ -199,7 +200,7 @@ class Learn(PPO, Pushes[xr.Dataset]):
             f"Compile {found.attrs['compile']:.1f} s, run {took:.1f} s "
             f"({simulated / max(took, 1e-9):.0f} simulated s per s). "
             f"`{run.folder}/policy.npz` is a law by that name, of "
-            f"{100 * np.max(judged.values, initial=0.0):.1f} % in validation."
+            f"{tables.percent(float(np.max(judged.values, initial=0.0)))} % in validation."
         )
         rows = [["update", "wall clock", "success in validation", "mean time", "curriculum"]]
         for update, rate in zip(judged["update"].values, judged.values, strict=True):
@@ -208,7 +209,7 @@ class Learn(PPO, Pushes[xr.Dataset]):
                 [
                     str(update),
                     f"{float(at.time) / 60:.1f} min",
-                    f"{100 * rate:.1f} %",
+                    f"{tables.percent(rate)} %",
                     f"{float(at.validation_time):.0f} s",
                     f"{100 * float(at.level):.0f} %",
                 ]
@@ -371,6 +372,8 @@ class _Learning:
         self._kept += 1
         Parts(self.folder).put(f"learner-{self._kept % 2}", content.getvalue(), ".npz")
         files.write_bytes(self.folder / "policy.npz", policies.encoded(self.policy()))
+        rows = [{"update": i + 1} | metrics for i, metrics in enumerate(self.curve)]
+        files.write_csv(self.folder / "curve.csv", rows)
 
     def _restore(self) -> None:
         """Take up what was kept last, if it is sound."""

@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import engines, errors
-from rps_jax.analysis import figures
+from rps_jax.analysis import figures, tables
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.control.base import Params
@@ -201,15 +201,15 @@ class Tuning(OfLaw[xr.Dataset]):
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
         """What was found, where the time went, and the search over its generations."""
         best = int(found.validation.argmin("generation"))
-        rate = 100 * found.validation_success.values
+        rate = [tables.percent(float(won)) for won in found.validation_success.values]
         total = {name: float(found[name].sum()) for name in ("compile", "run", "simulated")}
         grad = ""
         if "differentiate" in found:
             took = float(found["differentiate"].sum())  # `found.differentiate` is a method
             grad = f", gradients {took:.1f} s with their compilation"
         text = (
-            f"Validation: objective {float(found.validation[0]):.4f} and success {rate[0]:.1f} % "
-            f"at the start, {float(found.validation[best]):.4f} and {rate[best]:.1f} % after "
+            f"Validation: objective {float(found.validation[0]):.4f} and success {rate[0]} % "
+            f"at the start, {float(found.validation[best]):.4f} and {rate[best]} % after "
             f"{best} of {found.sizes['generation']}. Compile {total['compile']:.1f} s, run "
             f"{total['run']:.1f} s{grad}, {total['simulated']:.3g} s simulated."
         )
@@ -351,6 +351,10 @@ def read_log(folder: Path) -> list[dict[str, Any]]:
 def _write(folder: Path, tuner: Tuner, log: Sequence[dict[str, Any]]) -> None:
     files.write_json(folder / TUNED, tuner.space.named(tuner.best))
     files.write_text(folder / "log.jsonl", "".join(json.dumps(line) + "\n" for line in log))
+    rows = [line | {f"params.{k}": v for k, v in line["params"].items()} for line in log]
+    files.write_csv(
+        folder / "curve.csv", [{k: row[k] for k in row if k != "params"} for row in rows]
+    )
 
 
 def _encoded(vectors: np.ndarray, metrics: Metrics, line: dict[str, Any]) -> bytes:

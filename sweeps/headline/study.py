@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
-from rps_jax.analysis import statistics
+from rps_jax.analysis import tables
 from rps_jax.analysis.report import Section
 from rps_jax.control import registry
 from rps_jax.record import provenance
@@ -145,13 +145,13 @@ def table(found: xr.Dataset) -> list[list[Any]]:
 def _row(found: xr.Dataset, domain: str, law: str) -> dict[str, str]:
     by_model = rates(found, domain, law)
     own = found.sel(domain=domain, law=law, model=models.OWN)
-    shares = [100 * won / of for won, of in by_model.values()]
+    shares = [won / of for won, of in by_model.values()]
     return {
         "domain": domain,
         "law": law,
-        "success": _rate(*by_model[models.OWN]),
-        "over the models": f"{min(shares):.1f} to {max(shares):.1f} %" * (len(shares) > 1),
-        "in C MuJoCo": _rate(*by_model[C]) if C in by_model else "",
+        "success": tables.share(*by_model[models.OWN]),
+        "over the models": tables.spread(shares) if len(shares) > 1 else "",
+        "in C MuJoCo": tables.share(*by_model[C]) if C in by_model else "",
         "median time of a success": f"{float(own.time.where(own.success == 1).median()):.1f} s",
     }
 
@@ -163,12 +163,6 @@ def panel_table(found: xr.Dataset) -> list[list[str]]:
     for domain in found.domain.values:
         for law in found.law.values:
             by_model = rates(found, domain, law)
-            told = [_rate(*by_model[name]) if name in by_model else "" for name in names]
+            told = [tables.share(*by_model[name]) if name in by_model else "" for name in names]
             rows.append([str(domain), str(law), *told])
     return rows
-
-
-def _rate(won: int, of: int) -> str:
-    low, high = statistics.wilson(won, of)
-    digits = 2 if won > 0.99 * of else 1
-    return f"{100 * won / of:.{digits}f} % [{100 * low:.{digits}f}, {100 * high:.{digits}f}]"

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
+from rps_jax.analysis import tables
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Ask
@@ -171,7 +172,7 @@ def front_table(results: xr.Dataset) -> list[list[str]]:
         rows.append(
             [
                 labels[i],
-                f"{100 * float(one.success):.1f} %",
+                f"{tables.percent(float(one.success))} %",
                 f"{float(one.time):.1f} s",
                 f"{float(one.path):.2f} m",
                 "yes" if bool(one.front) else "no",

@@ -243,7 +243,7 @@ def losses(found: Mapping[str, xr.Dataset]) -> list[list[str]]:
     for name in (name for name in found if LIMITS[name].drawn):
         one, at = found[name], [crossings(found[name], level) for level in LOSSES]
         for law in map(str, one.law.values):
-            usual = f"{100 * float(one.usual.sel(law=law).mean()):.1f} %"
+            usual = f"{tables.percent(float(one.usual.sel(law=law).mean()))} %"
             rows.append([LIMITS[name].what, law, usual, *(_place(*each[law]) for each in at)])
     return rows
 

@@ -1,0 +1,204 @@
+"""Does a library that knows nothing of this project learn in `rps_jax/Push-v0`?
+
+    pip install stable-baselines3  # in an environment of its own: it brings PyTorch
+    rps sweeps/learned/sb3.py --machine "two cores"
+
+runs PPO of Stable-Baselines3, unmodified, for a minute of wall clock on worlds of Gymnasium that
+are stepped together. Its own vector environments step one world after another; `Batched` lends it
+the one of `gymnasium.make_vec`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import importlib.util
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import xarray as xr
+
+from rps_jax import errors
+from rps_jax.analysis import tables
+from rps_jax.analysis.report import Section
+from rps_jax.record import provenance
+from rps_jax.record.options import option
+from rps_jax.runs.question import Run, call_of
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+from rps_jax.world import domain as domains
+from sweeps.shared import Study, publish
+
+_FOUND = {
+    "time": ("s", "wall clock since learning began"),
+    "steps": ("1", "steps of all worlds"),
+    "episodes": ("1", "trials that ended since the row before"),
+    "reward": ("1", "mean sum of the rewards of these"),
+    "success": ("1", "share of these that arrived"),
+}
+
+
+@dataclass(frozen=True)
+class SB3(Study[xr.Dataset]):
+    """Learn by PPO of Stable-Baselines3 in worlds of Gymnasium, and publish its curve."""
+
+    TITLE: ClassVar[str] = "PPO of Stable-Baselines3"
+
+    domain: str = "wide,distance=0.7:1.5,bearing=-0.5:0.5"
+    """Ranges from which worlds are drawn."""
+    object: str = "random_cylinder"
+    """Object of all worlds."""
+    num_envs: int = option(256, 2, 100_000)
+    """Number of worlds that are stepped together."""
+    seconds: float = option(60.0, above=0, at_most=1e5, unit="s")
+    """Wall clock of learning [s], without the compilation of the worlds."""
+    rows: int = option(6, 1, 1000)
+    """Number of rows of the curve."""
+    machine: str = ""
+    """What it runs on, in words; with these the table is published."""
+    setting: Setting = field(
+        default=Setting(fidelity="fast", rules=Rules(horizon=60.0, max_lost=20.0)), kw_only=True
+    )
+
+    def check(self) -> None:
+        """Check the domain, and that the libraries are there."""
+        domains.named(self.domain)
+        for name in ("gymnasium", "stable_baselines3"):
+            if not importlib.util.find_spec(name):
+                raise errors.InputError(
+                    f"{name} is not installed: run pip install gymnasium stable-baselines3."
+                )
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Learn (row)."""
+        found = run.part("curve", self._learned)
+        if self.machine and run.folder is not None:
+            head, *rows = table(found)
+            names = ("stable-baselines3", "torch", "gymnasium")
+            versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in names)
+            made, columns = [provenance.signed(run.folder)], [{"name": text} for text in head]
+            path = Path(__file__).parent / "results" / "sb3.json"
+            note = f"{versions}; a run of its own seed, with noise in the actions."
+            publish(path, made, self.machine, columns, rows, note)
+        return found
+
+    def _learned(self) -> xr.Dataset:
+        names = ("", ".common.vec_env", ".common.callbacks")
+        modules: list[Any] = [importlib.import_module(f"stable_baselines3{one}") for one in names]
+        sb3, vec, back = modules
+        gymnasium: Any = importlib.import_module("gymnasium")
+        how = {"object": self.object, "domain": self.domain, "setting": self.setting}
+        envs = gymnasium.make_vec(
+            "rps_jax.tuning.gym:rps_jax/Push-v0",
+            num_envs=self.num_envs,
+            autoreset_mode="SameStep",
+            **how,
+        )
+        worlds = vec.VecMonitor(batched(vec.VecEnv, envs), info_keywords=("is_success",))
+        worlds.seed(self.setting.seed)
+        worlds.reset()
+        worlds.step(np.zeros((self.num_envs, 3), np.float32))
+        curve: list[list[float]] = []
+        began, every, ended = time.perf_counter(), self.seconds / self.rows, []
+
+        class Curve(back.BaseCallback):
+            def _on_step(self) -> bool:
+                ended.extend(i["episode"] for i in self.locals["infos"] if "episode" in i)
+                spent = time.perf_counter() - began
+                if spent >= every * (len(curve) + 1):
+                    mean = [
+                        float(np.mean([one[key] for one in ended])) if ended else np.nan
+                        for key in ("r", "is_success")
+                    ]
+                    curve.append([spent, self.num_timesteps, len(ended), *mean])
+                    ended.clear()
+                return len(curve) < rows
+
+        rows = self.rows
+        options = {"n_steps": 32, "batch_size": 2048, "n_epochs": 4, "learning_rate": 1e-3}
+        model = sb3.PPO(
+            "MlpPolicy", worlds, seed=self.setting.seed, device="cpu",
+            policy_kwargs={"log_std_init": -0.7}, **options,
+        )  # fmt: skip
+        model.learn(10**9, callback=Curve())
+        values = np.array(curve)
+        return xr.Dataset(
+            {
+                name: ("row", values[:, i], {"units": unit, "long_name": words})
+                for i, (name, (unit, words)) in enumerate(_FOUND.items())
+            }
+        )
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """The curve."""
+        return [Section("Curve", "", table(found))]
+
+
+sb3 = call_of(SB3)
+
+
+def batched(base: Any, envs: Any) -> Any:
+    """Lend a vector environment of Gymnasium, in the mode SameStep, to Stable-Baselines3."""
+
+    class Batched(base):
+        render_mode = None
+
+        def __init__(self) -> None:
+            super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
+
+        def reset(self) -> np.ndarray:
+            return envs.reset(seed=self._seeds[0])[0]
+
+        def step_async(self, actions: np.ndarray) -> None:
+            self._actions = actions
+
+        def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+            seen, rewards, terminated, truncated, told = envs.step(self._actions)
+            infos: list[dict[str, Any]] = [{} for _ in range(envs.num_envs)]
+            for i in np.flatnonzero(terminated | truncated):
+                infos[i] = {
+                    "terminal_observation": told["final_obs"][i],
+                    "TimeLimit.truncated": bool(truncated[i]),
+                    "is_success": bool(told["final_info"]["is_success"][i]),
+                }
+            return seen, rewards.astype(np.float32), terminated | truncated, infos
+
+        def close(self) -> None:
+            envs.close()
+
+        def get_attr(self, name: str, indices: Any = None) -> list[Any]:
+            return [getattr(envs, name)] * envs.num_envs
+
+        def set_attr(self, name: str, value: Any, indices: Any = None) -> None:
+            raise NotImplementedError
+
+        def env_method(self, name: str, *args: Any, **kwargs: Any) -> list[Any]:
+            raise NotImplementedError
+
+        def env_is_wrapped(self, kind: Any, indices: Any = None) -> list[bool]:
+            return [False] * envs.num_envs
+
+    return Batched()
+
+
+def table(found: xr.Dataset) -> list[list[str]]:
+    """Header and rows of the curve."""
+    rows = [
+        ["wall clock", "steps of all worlds", "trials that ended", "reward of these", "success"]
+    ]
+    for i in range(found.sizes["row"]):
+        at = found.isel(row=i)
+        rows.append(
+            [
+                f"{float(at.time):.0f} s",
+                f"{int(at.steps):,}",
+                f"{int(at.episodes):,}",
+                f"{float(at.reward):.2f}",
+                tables.share(round(float(at.success) * int(at.episodes)), int(at.episodes)),
+            ]
+        )
+    return rows

@@ -1,0 +1,173 @@
+"""The environment of Gymnasium is a `PushEnv` whose actions last, alone or many at once."""
+
+import importlib
+import sys
+from dataclasses import replace
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+from rps_jax.errors import InputError
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+from rps_jax.tuning import gym
+from rps_jax.world import domain
+from rps_jax.world.domain import DOMAINS, Range
+
+# Targets ahead and so near that driving ahead for some seconds arrives; a perfect base.
+NEAR = replace(
+    DOMAINS["wide"],
+    distance=Range(0.7, 0.72),
+    bearing=Range(-0.1, 0.1),
+    lateral=Range(-0.03, 0.03),
+    com_offset=Range(0, 0),
+    gap=Range(0.02, 0.02),
+    **{name: Range(0, 0) for name in domain.of("base")},
+)
+HOW = {"object": "random_cylinder", "domain": NEAR, "worlds": 6, "hold": 1.0}
+HOW |= {"setting": Setting("fused", fidelity="fast", rules=Rules(horizon=20.0))}
+COUNT = 4
+AHEAD = np.tile(np.float32([1.0, 0.0, 0.0]), (COUNT, 1))
+
+
+def many(**options):
+    return gymnasium.make_vec("rps_jax/Push-v0", num_envs=COUNT, **HOW | options)
+
+
+@pytest.fixture(scope="module")
+def one():
+    return gymnasium.make("rps_jax/Push-v0", **HOW)
+
+
+@pytest.fixture(scope="module")
+def several():
+    return many()
+
+
+@pytest.mark.filterwarnings("ignore:.*A Box observation space (min|max)imum value is")
+@pytest.mark.filterwarnings("error:.*WARN")
+def test_gymnasium_finds_nothing_wrong(one):
+    check_env(one.unwrapped, skip_render_check=True)
+    assert one.observation_space.shape == (44,)
+    assert one.action_space == gymnasium.spaces.Box(-1, 1, (3,), np.float32)
+    assert one.metadata["render_fps"] == 1  # an action lasts for a second
+
+
+def test_a_step_is_an_action_of_push_env_held(one):
+    seen, info = one.reset(seed=3)
+    push, worlds = one.unwrapped.push_env, one.unwrapped._worlds
+    state = jax.tree.map(lambda leaf: leaf[0], worlds.state)
+    assert int(state.info["index"]) == info["world"]
+    np.testing.assert_array_equal(seen, state.obs)
+    step, total = jax.jit(push.step), 0.0
+    for _ in range(round(1.0 / push.dt)):
+        state = step(state, AHEAD[0])
+        total += float(state.reward)
+    seen, reward, terminated, truncated, info = one.step(AHEAD[0])
+    np.testing.assert_allclose(seen, state.obs, atol=1e-4)
+    assert reward == pytest.approx(total, abs=1e-4)
+    assert not any((terminated, truncated, info["is_success"]))
+    assert info["time"] == pytest.approx(1.0)
+
+
+def test_a_seed_decides_on_worlds_and_noise(one, several):
+    for env, action in ((one, AHEAD[0]), (several, AHEAD)):
+        runs = []
+        for seed in (5, 5, 6):
+            start, _ = env.reset(seed=seed)
+            runs.append((start, *env.step(action)[:2]))
+        for a, b in zip(runs[0], runs[1], strict=True):
+            np.testing.assert_array_equal(a, b)
+        assert not np.array_equal(runs[0][0], runs[2][0])
+    start, _ = several.reset(seed=5)
+    assert len(np.unique(start, axis=0)) == COUNT  # each world its own
+
+
+def to_the_end(envs):
+    """Steps until a trial arrives."""
+    envs.reset(seed=0)
+    for _ in range(20):
+        seen, rewards, terminated, truncated, told = envs.step(AHEAD)
+        if terminated.any():
+            return seen, rewards, terminated, truncated, told
+    raise AssertionError("targets are ahead")
+
+
+def test_who_arrives_is_terminated_and_begins_anew_in_the_next_step(several):
+    assert several.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    _, rewards, ended, truncated, told = to_the_end(several)
+    assert told["is_success"][ended].all()
+    assert not truncated[ended].any()
+    assert (rewards[ended] > 0.5).all()  # the success, which is worth 1, less what contact costs
+    before = told["time"]
+    seen, rewards, terminated, truncated, told = several.step(AHEAD)
+    assert (rewards[ended] == 0).all()
+    assert not (terminated | truncated)[ended].any()
+    assert (told["time"][ended] == 0).all()
+    assert (told["time"][~ended] >= before[~ended]).all()
+    assert told["_time"].all()
+    start = np.linalg.norm(seen[ended, 42:], axis=1)
+    np.testing.assert_allclose(start, 0.71, atol=0.02)  # far again
+    assert (several.step(AHEAD)[4]["time"][ended] == 1).all()
+
+
+def test_or_at_once_where_that_is_asked_for(several):
+    _, rewards, ended, *_ = to_the_end(several)
+    envs = many(autoreset_mode="SameStep")
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    seen, same, terminated, _, told = to_the_end(envs)
+    np.testing.assert_array_equal(terminated, ended)
+    np.testing.assert_array_equal(same, rewards)
+    np.testing.assert_array_equal(told["_final_obs"], ended)
+    assert (told["time"][ended] == 0).all()
+    assert told["final_info"]["is_success"][ended].all()
+    i = int(np.argmax(ended))
+    assert np.linalg.norm(told["final_obs"][i][42:]) < 0.45 < np.linalg.norm(seen[i, 42:])
+    assert all(last is None for last in told["final_obs"][~ended])
+
+
+def test_who_runs_out_of_time_is_truncated(several):
+    several.reset(seed=1)
+    for second in range(1, 21):
+        _, _, terminated, truncated, told = several.step(0 * AHEAD)
+        assert not terminated.any()
+        assert truncated.all() == (second == 20)
+    assert not told["is_success"].any()
+
+
+def test_images_are_drawn_where_they_are_asked_for(one):
+    one.reset(seed=0)
+    assert one.unwrapped.render() is None
+    drawn = gymnasium.make("rps_jax/Push-v0", render_mode="rgb_array", **HOW)
+    drawn.reset(seed=0)
+    image = drawn.render()
+    assert image.shape == (240, 320, 3)
+    assert image.std() > 10
+
+
+def test_what_means_nothing_is_refused(one, several):
+    with pytest.raises(InputError, match=r"hold = 0.001 is not allowed"):
+        gym.Push(hold=0.001)
+    with pytest.raises(InputError, match="num_envs = 0 is not allowed"):
+        gym.PushVector(0)
+    with pytest.raises(InputError, match="unknown autoreset_mode 'Disabled'"):
+        gym.PushVector(2, autoreset_mode=AutoresetMode.DISABLED)
+    with pytest.raises(InputError, match="unknown domain 'wild'"):
+        gym.Push(domain="wild")
+    several.reset(seed=0)
+    with pytest.raises(InputError, match=r"action = of shape \(3,\) is not allowed"):
+        several.step(AHEAD[0])
+    one.reset(seed=0)
+    with pytest.raises(InputError, match=r"action = \[\[nan, 0.0, 0.0\]\] is not allowed"):
+        one.unwrapped.step([np.nan, 0, 0])
+
+
+def test_without_gymnasium_it_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    monkeypatch.delitem(sys.modules, "rps_jax.tuning.gym")
+    with pytest.raises(InputError, match=r"run pip install 'rps_jax\[gym\]'"):
+        importlib.import_module("rps_jax.tuning.gym")
