@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-RPS = (sys.executable, "-c", "import sys; from rps_jax.app.cli import main; sys.exit(main())")
+RPS = (sys.executable, "-m", "rps_jax")
 HOME = Path(__file__).parents[1]
 SHORT = ("--engine", "quasistatic", "--horizon", "2")
 DRUMS = ("--domain", "wide,objects=random_cylinder")

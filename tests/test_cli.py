@@ -1,8 +1,11 @@
 """The command line as a user meets it: whole runs, repeatable files, and teaching errors."""
 
+import gc
 import json
+import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ import xarray as xr
 from helpers import refusal, rps
 
 import rps_jax
+from rps_jax.app.cli import running
 from rps_jax.control import registry
 from rps_jax.record import files
 from rps_jax.trials.results import DIMS
@@ -186,3 +190,39 @@ def test_a_command_is_the_call_of_its_question(tmp_path):
     setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
     called = rps_jax.sweep(["rps", "rps,K_h=0.3"], "prisms", 4, setting=setting)
     xr.testing.assert_identical(rps_jax.load(tmp_path), called)
+
+
+def test_a_run_that_is_stopped_says_so_in_one_line(tmp_path):
+    """At any moment: here while programs are compiled, in threads that know nothing of it."""
+    command = [sys.executable, "-m", "rps_jax", "sweep", "--worlds", "64", *map(str, BRIEF)]
+    process = subprocess.Popen(
+        [*command, "--out", tmp_path / "run"], stderr=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    deadline = time.monotonic() + 120
+    while not (tmp_path / "run" / "manifest.json").exists():
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    error = process.communicate(timeout=60)[1].decode()
+    assert process.returncode == 130
+    assert error.splitlines()[-1] == "rps: interrupted."
+    assert "Traceback" not in error
+
+
+def test_an_interrupt_that_the_garbage_collector_swallows_comes_again(capsys):
+    def swallowed(phase, _):
+        gc.callbacks.remove(swallowed)
+        raise KeyboardInterrupt
+
+    def action():
+        gc.callbacks.append(swallowed)
+        gc.collect()
+        for _ in range(500):
+            time.sleep(0.01)
+
+    began = time.monotonic()
+    assert running.guarded(action) == 130
+    assert time.monotonic() - began < 4
+    assert capsys.readouterr().err.endswith("rps: interrupted.\n")

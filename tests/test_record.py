@@ -359,3 +359,10 @@ def test_what_a_run_was_made_on_before_is_not_forgotten(tmp_path):
     (tmp_path / provenance.ENVIRONMENT).write_text("{}")
     with pytest.raises(InputError, match=r"environment\.json is corrupt"):
         provenance.told(tmp_path)
+
+
+def test_names_that_are_no_utf8_keep_their_bytes(tmp_path):
+    """As in the C locale, where Python reads a snowman in a path as three lone surrogates."""
+    name = "\N{SNOWMAN}".encode().decode("ascii", errors="surrogateescape")
+    path = files.write_text(tmp_path / "report.md", f"run folder: {name}")
+    assert path.read_bytes() == "run folder: \N{SNOWMAN}".encode()

@@ -6,14 +6,29 @@ A question's fields are the options (`flags`), found by its file's text (`names`
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 from rps_jax.app.cli import names, running
 
 
+def run() -> NoReturn:
+    """Run `rps` as a process, which ends at once if it was stopped.
+
+    Threads of XLA may still be compiling then, and can crash while Python is taken down.
+    """
+    code = main()
+    if code == 130:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `rps` and `python -m rps_jax`; exit code 0, 2 for bad input, 130 if stopped."""
+    """Ask what the words ask; exit code 0, 2 for bad input, 130 if stopped."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help"):
         return running.guarded(lambda: print(names.overview()))
