@@ -100,12 +100,16 @@ class Export(Study[xr.Dataset]):
         return _columns("inputs", rows, "form", _FORMS, but=("law", "form"))
 
     def _trials(self, law: str, where: Path) -> xr.Dataset:
-        cases = [Case(o, "S1", t, law=law) for o in PAPER_OBJECTS for t in paper.FEW_TARGETS]
-        seen, found = native.recorded(cases, Setting("fused")), {}
+        cases = [
+            [Case(thing, "S1", target, law=law) for target in paper.FEW_TARGETS]
+            for thing in PAPER_OBJECTS
+        ]
+        seen = [one for some in cases for one in native.recorded(some, Setting("fused"))]
+        found = {}
         for form in _FORMS:
             error = np.concatenate(native.trial_errors(law, form, seen, where))
             found[form] = (
-                len(cases), error.size, error.max(), np.quantile(error, 0.999),
+                len(seen), error.size, error.max(), np.quantile(error, 0.999),
                 (error > native.TOLERANCE[form]).sum(), (error > native.JUMP).sum(),
             )  # fmt: skip
         names = ("trials", "steps", "greatest", "usual", "beyond", "flips")
