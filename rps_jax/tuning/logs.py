@@ -1,7 +1,8 @@
 """Logs of pushes as `rps fit` takes them: read, checked, and brought to one clock.
 
 A log is a trace, as `push` and `replay` return it or keep it in their run folder; a bag, as
-`rps push --bag` writes it; or a table `FILE.csv` with a header and the columns
+`rps push --bag` writes it or a robot records it (`record.bag` lists the topics); or a table
+`FILE.csv` with a header and the columns
 
     time                             [s]
     x, y, yaw                        [m, m, rad] of the base, by its odometry
@@ -22,6 +23,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
@@ -90,7 +92,7 @@ def read(source: Any, shell: Shell) -> Given:
         found = _of_trace(files.read_results(Path(source)), name)
     elif Path(source).suffix == ".mcap" and Path(source).is_file():
         bag.check()
-        read_ = bag.read(Path(source))
+        read_ = read_bag(Path(source), shell)
         known = (*COLUMNS, "signal")
         found = Given({k: np.asarray(v, float) for k, v in read_.items() if k in known}, False)
     elif Path(source).suffix == ".csv" and Path(source).is_file():
@@ -100,15 +102,44 @@ def read(source: Any, shell: Shell) -> Given:
             f"{name} is not allowed: give a trace, a run folder of rps push, FILE.csv or FILE.mcap."
         )
     columns = found.columns
-    if "signal" in columns and (count := columns["signal"].shape[1]) != shell.count:
-        raise InputError(
-            f"{name} has {count} taxels, and the robot {shell.count}: name the log's robot by "
-            "--robot."
-        )
+    if "signal" in columns:
+        _check_taxels(columns["signal"], name, shell)
     if "contact_type" not in columns:
         columns |= _touch_of(columns["signal"], shell)
     _check(columns, name, shell)
     return found
+
+
+def read_bag(path: Path, shell: Shell) -> dict[str, np.ndarray]:
+    """Read a bag as `bag.read` does; of one without contacts the skin makes them of its taxels.
+
+    The usual skin on this shell filters one scan for each command, as the exported skin does, and
+    compares it to its threshold.
+
+    Raises:
+      InputError: it cannot be read, or its taxels are not those of this shell.
+    """
+    found = bag.read(path)
+    if "contact_type" in found:
+        return found
+    _check_taxels(found["signal"], f"bag = {path}", shell)
+    skin = CapacitiveSkin(shell=shell)
+
+    def scan(state: Any, row: Any) -> Any:
+        state, reading = skin.read(state, *row)
+        return state, (state.signal, reading.contact_type, reading.p_robot_contact)
+
+    rows = jnp.asarray(found["signal"]), jnp.asarray(found["period"])
+    felt = jax.lax.scan(scan, skin.init(jax.random.PRNGKey(0)), rows)[1]
+    return found | dict(zip(("signal", *_TOUCH), map(np.asarray, felt), strict=True))
+
+
+def _check_taxels(signal: np.ndarray, name: str, shell: Shell) -> None:
+    if signal.shape[1] != shell.count:
+        raise InputError(
+            f"{name} has {signal.shape[1]} taxels, and the robot {shell.count}: name the log's "
+            "robot by --robot."
+        )
 
 
 def _of_trace(data: xr.Dataset, name: str) -> Given:
