@@ -47,6 +47,9 @@ REFUSED = [
     ("force_push_grid", "--duration 0", "duration"),
     ("fit", "--logs 1", "logs = 1 is not allowed"),
     ("fit", "--law aps", "fit knows laws that sense touch"),
+    ("export", "--laws nune", "unknown law 'nune'"),
+    ("export", "--tables sped", "sped"),
+    ("export", "--inputs 0", "inputs = 0 is not allowed"),
 ]
 
 
