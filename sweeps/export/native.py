@@ -18,6 +18,7 @@ import shutil
 import subprocess
 import tempfile
 import time
+from collections import namedtuple
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -176,7 +177,7 @@ class Onnx(Structs):
         for name in memory.dtype.names or ():
             if (after := f"next_memory_{name}") in found:
                 memory[name] = found[after]
-        twist = np.stack([found[name] for name in ("v_x", "v_y", "omega")], -1)
+        twist = np.stack([np.asarray(found[name]) for name in ("v_x", "v_y", "omega")], -1)
         return twist, np.zeros(len(seen), np.int32)
 
 
@@ -433,13 +434,11 @@ def in_the_loop(name: str, where: Path) -> Any:
             Details.of(getattr(seen, "touch", seen)),
         )
 
-    class InC(NamedTuple):
-        law: Any
-        d_success: Any
-
-    mine = InC(params, params.d_success)
+    own = program.identifier(label)
+    kind = namedtuple(f"{own}_InC", "law d_success")  # each law has parameters of its own class
+    mine = kind(params, params.d_success)
     native_law = Law(lambda p: law.init(p.law), step, senses=law.senses)
-    registry.register_law(f"{program.identifier(label)}_in_c", native_law, mine)
+    registry.register_law(f"{own}_in_c", native_law, mine)
     return mine
 
 

@@ -76,15 +76,18 @@ class Export(Study[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Answer table by table and law by law."""
-        found = []
+        found: list[xr.Dataset] = []
         for table in self.tables:
             make = getattr(self, f"_{table}")
             rows = []
             for law in self.laws:
                 rows.append(run.part(f"{table}-{law}", partial(self._kept, make, law)))
                 run.report(Progress(len(rows), 0.0))
-            found.append(xr.concat(rows, "law").assign_coords(law=list(self.laws)))
+            joined = xr.concat(rows, "law")
+            assert isinstance(joined, xr.Dataset)
+            found.append(joined.assign_coords(law=list(self.laws)))
         whole = xr.merge(found)
+        assert isinstance(whole, xr.Dataset)
         if self.machine and run.folder is not None:
             self._publish(whole, run.folder)
         return whole
