@@ -48,7 +48,7 @@ class Export(Study[xr.Dataset]):
     """Compare exported laws with those in JAX, and time them."""
 
     TITLE: ClassVar[str] = "Laws in C and ONNX beside those in JAX"
-    GROWS: ClassVar[tuple[str, ...]] = ("tables", "machine")
+    GROWS: ClassVar[tuple[str, ...]] = ("laws", "tables", "machine")
     SMALL: ClassVar[Mapping[str, Any]] = {"laws": ("rps_plus",), "inputs": 20_000, "worlds": 4}
 
     laws: tuple[str, ...] = ("rps", "rps_tuned", "rps_plus", "learned_mlp", "learned_gru")
