@@ -40,7 +40,10 @@ TABS: dict[str, list[Any]] = {
         *("notebooks/05_tuning.md", "tuned", "landscape", "gradients"),
     ],
     "Laws": ["ladder", "rps_plus", "mends", "learned", "force_push_grid", "failures"],
-    "Robots": ["robots", "limits", "notebooks/examples/ros2/rps_push/README.md"],
+    "Robots": [
+        *("docs/on_a_robot.md", "robots", "limits", "export"),
+        "notebooks/examples/ros2/rps_push/README.md",
+    ],
     "Physics": ["mjcf/README.md", "ground", "real_pushes", "fit", "engines", "fidelity"],
     "Studies": ["sweeps/README.md"],
     "Make it yours": ["rps_jax/README.md", "rps_jax/adding.md", "CONTRIBUTING.md"],

@@ -13,7 +13,9 @@ import rps_jax
 from rps_jax.app.shadow import Shadow, shadow
 from rps_jax.record import bag
 from rps_jax.record.bag import Step
+from rps_jax.robot.robot import Robot
 from rps_jax.runs.push import push
+from rps_jax.tuning import logs
 
 pytest.importorskip("mcap_ros2")
 BRIEF = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=6.0))
@@ -138,7 +140,7 @@ def test_odd_files_are_refused_in_one_sentence(tmp_path, recorded):
     bag.write(path, steps(pose=(float("nan"), 0, 0)), {})
     assert "pose is not finite" in said_of(path)
     bag.write(path, [], {})
-    assert "no messages on /odom, /target, /contact, /cmd_vel" in said_of(path)
+    assert "no messages on /odom, /target, /cmd_vel, /contact or /taxels" in said_of(path)
 
 
 def test_damage_anywhere_is_refused_or_read(tmp_path):
@@ -155,6 +157,45 @@ def test_damage_anywhere_is_refused_or_read(tmp_path):
         except rps_jax.InputError:
             refused += 1
     assert refused > 20
+
+
+def without_contacts(path, steps, monkeypatch):
+    """A bag as a robot records it: taxels as its skin answers, and no contacts."""
+    whole = bag._messages
+    monkeypatch.setattr(bag, "_messages", lambda s: (m for m in whole(s) if m[0] != "/contact"))
+    found = bag.write(path, steps, {})
+    monkeypatch.undo()
+    return found
+
+
+def test_the_skin_feels_the_taxels_of_a_bag_without_contacts(tmp_path, capsys, monkeypatch):
+    """It filters them: of a taxel at 0.4, (1 - exp(-t / 50 ms)) 0.4 > 0.25 from the third on."""
+    signal = np.zeros(42)
+    signal[20] = 0.4
+    path = without_contacts(tmp_path / "a.mcap", steps(9, signal=signal), monkeypatch)
+    assert "contact_type" not in bag.read(path)
+    found = logs.read_bag(path, Robot().shell)
+    assert found["contact_type"].tolist() == [0, 0] + [1] * 7
+    place = [0.3625, 0.29 - 0.58 * 5.5 / 12]  # the sixth of the front's twelve
+    np.testing.assert_allclose(found["p_robot_contact"][2:], [place] * 7, atol=1e-6)
+    np.testing.assert_allclose(found["signal"][1, 20], 0.4 * (1 - np.exp(-0.8)), rtol=1e-5)
+    twists = np.stack([shadow(path, "rps")[name][1] for name in ("v_x", "v_y", "omega")], -1)
+    touched = steps(9, signal=signal, p_robot_contact=place)
+    touched = [one._replace(contact_type=int(i > 1)) for i, one in enumerate(touched)]
+    same = shadow(bag.write(tmp_path / "b.mcap", touched, {}), "rps")
+    np.testing.assert_allclose(twists[:, 0], same.v_x[1], atol=1e-6)
+    np.testing.assert_allclose(twists[:, 1], same.v_y[1], atol=1e-6)
+    said = refusal(capsys, "shadow", path, "--robot", "ridgeback", "--out", tmp_path / "run")
+    assert "has 42 taxels, and the robot 51: name the log's robot by --robot" in said
+
+
+def test_steps_begin_with_the_first_contact(tmp_path, monkeypatch):
+    signal, whole = np.zeros(42), bag._messages
+    late = lambda s: (m for m in whole(s) if m[0] != "/contact" or m[1] > 0.05e9)  # noqa: E731
+    monkeypatch.setattr(bag, "_messages", late)
+    found = bag.read(bag.write(tmp_path / "a.mcap", steps(6, signal=signal), {}))
+    np.testing.assert_allclose(found["time"], [0.06, 0.08, 0.1])
+    assert found["contact_type"].tolist() == [1, 1, 1]
 
 
 def test_a_foreign_topic_of_another_type_is_named(tmp_path, monkeypatch):

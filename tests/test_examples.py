@@ -1,6 +1,7 @@
 """The examples run, and what they register is known everywhere."""
 
 import runpy
+import time
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import NamedTuple
@@ -375,13 +376,14 @@ def test_a_policy_is_trained():
 
 def test_the_law_runs_on_a_robot_and_compiles_nothing_on_the_way(compiled, capsys):
     made = example("on_a_robot")
-    tick, memory = made["controller"](RPSParams.paper(), CapacitiveSkin(), 0.001)
+    tick, memory = made["controller"](RPSParams.paper(), CapacitiveSkin())
     robot, target = made["Robot"](), np.array([-2.0, 0.0], np.float32)
-    memory, twist = tick(memory, *robot.read(), target)
+    given = target, np.float32(0.001)
+    memory, twist = tick(memory, *robot.read(), *given)
     assert compiled
     before = len(compiled)
     for _ in range(200):
-        memory, twist = tick(memory, *robot.read(), target)
+        memory, twist = tick(memory, *robot.read(), *given)
         robot.command(np.asarray(twist))
     assert len(compiled) == before
     # Four taxels left of the middle, the 17th to 20th, are felt after the filter's delay.
@@ -396,6 +398,32 @@ def test_the_law_runs_on_a_robot_and_compiles_nothing_on_the_way(compiled, capsy
     latency = made["main"](made["Options"](seconds=0.3))
     assert latency.shape == (300,)
     assert "99.9th percentile" in capsys.readouterr().out
+
+
+def test_skin_and_law_on_a_robot_hear_the_time_since_the_last_step(monkeypatch):
+    made, heard = example("on_a_robot"), []
+    inside = made["controller"].__globals__
+
+    def law(params, state, seen):
+        return state, Twist(seen.period, 0.0, 0.0)
+
+    monkeypatch.setitem(inside, "step", law)
+    tick, memory = made["controller"](RPSParams.paper(), CapacitiveSkin())
+    taxels, pose = made["Robot"]().read()
+    for period in (0.001, 0.02):
+        (skin, _), twist = tick(memory, taxels, pose, np.zeros(2, np.float32), np.float32(period))
+        assert float(twist[0]) == pytest.approx(period)
+        share = 1 - np.exp(-period / CapacitiveSkin().time_constant)
+        assert float(skin.signal[17]) == pytest.approx(0.6 * share, rel=1e-4)
+
+    class Noting(made["Robot"]):
+        def command(self, twist):
+            heard.append(float(twist[0]))
+            time.sleep(0.01)  # late
+
+    made["run"](Noting(), np.zeros(2, np.float32), 0.02)
+    assert heard[0] < 0.01
+    assert min(heard[1:]) > 0.01
 
 
 def test_a_skin_reads_real_taxels_as_it_reads_its_own():

@@ -19,11 +19,18 @@ from rps_jax.robot.skin import SKINS
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
-from sweeps.export.native import Native, agreement, observations, trial_errors
+from sweeps.export.native import (
+    COMPILERS,
+    SANE,
+    Native,
+    agreement,
+    fuzzed,
+    observations,
+    recorded,
+    trial_errors,
+)
 
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"]
-SANE = ["-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
 LAWS = [
     *("rps", "nps", "rps_plus", "aps", "pursuit", "dipole", "force_push", "force_push_published"),
     *("learned_mlp", "learned_gru"),
@@ -145,61 +152,13 @@ def test_the_folder_compiles_without_a_warning_and_runs(name, compiler, tmp_path
     assert not re.search(r"\b(malloc|calloc|realloc|alloca)\b", texts["law.h"])
 
 
-FUZZ = """
-#include <math.h>
-#include <stdlib.h>
-#include <string.h>
-#include "law.h"
-static law_real odd(void) {
-  static const float some[] = {0, -0.0f, 1e-38f, 1e38f, -1e38f, 3e9f, -3e9f, 1, 0.3f};
-  int i = rand() % 40;
-  return i == 0 ? (law_real)NAN : i == 1 ? (law_real)INFINITY : i == 2 ? (law_real)-INFINITY
-       : (law_real)some[i % 9];
-}
-int main(void) {
-  law_params params = LAW_PARAMS;
-  law_skin_params skin_params = LAW_SKIN_PARAMS;
-  law_memory memory;
-  law_skin skin;
-  int codes[3] = {0, 0, 0};
-  law_init(&params, &memory);
-  law_skin_init(&skin);
-  for (int i = 0; i < 20000; i++) {
-    law_observation seen;
-    law_twist twist;
-    law_contact contact;
-    law_real taxels[LAW_TAXELS], numbers[sizeof seen / sizeof(law_real)];
-    law_memory before = memory;
-    int bad = 0;
-    for (unsigned k = 0; k < sizeof numbers / sizeof numbers[0]; k++) numbers[k] = odd();
-    memcpy(&seen, numbers, sizeof numbers); /* flags of any bits, too */
-    int code = law_step(&params, &memory, &seen, &twist);
-    codes[code]++;
-    if (!isfinite(twist.v_x) || !isfinite(twist.v_y) || !isfinite(twist.omega)) return 2;
-    if (code && (twist.v_x != 0 || twist.v_y != 0 || twist.omega != 0)) return 3;
-    if (code && memcmp(&before, &memory, sizeof memory)) return 4;
-    if (!isfinite(seen.yaw) && code != LAW_BAD_INPUT) return 5;
-    if (rand() % 50 == 0) memset(&memory, rand() % 256, sizeof memory);
-    for (int k = 0; k < LAW_TAXELS; k++) bad |= !isfinite(taxels[k] = rand() % 20 ? 1 : odd());
-    law_real period = rand() % 9 ? (law_real)0.01 : odd();
-    code = law_skin_step(&skin_params, &skin, taxels, period, &contact);
-    if (bad && (code != LAW_BAD_INPUT || contact.in_contact)) return 6;
-    for (int k = 0; k < LAW_TAXELS; k++) if (!isfinite(skin.signal[k])) return 7;
-  }
-  return codes[0] && codes[1] ? 0 : 8;
-}
-"""
-
-
 @pytest.mark.parametrize("name", ["rps_plus", "learned_mlp", "force_push_published", "own"])
 def test_what_is_not_finite_gives_a_zero_twist_and_nothing_undefined(name, tmp_path, own):
     made = program.program(own if name == "own" else name)
-    (tmp_path / "law.h").write_text(c.header(made, "law"))
-    (tmp_path / "fuzz.c").write_text(FUZZ)
     for compiler in COMPILERS:
-        binary = compiled(compiler, tmp_path / "fuzz.c", *SANE)
-        ran = subprocess.run([str(binary)], capture_output=True, text=True)
-        assert ran.returncode == 0, (ran.returncode, ran.stderr)
+        found = fuzzed(made, compiler, "float", 20_000, tmp_path)
+        assert found.fault == 0, found
+        assert found.taken > 0 < found.refused
 
 
 def test_a_law_of_a_users_file_is_exported(own, tmp_path):
@@ -246,8 +205,11 @@ def test_a_whole_trial_step_by_step(name, tmp_path):
     """C remembers by itself; observations are those of the trial in JAX."""
     case = Case("box", "S1", (-1.0, 0.5), law=name)
     setting = Setting("quasistatic", rules=Rules(horizon=20.0))
-    errors = trial_errors(name, case, setting, tmp_path)
-    assert len(errors) > 900
+    trials = recorded([case], setting)
+    assert len(trials[0][0]) > 900
+    (errors,) = trial_errors(name, "double", trials, tmp_path)
+    assert errors.max() < 1e-12
+    (errors,) = trial_errors(name, "float", trials, tmp_path)
     # A step differs where a switch flips in one of the two; it must not last.
     assert np.mean(errors > 2e-5) < 0.01
     assert np.median(errors) < 1e-6

@@ -9,6 +9,7 @@ from helpers import refusal, rps
 
 import rps_jax
 from rps_jax.errors import InputError
+from rps_jax.record import bag, files
 from rps_jax.robot.robot import Robot
 from rps_jax.tuning import fit, logs, posterior
 from rps_jax.world import domain as domains
@@ -98,6 +99,50 @@ def test_what_cannot_be_fitted_is_refused(arguments, message, tmp_path, capsys, 
     monkeypatch.chdir(tmp_path)
     written(tmp_path / "log.csv", rows_of())
     assert message in refusal(capsys, "fit", *arguments)
+
+
+def bagged(path, rows, **changes):
+    """The rows of a table as a bag."""
+    steps = [
+        bag.Step(
+            row[0], row[1:4], row[10:12], int(row[4]), row[5:7], row[7:10],
+            **{name: values[i] for name, values in changes.items()},
+        )
+        for i, row in enumerate(rows)
+    ]  # fmt: skip
+    return bag.write(path, steps, {})
+
+
+def test_a_bag_is_the_log_that_a_table_is(tmp_path):
+    rows = rows_of()
+    rows[:, 3] = np.linspace(3.0, 3.5, len(rows))  # a heading that a quaternion breaks
+    table = logs.read(written(tmp_path / "log.csv", rows), SHELL)
+    found = logs.read(bagged(tmp_path / "log.mcap", rows), SHELL)
+    assert found.exact is table.exact is False
+    assert set(found.columns) == set(table.columns)
+    for name, values in table.columns.items():
+        np.testing.assert_allclose(found.columns[name], values, atol=1e-6)
+    signal = np.zeros((len(rows), SHELL.count))
+    found = logs.read(bagged(tmp_path / "felt.mcap", rows, signal=signal), SHELL)
+    np.testing.assert_array_equal(found.columns["signal"], signal)
+
+
+def test_bags_that_are_no_log_are_refused_before_anything_compiles(tmp_path, compiled, capsys):
+    rows, path = rows_of(), tmp_path / "log.mcap"
+    moving = rows.copy()
+    moving[200:, 10] = 1.0
+    for said, make in {
+        "a target that moves": lambda: bagged(path, moving),
+        "has 41 taxels, and the robot 42": lambda: bagged(path, rows, signal=np.zeros((400, 41))),
+        "lasts 1.9 s: it must last 5 s": lambda: bagged(path, rows[:95]),
+        "no messages on /odom": lambda: bag.write(path, [], {}),
+        "give an MCAP file": lambda: path.write_bytes(b"no bag"),
+        "is not allowed": lambda: path.write_bytes(bagged(path, rows).read_bytes()[:20_000]),
+    }.items():
+        make()
+        assert said in refusal(capsys, "fit", path, "--out", tmp_path / "run")
+    assert not compiled
+    assert not (tmp_path / "run").exists()
 
 
 def test_traces_and_odometry_are_not_mixed_and_something_must_be_given(tmp_path):
@@ -209,3 +254,7 @@ def test_a_log_is_fitted_from_the_shell(tmp_path, capsys):
     assert found.objects == ("random_box",)
     assert (tmp_path / "run" / "marginals.png").stat().st_size > 10_000
     assert rps(*ask, "--physics", "default,timestep=0.01", "--out", tmp_path / "run") == 0
+    ask[1] = bagged(tmp_path / "log.mcap", rows_of())
+    assert rps(*ask, "--physics", "default,timestep=0.01", "--out", tmp_path / "bag") == 0
+    both = [files.read_results(tmp_path / name) for name in ("run", "bag")]
+    np.testing.assert_allclose(both[1]["median"], both[0]["median"], rtol=0.05, atol=1e-3)

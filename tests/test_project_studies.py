@@ -52,6 +52,9 @@ REFUSED = [
     ("publish", "--only nothing", "no data file has such a name"),
     ("fit", "--logs 1", "logs = 1 is not allowed"),
     ("fit", "--law aps", "fit knows laws that sense touch"),
+    ("export", "--laws nune", "unknown law 'nune'"),
+    ("export", "--tables sped", "sped"),
+    ("export", "--inputs 0", "inputs = 0 is not allowed"),
 ]
 
 

@@ -33,23 +33,25 @@ class Options:
     """Core to stay on; by default any."""
 
 
-def controller(params: RPSParams, skin: CapacitiveSkin, period: float) -> tuple[Callable, tuple]:
+def controller(params: RPSParams, skin: CapacitiveSkin) -> tuple[Callable, tuple]:
     """The compiled step, and what it remembers before the first.
 
     The step takes what it remembers, taxels (42,) [1] as relative changes of capacitance, the
-    base's pose (3,) [m, m, rad] and the target (2,) [m] in the world, and returns what it
-    remembers and the twist (3,) [m/s, m/s, rad/s] in the robot's frame.
+    base's pose (3,) [m, m, rad] and the target (2,) [m] in the world, and the time [s] since the
+    last step as it was measured. It returns what it remembers and the twist (3,) [m/s, m/s, rad/s]
+    in the robot's frame.
     """
 
-    def tick(memory, taxels, pose, p_world_target):
+    def tick(memory, taxels, pose, p_world_target, period):
         skin_state, state = memory
         skin_state, reading = skin.read(skin_state, taxels, period)
         contact = reading.p_robot_contact, reading.in_contact
-        state, twist = step(params, state, Observation(pose[:2], pose[2], *contact, p_world_target))
+        seen = Observation(pose[:2], pose[2], *contact, p_world_target, period)
+        state, twist = step(params, state, seen)
         return (skin_state, state), jnp.stack(twist)
 
     memory = skin.init(jax.random.PRNGKey(0)), RPSState.init(params)
-    inputs = [jax.ShapeDtypeStruct((size,), jnp.float32) for size in (42, 3, 2)]
+    inputs = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in ((42,), (3,), (2,), ())]
     return jax.jit(tick).lower(memory, *inputs).compile(), memory
 
 
@@ -74,16 +76,19 @@ class Robot:
 
 def run(robot: Robot, target: np.ndarray, seconds: float) -> np.ndarray:
     """Drive for some time; returns how long each step took to decide, (n,) [s]."""
-    tick, memory = controller(RPSParams.paper(), CapacitiveSkin(), PERIOD)
+    tick, memory = controller(RPSParams.paper(), CapacitiveSkin())
     latency = np.zeros(round(seconds / PERIOD))
-    jax.block_until_ready(tick(memory, *robot.read(), target))  # the first call sets things up
+    period = np.float32(PERIOD)
+    jax.block_until_ready(tick(memory, *robot.read(), target, period))  # sets things up
     gc.collect()
     gc.disable()
     due = time.perf_counter()
+    last = due - PERIOD
     for i in range(latency.size):
         taxels, pose = robot.read()
         began = time.perf_counter()
-        memory, twist = tick(memory, taxels, pose, target)
+        period, last = np.float32(began - last), began
+        memory, twist = tick(memory, taxels, pose, target, period)
         twist = np.asarray(twist)
         latency[i] = time.perf_counter() - began
         robot.command(twist)

@@ -26,7 +26,10 @@ from rps_jax.control.observation import (
 from rps_jax.errors import InputError
 from rps_jax.record import bag as bags
 from rps_jax.record.options import option
+from rps_jax.robot import robot as robots
+from rps_jax.robot.robot import RobotLike
 from rps_jax.runs.question import Question, Run, call_of
+from rps_jax.tuning import logs
 
 _UNITS = {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s"}
 _SENSED = {"taxels": ("signal",), "force": ("f_robot",), "pose": ("p_world_object", "r_object")}
@@ -40,6 +43,9 @@ class Shadow(Question[xr.Dataset]):
     """MCAP file with what a robot observed, as `rps push --bag` writes it."""
     law: str | Any = "rps_plus"
     """The law, by its name or its file, with changes, as rps_plus,mine.json."""
+    robot: RobotLike = "ideal"
+    """The robot of a bag that has taxels but no contacts: ideal, kairos, ridgeback or mpo_500, or a
+    JSON file of its size and boards."""
 
     TITLE = "A law in the shadow of another"
 
@@ -49,15 +55,15 @@ class Shadow(Question[xr.Dataset]):
         return registry.checked(registry.read_law(self.law)[1])
 
     def check(self) -> None:
-        """Check the law, and that the file is there."""
-        _ = self.params
+        """Check the law and the robot, and that the file is there."""
+        _ = self.params, robots.named(self.robot)
         bags.check()
         if not Path(self.file).is_file():
             raise InputError(f"bag = {self.file} is not allowed: give an MCAP file.")
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run the law over the bag."""
-        recorded = bags.read(Path(self.file))
+        recorded = logs.read_bag(Path(self.file), robots.named(self.robot).shell)
         params = self.params
         twists = shadowed(registry.law_of(params), params, recorded)
         both = np.stack([recorded["twist"], twists])

@@ -8,7 +8,8 @@ Topics, each with one message a control step but `/tf` and the marker, which are
                                                    a contact that is a point, twice the same for a
                                                    line
     /taxels         std_msgs/Float32MultiArray     relative change of capacitance of each taxel,
-                                                   along the strip; filtered
+                                                   along the strip; filtered if there are contacts,
+                                                   and else as the skin answered
     /force          geometry_msgs/WrenchStamped    of the object on the base, where a law senses it
     /object         visualization_msgs/Marker      a cylinder as wide as the object, where a law
                                                    senses its pose
@@ -85,7 +86,8 @@ TOPICS = {
     "/target_marker": "visualization_msgs/Marker",
     "/tf": "tf2_msgs/TFMessage",
 }
-_NEEDED = ("/odom", "/target", "/contact", "/cmd_vel")
+_NEEDED = ("/odom", "/target", "/cmd_vel")
+_TOUCH = ("/contact", "/taxels")  # of which one is needed, too
 
 
 class Step(NamedTuple):
@@ -240,7 +242,8 @@ def _cylinder(header: Any, name: str, pose: Any, width: float) -> dict[str, Any]
 def read(path: Path) -> dict[str, np.ndarray]:
     """The steps of a bag, as arrays by the fields of `Step`; those that it lacks are missing.
 
-    A step is a command, with what was heard last before it. The period of each is beside.
+    A step is a command, with what was heard last before it. The period of each is beside. A bag
+    with `/taxels` alone, as a robot's is, has no `contact_type` and no `p_robot_contact`.
 
     Raises:
       InputError: the file is no bag, is damaged or too large, or lacks a topic.
@@ -250,13 +253,15 @@ def read(path: Path) -> dict[str, np.ndarray]:
     try:
         with open(path, "rb") as file:
             for topic, time, message in _decoded(file):
+                if topic == "/contact" and topic not in latest:
+                    columns.clear()  # what came before has none
                 latest[topic] = message
-                if topic == "/cmd_vel" and all(one in latest for one in _NEEDED):
+                if topic == "/cmd_vel" and not _missing(latest):
                     for name, value in _observed(1e-9 * time, latest).items():
                         columns.setdefault(name, []).append(value)
                     if len(columns["time"]) > _MOST_STEPS:
                         raise ValueError(f"it has more than {_MOST_STEPS} commands")
-        if missing := [one for one in _NEEDED if one not in latest]:
+        if missing := _missing(latest):
             raise ValueError(f"it has no messages on {', '.join(missing)}")
         if not columns:
             raise ValueError("it has no command after its observations")
@@ -276,11 +281,17 @@ def read(path: Path) -> dict[str, np.ndarray]:
         said = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
         raise InputError(
             f"bag = {path} is not allowed ({said}): give an MCAP file with the topics "
-            f"{', '.join(_NEEDED)}."
+            f"{', '.join(_NEEDED)}, and {' or '.join(_TOUCH)}."
         ) from error
     found["pose"][:, 2] = np.unwrap(found["pose"][:, 2])
     found["period"] = np.concatenate([[np.median(periods)], periods])
     return found
+
+
+def _missing(latest: Mapping[str, Any]) -> list[str]:
+    """Topics that a bag must have, and has not."""
+    touch = [] if any(one in latest for one in _TOUCH) else [" or ".join(_TOUCH)]
+    return [one for one in _NEEDED if one not in latest] + touch
 
 
 def _decoded(file: Any) -> Iterator[tuple[str, int, Any]]:
@@ -329,16 +340,17 @@ def _observed(time: float, latest: Mapping[str, Any]) -> dict[str, Any]:
     """The fields of `Step` in the latest messages."""
     pose = latest["/odom"].pose.pose
     turn, place, target = pose.orientation, pose.position, latest["/target"].point
-    sent, points = latest["/cmd_vel"].twist, latest["/contact"].polygon.points
-    touch = points[0] if points else None
+    sent = latest["/cmd_vel"].twist
     found: dict[str, Any] = {
         "time": time,
         "pose": (place.x, place.y, 2 * math.atan2(turn.z, turn.w)),
         "target": (target.x, target.y),
-        "contact_type": min(len(points), 2),
-        "p_robot_contact": (touch.x, touch.y) if touch else (0.0, 0.0),
         "twist": (sent.linear.x, sent.linear.y, sent.angular.z),
     }
+    if "/contact" in latest:
+        points = latest["/contact"].polygon.points
+        found["contact_type"] = min(len(points), 2)
+        found["p_robot_contact"] = (points[0].x, points[0].y) if points else (0.0, 0.0)
     if "/taxels" in latest:
         found["signal"] = np.array(latest["/taxels"].data, np.float32)
     if "/force" in latest:

@@ -1,7 +1,8 @@
 """Logs of pushes as `rps fit` takes them: read, checked, and brought to one clock.
 
 A log is a trace, as `push` and `replay` return it or keep it in their run folder; a bag, as
-`rps push --bag` writes it; or a table `FILE.csv` with a header and the columns
+`rps push --bag` writes it or a robot records it (`record.bag` lists the topics); or a table
+`FILE.csv` with a header and the columns
 
     time                             [s]
     x, y, yaw                        [m, m, rad] of the base, by its odometry
@@ -22,6 +23,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
@@ -48,6 +50,7 @@ OPTIONAL = ("object_pose", "f_robot", "signal")  # what a log may have besides
 _TOUCH = ("contact_type", "p_robot_contact")
 _SHORTEST = 5.0  # [s]
 _SLOWEST = 0.2  # [s] between two rows
+_STILL = 0.001  # [m] that a target may move
 # Greatest numbers of a log, and what they would otherwise be.
 _MOST = {
     "twist": (np.array([3.0, 3.0, 10.0]), "v_x and v_y [m/s] and omega [rad/s]"),
@@ -89,19 +92,54 @@ def read(source: Any, shell: Shell) -> Given:
         found = _of_trace(files.read_results(Path(source)), name)
     elif Path(source).suffix == ".mcap" and Path(source).is_file():
         bag.check()
-        read_ = bag.read(Path(source))
+        read_ = read_bag(Path(source), shell)
         known = (*COLUMNS, "signal")
         found = Given({k: np.asarray(v, float) for k, v in read_.items() if k in known}, False)
-        if found.columns["target"].ndim == 2:
-            found.columns["target"] = found.columns["target"][-1]
     elif Path(source).suffix == ".csv" and Path(source).is_file():
-        found = _of_table(Path(source), name, shell)
+        found = _of_table(Path(source), name)
     else:
         raise InputError(
             f"{name} is not allowed: give a trace, a run folder of rps push, FILE.csv or FILE.mcap."
         )
-    _check(found.columns, name, shell)
+    columns = found.columns
+    if "signal" in columns:
+        _check_taxels(columns["signal"], name, shell)
+    if "contact_type" not in columns:
+        columns |= _touch_of(columns["signal"], shell)
+    _check(columns, name, shell)
     return found
+
+
+def read_bag(path: Path, shell: Shell) -> dict[str, np.ndarray]:
+    """Read a bag as `bag.read` does; of one without contacts the skin makes them of its taxels.
+
+    The usual skin on this shell filters one scan for each command, as the exported skin does, and
+    compares it to its threshold.
+
+    Raises:
+      InputError: it cannot be read, or its taxels are not those of this shell.
+    """
+    found = bag.read(path)
+    if "contact_type" in found:
+        return found
+    _check_taxels(found["signal"], f"bag = {path}", shell)
+    skin = CapacitiveSkin(shell=shell)
+
+    def scan(state: Any, row: Any) -> Any:
+        state, reading = skin.read(state, *row)
+        return state, (state.signal, reading.contact_type, reading.p_robot_contact)
+
+    rows = jnp.asarray(found["signal"]), jnp.asarray(found["period"])
+    felt = jax.lax.scan(scan, skin.init(jax.random.PRNGKey(0)), rows)[1]
+    return found | dict(zip(("signal", *_TOUCH), map(np.asarray, felt), strict=True))
+
+
+def _check_taxels(signal: np.ndarray, name: str, shell: Shell) -> None:
+    if signal.shape[1] != shell.count:
+        raise InputError(
+            f"{name} has {signal.shape[1]} taxels, and the robot {shell.count}: name the log's "
+            "robot by --robot."
+        )
 
 
 def _of_trace(data: xr.Dataset, name: str) -> Given:
@@ -121,7 +159,7 @@ def _of_trace(data: xr.Dataset, name: str) -> Given:
     return Given({k: np.asarray(v, float) for k, v in columns.items()}, True)
 
 
-def _of_table(path: Path, name: str, shell: Shell) -> Given:
+def _of_table(path: Path, name: str) -> Given:
     text = path.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     if len(text) < 2:
         raise InputError(f"{name} is empty: give a header and at least two rows.")
@@ -142,16 +180,8 @@ def _of_table(path: Path, name: str, shell: Shell) -> Given:
     wanted = {k: c for k, c in COLUMNS.items() if all(one in at for one in c)}
     found = {k: rows[:, [at[one] for one in c]] for k, c in wanted.items()}
     found |= {k: found[k][:, 0] for k in ("time", "contact_type") if k in found}
-    found["target"] = found["target"][0]
     if taxels:
         found["signal"] = rows[:, [at[one] for one in taxels]]
-        if len(taxels) != shell.count:
-            raise InputError(
-                f"{name} has {len(taxels)} taxels, and the robot {shell.count}: name the log's "
-                "robot by --robot."
-            )
-        if "contact_type" not in found:
-            found |= _touch_of(found["signal"], shell)
     return Given(found, False)
 
 
@@ -169,6 +199,10 @@ def _check(found: dict[str, np.ndarray], name: str, shell: Shell) -> None:
     for key, values in found.items():
         if len(bad := np.argwhere(~np.isfinite(values))):
             raise InputError(f"{name} has no number for {key} in row {bad[0][0]}: fill or cut it.")
+    targets = np.atleast_2d(found["target"])
+    if np.ptp(targets, axis=0).max() > _STILL:
+        raise InputError(f"{name} has a target that moves: cut the log where it does.")
+    found["target"] = targets[0]
     time, steps = found["time"], np.diff(found["time"])
     if len(time) < 2 or (steps <= 0).any():
         raise InputError(f"{name} is not allowed: its time must rise, over at least two rows.")

@@ -1,6 +1,6 @@
-"""Laws in C, compiled and loaded, beside those in JAX: chance inputs, whole trials, and times.
+"""Laws in C and ONNX beside those in JAX: chance inputs, whole trials, odd inputs and times.
 
-Each input is a chance observation with the memory that JAX had there, so a switch that flips does
+Each chance input is an observation with the memory that JAX had there, so a switch that flips does
 not spoil what follows. Errors are relative to the greatest speed and turning rate of a law. Where
 one exceeds the tolerance, the inputs are moved by a few roundings: JAX's own twist moves as far
 where a switch is near (a flip) or where the law is ill-conditioned; and JAX's float32 is compared
@@ -11,9 +11,15 @@ these explains is a fault, and there must be none.
 from __future__ import annotations
 
 import ctypes
+import json
+import os
 import re
+import shutil
 import subprocess
 import tempfile
+import time
+from collections import namedtuple
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -21,7 +27,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax.app.export import c, folder, program
+import rps_jax
+from rps_jax.app.export import c, folder, graph, program
 from rps_jax.app.export.program import Group, Program
 from rps_jax.control import registry, trying
 from rps_jax.control.base import Law
@@ -30,16 +37,18 @@ from rps_jax.runs.push import recorded_law
 from rps_jax.trials import pushes
 from rps_jax.trials.batch import Part
 from rps_jax.trials.case import Case
+from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.scene import FRICTION
 
 Precision = Literal["float", "double"]
-TOLERANCE = {"float": 1e-6, "double": 1e-12}
-ROUNDING = {"float": 2.0**-23, "double": 2.0**-52}
+Form = Literal["float", "double", "onnx"]  # C of either precision, or ONNX, which is of float
+REAL: dict[str, Any] = {"float": np.float32, "double": np.float64, "onnx": np.float32}
+TOLERANCE = {"float": 1e-6, "double": 1e-12, "onnx": 1e-6}
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-fPIC", "-shared")
 STEPS = 100  # of each world, from its first
-_JUMP = 1e-3  # [1] beyond which a difference is a flip
+JUMP = 1e-3  # [1] beyond which a difference is a flip
 
 DRIVER = """
 #include "{p}.h"
@@ -64,25 +73,13 @@ void touches(int n, {p}_skin *skin, const {p}_real *taxels, const {p}_real *peri
 """
 
 
-class Native:
-    """A law in C, compiled and loaded; arrays of structs go in and out."""
+class Structs:
+    """Arrays of structs that a law takes and gives."""
 
-    def __init__(self, made: Program, where: Path, precision: Precision, compiler: str = "gcc"):
-        """Compile it in a folder."""
-        self.program, self.real = made, {"float": np.float32, "double": np.float64}[precision]
-        p = "law"
-        folder = Path(tempfile.mkdtemp(dir=where))  # a library is loaded once from one path
-        (folder / "law.h").write_text(c.header(made, p))
-        (folder / "driver.c").write_text(DRIVER.format(p=p, P=p.upper()))
-        library = folder / f"{compiler}_{precision}.so"
-        double = ["-DLAW_DOUBLE"] if precision == "double" else []
-        command = [compiler, *FLAGS, *double, str(folder / "driver.c"), "-lm", "-o", str(library)]
-        subprocess.run(command, check=True)
-        self._library = ctypes.CDLL(str(library))
+    def __init__(self, made: Program, form: Form):
+        """Take the types of a program's groups."""
+        self.program, self.real = made, REAL[form]
         self.dtypes = {name: self._dtype(group) for name, group in made.groups.items()}
-        self.params = self.struct("params", 1)
-        for one in made.groups["params"]:
-            self.params[one.name] = one.value
 
     def _dtype(self, group: Group) -> np.dtype:
         kinds = {"f": self.real, "i": np.int32, "b": np.int32}
@@ -100,6 +97,26 @@ class Native:
             if one.size:
                 found[one.name] = leaf
         return found
+
+
+class Native(Structs):
+    """A law in C, compiled and loaded."""
+
+    def __init__(self, made: Program, where: Path, precision: Precision, compiler: str = "gcc"):
+        """Compile it in a folder."""
+        super().__init__(made, precision)
+        p = "law"
+        folder = Path(tempfile.mkdtemp(dir=where))  # a library is loaded once from one path
+        (folder / "law.h").write_text(c.header(made, p))
+        (folder / "driver.c").write_text(DRIVER.format(p=p, P=p.upper()))
+        library = folder / f"{compiler}_{precision}.so"
+        double = ["-DLAW_DOUBLE"] if precision == "double" else []
+        command = [compiler, *FLAGS, *double, str(folder / "driver.c"), "-lm", "-o", str(library)]
+        subprocess.run(command, check=True)
+        self._library = ctypes.CDLL(str(library))
+        self.params = self.struct("params", 1)
+        for one in made.groups["params"]:
+            self.params[one.name] = one.value
 
     def begin(self, count: int) -> np.ndarray:
         """Memories before the first step."""
@@ -125,6 +142,48 @@ class Native:
     def _call(self, name: str, count: int, *arrays: np.ndarray) -> None:
         places = [array.ctypes.data_as(ctypes.c_void_p) for array in arrays]
         getattr(self._library, name)(ctypes.c_int(count), *places)
+
+
+class Onnx(Structs):
+    """A law as an ONNX model of so many worlds, in a session of the runtime."""
+
+    def __init__(self, made: Program, count: int):
+        """Write the model and load it."""
+        import onnx
+        import onnxruntime
+
+        super().__init__(made, "onnx")
+        model = graph.models(made, "law", count)["law.onnx"]
+        assert isinstance(model, bytes)
+        self.session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
+        self.about = {one.key: one.value for one in onnx.load_from_string(model).metadata_props}
+        types = {"tensor(float)": np.float32, "tensor(bool)": np.bool_, "tensor(int32)": np.int32}
+        self._types = {one.name: types[one.type] for one in self.session.get_inputs()}
+        self._names = [one.name for one in self.session.get_outputs()]
+
+    def begin(self, count: int) -> np.ndarray:
+        """Memories before the first step."""
+        memory = self.struct("memory", count)
+        for name, value in json.loads(self.about["memory_at_the_start"]).items():
+            memory[name.removeprefix("memory_")] = np.array(value)
+        return memory
+
+    def step(self, memory: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Twists (n, 3) and codes (n,), all 0; the memory becomes that after the step."""
+        known = {f"memory_{name}": memory[name] for name in memory.dtype.names or ()}
+        known |= {name: seen[name] for name in seen.dtype.names or ()}
+        given = {k: np.ascontiguousarray(known[k], kind) for k, kind in self._types.items()}
+        found = dict(zip(self._names, self.session.run(None, given), strict=True))
+        for name in memory.dtype.names or ():
+            if (after := f"next_memory_{name}") in found:
+                memory[name] = found[after]
+        twist = np.stack([np.asarray(found[name]) for name in ("v_x", "v_y", "omega")], -1)
+        return twist, np.zeros(len(seen), np.int32)
+
+
+def made_in(form: Form, made: Program, where: Path, count: int) -> Native | Onnx:
+    """A law in C, or as ONNX for `count` worlds at once."""
+    return Onnx(made, count) if form == "onnx" else Native(made, where, form)
 
 
 def observations(made: Program, rng: np.random.Generator, count: int, real: Any) -> Any:
@@ -153,27 +212,27 @@ def observations(made: Program, rng: np.random.Generator, count: int, real: Any)
 
 
 class Agreement(NamedTuple):
-    """How far C is from JAX."""
+    """How far C or ONNX is from JAX, counted in inputs."""
 
     law: str
-    precision: str
-    inputs: int
-    greatest: float  # error
-    beyond: int  # inputs whose error exceeds the tolerance, of which
-    flips: int  # a switch flips, and JAX's own does after a few roundings
-    ill: int  # JAX's own twist is or moves as far off by a few roundings
-    unexplained: int
+    form: str
+    inputs: int = 0
+    greatest: float = 0.0  # error
+    beyond: int = 0  # whose error exceeds the tolerance, of which
+    flips: int = 0  # a switch flips, and JAX's own does after a few roundings
+    ill: int = 0  # JAX's own twist is or moves as far off by a few roundings
+    unexplained: int = 0
+    off: int = 0  # in float, further than the tolerance from the twist of float64
+    off_in_jax: int = 0  # where JAX's float32 is
 
 
-def agreement(
-    name: str, precision: Precision, inputs: int, where: Path, seed: int = 0
-) -> Agreement:
-    """Compare a law's twist and memory in C and in JAX."""
+def agreement(name: str, form: Form, inputs: int, where: Path, seed: int = 0) -> Agreement:
+    """Compare a law's twist and memory in C or ONNX and in JAX."""
     label, params = registry.read_law(name)
     law, made = registry.law_of(params), program.program(name)
-    native = Native(made, where, precision)
-    real, worlds = native.real, max(1, min(inputs // STEPS, 5000))
-    with jax.enable_x64(precision == "double"):
+    worlds, real = max(1, min(inputs // STEPS, 5000)), REAL[form]
+    native = made_in(form, made, where, worlds)
+    with jax.enable_x64(form == "double"):
         params = jax.tree.map(lambda x: jnp.asarray(x, real), params)
         seen_tree = jax.tree.structure(trying.observation_of(law.senses))
 
@@ -182,9 +241,8 @@ def agreement(
             return memory, twist
 
         step = jax.jit(jax.vmap(step))
-        exact = None if precision == "double" else _exact(law, params, seen_tree)
-        rng, found = np.random.default_rng(seed), Agreement(label, precision, 0, 0.0, 0, 0, 0, 0)
-        scale = _scale(params)
+        exact = None if form == "double" else _exact(law, params, seen_tree)
+        rng, found, scale = np.random.default_rng(seed), Agreement(label, form), _scale(params)
         begin = jax.tree.map(
             lambda x: np.broadcast_to(np.asarray(x), (worlds, *np.shape(x))), law.init(params)
         )
@@ -200,8 +258,18 @@ def agreement(
                 both = np.stack(jax.tree.leaves(twist), -1)
                 error = (np.abs(theirs - both) / scale).max(-1)
                 error = np.maximum(error, _apart(mine, native.filled("memory", after, worlds)))
-                own = None if exact is None or error.max() <= 1e-6 else exact(memory, leaves)
-                found = _judged(found, error, native, step, memory, leaves, both, scale, rng, own)
+                spread = np.zeros(worlds)
+                if exact is not None:
+                    own = exact(memory, leaves)
+                    spread = (np.abs(own - both) / scale).max(-1)
+                    off = (np.abs(own - theirs) / scale).max(-1) > TOLERANCE[form]
+                    found = found._replace(
+                        off=found.off + int(off.sum()),
+                        off_in_jax=found.off_in_jax + int((spread > TOLERANCE[form]).sum()),
+                    )
+                found = _judged(
+                    found, error, native, step, memory, leaves, both, scale, rng, spread
+                )
                 memory = after
     return found
 
@@ -226,34 +294,36 @@ def _exact(law: Any, params: Any, seen_tree: Any) -> Any:
 
 
 def _judged(
-    found: Agreement, error: np.ndarray, native: Native, step: Any, memory: Any, leaves: Any,
-    both: np.ndarray, scale: np.ndarray, rng: np.random.Generator, own: np.ndarray | None,
+    found: Agreement, error: np.ndarray, native: Structs, step: Any, memory: Any, leaves: Any,
+    both: np.ndarray, scale: np.ndarray, rng: np.random.Generator, spread: np.ndarray,
 ) -> Agreement:  # fmt: skip
-    precision: Precision = "float" if native.real == np.float32 else "double"
-    beyond = error > TOLERANCE[precision]
+    """The tally after one batch, of which JAX itself is off by `spread`."""
+    beyond = error > TOLERANCE[found.form]
     found = found._replace(
         inputs=found.inputs + error.size,
         greatest=max(found.greatest, float(error.max(initial=0))),
         beyond=found.beyond + int(beyond.sum()),
     )
-    if not beyond.any():
-        return found
+    few = 4 * np.finfo(native.real).eps
 
     def moved(x: Any) -> Any:
         x = np.asarray(x)
         if x.dtype.kind != "f":
             return x
-        return (x * (1 + 4 * ROUNDING[precision] * rng.uniform(-1, 1, x.shape))).astype(x.dtype)
+        return (x * (1 + few * rng.uniform(-1, 1, x.shape))).astype(x.dtype)
 
-    spread = np.zeros(error.size) if own is None else (np.abs(own - both) / scale).max(-1)
-    here = native.filled("memory", step(memory, leaves)[0], error.size)
+    here = None
     for _ in range(40):
+        if not (beyond & (error > 4 * spread)).any():
+            break
+        if here is None:
+            here = native.filled("memory", step(memory, leaves)[0], error.size)
         other, twist = jax.device_get(step(*jax.tree.map(moved, (memory, leaves))))
         away = (np.abs(np.stack(jax.tree.leaves(twist), -1) - both) / scale).max(-1)
         away = np.maximum(away, _apart(here, native.filled("memory", other, error.size)))
         spread = np.maximum(spread, away)
     explained = beyond & (error <= 4 * spread)
-    flips = explained & (error > _JUMP)
+    flips = explained & (error > JUMP)
     return found._replace(
         flips=found.flips + int(flips.sum()),
         ill=found.ill + int((explained & ~flips).sum()),
@@ -277,92 +347,242 @@ def _scale(params: Any) -> np.ndarray:
     return np.array([speed, speed, turn])
 
 
-def trial_errors(name: str, case: Any, setting: Any, where: Path) -> np.ndarray:
-    """Errors (T,) of the twists of a whole trial, C's memory being its own."""
-    law = registry.law_of(case.params)
-    stage, worlds = pushes.build([case], setting)
-    period = setting.physics.control_period
-    part = Part(np.arange(1), worlds, stage)
-    (followed,) = pushes.follow_part(part, recorded_law(law), setting, interval=period)
-    seen, native = followed.snapshots, Native(program.program(name), where, "float")
-    observed = tuple(seen.details)[1]  # of `recorded_law`, with taxels
-    observed = observed.touch if law.senses == "touch" else observed
-    leaves, memory = jax.tree.leaves(observed), native.begin(1)
-    count = len(seen.time)
-    leaves = [np.broadcast_to(x, (count, *x.shape[1:])) for x in leaves]
-    every = native.filled("observation", leaves, count)
-    twists = np.concatenate([native.step(memory, every[i : i + 1])[0] for i in range(count)])
-    both = np.stack([np.broadcast_to(x, (count,)) for x in seen.twist], -1)
-    return (np.abs(twists - both) / _scale(case.params)).max(-1)
-
-
-def ends(names: list[str], setting: Any, where: Path) -> list[dict[str, Any]]:
-    """How the paper's 144 trials of RPS end with a law of JAX and with that of C in the loop."""
-    found = []
-    for name in names:
-        label, params = registry.read_law(name)
-        law, native = registry.law_of(params), Native(program.program(name), where, "float")
-
-        def called(memory: Any, seen: Any, native: Native = native) -> Any:
-            shape = np.shape(jax.tree.leaves(seen)[0])[:-1]
-            count = int(np.prod(shape))
-            given, fields = native.filled, native.program.groups["memory"]
-            flat = [np.asarray(x).reshape(count, *np.shape(x)[len(shape) :]) for x in memory]
-            mine = given("memory", flat, count)
-            seen = [np.asarray(x).reshape(count, *np.shape(x)[len(shape) :]) for x in seen]
-            twist, _ = native.step(mine, given("observation", seen, count))
-            after = [
-                np.asarray(mine[f.name]).reshape(np.shape(x)).astype(x.dtype) if f.size else x
-                for f, x in zip(fields, memory, strict=True)
-            ]
-            return after, twist.reshape(*shape, 3)
-
-        def step(_: Any, memory: Any, seen: Any, called: Any = called) -> Any:
-            tree = jax.tree.structure(memory)
-            shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in jax.tree.leaves(memory)]
-            out = (shapes, jax.ShapeDtypeStruct((3,), np.float32))
-            after, twist = jax.pure_callback(
-                called, out, jax.tree.leaves(memory), jax.tree.leaves(seen),
-                vmap_method="broadcast_all",
-            )  # fmt: skip
-            touch = getattr(seen, "touch", seen)
-            return jax.tree.unflatten(tree, after), Twist(*twist), Details.of(touch)
-
-        class InC(NamedTuple):
-            law: Any
-            d_success: Any
-
-        mine = InC(params, params.d_success)
-        native_law = Law(lambda p, law=law: law.init(p.law), step, senses=law.senses)
-        registry.register_law(f"{program.identifier(label)}_in_c", native_law, mine)
-        cases = [(o, f, t) for o in PAPER_OBJECTS for f in FRICTION for t in paper.TARGETS]
-        outcomes = [
-            pushes.run([Case(o, f, t, law=p) for o, f, t in cases], setting)[0]
-            for p in (params, mine)
-        ]
-        jax_success, c_success = (np.asarray(one.success) for one in outcomes)
-        found.append(
-            {
-                "law": label,
-                "trials": len(cases),
-                "succeed in JAX": int(jax_success.sum()),
-                "succeed in C": int(c_success.sum()),
-                "end alike": int((jax_success == c_success).sum()),
-                "greatest difference of time [s]": float(
-                    np.abs(outcomes[0].time - outcomes[1].time).max()
-                ),
-            }
-        )
+def recorded(cases: Sequence[Case], setting: Setting) -> list[Any]:
+    """What the law of each case observed in each control step: leaves (T, ...), by trial."""
+    law = registry.law_of(cases[0].params)
+    stage, worlds = pushes.build(cases, setting)
+    part = Part(np.arange(len(cases)), worlds, stage)
+    period, found = setting.physics.control_period, []
+    for followed in pushes.follow_part(part, recorded_law(law), setting, interval=period):
+        seen = followed.snapshots
+        observed = tuple(seen.details)[1]  # of `recorded_law`, with taxels
+        leaves = jax.tree.leaves(observed.touch if law.senses == "touch" else observed)
+        found.append([np.broadcast_to(x, (len(seen.time), *x.shape[1:])) for x in leaves])
     return found
 
 
-def latency(name: str, where: Path) -> tuple[float, float]:
-    """Median and 99.9th percentile [us] of a step of skin and law, by the exported example."""
+def trial_errors(name: str, form: Form, trials: Sequence[Any], where: Path) -> list[np.ndarray]:
+    """Errors (T,) of the twists of whole trials, observed as `recorded`; each has its own memory.
+
+    Both laws, that of JAX and the other, remember by themselves from the first step to the last, in
+    the precision that is asked for.
+    """
+    law_params = registry.read_law(name)[1]
+    law, made, real = registry.law_of(law_params), program.program(name), REAL[form]
+    native, longest = made_in(form, made, where, len(trials)), max(len(one[0]) for one in trials)
+    fields = made.groups["observation"]
+
+    def whole(leaves: Any) -> list[np.ndarray]:
+        """Leaves (longest, ...), the last row held."""
+        rows = np.minimum(np.arange(longest), len(leaves[0]) - 1)
+        kinds = [real if one.kind == "f" else np.asarray(x).dtype
+                 for one, x in zip(fields, leaves, strict=True)]  # fmt: skip
+        return [np.asarray(x)[rows].astype(kind) for x, kind in zip(leaves, kinds, strict=True)]
+
+    seen = [np.stack(columns, 1) for columns in zip(*map(whole, trials), strict=True)]
+    with jax.enable_x64(form == "double"):
+        params = jax.tree.map(lambda x: jnp.asarray(x, real), law_params)
+        tree = jax.tree.structure(trying.observation_of(law.senses))
+
+        def step(memory: Any, leaves: Any) -> Any:
+            memory, twist, _ = law.step(params, memory, jax.tree.unflatten(tree, leaves))
+            return memory, jnp.stack([jnp.asarray(x, real) for x in twist])
+
+        begin = jax.tree.map(
+            lambda x: jnp.broadcast_to(x, (len(trials), *jnp.shape(x))), law.init(params)
+        )
+        both = np.asarray(jax.lax.scan(jax.vmap(step), begin, seen)[1])
+    memory, twists = native.begin(len(trials)), []
+    for i in range(longest):
+        rows = native.filled("observation", [x[i] for x in seen], len(trials))
+        twists.append(native.step(memory, rows)[0])
+    error = (np.abs(np.array(twists) - both) / _scale(law_params)).max(-1)
+    return [error[: len(one[0]), i] for i, one in enumerate(trials)]
+
+
+def in_the_loop(name: str, where: Path) -> Any:
+    """Parameters of a law of this process whose step is that in C, in float."""
+    label, params = registry.read_law(name)
+    law, native = registry.law_of(params), Native(program.program(name), where, "float")
+
+    def called(memory: Any, seen: Any) -> Any:
+        shape = np.shape(jax.tree.leaves(seen)[0])[:-1]
+        count, given = int(np.prod(shape)), native.filled
+        flat = [
+            [np.asarray(x).reshape(count, *np.shape(x)[len(shape) :]) for x in group]
+            for group in (memory, seen)
+        ]
+        mine = given("memory", flat[0], count)
+        twist, _ = native.step(mine, given("observation", flat[1], count))
+        after = [
+            np.asarray(mine[f.name]).reshape(np.shape(x)).astype(x.dtype) if f.size else x
+            for f, x in zip(native.program.groups["memory"], memory, strict=True)
+        ]
+        return after, twist.reshape(*shape, 3)
+
+    def step(_: Any, memory: Any, seen: Any) -> Any:
+        tree = jax.tree.structure(memory)
+        shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in jax.tree.leaves(memory)]
+        out = (shapes, jax.ShapeDtypeStruct((3,), np.float32))
+        after, twist = jax.pure_callback(
+            called, out, jax.tree.leaves(memory), jax.tree.leaves(seen),
+            vmap_method="broadcast_all",
+        )  # fmt: skip
+        return (
+            jax.tree.unflatten(tree, after),
+            Twist(*twist),
+            Details.of(getattr(seen, "touch", seen)),
+        )
+
+    own = program.identifier(label)
+    kind = namedtuple(f"{own}_InC", "law d_success")  # each law has parameters of its own class
+    mine = kind(params, params.d_success)
+    native_law = Law(lambda p: law.init(p.law), step, senses=law.senses)
+    registry.register_law(f"{own}_in_c", native_law, mine)
+    return mine
+
+
+class Ends(NamedTuple):
+    """How trials end with a law of JAX and with that of C in the loop."""
+
+    trials: int
+    in_jax: int  # succeed
+    in_c: int
+    alike: int  # succeed with both, or with neither
+    apart: float  # [s] 99th percentile of the difference of the times of those that both succeed in
+    seconds_in_jax: float  # [s] that the run took, with compilation
+    seconds_in_c: float
+
+
+def _ends(outcomes: Sequence[Any], took: Sequence[float]) -> Ends:
+    won = [np.asarray(one.success).astype(bool).ravel() for one in outcomes]
+    times = [np.asarray(one.time).ravel() for one in outcomes]
+    both = won[0] & won[1]
+    apart = np.abs(times[0] - times[1])[both]
+    return Ends(
+        won[0].size, int(won[0].sum()), int(won[1].sum()), int((won[0] == won[1]).sum()),
+        float(np.quantile(apart, 0.99)) if both.any() else 0.0, *took,
+    )  # fmt: skip
+
+
+def timed(make: Any) -> tuple[Any, float]:
+    """What a call returns, and how long [s] it took."""
+    began = time.perf_counter()
+    return make(), time.perf_counter() - began
+
+
+def papers_trials(name: str, setting: Setting, where: Path) -> Ends:
+    """The paper's 144 trials with a law of JAX, and with that of C in the loop."""
+    cases = [(o, f, t) for o in PAPER_OBJECTS for f in FRICTION for t in paper.TARGETS]
+    both = (registry.read_law(name)[1], in_the_loop(name, where))
+    outcomes, took = zip(
+        *(timed(lambda p=p: pushes.run([Case(*one, law=p) for one in cases], setting)[0])
+          for p in both), strict=True,
+    )  # fmt: skip
+    return _ends(outcomes, took)
+
+
+def random_worlds(name: str, domain: str, worlds: int, setting: Setting, where: Path) -> Ends:
+    """Random worlds with a law of JAX, and with that of C in the loop."""
+    both = (registry.read_law(name)[1], in_the_loop(name, where))
+
+    def run(params: Any) -> Any:
+        return rps_jax.sweep({"law": params}, domain, worlds, setting=setting, progress=False)
+
+    outcomes, took = zip(*(timed(lambda p=p: run(p)) for p in both), strict=True)
+    return _ends(outcomes, took)
+
+
+def latency(name: str, precision: Precision, where: Path, runs: int = 5) -> np.ndarray:
+    """Median and 99.9th percentile (runs, 2) [us] of a step of skin and law, on one core.
+
+    The exported example measures itself, 200,000 steps in a run.
+    """
     made, place = program.program(name), Path(tempfile.mkdtemp(dir=where))
     for file, text in {"law.h": c.header(made, "law"), **folder.files(made, "law")}.items():
         (place / file).write_text(text, encoding="utf-8")
-    command = ["gcc", "-std=c99", "-O2", str(place / "main.c"), "-lm", "-o", str(place / "main")]
-    subprocess.run(command, check=True)
-    ran = subprocess.run([str(place / "main")], check=True, capture_output=True, text=True)
-    median, slow = re.findall(r"([\d.]+) us", ran.stdout)[:2]
-    return float(median), float(slow)
+    double = ["-DLAW_DOUBLE"] if precision == "double" else []
+    source, binary = str(place / "main.c"), str(place / "main")
+    subprocess.run(["gcc", "-std=c99", "-O2", *double, source, "-lm", "-o", binary], check=True)
+    one_core = ["taskset", "-c", str(max(os.sched_getaffinity(0)))] * bool(shutil.which("taskset"))
+    found = []
+    for _ in range(runs):
+        ran = subprocess.run([*one_core, binary], check=True, capture_output=True, text=True)
+        found.append([float(x) for x in re.findall(r"([\d.]+) us", ran.stdout)[:2]])
+    return np.array(found)
+
+
+# Odd inputs: 0 if nothing that is not finite is taken, or comes out; else what went wrong.
+FUZZ = """
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include "law.h"
+static law_real odd(void) {
+  static const float some[] = {0, -0.0f, 1e-38f, 1e38f, -1e38f, 3e9f, -3e9f, 1, 0.3f};
+  int i = rand() % 40;
+  return i == 0 ? (law_real)NAN : i == 1 ? (law_real)INFINITY : i == 2 ? (law_real)-INFINITY
+       : (law_real)some[i % 9];
+}
+int main(void) {
+  law_params params = LAW_PARAMS;
+  law_skin_params skin_params = LAW_SKIN_PARAMS;
+  law_memory memory;
+  law_skin skin;
+  int codes[3] = {0, 0, 0};
+  law_init(&params, &memory);
+  law_skin_init(&skin);
+  for (int i = 0; i < INPUTS; i++) {
+    law_observation seen;
+    law_twist twist;
+    law_contact contact;
+    law_real taxels[LAW_TAXELS], numbers[sizeof seen / sizeof(law_real)];
+    law_memory before = memory;
+    int bad = 0;
+    for (unsigned k = 0; k < sizeof numbers / sizeof numbers[0]; k++) numbers[k] = odd();
+    memcpy(&seen, numbers, sizeof numbers); /* flags of any bits, too */
+    int code = law_step(&params, &memory, &seen, &twist);
+    codes[code]++;
+    if (!isfinite(twist.v_x) || !isfinite(twist.v_y) || !isfinite(twist.omega)) return 2;
+    if (code && (twist.v_x != 0 || twist.v_y != 0 || twist.omega != 0)) return 3;
+    if (code && memcmp(&before, &memory, sizeof memory)) return 4;
+    if (!isfinite(seen.yaw) && code != LAW_BAD_INPUT) return 5;
+    if (rand() % 50 == 0) memset(&memory, rand() % 256, sizeof memory);
+    for (int k = 0; k < LAW_TAXELS; k++) bad |= !isfinite(taxels[k] = rand() % 20 ? 1 : odd());
+    law_real period = rand() % 9 ? (law_real)0.01 : odd();
+    code = law_skin_step(&skin_params, &skin, taxels, period, &contact);
+    if (bad && (code != LAW_BAD_INPUT || contact.in_contact)) return 6;
+    for (int k = 0; k < LAW_TAXELS; k++) if (!isfinite(skin.signal[k])) return 7;
+  }
+  printf("%d %d %d\\n", codes[0], codes[1], codes[2]);
+  return codes[0] && codes[1] ? 0 : 8;
+}
+"""
+SANE = ("-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+COMPILERS = tuple(name for name in ("gcc", "clang") if shutil.which(name))
+
+
+class Fuzzed(NamedTuple):
+    """What a law in C made of odd inputs."""
+
+    fault: int  # 0, or which promise was broken; a negative number is a signal's
+    taken: int  # inputs that gave a twist
+    refused: int  # that were not finite
+    no_result: int  # for which the law has no finite twist
+    said: str  # by the sanitizers
+
+
+def fuzzed(made: Program, compiler: str, precision: Precision, inputs: int, where: Path) -> Fuzzed:
+    """Step a law with odd inputs, under the sanitizers of addresses and undefined behaviour."""
+    place = Path(tempfile.mkdtemp(dir=where))
+    (place / "law.h").write_text(c.header(made, "law"))
+    (place / "fuzz.c").write_text(FUZZ)
+    double = ["-DLAW_DOUBLE"] if precision == "double" else []
+    source, binary = str(place / "fuzz.c"), str(place / "fuzz")
+    strict = [flag for flag in FLAGS if flag not in ("-O2", "-fPIC", "-shared")]
+    options = [*strict, *SANE, *double, f"-DINPUTS={inputs}"]
+    subprocess.run([compiler, *options, source, "-lm", "-o", binary], check=True)
+    ran = subprocess.run([binary], capture_output=True, text=True)
+    codes = [int(x) for x in ran.stdout.split()] or [0, 0, 0]
+    return Fuzzed(ran.returncode, codes[0], codes[1], codes[2], ran.stderr)

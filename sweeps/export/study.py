@@ -1,136 +1,284 @@
-"""Do the laws in C do what they do in JAX, and how fast? Chance inputs, trials and times.
+"""Do the laws in C and ONNX do what they do in JAX, and how fast?
 
-rps sweeps/export --inputs 10000000
-rps sweeps/export --inputs 0 --in-the-loop rps rps_plus
+    rps sweeps/export
+
+compares each law in C (float and double) and as ONNX with that in JAX: at chance inputs, over whole
+trials, and with the C in the loop of the paper's trials and of random worlds. It feeds odd inputs
+to the C under sanitizers, and times it on one core.
 """
 
 from __future__ import annotations
 
+import os
+import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Literal
 
+import numpy as np
 import xarray as xr
 
 from rps_jax.analysis.report import Section
+from rps_jax.app.export import program
+from rps_jax.errors import InputError
 from rps_jax.record import provenance
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
+from rps_jax.trials.case import Case
+from rps_jax.trials.progress import Progress
 from rps_jax.trials.setting import Setting
+from rps_jax.world import paper
+from rps_jax.world.objects import PAPER_OBJECTS
 from sweeps.export import native
 from sweeps.shared import Study, publish
 
-_LAWS = (
-    *("rps", "rps_tuned", "nps", "rps_plus", "pursuit", "force_push", "force_push_published"),
-    *("dipole", "aps", "learned_mlp", "learned_gru"),
-)
-_COLUMNS = ("inputs", "greatest", "beyond", "flips", "ill", "unexplained")
+Table = Literal["inputs", "trials", "paper", "worlds", "odd", "speed"]
+_TABLES: tuple[Table, ...] = ("speed", "inputs", "trials", "paper", "worlds", "odd")
+_FORMS: tuple[native.Form, ...] = ("double", "float", "onnx")
+_PRECISIONS: tuple[native.Precision, ...] = ("double", "float")
 _HERE = Path(__file__).parent
+_WORDS = {"double": "C, double", "float": "C, float", "onnx": "ONNX, float"}
 
 
 @dataclass(frozen=True)
 class Export(Study[xr.Dataset]):
-    """Compare the laws in C with those in JAX, and time them."""
+    """Compare exported laws with those in JAX, and time them."""
 
-    laws: tuple[str, ...] = _LAWS
+    TITLE: ClassVar[str] = "Laws in C and ONNX beside those in JAX"
+    GROWS: ClassVar[tuple[str, ...]] = ("laws", "tables", "machine")
+    SMALL: ClassVar[Mapping[str, Any]] = {"laws": ("rps_plus",), "inputs": 20_000, "worlds": 4}
+
+    laws: tuple[str, ...] = ("rps", "rps_tuned", "rps_plus", "learned_mlp", "learned_gru")
     """Laws that are compared."""
-    inputs: int = option(1_000_000, 0, 10**9)
-    """Chance inputs of each law, in float and in double each."""
-    in_the_loop: tuple[str, ...] = ()
-    """Laws with which the paper's 144 trials are run in JAX and with C in the loop."""
+    tables: tuple[Table, ...] = _TABLES
+    """What is asked: chance inputs, whole trials, the paper's trials and random worlds with C in
+    the loop, odd inputs, and speed."""
+    inputs: int = option(1_000_000, 100, 10**9)
+    """Number of chance inputs of each law, for C in float, in double, and ONNX each."""
+    worlds: int = option(1000, 1, 1_000_000)
+    """Number of random worlds with C in the loop."""
+    domain: str = "real"
+    """Domain of these worlds."""
     machine: str = ""
-    """What it runs on, in words; with these the table is published."""
+    """What it runs on, in words; with these the tables are published."""
+    quick: bool = False
+    """Whether to make a small run of minutes on two cores: what is not asked for becomes small."""
 
-    TITLE = "Laws in C beside those in JAX"
+    def check(self) -> None:
+        """Check that the laws can be exported, and that a compiler is there."""
+        for law in self.laws:
+            program.program(law)
+        if shutil.which("gcc") is None:
+            raise InputError("gcc is not installed: install it to compile what was exported.")
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Compare law by law."""
-        laws = self.laws if self.inputs else ()
-        parts = [run.part(f"inputs-{law}", lambda law=law: self._compared(law)) for law in laws]
-        found = xr.concat(parts, "law") if parts else xr.Dataset()
-        if self.in_the_loop:
-            found = found.merge(run.part("trials", self._tried))
-        if self.machine and run.folder is not None and self.inputs:
-            self._publish(found, run.folder)
-        return found
+        """Answer table by table and law by law."""
+        found: list[xr.Dataset] = []
+        for table in self.tables:
+            make = getattr(self, f"_{table}")
+            rows = []
+            for law in self.laws:
+                rows.append(run.part(f"{table}-{law}", partial(self._kept, make, law)))
+                run.report(Progress(len(rows), 0.0))
+            joined = xr.concat(rows, "law")
+            assert isinstance(joined, xr.Dataset)
+            found.append(joined.assign_coords(law=list(self.laws)))
+        whole = xr.merge(found)
+        assert isinstance(whole, xr.Dataset)
+        if self.machine and run.folder is not None:
+            self._publish(whole, run.folder)
+        return whole
 
-    def _compared(self, law: str) -> xr.Dataset:
+    def _kept(self, make: Callable[[str, Path], xr.Dataset], law: str) -> xr.Dataset:
         with tempfile.TemporaryDirectory() as where:
-            both = [
-                native.agreement(law, precision, self.inputs, Path(where))
-                for precision in ("float", "double")
-            ]
-            times = native.latency(law, Path(where))
-        columns = {
-            name: (("law", "precision"), [[float(getattr(one, name)) for one in both]])
-            for name in _COLUMNS
-        }
-        return xr.Dataset(
-            columns | {"latency": (("law", "share"), [times], {"units": "us"})},
-            {"law": [law], "precision": ["float", "double"], "share": [0.5, 0.999]},
-        )
+            return make(law, Path(where))
 
-    def _tried(self) -> xr.Dataset:
-        with tempfile.TemporaryDirectory() as where:
-            rows = native.ends(list(self.in_the_loop), Setting("fused"), Path(where))
-        return xr.Dataset(
-            {name: ("tried", [row[name] for row in rows]) for name in rows[0] if name != "law"},
-            {"tried": list(self.in_the_loop)},
-        )
+    # --- what is asked of each law ---
 
-    def _rows(self, found: xr.Dataset) -> list[list[Any]]:
+    def _inputs(self, law: str, where: Path) -> xr.Dataset:
+        rows = [native.agreement(law, form, self.inputs, where) for form in _FORMS]
+        return _columns("inputs", rows, "form", _FORMS, but=("law", "form"))
+
+    def _trials(self, law: str, where: Path) -> xr.Dataset:
+        cases = [
+            [Case(thing, "S1", target, law=law) for target in paper.FEW_TARGETS]
+            for thing in PAPER_OBJECTS
+        ]
+        seen = [one for some in cases for one in native.recorded(some, Setting("fused"))]
+        found = {}
+        for form in _FORMS:
+            error = np.concatenate(native.trial_errors(law, form, seen, where))
+            found[form] = (
+                len(seen), error.size, error.max(), np.quantile(error, 0.999),
+                (error > native.TOLERANCE[form]).sum(), (error > native.JUMP).sum(),
+            )  # fmt: skip
+        names = ("trials", "steps", "greatest", "usual", "beyond", "flips")
+        return xr.Dataset(
+            {f"trials_{name}": ("form", [float(found[form][i]) for form in _FORMS])
+             for i, name in enumerate(names)}, {"form": list(_FORMS)},
+        )  # fmt: skip
+
+    def _paper(self, law: str, where: Path) -> xr.Dataset:
+        return _columns("paper", [native.papers_trials(law, Setting("fused"), where)])
+
+    def _worlds(self, law: str, where: Path) -> xr.Dataset:
+        setting = Setting("fused")
+        ends = native.random_worlds(law, self.domain, self.worlds, setting, where)
+        return _columns("worlds", [ends])
+
+    def _odd(self, law: str, where: Path) -> xr.Dataset:
+        made, compilers = program.program(law), native.COMPILERS
         rows = []
-        for law in found.law.values:
-            one = found.sel(law=law)
-            single, double = one.sel(precision="float"), one.sel(precision="double")
-            rows.append(
-                [
-                    str(law),
-                    float(double.greatest),
-                    int(double.flips),
-                    *(float(100 * single[k] / single.inputs) for k in ("beyond",)),
-                    int(single.flips),
-                    int(single.unexplained + double.unexplained),
-                    *(float(one.latency.sel(share=share)) for share in (0.5, 0.999)),
-                ]
-            )
-        return rows
+        for compiler in compilers:
+            both = [native.fuzzed(made, compiler, p, 200_000, where) for p in _PRECISIONS]
+            if wrong := [one for one in both if one.fault]:
+                raise AssertionError(f"{law}, {compiler}: {wrong}")
+            rows.append(native.Fuzzed(*(a + b for a, b in zip(*both, strict=True))))
+        return _columns("odd", rows, "compiler", compilers, but=("said", "fault"))
+
+    def _speed(self, law: str, where: Path) -> xr.Dataset:
+        found = [native.latency(law, precision, where) for precision in _PRECISIONS]
+        return xr.Dataset(
+            {
+                "speed_latency": (("precision", "of", "share"), found, {"units": "us"}),
+                "speed_load": os.getloadavg()[0],
+            },
+            {"precision": list(_PRECISIONS), "share": [0.5, 0.999]},
+        )
+
+    # --- how it is told ---
 
     def _publish(self, found: xr.Dataset, out: Path) -> None:
-        names = (
-            ("law", "{}"), ("double: greatest error", "{:.1g}"), ("flips", "{}"),
-            ("float: beyond 1e-6", "{:.2f} %"), ("flips", "{}"), ("unexplained", "{}"),
-            ("median [us]", "{:.2f}"), ("99.9th percentile [us]", "{:.2f}"),
-        )  # fmt: skip
-        publish(
-            _HERE / "results" / "export.json",
-            [provenance.signed(out)],
-            self.machine,
-            [{"name": name, "format": text} for name, text in names],
-            self._rows(found),
-            f"{self.inputs} chance inputs of each law and precision; errors are shares of the "
-            "greatest speed and turning rate.",
-        )
+        made = [provenance.signed(out)]
+        for name, (_, note, (head, *rows)) in tables(found, self).items():
+            columns = [{"name": text} for text in head]
+            path = _HERE / "results" / f"export_{name}.json"
+            publish(path, made, self.machine, columns, rows, note)
 
     def report(self, found: Any, run: Run) -> Sequence[Section]:
-        """Tables of both."""
-        sections = []
-        if "law" in found:
-            head = ["law", "double: greatest error", "flips", "float: beyond 1e-6 [%]", "flips",
-                    "unexplained", "median [us]", "99.9th percentile [us]"]  # fmt: skip
-            rows = [[f"{x:.3g}" if isinstance(x, float) else str(x) for x in row]
-                    for row in self._rows(found)]  # fmt: skip
-            sections.append(Section("Chance inputs, and times", "", [head, *rows]))
-        if "tried" in found:
-            names = [name for name in found if found[name].dims == ("tried",)]
-            rows = [
-                [str(law), *(f"{float(found[n].sel(tried=law)):g}" for n in names)]
-                for law in found.tried.values
-            ]
-            sections.append(Section("The paper's trials", "", [["law", *map(str, names)], *rows]))
-        return sections
+        """One section for each table."""
+        return [Section(title, note, rows) for title, note, rows in tables(found, self).values()]
 
 
 export = call_of(Export)
+
+
+def _columns(
+    table: Table, rows: Sequence[Any], dim: str = "", names: Sequence[str] = (),
+    but: Sequence[str] = (),
+) -> xr.Dataset:  # fmt: skip
+    """Rows of named tuples as variables of their fields, along a dimension if it has a name."""
+    kept = [name for name in rows[0]._fields if name not in but]
+    if not dim:
+        return xr.Dataset({f"{table}_{name}": float(getattr(rows[0], name)) for name in kept})
+    return xr.Dataset(
+        {f"{table}_{n}": (dim, [float(getattr(one, n)) for one in rows]) for n in kept},
+        {dim: list(names)},
+    )
+
+
+def _share(part: Any, whole: Any) -> str:
+    """A count as a share, with enough digits to tell it from nothing."""
+    part, whole = int(part), int(whole)
+    return "0" if part == 0 else f"{100 * part / whole:.2g} %"
+
+
+def tables(found: xr.Dataset, asked: Export) -> dict[str, tuple[str, str, list[list[str]]]]:
+    """Title, note, header and rows of each table, by name."""
+    made = {
+        "speed": _speed_rows, "inputs": _input_rows, "trials": _trial_rows, "paper": _paper_rows,
+        "worlds": partial(_world_rows, asked.domain), "odd": _odd_rows,
+    }  # fmt: skip
+    return {name: made[name](found) for name in asked.tables}
+
+
+def _each(found: xr.Dataset, table: Table, dim: str) -> list[tuple[str, str, Any]]:
+    """Law, name along a dimension, and the numbers of a table there."""
+    prefix = f"{table}_"
+    own = found[[name for name in map(str, found) if name.startswith(prefix)]]
+    own = own.rename({name: str(name).removeprefix(prefix) for name in own})
+    return [
+        (str(law), str(one), own.sel({"law": law, dim: one}))
+        for law in found.law.values
+        for one in found[dim].values
+    ]
+
+
+def _input_rows(found: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+    rows = [
+        ["law", "form", "inputs", "greatest difference", "beyond the goal", "flips", "unexplained",
+         "beyond 1e-6 of float64", "JAX's float32 is"],
+    ]  # fmt: skip
+    for law, form, one in _each(found, "inputs", "form"):
+        wide = ["", ""] if form == "double" else [_share(one.off, one.inputs),
+                                                  _share(one.off_in_jax, one.inputs)]  # fmt: skip
+        rows.append(
+            [law, _WORDS[form], f"{int(one.inputs):,}", f"{float(one.greatest):.1e}",
+             _share(one.beyond, one.inputs), f"{int(one.flips)}", f"{int(one.unexplained)}", *wide]
+        )  # fmt: skip
+    note = (
+        "The goal is 1e-12 in double and 1e-6 in float. Differences are shares of the greatest "
+        "speed and turning rate, or of the memory."
+    )
+    return "Chance inputs", note, rows
+
+
+def _trial_rows(found: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+    rows = [["law", "form", "trials", "steps", "99.9 % of differences are within", "greatest",
+             "steps beyond the goal", "beyond 1e-3"]]  # fmt: skip
+    for law, form, one in _each(found, "trials", "form"):
+        rows.append(
+            [law, _WORDS[form], f"{int(one.trials)}", f"{int(one.steps):,}",
+             f"{float(one.usual):.1e}", f"{float(one.greatest):.1e}",
+             _share(one.beyond, one.steps), f"{int(one.flips)}"]
+        )  # fmt: skip
+    note = "Each law has its own memory from the first step to the last."
+    return "Whole trials", note, rows
+
+
+def _end_rows(found: xr.Dataset, table: Table) -> list[list[str]]:
+    rows = [["law", "succeed with JAX", "with C in the loop", "end alike",
+             "99 % of times differ by at most"]]  # fmt: skip
+    for law in map(str, found.law.values):
+        one = {name: float(found[f"{table}_{name}"].sel(law=law)) for name in native.Ends._fields}
+        count = f"{one['trials']:.0f}"
+        won = [f"{one[name]:.0f} of {count}" for name in ("in_jax", "in_c", "alike")]
+        rows.append([law, *won, f"{one['apart']:.2g} s"])
+    return rows
+
+
+def _paper_rows(found: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+    note = "Fused engine, float; times are those of trials in which both succeed."
+    return "The paper's trials", note, _end_rows(found, "paper")
+
+
+def _world_rows(domain: str, found: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+    note = f"The same worlds of `{domain}` for both; fused engine, float."
+    return "Random worlds", note, _end_rows(found, "worlds")
+
+
+def _odd_rows(found: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+    rows = [["law", "compiler", "inputs", "refused (not finite)", "no finite twist", "faults"]]
+    for law, compiler, one in _each(found, "odd", "compiler"):
+        counts = [int(one[name]) for name in ("taken", "refused", "no_result")]
+        rows.append([law, compiler, *(f"{n:,}" for n in (sum(counts), *counts[1:])), "0"])
+    note = "A fault would have ended the run without a table. Both precisions are counted together."
+    return "Odd inputs", note, rows
+
+
+def _speed_rows(found: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+    rows = [["law", "form", "median", "99.9th percentile", "of five runs, from", "to"]]
+    for law, precision, one in _each(found, "speed", "precision"):
+        median, slow = (np.sort(one.latency.sel(share=share).values) for share in (0.5, 0.999))
+        middle = len(slow) // 2
+        texts = [f"{x:.2f} us" for x in (median[middle], slow[middle], slow[0], slow[-1])]
+        rows.append([law, _WORDS[precision], *texts])
+    load = float(found.speed_load.max())
+    note = (
+        "gcc -O2, 200,000 steps of skin and law in a run, on one core; the median of five runs. "
+        f"The load of the machine was {load:.1f} at most."
+    )
+    return "Speed", note, rows
