@@ -306,14 +306,15 @@ def run_machine(most: int, seed: int, tell: Callable[[str], None]) -> Counter[st
 def run_memory(most: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
     """Call `evaluate` many times in one process: after the fifth call memory does not grow."""
     program = f"""
-import resource, rps_jax, gc
+import dataclasses, gc, rps_jax
 drums = rps_jax.Domain(("random_cylinder",))
 setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
 def now():
     gc.collect()
     return int(open("/proc/self/statm").read().split()[1]) * 4096 / 2**20
 for call in range({most}):
-    rps_jax.evaluate(rps_jax.RPSParams.paper(), drums, worlds=16, seed=call, setting=setting)
+    seeded = dataclasses.replace(setting, seed=call)
+    rps_jax.evaluate(rps_jax.RPSParams.paper(), drums, worlds=16, setting=seeded)
     if call in (4, {most - 1}):
         print(f"{{now():.1f}}")
 """

@@ -124,6 +124,10 @@ def manifest(folder: Path) -> dict[str, Any]:
     return files.noted(folder / MANIFEST)
 
 
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel = 1
+
+
 def difference(found: Any, wanted: Any) -> str:
     """The first few differences of two JSON values, in words."""
     differences = list(_differences(found, wanted, ""))
@@ -137,4 +141,4 @@ def _differences(found: Any, wanted: Any, path: str) -> Iterator[str]:
             there, asked = (side.get(key, "nothing") for side in (found, wanted))
             yield from _differences(there, asked, f"{path}.{key}" if path else key)
     elif found != wanted:
-        yield f"{path} = {reprlib.repr(found)} there, {reprlib.repr(wanted)} asked for"
+        yield f"{path} = {_SHORT.repr(found)} there, {_SHORT.repr(wanted)} asked for"
