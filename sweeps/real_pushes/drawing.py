@@ -1,4 +1,4 @@
-"""The picture of the page: where pushes ended and were predicted to end, and how far off models are."""
+"""The picture of the page: where pushes ended and should have, and how far off models are."""
 
 from __future__ import annotations
 
@@ -84,7 +84,8 @@ def figure(found: xr.Dataset, table: pd.DataFrame, words: Mapping[str, str]) -> 
         ax.set_xticks([0.3, 1, 3, 10, 30], ["0.3", "1", "3", "10", "30"])
         ax.grid(alpha=0.3)
         ax.text(0.33, 93, "a push repeats\nno better", fontsize=8, va="top", color="0.4")
-        ax.legend(fontsize=8, loc="lower right")
+    handles, labels = ax.get_legend_handles_labels()
+    below.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
     return drawn
 
 

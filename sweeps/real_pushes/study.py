@@ -212,7 +212,8 @@ class RealPushes(Study[xr.Dataset]):
     def answer(self, run: Run) -> xr.Dataset:
         """Fit friction, and predict."""
         table = self.table
-        friction = run.part("friction", self._fitted) if self.fits.any() else None
+        fit = self.fits.any() and set(self.models) & {*FITTED, *MUJOCOS}
+        friction = run.part("friction", self._fitted) if fit else None
         done, found = 0, []
         for model in self.models:
             found.append(run.part(model, partial(self._one, model, friction)))
@@ -247,8 +248,10 @@ class RealPushes(Study[xr.Dataset]):
         finger, actual = pushes.kind_of_finger(table), pushes.measured(table)
         many = pd.concat([table] * len(_TRIED), ignore_index=True)
         mu = np.repeat(_TRIED, len(table))
-        off = np.full((len(FITTED), len(FINGERS), len(_TRIED)), np.nan)
-        for i, model in enumerate(FITTED):
+        needed = {"rigid_feet", *self.models} if set(MUJOCOS) & set(self.models) else self.models
+        fitted = [name for name in FITTED if name in needed]
+        off = np.full((len(fitted), len(FINGERS), len(_TRIED)), np.nan)
+        for i, model in enumerate(fitted):
             pose = pushes.slide(many, mu, on=SLIDING[model], steps=STEPS // 2).pose
             both = pushes.errors_of(pose.reshape(len(_TRIED), len(table), 3), actual).both
             for j, name in enumerate(FINGERS):
@@ -258,15 +261,17 @@ class RealPushes(Study[xr.Dataset]):
         dims = ("fitted", "finger_kind")
         return xr.Dataset(
             {"fit_error": ((*dims, "tried"), off), "friction": (dims, best)},
-            {"fitted": list(FITTED), "finger_kind": list(FINGERS), "tried": list(_TRIED)},
+            {"fitted": fitted, "finger_kind": list(FINGERS), "tried": list(_TRIED)},
         )
 
     def _one(self, model: str, friction: xr.Dataset | None) -> xr.Dataset:
         """What one model predicts of its pushes."""
         chosen: Mapping[str, float] = FRICTION
         if friction is not None:
-            own = friction.friction.sel(fitted=model if model in FITTED else "rigid_feet")
-            chosen = {name: float(own.sel(finger_kind=name)) for name in FINGERS}
+            fitted = model if model in FITTED else "rigid_feet"
+            own = friction.friction.sel(fitted=fitted) if fitted in friction.fitted else None
+            if own is not None:
+                chosen = {name: float(own.sel(finger_kind=name)) for name in FINGERS}
         rows = self._rows(model)
         pose, force = np.full((len(rows), 3), np.nan), np.full((len(rows), 2), np.nan)
         if rows.any():
