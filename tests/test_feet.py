@@ -1,4 +1,4 @@
-"""Objects that stand on feet of their own, apart from their outline, in the engines that know them."""
+"""Objects that stand on feet of their own, in the engines that know them."""
 
 import jax
 import jax.numpy as jnp
@@ -133,7 +133,8 @@ def test_the_arm_of_friction_is_that_of_the_feet():
     loads = np.linalg.solve(np.vstack([FEET.T, np.ones(3)]), [0, 0, 1])
     arm = solid.friction_arm(one)[0]
     assert arm == pytest.approx(loads @ np.linalg.norm(FEET, axis=1), rel=1e-4)
-    both, corners = (scene.solid_of(scene.load(f"on_{x}", FINE, FRICTION)) for x in ("both", "corners"))  # fmt: skip
+    names = ("on_both", "on_corners")
+    both, corners = (scene.solid_of(scene.load(name, FINE, FRICTION)) for name in names)
     assert solid.friction_arm(both) == pytest.approx(solid.friction_arm(corners))
     # A foot that is heavy on the load counts for more: four in a square, about the middle.
     square = np.array([[0.1, 0.1], [-0.1, 0.1], [-0.1, -0.1], [0.1, -0.1], [0.0, 0.0]])

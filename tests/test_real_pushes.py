@@ -87,7 +87,7 @@ def test_lengths_have_no_scale():
     one, _ = pushed(on(FEET), ([[0.1, -0.001]], (0.004, 0.02)))
     four, _ = pushed(on(FEET), ([[0.1, -0.001]], (0.004, 0.02)), scale=4.0)
     assert abs(one[-1, 2]) > 0.05
-    np.testing.assert_allclose(four, one, atol=1e-7)
+    np.testing.assert_allclose(four, one, atol=1e-6)
 
 
 def test_feet_move_with_the_pose():
@@ -217,13 +217,15 @@ def test_errors_by_hand():
 
 
 def test_a_small_study_is_continued_and_tells_every_model(tmp_path):
-    models = ("no_motion", "ellipsoid", "rigid_feet", "mujoco_ours")
-    asked = study.RealPushes(models=models, few=30, mujoco=1, out=tmp_path / "run", progress=False)
+    models = ("no_motion", "rigid_feet", "mujoco_ours")
+    asked = study.RealPushes(models=models, few=20, mujoco=1, out=tmp_path / "run", progress=False)
     found = asked()
     again = asked()
     assert found.drop_attrs().identical(again.drop_attrs())
     assert set(study.tables(found)) == {"models", "mujoco", "friction", "forces"}
-    assert not (found.fits & np.isfinite(found.predicted.sel(model="mujoco_ours")).all("pose")).any()
+    assert not (
+        found.fits & np.isfinite(found.predicted.sel(model="mujoco_ours")).all("pose")
+    ).any()
     lines = (tmp_path / "run" / "predictions.csv").read_text().splitlines()
     assert lines[0] == "id,model,post_x,post_y,post_yaw"
     assert len(lines) == 1 + int(np.isfinite(found.both).sum())

@@ -111,7 +111,7 @@ def _model(support: str, ground: float, friction: float, kind: Kind) -> mujoco.M
     mesh = " ".join(f"{k * x:.9g}" for corner in corners for x in corner)
     feet = [k * np.array([*foot, 0.0]) for foot in pushes.feet_of(support)]
     own = physics == _DEFAULT
-    soft = f'{_SOFT[0]} {_SOFT[1]}' if own else ""
+    soft = f"{_SOFT[0]} {_SOFT[1]}" if own else ""
     touch = f'solref="{physics.base_solref[0]} {physics.base_solref[1]}"' + (
         f' solimp="{soft}"' if own else ""
     )

@@ -17,6 +17,7 @@ An ellipsoid limit surface is one point of the ground more, whose "sliding" is (
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -85,7 +86,7 @@ def push(
     pose = np.array(pose, float)
     twist, force = np.zeros_like(pose), np.zeros((len(pose), 2))
     poses, forces = [pose], []
-    for before, after in zip(ways[:-1], ways[1:], strict=True):
+    for before, after in itertools.pairwise(ways):
         way = after - before
         length = np.maximum(np.linalg.norm(way, axis=-1).max(axis=1), 1e-9)
         step, normal, tangent = _step(outline, com, ground, before, way, length, pose, force)
