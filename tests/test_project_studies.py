@@ -46,7 +46,7 @@ REFUSED = [
     ("learned", "run run", "runs"),
     ("force_push_grid", "--duration 0", "duration"),
     ("real_pushes", "--pushes none.csv", r"pushes = none\.csv cannot be read"),
-    ("real_pushes", "--models rigid", "did you mean 'rigid_feet'"),
+    ("real_pushes", "--models rigid", r"invalid choice 'rigid'"),
     ("real_pushes", "--mujoco -1", "mujoco = -1 is not allowed"),
     ("fit", "--logs 1", "logs = 1 is not allowed"),
     ("fit", "--law aps", "fit knows laws that sense touch"),

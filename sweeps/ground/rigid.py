@@ -175,8 +175,8 @@ def supports(solids: Solid, yaw: np.ndarray, pressure: np.ndarray) -> np.ndarray
     """Points (B, S, 2) [m], from the centre of mass, on which engines stand solids.
 
     They are their feet, if they have some of their own; else the corners of a box or prism, and
-    three points of a cylinder's rim, one of them where it leans to: where its centre of mass and the `pressure` (B, 2) [m], the moment of the push over
-    the weight, move the load.
+    three points of a cylinder's rim, one of them where it leans to: where its centre of mass and
+    the `pressure` (B, 2) [m], the moment of the push over the weight, move the load.
     """
     com = _turned(yaw, solids.p_object_com[:, :2])
     if solids.feet is not None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -55,32 +55,31 @@ def read(table: Table | None = None) -> pd.DataFrame:
     Raises:
       InputError: it cannot be read, has no rows, or a column or a number is missing.
     """
-    if table is None:
-        table = DATA / "pushes.csv"
-    if isinstance(table, xr.Dataset):
-        table = table.to_dataframe().reset_index()
-    if not isinstance(table, pd.DataFrame):
+    found: Any = DATA / "pushes.csv" if table is None else table
+    if isinstance(found, xr.Dataset):
+        found = found.to_dataframe().reset_index()
+    if not isinstance(found, pd.DataFrame):
         try:
-            table = pd.read_csv(table)
+            found = pd.read_csv(found)
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or str(error).strip()
             raise InputError(
-                f"pushes = {table} cannot be read ({reason}): give a CSV file of pushes."
+                f"pushes = {found} cannot be read ({reason}): give a CSV file of pushes."
             ) from error
-    if "usable" in table:
-        table = table[table.usable != 0]
-    table = table.reset_index(drop=True)
-    if table.empty:
+    if "usable" in found:
+        found = found[found.usable != 0]
+    found = found.reset_index(drop=True)
+    if found.empty:
         raise InputError("pushes without a usable row are not allowed: give at least one push.")
-    _require(table, ("kind", "support", *(f"pre_{name}" for name in POSE)), "all")
-    for kind in pd.unique(table.kind):
+    _require(found, ("kind", "support", *(f"pre_{name}" for name in POSE)), "all")
+    for kind in pd.unique(found.kind):
         errors.check_name("kind of push", kind, KINDS)
-        _require(table[table.kind == kind], _NEEDED[kind], kind)
-    for name in pd.unique(table.support):
+        _require(chosen(found, found.kind == kind), _NEEDED[kind], kind)
+    for name in pd.unique(found.support):
         feet_of(name)
-    if "edge" in table and not table.edge.dropna().isin([0, 1, 2]).all():
+    if "edge" in found and not found.edge.dropna().isin([0, 1, 2]).all():
         raise InputError("pushes: column edge must be 0 (y = 0), 1 (hypotenuse) or 2 (x = 0).")
-    return table
+    return found
 
 
 def _require(table: pd.DataFrame, names: tuple[str, ...], kind: str) -> None:
@@ -88,10 +87,10 @@ def _require(table: pd.DataFrame, names: tuple[str, ...], kind: str) -> None:
     for name in names:
         if name not in table:
             raise InputError(f"pushes lack the column {name}, which kind = {kind} needs.")
-        if name in ("kind", "support"):
-            bad = table[name].isna()
-        else:
-            bad = ~np.isfinite(pd.to_numeric(table[name], errors="coerce"))
+        values: Any = table[name]
+        if name not in ("kind", "support"):
+            values = pd.to_numeric(values, errors="coerce").replace([np.inf, -np.inf], np.nan)
+        bad = values.isna().to_numpy()
         if bad.any():
             row = int(np.flatnonzero(bad)[0])
             raise InputError(
@@ -117,6 +116,11 @@ def kind_of_finger(table: pd.DataFrame) -> np.ndarray:
     return np.where(table.kind == "point", "point", "two-point")
 
 
+def chosen(table: pd.DataFrame, rows: np.ndarray) -> pd.DataFrame:
+    """Some rows of a table, by a mask (n,)."""
+    return table.iloc[np.flatnonzero(rows)].reset_index(drop=True)
+
+
 def doubted(table: pd.DataFrame) -> np.ndarray:
     """Whether (n,) the logs disagree about what the object stood on, or do not tell."""
     noted = table.note.notna() if "note" in table else np.zeros(len(table), bool)
@@ -135,13 +139,13 @@ def feet_of(support: str) -> np.ndarray:
     if support == FLAT:
         x, y = np.meshgrid(*[(np.arange(_CELLS) + 0.5) / _CELLS * 0.15] * 2)
         return np.stack([x, y], axis=-1)[x + y < 0.15 - 1e-9]
+    x = y = np.zeros(0)
     try:
         numbers = np.array((USUAL if support == UNKNOWN else support).split("_"), float) / 1000
         x, y = numbers.reshape(2, -1)
-        ok = x.size >= 3
     except ValueError:
-        ok = False
-    if not ok:
+        pass  # told below
+    if x.size < 3:
         raise InputError(
             f"support = {support} is not allowed: give {FLAT}, {UNKNOWN} or three x and three y in "
             f"mm, as {USUAL}."
@@ -198,7 +202,7 @@ def ways(table: pd.DataFrame, steps: int) -> np.ndarray:
         found[:, straight, 0] = line - np.where(double, apart, 0)
         found[:, straight, 1] = np.where(double, line + apart, _FAR)
     if (some := ~straight).any():
-        part = table[some]
+        part = chosen(table, some)
         centre = np.asarray(part[["cor_bx", "cor_by"]], float)
         angle = share[..., 0] * np.asarray(part.commanded, float)
         meet = np.asarray(part[["point_bx", "point_by"]], float)
@@ -226,7 +230,7 @@ def slide(table: pd.DataFrame, friction: np.ndarray, *, on: str, steps: int) -> 
     flat = np.asarray(table.support == FLAT)
     for rows in (flat, ~flat):  # of equally many feet
         if rows.any():
-            part = table[rows]
+            part = chosen(table, rows)
             found = sliding.push(
                 OUTLINE, COM, grounds(part, on=on), ways(part, steps), before(part), friction[rows]
             )

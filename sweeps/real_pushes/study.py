@@ -244,7 +244,7 @@ class RealPushes(Study[xr.Dataset]):
 
     def _fitted(self) -> xr.Dataset:
         """Median error `fit_error` [m] (fitted, finger, tried), and the best friction."""
-        table = self.table[self.fits & ~pushes.doubted(self.table)].reset_index(drop=True)
+        table = pushes.chosen(self.table, self.fits & ~pushes.doubted(self.table))
         finger, actual = pushes.kind_of_finger(table), pushes.measured(table)
         many = pd.concat([table] * len(_TRIED), ignore_index=True)
         mu = np.repeat(_TRIED, len(table))
@@ -275,7 +275,7 @@ class RealPushes(Study[xr.Dataset]):
         rows = self._rows(model)
         pose, force = np.full((len(rows), 3), np.nan), np.full((len(rows), 2), np.nan)
         if rows.any():
-            part = self.table[rows].reset_index(drop=True)
+            part = pushes.chosen(self.table, rows)
             pose[rows], force[rows] = _predicted(part, model, chosen)
         return xr.Dataset(
             {"predicted": (("push", "pose"), pose), "force": (("push", "axis"), force)}
