@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -35,7 +36,8 @@ def figure(found: xr.Dataset, table: pd.DataFrame, words: Mapping[str, str]) -> 
       words: for models.
     """
     drawn = Figure(figsize=(12.5, 9.2), layout="constrained", dpi=100)
-    above, below = drawn.subfigures(2, 1, height_ratios=(1.45, 1))
+    halves: Any = drawn.subfigures(2, 1, height_ratios=(1.45, 1))
+    above, below = halves
     panels = above.subplots(2, len(_SHARES))
     test = ~found.fits.values
     three = np.array([", three feet" in str(one) for one in found.group.values])
@@ -84,7 +86,7 @@ def figure(found: xr.Dataset, table: pd.DataFrame, words: Mapping[str, str]) -> 
         ax.set_xticks([0.3, 1, 3, 10, 30], ["0.3", "1", "3", "10", "30"])
         ax.grid(alpha=0.3)
         ax.text(0.33, 93, "a push repeats\nno better", fontsize=8, va="top", color="0.4")
-    handles, labels = ax.get_legend_handles_labels()
+    handles, labels = below.axes[-1].get_legend_handles_labels()
     below.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
     return drawn
 

@@ -89,7 +89,8 @@ def _require(table: pd.DataFrame, names: tuple[str, ...], kind: str) -> None:
             raise InputError(f"pushes lack the column {name}, which kind = {kind} needs.")
         values: Any = table[name]
         if name not in ("kind", "support"):
-            values = pd.to_numeric(values, errors="coerce").replace([np.inf, -np.inf], np.nan)
+            values = pd.Series(pd.to_numeric(values, errors="coerce"))
+            values = values.where(np.isfinite(values))
         bad = values.isna().to_numpy()
         if bad.any():
             row = int(np.flatnonzero(bad)[0])

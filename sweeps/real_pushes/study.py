@@ -77,6 +77,8 @@ GROUPS = (
 )
 _MAIN = (GROUPS[0], GROUPS[1], GROUPS[3], GROUPS[4])
 _TRIED = tuple(round(0.05 * i, 2) for i in range(2, 18))  # frictions at the fingers
+_FIT = 100  # pushes with one finger, and with two each, that friction is fitted on
+_TOGETHER = 320  # pushes that are predicted as one part of the run
 _DRAWS = 2000  # of the bootstrap
 _SPLIT = 2015  # seed of the halves
 
@@ -213,12 +215,17 @@ class RealPushes(Study[xr.Dataset]):
         """Fit friction, and predict."""
         table = self.table
         fit = self.fits.any() and set(self.models) & {*FITTED, *MUJOCOS}
-        friction = run.part("friction", self._fitted) if fit else None
+        friction = self._fitted(run) if fit else None
         done, found = 0, []
         for model in self.models:
-            found.append(run.part(model, partial(self._one, model, friction)))
-            done += int(self._rows(model).sum())
-            run.report(Progress(done, 0.0))
+            parts = []
+            for first in range(0, len(table), _TOGETHER):
+                rows = slice(first, first + _TOGETHER)
+                make = partial(self._one, model, friction, rows)
+                parts.append(run.part(f"{model}-{first}", make))
+                done += int(self._rows(model)[rows].sum())
+                run.report(Progress(done, 0.0))
+            found.append(xr.concat(parts, "push"))
         whole = xr.concat(found, "model", join="override", coords="minimal", compat="override")
         whole = whole.assign_coords(
             model=list(self.models),
@@ -242,40 +249,56 @@ class RealPushes(Study[xr.Dataset]):
                 self._publish(whole, run.folder)
         return whole
 
-    def _fitted(self) -> xr.Dataset:
-        """Median error `fit_error` [m] (fitted, finger, tried), and the best friction."""
-        table = pushes.chosen(self.table, self.fits & ~pushes.doubted(self.table))
-        finger, actual = pushes.kind_of_finger(table), pushes.measured(table)
-        many = pd.concat([table] * len(_TRIED), ignore_index=True)
-        mu = np.repeat(_TRIED, len(table))
+    def _fitted(self, run: Run) -> xr.Dataset:
+        """Median error `fit_error` [m] (fitted, finger_kind, tried), and the best friction."""
+        clear = pushes.chosen(self.table, self.fits & ~pushes.doubted(self.table))
+        finger = pushes.kind_of_finger(clear)
+        few = np.zeros(len(clear), bool)
+        for name in FINGERS:
+            few[
+                np.random.default_rng(_SPLIT).permutation(np.flatnonzero(finger == name))[:_FIT]
+            ] = 1
+        table = pushes.chosen(clear, few)
         needed = {"rigid_feet", *self.models} if set(MUJOCOS) & set(self.models) else self.models
         fitted = [name for name in FITTED if name in needed]
-        off = np.full((len(fitted), len(FINGERS), len(_TRIED)), np.nan)
-        for i, model in enumerate(fitted):
-            pose = pushes.slide(many, mu, on=SLIDING[model], steps=STEPS // 2).pose
-            both = pushes.errors_of(pose.reshape(len(_TRIED), len(table), 3), actual).both
-            for j, name in enumerate(FINGERS):
-                if (rows := finger == name).any():
-                    off[i, j] = np.median(both[:, rows], axis=1)
-        best = np.array(_TRIED)[np.nan_to_num(off, nan=9.0).argmin(axis=-1)]
-        dims = ("fitted", "finger_kind")
-        return xr.Dataset(
-            {"fit_error": ((*dims, "tried"), off), "friction": (dims, best)},
-            {"fitted": fitted, "finger_kind": list(FINGERS), "tried": list(_TRIED)},
-        )
+        found = [
+            xr.concat(
+                [run.part(f"fit-{model}-{mu[0]:g}", partial(self._tried, table, model, mu))
+                 for mu in (_TRIED[i : i + 4] for i in range(0, len(_TRIED), 4))],
+                "tried",
+            )
+            for model in fitted
+        ]  # fmt: skip
+        off = xr.concat(found, "fitted").assign_coords(fitted=fitted)
+        best = off.fit_error.fillna(9.0).idxmin("tried")
+        return off.assign(friction=best)
 
-    def _one(self, model: str, friction: xr.Dataset | None) -> xr.Dataset:
-        """What one model predicts of its pushes."""
+    def _tried(self, table: pd.DataFrame, model: str, tried: Sequence[float]) -> xr.Dataset:
+        """Median error [m] (finger_kind, tried) of one model with some frictions."""
+        many = pd.concat([table] * len(tried), ignore_index=True)
+        mu = np.repeat(tried, len(table))
+        pose = pushes.slide(many, mu, on=SLIDING[model], steps=STEPS // 2).pose
+        pose = pose.reshape(len(tried), len(table), 3)
+        both = pushes.errors_of(pose, pushes.measured(table)).both
+        off, finger = np.full((len(FINGERS), len(tried)), np.nan), pushes.kind_of_finger(table)
+        for j, name in enumerate(FINGERS):
+            if (rows := finger == name).any():
+                off[j] = np.median(both[:, rows], axis=1)
+        at = {"finger_kind": list(FINGERS), "tried": list(tried)}
+        return xr.Dataset({"fit_error": (("finger_kind", "tried"), off)}, at)
+
+    def _one(self, model: str, friction: xr.Dataset | None, some: slice) -> xr.Dataset:
+        """What one model predicts of its pushes among some."""
         chosen: Mapping[str, float] = FRICTION
         if friction is not None:
             fitted = model if model in FITTED else "rigid_feet"
             own = friction.friction.sel(fitted=fitted) if fitted in friction.fitted else None
             if own is not None:
                 chosen = {name: float(own.sel(finger_kind=name)) for name in FINGERS}
-        rows = self._rows(model)
+        rows = self._rows(model)[some]
         pose, force = np.full((len(rows), 3), np.nan), np.full((len(rows), 2), np.nan)
         if rows.any():
-            part = pushes.chosen(self.table, rows)
+            part = pushes.chosen(self.table.iloc[some], rows)
             pose[rows], force[rows] = _predicted(part, model, chosen)
         return xr.Dataset(
             {"predicted": (("push", "pose"), pose), "force": (("push", "axis"), force)}
