@@ -149,6 +149,11 @@ class MJX(Engine):
 
     def stage_of_scenes(self, scenes: Sequence[Scene], which: np.ndarray) -> tuple[Any, Any]:
         """Stage and fields of worlds in scenes of one shape family."""
+        if any(scene.solid_of(s).feet is not None for s in scenes):
+            raise errors.InputError(
+                "engine = mjx is not allowed for objects with feet of their own, since it reads "
+                "the corners of prisms from their feet: choose fused, mujoco or quasistatic."
+            )
         models = [s.physics for s in scenes]
         model, fields = stack(models)
         return MJXStage(model, mjx.make_data(models[0])), taken(jax.device_get(fields), which)

@@ -278,7 +278,7 @@ class QuasistaticEngine(Engine):
 
     def stage_of_scenes(self, scenes: Sequence[Scene], which: np.ndarray) -> tuple[Any, Any]:
         """Stage and fields of worlds in scenes of one shape family."""
-        solids = jax.tree.map(lambda *x: np.concatenate(x), *map(scene.solid_of, scenes))
+        solids = scene.solids_of(scenes)
         friction = np.array([s.physics.pair("base_object").friction[0] for s in scenes])
         half = np.array([s.physics.geom("base").size[:2] for s in scenes])
         return Quasistatic(), taken(sliders(solids, friction, half), which)

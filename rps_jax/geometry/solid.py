@@ -33,6 +33,9 @@ class Solid(NamedTuple):
     p_object_com: np.ndarray  # (n, 3) [m]
     inertia: np.ndarray  # (n, 3) [kg m^2] principal moments about the centre of mass
     q_object_body: np.ndarray  # (n, 4) principal axes in the object's frame, scalar first
+    # (n, SIDES, 3) [m, m, 1] places of feet and their weights, as of springs; a weight of 0 is no
+    # foot. None: prisms stand on their corners, cylinders on their rims.
+    feet: np.ndarray | None = None
 
 
 def build(
@@ -160,12 +163,22 @@ def friction_arm(solid: Solid, support: Support = "feet") -> np.ndarray:
 
 def _feet(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, N, 2) [m] on which engines stand solids, and whether (n, N) each counts."""
+    if solid.feet is not None:
+        return solid.feet[..., :2], solid.feet[..., 2]
     at = solid.vertices
     if at.shape[1] > 1:
         return at, np.any(at != np.roll(at, 1, axis=1), axis=2).astype(float)
     x, y, _ = solid.p_object_com.T
     lean = np.arctan2(y, x)[:, None] + np.array([0, 2, 4]) * np.pi / 3
     return _on_circle(solid.radius, lean), np.ones(lean.shape)
+
+
+def standing(solid: Solid) -> Solid:
+    """Prisms whose feet, if they have none of their own, are said to be their corners."""
+    if solid.feet is not None:
+        return solid
+    at, share = _feet(solid)
+    return solid._replace(feet=np.concatenate([at, share[..., None]], axis=-1))
 
 
 def _bed(solid: Solid) -> tuple[np.ndarray, np.ndarray]:

@@ -111,7 +111,7 @@ def _solid(name: str, at: dict[str, np.ndarray], u: dict[str, np.ndarray]) -> So
     count = u["mass"].size
     if name not in RANDOM:
         one = scene.solid_of(scene.load(name))
-        return Solid(*(np.repeat(leaf, count, axis=0) for leaf in one))
+        return jax.tree.map(lambda leaf: np.repeat(leaf, count, axis=0), one)
     depth, breadth = at["size"] / np.sqrt(at["aspect"]), at["size"] * np.sqrt(at["aspect"])
     radius = np.zeros(count)
     if name == "random_cylinder":

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.errors import InputError
@@ -89,7 +90,12 @@ def read(path: Path) -> mujoco.MjSpec:
     return mujoco.MjSpec.from_file(str(path), include={"base.xml": base})
 
 
-def register_object(name: str, path: str | Path, footprint: Footprint | None = None) -> None:
+def register_object(
+    name: str,
+    path: str | Path,
+    footprint: Footprint | None = None,
+    feet: ArrayLike | None = None,
+) -> None:
     """Make an object of one's own known, to be used as those of the paper are.
 
     Its file includes `base.xml`, which need not lie beside it, and has a body `object` with a free
@@ -102,9 +108,12 @@ def register_object(name: str, path: str | Path, footprint: Footprint | None = N
       footprint: outline of the solid that touches, in the body's frame: a circle about the origin,
         or a convex polygon of up to 8 corners around it. By default that of the geom `object`, if
         it is a box or a cylinder. The solid is as high as this geom.
+      feet: places (S, 2) [m] of 3 to 8 points on which a polygon stands, in the body's frame, or
+        with weights (S, 3) [m, m, 1], as of springs; only the engine quasistatic tells weights
+        apart. By default it stands on its corners. The engine mjx knows no feet.
 
     Raises:
-      InputError: the name is one of the paper's, or file or footprint are not such.
+      InputError: the name is one of the paper's, or file, footprint or feet are not such.
 
     Example:
       >>> from pathlib import Path
@@ -133,6 +142,9 @@ def register_object(name: str, path: str | Path, footprint: Footprint | None = N
     model = _compiled(what, path)
     family, vertices, radius = _outline(what, footprint or _own_outline(what, model))
     thing = model.body("object")
+    if feet is not None:
+        family, vertices = "prism", _padded(vertices)
+        feet = _feet(what, np.asarray(feet, float), radius, thing.ipos[:2])
     one = Solid(
         vertices=vertices,
         radius=np.asarray(radius),
@@ -141,6 +153,7 @@ def register_object(name: str, path: str | Path, footprint: Footprint | None = N
         p_object_com=thing.ipos.copy(),
         inertia=thing.inertia.copy(),
         q_object_body=thing.iquat.copy(),
+        feet=feet,
     )
     REGISTERED[name] = Registered(path, one)
     FAMILIES[name] = family
@@ -211,8 +224,32 @@ def _outline(what: str, footprint: Footprint) -> tuple[str, np.ndarray, float]:
     half = np.abs(vertices[0])
     if len(vertices) == 4 and np.allclose(np.abs(vertices), half):
         return "box", solid.rectangles(*half[:, None])[0], 0.0
+    return "prism", _padded(vertices), 0.0
+
+
+def _padded(vertices: np.ndarray) -> np.ndarray:
+    """Corners (SIDES, 2) [m] of a prism, the last of them repeated."""
     missing = SIDES - len(vertices)
-    return "prism", np.concatenate([vertices, np.repeat(vertices[-1:], missing, axis=0)]), 0.0
+    return np.concatenate([vertices, np.repeat(vertices[-1:], missing, axis=0)])
+
+
+def _feet(what: str, feet: np.ndarray, radius: float, com: np.ndarray) -> np.ndarray:
+    """Feet (SIDES, 3) [m, m, 1], those that are missing with a weight of 0."""
+    if radius:
+        raise InputError(f"{what}: feet are not allowed under a circle: give a polygon.")
+    if feet.ndim == 2 and feet.shape[1] == 2:
+        feet = np.column_stack([feet, np.ones(len(feet))])
+    said = f"{what}: feet = {feet.tolist()} is not allowed:"
+    if feet.ndim != 2 or feet.shape[1] != 3 or not 3 <= len(feet) <= SIDES:
+        raise InputError(f"{said} give 3 to {SIDES} rows of x, y [m] and, if you like, a weight.")
+    if not np.isfinite(feet).all() or (feet[:, 2] <= 0).any():
+        raise InputError(f"{said} all numbers must be finite, and weights positive.")
+    bearing = np.linspace(0, 2 * np.pi, 360)
+    reach = (feet[:, :2] - com) @ np.stack([np.cos(bearing), np.sin(bearing)])
+    if reach.max(axis=0).min() <= 0:
+        raise InputError(f"{said} the centre of mass must be between them, or it tips over.")
+    missing = np.repeat(feet[-1:] * [1, 1, 0], SIDES - len(feet), axis=0)
+    return np.concatenate([feet, missing])
 
 
 def _height(what: str, model: mujoco.MjModel) -> float:

@@ -7,6 +7,7 @@ both step.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -16,6 +17,7 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.geometry import footprint as fp
+from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import Solid
 from rps_jax.robot.robot import Robot
@@ -212,10 +214,16 @@ def _set_corners(spec: mujoco.MjSpec, one: Solid) -> None:
 
 
 def feet(solids: Solid) -> np.ndarray:
-    """Where prisms (...) stand, (..., N, 3) [m]; a repeated corner's foot is at the top, unused."""
-    repeated = np.all(solids.vertices == np.roll(solids.vertices, 1, axis=-2), axis=-1)
+    """Where prisms (...) stand, (..., N, 3) [m]; what is no foot is at the top, unused.
+
+    Feet of their own count alike here, whatever their weight.
+    """
+    at = solids.vertices
+    unused = np.all(at == np.roll(at, 1, axis=-2), axis=-1)
+    if solids.feet is not None:
+        at, unused = solids.feet[..., :2], solids.feet[..., 2] == 0
     half = np.expand_dims(solids.height / 2, -1)
-    return np.concatenate([solids.vertices, np.where(repeated, half, -half)[..., None]], axis=-1)
+    return np.concatenate([at, np.where(unused, half, -half)[..., None]], axis=-1)
 
 
 def _compile(
@@ -334,7 +342,7 @@ def _footprint(model: mujoco.MjModel) -> Footprint:
 def solid_of(scene: Scene) -> Solid:
     """The object of a scene as solids, one of them."""
     thing, geom = scene.physics.body("object"), scene.physics.geom("object")
-    return Solid(
+    one = Solid(
         vertices=np.asarray(scene.footprint.vertices, float)[None],
         radius=geom.size[:1] * (scene.family == "cylinder"),
         height=2 * thing.pos[2:],
@@ -343,6 +351,21 @@ def solid_of(scene: Scene) -> Solid:
         inertia=thing.inertia[None].copy(),
         q_object_body=thing.iquat[None].copy(),
     )
+    if scene.family != "prism":
+        return one
+    at = np.array([scene.physics.geom(f"foot_{i}").pos for i in range(one.vertices.shape[1])])
+    if np.array_equal(at[None], feet(one)):
+        return one
+    own = np.column_stack([at[:, :2], at[:, 2] < 0])
+    return one._replace(feet=own[None])
+
+
+def solids_of(scenes: Sequence[Scene]) -> Solid:
+    """Objects of scenes of one shape family; if one has feet of its own, all say theirs."""
+    every = [solid_of(one) for one in scenes]
+    if any(one.feet is not None for one in every):
+        every = [solid.standing(one) for one in every]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *every)
 
 
 def initial_qpos(scene: Scene, gap: float = 0.02, yaw: float = 0.0) -> np.ndarray:

@@ -150,7 +150,8 @@ def solve(
         pressure = pushed.height[:, None] * force
         feet = supports(pushed.solids, pose[:, 2], pressure)
         many = feet.shape[1]
-        before, loads = loads, borne(feet, pressure, lifted)
+        weight = 1.0 if pushed.solids.feet is None else pushed.solids.feet[..., 2]
+        before, loads = loads, borne(feet, pressure, lifted, weight)
         problem = _problem(feet, here, u, step)
         weights = np.concatenate([mu * loads, mu_robot * pressed], axis=1)
         twist = minimise(problem, weights, twist, rounding, first=rounds == 0)
@@ -173,11 +174,13 @@ def solve(
 def supports(solids: Solid, yaw: np.ndarray, pressure: np.ndarray) -> np.ndarray:
     """Points (B, S, 2) [m], from the centre of mass, on which engines stand solids.
 
-    They are the corners of a box or prism, and three points of a cylinder's rim, one of them where
-    it leans to: where its centre of mass and the `pressure` (B, 2) [m], the moment of the push over
-    the weight, move the load.
+    They are their feet, if they have some of their own; else the corners of a box or prism, and
+    three points of a cylinder's rim, one of them where it leans to: where its centre of mass and
+    the `pressure` (B, 2) [m], the moment of the push over the weight, move the load.
     """
     com = _turned(yaw, solids.p_object_com[:, :2])
+    if solids.feet is not None:
+        return _turned(yaw[:, None], solids.feet[..., :2]) - com[:, None]
     if solids.vertices.shape[1] > 1:
         return _turned(yaw[:, None], solids.vertices) - com[:, None]
     x, y = (com + pressure).T
@@ -186,21 +189,26 @@ def supports(solids: Solid, yaw: np.ndarray, pressure: np.ndarray) -> np.ndarray
     return rim - com[:, None]
 
 
-def borne(feet: np.ndarray, pressure: np.ndarray, lifted: np.ndarray) -> np.ndarray:
-    """Loads (B, S) [m g] of equal springs that only push, their sum 1, their moment `pressure`.
+def borne(
+    feet: np.ndarray, pressure: np.ndarray, lifted: np.ndarray, weight: np.ndarray | float = 1.0
+) -> np.ndarray:
+    """Loads (B, S) [m g] of springs that only push, their sum 1, their moment `pressure`.
 
-    `lifted` (B, 1 or S) [m g] is taken from what each spring would bear.
+    `lifted` (B, 1 or S) [m g] is taken from what each spring would bear. Their stiffnesses are in
+    the ratio of `weight` (B, S), by default equal; a weight of 0 is no spring.
     """
     rows = np.concatenate([np.ones((*feet.shape[:2], 1)), feet], axis=-1)
     lifted = np.broadcast_to(lifted, feet.shape[:2])
     wanted = np.column_stack([np.ones(len(feet)), pressure])
-    bears = np.ones(feet.shape[:2], bool)
+    weight = np.broadcast_to(weight, feet.shape[:2])
+    bears = weight > 0
     load = np.zeros(feet.shape[:2])
     for _ in range(feet.shape[1]):
         some = rows * bears[..., None]
         total = wanted + np.einsum("bsi,bs->bi", some, lifted)
-        plane = np.linalg.pinv(some.swapaxes(1, 2) @ some) @ total[..., None]
-        load = bears * ((some @ plane)[..., 0] - lifted)
+        stiff = weight[..., None] * some
+        plane = np.linalg.pinv(some.swapaxes(1, 2) @ stiff) @ total[..., None]
+        load = bears * ((stiff @ plane)[..., 0] - lifted)
         if not np.any(load < 0):
             break
         bears &= load >= 0

@@ -48,7 +48,8 @@ class Fused(Engine):
     def stage_of_scenes(self, scenes: Sequence[Scene], which: np.ndarray) -> tuple[Any, Any]:
         """Stage and fields of worlds in scenes of one shape family."""
         bodies = [step.body(s.physics, np.asarray(s.footprint.vertices)) for s in scenes]
-        return FusedStage(), taken(jax.tree.map(lambda *leaves: np.stack(leaves), *bodies), which)
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *bodies)
+        return FusedStage(), taken(_on_feet(stacked, scene.solids_of(scenes)), which)
 
     def stage_of_solids(
         self,
@@ -74,6 +75,16 @@ class Fused(Engine):
     def workers(self, backend: str) -> int:
         """Two for a GPU, which steps one's worlds while the host sees to the other's."""
         return super().workers(backend) if backend == "cpu" else 2
+
+
+def _on_feet(bodies: Body, solids: Solid) -> Body:
+    """Bodies (n, ...) that stand on the feet of solids, if these have feet of their own."""
+    if solids.feet is None:
+        return bodies
+    low = np.broadcast_to(-solids.height[:, None, None] / 2, (*solids.feet.shape[:2], 1))
+    at = np.concatenate([solids.feet[..., :2], low], axis=-1)
+    at = (at - bodies.p_object_com[:, None, :]) @ solid.axes(solids)
+    return bodies._replace(feet=at, bears=np.sign(solids.feet[..., 2:]))
 
 
 def bodies_of(solids: Solid, friction: Friction, template: Body) -> Body:
@@ -103,10 +114,10 @@ def bodies_of(solids: Solid, friction: Friction, template: Body) -> Body:
         base_half=None,
         base_z=None,
     )
-    shared = [np.broadcast_to(np.asarray(x), (count, *np.shape(x))) for x in template]
-    return Body(
-        *(theirs if mine is None else mine for mine, theirs in zip(own, shared, strict=True))
-    )
+    shared = [None if x is None else np.broadcast_to(np.asarray(x), (count, *np.shape(x)))
+              for x in template]  # fmt: skip
+    found = [theirs if mine is None else mine for mine, theirs in zip(own, shared, strict=True)]
+    return _on_feet(Body(*found), solids)
 
 
 ENGINE = Fused()

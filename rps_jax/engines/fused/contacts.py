@@ -43,6 +43,8 @@ class Body(NamedTuple):
     base_invweight: Any  # () [1/kg] and of the base
     base_half: Any  # (2,) [m] half length and width of the base
     base_z: Any  # (2,) [m] its lower and upper edge
+    feet: Any = None  # (N, 3) [m] on which a prism stands if not on its vertices; spread: a `Vec`
+    bears: Any = None  # (N, 1) [1] whether each is one; spread: of one entry
 
 
 class Corners(NamedTuple):
@@ -131,6 +133,8 @@ def on_ground(body: Body, state: State, m: Sequence[Vec], physics: Physics) -> C
 
 def _lower_face(body: Body, m: Sequence[Vec]) -> tuple[Vec, Any]:
     """Points that may touch the ground, from the centre of mass, and whether they exist."""
+    if body.feet is not None:
+        return sp.to_world(m, body.feet), body.bears[0] > 0
     if isinstance(body.vertices, Corners):
         return sp.to_world(m, body.vertices.at), body.vertices.real
     # Of a cylinder three points of the rim, the first the lowest; the fourth only fills up.

@@ -299,13 +299,16 @@ def _give(ref: Any, rows: list[jax.Array]) -> None:
 
 def spread(body: Body) -> Body:
     """Bodies (...) with every entry an array of its own, as `step` has them."""
-    leaves = body._replace(vertices=None)
+    leaves = body._replace(vertices=None, feet=None, bears=None)
     entries = {
         name: _split(leaf) if jnp.ndim(leaf) > jnp.ndim(body.mass) else leaf
         for name, leaf in leaves._asdict().items()
         if leaf is not None
     }
     corners = _split(jnp.moveaxis(body.vertices, -2, 0))
+    if body.feet is not None:
+        for name in ("feet", "bears"):
+            entries[name] = _split(jnp.moveaxis(getattr(body, name), -2, 0))
     if body.vertices.shape[-2] == 1:
         return Body(vertices=tuple(x[0] for x in corners), **entries)
     return Body(vertices=Corners.of(corners), **entries)

@@ -1,0 +1,152 @@
+"""Real pushes in C MuJoCo: the triangle on small spheres as feet, pushed by small spheres.
+
+Dry friction has no length: an object four times as large that is pushed four times as far, slowly
+enough, ends four times as far. The object is then as large as those that the project's base pushes,
+and its ground is made for the speed of that base, so most kinds here are four times as large, at
+50 mm/s. Poses that come back are of the true size.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+import pandas as pd
+
+from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
+from sweeps.real_pushes import pushes
+from sweeps.real_pushes.sliding import turned
+
+_FINE = 400  # parts of a way, between which fingers go straight
+_SETTLE = 0.5  # [s] that the object stands before the push
+_RISE = 0.1  # [s] in which fingers reach their speed
+_BALL = 2.5e-4  # [m] radius of a finger at the true size
+_SOFT = (0.9, 0.95)  # MuJoCo's own impedance
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How pushes are stepped."""
+
+    physics: Physics
+    scale: float = 4.0  # of all lengths
+    speed: float = 0.05  # [m/s] of the faster finger, at this scale
+
+
+_OURS = preset("default", "reference")  # converged, in steps of 1 ms
+_MUJOCOS = replace(_OURS, **MUJOCOS_GROUND)
+_DEFAULT = replace(_MUJOCOS, cone="pyramidal", impratio=1.0, base_solref=(0.02, 1.0))
+KINDS = {
+    "mujoco_ours": Kind(_OURS),
+    "mujoco_ours_stiff": Kind(replace(_OURS, base_solref=(0.005, 1.0))),
+    "mujoco_ground": Kind(_MUJOCOS),
+    "mujoco_default": Kind(_DEFAULT),
+    "mujoco_ours_true_size": Kind(_OURS, 1.0, 0.0025),
+    "mujoco_ground_true_size": Kind(_MUJOCOS, 1.0, 0.0025),
+}
+
+
+def push(table: pd.DataFrame, friction: np.ndarray, kind: Kind) -> np.ndarray:
+    """Poses (n, 3) [m, m, rad] at the end, of the true size; friction (n,) is the fingers'."""
+    way, start = pushes.ways(table, _FINE), pushes.before(table)
+    surface = table.surface if "surface" in table else [""] * len(table)
+    found = []
+    for i, (support, name) in enumerate(zip(table.support, surface, strict=True)):
+        ground = pushes.GROUND.get(name, pushes.GROUND["hardboard"])
+        model = _model(support, ground, float(friction[i]), kind)
+        found.append(_one(model, start[i], way[:, i], kind))
+    return np.array(found)
+
+
+def _one(model: mujoco.MjModel, start: np.ndarray, way: np.ndarray, kind: Kind) -> np.ndarray:
+    """Where one push ends (3,), of fingers that go a way (T + 1, 2, 2)."""
+    data, k, dt = mujoco.MjData(model), kind.scale, kind.physics.timestep
+    moves = np.linalg.norm(np.diff(way, axis=0), axis=-1).max(axis=1)
+    along = k * np.concatenate([[0.0], np.cumsum(moves)])
+    ball = _outside(start, way) * k
+    # The lone finger's fellow stands far off, where it does not round the numbers of the others.
+    at = np.where(np.abs(way) > 100, 50.0, k * way + ball)
+    data.qpos[:4] = at[0].ravel()
+    data.qpos[4:] = [
+        *(k * start[:2]),
+        0.0,
+        np.cos(start[2] / 2),
+        0.0,
+        0.0,
+        np.sin(start[2] / 2),
+    ]
+    for _ in range(round(_SETTLE / dt)):
+        data.qvel[:4] = 0.0
+        mujoco.mj_step(model, data)
+    steps = int(np.ceil((along[-1] / kind.speed + _RISE / 2) / dt))
+    time = dt * np.arange(1, steps + 1)
+    gone = kind.speed * np.where(time < _RISE, time * time / (2 * _RISE), time - _RISE / 2)
+    ways = np.stack([np.interp(gone, along, one) for one in at.reshape(len(at), 4).T], axis=1)
+    for goal in ways:
+        data.qvel[:4] = (goal - data.qpos[:4]) / dt
+        mujoco.mj_step(model, data)
+    x, y = data.qpos[4:6] / k
+    w, i, j, z = data.qpos[7:]
+    yaw = np.arctan2(2 * (w * z + i * j), 1 - 2 * (j * j + z * z))
+    return np.array([x, y, yaw])
+
+
+def _outside(start: np.ndarray, way: np.ndarray) -> np.ndarray:
+    """By how much (2, 2) [m] balls are moved, so that they touch where the points of a way do."""
+    yaw = start[2]
+    seen = turned(np.full(way.shape[:2], -yaw), way - start[:2])
+    gap, normal = pushes.sliding.nearest(pushes.OUTLINE, seen)
+    first = np.argmax(gap <= 0, axis=0)
+    first = np.where((gap <= 0).any(axis=0), first, gap.argmin(axis=0))
+    return _BALL * turned(np.full(2, yaw), normal[first, [0, 1]])
+
+
+@functools.lru_cache(maxsize=64)
+def _model(support: str, ground: float, friction: float, kind: Kind) -> mujoco.MjModel:
+    """The triangle on its feet, and two fingers that move as they are told."""
+    k, physics = kind.scale, kind.physics
+    corners = [(*c, z) for z in (0.0, pushes.HEIGHT) for c in pushes.OUTLINE]
+    mesh = " ".join(f"{k * x:.9g}" for corner in corners for x in corner)
+    feet = [k * np.array([*foot, 0.0]) for foot in pushes.feet_of(support)]
+    own = physics == _DEFAULT
+    soft = f"{_SOFT[0]} {_SOFT[1]}" if own else ""
+    touch = f'solref="{physics.base_solref[0]} {physics.base_solref[1]}"' + (
+        f' solimp="{soft}"' if own else ""
+    )
+    bears = soft if own else f"{physics.ground_impedance} {physics.ground_impedance}"
+    stands = f'solref="{physics.ground_solref[0]} {physics.ground_solref[1]}" solimp="{bears}"'
+    spheres = "".join(
+        f'<geom name="foot{i}" type="sphere" size="1e-6" mass="0" pos="{x:.9g} {y:.9g} {z:.9g}"/>'
+        for i, (x, y, z) in enumerate(feet)
+    )
+    fingers = "".join(
+        f'<body pos="0 0 {k * pushes.PUSHED_AT}"><joint type="slide" axis="1 0 0" armature="1e6"/>'
+        f'<joint type="slide" axis="0 1 0" armature="1e6"/><geom name="finger{i}" type="sphere" '
+        f'size="{k * _BALL}" mass="1"/></body>'
+        for i in range(2)
+    )
+    pairs = "".join(
+        f'<pair geom1="ground" geom2="foot{i}" condim="3" friction="{ground} {ground}" {stands}/>'
+        for i in range(len(feet))
+    ) + "".join(
+        f'<pair geom1="finger{i}" geom2="object" condim="3" friction="{friction} {friction}" '
+        f"{touch}/>"
+        for i in range(2)
+    )
+    return mujoco.MjModel.from_xml_string(f"""
+<mujoco>
+  <option timestep="{physics.timestep}" cone="{physics.cone}" impratio="{physics.impratio}"
+   iterations="{physics.iterations}" ls_iterations="{physics.ls_iterations}"
+   tolerance="{physics.tolerance}"/>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <asset><mesh name="object" vertex="{mesh}"/></asset>
+  <worldbody>
+    <geom name="ground" type="plane" size="0 0 1"/>
+    {fingers}
+    <body name="object"><freejoint/>
+      <geom name="object" type="mesh" mesh="object" mass="{pushes.MASS * k**3}"/>{spheres}</body>
+  </worldbody>
+  <contact>{pairs}</contact>
+</mujoco>""")

@@ -1,0 +1,125 @@
+"""The picture of the page: where pushes ended and should have, and how far off models are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from rps_jax.analysis.figures.style import Figure
+from sweeps.real_pushes import pushes
+from sweeps.real_pushes.sliding import turned
+
+_SHARES = (0.1, 0.3, 0.5, 0.7, 0.9, 0.97)  # of all pushes, that are predicted better than the drawn
+_DRAWN = {
+    "no_motion": "0.6",
+    "with_pusher": "C1",
+    "rigid_corners": "C4",
+    "ellipsoid": "C2",
+    "rigid_feet": "C3",
+}
+_FINGERS = ("point", "two-point")
+_STEPS = 60
+
+
+def figure(found: xr.Dataset, table: pd.DataFrame, words: Mapping[str, str]) -> Figure:
+    """Draw a dozen pushes with measured and predicted ends, and below how errors are distributed.
+
+    Args:
+      found: the answer of the study, with the model `rigid_feet`.
+      table: the pushes.
+      words: for models.
+    """
+    drawn = Figure(figsize=(12.5, 9.2), layout="constrained", dpi=100)
+    halves: Any = drawn.subfigures(2, 1, height_ratios=(1.45, 1))
+    above, below = halves
+    panels = above.subplots(2, len(_SHARES))
+    test = ~found.fits.values
+    three = np.array([", three feet" in str(one) for one in found.group.values])
+    way = pushes.ways(table, _STEPS)
+    best = found.sel(model="rigid_feet")
+    for row, finger in zip(panels, _FINGERS, strict=True):
+        told = np.isfinite(best.both.values)
+        rows = np.flatnonzero(test & three & told & (found.finger.values == finger))
+        order = rows[np.argsort(best.both.values[rows])]
+        for ax, share in zip(row, _SHARES, strict=True):
+            ax.set_axis_off()
+            if order.size:
+                i = order[int(share * (order.size - 1))]
+                _push(ax, best.isel(push=i), table.iloc[i], way[:, i])
+                ax.set_title(
+                    f"{finger} push, {1e3 * float(best.both[i]):.1f} mm off\n"
+                    f"(better than {100 * (1 - share):.0f} % of all)",
+                    fontsize=8,
+                )
+    lines = [
+        Line2D([], [], color="0.65", lw=1, label="before the push"),
+        Line2D([], [], color="k", lw=2.2, label="measured after it"),
+        Line2D([], [], color="C3", lw=1.3, ls="--", label="predicted: rigid body on its feet"),
+        Line2D([], [], color="C0", lw=1.5, marker=">", ms=4, label="way of the finger(s)"),
+        Line2D([], [], color="0.4", marker="o", ls="none", ms=4, label="feet, before"),
+    ]
+    above.legend(handles=lines, loc="outside lower center", ncols=5, fontsize=9)
+    names = [name for name in _DRAWN if name in found.model]
+    for ax, finger in zip(below.subplots(1, 2), _FINGERS, strict=True):
+        rows = test & three & (found.finger.values == finger)
+        for name in names:
+            off = np.sort(1e3 * found.both.sel(model=name).values[rows])
+            off = off[np.isfinite(off)]
+            if off.size:
+                share = 100 * (np.arange(off.size) + 1) / off.size
+                ax.plot(off, share, color=_DRAWN[name], lw=1.6, label=words[name])
+        ax.axvspan(0.3, 0.8, color="0.93", lw=0)
+        ax.set(
+            xscale="log",
+            xlim=(0.3, 60),
+            ylim=(0, 100),
+            xlabel="distance of the predicted from the measured end, over the whole body [mm]",
+            ylabel="pushes that are nearer [%]",
+            title=f"{finger} pushes on three feet",
+        )
+        ax.set_xticks([0.3, 1, 3, 10, 30], ["0.3", "1", "3", "10", "30"])
+        ax.grid(alpha=0.3)
+        ax.text(0.33, 93, "a push repeats\nno better", fontsize=8, va="top", color="0.4")
+    handles, labels = below.axes[-1].get_legend_handles_labels()
+    below.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
+    return drawn
+
+
+def _push(ax: Axes, one: xr.Dataset, row: pd.Series, way: np.ndarray) -> None:
+    """One push, turned so that its way goes up."""
+    pre = np.array([row.pre_x, row.pre_y, row.pre_yaw], float)
+    fingers = way[:, np.abs(way[0]).max(axis=1) < 100]
+    middle = fingers.mean(axis=1)
+    at = middle[-1] - middle[0]
+    turn = np.pi / 2 - np.arctan2(at[1], at[0])
+    origin = pre[:2] + turned(pre[2], pushes.COM)
+
+    def seen(place: np.ndarray) -> np.ndarray:
+        return 1e3 * turned(np.full(place.shape[:-1], turn), place - origin)
+
+    def outline(pose: np.ndarray, corners: np.ndarray = pushes.OUTLINE) -> np.ndarray:
+        return seen(pose[:2] + turned(np.full(len(corners), pose[2]), corners))
+
+    for pose, style in (
+        (pre, {"color": "0.65", "lw": 1}),
+        (one.measured.values, {"color": "k", "lw": 2.2}),
+        (one.predicted.values, {"color": "C3", "lw": 1.3, "ls": "--"}),
+    ):
+        shape = outline(pose)
+        ax.plot(*np.concatenate([shape, shape[:1]]).T, **style)
+    if row.support != pushes.FLAT:
+        ax.plot(*outline(pre, pushes.feet_of(row.support)).T, "o", color="0.4", ms=3.5)
+    for finger in np.moveaxis(fingers, 1, 0):
+        line = seen(finger)
+        ax.plot(*line.T, color="C0", lw=1.5)
+        ax.annotate(
+            "", line[-1], line[-6], arrowprops={"arrowstyle": "-|>", "color": "C0", "lw": 1.5}
+        )
+    ax.set_aspect("equal")
+    ax.margins(0.03)

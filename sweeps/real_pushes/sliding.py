@@ -1,0 +1,302 @@
+"""How a rigid object slides that fingers push slowly over dry ground, many pushes at once.
+
+The object is pushed so slowly that inertia does not count, and so everything depends on the ways of
+the fingers alone, which are points. In each step the twist V of the object minimises
+
+    sum over points of the ground of N_i |v_i| + sum over fingers of P(gap + v_n - mu_c |v_t|),
+
+the power that friction with the ground takes (N_i: the loads, their sum 1; v_i: the sliding) under
+contacts that only push: P is the potential of a very stiff spring, v_n and v_t the velocities of
+the object's point relative to the finger. Where the derivative is zero, friction balances contact
+forces within Coulomb's cones (Anitescu 2006, whose cones hold a contact that slides mu_c |v_t| of a
+step apart, here below 0.1 mm). Forces are in units of mu m g, so neither mass nor friction with the
+ground matter, but that a push at a height z moves the load: by mu z in the direction of the push.
+
+An ellipsoid limit surface is one point of the ground more, whose "sliding" is (v_x, v_y, c omega).
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+
+_ARM = 0.05  # [m] by which turns are made lengths
+_SLIP = 1e-3  # share of a step's way from which on friction is dry
+_SINK = 1e-4  # share of a step's way that a finger sinks in under mu m g
+_BALANCED = 1e-5  # [mu m g] to which forces balance
+_ROUNDS = 60  # of Newton's method at most
+_PACES = 0.3 ** np.arange(6)  # of a line search
+_NEAR = 0.1  # steps of room below which a contact might close
+_WIDER = (100.0, 10.0, 1.0)  # by which friction begins rounded when forces jump
+
+
+class Ground(NamedTuple):
+    """What objects (B,) stand on: S points, or an ellipsoid at the centre of mass."""
+
+    at: np.ndarray  # (B, S, 2) [m] body frame, from the centre of mass
+    weight: np.ndarray  # (B, S) [1] of the points, which share the load as springs of this size do
+    arm: np.ndarray  # (B,) [m] c of an ellipsoid; 0 of points
+    shift: np.ndarray  # (B,) [m] by which a push of mu m g moves the load: mu times its height
+
+
+class Slid(NamedTuple):
+    """Pushes (B,) in T steps."""
+
+    pose: np.ndarray  # (T + 1, B, 3) [m, m, rad] of the body frame
+    force: np.ndarray  # (T, B, 2) [mu m g] of the fingers on the object, world axes
+
+
+class _Step(NamedTuple):
+    """What decides the twists of some objects in one step, in lengths of the step."""
+
+    slide: np.ndarray  # (B, S, 3, 3) twist to sliding
+    load: np.ndarray  # (B, S)
+    a_n: np.ndarray  # (B, F, 3) twist to speed along the normals
+    a_t: np.ndarray  # (B, F, 3)
+    d_n: np.ndarray  # (B, F) way of the fingers along the normals
+    d_t: np.ndarray  # (B, F)
+    gap: np.ndarray  # (B, F)
+    friction: np.ndarray  # (B, 1)
+
+    def of(self, rows: np.ndarray) -> _Step:
+        """Some of the objects."""
+        return _Step(*(leaf[rows] for leaf in self))
+
+
+def push(
+    outline: np.ndarray,
+    com: np.ndarray,
+    ground: Ground,
+    ways: np.ndarray,
+    pose: np.ndarray,
+    friction: np.ndarray,
+) -> Slid:
+    """Push objects of one outline along ways of fingers.
+
+    Args:
+      outline: corners (N, 2) [m] of a convex polygon, counter-clockwise, body frame.
+      com: centre of mass (2,) [m], body frame.
+      ground: what they stand on.
+      ways: of F fingers (T + 1, B, F, 2) [m], world; a finger that is not there is far away.
+      pose: of the body frame at the start (B, 3) [m, m, rad], world.
+      friction: between object and fingers (B,) [1].
+    """
+    pose = np.array(pose, float)
+    twist, force = np.zeros_like(pose), np.zeros((len(pose), 2))
+    poses, forces = [pose], []
+    for before, after in itertools.pairwise(ways):
+        way = after - before
+        length = np.maximum(np.linalg.norm(way, axis=-1).max(axis=1), 1e-9)
+        step, normal, tangent = _step(outline, com, ground, before, way, length, pose, force)
+        step = step._replace(friction=friction[:, None])
+        twist = _solved(step, twist)
+        pushing, rubbing = _forces(step, twist)
+        force = np.sum(pushing[..., None] * normal + rubbing[..., None] * tangent, axis=1)
+        middle = pose[:, :2] + turned(pose[:, 2], com) + length[:, None] * twist[:, :2]
+        yaw = pose[:, 2] + length * twist[:, 2] / _ARM
+        pose = np.column_stack([middle - turned(yaw, com), yaw])
+        poses.append(pose)
+        forces.append(force)
+    return Slid(np.stack(poses), np.stack(forces))
+
+
+def turned(yaw: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Vectors (..., 2) turned by yaw (...) [rad]."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    x, y = vector[..., 0], vector[..., 1]
+    return np.stack([c * x - s * y, s * x + c * y], axis=-1)
+
+
+def nearest(outline: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance (...) [m] of points (..., 2) from a convex polygon, negative inside, and its normal.
+
+    The normal (..., 2) is the outward one there.
+    """
+    along = np.roll(outline, -1, axis=0) - outline
+    length = np.linalg.norm(along, axis=1)
+    unit = along / length[:, None]
+    out = np.stack([unit[:, 1], -unit[:, 0]], axis=1)
+    apart = point[..., None, :] - outline  # (..., N, 2)
+    beyond = np.sum(apart * out, axis=-1)
+    side = np.argmax(beyond, axis=-1)
+    far = np.take_along_axis(beyond, side[..., None], -1)[..., 0]
+    place = np.clip(np.sum(apart * unit, axis=-1), 0, length)
+    off = apart - place[..., None] * unit
+    distance = np.linalg.norm(off, axis=-1)
+    which = np.argmin(distance, axis=-1)[..., None]
+    close = np.take_along_axis(distance, which, -1)[..., 0]
+    way = np.take_along_axis(off, which[..., None], -2)[..., 0, :]
+    corner = (far > 0) & (close > far * (1 + 1e-9)) & (close > 1e-9)
+    normal = np.where(corner[..., None], way / np.maximum(close, 1e-12)[..., None], out[side])
+    return np.where(corner, close, far), normal
+
+
+def borne(at: np.ndarray, weight: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """Loads (B, S) [1] of springs of some weights at (B, S, 2) that only push.
+
+    Their sum is 1 and their centre (B, 2) [m]. If no springs could bear that, as when the object
+    tips over, what they bear has the centre that is nearest to it in the least squares.
+    """
+    rows = np.concatenate([np.ones((*at.shape[:2], 1)), at / _ARM], axis=-1)
+    wanted = np.column_stack([np.ones(len(at)), centre / _ARM])
+    bears = weight > 0
+    load = weight / weight.sum(axis=1, keepdims=True)
+    for _ in range(at.shape[1]):
+        some = rows * (weight * bears)[..., None]
+        plane = np.linalg.pinv(some.swapaxes(1, 2) @ rows, rcond=1e-9) @ wanted[..., None]
+        load = (some @ plane)[..., 0]
+        if not np.any(load < 0):
+            break
+        bears &= load >= 0
+    load = np.maximum(load, 0)
+    return load / load.sum(axis=1, keepdims=True)
+
+
+def _step(
+    outline: np.ndarray,
+    com: np.ndarray,
+    ground: Ground,
+    finger: np.ndarray,
+    way: np.ndarray,
+    length: np.ndarray,
+    pose: np.ndarray,
+    force: np.ndarray,
+) -> tuple[_Step, np.ndarray, np.ndarray]:
+    """One step, with the normals (B, F, 2) towards the objects, and the tangents."""
+    yaw, scale = pose[:, 2], length[:, None]
+    at = turned(yaw[:, None], ground.at)
+    zero, one = np.zeros(at.shape[:2]), np.ones(at.shape[:2])
+    arm = np.broadcast_to(ground.arm[:, None], at.shape[:2])
+    slide = np.stack(
+        [
+            np.stack([one, zero, -at[..., 1] / _ARM], axis=-1),
+            np.stack([zero, one, at[..., 0] / _ARM], axis=-1),
+            np.stack([zero, zero, arm / _ARM], axis=-1),
+        ],
+        axis=-2,
+    )
+    seen = turned(-yaw[:, None], finger - pose[:, None, :2])
+    gap, outward = nearest(outline, seen)
+    normal = -turned(yaw[:, None], outward)
+    tangent = np.stack([-normal[..., 1], normal[..., 0]], axis=-1)
+    r = finger + gap[..., None] * normal - pose[:, None, :2] - turned(yaw, com)[:, None]
+
+    def row(direction: np.ndarray) -> np.ndarray:
+        moment = r[..., 0] * direction[..., 1] - r[..., 1] * direction[..., 0]
+        return np.concatenate([direction, moment[..., None] / _ARM], axis=-1)
+
+    centre = ground.shift[:, None] * force
+    return (
+        _Step(
+            slide,
+            borne(at, ground.weight, centre) if at.shape[1] > 1 else one,
+            row(normal),
+            row(tangent),
+            np.sum(way * normal, axis=-1) / scale,
+            np.sum(way * tangent, axis=-1) / scale,
+            gap / scale,
+            one[:, :1],
+        ),
+        normal,
+        tangent,
+    )
+
+
+# --- the convex problem ---------------------------------------------------------------------
+
+
+def _contact(step: _Step, twist: np.ndarray, slip: float) -> tuple[np.ndarray, ...]:
+    """Room, sliding and its rounded size (B, F), in lengths of the step."""
+    v_t = np.einsum("bfi,bi->bf", step.a_t, twist) - step.d_t
+    size = np.sqrt(v_t * v_t + slip * slip)
+    v_n = np.einsum("bfi,bi->bf", step.a_n, twist) - step.d_n
+    return step.gap + v_n - step.friction * (size - slip), v_t, size
+
+
+def _forces(step: _Step, twist: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pushes and friction (B, F) [mu m g] of the fingers on the objects."""
+    room, v_t, size = _contact(step, twist, _SLIP)
+    pushing = np.maximum(-room, 0.0) / _SINK
+    return pushing, -step.friction * pushing * v_t / size
+
+
+def _value(step: _Step, twist: np.ndarray, slip: float) -> np.ndarray:
+    slid = np.einsum("bsij,bj->bsi", step.slide, twist)
+    size = np.sqrt(np.sum(slid * slid, axis=-1) + slip * slip)
+    inside = np.maximum(-_contact(step, twist, slip)[0], 0.0)
+    return np.sum(step.load * (size - slip), 1) + np.sum(inside * inside, 1) / (2 * _SINK)
+
+
+def _derivatives(
+    step: _Step, twist: np.ndarray, slip: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gradient (B, 3), Hessian (B, 3, 3), and what an upper bound of it adds."""
+    slid = np.einsum("bsij,bj->bsi", step.slide, twist)
+    size = np.sqrt(np.sum(slid * slid, axis=-1) + slip * slip)
+    per = step.load / size
+    pull = np.einsum("bsi,bsij->bsj", slid / size[..., None], step.slide)
+    gradient = np.einsum("bs,bsj->bj", step.load, pull)
+    turning = (np.sqrt(per)[..., None, None] * step.slide).reshape(len(twist), -1, 3)
+    along = np.sqrt(per)[..., None] * pull
+    less = along.swapaxes(1, 2) @ along
+    hessian = turning.swapaxes(1, 2) @ turning - less
+    room, v_t, round_ = _contact(step, twist, slip)
+    pushing = np.maximum(-room, 0.0) / _SINK
+    b = step.a_n - (step.friction * v_t / round_)[..., None] * step.a_t
+    gradient -= np.einsum("bf,bfj->bj", pushing, b)
+    wall = b[..., :, None] * b[..., None, :] / _SINK
+    hessian += np.sum((room < 0)[..., None, None] * wall, axis=1)
+    # Contacts that might close in the step.
+    more = less + np.sum(((room >= 0) & (room < _NEAR))[..., None, None] * wall, axis=1)
+    bend = pushing * step.friction * slip**2 / round_**3
+    hessian += np.sum(
+        bend[..., None, None] * step.a_t[..., :, None] * step.a_t[..., None, :], axis=1
+    )
+    return gradient, hessian + 1e-7 * np.eye(3), more
+
+
+def _solved(step: _Step, twist: np.ndarray) -> np.ndarray:
+    """The twists (B, 3) of least power, from a first guess: Newton's method with a line search."""
+    rest = _value(step, 0 * twist, _SLIP) <= _value(step, twist, _SLIP)
+    found = np.where(rest[:, None], 0.0, twist)
+    rows = np.arange(len(twist))
+    for wide in (1.0, *_WIDER):  # with a good guess the first is enough
+        rows = _newton(step, found, rows, wide * _SLIP)
+        if not rows.size:
+            break
+    return found
+
+
+def _newton(step: _Step, found: np.ndarray, rows: np.ndarray, slip: float) -> np.ndarray:
+    """Improve the twists of some rows in place; those that are not solved."""
+    for _ in range(_ROUNDS if slip == _SLIP else 10):
+        part, twist = step.of(rows), found[rows]
+        gradient, hessian, more = _derivatives(part, twist, slip)
+        if slip == _SLIP:
+            open_ = np.abs(gradient).max(axis=1) > _BALANCED
+            rows = rows[open_]
+            if not rows.size:
+                return rows
+            part, twist = part.of(open_), twist[open_]
+            gradient, hessian, more = gradient[open_], hessian[open_], more[open_]
+        # Newton's step is fast at the end; where friction is nearly level along it, that of an
+        # upper bound of the Hessian is safe.
+        now, best = _value(part, twist, slip), twist
+        least = now.copy()
+        changes = [-np.linalg.solve(one, gradient[..., None])[..., 0]
+                   for one in (hessian, hessian + more)]  # fmt: skip
+        for pace in _PACES:
+            for change in changes:
+                tried = twist + pace * change
+                value = _value(part, tried, slip)
+                better = value < least
+                best = np.where(better[:, None], tried, best)
+                least = np.where(better, value, least)
+            if (least < now).all():
+                break
+        found[rows] = best
+        if (least >= now).all():
+            break
+    return rows

@@ -1,0 +1,239 @@
+"""The study of real pushes: laws that its models obey, and its data."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from helpers import ROOT, refusal
+
+from rps_jax.errors import InputError
+from sweeps.real_pushes import contact, pushes, sliding, study
+from sweeps.real_pushes.pushes import COM, OUTLINE, turned
+from sweeps.real_pushes.sliding import Ground
+from sweeps.real_pushes.study import predict
+
+FEET = np.array([[0.03, 0.03], [0.09, 0.03], [0.03, 0.09]])
+STEPS = 30
+FOLDER = ROOT / "sweeps" / "real_pushes"
+
+
+@pytest.fixture(scope="module")
+def few():
+    """Ten pushes of every kind."""
+    whole = pushes.read()
+    return whole.groupby("kind").head(10).reset_index(drop=True)
+
+
+def on(feet, count=1, shift=0.0):
+    """A ground of such points under some objects, without an ellipsoid."""
+    at = np.repeat((feet - COM)[None], count, axis=0)
+    return Ground(at, np.ones(at.shape[:2]), np.zeros(count), np.full(count, shift))
+
+
+def pushed(ground, ways, pose=(0.0, 0.0, 0.0), friction=0.5, scale=1.0):
+    """One push by fingers (F, 2) [m] that go a way (2,) [m], in the body's frame at the start."""
+    start, way = np.array(ways[0], float), np.array(ways[1], float)
+    if len(start) == 1:
+        start = np.concatenate([start, start + 100.0])
+    pose = np.array(pose, float)
+    share = np.linspace(0, 1, STEPS + 1)[:, None, None]
+    path = turned(np.full((STEPS + 1, 2), pose[2]), start + share * way) + pose[:2]
+    found = sliding.push(
+        scale * OUTLINE,
+        scale * COM,
+        ground._replace(at=scale * ground.at, arm=scale * ground.arm),
+        scale * path[:, None],
+        (pose * [scale, scale, 1])[None],
+        np.array([friction]),
+    )
+    return found.pose[:, 0] * [1 / scale, 1 / scale, 1], found.force[:, 0]
+
+
+UPWARDS = ([[0.025, -0.001], [0.075, -0.001]], (0.0, 0.02))  # two fingers about the centroid's x
+
+
+@pytest.mark.parametrize("friction", [0.05, 0.5])
+def test_two_fingers_through_the_centre_of_friction_translate(friction):
+    """The feet bear a third each, and fingers at equal distances hold it straight."""
+    pose, force = pushed(on(FEET), UPWARDS, friction=friction)
+    assert pose[-1] == pytest.approx([0.0, 0.019, 0.0], abs=2e-5)
+    assert force[-1] == pytest.approx([0.0, 1.0], abs=2e-3)  # the friction mu m g
+
+
+def test_a_finger_aside_turns_the_object_and_pushes_less_than_it_weighs():
+    pose, force = pushed(on(FEET), ([[0.1, -0.001]], (0.0, 0.02)))
+    assert pose[-1, 2] > 0.05
+    assert 0.1 < np.linalg.norm(force[-1]) < 0.95
+
+
+def test_a_finger_stays_in_its_cone_and_outside():
+    mu, way = 0.3, ([[0.07, -0.002]], (0.02, 0.02))
+    pose, force = pushed(on(FEET), way, friction=mu)
+    normal = turned(pose[:-1, 2], np.array([0.0, 1.0]))
+    tangent = turned(pose[:-1, 2], np.array([1.0, 0.0]))
+    along, across = np.sum(force * normal, 1), np.sum(force * tangent, 1)
+    touching = along > 1e-6
+    assert touching.sum() > STEPS / 2
+    assert (np.abs(across[touching]) <= mu * along[touching] * (1 + 1e-6)).all()
+    assert across[touching][-1] == pytest.approx(mu * along[touching][-1], rel=0.01)  # it slides
+    finger = np.array([0.09, 0.018])
+    seen = turned(-pose[-1, 2], finger - pose[-1, :2])
+    gap, _ = sliding.nearest(OUTLINE, seen)
+    assert abs(gap) < 3e-4
+
+
+def test_lengths_have_no_scale():
+    one, _ = pushed(on(FEET), ([[0.1, -0.001]], (0.004, 0.02)))
+    four, _ = pushed(on(FEET), ([[0.1, -0.001]], (0.004, 0.02)), scale=4.0)
+    assert abs(one[-1, 2]) > 0.05
+    np.testing.assert_allclose(four, one, atol=1e-6)
+
+
+def test_feet_move_with_the_pose():
+    """A push that is moved and turned ends moved and turned."""
+    one, _ = pushed(on(FEET), ([[0.1, -0.001]], (0.004, 0.02)))
+    there = (0.3, -0.2, 2.0)
+    other, _ = pushed(on(FEET), ([[0.1, -0.001]], (0.004, 0.02)), pose=there)
+    np.testing.assert_allclose(other[:, :2], turned(np.full(len(one), 2.0), one[:, :2]) + there[:2],
+                               atol=1e-6)  # fmt: skip
+    np.testing.assert_allclose(other[:, 2], one[:, 2] + 2.0, atol=1e-5)
+
+
+def test_where_the_feet_stand_decides_how_far_it_turns():
+    way = ([[0.1, -0.001]], (0.0, 0.02))
+    near, far = (COM + share * (OUTLINE - COM) for share in (0.2, 1.0))
+    assert pushed(on(near), way)[0][-1, 2] > 1.2 * pushed(on(far), way)[0][-1, 2]
+
+
+def test_feet_bear_the_weight_about_its_centre():
+    at = np.array([[[0.1, 0.0], [-0.1, 0.1], [-0.1, -0.1], [0.0, 0.02]]])
+    weight, centre = np.array([[1.0, 2.0, 1.0, 0.5]]), np.array([[0.01, 0.02]])
+    load = sliding.borne(at, weight, centre)
+    assert load.sum() == pytest.approx(1)
+    assert (load >= 0).all()
+    np.testing.assert_allclose(np.einsum("bs,bsi->bi", load, at), centre, atol=1e-12)
+
+
+def test_nearest_is_the_edge_or_the_corner():
+    points = np.array([[0.05, -0.01], [-0.03, -0.04], [0.1, 0.1], [0.05, 0.05]])
+    gap, normal = sliding.nearest(OUTLINE, points)
+    root = np.sqrt(0.5)
+    np.testing.assert_allclose(gap, [0.01, 0.05, 0.05 * root, -0.05 * root], atol=1e-12)
+    np.testing.assert_allclose(normal, [[0, -1], [-0.6, -0.8], [root, root], [root, root]],
+                               atol=1e-12)  # fmt: skip
+
+
+def test_the_data_are_what_the_page_says():
+    table = pushes.read()
+    assert len(table) == 1271
+    assert table.id.is_unique
+    assert table.kind.value_counts().to_dict() == {
+        "two_point_rotation": 683, "point": 548, "two_point_translation": 40,
+    }  # fmt: skip
+    assert np.isfinite(pushes.measured(table)).all()
+    assert "Apache License" in (FOLDER / "data" / "LICENSE-MLab_EXP.txt").read_text()
+    assert sum(path.stat().st_size for path in (FOLDER / "data").iterdir()) < 1.5e6
+    with np.load(FOLDER / "data" / "force.npz") as force:
+        assert force["force"].dtype == np.float32
+        assert np.isin(force["id"], table.id).all()
+        assert force["force"].shape == (force["id"].size, force["share_of_time"].size, 2)
+        # The table's means are those of the second half of the way.
+        late = force["force"][:, force["share_of_time"] >= 0.5].mean(axis=1)
+        told = table.set_index("id").loc[force["id"], ["force_wx", "force_wy"]].to_numpy()
+        assert np.median(np.linalg.norm(late - told, axis=1)) < 0.1
+
+
+def test_fingers_begin_outside_and_end_where_the_object_was_pushed(few):
+    way, pre, post = pushes.ways(few, STEPS), pushes.before(few), pushes.measured(few)
+    for pose, finger, low, high in ((pre, way[0], 2e-4, 5e-3), (post, way[-1], -2e-3, 6e-3)):
+        seen = turned(-pose[:, None, 2], finger - pose[:, None, :2])
+        gap = sliding.nearest(OUTLINE, seen)[0].min(axis=1)
+        assert (gap > low).all()
+        assert (gap < high).all()
+
+
+def test_a_rigid_body_on_its_feet_is_nearest(few):
+    actual = pushes.measured(few)
+
+    def median(model):
+        found = predict(few, model, steps=STEPS)
+        pose = np.stack([found[f"post_{name}"].values for name in pushes.POSE], axis=1)
+        return float(np.median(pushes.errors_of(pose, actual).both))
+
+    feet = median("rigid_feet")
+    assert feet < 2.5e-3
+    assert 1.5 * feet < median("rigid_corners") < median("no_motion")
+    assert 3 * feet < median("with_pusher") < median("no_motion")
+
+
+def test_mujoco_with_stiff_fingers_comes_near_the_rigid_body(few):
+    some = few[few.support != pushes.FLAT].groupby("kind").head(2).reset_index(drop=True)
+    rigid = predict(some, "rigid_feet")
+    soft = predict(some, "mujoco_ours_stiff")
+    for name, near in (("x", 2e-3), ("y", 2e-3), ("yaw", 0.03)):
+        off = np.abs(rigid[f"post_{name}"] - soft[f"post_{name}"])
+        assert float(off.median()) < near
+    assert contact.KINDS["mujoco_ours"].scale == 4
+
+
+def test_a_prediction_takes_a_file_and_a_dataset_and_needs_no_ends(few, tmp_path):
+    kept = few.drop(columns=[name for name in few if name.startswith(("post_", "gap", "force"))])
+    kept.to_csv(tmp_path / "kept.csv", index=False)
+    first = predict(few, "ellipsoid", steps=10)
+    for table in (tmp_path / "kept.csv", str(tmp_path / "kept.csv"), kept, kept.to_xarray()):
+        again = predict(table, "ellipsoid", steps=10)
+        np.testing.assert_allclose(again.post_yaw, first.post_yaw, rtol=1e-12)
+    assert list(first.id.values) == list(few.id)
+
+
+def test_a_table_without_sense_is_refused(few, tmp_path, capsys):
+    with pytest.raises(InputError, match="lack the column edge, which kind = two_point"):
+        predict(few.drop(columns="edge"))
+    with pytest.raises(InputError, match=r"pre_yaw = nan in row 0 is not allowed"):
+        predict(few.assign(pre_yaw=np.nan))
+    with pytest.raises(InputError, match="support = round is not allowed"):
+        predict(few.assign(support="round"))
+    with pytest.raises(InputError, match="without a usable row"):
+        predict(few.assign(usable=0))
+    with pytest.raises(InputError, match="unknown model 'rigid'"):
+        predict(few, "rigid")
+    assert "cannot be read" in refusal(capsys, FOLDER, "--pushes", str(tmp_path / "none.csv"))
+
+
+def test_errors_by_hand():
+    here = np.array([0.0, 0.0, 0.0])
+    about = np.array([*(COM - turned(np.array(0.2), COM)), 0.2])  # turned about the centroid
+    off = pushes.errors_of(np.stack([about, np.array([0.003, 0.004, 0.0])]), here)
+    np.testing.assert_allclose(off.place, [0, 5e-3], atol=1e-12)
+    np.testing.assert_allclose(off.turn, [0.2, 0], atol=1e-12)
+    # Over the area of the triangle, root of the mean square.
+    grid = np.random.default_rng(0).random((200_000, 2))
+    grid = 0.15 * grid[grid.sum(axis=1) < 1]
+    moved = turned(np.full(len(grid), 0.2), grid) + about[:2]
+    truth = np.sqrt(np.mean(np.sum((moved - grid) ** 2, axis=1)))
+    assert off.both[0] == pytest.approx(truth, rel=0.01)
+    assert off.both[1] == pytest.approx(5e-3)
+
+
+def test_a_small_study_is_continued_and_tells_every_model(tmp_path):
+    models = ("no_motion", "rigid_feet", "mujoco_ours")
+    asked = study.RealPushes(models=models, few=20, mujoco=1, out=tmp_path / "run", progress=False)
+    found = asked()
+    again = asked()
+    assert found.drop_attrs().identical(again.drop_attrs())
+    assert set(study.tables(found)) == {"models", "mujoco", "friction", "forces"}
+    ran = np.isfinite(found.predicted.sel(model="mujoco_ours")).all("pose")
+    assert ran.any()
+    assert not (found.fits & ran).any()
+    lines = (tmp_path / "run" / "predictions.csv").read_text().splitlines()
+    assert lines[0] == "id,model,post_x,post_y,post_yaw"
+    assert len(lines) == 1 + int(np.isfinite(found.both).sum())
+
+
+def test_the_published_friction_is_that_of_predictions():
+    data = json.loads((FOLDER / "results" / "real_pushes_friction.json").read_text())
+    fitted = {row[0]: row[2] for row in data["rows"] if row[1] == study.WORDS["rigid_feet"]}
+    assert fitted == study.FRICTION
+    page = (FOLDER / "README.md").read_text()
+    assert re.search("Apache-2.0", page)
