@@ -37,13 +37,17 @@ class Kind:
 
 _OURS = preset("default", "reference")  # converged, in steps of 1 ms
 _MUJOCOS = replace(_OURS, **MUJOCOS_GROUND)
+_LIGHT = replace(_OURS, ground_solref=(0.1, 0.2), ground_impedance=0.3)
 _DEFAULT = replace(_MUJOCOS, cone="pyramidal", impratio=1.0, base_solref=(0.02, 1.0))
 KINDS = {
     "mujoco_ours": Kind(_OURS),
     "mujoco_ours_stiff": Kind(replace(_OURS, base_solref=(0.005, 1.0))),
     "mujoco_ground": Kind(_MUJOCOS),
     "mujoco_default": Kind(_DEFAULT),
+    "mujoco_light": Kind(_LIGHT),
+    "mujoco_light_stiff": Kind(replace(_LIGHT, base_solref=(0.005, 1.0))),
     "mujoco_ours_true_size": Kind(_OURS, 1.0, 0.0025),
+    "mujoco_light_true_size": Kind(_LIGHT, 1.0, 0.0025),
     "mujoco_ground_true_size": Kind(_MUJOCOS, 1.0, 0.0025),
 }
 

@@ -1,4 +1,4 @@
-"""Does the physics predict real pushes? 1,271 of a robot's, beside what seven models say.
+"""Does the physics predict real pushes? 1,271 of a robot's, beside what models say.
 
     rps sweeps/real_pushes
     rps sweeps/real_pushes --pushes FILE.csv
@@ -44,7 +44,10 @@ Model = Literal[
     "mujoco_ours_stiff",
     "mujoco_ground",
     "mujoco_default",
+    "mujoco_light",
+    "mujoco_light_stiff",
     "mujoco_ours_true_size",
+    "mujoco_light_true_size",
     "mujoco_ground_true_size",
 ]
 WORDS: Mapping[str, str] = {
@@ -57,7 +60,10 @@ WORDS: Mapping[str, str] = {
     "mujoco_ours_stiff": "our ground, stiff fingers",
     "mujoco_ground": "MuJoCo's ground, our cone and impratio",
     "mujoco_default": "MuJoCo's full default",
+    "mujoco_light": "ground of (0.1 s, 0.2), impedance 0.3",
+    "mujoco_light_stiff": "that ground, stiff fingers",
     "mujoco_ours_true_size": "our ground, true size, 2.5 mm/s",
+    "mujoco_light_true_size": "that ground, true size, 2.5 mm/s",
     "mujoco_ground_true_size": "MuJoCo's ground, true size, 2.5 mm/s",
 }
 FITTED = ("ellipsoid", "rigid_feet", "rigid_corners")  # have a friction of their own
