@@ -331,8 +331,7 @@ def shift_figure(found: xr.Dataset) -> Figure:
     won, of = counts(found)
     size = 100 * found["shift"].values
     for i, name in enumerate(map(str, found.object.values)):
-        style = {"color": OBJECT_COLOURS[name], "label": words(name)}
-        success_rates(ax, size, won[i], of[i], **style)
+        success_rates(ax, size, won[i], of[i], color=OBJECT_COLOURS[name], label=words(name))
     ax.set(xlabel="the object is moved sideways by [cm]", ylabel="success [%]", ylim=(-3, 103))
     ax.grid(alpha=0.3)
     ax.legend(fontsize=8)

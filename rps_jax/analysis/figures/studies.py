@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -23,7 +24,7 @@ def tolerance_curve(curve: xr.Dataset, trials: int) -> Figure:
     for (above, below), loss in zip(axes.T, map(str, curve.loss.values), strict=True):
         for i, name in enumerate(map(str, curve.object.values)):
             one = curve.sel(loss=loss, object=name)
-            style = {"color": OBJECT_COLOURS[name], "label": words(name)}
+            style: dict[str, Any] = {"color": OBJECT_COLOURS[name], "label": words(name)}
             beside = x + 0.15 * (i - 1)  # where curves coincide
             success_rates(above, beside, one.won.values, np.full(len(x), trials), **style)
             below.plot(beside, one.lost.values, "o-", ms=4, lw=1.2, **style)

@@ -71,6 +71,7 @@ def success_rates(
     moved = transforms.ScaledTranslation(
         2.5 * beside / 72, 0, ax.get_figure(root=True).dpi_scale_trans
     )
-    style = {"marker": "osD^v"[beside % 5]} | style
-    for drawn in ax.errorbar(x, rate, errors, capsize=2, ms=4, lw=1.2, **style).get_children():
+    mark = "osD^v"[beside % 5]
+    bars = ax.errorbar(x, rate, errors, capsize=2, marker=mark, ms=4, lw=1.2, **style)
+    for drawn in bars.get_children():
         drawn.set_transform(drawn.get_transform() + moved)
