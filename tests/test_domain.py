@@ -109,6 +109,9 @@ def test_fused_bodies_equal_those_of_recompiled_models(name):
         one = scene.of_solid(family, worlds.solid, worlds.friction, preset(), i)
         compiled = fused.body(one.physics, np.asarray(one.footprint.vertices, float))
         for field, a, b in zip(compiled._fields, bodies, compiled, strict=True):
+            if b is None:  # these solids have no feet of their own
+                assert a is None
+                continue
             np.testing.assert_allclose(a[i], b, rtol=1e-6, atol=1e-7, err_msg=field)
 
 

@@ -330,7 +330,7 @@ class RealPushes(Study[xr.Dataset]):
             Section(name.replace("_", " ").capitalize(), "", _texts(*made))
             for name, made in tables(found).items()
         ]
-        if np.isfinite(found.both).any() and "rigid_feet" in self.models:
+        if sections and np.isfinite(found.both).any() and "rigid_feet" in self.models:
             draw = partial(figure, found, self.table, WORDS)
             sections[0] = sections[0]._replace(picture=Picture("real_pushes", draw))
         return sections
@@ -422,7 +422,7 @@ def tables(found: xr.Dataset) -> dict[str, tuple[list[dict[str, Any]], list[list
         made["friction"] = _FRICTION_COLUMNS, list(_friction_rows(found))
     if "force_measured" in found and "rigid_feet" in models:
         made["forces"] = _FORCE_COLUMNS, list(_force_rows(found))
-    return made
+    return {name: (columns, rows) for name, (columns, rows) in made.items() if rows}
 
 
 _FRICTION_COLUMNS = [

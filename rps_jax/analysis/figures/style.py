@@ -68,9 +68,9 @@ def success_rates(
     rate = 100 * won / np.maximum(of, 1)
     ends = 100 * np.array([statistics.wilson(int(n), int(m)) for n, m in zip(won, of, strict=True)])
     errors = np.abs(np.stack([rate - ends[:, 0], ends[:, 1] - rate]))
-    moved = transforms.ScaledTranslation(
-        2.5 * beside / 72, 0, ax.get_figure(root=True).dpi_scale_trans
-    )
+    sheet = ax.get_figure(root=True)
+    assert sheet is not None
+    moved = transforms.ScaledTranslation(2.5 * beside / 72, 0, sheet.dpi_scale_trans)
     mark = "osD^v"[beside % 5]
     bars = ax.errorbar(x, rate, errors, capsize=2, marker=mark, ms=4, lw=1.2, **style)
     for drawn in bars.get_children():
