@@ -1,0 +1,92 @@
+"""Traced programs that are kept between processes: used again, verified, dropped, bounded."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rps_jax.engines import programs
+
+
+@pytest.fixture
+def cache(tmp_path):
+    """A cache of its own, and the number of tracings so far."""
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    yield tmp_path / "traced"
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+@pytest.fixture
+def made():
+    """Compile x + a y, of n numbers, and tell how often that was traced."""
+    traced = []
+
+    def make(n=3, factor=2.0, static=None):
+        def function(x, y):
+            traced.append(n)
+            return {"sum": x + factor * y}
+
+        shape = jax.ShapeDtypeStruct((n,), jnp.float32)
+        known = [factor] if static is None else [static]
+        program = programs.compiled(function, (shape, shape), {"sum": 0}, donate=0, static=known)
+        return np.asarray(program(jnp.ones(n), jnp.ones(n))["sum"]).tolist()
+
+    return make, traced
+
+
+def test_a_program_is_traced_once_for_all_processes(cache, made):
+    make, traced = made
+    assert make() == make() == [3.0] * 3
+    assert len(traced) == 1
+    assert make(factor=3.0) == [4.0] * 3
+    assert make(n=2) == [3.0] * 2
+    assert len(traced) == 3
+    assert len(list(cache.iterdir())) == 3
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "of another program"])
+def test_a_damaged_program_is_dropped_with_one_line(damage, cache, made):
+    make, traced = made
+    make()
+    (kept,) = cache.iterdir()
+    content = kept.read_bytes()
+    if damage == "of another program":
+        make(n=2)
+        content = next(one for one in cache.iterdir() if one != kept).read_bytes()
+    elif damage == "flipped":
+        content = content[:-1] + bytes([content[-1] ^ 1])
+    else:
+        content = content[: 100 * (damage == "cut")]
+    kept.write_bytes(content)
+    count = len(traced)
+    with pytest.warns(UserWarning, match="is dropped, and traced again: it") as told:
+        assert make() == [3.0] * 3
+    assert len(told) == 1
+    assert len(traced) == count + 1
+    assert make() == [3.0] * 3  # what was traced again is kept again
+    assert len(traced) == count + 1
+
+
+def test_what_says_not_all_that_a_program_depends_on_keeps_none(cache, made):
+    make, traced = made
+    for static in (object(), np.arange(5000)):
+        make(static=static)
+        make(static=static)
+    assert len(traced) == 4
+    assert not cache.exists()
+
+
+def test_programs_that_were_not_used_for_longest_go_first(cache, made, monkeypatch):
+    make, traced = made
+    make(n=1)
+    size = next(cache.iterdir()).stat().st_size
+    monkeypatch.setattr(programs, "MOST", int(2.5 * size))
+    for n in (2, 3, 4):
+        make(n=n)
+    assert len(list(cache.iterdir())) == 2
+    count = len(traced)
+    make(n=4)
+    assert len(traced) == count
+    make(n=1)
+    assert len(traced) == count + 1
