@@ -70,8 +70,8 @@ def texts() -> dict[str, str]:
     """Pages of the repository by the place that they have in the site."""
     paths = [
         *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")),
-        *(ROOT / name for name in ("rps_jax/README.md", "mjcf/README.md", "sweeps/README.md")),
-        *ROOT.glob("sweeps/*/README.md"),
+        *(ROOT / name for name in ("rps_jax/README.md", "mjcf/README.md")),
+        *ROOT.glob("sweeps/**/README.md"),
         *ROOT.glob("notebooks/**/README.md"),
         *ROOT.glob("docs/*.md"),
     ]

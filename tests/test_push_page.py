@@ -131,3 +131,17 @@ def test_an_object_is_borne_as_in_the_package(corners):
         com, arm = jax.vmap(MAKE["borne"])(outlines)
     np.testing.assert_allclose(com, wanted.p_object_com, atol=1e-12)
     np.testing.assert_allclose(arm, wanted.arm, atol=1e-9)
+
+
+def test_the_recorded_push_stands_on_the_floor_and_is_seen_from_any_side(browser):
+    """It ends at its target, upright; a drag turns the eye, and other pixels are drawn."""
+    ends = "const q = RECORDED.qpos.at(-1); return [q[3], q[4], q[5], q[7], q[8]]"
+    x, y, z, *tilt = browser.execute_script(ends)
+    assert np.hypot(x + 2, y) < 0.2  # the contact is at the target, the middle beside it
+    assert abs(z - 0.4) < 2e-3
+    np.testing.assert_allclose(tilt, 0, atol=2e-3)
+    look = """
+    eye.playing = false; eye.at = 100; eye.turn = arguments[0]; drawRecorded();
+    return by("view").toDataURL();
+    """
+    assert browser.execute_script(look, 0.5) != browser.execute_script(look, 1.5)

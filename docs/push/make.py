@@ -1,12 +1,14 @@
-"""Write the page on which one pushes oneself: python docs/push/make.py [FILE.html].
+"""Write the page on which one pushes oneself: python docs/push/make.py [FILE.html] [--record].
 
 Law, skin, rules of a trial and the quasi-static engine are traced here from the package's own
 functions, and printed as JavaScript by the emitter of `rps export js`. Written by hand are the
 order of the three calls of a control step, the outlines that one may choose, and what is seen.
+Beside it stands a push in C MuJoCo, to be looked at from all sides; `--record` records it anew.
 """
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,13 +27,16 @@ from rps_jax.control.observation import TaxelObservation, Twist
 from rps_jax.engines import quasistatic
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import NONE
+from rps_jax.runs.push import push
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
+from rps_jax.world import scene
 from rps_jax.world.scene import FRICTION
 
 HERE = Path(__file__).parent
+RECORDED = HERE / "recorded.json"
 LAWS = {
     "rps": "RPS, the paper's",
     "rps_tuned": "RPS, tuned by evolution",
@@ -226,9 +231,25 @@ def scripts() -> str:
         "TAXELS": taxels,
         "FRICTION": {name: list(one) for name, one in FRICTION.items()},
         "GAP": Case().gap,
+        "RECORDED": json.loads(RECORDED.read_text("utf-8")),
     }
     told = [f"const {name} = {js.text(value)};" for name, value in numbers.items()]
     return "\n".join([*told, js.HELPERS, js.weights(tables), *functions])
+
+
+def recorded(every: int = 3) -> dict[str, Any]:
+    """The paper's push to (-2, 0) in C MuJoCo: places of base and object, and their sizes [m]."""
+    trace = push("box", target=(-2.0, 0.0)).data
+    model = scene.load("box").model
+    boxes = {
+        name: {"half": model.geom_size[i].tolist(), "at": model.geom_pos[i].tolist()}
+        for name in ("base", "object")
+        for i in [model.geom(name).id]
+    }
+    qpos = np.round(trace.qpos.values[::every].astype(float), 3)
+    period = float(trace.time[every] - trace.time[0])
+    target = trace.p_world_target.values.tolist()
+    return {"period": round(period, 4), "target": target, "boxes": boxes, "qpos": qpos.tolist()}
 
 
 def page() -> str:
@@ -237,6 +258,9 @@ def page() -> str:
 
 
 if __name__ == "__main__":
-    path = Path(sys.argv[1] if len(sys.argv) > 1 else "push.html")
+    words = [word for word in sys.argv[1:] if word != "--record"]
+    if "--record" in sys.argv:
+        RECORDED.write_text(json.dumps(recorded(), separators=(",", ":")) + "\n", "utf-8")
+    path = Path(words[0] if words else "push.html")
     path.write_text(page(), "utf-8")
     sys.stdout.write(f"{path}: {path.stat().st_size / 1e6:.2f} MB\n")
