@@ -44,7 +44,10 @@ TABS: dict[str, list[Any]] = {
         *("docs/on_a_robot.md", "robots", "limits", "export"),
         "notebooks/examples/ros2/rps_push/README.md",
     ],
-    "Physics": ["mjcf/README.md", "ground", "real_pushes", "fit", "engines", "fidelity"],
+    "Physics": [
+        *("mjcf/README.md", "ground", "real_pushes", "notebooks/06_fitting.md", "fit"),
+        *("engines", "fidelity"),
+    ],
     "Studies": ["sweeps/README.md"],
     "Make it yours": ["rps_jax/README.md", "rps_jax/adding.md", "CONTRIBUTING.md"],
 }
