@@ -195,6 +195,7 @@ def test_a_command_is_the_call_of_its_question(tmp_path):
 def test_a_run_that_is_stopped_says_so_in_one_line(tmp_path):
     """At any moment: here while programs are compiled, in threads that know nothing of it."""
     command = [sys.executable, "-m", "rps_jax", "sweep", "--worlds", "64", *map(str, BRIEF)]
+    command += ["--domain", "wide,objects=random_cylinder"]
     process = subprocess.Popen(
         [*command, "--out", tmp_path / "run"], stderr=subprocess.PIPE, stdout=subprocess.PIPE
     )

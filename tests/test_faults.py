@@ -5,7 +5,7 @@ import pytest
 
 from rps_jax.analysis.report import Picture
 
-SHARE = {"values": 120, "laws": 1000, "edits": 12, "damages": 12}
+SHARE = {"values": 60, "laws": 1000, "edits": 6, "damages": 12}
 
 
 @pytest.fixture

@@ -65,18 +65,18 @@ def test_what_is_kept_has_figures_and_no_error_and_names_no_machine(name):
     assert not any("execution" in cell.metadata for cell in kept(name).cells)
 
 
-@pytest.fixture(scope="module")
-def executed(request):
-    """All of them executed anew, with the compiled programs of other tests."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JAX_COMPILATION_CACHE_DIR", str(request.config.rootpath / ".jax_cache"))
-        patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
-        return dict(zip(TEXTS, RUNNER["execute"](list(TEXTS.values())), strict=True))
+# A push, a tuner and a fit for minutes: what they call, other tests call.
+LONG = ("02", "05", "06")
+ANEW = [pytest.param(n, marks=[pytest.mark.slow] if n[:2] in LONG else []) for n in TEXTS]
 
 
-@every_notebook
-def test_it_runs_and_where_it_only_reads_says_what_is_kept(name, executed):
-    again, before = executed[name], kept(name)
+@pytest.mark.parametrize("name", ANEW)
+def test_it_runs_and_where_it_only_reads_says_what_is_kept(name, pytestconfig, monkeypatch):
+    """Executed anew, with the compiled programs of other tests."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(pytestconfig.rootpath / ".jax_cache"))
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+    (again,) = RUNNER["execute"]([TEXTS[name]])
+    before = kept(name)
     assert [kind for _, kind, _ in outputs(again)] == [kind for _, kind, _ in outputs(before)]
     if name[:2] in ("03", "04"):
         assert told(again) == told(before)
