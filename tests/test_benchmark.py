@@ -92,6 +92,7 @@ def test_every_measurement_is_of_an_engine_or_of_c():
     assert not speeds.can("warp standard", "prism")  # whose worlds share a mesh's corners
 
 
+@pytest.mark.slow
 def test_levers_are_timed_beside_the_program_as_it_is(monkeypatch):
     some = ("no physics: law, skin, rules", "four times the worlds", "state not donated")
     every = levers.levers_of("quasistatic", "cylinder")

@@ -104,6 +104,7 @@ def test_perturbations_belong_to_world_and_round_and_fill_one_window():
     assert (other != alone).any()
 
 
+@pytest.mark.slow
 def test_a_search_goes_on_where_it_was_stopped_and_its_plans_win(tmp_path):
     asked = SIZES | {"sample": 6, "setting": SHORT, "slots": 12, "out": tmp_path / "run"}
     whole = rps_jax.ceiling(CYLINDERS, **asked)

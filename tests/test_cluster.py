@@ -148,6 +148,7 @@ def opened(folder):
     return sweep.open_run(folder, OF_NEAR), OF_NEAR
 
 
+@pytest.mark.slow
 def test_a_worker_killed_at_work_changes_nothing(domain, tmp_path, two_workers, monkeypatch):
     """SIGKILL after some of its trials; the parts are those of one process without Ray."""
     out, plan = opened(tmp_path / "run")

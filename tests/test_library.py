@@ -141,7 +141,18 @@ def test_every_public_function_has_an_example():
     assert [name for name in functions if not examples(name)] == []
 
 
-@pytest.mark.parametrize("name", [name for name in PUBLIC if examples(name)])
+# Questions whose small runs take longest, which tests of their own ask, too.
+LONG = {"models", "hardware", "learn", "ladder", "regress", "ceiling", "score", "attack", "replay"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] if name in LONG else [])
+        for name in PUBLIC
+        if examples(name)
+    ],
+)
 def test_the_examples_of_docstrings_run(name, tmp_path, monkeypatch, registries):
     monkeypatch.chdir(tmp_path)
     told = []
