@@ -118,6 +118,8 @@ def test_points_that_are_none_are_refused(tmp_path, capsys):
         (u + 1, r"u\[0, 0\] = 1\.1.* \(object\) is not allowed: it must be at least 0 and below 1"),
         (np.where(u == u[1, 3], np.nan, u), r"u\[1, 3\] = nan"),
         (rps_jax.worlds_at("hostile", u), "of another domain"),
+        (rps_jax.worlds_at("wide", u).assign_attrs(domain="no JSON"), "of another domain"),
+        (rps_jax.worlds_at("wide", u).assign_attrs(domain="[3]"), "of another domain"),
         (xr.Dataset(), "has no u"),
         ([["a"]], "give an array"),
     ):

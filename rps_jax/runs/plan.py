@@ -196,9 +196,10 @@ def load_plan(folder: Path) -> Plan:
       InputError: it holds none, or a corrupt one, or one of another version of this code.
     """
     found = run_folder.manifest(folder)
-    made = provenance.version(folder)
     if "arms" in found or "strategies" in found:  # as 0.2.0 called them
-        raise InputError(f"run = {folder} was made by {made}: use that version.")
+        raise InputError(
+            f"run = {folder} was made by {provenance.version(folder)}: use that version."
+        )
     if "laws" not in found:
         raise InputError(f"run = {folder} is not of a sweep: give the folder of `rps sweep`.")
     try:
@@ -217,7 +218,7 @@ def load_plan(folder: Path) -> Plan:
     if (now := json.loads(json.dumps(plan.configuration()))) != found:
         raise InputError(
             f"run = {folder} was made by another version ({run_folder.difference(found, now)}), "
-            f"{made}: use that one."
+            f"{provenance.version(folder)}: use that one."
         )
     return plan
 

@@ -185,8 +185,7 @@ def checked(domain: Domain, u: Any) -> Points:
         if "u" not in u or "quantity" not in u.coords:
             raise InputError("points are not allowed: the dataset has no u (world, quantity).")
         theirs = tuple(map(str, u.quantity.values))
-        told = from_json(json.loads(u.attrs.get("domain", _told(domain))))
-        if theirs != every or told != domain:
+        if theirs != every or ("domain" in u.attrs and not _tells(u.attrs["domain"], domain)):
             raise InputError(
                 "points are not allowed: they are of another domain; give that domain."
             )
@@ -333,6 +332,14 @@ def _labelled(domain: Domain, u: np.ndarray) -> xr.Dataset:
     return xr.Dataset(
         {"u": (("world", "quantity"), u, text)}, coordinates, {"domain": _told(domain)}
     )
+
+
+def _tells(text: Any, domain: Domain) -> bool:
+    """Whether a text is of this domain, maybe written before some quantity could be drawn."""
+    try:
+        return from_json(json.loads(text)) == domain
+    except (TypeError, ValueError, AttributeError, RecursionError):
+        return False
 
 
 def _told(domain: Domain) -> str:
