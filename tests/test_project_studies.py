@@ -124,7 +124,11 @@ def test_a_published_command_names_no_place_of_a_machine(tmp_path):
         "time": "2026-01-01T00:00:00",
     }
     path = publish(tmp_path / "results" / "x.json", [made], "", [{"name": "what"}], [])
-    assert json.loads(path.read_text())["command"] == ["rps sweep --worlds 3"]
+    told = json.loads(path.read_text())
+    assert told["command"] == ["rps sweep --worlds 3"]
+    assert told["digest"] == digest([["rps", "sweep", "--worlds", "3"]])
+    script = [made | {"command": ["python", "mine.py"]}]  # has none, and is published
+    assert "digest" not in json.loads(publish(path, script, "", [{"name": "what"}], []).read_text())
     for path in SWEEPS.rglob("results/*.json"):
         assert "--out /" not in path.read_text(), path
 
