@@ -23,7 +23,7 @@ from rps_jax.runs.plan import Plan
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
-from rps_jax.world import objects
+from rps_jax.world import domain, objects
 from rps_jax.world.domain import DOMAINS, Range
 from rps_jax.world.physics import preset
 
@@ -59,6 +59,16 @@ def one_sentence(error: str) -> str:
 FAST = preset(fidelity="fast")
 # The fused engine, which compiles soonest of those that solve for contact.
 SHORT = Setting("fused", FAST, rules=Rules(horizon=20.0))
+# Targets ahead, so near that a push of a few seconds arrives; a perfect base.
+NEAR = replace(
+    DOMAINS["wide"],
+    distance=Range(0.7, 0.72),
+    bearing=Range(-0.1, 0.1),
+    lateral=Range(-0.03, 0.03),
+    com_offset=Range(0, 0),
+    gap=Range(0.02, 0.02),
+    **{name: Range(0, 0) for name in domain.of("base")},
+)
 SLOTS = 8  # of all sweeps of this setting, so that they share their programs
 BOXES = replace(
     DOMAINS["wide"],

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import FAST, NEAR
 
 from rps_jax.control.base import Law
 from rps_jax.control.laws.rps import RPSParams
@@ -17,21 +18,9 @@ from rps_jax.trials.env import PushEnv, Reward
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.trials.worlds import drawn_worlds
-from rps_jax.world import domain, draws
-from rps_jax.world.domain import DOMAINS, Range
-from rps_jax.world.physics import preset
+from rps_jax.world import draws
+from rps_jax.world.domain import DOMAINS
 
-FAST = preset(fidelity="fast")
-# Targets ahead, so near that a push of a few seconds arrives; a perfect base.
-NEAR = replace(
-    DOMAINS["wide"],
-    distance=Range(0.7, 0.72),
-    bearing=Range(-0.1, 0.1),
-    lateral=Range(-0.03, 0.03),
-    com_offset=Range(0, 0),
-    gap=Range(0.02, 0.02),
-    **{name: Range(0, 0) for name in domain.of("base")},
-)
 COUNT, STEPS = 4, 50
 AHEAD, BACK = jnp.array([1.0, 0.0, 0.0]), jnp.array([-1.0, 0.0, 0.0])
 PERIOD = FAST.control_period

@@ -2,7 +2,6 @@
 
 import importlib
 import sys
-from dataclasses import replace
 
 import gymnasium
 import jax
@@ -10,24 +9,13 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
+from helpers import NEAR
 
 from rps_jax.errors import InputError
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import gym
-from rps_jax.world import domain
-from rps_jax.world.domain import DOMAINS, Range
 
-# Targets ahead and so near that driving ahead for some seconds arrives; a perfect base.
-NEAR = replace(
-    DOMAINS["wide"],
-    distance=Range(0.7, 0.72),
-    bearing=Range(-0.1, 0.1),
-    lateral=Range(-0.03, 0.03),
-    com_offset=Range(0, 0),
-    gap=Range(0.02, 0.02),
-    **{name: Range(0, 0) for name in domain.of("base")},
-)
 HOW = {"object": "random_cylinder", "domain": NEAR, "worlds": 6, "hold": 1.0}
 HOW |= {"setting": Setting("fused", fidelity="fast", rules=Rules(horizon=20.0))}
 COUNT = 4
