@@ -57,15 +57,16 @@ class OfPlan(InDomain[xr.Dataset], OfLaws[xr.Dataset]):
     worlds: int | None = option(None, 1, 1_000_000_000)
     """Number of worlds, of indices 0, 1, ...; by default 1000, or the whole grid of a domain with
     listed targets."""
-    part: int = option(1024, 1, 1_000_000, kw_only=True)
-    """Number of trials in a part: what is lost of each law and object when killed, at most."""
+    part: int | None = option(None, 1, 1_000_000, kw_only=True)
+    """Number of trials in a part: what is lost of each law and object when killed, at most; by
+    default 1024, and of many worlds a 64th, up to 16384."""
 
     @functools.cached_property
     def plan(self) -> Plan:
         """What is run."""
         usual = self.ranges.combinations if self.ranges.targets else 1000
         count = usual if self.worlds is None else self.worlds
-        return Plan(self.ranges, count, self.chosen, self.setting, self.part)
+        return Plan(self.ranges, count, self.chosen, self.setting, self.part or _part_of(count))
 
     def check(self) -> None:
         """Check the plan, and that the engine can step its worlds here."""
@@ -94,6 +95,11 @@ class OfPlan(InDomain[xr.Dataset], OfLaws[xr.Dataset]):
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
         """Rates, differences, what success depends on, and the hardest worlds."""
         return report_of(self.plan, found, run.folder)
+
+
+def _part_of(worlds: int) -> int:
+    """How many trials a part has: a file costs more than the trials in it."""
+    return min(max(worlds // 64, 1024), 16384)
 
 
 def intro_of(plan: Plan) -> str:
@@ -194,7 +200,8 @@ class Sweep(OfPlan):
         if isinstance(given, str | Path):
             given = files.read(Path(given))
         at = points.checked(self.ranges, given)
-        return Plan(self.ranges, len(at.u), self.chosen, self.setting, self.part, at)
+        part = self.part or _part_of(len(at.u))
+        return Plan(self.ranges, len(at.u), self.chosen, self.setting, part, at)
 
     @property
     def share(self) -> Shard:
