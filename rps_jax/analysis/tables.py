@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
@@ -257,30 +257,4 @@ def influence_table(results: xr.Dataset, law: str) -> list[list[str]]:
             for cell in (told[n], share(int(found.won[n]), int(found.of[n])))
         ]
         rows.append([WORDS[name], *ends, f"{q[i]:.2g}"])
-    return rows
-
-
-def agreement_table(found: Mapping[str, xr.Dataset]) -> list[list[str]]:
-    """Header and one row for each engine: success, and outcomes equal to the first's, by object.
-
-    The results are those of one law in the same worlds.
-    """
-    base = next(iter(found.values()))
-    groups = statistics.worlds_by_object(base)
-    rows = [["engine", *groups, "equal outcomes", "95 %", *(f"equal, {g}" for g in groups), "+/-"]]
-    for name, one in found.items():
-        won = one.success.values > 0
-        same = won == (base.success.values > 0)
-        c = statistics.compare(base.success, one.success)
-        low, high = c.equal_interval
-        rows.append(
-            [
-                name,
-                *(f"{won[mask].sum()} of {mask.sum()}" for mask in groups.values()),
-                f"{100 * c.equal:.1f} %",
-                f"{100 * low:.0f}-{100 * high:.0f} %",
-                *(f"{same[mask].sum()} of {mask.sum()}" for mask in groups.values()),
-                f"+{c.gained} -{c.lost}",
-            ]
-        )
     return rows
