@@ -192,7 +192,7 @@ def test_a_search_finds_many_times_the_failing_cells_of_drawn_worlds(made, algor
     gain = attack.yields(found)
     assert gain["times"] > (1 if algorithm in ("cma_me", "line") else 4)
     assert (np.diff(found.severity) <= 0).all()
-    worlds = rps_jax.worlds_at("wide", found.u)
+    worlds = points.worlds_at("wide", found.u)
     some = found.isel(elite=0)
     cell = found.margin.isel(object=int(some.which_object)).sel(
         {axis: float(worlds[axis][0]) for axis in ("com_offset", "friction_robot")},

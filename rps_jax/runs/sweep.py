@@ -169,7 +169,7 @@ class Sweep(OfPlan):
     laws: LawsLike = ("rps", "nps", "aps")
     points: str | Path | xr.Dataset | np.ndarray | None = field(default=None, kw_only=True)
     """Points of the domain's unit cube at which the worlds lie, instead of drawn ones: what
-    rps_jax.worlds_at returned, or a NetCDF file of it, as points.nc of a run folder."""
+    world.points.worlds_at returned, or a NetCDF file of it, as points.nc of a run folder."""
     models: bool = field(default=False, kw_only=True)
     """Whether to run the same worlds on other grounds, cones and steps and in the quasi-static
     model, too, and to report how much the rates hang on these."""
