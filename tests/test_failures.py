@@ -21,6 +21,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import points
 from rps_jax.world.domain import DOMAINS, Range
+from sweeps.failures import picked
 
 RULES = Rules(horizon=10.0, max_lost=5.0)
 BRIEF = Setting("quasistatic", rules=RULES)
@@ -80,11 +81,16 @@ def beyond(p, kinds):
     return score, ["range"] * kinds + ["noise"] * 2
 
 
+def split(score, kinds, how, seed=0):
+    """One subset simulation."""
+    (found,) = rare.together(score, [rare.steps(kinds, how, seed)])
+    return found
+
+
 def test_splitting_is_unbiased_and_its_interval_covers():
     score, kinds = beyond(0.01, 12)
     found = [
-        rare.split(score, kinds, Rare(particles=1000, groups=10), seed).estimate
-        for seed in range(60)
+        split(score, kinds, Rare(particles=1000, groups=10), seed).estimate for seed in range(60)
     ]
     p = np.array([one.p for one in found])
     assert abs(p.mean() / 0.01 - 1) < 3 * p.std() / p.mean() / np.sqrt(60)
@@ -102,7 +108,7 @@ def test_several_splittings_side_by_side_are_what_each_is_alone():
         return score(u)
 
     found = rare.together(counted, [rare.steps(kinds, sizes, seed) for seed in seeds])
-    alone = [rare.split(score, kinds, sizes, seed) for seed in seeds]
+    alone = [split(score, kinds, sizes, seed) for seed in seeds]
     assert [one.estimate for one in found] == [one.estimate for one in alone]
     assert asked[:2] == [600, 300]
     assert len(asked) == max(len(one.levels) for one in alone)
@@ -111,8 +117,7 @@ def test_several_splittings_side_by_side_are_what_each_is_alone():
 def test_one_in_a_hundred_thousand_takes_a_twentieth_of_the_worlds():
     score, kinds = beyond(1e-5, 18)
     found = [
-        rare.split(score, kinds, Rare(particles=18_000, groups=20), seed).estimate
-        for seed in range(8)
+        split(score, kinds, Rare(particles=18_000, groups=20), seed).estimate for seed in range(8)
     ]
     p, trials = np.array([(one.p, one.trials) for one in found]).T
     assert p.std(ddof=1) / 1e-5 <= 0.2
@@ -121,11 +126,9 @@ def test_one_in_a_hundred_thousand_takes_a_twentieth_of_the_worlds():
 
 
 def test_splitting_says_nothing_where_nothing_fails_or_everything():
-    never = rare.split(
-        lambda u: 0.5 * u[:, 0], ["range"] * 3, Rare(particles=200, groups=4, levels=3)
-    )
+    never = split(lambda u: 0.5 * u[:, 0], ["range"] * 3, Rare(particles=200, groups=4, levels=3))
     assert (never.estimate.p, never.estimate.low, never.estimate.high) == (0, 0, 1)
-    always = rare.split(lambda u: 1 + u[:, 0], ["range"] * 3, Rare(particles=200, groups=4))
+    always = split(lambda u: 1 + u[:, 0], ["range"] * 3, Rare(particles=200, groups=4))
     assert always.estimate.p == 1
     assert always.u.shape == (200, 3)
     found = xr.Dataset({k: ("repetition", [v]) for k, v in always.estimate._asdict().items()})
@@ -402,7 +405,7 @@ def test_the_worlds_of_the_set_are_far_from_each_other():
     u = points.points_of(domain, np.arange(100))
     twice = np.concatenate([u, u])
     bad = np.ones((2, 200))
-    taken = regress.chosen(domain, twice, bad, 100, np.array([7]))
+    taken = picked.chosen(domain, twice, bad, 100, np.array([7]))
     assert taken[0] == 7
     assert len(set(taken % 100)) == 100  # none of them twice
 

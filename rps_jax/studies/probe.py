@@ -5,10 +5,9 @@ from __future__ import annotations
 import importlib
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -36,11 +35,7 @@ _STILL = 0.002  # [rad] tilt that says nothing: half of all pushes tilt their ob
 
 
 def need(module: str, package: str) -> ModuleType:
-    """A module of the optional packages.
-
-    Raises:
-      InputError: it is not installed.
-    """
+    """A module of the optional packages, or an InputError."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
@@ -79,24 +74,9 @@ class Probe:
         batch.check_shape(self.slots, self.workers)
         self._heard = InTurn(self.report)
 
-    def configuration(self) -> dict[str, Any]:
-        """What the answers depend on, as JSON."""
-        return {
-            "domain": asdict(self.domain),
-            "law": registry.recorded(self.params),
-            "physics": asdict(self.setting.physics),
-            "rules": registry.as_json(self.setting.rules),
-            "engine": self.setting.engine,
-        }
-
     def __call__(self, u: np.ndarray) -> xr.Dataset:
-        """Outcomes and `severity` (world) at points `u` (n, q).
-
-        Raises:
-          InputError: the folder holds an answer for other points.
-        """
+        """Outcomes and `severity` (world) at points `u` (n, q)."""
         at, name = points.checked(self.domain, u), f"{self.calls:06d}"
-        found = None
         if self.folder is not None:
             found = Parts(self.folder).results(name, lambda: self._try(at))
             sizes = {"world": len(at.u)}

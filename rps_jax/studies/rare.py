@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import zip_longest
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -76,19 +77,6 @@ def joined(groups: np.ndarray, trials: int, least: float = 0.0) -> Estimate:
     variation = max(least, float(groups.std(ddof=1)) / p / np.sqrt(count))
     reach = variation * float(stats.t.ppf(0.975, count - 1))
     return Estimate(p, p * np.exp(-reach), min(1.0, p * np.exp(reach)), variation, trials)
-
-
-def split(score: Severity, kinds: Sequence[str], how: Rare, seed: int = 0) -> Found:
-    """The probability that `score` of a uniform point reaches a level.
-
-    Args:
-      score: of points (n, q), asked for one batch of all groups at a time.
-      kinds: (q,) of the coordinates; those of noise are drawn anew or kept, not moved.
-      how: sizes, and the level.
-      seed: of the points and moves.
-    """
-    (found,) = together(score, [steps(kinds, how, seed)])
-    return found
 
 
 def together(score: Severity, every: Sequence[Steps]) -> list[Found]:
@@ -274,13 +262,14 @@ class Rare(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
             "worlds with the same coefficient of variation. A kind of failure that no group has "
             "met is in no interval."
         )
-        against = drawn_of(found)
+        against = _estimate(found, "drawn_") if self.brute else None
         if against is not None and not against.p:
             text += " None of the drawn worlds fails."
         elif against is not None:
             off = 100 * (float(found.p.mean()) / against.p - 1)
+            held = count_of(((found.low <= against.p) & (against.p <= found.high)).values)
             text += (
-                f" {covered(found, against.p)} of {self.repetitions} intervals hold the rate of "
+                f" {held} of {self.repetitions} intervals hold the rate of "
                 f"the drawn worlds, and the mean of all is {off:+.1f} % off it."
             )
         picture = Picture("rare", partial(figure_of, found, against))
@@ -290,12 +279,10 @@ class Rare(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
 rare = call_of(Rare)
 
 
-def drawn_of(found: xr.Dataset) -> Estimate | None:
-    """The estimate from drawn worlds, if it was asked for."""
-    if "drawn_p" not in found:
-        return None
-    p, low, high, variation = (float(found[f"drawn_{name}"]) for name in Estimate._fields[:4])
-    return Estimate(p, low, high, variation, int(found.drawn_trials))
+def _estimate(found: xr.Dataset, prefix: str = "") -> Estimate:
+    """The estimate that labelled results hold."""
+    p, low, high, variation, trials = (float(found[prefix + name]) for name in Estimate._fields)
+    return Estimate(p, low, high, variation, int(trials))
 
 
 def _labelled(domain: Domain, every: Sequence[Found]) -> xr.Dataset:
@@ -303,15 +290,11 @@ def _labelled(domain: Domain, every: Sequence[Found]) -> xr.Dataset:
     columns: dict[str, Any] = {
         name: ("repetition", [getattr(one, name) for one in estimates]) for name in Estimate._fields
     }
-    deepest = max(len(found.levels) for found in every)
-    levels = np.full((len(every), deepest), np.nan)
-    for i, found in enumerate(every):
-        levels[i, : len(found.levels)] = found.levels
+    levels = np.array(list(zip_longest(*(found.levels for found in every), fillvalue=np.nan))).T
     columns["p_group"] = (("repetition", "group"), np.stack([found.groups for found in every]))
     columns["level"] = (("repetition", "depth"), levels)
-    u, severity = (np.concatenate([getattr(f, name) for f in every]) for name in ("u", "severity"))
-    columns["u"] = (("failure", "quantity"), u)
-    columns["severity"] = ("failure", severity)
+    columns["u"] = (("failure", "quantity"), np.concatenate([found.u for found in every]))
+    columns["severity"] = ("failure", np.concatenate([found.severity for found in every]))
     return xr.Dataset(columns, {"quantity": list(points.names(domain))})
 
 
@@ -340,21 +323,13 @@ def table(found: xr.Dataset, against: Estimate | None = None) -> list[list[str]]
         return [name, f"{one.p:.3g}", ends, f"{one.variation:.2f}", f"{one.trials:,}", said]
 
     for i in range(found.sizes["repetition"]):
-        one = found.isel(repetition=i)
-        p, low, high, variation = (float(one[name]) for name in Estimate._fields[:4])
-        each = Estimate(p, low, high, variation, int(one.trials))
-        rows.append(row(f"splitting, {i + 1}", each))
+        rows.append(row(f"splitting, {i + 1}", _estimate(found.isel(repetition=i))))
     if found.sizes["repetition"] > 1:
         whole = joined(found.p.values, int(found.trials.sum()))
         rows.append(row("splitting, all", whole))
     if against is not None:
         rows.append(row("drawn worlds", against))
     return rows
-
-
-def covered(found: xr.Dataset, p: float) -> int:
-    """In how many repetitions the interval holds `p`."""
-    return int(((found.low <= p) & (p <= found.high)).sum())
 
 
 def figure_of(found: xr.Dataset, against: Estimate | None) -> Figure:

@@ -15,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -29,11 +28,10 @@ from rps_jax.analysis.report import Picture, Section
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.options import option
-from rps_jax.runs import sweep as sweeps
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, count_of, name_of, seed_of
+from rps_jax.runs.sweep import Planned
 from rps_jax.studies.probe import need
-from rps_jax.trials.progress import Report
 from rps_jax.world import points
 from rps_jax.world.domain import WORDS, Domain
 
@@ -87,14 +85,7 @@ class Design:
 def design(domain: Domain, worlds: int, seed: int = 0, apart: bool = False) -> Design:
     """The greatest design of at most so many worlds.
 
-    Args:
-      domain: ranges of what differs between worlds.
-      worlds: at most.
-      seed: of the scrambling, of points of its own.
-      apart: whether each number of the noise and of a prism's corners is a factor of its own.
-
-    Raises:
-      InputError: so few worlds have no design.
+    If `apart`, each number of the noise and of a prism's corners is a factor of its own.
     """
     every = points.quantities(domain)
     groups = tuple(one.name if apart else _TOGETHER.get(one.kind, one.name) for one in every)
@@ -110,7 +101,7 @@ def design(domain: Domain, worlds: int, seed: int = 0, apart: bool = False) -> D
 
 
 @dataclass(frozen=True)
-class Sensitivity(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
+class Sensitivity(Planned, InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     """Share the blame for failures among all quantities that are drawn, by Sobol indices.
 
     The answer holds `first`, `total` and the half widths `first_reach`, `total_reach` of their
@@ -144,28 +135,11 @@ class Sensitivity(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         at = points.checked(self.ranges, self.design.u())
         return Plan(self.ranges, self.design.worlds, {"law": self.params}, self.setting, points=at)
 
-    def check(self) -> None:
-        """Check that there are worlds enough, the engine and SALib."""
-        self.check_engine([self.params])
-        _ = self.plan
-
-    def trials(self) -> int | None:
-        """How many trials there are."""
-        return self.plan.trials
-
-    def configuration(self) -> dict[str, Any]:
-        """All that the results depend on, as JSON."""
-        return self.plan.configuration()
-
-    def answered(self, report: Report) -> xr.Dataset:
+    def answer(self, run: Run) -> xr.Dataset:
         """Run the worlds that are missing, and analyse them."""
-        out = None if self.out is None else Path(self.out)
-        results = sweeps.whole(
-            self.plan, out, slots=self.slots, workers=self.workers, report=report
-        )
-        found = analysed(self.design, results)
-        if out is not None:
-            files.write_results(out / "sobol.nc", found)
+        found = analysed(self.design, super().answer(run))
+        if run.folder is not None:
+            files.write_results(run.folder / "sobol.nc", found)
         return found
 
     def intro(self, found: xr.Dataset) -> str:
@@ -329,13 +303,7 @@ _BINS = 4  # of each range of a map of interactions
 def indices_figure(
     found: xr.Dataset, order: Mapping[str, str], outputs: Mapping[str, str]
 ) -> Figure:
-    """Indices of first and total order with their intervals, the greatest on top.
-
-    Args:
-      found: what `sensitivity` returned.
-      order: factors in words, by name, the greatest first.
-      outputs: what is explained, in words.
-    """
+    """Indices of first and total order with their intervals, the greatest on top."""
     order = dict(list(order.items())[::-1])
     figure = Figure(figsize=(11, 1.4 + 0.24 * len(order)), layout="constrained")
     axes = figure.subplots(1, len(outputs), sharey=True)
@@ -365,14 +333,9 @@ def interactions(
     choices: Mapping[str, Sequence[str]],
     title: str,
 ) -> Figure:
-    """Failures over each pair of quantities, their ranges in equal parts.
+    """Failures (n,) at points `u` (n, k) over each pair of quantities, ranges in equal parts.
 
-    Args:
-      u: (n, k) coordinates of worlds in the unit cube.
-      failed: (n,) 0 or 1.
-      names: (k,) of the quantities, in words.
-      choices: what is chosen from, of those that are no ranges, by their names in words.
-      title: of the figure.
+    `choices` has what is chosen from, of those that are no ranges, by their names in words.
     """
     count = len(names)
     figure = Figure(figsize=(1.5 + 2 * (count - 1), 1.6 + 1.8 * (count - 1)), layout="constrained")
