@@ -47,9 +47,7 @@ _WORDS = {
     "key": "key of all noise",
     "com_bearing": "bearing of the centre of mass",
 }
-_ENOUGH = 30  # base points at which a trial fails, for indices that mean something
-_RESAMPLES = 1000
-_NOTHING = 0.05  # [1] a total index that is not worth a word
+ENOUGH = 30  # base points at which a trial fails, for indices that mean something
 
 
 @dataclass(frozen=True)
@@ -151,9 +149,9 @@ class Sensitivity(Planned, InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Indices, whether mass costs anything, and pairs of quantities."""
+        """Indices, and pairs of quantities."""
         order = ranked(found)
-        said_ = {one: in_words(one) for one in order}
+        said = {one: in_words(one) for one in order}
         drawn = [one for one in order if one in found.quantity.values][:5]
         failed = found.success.values == 0
         title = f"{self.label}, {name_of(self.domain)}: failures over pairs, {failed.size:,} worlds"
@@ -162,7 +160,7 @@ class Sensitivity(Planned, InDomain[xr.Dataset], OfLaw[xr.Dataset]):
             interactions,
             found.u.sel(quantity=drawn).values,
             failed,
-            [said_[one] for one in drawn],
+            [said[one] for one in drawn],
             {in_words("object"): kinds},
             title,
         )
@@ -171,11 +169,10 @@ class Sensitivity(Planned, InDomain[xr.Dataset], OfLaw[xr.Dataset]):
             "total one what goes with it and all its interactions; noise and the corners of "
             f"prisms are one quantity each. Intervals are bootstrapped, of 95 %. {reliable(found)}"
         )
-        indices = Picture("sobol", partial(indices_figure, found, said_, OUTPUTS))
+        indices = Picture("sobol", partial(indices_figure, found, said))
         maps = Picture("interactions", pairs)
         return [
             Section("Which quantity is to blame", text, table(found), indices),
-            Section("Does mass cost anything", said(found)),
             Section("Interactions of the first five", "", (), maps),
         ]
 
@@ -249,50 +246,9 @@ def failing(found: xr.Dataset) -> int:
 def reliable(found: xr.Dataset) -> str:
     """Whether there are failures enough, in a sentence."""
     told = f"Trials fail at {failing(found)} of {found.attrs['base']} base points"
-    if failing(found) < _ENOUGH:
+    if failing(found) < ENOUGH:
         return f"{told}, too few for indices of success to mean anything: run more worlds."
     return f"{told}."
-
-
-def cost(found: xr.Dataset, name: str) -> tuple[float, float, float]:
-    """Success in the upper third of a quantity's range less that in its lower third, with 95 %.
-
-    The interval resamples base points, since the worlds of one differ in one factor only.
-    """
-    at = found.u.sel(quantity=name).values
-    won = found.success.values
-    high, low = at >= 2 / 3, at < 1 / 3
-    blocks = np.arange(won.size) // (won.size // found.attrs["base"])
-    sums = np.stack(
-        [np.bincount(blocks, w, found.attrs["base"]) for w in (high * won, high, low * won, low)]
-    )
-    rng = np.random.default_rng(0)
-    drawn = rng.integers(0, sums.shape[1], (_RESAMPLES, sums.shape[1]))
-    a, b, c, d = sums[:, drawn].sum(axis=2)
-    spread = a / np.maximum(b, 1) - c / np.maximum(d, 1)
-    a, b, c, d = sums.sum(axis=1)
-    ends = np.quantile(spread, [0.025, 0.975])
-    return float(a / max(b, 1) - c / max(d, 1)), float(ends[0]), float(ends[1])
-
-
-def said(found: xr.Dataset, name: str = "mass") -> str:
-    """Whether a quantity costs success, in a sentence."""
-    if name not in found.factor.values:
-        return f"The domain draws no {name}."
-    difference, low, high = (100 * value for value in cost(found, name))
-    one = found.sel(output="success", factor=name)
-    numbers = (
-        f"between the lower and the upper third of its range success changes by {difference:+.1f} "
-        f"points [{low:+.1f}, {high:+.1f}], and its total index is {one.total:.2f} ± "
-        f"{one.total_reach:.2f}"
-    )
-    if high < 0:
-        return f"More {name} costs success: {numbers}."
-    if low > 0:
-        return f"More {name} helps: {numbers}."
-    if float(one.total - one.total_reach) > _NOTHING and failing(found) >= _ENOUGH:
-        return f"On average {name} costs nothing, but together with others it matters: {numbers}."
-    return f"No cost of {name} is seen in {found.sizes['world']:,} worlds: {numbers}."
 
 
 # --- figures -------------------------------------------------------------------------------
@@ -300,15 +256,13 @@ def said(found: xr.Dataset, name: str = "mass") -> str:
 _BINS = 4  # of each range of a map of interactions
 
 
-def indices_figure(
-    found: xr.Dataset, order: Mapping[str, str], outputs: Mapping[str, str]
-) -> Figure:
+def indices_figure(found: xr.Dataset, order: Mapping[str, str]) -> Figure:
     """Indices of first and total order with their intervals, the greatest on top."""
     order = dict(list(order.items())[::-1])
     figure = Figure(figsize=(11, 1.4 + 0.24 * len(order)), layout="constrained")
-    axes = figure.subplots(1, len(outputs), sharey=True)
+    axes = figure.subplots(1, len(OUTPUTS), sharey=True)
     place = np.arange(len(order))
-    for ax, (output, said) in zip(axes, outputs.items(), strict=True):
+    for ax, (output, said) in zip(axes, OUTPUTS.items(), strict=True):
         one = found.sel(output=output, factor=list(order))
         for which, shift, colour in (("total", 0.15, "C3"), ("first", -0.15, "C0")):
             ax.errorbar(
