@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -50,10 +50,7 @@ class Influence(NamedTuple):
 
 def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
     """Wilson score interval of a success rate, each end in [0, 1]; all of it without trials."""
-    if trials == 0:
-        return 0.0, 1.0
-    interval = stats.binomtest(successes, trials).proportion_ci(confidence, method="wilson")
-    return float(interval.low), float(interval.high)
+    return _interval(successes, trials, confidence, "wilson")
 
 
 def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -61,9 +58,15 @@ def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> tu
 
     Each end by itself is a bound of confidence (1 + `confidence`) / 2 (Clopper and Pearson, 1934).
     """
+    return _interval(successes, trials, confidence, "exact")
+
+
+def _interval(
+    successes: int, trials: int, confidence: float, method: Literal["wilson", "exact"]
+) -> tuple[float, float]:
     if trials == 0:
         return 0.0, 1.0
-    interval = stats.binomtest(successes, trials).proportion_ci(confidence, method="exact")
+    interval = stats.binomtest(successes, trials).proportion_ci(confidence, method=method)
     return float(interval.low), float(interval.high)
 
 
@@ -74,12 +77,6 @@ def fails_at_most(
 
     The best of N candidates on the same worlds looks better than it is. Its bound holds if those
     of all N hold, so each is asked for 1 - (1 - `confidence`) / N; this needs no independence.
-
-    Args:
-      failures: of the candidate, that was picked.
-      trials: worlds that it met.
-      picked_of: number N of the candidates among which it was picked on these worlds.
-      confidence: with which the bound holds.
     """
     least = 1 - (1 - confidence) / picked_of
     return clopper_pearson(failures, trials, 2 * least - 1)[1]
@@ -138,12 +135,9 @@ def cvar_interval(
 
 
 def missed(min_distance: ArrayLike, way: ArrayLike) -> np.ndarray:
-    """How far (...) [m] trials missed their targets.
+    """How far (...) [m] trials missed their targets, by `min_distance` of the contact point.
 
-    Args:
-      min_distance: (...) [m] least distance of the contact point to the target, infinite of a
-        trial that never touched its object.
-      way: (...) [m] what such a trial missed by: the target's distance from the start.
+    A trial whose distance is infinite never touched its object, and missed by the whole `way`.
     """
     near = np.asarray(min_distance, float)
     return np.where(np.isfinite(near), near, way)

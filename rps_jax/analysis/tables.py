@@ -103,7 +103,6 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
 
 
 def _cvar(left: np.ndarray) -> str:
-    """The mean over the worst worlds of the distance left, with its interval."""
     low, high = statistics.cvar_interval(left)
     ends = f"[{low:.2f}, {high:.2f}]" if np.isfinite(high) else "(too few worlds for an interval)"
     return f"{statistics.cvar(left):.2f} m {ends}"
@@ -167,16 +166,9 @@ def difference_table(results: xr.Dataset) -> list[list[str]]:
     for first, second in combinations(map(str, results.law.values), 2):
         a, b = results.success.sel(law=first), results.success.sel(law=second)
         c = statistics.compare(a, b)
-        share = 100 * (c.gained - c.lost) / a.size
-        rows.append(
-            [
-                f"{second} against {first}",
-                str(c.gained),
-                str(c.lost),
-                f"{share:+.2f} %",
-                f"{c.p:.2g}",
-            ]
-        )
+        share = f"{100 * (c.gained - c.lost) / a.size:+.2f} %"
+        counts = str(c.gained), str(c.lost)
+        rows.append([f"{second} against {first}", *counts, share, f"{c.p:.2g}"])
     return rows
 
 
@@ -251,10 +243,8 @@ def influence_table(results: xr.Dataset, law: str) -> list[list[str]]:
         name, found = list(binned.items())[i]
         order, unit = np.argsort(found.won / found.of, kind="stable"), results[name].attrs["units"]
         told = [f"{value:.3g} {unit}".removesuffix(" 1") for value in found.middle]
-        ends = [
-            cell
-            for n in (order[0], order[-1])
-            for cell in (told[n], share(int(found.won[n]), int(found.of[n])))
-        ]
+        ends = []
+        for n in (order[0], order[-1]):
+            ends += [told[n], share(int(found.won[n]), int(found.of[n]))]
         rows.append([WORDS[name], *ends, f"{q[i]:.2g}"])
     return rows
