@@ -187,13 +187,7 @@ def _followed(plan: Plan, law: str, worlds: np.ndarray, heard: InTurn) -> Mappin
 
 
 def figure_of(seen: Sequence[xr.Dataset], labels: Sequence[str], title: str) -> Figure:
-    """Draw a map of each trial: the ways of base and object, and the base at ten moments.
-
-    Args:
-      seen: trials over time, as of `Trace.data`, variables (time, ...).
-      labels: of their panels.
-      title: of the figure.
-    """
+    """Draw a map of each trial: the ways of base and object, and the base at ten moments."""
     columns = min(_COLUMNS, len(seen))
     rows = -(-len(seen) // columns)
     figure = Figure(figsize=(0.4 + 2.3 * columns, 0.9 + 2.4 * rows), layout="constrained")
