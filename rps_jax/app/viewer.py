@@ -30,7 +30,7 @@ from rps_jax.errors import InputError
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, scene_of, title_of, world_part
 from rps_jax.runs.push import Push as PushQuestion
-from rps_jax.runs.push import another_engine, chosen
+from rps_jax.runs.push import another_engine, chosen, sensed
 from rps_jax.runs.question import call_of
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case, label_of
@@ -91,10 +91,8 @@ class View(PushQuestion):
     @property
     def case(self) -> Case:
         """The options' push."""
-        return dataclasses.replace(self, law=self._own, run=None)._case()
-
-    def _case(self) -> Case:
-        return super().case
+        own = {one.name: getattr(self, one.name) for one in dataclasses.fields(Case)}
+        return Case(**own | sensed(self, self.setting) | {"law": self._own})
 
     def note(self) -> str:
         """Whether another engine than the run's is shown."""
@@ -105,11 +103,11 @@ class View(PushQuestion):
         super().check()
         engines.get(self.setting.engine).check_traced()
         if self.run is not None:
-            chosen(Path(self.run), self.world, self._label)
+            self._chosen()
 
-    @property
-    def _label(self) -> str | None:
-        return None if self.law is None else str(self.law)
+    def _chosen(self) -> tuple[Plan, str]:
+        """The plan and the law of a run that is shown."""
+        return chosen(Path(str(self.run)), self.world, None if self.law is None else str(self.law))
 
     def in_shell(self) -> None:
         """Serve the page until it is ended."""
@@ -118,7 +116,7 @@ class View(PushQuestion):
         asked = Asked(self.object, friction, law, self.target)
         first = partial(self.push_of, asked)
         if self.run is not None:
-            first = partial(_in_world, *chosen(Path(self.run), self.world, self._label), self.world)
+            first = partial(_in_world, *self._chosen(), self.world)
         page = open_page(self.host, self.port, asked, self.push_of)
         print(f"page: {page.url} (Ctrl-C ends it)", flush=True)
         try:

@@ -156,14 +156,8 @@ class Sensitivity(Planned, InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         failed = found.success.values == 0
         title = f"{self.label}, {name_of(self.domain)}: failures over pairs, {failed.size:,} worlds"
         kinds = [one.removeprefix("random_") for one in self.ranges.objects]
-        pairs = partial(
-            interactions,
-            found.u.sel(quantity=drawn).values,
-            failed,
-            [said[one] for one in drawn],
-            {in_words("object"): kinds},
-            title,
-        )
+        u, names = found.u.sel(quantity=drawn).values, [said[one] for one in drawn]
+        pairs = partial(interactions, u, failed, names, {in_words("object"): kinds}, title)
         text = (
             "The first index is the share of the variance that a quantity explains alone, the "
             "total one what goes with it and all its interactions; noise and the corners of "
@@ -198,9 +192,8 @@ def analysed(blocks: Design, results: xr.Dataset) -> xr.Dataset:
             blocks.problem(), values[name], calc_second_order=False, seed=blocks.seed + 1,
             num_resamples=200,
         )  # fmt: skip
-        for column, key in (("first", "S1"), ("total", "ST")):
+        for column, key in zip(columns, ("S1", "S1_conf", "ST", "ST_conf"), strict=True):
             columns[column][i] = told[key]
-            columns[f"{column}_reach"][i] = told[f"{key}_conf"]
     found: dict[str, Any] = {name: (("output", "factor"), v) for name, v in columns.items()}
     found["u"] = (("world", "quantity"), blocks.u())
     found |= {name: ("world", v) for name, v in values.items()}
