@@ -90,7 +90,7 @@ class Drawing:
             f"{_ROOT}/base/contact", studio.CONTACT_RADIUS, color=_rgb(studio.CONTACT_RGBA)
         )
         nowhere = np.zeros((1, 2, 3))
-        shape = {"shaft_radius": 0.016, "head_radius": 0.045, "head_length": 0.1}
+        shape: dict[str, Any] = {"shaft_radius": 0.016, "head_radius": 0.045, "head_length": 0.1}
         self._velocity = world.add_arrows(f"{_ROOT}/base/velocity", nowhere, _TWIST, **shape)
         line = partial(world.add_line_segments, points=nowhere)
         self._turn = line(f"{_ROOT}/base/turn", colors=_TWIST, thickness=0.022)

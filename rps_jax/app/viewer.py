@@ -92,7 +92,9 @@ class View(PushQuestion):
     def case(self) -> Case:
         """The options' push."""
         own = {one.name: getattr(self, one.name) for one in dataclasses.fields(Case)}
-        return Case(**own | sensed(self, self.setting) | {"law": self._own})
+        own |= sensed(self, self.setting)
+        own["law"] = self._own
+        return Case(**own)
 
     def note(self) -> str:
         """Whether another engine than the run's is shown."""
