@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import CYLINDERS, PAPER, refusal, rps
+from helpers import CYLINDERS, PAPER, ROOT, refusal, rps
 from scipy import stats
 
 import rps_jax
@@ -22,6 +22,7 @@ from rps_jax.trials.trial import Rules
 from rps_jax.world import points
 from rps_jax.world.domain import DOMAINS, Range
 from sweeps.failures import picked, study
+from sweeps.failures.drawn import of_drawn
 
 RULES = Rules(horizon=10.0, max_lost=5.0)
 BRIEF = Setting("quasistatic", rules=RULES)
@@ -142,13 +143,13 @@ def test_estimates_by_hand():
     assert one.high == 1  # a probability
     assert one.low == pytest.approx(2 * np.exp(-4.3027 * one.variation), rel=1e-4)
     assert rare.worlds_needed(1e-5, 0.2) == pytest.approx(2.5e6, rel=1e-4)
-    drawn = rare.brute(25, 1000)
+    drawn = of_drawn(25, 1000)
     assert (drawn.p, drawn.variation) == (0.025, pytest.approx((0.975 / 25) ** 0.5))
     assert drawn.low < 0.025 < drawn.high
 
 
 def test_the_command_compares_splitting_with_drawn_worlds(tmp_path, capsys):
-    asked = ["rare", "--law", "rps", "--engine", "quasistatic"]
+    asked = [ROOT / "sweeps" / "failures" / "drawn.py", "--law", "rps", "--engine", "quasistatic"]
     asked += ["--domain", "wide,objects=random_cylinder,distance=0.7:0.72,bearing=-0.3:0.3"]
     asked += ["--particles", 40, "--groups", 4, "--horizon", 20, "--brute", 30]
     asked += ["--slots", 8, "--workers", 1, "--out", tmp_path / "run"]

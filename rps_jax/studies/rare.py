@@ -15,7 +15,7 @@ failure that no group has met is in no interval.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import zip_longest
 from typing import Any, ClassVar, NamedTuple
@@ -25,16 +25,11 @@ import xarray as xr
 from scipy import stats
 
 from rps_jax import errors
-from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import Figure
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.record.options import option
-from rps_jax.runs import sweep as sweeps
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, count_of, name_of, seed_of
+from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, name_of, seed_of
 from rps_jax.studies.probe import Probe
-from rps_jax.trials.progress import phase
-from rps_jax.trials.score import severity_of
 from rps_jax.world import points
 from rps_jax.world.domain import Domain
 
@@ -204,8 +199,6 @@ class Rare(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     """Number of levels after which it gives up, and says 0 if nothing has failed."""
     repetitions: int = option(1, 1, 10_000)
     """How often all of it is done, side by side, each time with points of its own."""
-    brute: int = option(0, 0, 1_000_000_000)
-    """Number of drawn worlds that it is compared with."""
 
     def check(self) -> None:
         """Check that the groups are large enough, and the engine."""
@@ -214,38 +207,19 @@ class Rare(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         errors.check_count("seed", self.setting.seed, at_least=0, at_most=2**30)
         self.check_engine([self.params])
 
-    def configuration(self) -> dict[str, Any]:
-        """All that the answer depends on, but the drawn worlds beside it."""
-        found = super().configuration()
-        del found["brute"]
-        return found
-
     @property
     def level(self) -> float:
         """Severity from which on a trial is what is looked for."""
         return 1 + self.beyond
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Run the repetitions, and the drawn worlds they are compared with."""
+        """Run the repetitions."""
         domain, seed = self.ranges, self.setting.seed
         probe = Probe(domain, self.params, self.setting, run.folder, **run.shape)
         kinds = [one.kind for one in points.quantities(domain)]
         first = seed_of(seed, "tune") * 10_000
         every = [steps(kinds, self, first + i) for i in range(self.repetitions)]
-        found = _labelled(domain, together(lambda u: probe(u).severity.values, every))
-        return self._compared(found, run) if self.brute else found
-
-    def _compared(self, found: xr.Dataset, run: Run) -> xr.Dataset:
-        """The answer with the rate in drawn worlds, a sweep in the folder's `drawn`."""
-        seeded = replace(self.setting, seed=seed_of(self.setting.seed, "tune"))
-        plan = Plan(self.ranges, self.brute, {"law": self.params}, seeded, 4096)
-        phase(run.report, "drawn worlds")
-        folder = None if run.folder is None else run.folder / "drawn"
-        results = sweeps.whole(plan, folder, **run.shape)
-        failed = severity_of(results.sel(law="law"), self.setting.rules) >= self.level
-        told = brute(count_of(failed), failed.size)
-        values = {name: getattr(told, name) for name in Estimate._fields}
-        return found.assign({f"drawn_{name}": ((), value) for name, value in values.items()})
+        return _labelled(domain, together(lambda u: probe(u).severity.values, every))
 
     def intro(self, found: xr.Dataset) -> str:
         """What was asked."""
@@ -255,34 +229,17 @@ class Rare(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         return f"{self.label} in the domain {name_of(self.domain)}: {what}"
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """The estimates, beside drawn worlds if there are any."""
+        """The estimates."""
         text = (
-            "Intervals of 95 %: of the splitting from the spread of its groups, of drawn worlds by "
-            "Clopper and Pearson. The last column is the number of worlds over that of drawn "
-            "worlds with the same coefficient of variation. A kind of failure that no group has "
-            "met is in no interval."
+            "Intervals of 95 %, from the spread of the groups. The last column is the number of "
+            "worlds over that of drawn worlds with the same coefficient of variation. A kind of "
+            "failure that no group has met is in no interval."
         )
-        against = _estimate(found, "drawn_") if self.brute else None
-        if against is not None and not against.p:
-            text += " None of the drawn worlds fails."
-        elif against is not None:
-            off = 100 * (float(found.p.mean()) / against.p - 1)
-            held = count_of(((found.low <= against.p) & (against.p <= found.high)).values)
-            text += (
-                f" {held} of {self.repetitions} intervals hold the rate of "
-                f"the drawn worlds, and the mean of all is {off:+.1f} % off it."
-            )
-        picture = Picture("rare", partial(figure_of, found, against))
-        return [Section("How rare is a failure", text, table(found, against), picture)]
+        picture = Picture("rare", partial(figure_of, found))
+        return [Section("How rare is a failure", text, table(found), picture)]
 
 
 rare = call_of(Rare)
-
-
-def _estimate(found: xr.Dataset, prefix: str = "") -> Estimate:
-    """The estimate that labelled results hold."""
-    p, low, high, variation, trials = (float(found[prefix + name]) for name in Estimate._fields)
-    return Estimate(p, low, high, variation, int(trials))
 
 
 def _labelled(domain: Domain, every: Sequence[Found]) -> xr.Dataset:
@@ -298,51 +255,40 @@ def _labelled(domain: Domain, every: Sequence[Found]) -> xr.Dataset:
     return xr.Dataset(columns, {"quantity": list(points.names(domain))})
 
 
-def brute(failures: int, trials: int) -> Estimate:
-    """Estimate the probability from drawn worlds, with the interval of Clopper and Pearson."""
-    p = failures / trials
-    low, high = statistics.clopper_pearson(failures, trials)
-    variation = np.sqrt((1 - p) / (p * trials)) if failures else float("inf")
-    return Estimate(p, low, high, float(variation), trials)
-
-
 def worlds_needed(p: float, variation: float) -> float:
     """How many drawn worlds give the probability `p` with this coefficient of variation."""
     return (1 - p) / (p * variation**2) if p > 0 else float("inf")
 
 
-def table(found: xr.Dataset, against: Estimate | None = None) -> list[list[str]]:
-    """Header and a row for each repetition, all of them together, and drawn worlds beside them."""
+def table(found: xr.Dataset) -> list[list[str]]:
+    """Header and a row for each repetition, and one for all of them together."""
     rows = [["", "probability of failure", "95 %", "variation", "worlds", "share of drawn worlds"]]
-
-    def row(name: str, one: Estimate) -> list[str]:
-        known = one is not against and 0 < one.p < 1
-        share = one.trials / worlds_needed(one.p, one.variation) if known else float("nan")
-        ends = f"[{one.low:.2g}, {one.high:.2g}]"
-        said = f"{100 * share:.2g} %" if known else ""
-        return [name, f"{one.p:.3g}", ends, f"{one.variation:.2f}", f"{one.trials:,}", said]
-
     for i in range(found.sizes["repetition"]):
-        rows.append(row(f"splitting, {i + 1}", _estimate(found.isel(repetition=i))))
+        one = found.isel(repetition=i)
+        p, low, high, variation, trials = (float(one[name]) for name in Estimate._fields)
+        rows.append(row(f"splitting, {i + 1}", Estimate(p, low, high, variation, int(trials))))
     if found.sizes["repetition"] > 1:
-        whole = joined(found.p.values, int(found.trials.sum()))
-        rows.append(row("splitting, all", whole))
-    if against is not None:
-        rows.append(row("drawn worlds", against))
+        rows.append(row("splitting, all", joined(found.p.values, int(found.trials.sum()))))
     return rows
 
 
-def figure_of(found: xr.Dataset, against: Estimate | None) -> Figure:
-    """Estimates of every repetition with their intervals, and drawn worlds' behind them."""
+def row(name: str, one: Estimate) -> list[str]:
+    """An estimate, and its number of worlds over that of drawn ones."""
+    said = ""
+    if 0 < one.p < 1:
+        said = f"{100 * one.trials / worlds_needed(one.p, one.variation):.2g} %"
+    ends = f"[{one.low:.2g}, {one.high:.2g}]"
+    return [name, f"{one.p:.3g}", ends, f"{one.variation:.2f}", f"{one.trials:,}", said]
+
+
+def figure_of(found: xr.Dataset) -> Figure:
+    """Estimates of every repetition with their intervals."""
     figure = Figure(figsize=(6.5, 3.4), layout="constrained")
     ax = figure.subplots()
     place = np.arange(found.sizes["repetition"])
     p = found.p.values
     errors = np.abs(np.stack([p - found.low.values, found.high.values - p]))
     ax.errorbar(place + 1, p, errors, fmt="o", ms=4, capsize=2, color="C3", label="splitting")
-    if against is not None:
-        ax.axhspan(against.low, against.high, color="C0", alpha=0.2, lw=0)
-        ax.axhline(against.p, color="C0", label="drawn worlds")
     if (p > 0).all():
         ax.set_yscale("log")
     ax.set_xlabel("repetition")
