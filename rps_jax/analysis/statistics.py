@@ -70,15 +70,13 @@ def _interval(
     return float(interval.low), float(interval.high)
 
 
-def fails_at_most(
-    failures: int, trials: int, picked_of: int = 1, confidence: float = 0.95
-) -> float:
-    """Upper bound [1] of a failure rate, also of one that was the least of several.
+def fails_at_most(failures: int, trials: int, picked_of: int = 1) -> float:
+    """Upper bound (95 %) of a failure rate [1], also of one that was the least of several.
 
     The best of N candidates on the same worlds looks better than it is. Its bound holds if those
-    of all N hold, so each is asked for 1 - (1 - `confidence`) / N; this needs no independence.
+    of all N hold, so each is asked for 1 - 0.05 / N; this needs no independence.
     """
-    least = 1 - (1 - confidence) / picked_of
+    least = 1 - (1 - 0.95) / picked_of
     return clopper_pearson(failures, trials, 2 * least - 1)[1]
 
 
@@ -106,29 +104,27 @@ def drawn(results: xr.Dataset) -> list[str]:
     return [name for name in WORDS if name in results and differs(results[name].values)]
 
 
-def cvar(values: np.ndarray, tail: float = _TAIL) -> float:
-    """Mean of the worst, greatest `tail` of the values: their conditional value at risk."""
-    worst = max(1, round(tail * values.size))
+def cvar(values: np.ndarray) -> float:
+    """Mean of the worst, greatest 5 % of the values: their conditional value at risk."""
+    worst = max(1, round(_TAIL * values.size))
     return float(np.sort(values)[-worst:].mean())
 
 
-def cvar_interval(
-    values: np.ndarray, tail: float = _TAIL, confidence: float = 0.95
-) -> tuple[float, float]:
-    """Approximate interval of `cvar`, from the spread of the values beyond their quantile.
+def cvar_interval(values: np.ndarray) -> tuple[float, float]:
+    """Approximate interval (95 %) of `cvar`, from the spread of the values beyond their quantile.
 
     With q the quantile, the mean of q + max(x - q, 0) / tail has the variance of the CVaR (Trindade
     et al., 2007). The interval is even in the logarithm, and has a t-distribution with as many
     degrees of freedom as there are values in the tail, less one: for skewed values of which 10 and
     more are in the tail it covers in 87 to 95 % of samples (see its test).
     """
-    worst = max(1, round(tail * values.size))
+    worst = max(1, round(_TAIL * values.size))
     if worst < 2:
         return 0.0, float("inf")
-    mean, quantile = cvar(values, tail), np.partition(values, -worst)[-worst]
-    terms = quantile + np.maximum(values - quantile, 0) / tail
+    mean, quantile = cvar(values), np.partition(values, -worst)[-worst]
+    terms = quantile + np.maximum(values - quantile, 0) / _TAIL
     error = float(np.std(terms, ddof=1)) / np.sqrt(values.size)
-    error *= float(stats.t.ppf((1 + confidence) / 2, worst - 1))
+    error *= float(stats.t.ppf(0.975, worst - 1))
     if mean <= 0:
         return mean - error, mean + error
     return float(mean * np.exp(-error / mean)), float(mean * np.exp(error / mean))

@@ -190,12 +190,8 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
             f"{gain['search']:.2f} an hour. {found.attrs['drawn_trials']:,} trials of drawn worlds "
             f"found {found.attrs['drawn_failing']}: {gain['drawn']:.2f} an hour. "
         )
-        text += (
-            f"The search finds {gain['times']:.1f} times as many, at least "
-            f"{gain['times_low']:.1f} times (95 %)."
-            if found.attrs["drawn_failing"]
-            else f"The search finds at least {gain['times_low']:.1f} times as many (95 %)."
-        )
+        times = f"{gain['times']:.1f} times as many, " if found.attrs["drawn_failing"] else ""
+        text += f"The search finds {times}at least {gain['times_low']:.1f} times (95 %)."
         title = f"{self.label}, {name_of(self.domain)}: worst trial of each cell"
         rise = Picture("search", partial(search_figure, found, gain["drawn"]))
         maps = Picture("archive", partial(archive_figure, found, self.axes, title))

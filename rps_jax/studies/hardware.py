@@ -249,7 +249,7 @@ def shift_table(results: xr.Dataset) -> list[list[str]]:
     for i, size in enumerate(results["shift"].values):
         cells = []
         for one, every in zip(won[:, i], of[:, i], strict=True):
-            low, high = statistics.wilson(int(one), int(every)) if every else (0.0, 1.0)
+            low, high = statistics.wilson(int(one), int(every))
             cells.append(f"{one} of {every} ({100 * low:.0f}-{100 * high:.0f} %)")
         rows.append([f"{100 * float(size):g} cm", *cells])
     return rows

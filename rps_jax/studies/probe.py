@@ -12,7 +12,6 @@ from types import ModuleType
 import numpy as np
 import xarray as xr
 
-from rps_jax import engines
 from rps_jax.analysis import statistics
 from rps_jax.control import registry
 from rps_jax.control.base import Params
@@ -66,12 +65,7 @@ class Probe:
     _heard: InTurn = field(init=False)
 
     def __post_init__(self) -> None:
-        """Raises InputError unless the engine can step these worlds with this law."""
-        registry.checked(self.params)
-        engine = engines.get(self.setting.engine)
-        engine.check(self.domain.families)
-        engine.check_robot(self.domain.weakest)
-        batch.check_shape(self.slots, self.workers)
+        """Hear of the progress of all calls in turn."""
         self._heard = InTurn(self.report)
 
     def __call__(self, u: np.ndarray) -> xr.Dataset:
