@@ -17,7 +17,10 @@
 # In all figures $l$ is the place of the contact along the front of the base, positive to the left.
 
 # %%
-from rps_jax import RPSParams, figures
+import drawing
+
+from rps_jax import RPSParams
+from rps_jax.analysis import figures
 
 paper = RPSParams.paper()
 
@@ -48,7 +51,7 @@ figures.profile(paper)
 
 # %%
 sets = {"paper": paper, "tangent as printed": paper._replace(gamma_max=float("inf"))}
-figures.twist_field(sets, 2.0)
+drawing.twist_field(sets, 2.0)
 
 # %% [markdown]
 # The left column, from top to bottom:
@@ -78,7 +81,7 @@ figures.twist_field(sets, 2.0)
 
 # %%
 sets = {f"$l_{{mr}}$ = {l_mr} m": paper._replace(l_mr=l_mr) for l_mr in (0.05, 0.15, 0.24)}
-figures.hysteresis(sets, 0.012)
+drawing.hysteresis(sets, 0.012)
 
 # %% [markdown]
 # With one threshold (right) the state flickers while the ripple crosses it: five entries where

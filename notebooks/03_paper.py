@@ -15,10 +15,11 @@
 # two processors). Name another folder as `run` to read your own.
 
 # %%
+import drawing
 from IPython.display import Markdown
 
 import rps_jax
-from rps_jax import figures, tables
+from rps_jax.analysis import figures, tables
 
 run = "runs/table"
 results = rps_jax.load(run)
@@ -61,7 +62,7 @@ figures.min_distance(results)
 # ## How long a success takes
 
 # %%
-figures.time_to_success(results, "rps")
+drawing.time_to_success(results, "rps")
 
 # %% [markdown]
 # Straight ahead (dark), a metre takes 20 s: the base does its 0.05 m/s all the way. A target

@@ -20,10 +20,11 @@
 # another folder as `run` to read a sweep of your own.
 
 # %%
+import drawing
 from IPython.display import Markdown
 
 import rps_jax
-from rps_jax import figures, tables
+from rps_jax.analysis import figures, tables
 
 run = "runs/compare/wide"
 results = rps_jax.load(run)
@@ -45,7 +46,7 @@ Markdown(tables.markdown(tables.success_table(results, max_lost)))
 # ## How it fails
 
 # %%
-figures.failures(results, max_lost)
+drawing.failures(results, max_lost)
 
 # %% [markdown]
 # There are two ways to fail, and the lower row tells them apart. With the paper's parameters all

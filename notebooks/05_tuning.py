@@ -21,12 +21,18 @@
 import json
 from pathlib import Path
 
+import drawing
 import jax
 import xarray as xr
 from IPython.display import Markdown
 
 import rps_jax
-from rps_jax import Case, RPSParams, SmoothSkin, Space, figures, gradients, tables
+from rps_jax import RPSParams
+from rps_jax.analysis import figures, tables
+from rps_jax.robot.skin import SmoothSkin
+from rps_jax.trials.case import Case
+from rps_jax.tuning import gradients
+from rps_jax.tuning.space import Space
 
 
 def read_log(run):
@@ -105,14 +111,14 @@ kept = json.loads(Path("runs/robots/tuned.json").read_text())
 assert kept == {name: getattr(sets["tuned"], name) for name in kept}
 space = Space(names)
 places = {label: jax.nn.sigmoid(space.vector(params)) for label, params in sets.items()}
-figures.between_bounds(places, names)
+drawing.between_bounds(places, names)
 
 # %% [markdown]
 # $K_v$, $a_r^{max}$, $K_h$ and $l_{cr}$ moved most; $\beta$ and $\gamma_{max}$ hardly moved. What
 # this means is easier to see in the twist (compare `01_the_law`), here 1 m from the target:
 
 # %%
-figures.twist_field(sets, 1.0)
+drawing.twist_field(sets, 1.0)
 
 # %% [markdown]
 # The tuned law has all but given up Eq. 5, which acts only beyond $d_{th}$ = 1.53 m. Nearer to the
@@ -127,7 +133,7 @@ results = rps_jax.load("runs/compare/wide")
 Markdown(tables.markdown(tables.difference_table(results)))
 
 # %%
-figures.paired(results)
+drawing.paired(results)
 
 # %% [markdown]
 # The tuned law wins 71 worlds that the paper's parameters lose and loses 6 that they win, which is
@@ -160,7 +166,7 @@ found = {
     "evolution": gradients.evolution(distances, theta, starts, key, sigma=0.15, pairs=4),
 }
 bars = {name: (one.gradient.T, one.variance.T) for name, one in found.items()}
-figures.estimates(horizons, bars, names)
+drawing.estimates(horizons, bars, names)
 
 # %% [markdown]
 # Bars are two standard errors over the targets, so they show how much targets differ as well as
@@ -187,7 +193,7 @@ figures.estimates(horizons, bars, names)
 # %%
 logs = {name: read_log(f"race/{name}") for name in ("evolution", "gradient")}
 logs["gradient, then evolution"] = read_log("race/half") + read_log("race/hybrid")
-figures.races(logs)
+drawing.races(logs)
 
 # %% [markdown]
 # In one step, gradients come as far as evolution in its first generation, at equal cost; the best

@@ -29,7 +29,6 @@ from rps_jax.tuning.evolution import tune_es as tune_es
 from rps_jax.tuning.descent import tune_grad as tune_grad
 from rps_jax.tuning.learn import learn as learn
 from rps_jax.tuning.fit import fit as fit
-from rps_jax.tuning.space import Space as Space
 from rps_jax.trials.env import PushEnv as PushEnv
 
 # --- laws --------------------------------------------------------------------------------------
@@ -41,27 +40,15 @@ from rps_jax.control.observation import Details as Details
 from rps_jax.control.laws.rps import RPSParams as RPSParams
 from rps_jax.control.laws.rps import RPSState as RPSState
 from rps_jax.control.laws.rps import step as step
-from rps_jax.control.laws.rps_plus import RPSPlusParams as RPSPlusParams
 
 # --- what is pushed ----------------------------------------------------------------------------
 from rps_jax.world.domain import Domain as Domain
 from rps_jax.world.domain import Range as Range
-from rps_jax.world.points import worlds_at as worlds_at
-from rps_jax.trials.case import Case as Case
-from rps_jax.geometry.footprint import polygon as polygon
 from rps_jax.world.objects import register_object as register_object
 
 # --- how it is sensed and stepped --------------------------------------------------------------
 from rps_jax.robot.robot import Robot as Robot
-from rps_jax.robot.skin import CapacitiveSkin as CapacitiveSkin
-from rps_jax.robot.skin import SmoothSkin as SmoothSkin
 from rps_jax.trials.setting import Setting as Setting
 from rps_jax.trials.trial import Rules as Rules
-from rps_jax.trials.progress import Bar as Bar
 from rps_jax.engines.device import use_cache as use_cache
 from rps_jax.errors import InputError as InputError
-
-# --- modules for figures, tables and gradients of one's own ------------------------------------
-from rps_jax.analysis import figures as figures
-from rps_jax.analysis import tables as tables
-from rps_jax.tuning import gradients as gradients

@@ -655,7 +655,7 @@ def furnish_runs(folder: Path, learned: bool) -> dict[str, list[tuple[str, ...]]
 
     (folder / "drums.json").write_text('{"objects": ["random_cylinder"]}')
     drums = rps_jax.Domain(("random_cylinder",))
-    at = rps_jax.worlds_at(drums, points.points_of(drums, range(12)))
+    at = points.worlds_at(drums, points.points_of(drums, range(12)))
     small_run(folder / "points", worlds=None, points=at)
     (folder / "policy").mkdir()
     shutil.copy(Path(policy.__file__).parent / "learned_mlp.npz", folder / "policy" / "policy.npz")

@@ -2,6 +2,7 @@
 
 import ast
 import contextlib
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -143,6 +144,13 @@ def imported(path: Path) -> Iterator[str]:
             yield str(node.module)
         elif isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name.startswith("rps_jax"))
+
+
+def addresses() -> Iterator[tuple[str, str]]:
+    """Modules and names below the top that the table of public names has."""
+    for line in (ROOT / "rps_jax" / "README.md").read_text().splitlines():
+        if found := re.match(r"\| `(rps_jax\.[\w.]+)` \| (.*?) \|", line):
+            yield from ((found[1], name) for name in re.findall(r"`(\w+)`", found[2]))
 
 
 # --- comparisons ---------------------------------------------------------------------------

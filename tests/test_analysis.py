@@ -15,6 +15,10 @@ from rps_jax.studies import hardware
 from rps_jax.trials.progress import unheard
 from rps_jax.tuning import learn
 from rps_jax.world.domain import WORDS
+from sweeps.ambiguities.study import tolerance_curve
+from sweeps.landscape.study import parameters_figure
+from sweeps.levers.study import levers_figure
+from sweeps.speed.study import throughput
 
 
 @pytest.fixture
@@ -218,7 +222,7 @@ def test_rates_are_drawn_in_percent_by_object(drawn):
     coords = {"loss": ["creep"], "what": ("loss", ["ahead"]), "tolerance": [1.0, 6.0]}
     coords["object"] = ["box"]
     curve = xr.Dataset({"won": (dims, [[[1], [4]]]), "lost": (dims, [[[5.0], [2.0]]])}, coords)
-    above, below = drawn(figures.tolerance_curve, curve, 4).axes
+    above, below = drawn(tolerance_curve, curve, 4).axes
     assert above.get_title() == "on loss: ahead"
     assert above.lines[0].get_ydata().tolist() == [25.0, 100.0]
     assert below.lines[0].get_ydata().tolist() == [5.0, 2.0]
@@ -237,12 +241,12 @@ def test_rates_are_drawn_in_percent_by_object(drawn):
 
 def test_speeds_are_drawn_by_batch_and_gains_from_one(drawn):
     rows = [("box", "fast", 64, 100.0), ("box", "fast", 512, 300.0), ("box", "C", 8, 50.0)]
-    (ax,) = drawn(figures.throughput, rows, {"C"}).axes
+    (ax,) = drawn(throughput, rows, {"C"}).axes
     fast, level = ax.lines
     assert fast.get_xydata().tolist() == [[64, 100.0], [512, 300.0]]
     assert list(level.get_ydata()) == [50.0, 50.0]
     gains = {"as it is": 1.0, "long steps": 2.5, "short steps": 0.4}
-    (ax,) = drawn(figures.levers, gains, "MJX").axes
+    (ax,) = drawn(levers_figure, gains, "MJX").axes
     assert [bar.get_x() + bar.get_width() for bar in ax.patches] == [1.0, 2.5, 0.4]
     assert [label.get_text() for label in ax.get_yticklabels()][1] == "long steps"
 
@@ -254,7 +258,7 @@ def test_a_parameter_is_drawn_on_the_axis_of_its_bounds(drawn):
         {"set": ["paper"], "parameter": ["k", "zeta"]},
         {"worlds": 10},
     )
-    k, zeta, *_ = drawn(figures.sensitivity, found, ["k"]).axes
+    k, zeta, *_ = drawn(parameters_figure, found, ["k"]).axes
     assert (k.get_xscale(), zeta.get_xscale()) == ("log", "linear")
     assert k.lines[0].get_xydata().tolist() == [[1.0, 50.0], [10.0, 100.0]]
 
@@ -316,9 +320,9 @@ def test_the_bound_of_the_best_of_many_holds_where_the_plain_one_fails():
 def test_the_interval_of_cvar_covers():
     """Of an exponential law the CVaR of the tail t is 1 - log t."""
     rng = np.random.default_rng(0)
-    ends = np.array([statistics.cvar_interval(rng.exponential(size=400), 0.05) for _ in range(400)])
+    ends = np.array([statistics.cvar_interval(rng.exponential(size=400)) for _ in range(400)])
     truth = 1 - np.log(0.05)
     assert np.mean((ends[:, 0] <= truth) & (truth <= ends[:, 1])) > 0.9
-    one = statistics.cvar_interval(np.arange(10.0), 0.05)
+    one = statistics.cvar_interval(np.arange(10.0))
     assert one == (0, np.inf)  # of a single value nothing is known
     assert statistics.cvar_interval(np.zeros(100)) == (0, 0)

@@ -92,15 +92,15 @@ def test_weights_go_from_the_best_to_the_mean():
 
 
 def test_perturbations_belong_to_world_and_round_and_fill_one_window():
-    many = ceiling.perturbations(SMALL, 3, np.array([4, 9]), 1, np.array([300.0, 60.0]))
-    alone = ceiling.perturbations(SMALL, 3, np.array([9]), 1, np.array([60.0]))
+    many = SMALL.perturbations(np.array([4, 9]), 1, np.array([300.0, 60.0]))
+    alone = SMALL.perturbations(np.array([9]), 1, np.array([60.0]))
     np.testing.assert_array_equal(many[1], alone[0])
     assert not many[:, :2].any()
     # Window 10 s, knots of 5 s, in the second of three rounds: from 100 s and from 20 s on.
     for row, first in ((0, 20), (1, 4)):
         used = np.flatnonzero(many[row, 2:].any(axis=(0, 2)))
         assert used.tolist() == [first, first + 1]
-    other = ceiling.perturbations(SMALL, 3, np.array([9]), 2, np.array([60.0]))
+    other = SMALL.perturbations(np.array([9]), 2, np.array([60.0]))
     assert (other != alone).any()
 
 

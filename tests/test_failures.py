@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import CYLINDERS, PAPER, refusal, rps
+from helpers import CYLINDERS, PAPER, ROOT, refusal, rps
 from scipy import stats
 
 import rps_jax
@@ -21,6 +21,8 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import points
 from rps_jax.world.domain import DOMAINS, Range
+from sweeps.failures import picked, study
+from sweeps.failures.drawn import of_drawn
 
 RULES = Rules(horizon=10.0, max_lost=5.0)
 BRIEF = Setting("quasistatic", rules=RULES)
@@ -80,11 +82,16 @@ def beyond(p, kinds):
     return score, ["range"] * kinds + ["noise"] * 2
 
 
+def split(score, kinds, how, seed=0):
+    """One subset simulation."""
+    (found,) = rare.together(score, [rare.steps(kinds, how, seed)])
+    return found
+
+
 def test_splitting_is_unbiased_and_its_interval_covers():
     score, kinds = beyond(0.01, 12)
     found = [
-        rare.split(score, kinds, Rare(particles=1000, groups=10), seed).estimate
-        for seed in range(60)
+        split(score, kinds, Rare(particles=1000, groups=10), seed).estimate for seed in range(60)
     ]
     p = np.array([one.p for one in found])
     assert abs(p.mean() / 0.01 - 1) < 3 * p.std() / p.mean() / np.sqrt(60)
@@ -102,7 +109,7 @@ def test_several_splittings_side_by_side_are_what_each_is_alone():
         return score(u)
 
     found = rare.together(counted, [rare.steps(kinds, sizes, seed) for seed in seeds])
-    alone = [rare.split(score, kinds, sizes, seed) for seed in seeds]
+    alone = [split(score, kinds, sizes, seed) for seed in seeds]
     assert [one.estimate for one in found] == [one.estimate for one in alone]
     assert asked[:2] == [600, 300]
     assert len(asked) == max(len(one.levels) for one in alone)
@@ -111,8 +118,7 @@ def test_several_splittings_side_by_side_are_what_each_is_alone():
 def test_one_in_a_hundred_thousand_takes_a_twentieth_of_the_worlds():
     score, kinds = beyond(1e-5, 18)
     found = [
-        rare.split(score, kinds, Rare(particles=18_000, groups=20), seed).estimate
-        for seed in range(8)
+        split(score, kinds, Rare(particles=18_000, groups=20), seed).estimate for seed in range(8)
     ]
     p, trials = np.array([(one.p, one.trials) for one in found]).T
     assert p.std(ddof=1) / 1e-5 <= 0.2
@@ -121,11 +127,9 @@ def test_one_in_a_hundred_thousand_takes_a_twentieth_of_the_worlds():
 
 
 def test_splitting_says_nothing_where_nothing_fails_or_everything():
-    never = rare.split(
-        lambda u: 0.5 * u[:, 0], ["range"] * 3, Rare(particles=200, groups=4, levels=3)
-    )
+    never = split(lambda u: 0.5 * u[:, 0], ["range"] * 3, Rare(particles=200, groups=4, levels=3))
     assert (never.estimate.p, never.estimate.low, never.estimate.high) == (0, 0, 1)
-    always = rare.split(lambda u: 1 + u[:, 0], ["range"] * 3, Rare(particles=200, groups=4))
+    always = split(lambda u: 1 + u[:, 0], ["range"] * 3, Rare(particles=200, groups=4))
     assert always.estimate.p == 1
     assert always.u.shape == (200, 3)
     found = xr.Dataset({k: ("repetition", [v]) for k, v in always.estimate._asdict().items()})
@@ -139,13 +143,13 @@ def test_estimates_by_hand():
     assert one.high == 1  # a probability
     assert one.low == pytest.approx(2 * np.exp(-4.3027 * one.variation), rel=1e-4)
     assert rare.worlds_needed(1e-5, 0.2) == pytest.approx(2.5e6, rel=1e-4)
-    drawn = rare.brute(25, 1000)
+    drawn = of_drawn(25, 1000)
     assert (drawn.p, drawn.variation) == (0.025, pytest.approx((0.975 / 25) ** 0.5))
     assert drawn.low < 0.025 < drawn.high
 
 
 def test_the_command_compares_splitting_with_drawn_worlds(tmp_path, capsys):
-    asked = ["rare", "--law", "rps", "--engine", "quasistatic"]
+    asked = [ROOT / "sweeps" / "failures" / "drawn.py", "--law", "rps", "--engine", "quasistatic"]
     asked += ["--domain", "wide,objects=random_cylinder,distance=0.7:0.72,bearing=-0.3:0.3"]
     asked += ["--particles", 40, "--groups", 4, "--horizon", 20, "--brute", 30]
     asked += ["--slots", 8, "--workers", 1, "--out", tmp_path / "run"]
@@ -192,7 +196,7 @@ def test_a_search_finds_many_times_the_failing_cells_of_drawn_worlds(made, algor
     gain = attack.yields(found)
     assert gain["times"] > (1 if algorithm in ("cma_me", "line") else 4)
     assert (np.diff(found.severity) <= 0).all()
-    worlds = rps_jax.worlds_at("wide", found.u)
+    worlds = points.worlds_at("wide", found.u)
     some = found.isel(elite=0)
     cell = found.margin.isel(object=int(some.which_object)).sel(
         {axis: float(worlds[axis][0]) for axis in ("com_offset", "friction_robot")},
@@ -303,13 +307,13 @@ def test_the_quantity_that_decides_takes_all_the_blame():
     assert float(first.sel(factor="mass")) == pytest.approx(1, abs=0.2)
     assert float(total.sel(factor="mass")) == pytest.approx(1, abs=0.2)
     assert np.abs(total.drop_sel(factor="mass")).max() < 0.02
-    difference, low, high = sensitivity.cost(found, "mass")
+    difference, low, high = study.difference(found, "mass")
     # Of the upper third three fifths fail, of the lower none.
     assert difference == pytest.approx(-0.6, abs=0.05)
     assert low < difference < high < 0
-    assert sensitivity.said(found).startswith("More mass costs success")
-    assert sensitivity.said(found, "gap").startswith("No cost of gap is seen")
-    assert "draws no robot_force" in sensitivity.said(found, "robot_force")
+    assert study.said(found).startswith("More mass costs success")
+    assert study.said(found, "gap").startswith("No cost of gap is seen")
+    assert "draws no robot_force" in study.said(found, "robot_force")
     assert sensitivity.table(found)[1][0] == "mass of the object"
     assert sensitivity.reliable(found).startswith("Trials fail at ")
     assert "run more worlds" not in sensitivity.reliable(found)
@@ -342,7 +346,7 @@ def test_the_command_of_sensitivity_draws_and_continues(tmp_path, capsys):
     asked += ["--horizon", 3, "--slots", 4, "--workers", 1, "--out", tmp_path / "run"]
     assert rps(*asked) == 0
     text = capsys.readouterr().out
-    assert "The domain draws no mass." in text
+    assert "Trials fail at" in text
     for name in ("sobol", "interactions"):
         assert (tmp_path / "run" / f"{name}.png").stat().st_size > 5000
     assert files.read(tmp_path / "run" / "sobol.nc").total.sizes["factor"] == 5
@@ -402,7 +406,7 @@ def test_the_worlds_of_the_set_are_far_from_each_other():
     u = points.points_of(domain, np.arange(100))
     twice = np.concatenate([u, u])
     bad = np.ones((2, 200))
-    taken = regress.chosen(domain, twice, bad, 100, np.array([7]))
+    taken = picked.chosen(domain, twice, bad, 100, np.array([7]))
     assert taken[0] == 7
     assert len(set(taken % 100)) == 100  # none of them twice
 

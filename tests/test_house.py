@@ -8,7 +8,7 @@ import subprocess
 import sys
 
 import pytest
-from helpers import ROOT, imported
+from helpers import ROOT, addresses, imported
 
 import rps_jax
 
@@ -44,8 +44,14 @@ def test_the_test_command_of_the_readme_is_that_of_ci():
 @pytest.mark.parametrize(
     "path", sorted((ROOT / "notebooks").glob("examples/*.py")), ids=lambda path: path.stem
 )
-def test_examples_import_the_package_and_nothing_below_it(path):
-    assert set(imported(path)) <= {"rps_jax"}
+def test_examples_import_what_the_table_of_public_names_has(path):
+    assert set(imported(path)) <= {"rps_jax", *dict(addresses())}
+
+
+def test_there_are_forty_public_names_and_all_are_in_the_table():
+    rows = re.findall(r"^\| `(\w+)` \|", (PACKAGE / "README.md").read_text(), re.M)
+    assert sorted(rows) == rps_jax.__all__
+    assert len(rows) <= 40
 
 
 def test_every_public_name_is_there():

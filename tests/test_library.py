@@ -2,11 +2,12 @@
 
 import doctest
 import inspect
+from importlib import import_module
 
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import PAPER, SLOTS, decode, rps
+from helpers import PAPER, SLOTS, addresses, decode, rps
 
 import rps_jax
 from rps_jax.errors import InputError
@@ -124,19 +125,19 @@ def test_a_table_is_what_the_command_writes(tmp_path):
 
 # --- examples ------------------------------------------------------------------------------
 
-PUBLIC = [name for name in rps_jax.__all__ if callable(getattr(rps_jax, name))]
+EVERY = {name: getattr(rps_jax, name) for name in rps_jax.__all__}
+EVERY |= {name: getattr(import_module(module), name) for module, name in addresses()}
+PUBLIC = [name for name, found in EVERY.items() if callable(found)]
 OPTIONS = doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
 
 
 def examples(name):
     """The examples of a public function, or of a class and its methods."""
-    return [
-        one for one in doctest.DocTestFinder().find(getattr(rps_jax, name), name) if one.examples
-    ]
+    return [one for one in doctest.DocTestFinder().find(EVERY[name], name) if one.examples]
 
 
 def test_every_public_function_has_an_example():
-    functions = [name for name in PUBLIC if not inspect.isclass(getattr(rps_jax, name))]
+    functions = [name for name in PUBLIC if not inspect.isclass(EVERY[name])]
     assert {"sweep", "evaluate", "table", "push"} <= set(functions)
     assert [name for name in functions if not examples(name)] == []
 

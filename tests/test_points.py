@@ -63,7 +63,7 @@ def test_a_quantity_is_where_its_range_says():
     u[:, names.index("mass")] = 0.5  # evenly in the logarithm from 3 to 60 kg
     u[:, names.index("distance")] = 0.25  # evenly from 1 to 3 m
     u[:, names.index("object")] = 0.99
-    worlds = rps_jax.worlds_at("wide", u)
+    worlds = points.worlds_at("wide", u)
     np.testing.assert_allclose(worlds.mass, np.sqrt(3 * 60))
     np.testing.assert_allclose(worlds.distance, 1.5)
     assert set(worlds.object.values) == {"random_prism"}
@@ -83,7 +83,7 @@ def test_sweeps_and_evaluations_take_points_as_they_take_drawn_worlds(tmp_path):
     assert load_plan(kept).points == points.Points(u)
     again = rps_jax.replay(kept, 4)
     assert int(again.outcome.success) == int(drawn.success[0, 4])
-    reversed_ = rps_jax.worlds_at(CYLINDERS, u[::-1])
+    reversed_ = points.worlds_at(CYLINDERS, u[::-1])
     some = jax.tree.map(lambda value: np.full(1, value), PAPER)
     tried = rps_jax.evaluate(some, CYLINDERS, points=reversed_, **SWEPT)
     np.testing.assert_allclose(tried.mass, drawn.mass.values[::-1], rtol=1e-6)
@@ -117,15 +117,15 @@ def test_points_that_are_none_are_refused(tmp_path, capsys):
         (u[:0], "is not allowed"),
         (u + 1, r"u\[0, 0\] = 1\.1.* \(object\) is not allowed: it must be at least 0 and below 1"),
         (np.where(u == u[1, 3], np.nan, u), r"u\[1, 3\] = nan"),
-        (rps_jax.worlds_at("hostile", u), "of another domain"),
-        (rps_jax.worlds_at("wide", u).assign_attrs(domain="no JSON"), "of another domain"),
-        (rps_jax.worlds_at("wide", u).assign_attrs(domain="[3]"), "of another domain"),
+        (points.worlds_at("hostile", u), "of another domain"),
+        (points.worlds_at("wide", u).assign_attrs(domain="no JSON"), "of another domain"),
+        (points.worlds_at("wide", u).assign_attrs(domain="[3]"), "of another domain"),
         (xr.Dataset(), "has no u"),
         ([["a"]], "give an array"),
     ):
         with pytest.raises(InputError, match=words):
             rps_jax.sweep("rps", "wide", points=wrong)
-    files.write_results(tmp_path / "some.nc", rps_jax.worlds_at("wide", u))
+    files.write_results(tmp_path / "some.nc", points.worlds_at("wide", u))
     said = refusal(capsys, "sweep", "--domain", "hostile", "--points", tmp_path / "some.nc")
     assert "of another domain" in said
     said = refusal(capsys, "sweep", "--points", tmp_path / "some.nc", "--worlds", 3)
@@ -135,7 +135,7 @@ def test_points_that_are_none_are_refused(tmp_path, capsys):
 
 def test_the_command_sweeps_points_and_can_be_continued(tmp_path, capsys):
     u = points.points_of("paper", np.arange(0, 144, 48))
-    files.write_results(tmp_path / "some.nc", rps_jax.worlds_at("paper", u))
+    files.write_results(tmp_path / "some.nc", points.worlds_at("paper", u))
     asked = [
         "sweep",
         "--domain",

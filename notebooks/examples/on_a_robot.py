@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from rps_jax import CapacitiveSkin, Observation, RPSParams, RPSState, step
+from rps_jax import Observation, RPSParams, RPSState, step
+from rps_jax.robot.skin import CapacitiveSkin
 
 PERIOD = 0.001  # [s]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import rps_jax
-from rps_jax import polygon
+from rps_jax.geometry.footprint import polygon
 
 CORNERS = np.pi / 180 * np.arange(30, 390, 60)  # [rad] counter-clockwise
 OUTLINE = 0.2 * np.stack([np.cos(CORNERS), np.sin(CORNERS)], axis=-1)  # (6, 2) [m]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -50,10 +50,7 @@ class Influence(NamedTuple):
 
 def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
     """Wilson score interval of a success rate, each end in [0, 1]; all of it without trials."""
-    if trials == 0:
-        return 0.0, 1.0
-    interval = stats.binomtest(successes, trials).proportion_ci(confidence, method="wilson")
-    return float(interval.low), float(interval.high)
+    return _interval(successes, trials, confidence, "wilson")
 
 
 def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -61,27 +58,25 @@ def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> tu
 
     Each end by itself is a bound of confidence (1 + `confidence`) / 2 (Clopper and Pearson, 1934).
     """
+    return _interval(successes, trials, confidence, "exact")
+
+
+def _interval(
+    successes: int, trials: int, confidence: float, method: Literal["wilson", "exact"]
+) -> tuple[float, float]:
     if trials == 0:
         return 0.0, 1.0
-    interval = stats.binomtest(successes, trials).proportion_ci(confidence, method="exact")
+    interval = stats.binomtest(successes, trials).proportion_ci(confidence, method=method)
     return float(interval.low), float(interval.high)
 
 
-def fails_at_most(
-    failures: int, trials: int, picked_of: int = 1, confidence: float = 0.95
-) -> float:
-    """Upper bound [1] of a failure rate, also of one that was the least of several.
+def fails_at_most(failures: int, trials: int, picked_of: int = 1) -> float:
+    """Upper bound (95 %) of a failure rate [1], also of one that was the least of several.
 
     The best of N candidates on the same worlds looks better than it is. Its bound holds if those
-    of all N hold, so each is asked for 1 - (1 - `confidence`) / N; this needs no independence.
-
-    Args:
-      failures: of the candidate, that was picked.
-      trials: worlds that it met.
-      picked_of: number N of the candidates among which it was picked on these worlds.
-      confidence: with which the bound holds.
+    of all N hold, so each is asked for 1 - 0.05 / N; this needs no independence.
     """
-    least = 1 - (1 - confidence) / picked_of
+    least = 1 - (1 - 0.95) / picked_of
     return clopper_pearson(failures, trials, 2 * least - 1)[1]
 
 
@@ -109,41 +104,36 @@ def drawn(results: xr.Dataset) -> list[str]:
     return [name for name in WORDS if name in results and differs(results[name].values)]
 
 
-def cvar(values: np.ndarray, tail: float = _TAIL) -> float:
-    """Mean of the worst, greatest `tail` of the values: their conditional value at risk."""
-    worst = max(1, round(tail * values.size))
+def cvar(values: np.ndarray) -> float:
+    """Mean of the worst, greatest 5 % of the values: their conditional value at risk."""
+    worst = max(1, round(_TAIL * values.size))
     return float(np.sort(values)[-worst:].mean())
 
 
-def cvar_interval(
-    values: np.ndarray, tail: float = _TAIL, confidence: float = 0.95
-) -> tuple[float, float]:
-    """Approximate interval of `cvar`, from the spread of the values beyond their quantile.
+def cvar_interval(values: np.ndarray) -> tuple[float, float]:
+    """Approximate interval (95 %) of `cvar`, from the spread of the values beyond their quantile.
 
     With q the quantile, the mean of q + max(x - q, 0) / tail has the variance of the CVaR (Trindade
     et al., 2007). The interval is even in the logarithm, and has a t-distribution with as many
     degrees of freedom as there are values in the tail, less one: for skewed values of which 10 and
     more are in the tail it covers in 87 to 95 % of samples (see its test).
     """
-    worst = max(1, round(tail * values.size))
+    worst = max(1, round(_TAIL * values.size))
     if worst < 2:
         return 0.0, float("inf")
-    mean, quantile = cvar(values, tail), np.partition(values, -worst)[-worst]
-    terms = quantile + np.maximum(values - quantile, 0) / tail
+    mean, quantile = cvar(values), np.partition(values, -worst)[-worst]
+    terms = quantile + np.maximum(values - quantile, 0) / _TAIL
     error = float(np.std(terms, ddof=1)) / np.sqrt(values.size)
-    error *= float(stats.t.ppf((1 + confidence) / 2, worst - 1))
+    error *= float(stats.t.ppf(0.975, worst - 1))
     if mean <= 0:
         return mean - error, mean + error
     return float(mean * np.exp(-error / mean)), float(mean * np.exp(error / mean))
 
 
 def missed(min_distance: ArrayLike, way: ArrayLike) -> np.ndarray:
-    """How far (...) [m] trials missed their targets.
+    """How far (...) [m] trials missed their targets, by `min_distance` of the contact point.
 
-    Args:
-      min_distance: (...) [m] least distance of the contact point to the target, infinite of a
-        trial that never touched its object.
-      way: (...) [m] what such a trial missed by: the target's distance from the start.
+    A trial whose distance is infinite never touched its object, and missed by the whole `way`.
     """
     near = np.asarray(min_distance, float)
     return np.where(np.isfinite(near), near, way)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
@@ -103,7 +103,6 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
 
 
 def _cvar(left: np.ndarray) -> str:
-    """The mean over the worst worlds of the distance left, with its interval."""
     low, high = statistics.cvar_interval(left)
     ends = f"[{low:.2f}, {high:.2f}]" if np.isfinite(high) else "(too few worlds for an interval)"
     return f"{statistics.cvar(left):.2f} m {ends}"
@@ -167,16 +166,9 @@ def difference_table(results: xr.Dataset) -> list[list[str]]:
     for first, second in combinations(map(str, results.law.values), 2):
         a, b = results.success.sel(law=first), results.success.sel(law=second)
         c = statistics.compare(a, b)
-        share = 100 * (c.gained - c.lost) / a.size
-        rows.append(
-            [
-                f"{second} against {first}",
-                str(c.gained),
-                str(c.lost),
-                f"{share:+.2f} %",
-                f"{c.p:.2g}",
-            ]
-        )
+        share = f"{100 * (c.gained - c.lost) / a.size:+.2f} %"
+        counts = str(c.gained), str(c.lost)
+        rows.append([f"{second} against {first}", *counts, share, f"{c.p:.2g}"])
     return rows
 
 
@@ -251,36 +243,8 @@ def influence_table(results: xr.Dataset, law: str) -> list[list[str]]:
         name, found = list(binned.items())[i]
         order, unit = np.argsort(found.won / found.of, kind="stable"), results[name].attrs["units"]
         told = [f"{value:.3g} {unit}".removesuffix(" 1") for value in found.middle]
-        ends = [
-            cell
-            for n in (order[0], order[-1])
-            for cell in (told[n], share(int(found.won[n]), int(found.of[n])))
-        ]
+        ends = []
+        for n in (order[0], order[-1]):
+            ends += [told[n], share(int(found.won[n]), int(found.of[n]))]
         rows.append([WORDS[name], *ends, f"{q[i]:.2g}"])
-    return rows
-
-
-def agreement_table(found: Mapping[str, xr.Dataset]) -> list[list[str]]:
-    """Header and one row for each engine: success, and outcomes equal to the first's, by object.
-
-    The results are those of one law in the same worlds.
-    """
-    base = next(iter(found.values()))
-    groups = statistics.worlds_by_object(base)
-    rows = [["engine", *groups, "equal outcomes", "95 %", *(f"equal, {g}" for g in groups), "+/-"]]
-    for name, one in found.items():
-        won = one.success.values > 0
-        same = won == (base.success.values > 0)
-        c = statistics.compare(base.success, one.success)
-        low, high = c.equal_interval
-        rows.append(
-            [
-                name,
-                *(f"{won[mask].sum()} of {mask.sum()}" for mask in groups.values()),
-                f"{100 * c.equal:.1f} %",
-                f"{100 * low:.0f}-{100 * high:.0f} %",
-                *(f"{same[mask].sum()} of {mask.sum()}" for mask in groups.values()),
-                f"+{c.gained} -{c.lost}",
-            ]
-        )
     return rows

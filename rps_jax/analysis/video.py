@@ -73,8 +73,8 @@ def snapshot(
       InputError: a qpos, target, size or camera that cannot be used.
       VideoError: this machine cannot draw.
     """
-    options = {"p_world_target": p_world_target, "size": size, "camera": camera}
-    return images(scene, [qpos], **options)[0]
+    (image,) = images(scene, [qpos], p_world_target=p_world_target, size=size, camera=camera)
+    return image
 
 
 def images(
@@ -121,17 +121,15 @@ def render(
       ValueError: not as many contacts as frames.
       VideoError: this machine cannot draw or encode, or `path` cannot be written.
     """
-    _check_film(size, fps)
-    pairs = _paired(frames, p_world_contacts)
-    first = next(pairs, None)
-    if first is None:
+    if p_world_contacts is None:
+        pairs = zip(frames, itertools.repeat(NO_CONTACT), strict=False)
+    else:
+        pairs = zip(frames, p_world_contacts, strict=True)
+    if (first := next(pairs, None)) is None:
         raise errors.InputError("frames = [] is not allowed: a video needs at least one frame.")
-    with (
-        open_studios([Tile(scene, p_world_target)], size, camera) as (studio,),
-        _encoder(Path(path), size, fps) as sink,
-    ):
-        for qpos, p_world_contact in itertools.chain([first], pairs):
-            sink(np.ascontiguousarray(studio.draw(qpos, p_world_contact)))
+    shots = ([Shot(*pair, "")] for pair in itertools.chain([first], pairs))
+    tile = Tile(scene, p_world_target)
+    render_grid([tile], shots, path, shape=(1, 1), size=size, fps=fps, camera=camera)
 
 
 def render_grid(
@@ -146,8 +144,6 @@ def render_grid(
 ) -> None:
     """Write an MP4 as of `render` of many trials side by side.
 
-    Each frame is drawn tile by tile into one image and encoded at once.
-
     Args:
       tiles: of the grid, row by row; it may have room for more.
       frames: what each tile shows in each frame; one that shows the very same as in the frame
@@ -157,12 +153,10 @@ def render_grid(
       size: width and height of a tile [px], even numbers.
       fps: frames per second of the video.
       camera: name of a camera of the scenes: oblique or above.
-
-    Raises:
-      InputError: no tiles, more than there is room for, or as for `render`.
-      VideoError: this machine cannot draw or encode, or `path` cannot be written.
     """
-    _check_film(size, fps)
+    errors.check_finite("fps", fps, above=0, at_most=1000)
+    if any(n % 2 for n in size):
+        raise errors.InputError(f"size = {size} is not allowed: H.264 needs two even numbers.")
     (rows, columns), (width, height) = shape, size
     if not 0 < len(tiles) <= rows * columns:
         raise errors.InputError(
@@ -185,27 +179,16 @@ def render_grid(
 
 
 def _labelled(studio: Studio, shot: Shot) -> np.ndarray:
-    """A tile with its label and a line around it."""
-    image = Image.fromarray(studio.draw(shot.qpos, shot.p_world_contact))
+    """A tile, with its label and a line around it if it has one."""
+    drawn = studio.draw(shot.qpos, shot.p_world_contact)
+    if not shot.label:
+        return drawn
+    image = Image.fromarray(drawn)
     font = ImageFont.load_default(size=max(9, image.height // _LABEL))
     draw = ImageDraw.Draw(image)
     draw.text((5, 3), shot.label, "white", font, stroke_width=2, stroke_fill=_INK)
     draw.rectangle((0, 0, image.width - 1, image.height - 1), outline=_INK)
     return np.asarray(image)
-
-
-def _check_film(size: tuple[int, int], fps: float) -> None:
-    errors.check_finite("fps", fps, above=0, at_most=1000)
-    if any(n % 2 for n in size):
-        raise errors.InputError(f"size = {size} is not allowed: H.264 needs two even numbers.")
-
-
-def _paired(
-    frames: Iterable[ArrayLike], p_world_contacts: Iterable[ArrayLike] | None
-) -> Iterator[tuple[ArrayLike, ArrayLike]]:
-    if p_world_contacts is None:
-        return zip(frames, itertools.repeat(NO_CONTACT), strict=False)
-    return zip(frames, p_world_contacts, strict=True)
 
 
 @contextlib.contextmanager

@@ -90,14 +90,8 @@ class Drawing:
             f"{_ROOT}/base/contact", studio.CONTACT_RADIUS, color=_rgb(studio.CONTACT_RGBA)
         )
         nowhere = np.zeros((1, 2, 3))
-        self._velocity = world.add_arrows(
-            f"{_ROOT}/base/velocity",
-            nowhere,
-            _TWIST,
-            shaft_radius=0.016,
-            head_radius=0.045,
-            head_length=0.1,
-        )
+        shape: dict[str, Any] = {"shaft_radius": 0.016, "head_radius": 0.045, "head_length": 0.1}
+        self._velocity = world.add_arrows(f"{_ROOT}/base/velocity", nowhere, _TWIST, **shape)
         line = partial(world.add_line_segments, points=nowhere)
         self._turn = line(f"{_ROOT}/base/turn", colors=_TWIST, thickness=0.022)
         self._paths = {
@@ -170,7 +164,8 @@ def _add_taxels(world: Any, name: str, shell: Shell) -> Any:
     box = _solid_of(mujoco.mjtGeom.mjGEOM_BOX, np.full(3, 0.5))
     return world.add_batched_meshes_simple(
         name,
-        *box,
+        np.asarray(box.vertices),
+        np.asarray(box.faces),
         batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (len(places), 1)),
         batched_positions=places,
         batched_scales=np.column_stack([sizes, np.full(len(places), height)]),
@@ -187,48 +182,48 @@ def meshes(
 
     One mesh for each colour of each body, in the body's frame.
     """
-    parts: dict[tuple[str, tuple[int, int, int]], list[tuple[np.ndarray, np.ndarray]]] = {}
+    from trimesh import transformations, util  # comes with viser
+
+    parts: dict[tuple[str, tuple[int, int, int]], list[Any]] = {}
     for i in range(model.ngeom):
         geom = model.geom(i)
         body = model.body(int(geom.bodyid[0])).name
         if geom.group[0] > 2 or geom.type[0] == mujoco.mjtGeom.mjGEOM_PLANE:
             continue  # MuJoCo hides these groups, and the page has a ground of its own
-        vertices, faces = _mesh_of(model, geom)
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, geom.quat)
-        placed = vertices @ turn.reshape(3, 3).T + geom.pos
-        parts.setdefault((body, _colour_of(model, geom)), []).append((placed, faces))
+        place = transformations.quaternion_matrix(geom.quat)
+        place[:3, 3] = geom.pos
+        placed = _mesh_of(model, geom).apply_transform(place)
+        parts.setdefault((body, _colour_of(model, geom)), []).append(placed)
     for (body, colour), some in parts.items():
-        starts = np.cumsum([0, *(len(vertices) for vertices, _ in some[:-1])])
-        vertices = np.concatenate([vertices for vertices, _ in some])
-        faces = np.concatenate([f + n for (_, f), n in zip(some, starts, strict=True)])
-        yield body, colour, vertices.astype(np.float32), faces.astype(np.uint32)
+        whole: Any = util.concatenate(some)
+        yield body, colour, whole.vertices.astype(np.float32), whole.faces.astype(np.uint32)
 
 
-def _mesh_of(model: mujoco.MjModel, geom: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) [m] and faces (F, 3) of a geom, in its frame."""
-    if geom.type[0] == mujoco.mjtGeom.mjGEOM_MESH:
-        mesh = model.mesh(int(geom.dataid[0]))
-        first_vertex, first_face = int(mesh.vertadr[0]), int(mesh.faceadr[0])
-        vertices = model.mesh_vert[first_vertex : first_vertex + int(mesh.vertnum[0])]
-        return vertices, model.mesh_face[first_face : first_face + int(mesh.facenum[0])]
-    return _solid_of(geom.type[0], geom.size)
+def _mesh_of(model: mujoco.MjModel, geom: Any) -> Any:
+    """A geom in its frame, as trimesh has it."""
+    from trimesh import Trimesh
+
+    if geom.type[0] != mujoco.mjtGeom.mjGEOM_MESH:
+        return _solid_of(geom.type[0], geom.size)
+    mesh = model.mesh(int(geom.dataid[0]))
+    first_vertex, first_face = int(mesh.vertadr[0]), int(mesh.faceadr[0])
+    vertices = model.mesh_vert[first_vertex : first_vertex + int(mesh.vertnum[0])]
+    faces = model.mesh_face[first_face : first_face + int(mesh.facenum[0])]
+    return Trimesh(vertices, faces, process=False)
 
 
-def _solid_of(kind: int, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of a primitive of MuJoCo's."""
-    from trimesh import creation  # comes with viser
+def _solid_of(kind: int, size: np.ndarray) -> Any:
+    """A primitive of MuJoCo's."""
+    from trimesh import creation
 
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        made = creation.box(extents=2 * size)
-    elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        made = creation.cylinder(radius=size[0], height=2 * size[1], sections=_SIDES)
-    elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        made = creation.capsule(radius=size[0], height=2 * size[1], count=(_SIDES // 2, 12))
-    else:  # a sphere, or an ellipsoid
-        made = creation.icosphere()
-        made.apply_scale(size if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID else size[0])
-    return np.asarray(made.vertices), np.asarray(made.faces)
+        return creation.box(extents=2 * size)
+    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        return creation.cylinder(radius=size[0], height=2 * size[1], sections=_SIDES)
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        return creation.capsule(radius=size[0], height=2 * size[1], count=(_SIDES // 2, 12))
+    round_ = creation.icosphere()  # a sphere, or an ellipsoid
+    return round_.apply_scale(size if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID else size[0])
 
 
 def _colour_of(model: mujoco.MjModel, geom: Any) -> tuple[int, int, int]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -32,7 +32,7 @@ from rps_jax.studies.table import table_of
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.batch import Part, rows
 from rps_jax.trials.case import Case
-from rps_jax.trials.progress import Bar, Progress
+from rps_jax.trials.progress import Bar, Progress, Report
 from rps_jax.trials.setting import Setting
 from rps_jax.world.scene import Scene
 
@@ -40,6 +40,7 @@ _MOST = 12  # rows, and columns
 _WHOLE = (1920, 1080)  # [px] that the grid is fitted into
 _LENGTH = 40  # [s] of a film at the default speed, at most
 _HELD = 1.0  # [s] that the end is held
+_FPS = 12  # frames per second
 
 
 @dataclass(frozen=True)
@@ -106,8 +107,11 @@ class Film(Question[Path]):
 
     def bar(self) -> Bar:
         """A bar over simulated time."""
-        seconds = min(float(self.takes()[1].rules.horizon), self.seconds or math.inf)
-        return Bar(self.name, seconds, "simulated", shown=self.shown)
+        return Bar(self.name, self._length(self.takes()[1]), "simulated", shown=self.shown)
+
+    def _length(self, setting: Setting) -> float:
+        """Simulated time that is filmed, at most [s]."""
+        return min(float(setting.rules.horizon), self.seconds or math.inf)
 
     @contextlib.contextmanager
     def opened(self) -> Iterator[None]:
@@ -117,19 +121,14 @@ class Film(Question[Path]):
     def answer(self, run: Run) -> Path:
         """Run the trials again and film them."""
         takes, setting = self.takes()
-        seconds = min(float(setting.rules.horizon), self.seconds or math.inf)
-        out = Path(self.out or self.place)
+        seconds, out = self._length(setting), Path(self.out or self.place)
+        speed = self.speed or float(max(1, math.ceil(seconds / _LENGTH)))
+        of_takes = [list(map(Tile, take.scenes, take.part.worlds.p_world_target)) for take in takes]
+        frames = _frames(takes, setting, speed, seconds, run.report)
+        size = _tile_size(self.shape)
+        grid = {"shape": self.shape, "size": size, "fps": _FPS, "camera": self.camera}
         try:
-            shoot(
-                takes,
-                setting,
-                out,
-                shape=self.shape,
-                speed=self.speed or default_speed(seconds),
-                seconds=seconds,
-                camera=self.camera,
-                report=lambda simulated: run.report(Progress(0, simulated)),
-            )
+            video.render_grid(_placed(of_takes, takes), frames, out, **grid)
         except video.VideoError as error:
             raise InputError(str(error)) from error
         return out
@@ -145,12 +144,9 @@ class Film(Question[Path]):
             return of_sweep(run, plan, self.laws or (law,), which, shape), plan.setting
         table = table_of(run)
         law = self.law or next(iter(table.chosen))
-        for field, name, known in (
-            ("object", self.object, table.objects),
-            ("friction", self.friction, table.friction),
-            ("law", law, table.chosen),
-        ):
-            errors.check_name(f"{field} of the run", name, list(map(str, known)))
+        errors.check_name("object of the run", self.object, table.objects)
+        errors.check_name("friction of the run", self.friction, map(str, table.friction))
+        errors.check_name("law of the run", law, table.chosen)
         cases = [
             one
             for one in table.cases
@@ -174,11 +170,7 @@ class Take(NamedTuple):
 
 
 def shape_of(grid: str) -> tuple[int, int]:
-    """Rows and columns of a grid, written as 4x6.
-
-    Raises:
-      InputError: it is not written so, or has no place, or too many.
-    """
+    """Rows and columns of a grid, written as 4x6."""
     found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", grid)
     if not found or not all(1 <= int(n) <= _MOST for n in found.groups()):
         raise InputError(
@@ -216,16 +208,7 @@ def of_sweep(
 ) -> list[Take]:
     """The takes of worlds of a sweep: of one law, or a row of the grid for each of several.
 
-    Args:
-      run: its folder.
-      plan: its plan.
-      laws: some of the plan's; several meet the same worlds, one a column.
-      which: `first`, those of the least index; `hardest`, as the report of the sweep has them;
-        or their indices.
-      shape: rows and columns of the grid.
-
-    Raises:
-      InputError: an unknown choice, an engine that is not followed, or no results to choose by.
+    Which worlds: the `first`; the `hardest`, as the report of the sweep has them; or indices.
     """
     engines.get(plan.setting.engine).check()
     count = shape[0] * shape[1] if len(laws) == 1 else shape[1]
@@ -242,17 +225,13 @@ def of_sweep(
     for row, law in enumerate(laws):
         said = f"{law}, " if len(laws) > 1 else ""
         for one in np.unique(of_object):
-            places = np.flatnonzero(of_object == one)
-            worlds = index[places]
-            takes.append(
-                Take(
-                    [row * shape[1] + int(place) for place in places],
-                    world_part(plan, list(plan.laws).index(law), worlds),
-                    registry.law_of(plan.laws[law]),
-                    [scene_of(plan, int(i)) for i in worlds],
-                    [f"{said}world {i}" for i in worlds],
-                )
-            )
+            columns = np.flatnonzero(of_object == one)
+            worlds = index[columns].tolist()
+            places = (row * shape[1] + columns).tolist()
+            part = world_part(plan, list(plan.laws).index(law), index[columns])
+            scenes = [scene_of(plan, i) for i in worlds]
+            labels = [f"{said}world {i}" for i in worlds]
+            takes.append(Take(places, part, registry.law_of(plan.laws[law]), scenes, labels))
     return takes
 
 
@@ -265,47 +244,6 @@ def rows_of(plan: Plan, laws: Sequence[str], shape: tuple[int, int]) -> None:
         raise InputError(
             f"grid = {shape[0]}x{shape[1]} is not allowed with {len(laws)} laws: each has a row."
         )
-
-
-def default_speed(seconds: float) -> float:
-    """Simulated seconds in a second of the film, so that it lasts less than a minute."""
-    return float(max(1, math.ceil(seconds / _LENGTH)))
-
-
-def shoot(
-    takes: Sequence[Take],
-    setting: Setting,
-    path: Path,
-    *,
-    shape: tuple[int, int],
-    speed: float,
-    seconds: float,
-    fps: int = 12,
-    camera: str = "oblique",
-    report: Callable[[float], Any] = lambda simulated: None,
-) -> None:
-    """Film trials from their start until all have ended, or for some simulated time.
-
-    Args:
-      takes: the trials.
-      setting: what they share.
-      path: the MP4 to write.
-      shape: rows and columns of the grid.
-      speed: simulated seconds in a second of the film; rounded to whole control steps a frame.
-      seconds: simulated time that is filmed, at most [s].
-      fps: frames per second of the film.
-      camera: oblique or above.
-      report: called with the simulated time [s] after each frame.
-
-    Raises:
-      InputError: grid or camera do not fit the trials.
-      VideoError: this machine cannot draw or encode, or `path` cannot be written.
-    """
-    of_takes = [list(map(Tile, take.scenes, take.part.worlds.p_world_target)) for take in takes]
-    tiles = _placed(of_takes, takes)
-    frames = _frames(takes, setting, speed, seconds, fps, report)
-    size = _tile_size(shape)
-    video.render_grid(tiles, frames, path, shape=shape, size=size, fps=fps, camera=camera)
 
 
 def _tile_size(shape: tuple[int, int]) -> tuple[int, int]:
@@ -327,12 +265,11 @@ def _frames(
     setting: Setting,
     speed: float,
     seconds: float,
-    fps: int,
-    report: Callable[[float], Any],
+    report: Report,
 ) -> Iterator[list[Shot]]:
     """What all tiles show in each frame."""
     period = setting.physics.control_period
-    every = max(1, round(speed / (fps * period)))
+    every = max(1, round(speed / (_FPS * period)))
     running = [_shots(take, setting, every) for take in takes]
     shots: list[Shot] = []
     # One more where they run to their ends, which are seen a step later.
@@ -341,10 +278,10 @@ def _frames(
         ended, of_takes = zip(*map(next, running), strict=True)
         shots = _placed(of_takes, takes)
         yield shots
-        report(count * every * period)
+        report(Progress(0, count * every * period))
         if all(ended):
             break
-    for _ in range(round(_HELD * fps)):
+    for _ in range(round(_HELD * _FPS)):
         yield shots
 
 

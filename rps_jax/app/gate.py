@@ -189,7 +189,6 @@ def updates_of(handle: Any, updates: Any) -> bool:
     options = getattr(props, "options", None)
     if options is not None:
         return value in options
-    low, high = getattr(props, "min", None), getattr(props, "max", None)
     usual = handle.value
     if isinstance(usual, bool) or isinstance(value, bool):
         return isinstance(usual, bool) and isinstance(value, bool)
@@ -197,24 +196,21 @@ def updates_of(handle: Any, updates: Any) -> bool:
         return isinstance(value, str)
     if isinstance(usual, tuple):
         numbers = list(value) if isinstance(value, tuple | list) else []
-        return len(numbers) == len(usual) and all(_within(one, low, high) for one in numbers)
-    return _within(value, low, high)
+        return len(numbers) == len(usual) and all(_within(one, props) for one in numbers)
+    return _within(value, props)
 
 
-def _within(value: Any, low: Any, high: Any) -> bool:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    low = low if isinstance(low, int | float) else -_GREATEST
-    high = high if isinstance(high, int | float) else _GREATEST
-    return low <= value <= high
+def _within(value: Any, props: Any) -> bool:
+    """Whether a number is within the bounds of a control; a text box has none, or tuples."""
+    ends = getattr(props, "min", None), getattr(props, "max", None)
+    low, high = (end if isinstance(end, int | float) else None for end in ends)
+    low, high = -_GREATEST if low is None else low, _GREATEST if high is None else high
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return number and low <= value <= high
 
 
 def check_guarded(gate: Gate, host: str, port: int) -> None:
-    """Try the gate as a stranger would, before it tells of strangers.
-
-    Raises:
-      InputError: a foreign page is let in, because viser makes its server otherwise by now.
-    """
+    """Try the gate as a stranger would; InputError if this viser makes its server otherwise."""
     address = "127.0.0.1" if host in ("0.0.0.0", "", "::") else host
     for name in ("Host: rebound.example\r\n", f"Host: {address}\r\nOrigin: http://a.example\r\n"):
         with socket.create_connection((address, port), timeout=5) as stranger:

@@ -21,7 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rps_jax import engines, errors
+from rps_jax import engines
 from rps_jax.app.drawing import TARGET, Drawing, furnish
 from rps_jax.app.gate import Gate, check_guarded, updates_of
 from rps_jax.control import registry
@@ -30,7 +30,7 @@ from rps_jax.errors import InputError
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, scene_of, title_of, world_part
 from rps_jax.runs.push import Push as PushQuestion
-from rps_jax.runs.push import another_engine, chosen
+from rps_jax.runs.push import another_engine, chosen, sensed
 from rps_jax.runs.question import call_of
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case, label_of
@@ -91,10 +91,10 @@ class View(PushQuestion):
     @property
     def case(self) -> Case:
         """The options' push."""
-        return dataclasses.replace(self, law=self._own, run=None)._case()
-
-    def _case(self) -> Case:
-        return super().case
+        own = {one.name: getattr(self, one.name) for one in dataclasses.fields(Case)}
+        own |= sensed(self, self.setting)
+        own["law"] = self._own
+        return Case(**own)
 
     def note(self) -> str:
         """Whether another engine than the run's is shown."""
@@ -105,11 +105,11 @@ class View(PushQuestion):
         super().check()
         engines.get(self.setting.engine).check_traced()
         if self.run is not None:
-            chosen(Path(self.run), self.world, self._label)
+            self._chosen()
 
-    @property
-    def _label(self) -> str | None:
-        return None if self.law is None else str(self.law)
+    def _chosen(self) -> tuple[Plan, str]:
+        """The plan and the law of a run that is shown."""
+        return chosen(Path(str(self.run)), self.world, None if self.law is None else str(self.law))
 
     def in_shell(self) -> None:
         """Serve the page until it is ended."""
@@ -118,7 +118,7 @@ class View(PushQuestion):
         asked = Asked(self.object, friction, law, self.target)
         first = partial(self.push_of, asked)
         if self.run is not None:
-            first = partial(_in_world, *chosen(Path(self.run), self.world, self._label), self.world)
+            first = partial(_in_world, *self._chosen(), self.world)
         page = open_page(self.host, self.port, asked, self.push_of)
         print(f"page: {page.url} (Ctrl-C ends it)", flush=True)
         try:
@@ -131,8 +131,7 @@ class View(PushQuestion):
 
     def push_of(self, asked: Asked) -> Push:
         """The push that the page asks for."""
-        given = {name: getattr(asked, name) for name in Asked._fields}
-        case = dataclasses.replace(self.case, **given)
+        case = dataclasses.replace(self.case, **asked._asdict())
         title = (
             f"{case.object_name.replace('_', ' ')}, friction ground {case.contact.ground:g}, robot "
             f"{case.contact.robot:g}, {asked.law}"
@@ -170,13 +169,9 @@ class Page:
     def __init__(
         self, server: ViserServer, gate: Gate, asked: Asked, make: Callable[[Asked], Push]
     ) -> None:
-        """A page without a push.
+        """A page without a push, whose panel proposes what is `asked`.
 
-        Args:
-          server: of viser, new.
-          gate: what guards it; the page says which messages it lets through.
-          asked: what the panel proposes at first.
-          make: the push that is asked for; called in a thread of its own, it may raise InputError.
+        `make` is called in a thread of its own, and may raise InputError.
         """
         self._server, self._make = server, make
         self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
@@ -317,11 +312,9 @@ class Page:
     def _state(self, live: Live) -> str:
         index = min(int(self._cursor), len(live.past) - 1)
         seen = live.past[index].seen
-        words = [
-            f"{index * live.period:.1f} s",
-            f"{float(seen.details.distance):.2f} m to the target",
-            _CONTACTS[int(seen.reading.contact_type)],
-        ]
+        words = [f"{index * live.period:.1f} s"]
+        words.append(f"{float(seen.details.distance):.2f} m to the target")
+        words.append(_CONTACTS[int(seen.reading.contact_type)])
         if seen.details.realigning:
             words.append("realigning")
         if live.done and index == len(live.past) - 1:
@@ -360,11 +353,8 @@ class Page:
             self._friction = gui.add_text(
                 "friction", asked.friction, hint="S1, S2 or ground,robot (as 0.25,0.4)"
             )
-            self._law = gui.add_dropdown(
-                "law",
-                tuple(dict.fromkeys((*registry.LAWS, asked.law))),
-                initial_value=asked.law,
-            )
+            laws = tuple(dict.fromkeys((*registry.LAWS, asked.law)))
+            self._law = gui.add_dropdown("law", laws, initial_value=asked.law)
             self._target = gui.add_vector2("target [m]", asked.target, step=0.1)
             self._again = gui.add_button("Push", color=(13, 148, 141))
         self._when(self._play.on_click, self._toggle)
@@ -430,18 +420,7 @@ def _ending(live: Live) -> str:
 
 
 def open_page(host: str, port: int, asked: Asked, make: Callable[[Asked], Push]) -> Page:
-    """A page, served from now on; see `Page`.
-
-    Args:
-      host: address to serve on.
-      port: to serve on; 0 takes any that is free.
-      asked: as for `Page`.
-      make: as for `Page`.
-
-    Raises:
-      InputError: viser is not installed, or host and port cannot be served on.
-    """
-    errors.check_count("port", port, at_least=0, at_most=65535)
+    """A page, served from now on; InputError if viser is missing, or it can't be served there."""
     try:
         import viser
     except ImportError as error:

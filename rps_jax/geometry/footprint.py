@@ -41,8 +41,8 @@ def polygon(vertices: np.ndarray | list) -> Footprint:
       InputError: they are not finite, not convex or not counter-clockwise.
 
     Example:
-      >>> import rps_jax
-      >>> rps_jax.polygon([(0.2, 0.0), (-0.1, 0.2), (-0.1, -0.2)]).vertices.shape
+      >>> from rps_jax.geometry.footprint import polygon
+      >>> polygon([(0.2, 0.0), (-0.1, 0.2), (-0.1, -0.2)]).vertices.shape
       (3, 2)
     """
     points = np.asarray(vertices, float)

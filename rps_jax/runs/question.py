@@ -376,9 +376,9 @@ def labelled(results: xr.Dataset) -> xr.Dataset:
     return results.set_coords([name for name in results if results[name].dims == ("world",)])
 
 
-def name_of(domain: DomainLike) -> str:
-    """What a domain is called."""
-    return domain if isinstance(domain, str) else "of one's own"
+def name_of(given: object) -> str:
+    """What a domain or a skin is called."""
+    return given if isinstance(given, str) else "of one's own"
 
 
 def count_of(mask: np.ndarray) -> int:

@@ -30,7 +30,7 @@ from rps_jax.record import folder as run_folder
 from rps_jax.record.checkpoint import Parts
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Kind, Plan, Shard, draw, made, open_run, share
-from rps_jax.runs.question import InDomain, OfLaws, Run, call_of, labelled
+from rps_jax.runs.question import InDomain, OfLaws, Pushes, Run, call_of, labelled
 from rps_jax.runs.results import (
     UNITS,
     Collector,
@@ -50,27 +50,15 @@ from rps_jax.world.draws import table
 _AHEAD = 16384  # worlds of a kind that are made before they are asked for, about
 
 
-@dataclass(frozen=True)
-class OfPlan(InDomain[xr.Dataset], OfLaws[xr.Dataset]):
-    """A question that pushes with every law in the same worlds of a plan."""
+class Planned(Pushes[xr.Dataset]):
+    """A question whose trials are those of a `plan`, which holds the run folder."""
 
-    worlds: int | None = option(None, 1, 1_000_000_000)
-    """Number of worlds, of indices 0, 1, ...; by default 1000, or the whole grid of a domain with
-    listed targets."""
-    part: int | None = option(None, 1, 1_000_000, kw_only=True)
-    """Number of trials in a part: what is lost of each law and object when killed, at most; by
-    default 1024, and of many worlds a 64th, up to 16384."""
-
-    @functools.cached_property
-    def plan(self) -> Plan:
-        """What is run."""
-        usual = self.ranges.combinations if self.ranges.targets else 1000
-        count = usual if self.worlds is None else self.worlds
-        return Plan(self.ranges, count, self.chosen, self.setting, self.part or _part_of(count))
+    plan: Plan | functools.cached_property[Plan]  # what is run
 
     def check(self) -> None:
         """Check the plan, and that the engine can step its worlds here."""
-        self.check_engine(list(self.plan.laws.values()))
+        self.plan.check_here()
+        batch.check_shape(self.slots, self.workers)
 
     def trials(self) -> int | None:
         """How many trials there are."""
@@ -87,6 +75,25 @@ class OfPlan(InDomain[xr.Dataset], OfLaws[xr.Dataset]):
     def answer(self, run: Run) -> xr.Dataset:
         """Run what is missing of the plan."""
         return whole(self.plan, run.folder, **run.shape)
+
+
+@dataclass(frozen=True)
+class OfPlan(Planned, InDomain[xr.Dataset], OfLaws[xr.Dataset]):
+    """A question that pushes with every law in the same worlds of a plan."""
+
+    worlds: int | None = option(None, 1, 1_000_000_000)
+    """Number of worlds, of indices 0, 1, ...; by default 1000, or the whole grid of a domain with
+    listed targets."""
+    part: int | None = option(None, 1, 1_000_000, kw_only=True)
+    """Number of trials in a part: what is lost of each law and object when killed, at most; by
+    default 1024, and of many worlds a 64th, up to 16384."""
+
+    @functools.cached_property
+    def plan(self) -> Plan:
+        """What is run."""
+        usual = self.ranges.combinations if self.ranges.targets else 1000
+        count = usual if self.worlds is None else self.worlds
+        return Plan(self.ranges, count, self.chosen, self.setting, self.part or _part_of(count))
 
     def intro(self, found: xr.Dataset) -> str:
         """What was asked."""
@@ -175,7 +182,7 @@ class Sweep(OfPlan):
     laws: LawsLike = ("rps", "nps", "aps")
     points: str | Path | xr.Dataset | np.ndarray | None = field(default=None, kw_only=True)
     """Points of the domain's unit cube at which the worlds lie, instead of drawn ones: what
-    rps_jax.worlds_at returned, or a NetCDF file of it, as points.nc of a run folder."""
+    world.points.worlds_at returned, or a NetCDF file of it, as points.nc of a run folder."""
     models: bool = field(default=False, kw_only=True)
     """Whether to run the same worlds on other grounds, cones and steps and in the quasi-static
     model, too, and to report how much the rates hang on these."""

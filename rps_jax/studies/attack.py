@@ -190,12 +190,8 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
             f"{gain['search']:.2f} an hour. {found.attrs['drawn_trials']:,} trials of drawn worlds "
             f"found {found.attrs['drawn_failing']}: {gain['drawn']:.2f} an hour. "
         )
-        text += (
-            f"The search finds {gain['times']:.1f} times as many, at least "
-            f"{gain['times_low']:.1f} times (95 %)."
-            if found.attrs["drawn_failing"]
-            else f"The search finds at least {gain['times_low']:.1f} times as many (95 %)."
-        )
+        times = f"{gain['times']:.1f} times as many, " if found.attrs["drawn_failing"] else ""
+        text += f"The search finds {times}at least {gain['times_low']:.1f} times (95 %)."
         title = f"{self.label}, {name_of(self.domain)}: worst trial of each cell"
         rise = Picture("search", partial(search_figure, found, gain["drawn"]))
         maps = Picture("archive", partial(archive_figure, found, self.axes, title))
@@ -321,13 +317,8 @@ class _Search:
                     bars.append(bar)
                 elif many and bars[k] < 1:
                     schedulers[k], bars[k] = self._scheduler(k, archive, bar), bar
-            history.append(
-                (
-                    int(archive.failing.sum()),
-                    self.probe.trials - before[0],
-                    self.probe.simulated - before[1],
-                )
-            )
+            spent = self.probe.trials - before[0], self.probe.simulated - before[1]
+            history.append((int(archive.failing.sum()), *spent))
         return self._labelled(archive, history, chance)
 
     @property
@@ -428,11 +419,7 @@ class _Search:
                 "trials": ("generation", trials),
                 "simulated": ("generation", simulated),
             },
-            {
-                "object": list(self.domain.objects),
-                "quantity": [one.name for one in every],
-                **middles,
-            },
+            {"object": list(self.domain.objects), "quantity": list(archive.names), **middles},
             chance,
         )
 
@@ -474,9 +461,8 @@ def archive_figure(found: xr.Dataset, axes_: Sequence[str], title: str) -> Figur
     """
     pairs = list(combinations(axes_, 2))
     objects = [str(name) for name in found.object.values]
-    figure = Figure(
-        figsize=(1.5 + 3.4 * len(pairs), 1.2 + 2.7 * len(objects)), layout="constrained"
-    )
+    size = 1.5 + 3.4 * len(pairs), 1.2 + 2.7 * len(objects)
+    figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(len(objects), len(pairs), squeeze=False)
     most = max(0.3, float(np.nanquantile(found.margin, 0.98)))
     norm, image = TwoSlopeNorm(0, -1, most), None
@@ -502,12 +488,7 @@ def archive_figure(found: xr.Dataset, axes_: Sequence[str], title: str) -> Figur
 
 
 def search_figure(found: xr.Dataset, drawn: float) -> Figure:
-    """Failing cells over simulated time: of a search, and as many as `drawn` worlds would give.
-
-    Args:
-      found: what `attack` returned.
-      drawn: failing cells of drawn worlds for each simulated hour.
-    """
+    """Failing cells over simulated time: of a search, and of `drawn` cells each hour."""
     figure = Figure(figsize=(5.5, 3.6), layout="constrained")
     ax = figure.subplots()
     hours = found.simulated.values / 3600

@@ -33,13 +33,12 @@ from rps_jax.control import registry
 from rps_jax.control.laws.guided import KNOTS, GuidedParams
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.record import files
-from rps_jax.record.checkpoint import Parts
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, draw, load_plan
 from rps_jax.runs.question import InDomain, Run, call_of, count_of, seed_of
 from rps_jax.trials import batch, score
 from rps_jax.trials.batch import Job, Part
-from rps_jax.trials.progress import InTurn, Report
+from rps_jax.trials.progress import InTurn
 from rps_jax.trials.trial import Outcome
 from rps_jax.trials.worlds import drawn_worlds
 
@@ -134,8 +133,93 @@ class Ceiling(InDomain[xr.Dataset]):
         return {"ceiling": self.plan.configuration(), "worlds": self.numbers.tolist()} | own
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Search plans, round by round."""
-        return _rounds(run.parts, self.plan, self.numbers, self, **run.shape)
+        """Search plans, round by round; finished rounds are not run again."""
+        state = start = _start(self.numbers)
+        heard = InTurn(run.report)
+        run = run._replace(report=heard)
+        for r in range(self.rounds):
+            open_ = np.flatnonzero(state.solved.values == 0)
+            if not open_.size:
+                break
+            name = f"round-{r:04d}"
+            if run.parts is None:
+                state = self._round(state, open_, r, run)
+            elif (content := run.parts.get(name)) is None:
+                state = self._round(state, open_, r, run)
+                run.parts.put(name, files.encoded(state))
+            else:
+                source = run.parts.folder / name
+                state = files.check_like(files.decoded(content, source, own=True), start, source)
+            heard.ended(open_.size * self.samples)
+        return state
+
+    def _round(self, state: xr.Dataset, open_: np.ndarray, r: int, run: Run) -> xr.Dataset:
+        """The state after one more round in the worlds `open_`, which are not solved."""
+        numbers, best = state.world.values[open_], state.offsets.values[open_]
+        until = np.nan_to_num(state.time.values[open_], nan=float(self.plan.setting.rules.horizon))
+        noise = self.perturbations(numbers, r, until)
+        tried = best[:, None] + noise  # (W, K, J, 3)
+        tried[:, 1] = state["mean"].values[open_]
+        outcome = self._tried(numbers, tried, state.sizes["world"], run)
+        cost = score.plan_costs(outcome, self.plan.setting.rules)
+        cost = cost.reshape(open_.size, self.samples)
+        weights = _weights(cost, self.temperature)
+        own = np.arange(self.samples) != 1  # M2's plan is no perturbation of the best
+        moved: Any = np.einsum("wk,wkji->wji", weights * own, noise)
+        moved /= np.maximum((weights * own).sum(axis=1), 1e-12)[:, None, None]
+        at = np.arange(open_.size), cost.argmin(axis=1)
+        won = outcome.success.reshape(cost.shape)
+        after = state.copy(deep=True)
+        after.offsets.values[open_] = tried[at]
+        after["mean"].values[open_] = best + moved
+        after.cost.values[open_] = cost[at]
+        after.time.values[open_] = np.asarray(outcome.time, float).reshape(cost.shape)[at]
+        after.solved.values[open_] = won[at]
+        if r == 0:
+            after.alone.values[open_] = won[:, 0]
+        after.rounds.values[open_] += 1
+        after.trials.values[open_] += self.samples
+        return after
+
+    def perturbations(self, worlds: np.ndarray, r: int, until: np.ndarray) -> np.ndarray:
+        """The perturbations (W, K, J, 3) [1] of round r; those of samples 0 and 1 are zero.
+
+        The window begins at r / `rounds` of the best plan's trials, which end at `until` (W,) [s].
+        They depend on the seed, the world's index and the round alone.
+        """
+        knots = max(1, round(self.window / self.hold))
+        found = np.zeros((worlds.size, self.samples, KNOTS, 3))
+        for row, (world, end) in enumerate(zip(worlds.tolist(), until, strict=True)):
+            first = min(int(end * r / self.rounds / self.hold), KNOTS - 1)
+            width = min(knots, KNOTS - first)
+            random = np.random.default_rng((self.plan.setting.seed, world, r))
+            drawn = random.normal(scale=self.spread, size=(self.samples - 2, width, 3))
+            found[row, 2:, first : first + width] = drawn
+        return found
+
+    def _tried(self, numbers: np.ndarray, offsets: np.ndarray, most: int, run: Run) -> Outcome:
+        """How every world (W,) goes under each of its plans (W, K, J, 3); leaves (W * K, ...).
+
+        There are as many slots as `most` worlds have use for, so that every round has one program.
+        """
+        flat = offsets.reshape(-1, *offsets.shape[2:]).astype(jnp.zeros(()).dtype)
+        guided = registry.law_of(GuidedParams())
+        which = self.plan.domain.object_of(numbers)
+        of_objects = [np.flatnonzero(which == one) for one in np.unique(which)]
+        slots = most * self.samples
+        jobs = [Job(guided, slots, self._part(numbers, rows, flat)) for rows in of_objects]
+        return batch.gathered(jobs, self.plan.setting, len(flat), **run.shape)[0]
+
+    def _part(self, numbers: np.ndarray, rows: np.ndarray, flat: np.ndarray) -> Iterator[Part]:
+        """The trials of the worlds `rows`, which are of one object, made when they are needed."""
+        plan = self.plan
+        part = drawn_worlds(plan.domain, draw(plan, numbers[rows]), RPSParams.tuned(), plan.setting)
+        trials = (rows[:, None] * self.samples + np.arange(self.samples)).ravel()
+        worlds = batch.rows(part.worlds, np.repeat(np.arange(rows.size), self.samples))
+        steps = max(1, round(self.hold / plan.setting.physics.control_period))
+        each: Any = np.full(trials.size, steps, flat.dtype)
+        params = GuidedParams(worlds.params, flat[trials], each)
+        yield Part(trials, worlds._replace(params=params), part.stage)
 
     def intro(self, found: xr.Dataset) -> str:
         """What was asked."""
@@ -144,49 +228,17 @@ class Ceiling(InDomain[xr.Dataset]):
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
         """How many were won, and by whom else."""
-        text = _sampled_told(found)
-        if self.results is None:
-            return [Section("A planner that knows the world", text)]
-        lost = " and ".join(self.lost_by)
-        text = f"In the worlds that {lost} lose, and in the first {self.sample}. {text}"
-        table = won_table(found, self.results, self.lost_by)
+        text, table = _sampled_told(found), []
+        if self.results is not None:
+            lost = " and ".join(self.lost_by)
+            text = f"In the worlds that {lost} lose, and in the first {self.sample}. {text}"
+            table = won_table(found, self.results, self.lost_by)
         return [Section("A planner that knows the world", text, table)]
 
 
 _SEARCH = ("samples", "rounds", "window", "spread", "temperature", "hold")  # fields of the search
 
 ceiling = call_of(Ceiling)
-
-
-def _rounds(
-    parts: Parts | None,
-    plan: Plan,
-    numbers: np.ndarray,
-    search: Ceiling,
-    *,
-    report: Report,
-    **shape: Any,
-) -> xr.Dataset:
-    """All rounds, those that are kept not run again."""
-    heard = InTurn(report)
-    state = _start(numbers)
-    for r in range(search.rounds):
-        open_ = np.flatnonzero(state.solved.values == 0)
-        if not open_.size:
-            break
-        content = None if parts is None else parts.get(f"round-{r:04d}")
-        if content is None:
-            state = _round(state, plan, search, r, heard, **shape)
-            if parts is not None:
-                parts.put(f"round-{r:04d}", files.encoded(state))
-        else:
-            assert parts is not None
-            source = parts.folder / f"round-{r:04d}"
-            state = files.check_like(
-                files.decoded(content, source, own=True), _start(numbers), source
-            )
-        heard.ended(open_.size * search.samples)
-    return state
 
 
 def _start(numbers: np.ndarray) -> xr.Dataset:
@@ -210,113 +262,17 @@ def _start(numbers: np.ndarray) -> xr.Dataset:
     return xr.Dataset(variables, {"world": numbers, "axis": ["v_x", "v_y", "omega"]})
 
 
-def _round(
-    state: xr.Dataset, plan: Plan, search: Ceiling, r: int, report: Report, **shape: Any
-) -> xr.Dataset:
-    """The state after one more round in the worlds that are not solved."""
-    open_ = np.flatnonzero(state.solved.values == 0)
-    numbers, best = state.world.values[open_], state.offsets.values[open_]
-    until = np.nan_to_num(state.time.values[open_], nan=float(plan.setting.rules.horizon))
-    noise = perturbations(search, plan.setting.seed, numbers, r, until)
-    tried = best[:, None] + noise  # (W, K, J, 3)
-    tried[:, 1] = state["mean"].values[open_]
-    outcome = _tried(plan, numbers, tried, search, report, state.sizes["world"], **shape)
-    cost = score.plan_costs(outcome, plan.setting.rules).reshape(open_.size, search.samples)
-    weights = _weights(cost, search.temperature)
-    own = np.arange(search.samples) != 1  # M2's plan is no perturbation of the best
-    moved: Any = np.einsum("wk,wkji->wji", weights * own, noise)
-    moved /= np.maximum((weights * own).sum(axis=1), 1e-12)[:, None, None]
-    pick = cost.argmin(axis=1)
-    rows = np.arange(open_.size)
-    at = rows, pick
-    won = outcome.success.reshape(cost.shape)
-    after = state.copy(deep=True)
-    after.offsets.values[open_] = tried[at]
-    after["mean"].values[open_] = best + moved
-    after.cost.values[open_] = cost[at]
-    after.time.values[open_] = np.asarray(outcome.time, float).reshape(cost.shape)[at]
-    after.solved.values[open_] = won[at]
-    if r == 0:
-        after.alone.values[open_] = won[:, 0]
-    after.rounds.values[open_] += 1
-    after.trials.values[open_] += search.samples
-    return after
-
-
-def perturbations(
-    search: Ceiling, seed: int, worlds: np.ndarray, r: int, until: np.ndarray
-) -> np.ndarray:
-    """The perturbations (W, K, J, 3) [1] of round r; those of samples 0 and 1 are zero.
-
-    The window begins at r / `rounds` of the best plan's trials, which end at `until` (W,) [s].
-    They depend on the seed, the world's index and the round alone.
-    """
-    knots = max(1, round(search.window / search.hold))
-    found = np.zeros((worlds.size, search.samples, KNOTS, 3))
-    for row, (world, end) in enumerate(zip(worlds.tolist(), until, strict=True)):
-        first = min(int(end * r / search.rounds / search.hold), KNOTS - 1)
-        width = min(knots, KNOTS - first)
-        random = np.random.default_rng((seed, world, r))
-        drawn = random.normal(scale=search.spread, size=(search.samples - 2, width, 3))
-        found[row, 2:, first : first + width] = drawn
-    return found
-
-
 def _weights(cost: np.ndarray, temperature: float) -> np.ndarray:
     """M1 (W, K) [1]; equal if all costs are."""
     lambda_ = temperature * cost.std(axis=1, keepdims=True)
     return np.exp(-(cost - cost.min(axis=1, keepdims=True)) / np.maximum(lambda_, 1e-9))
 
 
-def _tried(
-    plan: Plan,
-    numbers: np.ndarray,
-    offsets: np.ndarray,
-    search: Ceiling,
-    report: Report,
-    most: int,
-    **shape: Any,
-) -> Outcome:
-    """How every world (W,) goes under each of its plans (W, K, J, 3); leaves (W * K, ...).
-
-    There are as many slots as `most` worlds have use for, so that every round has one program.
-    """
-    samples = offsets.shape[1]
-    flat = offsets.reshape(-1, *offsets.shape[2:]).astype(jnp.zeros(()).dtype)
-    guided = registry.law_of(GuidedParams())
-    jobs = [
-        Job(guided, most * samples, parts)
-        for parts in _parts(plan, numbers, flat, samples, search.hold)
-    ]
-    return batch.gathered(jobs, plan.setting, len(flat), report=report, **shape)[0]
-
-
-def _parts(
-    plan: Plan, numbers: np.ndarray, flat: np.ndarray, samples: int, hold: float
-) -> Iterator[list[Part]]:
-    """The trials of each object of the domain."""
-    which = plan.domain.object_of(numbers)
-    steps = max(1, round(hold / plan.setting.physics.control_period))
-    for thing in np.unique(which):
-        rows = np.flatnonzero(which == thing)
-        part = drawn_worlds(plan.domain, draw(plan, numbers[rows]), RPSParams.tuned(), plan.setting)
-        many = np.repeat(np.arange(rows.size), samples)
-        trials = (rows[:, None] * samples + np.arange(samples)).ravel()
-        worlds = batch.rows(part.worlds, many)
-        each: Any = np.full(trials.size, steps, flat.dtype)
-        params = GuidedParams(worlds.params, flat[trials], each)
-        yield [Part(trials, worlds._replace(params=params), part.stage)]
-
-
 # --- beside a sweep or a ladder ------------------------------------------------------------
 
 
 def lost_worlds(results: xr.Dataset, lost_by: Sequence[str]) -> np.ndarray:
-    """Worlds of a sweep (law, world) that some laws all lose.
-
-    Raises:
-      InputError: a law is unknown.
-    """
+    """Worlds of a sweep (law, world) that some laws all lose."""
     laws = results.law.values.tolist()
     for name in lost_by:
         errors.check_name("law of the run", name, laws)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
+from scipy import stats
 
 from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import Figure, base_patch
@@ -66,12 +67,11 @@ def in_common(one: xr.Dataset, mask: np.ndarray, most: int = 4) -> list[tuple[st
     found = []
     for name in statistics.drawn(one):
         values = one[name].values.astype(float)
-        mine, every = values[mask], np.sort(values)
-        mine = mine[np.isfinite(mine)]
+        mine = values[mask & np.isfinite(values)]
         if mine.size < 3:
             continue
-        below = np.searchsorted(every, mine, "left") + np.searchsorted(every, mine, "right")
-        away = abs(below.mean() / (2 * every.size) - 0.5)
+        more = stats.mannwhitneyu(mine, np.nan_to_num(values, nan=np.inf)).statistic
+        away = abs(more / (mine.size * values.size) - 0.5)
         found.append((away, name, float(np.median(mine)), float(np.nanmedian(values))))
     ranked = sorted(found, reverse=True)[:most]
     return [(name, mine, usual) for away, name, mine, usual in ranked if away >= 0.1]
@@ -187,13 +187,7 @@ def _followed(plan: Plan, law: str, worlds: np.ndarray, heard: InTurn) -> Mappin
 
 
 def figure_of(seen: Sequence[xr.Dataset], labels: Sequence[str], title: str) -> Figure:
-    """Draw a map of each trial: the ways of base and object, and the base at ten moments.
-
-    Args:
-      seen: trials over time, as of `Trace.data`, variables (time, ...).
-      labels: of their panels.
-      title: of the figure.
-    """
+    """Draw a map of each trial: the ways of base and object, and the base at ten moments."""
     columns = min(_COLUMNS, len(seen))
     rows = -(-len(seen) // columns)
     figure = Figure(figsize=(0.4 + 2.3 * columns, 0.9 + 2.4 * rows), layout="constrained")

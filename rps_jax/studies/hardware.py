@@ -21,7 +21,7 @@ from rps_jax.control.registry import LawLike
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.robot.skin import SkinLike
-from rps_jax.runs.question import OfLaw, Run, call_of
+from rps_jax.runs.question import OfLaw, Run, call_of, name_of
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
 from rps_jax.trials.progress import InTurn
@@ -41,8 +41,7 @@ MIDDLE = Friction(0.35, 0.5)  # of which the paths are drawn, and at which the o
 
 def frictions() -> dict[str, Friction]:
     """The range of friction, labelled ground,robot."""
-    pairs = [Friction(ground, robot) for ground in HARDWARE_GROUND for robot in HARDWARE_ROBOT]
-    return {f"{one.ground:g},{one.robot:g}": one for one in pairs}
+    return {f"{g:g},{r:g}": Friction(g, r) for g in HARDWARE_GROUND for r in HARDWARE_ROBOT}
 
 
 @dataclass(frozen=True)
@@ -106,11 +105,8 @@ class Hardware(OfLaw[xr.Dataset]):
         """Run the experiments, the shoves, and the trials of Fig. 7."""
         heard, found = InTurn(run.report), []
         run = run._replace(report=heard)
-        for name, make in (
-            ("hardware", self._pushed),
-            ("shifted", self._shifted),
-            ("paths", self._paths),
-        ):
+        parts = {"hardware": self._pushed, "shifted": self._shifted, "paths": self._paths}
+        for name, make in parts.items():
             found.append(run.part(name, partial(make, run)))
             heard.ended(found[-1].attrs.pop("trials"))
         whole = xr.merge(found, combine_attrs="drop")
@@ -126,23 +122,16 @@ class Hardware(OfLaw[xr.Dataset]):
             for target in self.targets
         ]
         outcome, _ = pushes.run(cases, self.setting, **run.shape)
-        names = [self.label], HARDWARE_OBJECTS, tuple(frictions())
-        found = outcome_dataset(outcome, *names, self.targets)
-        return found.assign_attrs(trials=len(cases))
+        labels = [self.label], HARDWARE_OBJECTS, tuple(frictions()), self.targets
+        return outcome_dataset(outcome, *labels).assign_attrs(trials=len(cases))
 
     def _shifted(self, run: Run) -> xr.Dataset:
         """Success when the object is moved along the front of the robot, to either side."""
         sides = (1.0, -1.0)
         cases = [
-            replace(
-                self.base,
-                object=name,
-                target=target,
-                shift=Shift(self.shift_time, (0.0, side * size)),
-            )
+            replace(self.base, object=name, target=target, shift=Shift(self.shift_time, moved))
             for name in HARDWARE_OBJECTS
-            for size in self.shifts
-            for side in sides
+            for moved in [(0.0, side * size) for size in self.shifts for side in sides]
             for target in self.targets
         ]
         outcome, _ = pushes.run(cases, self.setting, **run.shape)
@@ -154,18 +143,13 @@ class Hardware(OfLaw[xr.Dataset]):
             "recovered": (outcome.success, "the target is reached after the shove"),
             "counted": (counted, "the trial was under way when the object was shoved"),
         }
-        return xr.Dataset(
-            {
-                name: (dims, values.astype(np.int8).reshape(sizes), _attrs("1", meaning))
-                for name, (values, meaning) in telling.items()
-            },
-            coords={
-                "object": list(HARDWARE_OBJECTS),
-                "shift": ("shift", list(self.shifts), _attrs("m", "length of the shove")),
-                "side": ["left", "right"],
-            },
-            attrs={"trials": len(cases)},
-        )
+        variables = {
+            name: (dims, values.astype(np.int8).reshape(sizes), _attrs("1", meaning))
+            for name, (values, meaning) in telling.items()
+        }
+        shift = ("shift", list(self.shifts), _attrs("m", "length of the shove"))
+        coords = {"object": list(HARDWARE_OBJECTS), "shift": shift, "side": ["left", "right"]}
+        return xr.Dataset(variables, coords, {"trials": len(cases)})
 
     def _paths(self, run: Run) -> xr.Dataset:
         """Fig. 7: every object to every target, at the middle of the friction range."""
@@ -189,11 +173,8 @@ class Hardware(OfLaw[xr.Dataset]):
         variables: dict[str, Any] = {k: (dims, v, _attrs("m", told[k])) for k, v in paths.items()}
         variables["path_success"] = (dims[:2], won, _attrs("1", "the target of Fig. 7 is reached"))
         variables["half"] = ("axis", half, _attrs("m", "half length and half width of the base"))
-        seconds = (
-            "path_time",
-            0.5 * np.arange(1, longest + 1),
-            _attrs("s", "time after the start"),
-        )
+        after = 0.5 * np.arange(1, longest + 1)
+        seconds = ("path_time", after, _attrs("s", "time after the start"))
         coords = {"object": list(HARDWARE_OBJECTS), "path_time": seconds, "axis": ["x", "y"]}
         return xr.Dataset(variables, coords, {"trials": len(HARDWARE_OBJECTS) * len(self.targets)})
 
@@ -201,7 +182,7 @@ class Hardware(OfLaw[xr.Dataset]):
         """What was asked."""
         ground, robot = HARDWARE_GROUND, HARDWARE_ROBOT
         return (
-            f"{self.label}, skin {registry_text(self.skin)}, engine {self.setting.engine}. "
+            f"{self.label}, skin {name_of(self.skin)}, engine {self.setting.engine}. "
             f"Friction was not measured by the paper: here every pair of object-ground {ground} "
             f"and object-robot {robot} is run."
         )
@@ -233,11 +214,6 @@ class Hardware(OfLaw[xr.Dataset]):
 hardware = call_of(Hardware)
 
 
-def registry_text(value: Any) -> str:
-    """A text as it was given, or what stands for one of one's own."""
-    return value if isinstance(value, str) else "of one's own"
-
-
 def _attrs(unit: str, meaning: str) -> dict[str, str]:
     return {"units": unit, "long_name": meaning}
 
@@ -250,18 +226,10 @@ def table(results: xr.Dataset) -> list[list[str]]:
         won = one.success.values.astype(bool)
         low, high = statistics.wilson(int(won.sum()), won.size)
         theirs = HARDWARE_RESULTS[name]
-        rows.append(
-            [
-                words(name),
-                f"{won.sum()} of {won.size}",
-                f"{100 * low:.0f}-{100 * high:.0f} %",
-                f"{theirs.success} of 8",
-                _spread(one.mean_abs_l.where(won), 3, "m"),
-                f"{theirs.mean_abs_l:.3f} m",
-                _spread(one.time.where(won), 0, "s"),
-                f"{theirs.time:.0f} s",
-            ]
-        )
+        rate = [f"{won.sum()} of {won.size}", f"{100 * low:.0f}-{100 * high:.0f} %"]
+        off = [_spread(one.mean_abs_l.where(won), 3, "m"), f"{theirs.mean_abs_l:.3f} m"]
+        time = [_spread(one.time.where(won), 0, "s"), f"{theirs.time:.0f} s"]
+        rows.append([words(name), *rate, f"{theirs.success} of 8", *off, *time])
     return rows
 
 
@@ -270,10 +238,8 @@ def _spread(values: xr.DataArray, digits: int, unit: str) -> str:
     if not values.notnull().any():
         return "-"
     each = values.mean("target")
-    low, high = float(each.min()), float(each.max())
-    return (
-        f"{float(values.mean()):.{digits}f} {unit} (by friction {low:.{digits}f}-{high:.{digits}f})"
-    )
+    mean, low, high = (f"{float(v):.{digits}f}" for v in (values.mean(), each.min(), each.max()))
+    return f"{mean} {unit} (by friction {low}-{high})"
 
 
 def shift_table(results: xr.Dataset) -> list[list[str]]:
@@ -283,7 +249,7 @@ def shift_table(results: xr.Dataset) -> list[list[str]]:
     for i, size in enumerate(results["shift"].values):
         cells = []
         for one, every in zip(won[:, i], of[:, i], strict=True):
-            low, high = statistics.wilson(int(one), int(every)) if every else (0.0, 1.0)
+            low, high = statistics.wilson(int(one), int(every))
             cells.append(f"{one} of {every} ({100 * low:.0f}-{100 * high:.0f} %)")
         rows.append([f"{100 * float(size):g} cm", *cells])
     return rows

@@ -89,12 +89,21 @@ class Paper(Pushes[xr.DataTree]):
 
     def report(self, found: xr.DataTree, run: Run) -> Sequence[Section]:
         """All tables and figures."""
+        trial, (_, push, hardware) = found["trial"].to_dataset(), self.parts
+        reached = "reached" if int(trial.outcome_success) else "not reached"
+        text = f"The target is {reached} at {float(trial.outcome_time):.1f} s."
+        fig_6 = Picture("trial", partial(figures.one_trial, trial, push.case.title))
+        rows = [["open", "our reading", "because"], *map(list, papers.CHOICES)]
+        left_open = (
+            "What another reading of each would change is measured in the project's study of "
+            "ambiguities, `sweeps/ambiguities`."
+        )
         return [
             *_setup(),
             *table.sections(found["table"].to_dataset()),
-            _fig_6(found["trial"].to_dataset(), self.parts[1].case.title),
-            *self.parts[2].report(found["hardware"].to_dataset(), run),
-            _open(),
+            Section("Fig. 6: the box to (-2, 0) under S1", text, (), fig_6),
+            *hardware.report(found["hardware"].to_dataset(), run),
+            Section("What the paper leaves open", left_open, rows),
         ]
 
 
@@ -103,9 +112,9 @@ paper = call_of(Paper)
 
 def _setup() -> list[Section]:
     """Table I, Fig. 3 and Fig. 4."""
-    rows = [["", *FRICTION]]
-    for i, name in enumerate(("object-ground", "object-robot")):
-        rows.append([name, *(f"{friction[i]:g}" for friction in FRICTION.values())])
+    ground, robot = zip(*FRICTION.values(), strict=True)
+    rows = [["", *FRICTION], ["object-ground", *map("{:g}".format, ground)]]
+    rows.append(["object-robot", *map("{:g}".format, robot)])
     profile = Picture("profile", partial(figures.profile, RPSParams.paper()))
     return [
         Section("Table I: friction", "As in the paper, by construction.", rows),
@@ -125,20 +134,3 @@ def _objects() -> Section:
         return Section("Fig. 4: the objects", f"Not drawn: {error}")
     picture = Picture("objects", partial(figures.stills, images, PAPER_OBJECTS))
     return Section("Fig. 4: the objects", "", (), picture)
-
-
-def _fig_6(seen: xr.Dataset, title: str) -> Section:
-    reached = "reached" if int(seen.outcome_success) else "not reached"
-    text = f"The target is {reached} at {float(seen.outcome_time):.1f} s."
-    picture = Picture("trial", partial(figures.one_trial, seen, title))
-    return Section("Fig. 6: the box to (-2, 0) under S1", text, (), picture)
-
-
-def _open() -> Section:
-    """What the paper leaves open, and what we chose."""
-    rows = [["open", "our reading", "because"], *map(list, papers.CHOICES)]
-    text = (
-        "What another reading of each would change is measured in the project's study of "
-        "ambiguities, `sweeps/ambiguities`."
-    )
-    return Section("What the paper leaves open", text, rows)

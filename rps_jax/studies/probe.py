@@ -5,15 +5,13 @@ from __future__ import annotations
 import importlib
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from rps_jax import engines
 from rps_jax.analysis import statistics
 from rps_jax.control import registry
 from rps_jax.control.base import Params
@@ -36,11 +34,7 @@ _STILL = 0.002  # [rad] tilt that says nothing: half of all pushes tilt their ob
 
 
 def need(module: str, package: str) -> ModuleType:
-    """A module of the optional packages.
-
-    Raises:
-      InputError: it is not installed.
-    """
+    """A module of the optional packages, or an InputError."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
@@ -71,32 +65,12 @@ class Probe:
     _heard: InTurn = field(init=False)
 
     def __post_init__(self) -> None:
-        """Raises InputError unless the engine can step these worlds with this law."""
-        registry.checked(self.params)
-        engine = engines.get(self.setting.engine)
-        engine.check(self.domain.families)
-        engine.check_robot(self.domain.weakest)
-        batch.check_shape(self.slots, self.workers)
+        """Hear of the progress of all calls in turn."""
         self._heard = InTurn(self.report)
 
-    def configuration(self) -> dict[str, Any]:
-        """What the answers depend on, as JSON."""
-        return {
-            "domain": asdict(self.domain),
-            "law": registry.recorded(self.params),
-            "physics": asdict(self.setting.physics),
-            "rules": registry.as_json(self.setting.rules),
-            "engine": self.setting.engine,
-        }
-
     def __call__(self, u: np.ndarray) -> xr.Dataset:
-        """Outcomes and `severity` (world) at points `u` (n, q).
-
-        Raises:
-          InputError: the folder holds an answer for other points.
-        """
+        """Outcomes and `severity` (world) at points `u` (n, q)."""
         at, name = points.checked(self.domain, u), f"{self.calls:06d}"
-        found = None
         if self.folder is not None:
             found = Parts(self.folder).results(name, lambda: self._try(at))
             sizes = {"world": len(at.u)}

@@ -15,8 +15,9 @@ failure that no group has met is in no interval.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
+from itertools import zip_longest
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -24,16 +25,11 @@ import xarray as xr
 from scipy import stats
 
 from rps_jax import errors
-from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import Figure
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.record.options import option
-from rps_jax.runs import sweep as sweeps
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, count_of, name_of, seed_of
+from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, name_of, seed_of
 from rps_jax.studies.probe import Probe
-from rps_jax.trials.progress import phase
-from rps_jax.trials.score import severity_of
 from rps_jax.world import points
 from rps_jax.world.domain import Domain
 
@@ -76,19 +72,6 @@ def joined(groups: np.ndarray, trials: int, least: float = 0.0) -> Estimate:
     variation = max(least, float(groups.std(ddof=1)) / p / np.sqrt(count))
     reach = variation * float(stats.t.ppf(0.975, count - 1))
     return Estimate(p, p * np.exp(-reach), min(1.0, p * np.exp(reach)), variation, trials)
-
-
-def split(score: Severity, kinds: Sequence[str], how: Rare, seed: int = 0) -> Found:
-    """The probability that `score` of a uniform point reaches a level.
-
-    Args:
-      score: of points (n, q), asked for one batch of all groups at a time.
-      kinds: (q,) of the coordinates; those of noise are drawn anew or kept, not moved.
-      how: sizes, and the level.
-      seed: of the points and moves.
-    """
-    (found,) = together(score, [steps(kinds, how, seed)])
-    return found
 
 
 def together(score: Severity, every: Sequence[Steps]) -> list[Found]:
@@ -216,8 +199,6 @@ class Rare(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     """Number of levels after which it gives up, and says 0 if nothing has failed."""
     repetitions: int = option(1, 1, 10_000)
     """How often all of it is done, side by side, each time with points of its own."""
-    brute: int = option(0, 0, 1_000_000_000)
-    """Number of drawn worlds that it is compared with."""
 
     def check(self) -> None:
         """Check that the groups are large enough, and the engine."""
@@ -226,38 +207,19 @@ class Rare(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         errors.check_count("seed", self.setting.seed, at_least=0, at_most=2**30)
         self.check_engine([self.params])
 
-    def configuration(self) -> dict[str, Any]:
-        """All that the answer depends on, but the drawn worlds beside it."""
-        found = super().configuration()
-        del found["brute"]
-        return found
-
     @property
     def level(self) -> float:
         """Severity from which on a trial is what is looked for."""
         return 1 + self.beyond
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Run the repetitions, and the drawn worlds they are compared with."""
+        """Run the repetitions."""
         domain, seed = self.ranges, self.setting.seed
         probe = Probe(domain, self.params, self.setting, run.folder, **run.shape)
         kinds = [one.kind for one in points.quantities(domain)]
         first = seed_of(seed, "tune") * 10_000
         every = [steps(kinds, self, first + i) for i in range(self.repetitions)]
-        found = _labelled(domain, together(lambda u: probe(u).severity.values, every))
-        return self._compared(found, run) if self.brute else found
-
-    def _compared(self, found: xr.Dataset, run: Run) -> xr.Dataset:
-        """The answer with the rate in drawn worlds, a sweep in the folder's `drawn`."""
-        seeded = replace(self.setting, seed=seed_of(self.setting.seed, "tune"))
-        plan = Plan(self.ranges, self.brute, {"law": self.params}, seeded, 4096)
-        phase(run.report, "drawn worlds")
-        folder = None if run.folder is None else run.folder / "drawn"
-        results = sweeps.whole(plan, folder, **run.shape)
-        failed = severity_of(results.sel(law="law"), self.setting.rules) >= self.level
-        told = brute(count_of(failed), failed.size)
-        values = {name: getattr(told, name) for name in Estimate._fields}
-        return found.assign({f"drawn_{name}": ((), value) for name, value in values.items()})
+        return _labelled(domain, together(lambda u: probe(u).severity.values, every))
 
     def intro(self, found: xr.Dataset) -> str:
         """What was asked."""
@@ -267,35 +229,17 @@ class Rare(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         return f"{self.label} in the domain {name_of(self.domain)}: {what}"
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """The estimates, beside drawn worlds if there are any."""
+        """The estimates."""
         text = (
-            "Intervals of 95 %: of the splitting from the spread of its groups, of drawn worlds by "
-            "Clopper and Pearson. The last column is the number of worlds over that of drawn "
-            "worlds with the same coefficient of variation. A kind of failure that no group has "
-            "met is in no interval."
+            "Intervals of 95 %, from the spread of the groups. The last column is the number of "
+            "worlds over that of drawn worlds with the same coefficient of variation. A kind of "
+            "failure that no group has met is in no interval."
         )
-        against = drawn_of(found)
-        if against is not None and not against.p:
-            text += " None of the drawn worlds fails."
-        elif against is not None:
-            off = 100 * (float(found.p.mean()) / against.p - 1)
-            text += (
-                f" {covered(found, against.p)} of {self.repetitions} intervals hold the rate of "
-                f"the drawn worlds, and the mean of all is {off:+.1f} % off it."
-            )
-        picture = Picture("rare", partial(figure_of, found, against))
-        return [Section("How rare is a failure", text, table(found, against), picture)]
+        picture = Picture("rare", partial(figure_of, found))
+        return [Section("How rare is a failure", text, table(found), picture)]
 
 
 rare = call_of(Rare)
-
-
-def drawn_of(found: xr.Dataset) -> Estimate | None:
-    """The estimate from drawn worlds, if it was asked for."""
-    if "drawn_p" not in found:
-        return None
-    p, low, high, variation = (float(found[f"drawn_{name}"]) for name in Estimate._fields[:4])
-    return Estimate(p, low, high, variation, int(found.drawn_trials))
 
 
 def _labelled(domain: Domain, every: Sequence[Found]) -> xr.Dataset:
@@ -303,24 +247,12 @@ def _labelled(domain: Domain, every: Sequence[Found]) -> xr.Dataset:
     columns: dict[str, Any] = {
         name: ("repetition", [getattr(one, name) for one in estimates]) for name in Estimate._fields
     }
-    deepest = max(len(found.levels) for found in every)
-    levels = np.full((len(every), deepest), np.nan)
-    for i, found in enumerate(every):
-        levels[i, : len(found.levels)] = found.levels
+    levels = np.array(list(zip_longest(*(found.levels for found in every), fillvalue=np.nan))).T
     columns["p_group"] = (("repetition", "group"), np.stack([found.groups for found in every]))
     columns["level"] = (("repetition", "depth"), levels)
-    u, severity = (np.concatenate([getattr(f, name) for f in every]) for name in ("u", "severity"))
-    columns["u"] = (("failure", "quantity"), u)
-    columns["severity"] = ("failure", severity)
+    columns["u"] = (("failure", "quantity"), np.concatenate([found.u for found in every]))
+    columns["severity"] = ("failure", np.concatenate([found.severity for found in every]))
     return xr.Dataset(columns, {"quantity": list(points.names(domain))})
-
-
-def brute(failures: int, trials: int) -> Estimate:
-    """Estimate the probability from drawn worlds, with the interval of Clopper and Pearson."""
-    p = failures / trials
-    low, high = statistics.clopper_pearson(failures, trials)
-    variation = np.sqrt((1 - p) / (p * trials)) if failures else float("inf")
-    return Estimate(p, low, high, float(variation), trials)
 
 
 def worlds_needed(p: float, variation: float) -> float:
@@ -328,46 +260,35 @@ def worlds_needed(p: float, variation: float) -> float:
     return (1 - p) / (p * variation**2) if p > 0 else float("inf")
 
 
-def table(found: xr.Dataset, against: Estimate | None = None) -> list[list[str]]:
-    """Header and a row for each repetition, all of them together, and drawn worlds beside them."""
+def table(found: xr.Dataset) -> list[list[str]]:
+    """Header and a row for each repetition, and one for all of them together."""
     rows = [["", "probability of failure", "95 %", "variation", "worlds", "share of drawn worlds"]]
-
-    def row(name: str, one: Estimate) -> list[str]:
-        known = one is not against and 0 < one.p < 1
-        share = one.trials / worlds_needed(one.p, one.variation) if known else float("nan")
-        ends = f"[{one.low:.2g}, {one.high:.2g}]"
-        said = f"{100 * share:.2g} %" if known else ""
-        return [name, f"{one.p:.3g}", ends, f"{one.variation:.2f}", f"{one.trials:,}", said]
-
     for i in range(found.sizes["repetition"]):
         one = found.isel(repetition=i)
-        p, low, high, variation = (float(one[name]) for name in Estimate._fields[:4])
-        each = Estimate(p, low, high, variation, int(one.trials))
-        rows.append(row(f"splitting, {i + 1}", each))
+        p, low, high, variation, trials = (float(one[name]) for name in Estimate._fields)
+        rows.append(row(f"splitting, {i + 1}", Estimate(p, low, high, variation, int(trials))))
     if found.sizes["repetition"] > 1:
-        whole = joined(found.p.values, int(found.trials.sum()))
-        rows.append(row("splitting, all", whole))
-    if against is not None:
-        rows.append(row("drawn worlds", against))
+        rows.append(row("splitting, all", joined(found.p.values, int(found.trials.sum()))))
     return rows
 
 
-def covered(found: xr.Dataset, p: float) -> int:
-    """In how many repetitions the interval holds `p`."""
-    return int(((found.low <= p) & (p <= found.high)).sum())
+def row(name: str, one: Estimate) -> list[str]:
+    """An estimate, and its number of worlds over that of drawn ones."""
+    said = ""
+    if 0 < one.p < 1:
+        said = f"{100 * one.trials / worlds_needed(one.p, one.variation):.2g} %"
+    ends = f"[{one.low:.2g}, {one.high:.2g}]"
+    return [name, f"{one.p:.3g}", ends, f"{one.variation:.2f}", f"{one.trials:,}", said]
 
 
-def figure_of(found: xr.Dataset, against: Estimate | None) -> Figure:
-    """Estimates of every repetition with their intervals, and drawn worlds' behind them."""
+def figure_of(found: xr.Dataset) -> Figure:
+    """Estimates of every repetition with their intervals."""
     figure = Figure(figsize=(6.5, 3.4), layout="constrained")
     ax = figure.subplots()
     place = np.arange(found.sizes["repetition"])
     p = found.p.values
     errors = np.abs(np.stack([p - found.low.values, found.high.values - p]))
     ax.errorbar(place + 1, p, errors, fmt="o", ms=4, capsize=2, color="C3", label="splitting")
-    if against is not None:
-        ax.axhspan(against.low, against.high, color="C0", alpha=0.2, lw=0)
-        ax.axhline(against.p, color="C0", label="drawn worlds")
     if (p > 0).all():
         ax.set_yscale("log")
     ax.set_xlabel("repetition")

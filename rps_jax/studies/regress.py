@@ -12,25 +12,22 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import xarray as xr
 
-from rps_jax import engines
 from rps_jax.analysis.report import Section
-from rps_jax.control import registry
 from rps_jax.control.registry import LawsLike
 from rps_jax.record import files
 from rps_jax.record.options import option
-from rps_jax.runs import sweep
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import OfLaws, Run, call_of
-from rps_jax.trials.progress import Report
+from rps_jax.runs.sweep import Planned
 from rps_jax.trials.score import severity_of
 from rps_jax.trials.trial import Rules
 from rps_jax.world import points
-from rps_jax.world.domain import DOMAINS, Domain
+from rps_jax.world.domain import DOMAINS
 
 FILE = Path(__file__).with_name("regression.nc")
 DOMAIN = "wide"
@@ -38,16 +35,12 @@ Known = Literal["rps", "rps_tuned", "rps_plus", "learned_gru"]
 
 
 def worlds() -> xr.Dataset:
-    """Read the points `u` (world, quantity), and `success` and `severity` (known, world).
-
-    Raises:
-      InputError: the file is damaged.
-    """
+    """Read the points `u` (world, quantity), and `success` and `severity` (known, world)."""
     return files.read(FILE)
 
 
 @dataclass(frozen=True)
-class Regress(OfLaws[xr.Dataset]):
+class Regress(Planned, OfLaws[xr.Dataset]):
     """Try laws in 200 worlds that were hard for those before them, and compare.
 
     The answer holds outcomes (law, world), and as `known_success` and `known_severity` (known,
@@ -75,28 +68,9 @@ class Regress(OfLaws[xr.Dataset]):
         at = points.checked(DOMAINS[DOMAIN], worlds().u.values[: self.worlds])
         return Plan(DOMAINS[DOMAIN], len(at.u), self.chosen, self.setting, points=at)
 
-    def check(self) -> None:
-        """Check that the engine can step these worlds with these laws here."""
-        engine = engines.get(self.setting.engine)
-        engine.check(self.plan.domain.families)
-        for params in self.chosen.values():
-            engine.check_senses(registry.law_of(params).senses)
-
-    def trials(self) -> int | None:
-        """How many trials there are."""
-        return self.plan.trials
-
-    def configuration(self) -> dict[str, Any]:
-        """All that the results depend on, as JSON."""
-        return self.plan.configuration()
-
-    def answered(self, report: Report) -> xr.Dataset:
-        """Push in these worlds; the sweep itself holds the run folder."""
-        return self.answer(self.run_in(None if self.out is None else Path(self.out), report))
-
     def answer(self, run: Run) -> xr.Dataset:
         """Push in these worlds."""
-        found = sweep.whole(self.plan, run.folder, **run.shape)
+        found = super().answer(run)
         known = worlds().isel(world=slice(found.sizes["world"]))
         return found.assign(
             known_success=(("known", "world"), known.success.values),
@@ -156,44 +130,3 @@ def changes(found: xr.Dataset, law: str, against: str, rules: Rules = Rules()) -
 
 def _told(severity: float) -> str:
     return "wins" if severity < 1 else f"fails, {100 * (severity - 1):.0f} cm off"
-
-
-def chosen(
-    domain: Domain, u: np.ndarray, severity: np.ndarray, count: int, first: np.ndarray
-) -> np.ndarray:
-    """Choose instructive and different worlds, as indices (count,).
-
-    All of `first` come in; then, again and again, the world that is farthest from those that are
-    in. A distance is that of the ranges' coordinates, and of the laws' severities, up to 2.
-
-    Args:
-      domain: whose points they are.
-      u: points (n, q).
-      severity: (laws, n) of each law.
-      count: how many.
-      first: indices that come in anyway.
-    """
-    kinds = np.array([one.kind for one in points.quantities(domain)])
-    features = np.concatenate(
-        [u[:, (kinds == "range") | (kinds == "choice")], 2 * np.minimum(severity, 2).T], axis=1
-    )
-    taken = list(map(int, first[:count])) or [int(severity.max(axis=0).argmax())]
-    near = np.min([np.linalg.norm(features - features[i], axis=1) for i in taken], axis=0)
-    while len(taken) < min(count, len(u)):
-        far = int(np.where(np.isin(np.arange(len(u)), taken), -1, near).argmax())
-        taken.append(far)
-        near = np.minimum(near, np.linalg.norm(features - features[far], axis=1))
-    return np.array(taken)
-
-
-def made(
-    domain: Domain, u: np.ndarray, found: xr.Dataset, laws: list[str], rules: Rules = Rules()
-) -> xr.Dataset:
-    """Make the content of the file, from points and their outcomes (law, world)."""
-    severity = np.stack([severity_of(found.sel(law=law), rules) for law in laws])
-    success = np.stack([found.success.sel(law=law).values for law in laws]).astype(np.int8)
-    return (
-        points.worlds_at(domain, u)[["u"]]
-        .assign(success=(("known", "world"), success), severity=(("known", "world"), severity))
-        .assign_coords(known=laws)
-    )

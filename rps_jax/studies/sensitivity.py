@@ -15,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -29,11 +28,10 @@ from rps_jax.analysis.report import Picture, Section
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.options import option
-from rps_jax.runs import sweep as sweeps
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, count_of, name_of, seed_of
+from rps_jax.runs.sweep import Planned
 from rps_jax.studies.probe import need
-from rps_jax.trials.progress import Report
 from rps_jax.world import points
 from rps_jax.world.domain import WORDS, Domain
 
@@ -49,9 +47,7 @@ _WORDS = {
     "key": "key of all noise",
     "com_bearing": "bearing of the centre of mass",
 }
-_ENOUGH = 30  # base points at which a trial fails, for indices that mean something
-_RESAMPLES = 1000
-_NOTHING = 0.05  # [1] a total index that is not worth a word
+ENOUGH = 30  # base points at which a trial fails, for indices that mean something
 
 
 @dataclass(frozen=True)
@@ -87,14 +83,7 @@ class Design:
 def design(domain: Domain, worlds: int, seed: int = 0, apart: bool = False) -> Design:
     """The greatest design of at most so many worlds.
 
-    Args:
-      domain: ranges of what differs between worlds.
-      worlds: at most.
-      seed: of the scrambling, of points of its own.
-      apart: whether each number of the noise and of a prism's corners is a factor of its own.
-
-    Raises:
-      InputError: so few worlds have no design.
+    If `apart`, each number of the noise and of a prism's corners is a factor of its own.
     """
     every = points.quantities(domain)
     groups = tuple(one.name if apart else _TOGETHER.get(one.kind, one.name) for one in every)
@@ -110,7 +99,7 @@ def design(domain: Domain, worlds: int, seed: int = 0, apart: bool = False) -> D
 
 
 @dataclass(frozen=True)
-class Sensitivity(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
+class Sensitivity(Planned, InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     """Share the blame for failures among all quantities that are drawn, by Sobol indices.
 
     The answer holds `first`, `total` and the half widths `first_reach`, `total_reach` of their
@@ -144,28 +133,11 @@ class Sensitivity(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         at = points.checked(self.ranges, self.design.u())
         return Plan(self.ranges, self.design.worlds, {"law": self.params}, self.setting, points=at)
 
-    def check(self) -> None:
-        """Check that there are worlds enough, the engine and SALib."""
-        self.check_engine([self.params])
-        _ = self.plan
-
-    def trials(self) -> int | None:
-        """How many trials there are."""
-        return self.plan.trials
-
-    def configuration(self) -> dict[str, Any]:
-        """All that the results depend on, as JSON."""
-        return self.plan.configuration()
-
-    def answered(self, report: Report) -> xr.Dataset:
+    def answer(self, run: Run) -> xr.Dataset:
         """Run the worlds that are missing, and analyse them."""
-        out = None if self.out is None else Path(self.out)
-        results = sweeps.whole(
-            self.plan, out, slots=self.slots, workers=self.workers, report=report
-        )
-        found = analysed(self.design, results)
-        if out is not None:
-            files.write_results(out / "sobol.nc", found)
+        found = analysed(self.design, super().answer(run))
+        if run.folder is not None:
+            files.write_results(run.folder / "sobol.nc", found)
         return found
 
     def intro(self, found: xr.Dataset) -> str:
@@ -177,31 +149,24 @@ class Sensitivity(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Indices, whether mass costs anything, and pairs of quantities."""
+        """Indices, and pairs of quantities."""
         order = ranked(found)
-        said_ = {one: in_words(one) for one in order}
+        said = {one: in_words(one) for one in order}
         drawn = [one for one in order if one in found.quantity.values][:5]
         failed = found.success.values == 0
         title = f"{self.label}, {name_of(self.domain)}: failures over pairs, {failed.size:,} worlds"
         kinds = [one.removeprefix("random_") for one in self.ranges.objects]
-        pairs = partial(
-            interactions,
-            found.u.sel(quantity=drawn).values,
-            failed,
-            [said_[one] for one in drawn],
-            {in_words("object"): kinds},
-            title,
-        )
+        u, names = found.u.sel(quantity=drawn).values, [said[one] for one in drawn]
+        pairs = partial(interactions, u, failed, names, {in_words("object"): kinds}, title)
         text = (
             "The first index is the share of the variance that a quantity explains alone, the "
             "total one what goes with it and all its interactions; noise and the corners of "
             f"prisms are one quantity each. Intervals are bootstrapped, of 95 %. {reliable(found)}"
         )
-        indices = Picture("sobol", partial(indices_figure, found, said_, OUTPUTS))
+        indices = Picture("sobol", partial(indices_figure, found, said))
         maps = Picture("interactions", pairs)
         return [
             Section("Which quantity is to blame", text, table(found), indices),
-            Section("Does mass cost anything", said(found)),
             Section("Interactions of the first five", "", (), maps),
         ]
 
@@ -227,9 +192,8 @@ def analysed(blocks: Design, results: xr.Dataset) -> xr.Dataset:
             blocks.problem(), values[name], calc_second_order=False, seed=blocks.seed + 1,
             num_resamples=200,
         )  # fmt: skip
-        for column, key in (("first", "S1"), ("total", "ST")):
+        for column, key in zip(columns, ("S1", "S1_conf", "ST", "ST_conf"), strict=True):
             columns[column][i] = told[key]
-            columns[f"{column}_reach"][i] = told[f"{key}_conf"]
     found: dict[str, Any] = {name: (("output", "factor"), v) for name, v in columns.items()}
     found["u"] = (("world", "quantity"), blocks.u())
     found |= {name: ("world", v) for name, v in values.items()}
@@ -275,50 +239,9 @@ def failing(found: xr.Dataset) -> int:
 def reliable(found: xr.Dataset) -> str:
     """Whether there are failures enough, in a sentence."""
     told = f"Trials fail at {failing(found)} of {found.attrs['base']} base points"
-    if failing(found) < _ENOUGH:
+    if failing(found) < ENOUGH:
         return f"{told}, too few for indices of success to mean anything: run more worlds."
     return f"{told}."
-
-
-def cost(found: xr.Dataset, name: str) -> tuple[float, float, float]:
-    """Success in the upper third of a quantity's range less that in its lower third, with 95 %.
-
-    The interval resamples base points, since the worlds of one differ in one factor only.
-    """
-    at = found.u.sel(quantity=name).values
-    won = found.success.values
-    high, low = at >= 2 / 3, at < 1 / 3
-    blocks = np.arange(won.size) // (won.size // found.attrs["base"])
-    sums = np.stack(
-        [np.bincount(blocks, w, found.attrs["base"]) for w in (high * won, high, low * won, low)]
-    )
-    rng = np.random.default_rng(0)
-    drawn = rng.integers(0, sums.shape[1], (_RESAMPLES, sums.shape[1]))
-    a, b, c, d = sums[:, drawn].sum(axis=2)
-    spread = a / np.maximum(b, 1) - c / np.maximum(d, 1)
-    a, b, c, d = sums.sum(axis=1)
-    ends = np.quantile(spread, [0.025, 0.975])
-    return float(a / max(b, 1) - c / max(d, 1)), float(ends[0]), float(ends[1])
-
-
-def said(found: xr.Dataset, name: str = "mass") -> str:
-    """Whether a quantity costs success, in a sentence."""
-    if name not in found.factor.values:
-        return f"The domain draws no {name}."
-    difference, low, high = (100 * value for value in cost(found, name))
-    one = found.sel(output="success", factor=name)
-    numbers = (
-        f"between the lower and the upper third of its range success changes by {difference:+.1f} "
-        f"points [{low:+.1f}, {high:+.1f}], and its total index is {one.total:.2f} ± "
-        f"{one.total_reach:.2f}"
-    )
-    if high < 0:
-        return f"More {name} costs success: {numbers}."
-    if low > 0:
-        return f"More {name} helps: {numbers}."
-    if float(one.total - one.total_reach) > _NOTHING and failing(found) >= _ENOUGH:
-        return f"On average {name} costs nothing, but together with others it matters: {numbers}."
-    return f"No cost of {name} is seen in {found.sizes['world']:,} worlds: {numbers}."
 
 
 # --- figures -------------------------------------------------------------------------------
@@ -326,21 +249,13 @@ def said(found: xr.Dataset, name: str = "mass") -> str:
 _BINS = 4  # of each range of a map of interactions
 
 
-def indices_figure(
-    found: xr.Dataset, order: Mapping[str, str], outputs: Mapping[str, str]
-) -> Figure:
-    """Indices of first and total order with their intervals, the greatest on top.
-
-    Args:
-      found: what `sensitivity` returned.
-      order: factors in words, by name, the greatest first.
-      outputs: what is explained, in words.
-    """
+def indices_figure(found: xr.Dataset, order: Mapping[str, str]) -> Figure:
+    """Indices of first and total order with their intervals, the greatest on top."""
     order = dict(list(order.items())[::-1])
     figure = Figure(figsize=(11, 1.4 + 0.24 * len(order)), layout="constrained")
-    axes = figure.subplots(1, len(outputs), sharey=True)
+    axes = figure.subplots(1, len(OUTPUTS), sharey=True)
     place = np.arange(len(order))
-    for ax, (output, said) in zip(axes, outputs.items(), strict=True):
+    for ax, (output, said) in zip(axes, OUTPUTS.items(), strict=True):
         one = found.sel(output=output, factor=list(order))
         for which, shift, colour in (("total", 0.15, "C3"), ("first", -0.15, "C0")):
             ax.errorbar(
@@ -365,14 +280,9 @@ def interactions(
     choices: Mapping[str, Sequence[str]],
     title: str,
 ) -> Figure:
-    """Failures over each pair of quantities, their ranges in equal parts.
+    """Failures (n,) at points `u` (n, k) over each pair of quantities, ranges in equal parts.
 
-    Args:
-      u: (n, k) coordinates of worlds in the unit cube.
-      failed: (n,) 0 or 1.
-      names: (k,) of the quantities, in words.
-      choices: what is chosen from, of those that are no ranges, by their names in words.
-      title: of the figure.
+    `choices` has what is chosen from, of those that are no ranges, by their names in words.
     """
     count = len(names)
     figure = Figure(figsize=(1.5 + 2 * (count - 1), 1.6 + 1.8 * (count - 1)), layout="constrained")

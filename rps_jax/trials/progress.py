@@ -67,9 +67,10 @@ class Bar:
 
     Example:
       >>> import rps_jax
+      >>> from rps_jax.trials.progress import Bar
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
       >>> setting = rps_jax.Setting("quasistatic", rules=rules)
-      >>> with rps_jax.Bar("sweep", 8, shown=False) as bar:
+      >>> with Bar("sweep", 8, shown=False) as bar:
       ...     found = rps_jax.sweep("rps", drums, worlds=8, setting=setting, report_to=bar)
       >>> bar.timing.simulated > 0
       True

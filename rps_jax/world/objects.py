@@ -130,7 +130,8 @@ def register_object(
       ... </mujoco>'''
       >>> _ = Path("crate.xml").write_text(crate)
       >>> rps_jax.register_object("crate", "crate.xml")
-      >>> rps_jax.Case("crate", "S1", (2.0, 0.0), "rps").object
+      >>> from rps_jax.trials.case import Case
+      >>> Case("crate", "S1", (2.0, 0.0), "rps").object
       'crate'
     """
     if name in _BUILT_IN:

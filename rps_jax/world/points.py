@@ -290,10 +290,10 @@ def worlds_at(
     Example:
       >>> import numpy as np
       >>> import rps_jax
-      >>> from rps_jax.world.points import points_of
+      >>> from rps_jax.world.points import points_of, worlds_at
       >>> drums = rps_jax.Domain(("random_cylinder",))
       >>> u = points_of(drums, np.arange(4))
-      >>> worlds = rps_jax.worlds_at(drums, u)
+      >>> worlds = worlds_at(drums, u)
       >>> float(worlds.high.sel(quantity="mass"))
       60.0
       >>> setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
 
+import numpy as np
 import xarray as xr
 
 from rps_jax import errors
-from rps_jax.analysis import figures
+from rps_jax.analysis.figures.style import OBJECT_COLOURS, Figure, success_rates, words
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.runs.question import Run, call_of
@@ -110,9 +111,37 @@ class Ambiguities(Trials[xr.Dataset]):
         if self.curve and not self.readings and "rps" in laws:
             curve = readings.by_tolerance(found, readings.TOLERANCES)
             trials = self.grid.size // len(PAPER_OBJECTS)
-            picture = Picture("tolerance", partial(figures.tolerance_curve, curve, trials))
+            picture = Picture("tolerance", partial(tolerance_curve, curve, trials))
             sections.append(Section("Success over the skin's tolerance", "", (), picture))
         return sections
 
 
 ambiguities = call_of(Ambiguities)
+
+
+def tolerance_curve(curve: xr.Dataset, trials: int) -> Figure:
+    """Success of RPS, and time without contact, over skin tolerance.
+
+    A column for each behaviour on loss of contact, which `what` puts into words; `curve` has, by
+    (loss, tolerance, object), the mean time `lost`, and how many of `trials` were `won`.
+    """
+    columns = curve.sizes["loss"]
+    figure = Figure(figsize=(4 * columns, 5), layout="constrained")
+    axes = figure.subplots(2, columns, squeeze=False, sharex=True, sharey="row")
+    x = curve.tolerance.values
+    for (above, below), loss in zip(axes.T, map(str, curve.loss.values), strict=True):
+        for i, name in enumerate(map(str, curve.object.values)):
+            one = curve.sel(loss=loss, object=name)
+            style: dict[str, Any] = {"color": OBJECT_COLOURS[name], "label": words(name)}
+            beside = x + 0.15 * (i - 1)  # where curves coincide
+            success_rates(above, beside, one.won.values, np.full(len(x), trials), **style)
+            below.plot(beside, one.lost.values, "o-", ms=4, lw=1.2, **style)
+        above.set_title(f"on loss: {curve.what.sel(loss=loss).item()}", fontsize=9)
+        above.set_ylim(-3, 103)
+        below.set_xlabel("skin tolerance [mm]")
+        for ax in (above, below):
+            ax.grid(alpha=0.3)
+    axes[0, 0].set_ylabel("success [%]")
+    axes[1, 0].set_ylabel("mean time without contact [s]")
+    axes[0, -1].legend(fontsize=8)
+    return figure

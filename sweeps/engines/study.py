@@ -18,7 +18,7 @@ import xarray as xr
 
 from rps_jax import engines as engines_
 from rps_jax import errors
-from rps_jax.analysis import tables
+from rps_jax.analysis import statistics
 from rps_jax.analysis.report import Section
 from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
@@ -122,7 +122,33 @@ class Engines(Trials[xr.DataTree]):
     def report(self, found: xr.DataTree, run: Run) -> Sequence[Section]:
         """Outcomes equal to those of the first engine."""
         each = {name: found[name].to_dataset() for name in self.plans}
-        return [Section("Equal outcomes", "", tables.agreement_table(each))]
+        return [Section("Equal outcomes", "", agreement_table(each))]
 
 
 engines = call_of(Engines)
+
+
+def agreement_table(found: Mapping[str, xr.Dataset]) -> list[list[str]]:
+    """Header and one row for each engine: success, and outcomes equal to the first's, by object.
+
+    The results are those of one law in the same worlds.
+    """
+    base = next(iter(found.values()))
+    groups = statistics.worlds_by_object(base)
+    rows = [["engine", *groups, "equal outcomes", "95 %", *(f"equal, {g}" for g in groups), "+/-"]]
+    for name, one in found.items():
+        won = one.success.values > 0
+        same = won == (base.success.values > 0)
+        c = statistics.compare(base.success, one.success)
+        low, high = c.equal_interval
+        rows.append(
+            [
+                name,
+                *(f"{won[mask].sum()} of {mask.sum()}" for mask in groups.values()),
+                f"{100 * c.equal:.1f} %",
+                f"{100 * low:.0f}-{100 * high:.0f} %",
+                *(f"{same[mask].sum()} of {mask.sum()}" for mask in groups.values()),
+                f"+{c.gained} -{c.lost}",
+            ]
+        )
+    return rows

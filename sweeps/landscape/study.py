@@ -8,16 +8,16 @@ and around sets of parameters. Both push with a few hundred candidates: for a GP
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, ClassVar
 
+import numpy as np
 import xarray as xr
 
 from rps_jax import engines, errors
-from rps_jax.analysis import figures
-from rps_jax.analysis.figures.style import Figure
+from rps_jax.analysis.figures.style import Figure, success_rates
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.laws.rps import BOUNDS, RPSParams
 from rps_jax.record.options import option
@@ -103,7 +103,7 @@ class Landscape(OfLaws[xr.DataTree]):
         """Success against each parameter, and the front."""
         alone, front = (found[name].to_dataset() for name in ("alone", "front"))
         log = [name for name, bound in BOUNDS.items() if bound.log]
-        lines = Picture("landscape", partial(figures.sensitivity, alone, log))
+        lines = Picture("landscape", partial(parameters_figure, alone, log))
         trade = Picture("front", partial(front_figure, front))
         return [
             Section("Success against each parameter", "", (), lines),
@@ -135,4 +135,39 @@ def front_figure(results: xr.Dataset) -> Figure:
         ax.grid(alpha=0.3)
     figure.axes[0].set_ylabel("success [%]")
     figure.axes[0].legend(fontsize=8, loc="lower right")
+    return figure
+
+
+def parameters_figure(results: xr.Dataset, log: Collection[str]) -> Figure:
+    """Success against each parameter alone, those of `log` on a logarithmic axis.
+
+    Intervals are Wilson's, of 95 %.
+    """
+    names = list(map(str, results.parameter.values))
+    rows = -(-len(names) // 4)
+    figure = Figure(figsize=(12, 2.5 * rows), layout="constrained")
+    axes = figure.subplots(rows, 4, squeeze=False, sharey=True).ravel()
+    for ax in axes[len(names) :]:
+        ax.axis("off")
+    of = int(results.attrs["worlds"])
+    for ax, name in zip(axes, names, strict=False):
+        for i, which in enumerate(map(str, results.set.values)):
+            one = results.sel(set=which, parameter=name)
+            won = np.round(one.success.values * of).astype(int)
+            success_rates(
+                ax,
+                one.value.values,
+                won,
+                np.full(won.size, of),
+                beside=i,
+                color=f"C{i}",
+                label=which,
+            )
+        ax.set_xlabel(name, fontsize=9)
+        ax.grid(alpha=0.3)
+        if name in log:
+            ax.set_xscale("log")
+    for ax in axes[::4]:
+        ax.set_ylabel("success [%]")
+    axes[0].legend(fontsize=8)
     return figure

@@ -11,7 +11,7 @@ import dataclasses
 import os
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import product
@@ -23,7 +23,7 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import engines, errors
-from rps_jax.analysis import figures
+from rps_jax.analysis.figures.style import Figure, words
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
@@ -165,7 +165,7 @@ class Speed(Study[xr.Dataset]):
             for row in (found.isel(measurement=i) for i in range(found.sizes["measurement"]))
         ]
         points = [(s.family, s.name, s.worlds, s.rate) for s in speeds]
-        picture = Picture("throughput", partial(figures.throughput, points, tuple(IN_C)))
+        picture = Picture("throughput", partial(throughput, points, tuple(IN_C)))
         sections = [Section("Simulated seconds in a second", "", table(speeds), picture)]
         if self.refill and run.parts is not None:
             gain = run.part("refilling", partial(_gain, self.refill, self.rounds))
@@ -326,3 +326,27 @@ def table(speeds: list[Measurement]) -> list[list[str]]:
              f"{s.contacts}", f"{s.compile:.1f} s", f"{s.rate:,.0f}", ratio, memory]
         )  # fmt: skip
     return rows
+
+
+def throughput(speeds: Iterable[tuple[str, str, int, float]], steady: Collection[str]) -> Figure:
+    """Simulated seconds per second over the batch, a panel for each family.
+
+    `speeds` has rows of a family, a program, its worlds, and its speed; a program of `steady` has
+    one speed whatever the batch, and is drawn as a level line.
+    """
+    found: dict[str, dict[str, list[tuple[int, float]]]] = {}
+    for family, name, worlds, rate in speeds:
+        found.setdefault(family, {}).setdefault(name, []).append((worlds, rate))
+    figure = Figure(figsize=(4.5 * len(found), 4.0), layout="constrained")
+    axes = figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
+    for ax, (family, programs) in zip(axes, found.items(), strict=True):
+        for i, (name, points) in enumerate(programs.items()):
+            if name in steady:
+                ax.axhline(points[0][1], color=f"C{i}", ls="--", label=name)
+            else:
+                ax.plot(*zip(*points, strict=True), marker="o", color=f"C{i}", label=name)
+        ax.set(xscale="log", yscale="log", xlabel="worlds in the batch", title=words(family))
+        ax.grid(alpha=0.3, which="both")
+    axes[0].set_ylabel("simulated s per s")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return figure

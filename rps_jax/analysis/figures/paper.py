@@ -5,37 +5,34 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from matplotlib import patches
 from matplotlib.axes import Axes
 
 from rps_jax.analysis.figures.style import SHADES, Figure, base_patch, shade, words
-from rps_jax.robot import skin
+from rps_jax.control.laws import rps
+from rps_jax.control.laws.rps import RPSParams
+from rps_jax.robot import shell, skin
 
 
-def time_to_success(results: xr.Dataset, law: str) -> Figure:
-    """Time of the successes over the target's distance, coloured by how far it lies off ahead."""
-    distance = np.hypot(results.target_x.values, results.target_y.values)
-    off = np.degrees(np.abs(np.arctan2(results.target_y.values, results.target_x.values)))
-    objects = list(map(str, results.object.values))
-    figure = Figure(figsize=(1 + 3.2 * len(objects), 3.4), layout="constrained")
-    axes = figure.subplots(1, len(objects), squeeze=False, sharey=True)[0]
-    image = None
-    for ax, name in zip(axes, objects, strict=True):
-        part = results.sel(law=law, object=name)
-        for marker, friction in zip("osv^", map(str, part.friction.values), strict=False):
-            one = part.sel(friction=friction)
-            time = one.time.where(one.success == 1).values
-            image = ax.scatter(
-                distance, time, c=off, marker=marker, vmin=0, vmax=180, s=26, label=friction
-            )
-        ax.set(xlabel="distance of the target [m]", title=words(name))
-        ax.grid(alpha=0.3)
-    axes[0].set_ylabel("time to success [s]")
-    axes[0].legend(fontsize=8)
-    assert image is not None
-    figure.colorbar(image, ax=axes).set_label("target off straight ahead [deg]")
+def profile(params: RPSParams) -> Figure:
+    """The logistic profile of Eq. 5 (in the paper's Fig. 3): a_r over the contact location."""
+    l = jnp.linspace(-shell.HALF_WIDTH, shell.HALF_WIDTH, 401)  # noqa: E741
+    far = jnp.asarray(2 * params.d_th)
+    a_r = jax.vmap(lambda l: rps.adaptive_rate(params, l, far))(l)  # noqa: E741
+    figure = Figure(figsize=(5.5, 3.2), layout="constrained")
+    ax = figure.subplots()
+    ax.plot(l, a_r, color="C0")
+    for side in (-1, 1):
+        ax.axvspan(
+            side * float(params.l_cr), side * shell.HALF_WIDTH, color=SHADES["realigning"], lw=0
+        )
+        ax.axvline(side * float(params.beta), color="0.6", lw=0.7, ls="--")
+    ax.set(xlabel="contact location $l$ [m]", ylabel="adaptive rate $a_r$ [1]")
+    ax.set_title("Eq. 5; dashed: $\\pm\\beta$; shaded: critical region", fontsize=9)
     return figure
 
 

@@ -46,9 +46,7 @@ def base_patch(
     corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half
     c, s = np.cos(pose[2]), np.sin(pose[2])
     world = corners @ np.array([[c, s], [-s, c]]) + pose[:2]
-    return patches.Polygon(
-        world, closed=True, facecolor="0.35" if fill else "none", edgecolor="0.35"
-    )
+    return patches.Polygon(world, facecolor="0.35" if fill else "none", edgecolor="0.35")
 
 
 def shade(ax: Axes, time: np.ndarray, active: np.ndarray, colour: str) -> None:

@@ -42,8 +42,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _ask(words: list[str]) -> None:
     """Find the question, read its options, and answer it."""
     from rps_jax.app.cli import flags
+    from rps_jax.engines import device
 
     name, rest = names.split(words)
-    running.be_deterministic()
+    device.be_deterministic()
     question = names.question_of(name)
     running.carry_out(*flags.parse(question, name, rest))

@@ -45,12 +45,7 @@ class Beside(NamedTuple):
 
 
 def parse(kind: type[Any], name: str, words: Sequence[str]) -> tuple[Any, Beside]:
-    """Read the options of a question.
-
-    Raises:
-      InputError: one is unknown, lacks its value, or is not allowed.
-      SystemExit: help was asked for, and is printed.
-    """
+    """Read the options of a question, or raise InputError; SystemExit if help was asked for."""
     flat, beside = _flat(kind)
     summary = (kind.__doc__ or "").split("\n\n", 1)[0].replace("\n", " ")
     made = dataclasses.make_dataclass(kind.__name__, flat, frozen=True)
@@ -141,27 +136,19 @@ def _flat(kind: type[Any]) -> tuple[list[Any], list[str]]:
         if types_[one.name] is Setting:
             last = [*_of_setting(_default(one)), *last]
         else:
-            made = _option(one, cli_type(types_[one.name]), helps.get(one.name, ""))
+            kind_, help_ = cli_type(types_[one.name]), helps.get(one.name, "")
+            made = _made(one.name, kind_, _default(one), help_, options.is_positional(one))
             (last if one.name in shared else own).append(made)
-    beside: list[str] = []
-    if issubclass(kind, Pushes) or _followed(kind):
-        beside = ["device"] if hasattr(kind, "in_shell") else ["device", "overwrite"]
-    beside += ["video", "film_length"] if _followed(kind) else []
+    beside = ["device"] if issubclass(kind, Pushes | FollowsOne) else []
+    if beside and not hasattr(kind, "in_shell"):
+        filmed = issubclass(kind, FollowsOne)  # one trial over time
+        beside += ["overwrite", "video", "film_length"] if filmed else ["overwrite"]
     texts, hints = options.helps(Beside), typing.get_type_hints(Beside)
     extra = [_made(n, hints[n], Beside._field_defaults[n], texts[n]) for n in beside]
     every = [*own, *last, *extra]
     # Required ones must come first in a dataclass, and so must positional ones here.
     every.sort(key=lambda one: (not one.required, not one.positional))
     return [(one.name, one.kind, one.field) for one in every], beside
-
-
-def _followed(kind: type[Any]) -> bool:
-    """Whether the answer is one trial over time, which is filmed."""
-    return issubclass(kind, FollowsOne) and not hasattr(kind, "in_shell")
-
-
-def _option(one: Field[Any], kind: Any, text: str) -> _Made:
-    return _made(one.name, kind, _default(one), text, options.is_positional(one))
 
 
 def _default(one: Field[Any]) -> Any:
@@ -239,13 +226,9 @@ def _gathered(kind: type[Any], given: Mapping[str, Any]) -> dict[str, Any]:
     found = dict(given)
     for one in dataclasses.fields(kind):
         if options.typed_fields(kind)[one.name] is Setting:
-            rules = {name: found.pop(name) for name in _names(Rules) if name in found}
-            own = {name: found.pop(name) for name in _names(Setting) if name in found}
+            rules = {name: found.pop(name) for name in options.helps(Rules) if name in found}
+            own = {name: found.pop(name) for name in options.helps(Setting) if name in found}
             usual: Setting = _default(one)
             rules_ = usual.rules._replace(**rules)
             found[one.name] = dataclasses.replace(usual, **own, rules=rules_)
     return found
-
-
-def _names(kind: type[Any]) -> list[str]:
-    return list(options.helps(kind))

@@ -44,13 +44,8 @@ def known() -> dict[str, Name]:
             text = path.read_text(encoding="utf-8")
             for name, kind in _MAKES.findall(text):
                 module = f"rps_jax.{room}.{path.stem}"
-                found[_words(name)] = Name(room, module, kind, _summary(text, kind))
+                found[name.replace("_", " ")] = Name(room, module, kind, _summary(text, kind))
     return found
-
-
-def _words(name: str) -> str:
-    """`tune_es` as it is typed: `tune es`."""
-    return name.replace("_", " ")
 
 
 def _summary(text: str, kind: str) -> str:
@@ -81,11 +76,7 @@ def overview() -> str:
 
 
 def split(words: list[str]) -> tuple[str, list[str]]:
-    """The words that name a question, and the others.
-
-    Raises:
-      InputError: they name none.
-    """
+    """The words that name a question, and the others."""
     for count in (2, 1):
         name = " ".join(words[:count])
         if name in known():
@@ -98,11 +89,7 @@ def split(words: list[str]) -> tuple[str, list[str]]:
 
 
 def question_of(name: str) -> type[Any]:
-    """The class of a question, by its words or its path.
-
-    Raises:
-      InputError: the file cannot be run, or makes no question.
-    """
+    """The class of a question, by its words or its path."""
     if name in known():
         return getattr(importlib.import_module(known()[name].module), known()[name].question)
     path = Path(name)
@@ -122,11 +109,7 @@ def question_of(name: str) -> type[Any]:
 
 
 def _module_of(path: Path) -> Any:
-    """The module of a file: one of its package, if it is in one, else one of its own.
-
-    Raises:
-      InputError: it cannot be run.
-    """
+    """The module of a file: one of its package, if it is in one, else one of its own."""
     from rps_jax.control import registry
 
     root = path.parent

@@ -6,6 +6,7 @@ import _thread
 import contextlib
 import dataclasses
 import errno
+import functools
 import io
 import os
 import signal
@@ -24,13 +25,6 @@ if TYPE_CHECKING:
 
 _MEND = "make room, then run the same command again; what is done is kept"
 _stopped: list[bool] = []  # interrupts of this command
-
-
-def be_deterministic() -> None:
-    """Make the numbers of a GPU not depend on the order in which its threads come."""
-    from rps_jax.engines import device
-
-    device.be_deterministic()
 
 
 def guarded(action: Callable[[], object]) -> int:
@@ -111,20 +105,18 @@ def _told(sentence: str | InputError) -> int:
 
 
 def carry_out(question: Any, beside: Beside) -> None:
-    """Check a question, answer it, and write and print its report.
-
-    Raises:
-      InputError: it is not allowed, or its run folder holds another run.
-    """
+    """Check a question, answer it, and write and print its report."""
     from rps_jax.engines import device
     from rps_jax.record import folder
+    from rps_jax.runs.push import check_length
+    from rps_jax.runs.question import told
 
     device.choose("cpu" if getattr(question, "ray", None) else beside.device)
     if question.out is None and not hasattr(question, "in_shell"):
         question = dataclasses.replace(question, out=question.place)
     asked = question.asked()
     asked.checked()
-    check_film(beside)
+    check_length(beside.film_length)
     _go_on()
     if note := asked.note():
         print(note)
@@ -137,36 +129,22 @@ def carry_out(question: Any, beside: Beside) -> None:
     with asked.bar() as bar:
         _go_on()
         found = asked.answered(bar)
-        told = _timing(bar)
+        timed = bar.timing.simulated > 0 and bar.over != "clock"
+        spent = told(bar.timing, device.kind()) if timed else ""
         if isinstance(found, Path):
             print(f"{asked.name}: {found}")
             return
         path = _report(asked, found, bar)
     print(path.read_text(encoding="utf-8"))
-    if told:
-        print(told)
+    if spent:
+        print(spent)
     if beside.video and hasattr(found, "film"):
         _film(found, Path(asked.out), beside.film_length)
-    if getattr(asked, "film", False):
-        _film_worst(Path(asked.out))
+    if getattr(asked, "film", False) and (Path(asked.out) / "worlds").is_dir():
+        from rps_jax.app.film import Film
+
+        print(f"film: {Film(Path(asked.out) / 'worlds', grid='3x4', which='hardest')()}")
     print(f"run folder: {asked.out}")
-
-
-def check_film(beside: Beside) -> None:
-    """Raises InputError for a length that no film can have."""
-    from rps_jax.runs.push import check_length
-
-    check_length(beside.film_length)
-
-
-def _timing(bar: Bar) -> str:
-    """Where the time went, if trials ran."""
-    from rps_jax.engines import device
-    from rps_jax.runs.question import told
-
-    if bar.timing.simulated <= 0 or bar.over == "clock":
-        return ""
-    return told(bar.timing, device.kind())
 
 
 def _report(asked: Any, found: Any, bar: Bar) -> Path:
@@ -190,19 +168,9 @@ def _film(trace: Trace, out: Path, seconds: float) -> None:
     from rps_jax.analysis import video
     from rps_jax.analysis.report import save
 
-    def watch(frames: Any) -> Any:
-        return tqdm(frames, unit="frame", desc="film")
-
+    watch = functools.partial(tqdm, unit="frame", desc="film")
     try:
         save(trace.stills(), out / "stills.png")
         print(f"film: {trace.film(out / 'push.mp4', seconds, watch=watch)}")
     except video.VideoError as error:
         print(f"no film: {error}")
-
-
-def _film_worst(out: Path) -> None:
-    """The worst twelve worlds of a search."""
-    from rps_jax.app.film import Film
-
-    if (out / "worlds").is_dir():
-        print(f"film: {Film(out / 'worlds', grid='3x4', which='hardest')()}")

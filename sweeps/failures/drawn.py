@@ -1,0 +1,100 @@
+"""Are rare failures as rare as drawn worlds say?
+
+    rps sweeps/failures/drawn.py --law rps --repetitions 20 --brute 100000
+
+asks what `rps rare` asks, and compares its estimates with the rate in drawn worlds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, ClassVar
+
+import numpy as np
+import xarray as xr
+
+from rps_jax.analysis import statistics
+from rps_jax.analysis.figures.style import Figure
+from rps_jax.analysis.report import Picture, Section
+from rps_jax.record.options import option
+from rps_jax.runs import sweep as sweeps
+from rps_jax.runs.plan import Plan
+from rps_jax.runs.question import Run, call_of, count_of, seed_of
+from rps_jax.studies.rare import Estimate, Rare, figure_of, row, table
+from rps_jax.trials.progress import phase
+from rps_jax.trials.score import severity_of
+
+
+@dataclass(frozen=True)
+class Drawn(Rare):
+    """Compare subset simulation with the rate in drawn worlds.
+
+    The answer is that of `rps_jax.rare`, with the estimate from drawn worlds, as `drawn_p`.
+    """
+
+    TITLE: ClassVar[str] = "Rare failures, and drawn worlds"
+
+    brute: int = option(1000, 1, 1_000_000_000)
+    """Number of drawn worlds that it is compared with."""
+
+    def configuration(self) -> dict[str, Any]:
+        """All that the estimates depend on, but the drawn worlds beside them."""
+        found = super().configuration() | {"question": "rare"}
+        del found["brute"]
+        return found
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Estimate, and run the drawn worlds, a sweep in the folder's `drawn`."""
+        found = super().answer(run)
+        seeded = replace(self.setting, seed=seed_of(self.setting.seed, "tune"))
+        plan = Plan(self.ranges, self.brute, {"law": self.params}, seeded, 4096)
+        phase(run.report, "drawn worlds")
+        folder = None if run.folder is None else run.folder / "drawn"
+        results = sweeps.whole(plan, folder, **run.shape)
+        failed = severity_of(results.sel(law="law"), self.setting.rules) >= self.level
+        told = of_drawn(count_of(failed), failed.size)._asdict()
+        return found.assign({f"drawn_{name}": ((), value) for name, value in told.items()})
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """The estimates, beside drawn worlds."""
+        (usual,) = super().report(found, run)
+        p, low, high, variation, trials = (
+            float(found[f"drawn_{name}"]) for name in Estimate._fields
+        )
+        against = Estimate(p, low, high, variation, int(trials))
+        text = f"{usual.text} Those of drawn worlds are by Clopper and Pearson."
+        if against.p:
+            off = 100 * (float(found.p.mean()) / against.p - 1)
+            held = count_of(((found.low <= against.p) & (against.p <= found.high)).values)
+            text += (
+                f" {held} of {self.repetitions} intervals hold the rate of the drawn worlds, and "
+                f"the mean of all is {off:+.1f} % off it."
+            )
+        else:
+            text += " None of the drawn worlds fails."
+        rows = [*table(found), [*row("drawn worlds", against)[:-1], ""]]
+        picture = Picture("rare", partial(figure, found, against))
+        return [usual._replace(text=text, table=rows, picture=picture)]
+
+
+drawn = call_of(Drawn)
+
+
+def of_drawn(failures: int, trials: int) -> Estimate:
+    """Estimate the probability from drawn worlds, with the interval of Clopper and Pearson."""
+    p = failures / trials
+    low, high = statistics.clopper_pearson(failures, trials)
+    variation = np.sqrt((1 - p) / (p * trials)) if failures else float("inf")
+    return Estimate(p, low, high, float(variation), trials)
+
+
+def figure(found: xr.Dataset, against: Estimate) -> Figure:
+    """Estimates of every repetition with their intervals, and drawn worlds' behind them."""
+    made = figure_of(found)
+    (ax,) = made.axes
+    ax.axhspan(against.low, against.high, color="C0", alpha=0.2, lw=0)
+    ax.axhline(against.p, color="C0", label="drawn worlds")
+    ax.legend(fontsize=8)
+    return made
