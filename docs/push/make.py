@@ -208,7 +208,7 @@ def of_law(name: str) -> tuple[list[Routine], dict[str, Any]]:
 def scripts() -> str:
     """All that is generated: functions, laws and the numbers of the paper's first trial."""
     with jax.enable_x64(True):
-        tables: dict[bytes, str] = {}
+        tables: dict[str, str] = {}
         routines, laws = {}, {}
         for family in FAMILIES:
             routines |= {one.name: one for one in of_family(family)}

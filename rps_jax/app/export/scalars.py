@@ -334,11 +334,9 @@ class Scalars:
         )
         found = np.empty((a.shape[0], b.shape[1]), object)
         if is_constant(b) and b.size >= _MANY:
-            for i, row in enumerate(self.array(a)):
-                found[i] = self._loop(row, b)
+            found[:] = self._loops(self.array(a), b)
         elif is_constant(a) and a.size >= _MANY:
-            for j, column in enumerate(self.array(b).T):
-                found[:, j] = self._loop(column, a.T)
+            found.T[:] = self._loops(self.array(b).T, a.T)
         else:
             a, b = self.array(a), self.array(b)
             for i, j in np.ndindex(found.shape):
@@ -346,12 +344,15 @@ class Scalars:
                 found[i, j] = functools.reduce(lambda x, y: self.node("add", (x, y), "f"), terms)
         return found.reshape(out.shape)
 
-    def _loop(self, row: Iterable[Node], matrix: np.ndarray) -> list[Node]:
+    def _loops(self, rows: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+        """Rows times a matrix, all of them in one loop over it."""
         matrix = np.ascontiguousarray(matrix, float)
         key = matrix.tobytes()
         self.tables.setdefault(key, matrix)
-        product = self.node("product", tuple(row), "array", key)
-        return [self.node("part", (product,), "f", j) for j in range(matrix.shape[1])]
+        product = self.node("product", tuple(rows.reshape(-1)), "array", key)
+        places = np.ndindex(len(rows), matrix.shape[1])
+        parts = [self.node("part", (product,), "f", at) for at in places]
+        return _shaped(parts, (len(rows), matrix.shape[1]))
 
 
 def _shaped(nodes: Sequence[Node], shape: tuple[int, ...]) -> np.ndarray:
