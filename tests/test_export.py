@@ -207,9 +207,9 @@ def test_a_whole_trial_step_by_step(name, tmp_path):
     setting = Setting("quasistatic", rules=Rules(horizon=20.0))
     trials = recorded([case], setting)
     assert len(trials[0][0]) > 900
-    (errors,) = trial_errors(name, "double", trials, tmp_path)
+    (errors,) = trial_errors(name, "double", trials, tmp_path).own
     assert errors.max() < 1e-12
-    (errors,) = trial_errors(name, "float", trials, tmp_path)
+    (errors,) = trial_errors(name, "float", trials, tmp_path).own
     # A step differs where a switch flips in one of the two; it must not last.
     assert np.mean(errors > 2e-5) < 0.01
     assert np.median(errors) < 1e-6

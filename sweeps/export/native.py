@@ -17,7 +17,6 @@ import re
 import shutil
 import subprocess
 import tempfile
-import time
 from collections import namedtuple
 from collections.abc import Sequence
 from pathlib import Path
@@ -361,16 +360,20 @@ def recorded(cases: Sequence[Case], setting: Setting) -> list[Any]:
     return found
 
 
-def trial_errors(name: str, form: Form, trials: Sequence[Any], where: Path) -> list[np.ndarray]:
-    """Errors (T,) of the twists of whole trials, observed as `recorded`; each has its own memory.
+class Whole(NamedTuple):
+    """Errors (T,) of the twists over whole trials, by trial."""
 
-    Both laws, that of JAX and the other, remember by themselves from the first step to the last, in
-    the precision that is asked for.
-    """
+    own: list[np.ndarray]  # each law remembers by itself, from the first step to the last
+    told: list[np.ndarray]  # before each step, the law in C or ONNX is given the memory of JAX
+    in_jax: list[np.ndarray]  # of JAX in float32 from JAX in float64, which remember by themselves
+
+
+def trial_errors(name: str, form: Form, trials: Sequence[Any], where: Path) -> Whole:
+    """Errors of the twists over whole trials, observed as `recorded`, in a form's precision."""
     law_params = registry.read_law(name)[1]
     law, made, real = registry.law_of(law_params), program.program(name), REAL[form]
     native, longest = made_in(form, made, where, len(trials)), max(len(one[0]) for one in trials)
-    fields = made.groups["observation"]
+    fields, scale = made.groups["observation"], _scale(law_params)
 
     def whole(leaves: Any) -> list[np.ndarray]:
         """Leaves (longest, ...), the last row held."""
@@ -380,24 +383,37 @@ def trial_errors(name: str, form: Form, trials: Sequence[Any], where: Path) -> l
         return [np.asarray(x)[rows].astype(kind) for x, kind in zip(leaves, kinds, strict=True)]
 
     seen = [np.stack(columns, 1) for columns in zip(*map(whole, trials), strict=True)]
-    with jax.enable_x64(form == "double"):
-        params = jax.tree.map(lambda x: jnp.asarray(x, real), law_params)
-        tree = jax.tree.structure(trying.observation_of(law.senses))
-
-        def step(memory: Any, leaves: Any) -> Any:
-            memory, twist, _ = law.step(params, memory, jax.tree.unflatten(tree, leaves))
-            return memory, jnp.stack([jnp.asarray(x, real) for x in twist])
-
-        begin = jax.tree.map(
-            lambda x: jnp.broadcast_to(x, (len(trials), *jnp.shape(x))), law.init(params)
-        )
-        both = np.asarray(jax.lax.scan(jax.vmap(step), begin, seen)[1])
-    memory, twists = native.begin(len(trials)), []
+    memories, both = _in_jax(law, law_params, seen, real)
+    mine, own, told = native.begin(len(trials)), [], []
     for i in range(longest):
         rows = native.filled("observation", [x[i] for x in seen], len(trials))
-        twists.append(native.step(memory, rows)[0])
-    error = (np.abs(np.array(twists) - both) / _scale(law_params)).max(-1)
-    return [error[: len(one[0]), i] for i, one in enumerate(trials)]
+        own.append(native.step(mine, rows)[0])
+        theirs = native.filled("memory", [x[i] for x in memories], len(trials))
+        told.append(native.step(theirs, rows)[0])
+    exact = both if form == "double" else _in_jax(law, law_params, seen, np.float64)[1]
+
+    def errors(twists: Any, those: np.ndarray) -> list[np.ndarray]:
+        error = (np.abs(np.asarray(twists) - those) / scale).max(-1)
+        return [error[: len(one[0]), i] for i, one in enumerate(trials)]
+
+    return Whole(errors(own, both), errors(told, both), errors(both, exact))
+
+
+def _in_jax(law: Law, params: Any, seen: Sequence[Any], real: Any) -> tuple[list[Any], np.ndarray]:
+    """Memories before each step and twists (T, n, 3) of a law that observes leaves (T, n, ...)."""
+    with jax.enable_x64(real == np.float64):
+        own = jax.tree.map(lambda x: jnp.asarray(x, real), params)
+        tree = jax.tree.structure(trying.observation_of(law.senses))
+        given = [x.astype(real) if x.dtype.kind == "f" else x for x in seen]
+
+        def step(memory: Any, leaves: Any) -> Any:
+            after, twist, _ = law.step(own, memory, jax.tree.unflatten(tree, leaves))
+            return after, (memory, jnp.stack([jnp.asarray(x, real) for x in twist]))
+
+        count = seen[0].shape[1]
+        begin = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *jnp.shape(x))), law.init(own))
+        memories, twists = jax.jit(lambda m, x: jax.lax.scan(jax.vmap(step), m, x)[1])(begin, given)
+        return [np.asarray(x) for x in jax.tree.leaves(memories)], np.asarray(twists)
 
 
 def in_the_loop(name: str, where: Path) -> Any:
@@ -434,63 +450,72 @@ def in_the_loop(name: str, where: Path) -> Any:
             Details.of(getattr(seen, "touch", seen)),
         )
 
-    own = program.identifier(label)
-    kind = namedtuple(f"{own}_InC", "law d_success")  # each law has parameters of its own class
+    return _registered(f"{program.identifier(label)}_in_c", law, step, params)
+
+
+def nudged(name: str) -> Any:
+    """Parameters of a law of this process whose every twist is greater by one rounding."""
+    label, params = registry.read_law(name)
+    law = registry.law_of(params)
+
+    def step(own: Any, memory: Any, seen: Any) -> Any:
+        memory, twist, details = law.step(own.law, memory, seen)
+        return memory, Twist(*(x * np.float32(1 + 2**-23) for x in twist)), details
+
+    return _registered(f"{program.identifier(label)}_nudged", law, step, params)
+
+
+def _registered(name: str, law: Law, step: Any, params: Any) -> Any:
+    """Parameters, of a class of their own, of a law with another step."""
+    kind = namedtuple(name, "law d_success")
     mine = kind(params, params.d_success)
-    native_law = Law(lambda p: law.init(p.law), step, senses=law.senses)
-    registry.register_law(f"{own}_in_c", native_law, mine)
+    registry.register_law(name, Law(lambda p: law.init(p.law), step, senses=law.senses), mine)
     return mine
 
 
 class Ends(NamedTuple):
-    """How trials end with a law of JAX and with that of C in the loop."""
+    """How trials end with a law of JAX, with that of C in the loop, and with JAX a rounding off."""
 
     trials: int
     in_jax: int  # succeed
     in_c: int
-    alike: int  # succeed with both, or with neither
+    nudged: int
+    alike: int  # succeed with JAX and C, or with neither
+    nudged_alike: int  # the same of JAX, and of JAX with every twist greater by one rounding
     apart: float  # [s] 99th percentile of the difference of the times of those that both succeed in
-    seconds_in_jax: float  # [s] that the run took, with compilation
-    seconds_in_c: float
 
 
-def _ends(outcomes: Sequence[Any], took: Sequence[float]) -> Ends:
+def _ends(name: str, where: Path, run: Any) -> Ends:
+    """Ends of the trials that `run` makes with a law's parameters."""
+    outcomes = [
+        run(p) for p in (registry.read_law(name)[1], in_the_loop(name, where), nudged(name))
+    ]
     won = [np.asarray(one.success).astype(bool).ravel() for one in outcomes]
     times = [np.asarray(one.time).ravel() for one in outcomes]
     both = won[0] & won[1]
     apart = np.abs(times[0] - times[1])[both]
     return Ends(
-        won[0].size, int(won[0].sum()), int(won[1].sum()), int((won[0] == won[1]).sum()),
-        float(np.quantile(apart, 0.99)) if both.any() else 0.0, *took,
+        won[0].size, *(int(one.sum()) for one in won),
+        *(int((won[0] == one).sum()) for one in won[1:]),
+        float(np.quantile(apart, 0.99)) if both.any() else 0.0,
     )  # fmt: skip
-
-
-def timed(make: Any) -> tuple[Any, float]:
-    """What a call returns, and how long [s] it took."""
-    began = time.perf_counter()
-    return make(), time.perf_counter() - began
 
 
 def papers_trials(name: str, setting: Setting, where: Path) -> Ends:
-    """The paper's 144 trials with a law of JAX, and with that of C in the loop."""
+    """How the paper's 144 trials end."""
     cases = [(o, f, t) for o in PAPER_OBJECTS for f in FRICTION for t in paper.TARGETS]
-    both = (registry.read_law(name)[1], in_the_loop(name, where))
-    outcomes, took = zip(
-        *(timed(lambda p=p: pushes.run([Case(*one, law=p) for one in cases], setting)[0])
-          for p in both), strict=True,
-    )  # fmt: skip
-    return _ends(outcomes, took)
+    return _ends(
+        name, where, lambda p: pushes.run([Case(*one, law=p) for one in cases], setting)[0]
+    )
 
 
 def random_worlds(name: str, domain: str, worlds: int, setting: Setting, where: Path) -> Ends:
-    """Random worlds with a law of JAX, and with that of C in the loop."""
-    both = (registry.read_law(name)[1], in_the_loop(name, where))
+    """How random worlds end."""
 
     def run(params: Any) -> Any:
         return rps_jax.sweep({"law": params}, domain, worlds, setting=setting, progress=False)
 
-    outcomes, took = zip(*(timed(lambda p=p: run(p)) for p in both), strict=True)
-    return _ends(outcomes, took)
+    return _ends(name, where, run)
 
 
 def latency(name: str, precision: Precision, where: Path, runs: int = 5) -> np.ndarray:
