@@ -17,7 +17,6 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections import namedtuple
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -26,20 +25,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import rps_jax
 from rps_jax.app.export import c, folder, graph, program
 from rps_jax.app.export.program import Group, Program
 from rps_jax.control import registry, trying
 from rps_jax.control.base import Law
-from rps_jax.control.observation import Details, Twist
-from rps_jax.runs.push import recorded_law
-from rps_jax.trials import pushes
-from rps_jax.trials.batch import Part
-from rps_jax.trials.case import Case
-from rps_jax.trials.setting import Setting
-from rps_jax.world import paper
-from rps_jax.world.objects import PAPER_OBJECTS
-from rps_jax.world.scene import FRICTION
 
 Precision = Literal["float", "double"]
 Form = Literal["float", "double", "onnx"]  # C of either precision, or ONNX, which is of float
@@ -241,7 +230,7 @@ def agreement(name: str, form: Form, inputs: int, where: Path, seed: int = 0) ->
 
         step = jax.jit(jax.vmap(step))
         exact = None if form == "double" else _exact(law, params, seen_tree)
-        rng, found, scale = np.random.default_rng(seed), Agreement(label, form), _scale(params)
+        rng, found, scale = np.random.default_rng(seed), Agreement(label, form), scale_of(params)
         begin = jax.tree.map(
             lambda x: np.broadcast_to(np.asarray(x), (worlds, *np.shape(x))), law.init(params)
         )
@@ -339,25 +328,11 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return worst
 
 
-def _scale(params: Any) -> np.ndarray:
+def scale_of(params: Any) -> np.ndarray:
     """The greatest speeds and turning rate (3,) of a law."""
     own = getattr(params, "law", params)
     speed, turn = (float(getattr(own, name, 1.0)) for name in ("v_max", "omega_max"))
     return np.array([speed, speed, turn])
-
-
-def recorded(cases: Sequence[Case], setting: Setting) -> list[Any]:
-    """What the law of each case observed in each control step: leaves (T, ...), by trial."""
-    law = registry.law_of(cases[0].params)
-    stage, worlds = pushes.build(cases, setting)
-    part = Part(np.arange(len(cases)), worlds, stage)
-    period, found = setting.physics.control_period, []
-    for followed in pushes.follow_part(part, recorded_law(law), setting, interval=period):
-        seen = followed.snapshots
-        observed = tuple(seen.details)[1]  # of `recorded_law`, with taxels
-        leaves = jax.tree.leaves(observed.touch if law.senses == "touch" else observed)
-        found.append([np.broadcast_to(x, (len(seen.time), *x.shape[1:])) for x in leaves])
-    return found
 
 
 class Whole(NamedTuple):
@@ -373,7 +348,7 @@ def trial_errors(name: str, form: Form, trials: Sequence[Any], where: Path) -> W
     law_params = registry.read_law(name)[1]
     law, made, real = registry.law_of(law_params), program.program(name), REAL[form]
     native, longest = made_in(form, made, where, len(trials)), max(len(one[0]) for one in trials)
-    fields, scale = made.groups["observation"], _scale(law_params)
+    fields, scale = made.groups["observation"], scale_of(law_params)
 
     def whole(leaves: Any) -> list[np.ndarray]:
         """Leaves (longest, ...), the last row held."""
@@ -416,115 +391,13 @@ def _in_jax(law: Law, params: Any, seen: Sequence[Any], real: Any) -> tuple[list
         return [np.asarray(x) for x in jax.tree.leaves(memories)], np.asarray(twists)
 
 
-def in_the_loop(name: str, where: Path) -> Any:
-    """Parameters of a law of this process whose step is that in C, in float."""
-    label, params = registry.read_law(name)
-    law, native = registry.law_of(params), Native(program.program(name), where, "float")
-
-    def called(memory: Any, seen: Any) -> Any:
-        shape = np.shape(jax.tree.leaves(seen)[0])[:-1]
-        count, given = int(np.prod(shape)), native.filled
-        flat = [
-            [np.asarray(x).reshape(count, *np.shape(x)[len(shape) :]) for x in group]
-            for group in (memory, seen)
-        ]
-        mine = given("memory", flat[0], count)
-        twist, _ = native.step(mine, given("observation", flat[1], count))
-        after = [
-            np.asarray(mine[f.name]).reshape(np.shape(x)).astype(x.dtype) if f.size else x
-            for f, x in zip(native.program.groups["memory"], memory, strict=True)
-        ]
-        return after, twist.reshape(*shape, 3)
-
-    def step(_: Any, memory: Any, seen: Any) -> Any:
-        tree = jax.tree.structure(memory)
-        shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in jax.tree.leaves(memory)]
-        out = (shapes, jax.ShapeDtypeStruct((3,), np.float32))
-        after, twist = jax.pure_callback(
-            called, out, jax.tree.leaves(memory), jax.tree.leaves(seen),
-            vmap_method="broadcast_all",
-        )  # fmt: skip
-        return (
-            jax.tree.unflatten(tree, after),
-            Twist(*twist),
-            Details.of(getattr(seen, "touch", seen)),
-        )
-
-    return _registered(f"{program.identifier(label)}_in_c", law, step, params)
-
-
-def nudged(name: str) -> Any:
-    """Parameters of a law of this process whose every twist is greater by one rounding."""
-    label, params = registry.read_law(name)
-    law = registry.law_of(params)
-
-    def step(own: Any, memory: Any, seen: Any) -> Any:
-        memory, twist, details = law.step(own.law, memory, seen)
-        return memory, Twist(*(x * np.float32(1 + 2**-23) for x in twist)), details
-
-    return _registered(f"{program.identifier(label)}_nudged", law, step, params)
-
-
-def _registered(name: str, law: Law, step: Any, params: Any) -> Any:
-    """Parameters, of a class of their own, of a law with another step."""
-    kind = namedtuple(name, "law d_success")
-    mine = kind(params, params.d_success)
-    registry.register_law(name, Law(lambda p: law.init(p.law), step, senses=law.senses), mine)
-    return mine
-
-
-class Ends(NamedTuple):
-    """How trials end with a law of JAX, with that of C in the loop, and with JAX a rounding off."""
-
-    trials: int
-    in_jax: int  # succeed
-    in_c: int
-    nudged: int
-    alike: int  # succeed with JAX and C, or with neither
-    nudged_alike: int  # the same of JAX, and of JAX with every twist greater by one rounding
-    apart: float  # [s] 99th percentile of the difference of the times of those that both succeed in
-
-
-def _ends(name: str, where: Path, run: Any) -> Ends:
-    """Ends of the trials that `run` makes with a law's parameters."""
-    outcomes = [
-        run(p) for p in (registry.read_law(name)[1], in_the_loop(name, where), nudged(name))
-    ]
-    won = [np.asarray(one.success).astype(bool).ravel() for one in outcomes]
-    times = [np.asarray(one.time).ravel() for one in outcomes]
-    both = won[0] & won[1]
-    apart = np.abs(times[0] - times[1])[both]
-    return Ends(
-        won[0].size, *(int(one.sum()) for one in won),
-        *(int((won[0] == one).sum()) for one in won[1:]),
-        float(np.quantile(apart, 0.99)) if both.any() else 0.0,
-    )  # fmt: skip
-
-
-def papers_trials(name: str, setting: Setting, where: Path) -> Ends:
-    """How the paper's 144 trials end."""
-    cases = [(o, f, t) for o in PAPER_OBJECTS for f in FRICTION for t in paper.TARGETS]
-    return _ends(
-        name, where, lambda p: pushes.run([Case(*one, law=p) for one in cases], setting)[0]
-    )
-
-
-def random_worlds(name: str, domain: str, worlds: int, setting: Setting, where: Path) -> Ends:
-    """How random worlds end."""
-
-    def run(params: Any) -> Any:
-        return rps_jax.sweep({"law": params}, domain, worlds, setting=setting, progress=False)
-
-    return _ends(name, where, run)
-
-
 def latency(name: str, precision: Precision, where: Path, runs: int = 5) -> np.ndarray:
     """Median and 99.9th percentile (runs, 2) [us] of a step of skin and law, on one core.
 
     The exported example measures itself, 200,000 steps in a run.
     """
     made, place = program.program(name), Path(tempfile.mkdtemp(dir=where))
-    for file, text in {"law.h": c.header(made, "law"), **folder.files(made, "law")}.items():
+    for file, text in folder.files(made, "law").items():
         (place / file).write_text(text, encoding="utf-8")
     double = ["-DLAW_DOUBLE"] if precision == "double" else []
     source, binary = str(place / "main.c"), str(place / "main")

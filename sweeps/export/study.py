@@ -32,11 +32,11 @@ from rps_jax.trials.progress import Progress
 from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
-from sweeps.export import native
+from sweeps.export import loop, native
 from sweeps.shared import Study, publish
 
-Table = Literal["inputs", "trials", "paper", "worlds", "odd", "speed"]
-_TABLES: tuple[Table, ...] = ("speed", "inputs", "trials", "paper", "worlds", "odd")
+Table = Literal["inputs", "trials", "paper", "worlds", "bags", "odd", "speed"]
+_TABLES: tuple[Table, ...] = ("speed", "inputs", "trials", "paper", "worlds", "bags", "odd")
 _FORMS: tuple[native.Form, ...] = ("double", "float", "onnx")
 _PRECISIONS: tuple[native.Precision, ...] = ("double", "float")
 _HERE = Path(__file__).parent
@@ -49,19 +49,26 @@ class Export(Study[xr.Dataset]):
 
     TITLE: ClassVar[str] = "Laws in C and ONNX beside those in JAX"
     GROWS: ClassVar[tuple[str, ...]] = ("laws", "tables", "machine", "in_worlds")
-    SMALL: ClassVar[Mapping[str, Any]] = {"laws": ("rps_plus",), "inputs": 20_000, "worlds": 4}
+    SMALL: ClassVar[Mapping[str, Any]] = {
+        "laws": ("rps_plus",),
+        "inputs": 20_000,
+        "worlds": 4,
+        "bags": 1,
+    }
 
     laws: tuple[str, ...] = ("rps", "rps_tuned", "rps_plus", "learned_mlp", "learned_gru")
     """Laws that are compared."""
     tables: tuple[Table, ...] = _TABLES
     """What is asked: chance inputs, whole trials, the paper's trials and random worlds with C in
-    the loop, odd inputs, and speed."""
+    the loop, bags of random worlds, odd inputs, and speed."""
     in_worlds: tuple[str, ...] = ("rps_plus",)
     """Those of the laws that are in the loop of random worlds, too."""
     inputs: int = option(10_000_000, 100, 10**9)
     """Number of chance inputs of each law, for C in float, in double, and ONNX each."""
     worlds: int = option(1000, 1, 1_000_000)
     """Number of random worlds with C in the loop."""
+    bags: int = option(4, 1, 1000)
+    """Number of random worlds that become bags, for each law."""
     domain: str = "real"
     """Domain of these worlds."""
     machine: str = ""
@@ -111,7 +118,7 @@ class Export(Study[xr.Dataset]):
             [Case(thing, "S1", target, law=law) for target in paper.FEW_TARGETS]
             for thing in PAPER_OBJECTS
         ]
-        seen = [one for some in cases for one in native.recorded(some, Setting("fused"))]
+        seen = [one for some in cases for one in loop.recorded(some, Setting("fused"))]
         found = []
         for form in _FORMS:
             errors = native.trial_errors(law, form, seen, where)
@@ -129,12 +136,16 @@ class Export(Study[xr.Dataset]):
         )
 
     def _paper(self, law: str, where: Path) -> xr.Dataset:
-        return _columns("paper", [native.papers_trials(law, Setting("fused"), where)])
+        return _columns("paper", [loop.papers_trials(law, Setting("fused"), where)])
 
     def _worlds(self, law: str, where: Path) -> xr.Dataset:
         setting = Setting("fused")
-        ends = native.random_worlds(law, self.domain, self.worlds, setting, where)
+        ends = loop.random_worlds(law, self.domain, self.worlds, setting, where)
         return _columns("worlds", [ends])
+
+    def _bags(self, law: str, where: Path) -> xr.Dataset:
+        found = loop.bags(law, self.domain, self.bags, Setting("fused"), where)
+        return _columns("bags", [found])
 
     def _odd(self, law: str, where: Path) -> xr.Dataset:
         made, compilers = program.program(law), native.COMPILERS
@@ -197,7 +208,8 @@ def tables(found: xr.Dataset, asked: Export) -> dict[str, tuple[str, str, list[l
     """Title, note, header and rows of each table, by name."""
     made = {
         "speed": _speed_rows, "inputs": _input_rows, "trials": _trial_rows, "paper": _paper_rows,
-        "worlds": partial(_world_rows, asked.domain), "odd": _odd_rows,
+        "worlds": partial(_world_rows, asked.domain), "bags": partial(_bag_rows, asked.domain),
+        "odd": _odd_rows,
     }  # fmt: skip
     return {name: made[name](found) for name in asked.tables}
 
@@ -256,7 +268,7 @@ def _end_rows(found: xr.Dataset, table: Table) -> list[list[str]]:
              "C ends alike", "a rounding off ends alike", "99 % of times are within"]]  # fmt: skip
     counts = ("in_jax", "in_c", "nudged", "alike", "nudged_alike")
     for law in map(str, found.law.values):
-        one = {name: float(found[f"{table}_{name}"].sel(law=law)) for name in native.Ends._fields}
+        one = {name: float(found[f"{table}_{name}"].sel(law=law)) for name in loop.Ends._fields}
         if np.isfinite(one["trials"]):
             told = [f"{one[name]:.0f} of {one['trials']:.0f}" for name in counts]
             rows.append([law, *told, f"{one['apart']:.2g} s"])
@@ -274,6 +286,21 @@ def _paper_rows(found: xr.Dataset) -> tuple[str, str, list[list[str]]]:
 def _world_rows(domain: str, found: xr.Dataset) -> tuple[str, str, list[list[str]]]:
     note = f"The same worlds of `{domain}` for both; fused engine, float."
     return "Random worlds", note, _end_rows(found, "worlds")
+
+
+def _bag_rows(domain: str, found: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+    rows = [["law", "bags", "commands", "greatest difference", "beyond 1e-6",
+             "read otherwise by rosbags"]]  # fmt: skip
+    for law in map(str, found.law.values):
+        one = {name: float(found[f"bags_{name}"].sel(law=law)) for name in loop.Bags._fields}
+        counts = [f"{one[name]:,.0f}" for name in ("bags", "commands")]
+        odd = [f"{one[name]:.0f}" for name in ("beyond", "strange")]
+        rows.append([law, *counts, f"{one['greatest']:.1e}", *odd])
+    note = (
+        f"Worlds of `{domain}`, fused engine. Each law is fed its own bag; differences are shares "
+        "of the greatest speed and turning rate."
+    )
+    return "Bags", note, rows
 
 
 def _odd_rows(found: xr.Dataset) -> tuple[str, str, list[list[str]]]:

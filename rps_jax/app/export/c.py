@@ -1,4 +1,4 @@
-"""The emitter of C99: one header, and beside it an example and a CMake file."""
+"""The emitter of C99: one header."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from rps_jax.app.export.program import Field, Group, Program, Routine
 from rps_jax.app.export.writer import FORMS, Writer
 
 _KINDS = {"f": "{p}_real", "i": "int", "b": "int"}
-_NAMES = {"abs": "fabs", "rem": "fmod"}
 # How an operation is written that is no function of math.h.
 _FORMS = FORMS | {
+    "abs": "{P}_F(fabs)({0})",
+    "rem": "{P}_F(fmod)({0}, {1})",
     "max": "{p}_max({0}, {1})",
     "min": "{p}_min({0}, {1})",
     "sign": "{p}_sign({0})",
@@ -51,8 +52,15 @@ _HEADER = """\
      {p}_init(&params, &memory);
      {p}_step(&params, &memory, &seen, &twist);   once in each control period
 
-   A step returns {P}_OK, or another code: then the twist is zero and the memory as it was. Do not
-   compile with -ffast-math, which takes no number for infinite. */
+     {p}_skin_params skin_params = {P}_SKIN_PARAMS;
+     {p}_skin skin;
+     {p}_skin_init(&skin);
+     {p}_skin_step(&skin_params, &skin, taxels, period, &contact);   once for each scan
+
+   Taxels are in the order of the strip: left side from the rear, front from left to right, right
+   side from the front. One whose `alive` is 0 is ignored, but must be finite. A step returns
+   {P}_OK, or another code: then the twist is zero (there is no contact), and the memory is as it
+   was. Do not compile with -ffast-math, which takes no number for infinite. */
 
 #ifndef {P}_H
 #define {P}_H
@@ -153,32 +161,22 @@ class _Writer(Writer):
     """One routine as statements of C."""
 
     forms = _FORMS
+    call = "{P}_F({0})({1})"
+    heads = ("{kind} {sized}", "const {kind} {sized}")
+    kinds = _KINDS
     index = "int"
     flag = "({} != 0)"  # C takes any other number than 0 for true
+    zeros = "{{{{0}}}}"
 
     def literal(self, value: object, kind: str) -> str:
         """A constant."""
         return _literal(self.prefix, value, kind)
-
-    def called(self, name: str, arguments: str) -> str:
-        """A call of a function of math.h, of float or of double."""
-        return f"{self.prefix.upper()}_F({_NAMES.get(name, name)})({arguments})"
-
-    def declared(
-        self, name: str, kind: str, sizes: Sequence[int] = (), constant: bool = True
-    ) -> str:
-        """The left side of a declaration."""
-        return f"{'const ' * constant}{_KINDS[kind].format(p=self.prefix)} {_sized(name, sizes)}"
 
     def listed(self, texts: Iterable[str]) -> str:
         """An array of these elements, in lines of some width."""
         text = " ".join(", ".join(texts).split())
         lines = textwrap.wrap(text, 92, break_long_words=False, break_on_hyphens=False)
         return "{" + (text if len(lines) < 2 else "\n    " + "\n    ".join(lines)) + "}"
-
-    def zeros(self, rows: int, columns: int) -> str:
-        """A matrix of zeros."""
-        return "{{0}}"
 
     def packed(self, name: str, array: np.ndarray) -> str:
         """The declaration of constants that stand before the functions."""

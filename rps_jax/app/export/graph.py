@@ -15,7 +15,7 @@ from jax.extend.core import jaxpr_as_fun
 from rps_jax import __version__
 from rps_jax.app.export import walk
 from rps_jax.app.export.program import Field, Program
-from rps_jax.app.export.walk import REDUCTIONS, kind_of, unsupported
+from rps_jax.app.export.walk import PAIRED, kind_of, unsupported
 from rps_jax.errors import InputError
 
 _OPSET, _FORMAT = 18, 9  # of ONNX, and of its files
@@ -150,8 +150,8 @@ class Graph:
             turn = make("Where", make("Less", at, zero, to="b"), behind, zero)
             angle = make("Add", make("Atan", make("Div", y, at)), turn)
             return make("Where", make("Equal", at, zero, to="b"), upright, angle)
-        if name in REDUCTIONS:
-            return self._reduced(REDUCTIONS[name], x[0], params["axes"], shape, kind)
+        if name in PAIRED and "axes" in params:
+            return self._reduced(PAIRED[name], x[0], params["axes"], shape, kind)
         if name in ("argmax", "argmin"):
             op = "ArgMax" if name == "argmax" else "ArgMin"
             place = make(op, x[0], axis=params["axes"][0], keepdims=0)

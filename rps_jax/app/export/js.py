@@ -5,14 +5,13 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 from rps_jax import __version__
 from rps_jax.app.export.program import Group, Program, Routine
-from rps_jax.app.export.walk import unsupported
-from rps_jax.app.export.writer import FORMS, Writer
+from rps_jax.app.export.writer import FORMS, FUNCTIONS, Writer
 
 _FORMS = FORMS | {
     "rem": "{0} % {1}",
@@ -101,32 +100,20 @@ class _Writer(Writer):
     """One routine as statements of JavaScript."""
 
     forms = _FORMS
+    functions = FUNCTIONS - {"erf"}
+    call = "Math.{0}({1})"
+    heads = ("let {name}", "const {name}")
     index = "let"
     flag = "Boolean({})"
+    zeros = "zeros({}, {})"
 
     def literal(self, value: object, kind: str) -> str:
         """A constant."""
         return text(value)
 
-    def called(self, name: str, arguments: str) -> str:
-        """A call of a function of Math."""
-        if name == "erf":
-            raise unsupported(name)
-        return f"Math.{name}({arguments})"
-
-    def declared(
-        self, name: str, kind: str, sizes: Sequence[int] = (), constant: bool = True
-    ) -> str:
-        """The left side of a declaration."""
-        return f"{'const' if constant else 'let'} {name}"
-
     def listed(self, texts: Iterable[str]) -> str:
         """An array of these elements."""
         return f"[{', '.join(texts)}]"
-
-    def zeros(self, rows: int, columns: int) -> str:
-        """A matrix of zeros."""
-        return f"zeros({rows}, {columns})"
 
     def packed(self, name: str, array: np.ndarray) -> str:
         """Constants before the functions; of a matrix in so few bytes as lose nothing."""

@@ -15,7 +15,7 @@ from rps_jax.app.export.walk import unsupported
 # Inputs of a product with a matrix that are taken together: compilers then vectorise the loop over
 # the outputs, and a sum is loaded and stored once for all of them.
 _TOGETHER = 4
-_FUNCTIONS = {*UNARY, "atan2", "pow", "rem", "round", "rint", "max", "min"}
+FUNCTIONS = {*UNARY, "atan2", "pow", "rem", "round", "rint", "max", "min"}
 _INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "gt": ">"}
 _INFIX |= {"ge": ">=", "eq": "==", "ne": "!=", "and": "&&", "or": "||", "xor": "!="}
 _INFIX |= {"iand": "&", "ior": "|", "ixor": "^"}
@@ -31,11 +31,16 @@ FORMS = {name: f"{{0}} {sign} {{1}}" for name, sign in _INFIX.items()} | {
 
 
 class Writer:
-    """One routine as statements of a language."""
+    """One routine as statements of a language, which is what stands in these tables."""
 
-    forms: ClassVar[Mapping[str, str]] = FORMS
+    forms: ClassVar[Mapping[str, str]]  # of operations that are no function
+    functions: ClassVar[set[str]] = FUNCTIONS
+    call: ClassVar[str]  # of a function
+    heads: ClassVar[tuple[str, str]]  # of the declaration of what changes, and of a constant
+    kinds: ClassVar[Mapping[str, str]] = dict.fromkeys("fib", "")  # of numbers
     index: ClassVar[str]  # how the number of a loop is declared
     flag: ClassVar[str]  # how an input is read that is a bool
+    zeros: ClassVar[str]  # a matrix of zeros
 
     def __init__(
         self, routine: Routine, groups: Mapping[str, str], tables: dict[str, str], prefix: str = ""
@@ -62,27 +67,19 @@ class Writer:
         """A constant."""
         raise NotImplementedError
 
-    def called(self, name: str, arguments: str) -> str:
-        """A call of a function."""
-        raise NotImplementedError
-
-    def declared(
-        self, name: str, kind: str, sizes: Sequence[int] = (), constant: bool = True
-    ) -> str:
-        """The left side of a declaration."""
-        raise NotImplementedError
-
     def listed(self, texts: Iterable[str]) -> str:
         """An array of these elements."""
-        raise NotImplementedError
-
-    def zeros(self, rows: int, columns: int) -> str:
-        """A matrix of zeros."""
         raise NotImplementedError
 
     def packed(self, name: str, array: np.ndarray) -> str:
         """The declaration of constants that stand before the functions."""
         raise NotImplementedError
+
+    def declared(self, name: str, kind: str, sizes: Sequence[int], constant: bool = True) -> str:
+        """The left side of a declaration."""
+        kind = self.kinds[kind].format(p=self.prefix)
+        sized = name + "".join(f"[{size}]" for size in sizes)
+        return self.heads[constant].format(kind=kind, name=name, sized=sized)
 
     def table(self, array: np.ndarray) -> str:
         """The name of constants that stand before the functions."""
@@ -111,9 +108,9 @@ class Writer:
         """What a node is."""
         names = [self.name(arg) for arg in node.args]
         if node.op in self.forms:
-            return self.forms[node.op].format(*names, p=self.prefix)
-        if node.op in _FUNCTIONS:
-            return self.called(node.op, ", ".join(names))
+            return self.forms[node.op].format(*names, p=self.prefix, P=self.prefix.upper())
+        if node.op in self.functions:
+            return self.call.format(node.op, ", ".join(names), P=self.prefix.upper())
         raise unsupported(node.op)
 
     def lines(self, items: Sequence[Node | Block], indent: str = "  ") -> list[str]:
@@ -136,7 +133,7 @@ class Writer:
         return found
 
     def _declared(self, node: Node, constant: bool = True) -> str:
-        return self.declared(f"v{node.number}", node.kind, constant=constant)
+        return self.declared(f"v{node.number}", node.kind, (), constant)
 
     def _block(self, block: Block) -> list[str]:
         """Statements of what is computed under a condition alone."""
@@ -174,7 +171,7 @@ class Writer:
         lines = [
             f"{self.declared(f'x{n}', 'f', sizes)} = {self.listed(map(self.listed, rows))};",
             f"{self.declared(f'v{n}', 'f', (len(rows), columns), False)} = "
-            f"{self.zeros(len(rows), columns)};",
+            f"{self.zeros.format(len(rows), columns)};",
             f"for ({self.index} i = 0; i < {inputs + more}; i += {_TOGETHER}) {{",
             f"  for ({self.index} j = 0; j < {columns}; j++) {{",
         ]
