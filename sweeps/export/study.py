@@ -51,9 +51,7 @@ class Export(Study[xr.Dataset]):
     GROWS: ClassVar[tuple[str, ...]] = ("laws", "tables", "machine", "in_worlds")
     SMALL: ClassVar[Mapping[str, Any]] = {
         "laws": ("rps_plus",),
-        "inputs": 20_000,
-        "worlds": 4,
-        "bags": 1,
+        **{"inputs": 20_000, "states": 20_000, "worlds": 4, "bags": 1},
     }
 
     laws: tuple[str, ...] = ("rps", "rps_tuned", "rps_plus", "learned_mlp", "learned_gru")
@@ -64,7 +62,9 @@ class Export(Study[xr.Dataset]):
     in_worlds: tuple[str, ...] = ("rps_plus",)
     """Those of the laws that are in the loop of random worlds, too."""
     inputs: int = option(10_000_000, 100, 10**9)
-    """Number of chance inputs of each law, for C in float, in double, and ONNX each."""
+    """Number of chance inputs of each law, for C in float and in double each."""
+    states: int = option(1_000_000, 100, 10**9)
+    """Number of chance inputs of each law as ONNX."""
     worlds: int = option(1000, 1, 1_000_000)
     """Number of random worlds with C in the loop."""
     bags: int = option(4, 1, 1000)
@@ -110,7 +110,10 @@ class Export(Study[xr.Dataset]):
     # --- what is asked of each law ---
 
     def _inputs(self, law: str, where: Path) -> xr.Dataset:
-        rows = [native.agreement(law, form, self.inputs, where) for form in _FORMS]
+        counts = {"onnx": self.states}
+        rows = [
+            native.agreement(law, form, counts.get(form, self.inputs), where) for form in _FORMS
+        ]
         return _columns("inputs", rows, "form", _FORMS, but=("law", "form"))
 
     def _trials(self, law: str, where: Path) -> xr.Dataset:
