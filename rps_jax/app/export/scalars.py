@@ -122,7 +122,8 @@ class Scalars:
         if name in ("argmax", "argmin"):
             return self._place_of(name, arrays[0], params["axes"][0])
         if name == "dynamic_slice":
-            return self._slice(arrays[0], arrays[1:], params["slice_sizes"])
+            starts = [one.item() for one in arrays[1:]]
+            return self._slice(arrays[0], starts, params["slice_sizes"])
         if name == "gather":
             return self._gathered(arrays[0], arrays[1], params, out)
         one = np.frompyfunc(lambda *args: self._one(name, args, params, kind), len(arrays), 1)
@@ -241,72 +242,47 @@ class Scalars:
             found[at] = place
         return found
 
-    def _taken(self, elements: Sequence[Node], place: Node) -> Node:
-        """The element at a place that is within them."""
-        return self.node("take", (place, *elements), elements[0].kind)
-
-    def _slice(
-        self, array: np.ndarray, starts: Sequence[np.ndarray], sizes: Sequence[int]
-    ) -> np.ndarray:
+    def _slice(self, array: np.ndarray, starts: Sequence[Node], sizes: Sequence[int]) -> np.ndarray:
         """A slice from a place that is known only when it runs, held within the array."""
-        if tuple(sizes) == array.shape:
+        windows = np.lib.stride_tricks.sliding_window_view(array, tuple(sizes))
+        place = None
+        for start, room in zip(starts, windows.shape, strict=False):
+            if room > 1:
+                held = self.node("imax", (start, self.constant(0, "i")), "i")
+                held = self.node("imin", (held, self.constant(room - 1, "i")), "i")
+                before = place and self.node("imul", (place, self.constant(room, "i")), "i")
+                place = self.node("iadd", (before, held), "i") if before else held
+        if place is None:
             return array
-        zero = self.constant(0, "i")
-        strides = [int(np.prod(array.shape[i + 1 :])) for i in range(array.ndim)]
-        most = [length - size for length, size in zip(array.shape, sizes, strict=True)]
-        free = [i for i, room in enumerate(most) if room]
-        held = {}
-        for i in free:
-            start = self.node("imax", (starts[i].item(), zero), "i")
-            held[i] = self.node("imin", (start, self.constant(most[i], "i")), "i")
-        flat, found = array.reshape(-1), np.empty(tuple(sizes), object)
-        for at in np.ndindex(found.shape):
-            offset = sum(i * stride for i, stride in zip(at, strides, strict=True))
-            # The elements that each free place can mean, the last of them varying fastest.
-            reach = [offset + strides[i] * np.arange(most[i] + 1) for i in free]
-            meant = functools.reduce(lambda a, b: np.add.outer(a, b - offset), reach).reshape(-1)
-            place = held[free[0]]
-            for i in free[1:]:
-                count = self.constant(most[i] + 1, "i")
-                place = self.node("iadd", (self.node("imul", (place, count), "i"), held[i]), "i")
-            found[at] = self._taken(list(flat[meant]), place)
-        return found
+        elements = windows.reshape(-1, int(np.prod(sizes, dtype=int))).T
+        return _shaped([self.node("take", (place, *x), x[0].kind) for x in elements], sizes)
 
     def _gathered(
         self, array: np.ndarray, indices: np.ndarray, params: Mapping[str, Any], out: Any
     ) -> np.ndarray:
         """Rows at places that are known only when it runs; NaN outside where JAX fills so."""
         numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
-        mode = str(params["mode"]).rsplit(".", maxsplit=1)[-1].upper()
         if numbers.operand_batching_dims:
             raise unsupported("gather in a batch")
-        rest = [i for i in range(len(out.shape)) if i not in numbers.offset_dims]
-        found = np.empty(out.shape, object)
-        for batch in np.ndindex(indices.shape[:-1]):
-            zero = np.array(self.constant(0, "i"), object)
-            starts = [zero] * array.ndim
-            inside = None
-            for i, dim in enumerate(numbers.start_index_map):
-                start = indices[(*batch, i)]
-                starts[dim] = np.array(start, object)
+        kind, zero = kind_of(out.dtype, "gather"), self.constant(0, "i")
+        fill = self.constant({"f": np.nan, "i": -(2**31), "b": True}[kind], kind)
+        blocks = []
+        for row in indices.reshape(-1, indices.shape[-1]):
+            starts, inside = [zero] * array.ndim, []
+            for start, dim in zip(row, numbers.start_index_map, strict=True):
+                starts[dim] = start
                 most = self.constant(array.shape[dim] - sizes[dim], "i")
-                low = self.node("ge", (start, self.constant(0, "i")), "b")
-                ok = self.node("and", (low, self.node("le", (start, most), "b")), "b")
-                inside = ok if inside is None else self.node("and", (inside, ok), "b")
+                inside += [self.node("ge", (start, zero), "b"), self.node("le", (start, most), "b")]
             block = self._slice(array, starts, sizes)
-            block = np.squeeze(block, tuple(numbers.collapsed_slice_dims))
-            if "FILL" in mode and inside is not None:
-                kind = kind_of(out.dtype, "gather")
-                fill = self.constant({"f": np.nan, "i": -(2**31), "b": True}[kind], kind)
-                outside = [self.node("select", (inside, fill, x), kind) for x in block.reshape(-1)]
-                filled = np.empty(block.size, object)
-                filled[:] = outside
-                block = filled.reshape(block.shape)
-            place: list[Any] = [slice(None)] * len(out.shape)
-            for axis, at in zip(rest, batch, strict=True):
-                place[axis] = at
-            found[tuple(place)] = block if block.ndim else block.item()
-        return found
+            if "FILL" in str(params["mode"]).upper() and inside:
+                within = functools.reduce(lambda a, b: self.node("and", (a, b), "b"), inside)
+                chosen = [self.node("select", (within, fill, x), kind) for x in block.reshape(-1)]
+                block = _shaped(chosen, block.shape)
+            blocks.append(np.squeeze(block, tuple(numbers.collapsed_slice_dims)))
+        whole = np.stack(blocks)
+        whole = whole.reshape((*indices.shape[:-1], *whole.shape[1:]))
+        rest = [i for i in range(len(out.shape)) if i not in numbers.offset_dims]
+        return np.moveaxis(whole, range(len(rest)), rest)
 
     def _product(self, values: Sequence[Any], params: Mapping[str, Any], out: Any) -> np.ndarray:
         """A product of matrices: a loop if one of them is large and constant."""
