@@ -260,12 +260,12 @@ def header(program: Program, prefix: str) -> str:
     odd, tables = "if (!isfinite({})) ", dict[str, str]()
     structs = ("params", "memory", "observation", "twist", "skin_params", "skin", "contact")
     law = {"params": "params->", "memory": "memory->", "observation": "seen->"}
-    skin = {"skin_params": "params->", "skin": "skin->", "taxels": "", "period": ""}
+    skin = {"skin_params": "params->", "skin": "skin->", "scan": ""}
     lines = {
         "INIT": _computed(program.init, law, {"memory": "memory->"}, tables, p),
         "STEP": _computed(program.step, law, {"memory": "next.", "twist": "found."}, tables, p),
         "SKIN": _computed(
-            program.skin_step, skin, {"signal": "next.", "contact": "found."}, tables, p
+            program.skin_step, skin, {"filtered": "next.", "contact": "found."}, tables, p
         ),
         "STEP_CHECKED": _each(groups["observation"], "seen->", odd + bad_input),
         "STEP_RESULT": "\n".join(
@@ -275,7 +275,7 @@ def header(program: Program, prefix: str) -> str:
             ]
         ),
         "NO_CONTACT": _each(groups["contact"], "contact->", "{} = 0;", "fib"),
-        "SKIN_CHECKED": _each((*groups["taxels"], *groups["period"]), "", odd + bad_input),
+        "SKIN_CHECKED": _each(groups["scan"], "", odd + bad_input),
         "SKIN_RESULT": _each(groups["skin"], "next.", odd + bad_result),
         "STRUCTS": "\n".join(_struct(p, name, groups[name]) for name in structs),
         "INITIALISERS": "\n".join(

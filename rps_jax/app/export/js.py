@@ -90,7 +90,7 @@ export function step(params, memory, seen) {{
 export function skinStep(params, skin, taxels, period) {{
   if (!finite(taxels) || !finite(period)) return {{ code: 1, skin, contact: null }};
 {SKIN}
-  const next = {{ ...skin, signal: found_signal_signal }};
+  const next = {{ ...skin, signal: found_filtered_signal }};
   return {{ code: 0, skin: next, contact: {CONTACT} }};
 }}
 """
@@ -129,7 +129,7 @@ def module(program: Program, prefix: str) -> str:
     """The whole module."""
     groups, tables = program.groups, dict[str, str]()
     law = {"params": "params.", "memory": "memory.", "observation": "seen."}
-    skin = {"skin_params": "params.", "skin": "skin.", "taxels": "", "period": ""}
+    skin = {"skin_params": "params.", "skin": "skin.", "scan": ""}
     lines = {
         "HELPERS": HELPERS,
         "PARAMS": _values(groups["params"]),
