@@ -23,6 +23,7 @@ import xarray as xr
 
 from rps_jax.analysis.report import Section
 from rps_jax.app.export import program
+from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
 from rps_jax.record import provenance
 from rps_jax.record.options import option
@@ -62,9 +63,9 @@ class Export(Study[xr.Dataset]):
     in_worlds: tuple[str, ...] = ("rps_plus",)
     """Those of the laws that are in the loop of random worlds, too."""
     inputs: int = option(10_000_000, 100, 10**9)
-    """Number of chance inputs of each law, for C in float and in double each."""
+    """Number of chance inputs of each law that is an equation, for C in either precision."""
     states: int = option(1_000_000, 100, 10**9)
-    """Number of chance inputs of each law as ONNX."""
+    """Number of chance inputs of each learned law, and of each law as ONNX."""
     worlds: int = option(1000, 1, 1_000_000)
     """Number of random worlds with C in the loop."""
     bags: int = option(4, 1, 1000)
@@ -110,10 +111,10 @@ class Export(Study[xr.Dataset]):
     # --- what is asked of each law ---
 
     def _inputs(self, law: str, where: Path) -> xr.Dataset:
-        counts = {"onnx": self.states}
-        rows = [
-            native.agreement(law, form, counts.get(form, self.inputs), where) for form in _FORMS
-        ]
+        rows = []
+        for form in _FORMS:
+            few = form == "onnx" or law in policy.SHIPPED
+            rows.append(native.agreement(law, form, self.states if few else self.inputs, where))
         return _columns("inputs", rows, "form", _FORMS, but=("law", "form"))
 
     def _trials(self, law: str, where: Path) -> xr.Dataset:
