@@ -384,7 +384,7 @@ def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys):
     error = refusal(capsys, "merge", run, "--out", other)
     assert "other holds another run (domain.objects = " in error
     assert not (other / "results.nc").exists()
-    assert rps("replay", run, 4, "--law", "rps,tuned") == 0
+    assert rps("replay", run, 4, "--law", "rps,tuned", "--film-length", 0.1) == 0
     seen = files.read(run / "replay-4" / "results.nc")
     # Followed alone, in another batch than in the sweep.
     assert float(seen.outcome_time) == pytest.approx(float(results.time[1, 4]), abs=0.5)
