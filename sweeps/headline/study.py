@@ -80,7 +80,8 @@ class Headline(Study[xr.Dataset]):
                 found.append(part.expand_dims(domain=[name], model=[model]))
         whole = xr.combine_by_coords(found, join="outer", combine_attrs="drop")
         assert isinstance(whole, xr.Dataset)
-        whole = whole.sel(law=list(self.laws), domain=list(self.domains))
+        names = list(dict.fromkeys(str(one.model.item()) for one in found))
+        whole = whole.sel(law=list(self.laws), domain=list(self.domains), model=names)
         if self.machine and run.folder is not None and not self.only:
             self._publish("headline/results/headline.json", table(whole), run.folder)
             if whole.sizes["model"] > 1:
@@ -160,13 +161,14 @@ def _row(found: xr.Dataset, domain: str, law: str) -> dict[str, str]:
     by_model = rates(found, domain, law)
     own = found.sel(domain=domain, law=law, model=models.OWN)
     shares = [won / of for won, of in by_model.values()]
+    median = float(own.time.where(own.success == 1).median())
     return {
         "domain": domain,
         "law": law,
         "success": tables.share(*by_model[models.OWN]),
         "over the models": tables.spread(shares) if len(shares) > 1 else "",
         "in C MuJoCo": tables.share(*by_model[C]) if C in by_model else "",
-        "median time of a success": f"{float(own.time.where(own.success == 1).median()):.1f} s",
+        "median time of a success": f"{median:.1f} s" if np.isfinite(median) else "-",
     }
 
 
