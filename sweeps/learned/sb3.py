@@ -23,10 +23,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
+from matplotlib.figure import Figure
 
 from rps_jax import errors
-from rps_jax.analysis import tables
-from rps_jax.analysis.report import Section
+from rps_jax.analysis import statistics, tables
+from rps_jax.analysis.report import Picture, Section
 from rps_jax.record import provenance
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
@@ -139,8 +140,8 @@ class SB3(Study[xr.Dataset]):
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """The curve."""
-        return [Section("Curve", "", table(found))]
+        """The curves."""
+        return [Section("Curve", "", table(found), Picture("sb3", partial(figure_of, found)))]
 
 
 sb3 = call_of(SB3)
@@ -210,3 +211,21 @@ def table(found: xr.Dataset) -> list[list[str]]:
             ]
         )
     return rows
+
+
+def figure_of(found: xr.Dataset) -> Figure:
+    """Draw success over wall clock, with Wilson's 95 % intervals."""
+    figure = Figure(figsize=(6, 3.2), layout="constrained")
+    ax = figure.subplots()
+    for i, count in enumerate(found.envs.values):
+        one = found.sel(envs=count)
+        at = np.flatnonzero(one.episodes.values > 0)
+        trials = one.episodes.values[at].astype(int)
+        won = np.rint(one.success.values[at] * trials).astype(int)
+        ends = [statistics.wilson(int(w), int(n)) for w, n in zip(won, trials, strict=True)]
+        ax.plot(one.time[at], 100 * won / trials, "o-", color=f"C{i}", label=f"{count} at once")
+        ax.fill_between(one.time[at], *100 * np.transpose(ends), color=f"C{i}", alpha=0.2, lw=0)
+    ax.set(xlabel="wall clock [s]", ylabel="success [%]", ylim=(0, 100))
+    ax.grid(alpha=0.3)
+    ax.legend(title="worlds")
+    return figure
