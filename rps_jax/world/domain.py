@@ -90,6 +90,9 @@ class Domain:
     height: Range = drawn(Range(0.3, 0.8), 3, "m", 0.1, 2.0, "height of the object")
     # Of the way from the middle to the outline.
     com_offset: Range = drawn(Range(0, 0.4), 4, "1", 0, 0.75, "centre of mass off the middle")
+    # Of the way from the centre of mass to the outline are three or four feet; None: it stands on
+    # its corners or its rim.
+    feet: Range | None = drawn(None, 43, "1", 0.1, 1, "feet, of the way to the outline")
     friction_ground: Range = drawn(Range(0.1, 0.7), 6, "1", _POSITIVE, 10, "friction object-ground")
     friction_robot: Range = drawn(Range(0.1, 0.8), 7, "1", _POSITIVE, 10, "friction object-robot")
     frictions: tuple[Friction, ...] = ()
@@ -157,6 +160,11 @@ class Domain:
         for friction in self.frictions:
             scene.check(friction, None)
         errors.check_name("domain skin", self.skin, ("ideal", "capacitive"))
+        if self.feet is not None and not set(self.objects) <= set(RANDOM):
+            raise InputError(
+                f"domain feet are not allowed with objects = {self.objects}: random ones alone "
+                "stand on drawn feet."
+            )
         self.robot.check()
         for target in self.targets:
             scene.check_target(target, self.robot.shell)
@@ -220,7 +228,8 @@ class Domain:
     @property
     def families(self) -> tuple[str, ...]:
         """The shape family of each of `objects`."""
-        return tuple(RANDOM.get(name) or FAMILIES[name] for name in self.objects)
+        known = FAMILIES | RANDOM | ({} if self.feet is None else {"random_box": "prism"})
+        return tuple(known[name] for name in self.objects)
 
     def family_of(self, index: int) -> str:
         """The shape family of one world's object."""

@@ -43,6 +43,7 @@ _OTHERS = {
     **{name: 20 + i for i, name in enumerate(ERRORS)},
     **{"key_0": 23, "key_1": 24, "sides": 25, "turn": 26},
     **{f"corner_{i}": 27 + i for i in range(SIDES)},
+    **{"feet_number": 44, "feet_turn": 45},
 }
 # Which random number of a world is what, in the order of the columns.
 USES: dict[str, int] = dict(
@@ -120,9 +121,12 @@ def _solid(name: str, at: dict[str, np.ndarray], u: dict[str, np.ndarray]) -> So
         vertices = solid.rectangles(depth, breadth)
     else:
         vertices = _polygons(depth, breadth, u)
-    return solid.build(
+    found = solid.build(
         vertices, radius, at["height"], at["mass"], at["com_offset"], 2 * np.pi * u["com_bearing"]
     )
+    if "feet" not in at:
+        return found
+    return solid.on_feet(found, at["feet"], 3 + np.floor(2 * u["feet_number"]), u["feet_turn"])
 
 
 def _polygons(depth: np.ndarray, breadth: np.ndarray, u: dict[str, np.ndarray]) -> np.ndarray:

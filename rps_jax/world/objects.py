@@ -108,9 +108,10 @@ def register_object(
       footprint: outline of the solid that touches, in the body's frame: a circle about the origin,
         or a convex polygon of up to 8 corners around it. By default that of the geom `object`, if
         it is a box or a cylinder. The solid is as high as this geom.
-      feet: places (S, 2) [m] of 3 to 8 points on which a polygon stands, in the body's frame, or
-        with weights (S, 3) [m, m, 1], as of springs; only the engine quasistatic tells weights
-        apart. By default it stands on its corners. The engine mjx knows no feet.
+      feet: places (S, 2) [m] of 3 to 8 points on which it stands, in the body's frame, or with
+        weights (S, 3) [m, m, 1], as of springs; by default its corners or its rim. Weights are of
+        the engine quasistatic alone: the others find the load of each foot from how the object
+        leans, on ground that gives way alike under all.
 
     Raises:
       InputError: the name is one of the paper's, or file, footprint or feet are not such.
@@ -144,8 +145,8 @@ def register_object(
     family, vertices, radius = _outline(what, footprint or _own_outline(what, model))
     thing = model.body("object")
     if feet is not None:
-        family, vertices = "prism", _padded(vertices)
-        feet = _feet(what, np.asarray(feet, float), radius, thing.ipos[:2])
+        family, vertices = "cylinder" if radius else "prism", solid.padded(vertices)
+        feet = _feet(what, np.asarray(feet, float), thing.ipos[:2])
     one = Solid(
         vertices=vertices,
         radius=np.asarray(radius),
@@ -225,19 +226,11 @@ def _outline(what: str, footprint: Footprint) -> tuple[str, np.ndarray, float]:
     half = np.abs(vertices[0])
     if len(vertices) == 4 and np.allclose(np.abs(vertices), half):
         return "box", solid.rectangles(*half[:, None])[0], 0.0
-    return "prism", _padded(vertices), 0.0
+    return "prism", solid.padded(vertices), 0.0
 
 
-def _padded(vertices: np.ndarray) -> np.ndarray:
-    """Corners (SIDES, 2) [m] of a prism, the last of them repeated."""
-    missing = SIDES - len(vertices)
-    return np.concatenate([vertices, np.repeat(vertices[-1:], missing, axis=0)])
-
-
-def _feet(what: str, feet: np.ndarray, radius: float, com: np.ndarray) -> np.ndarray:
+def _feet(what: str, feet: np.ndarray, com: np.ndarray) -> np.ndarray:
     """Feet (SIDES, 3) [m, m, 1], those that are missing with a weight of 0."""
-    if radius:
-        raise InputError(f"{what}: feet are not allowed under a circle: give a polygon.")
     if feet.ndim == 2 and feet.shape[1] == 2:
         feet = np.column_stack([feet, np.ones(len(feet))])
     said = f"{what}: feet = {feet.tolist()} is not allowed:"

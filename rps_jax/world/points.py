@@ -29,6 +29,7 @@ from rps_jax.world.draws import Draw
 Kind = Literal["range", "choice", "shape", "noise"]
 FILE = "points.nc"  # of a run folder whose worlds are points
 _OF_PRISMS = ("sides", "turn", *(f"corner_{i}" for i in range(SIDES)))
+_OF_FEET = ("feet_number", "feet_turn")
 _TURN = Range(0, 2 * np.pi)
 _MOST = 100_000_000
 
@@ -37,7 +38,7 @@ class Quantity(NamedTuple):
     """One coordinate of the cube, and what it stands for."""
 
     name: str
-    kind: Kind  # a range; a choice from a list; a prism's corners; the key of all noise
+    kind: Kind  # a range; a choice from a list; corners or feet; the key of all noise
     range: Range  # of the quantity, or from 0 to how many there are to choose from
     unit: str
 
@@ -57,8 +58,8 @@ def _quantities(domain: Domain) -> Iterator[Quantity]:
     random = set(domain.objects) & set(RANDOM)
     idle = set(domain.idle) | ({"aspect"} if random == {"random_cylinder"} else set())
     for name in draws.USES:
-        if name in _OF_PRISMS:
-            if "random_prism" in random:
+        if name in (*_OF_PRISMS, *_OF_FEET):
+            if domain.feet is not None if name in _OF_FEET else "random_prism" in random:
                 yield Quantity(name, "shape", Range(0, 1), "1")
         elif name == "com_bearing":
             if random and domain.com_offset.high > 0:
@@ -272,8 +273,8 @@ def worlds_at(
 
     A quantity is at `low + u (high - low)`, or at `low (high / low)^u` where its range is even in
     the logarithm. Kinds of quantities are `range`; `choice`, of the object, friction or target from
-    the domain's lists; `shape`, of a prism's corners; and `noise`, the key of all that is drawn
-    while a world runs, so that neighbours in it have nothing in common.
+    the domain's lists; `shape`, of a prism's corners or of feet; and `noise`, the key of all that
+    is drawn while a world runs, so that neighbours in it have nothing in common.
 
     Args:
       domain: ranges of what differs between worlds, or their name, as wide.
