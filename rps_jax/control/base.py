@@ -63,18 +63,12 @@ def check_finite(params: Params) -> Params:
 
 
 def check_signs(
-    law: str, params: Params, positive: Sequence[str], free: Sequence[str] = ()
+    law: str, positive: Sequence[str], params: Params, free: Sequence[str] = ()
 ) -> Params:
-    """Return the parameters if they are finite scalars of the right signs.
+    """Return parameters of one level if they are finite scalars of the right signs.
 
-    Args:
-      law: its name, for the error.
-      params: of one level.
-      positive: names of those that must be above 0.
-      free: names of those of any sign; all others must not be negative.
-
-    Raises:
-      InputError: one is not such a number.
+    Those named `positive` must be above 0, those `free` may have any sign, and all others must not
+    be negative; else InputError names the `law` and the parameter.
     """
     for name, value in params._asdict().items():
         bounds = {} if name in free else {"at_least": 0}

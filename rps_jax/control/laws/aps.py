@@ -14,6 +14,7 @@ the robot stands behind the object, seen from the target.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -75,14 +76,8 @@ class APSState(NamedTuple):
         )
 
 
-def check(params: APSParams) -> APSParams:
-    """Return the parameters if they are scalars that mean something.
-
-    Raises:
-      InputError: a value is not a finite number, or is out of bounds.
-    """
-    positive = ("alpha_variance", "alpha_count", "v_max", "omega_max", "d_success")
-    return check_signs("aps", params, positive)
+_POSITIVE = ("alpha_variance", "alpha_count", "v_max", "omega_max", "d_success")
+check = partial(check_signs, "aps", _POSITIVE)
 
 
 def predictive(params: APSParams, state: APSState) -> tuple[jax.Array, jax.Array]:
