@@ -167,9 +167,6 @@ def friction_arm(solid: Solid, support: Support = "feet") -> np.ndarray:
     bear that give way alike and only push: `feet`, points as engines stand solids on (the corners
     of a prism, three points of a cylinder's rim, one where it leans to); `even`, all of the ground
     that is covered.
-
-    Raises:
-      InputError: unknown support.
     """
     errors.check_name("support", support, get_args(Support))
     at, share = _feet(solid) if support == "feet" else _bed(solid)

@@ -32,10 +32,9 @@ from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Bool, Float, Int, Scalar
 from rps_jax.geometry.footprint import Footprint
-from rps_jax.robot import base, drive, load_cell
-from rps_jax.robot.base import Odometry
+from rps_jax.robot import base, drive
+from rps_jax.robot.base import Load, Odometry
 from rps_jax.robot.drive import Drive
-from rps_jax.robot.load_cell import Load
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import NONE, Reading, Skin, SkinState, SmoothReading
 from rps_jax.world.physics import Physics
@@ -179,7 +178,7 @@ def start(world: World, law: Law = rps.LAW) -> Trial:
         diverged=false,
         overflows=zero,
         drive=None if world.robot is None else drive.start(world.qpos),
-        load=load_cell.start(world.qpos) if law.senses == "force" else None,
+        load=base.unloaded(world.qpos) if law.senses == "force" else None,
     )
 
 

@@ -41,30 +41,20 @@ _KEY = "quantity"
 
 
 class Quantity(NamedTuple):
-    """What a drawn quantity is, beside its range."""
+    """What a drawn quantity is: all that there is to say of it, beside its range."""
 
     column: int  # of a world's random numbers; a new quantity takes the next one that is free
     unit: str
     least: float  # which its range must not leave
     most: float
     words: str  # what it is called in reports; empty: it is in none
-    of: Part
+    of: Part = "object"
     sets: str = ""  # number of the skin, of odometry or of the robot that is drawn
 
 
-def drawn(
-    usual: Range | None,
-    column: int,
-    unit: str,
-    least: float,
-    most: float,
-    words: str,
-    of: Part = "object",
-    sets: str = "",
-) -> Any:
-    """Declare a drawn quantity: all that there is to say of it, see `Quantity`."""
-    about = Quantity(column, unit, least, most, words, of, sets)
-    return field(default=usual, metadata={_KEY: about})
+def drawn(usual: Range | None, *about: Any) -> Any:
+    """Declare a drawn quantity by its usual range, and the values of a `Quantity`."""
+    return field(default=usual, metadata={_KEY: Quantity(*about)})
 
 
 _POSITIVE = 1e-3
@@ -326,9 +316,6 @@ def named(domain: DomainLike, robot: RobotLike | None = None) -> Domain:
 
     Changes may follow a name or a file, as `wide,mass=3:10,objects=random_box`. With a robot, its
     worlds have that one, but for what the domain draws of it.
-
-    Raises:
-      InputError: no domain has this name, the file is no domain, or a change is not allowed.
     """
     if robot is not None:
         return replace(named(domain), robot=named_robot(robot))
@@ -387,11 +374,7 @@ _FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
 
 
 def from_json(values: dict[str, Any]) -> Domain:
-    """Read the domain that `dataclasses.asdict` wrote as JSON.
-
-    Raises:
-      InputError: a name or a value is not of a domain.
-    """
+    """Read the domain that `dataclasses.asdict` wrote as JSON; InputError if it is none."""
     return Domain(**_from_json(values, DOMAINS["wide"]))
 
 

@@ -58,22 +58,18 @@ USES: dict[str, int] = dict(
 
 
 def draw(domain: Domain, seed: int, index: ArrayLike) -> Draw:
-    """The worlds `index` (n,), all of one object of the domain.
-
-    Raises:
-      ValueError: they are of several objects.
-    """
+    """The worlds `index` (n,), all of one object of the domain."""
     index = np.asarray(index, np.int64)
-    which = domain.object_of(index)
-    if (which != which[0]).any():
-        raise ValueError("worlds of several objects cannot be batched")
     return drawn_at(domain, index, numbers_of(seed, index))
 
 
 def drawn_at(domain: Domain, index: np.ndarray, numbers: np.ndarray) -> Draw:
-    """Worlds of the same object, from their random numbers (n, columns)."""
+    """Worlds from their random numbers (n, columns); ValueError if they are of several objects."""
+    which = domain.object_of(index)
+    if (which != which[0]).any():
+        raise ValueError("worlds of several objects cannot be batched")
     u = {name: numbers[:, column] for name, column in USES.items()}
-    name = domain.objects[int(domain.object_of(index[0]))]
+    name = domain.objects[int(which[0])]
     ranges = {name: getattr(domain, name) for name in QUANTITIES if name in u}
     at = {name: one.at(u[name]) for name, one in ranges.items() if one is not None}
     if domain.skin == "ideal":

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -64,11 +64,7 @@ def path_of(name: str) -> Path:
 
 
 def named(text: str) -> str:
-    """Read an object's text: its name, or the path of an MJCF file, which is then registered.
-
-    Raises:
-      InputError: the file cannot be read, or is no object.
-    """
+    """Read an object's text: its name, or the path of an MJCF file, which is then registered."""
     if not isinstance(text, str) or not text.endswith(".xml"):
         return text
     path = Path(text).absolute()
@@ -190,14 +186,19 @@ def _compiled(what: str, path: Path) -> mujoco.MjModel:
     return model
 
 
+def outline_of(geom: Any) -> Footprint | None:
+    """The outline of a geom that is a box or a cylinder."""
+    if geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX:
+        return fp.rectangle(geom.size[0], geom.size[1])
+    return fp.circle(geom.size[0]) if geom.type[0] == mujoco.mjtGeom.mjGEOM_CYLINDER else None
+
+
 def _own_outline(what: str, model: mujoco.MjModel) -> Footprint:
     """The outline of the geom `object`."""
     geom = model.geom("object")
     centred = np.allclose(geom.pos[:2], 0) and np.allclose(geom.quat, _UPRIGHT)
-    if centred and geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX:
-        return fp.rectangle(geom.size[0], geom.size[1])
-    if centred and geom.type[0] == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        return fp.circle(geom.size[0])
+    if centred and (outline := outline_of(geom)) is not None:
+        return outline
     raise InputError(
         f"{what}: footprint = None is not allowed: the geom object is not an upright box or "
         "cylinder about the body's origin, so give the outline."

@@ -8,8 +8,9 @@ drawing them, moves such points.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -79,11 +80,7 @@ def names(domain: Domain, *kinds: Kind) -> tuple[str, ...]:
 
 
 def check_drawn(field: str, name: str, domain: Domain) -> str:
-    """`name` if the domain draws a quantity of this name from a range.
-
-    Raises:
-      InputError: there is none, or the domain draws none from it.
-    """
+    """`name` if the domain draws a quantity of this name from a range, or InputError."""
     drawn = names(domain, "range")
     known = (*QUANTITIES, *ERRORS, "com_bearing")
     if name in known and name not in drawn:
@@ -104,10 +101,6 @@ class Points:
         """Two tables are equal if all their numbers are."""
         return isinstance(other, Points) and self.digest == other.digest
 
-    def __hash__(self) -> int:
-        """The digest's."""
-        return hash(self.digest)
-
     @property
     def digest(self) -> str:
         """SHA-256 of the numbers and of how many each point has."""
@@ -123,16 +116,9 @@ class Points:
         return found
 
     def draw(self, domain: Domain, index: Any) -> Draw:
-        """The worlds `index` (n,), all of one object of the domain.
-
-        Raises:
-          ValueError: they are of several objects.
-        """
+        """The worlds `index` (n,), all of one object of the domain."""
         index = np.asarray(index, np.int64)
         cases = self.cases(domain, index)
-        which = domain.object_of(cases)
-        if (which != which[0]).any():
-            raise ValueError("worlds of several objects cannot be batched")
         numbers = np.full((index.size, draws.COLUMNS), 0.5)
         own = [i for i, name in enumerate(names(domain)) if name in draws.USES]
         at = [draws.USES[name] for name in names(domain) if name in draws.USES]
@@ -140,22 +126,12 @@ class Points:
         return draws.drawn_at(domain, cases, numbers)._replace(number=index)
 
     def write(self, folder: Path, domain: Domain) -> Path:
-        """Keep the points in a run folder, if it does not hold them already."""
-        path = folder / FILE
-        try:
-            if path.exists() and Points(_numbers(path)) == self:
-                return path
-        except InputError:  # it is damaged
-            pass
-        return files.write_results(path, _labelled(domain, self.u))
+        """Keep the points in a run folder."""
+        return files.write_results(folder / FILE, _labelled(domain, self.u))
 
     @staticmethod
     def read(folder: Path, digest: str) -> Points:
-        """The points that a run folder holds.
-
-        Raises:
-          InputError: there are none, or others than those of this digest.
-        """
+        """The points of this digest that a run folder holds; InputError if it does not."""
         if not (folder / FILE).exists():
             raise InputError(f"run = {folder} lacks its {FILE}: run the same command again.")
         found = Points(_numbers(folder / FILE))
@@ -176,11 +152,7 @@ def _counts(domain: Domain) -> tuple[int, int, int]:
 
 
 def checked(domain: Domain, u: Any) -> Points:
-    """Points of a domain: an array (n, q), or what `worlds_at` returned.
-
-    Raises:
-      InputError: they are not numbers in [0, 1), or of another domain.
-    """
+    """Points of a domain: an array (n, q) in [0, 1), or of `worlds_at`; or InputError."""
     every = names(domain)
     if isinstance(u, xr.Dataset):
         if "u" not in u or "quantity" not in u.coords:
@@ -209,18 +181,6 @@ def checked(domain: Domain, u: Any) -> Points:
         )
     errors.check_count("points", len(found), at_most=_MOST)
     return Points(found)
-
-
-def asked(domain: Domain, worlds: Any) -> tuple[int, Points | None]:
-    """How many worlds are asked for, and at which points, if it is not a number of drawn ones.
-
-    Raises:
-      InputError: it is neither a whole number nor points of the domain.
-    """
-    if isinstance(worlds, xr.Dataset | np.ndarray | list | tuple):
-        points = checked(domain, worlds)
-        return len(points.u), points
-    return worlds, None
 
 
 def cases(domain: Domain, points: Points | None, index: Any) -> np.ndarray:
@@ -307,14 +267,24 @@ def worlds_at(
     points = checked(domain, u)
     every = np.arange(len(points.u))
     which = domain.object_of(points.cases(domain, every))
-    found = _labelled(domain, points.u)
+    columns = coordinates(domain, which, partial(points.draw, domain))
+    return _labelled(domain, points.u).assign_coords(columns)
+
+
+def coordinates(
+    domain: Domain, which: np.ndarray, draw: Callable[[np.ndarray], Draw]
+) -> dict[str, Any]:
+    """Objects of worlds, and what was drawn for them, as coordinates.
+
+    `which` (n,) of the domain's objects they have, and `draw` makes some of them, by their rows.
+    """
     columns: dict[str, Any] = {"object": ("world", np.array(domain.objects)[which])}
     for thing in np.unique(which):
         rows = np.flatnonzero(which == thing)
-        for name, (values, unit) in draws.table(points.draw(domain, rows)).items():
-            empty = ("world", np.empty(every.size), {"units": unit})
+        for name, (values, unit) in draws.table(draw(rows)).items():
+            empty = ("world", np.empty(which.size), {"units": unit})
             columns.setdefault(name, empty)[1][rows] = values
-    return found.assign_coords(columns)
+    return columns
 
 
 def _labelled(domain: Domain, u: np.ndarray) -> xr.Dataset:

@@ -97,9 +97,14 @@ def load(
         if geom.name == "load" and rear == "far":
             geom.pos[0] = -geom.pos[0]
     if mass is not None:
-        _set_mass(spec, mass)
+        geoms = [geom for geom in spec.body("object").geoms if geom.mass > 0]
+        total = sum(geom.mass for geom in geoms)
+        for geom in geoms:
+            geom.mass *= mass / total
     model, stripped = _compile(spec, physics, friction, robot)
-    return Scene(name, FAMILIES[name], model, stripped, _footprint(stripped), robot.shell)
+    outline = objects.outline_of(stripped.geom("object"))
+    assert outline is not None
+    return Scene(name, FAMILIES[name], model, stripped, outline, robot.shell)
 
 
 def _load_registered(
@@ -127,11 +132,7 @@ def shaped(
     *,
     robot: Robot = Robot(),
 ) -> Scene:
-    """Compile a scene with one solid (its leaves without a leading axis) of a shape family.
-
-    Raises:
-      InputError: unknown family, or friction that is not a positive finite number.
-    """
+    """Compile a scene with one solid (its leaves without a leading axis) of a shape family."""
     errors.check_name("family", family, SHAPES)
     check(friction, float(one.mass))
     spec = objects.read(path_of(family))
@@ -301,14 +302,6 @@ def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
         joint.armature = 0.0
 
 
-def _set_mass(spec: mujoco.MjSpec, mass: float) -> None:
-    """Scale the object's geoms to this mass in all [kg]."""
-    geoms = [geom for geom in spec.body("object").geoms if geom.mass > 0]
-    total = sum(geom.mass for geom in geoms)
-    for geom in geoms:
-        geom.mass *= mass / total
-
-
 def _set_options(option: mujoco.MjOption, physics: Physics) -> None:
     option.timestep = physics.timestep
     option.cone = {
@@ -344,15 +337,6 @@ def _strip(spec: mujoco.MjSpec, full: mujoco.MjModel) -> mujoco.MjModel:
     model = spec.compile()
     model.body_sameframe[:] = 0  # likewise: always the general formula for the inertial frame
     return model
-
-
-def _footprint(model: mujoco.MjModel) -> Footprint:
-    """The outline of the object's geom that stands on the ground."""
-    geom = model.geom("object")
-    half_x, half_y, _ = geom.size
-    if geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX:
-        return fp.rectangle(half_x, half_y)
-    return fp.circle(half_x)
 
 
 def solid_of(scene: Scene) -> Solid:

@@ -116,21 +116,16 @@ def _learn(
     offset = state.alpha - state.mean
     mean = state.mean + offset / count
     variance = state.variance + (offset * (state.alpha - mean) - state.variance) / count
-    place = moved | ~state.started
-    return APSState(
-        p_world_object=jnp.where(place, p_world_object, state.p_world_object),
-        a_OT=jnp.where(place, a_OT, state.a_OT),
+    gamma_mean = state.gamma_mean + (gamma - state.gamma_mean) / gamma_count
+
+    def where(condition: jax.Array, **new: jax.Array) -> dict[str, jax.Array]:
+        return {key: jnp.where(condition, x, getattr(state, key)) for key, x in new.items()}
+
+    return state._replace(
         started=jnp.ones_like(state.started),
-        alpha=state.alpha,
-        gamma=jnp.where(moved, gamma, state.gamma),
-        gamma_mean=jnp.where(
-            moved, state.gamma_mean + (gamma - state.gamma_mean) / gamma_count, state.gamma_mean
-        ),
-        gamma_count=jnp.where(moved, gamma_count, state.gamma_count),
-        mean=jnp.where(good, mean, state.mean),
-        variance=jnp.where(good, variance, state.variance),
-        weight=jnp.where(good, count, state.weight),
-        yaw_error=state.yaw_error,
+        **where(moved | ~state.started, p_world_object=p_world_object, a_OT=a_OT),
+        **where(moved, gamma=gamma, gamma_mean=gamma_mean, gamma_count=gamma_count),
+        **where(good, mean=mean, variance=variance, weight=count),
     )
 
 
