@@ -98,7 +98,7 @@ def run(
         plan = _Schedule([_Queue(job) for job in jobs], setting, slots, workers)
         tasks = [partial(_Worker(plan, shared).work, number) for number in range(workers)]
         if backend != "cpu":  # the processor is idle: compile all at once, what is needed first
-            tasks += [each.program for each in plan.batches]
+            tasks += [each.program for each in (*plan.own, *plan.last)]
         count = len(tasks)
     _side_by_side(tasks, count, shared)
     warn_of_lost(shared.overflowed)
@@ -257,24 +257,15 @@ class _Schedule:
             if width:
                 groups.setdefault(queue.law if together else number, []).append((queue, width))
         self.last = [
-            _Batch(*zip(*some, strict=True), setting)
+            _Batch(*zip(*group[i : i + _SIDE_BY_SIDE], strict=True), setting)
             for group in groups.values()
-            for some in _by(group, _SIDE_BY_SIDE)
+            for i in range(0, len(group), _SIDE_BY_SIDE)
         ]
-
-    @property
-    def batches(self) -> list[_Batch]:
-        """All, those that are needed first in front."""
-        return [*self.own, *self.last]
 
 
 def _most_aside() -> int:
     """How many running trials of a job a worker sets aside, at most."""
     return 0 if jax.default_backend() == "cpu" else jax.device_count() * _ASIDE
-
-
-def _by(every: Sequence[Any], most: int) -> list[Sequence[Any]]:
-    return [every[i : i + most] for i in range(0, len(every), most)]
 
 
 class _Batch:
@@ -308,16 +299,25 @@ class _Batch:
         return jax.device_put(tree, self.sharding)
 
     def _compile(self) -> Any:
-        worlds, trials = [], []
-        for queue, slots in zip(self.queues, self.slots, strict=True):
-            shaped = partial(self._batched, slots)
-            worlds.append(jax.tree.map(shaped, queue.like.worlds))
-            start = partial(trial.start_all, law=self.law)
-            live = jax.ShapeDtypeStruct((slots,), bool)
-            trials.append(jax.tree.map(shaped, jax.eval_shape(start, worlds[-1], live)))
+        worlds = [
+            jax.tree.map(partial(self._batched, slots), queue.like.worlds)
+            for queue, slots in zip(self.queues, self.slots, strict=True)
+        ]
+        masks = tuple(jax.ShapeDtypeStruct((n,), bool, sharding=self.sharding) for n in self.slots)
         stages, rules = jax.eval_shape(lambda: (self.stages, self.setting.rules))
-        leaves, tree = jax.tree.flatten((stages, tuple(worlds), tuple(trials), rules))
+        shapes = (stages, tuple(worlds), self.blank, masks, masks, rules)
+        leaves, tree = jax.tree.flatten(shapes)
         return _compiled(self.setting.physics, self.law, self.sharding, tree, tuple(leaves))
+
+    @functools.cached_property
+    def blank(self) -> tuple[Trial, ...]:
+        """Shapes of the trials of each queue."""
+        start, found = partial(trial.start_all, law=self.law), []
+        for queue, slots in zip(self.queues, self.slots, strict=True):
+            one = jax.tree.map(partial(self._batched, 1), queue.like.worlds)
+            like = jax.eval_shape(start, one, jax.ShapeDtypeStruct((1,), bool))
+            found.append(jax.tree.map(partial(self._batched, slots), like))
+        return tuple(found)
 
     def _batched(self, slots: int, leaf: Any) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((slots, *leaf.shape[1:]), leaf.dtype, sharding=self.sharding)
@@ -337,12 +337,19 @@ def _compiled(
     """
 
     def advance(
-        stages: tuple[Any, ...], worlds: tuple[World, ...], trials: tuple[Trial, ...], rules: Rules
+        stages: tuple[Any, ...],
+        worlds: tuple[World, ...],
+        trials: tuple[Trial, ...],
+        fresh: tuple[jax.Array, ...],
+        live: tuple[jax.Array, ...],
+        rules: Rules,
     ) -> tuple[tuple[Trial, ...], tuple[tuple[jax.Array, jax.Array, Outcome], ...]]:
+        started = [trial.start_all(*each, law=law) for each in zip(worlds, live, strict=True)]
+        begun = tuple(map(_pick, fresh, started, trials))
         after = trial.advance_all(
             stages,
             worlds,
-            trials,
+            begun,
             physics=physics,
             rules=rules,
             law=law,
@@ -357,7 +364,7 @@ def _compiled(
         advance = jax.shard_map(
             advance,
             mesh=sharding.mesh,
-            in_specs=(P(), P("worlds"), P("worlds"), P()),
+            in_specs=(P(), *(P("worlds"),) * 4, P()),
             out_specs=P("worlds"),
             check_vma=False,
         )
@@ -387,49 +394,44 @@ def _cut(part: Part, count: int) -> tuple[Part, Part | None]:
     return piece(slice(count)), piece(slice(count, None)) if over else None
 
 
-def _count(parts: Sequence[Part]) -> int:
-    return sum(part.numbers.size for part in parts)
-
-
-@partial(jax.jit, static_argnames=("law",), donate_argnames=("trials",))
-def _refill(worlds: World, trials: Trial, fresh: jax.Array, *, law: Law) -> Trial:
-    """Start a new trial in the slots that are `fresh` (B,)."""
-    started = trial.start_all(worlds, jnp.ones_like(fresh), law=law)
-    pick = partial(jax.vmap(lambda f, a, b: jnp.where(f, a, b)), fresh)
-    return jax.tree.map(pick, started, trials)
+def _pick(which: jax.Array, yes: Trial, no: Trial) -> Trial:
+    """Rows of one batch of trials where `which` (B,) holds, and of another elsewhere."""
+    one = partial(jax.vmap(lambda w, a, b: jnp.where(w, a, b)), which)
+    return jax.tree.map(one, yes, no)
 
 
 class _Slots:
     """The slots of one queue in a batch of one worker, and what is in them."""
 
-    def __init__(self, queue: _Queue, slots: int, batch: _Batch, resumed: bool):
+    def __init__(self, batch: _Batch, number: int, resumed: bool):
+        queue, slots = batch.queues[number], batch.slots[number]
         self._queue, self._batch = queue, batch
         self._numbers = np.zeros(slots, np.int64)
         self.live = np.zeros(slots, bool)
         self._before = np.zeros(slots, int)  # steps at the last look
         like = queue.like.worlds
         self._host = jax.tree.map(lambda leaf: np.repeat(leaf[:1], slots, axis=0), like)
-        self.worlds, self.trials = self._filled(queue.aside if resumed else ())
-
-    def _filled(self, aside: Sequence[tuple[Part, Trial]]) -> tuple[World, Trial]:
-        """The first trials: those that were set aside, or else those that wait."""
-        if not aside:
-            worlds = self._put(np.arange(self.live.size), self._queue.take(self.live.size))
-            started = trial.start_all(worlds, self.live, law=self._batch.law)
-            return worlds, self._batch.put(started)
+        self._fresh = np.ones(
+            slots, bool
+        )  # begin with the next segment; what is not live has ended
+        blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), batch.blank[number])
+        self.trials = batch.put(blank)
+        if not (aside := queue.aside if resumed else ()):
+            self.worlds = self._put(np.arange(slots), queue.take(slots))
+            return
         parts, states = zip(*aside, strict=True)
-        worlds = self._put(np.arange(self.live.size), parts)
+        self.worlds = self._put(np.arange(slots), parts)
         running = jax.tree.map(lambda *leaves: np.concatenate(leaves), *states)
         # What fills the other slots has ended.
-        running = rows(running, np.resize(np.arange(_count(parts)), self.live.size))
-        self._before = running.steps.copy()
-        return worlds, self._batch.put(running._replace(done=~self.live))
+        running = rows(running, np.resize(np.arange(len(running.steps)), slots))
+        self._before, self._fresh = running.steps.copy(), np.zeros(slots, bool)
+        self.trials = batch.put(running._replace(done=~self.live))
 
     def _put(self, at: np.ndarray, taken: Sequence[Part]) -> World:
         """Put trials into the first of the slots `at`; returns all worlds."""
-        at = at[: _count(taken)]
-        ends = np.cumsum([part.numbers.size for part in taken])
-        for part, slots in zip(taken, np.split(at, ends[:-1]) if taken else (), strict=True):
+        ends = np.cumsum([0, *(part.numbers.size for part in taken)])
+        at = at[: ends[-1]]
+        for part, slots in zip(taken, np.split(at, ends[1:-1]) if taken else (), strict=True):
             self._numbers[slots] = part.numbers
             for mine, theirs in zip(
                 jax.tree.leaves(self._host), jax.tree.leaves(part.worlds), strict=True
@@ -438,6 +440,12 @@ class _Slots:
         self.live[at], self._before[at] = True, 0
         # A copy: the device may otherwise share the host's memory, which the next call changes.
         return self._batch.put(jax.tree.map(np.copy, self._host))
+
+    def give(self) -> tuple[World, Trial, Any, Any]:
+        """What the program takes; what is fresh then begins."""
+        masks = self._batch.put((self._fresh.copy(), self.live.copy()))
+        self._fresh[:] = False
+        return self.worlds, self.trials, *masks
 
     def look(self, steps: np.ndarray, done: np.ndarray, outcomes: Outcome) -> tuple[Any, ...]:
         """What `_Shared.add` takes of a segment; what ended in it makes room."""
@@ -449,9 +457,7 @@ class _Slots:
         self.live[at] = False
         if taken := self._queue.take(at.size):
             self.worlds = self._put(at, taken)
-            fresh = np.isin(np.arange(self.live.size), at[: _count(taken)])
-            refilled = _refill(self.worlds, self.trials, fresh, law=self._batch.law)
-            self.trials = self._batch.put(refilled)
+            self._fresh[at] = self.live[at]
         return ended
 
     def set_aside(self) -> None:
@@ -490,8 +496,7 @@ class _Worker:
         """Run the trials of a batch until none waits, and no more than so many run."""
         if self._shared.stop:
             return
-        pairs, resumed = zip(batch.queues, batch.slots, strict=True), not most_aside
-        every = [_Slots(*each, batch, resumed) for each in pairs]
+        every = [_Slots(batch, number, not most_aside) for number in range(len(batch.queues))]
         if not any(each.live.any() for each in every):
             return
         program, stages, rules = self._program(batch), batch.stages, batch.setting.rules
@@ -506,8 +511,8 @@ class _Worker:
                 return [teller.submit(self._shared.add, *one) for one in ended]
 
             while sum(each.live.sum() for each in every) > most_aside and not self._shared.stop:
-                worlds = tuple(each.worlds for each in every)
-                after, seen = program(stages, worlds, tuple(each.trials for each in every), rules)
+                given = zip(*(each.give() for each in every), strict=True)
+                after, seen = program(stages, *given, rules)
                 for each, trials in zip(every, after, strict=True):
                     each.trials = trials
                 # Where no trial waits for room, a GPU goes on while the host looks.
