@@ -5,8 +5,10 @@
 `NAME.json` in `sweeps/results`, or in the `results` of a folder of `sweeps`, holds one table: the
 command, device, versions, commit and date that made it, its columns and its rows. A page shows it
 between `<!-- table: NAME -->` and `<!-- end -->`, and its commands between `<!-- command: NAME -->`
-and `<!-- end -->`. With `--check` nothing is written, and the exit code is 1 if a page differs from
-the data. Only the standard library is needed.
+and `<!-- end -->`. Within a sentence `<!-- cell: NAME | ROW | COLUMN -->...<!-- end -->` is a cell
+without its interval; ROW are the first cells of its row, also divided by bars. With `--check`
+nothing is written, and the exit code is 1 if a page differs from the data. Only the standard
+library is needed.
 
 A cell is a text, a number, a list of numbers (a rate and the ends of its interval), or null. The
 `format` of a column is applied to a number and to the first of a list, its `rest` to those that
@@ -25,6 +27,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SWEEPS = ROOT / "sweeps"
 KEYS = ("command", "device", "versions", "commit", "date", "columns", "rows")
 _BLOCK = re.compile(r"(<!-- (table|command): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+_CELL = re.compile(r"(<!-- cell: ([^>]*?) -->).*?(<!-- end -->)", re.DOTALL)
 _SKIPPED = {"runs", "build", "dist"}  # folders of the root that hold no pages of the repository
 
 
@@ -126,7 +129,14 @@ def render(page: Path, root: Path = SWEEPS) -> str:
         link = Path(os.path.relpath(path_of(name, root), page.parent)).as_posix()
         return begin + table(data, root) + caption(data, link) + end
 
-    return _BLOCK.sub(block, page.read_text(encoding="utf-8"))
+    def cell(found: re.Match[str]) -> str:
+        begin, words, end = found.groups()
+        name, *row, column = (word.strip() for word in words.split("|"))
+        return (
+            begin + _cited({"from": name, "row": row, "column": column}, root).split(" [")[0] + end
+        )
+
+    return _CELL.sub(cell, _BLOCK.sub(block, page.read_text(encoding="utf-8")))
 
 
 def pages(root: Path = ROOT) -> list[Path]:

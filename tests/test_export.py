@@ -19,6 +19,7 @@ from rps_jax.robot.skin import SKINS
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
+from sweeps.export.loop import recorded
 from sweeps.export.native import (
     COMPILERS,
     SANE,
@@ -26,7 +27,6 @@ from sweeps.export.native import (
     agreement,
     fuzzed,
     observations,
-    recorded,
     trial_errors,
 )
 
@@ -139,7 +139,7 @@ def test_a_fault_in_c_is_found(tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", ["rps_plus", "learned_mlp"])
 def test_the_folder_compiles_without_a_warning_and_runs(name, compiler, tmp_path):
     made = program.program(name, "kairos")
-    texts = {"law.h": c.header(made, "law"), **folder.files(made, "law")}
+    texts = folder.files(made, "law")
     for file, text in texts.items():
         (tmp_path / file).write_text(text)
     (tmp_path / "main.c").write_text(texts["main.c"].replace("STEPS 200000", "STEPS 3000"))
@@ -207,9 +207,9 @@ def test_a_whole_trial_step_by_step(name, tmp_path):
     setting = Setting("quasistatic", rules=Rules(horizon=20.0))
     trials = recorded([case], setting)
     assert len(trials[0][0]) > 900
-    (errors,) = trial_errors(name, "double", trials, tmp_path)
+    (errors,) = trial_errors(name, "double", trials, tmp_path).own
     assert errors.max() < 1e-12
-    (errors,) = trial_errors(name, "float", trials, tmp_path)
+    (errors,) = trial_errors(name, "float", trials, tmp_path).own
     # A step differs where a switch flips in one of the two; it must not last.
     assert np.mean(errors > 2e-5) < 0.01
     assert np.median(errors) < 1e-6
@@ -247,7 +247,7 @@ def test_the_command_writes_a_folder_with_the_chosen_parameters(tmp_path, capsys
     assert rps("export", "c", *arguments, "--out", tmp_path / "c") == 0
     assert str(tmp_path / "c" / "mine.h") in capsys.readouterr().out
     names = {path.name for path in (tmp_path / "c").iterdir()}
-    assert names == {"mine.h", "main.c", "CMakeLists.txt", "README.md"}
+    assert names == {"mine.h", "main.c", "CMakeLists.txt"}
     header = (tmp_path / "c" / "mine.h").read_text()
     assert "(mine_real)0.37, /* press */" in header
     assert "#define MINE_TAXELS 51" in header

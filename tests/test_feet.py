@@ -11,9 +11,12 @@ from rps_jax.control.observation import Twist
 from rps_jax.engines.base import Motion
 from rps_jax.engines.fused import step as fused
 from rps_jax.errors import InputError
-from rps_jax.geometry import footprint, solid
+from rps_jax.geometry import solid
 from rps_jax.geometry.solid import SIDES
-from rps_jax.world import objects, scene
+from rps_jax.robot.robot import Robot
+from rps_jax.trials.worlds import starts
+from rps_jax.world import domain as domains
+from rps_jax.world import draws, objects, points, scene
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import Friction
 from sweeps.ground import rigid
@@ -88,10 +91,11 @@ def driven(engine, names, steps):
 Y = 4  # of the object, along the base's front, on which it comes to lie
 
 
-def test_feet_decide_where_an_object_ends_and_fused_ends_where_c_mujoco_does():
+@pytest.mark.parametrize("engine", ["fused", "mjx"])
+def test_feet_decide_where_an_object_ends_and_engines_end_where_c_mujoco_does(engine):
     feet, corners = in_c("on_feet", 300), in_c("on_corners", 300)
     assert feet[Y] - corners[Y] > 0.01
-    found = driven("fused", ["on_feet", "on_both"], 300)
+    found = driven(engine, ["on_feet", "on_both"], 300)
     np.testing.assert_allclose(found[0], feet, atol=2e-3)
     np.testing.assert_allclose(found[1, :6], corners[:6], atol=3e-3)
 
@@ -166,11 +170,111 @@ def test_the_rigid_solver_stands_on_feet():
 def test_feet_without_sense_are_refused(stands, feet, message):
     with pytest.raises(InputError, match=message):
         objects.register_object("wrong", stands, feet=feet)
-    with pytest.raises(InputError, match="not allowed under a circle"):
-        objects.register_object("wrong", stands, footprint.circle(0.2), FEET)
     assert "wrong" not in objects.REGISTERED
 
 
-def test_mjx_says_that_it_knows_no_feet():
-    with pytest.raises(InputError, match="engine = mjx is not allowed for objects with feet"):
-        engines.get("mjx").stage_of_scenes([start("on_feet")[0]], np.zeros(1, int))
+# --- feet that are drawn ---
+
+
+def drawn_on_feet(name, count=4):
+    """Worlds with drawn feet, and with those of the same worlds without."""
+    changes = f"wide,objects={name},gap=0,lateral=-0.05:0.05,height=0.3:0.4,friction_ground=0.1:0.4"
+    ranges = [domains.named(changes), domains.named(f"{changes},feet=0.5:0.9")]
+    plain, on_feet = (draws.draw(one, 3, np.arange(count)) for one in ranges)
+    return plain, on_feet, ranges[1].families[0]
+
+
+def stepped(engine, family, drawn, steps):
+    """Positions (n, 10) of drawn worlds after steps at TWIST in a traced engine, or in C."""
+    found = engines.get(engine)
+    stage, fields = found.stage_of_solids(family, drawn.solid, drawn.friction, FINE, Robot())
+    qpos = starts(drawn)
+    qpos[:, [3, 5]] -= 0.0005
+    if engine == "mujoco":
+        batch = found.stepper(stage, qpos, 1)
+        for _ in range(steps):
+            batch.drive(np.arange(len(qpos)), np.tile(TWIST, (len(qpos), 1)), 1)
+        batch.close()
+        return batch.qpos
+    twist = Twist(*(jnp.full(len(qpos), x) for x in TWIST))
+    fields = jax.tree.map(lambda x: jnp.asarray(x, float), fields)
+    still = jnp.zeros((len(qpos), 9))
+
+    @jax.jit
+    def run(motion):
+        return jax.lax.fori_loop(
+            0, steps, lambda _, now: stage.drive(fields, now, twist, FINE).motion, motion
+        )
+
+    return np.asarray(run(Motion(jnp.asarray(qpos, float), still, still)).qpos, float)
+
+
+@pytest.mark.parametrize("name", domains.RANDOM)
+def test_drawn_feet_change_nothing_else_and_bear_the_object(name):
+    plain, drawn, _ = drawn_on_feet(name, 64)
+    assert plain.solid.feet is None
+    for a, b in zip(jax.tree.leaves(plain._replace(solid=None, at=None)),
+                    jax.tree.leaves(drawn._replace(solid=None, at=None)), strict=True):  # fmt: skip
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(plain.solid.mass, drawn.solid.mass)
+    assert set(drawn.at) - set(plain.at) == {"feet"}
+    feet, com = drawn.solid.feet, drawn.solid.p_object_com[:, :2]
+    assert set(feet[..., 2].sum(axis=1)) == {3.0, 4.0}
+    for share, one, middle, outline, radius in zip(
+        drawn.at["feet"], feet, com, drawn.solid.vertices, drawn.solid.radius, strict=True
+    ):
+        for foot in one[one[:, 2] > 0, :2]:
+            # Stretched by the share, a foot lies on the outline.
+            edge = middle + (foot - middle) / share
+            if radius:
+                assert np.hypot(*edge) == pytest.approx(radius)
+                continue
+            along = np.roll(outline, -1, axis=0) - outline
+            away = edge - outline
+            away = along[:, 0] * away[:, 1] - along[:, 1] * away[:, 0]
+            away = away[np.hypot(*along.T) > 0]
+            assert np.abs(away).min() < 1e-9
+            assert away.min() > -1e-9
+        bearing = np.linspace(0, 2 * np.pi, 90)
+        reach = (one[:, :2] - middle) @ np.stack([np.cos(bearing), np.sin(bearing)])
+        assert reach.max(axis=0).min() > 0
+
+
+@pytest.mark.parametrize(
+    ("engine", "name"),
+    [("fused", "random_box"), ("fused", "random_cylinder"), ("mjx", "random_cylinder")],
+)
+def test_objects_on_drawn_feet_end_where_those_of_c_mujoco_do(engine, name):
+    plain, drawn, family = drawn_on_feet(name)
+    expected = stepped("mujoco", family, drawn, 300)
+    of_plain = stepped("mujoco", name.removeprefix("random_"), plain, 300)
+    off = np.abs(stepped(engine, family, drawn, 300) - expected)[:, 3:5].max()
+    assert off < 0.2 * np.abs(of_plain - expected)[:, 3:5].max()
+    assert off < 0.004
+
+
+def test_quasistatic_slides_on_drawn_feet():
+    plain, drawn, family = drawn_on_feet("random_prism")
+    _, sliders = engines.get("quasistatic").stage_of_solids(
+        family, drawn.solid, drawn.friction, FINE, Robot()
+    )
+    three = drawn.solid.feet[..., 2].sum(axis=1) == 3
+    assert three.any()
+    for i in np.flatnonzero(three):
+        r = drawn.solid.feet[i, :3, :2] - drawn.solid.p_object_com[i, :2]
+        load = np.linalg.solve(np.vstack([r.T, np.ones(3)]), [0, 0, 1])
+        assert sliders.arm[i] == pytest.approx(load @ np.linalg.norm(r, axis=1), rel=1e-6)
+    assert (np.asarray(sliders.arm) < solid.friction_arm(plain.solid)).all()
+
+
+def test_feet_are_drawn_for_random_objects_alone():
+    with pytest.raises(InputError, match="random ones alone stand on drawn feet"):
+        domains.named("wide,objects=box,feet=0.5:0.9")
+    ranges = domains.named("wide,feet=0.5:0.9")
+    assert {"feet", "feet_number", "feet_turn"} == set(points.names(ranges)) - set(
+        points.names(domains.named("wide"))
+    )
+    u = points.points_of(ranges, np.arange(6), 1)
+    again = points.checked(ranges, u).draw(ranges, np.array([0, 3]))
+    drawn = draws.draw(ranges, 1, np.array([0, 3]))
+    np.testing.assert_array_equal(again.solid.feet, drawn.solid.feet)

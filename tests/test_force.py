@@ -16,8 +16,7 @@ from rps_jax.engines.base import Motion
 from rps_jax.engines.fused import step as fused
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
-from rps_jax.robot import load_cell
-from rps_jax.robot.load_cell import LoadCell
+from rps_jax.robot.base import LoadCell, unloaded
 from rps_jax.robot.robot import Robot
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.pushes import Case
@@ -144,7 +143,7 @@ def test_who_does_not_ask_is_told_no_force():
 
 
 def told(cell, forces, period=0.02):
-    key, load = jnp.array([1, 2], jnp.uint32), load_cell.start(jnp.zeros(1))
+    key, load = jnp.array([1, 2], jnp.uint32), unloaded(jnp.zeros(1))
     seen = []
     for i, force in enumerate(forces):
         load = load._replace(wrench=jnp.array([*force, 0.0]))

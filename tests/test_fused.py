@@ -114,7 +114,7 @@ def some_worlds(name, physics, count=5):
 
 @pytest.mark.parametrize("name", ["box", "cylinder"])
 def test_the_kernel_computes_what_xla_computes(name):
-    """In Pallas's interpreter; five worlds, padded to a block of 16."""
+    """In Pallas's interpreter; five worlds, padded to whole blocks."""
     physics = Physics(timestep=0.02)
     scalars, state = some_worlds(name, physics)
     twist = tuple(jnp.full(5, x) for x in TWIST)

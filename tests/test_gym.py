@@ -47,8 +47,8 @@ def test_gymnasium_finds_nothing_wrong(one):
 
 def test_a_step_is_an_action_of_push_env_held(one):
     seen, info = one.reset(seed=3)
-    push, worlds = one.unwrapped.push_env, one.unwrapped._worlds
-    state = jax.tree.map(lambda leaf: leaf[0], worlds.state)
+    push, worlds = one.unwrapped.push_env, one.unwrapped._vector
+    state = jax.tree.map(lambda leaf: leaf[0], worlds._state)
     assert int(state.info["index"]) == info["world"]
     np.testing.assert_array_equal(seen, state.obs)
     step, total = jax.jit(push.step), 0.0

@@ -82,7 +82,7 @@ print(rps_jax.__file__, found.success.size)
 
 
 QUANTITY = """    max_compression: Range | None = drawn(
-        None, 43, "1", 0.01, 0.99, "greatest compression", "skin", "max_compression"
+        None, 46, "1", 0.01, 0.99, "greatest compression", "skin", "max_compression"
     )
 
 """

@@ -130,7 +130,8 @@ def test_a_contact_that_is_lost_is_remembered_where_it_was():
 def _registered(network, seed=0):
     """Name and parameters of a policy by chance, registered by its file."""
     policy = Policy(network, weights_of(network, seed))
-    return policies.label(policy), policies.parameters(policy)
+    label, _, params = policies.law_of(policy)
+    return label, params
 
 
 def written(path, kind="gru", **changes):

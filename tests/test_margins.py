@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rps_jax import InputError, Observation, RPSParams
-from rps_jax.control import margins
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSState
+from sweeps.limits import margins
 
 COUNT = 1_000_000
 

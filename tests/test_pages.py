@@ -67,6 +67,25 @@ def test_a_table_follows_its_data_and_those_it_cites(tmp_path):
         rendered([["a", 1.0]])
 
 
+def test_a_number_in_a_sentence_follows_its_data(tmp_path):
+    columns = [{"name": "domain", "merge": True}, {"name": "law"}, {"name": "rate"}]
+    rows = [["wide", "rps", "93.1 % [92.6, 93.6]"], ["wide", "nps", "16.7 %"]]
+    data = dict.fromkeys(TABLES["KEYS"], "") | {"columns": columns, "rows": rows}
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "one.json").write_text(json.dumps(data))
+    page = tmp_path / "page.md"
+    cell = "<!-- cell: one | wide | {} | rate -->{}<!-- end -->"
+    page.write_text(f"It wins {cell.format('rps', '9 %')},\nand NPS {cell.format('nps', '')}.")
+    rendered = TABLES["render"](page, tmp_path)
+    assert (
+        rendered
+        == f"It wins {cell.format('rps', '93.1 %')},\nand NPS {cell.format('nps', '16.7 %')}."
+    )
+    page.write_text(cell.format("none", ""))
+    with pytest.raises(ValueError, match="does not name one cell"):
+        TABLES["render"](page, tmp_path)
+
+
 @pytest.mark.parametrize("page", PAGES, ids=named)
 def test_links_lead_somewhere(page):
     links = re.findall(r"\]\(([^)\s]+)\)", page.read_text())

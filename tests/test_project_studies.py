@@ -47,6 +47,8 @@ REFUSED = [
     ("ground", "--worlds 0", "worlds = 0 is not allowed"),
     ("learned", "run run", "runs"),
     ("force_push_grid", "--duration 0", "duration"),
+    ("hardware", "--setups 1", "setups = 1 is not allowed"),
+    ("hardware", "--domain wyde", "unknown domain 'wyde'"),
     ("headline", "--domains wyde", "unknown domain 'wyde'"),
     ("headline", "--laws none", "unknown law 'none'"),
     ("publish", "--only nothing", "no data file has such a name"),

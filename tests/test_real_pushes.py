@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+import xarray as xr
 from helpers import ROOT, refusal
 
 from rps_jax.errors import InputError
@@ -221,13 +222,34 @@ def test_a_small_study_is_continued_and_tells_every_model(tmp_path):
     found = asked()
     again = asked()
     assert found.drop_attrs().identical(again.drop_attrs())
-    assert set(study.tables(found)) == {"models", "mujoco", "friction", "forces"}
+    assert set(study.tables(found)) == {"models", "mujoco", "friction", "layouts", "forces"}
     ran = np.isfinite(found.predicted.sel(model="mujoco_ours")).all("pose")
     assert ran.any()
     assert not (found.fits & ran).any()
     lines = (tmp_path / "run" / "predictions.csv").read_text().splitlines()
     assert lines[0] == "id,model,post_x,post_y,post_yaw"
     assert len(lines) == 1 + int(np.isfinite(found.both).sum())
+
+
+def test_a_layout_is_judged_with_the_friction_of_the_others():
+    """Of layout a 0.2 is best, of b 0.4; each is told the other's, and what its own would give."""
+    rows = {"a": [1.0, 3.0], "b": [4.0, 2.0]}  # [mm] at 0.2 and 0.4
+    both = np.array([[rows["a"][i]] * 3 + [rows["b"][i]] * 3 for i in (0, 1)]) / 1e3
+    off = (("fitted", "tried", "few"), both[None])
+    found = xr.Dataset(
+        {"few_both": off, "few_place": off, "few_turn": off},
+        {
+            "fitted": ["rigid_feet"],
+            "tried": [0.2, 0.4],
+            "few_support": ("few", list("aaabbb")),
+            "few_finger": ("few", ["point"] * 6),
+        },
+    )
+    told = list(study._layout_rows(found))
+    assert [(row[1], row[4], row[7][0], row[8]) for row in told] == [
+        ("a", 0.4, 3.0, 1.0),
+        ("b", 0.2, 4.0, 2.0),
+    ]
 
 
 def test_the_published_friction_is_that_of_predictions():

@@ -124,12 +124,12 @@ def test_force_push_forgets_a_drift_over_its_length_of_way():
 def test_force_push_lays_its_path_anew_when_it_has_passed_the_target():
     params = ForcePushParams()
     state, _, _ = force_push.step(params, force_push.init(params), seen())
-    assert float(state.theta_d) == 0
+    assert float(state.path.theta_d) == 0
     state, _, _ = force_push.step(params, state, seen(robot=(1.9, 0.0)))
-    assert float(state.theta_d) == 0  # 10 cm before it
+    assert float(state.path.theta_d) == 0  # 10 cm before it
     state, _, _ = force_push.step(params, state, seen(robot=(2.1, 0.0)))
-    assert abs(float(state.theta_d)) == pytest.approx(math.pi)
-    np.testing.assert_allclose(state.p_world_start, (2.46, 0.0), atol=1e-6)
+    assert abs(float(state.path.theta_d)) == pytest.approx(math.pi)
+    np.testing.assert_allclose(state.path.p_world_start, (2.46, 0.0), atol=1e-6)
 
 
 def test_the_published_force_push_steers_by_the_angle_of_the_force():
@@ -192,7 +192,7 @@ def test_the_published_force_push_turns_to_face_along_its_path():
     # 10 cm past the target the path is laid anew, back.
     past = seen((0.36, 0.0), (0.26, 0.0))
     state, _, _ = step(params, state, loaded(past))
-    assert abs(float(state.theta_d)) == pytest.approx(math.pi)
+    assert abs(float(state.path.theta_d)) == pytest.approx(math.pi)
 
 
 @pytest.mark.parametrize(

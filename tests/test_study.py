@@ -22,13 +22,14 @@ from rps_jax.trials.case import Case
 from rps_jax.trials.results import DIMS
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules, Shift
-from rps_jax.world import paper, scene
+from rps_jax.world import paper, points, scene
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.physics import preset
 from rps_jax.world.scene import FRICTION
 from sweeps import shared
 from sweeps.ambiguities import readings
 from sweeps.fidelity import study as fidelity
+from sweeps.hardware import study as reproduce
 from sweeps.shared import Condition, Grid
 
 NEAR = ((0.6, 0.0), (0.62, 0.03))
@@ -143,6 +144,43 @@ def test_the_hardware_experiments_cover_friction_targets_and_shoves():
     assert results.recovered.shape == (2, 1, 2, 8)
     # All trials ended at 3 s, before the object was to be moved: none tells anything.
     assert not results.counted.any()
+
+
+def test_a_setup_has_one_robot_and_a_friction_for_each_object():
+    asked = reproduce.Reproduce(setups=4, setting=rps_jax.Setting("quasistatic"))
+    every = points.names(asked.ranges)
+    u = asked.plan.points.u.reshape(4, 2, 8, -1)
+    for name in ("foam", "robot_lag", "command_delay"):
+        column = u[..., every.index(name)]
+        assert (np.ptp(column, axis=(1, 2)) == 0).all()
+        assert np.ptp(column) > 0
+    mu = u[..., every.index("friction_robot")]
+    assert (np.ptp(mu, axis=2) == 0).all()
+    assert (mu[:, 0, 0] != mu[:, 1, 0]).all()
+    assert (np.ptp(u[..., every.index("yaw")], axis=2) > 0).all()
+    cases = asked.plan.points.cases(asked.ranges, np.arange(64))
+    np.testing.assert_array_equal(asked.ranges.object_of(cases), np.tile(np.repeat([0, 1], 8), 4))
+    np.testing.assert_array_equal(cases % 8, np.tile(np.arange(8), 8))
+
+
+def test_the_nearest_setups_are_those_that_give_all_of_the_papers_numbers():
+    told = [paper.HARDWARE_RESULTS[name] for name in paper.HARDWARE_OBJECTS]
+    off = np.arange(101.0)
+    found = xr.Dataset(
+        {
+            "D": (("setup", "object"), [[t.mean_abs_l + 0.001 * i for t in told] for i in off]),
+            "time": (("setup", "object"), [[t.time for t in told]] * 101),
+            "success": (("setup", "object"), np.full((101, 2), 8)),
+            "off": ("setup", off),
+            "drawn": (("setup", "quantity"), off[:, None]),
+        },
+        {"object": ["box", "cylinder"], "quantity": ["foam"]},
+    )
+    assert list(reproduce.nearest(found.isel(setup=slice(None, None, -1))).off) == [0, 1, 2, 3, 4]
+    results, quantities = reproduce.tables(found).values()
+    assert results[1] == ["D, box", "0.032 m", "0.082 m [0.037, 0.127]", "0.034 m [0.032, 0.036]",
+                          "0.032 m"]  # fmt: skip
+    assert quantities[1][2:] == ["2 [0.2, 3.8]", "+1.00", "+1.00", *quantities[1][5:]]
 
 
 def test_the_hardware_targets_are_2_1_m_from_the_start():

@@ -43,7 +43,7 @@ from rps_jax.geometry import planar
 from rps_jax.record import files
 from rps_jax.runs import sweep
 from rps_jax.runs.plan import Shard, load_plan, open_run
-from rps_jax.runs.results import merge
+from rps_jax.runs.sweep import merge
 from rps_jax.trials import batch, trial
 from rps_jax.trials.batch import Job
 from rps_jax.trials.trial import Rules
@@ -192,7 +192,7 @@ def test_two_devices_find_what_one_finds_and_never_talk(whole, tmp_path):
     assert done.stdout.split() == ["16"]  # slots, and no collective
     results = []
     for folder in (tmp_path / "run", whole):
-        merge([folder], tmp_path)
+        merge([folder], out=tmp_path)
         results.append(files.read_results(tmp_path))
     # Another program rounds otherwise, and contact amplifies it.
     two, one = results
@@ -202,7 +202,7 @@ def test_two_devices_find_what_one_finds_and_never_talk(whole, tmp_path):
 
 
 def test_results_hold_every_world_with_what_was_drawn(whole, tmp_path):
-    merge([whole], tmp_path)
+    merge([whole], out=tmp_path)
     results = files.read_results(tmp_path)
     assert dict(results.sizes) == {"law": 2, "world": 20, "pose": 3, "object": 1}
     columns = draws.table(draws.draw(BOXES, 0, np.arange(20)))
@@ -236,7 +236,7 @@ def sweep_in_a_process(folder):
     swept(folder, KILLED)
 
 
-def test_a_run_killed_ten_times_ends_as_one_that_was_not(tmp_path, monkeypatch):
+def test_a_run_killed_six_times_ends_as_one_that_was_not(tmp_path, monkeypatch):
     """SIGKILL at random moments, in turn of a start and of the work; then one may end."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # or the server finds no tests
     context = multiprocessing.get_context("forkserver")
@@ -246,11 +246,11 @@ def test_a_run_killed_ten_times_ends_as_one_that_was_not(tmp_path, monkeypatch):
     def done():
         return len(list(folder.glob("parts/*.nc")))
 
-    for kill in range(11):
+    for kill in range(7):
         before = done()
         process = context.Process(target=sweep_in_a_process, args=(folder,))
         process.start()
-        if kill < 10:
+        if kill < 6:
             while kill % 2 and process.is_alive() and done() == before:
                 time.sleep(0.01)  # until it is at work, however slow the machine
             process.join(dice.uniform(0.0, 0.5 if kill % 2 else 2.0))
@@ -327,15 +327,15 @@ def test_a_part_of_an_older_version_is_named(whole, tmp_path):
     victim.unlink()
     sweep.store(folder, 0, older)
     with pytest.raises(InputError, match=r"part 0 .* another version .it lacks overflows"):
-        merge([folder], folder)
+        merge([folder], out=folder)
 
 
 def test_the_report_of_one_world_tells_what_was_lost_and_how_to_see_it(whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "a run")
-    plan, results = merge([folder], folder)
+    results = merge([folder], out=folder)
     one = results.isel(world=[0])
     one.success[:], one.overflows[:] = [[1], [0]], [[0], [3]]
-    text = str(sweep.report_of(plan, one, folder))
+    text = str(sweep.report_of(load_plan(folder), one, folder))
     assert "1 trials lost contacts for want of room: they are not to be trusted" in text
     assert f"rps replay '{folder}' 0 --law nps" in text  # the law that fails
     assert tables.influence_table(one, "rps")[1:] == []
@@ -344,16 +344,16 @@ def test_the_report_of_one_world_tells_what_was_lost_and_how_to_see_it(whole, tm
 def test_shards_merge_to_the_whole(whole, tmp_path):
     folders = [swept(tmp_path / f"{k}", shard=Shard(k, 3)) for k in (1, 2, 3)]
     with pytest.raises(InputError, match="lacks 2 of 6 parts"):
-        merge(folders[:2], tmp_path)
-    merge(folders, tmp_path)
+        merge(folders[:2], out=tmp_path)
+    merge(folders, out=tmp_path)
     (tmp_path / "direct").mkdir()
-    merge([whole], tmp_path / "direct")
+    merge([whole], out=tmp_path / "direct")
     together = [files.read_results(f) for f in (tmp_path, tmp_path / "direct")]
     xr.testing.assert_identical(*together)
     other = replace(PLAN, setting=replace(SHORT, seed=5))
     open_run(tmp_path / "other", other)
     with pytest.raises(InputError, match="seed = 0 there, 5 asked for"):
-        merge([folders[0], tmp_path / "other"], tmp_path)
+        merge([folders[0], tmp_path / "other"], out=tmp_path)
 
 
 def test_another_configuration_is_refused_with_what_differs(whole):
@@ -384,7 +384,7 @@ def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys):
     error = refusal(capsys, "merge", run, "--out", other)
     assert "other holds another run (domain.objects = " in error
     assert not (other / "results.nc").exists()
-    assert rps("replay", run, 4, "--law", "rps,tuned") == 0
+    assert rps("replay", run, 4, "--law", "rps,tuned", "--film-length", 0.1) == 0
     seen = files.read(run / "replay-4" / "results.nc")
     # Followed alone, in another batch than in the sweep.
     assert float(seen.outcome_time) == pytest.approx(float(results.time[1, 4]), abs=0.5)

@@ -81,30 +81,24 @@ def test_a_gpu_that_seldom_asks_who_still_runs_finds_the_same(monkeypatch):
     chex.assert_trees_all_close(seldom, run("cpu"), atol=1e-6)
 
 
-def test_the_last_trials_of_a_job_end_alike_in_fewer_slots(monkeypatch):
-    """On a GPU; here seven trials through four slots and then one, since three have ended."""
-    setting = Setting(engine="quasistatic", rules=Rules(horizon=60.0))
+@pytest.mark.parametrize("most", [1, SLOTS])
+def test_the_last_trials_of_jobs_end_alike_side_by_side(monkeypatch, most):
+    """On a GPU; here of two families, and all trials but one, or all, are set aside."""
+    rules = Rules(horizon=60.0)
     some = [case((0.6 + 0.05 * k, 0.05 * k)) for k in range(6)] + [case(AHEAD)]
-    wide, _ = pushes.run(some, setting, slots=SLOTS, workers=1)
-    programs, plain = [], batch._Worker._program
-    monkeypatch.setattr(batch, "_ever_fewer", lambda slots, fewest: (slots, 1))
+    some += [case((0.6, 0.1 * k), name="cylinder") for k in range(3)]
+    alone, _ = pushes.run(some, replace(FUSED, rules=rules), slots=SLOTS, workers=1)
+    ran, plain = [], batch._Worker._program
+    monkeypatch.setattr(batch, "_most_aside", lambda: most)
     monkeypatch.setattr(
-        batch._Worker,
-        "_program",
-        lambda self, width: programs.append(width.slots) or plain(self, width),
+        batch._Worker, "_program", lambda self, one: ran.append(one.slots) or plain(self, one)
     )
-    narrow, _ = pushes.run(some, setting, slots=SLOTS, workers=1)
-    assert programs == [SLOTS, 1]
-    assert wide.success.sum() > 0
+    found, _ = pushes.run(some, replace(FUSED, rules=rules), slots=SLOTS, workers=2)
+    assert ([len(slots) for slots in ran][-1], max(map(max, ran))) == (2, SLOTS)
+    assert alone.success.sum() > 0
     for name in ("success", "time"):
-        np.testing.assert_array_equal(getattr(narrow, name), getattr(wide, name))
-    np.testing.assert_allclose(narrow.object_pose, wide.object_pose, atol=1e-5)
-
-
-def test_a_gpu_takes_the_last_trials_into_ever_fewer_slots_but_never_few():
-    assert list(batch._ever_fewer(65536, 4096)) == [65536, 16384, 4096]
-    assert list(batch._ever_fewer(4097, 4096)) == [4097]
-    assert list(batch._ever_fewer(64, 64)) == [64]
+        np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
+    np.testing.assert_allclose(found.object_pose, alone.object_pose, atol=1e-5)
 
 
 def test_a_base_may_turn_as_often_as_it_likes_and_not_go_as_far():

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import __version__
-from rps_jax.app.export import js, walk
-from rps_jax.app.export.program import Group, Routine, fields_of, identifier
+from rps_jax.app.export import js
+from rps_jax.app.export.program import Group, Routine, fields_of, identifier, routine
 from rps_jax.control import registry, trying
 from rps_jax.control.learned import features
 from rps_jax.control.observation import TaxelObservation, Twist
@@ -101,17 +100,6 @@ def borne(outline: Outline) -> Borne:
     return Borne(com, jnp.sum(load * jnp.sqrt(x * x + y * y)))
 
 
-def _routine(name: str, function: Any, given: dict[str, Any], found: Sequence[str]) -> Routine:
-    """A traced function of named pytrees, which returns as many as are named."""
-    jaxpr, out = walk.traced(function, *given.values())
-    return Routine(
-        name,
-        jaxpr,
-        {key: fields_of(tree) for key, tree in given.items()},
-        {key: fields_of(tree) for key, tree in zip(found, out, strict=True)},
-    )
-
-
 def _shapes(tree: Any) -> Any:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x), jnp.asarray(x).dtype), tree)
 
@@ -163,9 +151,9 @@ def of_family(family: str) -> list[Routine]:
     seen = {"world": _shapes(world._replace(**live)), "trial": shape}
     driven = {"fields": _shapes(world.fields), "before": shape, "told": shape}
     return [
-        _routine(f"borne_{family}", lambda o: (borne(o),), {"outline": _shapes(outline)}, ["made"]),
-        _routine(f"sense_{family}", sense, seen, ["told", "observation", "reading"]),
-        _routine(f"drive_{family}", drive, {**driven, "twist": _shapes(twist)}, ["trial"]),
+        routine(f"borne_{family}", lambda o: (borne(o),), {"outline": _shapes(outline)}, ["made"]),
+        routine(f"sense_{family}", sense, seen, ["told", "observation", "reading"]),
+        routine(f"drive_{family}", drive, {**driven, "twist": _shapes(twist)}, ["trial"]),
     ]
 
 
@@ -186,8 +174,8 @@ def of_law(name: str) -> tuple[list[Routine], dict[str, Any]]:
         return memory, Twist(*twist), details
 
     routines = [
-        _routine(f"init_{kind}", lambda p: (law.init(p),), {"params": shapes}, ["memory"]),
-        _routine(f"step_{kind}", step, given, ["memory", "twist", "details"]),
+        routine(f"init_{kind}", lambda p: (law.init(p),), {"params": shapes}, ["memory"]),
+        routine(f"step_{kind}", step, given, ["memory", "twist", "details"]),
     ]
     fields: Group = fields_of(params, values=params)
     values = {one.name: np.asarray(one.value, float).tolist() for one in fields}
@@ -208,7 +196,7 @@ def of_law(name: str) -> tuple[list[Routine], dict[str, Any]]:
 def scripts() -> str:
     """All that is generated: functions, laws and the numbers of the paper's first trial."""
     with jax.enable_x64(True):
-        tables: dict[bytes, str] = {}
+        tables: dict[str, str] = {}
         routines, laws = {}, {}
         for family in FAMILIES:
             routines |= {one.name: one for one in of_family(family)}

@@ -77,11 +77,10 @@ class ExportC(Export):
     """Write a law and a skin as one C99 header, with an example that measures itself."""
 
     def texts(self) -> dict[str, str | bytes]:
-        """Header, example, CMake file and page."""
-        from rps_jax.app.export import c, folder
+        """Header, example and CMake file."""
+        from rps_jax.app.export import folder
 
-        header = c.header(self.program, self.named)
-        return {f"{self.named}.h": header, **folder.files(self.program, self.named)}
+        return dict(folder.files(self.program, self.named))
 
 
 @dataclass(frozen=True)

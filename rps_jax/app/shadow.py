@@ -14,15 +14,9 @@ import xarray as xr
 
 from rps_jax.analysis.figures.style import Figure
 from rps_jax.analysis.report import Picture, Section
-from rps_jax.control import registry
+from rps_jax.control import registry, trying
 from rps_jax.control.base import Law, Params
-from rps_jax.control.observation import (
-    ForceObservation,
-    Observation,
-    PoseObservation,
-    TaxelObservation,
-    Twist,
-)
+from rps_jax.control.observation import Twist
 from rps_jax.errors import InputError
 from rps_jax.record import bag as bags
 from rps_jax.record.options import option
@@ -32,7 +26,6 @@ from rps_jax.runs.question import Question, Run, call_of
 from rps_jax.tuning import logs
 
 _UNITS = {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s"}
-_SENSED = {"taxels": ("signal",), "force": ("f_robot",), "pose": ("p_world_object", "r_object")}
 
 
 @dataclass(frozen=True)
@@ -106,27 +99,24 @@ def shadowed(law: Law, params: Params, recorded: dict[str, np.ndarray]) -> np.nd
     Raises:
       InputError: the bag lacks what the law senses.
     """
-    for name in _SENSED.get(law.senses, ()):
-        if name not in recorded:
-            raise InputError(
-                f"the bag has no {name}, which the law senses ({law.senses}): record it, or choose "
-                "another law."
-            )
-    given = {name: jnp.asarray(values, float) for name, values in recorded.items()}
-    touching = jnp.asarray(recorded["contact_type"] > 0)
-    pose = given["pose"]
-    touch = Observation(
-        pose[:, :2], pose[:, 2], given["p_robot_contact"], touching, given["target"],
-        given["period"],
-    )  # fmt: skip
-    seen: Any = touch
-    if law.senses == "taxels":
-        line = jnp.asarray(recorded["contact_type"] == 2)
-        seen = TaxelObservation(touch, given["signal"], line)
-    elif law.senses == "force":
-        seen = ForceObservation(touch, given["f_robot"])
-    elif law.senses == "pose":
-        seen = PoseObservation(touch, given["p_world_object"], given["r_object"])
+    pose, kind = recorded["pose"], recorded["contact_type"]
+    given = recorded | {"p_world_robot": pose[:, :2], "yaw": pose[:, 2], "in_contact": kind > 0}
+    given |= {"line": kind == 2, "p_world_target": recorded["target"]}
+
+    def filled(seen: Any) -> Any:
+        """What is observed, (N, ...)."""
+        fields = {}
+        for name, value in seen._asdict().items():
+            if hasattr(value, "_fields"):
+                fields[name] = filled(value)
+            elif name in given:
+                fields[name] = jnp.asarray(given[name], value.dtype)
+            else:
+                raise InputError(
+                    f"the bag has no {name}, which the law senses ({law.senses}): record it, or "
+                    "choose another law."
+                )
+        return type(seen)(**fields)
 
     @jax.jit
     def whole(params: Any, seen: Any) -> jax.Array:
@@ -137,7 +127,7 @@ def shadowed(law: Law, params: Params, recorded: dict[str, np.ndarray]) -> np.nd
         return jax.lax.scan(one, law.init(params), seen)[1]
 
     params = jax.tree.map(lambda x: jnp.asarray(x, float), params)
-    return np.asarray(whole(params, seen))
+    return np.asarray(whole(params, filled(trying.observation_of(law.senses))))
 
 
 def figure(found: xr.Dataset) -> Figure:

@@ -14,7 +14,7 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.control.observation import Details, Twist
-from rps_jax.robot.load_cell import LoadCell
+from rps_jax.robot.base import LoadCell
 
 T = TypeVar("T")
 Params = Any  # a pytree of numbers, of a class of the law's own, with `d_success` [m]
@@ -44,18 +44,14 @@ def documented(kind: type[T]) -> type[T]:
     return kind
 
 
-def numbers(params: Params) -> dict[str, Any]:
+def numbers(params: Params, is_leaf: Callable[[Any], bool] | None = None) -> dict[str, Any]:
     """Leaves of parameters by their place in the pytree, as `gains.k`."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(params)
+    leaves, _ = jax.tree_util.tree_flatten_with_path(params, is_leaf=is_leaf)
     return {jax.tree_util.keystr(at, simple=True, separator="."): leaf for at, leaf in leaves}
 
 
 def check_finite(params: Params) -> Params:
-    """Return the parameters if all their leaves are finite numbers.
-
-    Raises:
-      InputError: one is not.
-    """
+    """Return the parameters if all their leaves are finite numbers, or raise InputError."""
     for name, leaf in numbers(params).items():
         for value in np.ravel(leaf):
             errors.check_finite(name, value)
@@ -63,18 +59,12 @@ def check_finite(params: Params) -> Params:
 
 
 def check_signs(
-    law: str, params: Params, positive: Sequence[str], free: Sequence[str] = ()
+    law: str, positive: Sequence[str], params: Params, free: Sequence[str] = ()
 ) -> Params:
-    """Return the parameters if they are finite scalars of the right signs.
+    """Return parameters of one level if they are finite scalars of the right signs.
 
-    Args:
-      law: its name, for the error.
-      params: of one level.
-      positive: names of those that must be above 0.
-      free: names of those of any sign; all others must not be negative.
-
-    Raises:
-      InputError: one is not such a number.
+    Those named `positive` must be above 0, those `free` may have any sign, and all others must not
+    be negative; else InputError names the `law` and the parameter.
     """
     for name, value in params._asdict().items():
         bounds = {} if name in free else {"at_least": 0}

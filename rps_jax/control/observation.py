@@ -39,7 +39,7 @@ class ForceObservation(NamedTuple):
     """What a law that senses the contact's force may know besides."""
 
     touch: Observation
-    f_robot: Float[Array, "2"]  # [N] of the object on the base, in its frame: see `robot.load_cell`
+    f_robot: Float[Array, "2"]  # [N] of the object on the base, in its frame: see `LoadCell`
 
 
 class PoseObservation(NamedTuple):

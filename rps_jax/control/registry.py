@@ -8,7 +8,6 @@ changes, as `rps,K_h=0.3` or `pursuit,mine.json`.
 from __future__ import annotations
 
 import functools
-import hashlib
 import importlib
 import importlib.util
 import pkgutil
@@ -44,7 +43,7 @@ def _find() -> None:
             _OF[type(params)] = module.LAW
             (_INNER if name.startswith("_") else LAWS)[name] = params
     for name, path in policy.SHIPPED.items():
-        _, law, params = policy.law_of(path.read_bytes(), path)
+        _, law, params = policy.law_of(policy.decoded(path.read_bytes(), path))
         _OF[type(params)], LAWS[name] = law, params
 
 
@@ -61,11 +60,7 @@ def as_json(params: Params) -> dict[str, Any]:
 
 
 def changed(params: Params, changes: Mapping[str, Any]) -> Params:
-    """Replace parameters at some places of the pytree, named as in `numbers`.
-
-    Raises:
-      InputError: there is no such place.
-    """
+    """Replace parameters at some places of the pytree, named as in `numbers`."""
     known = numbers(params)
     for name in changes:
         errors.check_name(f"parameter of {type(params).__name__}", name, known)
@@ -74,11 +69,7 @@ def changed(params: Params, changes: Mapping[str, Any]) -> Params:
 
 
 def law_of(params: Params) -> Law:
-    """Look up the law that parameters belong to, by their class.
-
-    Raises:
-      InputError: they belong to none.
-    """
+    """Look up the law that parameters belong to, by their class; InputError if there is none."""
     kind = type(params)
     if kind not in _OF:
         known = ", ".join(known.__name__ for known in _OF)
@@ -111,14 +102,8 @@ def smooth_law(law: Law, temperatures: Any = None) -> Law:
     """Smooth form of a law, for the derivatives of what it does.
 
     Outcomes are judged as ever. With a `SmoothSkin` all that leads from the parameters to a
-    snapshot's twist is smooth, and what it saw of the contact, in `reading` and `details`.
-
-    Args:
-      law: one that has a smooth form.
-      temperatures: of its switches; None: its own.
-
-    Raises:
-      InputError: it has none, or a temperature is not a positive length.
+    snapshot's twist is smooth, and what it saw of the contact, in `reading` and `details`. The
+    `temperatures` of its switches are by default its own.
     """
     if law.temperatures is None:
         soft = [name for name, params in LAWS.items() if law_of(params).temperatures is not None]
@@ -165,7 +150,8 @@ def register_law(name: str, law: Law, params: Params) -> None:
         raise InputError(f"law name '{name}' is not allowed: {', '.join(_OWN)} are this package's.")
     kind, leaves = type(params), jax.tree.leaves(params)
     own = kind not in (dict, list, tuple) and leaves != [params]
-    if not own or not hasattr(params, "d_success") or not all(map(_is_number, leaves)):
+    plain = all(np.issubdtype(np.asarray(leaf).dtype, np.number) for leaf in leaves)
+    if not (own and plain and hasattr(params, "d_success")):
         raise InputError(
             f"params = {params} of law '{name}' is not allowed: give a pytree of numbers of a "
             "class of its own, as a NamedTuple, with a field or property d_success [m]."
@@ -182,10 +168,6 @@ def register_law(name: str, law: Law, params: Params) -> None:
     LAWS[name], _OF[kind] = params, law
     if before is not None and type(before) not in map(type, LAWS.values()):
         del _OF[type(before)]
-
-
-def _is_number(leaf: Any) -> bool:
-    return np.issubdtype(np.asarray(leaf).dtype, np.number)
 
 
 # --- laws by their texts -------------------------------------------------------------------
@@ -230,7 +212,7 @@ def _known(text: str) -> tuple[str, Params]:
     if not path.endswith(".py"):
         return text, LAWS[errors.check_name("law", text, LAWS)]
     content = _read(Path(path))
-    digest = hashlib.sha256(content).hexdigest()[:16]
+    digest = files.digest(content)[:16]
     module = f"_rps_jax_{Path(path).stem}_{digest}"
     # It is run again if something else was registered by its name since.
     if (found := _registered(module, kind)) is None:
@@ -246,19 +228,11 @@ def _known(text: str) -> tuple[str, Params]:
     )
 
 
-def laws_of(asked: LawsLike, field: str = "laws") -> dict[str, Params]:
-    """Read one law or several: texts, parameters, or either with names of one's own.
+def laws_of(asked: LawsLike) -> dict[str, Params]:
+    """Read one law or several: texts, parameters, or either with names of one's own, by label.
 
-    Args:
-      asked: a text, parameters, a sequence of these, or names with them.
-      field: what it is called in errors.
-
-    Returns:
-      Parameters by label. Of parameters without a name the label is that of the law, with a number
-      if they are none of its presets.
-
-    Raises:
-      InputError: none is asked for, one twice, or one that is unknown or not allowed.
+    Of parameters without a name the label is that of the law, with a number if they are none of its
+    presets.
     """
     if isinstance(asked, Mapping):
         found = {str(name): read_law(one)[1] for name, one in asked.items()}
@@ -267,10 +241,10 @@ def laws_of(asked: LawsLike, field: str = "laws") -> dict[str, Params]:
         several = [asked] if one else list(asked)
         pairs = [read_law(law, number + 1) for number, law in enumerate(several)]
         labels = _apart([label for label, _ in pairs], several)
-        errors.check_each_once(field, several, labels)
+        errors.check_each_once("laws", several, labels)
         found = dict(zip(labels, (params for _, params in pairs), strict=True))
     if not found:
-        raise InputError(f"{field} = {asked} is not allowed: name at least one law.")
+        raise InputError(f"laws = {asked} is not allowed: name at least one law.")
     for params in found.values():
         checked(params)
     return found
@@ -282,18 +256,12 @@ def read_law(law: LawLike, number: int = 1) -> tuple[str, Params]:
         return named(law)
     law_of(law)
     alike = [name for name, params in LAWS.items() if type(params) is type(law)]
+    mine = numbers(law)
     for name in alike:
-        if numbers_equal(LAWS[name], law):
+        theirs = numbers(LAWS[name])
+        if list(theirs) == list(mine) and all(np.array_equal(mine[k], theirs[k]) for k in mine):
             return name, law
     return f"{alike[0] if alike else type(law).__name__}_{number}", law
-
-
-def numbers_equal(one: Params, other: Params) -> bool:
-    """Whether two sets of parameters of a class have equal numbers."""
-    mine, theirs = numbers(one), numbers(other)
-    return list(mine) == list(theirs) and all(
-        np.array_equal(mine[name], theirs[name]) for name in mine
-    )
 
 
 def _apart(labels: list[str], asked: Sequence[Any]) -> list[str]:
@@ -308,12 +276,12 @@ def _apart(labels: list[str], asked: Sequence[Any]) -> list[str]:
 def _learned(path: Path) -> tuple[str, Params]:
     """Name and parameters of a learned law's file, registered by a name of its own."""
     content = _read(path)
-    name, law, params = policy.law_of(content, path)
+    name, law, params = policy.law_of(policy.decoded(content, path))
     kind = type(params).__name__  # it says the file's content: a copy is the law that is known
     name = next((known for known, one in LAWS.items() if type(one).__name__ == kind), name)
     if name not in LAWS:
         register_law(name, law, params)
-    found, digest = LAWS[name], hashlib.sha256(content).hexdigest()[:16]
+    found, digest = LAWS[name], files.digest(content)[:16]
     _SOURCES[type(found)] = {"file": str(path.resolve()), "digest": digest}
     return name, found
 
@@ -342,11 +310,7 @@ def _read(path: Path) -> bytes:
 
 
 def run_file(path: Path, name: str) -> Any:
-    """Run a user's file of Python as a module of this name.
-
-    Raises:
-      InputError: it raises something.
-    """
+    """Run a user's file of Python as a module of this name; InputError for whatever it raises."""
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None
@@ -378,15 +342,11 @@ def recorded(params: Params) -> dict[str, Any]:
 
 
 def restored(values: Mapping[str, Any]) -> Params:
-    """Read the parameters that `recorded` wrote.
-
-    Raises:
-      InputError: their class or a name in it is unknown, or their file is not what it was.
-    """
+    """Read the parameters that `recorded` wrote; InputError if they cannot be had."""
     left = dict(values)
     kind, file, digest = (left.pop(key, None) for key in ("law", "file", "digest"))
     if file:  # it is compared before it is run
-        if hashlib.sha256(_read(Path(str(file)))).hexdigest()[:16] != digest:
+        if files.digest(_read(Path(str(file))))[:16] != digest:
             raise InputError(
                 f"law = {file} is not what it was when the run was made: restore the file."
             )

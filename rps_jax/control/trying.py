@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rps_jax.control.base import numbers
 from rps_jax.control.observation import (
     Details,
     ForceObservation,
@@ -82,9 +83,9 @@ def _tried(
 ) -> None:
     params = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*leaf) for leaf in leaves])
     memory = _called("init", init, params)
-    wrong = _not_arrays(memory)
-    if wrong:
-        raise _refused("init", init, f"returns {wrong}", "a pytree of arrays, the law's memory")
+    if odd := [leaf for leaf in jax.tree.leaves(memory) if _is_odd(leaf)]:
+        told = f"returns {_described(odd[0])}"
+        raise _refused("init", init, told, "a pytree of arrays, the law's memory")
     found = _called("step", step, params, memory, observation_of(senses))
     wanted = "(memory, Twist, Details)"
     if not (isinstance(found, tuple) and len(found) == 3):
@@ -101,11 +102,9 @@ def _tried(
     for name, leaf in details._asdict().items():
         if (what := _not_number(leaf, flags=True)) is not None:
             raise _refused("step", step, f"returns details whose {name} is {what}", "a number ()")
-    changed = _difference(memory, after)
-    if changed:
-        raise _refused(
-            "step", step, f"returns a memory {changed}", "the shapes and types that init returned"
-        )
+    if changed := _difference(memory, after):
+        told = f"returns a memory {changed}"
+        raise _refused("step", step, told, "the shapes and types that init returned")
 
 
 def check_law(init: Callable[..., Any], step: Callable[..., Any], senses: str, params: Any) -> None:
@@ -113,27 +112,21 @@ def check_law(init: Callable[..., Any], step: Callable[..., Any], senses: str, p
 
     Laws of this package are not tried, and another one once for each form of its parameters.
     """
-    if _own(step):
+    if (getattr(_inner(step), "__module__", None) or "").startswith("rps_jax."):
         return
-    for name, value in _fields(params):
-        what = _no_leaf(value)
-        if what:
+    for name, value in numbers(params, is_leaf=lambda x: x is None).items():
+        if what := _no_leaf(value):
             raise InputError(f"params.{name} = {value!r} is not allowed: it is {what}.")
     leaves, tree = jax.tree.flatten(params)
     kinds = tuple((np.shape(leaf), jnp.result_type(float)) for leaf in leaves)
     _tried(init, step, senses, tree, kinds)
 
 
-def _own(step: Callable[..., Any]) -> bool:
-    while isinstance(step, functools.partial):
-        step = step.func
-    return (getattr(step, "__module__", None) or "").startswith("rps_jax.")
-
-
-def _fields(params: Any) -> list[tuple[str, Any]]:
-    """Values of parameters by their place, None among them."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(params, is_leaf=lambda x: x is None)
-    return [(jax.tree_util.keystr(at, simple=True, separator="."), leaf) for at, leaf in leaves]
+def _inner(function: Any) -> Any:
+    """The function that partial ones call in the end."""
+    while isinstance(function, functools.partial):
+        function = function.func
+    return function
 
 
 def _no_leaf(value: Any) -> str:
@@ -150,11 +143,19 @@ def _no_leaf(value: Any) -> str:
 
 
 def _called(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """What a function of a law returns on abstract values."""
+    """What a function of a law returns on abstract values, as it is if JAX cannot hold it."""
+    odd: list[Any] = []
+
+    def run(*given: Any) -> Any:
+        found = function(*given)
+        if any(map(_is_odd, jax.tree.leaves(found))):
+            odd.append(found)
+            return None
+        return found
+
     try:
-        return jax.eval_shape(lambda *given: _Box(function(*given)).opened, *arguments)
-    except _OddResultError as error:
-        return error.found
+        shapes = jax.eval_shape(run, *arguments)
+        return odd[0] if odd else shapes
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # whatever a user's file raises
@@ -166,28 +167,6 @@ def _called(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
         raise InputError(f"{name} of the law in {where} {said}.") from error
 
 
-class _OddResultError(Exception):
-    """A function returned what JAX cannot hold."""
-
-    def __init__(self, found: Any):
-        super().__init__()
-        self.found = found
-
-
-class _Box:
-    """What a function returned: handed on if JAX can hold it, else carried out by an exception."""
-
-    def __init__(self, found: Any):
-        self._found = found
-
-    @property
-    def opened(self) -> Any:
-        """Return it."""
-        if any(map(_is_odd, jax.tree.leaves(self._found))):
-            raise _OddResultError(self._found)
-        return self._found
-
-
 def _is_odd(leaf: Any) -> bool:
     """Whether JAX can't hold it."""
     if isinstance(leaf, str | bytes | type):
@@ -197,11 +176,6 @@ def _is_odd(leaf: Any) -> bool:
     except (TypeError, ValueError):  # a key of jax.random, or something else
         dtype = getattr(leaf, "dtype", None)
         return dtype is None or not jnp.issubdtype(dtype, jax.dtypes.extended)
-
-
-def _not_arrays(tree: Any) -> str:
-    odd = next(filter(_is_odd, jax.tree.leaves(tree)), None)
-    return "" if odd is None else _described(odd)
 
 
 def _described(found: Any) -> str:
@@ -228,11 +202,9 @@ def _not_number(leaf: Any, *, flags: bool = False) -> str | None:
 
 def _difference(before: Any, after: Any) -> str:
     """How the memory after a step differs from the one before; empty if it does not."""
-    old, new = (jax.tree_util.tree_flatten_with_path(tree) for tree in (before, after))
-    if old[1] != new[1]:
+    if jax.tree.structure(before) != jax.tree.structure(after):
         return "of another structure"
-    for (at, a), (_, b) in zip(old[0], new[0], strict=True):
-        name = jax.tree_util.keystr(at, simple=True, separator=".")
+    for (name, a), b in zip(numbers(before).items(), jax.tree.leaves(after), strict=True):
         whose = f"whose {name}" if name else "that"
         if _is_odd(b):
             return f"{whose} is {_described(b)}"
@@ -249,8 +221,7 @@ def _refused(name: str, function: Callable[..., Any], told: str, wanted: str) ->
 
 def _place(function: Callable[..., Any]) -> str:
     """The file and the first line of a function."""
-    while isinstance(function, functools.partial):
-        function = function.func
+    function = _inner(function)
     try:
         file, (_, line) = inspect.getsourcefile(function), inspect.getsourcelines(function)
     except (OSError, TypeError):
@@ -260,9 +231,7 @@ def _place(function: Callable[..., Any]) -> str:
 
 def _line_of(error: BaseException, function: Callable[..., Any]) -> str:
     """The line of the user's own code at which something was raised."""
-    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
-    lines = [line for _, line in traceback.walk_tb(error.__traceback__)]
-    for frame, line in reversed(list(zip(frames, lines, strict=True))):
+    for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
         file = frame.f_code.co_filename
         if not (file.startswith((_PACKAGE, "<")) or "site-packages" in file):
             code = linecache.getline(file, line).strip()

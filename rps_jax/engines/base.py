@@ -98,6 +98,7 @@ class Engine(abc.ABC):
     shapes: ClassVar[tuple[str, ...]] = SHAPES  # the shape families that it knows
     cones: ClassVar[tuple[str, ...]] = ("elliptic", "pyramidal")  # the friction that it knows
     traced: ClassVar[bool] = True  # JAX steps it: its trials can be viewed, and learned in
+    side_by_side: ClassVar[bool] = False  # batches of several families fit one program of a GPU
     modes: ClassVar[tuple[Mode, ...]] = ()  # in which it can be differentiated
     newton: ClassVar[bool] = True  # it solves as `Physics` says: by so many iterations
     forces: ClassVar[bool] = True  # a contact can slow and stop the base

@@ -20,6 +20,7 @@ from rps_jax import errors
 from rps_jax.control.observation import Twist
 from rps_jax.engines.base import Driven, Engine, Mode, Motion, taken
 from rps_jax.engines.mjx_colliders import (
+    BASE_PRISM,
     OWN,
     GeomType,
     Pair,
@@ -45,6 +46,9 @@ FIELDS = (
     *(".body_invweight0", ".dof_invweight0", ".dof_M0", ".qpos0", ".qpos_spring"),
     *(".geom_pos", ".geom_size", ".geom_aabb", ".geom_rbound", ".pair_friction"),
 )
+
+# Beside these, of prisms on feet of their own: (N, 2) [m], which else are their feet.
+OUTLINE = "outline"
 
 
 @jax.tree_util.register_static
@@ -106,14 +110,16 @@ class MJXStage(NamedTuple):
             data, integral = data.replace(qfrc_applied=applied), jnp.stack(after)
         data = data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
         with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
-            data = step(model, data, self.colliders)
+            data = step(model, data, self.colliders, fields.get(OUTLINE))
         felt = data.qfrc_constraint[JOINTS.base]  # of the contacts alone: the drive is applied
         felt = felt.at[:2].set(planar.rotate(-qpos[2], felt[:2]))
         return Motion(data.qpos, data.qvel, data.qacc_warmstart, integral), felt
 
 
-def step(model: mjx.Model, data: mjx.Data, colliders: Colliders = Colliders()) -> mjx.Data:
-    """One step of MJX by MJX's own stages, and our colliders.
+def step(
+    model: mjx.Model, data: mjx.Data, colliders: Colliders = Colliders(), outline: Any = None
+) -> mjx.Data:
+    """One step of MJX by MJX's own stages, and our colliders, of a prism of this outline (N, 2).
 
     Left out is what these scenes have not: tendons, actuators, sensors, springs, dampers, cameras
     and lights. As in C MuJoCo, without dampers nothing is integrated implicitly.
@@ -122,7 +128,10 @@ def step(model: mjx.Model, data: mjx.Data, colliders: Colliders = Colliders()) -
     data = smooth.com_pos(model, data)
     data = smooth.crb(model, data)
     data = smooth.factor_m(model, data)
-    data = collision(model, data, {pair: OWN[pair] for pair in colliders.pairs})
+    own = {pair: OWN[pair] for pair in colliders.pairs}
+    if outline is not None:
+        own[BASE_PRISM] = partial(own[BASE_PRISM], outline=outline)
+    data = collision(model, data, own)
     data = constraint.make_constraint(model, data)
     data = smooth.com_vel(model, data)
     data = smooth.rne(model, data)
@@ -149,13 +158,10 @@ class MJX(Engine):
 
     def stage_of_scenes(self, scenes: Sequence[Scene], which: np.ndarray) -> tuple[Any, Any]:
         """Stage and fields of worlds in scenes of one shape family."""
-        if any(scene.solid_of(s).feet is not None for s in scenes):
-            raise errors.InputError(
-                "engine = mjx is not allowed for objects with feet of their own, since it reads "
-                "the corners of prisms from their feet: choose fused, mujoco or quasistatic."
-            )
-        models = [s.physics for s in scenes]
+        models, solids = [s.physics for s in scenes], scene.solids_of(scenes)
         model, fields = stack(models)
+        if solids.feet is not None:
+            fields[OUTLINE] = solids.vertices
         return MJXStage(model, mjx.make_data(models[0])), taken(jax.device_get(fields), which)
 
     def stage_of_solids(
@@ -284,6 +290,8 @@ def mjx_fields(
     new[".dof_M0"][:, 6:9] = np.diagonal(about, axis1=1, axis2=2)
     new[".stat.meaninertia"] = new[".dof_M0"].mean(axis=1)
     _size_geoms(family, solids, template, new)
+    if solids.feet is not None:
+        new[OUTLINE] = solids.vertices
     robot = np.array([model.pair(i).name == "base_object" for i in range(model.npair)])
     new[".pair_friction"][:, :, :2] = np.where(
         robot[:, None], friction.robot[:, None, None], friction.ground[:, None, None]
@@ -330,7 +338,7 @@ def _size_geoms(family: str, solids: Solid, template: Scene, new: dict[str, np.n
             new[".geom_aabb"][:, geom].shape
         )
         new[".geom_rbound"][:, geom] = bound
-    if family == "prism":
+    if family == "prism" or solids.feet is not None:
         for i, at in enumerate(scene.feet(solids).swapaxes(0, 1)):
             new[".geom_pos"][:, model.geom(f"foot_{i}").id] = at
 

@@ -6,8 +6,9 @@ none at all up to 25 cm, and the cylinder gains energy. Here the direction comes
 product, which is exact for any tilt.
 
 The corners of a mesh are constants of a compiled program. Those of a prism are read from the feet
-that it stands on, and so may differ from world to world. A box is found in the same way, with four
-points as in the fused engine: MJX's own box collider finds the same ones more slowly.
+that it stands on, or from an outline beside them, and so may differ from world to world. A box is
+found in the same way, with four points as in the fused engine: MJX's own box collider finds the
+same ones more slowly.
 
 MJX's table of colliders is read and never written: other models in the process are not concerned.
 """
@@ -62,26 +63,29 @@ def plane_cylinder(plane: GeomInfo, cylinder: GeomInfo) -> tuple[jax.Array, jax.
     return distance, points - 0.5 * distance[:, None] * n, frames
 
 
-def _box_box(model: Model, data: Data, key: Any, geom: jax.Array) -> Collision:
+def _box_box(model: Model, data: Data, *_: Any) -> Collision:
     """Distances (4,), points (4, 3) and frames (4, 3, 3) [m] of a base and an upright box."""
     base, thing = map(int, np.flatnonzero(model.geom_type == GeomType.BOX))
     signs = np.array([[1, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1]])
     return upright(model, data, base, thing, model.geom_size[thing] * signs)
 
 
-def _box_prism(model: Model, data: Data, key: Any, geom: jax.Array) -> Collision:
+def _box_prism(model: Model, data: Data, key: Any, geom: Any, outline: Any = None) -> Collision:
     """Distances (4,), points (4, 3) and frames (4, 3, 3) [m] of a base and an upright prism."""
     base, thing, feet = (
         np.flatnonzero(model.geom_type == kind)
         for kind in (GeomType.BOX, GeomType.MESH, GeomType.SPHERE)
     )
-    return upright(model, data, base[0], thing[0], model.geom_pos[feet])
+    corners = model.geom_pos[feet]
+    if outline is not None:
+        corners = jnp.concatenate([outline, corners[:, 2:]], axis=1)
+    return upright(model, data, base[0], thing[0], corners)
 
 
 def upright(model: Model, data: Data, base: int, thing: int, corners: jax.Array) -> Collision:
     """Distances (4,), points (4, 3) and frames (4, 3, 3) [m] of a box and an upright prism.
 
-    `base` and `thing` are their geoms; `corners` (N, 3) [m] are the prism's feet, in its body.
+    `base` and `thing` are their geoms; `corners` (N, 3) [m] are the prism's, in its body.
     """
     body, half = model.geom_bodyid[thing], model.geom_size[base]
     lower = -jnp.abs(corners[:, 2])
@@ -107,10 +111,11 @@ def upright(model: Model, data: Data, base: int, thing: int, corners: jax.Array)
 
 Pair = tuple[GeomType, GeomType]
 # Each has as many points as MJX's own collider of the pair, for which a `Data` has room.
+BASE_PRISM = (GeomType.BOX, GeomType.MESH)
 OWN: dict[Pair, Any] = {
     (GeomType.PLANE, GeomType.CYLINDER): plane_cylinder,
     (GeomType.BOX, GeomType.BOX): _box_box,
-    (GeomType.BOX, GeomType.MESH): _box_prism,
+    BASE_PRISM: _box_prism,
 }
 
 

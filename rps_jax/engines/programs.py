@@ -68,9 +68,17 @@ def compiled(
         exported = lowered(*leaves)
         if kept is not None:
             _write(kept, exported)
-    program = jax.jit(exported.call, donate_argnums=donated).lower(*leaves).compile()
+    program = built(jax.jit(exported.call, donate_argnums=donated).lower(*leaves))
     outcome = jax.tree.structure(result)
     return lambda *given: jax.tree.unflatten(outcome, program(*jax.tree.leaves(given)))
+
+
+def built(lowered: Any) -> Any:
+    """Compile a program; on a GPU so that what does not wait for one another runs side by side."""
+    if jax.default_backend() == "gpu":
+        with contextlib.suppress(Exception):  # an XLA that does not know of it
+            return lowered.compile({"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"})
+    return lowered.compile()
 
 
 def identity(law: Law) -> str | None:

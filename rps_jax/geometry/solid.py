@@ -77,6 +77,33 @@ def build(
     )
 
 
+def on_feet(solid: Solid, share: np.ndarray, count: np.ndarray, turn: np.ndarray) -> Solid:
+    """Solids on `count` (n,) feet, at most 4, evenly about the centre of mass.
+
+    Each is `share` (n,) [1] of the way from there to the outline, the first in the direction
+    `turn` (n,) [turns].
+    """
+    com, at = solid.p_object_com[:, :2], []
+    for i in range(SIDES):
+        angle = 2 * np.pi * (turn + np.minimum(i, count - 1) / count)
+        toward = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        along = np.sum(com * toward, axis=1)
+        if solid.vertices.shape[1] == 1:
+            far = np.sqrt(along**2 + solid.radius**2 - np.sum(com**2, axis=1)) - along
+        else:
+            far = reach(solid.vertices - com[:, None], solid.radius, toward)
+        at.append(np.column_stack([com + (share * far)[:, None] * toward, i < count]))
+    return solid._replace(vertices=padded(solid.vertices), feet=np.stack(at, axis=1))
+
+
+def padded(vertices: np.ndarray) -> np.ndarray:
+    """Outlines (..., N, 2) [m] with SIDES corners, the last repeated; circles as they are."""
+    if vertices.shape[-2] == 1:
+        return vertices
+    missing = SIDES - vertices.shape[-2]
+    return np.concatenate([vertices, np.repeat(vertices[..., -1:, :], missing, axis=-2)], axis=-2)
+
+
 def rectangles(half_x: np.ndarray, half_y: np.ndarray) -> np.ndarray:
     """Outlines (n, 4, 2) [m] of boxes, as `footprint.rectangle` has them."""
     signs = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
@@ -140,9 +167,6 @@ def friction_arm(solid: Solid, support: Support = "feet") -> np.ndarray:
     bear that give way alike and only push: `feet`, points as engines stand solids on (the corners
     of a prism, three points of a cylinder's rim, one where it leans to); `even`, all of the ground
     that is covered.
-
-    Raises:
-      InputError: unknown support.
     """
     errors.check_name("support", support, get_args(Support))
     at, share = _feet(solid) if support == "feet" else _bed(solid)

@@ -151,41 +151,38 @@ def write(path: Path, steps: Iterable[Step], about: Mapping[str, str]) -> Path:
 
 
 def _messages(steps: Iterable[Step]) -> Iterator[tuple[str, int, dict[str, Any]]]:
-    """Topics, times [ns] and messages of steps, in their order."""
+    """Topics, times [ns] and messages of steps, in their order; what a message lacks is zero."""
     before, shown = None, -math.inf
     for step in steps:
         now = round(1e9 * step.time)
         odom, base = _header(now, "odom"), _header(now, "base_link")
         x, y, yaw = map(float, step.pose)
         placed = {"position": _xyz(x, y), "orientation": _turned(yaw)}
-        target = _xyz(*step.target)
         yield "/odom", now, {
             "header": odom,
             "child_frame_id": "base_link",
-            "pose": {"pose": placed, "covariance": [0.0] * 36},
-            "twist": {"twist": _velocity(before, step), "covariance": [0.0] * 36},
+            "pose": {"pose": placed},
+            "twist": {"twist": _velocity(before, step)},
         }  # fmt: skip
-        yield "/target", now, {"header": odom, "point": target}
+        yield "/target", now, {"header": odom, "point": _xyz(*step.target)}
         touched = [_xyz(*step.p_robot_contact)] * int(step.contact_type)
         yield "/contact", now, {"header": base, "polygon": {"points": touched}}
         if step.signal is not None:
             count = len(step.signal)
             dim = [{"label": "taxels", "size": count, "stride": count}]
-            data = [float(one) for one in step.signal]
-            yield "/taxels", now, {"layout": {"dim": dim, "data_offset": 0}, "data": data}
+            yield "/taxels", now, {"layout": {"dim": dim}, "data": list(step.signal)}
         if step.f_robot is not None:
-            wrench = {"force": _xyz(*step.f_robot), "torque": _xyz()}
-            yield "/force", now, {"header": base, "wrench": wrench}
+            yield "/force", now, {"header": base, "wrench": {"force": _xyz(*step.f_robot)}}
         if step.p_world_object is not None:
-            place = {"position": _xyz(*step.p_world_object), "orientation": _turned(0.0)}
-            yield "/object", now, _cylinder(odom, "object", place, 2 * float(step.r_object))
+            width = 2 * float(step.r_object)
+            yield "/object", now, _cylinder(odom, "object", step.p_world_object, width)
         moved = [_frame(odom, "base_link", x, y, yaw)]
         if step.object_pose is not None:
             moved.append(_frame(odom, "object", *map(float, step.object_pose)))
         yield "/tf", now, {"transforms": moved}
         if step.time >= shown + _SHOWN:
-            shown, place = step.time, {"position": target, "orientation": _turned(0.0)}
-            yield "/target_marker", now, _cylinder(odom, "target", place, 0.1)
+            shown = step.time
+            yield "/target_marker", now, _cylinder(odom, "target", step.target, 0.1)
         yield "/cmd_vel", now, {"header": base, "twist": _twist(*step.twist)}
         before = step
 
@@ -194,16 +191,16 @@ def _header(now: int, frame: str) -> dict[str, Any]:
     return {"stamp": {"sec": now // 10**9, "nanosec": now % 10**9}, "frame_id": frame}
 
 
-def _xyz(x: Any = 0.0, y: Any = 0.0) -> dict[str, float]:
-    return {"x": float(x), "y": float(y), "z": 0.0}
+def _xyz(x: Any, y: Any) -> dict[str, float]:
+    return {"x": float(x), "y": float(y)}
 
 
 def _turned(yaw: float) -> dict[str, float]:
-    return {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
+    return {"z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
 
 
 def _twist(v_x: Any, v_y: Any, omega: Any) -> dict[str, Any]:
-    return {"linear": _xyz(v_x, v_y), "angular": {"x": 0.0, "y": 0.0, "z": float(omega)}}
+    return {"linear": _xyz(v_x, v_y), "angular": {"z": float(omega)}}
 
 
 def _velocity(before: Step | None, step: Step) -> dict[str, Any]:
@@ -222,17 +219,12 @@ def _frame(header: Any, child: str, x: float, y: float, yaw: float) -> dict[str,
     return {"header": header, "child_frame_id": child, "transform": transform}
 
 
-def _cylinder(header: Any, name: str, pose: Any, width: float) -> dict[str, Any]:
-    """A marker; what it does not have is empty."""
-    zero = {"sec": 0, "nanosec": 0}
+def _cylinder(header: Any, name: str, place: Any, width: float) -> dict[str, Any]:
+    """A marker of type 3."""
     return {
-        **{"header": header, "ns": name, "id": 0, "type": 3, "action": 0, "pose": pose},
-        **{"scale": {"x": width, "y": width, "z": 0.01}, "lifetime": zero, "frame_locked": False},
-        **{"color": {"r": 0.1, "g": 0.6, "b": 0.2, "a": 0.8}, "points": [], "colors": []},
-        **{"texture_resource": "", "uv_coordinates": [], "text": "", "mesh_resource": ""},
-        "texture": {"header": _header(0, ""), "format": "", "data": b""},
-        "mesh_file": {"filename": "", "data": b""},
-        "mesh_use_embedded_materials": False,
+        **{"header": header, "ns": name, "type": 3, "pose": {"position": _xyz(*place)}},
+        "scale": {"x": width, "y": width, "z": 0.01},
+        "color": {"r": 0.1, "g": 0.6, "b": 0.2, "a": 0.8},
     }
 
 

@@ -59,11 +59,7 @@ class Parts:
         return path
 
     def results(self, name: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
-        """The labelled results of a part, which are made and put if it is not finished.
-
-        Raises:
-          InputError: the file of the part holds another one.
-        """
+        """The labelled results of a part, which are made and put if it is not finished."""
         if (content := self.get(name)) is None:
             content = files.encoded(make().assign_attrs(part=name))
             self.put(name, content)

@@ -50,11 +50,7 @@ _KINDS = {
 
 
 def atomic(path: Path, write: Callable[[Path], Any]) -> Path:
-    """Have `write` fill a file beside `path`, then put it in place whole.
-
-    Raises:
-      OSError: it cannot be written; the error names `path`, and nothing is left behind.
-    """
+    """Have `write` fill a file beside `path`, then put that in place; an OSError names `path`."""
     partial = path.with_name(f".{path.stem}.partial{path.suffix}")
     try:
         partial.unlink(missing_ok=True)  # a pipe of this name would block
@@ -127,16 +123,11 @@ def encoded(results: xr.Dataset) -> bytes:
 
 def _structure(results: xr.Dataset) -> str:
     """Digest of the names, dimensions, sizes, kinds and units of all variables."""
-    told = [
-        (str(name), one.dims, one.shape, _kind(one), one.attrs.get("units", ""))
-        for name, one in sorted(results.variables.items(), key=lambda item: str(item[0]))
-    ]
+    told = []
+    for name, one in sorted(results.variables.items(), key=lambda item: str(item[0])):
+        kind = "text" if one.dtype.kind in "OUST" else one.dtype.str  # texts of any length
+        told.append((str(name), one.dims, one.shape, kind, one.attrs.get("units", "")))
     return digest(repr(told).encode())[:16]
-
-
-def _kind(column: xr.Variable) -> str:
-    """The type of a variable's values; texts of any length are one type."""
-    return "text" if column.dtype.kind in "OUST" else column.dtype.str
 
 
 def content_of(path: Path, kind: Kind = "results") -> bytes:
@@ -170,15 +161,9 @@ def _check_regular(path: Path, mode: int) -> None:
 
 
 def decoded(content: bytes, source: Any, *, own: bool = False) -> xr.Dataset:
-    """The labelled results that `encoded` made into bytes.
+    """The labelled results that `encoded` made into bytes; InputError names the `source`.
 
-    Args:
-      content: of a NetCDF 4 file.
-      source: where it came from, for the error.
-      own: whether only `encoded` can have made it, and so signed its structure.
-
-    Raises:
-      InputError: it is something else, or its structure is not what was signed.
+    If they are `own`, only `encoded` can have made them, and so signed their structure.
     """
     try:
         with xr.open_dataset(io.BytesIO(content), engine="h5netcdf") as found:
@@ -198,20 +183,11 @@ def check_columns(
     results: xr.Dataset,
     source: Any,
     dims: Mapping[str, Sequence[str]],
-    sizes: Mapping[str, int],
-    units: Mapping[str, str] | None = None,
+    sizes: Mapping[Any, int],
 ) -> xr.Dataset:
-    """Return the results if they have these variables of numbers.
+    """Return the results from `source` if they have these variables of numbers, or InputError.
 
-    Args:
-      results: what was read.
-      source: where it came from.
-      dims: dimensions that each variable must have, by its name.
-      sizes: lengths that dimensions must have.
-      units: units that variables must have, where these are known.
-
-    Raises:
-      InputError: a variable is missing or of another kind; the sentence names it.
+    They must have the dimensions `dims`, and lengths where these are known.
     """
     for name, wanted in dims.items():
         if name not in results.variables:
@@ -221,9 +197,6 @@ def check_columns(
             raise corrupt(source, f"{name} has the dimensions {column.dims}, not {tuple(wanted)}")
         if column.dtype.kind not in "biuf":
             raise corrupt(source, f"{name} holds {column.dtype}, not numbers")
-        unit = None if units is None else units.get(name)
-        if unit is not None and column.attrs.get("units") != unit:
-            raise corrupt(source, f"{name} is in {column.attrs.get('units')}, not in {unit}")
         for dim in wanted:
             if dim in sizes and column.sizes[dim] != sizes[dim]:
                 raise corrupt(source, f"{dim} has the length {column.sizes[dim]}, not {sizes[dim]}")
@@ -231,26 +204,26 @@ def check_columns(
 
 
 def check_like(results: xr.Dataset, like: xr.Dataset, source: Any) -> xr.Dataset:
-    """Return the results if their variables, dimensions and kinds of numbers are those of others.
+    """Return the results if they have the numbers and coordinates of others, or raise InputError.
 
-    Raises:
-      InputError: a variable is missing, is too much or is of another kind; the sentence names it.
+    The sentence names what is missing, too much or of another kind.
     """
-    for name in {*like.variables, *results.variables}:
-        if name not in results.variables or name not in like.variables:
-            raise corrupt(source, f"it {'holds' if name in results.variables else 'lacks'} {name}")
-        mine, wanted = results[name], like[name]
-        if mine.dims != wanted.dims or mine.shape != wanted.shape:
-            raise corrupt(
-                source,
-                f"{name} has the dimensions {dict(mine.sizes)}, not {dict(wanted.sizes)}",
-            )
-        kinds = "biuf" if wanted.dtype.kind in "biuf" else "OUST"
-        if mine.dtype.kind not in kinds:
-            raise corrupt(source, f"{name} holds {mine.dtype}, not {wanted.dtype}")
-        if name in like.coords and not np.array_equal(mine.values, wanted.values):
+    if odd := sorted(map(str, {*like.variables} ^ {*results.variables})):
+        raise corrupt(source, f"it {'holds' if odd[0] in results.variables else 'lacks'} {odd[0]}")
+    every = like.variables.items()
+    numbers = {str(name): one.dims for name, one in every if one.dtype.kind in "biuf"}
+    check_columns(results, source, numbers, like.sizes)
+    for name in like.coords:
+        if not np.array_equal(results[name].values, like[name].values):
             raise corrupt(source, f"{name} is of another run")
     return results
+
+
+def archive(**arrays: Any) -> bytes:
+    """The content of a NumPy archive (.npz)."""
+    content = io.BytesIO()
+    np.savez(content, **arrays)
+    return content.getvalue()
 
 
 def arrays_of(content: bytes) -> dict[str, np.ndarray]:
@@ -291,11 +264,7 @@ def _check_member(archive: zipfile.ZipFile, one: zipfile.ZipInfo) -> None:
 
 
 def read_bytes(path: Path, kind: Kind = "results") -> bytes:
-    """The content of a file, compared with the checksum beside it, if there is one.
-
-    Raises:
-      InputError: the two differ.
-    """
+    """The content of a file; InputError if it is not what the checksum beside it says, if any."""
     content, beside = content_of(path, kind), checksum(path)
     with contextlib.suppress(FileNotFoundError):  # there is none
         if content_of(beside, "json").split(b" ")[0] != digest(content).encode():
@@ -307,11 +276,7 @@ def read_bytes(path: Path, kind: Kind = "results") -> bytes:
 
 
 def parsed(content: bytes | str) -> Any:
-    """What JSON says, if it is not nested deeper than anything that people write.
-
-    Raises:
-      ValueError: it is no JSON.
-    """
+    """What JSON says; ValueError for none, and for one nested deeper than people write."""
     try:
         found = json.loads(content)
     except RecursionError as error:
@@ -331,11 +296,7 @@ def parsed(content: bytes | str) -> Any:
 
 
 def noted(path: Path) -> dict[str, Any]:
-    """What a JSON file of a run folder says, by name.
-
-    Raises:
-      InputError: there is no such file, or it is corrupt.
-    """
+    """What a JSON file of a run folder says, by name; InputError if it is missing or corrupt."""
     try:
         content = read_bytes(path, "json")
     except (FileNotFoundError, NotADirectoryError) as error:
@@ -352,11 +313,7 @@ def noted(path: Path) -> dict[str, Any]:
 
 
 def read(path: Path) -> xr.Dataset:
-    """The labelled results of one file.
-
-    Raises:
-      InputError: it is not there, or it is corrupt.
-    """
+    """The labelled results of one file; InputError if it is missing or corrupt."""
     try:
         content = read_bytes(path)
     except OSError as error:
@@ -367,11 +324,7 @@ def read(path: Path) -> xr.Dataset:
 
 
 def read_results(folder: Path) -> xr.Dataset:
-    """The results of a run folder.
-
-    Raises:
-      InputError: the folder holds no results, or they are corrupt.
-    """
+    """The results of a run folder; InputError if it holds none, or they are corrupt."""
     path = Path(folder) / "results.nc"
     if not path.exists():
         raise InputError(f"run = {folder} holds no results.nc: give the folder of a finished run.")
@@ -387,11 +340,7 @@ def corrupt(source: Any, why: Any) -> InputError:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Names with values from a JSON file that a user wrote.
-
-    Raises:
-      InputError: it cannot be read, or holds something else.
-    """
+    """Names with values from a JSON file that a user wrote; InputError if it is none."""
     try:
         content = content_of(path, "json")
     except OSError as error:

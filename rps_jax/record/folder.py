@@ -20,11 +20,7 @@ MANIFEST = "manifest.json"  # of a run that can be continued
 
 
 def clear(folder: Path) -> None:
-    """Remove the run that a folder holds, if there is one, and nothing else.
-
-    Raises:
-      InputError: it is in use, or cannot be removed.
-    """
+    """Remove the run that a folder holds, and nothing else; InputError if it is in use."""
     for inner in sorted(folder.rglob(MANIFEST)):  # runs in its folders, as of models
         if inner.parent != folder:
             clear(inner.parent)
@@ -44,11 +40,7 @@ def clear(folder: Path) -> None:
 
 
 def writable(folder: Path) -> Path:
-    """The folder, made if need be and tried for writing.
-
-    Raises:
-      InputError: it cannot be written.
-    """
+    """The folder, made if need be; InputError if it cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -61,11 +53,7 @@ def writable(folder: Path) -> Path:
 
 
 def claim(folder: Path, wanted: dict[str, Any]) -> Path:
-    """The folder of a run that can be continued, with its configuration as `manifest.json`.
-
-    Raises:
-      InputError: it cannot be written, or holds a run of another configuration.
-    """
+    """The folder of a run that can be continued, with its configuration as `manifest.json`."""
     writable(folder)
     wanted = json.loads(json.dumps(wanted))
     with alone(folder):
@@ -89,11 +77,7 @@ def alone(folder: Path) -> FileLock:
 
 @contextlib.contextmanager
 def hold(folder: Path, number: int = 1, of: int = 1) -> Iterator[None]:
-    """Hold a run folder, or one of several equal shares of it, against other processes.
-
-    Raises:
-      InputError: another process holds it, or shares it otherwise.
-    """
+    """Hold a run folder, or one of several equal shares of it; InputError if others do."""
     with contextlib.ExitStack() as held:
         with alone(folder):
             for path in folder.glob(".lock-*-*"):
@@ -116,11 +100,7 @@ def _seize(path: Path, folder: Path) -> FileLock:
 
 
 def manifest(folder: Path) -> dict[str, Any]:
-    """The configuration of the run in a folder.
-
-    Raises:
-      InputError: there is none, or it is corrupt.
-    """
+    """The configuration of the run in a folder; InputError if there is none, or it is corrupt."""
     return files.noted(folder / MANIFEST)
 
 

@@ -24,17 +24,6 @@ from rps_jax import errors
 _KEY = "option"
 
 
-class _Bounds(typing.NamedTuple):
-    """What is allowed of a number."""
-
-    at_least: float | None
-    at_most: float | None
-    above: float | None
-    unit: str
-    hidden: bool
-    positional: bool
-
-
 def option(
     default: Any = dataclasses.MISSING,
     at_least: float | None = None,
@@ -48,18 +37,12 @@ def option(
 ) -> Any:
     """Declare a field with bounds: of a number, or of each number of a tuple.
 
-    Args:
-      default: of the field.
-      at_least: least number allowed.
-      at_most: greatest number allowed.
-      above: number that it must exceed.
-      unit: of the number.
-      kw_only: whether it is named in calls.
-      hidden: whether the command line does not offer it.
-      positional: whether the command line has it without a flag.
+    The command line has a `positional` field without a flag, and does not offer a `hidden` one.
     """
-    bounds = _Bounds(at_least, at_most, above, unit, hidden, positional)
-    return dataclasses.field(default=default, metadata={_KEY: bounds}, kw_only=kw_only)
+    bounds = {"at_least": at_least, "at_most": at_most, "above": above, "unit": unit}
+    given = {name: bound for name, bound in bounds.items() if bound is not None}
+    metadata = {_KEY: given, "hidden": hidden, "positional": positional}
+    return dataclasses.field(default=default, metadata=metadata, kw_only=kw_only)
 
 
 def check_fields(asked: Any) -> None:
@@ -67,9 +50,6 @@ def check_fields(asked: Any) -> None:
 
     Whole numbers are `int`, finite numbers `float`, closed choices `Literal`; each may be `None`
     where the type says so. Fields of other types are left to their owner.
-
-    Raises:
-      InputError: one is not allowed.
     """
     types_ = typed_fields(type(asked))
     for one in dataclasses.fields(asked):
@@ -78,14 +58,12 @@ def check_fields(asked: Any) -> None:
 
 def is_hidden(field: Any) -> bool:
     """Whether the command line does not offer a field."""
-    bounds = field.metadata.get(_KEY)
-    return bounds is not None and bounds.hidden
+    return field.metadata.get("hidden", False)
 
 
 def is_positional(field: Any) -> bool:
     """Whether the command line has a field without a flag."""
-    bounds = field.metadata.get(_KEY)
-    return bounds is not None and bounds.positional
+    return field.metadata.get("positional", False)
 
 
 @functools.cache
@@ -94,7 +72,7 @@ def typed_fields(kind: type) -> dict[str, Any]:
     return typing.get_type_hints(kind)
 
 
-def _check(name: str, value: Any, kind: Any, bounds: _Bounds | None) -> None:
+def _check(name: str, value: Any, kind: Any, bounds: dict[str, Any] | None) -> None:
     if get_origin(kind) in (typing.Union, types.UnionType):
         if value is None and type(None) in get_args(kind):
             return
@@ -105,17 +83,11 @@ def _check(name: str, value: Any, kind: Any, bounds: _Bounds | None) -> None:
     if get_origin(kind) is Literal:
         errors.check_name(name, str(value), get_args(kind))
     elif kind is int:
-        low, high = (bounds.at_least, bounds.at_most) if bounds else (None, None)
-        errors.check_count(
-            name,
-            value,
-            at_least=-(2**63) if low is None else int(low),
-            at_most=2**63 if high is None else int(high),
-        )
+        given = {"at_least": -(2**63), "at_most": 2**63} | (bounds or {})
+        low, high = int(given["at_least"]), int(given["at_most"])
+        errors.check_count(name, value, at_least=low, at_most=high)
     elif kind is float:
-        named = ("at_least", "at_most", "above", "unit")
-        given = {} if bounds is None else {k: getattr(bounds, k) for k in named}
-        errors.check_finite(name, value, **{k: v for k, v in given.items() if v is not None})
+        errors.check_finite(name, value, **(bounds or {}))
     elif get_origin(kind) is tuple and bounds is not None:
         for one in value if isinstance(value, tuple | list) else (value,):
             _check(name, one, get_args(kind)[0], bounds)
@@ -151,11 +123,7 @@ def _below_fields(tree: Any) -> dict[str, str]:
 
 
 def described(value: Any) -> Any:
-    """JSON of a value: dataclasses and named tuples by their fields, arrays as lists.
-
-    Raises:
-      TypeError: it holds something that JSON has no form for.
-    """
+    """JSON of a value: dataclasses and named tuples by their fields, arrays as lists."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: described(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if hasattr(value, "_asdict"):
@@ -184,14 +152,8 @@ def described(value: Any) -> Any:
 def with_changes(kind: str, text: str) -> tuple[str, dict[str, Any]]:
     """Split a text `NAME,FIELD=VALUE,...` into its name and its changes.
 
-    A value is a number, several of them with colons between, as 3:10, or a text.
-
-    Args:
-      kind: what is named, for the error.
-      text: as the command line has it.
-
-    Raises:
-      InputError: a change has no value.
+    A value is a number, several of them with colons between, as 3:10, or a text. `kind` is what is
+    named, for the error.
     """
     head, *changes = text.split(",")
     found = {}

@@ -69,11 +69,7 @@ def sign(folder: Path, signed: Mapping[str, Any] | None = None) -> None:
 
 
 def signed(folder: Path) -> dict[str, Any]:
-    """What `sign` noted.
-
-    Raises:
-      InputError: there is nothing, or it is corrupt.
-    """
+    """What `sign` noted; InputError if there is nothing, or it is corrupt."""
     return files.noted(folder / ENVIRONMENT)
 
 
@@ -126,22 +122,18 @@ def _version(package: str) -> str | None:
 
 def commit() -> str | None:
     """The git commit of the checkout this code runs from, marked if changed; None elsewhere."""
-    here = Path(__file__).resolve().parent.parent
-
-    def git(*arguments: str) -> str:
-        return subprocess.run(
-            ["git", "-C", str(here), *arguments],
+    root = Path(__file__).resolve().parents[2]
+    words = ("describe", "--always", "--exclude=*", "--abbrev=40", "--dirty=-changed")
+    try:
+        if not (root / ".git").exists():
+            return None
+        done = subprocess.run(
+            ["git", "-C", str(root), *words],
             capture_output=True,
             text=True,
             check=True,
             timeout=10,
-        ).stdout.strip()
-
-    try:
-        if Path(git("rev-parse", "--show-toplevel")) != here.parent:
-            return None
-        return git("rev-parse", "HEAD") + (
-            "-changed" if git("status", "--porcelain", "-uno") else ""
         )
     except (OSError, subprocess.SubprocessError):
         return None
+    return done.stdout.strip()

@@ -82,13 +82,10 @@ class Robot:
         its part of it.
         """
         weight = self.mass * GRAVITY
-        bounds = [] if self.force_max is None else [self.force_max]
-        if self.traction is not None:
-            bounds.append(self.traction * weight)
-        if not bounds:
-            return None
-        least = bounds[0] if len(bounds) == 1 else _least(*bounds)
-        return least if self.resistance is None else least - self.resistance * weight
+        most = _least(self.force_max, None if self.traction is None else self.traction * weight)
+        if most is None or self.resistance is None:
+            return most
+        return most - self.resistance * weight
 
     @property
     def turn_max(self) -> Any:
@@ -96,12 +93,8 @@ class Robot:
 
         The wheels share the force.
         """
-        bounds = [] if self.torque_max is None else [self.torque_max]
-        if (force := self.push_max) is not None:
-            bounds.append(force * self.arm)
-        if not bounds:
-            return None
-        return bounds[0] if len(bounds) == 1 else _least(*bounds)
+        force = self.push_max
+        return _least(self.torque_max, None if force is None else force * self.arm)
 
     @property
     def body(self) -> Robot:
@@ -144,12 +137,11 @@ class Robot:
 
 
 def _least(a: Any, b: Any) -> Any:
-    """The lesser of two numbers, on the host or traced."""
-    return (
-        jnp.minimum(a, b)
-        if isinstance(a, jax.Array) or isinstance(b, jax.Array)
-        else np.minimum(a, b)
-    )
+    """The lesser of two numbers, on the host or traced; None is none."""
+    if a is None or b is None:
+        return b if a is None else a
+    xp = jnp if isinstance(a, jax.Array) or isinstance(b, jax.Array) else np
+    return xp.minimum(a, b)
 
 
 _FIELDS = [field.name for field in dataclasses.fields(Robot)]
@@ -229,9 +221,6 @@ def named(robot: RobotLike) -> Robot:
     """Read a robot: itself, its name, as kairos, a JSON file, or names with numbers.
 
     Changes may follow a name or a file, as `kairos,force_max=300`.
-
-    Raises:
-      InputError: no robot has this name, or the numbers are of none.
     """
     if isinstance(robot, str):
         head, changes = with_changes("robot", robot)

@@ -7,10 +7,9 @@ right side. What is None is as the paper has it.
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -27,17 +26,19 @@ SIDES: tuple[Side, ...] = ("left", "front", "right")  # in the order of the stri
 _ALONG = {"left": (1.0, 0.0), "front": (0.0, -1.0), "right": (-1.0, 0.0)}
 _ROUNDING = 1e-9  # [m]
 _APART = 0.01  # [m] between two points of a taxel, at most
+_STATIC = {"static": True}  # of a pytree's field: no leaf
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Boards:
     """A row of equal boards on one side, end to end; each taxel is an electrode of a board."""
 
-    side: Side
-    count: int  # boards
+    side: Side = field(metadata=_STATIC)
+    count: int = field(metadata=_STATIC)  # boards
     pitch: Any = None  # () [m] of the taxels; None: so that the row covers the whole side
     middle: Any = None  # () [m] of the row along the strip, from the middle of the side; None: 0
-    electrodes: int = 3  # on each board
+    electrodes: int = field(default=3, metadata=_STATIC)  # on each board
 
     @property
     def taxels(self) -> int:
@@ -57,6 +58,7 @@ class Row(NamedTuple):
     begins: Any  # () [m] where on the strip
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Shell:
     """A base's outline, a rectangle about its origin, and its boards, in the strip's order."""
@@ -64,7 +66,8 @@ class Shell:
     half_length: Any = HALF_LENGTH  # () [m]
     half_width: Any = None  # () [m]; None: the paper's, which a compiled program then knows
     boards: tuple[Boards, ...] = BOARDS
-    samples: int = 5  # points of each taxel at which it feels foam; 1 cm apart they feel a corner
+    # Points of each taxel at which it feels foam; 1 cm apart they feel a corner.
+    samples: int = field(default=5, metadata=_STATIC)
 
     @classmethod
     def of(cls, half_length: Any, half_width: Any, boards: tuple[Boards, ...]) -> Shell:
@@ -156,16 +159,6 @@ class Shell:
                         f"robot boards on the {one.side} side are not allowed: a row ends at "
                         f"{last:g} m and the following begins at {first:g} m, so they overlap."
                     )
-
-
-def _register(cls: type, *, static: tuple[str, ...]) -> None:
-    names = [field.name for field in dataclasses.fields(cls)]
-    data = [name for name in names if name not in static]
-    jax.tree_util.register_dataclass(cls, data_fields=data, meta_fields=static)
-
-
-_register(Boards, static=("side", "count", "electrodes"))
-_register(Shell, static=("samples",))
 
 
 def _lengths(x: Any, y: Any) -> dict[Side, Any]:

@@ -12,7 +12,7 @@ are; the two extreme positions of a contact are its first and last along the she
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,34 +51,6 @@ class SmoothReading(NamedTuple):
     contact_type: Int[Array, "*B"]  # NONE up to a weight of 1/2, beyond it POINT or LINE
     p_robot_contact: Float[Array, "*B 2"]  # [m] contact location in the robot frame, at any weight
     in_contact: Float[Array, "*B"]  # [1] weight of the contact, from 0 to 1
-
-
-@runtime_checkable
-class Skin(Protocol):
-    """A tactile sensor: a pytree of parameters with two pure functions."""
-
-    @property
-    def shell(self) -> Shell:
-        """What it covers."""
-        ...
-
-    def on(self, shell: Shell) -> Skin:
-        """Return this sensor on another shell."""
-        ...
-
-    def check(self) -> None:
-        """Raises InputError for scalar parameters that mean nothing."""
-        ...
-
-    def init(self, key: Array) -> SkinState:
-        """The sensor before it has felt anything; `key` draws its imperfections."""
-        ...
-
-    def sense(
-        self, state: SkinState, footprint: Footprint, period: Scalar
-    ) -> tuple[SkinState, Reading | SmoothReading]:
-        """One reading of a footprint placed in the robot frame, `period` [s] after the last."""
-        ...
 
 
 class SkinState(NamedTuple):
@@ -313,6 +285,9 @@ class SmoothSkin(NamedTuple):
         return self.sensor.sense_smoothly(state, footprint, period, self.temperature)
 
 
+Skin = IdealSkin | CapacitiveSkin | SmoothSkin  # a pytree of parameters with two pure functions
+
+
 def signals(skin: Skin, state: SkinState, footprint: Footprint) -> Float[Array, " T"]:
     """What the taxels of a skin tell [1], filtered; 0 of one that is dead.
 
@@ -344,11 +319,7 @@ SkinLike = str | Skin  # a sensor, or its text, see `named`
 
 
 def named(skin: SkinLike) -> Any:
-    """Read a skin: itself, or a name with changes, as `capacitive,foam=0.01`.
-
-    Raises:
-      InputError: unknown name or number, or a value that is not allowed.
-    """
+    """Read a skin: itself, or a name with changes, as `capacitive,foam=0.01`; or InputError."""
     if not isinstance(skin, str):
         skin.check()
         return skin

@@ -22,7 +22,6 @@ import itertools
 import logging
 import os
 import socket
-import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -36,9 +35,9 @@ from rps_jax.errors import InputError
 from rps_jax.record import folder as run_folder
 from rps_jax.record import provenance
 from rps_jax.runs import sweep
-from rps_jax.runs.board import Board, News
+from rps_jax.runs.board import Board
 from rps_jax.runs.sweep import Plan, Shard
-from rps_jax.trials.progress import Progress, Report, Timing, unheard
+from rps_jax.trials.progress import Progress, Report, unheard
 
 POLL = 0.5  # [s] between two looks at what the workers have done
 PATIENCE = 10.0  # [s] to reach a cluster
@@ -71,34 +70,22 @@ def _work(
             f"({run_folder.difference(_same(environment), same)}): install the same on all hosts."
         )
     ask("enter", environment)
-    shape = {"slots": slots, "workers": threads}
-    tell = functools.partial(board.tell.remote, worker)
-    while (found := ask("first")) is not None:
-        kind, first = found
-        _run(plan, kind, first, ask, tell, shape)
-
-
-def _run(
-    plan: Plan,
-    kind: int,
-    first: int,
-    ask: Callable[..., Any],
-    tell: Callable[[int, float], Any],
-    shape: dict[str, Any],
-) -> None:
-    """Run parts of a kind, the `first` and then what the board gives, until it gives no more."""
-    numbers = itertools.chain([first], iter(functools.partial(ask, "next", kind), None))
-    before = Progress(0, 0.0)
+    tell, before = board.tell.remote, Progress(0, 0.0)
 
     def keep(number: int, content: bytes) -> None:
         ask("deliver", number, plan.parts[number].size, content)
 
     def report(progress: Progress) -> None:
         nonlocal before
-        tell(progress.finished - before.finished, progress.simulated - before.simulated)
+        tell(worker, progress.finished - before.finished, progress.simulated - before.simulated)
         before = progress
 
-    sweep.work(plan, {plan.kind(first): numbers}, keep, report=report, **shape)
+    while (found := ask("first")) is not None:  # and then what the board gives of its kind
+        kind, first = found
+        numbers = itertools.chain([first], iter(functools.partial(ask, "next", kind), None))
+        before = Progress(0, 0.0)
+        own = {plan.kind(first): numbers}
+        sweep.work(plan, own, keep, report=report, slots=slots, workers=threads)
 
 
 # --- the process that the user started -----------------------------------------------------
@@ -108,13 +95,9 @@ def _run(
 def connected(address: str, **options: Any) -> Iterator[ModuleType]:
     """Ray itself, connected to the cluster at an address; left as it is if it was connected.
 
-    Args:
-      address: host:port, `auto` (the cluster that this host is part of), or `local`: one of this
-        host alone, which ends with the context and reports to nobody.
-      options: further ones of `ray.init`.
-
-    Raises:
-      InputError: Ray is not installed, or no cluster is there.
+    The address is host:port, `auto` (the cluster that this host is part of), or `local`: one of
+    this host alone, which ends with the context and reports to nobody. The options are of
+    `ray.init`.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
@@ -167,28 +150,13 @@ def run_on_cluster(
     report: Report = unheard,
     slots: int | None = None,
     workers: int | None = None,
-) -> Timing:
+) -> None:
     """Run what is missing of a plan, as `sweep.run_missing` does, on the workers of a cluster.
 
-    Args:
-      folder: a run folder that `plan.open_run` opened; `environment.json` in it will name
-        the workers.
-      plan: what is run.
-      address: of the cluster; see `connected`.
-      prepare: called first in every worker, to choose its device and its cache of programs.
-      gpus: claim a GPU for each worker if the cluster has any and the engine can use one.
-      shard: the share of the plan that is run.
-      report: called now and then.
-      slots: worlds stepped at once by one thread; by default chosen by the worker's device.
-      workers: threads of one Ray worker, and processors that it claims; by default 1.
-
-    Returns:
-      Wall clock until the first world was stepped (Ray's start included), and after that.
-
-    Raises:
-      InputError: no cluster is there, or none with room for one worker; a worker has other
-        software; workers died too often. Like every error of a worker, it leaves in the folder
-        what came back until then.
+    What came back is kept whatever error ends the run, and `environment.json` names the workers.
+    Each calls `prepare` first, to choose its device and its cache of programs. It has as many
+    threads as `workers` says, by default one, and claims as many processors, and with `gpus` a GPU
+    if the cluster has any and the engine can use one.
     """
     own, known = provenance.environment(), {}
     missing, before = sweep.remaining(folder, plan, shard)
@@ -196,36 +164,32 @@ def run_on_cluster(
         provenance.sign(folder, own)
     report(Progress(before, 0.0))
     if not missing:
-        return Timing(0.0, 0.0, 0.0)
+        return
     waiting = list(missing.values())
     lacking = set(itertools.chain.from_iterable(waiting))
     claim = {
         "num_cpus": workers or 1,
         "num_gpus": int(gpus and engines.get(plan.setting.engine).traced),
     }
-    began, stepped, simulated = time.perf_counter(), None, 0.0
     given = (_same(own), prepare, slots)
     with connected(address) as ray, _started(ray, plan, waiting, claim, given) as (board, tasks):
-        for news in _news(ray, board, tasks):
+        while tasks and lacking:
+            ended, tasks = ray.wait(tasks, num_returns=len(tasks), timeout=POLL)
+            news = ray.get(board.news.remote())
             for number, content in news.parts:
                 sweep.store(folder, number, content)
                 lacking.discard(number)
             if news.workers != known:
                 known = news.workers
                 provenance.sign(folder, own | _environment(known))
-            simulated = news.simulated
-            stepped = stepped or (time.perf_counter() if simulated else None)
-            report(Progress(before + news.ended, simulated))
-            if not lacking:
-                break
+            report(Progress(before + news.ended, news.simulated))
+            if lacking:
+                ray.get(ended)  # raises what ended a worker
     if lacking:
         raise InputError(f"ray = {address} lost {len(lacking)} parts: run the same command again.")
-    ended = time.perf_counter()
-    stepped = stepped or ended
-    return Timing(stepped - began, ended - stepped, simulated)
 
 
-def on_cluster(address: str, device: Device) -> Callable[..., Timing]:
+def on_cluster(address: str, device: Device) -> Callable[..., None]:
     """What runs a plan on the workers of a cluster, each on this device."""
     import jax
 
@@ -267,6 +231,13 @@ def _started(
     bare = ray.put(dataclasses.replace(plan))  # without what it has worked out
     try:
         yield board, [task.remote(board, i, bare, claim["num_cpus"], *given) for i in range(count)]
+    except ray.exceptions.RayError as error:
+        cause = getattr(error, "cause", None)
+        if cause is not None and not isinstance(cause, ray.exceptions.RayError):
+            raise cause from error  # what went wrong in a worker
+        raise InputError(
+            f"ray has failed ({_line(error)}): what came back is kept; run the same command again."
+        ) from error
     finally:
         ray.kill(board)  # workers that still run have nobody to work for
 
@@ -285,22 +256,6 @@ def _room(hosts: Sequence[Mapping[str, Any]], num_cpus: int, num_gpus: int) -> i
             f"{with_gpu}."
         )
     return count
-
-
-def _news(ray: ModuleType, board: Any, tasks: list[Any]) -> Iterator[News]:
-    """What the workers have done, now and then until all have ended."""
-    try:
-        while tasks:
-            ended, tasks = ray.wait(tasks, num_returns=len(tasks), timeout=POLL)
-            yield ray.get(board.news.remote())
-            ray.get(ended)  # raises what ended a worker
-    except ray.exceptions.RayError as error:
-        cause = getattr(error, "cause", None)
-        if cause is not None and not isinstance(cause, ray.exceptions.RayError):
-            raise cause from error  # what went wrong in a worker
-        raise InputError(
-            f"ray has failed ({_line(error)}): what came back is kept; run the same command again."
-        ) from error
 
 
 def _environment(workers: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ Worlds for tuning, validation and testing come from seeds that never meet.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -32,7 +33,7 @@ from rps_jax.trials.trial import Outcome
 from rps_jax.trials.worlds import drawn_worlds, remembered_steps
 from rps_jax.world import points as points_
 from rps_jax.world.domain import Domain, DomainLike, named
-from rps_jax.world.draws import Draw, table
+from rps_jax.world.draws import Draw
 from rps_jax.world.points import Points
 
 
@@ -90,7 +91,8 @@ def evaluate(
       (4,)
     """
     ranges, params = named(domain, robot), candidates(law)
-    count, at = points_.asked(ranges, worlds if points is None else points)
+    at = None if points is None else points_.checked(ranges, points)
+    count = worlds if at is None else len(at.u)
     errors.check_count("worlds", count, at_most=10_000_000)
     errors.check_count("seed", setting.seed, at_least=0, at_most=2**30)
     engines.get(setting.engine).check(ranges.families)
@@ -110,7 +112,8 @@ def evaluate(
         dims = ("candidate", "world", "pose")[: values.ndim]
         plain = values.astype(np.int8) if values.dtype == bool else values
         variables[name] = (dims, plain, {"units": unit, "long_name": meaning})
-    return xr.Dataset(variables, {"pose": ["x", "y", "yaw"]} | _drawn(ranges, ask))
+    drawn = points_.coordinates(ranges, ask.object_of(ranges), partial(ask.draw, ranges))
+    return xr.Dataset(variables, {"pose": ["x", "y", "yaw"], "world": ask.worlds} | drawn)
 
 
 def stack(laws: Sequence[LawLike]) -> Params:
@@ -155,11 +158,7 @@ def candidates(law: LawLike | Sequence[LawLike]) -> Params:
 
 
 def _checked(params: Params) -> Params:
-    """Bring parameters to the host.
-
-    Raises:
-      InputError: they are not of several candidates of one law, or mean nothing.
-    """
+    """Bring parameters of candidates of one law to the host; InputError if they are none."""
     law, name = registry.law_of(params), type(params).__name__
     sizes = {}
     for place, leaf in registry.numbers(params).items():
@@ -186,22 +185,6 @@ def _checked(params: Params) -> Params:
         except InputError as error:
             raise InputError(f"candidate {p}: {error}") from error
     return params
-
-
-def _drawn(domain: Domain, ask: Ask) -> dict[str, Any]:
-    """Coordinates of the worlds of an ask: their indices, objects, and what was drawn."""
-    which = ask.object_of(domain)
-    columns: dict[str, Any] = {
-        "world": ask.worlds,
-        "object": ("world", np.array(domain.objects)[which]),
-    }
-    for thing in np.unique(which):
-        rows = np.flatnonzero(which == thing)
-        drawn = ask.draw(domain, rows)
-        for name, (values, unit) in table(drawn).items():
-            empty = ("world", np.empty(which.size), {"units": unit})
-            columns.setdefault(name, empty)[1][rows] = values
-    return columns
 
 
 # --- several asks at once ------------------------------------------------------------------
@@ -259,12 +242,13 @@ def try_out(
     widths = [len(domains) * ask.worlds.size for ask in asks]
     counts = [ask.candidates for ask in asks]
     ends = np.cumsum(np.multiply(widths, counts))
+    narrow = partial(np.asarray, dtype=jnp.zeros(()).dtype)
     longest = max(remembered_steps(one, setting.physics.control_period) for one in domains)
     away = np.empty(ends[-1])  # [m] of the target from the start
     jobs: dict[Any, list[_Group]] = {}
     for ask, width, count, end in zip(asks, widths, counts, ends, strict=True):
         first = int(end) - count * width
-        ask = ask._replace(params=_narrow(jax.device_get(ask.params)))
+        ask = ask._replace(params=jax.tree.map(narrow, jax.device_get(ask.params)))
         for part, column, distance in parts(ask, domains, setting):
             away[first:end].reshape(count, width)[:, column] = distance
             part = _prepared(part, longest, ask.params)
@@ -292,11 +276,6 @@ def parts(
             drawn = ask.draw(one, rows)
             part = drawn_worlds(one, drawn, RPSParams(), setting)
             yield part, d * ask.worlds.size + rows, np.linalg.norm(drawn.p_world_target, axis=1)
-
-
-def _narrow(params: Params) -> Params:
-    dtype = jnp.zeros(()).dtype
-    return jax.tree.map(lambda leaf: np.asarray(leaf, dtype), params)
 
 
 def _prepared(part: Part, steps: int, params: Params) -> Part:

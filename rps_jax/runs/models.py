@@ -7,22 +7,24 @@ over models says what another simulation would have.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import xarray as xr
 
 from rps_jax.analysis.report import Section
 from rps_jax.engines import EngineName
+from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.runs import sweep as sweeps
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of
 from rps_jax.runs.sweep import OfPlan
 from rps_jax.trials.progress import InTurn, Report, unheard
-from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
+from rps_jax.world.physics import MUJOCOS_GROUND, preset
 
 _HALVED = replace(preset(), timestep=0.005)
 # Fine enough for MuJoCo's own ground, on which sliding objects hop.
@@ -30,41 +32,31 @@ _FINE = replace(preset(), timestep=0.002, **MUJOCOS_GROUND)
 OWN = "as asked"  # the model of the sweep itself
 
 
-class Model(NamedTuple):
-    """A physics that can be defended."""
-
-    physics: Physics
-    engine: EngineName | None = None  # None: that of the sweep
-
-
 # What can be defended, beside what a sweep was asked for.
 MODELS = {
-    "this ground, 10 ms": Model(preset()),
-    "this ground, 5 ms": Model(_HALVED),
-    "MuJoCo's ground, 5 ms": Model(replace(_HALVED, **MUJOCOS_GROUND)),
-    "MuJoCo's ground, 2 ms": Model(_FINE),
-    "MuJoCo's ground, impratio 1, 2 ms": Model(replace(_FINE, impratio=1.0)),
-    "quasi-static": Model(preset(), "quasistatic"),
-    "friction pyramid, 1 ms": Model(preset("paper_gazebo")),
+    "this ground, 10 ms": preset(),
+    "this ground, 5 ms": _HALVED,
+    "MuJoCo's ground, 5 ms": replace(_HALVED, **MUJOCOS_GROUND),
+    "MuJoCo's ground, 2 ms": _FINE,
+    "MuJoCo's ground, impratio 1, 2 ms": replace(_FINE, impratio=1.0),
+    "quasi-static": preset(),
+    "friction pyramid, 1 ms": preset("paper_gazebo"),
 }
+ENGINES: dict[str, EngineName] = {"quasi-static": "quasistatic"}  # of the others that of the sweep
 
 
 def plans(plan: Plan) -> dict[str, Plan]:
     """A sweep on every model that can step its worlds, its own first; the worlds are the same."""
     found = {OWN: plan}
-    for name, (physics, engine) in MODELS.items():
-        engine = engine or plan.setting.engine
-        setting = replace(plan.setting, physics=physics, engine=engine)
-        other = replace(plan, setting=setting)
-        if setting != plan.setting and other.works:
-            found[name] = other
+    for name, physics in MODELS.items():
+        engine = ENGINES.get(name, plan.setting.engine)
+        with contextlib.suppress(InputError):  # the engine knows no such worlds, laws or physics
+            setting = replace(plan.setting, physics=physics, engine=engine)
+            other = replace(plan, setting=setting)
+            other.check_here()
+            if setting != plan.setting:
+                found[name] = other
     return found
-
-
-def folder_of(out: Path, model: str) -> Path:
-    """Where in a run folder the sweep on a model is kept."""
-    name = "".join(letter if letter.isalnum() else "_" for letter in model)
-    return out / "models" / name
 
 
 @dataclass(frozen=True)
@@ -129,7 +121,8 @@ def complete(
     for name, one in plans(plan).items():
         if name in found:
             continue
-        folder = out if out is None or one is plan else folder_of(out, name)
+        plain = "".join(letter if letter.isalnum() else "_" for letter in name)
+        folder = out if out is None or one is plan else out / "models" / plain
         found[name] = sweeps.whole(one, folder, report=heard, **shape)
         heard.ended(one.trials)
     joined = xr.concat(found.values(), "model", coords="minimal", compat="override")

@@ -71,23 +71,9 @@ class Plan:
             engine.check_senses(registry.law_of(params).senses)
 
     @property
-    def works(self) -> bool:
-        """Whether `check_here` has nothing against it, and the engine knows the physics."""
-        try:
-            engines.get(self.setting.engine).check_physics(self.setting.physics)
-            self.check_here()
-        except errors.InputError:
-            return False
-        return True
-
-    @property
     def trials(self) -> int:
         """How many: trial a * worlds + i is of law a in world i."""
         return len(self.laws) * self.worlds
-
-    def trials_of(self, shard: Shard) -> int:
-        """How many trials one shard has."""
-        return sum(numbers.size for numbers in share(self, shard).values())
 
     def object_of(self, index: np.ndarray) -> np.ndarray:
         """Which of the domain's objects the worlds `index` have."""
@@ -99,17 +85,12 @@ class Plan:
         of_objects = np.bincount(self.object_of(np.arange(self.worlds)))
         return math.ceil(of_objects.max() / self.part)
 
-    def worlds_of(self, which: int) -> np.ndarray:
-        """Indices of the worlds with the object `which` of the domain, in order."""
-        every = np.arange(self.worlds)
-        return every[self.object_of(every) == which]
-
     @functools.cached_property
     def parts(self) -> dict[int, np.ndarray]:
         """Numbers of the trials of every part, by the part's number."""
-        found = {}
+        found, objects = {}, self.object_of(np.arange(self.worlds))
         for which in range(len(self.domain.objects)):
-            of_object = self.worlds_of(which)
+            of_object = np.flatnonzero(objects == which)
             for law in range(len(self.laws)):
                 for block in range(math.ceil(of_object.size / self.part)):
                     some = of_object[block * self.part : (block + 1) * self.part]
@@ -161,11 +142,7 @@ class Shard:
 
     @classmethod
     def named(cls, text: str) -> Shard:
-        """Read a share written as K/N.
-
-        Raises:
-          InputError: it is not written so, or is none.
-        """
+        """Read a share written as K/N; InputError if it is none."""
         found = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", str(text))
         if not found:
             raise InputError(f"shard = {text} is not allowed: write k/n, as 3/8.")
@@ -178,11 +155,7 @@ class Shard:
 
 
 def open_run(folder: Path, plan: Plan) -> Path:
-    """The run folder with the plan in it; a folder that has one must have the same.
-
-    Raises:
-      InputError: it cannot be written, or holds a run of another configuration.
-    """
+    """The run folder with the plan in it; InputError if it holds another one."""
     run_folder.claim(folder, plan.configuration())
     if plan.points is not None:
         plan.points.write(folder, plan.domain)
@@ -190,11 +163,7 @@ def open_run(folder: Path, plan: Plan) -> Path:
 
 
 def load_plan(folder: Path) -> Plan:
-    """The plan of a run folder.
-
-    Raises:
-      InputError: it holds none, or a corrupt one, or one of another version of this code.
-    """
+    """The plan of a run folder; InputError if it holds none, or one of another version."""
     found = run_folder.manifest(folder)
     if "arms" in found or "strategies" in found:  # as 0.2.0 called them
         raise InputError(

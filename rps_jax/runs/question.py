@@ -21,7 +21,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Literal, NamedTuple, ParamSpec, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, Literal, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -79,15 +79,7 @@ class Run(NamedTuple):
         return {"slots": self.slots, "workers": self.workers, "report": self.report}
 
 
-class Asks(Protocol[T]):
-    """What can be asked for: called, it gives its answer."""
-
-    def __call__(self) -> T:
-        """Answer."""
-        ...
-
-
-def call_of(question: Callable[P, Asks[T]]) -> Callable[P, T]:
+def call_of(question: Callable[P, Question[T]]) -> Callable[P, T]:
     """Make a function of a question, with its fields as arguments, that returns its answer."""
 
     @functools.wraps(question, assigned=("__module__", "__doc__"), updated=())
@@ -170,11 +162,7 @@ class Question(Generic[T]):
     # --- what is made of it ---
 
     def __call__(self) -> T:
-        """Check, run what is missing, and return the answer.
-
-        Raises:
-          InputError: a field is not allowed, or `out` holds another run.
-        """
+        """Check, run what is missing, and return the answer; InputError for what is not allowed."""
         asked = self.asked()
         asked.checked()
         device.use_cache_if_asked()

@@ -13,9 +13,8 @@ import xarray as xr
 
 from rps_jax.errors import InputError
 from rps_jax.record import files
-from rps_jax.record import folder as run_folder
 from rps_jax.record.checkpoint import Parts
-from rps_jax.runs.plan import Plan, load_plan, open_run
+from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import labelled
 from rps_jax.trials.results import UNITS
 from rps_jax.trials.trial import Outcome
@@ -34,17 +33,6 @@ def name_of(part: int) -> str:
     return f"{part:07d}"
 
 
-class _Rows:
-    """Outcomes of the trials of a part that is begun, by name."""
-
-    def __init__(self, size: int, like: Outcome):
-        self.missing = size
-        self.leaves = {
-            name: np.empty((size, *leaf.shape[1:]), _TYPES.get(name, np.float32))
-            for name, leaf in like._asdict().items()
-        }
-
-
 class Collector:
     """Trials on their way into the files of their parts."""
 
@@ -55,12 +43,9 @@ class Collector:
         self._part_of = np.empty(plan.trials, np.int32)
         for number, trials in plan.parts.items():
             self._part_of[trials] = number
-        self._open: dict[int, _Rows] = {}
-        self._drawn: dict[int, Columns] = {}
-
-    def expect(self, part: int, drawn: Columns) -> None:
-        """A part is begun; what was drawn for its worlds will stand in its file."""
-        self._drawn[part] = drawn
+        self._open: dict[int, dict[str, np.ndarray]] = {}
+        self._missing = {number: trials.size for number, trials in plan.parts.items()}
+        self.drawn: dict[int, Columns] = {}  # for the worlds of a part, to stand in its file
 
     def collect(self, numbers: np.ndarray, outcomes: Outcome) -> None:
         """Outcomes of trials that ended; the parts that are complete with them are kept."""
@@ -68,16 +53,17 @@ class Collector:
         for part in map(int, np.unique(part_of)):
             ended = part_of == part
             trials = self._parts[part]
-            if part not in self._open:
-                self._open[part] = _Rows(trials.size, outcomes)
-            rows = self._open[part]
+            rows = self._open.setdefault(part, {})
             at = np.searchsorted(trials, numbers[ended])
             for name, leaf in outcomes._asdict().items():
-                rows.leaves[name][at] = leaf[ended]
-            rows.missing -= at.size
-            if not rows.missing:
-                drawn = self._drawn.pop(part, {})
-                self._keep(part, _content(trials, self._open.pop(part).leaves, drawn))
+                if name not in rows:
+                    shape = trials.size, *leaf.shape[1:]
+                    rows[name] = np.empty(shape, _TYPES.get(name, np.float32))
+                rows[name][at] = leaf[ended]
+            self._missing[part] -= at.size
+            if not self._missing[part]:
+                drawn = self.drawn.pop(part, {})
+                self._keep(part, _content(trials, self._open.pop(part), drawn))
 
 
 def _content(trials: np.ndarray, leaves: dict[str, np.ndarray], drawn: Columns) -> bytes:
@@ -90,32 +76,8 @@ def _content(trials: np.ndarray, leaves: dict[str, np.ndarray], drawn: Columns) 
     return files.encoded(xr.Dataset(columns))
 
 
-def merge(folders: list[Path], out: Path) -> tuple[Plan, xr.Dataset]:
-    """The plan of some run folders, and `gather`.
-
-    `out` becomes a run folder of that plan, if it is not one of these folders.
-
-    Raises:
-      InputError: the folders differ in their plan, or parts are missing; `out` cannot be written,
-        or holds another run.
-    """
-    manifest = run_folder.manifest(folders[0])
-    for other in folders[1:]:
-        if (theirs := run_folder.manifest(other)) != manifest:
-            raise InputError(
-                f"run = {other} is of another plan than {folders[0]} "
-                f"({run_folder.difference(manifest, theirs)}): merge shards of one run."
-            )
-    plan = load_plan(folders[0])
-    return plan, gather(plan, folders, open_run(out, plan))
-
-
 def gather(plan: Plan, folders: Sequence[Path], out: Path) -> xr.Dataset:
-    """All parts of a plan as one Dataset, and as `results.nc` in the folder `out`.
-
-    Raises:
-      InputError: parts are missing in the folders, or `out` cannot be written.
-    """
+    """All parts of a plan as one Dataset, and as `results.nc` in `out`; InputError if some lack."""
     kept = {name: part for one in folders for name, part in Parts(one).contents().items()}
     contents = {n: kept[name_of(n)] for n in plan.parts if name_of(n) in kept}
     if missing := len(plan.parts) - len(contents):
@@ -129,11 +91,7 @@ def gather(plan: Plan, folders: Sequence[Path], out: Path) -> xr.Dataset:
 
 
 def dataset(plan: Plan, contents: Mapping[int, bytes]) -> xr.Dataset:
-    """All results of a plan, from the contents of all its parts: (law, world), and (world) drawn.
-
-    Raises:
-      InputError: a part was made by another version of this code.
-    """
+    """All results of a plan, from the contents of its parts: (law, world), and (world) drawn."""
     every = np.arange(plan.worlds)
     which = {"units": "1", "long_name": "index of the object in the coordinate object"}
     objects = plan.object_of(every).astype(np.int16)

@@ -29,21 +29,12 @@ from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
 from rps_jax.record.checkpoint import Parts
 from rps_jax.record.options import option
-from rps_jax.runs.plan import Kind, Plan, Shard, draw, made, open_run, share
-from rps_jax.runs.question import InDomain, OfLaws, Pushes, Run, call_of, labelled
-from rps_jax.runs.results import (
-    UNITS,
-    Collector,
-    Keep,
-    check_table,
-    dataset,
-    gather,
-    name_of,
-    write_table,
-)  # fmt: skip
+from rps_jax.runs import results
+from rps_jax.runs.plan import Kind, Plan, Shard, draw, load_plan, made, open_run, share
+from rps_jax.runs.question import InDomain, OfLaws, Pushes, Question, Run, call_of, labelled
 from rps_jax.trials import batch
 from rps_jax.trials.batch import Job, Part
-from rps_jax.trials.progress import Progress, Report, Timing, unheard
+from rps_jax.trials.progress import Progress, Report, unheard
 from rps_jax.world import points
 from rps_jax.world.draws import table
 
@@ -84,15 +75,16 @@ class OfPlan(Planned, InDomain[xr.Dataset], OfLaws[xr.Dataset]):
     worlds: int | None = option(None, 1, 1_000_000_000)
     """Number of worlds, of indices 0, 1, ...; by default 1000, or the whole grid of a domain with
     listed targets."""
-    part: int = option(1024, 1, 1_000_000, kw_only=True)
-    """Number of trials in a part: what is lost of each law and object when killed, at most."""
+    part: int | None = option(None, 1, 1_000_000, kw_only=True)
+    """Number of trials in a part: what is lost of each law and object when killed, at most; by
+    default 1024, and of many worlds a 64th, up to 16384."""
 
     @functools.cached_property
     def plan(self) -> Plan:
         """What is run."""
         usual = self.ranges.combinations if self.ranges.targets else 1000
         count = usual if self.worlds is None else self.worlds
-        return Plan(self.ranges, count, self.chosen, self.setting, self.part)
+        return Plan(self.ranges, count, self.chosen, self.setting, self.part or _part_of(count))
 
     def intro(self, found: xr.Dataset) -> str:
         """What was asked."""
@@ -101,6 +93,11 @@ class OfPlan(Planned, InDomain[xr.Dataset], OfLaws[xr.Dataset]):
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
         """Rates, differences, what success depends on, and the hardest worlds."""
         return report_of(self.plan, found, run.folder)
+
+
+def _part_of(worlds: int) -> int:
+    """How many trials a part has: a file costs more than the trials in it."""
+    return min(max(worlds // 64, 1024), 16384)
 
 
 def intro_of(plan: Plan) -> str:
@@ -115,12 +112,16 @@ def intro_of(plan: Plan) -> str:
 
 def report_of(plan: Plan, found: xr.Dataset, folder: Path | None) -> list[Section]:
     """Rates, differences, what success depends on, and the hardest worlds of a plan."""
-    return [
-        rates(found, float(plan.setting.rules.max_lost)),
-        *differences(found),
-        *dependence(found),
-        hardest(found, folder),
-    ]
+    told = [rates(found, float(plan.setting.rules.max_lost))]
+    if found.sizes["law"] > 1:
+        rows = tables.difference_table(found)
+        told.append(Section("Differences, world by world", "", rows))
+    if statistics.drawn(found):
+        picture = Picture("success", functools.partial(figures.success_curves, found))
+        told.append(Section("Success against what was drawn", "", (), picture))
+    text = "Worlds in which most laws fail, and most distance is left."
+    rows = tables.hardest_table(found, "RUN" if folder is None else str(folder))
+    return [*told, Section("The hardest worlds", text, rows)]
 
 
 def rates(found: xr.Dataset, max_lost: float) -> Section:
@@ -133,28 +134,6 @@ def rates(found: xr.Dataset, max_lost: float) -> Section:
     if lost := int((found.overflows.values > 0).sum()):
         text += f" {lost} trials lost contacts for want of room: they are not to be trusted."
     return Section("Success", text, tables.success_table(found, max_lost))
-
-
-def differences(found: xr.Dataset) -> list[Section]:
-    """Laws against each other, world by world."""
-    if found.sizes["law"] < 2:
-        return []
-    return [Section("Differences, world by world", "", tables.difference_table(found))]
-
-
-def dependence(found: xr.Dataset) -> list[Section]:
-    """What success depends on."""
-    if not statistics.drawn(found):
-        return []
-    picture = Picture("success", functools.partial(figures.success_curves, found))
-    return [Section("Success against what was drawn", "", (), picture)]
-
-
-def hardest(found: xr.Dataset, folder: Path | None) -> Section:
-    """The worlds in which most laws fail."""
-    text = "Worlds in which most laws fail, and most distance is left."
-    run = "RUN" if folder is None else str(folder)
-    return Section("The hardest worlds", text, tables.hardest_table(found, run))
 
 
 @dataclass(frozen=True)
@@ -201,7 +180,8 @@ class Sweep(OfPlan):
         if isinstance(given, str | Path):
             given = files.read(Path(given))
         at = points.checked(self.ranges, given)
-        return Plan(self.ranges, len(at.u), self.chosen, self.setting, self.part, at)
+        part = self.part or _part_of(len(at.u))
+        return Plan(self.ranges, len(at.u), self.chosen, self.setting, part, at)
 
     @property
     def share(self) -> Shard:
@@ -215,7 +195,7 @@ class Sweep(OfPlan):
         if self.table is not None:
             if self.share.of > 1:
                 raise InputError("table is not allowed with a shard: it is of all worlds.")
-            check_table(Path(self.table))
+            results.check_table(Path(self.table))
         if self.models and (self.ray or self.share.of > 1):
             raise InputError("models is not allowed with ray or a shard: run it in one process.")
         if self.out is None and (self.ray or self.share.of > 1):
@@ -225,13 +205,13 @@ class Sweep(OfPlan):
 
     def trials(self) -> int | None:
         """How many trials its share has."""
-        return self.plan.trials_of(self.share)
+        return sum(numbers.size for numbers in share(self.plan, self.share).values())
 
     def answered(self, report: Report) -> xr.Dataset:
         """Outcomes, written as a table, too, where that is asked for."""
         found = super().answered(report)
         if self.table is not None:
-            write_table(found, Path(self.table))
+            results.write_table(found, Path(self.table))
         return found
 
     def answer(self, run: Run) -> xr.Dataset:
@@ -244,10 +224,10 @@ class Sweep(OfPlan):
                 from rps_jax.runs import cluster
 
                 by = cluster.on_cluster(self.ray, self.ray_device)
-            _, results = complete(run.folder, self.plan, self.share, by=by, **run.shape)
-            if results is None:
+            joined = complete(run.folder, self.plan, self.share, by=by, **run.shape)
+            if joined is None:
                 return own_trials(run.folder, self.plan, self.share)
-            found = labelled(results)
+            found = labelled(joined)
         if self.models:
             from rps_jax.runs import models
 
@@ -278,37 +258,74 @@ def spread(found: xr.Dataset) -> list[Section]:
 sweep = call_of(Sweep)
 
 
+@dataclass(frozen=True)
+class Merge(Question[xr.Dataset]):
+    """Merge the shards of a sweep into one run folder, with its results and its report."""
+
+    TITLE: ClassVar[str] = Sweep.TITLE
+
+    folders: tuple[Path, ...] = option((), positional=True)
+    """Run folders of the shards; one, if they share it."""
+    out: Path | str | None = option(None, kw_only=True)
+    """Run folder of the whole."""
+
+    def check(self) -> None:
+        """Check that there are shards, and where they go."""
+        if not self.folders:
+            raise InputError("folders = () is not allowed: give the run folders of the shards.")
+        if self.out is None:
+            raise InputError("out = None is not allowed: name the run folder of the whole.")
+
+    def answered(self, report: Report) -> xr.Dataset:
+        """Gather the parts of all shards."""
+        folders = [Path(one) for one in self.folders]
+        out = run_folder.writable(Path(str(self.out)))
+        manifest = run_folder.manifest(folders[0])
+        for other in folders[1:]:
+            if (theirs := run_folder.manifest(other)) != manifest:
+                raise InputError(
+                    f"run = {other} is of another plan than {folders[0]} "
+                    f"({run_folder.difference(manifest, theirs)}): merge shards of one run."
+                )
+        plan = load_plan(folders[0])
+        found = results.gather(plan, folders, open_run(out, plan))
+        for one in folders:
+            provenance.sign(out, provenance.signed(one))
+        return labelled(found)
+
+    def intro(self, found: xr.Dataset) -> str:
+        """What was asked."""
+        return intro_of(load_plan(Path(str(self.out))))
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """What a sweep reports."""
+        return report_of(load_plan(Path(str(self.out))), found, run.folder)
+
+
+merge = call_of(Merge)
+
+
 def whole(plan: Plan, out: Path | None, *, report: Report = unheard, **shape: Any) -> xr.Dataset:
     """All results of a plan, in a run folder, in which it can be continued, or in memory alone."""
     if out is not None:
-        _, results = complete(out, plan, report=report, **shape)
-        assert results is not None
-        return labelled(results)
+        found = complete(out, plan, report=report, **shape)
+        assert found is not None
+        return labelled(found)
     contents: dict[int, bytes] = {}
     every: dict[Kind, list[int]] = {}
     for number in plan.parts:
         every.setdefault(plan.kind(number), []).append(number)
     work(plan, every, contents.__setitem__, report=report, **shape)
-    return labelled(dataset(plan, contents))
+    return labelled(results.dataset(plan, contents))
 
 
 def own_trials(folder: Path, plan: Plan, shard: Shard) -> xr.Dataset:
     """Outcomes (row) of a shard's own trials, with the law and the world of each."""
-    kept = Parts(folder).contents()
-    found = []
-    for number in share(plan, shard):
-        part = files.decoded(kept[name_of(number)], f"part {number}", own=True)
-        part = part.drop_vars([name for name in part if name not in ("trial", *UNITS)])
-        law, _ = plan.law_and_object(number)
-        rows = part.sizes["row"]
-        own = {
-            "law": ("row", [list(plan.laws)[law]] * rows),
-            "world": ("row", part.trial.values % plan.worlds),
-        }
-        found.append(part.drop_vars("trial").assign_coords(own))
-    whole = xr.concat(found, "row")
-    assert isinstance(whole, xr.Dataset)
-    return whole
+    own, kept = share(plan, shard), Parts(folder).contents()
+    found = results.dataset(plan, {number: kept[results.name_of(number)] for number in own})
+    law, world = np.divmod(np.concatenate(list(own.values())), plan.worlds)
+    at = {"law": xr.DataArray(law, dims="row"), "world": xr.DataArray(world, dims="row")}
+    return found[list(results.UNITS)].isel(at)
 
 
 def run_missing(
@@ -318,7 +335,7 @@ def run_missing(
     shard: Shard = Shard(),
     report: Report = unheard,
     **shape: Any,
-) -> Timing:
+) -> None:
     """Run what is missing of a plan, or of one shard of it, in a folder that `open_run` opened."""
     missing, before = remaining(folder, plan, shard)
     report(Progress(before, 0.0))
@@ -328,7 +345,7 @@ def run_missing(
     def tell(progress: Progress) -> None:
         report(replace(progress, finished=before + progress.finished))
 
-    return work(plan, missing, functools.partial(store, folder), report=tell, **shape)
+    work(plan, missing, functools.partial(store, folder), report=tell, **shape)
 
 
 def complete(
@@ -336,50 +353,39 @@ def complete(
     plan: Plan,
     shard: Shard = Shard(),
     *,
-    by: Callable[..., Timing] = run_missing,
+    by: Callable[..., Any] = run_missing,
     **options: Any,
-) -> tuple[Timing, xr.Dataset | None]:
-    """Run what a folder lacks of a plan, or of one shard of it; gather the whole in `results.nc`.
+) -> xr.Dataset | None:
+    """Run what a folder lacks of a plan, and gather the whole in `results.nc`; or run one shard.
 
-    Args:
-      folder: the run folder, new or to be continued.
-      plan: what is run.
-      shard: the share that is run.
-      by: what runs it, as `run_missing` or `cluster.run_on_cluster`.
-      options: of `by`.
-
-    Returns:
-      Where the time went; and all results, unless it was but a share of them.
-
-    Raises:
-      InputError: the folder cannot be written, is in use, or holds another run.
+    `by` runs it with its `options`, as `run_missing` or `cluster.run_on_cluster`.
     """
     open_run(folder, plan)
     with run_folder.hold(folder, shard.number, shard.of):
-        timing = by(folder, plan, shard=shard, **options)
-        return timing, gather(plan, [folder], folder) if shard.of == 1 else None
+        by(folder, plan, shard=shard, **options)
+        return results.gather(plan, [folder], folder) if shard.of == 1 else None
 
 
 def work(
     plan: Plan,
     numbers: Mapping[Kind, Iterable[int]],
-    keep: Keep,
+    keep: results.Keep,
     *,
     report: Callable[[Progress], Any],
     **shape: Any,
-) -> Timing:
+) -> None:
     """Run some parts of a plan: of each kind those with these numbers, asked for one by one.
 
     There are as many slots as the whole plan has use for, whatever parts are run, so that a part
     has the same bits whoever runs it, and with whatever other parts.
     """
-    jobs, collector = [], Collector(plan, keep)
+    jobs, collector = [], results.Collector(plan, keep)
     for kind, some in numbers.items():
         parts = _made(plan, some, collector)
         if isinstance(some, Sequence):  # what is asked for elsewhere is asked for when it is needed
             parts = _ahead(parts, max(1, _AHEAD // plan.part))
         jobs.append(Job(registry.of_class(kind[1]), plan.sizes[kind], parts))
-    return batch.run(jobs, plan.setting, collect=collector.collect, report=report, **shape)
+    batch.run(jobs, plan.setting, collect=collector.collect, report=report, **shape)
 
 
 def remaining(folder: Path, plan: Plan, shard: Shard) -> tuple[dict[Kind, list[int]], int]:
@@ -388,20 +394,20 @@ def remaining(folder: Path, plan: Plan, shard: Shard) -> tuple[dict[Kind, list[i
     missing: dict[Kind, list[int]] = {}
     before = 0
     for number, trials in share(plan, shard).items():
-        if name_of(number) in done:
+        if results.name_of(number) in done:
             before += trials.size
         else:
             missing.setdefault(plan.kind(number), []).append(number)
     return missing, before
 
 
-def _made(plan: Plan, numbers: Iterable[int], collector: Collector) -> Iterator[Part]:
+def _made(plan: Plan, numbers: Iterable[int], collector: results.Collector) -> Iterator[Part]:
     """The worlds of parts, made one part at a time; the first law's keep what was drawn."""
     for number in numbers:
         trials, (law, _) = plan.parts[number], plan.law_and_object(number)
         drawn = draw(plan, trials % plan.worlds)
         if law == 0:
-            collector.expect(number, table(drawn))
+            collector.drawn[number] = table(drawn)
         yield made(plan, law, drawn)._replace(numbers=trials)
 
 
@@ -416,4 +422,4 @@ def _ahead(parts: Iterator[Part], count: int) -> Iterator[Part]:
 
 def store(folder: Path, part: int, content: bytes) -> Path:
     """Write the file of a part into a run folder, whole or not at all."""
-    return Parts(folder).put(name_of(part), content, new=True)
+    return Parts(folder).put(results.name_of(part), content, new=True)

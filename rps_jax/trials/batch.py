@@ -10,7 +10,7 @@ import functools
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import partial
 from typing import Any, NamedTuple
@@ -31,9 +31,11 @@ from rps_jax.trials.trial import Outcome, Rules, Trial, World
 from rps_jax.world.physics import Physics
 
 SEGMENT = 10.0  # [s] simulated between two looks at which trials have ended
-# A GPU takes the last trials of a job into ever fewer slots, each time a quarter of them, as long
-# as there are this many: fewer take it as long.
-_FEWEST = 4096
+# A GPU steps a few thousand worlds in hardly less time than a few. So a worker there sets aside
+# what runs of a job when none of its trials waits and no more than this many run, and takes the
+# next job; in the end what was set aside of all jobs is run side by side.
+_ASIDE = 4096
+_SIDE_BY_SIDE = 4  # jobs, at most: a program of more would be long in compiling
 
 
 class Part(NamedTuple):
@@ -87,20 +89,17 @@ def run(
     engine, backend = engines.get(setting.engine), jax.default_backend()
     slots = slots or engine.slots(backend)
     workers = workers or engine.workers(backend)
-    shared = _Shared(collect, report)
+    shared = _Shared(collect, report, workers)
     began = time.perf_counter()
     if not engine.traced:
         count = max(1, min(workers, len(jobs)))
         tasks = [partial(_run_on_host, job, setting, workers // count, shared) for job in jobs]
     else:
-        count = workers
-        queues = [_Queue(job, setting, slots) for job in jobs]
-        orders = [queues[w % len(queues) :] + queues for w in range(count if queues else 0)]
-        tasks = [_Worker(order, shared).work for order in orders]
+        plan = _Schedule([_Queue(job) for job in jobs], setting, slots, workers)
+        tasks = [partial(_Worker(plan, shared).work, number) for number in range(workers)]
         if backend != "cpu":  # the processor is idle: compile all at once, what is needed first
-            programs = [width.program for width in sorted(_widths(queues), key=_slots_of)[::-1]]
-            tasks += programs
-            count += len(programs)
+            tasks += [each.program for each in plan.batches]
+        count = len(tasks)
     _side_by_side(tasks, count, shared)
     warn_of_lost(shared.overflowed)
     total = time.perf_counter() - began
@@ -152,6 +151,7 @@ def _side_by_side(tasks: Sequence[Callable[[], None]], count: int, shared: _Shar
                 job.result()
         except BaseException:
             shared.stop = True
+            shared.drained.abort()
             pool.shutdown(wait=False, cancel_futures=True)
             raise
 
@@ -159,7 +159,8 @@ def _side_by_side(tasks: Sequence[Callable[[], None]], count: int, shared: _Shar
 class _Shared:
     """What the workers report into."""
 
-    def __init__(self, collect: Collect, report: Callable[[Progress], Any]):
+    def __init__(self, collect: Collect, report: Callable[[Progress], Any], workers: int):
+        self.drained = threading.Barrier(workers)  # no trial of any queue waits
         self.simulated = 0.0
         self.compile = 0.0
         self.overflowed = 0  # trials
@@ -213,20 +214,22 @@ def _run_on_host(job: Job, setting: Setting, threads: int, shared: _Shared) -> N
 
 
 class _Queue:
-    """The waiting trials of one job, and the batches that can run them, the widest first."""
+    """The waiting trials of one job, and those that run and were set aside."""
 
-    def __init__(self, job: Job, setting: Setting, slots: int):
-        self.law = job.law
+    def __init__(self, job: Job):
+        self.law, self.trials = job.law, job.trials
         self._parts = iter(job.parts)
-        first = next(self._parts)
-        self._waiting: Part | None = first  # what is left of it
+        self.like: Part = next(self._parts)
+        self._waiting: Part | None = self.like  # what is left of it
         self._lock = threading.Lock()
-        devices = jax.device_count()
-        widest = min(slots, -(-job.trials // devices))
-        fewest = _FEWEST if jax.default_backend() != "cpu" else widest
-        self.widths = [
-            _Width(job.law, setting, first, devices * each) for each in _ever_fewer(widest, fewest)
-        ]
+        self.aside: list[tuple[Part, Trial]] = []
+
+    @property
+    def waits(self) -> bool:
+        """Whether any trial waits."""
+        with self._lock:
+            self._waiting = self._waiting or next(self._parts, None)
+            return self._waiting is not None
 
     def take(self, count: int) -> list[Part]:
         """Up to `count` waiting trials, as pieces of parts."""
@@ -239,26 +242,55 @@ class _Queue:
         return taken
 
 
-def _ever_fewer(slots: int, fewest: int) -> Iterator[int]:
-    """`slots`, a quarter of them and so on, as long as that is not less than `fewest`."""
-    yield slots
-    while (slots := slots // 4) >= fewest:
-        yield slots
+class _Schedule:
+    """Which batches run which queues: first those of one queue, then those of several."""
+
+    def __init__(self, queues: Sequence[_Queue], setting: Setting, slots: int, workers: int):
+        devices, self.most_aside = jax.device_count(), _most_aside()
+        self.own, groups = [], {}
+        together = engines.get(setting.engine).side_by_side
+        for number, queue in enumerate(queues):
+            width = devices * min(slots, -(-queue.trials // devices))
+            if width > self.most_aside:
+                self.own.append(_Batch([queue], [width], setting))
+                width = min(devices * -(-queue.trials // devices), workers * self.most_aside)
+            if width:
+                groups.setdefault(queue.law if together else number, []).append((queue, width))
+        self.last = [
+            _Batch(*zip(*some, strict=True), setting)
+            for group in groups.values()
+            for some in _by(group, _SIDE_BY_SIDE)
+        ]
+
+    @property
+    def batches(self) -> list[_Batch]:
+        """All, those that are needed first in front."""
+        return [*self.own, *self.last]
 
 
-class _Width:
-    """A batch of so many slots on all devices of the host, and its program once compiled."""
+def _most_aside() -> int:
+    """How many running trials of a job a worker sets aside, at most."""
+    return 0 if jax.default_backend() == "cpu" else jax.device_count() * _ASIDE
 
-    def __init__(self, law: Law, setting: Setting, like: Part, slots: int):
-        self.slots = slots
-        self.stage = like.stage
-        self.setting = setting
-        self._law = law
+
+def _by(every: Sequence[Any], most: int) -> list[Sequence[Any]]:
+    return [every[i : i + most] for i in range(0, len(every), most)]
+
+
+class _Batch:
+    """So many slots for each of some queues on all devices of the host, and their program.
+
+    All queues are of one law. What is done of a batch is done to its queues side by side.
+    """
+
+    def __init__(self, queues: Sequence[_Queue], slots: Sequence[int], setting: Setting):
+        self.queues, self.slots, self.setting = queues, slots, setting
+        self.law = queues[0].law
+        self.stages = tuple(queue.like.stage for queue in queues)
         self.sharding = None
         if jax.device_count() > 1:
             mesh = jax.make_mesh((jax.device_count(),), ("worlds",), (AxisType.Auto,))
             self.sharding = NamedSharding(mesh, P("worlds"))
-        self._worlds = jax.tree.map(self._batched, like.worlds)
         self._compiling = threading.Lock()
         self._program = None
         self.ready = 0.0  # [s] of `time.perf_counter`, when the program was there
@@ -275,33 +307,20 @@ class _Width:
         """Leaves (slots, ...) on the device, or split over all devices of the host."""
         return jax.device_put(tree, self.sharding)
 
-    def start(self, worlds: World, live: np.ndarray) -> Trial:
-        """New trials in all slots."""
-        return self.put(trial.start_all(worlds, live, law=self._law))
-
-    def refill(self, worlds: World, trials: Trial, fresh: np.ndarray) -> Trial:
-        """New trials in the slots that are `fresh` (slots,)."""
-        return self.put(_refill(worlds, trials, fresh, law=self._law))
-
-    def _batched(self, leaf: Any) -> jax.ShapeDtypeStruct:
-        shape = (self.slots, *leaf.shape[1:])
-        return jax.ShapeDtypeStruct(shape, leaf.dtype, sharding=self.sharding)
-
     def _compile(self) -> Any:
-        start = partial(trial.start_all, law=self._law)
-        live = jax.ShapeDtypeStruct((self.slots,), bool)
-        trials = jax.tree.map(self._batched, jax.eval_shape(start, self._worlds, live))
-        stage, rules = jax.eval_shape(lambda: (self.stage, self.setting.rules))
-        leaves, tree = jax.tree.flatten((stage, self._worlds, trials, rules))
-        return _compiled(self.setting.physics, self._law, self.sharding, tree, tuple(leaves))
+        worlds, trials = [], []
+        for queue, slots in zip(self.queues, self.slots, strict=True):
+            shaped = partial(self._batched, slots)
+            worlds.append(jax.tree.map(shaped, queue.like.worlds))
+            start = partial(trial.start_all, law=self.law)
+            live = jax.ShapeDtypeStruct((slots,), bool)
+            trials.append(jax.tree.map(shaped, jax.eval_shape(start, worlds[-1], live)))
+        stages, rules = jax.eval_shape(lambda: (self.stages, self.setting.rules))
+        leaves, tree = jax.tree.flatten((stages, tuple(worlds), tuple(trials), rules))
+        return _compiled(self.setting.physics, self.law, self.sharding, tree, tuple(leaves))
 
-
-def _widths(queues: Sequence[_Queue]) -> list[_Width]:
-    return [width for queue in queues for width in queue.widths]
-
-
-def _slots_of(width: _Width) -> int:
-    return width.slots
+    def _batched(self, slots: int, leaf: Any) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((slots, *leaf.shape[1:]), leaf.dtype, sharding=self.sharding)
 
 
 @functools.lru_cache(maxsize=32)
@@ -312,16 +331,16 @@ def _compiled(
     tree: Any,
     leaves: tuple[jax.ShapeDtypeStruct, ...],
 ) -> Any:
-    """`trial.advance` compiled for arguments of these shapes; later runs of the kind reuse it.
+    """`trial.advance_all` compiled for arguments of these shapes; later runs of the kind reuse it.
 
-    With the trials come their steps, who has ended, and how.
+    With the trials of each batch come their steps, who has ended, and how.
     """
 
     def advance(
-        stage: Any, worlds: World, trials: Trial, rules: Rules
-    ) -> tuple[Trial, tuple[jax.Array, jax.Array, Outcome]]:
-        after = trial.advance(
-            stage,
+        stages: tuple[Any, ...], worlds: tuple[World, ...], trials: tuple[Trial, ...], rules: Rules
+    ) -> tuple[tuple[Trial, ...], tuple[tuple[jax.Array, jax.Array, Outcome], ...]]:
+        after = trial.advance_all(
+            stages,
             worlds,
             trials,
             physics=physics,
@@ -330,7 +349,9 @@ def _compiled(
             steps=max(1, round(SEGMENT / physics.control_period)),
         )
         # Of the same program: one of its own would wait for the other workers' segments.
-        return after, (after.steps, after.done, trial.outcome(after, physics.control_period))
+        return after, tuple(
+            (one.steps, one.done, trial.outcome(one, physics.control_period)) for one in after
+        )
 
     if sharding is not None:  # each device runs its own worlds and waits for no other
         advance = jax.shard_map(
@@ -345,10 +366,10 @@ def _compiled(
     if sharding is None and who is not None:
         trials = arguments[2]
         names: tuple[Any, ...] = Outcome._fields  # any leaves: what counts is the structure
-        result = trials, (trials.steps, trials.done, Outcome(*names))
+        result = trials, tuple((one.steps, one.done, Outcome(*names)) for one in trials)
         static = (physics, who, SEGMENT)
         return programs.compiled(advance, arguments, result, donate=2, static=static)
-    return jax.jit(advance, donate_argnums=2).lower(*arguments).compile()
+    return programs.built(jax.jit(advance, donate_argnums=2).lower(*arguments))
 
 
 def rows(tree: Any, which: Any) -> Any:
@@ -378,89 +399,125 @@ def _refill(worlds: World, trials: Trial, fresh: jax.Array, *, law: Law) -> Tria
     return jax.tree.map(pick, started, trials)
 
 
-class _Held:
-    """The worlds in the slots of one worker, on the host."""
+class _Slots:
+    """The slots of one queue in a batch of one worker, and what is in them."""
 
-    def __init__(self, like: Part, slots: int):
-        self.numbers = np.zeros(slots, np.int64)
-        self._worlds = jax.tree.map(lambda leaf: np.repeat(leaf[:1], slots, axis=0), like.worlds)
+    def __init__(self, queue: _Queue, slots: int, batch: _Batch, resumed: bool):
+        self._queue, self._batch = queue, batch
+        self._numbers = np.zeros(slots, np.int64)
+        self.live = np.zeros(slots, bool)
+        self._before = np.zeros(slots, int)  # steps at the last look
+        like = queue.like.worlds
+        self._host = jax.tree.map(lambda leaf: np.repeat(leaf[:1], slots, axis=0), like)
+        self.worlds, self.trials = self._filled(queue.aside if resumed else ())
 
-    def put(self, at: np.ndarray, taken: Sequence[Part]) -> World:
-        """Put trials into the slots `at`; returns the worlds."""
+    def _filled(self, aside: Sequence[tuple[Part, Trial]]) -> tuple[World, Trial]:
+        """The first trials: those that were set aside, or else those that wait."""
+        if not aside:
+            worlds = self._put(np.arange(self.live.size), self._queue.take(self.live.size))
+            started = trial.start_all(worlds, self.live, law=self._batch.law)
+            return worlds, self._batch.put(started)
+        parts, states = zip(*aside, strict=True)
+        worlds = self._put(np.arange(self.live.size), parts)
+        running = jax.tree.map(lambda *leaves: np.concatenate(leaves), *states)
+        # What fills the other slots has ended.
+        running = rows(running, np.resize(np.arange(_count(parts)), self.live.size))
+        self._before = running.steps.copy()
+        return worlds, self._batch.put(running._replace(done=~self.live))
+
+    def _put(self, at: np.ndarray, taken: Sequence[Part]) -> World:
+        """Put trials into the first of the slots `at`; returns all worlds."""
+        at = at[: _count(taken)]
         ends = np.cumsum([part.numbers.size for part in taken])
-        for part, slots in zip(taken, np.split(at, ends[:-1]), strict=True):
-            self.numbers[slots] = part.numbers
+        for part, slots in zip(taken, np.split(at, ends[:-1]) if taken else (), strict=True):
+            self._numbers[slots] = part.numbers
             for mine, theirs in zip(
-                jax.tree.leaves(self._worlds), jax.tree.leaves(part.worlds), strict=True
+                jax.tree.leaves(self._host), jax.tree.leaves(part.worlds), strict=True
             ):
                 mine[slots] = theirs
+        self.live[at], self._before[at] = True, 0
         # A copy: the device may otherwise share the host's memory, which the next call changes.
-        return jax.tree.map(np.copy, self._worlds)
+        return self._batch.put(jax.tree.map(np.copy, self._host))
 
-    def keep(self, at: np.ndarray) -> World:
-        """Keep the slots `at` alone, in that order; returns their worlds."""
-        self.numbers, self._worlds = self.numbers[at], rows(self._worlds, at)
-        return jax.tree.map(np.copy, self._worlds)
+    def look(self, steps: np.ndarray, done: np.ndarray, outcomes: Outcome) -> tuple[Any, ...]:
+        """What `_Shared.add` takes of a segment; what ended in it makes room."""
+        at = np.flatnonzero(done & self.live)
+        period = self._batch.setting.physics.control_period
+        simulated = float((steps - self._before)[self.live].sum()) * period
+        ended = self._numbers[at], rows(outcomes, at), simulated
+        self._before = steps.copy()
+        self.live[at] = False
+        if taken := self._queue.take(at.size):
+            self.worlds = self._put(at, taken)
+            fresh = np.isin(np.arange(self.live.size), at[: _count(taken)])
+            refilled = _refill(self.worlds, self.trials, fresh, law=self._batch.law)
+            self.trials = self._batch.put(refilled)
+        return ended
+
+    def set_aside(self) -> None:
+        """Hand what runs over to the queue."""
+        at = np.flatnonzero(self.live)
+        part = Part(self._numbers[at], rows(self._host, at), self._queue.like.stage)
+        if at.size:
+            self._queue.aside.append((part, rows(jax.device_get(self.trials), at)))
 
 
 class _Worker:
-    """A host thread that drives a batch of its own through one queue after another."""
+    """A host thread that drives batches of its own."""
 
-    def __init__(self, queues: list[_Queue], shared: _Shared):
-        self._queues, self._shared = queues, shared
+    def __init__(self, schedule: _Schedule, shared: _Shared):
+        self._schedule, self._shared = schedule, shared
         self._waited = 0.0  # [s] for programs
 
-    def work(self) -> None:
-        """Until no trial waits in any queue."""
-        for queue in self._queues:
-            taken = [] if self._shared.stop else queue.take(queue.widths[0].slots)
-            if taken:
-                self._drain(queue, taken)
+    def work(self, number: int) -> None:
+        """Until no trial waits or runs; `number` is the worker's."""
+        own, last = self._schedule.own, self._schedule.last
+        first = number % max(1, len(own))
+        for batch in own[first:] + own[:first]:
+            self._run(batch, self._schedule.most_aside)
+        self._shared.drained.wait()
+        for batch in last[number :: self._shared.drained.parties]:
+            self._run(batch, 0)
 
-    def _program(self, width: _Width) -> Any:
+    def _program(self, batch: _Batch) -> Any:
         began = time.perf_counter()
-        program = width.program()
-        self._waited += max(0.0, width.ready - began)
+        program = batch.program()
+        self._waited += max(0.0, batch.ready - began)
         self._shared.compiled(self._waited)
         return program
 
-    def _drain(self, queue: _Queue, taken: list[Part]) -> None:
-        """Run trials, the `taken` first, until none waits and none of this worker's runs."""
-        width, *narrower = queue.widths
-        program, period = self._program(width), width.setting.physics.control_period
-        held = _Held(taken[0], width.slots)
-        first = np.arange(_count(taken))
-        live = np.arange(width.slots) < first.size
-        worlds = width.put(held.put(first, taken))
-        trials = width.start(worlds, live)
-        before = np.zeros(width.slots, int)
+    def _run(self, batch: _Batch, most_aside: int) -> None:
+        """Run the trials of a batch until none waits, and no more than so many run."""
+        if self._shared.stop:
+            return
+        pairs, resumed = zip(batch.queues, batch.slots, strict=True), not most_aside
+        every = [_Slots(*each, batch, resumed) for each in pairs]
+        if not any(each.live.any() for each in every):
+            return
+        program, stages, rules = self._program(batch), batch.stages, batch.setting.rules
         with ThreadPoolExecutor(1) as teller:  # what ended is kept while the next segment runs
-            telling = None
-            while live.any() and not self._shared.stop:
-                trials, seen = program(width.stage, worlds, trials, width.setting.rules)
-                steps, done, outcomes = jax.device_get(seen)
-                at = np.flatnonzero(done & live)
-                simulated = float((steps - before)[live].sum()) * period
-                if telling is not None:
-                    telling.result()
-                ended = held.numbers[at], rows(outcomes, at), simulated
-                telling = teller.submit(self._shared.add, *ended)
-                before = steps.copy()
-                live[at] = False
-                taken = queue.take(at.size)
-                if taken:
-                    fresh = at[: _count(taken)]
-                    live[fresh], before[fresh] = True, 0
-                    worlds = width.put(held.put(fresh, taken))
-                    trials = width.refill(worlds, trials, np.isin(np.arange(width.slots), fresh))
-                elif narrower and 0 < live.sum() <= narrower[0].slots:
-                    running = np.flatnonzero(live)
-                    width = narrower.pop(0)
-                    program = self._program(width)
-                    slots = np.resize(running, width.slots)  # the last ones are padding
-                    live = np.arange(width.slots) < running.size
-                    worlds, before = width.put(held.keep(slots)), before[slots]
-                    last = rows(jax.device_get(trials), slots)
-                    trials = width.put(last._replace(done=~live))
-            if telling is not None:
-                telling.result()
+            telling, unseen = [], None
+
+            def look(seen: Any) -> list[Any]:
+                seen = jax.device_get(seen)
+                ended = [each.look(*one) for each, one in zip(every, seen, strict=True)]
+                for one in telling:
+                    one.result()
+                return [teller.submit(self._shared.add, *one) for one in ended]
+
+            while sum(each.live.sum() for each in every) > most_aside and not self._shared.stop:
+                worlds = tuple(each.worlds for each in every)
+                after, seen = program(stages, worlds, tuple(each.trials for each in every), rules)
+                for each, trials in zip(every, after, strict=True):
+                    each.trials = trials
+                # Where no trial waits for room, the device goes on while the host looks.
+                ahead = not any(queue.waits for queue in batch.queues)
+                seen, unseen = (unseen, seen) if ahead else (seen, None)
+                if seen is not None:
+                    telling = look(seen)
+            if unseen is not None:
+                telling = look(unseen)
+            for one in telling:
+                one.result()
+        for each in every:
+            each.set_aside()

@@ -32,10 +32,9 @@ from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Bool, Float, Int, Scalar
 from rps_jax.geometry.footprint import Footprint
-from rps_jax.robot import base, drive, load_cell
-from rps_jax.robot.base import Odometry
+from rps_jax.robot import base, drive
+from rps_jax.robot.base import Load, Odometry
 from rps_jax.robot.drive import Drive
-from rps_jax.robot.load_cell import Load
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import NONE, Reading, Skin, SkinState, SmoothReading
 from rps_jax.world.physics import Physics
@@ -179,7 +178,7 @@ def start(world: World, law: Law = rps.LAW) -> Trial:
         diverged=false,
         overflows=zero,
         drive=None if world.robot is None else drive.start(world.qpos),
-        load=load_cell.start(world.qpos) if law.senses == "force" else None,
+        load=base.unloaded(world.qpos) if law.senses == "force" else None,
     )
 
 
@@ -422,21 +421,36 @@ def advance(
     steps: int,
 ) -> Trial:
     """Up to `steps` control steps of a batch of worlds; fewer if all of them end before."""
-    one = partial(control_step, stage, physics=physics, rules=rules, law=law)
+    options = {"physics": physics, "rules": rules, "law": law, "steps": steps}
+    return advance_all((stage,), (worlds,), (trials,), **options)[0]
+
+
+def advance_all(
+    stages: tuple[Stage, ...],
+    worlds: tuple[World, ...],
+    trials: tuple[Trial, ...],
+    *,
+    physics: Physics,
+    rules: Rules = Rules(),
+    law: Law = rps.LAW,
+    steps: int,
+) -> tuple[Trial, ...]:
+    """`advance` several batches side by side, each of a stage and a shape family of its own."""
+    one = partial(control_step, physics=physics, rules=rules, law=law)
 
     def some_run(carry):
-        count, trials = carry
-        return (count < steps) & ~jnp.all(trials.done)
+        count, batches = carry
+        return (count < steps) & ~jnp.all(jnp.stack([jnp.all(each.done) for each in batches]))
 
-    def on(_, trials):
-        return one(worlds, trials)[0]
+    def on(_, batches):
+        return tuple(one(*each)[0] for each in zip(stages, worlds, batches, strict=True))
 
     # A GPU waits for the host whenever it is asked whether any still runs.
     between = 1 if jax.default_backend() == "cpu" else math.gcd(steps, _UNASKED)
 
     def body(carry):
-        count, trials = carry
-        after = jax.lax.fori_loop(0, between, on, trials) if between > 1 else on(0, trials)
+        count, batches = carry
+        after = jax.lax.fori_loop(0, between, on, batches) if between > 1 else on(0, batches)
         return count + between, after
 
     return jax.lax.while_loop(some_run, body, (0, trials))[1]

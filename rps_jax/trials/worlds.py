@@ -42,7 +42,7 @@ def drawn_worlds(domain: Domain, drawn: Draw, params: Params, setting: Setting) 
         "params": jax.tree.map(lambda x: np.full((count, *np.shape(x)), x), params),
         "p_world_target": drawn.p_world_target,
         "shift": Shift(*_any(np.full(count, np.inf), np.zeros((count, 2)))),
-        "qpos": _starts(drawn),
+        "qpos": starts(drawn),
         "key": drawn.key,
         "odometry": _odometry(domain, drawn, setting.physics.control_period),
         "robot": None if robots.ideal else robots,
@@ -68,7 +68,7 @@ def _skin(domain: Domain, drawn: Draw) -> Skin:
     return full.on(drawn.robot.shell)._replace(**own)
 
 
-def _starts(drawn: Draw) -> np.ndarray:
+def starts(drawn: Draw) -> np.ndarray:
     """Positions (n, 10) at the start: the base at the origin, the object before it."""
     qpos = np.zeros((drawn.number.size, 10))
     front = drawn.robot.half_length + drawn.at["gap"] + solid.extent(drawn.solid, drawn.at["yaw"])

@@ -112,11 +112,6 @@ class TuneGrad(Tuning):
         return DescentState(self)
 
     @property
-    def seed(self) -> int:
-        """Of the starts, the steps and the worlds."""
-        return self.setting.seed
-
-    @property
     def how(self) -> Windows:
         """Which windows are differentiated, and how."""
         own = self.estimator, self.world_clip, self.window, self.within, self.arrive
@@ -266,12 +261,12 @@ def differentiated(thetas: jax.Array, how: Windows, seed: int, step: int) -> tup
 def smoothed(thetas: jax.Array, descent: TuneGrad, step: int, try_out: TryOut) -> Estimate:
     """Evolution gradients (S, p) of the hard law, of antithetic candidates in the same worlds."""
     problem = descent.problem
-    key = jax.random.fold_in(jax.random.key(descent.seed), step)
+    key = jax.random.fold_in(jax.random.key(descent.setting.seed), step)
     count, p = thetas.shape
     steps = jax.random.normal(key, (count, descent.pairs, p), thetas.dtype)
     both = jnp.concatenate([steps, -steps], axis=1) * descent.sigma
     params = descent.space.params((thetas[:, None] + both).reshape(-1, p))
-    (answer,) = try_out([problem.ask(params, descent.seed, step)])
+    (answer,) = try_out([problem.ask(params, descent.setting.seed, step)])
     values = problem.objective.value(answer.score).reshape(count, 2, descent.pairs)
     slopes = (values[:, 0] - values[:, 1])[..., None] * steps / (2 * descent.sigma)
     return jax.vmap(gradients.estimate)(slopes)
@@ -287,11 +282,7 @@ class DescentState:
     """
 
     def __init__(self, descent: TuneGrad):
-        """Begin nothing yet.
-
-        Raises:
-          InputError: the law has no smooth form, and its derivatives are asked for.
-        """
+        """Begin nothing yet; InputError if the law has no derivatives that are asked for."""
         self.descent, self.space, self.problem = descent, descent.space, descent.problem
         if descent.estimator != "evolution":
             registry.smooth_law(registry.law_of(self.space.base))
@@ -300,7 +291,7 @@ class DescentState:
     def begin(self) -> None:
         """Begin at the base parameters of the space, and at random places near them."""
         descent, base = self.descent, self.space.vector(self.space.base)
-        key = jax.random.key(descent.seed)
+        key = jax.random.key(descent.setting.seed)
         away = jax.random.normal(key, (descent.starts, base.size), base.dtype).at[0].set(0.0)
         self.thetas = base + descent.spread * away  # (S, p)
         self.best, self.best_value = np.asarray(base), np.inf
@@ -319,7 +310,7 @@ class DescentState:
 
     def judge(self, vectors: np.ndarray, generation: int, try_out: TryOut) -> tuple[Metrics, Any]:
         """Values (S,) in the worlds for validation, and, except after the last step, gradients."""
-        check = self.problem.validate(self.space.params(vectors), self.descent.seed)
+        check = self.problem.validate(self.space.params(vectors), self.descent.setting.seed)
         (tried,) = try_out([check])
         values = self.problem.objective.value(tried.score)
         first = int(jnp.nanargmin(values))
@@ -356,7 +347,7 @@ class DescentState:
             }
         began = time.perf_counter()
         found, seconds = jax.block_until_ready(
-            differentiated(thetas, descent.how, descent.seed, step)
+            differentiated(thetas, descent.how, descent.setting.seed, step)
         )
         more = {"simulated": seconds, "differentiate": time.perf_counter() - began}
         if descent.estimator == "combined":

@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import Any, ClassVar
 
 import jax
@@ -30,6 +30,7 @@ from rps_jax.control import registry
 from rps_jax.control.base import Law
 from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
+from rps_jax.geometry.solid import GRAVITY
 from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.question import InDomain, OfLaw, Pushes, Run, call_of, seed_of
@@ -47,19 +48,15 @@ from rps_jax.world import draws, points
 from rps_jax.world.domain import ERRORS, QUANTITIES, Domain, Range
 from rps_jax.world.draws import Draw
 
-_GRAVITY = 9.81  # [m/s^2]
 _TOGETHER = 64  # worlds of one object that are stepped at once
 SAMPLES = 2000
 UNDETERMINED = 0.8  # share of the prior's 90 % interval from which on nothing was learned
+_DELAYS = ("pose_latency", "command_delay")
 # What is told of a world beside its quantities, of what may be told where they may not.
 DERIVED: dict[str, tuple[str, tuple[str, ...], Callable[..., np.ndarray]]] = {
-    "ground_force": ("N", ("friction_ground", "mass"), lambda a, b: _GRAVITY * a * b),
-    "loop_delay": ("s", ("pose_latency", "command_delay"), lambda a, b: a + b),
-    "reaction_time": (
-        "s",
-        ("pose_latency", "command_delay", "robot_lag"),
-        lambda a, b, c: a + b + c,
-    ),
+    "ground_force": ("N", ("friction_ground", "mass"), lambda a, b: GRAVITY * a * b),
+    "loop_delay": ("s", _DELAYS, lambda a, b: a + b),
+    "reaction_time": ("s", (*_DELAYS, "robot_lag"), lambda a, b, c: a + b + c),
 }
 _WORDS = {"ground_force": "friction force of the ground",
           "loop_delay": "latency of the pose and delay of the command"}  # fmt: skip
@@ -308,12 +305,10 @@ def check_law(label: str, law: Law, setting: Setting) -> None:
         )
 
 
+@cache
 def _telling(law: Law) -> Law:
     """The law, with what it observed and the contact's force as its details."""
-    return _TELLING.setdefault(law, law._replace(step=partial(_tell, law), senses="force"))
-
-
-_TELLING: dict[Law, Law] = {}
+    return law._replace(step=partial(_tell, law), senses="force")
 
 
 def _tell(law: Law, params: Any, memory: Any, seen: Any) -> Any:
@@ -410,9 +405,8 @@ def summary(domain: Domain, u: np.ndarray) -> xr.Dataset:
     share = np.bincount(which, minlength=len(domain.objects)) / len(u)
     columns["probability"] = ("object", share)
     names = list(found)
-    coords: dict[str, Any] = {"quantity": names, "other": names, "object": list(domain.objects)}
-    coords["unit"] = ("quantity", [unit[k] for k in names])
-    return xr.Dataset(columns, coords)
+    coords = {"quantity": names, "other": names, "object": list(domain.objects)}
+    return xr.Dataset(columns, coords | {"unit": ("quantity", [unit[k] for k in names])})
 
 
 def fitted_domain(domain: Domain, data: xr.Dataset) -> Domain:
@@ -452,23 +446,19 @@ def table(data: xr.Dataset) -> list[list[str]]:
         ends = [f"{float(one[k]):.3g} to {float(one[m]):.3g}"
                 for k, m in (("low", "high"), ("prior_low", "prior_high"))]  # fmt: skip
         told = "undetermined" if one.undetermined else f"{float(one.shrinkage):.0%} narrower"
-        found.append(
-            [words(str(name)), str(one.unit.values), f"{float(one['median']):.3g}", *ends, told]
-        )
+        middle = f"{float(one['median']):.3g}"
+        found.append([words(str(name)), str(one.unit.values), middle, *ends, told])
     return found
 
 
 def together(data: xr.Dataset) -> list[list[str]]:
     """Header and the pairs of quantities that are told only together."""
-    return [["", "", "correlation"], *(list(row) for row in _pairs(data))]
-
-
-def _pairs(data: xr.Dataset) -> Iterator[tuple[str, str, str]]:
-    names = [str(q) for q in data.quantity.values if q not in DERIVED]
-    for i, a in enumerate(names):
-        for b in names[:i]:
-            if abs(value := float(data.correlation.sel(quantity=a, other=b))) > 0.5:
-                yield words(a), words(b), f"{value:.2f}"
+    at = data.correlation.values
+    names = [str(q) for q in data.quantity.values]
+    pairs = [(i, j) for i, j in np.argwhere(np.tril(abs(at), -1) > 0.5)
+             if not DERIVED.keys() & {names[i], names[j]}]  # fmt: skip
+    told = [[words(names[i]), words(names[j]), f"{at[i, j]:.2f}"] for i, j in pairs]
+    return [["", "", "correlation"], *told]
 
 
 def marginals(data: xr.Dataset) -> Figure:

@@ -40,61 +40,6 @@ except ImportError as error:
 _SEEDS = 2**31
 
 
-class _Worlds:
-    """Worlds that are stepped together, as arrays of NumPy with the worlds along the first axis."""
-
-    def __init__(self, count: int, domain: DomainLike, hold: float, options: Mapping[str, Any]):
-        given: dict[str, Any] = {"weights": REWARD} | dict(options)
-        self.env = PushEnv(domain=domains.named(domain), **given)
-        least = 0.999 * self.env.dt
-        hold = errors.check_finite("hold", hold, at_least=least, at_most=1000, unit="s")
-        self.count, self.period = count, max(1, round(hold / self.env.dt)) * self.env.dt
-        size = self.env.observation_size
-        self.seen_space = Box(-np.inf, np.inf, (size,), np.float32)
-        self.action_space = Box(-1.0, 1.0, (self.env.action_size,), np.float32)
-        self._begin = jax.jit(jax.vmap(self.env.reset))
-        steps = round(self.period / self.env.dt)
-        self._act = jax.jit(jax.vmap(partial(_carry_out, self.env, steps)))
-        self._pick = jax.jit(jax.vmap(switches.select))
-        self.state: State | None = None
-
-    def begin(self, random: np.random.Generator, where: np.ndarray | None = None) -> None:
-        """Begin in other worlds by chance: in all, or where a mask (count,) says so."""
-        keys = jax.random.split(jax.random.key(int(random.integers(_SEEDS))), self.count)
-        fresh = self._begin(keys)
-        self.state = fresh if where is None else self._pick(where, fresh, self.state)
-
-    def act(self, actions: Any) -> np.ndarray:
-        """Carry out actions (count, 3); returns the rewards (count,). What is done stays."""
-        actions = np.asarray(actions, np.float32)
-        shape = (self.count, *self.action_space.shape)
-        if actions.shape != shape or not np.isfinite(actions).all():
-            told = actions.tolist() if actions.shape == shape else f"of shape {actions.shape}"
-            raise errors.InputError(
-                f"action = {told} is not allowed: it must be finite, of shape {shape}."
-            )
-        self.state, rewards = self._act(self.state, actions)
-        return np.asarray(rewards, float)
-
-    def seen(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-        """Observations (count, T + 2), what is terminated and truncated, and more, by name."""
-        assert self.state is not None, "reset comes first"
-        data, metrics = self.state.data, self.state.metrics
-        ended = np.array(data.success | data.tipped | data.diverged)
-        more = {
-            "is_success": data.success, "time": data.steps * self.env.dt,
-            "in_contact": metrics["in_contact"] > 0, "world": self.state.info["index"],
-        }  # fmt: skip
-        told = {name: np.array(values) for name, values in more.items()}
-        done = np.array(data.done)
-        return np.array(self.state.obs, np.float32), done & ended, done & ~ended, told
-
-    def images(self) -> list[np.ndarray]:
-        """Images (240, 320, 3) uint8."""
-        each = [jax.tree.map(lambda leaf, i=i: leaf[i], self.state) for i in range(self.count)]
-        return self.env.render(each)
-
-
 def _carry_out(
     env: PushEnv, steps: int, state: State, action: jax.Array
 ) -> tuple[State, jax.Array]:
@@ -140,31 +85,31 @@ class Push(gymnasium.Env[np.ndarray, np.ndarray]):
         **options: Any,
     ):
         """Draw the worlds; nothing is compiled before the first reset."""
-        self._worlds = _Worlds(1, domain, hold, options)
-        self.render_mode, self.push_env = render_mode, self._worlds.env
-        self.observation_space = self._worlds.seen_space
-        self.action_space = self._worlds.action_space
-        self.metadata = self.metadata | {"render_fps": round(1 / self._worlds.period) or 1}
+        self._vector = PushVector(domain=domain, hold=hold, **options)
+        self.render_mode, self.push_env = render_mode, self._vector.push_env
+        self.observation_space = self._vector.single_observation_space
+        self.action_space = self._vector.single_action_space
+        self.metadata = self.metadata | {"render_fps": round(1 / self._vector.period) or 1}
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin in a world by chance, which the seed decides on; `options` are not used."""
         super().reset(seed=seed)
-        self._worlds.begin(self.np_random)
-        seen, _, _, told = self._worlds.seen()
+        self._vector.begin(self.np_random)
+        seen, _, _, told = self._vector.seen()
         return seen[0], {name: values[0].item() for name, values in told.items()}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Carry out an action (3,)."""
-        rewards = self._worlds.act(np.asarray(action)[None])
-        seen, terminated, truncated, told = self._worlds.seen()
+        rewards = self._vector.act(np.asarray(action)[None])
+        seen, terminated, truncated, told = self._vector.seen()
         info = {name: values[0].item() for name, values in told.items()}
         return seen[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def render(self) -> Any:
         """Image (240, 320, 3) uint8 of now, in the mode rgb_array."""
-        return self._worlds.images()[0] if self.render_mode == "rgb_array" else None
+        return self._vector.images()[0] if self.render_mode == "rgb_array" else None
 
 
 class PushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -196,23 +141,69 @@ class PushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         modes = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
         mode = str(getattr(autoreset_mode, "value", autoreset_mode))
         errors.check_name("autoreset_mode", mode, [one.value for one in modes])
-        self._worlds, self.render_mode = _Worlds(num_envs, domain, hold, options), render_mode
+        given: dict[str, Any] = {"weights": REWARD} | options
+        self.render_mode = render_mode
+        self.push_env = PushEnv(domain=domains.named(domain), **given)
+        dt = self.push_env.dt
+        hold = errors.check_finite("hold", hold, at_least=0.999 * dt, at_most=1000, unit="s")
+        steps = max(1, round(hold / dt))
+        self.period = steps * dt  # [s] of an action
         self.metadata = self.metadata | {"autoreset_mode": AutoresetMode(mode)}
-        self.push_env = self._worlds.env
-        self.single_observation_space = self._worlds.seen_space
-        self.single_action_space = self._worlds.action_space
+        size = self.push_env.observation_size
+        self.single_observation_space = Box(-np.inf, np.inf, (size,), np.float32)
+        self.single_action_space = Box(-1.0, 1.0, (self.push_env.action_size,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._ended = np.zeros(num_envs, bool)
+        self._state: State | None = None
+        self._begin = jax.jit(jax.vmap(self.push_env.reset))
+        self._act = jax.jit(jax.vmap(partial(_carry_out, self.push_env, steps)))
+        self._pick = jax.jit(jax.vmap(switches.select))
+
+    def begin(self, random: np.random.Generator, where: np.ndarray | None = None) -> None:
+        """Begin in other worlds by chance: in all, or where a mask (num_envs,) says so."""
+        keys = jax.random.split(jax.random.key(int(random.integers(_SEEDS))), self.num_envs)
+        fresh = self._begin(keys)
+        self._state = fresh if where is None else self._pick(where, fresh, self._state)
+
+    def act(self, actions: Any) -> np.ndarray:
+        """Carry out actions (num_envs, 3); returns the rewards (num_envs,). What is done stays."""
+        actions = np.asarray(actions, np.float32)
+        shape = (self.num_envs, *self.single_action_space.shape)
+        if actions.shape != shape or not np.isfinite(actions).all():
+            told = actions.tolist() if actions.shape == shape else f"of shape {actions.shape}"
+            raise errors.InputError(
+                f"action = {told} is not allowed: it must be finite, of shape {shape}."
+            )
+        self._state, rewards = self._act(self._state, actions)
+        return np.asarray(rewards, float)
+
+    def seen(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """Observations (num_envs, T + 2), what is terminated and truncated, and more, by name."""
+        assert self._state is not None, "reset comes first"
+        data, metrics = self._state.data, self._state.metrics
+        ended = np.array(data.success | data.tipped | data.diverged)
+        more = {
+            "is_success": data.success, "time": data.steps * self.push_env.dt,
+            "in_contact": metrics["in_contact"] > 0, "world": self._state.info["index"],
+        }  # fmt: skip
+        told = {name: np.array(values) for name, values in more.items()}
+        done = np.array(data.done)
+        return np.array(self._state.obs, np.float32), done & ended, done & ~ended, told
+
+    def images(self) -> list[np.ndarray]:
+        """Images (240, 320, 3) uint8."""
+        each = [jax.tree.map(lambda leaf, i=i: leaf[i], self._state) for i in range(self.num_envs)]
+        return self.push_env.render(each)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin in worlds by chance, which the seed decides on; `options` are not used."""
         super().reset(seed=seed)
-        self._worlds.begin(self.np_random)
+        self.begin(self.np_random)
         self._ended[:] = False
-        seen, _, _, told = self._worlds.seen()
+        seen, _, _, told = self.seen()
         return seen, self._masked(told, ~self._ended)
 
     def step(
@@ -220,24 +211,24 @@ class PushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Carry out actions (num_envs, 3)."""
         same = self.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-        rewards = self._worlds.act(actions)  # 0 where a trial had ended, which stays as it was
+        rewards = self.act(actions)  # 0 where a trial had ended, which stays as it was
         if not same and self._ended.any():
-            self._worlds.begin(self.np_random, self._ended)
-        seen, terminated, truncated, told = self._worlds.seen()
+            self.begin(self.np_random, self._ended)
+        seen, terminated, truncated, told = self.seen()
         self._ended, more = terminated | truncated, {}
         if same and self._ended.any():
             last = np.full(self.num_envs, None, object)
             for i in np.flatnonzero(self._ended):
                 last[i] = seen[i]
             more = {"final_obs": last, "final_info": self._masked(told, self._ended)}
-            self._worlds.begin(self.np_random, self._ended)
-            seen, _, _, told = self._worlds.seen()
+            self.begin(self.np_random, self._ended)
+            seen, _, _, told = self.seen()
         whole = self._masked(told, np.ones(self.num_envs, bool)) | self._masked(more, self._ended)
         return seen, rewards, terminated, truncated, whole
 
     def render(self) -> Any:
         """Images (240, 320, 3) uint8 of now, one of each world, in the mode rgb_array."""
-        return tuple(self._worlds.images()) if self.render_mode == "rgb_array" else None
+        return tuple(self.images()) if self.render_mode == "rgb_array" else None
 
     @staticmethod
     def _masked(told: Mapping[str, Any], where: np.ndarray) -> dict[str, Any]:

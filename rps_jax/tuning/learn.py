@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import io
 import json
 import time
 from collections.abc import Mapping, Sequence
@@ -11,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -30,11 +29,11 @@ from rps_jax.control.learned.policy import Policy
 from rps_jax.record import files, provenance
 from rps_jax.record.checkpoint import Parts
 from rps_jax.record.options import option
-from rps_jax.runs.question import Pushes, Run, call_of, seed_of
+from rps_jax.runs.question import Pushes, Run, Split, call_of, seed_of
 from rps_jax.trials.env import PushEnv, Reward
 from rps_jax.trials.progress import Bar, Progress, Report
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules, World
+from rps_jax.trials.trial import Rules
 from rps_jax.tuning import rollout
 from rps_jax.tuning.ppo import PPO
 from rps_jax.tuning.rollout import RunnerState
@@ -156,16 +155,11 @@ class Learn(PPO, Pushes[xr.Dataset]):
             del found[name]
         return found
 
-    def environments(self) -> list[PushEnv]:
-        """Those in which it is learned, of the worlds for tuning."""
-        return self._made(seed_of(self.setting.seed, "tune"), self.setting.rules, self.drawn)
-
-    def examinations(self) -> list[PushEnv]:
-        """Those by which it is judged, of the worlds for validation, by the rules of the paper."""
-        return self._made(seed_of(self.setting.seed, "validate"), Rules(), self.validation)
-
-    def _made(self, seed: int, rules: Rules, worlds: int) -> list[PushEnv]:
-        setting = replace(self.setting, rules=rules, seed=seed)
+    def environments(self, split: Split = "tune") -> list[PushEnv]:
+        """Those in which it is learned; or those for validation, by the rules of the paper."""
+        tune = split == "tune"
+        rules, worlds = (self.setting.rules, self.drawn) if tune else (Rules(), self.validation)
+        setting = replace(self.setting, rules=rules, seed=seed_of(self.setting.seed, split))
         return [
             PushEnv(name, one, RPSParams(), setting, weights=REWARD, worlds=worlds)
             for one in self.domains
@@ -223,11 +217,7 @@ learn = call_of(Learn)
 
 
 def _checked_note(note: Any) -> dict[str, Any]:
-    """What is kept of a run beside its numbers.
-
-    Raises:
-      ValueError: it is something else.
-    """
+    """What is kept of a run beside its numbers; ValueError if it is something else."""
     for name in ("spent", "compile", "best"):
         errors.check_number(name, note[name])
     for metrics in note["curve"]:
@@ -237,13 +227,6 @@ def _checked_note(note: Any) -> dict[str, Any]:
     return note
 
 
-class _Best(NamedTuple):
-    """The law that validated best, so far."""
-
-    success: float = -1.0  # [1]; -1 before a validation
-    actor: Weights | None = None
-
-
 class _Learning:
     """A learning run under way, in its folder."""
 
@@ -251,19 +234,21 @@ class _Learning:
         self.folder, self.how, self.report = folder, how, report
         self._began, self._before = began, 0.0  # [s]
         self._envs = how.environments()
-        self._exams = how.examinations()
+        self._exams = how.environments("validate")
+        self._tables = [env.table for env in self._envs]
         self.network = rollout.network_of(how, self._envs)
         self.curve: list[Metrics] = []
-        self.best, self.compile, self._kept = _Best(), 0.0, 0
+        self.best: Weights | None = None  # of the law that validated best, so far
+        self.best_rate, self.compile, self._kept = -1.0, 0.0, 0
         begin = self._programs()
         # A copy: no two leaves may share memory, which updates write to.
-        self.runner: RunnerState = jax.tree.map(jnp.copy, begin(self._tables(self._envs)))
+        self.runner: RunnerState = jax.tree.map(jnp.copy, begin(self._tables))
         self._restore()
 
     def _programs(self) -> Any:
         """Compile all programs side by side; returns the one that begins."""
         began, envs = time.perf_counter(), self._envs
-        tables, theirs = self._tables(envs), self._tables(self._exams)
+        tables, self._theirs = self._tables, [env.table for env in self._exams]
         begin = partial(rollout.begin, self.how, self.network, envs, seed=self.how.setting.seed)
         update = partial(rollout.update, self.how, self.network, envs)
         evaluate = partial(rollout.evaluate_policy, self.network, self._exams)
@@ -273,17 +258,13 @@ class _Learning:
                 pool.submit(lambda f, *shapes: f.lower(*shapes).compile(), *each)
                 for each in (
                     (jax.jit(update, donate_argnums=1), tables, runner),
-                    (jax.jit(evaluate), theirs, runner.train.ema),
+                    (jax.jit(evaluate), self._theirs, runner.train.ema),
                     (jax.jit(begin), tables),
                 )
             ]
             self._update, self._evaluate, begin = (one.result() for one in waiting)
         self.compile += time.perf_counter() - began
         return begin
-
-    @staticmethod
-    def _tables(envs: Sequence[PushEnv]) -> list[World]:
-        return [env.table for env in envs]
 
     @property
     def spent(self) -> float:
@@ -294,16 +275,14 @@ class _Learning:
         """Learn until the time is spent, or the updates are made."""
         reserve = 0.0  # [s] for the last validation
         kept = judged = self.spent
-        tables = self._tables(self._envs)
 
         def over() -> bool:
             late = seconds and self.spent + reserve >= seconds
             return bool(late or (updates and len(self.curve) >= updates))
 
         while not over():
-            self.runner, metrics = self._update(tables, self.runner)
+            self.runner, metrics = self._update(self._tables, self.runner)
             self._note({name: float(x) for name, x in jax.device_get(metrics).items()})
-            self._tell()
             if self.spent - kept > every and not over():
                 if self.spent - judged > _SPARE * reserve:
                     reserve, judged = self._validate(), self.spent
@@ -312,10 +291,15 @@ class _Learning:
         if self.curve and np.isnan(self.curve[-1]["validation"]):
             self._validate()
         self.keep()
-        return self.finish()
+        variables = {}
+        for name, (unit, words) in UNITS.items():
+            values = [metrics[name] for metrics in self.curve]
+            variables[name] = ("update", values, {"units": unit, "long_name": words})
+        took = {"compile": self.compile, "run": self.spent - self.compile}
+        return xr.Dataset(variables, {"update": np.arange(len(self.curve)) + 1}, took)
 
     def _note(self, metrics: Metrics) -> None:
-        """Add an update to the curve."""
+        """Add an update to the curve, and tell how far it is."""
         ended = max(metrics["ended"], 1.0)
         before = self.curve[-1]["simulated"] if self.curve else 0.0
         worlds = self.how.num_envs * len(self._envs)
@@ -325,9 +309,6 @@ class _Learning:
         metrics["time"] = self.spent
         metrics["validation"] = metrics["validation_time"] = float("nan")
         self.curve.append({name: metrics[name] for name in UNITS})
-
-    def _tell(self) -> None:
-        """Tell how far it is."""
         ended = int(sum(metrics["ended"] for metrics in self.curve))
         self.report(Progress(ended, self.curve[-1]["simulated"], self.compile, len(self.curve)))
 
@@ -335,12 +316,12 @@ class _Learning:
         """Try the law; returns how long that took [s]."""
         began = time.perf_counter()
         actor = self.runner.train.ema
-        success, took = jax.device_get(self._evaluate(self._tables(self._exams), actor))
+        success, took = jax.device_get(self._evaluate(self._theirs, actor))
         self.curve[-1]["validation"] = rate = float(np.mean(success))
         if success.any():
             self.curve[-1]["validation_time"] = float(np.mean(took[success]))
-        if rate >= self.best.success:
-            self.best = _Best(rate, jax.device_get(actor))
+        if rate >= self.best_rate:
+            self.best_rate, self.best = rate, jax.device_get(actor)
         return time.perf_counter() - began
 
     # --- what is kept ---
@@ -349,28 +330,26 @@ class _Learning:
         """The law that validated best, or the latest before any did."""
         made = provenance.environment()
         how = {
-            "success_in_validation": self.best.success if self.best.actor else None,
+            "success_in_validation": self.best_rate if self.best else None,
             "updates": len(self.curve),
             "simulated": self.curve[-1]["simulated"] if self.curve else 0.0,
             "seconds": round(self.spent, 1),
             "how": {one.name: getattr(self.how, one.name) for one in fields(PPO)},
             **{name: made[name] for name in ("command", "commit", "device", "packages")},
         }
-        actor = self.best.actor or jax.device_get(self.runner.train.ema)
+        actor = self.best or jax.device_get(self.runner.train.ema)
         return Policy(self.network, actor, learned=how)
 
     def keep(self) -> None:
         """Write what continues the run, and the law as it is; two such files are kept in turn."""
         leaves = jax.device_get(jax.tree.leaves(self.runner))
         arrays: dict[str, Any] = {f"leaf_{i:04d}": leaf for i, leaf in enumerate(leaves)}
-        for name, weight in (self.best.actor or {}).items():
+        for name, weight in (self.best or {}).items():
             arrays[f"best_{name}"] = weight
         note = {"curve": self.curve, "spent": self.spent, "compile": self.compile}
-        arrays["note"] = np.array(json.dumps(note | {"best": self.best.success}))
-        content = io.BytesIO()
-        np.savez(content, **arrays)
+        arrays["note"] = np.array(json.dumps(note | {"best": self.best_rate}))
         self._kept += 1
-        Parts(self.folder).put(f"learner-{self._kept % 2}", content.getvalue(), ".npz")
+        Parts(self.folder).put(f"learner-{self._kept % 2}", files.archive(**arrays), ".npz")
         files.write_bytes(self.folder / "policy.npz", policies.encoded(self.policy()))
         rows = [{"update": i + 1} | metrics for i, metrics in enumerate(self.curve)]
         files.write_csv(self.folder / "curve.csv", rows)
@@ -404,20 +383,7 @@ class _Learning:
         self.runner = jax.tree.unflatten(jax.tree.structure(self.runner), own)
         self.curve, self._before = note["curve"], note["spent"]
         self.compile += note["compile"]
-        self.best, self._kept = _Best(note["best"], best or None), int(name[-1])
-
-    def finish(self) -> xr.Dataset:
-        """The curve."""
-        variables = {
-            name: (
-                "update",
-                [metrics[name] for metrics in self.curve],
-                {"units": unit, "long_name": words},
-            )
-            for name, (unit, words) in UNITS.items()
-        }
-        took = {"compile": self.compile, "run": self.spent - self.compile}
-        return xr.Dataset(variables, {"update": np.arange(len(self.curve)) + 1}, took)
+        self.best_rate, self.best, self._kept = note["best"], best or None, int(name[-1])
 
 
 def figure_of(curve: xr.Dataset) -> Figure:

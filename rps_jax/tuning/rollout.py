@@ -63,11 +63,7 @@ class RunnerState(NamedTuple):
 
 
 def network_of(ppo: PPO, envs: Sequence[PushEnv]) -> Network:
-    """The network for these environments.
-
-    Raises:
-      InputError: their skins have different numbers of taxels.
-    """
+    """The network for these environments, whose skins must have as many taxels."""
     counts = {env.observation_size - 2 for env in envs}
     if len(counts) > 1:
         raise errors.InputError(
@@ -250,12 +246,8 @@ def update(
 ) -> tuple[RunnerState, dict[str, jax.Array]]:
     """Make one update; returns the state after it, and the update's metrics () for the curve.
 
-    Args:
-      ppo: the algorithm's numbers. Static.
-      network: of the law. Static.
-      envs: one for each shape of object and domain. Static.
-      tables: their worlds, `PushEnv.table`, which are data and no constants of the program.
-      runner: before the update.
+    Each of `envs` is of one shape of object and domain. Their worlds, `tables`, are data and no
+    constants of the program.
     """
     hidden = jnp.concatenate([batch.memory.hidden for batch in runner.batches])
     key, own, passes = jax.random.split(runner.key, 3)

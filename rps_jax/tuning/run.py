@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import functools
-import io
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from rps_jax import engines, errors
@@ -33,6 +33,12 @@ from rps_jax.trials.trial import Rules
 from rps_jax.tuning.space import Space, expanded
 from rps_jax.world import domain as worlds_
 from rps_jax.world.domain import DOMAINS, Domain, DomainLike
+
+if TYPE_CHECKING:
+    from rps_jax.tuning.descent import DescentState
+    from rps_jax.tuning.evolution import EvolutionState
+
+    Tuner = DescentState | EvolutionState
 
 Metrics = dict[str, np.ndarray]  # what was found out about a generation, by name
 TryOut = Callable[[list[Ask]], list[Answer]]  # in the worlds of a problem
@@ -56,41 +62,6 @@ class Problem:
     def validate(self, params: Params, seed: int) -> Ask:
         """Candidates with leaves (P,) in the worlds for validation."""
         return Ask(params, seed_of(seed, "validate"), np.arange(self.validation))
-
-
-class Tuner(Protocol):
-    """A search whose state follows from what it has proposed and the metrics of that.
-
-    Nothing is computed before it begins.
-    """
-
-    space: Space
-    problem: Problem
-    generations: int  # after which it ends
-    budget: float  # [s] simulated time after which no generation begins; 0: no bound
-    best: np.ndarray  # (p,) the vector that validated best
-
-    def begin(self) -> None:
-        """Take the place of the start."""
-        ...
-
-    def propose(self) -> np.ndarray:
-        """Vectors (P, p) of the next generation; asked for once in each generation."""
-        ...
-
-    def shapes(self, vectors: np.ndarray, generation: int) -> dict[str, tuple[int, ...]]:
-        """Shapes of the metrics of these vectors."""
-        ...
-
-    def judge(
-        self, vectors: np.ndarray, generation: int, try_out: TryOut
-    ) -> tuple[Metrics, dict[str, Any]]:
-        """Metrics of these vectors from trials, and the tuner's entries in the log."""
-        ...
-
-    def update(self, vectors: np.ndarray, metrics: Metrics) -> None:
-        """Go on to the next generation."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -229,13 +200,11 @@ TUNED = "tuned.json"  # in a run folder: the parameters that validated best
 def labelled(log: Sequence[Mapping[str, Any]], tuner: Tuner) -> xr.Dataset:
     """The log of a run (generation), and the parameters of each and at last (parameter)."""
     names = list(tuner.space.names)
-    keys = [key for key in dict.fromkeys(k for line in log for k in line) if key != "params"]
-    columns: dict[str, Any] = {}
-    for key in keys:
-        values = [np.nan if line.get(key) is None else line[key] for line in log]
-        attrs = {"units": UNITS.get(key, "1")}
-        columns[key] = ("generation", np.array(values, float), attrs)
-    columns.pop("generation", None)
+    frame = pd.DataFrame(log).drop(columns=["generation", "params"]).astype(float)
+    columns: dict[str, Any] = {
+        str(key): ("generation", values.to_numpy(), {"units": UNITS.get(str(key), "1")})
+        for key, values in frame.items()
+    }
     params = [[line["params"][name] for name in names] for line in log]
     columns["params"] = (("generation", "parameter"), np.array(params, float))
     best = registry.numbers(tuner.space.params(tuner.best))
@@ -255,6 +224,9 @@ def tune(
 ) -> list[dict[str, Any]]:
     """Run a tuner to its end, in a folder in which it can be continued, or in memory.
 
+    A tuner is a search whose state follows from the vectors (P, p) that it has proposed, once in
+    each generation, and from their metrics. Nothing is computed before it begins.
+
     Every generation is a part of the run: the vectors proposed, their metrics, and its line of
     `log.jsonl`. What is there is not tried again: a tuner that is continued proposes what it did
     and is given what it was, as if it had never been stopped. A part that is damaged is tried
@@ -267,7 +239,11 @@ def tune(
     tuner.begin()
     parts, log = None if folder is None else Parts(folder), []
     kept = {} if parts is None else parts.found()
-    heard = _Total(report)
+    simulated = 0.0
+
+    def heard(progress: Progress) -> None:
+        report(replace(progress, simulated=simulated + progress.simulated, rounds=len(log)))
+
     while (name := f"{len(log):06d}") in kept or (
         len(log) < tuner.generations and not spent(log, tuner.budget)
     ):
@@ -277,32 +253,18 @@ def tune(
         else:
             metrics, line = _tried(tuner, vectors, len(log), heard, shape)
             if parts is not None:
-                parts.put(name, _encoded(vectors, metrics, line), ".npz")
+                own = {f"metric_{key}": value for key, value in metrics.items()}
+                told = np.array(json.dumps(line))
+                parts.put(name, files.archive(vectors=vectors, line=told, **own), ".npz")
         tuner.update(vectors, metrics)
         log.append(line)
-        heard.ended(len(log), line["simulated"])
+        simulated += line["simulated"]
+        report(Progress(0, simulated, rounds=len(log)))
         if folder is not None and name not in kept:
             _write(folder, tuner, log)
     if folder is not None:
         _write(folder, tuner, log)
     return log
-
-
-class _Total:
-    """Progress of all generations from that of each."""
-
-    def __init__(self, report: Callable[[Progress], Any]):
-        self._report, self._done, self._simulated = report, 0, 0.0
-
-    def __call__(self, progress: Progress) -> None:
-        """Tell of a generation under way."""
-        simulated = self._simulated + progress.simulated
-        self._report(Progress(progress.finished, simulated, progress.compile, self._done))
-
-    def ended(self, done: int, simulated: float) -> None:
-        """Tell that so many generations are done."""
-        self._done, self._simulated = done, self._simulated + simulated
-        self._report(Progress(0, self._simulated, 0.0, done))
 
 
 def _tried(
@@ -357,14 +319,6 @@ def _write(folder: Path, tuner: Tuner, log: Sequence[dict[str, Any]]) -> None:
     )
 
 
-def _encoded(vectors: np.ndarray, metrics: Metrics, line: dict[str, Any]) -> bytes:
-    """The file of a generation."""
-    content = io.BytesIO()
-    own: dict[str, Any] = {f"metric_{name}": value for name, value in metrics.items()}
-    np.savez(content, vectors=vectors, line=np.array(json.dumps(line)), **own)
-    return content.getvalue()
-
-
 def _check_line(line: Any, names: Sequence[str]) -> None:
     """Raises ValueError or KeyError unless this is a line of a log, with these parameters."""
     if not (isinstance(line, dict) and isinstance(line["params"], dict)):
@@ -381,11 +335,7 @@ def _check_line(line: Any, names: Sequence[str]) -> None:
 def _restored(
     tuner: Tuner, path: Path, proposed: np.ndarray, generation: int
 ) -> tuple[np.ndarray, Metrics, dict[str, Any]]:
-    """The vectors of a generation that was tried before, their metrics, and the log's line.
-
-    Raises:
-      InputError: the file holds something else than this tuner would have written there.
-    """
+    """The vectors of a generation that was tried before, their metrics, and the log's line."""
     content = files.content_of(path, "part")
     try:
         arrays = files.arrays_of(content)

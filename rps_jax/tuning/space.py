@@ -87,17 +87,13 @@ class Space:
 
     def named(self, vector: Any) -> dict[str, float]:
         """A vector's tuned parameters by name, and the others that differ from the usual ones."""
+        kind = type(self.base)  # the law is known by the first parameters; RPS by the paper's
+        known = next(known for known in registry.LAWS.values() if type(known) is kind)
         found, usual = (
             {name: float(f"{float(value):.7g}") for name, value in numbers.items()}
-            for numbers in map(registry.numbers, (self.params(vector), self._usual))
+            for numbers in map(registry.numbers, (self.params(vector), known))
         )
         return {n: x for n, x in found.items() if n in self.names or x != usual[n]}
-
-    @property
-    def _usual(self) -> Params:
-        """The parameters by which the law is known; of RPS the paper's."""
-        kind = type(self.base)
-        return next(known for known in registry.LAWS.values() if type(known) is kind)
 
 
 def _share(bound: Bound, numbers: Mapping[str, Any], name: str) -> Any:

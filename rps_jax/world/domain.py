@@ -41,30 +41,20 @@ _KEY = "quantity"
 
 
 class Quantity(NamedTuple):
-    """What a drawn quantity is, beside its range."""
+    """What a drawn quantity is: all that there is to say of it, beside its range."""
 
     column: int  # of a world's random numbers; a new quantity takes the next one that is free
     unit: str
     least: float  # which its range must not leave
     most: float
     words: str  # what it is called in reports; empty: it is in none
-    of: Part
+    of: Part = "object"
     sets: str = ""  # number of the skin, of odometry or of the robot that is drawn
 
 
-def drawn(
-    usual: Range | None,
-    column: int,
-    unit: str,
-    least: float,
-    most: float,
-    words: str,
-    of: Part = "object",
-    sets: str = "",
-) -> Any:
-    """Declare a drawn quantity: all that there is to say of it, see `Quantity`."""
-    about = Quantity(column, unit, least, most, words, of, sets)
-    return field(default=usual, metadata={_KEY: about})
+def drawn(usual: Range | None, *about: Any) -> Any:
+    """Declare a drawn quantity by its usual range, and the values of a `Quantity`."""
+    return field(default=usual, metadata={_KEY: Quantity(*about)})
 
 
 _POSITIVE = 1e-3
@@ -90,6 +80,9 @@ class Domain:
     height: Range = drawn(Range(0.3, 0.8), 3, "m", 0.1, 2.0, "height of the object")
     # Of the way from the middle to the outline.
     com_offset: Range = drawn(Range(0, 0.4), 4, "1", 0, 0.75, "centre of mass off the middle")
+    # Of the way from the centre of mass to the outline are three or four feet; None: it stands on
+    # its corners or its rim.
+    feet: Range | None = drawn(None, 43, "1", 0.1, 1, "feet, of the way to the outline")
     friction_ground: Range = drawn(Range(0.1, 0.7), 6, "1", _POSITIVE, 10, "friction object-ground")
     friction_robot: Range = drawn(Range(0.1, 0.8), 7, "1", _POSITIVE, 10, "friction object-robot")
     frictions: tuple[Friction, ...] = ()
@@ -157,6 +150,11 @@ class Domain:
         for friction in self.frictions:
             scene.check(friction, None)
         errors.check_name("domain skin", self.skin, ("ideal", "capacitive"))
+        if self.feet is not None and not set(self.objects) <= set(RANDOM):
+            raise InputError(
+                f"domain feet are not allowed with objects = {self.objects}: random ones alone "
+                "stand on drawn feet."
+            )
         self.robot.check()
         for target in self.targets:
             scene.check_target(target, self.robot.shell)
@@ -220,7 +218,8 @@ class Domain:
     @property
     def families(self) -> tuple[str, ...]:
         """The shape family of each of `objects`."""
-        return tuple(RANDOM.get(name) or FAMILIES[name] for name in self.objects)
+        known = FAMILIES | RANDOM | ({} if self.feet is None else {"random_box": "prism"})
+        return tuple(known[name] for name in self.objects)
 
     def family_of(self, index: int) -> str:
         """The shape family of one world's object."""
@@ -317,9 +316,6 @@ def named(domain: DomainLike, robot: RobotLike | None = None) -> Domain:
 
     Changes may follow a name or a file, as `wide,mass=3:10,objects=random_box`. With a robot, its
     worlds have that one, but for what the domain draws of it.
-
-    Raises:
-      InputError: no domain has this name, the file is no domain, or a change is not allowed.
     """
     if robot is not None:
         return replace(named(domain), robot=named_robot(robot))
@@ -378,11 +374,7 @@ _FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
 
 
 def from_json(values: dict[str, Any]) -> Domain:
-    """Read the domain that `dataclasses.asdict` wrote as JSON.
-
-    Raises:
-      InputError: a name or a value is not of a domain.
-    """
+    """Read the domain that `dataclasses.asdict` wrote as JSON; InputError if it is none."""
     return Domain(**_from_json(values, DOMAINS["wide"]))
 
 

@@ -43,6 +43,7 @@ _OTHERS = {
     **{name: 20 + i for i, name in enumerate(ERRORS)},
     **{"key_0": 23, "key_1": 24, "sides": 25, "turn": 26},
     **{f"corner_{i}": 27 + i for i in range(SIDES)},
+    **{"feet_number": 44, "feet_turn": 45},
 }
 # Which random number of a world is what, in the order of the columns.
 USES: dict[str, int] = dict(
@@ -57,22 +58,18 @@ USES: dict[str, int] = dict(
 
 
 def draw(domain: Domain, seed: int, index: ArrayLike) -> Draw:
-    """The worlds `index` (n,), all of one object of the domain.
-
-    Raises:
-      ValueError: they are of several objects.
-    """
+    """The worlds `index` (n,), all of one object of the domain."""
     index = np.asarray(index, np.int64)
-    which = domain.object_of(index)
-    if (which != which[0]).any():
-        raise ValueError("worlds of several objects cannot be batched")
     return drawn_at(domain, index, numbers_of(seed, index))
 
 
 def drawn_at(domain: Domain, index: np.ndarray, numbers: np.ndarray) -> Draw:
-    """Worlds of the same object, from their random numbers (n, columns)."""
+    """Worlds from their random numbers (n, columns); ValueError if they are of several objects."""
+    which = domain.object_of(index)
+    if (which != which[0]).any():
+        raise ValueError("worlds of several objects cannot be batched")
     u = {name: numbers[:, column] for name, column in USES.items()}
-    name = domain.objects[int(domain.object_of(index[0]))]
+    name = domain.objects[int(which[0])]
     ranges = {name: getattr(domain, name) for name in QUANTITIES if name in u}
     at = {name: one.at(u[name]) for name, one in ranges.items() if one is not None}
     if domain.skin == "ideal":
@@ -120,9 +117,12 @@ def _solid(name: str, at: dict[str, np.ndarray], u: dict[str, np.ndarray]) -> So
         vertices = solid.rectangles(depth, breadth)
     else:
         vertices = _polygons(depth, breadth, u)
-    return solid.build(
+    found = solid.build(
         vertices, radius, at["height"], at["mass"], at["com_offset"], 2 * np.pi * u["com_bearing"]
     )
+    if "feet" not in at:
+        return found
+    return solid.on_feet(found, at["feet"], 3 + np.floor(2 * u["feet_number"]), u["feet_turn"])
 
 
 def _polygons(depth: np.ndarray, breadth: np.ndarray, u: dict[str, np.ndarray]) -> np.ndarray:

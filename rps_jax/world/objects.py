@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -64,11 +64,7 @@ def path_of(name: str) -> Path:
 
 
 def named(text: str) -> str:
-    """Read an object's text: its name, or the path of an MJCF file, which is then registered.
-
-    Raises:
-      InputError: the file cannot be read, or is no object.
-    """
+    """Read an object's text: its name, or the path of an MJCF file, which is then registered."""
     if not isinstance(text, str) or not text.endswith(".xml"):
         return text
     path = Path(text).absolute()
@@ -108,9 +104,10 @@ def register_object(
       footprint: outline of the solid that touches, in the body's frame: a circle about the origin,
         or a convex polygon of up to 8 corners around it. By default that of the geom `object`, if
         it is a box or a cylinder. The solid is as high as this geom.
-      feet: places (S, 2) [m] of 3 to 8 points on which a polygon stands, in the body's frame, or
-        with weights (S, 3) [m, m, 1], as of springs; only the engine quasistatic tells weights
-        apart. By default it stands on its corners. The engine mjx knows no feet.
+      feet: places (S, 2) [m] of 3 to 8 points on which it stands, in the body's frame, or with
+        weights (S, 3) [m, m, 1], as of springs; by default its corners or its rim. Weights are of
+        the engine quasistatic alone: the others find the load of each foot from how the object
+        leans, on ground that gives way alike under all.
 
     Raises:
       InputError: the name is one of the paper's, or file, footprint or feet are not such.
@@ -144,8 +141,8 @@ def register_object(
     family, vertices, radius = _outline(what, footprint or _own_outline(what, model))
     thing = model.body("object")
     if feet is not None:
-        family, vertices = "prism", _padded(vertices)
-        feet = _feet(what, np.asarray(feet, float), radius, thing.ipos[:2])
+        family, vertices = "cylinder" if radius else "prism", solid.padded(vertices)
+        feet = _feet(what, np.asarray(feet, float), thing.ipos[:2])
     one = Solid(
         vertices=vertices,
         radius=np.asarray(radius),
@@ -189,14 +186,19 @@ def _compiled(what: str, path: Path) -> mujoco.MjModel:
     return model
 
 
+def outline_of(geom: Any) -> Footprint | None:
+    """The outline of a geom that is a box or a cylinder."""
+    if geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX:
+        return fp.rectangle(geom.size[0], geom.size[1])
+    return fp.circle(geom.size[0]) if geom.type[0] == mujoco.mjtGeom.mjGEOM_CYLINDER else None
+
+
 def _own_outline(what: str, model: mujoco.MjModel) -> Footprint:
     """The outline of the geom `object`."""
     geom = model.geom("object")
     centred = np.allclose(geom.pos[:2], 0) and np.allclose(geom.quat, _UPRIGHT)
-    if centred and geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX:
-        return fp.rectangle(geom.size[0], geom.size[1])
-    if centred and geom.type[0] == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        return fp.circle(geom.size[0])
+    if centred and (outline := outline_of(geom)) is not None:
+        return outline
     raise InputError(
         f"{what}: footprint = None is not allowed: the geom object is not an upright box or "
         "cylinder about the body's origin, so give the outline."
@@ -225,19 +227,11 @@ def _outline(what: str, footprint: Footprint) -> tuple[str, np.ndarray, float]:
     half = np.abs(vertices[0])
     if len(vertices) == 4 and np.allclose(np.abs(vertices), half):
         return "box", solid.rectangles(*half[:, None])[0], 0.0
-    return "prism", _padded(vertices), 0.0
+    return "prism", solid.padded(vertices), 0.0
 
 
-def _padded(vertices: np.ndarray) -> np.ndarray:
-    """Corners (SIDES, 2) [m] of a prism, the last of them repeated."""
-    missing = SIDES - len(vertices)
-    return np.concatenate([vertices, np.repeat(vertices[-1:], missing, axis=0)])
-
-
-def _feet(what: str, feet: np.ndarray, radius: float, com: np.ndarray) -> np.ndarray:
+def _feet(what: str, feet: np.ndarray, com: np.ndarray) -> np.ndarray:
     """Feet (SIDES, 3) [m, m, 1], those that are missing with a weight of 0."""
-    if radius:
-        raise InputError(f"{what}: feet are not allowed under a circle: give a polygon.")
     if feet.ndim == 2 and feet.shape[1] == 2:
         feet = np.column_stack([feet, np.ones(len(feet))])
     said = f"{what}: feet = {feet.tolist()} is not allowed:"

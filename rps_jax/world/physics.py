@@ -85,26 +85,17 @@ Fidelity = Literal["reference", "standard", "fast"]
 
 
 def preset(name: PhysicsName = "default", fidelity: Fidelity = "standard") -> Physics:
-    """Physics by name.
+    """Physics by name: `default`, isotropic Coulomb friction; or `paper_gazebo`, as in the paper.
 
-    Args:
-      name: `default`, isotropic Coulomb friction; `paper_gazebo`, a friction pyramid along the
-        world's axes, as in the paper's engine.
-      fidelity: `reference`, converged, for the engine `mujoco`; `standard`, for tables; `fast`.
-
-    Raises:
-      InputError: unknown name or fidelity.
+    There friction is a pyramid along the world's axes. The fidelity is `reference`, converged, for
+    the engine `mujoco`; `standard`, for tables; or `fast`.
     """
     errors.check_name("physics", name, PHYSICS)
     return PHYSICS[name][errors.check_name("fidelity", fidelity, PHYSICS[name])]
 
 
 def named(physics: PhysicsLike, fidelity: Fidelity = "standard") -> Physics:
-    """Read a physics: itself, or a name with changes, as `default,timestep=0.005`.
-
-    Raises:
-      InputError: unknown name, fidelity or field, or a value that is not allowed.
-    """
+    """Read a physics: itself, or a name with changes, as `default,timestep=0.005`."""
     if isinstance(physics, Physics):
         return physics
     if not isinstance(physics, str):

@@ -8,8 +8,9 @@ drawing them, moves such points.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -29,6 +30,7 @@ from rps_jax.world.draws import Draw
 Kind = Literal["range", "choice", "shape", "noise"]
 FILE = "points.nc"  # of a run folder whose worlds are points
 _OF_PRISMS = ("sides", "turn", *(f"corner_{i}" for i in range(SIDES)))
+_OF_FEET = ("feet_number", "feet_turn")
 _TURN = Range(0, 2 * np.pi)
 _MOST = 100_000_000
 
@@ -37,7 +39,7 @@ class Quantity(NamedTuple):
     """One coordinate of the cube, and what it stands for."""
 
     name: str
-    kind: Kind  # a range; a choice from a list; a prism's corners; the key of all noise
+    kind: Kind  # a range; a choice from a list; corners or feet; the key of all noise
     range: Range  # of the quantity, or from 0 to how many there are to choose from
     unit: str
 
@@ -57,8 +59,8 @@ def _quantities(domain: Domain) -> Iterator[Quantity]:
     random = set(domain.objects) & set(RANDOM)
     idle = set(domain.idle) | ({"aspect"} if random == {"random_cylinder"} else set())
     for name in draws.USES:
-        if name in _OF_PRISMS:
-            if "random_prism" in random:
+        if name in (*_OF_PRISMS, *_OF_FEET):
+            if domain.feet is not None if name in _OF_FEET else "random_prism" in random:
                 yield Quantity(name, "shape", Range(0, 1), "1")
         elif name == "com_bearing":
             if random and domain.com_offset.high > 0:
@@ -78,11 +80,7 @@ def names(domain: Domain, *kinds: Kind) -> tuple[str, ...]:
 
 
 def check_drawn(field: str, name: str, domain: Domain) -> str:
-    """`name` if the domain draws a quantity of this name from a range.
-
-    Raises:
-      InputError: there is none, or the domain draws none from it.
-    """
+    """`name` if the domain draws a quantity of this name from a range, or InputError."""
     drawn = names(domain, "range")
     known = (*QUANTITIES, *ERRORS, "com_bearing")
     if name in known and name not in drawn:
@@ -103,10 +101,6 @@ class Points:
         """Two tables are equal if all their numbers are."""
         return isinstance(other, Points) and self.digest == other.digest
 
-    def __hash__(self) -> int:
-        """The digest's."""
-        return hash(self.digest)
-
     @property
     def digest(self) -> str:
         """SHA-256 of the numbers and of how many each point has."""
@@ -122,16 +116,9 @@ class Points:
         return found
 
     def draw(self, domain: Domain, index: Any) -> Draw:
-        """The worlds `index` (n,), all of one object of the domain.
-
-        Raises:
-          ValueError: they are of several objects.
-        """
+        """The worlds `index` (n,), all of one object of the domain."""
         index = np.asarray(index, np.int64)
         cases = self.cases(domain, index)
-        which = domain.object_of(cases)
-        if (which != which[0]).any():
-            raise ValueError("worlds of several objects cannot be batched")
         numbers = np.full((index.size, draws.COLUMNS), 0.5)
         own = [i for i, name in enumerate(names(domain)) if name in draws.USES]
         at = [draws.USES[name] for name in names(domain) if name in draws.USES]
@@ -139,22 +126,12 @@ class Points:
         return draws.drawn_at(domain, cases, numbers)._replace(number=index)
 
     def write(self, folder: Path, domain: Domain) -> Path:
-        """Keep the points in a run folder, if it does not hold them already."""
-        path = folder / FILE
-        try:
-            if path.exists() and Points(_numbers(path)) == self:
-                return path
-        except InputError:  # it is damaged
-            pass
-        return files.write_results(path, _labelled(domain, self.u))
+        """Keep the points in a run folder."""
+        return files.write_results(folder / FILE, _labelled(domain, self.u))
 
     @staticmethod
     def read(folder: Path, digest: str) -> Points:
-        """The points that a run folder holds.
-
-        Raises:
-          InputError: there are none, or others than those of this digest.
-        """
+        """The points of this digest that a run folder holds; InputError if it does not."""
         if not (folder / FILE).exists():
             raise InputError(f"run = {folder} lacks its {FILE}: run the same command again.")
         found = Points(_numbers(folder / FILE))
@@ -175,11 +152,7 @@ def _counts(domain: Domain) -> tuple[int, int, int]:
 
 
 def checked(domain: Domain, u: Any) -> Points:
-    """Points of a domain: an array (n, q), or what `worlds_at` returned.
-
-    Raises:
-      InputError: they are not numbers in [0, 1), or of another domain.
-    """
+    """Points of a domain: an array (n, q) in [0, 1), or of `worlds_at`; or InputError."""
     every = names(domain)
     if isinstance(u, xr.Dataset):
         if "u" not in u or "quantity" not in u.coords:
@@ -208,18 +181,6 @@ def checked(domain: Domain, u: Any) -> Points:
         )
     errors.check_count("points", len(found), at_most=_MOST)
     return Points(found)
-
-
-def asked(domain: Domain, worlds: Any) -> tuple[int, Points | None]:
-    """How many worlds are asked for, and at which points, if it is not a number of drawn ones.
-
-    Raises:
-      InputError: it is neither a whole number nor points of the domain.
-    """
-    if isinstance(worlds, xr.Dataset | np.ndarray | list | tuple):
-        points = checked(domain, worlds)
-        return len(points.u), points
-    return worlds, None
 
 
 def cases(domain: Domain, points: Points | None, index: Any) -> np.ndarray:
@@ -272,8 +233,8 @@ def worlds_at(
 
     A quantity is at `low + u (high - low)`, or at `low (high / low)^u` where its range is even in
     the logarithm. Kinds of quantities are `range`; `choice`, of the object, friction or target from
-    the domain's lists; `shape`, of a prism's corners; and `noise`, the key of all that is drawn
-    while a world runs, so that neighbours in it have nothing in common.
+    the domain's lists; `shape`, of a prism's corners or of feet; and `noise`, the key of all that
+    is drawn while a world runs, so that neighbours in it have nothing in common.
 
     Args:
       domain: ranges of what differs between worlds, or their name, as wide.
@@ -306,14 +267,24 @@ def worlds_at(
     points = checked(domain, u)
     every = np.arange(len(points.u))
     which = domain.object_of(points.cases(domain, every))
-    found = _labelled(domain, points.u)
+    columns = coordinates(domain, which, partial(points.draw, domain))
+    return _labelled(domain, points.u).assign_coords(columns)
+
+
+def coordinates(
+    domain: Domain, which: np.ndarray, draw: Callable[[np.ndarray], Draw]
+) -> dict[str, Any]:
+    """Objects of worlds, and what was drawn for them, as coordinates.
+
+    `which` (n,) of the domain's objects they have, and `draw` makes some of them, by their rows.
+    """
     columns: dict[str, Any] = {"object": ("world", np.array(domain.objects)[which])}
     for thing in np.unique(which):
         rows = np.flatnonzero(which == thing)
-        for name, (values, unit) in draws.table(points.draw(domain, rows)).items():
-            empty = ("world", np.empty(every.size), {"units": unit})
+        for name, (values, unit) in draws.table(draw(rows)).items():
+            empty = ("world", np.empty(which.size), {"units": unit})
             columns.setdefault(name, empty)[1][rows] = values
-    return found.assign_coords(columns)
+    return columns
 
 
 def _labelled(domain: Domain, u: np.ndarray) -> xr.Dataset:

@@ -97,9 +97,14 @@ def load(
         if geom.name == "load" and rear == "far":
             geom.pos[0] = -geom.pos[0]
     if mass is not None:
-        _set_mass(spec, mass)
+        geoms = [geom for geom in spec.body("object").geoms if geom.mass > 0]
+        total = sum(geom.mass for geom in geoms)
+        for geom in geoms:
+            geom.mass *= mass / total
     model, stripped = _compile(spec, physics, friction, robot)
-    return Scene(name, FAMILIES[name], model, stripped, _footprint(stripped), robot.shell)
+    outline = objects.outline_of(stripped.geom("object"))
+    assert outline is not None
+    return Scene(name, FAMILIES[name], model, stripped, outline, robot.shell)
 
 
 def _load_registered(
@@ -127,11 +132,7 @@ def shaped(
     *,
     robot: Robot = Robot(),
 ) -> Scene:
-    """Compile a scene with one solid (its leaves without a leading axis) of a shape family.
-
-    Raises:
-      InputError: unknown family, or friction that is not a positive finite number.
-    """
+    """Compile a scene with one solid (its leaves without a leading axis) of a shape family."""
     errors.check_name("family", family, SHAPES)
     check(friction, float(one.mass))
     spec = objects.read(path_of(family))
@@ -144,6 +145,11 @@ def shaped(
         spec.geom(name).size[: size.size] = size
     if family == "prism":
         _set_corners(spec, one)
+    if one.feet is not None and family == "cylinder":
+        _add_feet(spec)
+    if one.feet is not None or family == "prism":
+        for i, foot in enumerate(feet(one)):
+            spec.geom(f"foot_{i}").pos = foot
     body.explicitinertial = True
     body.mass, body.ipos = one.mass, one.p_object_com
     body.iquat, body.inertia = one.q_object_body, one.inertia
@@ -203,18 +209,28 @@ def geom_sizes(family: str, solids: Solid) -> dict[str, np.ndarray]:
 
 
 def _set_corners(spec: mujoco.MjSpec, one: Solid) -> None:
-    """Give the mesh and the feet of a prism their places."""
+    """Give the mesh of a prism its corners."""
     real = np.any(one.vertices != np.roll(one.vertices, 1, axis=0), axis=1)
     half = one.height / 2
     spec.mesh("prism").uservert = np.concatenate(
         [np.column_stack([one.vertices[real], np.full(real.sum(), z)]) for z in (-half, half)]
     ).ravel()
-    for i, foot in enumerate(feet(one)):
-        spec.geom(f"foot_{i}").pos = foot
+
+
+def _add_feet(spec: mujoco.MjSpec) -> None:
+    """Give a cylinder feet as a prism has them, and let these alone touch the ground."""
+    usual = spec.find_default("ground_object")
+    spec.delete(spec.pair("ground_object"))
+    for i in range(solid.SIDES):
+        spec.body("object").add_geom(
+            name=f"foot_{i}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-6, 0, 0], mass=0, group=3
+        )
+        pair = {"geomname1": "ground", "geomname2": f"foot_{i}"}
+        spec.add_pair(usual, name=f"ground_object_{i}", **pair)
 
 
 def feet(solids: Solid) -> np.ndarray:
-    """Where prisms (...) stand, (..., N, 3) [m]; what is no foot is at the top, unused.
+    """Where solids (...) on corners or feet stand, (..., N, 3) [m]; what is no foot is at the top.
 
     Feet of their own count alike here, whatever their weight.
     """
@@ -286,14 +302,6 @@ def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
         joint.armature = 0.0
 
 
-def _set_mass(spec: mujoco.MjSpec, mass: float) -> None:
-    """Scale the object's geoms to this mass in all [kg]."""
-    geoms = [geom for geom in spec.body("object").geoms if geom.mass > 0]
-    total = sum(geom.mass for geom in geoms)
-    for geom in geoms:
-        geom.mass *= mass / total
-
-
 def _set_options(option: mujoco.MjOption, physics: Physics) -> None:
     option.timestep = physics.timestep
     option.cone = {
@@ -313,6 +321,7 @@ def _strip(spec: mujoco.MjSpec, full: mujoco.MjModel) -> mujoco.MjModel:
     spec.stat.meanmass, spec.stat.meansize = 1.0, 1.0  # unused, and so the same for all
     spec.delete(spec.body("target"))
     touching = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
+    touching.add("object")  # of which the solid is read, though it stand on feet
     for geom in list(spec.geoms):
         if geom.name not in touching:
             spec.delete(geom)
@@ -330,15 +339,6 @@ def _strip(spec: mujoco.MjSpec, full: mujoco.MjModel) -> mujoco.MjModel:
     return model
 
 
-def _footprint(model: mujoco.MjModel) -> Footprint:
-    """The outline of the object's geom that stands on the ground."""
-    geom = model.geom("object")
-    half_x, half_y, _ = geom.size
-    if geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX:
-        return fp.rectangle(half_x, half_y)
-    return fp.circle(half_x)
-
-
 def solid_of(scene: Scene) -> Solid:
     """The object of a scene as solids, one of them."""
     thing, geom = scene.physics.body("object"), scene.physics.geom("object")
@@ -351,10 +351,11 @@ def solid_of(scene: Scene) -> Solid:
         inertia=thing.inertia[None].copy(),
         q_object_body=thing.iquat[None].copy(),
     )
-    if scene.family != "prism":
+    if "foot_0" not in [scene.physics.geom(i).name for i in range(scene.physics.ngeom)]:
         return one
-    at = np.array([scene.physics.geom(f"foot_{i}").pos for i in range(one.vertices.shape[1])])
-    if np.allclose(at, feet(one), atol=1e-6):  # outlines are in single precision
+    at = np.array([scene.physics.geom(f"foot_{i}").pos for i in range(solid.SIDES)])
+    stands = scene.family == "prism" and np.allclose(at, feet(one), atol=1e-6)
+    if stands:  # on its corners; outlines are in single precision
         return one
     own = np.column_stack([at[:, :2], at[:, 2] < 0])
     return one._replace(feet=own[None])

@@ -29,17 +29,32 @@ from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import InTurn
 from rps_jax.trials.setting import Setting
 from rps_jax.world import domain as domains
-from rps_jax.world.domain import DomainLike
+from rps_jax.world.domain import DomainLike, Range
 from rps_jax.world.physics import preset
 from sweeps.shared import Trials
 
-# The first is what the others are compared with.
+_CONVERGED = Setting(physics=preset(fidelity="reference"), engine="mujoco")
+
+
+_MOVED = 1e-6  # [m]
+
+
+def _steps(timestep: float, setting: Setting = Setting()) -> Setting:
+    return replace(setting, physics=replace(setting.physics, timestep=timestep))
+
+
+# The first is what the others are compared with. Those whose objects start a micrometre farther
+# away tell what no step can: how many outcomes hang on nothing.
 ENGINES = {
-    "C, reference": Setting(physics=preset(fidelity="reference"), engine="mujoco"),
+    "C, reference": _CONVERGED,
+    "C, reference, moved": _CONVERGED,
+    "C, 2 ms": _steps(0.002, _CONVERGED),
     "C, standard": Setting(physics=preset(), engine="mujoco"),
     "fused, standard": Setting(physics=preset(), engine="fused"),
-    "fused, 5 ms": Setting(physics=replace(preset(), timestep=0.005), engine="fused"),
-    "fused, 2 ms": Setting(physics=replace(preset(), timestep=0.002), engine="fused"),
+    "fused, 10 ms": _steps(0.01),
+    "fused, 5 ms": _steps(0.005),
+    "fused, 5 ms, moved": _steps(0.005),
+    "fused, 2 ms": _steps(0.002),
     "fused, fast": Setting(physics=preset(fidelity="fast"), engine="fused"),
     "quasistatic": Setting(physics=preset(), engine="quasistatic"),
     "MJX, standard": Setting(physics=preset(), engine="mjx"),
@@ -84,8 +99,16 @@ class Engines(Trials[xr.DataTree]):
         ranges = replace(ranges, objects=self.objects or ranges.objects)
         label, params = registry.read_law(self.law)
         here = (n for n, s in ENGINES.items() if engines_.get(s.engine).works(ranges.families))
+        low, high, log = ranges.gap
+        moved = replace(ranges, gap=Range(low + _MOVED, high + _MOVED, log))
         return {
-            name: Plan(ranges, self.worlds, {label: params}, ENGINES[name], self.part)
+            name: Plan(
+                moved if name.endswith("moved") else ranges,
+                self.worlds,
+                {label: params},
+                ENGINES[name],
+                self.part,
+            )
             for name in self.engines or here
         }
 

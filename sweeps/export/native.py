@@ -17,8 +17,6 @@ import re
 import shutil
 import subprocess
 import tempfile
-import time
-from collections import namedtuple
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -27,20 +25,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import rps_jax
 from rps_jax.app.export import c, folder, graph, program
 from rps_jax.app.export.program import Group, Program
 from rps_jax.control import registry, trying
 from rps_jax.control.base import Law
-from rps_jax.control.observation import Details, Twist
-from rps_jax.runs.push import recorded_law
-from rps_jax.trials import pushes
-from rps_jax.trials.batch import Part
-from rps_jax.trials.case import Case
-from rps_jax.trials.setting import Setting
-from rps_jax.world import paper
-from rps_jax.world.objects import PAPER_OBJECTS
-from rps_jax.world.scene import FRICTION
 
 Precision = Literal["float", "double"]
 Form = Literal["float", "double", "onnx"]  # C of either precision, or ONNX, which is of float
@@ -242,7 +230,7 @@ def agreement(name: str, form: Form, inputs: int, where: Path, seed: int = 0) ->
 
         step = jax.jit(jax.vmap(step))
         exact = None if form == "double" else _exact(law, params, seen_tree)
-        rng, found, scale = np.random.default_rng(seed), Agreement(label, form), _scale(params)
+        rng, found, scale = np.random.default_rng(seed), Agreement(label, form), scale_of(params)
         begin = jax.tree.map(
             lambda x: np.broadcast_to(np.asarray(x), (worlds, *np.shape(x))), law.init(params)
         )
@@ -340,37 +328,27 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return worst
 
 
-def _scale(params: Any) -> np.ndarray:
+def scale_of(params: Any) -> np.ndarray:
     """The greatest speeds and turning rate (3,) of a law."""
     own = getattr(params, "law", params)
     speed, turn = (float(getattr(own, name, 1.0)) for name in ("v_max", "omega_max"))
     return np.array([speed, speed, turn])
 
 
-def recorded(cases: Sequence[Case], setting: Setting) -> list[Any]:
-    """What the law of each case observed in each control step: leaves (T, ...), by trial."""
-    law = registry.law_of(cases[0].params)
-    stage, worlds = pushes.build(cases, setting)
-    part = Part(np.arange(len(cases)), worlds, stage)
-    period, found = setting.physics.control_period, []
-    for followed in pushes.follow_part(part, recorded_law(law), setting, interval=period):
-        seen = followed.snapshots
-        observed = tuple(seen.details)[1]  # of `recorded_law`, with taxels
-        leaves = jax.tree.leaves(observed.touch if law.senses == "touch" else observed)
-        found.append([np.broadcast_to(x, (len(seen.time), *x.shape[1:])) for x in leaves])
-    return found
+class Whole(NamedTuple):
+    """Errors (T,) of the twists over whole trials, by trial."""
+
+    own: list[np.ndarray]  # each law remembers by itself, from the first step to the last
+    told: list[np.ndarray]  # before each step, the law in C or ONNX is given the memory of JAX
+    in_jax: list[np.ndarray]  # of JAX in float32 from JAX in float64, which remember by themselves
 
 
-def trial_errors(name: str, form: Form, trials: Sequence[Any], where: Path) -> list[np.ndarray]:
-    """Errors (T,) of the twists of whole trials, observed as `recorded`; each has its own memory.
-
-    Both laws, that of JAX and the other, remember by themselves from the first step to the last, in
-    the precision that is asked for.
-    """
+def trial_errors(name: str, form: Form, trials: Sequence[Any], where: Path) -> Whole:
+    """Errors of the twists over whole trials, observed as `recorded`, in a form's precision."""
     law_params = registry.read_law(name)[1]
     law, made, real = registry.law_of(law_params), program.program(name), REAL[form]
     native, longest = made_in(form, made, where, len(trials)), max(len(one[0]) for one in trials)
-    fields = made.groups["observation"]
+    fields, scale = made.groups["observation"], scale_of(law_params)
 
     def whole(leaves: Any) -> list[np.ndarray]:
         """Leaves (longest, ...), the last row held."""
@@ -380,117 +358,37 @@ def trial_errors(name: str, form: Form, trials: Sequence[Any], where: Path) -> l
         return [np.asarray(x)[rows].astype(kind) for x, kind in zip(leaves, kinds, strict=True)]
 
     seen = [np.stack(columns, 1) for columns in zip(*map(whole, trials), strict=True)]
-    with jax.enable_x64(form == "double"):
-        params = jax.tree.map(lambda x: jnp.asarray(x, real), law_params)
-        tree = jax.tree.structure(trying.observation_of(law.senses))
-
-        def step(memory: Any, leaves: Any) -> Any:
-            memory, twist, _ = law.step(params, memory, jax.tree.unflatten(tree, leaves))
-            return memory, jnp.stack([jnp.asarray(x, real) for x in twist])
-
-        begin = jax.tree.map(
-            lambda x: jnp.broadcast_to(x, (len(trials), *jnp.shape(x))), law.init(params)
-        )
-        both = np.asarray(jax.lax.scan(jax.vmap(step), begin, seen)[1])
-    memory, twists = native.begin(len(trials)), []
+    memories, both = _in_jax(law, law_params, seen, real)
+    mine, own, told = native.begin(len(trials)), [], []
     for i in range(longest):
         rows = native.filled("observation", [x[i] for x in seen], len(trials))
-        twists.append(native.step(memory, rows)[0])
-    error = (np.abs(np.array(twists) - both) / _scale(law_params)).max(-1)
-    return [error[: len(one[0]), i] for i, one in enumerate(trials)]
+        own.append(native.step(mine, rows)[0])
+        theirs = native.filled("memory", [x[i] for x in memories], len(trials))
+        told.append(native.step(theirs, rows)[0])
+    exact = both if form == "double" else _in_jax(law, law_params, seen, np.float64)[1]
+
+    def errors(twists: Any, those: np.ndarray) -> list[np.ndarray]:
+        error = (np.abs(np.asarray(twists) - those) / scale).max(-1)
+        return [error[: len(one[0]), i] for i, one in enumerate(trials)]
+
+    return Whole(errors(own, both), errors(told, both), errors(both, exact))
 
 
-def in_the_loop(name: str, where: Path) -> Any:
-    """Parameters of a law of this process whose step is that in C, in float."""
-    label, params = registry.read_law(name)
-    law, native = registry.law_of(params), Native(program.program(name), where, "float")
+def _in_jax(law: Law, params: Any, seen: Sequence[Any], real: Any) -> tuple[list[Any], np.ndarray]:
+    """Memories before each step and twists (T, n, 3) of a law that observes leaves (T, n, ...)."""
+    with jax.enable_x64(real == np.float64):
+        own = jax.tree.map(lambda x: jnp.asarray(x, real), params)
+        tree = jax.tree.structure(trying.observation_of(law.senses))
+        given = [x.astype(real) if x.dtype.kind == "f" else x for x in seen]
 
-    def called(memory: Any, seen: Any) -> Any:
-        shape = np.shape(jax.tree.leaves(seen)[0])[:-1]
-        count, given = int(np.prod(shape)), native.filled
-        flat = [
-            [np.asarray(x).reshape(count, *np.shape(x)[len(shape) :]) for x in group]
-            for group in (memory, seen)
-        ]
-        mine = given("memory", flat[0], count)
-        twist, _ = native.step(mine, given("observation", flat[1], count))
-        after = [
-            np.asarray(mine[f.name]).reshape(np.shape(x)).astype(x.dtype) if f.size else x
-            for f, x in zip(native.program.groups["memory"], memory, strict=True)
-        ]
-        return after, twist.reshape(*shape, 3)
+        def step(memory: Any, leaves: Any) -> Any:
+            after, twist, _ = law.step(own, memory, jax.tree.unflatten(tree, leaves))
+            return after, (memory, jnp.stack([jnp.asarray(x, real) for x in twist]))
 
-    def step(_: Any, memory: Any, seen: Any) -> Any:
-        tree = jax.tree.structure(memory)
-        shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in jax.tree.leaves(memory)]
-        out = (shapes, jax.ShapeDtypeStruct((3,), np.float32))
-        after, twist = jax.pure_callback(
-            called, out, jax.tree.leaves(memory), jax.tree.leaves(seen),
-            vmap_method="broadcast_all",
-        )  # fmt: skip
-        return (
-            jax.tree.unflatten(tree, after),
-            Twist(*twist),
-            Details.of(getattr(seen, "touch", seen)),
-        )
-
-    own = program.identifier(label)
-    kind = namedtuple(f"{own}_InC", "law d_success")  # each law has parameters of its own class
-    mine = kind(params, params.d_success)
-    native_law = Law(lambda p: law.init(p.law), step, senses=law.senses)
-    registry.register_law(f"{own}_in_c", native_law, mine)
-    return mine
-
-
-class Ends(NamedTuple):
-    """How trials end with a law of JAX and with that of C in the loop."""
-
-    trials: int
-    in_jax: int  # succeed
-    in_c: int
-    alike: int  # succeed with both, or with neither
-    apart: float  # [s] 99th percentile of the difference of the times of those that both succeed in
-    seconds_in_jax: float  # [s] that the run took, with compilation
-    seconds_in_c: float
-
-
-def _ends(outcomes: Sequence[Any], took: Sequence[float]) -> Ends:
-    won = [np.asarray(one.success).astype(bool).ravel() for one in outcomes]
-    times = [np.asarray(one.time).ravel() for one in outcomes]
-    both = won[0] & won[1]
-    apart = np.abs(times[0] - times[1])[both]
-    return Ends(
-        won[0].size, int(won[0].sum()), int(won[1].sum()), int((won[0] == won[1]).sum()),
-        float(np.quantile(apart, 0.99)) if both.any() else 0.0, *took,
-    )  # fmt: skip
-
-
-def timed(make: Any) -> tuple[Any, float]:
-    """What a call returns, and how long [s] it took."""
-    began = time.perf_counter()
-    return make(), time.perf_counter() - began
-
-
-def papers_trials(name: str, setting: Setting, where: Path) -> Ends:
-    """The paper's 144 trials with a law of JAX, and with that of C in the loop."""
-    cases = [(o, f, t) for o in PAPER_OBJECTS for f in FRICTION for t in paper.TARGETS]
-    both = (registry.read_law(name)[1], in_the_loop(name, where))
-    outcomes, took = zip(
-        *(timed(lambda p=p: pushes.run([Case(*one, law=p) for one in cases], setting)[0])
-          for p in both), strict=True,
-    )  # fmt: skip
-    return _ends(outcomes, took)
-
-
-def random_worlds(name: str, domain: str, worlds: int, setting: Setting, where: Path) -> Ends:
-    """Random worlds with a law of JAX, and with that of C in the loop."""
-    both = (registry.read_law(name)[1], in_the_loop(name, where))
-
-    def run(params: Any) -> Any:
-        return rps_jax.sweep({"law": params}, domain, worlds, setting=setting, progress=False)
-
-    outcomes, took = zip(*(timed(lambda p=p: run(p)) for p in both), strict=True)
-    return _ends(outcomes, took)
+        count = seen[0].shape[1]
+        begin = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *jnp.shape(x))), law.init(own))
+        memories, twists = jax.jit(lambda m, x: jax.lax.scan(jax.vmap(step), m, x)[1])(begin, given)
+        return [np.asarray(x) for x in jax.tree.leaves(memories)], np.asarray(twists)
 
 
 def latency(name: str, precision: Precision, where: Path, runs: int = 5) -> np.ndarray:
@@ -499,7 +397,7 @@ def latency(name: str, precision: Precision, where: Path, runs: int = 5) -> np.n
     The exported example measures itself, 200,000 steps in a run.
     """
     made, place = program.program(name), Path(tempfile.mkdtemp(dir=where))
-    for file, text in {"law.h": c.header(made, "law"), **folder.files(made, "law")}.items():
+    for file, text in folder.files(made, "law").items():
         (place / file).write_text(text, encoding="utf-8")
     double = ["-DLAW_DOUBLE"] if precision == "double" else []
     source, binary = str(place / "main.c"), str(place / "main")

@@ -36,8 +36,7 @@ from rps_jax.engines import EngineName
 from rps_jax.geometry import planar, solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import Solid
-from rps_jax.robot.base import Odometry
-from rps_jax.robot.load_cell import LoadCell
+from rps_jax.robot.base import LoadCell, Odometry
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.shell import Boards
 from rps_jax.robot.skin import IdealSkin

@@ -7,6 +7,7 @@ rps sweeps/headline --machine "one NVIDIA H200"
 
 from __future__ import annotations
 
+import fnmatch
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -38,7 +39,7 @@ class Headline(Study[xr.Dataset]):
 
     TITLE: ClassVar[str] = "The headline: four laws in random worlds"
     SMALL: ClassVar[dict[str, Any]] = {"worlds": 24, "panel": 0, "in_c": 0}
-    GROWS: ClassVar[tuple[str, ...]] = ("domains", "machine", "panel", "in_c")
+    GROWS: ClassVar[tuple[str, ...]] = ("domains", "machine", "panel", "in_c", "only")
 
     laws: tuple[str, ...] = ("rps", "rps_tuned", "rps_plus", "learned_gru")
     """Laws that are compared."""
@@ -48,11 +49,14 @@ class Headline(Study[xr.Dataset]):
     """Number of worlds of a domain."""
     panel: int = option(2_000, 0, 10_000_000)
     """How many of them are tried on each model of the panel; 0: none."""
-    in_c: int = option(500, 0, 10_000_000)
+    in_c: int = option(2_000, 0, 10_000_000)
     """How many of them are tried in C MuJoCo; 0: none."""
+    only: tuple[str, ...] = ()
+    """Models that are run now, as "C MuJoCo*" or "quasi-static"; by default all. So a run can be
+    shared by a GPU and processors; its parts are then put together in one folder."""
     machine: str = ""
     """What it runs on, in words; with these the table is published."""
-    setting: Setting = field(default=Setting("fused", seed=2311), kw_only=True)
+    setting: Setting = field(default=Setting("fused", seed=3119), kw_only=True)
     quick: bool = False
     """Whether to make a small run of a minute on two cores."""
 
@@ -76,14 +80,19 @@ class Headline(Study[xr.Dataset]):
                 found.append(part.expand_dims(domain=[name], model=[model]))
         whole = xr.combine_by_coords(found, join="outer", combine_attrs="drop")
         assert isinstance(whole, xr.Dataset)
-        whole = whole.sel(law=list(self.laws), domain=list(self.domains))
-        if self.machine and run.folder is not None:
-            columns = [{"name": "domain", "merge": True}, {"name": "law"}]
-            head, *rows = table(whole)
-            columns += [{"name": text} for text in head[2:]]
-            made = [provenance.signed(run.folder)]
-            publish(_HERE / "results" / "headline.json", made, self.machine, columns, rows)
+        names = list(dict.fromkeys(str(one.model.item()) for one in found))
+        whole = whole.sel(law=list(self.laws), domain=list(self.domains), model=names)
+        if self.machine and run.folder is not None and not self.only:
+            self._publish("headline/results/headline.json", table(whole), run.folder)
+            if whole.sizes["model"] > 1:
+                self._publish("models/results/models.json", panel_table(whole), run.folder)
         return whole
+
+    def _publish(self, path: str, told: list[list[Any]], folder: Path) -> None:
+        """Write a table as a data file of a folder beside this one."""
+        head, *rows = told
+        columns = [{"name": name, "merge": name == "domain"} for name in head]
+        publish(_HERE.parent / path, [provenance.signed(folder)], self.machine, columns, rows)
 
     def plans(self, name: str) -> dict[str, Plan]:
         """What is run in a domain: on each model, the default's worlds first."""
@@ -96,7 +105,7 @@ class Headline(Study[xr.Dataset]):
         if self.in_c:
             in_c = replace(plan.setting, engine="mujoco")
             found[C] = replace(plan, worlds=min(self.in_c, self.worlds), setting=in_c)
-        return found
+        return {k: v for k, v in found.items() if not self.only or _meets(k, self.only)}
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
         """Rates with their intervals, their range over the models, and times."""
@@ -104,6 +113,8 @@ class Headline(Study[xr.Dataset]):
             f"{self.worlds:,} worlds of seed {self.setting.seed}; every law meets the same ones. "
             "Intervals: Wilson 95 %."
         )
+        if models.OWN not in found.model:
+            return [Section("Models", text, panel_table(found))]
         if found.sizes["model"] == 1:
             return [Section("Success", text, table(found))]
         text += (
@@ -114,6 +125,10 @@ class Headline(Study[xr.Dataset]):
 
 
 headline = call_of(Headline)
+
+
+def _meets(name: str, patterns: Sequence[str]) -> bool:
+    return any(fnmatch.fnmatch(name, one) for one in patterns)
 
 
 def _outcomes(plan: Plan, run: Run) -> xr.Dataset:
@@ -146,13 +161,14 @@ def _row(found: xr.Dataset, domain: str, law: str) -> dict[str, str]:
     by_model = rates(found, domain, law)
     own = found.sel(domain=domain, law=law, model=models.OWN)
     shares = [won / of for won, of in by_model.values()]
+    median = float(own.time.where(own.success == 1).median())
     return {
         "domain": domain,
         "law": law,
         "success": tables.share(*by_model[models.OWN]),
         "over the models": tables.spread(shares) if len(shares) > 1 else "",
         "in C MuJoCo": tables.share(*by_model[C]) if C in by_model else "",
-        "median time of a success": f"{float(own.time.where(own.success == 1).median()):.1f} s",
+        "median time of a success": f"{median:.1f} s" if np.isfinite(median) else "-",
     }
 
 

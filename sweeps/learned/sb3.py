@@ -3,9 +3,9 @@
     pip install stable-baselines3  # in an environment of its own: it brings PyTorch
     rps sweeps/learned/sb3.py --machine "two cores"
 
-runs PPO of Stable-Baselines3, unmodified, for a minute of wall clock on worlds of Gymnasium that
-are stepped together. Its own vector environments step one world after another; `Batched` lends it
-the one of `gymnasium.make_vec`.
+runs PPO of Stable-Baselines3 for a minute of wall clock on the environment as `gymnasium.make`
+gives it, and then for another on many worlds that are stepped together. The library's own vector
+environments step one world after another; `Batched` lends it the one of `gymnasium.make_vec`.
 """
 
 from __future__ import annotations
@@ -16,15 +16,18 @@ import importlib.util
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
+from matplotlib.figure import Figure
 
 from rps_jax import errors
-from rps_jax.analysis import tables
-from rps_jax.analysis.report import Section
+from rps_jax.analysis import statistics, tables
+from rps_jax.analysis.report import Picture, Section
 from rps_jax.record import provenance
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
@@ -44,16 +47,21 @@ _FOUND = {
 
 @dataclass(frozen=True)
 class SB3(Study[xr.Dataset]):
-    """Learn by PPO of Stable-Baselines3 in worlds of Gymnasium, and publish its curve."""
+    """Learn by PPO of Stable-Baselines3 in worlds of Gymnasium, and publish its curves.
+
+    The answer holds `time` [s], `steps`, `episodes`, `reward` and `success` (envs, row).
+    """
 
     TITLE: ClassVar[str] = "PPO of Stable-Baselines3"
 
-    domain: str = "wide,distance=0.7:1.5,bearing=-0.5:0.5"
+    domain: str = "wide,distance=0.7:1,bearing=-0.3:0.3"
     """Ranges from which worlds are drawn."""
     object: str = "random_cylinder"
     """Object of all worlds."""
-    num_envs: int = option(256, 2, 100_000)
-    """Number of worlds that are stepped together."""
+    num_envs: tuple[int, ...] = option((1, 256), 1, 100_000)
+    """Numbers of worlds that are stepped together; 1: the environment of gymnasium.make itself."""
+    hold: float = option(0.5, above=0, at_most=60, unit="s")
+    """How long an action is carried out [s]."""
     seconds: float = option(60.0, above=0, at_most=1e5, unit="s")
     """Wall clock of learning [s], without the compilation of the worlds."""
     rows: int = option(6, 1, 1000)
@@ -74,56 +82,54 @@ class SB3(Study[xr.Dataset]):
                 )
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Learn (row)."""
-        found = run.part("curve", self._learned)
+        """Learn with each number of worlds."""
+        each = [run.part(f"curve_{n}", partial(self._learned, n)) for n in self.num_envs]
+        found = xr.concat(each, xr.IndexVariable("envs", list(self.num_envs)))
         if self.machine and run.folder is not None:
             head, *rows = table(found)
             names = ("stable-baselines3", "torch", "gymnasium")
             versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in names)
             made, columns = [provenance.signed(run.folder)], [{"name": text} for text in head]
+            columns[0]["merge"] = True
             path = Path(__file__).parent / "results" / "sb3.json"
             note = f"{versions}; a run of its own seed, with noise in the actions."
             publish(path, made, self.machine, columns, rows, note)
         return found
 
-    def _learned(self) -> xr.Dataset:
+    def _learned(self, count: int) -> xr.Dataset:
         names = ("", ".common.vec_env", ".common.callbacks")
         modules: list[Any] = [importlib.import_module(f"stable_baselines3{one}") for one in names]
         sb3, vec, back = modules
         gymnasium: Any = importlib.import_module("gymnasium")
+        name = "rps_jax.tuning.gym:rps_jax/Push-v0"
         how = {"object": self.object, "domain": self.domain, "setting": self.setting}
-        envs = gymnasium.make_vec(
-            "rps_jax.tuning.gym:rps_jax/Push-v0",
-            num_envs=self.num_envs,
-            autoreset_mode="SameStep",
-            **how,
-        )
-        worlds = vec.VecMonitor(batched(vec.VecEnv, envs), info_keywords=("is_success",))
-        worlds.seed(self.setting.seed)
-        worlds.reset()
-        worlds.step(np.zeros((self.num_envs, 3), np.float32))
+        how |= {"hold": self.hold}
+        if count == 1:
+            worlds = gymnasium.make(name, **how)
+        else:
+            envs = gymnasium.make_vec(name, num_envs=count, autoreset_mode="SameStep", **how)
+            worlds = vec.VecMonitor(batched(vec.VecEnv, envs))
+        options = {"n_steps": max(32, 512 // count), "batch_size": max(64, 8 * count)}
+        options |= {"n_epochs": 10, "learning_rate": 1e-3, "policy_kwargs": {"log_std_init": -0.7}}
+        model = sb3.PPO("MlpPolicy", worlds, seed=self.setting.seed, device="cpu", **options)
+        first = model.get_env()
+        first.reset()
+        first.step(np.zeros((count, 3), np.float32))  # it compiles
         curve: list[list[float]] = []
-        began, every, ended = time.perf_counter(), self.seconds / self.rows, []
+        began, rows, ended = time.perf_counter(), self.rows, []
+        every = self.seconds / rows
 
         class Curve(back.BaseCallback):
             def _on_step(self) -> bool:
-                ended.extend(i["episode"] for i in self.locals["infos"] if "episode" in i)
+                infos = self.locals["infos"]
+                ended.extend((i["episode"]["r"], i["is_success"]) for i in infos if "episode" in i)
                 spent = time.perf_counter() - began
                 if spent >= every * (len(curve) + 1):
-                    mean = [
-                        float(np.mean([one[key] for one in ended])) if ended else np.nan
-                        for key in ("r", "is_success")
-                    ]
+                    mean = np.mean(ended, axis=0) if ended else [np.nan] * 2
                     curve.append([spent, self.num_timesteps, len(ended), *mean])
                     ended.clear()
                 return len(curve) < rows
 
-        rows = self.rows
-        options = {"n_steps": 32, "batch_size": 2048, "n_epochs": 4, "learning_rate": 1e-3}
-        model = sb3.PPO(
-            "MlpPolicy", worlds, seed=self.setting.seed, device="cpu",
-            policy_kwargs={"log_std_init": -0.7}, **options,
-        )  # fmt: skip
         model.learn(10**9, callback=Curve())
         values = np.array(curve)
         return xr.Dataset(
@@ -134,8 +140,8 @@ class SB3(Study[xr.Dataset]):
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """The curve."""
-        return [Section("Curve", "", table(found))]
+        """The curves."""
+        return [Section("Curve", "", table(found), Picture("sb3", partial(figure_of, found)))]
 
 
 sb3 = call_of(SB3)
@@ -188,17 +194,38 @@ def batched(base: Any, envs: Any) -> Any:
 def table(found: xr.Dataset) -> list[list[str]]:
     """Header and rows of the curve."""
     rows = [
-        ["wall clock", "steps of all worlds", "trials that ended", "reward of these", "success"]
-    ]
-    for i in range(found.sizes["row"]):
-        at = found.isel(row=i)
+        ["worlds", "wall clock", "steps of all worlds", "trials that ended", "reward of these",
+         "success"]
+    ]  # fmt: skip
+    for count, i in product(found.envs.values, range(found.sizes["row"])):
+        at = found.sel(envs=count).isel(row=i)
+        trials = int(at.episodes)
         rows.append(
             [
+                f"{count:,}",
                 f"{float(at.time):.0f} s",
                 f"{int(at.steps):,}",
-                f"{int(at.episodes):,}",
-                f"{float(at.reward):.2f}",
-                tables.share(round(float(at.success) * int(at.episodes)), int(at.episodes)),
+                f"{trials:,}",
+                f"{float(at.reward):.2f}" if trials else "-",
+                tables.share(round(float(at.success) * trials) if trials else 0, trials),
             ]
         )
     return rows
+
+
+def figure_of(found: xr.Dataset) -> Figure:
+    """Draw success over wall clock, with Wilson's 95 % intervals."""
+    figure = Figure(figsize=(6, 3.2), layout="constrained")
+    ax = figure.subplots()
+    for i, count in enumerate(found.envs.values):
+        one = found.sel(envs=count)
+        at = np.flatnonzero(one.episodes.values > 0)
+        trials = one.episodes.values[at].astype(int)
+        won = np.rint(one.success.values[at] * trials).astype(int)
+        ends = [statistics.wilson(int(w), int(n)) for w, n in zip(won, trials, strict=True)]
+        ax.plot(one.time[at], 100 * won / trials, "o-", color=f"C{i}", label=f"{count} at once")
+        ax.fill_between(one.time[at], *100 * np.transpose(ends), color=f"C{i}", alpha=0.2, lw=0)
+    ax.set(xlabel="wall clock [s]", ylabel="success [%]", ylim=(0, 100))
+    ax.grid(alpha=0.3)
+    ax.legend(title="worlds")
+    return figure

@@ -1,29 +1,39 @@
 """Which published numbers are of today's code, which are not, and which command makes them anew?
 
-rps sweeps/publish                 # what is stale, and why
-rps sweeps/publish --check-digests # fails if a number hangs on what has changed since
-rps sweeps/publish --only fit_*    # makes these anew; what was killed goes on
+rps sweeps/publish                       # what is stale, and why, and what making it anew takes
+rps sweeps/publish --check-digests       # fails if a number hangs on what has changed since
+rps sweeps/publish --only 'fit_*' table  # makes these anew; what was killed goes on
+rps sweeps/publish --only '*' --needs gpu
 """
 
 from __future__ import annotations
 
 import fnmatch
 import json
+import os
+import platform
+import re
 import shlex
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
+import jax
 import xarray as xr
 
 import rps_jax
 from rps_jax.analysis.report import Section
+from rps_jax.app.cli import flags, names
 from rps_jax.errors import InputError
+from rps_jax.record import provenance
 from rps_jax.runs.question import Question, Run, call_of
+from sweeps.publish.recipes import BY_HAND, RECIPES, Recipe, Rows
 from sweeps.shared import digest
+from sweeps.shared import publish as write
 
 _SWEEPS = Path(__file__).parents[1]
 CURRENT = "of today's code"
@@ -37,17 +47,22 @@ class Publish(Question[xr.Dataset]):
 
     only: tuple[str, ...] = ()
     """Data files to be made anew, as fit_coverage or fit_*; by default none."""
+    needs: Literal["any", "cpu", "gpu"] = "any"
+    """Which of these: those that are made on processors, or those that take a GPU."""
+    machine: str = ""
+    """What it runs on, in words; by default as the system names its device."""
     check_digests: bool = False
     """Whether to fail if a number hangs on what has changed since it was made."""
 
     def check(self) -> None:
-        """Check that there are such files."""
+        """Check that such files are known."""
+        known = [*(path.stem for path in published()), *RECIPES]
         for pattern in self.only:
-            if not any(fnmatch.fnmatch(path.stem, pattern) for path in published()):
+            if not fnmatch.filter(known, pattern):
                 raise InputError(f"only = {pattern} is not allowed: no data file has such a name.")
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Version, date, device, command and state (file)."""
+        """Version, date, device, command, state and what it takes (file)."""
         if self.only:
             self._anew(run)
         told = {path.stem: _told(path) for path in published()}
@@ -64,25 +79,34 @@ class Publish(Question[xr.Dataset]):
         return found
 
     def _anew(self, run: Run) -> None:
-        """Run the commands of the files that are asked for, each in a folder of its own."""
-        for path in published():
-            if not any(fnmatch.fnmatch(path.stem, pattern) for pattern in self.only):
+        """Make what is asked for, one file after the other; what fails is named at the end."""
+        failed, folder = [], run.folder or self.place
+        for name, recipe in RECIPES.items():
+            asked = any(_meet(name, pattern) for pattern in self.only)
+            if not asked or self.needs not in ("any", recipe.device):
                 continue
-            for number, command in enumerate(_commands(json.loads(path.read_text()))):
-                words = shlex.split(command)
-                out = (run.folder or self.place) / f"{path.stem}_{number}"
-                subprocess.run(
-                    [sys.executable, "-m", "rps_jax", *words[1:], "--out", str(out)], check=True
-                )
+            began = time.perf_counter()
+            try:
+                make(name, recipe, folder / "runs", self.machine or machine())
+                said = "made"
+            except Exception as error:  # whatever a study raises: the others are made all the same
+                said = f"failed, {type(error).__name__}: {error}"
+                failed.append(name)
+            print(f"{name}: {said}, {time.perf_counter() - began:.0f} s", flush=True)
+        if failed:
+            raise InputError(
+                f"{len(failed)} of the files could not be made: {', '.join(failed)}. What is done "
+                "is kept; the same command goes on."
+            )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
         """One row a data file, those that are not of today's code first."""
-        rows = [["file", "version", "date", "state", "device"]]
+        shown = ("version", "date", "state", "made", "two cores", "one H100")
+        rows = [["file", *shown]]
         order = found.sortby("state", ascending=False)
         for name in order.file.values:
             one = order.sel(file=name)
-            cells = [str(one[key].item()) for key in ("version", "date", "state", "device")]
-            rows.append([str(name), *cells])
+            rows.append([str(name), *(str(one[key].item()) for key in shown)])
         current = int((found.state == CURRENT).sum())
         text = (
             f"{current} of {found.sizes['file']} data files are of rps_jax {rps_jax.__version__} "
@@ -115,7 +139,13 @@ def _told(path: Path) -> dict[str, str]:
         "device": str(data["device"] or ""),
         "command": "; ".join(commands),
     }
-    return known | {"state": _state(data.get("digest"), commands, known["version"])}
+    recipe = next((r for name, r in RECIPES.items() if fnmatch.fnmatch(path.stem, name)), None)
+    takes = {"made": BY_HAND.get(path.stem, ""), "two cores": "", "one H100": ""}
+    if recipe is not None:
+        times = (recipe.two_cores, recipe.one_gpu)
+        cores, gpu = ("" if t is None else f"{t:g} min" for t in times)
+        takes = {"made": f"on {recipe.device}", "two cores": cores, "one H100": gpu}
+    return known | takes | {"state": _state(data.get("digest"), commands, known["version"])}
 
 
 def _state(noted: str | None, commands: Sequence[str], version: str) -> str:
@@ -130,3 +160,99 @@ def _state(noted: str | None, commands: Sequence[str], version: str) -> str:
     return (
         CURRENT if version == rps_jax.__version__ else f"made by {version}, nothing changed since"
     )
+
+
+# --- making them anew ----------------------------------------------------------------------
+
+
+def make(name: str, recipe: Recipe, runs: Path, device: str) -> None:
+    """Run the commands of a recipe, or read what they did, and write the data file."""
+    tables, made = [], []
+    labels = recipe.of or ("",) * len(recipe.commands)
+    for label, command in zip(labels, recipe.commands, strict=False):
+        words = shlex.split(command.replace("MACHINE", shlex.quote(device)))
+        if words[0] != "rps":
+            subprocess.run(command, shell=True, check=True)  # it writes a file that others read
+            continue
+        sections, answer, signed = _carried_out(words, runs)
+        made.append(signed)
+        if callable(recipe.section):
+            tables.append((label, recipe.section(answer)))
+        for section in sections if isinstance(recipe.section, str) else ():
+            if section.table and fnmatch.fnmatch(section.title, recipe.section):
+                kept = label or (section.title if "in *" in recipe.section else "")
+                tables.append((kept, [list(row) for row in section.table]))
+    if recipe.section:
+        columns, rows = joined(tables, recipe.columns)
+        path = next((p for p in published() if p.stem == name), None)
+        new = _SWEEPS / recipe.folder / "results" / f"{name}.json"
+        write(path or new, made, device, columns, rows, recipe.note)
+
+
+def _carried_out(words: list[str], runs: Path) -> tuple[Sequence[Section], Any, dict[str, Any]]:
+    """Sections of the report of a command, its answer, and what it was made by."""
+    named = words.index("--out") if "--out" in words else None
+    place = f"runs/{digest_of(words)}" if named is None else words[named + 1]
+    rest = words[1:] if named is None else [*words[1:named], *words[named + 2 :]]
+    here = [re.sub(r"\bruns/", f"{runs}/", word) for word in rest]
+    name, options = names.split(here)
+    out = runs / Path(place).name
+    asked = flags.parse(names.question_of(name), name, [*options, "--out", str(out)])[0].asked()
+    asked.checked()
+    before, sys.argv = sys.argv, list(words)
+    try:  # so that the run folder says which command makes it
+        with asked.bar() as bar:
+            found = asked.answered(bar)
+            sections = asked.report(found, asked.run_in(out, bar))
+    finally:
+        sys.argv = before
+    return sections, found, provenance.signed(out) | {"command": words}
+
+
+def digest_of(words: Sequence[str]) -> str:
+    """A short name for a command."""
+    told = re.sub(r"\W+", "_", " ".join(words[1:]))
+    return told[:80]
+
+
+def joined(tables: Sequence[tuple[str, Rows]], columns: Sequence[str]) -> tuple[Any, Rows]:
+    """Columns and rows of several tables of one header, each after what its rows are of.
+
+    Raises:
+      InputError: there is none, or their headers differ.
+    """
+    if not tables:
+        raise InputError("table = None is not allowed: no section of the report has that title.")
+    (_, (head, *_)), several = tables[0], any(label for label, _ in tables)
+    kept = [i for i, column in enumerate(head) if not columns or column in columns]
+    rows: Rows = []
+    for label, (header, *body) in tables:
+        if [header[i] for i in kept if i < len(header)] != [head[i] for i in kept]:
+            raise InputError(f"columns = {header} are not allowed beside {head}.")
+        rows += [[*[label] * several, *(row[i] for i in kept)] for row in body]
+    nameless = iter(("law", "whose"))
+    shown = [head[i] or next(nameless) for i in kept]
+    return [{"name": "", "merge": True}] * several + [{"name": one} for one in shown], rows
+
+
+def machine() -> str:
+    """What this process runs on, in words."""
+    device, count = jax.devices()[0], os.cpu_count() or 1
+    if device.platform != "cpu":
+        return f"one {device.device_kind} and {count} processors"
+    model = platform.processor() or platform.machine()
+    for line in _processors().splitlines():
+        if line.startswith("model name"):
+            model = line.partition(":")[2].strip()
+            break
+    return f"{len(os.sched_getaffinity(0))} of {count} processors, {model}"
+
+
+def _processors() -> str:
+    path = Path("/proc/cpuinfo")
+    return path.read_text() if path.exists() else ""
+
+
+def _meet(name: str, pattern: str) -> bool:
+    """Whether one of two patterns is a name of the other."""
+    return fnmatch.fnmatch(name, pattern) or fnmatch.fnmatch(pattern, name)

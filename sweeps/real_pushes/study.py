@@ -262,15 +262,25 @@ class RealPushes(Study[xr.Dataset]):
         return whole
 
     def _fitted(self, run: Run) -> xr.Dataset:
-        """Median error `fit_error` [m] (fitted, finger_kind, tried), and the best friction."""
-        clear = pushes.chosen(self.table, self.fits & ~pushes.doubted(self.table))
-        finger = pushes.kind_of_finger(clear)
-        few = np.zeros(len(clear), bool)
-        for name in FINGERS:
-            few[
-                np.random.default_rng(_SPLIT).permutation(np.flatnonzero(finger == name))[:_FIT]
-            ] = 1
-        table = pushes.chosen(clear, few)
+        """Median error `fit_error` [m] (fitted, finger_kind, tried), and the best friction.
+
+        And errors (fitted, tried, few) of pushes with each friction, for `layout_rows`: of those
+        that it is fitted on, and of as many of each layout of feet.
+        """
+        whole, every = self.table, np.arange(len(self.table))
+        finger, clear = pushes.kind_of_finger(whole), ~pushes.doubted(whole)
+        fitted_on, layouts = self.fits & clear, np.isin(groups_of(whole), (GROUPS[0], GROUPS[3]))
+        kinds = [[every[fitted_on][finger[fitted_on] == name]] for name in FINGERS]
+        support = np.asarray(whole.support)
+        kinds += [
+            [np.flatnonzero(layouts & (finger == name) & (support == one))]
+            for name in FINGERS
+            for one in dict.fromkeys(support)
+        ]
+        few = [np.random.default_rng(_SPLIT).permutation(rows)[:_FIT] for (rows,) in kinds]
+        fits = np.isin(every, np.concatenate(few[: len(FINGERS)]))
+        laid = np.isin(every, np.concatenate(few[len(FINGERS) :]))
+        table = pushes.chosen(whole, fits | laid)
         needed = {"rigid_feet", *self.models} if set(MUJOCOS) & set(self.models) else self.models
         fitted = [name for name in FITTED if name in needed]
         found = [
@@ -281,23 +291,26 @@ class RealPushes(Study[xr.Dataset]):
             )
             for model in fitted
         ]  # fmt: skip
-        off = xr.concat(found, "fitted").assign_coords(fitted=fitted)
-        best = off.fit_error.fillna(9.0).idxmin("tried")
-        return off.assign(friction=best)
+        off = xr.concat(found, "fitted").assign_coords(
+            fitted=fitted,
+            few_finger=("few", pushes.kind_of_finger(table).astype(str)),
+            few_support=("few", np.where(laid, support, "")[fits | laid].astype(str)),
+        )
+        rows = xr.DataArray(fits[fits | laid], dims="few")
+        each = [off.few_both.where(rows & (off.few_finger == name)) for name in FINGERS]
+        median = xr.concat([one.median("few") for one in each], "finger_kind")
+        off["fit_error"] = median.assign_coords(finger_kind=list(FINGERS))
+        return off.assign(friction=off.fit_error.fillna(9.0).idxmin("tried"))
 
     def _tried(self, table: pd.DataFrame, model: str, tried: Sequence[float]) -> xr.Dataset:
-        """Median error [m] (finger_kind, tried) of one model with some frictions."""
+        """Errors (tried, few) of one model with some frictions."""
         many = pd.concat([table] * len(tried), ignore_index=True)
         mu = np.repeat(tried, len(table))
         pose = pushes.slide(many, mu, on=SLIDING[model], steps=STEPS // 2).pose
         pose = pose.reshape(len(tried), len(table), 3)
-        both = pushes.errors_of(pose, pushes.measured(table)).both
-        off, finger = np.full((len(FINGERS), len(tried)), np.nan), pushes.kind_of_finger(table)
-        for j, name in enumerate(FINGERS):
-            if (rows := finger == name).any():
-                off[j] = np.median(both[:, rows], axis=1)
-        at = {"finger_kind": list(FINGERS), "tried": list(tried)}
-        return xr.Dataset({"fit_error": (("finger_kind", "tried"), off)}, at)
+        off = pushes.errors_of(pose, pushes.measured(table))._asdict()
+        errors_ = {f"few_{name}": (("tried", "few"), one) for name, one in off.items()}
+        return xr.Dataset(errors_, {"tried": list(tried)})
 
     def _one(self, model: str, friction: xr.Dataset | None, some: slice) -> xr.Dataset:
         """What one model predicts of its pushes among some."""
@@ -377,10 +390,12 @@ _COLUMNS = [
 ]  # fmt: skip
 
 
+_UNITS = (1e3, 180 / np.pi, 1e3)  # of errors in tables: mm, degrees, mm
+
+
 def _row(label: str, model: str, off: Errors) -> list[Any]:
-    units = (1e3, 180 / np.pi, 1e3)
     cells: list[Any] = []
-    for values, unit in zip(off, units, strict=True):
+    for values, unit in zip(off, _UNITS, strict=True):
         cells += [[unit * one for one in median_interval(values)], unit * np.quantile(values, 0.9)]
     return [label, WORDS[model], off.both.size, *_rounded(cells)]
 
@@ -420,6 +435,7 @@ def tables(found: xr.Dataset) -> dict[str, tuple[list[dict[str, Any]], list[list
         made["mujoco"] = (_COLUMNS, rows)
     if "friction" in found:
         made["friction"] = _FRICTION_COLUMNS, list(_friction_rows(found))
+        made["layouts"] = _LAYOUT_COLUMNS, list(_layout_rows(found))
     if "force_measured" in found and "rigid_feet" in models:
         made["forces"] = _FORCE_COLUMNS, list(_force_rows(found))
     return {name: (columns, rows) for name, (columns, rows) in made.items() if rows}
@@ -450,6 +466,35 @@ def _friction_rows(found: xr.Dataset) -> Iterator[list[Any]]:
             cells = [mu, float(np.nanmin(off)), [float(near.min()), float(near.max())],
                      [1e3 * one for one in median_interval(told)]]  # fmt: skip
             yield [name, WORDS[model], *_rounded(cells)]
+
+
+_LAYOUT_COLUMNS = [
+    {"name": "pushes", "merge": True},
+    {"name": "feet that nothing was fitted on", "merge": True},
+    *_COLUMNS[1:3],
+    {"name": "friction, fitted on other feet", "format": "{:.2f}"},
+    *(column for column in _COLUMNS[3:] if column["name"] != "90 %"),
+    {"name": "both, fitted on these feet", "format": "{:.2f} mm"},
+]
+
+
+def _layout_rows(found: xr.Dataset) -> Iterator[list[Any]]:
+    """Errors on each layout of feet, with the friction that suits the other layouts best."""
+    support, finger = found.few_support.values, found.few_finger.values
+    for name in FINGERS:
+        own = (finger == name) & (support != "")
+        for layout in dict.fromkeys(support[own]):
+            held, rest = own & (support == layout), own & (support != layout)
+            if not rest.any():
+                continue
+            for model in map(str, found.fitted.values):
+                off = [found[f"few_{one}"].sel(fitted=model).values for one in Errors._fields]
+                best, usual = (int(np.median(off[2][:, rows], axis=1).argmin())
+                               for rows in (rest, held))  # fmt: skip
+                cells = [[unit * one for one in median_interval(values[best, held])]
+                         for unit, values in zip(_UNITS, off, strict=True)]  # fmt: skip
+                mu, alone = float(found.tried[best]), 1e3 * np.median(off[2][usual, held])
+                yield [name, layout, WORDS[model], int(held.sum()), *_rounded([mu, *cells, alone])]
 
 
 _FORCE_COLUMNS = [

@@ -1,7 +1,8 @@
-"""What stands beside a header: an example that measures itself, a CMake file and a page."""
+"""The folder of a law in C: the header, an example that measures itself, and a CMake file."""
 
 from __future__ import annotations
 
+from rps_jax.app.export import c
 from rps_jax.app.export.program import Program
 
 # How the example fills what laws of each kind observe beside touch.
@@ -101,37 +102,13 @@ target_compile_options({p}_example PRIVATE -Wall -Wextra -pedantic)
 target_link_libraries({p}_example PRIVATE {p})
 """
 
-_PAGE = """\
-# The law {label} in C
-
-`{p}.h` is the law {label} and the skin of the robot {robot}, written by `rps export c` of rps_jax:
-C99, no allocation, no dependency but `math.h`, numbers in `float` (or `double`, with
-`-D{P}_DOUBLE`).
-
-    cmake -B build && cmake --build build && build/{p}_example
-
-- `{p}_params params = {P}_PARAMS;` holds the chosen parameters; change them as you like.
-- `{p}_init(&params, &memory)` once, then `{p}_step(&params, &memory, &seen, &twist)` in each
-  control period. The fields and their units stand in the header.
-- `{p}_skin_init(&skin)` once, then `{p}_skin_step(&skin_params, &skin, taxels, period, &contact)`
-  turns {taxels} taxels, relative changes of capacitance in the order of the strip (left side from
-  the rear, front from left to right, right side from the front), into a contact. A taxel whose
-  `alive` is 0 is ignored, but what it gives must be finite.
-- Both return `{P}_OK`, or a code: `{P}_BAD_INPUT` if an input was NaN or infinite,
-  `{P}_BAD_RESULT` if the law has no finite twist. Then the twist is zero (there is no contact),
-  and the memory is as it was.
-
-Do not compile with `-ffast-math`: the checks of what is finite would be removed.
-"""
-
 
 def files(program: Program, prefix: str) -> dict[str, str]:
-    """Texts beside the header, by name."""
-    names = {"p": prefix, "P": prefix.upper(), "label": program.label, "robot": program.robot}
-    names |= {"taxels": str(program.taxels)}
+    """Texts of the files, by name."""
+    names = {"p": prefix, "P": prefix.upper()}
     beside = _BESIDE[program.senses].format(**names)
     return {
+        f"{prefix}.h": c.header(program, prefix),
         "main.c": _EXAMPLE.format(**names, beside=beside),
         "CMakeLists.txt": _CMAKE.format(**names),
-        "README.md": _PAGE.format(**names),
     }

@@ -14,8 +14,8 @@ from jax.extend.core import jaxpr_as_fun
 
 from rps_jax import __version__
 from rps_jax.app.export import walk
-from rps_jax.app.export.program import Field, Program
-from rps_jax.app.export.walk import REDUCTIONS, kind_of, unsupported
+from rps_jax.app.export.program import Program
+from rps_jax.app.export.walk import PAIRED, kind_of, unsupported
 from rps_jax.errors import InputError
 
 _OPSET, _FORMAT = 18, 9  # of ONNX, and of its files
@@ -42,6 +42,7 @@ class Tensor(NamedTuple):
     name: str
     shape: tuple[int, ...]
     kind: str
+    about: str = ""
 
 
 class Graph:
@@ -150,8 +151,8 @@ class Graph:
             turn = make("Where", make("Less", at, zero, to="b"), behind, zero)
             angle = make("Add", make("Atan", make("Div", y, at)), turn)
             return make("Where", make("Equal", at, zero, to="b"), upright, angle)
-        if name in REDUCTIONS:
-            return self._reduced(REDUCTIONS[name], x[0], params["axes"], shape, kind)
+        if name in PAIRED and "axes" in params:
+            return self._reduced(PAIRED[name], x[0], params["axes"], shape, kind)
         if name in ("argmax", "argmin"):
             op = "ArgMax" if name == "argmax" else "ArgMin"
             place = make(op, x[0], axis=params["axes"][0], keepdims=0)
@@ -164,8 +165,11 @@ class Graph:
         raise unsupported(name)
 
     def _cast(self, x: Tensor, kind: str) -> Tensor:
-        to = self.onnx.helper.np_dtype_to_tensor_dtype(np.dtype(_TYPES[kind]))
-        return self.node("Cast", [x], x.shape, kind, to=to)
+        return self.node("Cast", [x], x.shape, kind, to=self.type_of(kind))
+
+    def type_of(self, kind: str) -> Any:
+        """The type of ONNX of a kind of numbers."""
+        return self.onnx.helper.np_dtype_to_tensor_dtype(np.dtype(_TYPES[kind]))
 
     def _reduced(self, op: str, x: Tensor, axes: Any, shape: Sequence[int], kind: str) -> Tensor:
         over = self.held(np.array(axes, np.int64))
@@ -206,32 +210,33 @@ def models(program: Program, prefix: str, batch: int | None = None) -> dict[str,
     target, closed = Graph(onnx), program.step.jaxpr
     params = [np.asarray(one.value, float) for one in groups["params"]]
     if batch is not None:
-        closed = _batched(closed, program, batch)
-    given, inputs = [], []
-    for group, mark in (("memory", "memory_"), ("observation", "")):
-        for one in groups[group]:
-            shape = (*lead, *one.shape)
-            if not one.size:
-                given.append(np.zeros(shape))
-                continue
-            given.append(Tensor(mark + one.name, shape, one.kind))
-            inputs.append((given[-1], one))
+        closed = _batched(closed, len(params), batch)
+
+    def tensors(mark: str, group: str) -> list[Tensor]:
+        return [
+            Tensor(mark + one.name, (*lead, *one.shape), one.kind, one.about)
+            for one in groups[group]
+        ]
+
+    def infos(those: Sequence[Tensor]) -> list[Any]:
+        types = [target.type_of(one.kind) for one in those]
+        make = onnx.helper.make_tensor_value_info
+        return [make(x.name, to, x.shape, x.about) for x, to in zip(those, types, strict=True)]
+
+    inputs = [*tensors("memory_", "memory"), *tensors("", "observation")]
+    outputs = [*tensors("next_memory_", "memory"), *tensors("", "twist")]
+    given = [np.zeros(one.shape) if 0 in one.shape else one for one in inputs]
     found = walk.walk(closed, [*params, *given], target)
-    outputs = []
-    names = [("next_memory_", one) for one in groups["memory"]]
-    names += [("", one) for one in groups["twist"]]
-    for (mark, one), value in zip(names, found, strict=True):
-        if one.size:
-            out = Tensor(mark + one.name, (*lead, *one.shape), one.kind)
-            shaped = target.tensor(value)
-            made = onnx.helper.make_node("Identity", [shaped.name], [out.name])
-            target.nodes.append(made)
-            outputs.append((out, one))
+    inputs, kept = ([x for x in those if 0 not in x.shape] for those in (inputs, outputs))
+    for out, value in zip(outputs, found, strict=True):
+        if 0 not in out.shape:
+            name = target.tensor(value).name
+            target.nodes.append(onnx.helper.make_node("Identity", [name], [out.name]))
     graph = onnx.helper.make_graph(
         target.nodes,
         prefix,
-        [_info(onnx, *one) for one in inputs],
-        [_info(onnx, *one) for one in outputs],
+        infos(inputs),
+        infos(kept),
         list(target.constants.values()),
         doc_string=f"One control step of the law {program.label}; it checks no input.",
     )
@@ -243,7 +248,7 @@ def models(program: Program, prefix: str, batch: int | None = None) -> dict[str,
     start = {
         f"memory_{one.name}": np.asarray(one.value).tolist() for one in groups["memory"] if one.size
     }
-    units = {tensor.name: one.about for tensor, one in (*inputs, *outputs)}
+    units = {one.name: one.about for one in (*inputs, *kept)}
     chosen = {one.name: np.asarray(one.value).tolist() for one in groups["params"]}
     about = {"law": program.label, "robot": program.robot, "params": json.dumps(chosen)}
     about |= {"memory_at_the_start": json.dumps(start), "units": json.dumps(units)}
@@ -252,23 +257,13 @@ def models(program: Program, prefix: str, batch: int | None = None) -> dict[str,
     return {f"{prefix}.onnx": model.SerializeToString()}
 
 
-def _batched(closed: Any, program: Program, batch: int) -> Any:
-    """The step of many worlds with one set of parameters."""
-    fixed = len(program.groups["params"])
-    every = [one for fields in program.step.given.values() for one in fields]
+def _batched(closed: Any, fixed: int, batch: int) -> Any:
+    """The step of many worlds with one set of parameters, so many numbers."""
+    axes = [None] * fixed + [0] * (len(closed.in_avals) - fixed)
     with jax.enable_x64(True):
-        function = jax.vmap(
-            lambda *x: jaxpr_as_fun(closed)(*x),
-            in_axes=[None] * fixed + [0] * (len(every) - fixed),
-        )
-    dtypes = {"f": np.float64, "i": np.int32, "b": np.bool_}
+        function = jax.vmap(jaxpr_as_fun(closed), in_axes=axes)
     shapes = [
-        jax.ShapeDtypeStruct((batch,) * (i >= fixed) + one.shape, dtypes[one.kind])
-        for i, one in enumerate(every)
+        jax.ShapeDtypeStruct(one.shape if axis is None else (batch, *one.shape), one.dtype)
+        for axis, one in zip(axes, closed.in_avals, strict=True)
     ]
     return walk.traced(function, *shapes)[0]
-
-
-def _info(onnx: Any, tensor: Tensor, field: Field) -> Any:
-    dtype = onnx.helper.np_dtype_to_tensor_dtype(np.dtype(_TYPES[tensor.kind]))
-    return onnx.helper.make_tensor_value_info(tensor.name, dtype, tensor.shape, field.about)

@@ -80,12 +80,49 @@ class Program(NamedTuple):
     groups: dict[str, Group]
     init: Routine  # params -> memory
     step: Routine  # params, memory, observation -> memory, twist
-    skin_step: Routine  # skin_params, skin, taxels, period -> skin, contact
+    skin_step: Routine  # skin_params, skin, scan -> filtered, contact
 
     @property
     def taxels(self) -> int:
         """How many taxels the skin has."""
         return self.groups["skin"][0].size
+
+
+class SkinParams(NamedTuple):
+    """Numbers of a skin."""
+
+    time_constant: Any  # [s] of the low-pass filter
+    threshold: Any  # [1] relative change of capacitance that counts as touch
+
+
+class Skin(NamedTuple):
+    """What a skin remembers."""
+
+    signal: Any  # (T,) [1] filtered, of each taxel
+    alive: Any  # (T,) 0 of a taxel that is to be ignored
+
+
+class Scan(NamedTuple):
+    """What a skin answers."""
+
+    taxels: Any  # (T,) [1] relative change of capacitance of each taxel, along the strip
+    period: Any  # [s] since the last step
+
+
+class Filtered(NamedTuple):
+    """What a scan changes of what a skin remembers."""
+
+    signal: Any  # (T,) [1] filtered, of each taxel
+
+
+class Contact(NamedTuple):
+    """What a skin feels."""
+
+    contact_type: Any  # 0 none, 1 a point, 2 a line
+    p_robot_contact: Any  # [m] in the robot frame; 0 without contact
+    in_contact: Any  # whether anything is felt
+    line: Any  # whether the contact is a line
+    signal: Any  # (T,) [1] filtered, 0 of a dead taxel
 
 
 def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive") -> Program:
@@ -103,10 +140,10 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
             f"skin = {skin} is not allowed: name one with taxels, as capacitive, on a robot with "
             "boards."
         )
+    taxels = jax.ShapeDtypeStruct((sensor.shell.count,), np.float64)
     with jax.enable_x64(True):
         seen = trying.observation_of(of.senses)
         if isinstance(seen, TaxelObservation):
-            taxels = jax.ShapeDtypeStruct((sensor.shell.count,), np.float64)
             seen = seen._replace(signal=taxels)
         # Parameters are real numbers, whatever they were written as, as in a trial.
         shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x), np.float64), params)
@@ -117,87 +154,47 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
         memory, twist, _ = of.step(params, memory, seen)
         return memory, Twist(*twist)
 
-    twist = Twist(_REAL, _REAL, _REAL)
-    numbers = {name: getattr(sensor, name) for name in ("time_constant", "threshold")}
-    answers = jax.ShapeDtypeStruct((sensor.shell.count,), np.float64)
-    groups = {
-        "params": fields_of(params, values=params),
-        "memory": fields_of(made, values=start),
-        "observation": fields_of(seen),
-        "twist": fields_of(twist),
-        "skin_params": tuple(
-            Field(name, (), "f", _ABOUT[name], np.asarray(float(value)))
-            for name, value in numbers.items()
-        ),
-        "skin": (
-            Field("signal", answers.shape, "f", "[1] filtered, of each taxel"),
-            Field("alive", answers.shape, "b", "0 of a taxel that is to be ignored"),
-        ),
-        "taxels": (Field("taxels", answers.shape, "f", _ABOUT["taxels"]),),
-        "period": (Field("period", (), "f", "[s] since the last step"),),
-        "contact": (
-            Field("contact_type", (), "i", "0 none, 1 a point, 2 a line"),
-            Field("p_robot_contact", (2,), "f", "[m] in the robot frame; 0 without contact"),
-            Field("in_contact", (), "b", "whether anything is felt"),
-            Field("line", (), "b", "whether the contact is a line"),
-            Field("signal", answers.shape, "f", "[1] filtered, 0 of a dead taxel"),
-        ),
-    }
-    return Program(
-        label,
-        robot if isinstance(robot, str) else "of one's own",
-        of.senses,
-        groups,
-        _routine("init", of.init, groups, ("params",), ("memory",), shapes),
-        _routine(
-            "step", step, groups, ("params", "memory", "observation"), ("memory", "twist"),
-            shapes, made, seen,
-        ),
-        _routine(
-            "skin_step", _skin_step(sensor), groups, ("skin_params", "skin", "taxels", "period"),
-            ("signal", "contact"), (_REAL, _REAL), answers,
-            jax.ShapeDtypeStruct(answers.shape, bool), answers, _REAL,
-        ),
-    )  # fmt: skip
-
-
-_ABOUT = {
-    "time_constant": "[s] of the low-pass filter",
-    "threshold": "[1] relative change of capacitance that counts as touch",
-    "taxels": "[1] relative change of capacitance of each taxel, along the strip",
-}
-
-
-def _skin_step(sensor: CapacitiveSkin) -> Callable[..., Any]:
-    """One scan of a real skin."""
-
-    def skin_step(numbers: Any, signal: Any, alive: Any, taxels: Any, period: Any) -> Any:
-        time_constant, threshold = numbers
-        own = sensor._replace(time_constant=time_constant, threshold=threshold)
-        key: Any = jax.ShapeDtypeStruct(
-            (2,), np.uint32
-        )  # of noise, which a real skin has of its own
-        state, reading = own.read(skins.SkinState(key, signal, signal, alive), taxels, period)
+    def skin_step(numbers: Any, before: Any, scan: Any) -> Any:
+        own = sensor._replace(**numbers._asdict())
+        key: Any = jax.ShapeDtypeStruct((2,), np.uint32)  # of noise, which a real skin has itself
+        state = skins.SkinState(key, before.signal, before.signal, before.alive)
+        state, reading = own.read(state, scan.taxels, scan.period)
         line = reading.contact_type == LINE
-        told = jnp.where(alive, state.signal, 0.0)
-        return state.signal, (
-            reading.contact_type, reading.p_robot_contact, reading.in_contact, line, told
-        )  # fmt: skip
+        told = jnp.where(before.alive, state.signal, 0.0)
+        touch = (reading.contact_type, reading.p_robot_contact, reading.in_contact)
+        return Filtered(state.signal), Contact(*touch, line, told)
 
-    return skin_step
+    numbers = SkinParams(*(np.asarray(float(getattr(sensor, x))) for x in SkinParams._fields))
+    own = {
+        "skin_params": SkinParams(_REAL, _REAL),
+        "skin": Skin(taxels, jax.ShapeDtypeStruct(taxels.shape, bool)),
+        "scan": Scan(taxels, _REAL),
+    }
+    given = {"params": shapes, "memory": made, "observation": seen}
+    init = routine("init", lambda params: (of.init(params),), {"params": shapes}, ("memory",))
+    stepped = routine("step", step, given, ("memory", "twist"))
+    felt = routine("skin_step", skin_step, own, ("filtered", "contact"))
+    groups = {**stepped.given, **stepped.found, **felt.given, **felt.found}
+    for name, tree, values in (
+        *(("params", shapes, params), ("memory", made, start)),
+        ("skin_params", own["skin_params"], numbers),
+    ):
+        groups[name] = fields_of(tree, values)
+    name = robot if isinstance(robot, str) else "of one's own"
+    return Program(label, name, of.senses, groups, init, stepped, felt)
 
 
-def _routine(
-    name: str,
-    function: Callable[..., Any],
-    groups: Mapping[str, Group],
-    given: Sequence[str],
-    found: Sequence[str],
-    *arguments: Any,
+def routine(
+    name: str, function: Callable[..., Any], given: Mapping[str, Any], found: Sequence[str]
 ) -> Routine:
-    named = {**groups, "signal": groups["skin"][:1]}
-    jaxpr, _ = walk.traced(function, *arguments)
-    return Routine(name, jaxpr, {n: named[n] for n in given}, {n: named[n] for n in found})
+    """A traced function of named pytrees, which returns as many as are named."""
+    jaxpr, out = walk.traced(function, *given.values())
+    return Routine(
+        name,
+        jaxpr,
+        {key: fields_of(tree) for key, tree in given.items()},
+        {key: fields_of(tree) for key, tree in zip(found, out, strict=True)},
+    )
 
 
 def fields_of(tree: Any, values: Any = None) -> Group:
@@ -209,9 +206,10 @@ def fields_of(tree: Any, values: Any = None) -> Group:
         path = jax.tree_util.keystr(at, simple=True, separator=".")
         name = identifier(path.removeprefix("touch.")) or "value"
         dtype = np.dtype(getattr(leaf, "dtype", np.asarray(leaf).dtype))
-        kind = "f" if values is tree else walk.kind_of(dtype)
         value = None if value is None else np.asarray(value)
-        found.append(Field(name, tuple(np.shape(leaf)), kind, _about(tree, path), value))
+        found.append(
+            Field(name, tuple(np.shape(leaf)), walk.kind_of(dtype), _about(tree, path), value)
+        )
     names = [one.name for one in found]
     errors.check_each_once("names of the law's numbers", names) if names else None
     return tuple(found)

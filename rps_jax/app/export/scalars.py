@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import heapq
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -12,8 +11,7 @@ import numpy as np
 
 from rps_jax.app.export.walk import (
     COMPARISONS,
-    CUMULATIVE,
-    REDUCTIONS,
+    PAIRED,
     is_constant,
     kind_of,
     unsupported,
@@ -119,21 +117,17 @@ class Scalars:
             return self._product(values, params, out)
         arrays = [self.array(value) for value in values]
         kind = kind_of(out.dtype, name)
-        if name in REDUCTIONS:
-            return self._reduced(REDUCTIONS[name], arrays[0], params["axes"], kind)
-        if name in CUMULATIVE:
-            return self._running(CUMULATIVE[name], arrays[0], params, kind)
+        if name in PAIRED:
+            return self._folded(PAIRED[name], arrays[0], params, kind)
         if name in ("argmax", "argmin"):
             return self._place_of(name, arrays[0], params["axes"][0])
         if name == "dynamic_slice":
-            return self._slice(arrays[0], arrays[1:], params["slice_sizes"])
+            starts = [one.item() for one in arrays[1:]]
+            return self._slice(arrays[0], starts, params["slice_sizes"])
         if name == "gather":
             return self._gathered(arrays[0], arrays[1], params, out)
-        found = np.empty(out.shape, object)
-        spread = [np.broadcast_to(array, out.shape).reshape(-1) for array in arrays]
-        for i, args in enumerate(zip(*spread, strict=True)):
-            found.reshape(-1)[i] = self._one(name, args, params, kind)
-        return found
+        one = np.frompyfunc(lambda *args: self._one(name, args, params, kind), len(arrays), 1)
+        return np.asarray(one(*(np.broadcast_to(array, out.shape) for array in arrays)), object)
 
     def repeated(
         self, once: Callable[[Sequence[Any]], list[Any]], carry: Sequence[Any], length: int
@@ -223,25 +217,17 @@ class Scalars:
     def _times(self, a: Node, b: Node) -> Node:
         return self.node("mul" if a.kind == "f" else "imul", (a, b), a.kind)
 
-    def _reduced(self, name: str, array: np.ndarray, axes: Any, kind: str) -> np.ndarray:
-        kept = [i for i in range(array.ndim) if i not in axes]
-        moved = np.transpose(array, [*kept, *axes]).reshape(*(array.shape[i] for i in kept), -1)
-        found = np.empty(moved.shape[:-1], object)
-        for at in np.ndindex(found.shape):
-            found[at] = functools.reduce(lambda a, b: self._one(name, (a, b), {}, kind), moved[at])
-        return found
-
-    def _running(
-        self, name: str, array: np.ndarray, params: Mapping[str, Any], kind: str
-    ) -> np.ndarray:
-        found = np.moveaxis(array.copy(), params["axis"], 0)
-        order = range(1, len(found))
-        step = -1 if params["reverse"] else 1
-        found = found[::step]
-        for i in order:
-            for at in np.ndindex(found.shape[1:]):
-                found[(i, *at)] = self._one(name, (found[(i - 1, *at)], found[(i, *at)]), {}, kind)
-        return np.moveaxis(found[::step], 0, params["axis"])
+    def _folded(self, name: str, array: np.ndarray, params: Mapping[str, Any], kind: str) -> Any:
+        """A reduction, or what it has come to at each place of an axis."""
+        fold: Any = np.frompyfunc(lambda a, b: self._one(name, (a, b), {}, kind), 2, 1)
+        if "axes" in params:
+            kept = [i for i in range(array.ndim) if i not in params["axes"]]
+            moved = np.transpose(array, [*kept, *params["axes"]])
+            return np.asarray(fold.reduce(moved.reshape(*moved.shape[: len(kept)], -1), -1), object)
+        axis = params["axis"]
+        if params["reverse"]:
+            return np.flip(fold.accumulate(np.flip(array, axis), axis), axis)
+        return fold.accumulate(array, axis)
 
     def _place_of(self, name: str, array: np.ndarray, axis: int) -> np.ndarray:
         """Where the greatest or the least number is, the first of equal ones."""
@@ -256,72 +242,47 @@ class Scalars:
             found[at] = place
         return found
 
-    def _taken(self, elements: Sequence[Node], place: Node) -> Node:
-        """The element at a place that is within them."""
-        return self.node("take", (place, *elements), elements[0].kind)
-
-    def _slice(
-        self, array: np.ndarray, starts: Sequence[np.ndarray], sizes: Sequence[int]
-    ) -> np.ndarray:
+    def _slice(self, array: np.ndarray, starts: Sequence[Node], sizes: Sequence[int]) -> np.ndarray:
         """A slice from a place that is known only when it runs, held within the array."""
-        if tuple(sizes) == array.shape:
+        windows = np.lib.stride_tricks.sliding_window_view(array, tuple(sizes))
+        place = None
+        for start, room in zip(starts, windows.shape, strict=False):
+            if room > 1:
+                held = self.node("imax", (start, self.constant(0, "i")), "i")
+                held = self.node("imin", (held, self.constant(room - 1, "i")), "i")
+                before = place and self.node("imul", (place, self.constant(room, "i")), "i")
+                place = self.node("iadd", (before, held), "i") if before else held
+        if place is None:
             return array
-        zero = self.constant(0, "i")
-        strides = [int(np.prod(array.shape[i + 1 :])) for i in range(array.ndim)]
-        most = [length - size for length, size in zip(array.shape, sizes, strict=True)]
-        free = [i for i, room in enumerate(most) if room]
-        held = {}
-        for i in free:
-            start = self.node("imax", (starts[i].item(), zero), "i")
-            held[i] = self.node("imin", (start, self.constant(most[i], "i")), "i")
-        flat, found = array.reshape(-1), np.empty(tuple(sizes), object)
-        for at in np.ndindex(found.shape):
-            offset = sum(i * stride for i, stride in zip(at, strides, strict=True))
-            # The elements that each free place can mean, the last of them varying fastest.
-            reach = [offset + strides[i] * np.arange(most[i] + 1) for i in free]
-            meant = functools.reduce(lambda a, b: np.add.outer(a, b - offset), reach).reshape(-1)
-            place = held[free[0]]
-            for i in free[1:]:
-                count = self.constant(most[i] + 1, "i")
-                place = self.node("iadd", (self.node("imul", (place, count), "i"), held[i]), "i")
-            found[at] = self._taken(list(flat[meant]), place)
-        return found
+        elements = windows.reshape(-1, int(np.prod(sizes, dtype=int))).T
+        return _shaped([self.node("take", (place, *x), x[0].kind) for x in elements], sizes)
 
     def _gathered(
         self, array: np.ndarray, indices: np.ndarray, params: Mapping[str, Any], out: Any
     ) -> np.ndarray:
         """Rows at places that are known only when it runs; NaN outside where JAX fills so."""
         numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
-        mode = str(params["mode"]).rsplit(".", maxsplit=1)[-1].upper()
         if numbers.operand_batching_dims:
             raise unsupported("gather in a batch")
-        rest = [i for i in range(len(out.shape)) if i not in numbers.offset_dims]
-        found = np.empty(out.shape, object)
-        for batch in np.ndindex(indices.shape[:-1]):
-            zero = np.array(self.constant(0, "i"), object)
-            starts = [zero] * array.ndim
-            inside = None
-            for i, dim in enumerate(numbers.start_index_map):
-                start = indices[(*batch, i)]
-                starts[dim] = np.array(start, object)
+        kind, zero = kind_of(out.dtype, "gather"), self.constant(0, "i")
+        fill = self.constant({"f": np.nan, "i": -(2**31), "b": True}[kind], kind)
+        blocks = []
+        for row in indices.reshape(-1, indices.shape[-1]):
+            starts, inside = [zero] * array.ndim, []
+            for start, dim in zip(row, numbers.start_index_map, strict=True):
+                starts[dim] = start
                 most = self.constant(array.shape[dim] - sizes[dim], "i")
-                low = self.node("ge", (start, self.constant(0, "i")), "b")
-                ok = self.node("and", (low, self.node("le", (start, most), "b")), "b")
-                inside = ok if inside is None else self.node("and", (inside, ok), "b")
+                inside += [self.node("ge", (start, zero), "b"), self.node("le", (start, most), "b")]
             block = self._slice(array, starts, sizes)
-            block = np.squeeze(block, tuple(numbers.collapsed_slice_dims))
-            if "FILL" in mode and inside is not None:
-                kind = kind_of(out.dtype, "gather")
-                fill = self.constant({"f": np.nan, "i": -(2**31), "b": True}[kind], kind)
-                outside = [self.node("select", (inside, fill, x), kind) for x in block.reshape(-1)]
-                filled = np.empty(block.size, object)
-                filled[:] = outside
-                block = filled.reshape(block.shape)
-            place: list[Any] = [slice(None)] * len(out.shape)
-            for axis, at in zip(rest, batch, strict=True):
-                place[axis] = at
-            found[tuple(place)] = block if block.ndim else block.item()
-        return found
+            if "FILL" in str(params["mode"]).upper() and inside:
+                within = functools.reduce(lambda a, b: self.node("and", (a, b), "b"), inside)
+                chosen = [self.node("select", (within, fill, x), kind) for x in block.reshape(-1)]
+                block = _shaped(chosen, block.shape)
+            blocks.append(np.squeeze(block, tuple(numbers.collapsed_slice_dims)))
+        whole = np.stack(blocks)
+        whole = whole.reshape((*indices.shape[:-1], *whole.shape[1:]))
+        rest = [i for i in range(len(out.shape)) if i not in numbers.offset_dims]
+        return np.moveaxis(whole, range(len(rest)), rest)
 
     def _product(self, values: Sequence[Any], params: Mapping[str, Any], out: Any) -> np.ndarray:
         """A product of matrices: a loop if one of them is large and constant."""
@@ -334,24 +295,24 @@ class Scalars:
         )
         found = np.empty((a.shape[0], b.shape[1]), object)
         if is_constant(b) and b.size >= _MANY:
-            for i, row in enumerate(self.array(a)):
-                found[i] = self._loop(row, b)
+            found[:] = self._loops(self.array(a), b)
         elif is_constant(a) and a.size >= _MANY:
-            for j, column in enumerate(self.array(b).T):
-                found[:, j] = self._loop(column, a.T)
+            found.T[:] = self._loops(self.array(b).T, a.T)
         else:
-            a, b = self.array(a), self.array(b)
-            for i, j in np.ndindex(found.shape):
-                terms = [self._times(x, y) for x, y in zip(a[i], b[:, j], strict=True)]
-                found[i, j] = functools.reduce(lambda x, y: self.node("add", (x, y), "f"), terms)
+            times: Any = np.frompyfunc(self._times, 2, 1)
+            terms = times(self.array(a)[:, :, None], self.array(b)[None])
+            found[:] = self._folded("add", terms, {"axes": (1,)}, "f")
         return found.reshape(out.shape)
 
-    def _loop(self, row: Iterable[Node], matrix: np.ndarray) -> list[Node]:
+    def _loops(self, rows: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+        """Rows times a matrix, all of them in one loop over it."""
         matrix = np.ascontiguousarray(matrix, float)
         key = matrix.tobytes()
         self.tables.setdefault(key, matrix)
-        product = self.node("product", tuple(row), "array", key)
-        return [self.node("part", (product,), "f", j) for j in range(matrix.shape[1])]
+        product = self.node("product", tuple(rows.reshape(-1)), "array", key)
+        places = np.ndindex(len(rows), matrix.shape[1])
+        parts = [self.node("part", (product,), "f", at) for at in places]
+        return _shaped(parts, (len(rows), matrix.shape[1]))
 
 
 def _shaped(nodes: Sequence[Node], shape: tuple[int, ...]) -> np.ndarray:
@@ -360,7 +321,9 @@ def _shaped(nodes: Sequence[Node], shape: tuple[int, ...]) -> np.ndarray:
     return found
 
 
-def _needed(outputs: Iterable[Node]) -> list[Node]:
+def _needed(
+    outputs: Iterable[Node], args_of: Callable[[Node], Sequence[Node]] = lambda node: node.args
+) -> list[Node]:
     """Outputs and all that they need, each after what it needs."""
     needed: dict[int, Node] = {}
     waiting = list(outputs)
@@ -368,7 +331,7 @@ def _needed(outputs: Iterable[Node]) -> list[Node]:
         node = waiting.pop()
         if node.number not in needed:
             needed[node.number] = node
-            waiting += node.args
+            waiting += args_of(node)
     return [needed[number] for number in sorted(needed)]
 
 
@@ -392,76 +355,42 @@ def ordered(outputs: Sequence[Node]) -> list[Node | Block]:
     `Block`: a learned law decides five times a second, and its network waits until then.
     """
     nodes = _needed(outputs)
-    block = _conditional(nodes, {node.number for node in outputs})
-    if block is None:
-        return list(nodes)
-    return _sorted(nodes, block) or list(nodes)
-
-
-def _conditional(nodes: list[Node], outputs: set[int]) -> Block | None:
-    """The block of a condition, if there is one with a product of a matrix."""
     if not any(node.op == "product" for node in nodes):
-        return None
-    users: dict[int, list[Node]] = {}
-    for node in nodes:
-        for arg in node.args:
-            users.setdefault(arg.number, []).append(node)
+        return list(nodes)
     conditions = {node.args[0].number: node.args[0] for node in nodes if node.op == "select"}
     for condition, side in itertools.product(conditions.values(), (2, 1)):
-        inside: set[int] = set()
-
-        def only_then(
-            node: Node, condition: Node = condition, side: int = side, inside: set[int] = inside
-        ) -> bool:
-            return all(
-                user.number in inside
-                or (
-                    user.op == "select"
-                    and user.args[0] is condition
-                    and user.args[side] is node
-                    and user.args[3 - side] is not node
-                )
-                for user in users[node.number]
-            )
-
-        for node in reversed(nodes):
-            movable = node.op not in ("constant", "input") and node.number not in outputs
-            if movable and users.get(node.number) and only_then(node):
-                inside.add(node.number)
-        if any(node.op == "product" and node.number in inside for node in nodes):
-            chosen = [
-                n
-                for n in nodes
-                if n.op == "select"
-                and n.args[0] is condition
-                and n.args[side].number in inside
-                and n.number not in inside
-            ]
-            return Block(condition, side == 2, [n for n in nodes if n.number in inside], chosen)
-    return None
+        found = _with_block(nodes, outputs, condition, side)
+        if found is not None:
+            return found
+    return list(nodes)
 
 
-def _sorted(nodes: list[Node], block: Block) -> list[Node | Block]:
-    """Nodes and the block, each after what it needs; nothing if they need each other."""
-    within = {node.number for node in (*block.nodes, *block.choices)}
-    alone = -1  # the block's number
-    needs: dict[int, set[int]] = {alone: set()}
+def _with_block(
+    nodes: list[Node], outputs: Sequence[Node], condition: Node, side: int
+) -> list[Node | Block] | None:
+    """Nodes with a block of all that only matters on one side of a condition, if one can be."""
+
+    def other(node: Node) -> Sequence[Node]:
+        """What matters of a node on the other side."""
+        chosen = node.op == "select" and node.args[0] is condition
+        return (condition, node.args[3 - side]) if chosen else node.args
+
+    always = {node.number for node in _needed(outputs, other)}
+    own = [n for n in nodes if n.number not in always and n.op not in ("constant", "input")]
+    if not any(node.op == "product" for node in own):
+        return None
+    inside = {node.number for node in own}
+    choices = [n for n in nodes if n.number in always and n.args and other(n) is not n.args
+               and n.args[side].number in inside]  # fmt: skip
+    block = inside | {node.number for node in choices}
+    after: set[int] = set()
     for node in nodes:
-        mine = needs.setdefault(alone if node.number in within else node.number, set())
-        mine |= {alone if arg.number in within else arg.number for arg in node.args}
-    needs[alone].discard(alone)
-    of, users = {node.number: node for node in nodes}, {}
-    for number, theirs in needs.items():
-        for other in theirs:
-            users.setdefault(other, []).append(number)
-    ready = [number for number, theirs in needs.items() if not theirs]
-    heapq.heapify(ready)
-    found: list[Node | Block] = []
-    while ready:
-        number = heapq.heappop(ready)
-        found.append(block if number == alone else of[number])
-        for user in users.get(number, ()):
-            needs[user].discard(number)
-            if not needs[user]:
-                heapq.heappush(ready, user)
-    return found if len(found) == len(needs) else []
+        if node.number not in block and any(arg.number in block | after for arg in node.args):
+            after.add(node.number)
+    if any(arg.number in after for node in (*own, *choices) for arg in node.args):
+        return None
+    return [
+        *(node for node in nodes if node.number not in block | after),
+        Block(condition, side == 2, own, choices),
+        *(node for node in nodes if node.number in after),
+    ]

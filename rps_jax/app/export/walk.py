@@ -223,19 +223,7 @@ def kind_of(dtype: Any, name: str = "") -> str:
     return kind
 
 
-# Pairs of an associative operation, and the value that leaves the other as it is.
-REDUCTIONS: dict[str, str] = {
-    "reduce_sum": "add",
-    "reduce_prod": "mul",
-    "reduce_max": "max",
-    "reduce_min": "min",
-    "reduce_and": "and",
-    "reduce_or": "or",
-}
-CUMULATIVE: dict[str, str] = {
-    "cumsum": "add",
-    "cumprod": "mul",
-    "cummax": "max",
-    "cummin": "min",
-}
+# Reductions and running ones, by the operation on two numbers that they repeat.
+_OF_PAIRS = {"sum": "add", "prod": "mul", "max": "max", "min": "min", "and": "and", "or": "or"}
+PAIRED = {f"{way}{name}": pair for name, pair in _OF_PAIRS.items() for way in ("reduce_", "cum")}
 COMPARISONS = ("lt", "le", "gt", "ge", "eq", "ne")

@@ -14,6 +14,7 @@ the robot stands behind the object, seen from the target.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -75,14 +76,8 @@ class APSState(NamedTuple):
         )
 
 
-def check(params: APSParams) -> APSParams:
-    """Return the parameters if they are scalars that mean something.
-
-    Raises:
-      InputError: a value is not a finite number, or is out of bounds.
-    """
-    positive = ("alpha_variance", "alpha_count", "v_max", "omega_max", "d_success")
-    return check_signs("aps", params, positive)
+_POSITIVE = ("alpha_variance", "alpha_count", "v_max", "omega_max", "d_success")
+check = partial(check_signs, "aps", _POSITIVE)
 
 
 def predictive(params: APSParams, state: APSState) -> tuple[jax.Array, jax.Array]:
@@ -121,21 +116,16 @@ def _learn(
     offset = state.alpha - state.mean
     mean = state.mean + offset / count
     variance = state.variance + (offset * (state.alpha - mean) - state.variance) / count
-    place = moved | ~state.started
-    return APSState(
-        p_world_object=jnp.where(place, p_world_object, state.p_world_object),
-        a_OT=jnp.where(place, a_OT, state.a_OT),
+    gamma_mean = state.gamma_mean + (gamma - state.gamma_mean) / gamma_count
+
+    def where(condition: jax.Array, **new: jax.Array) -> dict[str, jax.Array]:
+        return {key: jnp.where(condition, x, getattr(state, key)) for key, x in new.items()}
+
+    return state._replace(
         started=jnp.ones_like(state.started),
-        alpha=state.alpha,
-        gamma=jnp.where(moved, gamma, state.gamma),
-        gamma_mean=jnp.where(
-            moved, state.gamma_mean + (gamma - state.gamma_mean) / gamma_count, state.gamma_mean
-        ),
-        gamma_count=jnp.where(moved, gamma_count, state.gamma_count),
-        mean=jnp.where(good, mean, state.mean),
-        variance=jnp.where(good, variance, state.variance),
-        weight=jnp.where(good, count, state.weight),
-        yaw_error=state.yaw_error,
+        **where(moved | ~state.started, p_world_object=p_world_object, a_OT=a_OT),
+        **where(moved, gamma=gamma, gamma_mean=gamma_mean, gamma_count=gamma_count),
+        **where(good, mean=mean, variance=variance, weight=count),
     )
 
 

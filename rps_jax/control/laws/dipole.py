@@ -14,6 +14,7 @@ has passed it by `beyond` radii; the base turns to face the object.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -50,13 +51,8 @@ class DipoleState(NamedTuple):
     started: jax.Array  # () bool
 
 
-def check(params: DipoleParams) -> DipoleParams:
-    """Return the parameters if they are scalars that mean something.
-
-    Raises:
-      InputError: a value is not a finite number, or is out of bounds.
-    """
-    return check_signs("dipole", params, ("K_h", "lookahead", "v_max", "omega_max", "d_success"))
+_POSITIVE = ("K_h", "lookahead", "v_max", "omega_max", "d_success")
+check = partial(check_signs, "dipole", _POSITIVE)
 
 
 def init(params: DipoleParams) -> DipoleState:

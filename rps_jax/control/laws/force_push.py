@@ -17,7 +17,8 @@ within angle_max of the heading; the speed is the bound of RPS.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +26,7 @@ import jax.numpy as jnp
 from rps_jax.control.base import Bound, Law, check_signs, documented
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Scalar
 
 _POSITIVE = ("drift", "angle_max", "v_max", "omega_max", "d_success")
 
@@ -55,76 +57,93 @@ BOUNDS = {
 }
 
 
+class Path(NamedTuple):
+    """The path of a contact, straight from its first place to the target and on."""
+
+    p_world_start: jax.Array  # (2,) [m] where it begins
+    theta_d: jax.Array  # () [rad] its direction in the world
+    p_robot_contact: jax.Array  # (2,) [m] the last contact
+    touched: jax.Array  # () bool: the skin has felt the object
+
+    @classmethod
+    def none(cls, dtype: jax.typing.DTypeLike) -> Path:
+        """Before any contact there is no path."""
+        two = jnp.zeros(2, dtype)
+        return cls(two, jnp.zeros((), dtype), two, jnp.zeros((), bool))
+
+    def followed(self, seen: Observation) -> tuple[Path, Observation, jax.Array]:
+        """The path now, what is seen with the last contact, and its offset () [m] to the left.
+
+        A path is laid anew when the contact has passed the target.
+        """
+        touching = jnp.asarray(seen.in_contact)
+        contact = jnp.where(touching, seen.p_robot_contact, self.p_robot_contact)
+        told = seen._replace(p_robot_contact=contact)
+        d = displacement(told)
+        p_world_contact = seen.p_world_target - d
+        along = jnp.stack([jnp.cos(self.theta_d), jnp.sin(self.theta_d)])
+        passed = self.touched & touching & (jnp.sum(d * along) < 0)
+        anew = (touching & ~self.touched) | passed
+        p_world_start = jnp.where(anew, p_world_contact, self.p_world_start)
+        theta_d = jnp.where(anew, planar.direction(d), self.theta_d)
+        left = jnp.stack([-jnp.sin(theta_d), jnp.cos(theta_d)])
+        offset = jnp.sum((p_world_contact - p_world_start) * left)
+        return Path(p_world_start, theta_d, contact, self.touched | touching), told, offset
+
+    def twist(self, params: Any, v_robot: jax.Array, yaw: Scalar) -> Twist:
+        """The twist that moves the contact at `v_robot` (2,) [m/s] and turns along the path.
+
+        Before the first contact it goes straight ahead.
+        """
+        turn = params.k_omega * planar.wrap(self.theta_d - yaw)
+        omega = jnp.clip(turn, -params.omega_max, params.omega_max)
+        push = Twist.moving(self.p_robot_contact, v_robot, omega)
+        push = push.within(params.v_max, params.omega_max)
+        ahead = Twist(params.v_approach, 0.0, 0.0)
+        return jax.tree.map(lambda a, b: jnp.where(self.touched, a, b), push, ahead)
+
+
 class ForcePushState(NamedTuple):
     """What the law remembers between two control steps."""
 
-    p_world_start: jax.Array  # (2,) [m] where the path begins
-    theta_d: jax.Array  # () [rad] the path's direction in the world
+    path: Path
     theta_p: jax.Array  # () [rad] the last push's, from the path's
-    p_robot_contact: jax.Array  # (2,) [m] the last contact
     l_mean: jax.Array  # () [m] of l over the last of the way
     p_world_robot: jax.Array  # (2,) [m] of the last step
-    touched: jax.Array  # () bool
 
 
-def check(params: ForcePushParams) -> ForcePushParams:
-    """Return the parameters if they are scalars that mean something.
-
-    Raises:
-      InputError: a value is not a finite number, or is out of bounds.
-    """
-    return check_signs("force_push", params, _POSITIVE, free=("k_theta", "k_y"))
+check = partial(check_signs, "force_push", _POSITIVE, free=("k_theta", "k_y"))
 
 
 def init(params: ForcePushParams) -> ForcePushState:
     """Before any contact there is no path."""
     zero = jnp.zeros_like(jnp.asarray(params.v_max, float))
-    two = jnp.zeros(2, zero.dtype)
-    return ForcePushState(two, zero, zero, two, zero, two, jnp.zeros((), bool))
+    return ForcePushState(Path.none(zero.dtype), zero, zero, jnp.zeros(2, zero.dtype))
 
 
 def step(
     params: ForcePushParams, state: ForcePushState, seen: Observation
 ) -> tuple[ForcePushState, Twist, Details]:
     """One control step. Before the first contact it goes straight ahead."""
-    touching = jnp.asarray(seen.in_contact)
-    contact = jnp.where(touching, seen.p_robot_contact, state.p_robot_contact)
-    told = seen._replace(p_robot_contact=contact)
-    d = displacement(told)
-    p_world_contact = seen.p_world_target - d
-
-    along = jnp.stack([jnp.cos(state.theta_d), jnp.sin(state.theta_d)])
-    passed = state.touched & touching & (jnp.sum(d * along) < 0)
-    anew = (touching & ~state.touched) | passed
-    p_world_start = jnp.where(anew, p_world_contact, state.p_world_start)
-    theta_d = jnp.where(anew, planar.direction(d), state.theta_d)
-
-    left = jnp.stack([-jnp.sin(theta_d), jnp.cos(theta_d)])
-    offset = jnp.sum((p_world_contact - p_world_start) * left)  # [m] to the path's left
+    path, told, offset = state.path.followed(seen)
+    contact, theta_d = told.p_robot_contact, path.theta_d
     way = planar.norm(seen.p_world_robot - state.p_world_robot)
     kept = jnp.exp(-way / params.drift)
     l_mean = contact[1] + kept * (state.l_mean - contact[1])
-    l_mean = jnp.where(state.touched, l_mean, contact[1])
+    l_mean = jnp.where(state.path.touched, l_mean, contact[1])
     drifted = jnp.stack([jnp.asarray(params.drift, contact.dtype), contact[1] - l_mean])
     theta_f = planar.wrap(seen.yaw - theta_d) + planar.direction(drifted)
     pushed = (1 + params.k_theta) * theta_f + params.k_y * offset
     back = planar.wrap(-params.k_y * offset - state.theta_p)
     recovered = state.theta_p + jnp.clip(back, -params.converge, params.converge)
-    theta_p = planar.wrap(jnp.where(touching, pushed, recovered))
+    theta_p = planar.wrap(jnp.where(seen.in_contact, pushed, recovered))
 
     angle = planar.wrap(theta_d + theta_p - seen.yaw)
     angle = jnp.clip(angle, -jnp.asarray(params.angle_max), params.angle_max)
     v_contact = params.v_max * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-    turn = params.k_omega * planar.wrap(theta_d - seen.yaw)
-    omega = jnp.clip(turn, -params.omega_max, params.omega_max)
-    push = Twist.moving(contact, v_contact, omega).within(params.v_max, params.omega_max)
-    touched = state.touched | touching
-    ahead = Twist(params.v_approach, 0.0, 0.0)
-    twist = jax.tree.map(lambda a, b: jnp.where(touched, a, b), push, ahead)
-    theta_p = jnp.where(touched, theta_p, 0.0)
-    state = ForcePushState(
-        p_world_start, theta_d, theta_p, contact, l_mean, seen.p_world_robot, touched
-    )
+    twist = path.twist(params, v_contact, seen.yaw)
+    theta_p = jnp.where(path.touched, theta_p, 0.0)
+    state = ForcePushState(path, theta_p, l_mean, seen.p_world_robot)
     return state, twist, Details.of(told)._replace(gamma=theta_p)
 
 

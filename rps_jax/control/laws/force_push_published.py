@@ -21,13 +21,15 @@ so `converge` is a rate. Without their first second of acceleration.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from rps_jax.control.base import Bound, Law, check_signs, documented
-from rps_jax.control.observation import Details, ForceObservation, Twist, displacement
+from rps_jax.control.laws.force_push import Path
+from rps_jax.control.observation import Details, ForceObservation, Twist
 from rps_jax.geometry import planar
 
 _POSITIVE = ("v_max", "omega_max", "d_success")
@@ -64,28 +66,18 @@ BOUNDS = {
 class PublishedForcePushState(NamedTuple):
     """What the law remembers between two control steps."""
 
-    p_world_start: jax.Array  # (2,) [m] where the path begins
-    theta_d: jax.Array  # () [rad] the path's direction in the world
+    path: Path
     theta_p: jax.Array  # () [rad] the last push's, from the path's
-    p_robot_contact: jax.Array  # (2,) [m] the last contact
-    touched: jax.Array  # () bool: the skin has felt the object
-    pushed: jax.Array  # () bool: and the force sensor has
+    pushed: jax.Array  # () bool: the skin has felt the object, and the force sensor has
 
 
-def check(params: PublishedForcePushParams) -> PublishedForcePushParams:
-    """Return the parameters if they are scalars that mean something.
-
-    Raises:
-      InputError: a value is not a finite number, or is out of bounds.
-    """
-    return check_signs("force_push_published", params, _POSITIVE, ("k_theta", "k_y"))
+check = partial(check_signs, "force_push_published", _POSITIVE, free=("k_theta", "k_y"))
 
 
 def init(params: PublishedForcePushParams) -> PublishedForcePushState:
     """Before any contact there is no path."""
     zero = jnp.zeros_like(jnp.asarray(params.v_max, float))
-    two, false = jnp.zeros(2, zero.dtype), jnp.zeros((), bool)
-    return PublishedForcePushState(two, zero, zero, two, false, false)
+    return PublishedForcePushState(Path.none(zero.dtype), zero, jnp.zeros((), bool))
 
 
 def steered(
@@ -128,35 +120,16 @@ def step(
 ) -> tuple[PublishedForcePushState, Twist, Details]:
     """One control step. Before the first touch it goes straight ahead."""
     seen = observation.touch
-    touching = jnp.asarray(seen.in_contact)
-    contact = jnp.where(touching, seen.p_robot_contact, state.p_robot_contact)
-    told = seen._replace(p_robot_contact=contact)
-    d = displacement(told)
-    p_world_contact = seen.p_world_target - d
+    path, told, offset = state.path.followed(seen)
     f_world = -planar.rotate(seen.yaw, observation.f_robot)  # on the object
-
-    along = jnp.stack([jnp.cos(state.theta_d), jnp.sin(state.theta_d)])
-    passed = state.touched & touching & (jnp.sum(d * along) < 0)
-    anew = (touching & ~state.touched) | passed
-    p_world_start = jnp.where(anew, p_world_contact, state.p_world_start)
-    theta_d = jnp.where(anew, planar.direction(d), state.theta_d)
-    touched = state.touched | touching
-    pushed = touched & (state.pushed | (planar.norm(f_world) >= params.f_min))
-
-    left = jnp.stack([-jnp.sin(theta_d), jnp.cos(theta_d)])
-    offset = jnp.sum((p_world_contact - p_world_start) * left)
-    theta_p = steered(params, state.theta_p, f_world, theta_d, offset, seen.period)
+    pushed = path.touched & (state.pushed | (planar.norm(f_world) >= params.f_min))
+    theta_p = steered(params, state.theta_p, f_world, path.theta_d, offset, seen.period)
     theta_p = jnp.where(pushed, theta_p, 0.0)
-    angle = theta_d + theta_p
+    angle = path.theta_d + theta_p
     v_world = params.v_max * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
     v_robot = planar.rotate(-seen.yaw, yielding(params, v_world, f_world))
-    turn = params.k_omega * planar.wrap(theta_d - seen.yaw)
-    omega = jnp.clip(turn, -params.omega_max, params.omega_max)
-    push = Twist.moving(contact, v_robot, omega).within(params.v_max, params.omega_max)
-    ahead = Twist(params.v_approach, 0.0, 0.0)
-    twist = jax.tree.map(lambda a, b: jnp.where(touched, a, b), push, ahead)
-    state = PublishedForcePushState(p_world_start, theta_d, theta_p, contact, touched, pushed)
-    return state, twist, Details.of(told)._replace(gamma=theta_p)
+    state = PublishedForcePushState(path, theta_p, pushed)
+    return state, path.twist(params, v_robot, seen.yaw), Details.of(told)._replace(gamma=theta_p)
 
 
 LAW = Law(init, step, "force", check=check, bounds=tuple(BOUNDS.items()))

@@ -49,11 +49,7 @@ class GuidedState(NamedTuple):
 
 
 def check(params: GuidedParams) -> GuidedParams:
-    """Return the parameters if they mean something.
-
-    Raises:
-      InputError: as `rps.check`, or for offsets that are no (J, 3) numbers, or held for no step.
-    """
+    """Return the parameters if they mean something, or raise InputError."""
     rps.check(params.law)
     errors.check_finite("guided.hold", params.hold, at_least=1)
     shape = np.shape(params.offsets)

@@ -8,6 +8,7 @@ Symbols are those of `law`: C contact point, T target, d from C to T, e the head
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -38,13 +39,8 @@ BOUNDS = {
 }
 
 
-def check(params: PursuitParams) -> PursuitParams:
-    """Return the parameters if they are scalars that mean something.
-
-    Raises:
-      InputError: a value is not a finite number, or is out of bounds.
-    """
-    return check_signs("pursuit", params, ("K_v", "K_h", "v_max", "omega_max", "d_success"))
+_POSITIVE = ("K_v", "K_h", "v_max", "omega_max", "d_success")
+check = partial(check_signs, "pursuit", _POSITIVE)
 
 
 def init(params: PursuitParams) -> tuple[()]:

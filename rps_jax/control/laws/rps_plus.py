@@ -100,11 +100,7 @@ BOUNDS = {f"law.{name}": bound for name, bound in rps.BOUNDS.items() if not boun
 
 
 def check(params: RPSPlusParams) -> RPSPlusParams:
-    """Return the parameters if they are scalars that mean something.
-
-    Raises:
-      InputError: as `law.check`, or for a length, share or count that is negative.
-    """
+    """Return the parameters if they are scalars that mean something, or raise InputError."""
     rps.check(params.law)
     errors.check_finite("rps_plus.d_near", params.d_near, at_least=0)
     errors.check_finite("rps_plus.n_lost", params.n_lost, at_least=0)

@@ -8,7 +8,6 @@ that come with the package.
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 from collections.abc import Mapping
 from functools import partial
@@ -55,18 +54,11 @@ def encoded(policy: Policy) -> bytes:
     arrays: dict[str, Any] = {"about": np.array(json.dumps(policy.about))}
     for name in policy.network.shapes:
         arrays[name] = np.asarray(policy.weights[name], np.float32)
-    content = io.BytesIO()
-    np.savez(content, digest=np.array(_digest(arrays)), **arrays)
-    return content.getvalue()
+    return files.archive(digest=np.array(_digest(arrays)), **arrays)
 
 
 def decoded(content: bytes, source: Any) -> Policy:
-    """The policy of a file's content.
-
-    Raises:
-      InputError: the content, which came from `source`, is no policy, is damaged, is of another
-        version, or its weights are not those of its network.
-    """
+    """The policy of a file's content, which came from `source`; InputError if it is none."""
     try:
         arrays = files.arrays_of(content)
         digest = str(arrays.pop("digest"))
@@ -75,15 +67,11 @@ def decoded(content: bytes, source: Any) -> Policy:
             raise ValueError(f"its format is {about['format']}")
     except (ValueError, KeyError, TypeError) as error:
         reason = " ".join(str(error).split()).strip("'\".")
-        raise InputError(
-            f"policy = {source} is not allowed: it is no policy that can be read ({reason}); give "
-            "a file that `rps learn` wrote."
-        ) from error
-    if about.get("version") != VERSION:
-        raise InputError(
-            f"policy = {source} is not allowed: it is of version {about.get('version')}, and this "
-            f"package reads version {VERSION}."
-        )
+        why = f"it is no policy that can be read ({reason}); give a file that `rps learn` wrote"
+        raise _refused(source, why) from error
+    if (version := about.get("version")) != VERSION:
+        why = f"it is of version {version}, and this package reads version {VERSION}"
+        raise _refused(source, why)
     if digest != _digest(arrays):
         raise InputError(
             f"policy = {source} is corrupt: its content is not what its digest says; restore it."
@@ -91,11 +79,13 @@ def decoded(content: bytes, source: Any) -> Policy:
     del arrays["about"]
     learned = about.get("learned")
     if not isinstance(learned, dict):
-        raise InputError(
-            f"policy = {source} is not allowed: its note on how it was learned is {learned!r}, and "
-            "must be names with values."
-        )
+        why = f"its note on how it was learned is {learned!r}, and must be names with values"
+        raise _refused(source, why)
     return Policy(_network(about, arrays, source), arrays, _task(about, source), learned)
+
+
+def _refused(source: Any, why: str) -> InputError:
+    return InputError(f"policy = {source} is not allowed: {why}.")
 
 
 def _digest(arrays: Mapping[str, np.ndarray]) -> str:
@@ -110,64 +100,34 @@ def _digest(arrays: Mapping[str, np.ndarray]) -> str:
 
 def _network(about: Mapping[str, Any], weights: Weights, source: Any) -> Network:
     """The network of a file, whose weights must be its own, and finite."""
-    fields = about.get("network")
-    if not isinstance(fields, dict) or set(fields) != set(Network._fields):
-        raise InputError(
-            f"policy = {source} is not allowed: its network is {fields}, and must have "
-            f"{', '.join(Network._fields)}."
-        )
-    network = Network(**fields).check()
-    found = {name: array.shape for name, array in weights.items()}
-    if found != network.shapes:
-        names = [n for n in (*found, *network.shapes) if found.get(n) != network.shapes.get(n)]
-        raise InputError(
-            f"policy = {source} is not allowed: its {names[0]} has the shape "
-            f"{found.get(names[0])}, and its network asks for {network.shapes.get(names[0])}."
-        )
+    network = Network(**_named("network", Network._fields, about, source)).check()
+    found, wanted = {name: array.shape for name, array in weights.items()}, network.shapes
+    for name in (*found, *wanted):
+        if found.get(name) != wanted.get(name):
+            why = f"its {name} has the shape {found.get(name)}, and its network asks for "
+            raise _refused(source, f"{why}{wanted.get(name)}")
     for name, array in weights.items():
         if array.dtype != np.float32 or not np.isfinite(array).all():
-            raise InputError(
-                f"policy = {source} is not allowed: its {name} must hold finite numbers of 32 bits."
-            )
+            raise _refused(source, f"its {name} must hold finite numbers of 32 bits")
     return network
 
 
 def _task(about: Mapping[str, Any], source: Any) -> dict[str, float]:
-    given = about.get("task")
-    if not isinstance(given, dict) or set(given) != set(_TASK):
-        raise InputError(
-            f"policy = {source} is not allowed: its task is {given}, and must have "
-            f"{', '.join(_TASK)}."
-        )
+    given = _named("task", tuple(_TASK), about, source)
     return {
         name: errors.check_finite(f"policy {name}", given[name], above=0, at_most=100)
         for name in _TASK
     }
 
 
-def label(policy: Policy) -> str:
-    """What a policy of a file is called: by its network, and by its digest."""
-    return f"learned_{policy.network.kind}_{_digest(policy.weights)[:8]}"
-
-
-def parameters(policy: Policy) -> Any:
-    """Parameters of a class of this policy's own, which has no other numbers than the task's.
-
-    The weights are no parameters: they are constants of the program, and not copied to each world.
-    """
-    name = f"Learned{policy.network.kind.upper()}_{_digest(policy.weights)[:8]}"
-    kind = NamedTuple(name, [(field, Any) for field in _TASK])  # pyright: ignore
-    kind.__doc__ = "Parameters of a learned law: what is asked of it."
-    return kind(**policy.task)
-
-
-def functions(policy: Policy) -> tuple[Any, Any]:
-    """`init` and `step` of the law."""
-
-    def init(params: Any) -> Memory:
-        return Memory.init(policy.network)
-
-    return init, partial(networks.step, policy.network, policy.weights)
+def _named(
+    what: str, names: tuple[str, ...], about: Mapping[str, Any], source: Any
+) -> dict[str, Any]:
+    """What a file says of one thing, by these names."""
+    found = about.get(what)
+    if not isinstance(found, dict) or set(found) != set(names):
+        raise _refused(source, f"its {what} is {found}, and must have {', '.join(names)}")
+    return found
 
 
 def check(params: Any) -> Any:
@@ -177,11 +137,16 @@ def check(params: Any) -> Any:
     return params
 
 
-def law_of(content: bytes, source: Any) -> tuple[str, Law, Any]:
-    """Read a policy's file as a law: its label, the law and its parameters.
+def law_of(policy: Policy) -> tuple[str, Law, Any]:
+    """The label of a policy, by its network and digest, its law and parameters.
 
-    Raises:
-      InputError: as `decoded`.
+    These are of a class of their own, which has no other numbers than the task's. The weights are
+    no parameters: they are constants of the program, and not copied to each world.
     """
-    found = decoded(content, source)
-    return label(found), Law(*functions(found), "taxels", check=check), parameters(found)
+    kind, digest = policy.network.kind, _digest(policy.weights)[:8]
+    name = f"Learned{kind.upper()}_{digest}"
+    own = NamedTuple(name, [(field, Any) for field in _TASK])  # pyright: ignore
+    own.__doc__ = "Parameters of a learned law: what is asked of it."
+    step = partial(networks.step, policy.network, policy.weights)
+    law = Law(lambda params: Memory.init(policy.network), step, "taxels", check=check)
+    return f"learned_{kind}_{digest}", law, own(**policy.task)

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -43,6 +44,7 @@ class Fused(Engine):
     """MJX's equations, specialised to these scenes: the fastest engine on every device."""
 
     name = "fused"
+    side_by_side = True
     modes = ("forward",)
 
     def stage_of_scenes(self, scenes: Sequence[Scene], which: np.ndarray) -> tuple[Any, Any]:
@@ -60,9 +62,7 @@ class Fused(Engine):
         robots: Robot = Robot(),
     ) -> tuple[Any, Any]:
         """Stage and fields of solids (n, ...)."""
-        known = scene.load("box", physics)  # of which only the base matters
-        one = step.body(known.physics, np.asarray(known.footprint.vertices))
-        bodies = bodies_of(solids, friction, one)
+        bodies = bodies_of(solids, friction, _template(physics))
         bodies = bodies._replace(base_half=scene.base_half(robots, solids.mass.size))
         if robots.driven:
             bodies = bodies._replace(base_invweight=scene.base_invweight(robots))
@@ -75,6 +75,13 @@ class Fused(Engine):
     def workers(self, backend: str) -> int:
         """Two for a GPU, which steps one's worlds while the host sees to the other's."""
         return super().workers(backend) if backend == "cpu" else 2
+
+
+@functools.cache
+def _template(physics: Physics) -> Body:
+    """A body of which only the base matters."""
+    known = scene.load("box", physics)
+    return step.body(known.physics, np.asarray(known.footprint.vertices))
 
 
 def _on_feet(bodies: Body, solids: Solid) -> Body:

@@ -32,8 +32,9 @@ from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS
 
 _ROWS = 8  # numbers of a world read by one load of the kernel
-_BLOCK = 16  # worlds of one program of the kernel; they go on until the last has converged
-_WARPS = 2  # of one program: four threads share a world
+# Worlds of one program of the kernel, which is one warp and goes on until the last has converged:
+# of an object of up to so many corners, and of one of more. A world's bits do not hang on them.
+_FEW, _WORLDS_OF_FEW, _WORLDS_OF_MANY = 4, 8, 4
 
 
 def body(model: mujoco.MjModel, vertices: np.ndarray) -> Body:
@@ -218,7 +219,8 @@ def in_a_kernel(
 ) -> State:
     """`in_xla` as one kernel, a world to a thread, which keeps its world in registers."""
     count, moving = state.p[0].size, (state, twist, robot)
-    bodies, motion = _packed(scalars), _packed(moving)
+    together = _together(scalars)
+    bodies, motion = _packed(scalars, together), _packed(moving, together)
 
     def kernel(*refs):
         *given, out = refs
@@ -229,32 +231,38 @@ def in_a_kernel(
         _give(out, jax.tree.leaves(after))
 
     def block(outer: tuple[int, ...]) -> pallas.BlockSpec:
-        return pallas.BlockSpec((*outer, _BLOCK), lambda i: (*(0,) * len(outer), i))
+        return pallas.BlockSpec((*outer, together), lambda i: (*(0,) * len(outer), i))
 
     inputs = [*bodies, *motion]
     numbers, worlds = len(jax.tree.leaves(state)), motion[0].shape[-1]
     after = pallas.pallas_call(
         kernel,
-        grid=(worlds // _BLOCK,),
+        grid=(worlds // together,),
         in_specs=[block(x.shape[:-1]) for x in inputs],
         out_specs=block((numbers,)),
         out_shape=jax.ShapeDtypeStruct((numbers, worlds), motion[0].dtype),
         interpret=interpret,
-        compiler_params=triton.CompilerParams(num_warps=_WARPS),
+        compiler_params=triton.CompilerParams(num_warps=1),
     )(*inputs)
     return jax.tree.unflatten(jax.tree.structure(state), list(after[:, :count]))
 
 
-def _packed(tree: Any) -> list[jax.Array]:
+def _together(scalars: Body) -> int:
+    """How many worlds one program of the kernel steps."""
+    corners = max(leaf.shape[0] if leaf.ndim > 1 else 1 for leaf in jax.tree.leaves(scalars))
+    return _WORLDS_OF_FEW if corners <= _FEW else _WORLDS_OF_MANY
+
+
+def _packed(tree: Any, together: int) -> list[jax.Array]:
     """Numbers of worlds (B,), and those of their corners (N, B), as arrays (K, B) and (K, N, B).
 
-    The worlds are filled up to whole blocks by copies of the last.
+    The worlds are filled up to whole blocks of `together` by copies of the last.
     """
     kinds: dict[int, list[jax.Array]] = {}
     for leaf in jax.tree.leaves(tree):
         kinds.setdefault(leaf.ndim, []).append(leaf)
     stacks = [jnp.stack(leaves) for leaves in kinds.values()]
-    over = -stacks[0].shape[-1] % _BLOCK
+    over = -stacks[0].shape[-1] % together
     return [jnp.pad(x, (*((0, 0),) * (x.ndim - 1), (0, over)), mode="edge") for x in stacks]
 
 
