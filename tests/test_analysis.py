@@ -326,3 +326,29 @@ def test_the_interval_of_cvar_covers():
     one = statistics.cvar_interval(np.arange(10.0))
     assert one == (0, np.inf)  # of a single value nothing is known
     assert statistics.cvar_interval(np.zeros(100)) == (0, 0)
+
+
+def test_statistics_are_those_of_scipy():
+    rng = np.random.default_rng(0)
+    for trials in (1, 2, 7, 60, 4096):
+        for successes in {0, trials, *rng.integers(0, trials + 1, 5).tolist()}:
+            theirs = stats.binomtest(successes, trials)
+            for ours, method in (
+                (statistics.wilson, "wilson"),
+                (statistics.clopper_pearson, "exact"),
+            ):
+                interval = theirs.proportion_ci(0.9, method=method)
+                np.testing.assert_allclose(ours(successes, trials, 0.9), interval, atol=1e-12)
+    for bins in (2, 3, 12):
+        of = rng.integers(5, 50, bins)
+        found = statistics.Bins(np.zeros(bins), rng.binomial(of, 0.8), of)
+        table = np.stack([found.won, of - found.won])
+        expected = stats.chi2_contingency(table).pvalue
+        np.testing.assert_allclose(statistics.one_rate(found), expected, rtol=1e-9)
+    p = rng.uniform(size=20) ** 3
+    expected = stats.false_discovery_control(p)
+    np.testing.assert_allclose(statistics.false_discovery(p), expected, rtol=1e-12)
+    assert statistics.false_discovery([]).size == 0
+    won = xr.DataArray([True] * 9 + [False] * 3)
+    other = xr.DataArray([False] * 7 + [True] * 5)
+    assert statistics.compare(won, other).p == pytest.approx(stats.binomtest(3, 10).pvalue)

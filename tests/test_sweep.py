@@ -210,7 +210,7 @@ def test_results_hold_every_world_with_what_was_drawn(whole, tmp_path):
         np.testing.assert_allclose(results[name], values, rtol=1e-6)
         assert results[name].attrs["units"] == unit
     undrawn = {name for name in QUANTITIES if getattr(BOXES, name) is None}
-    assert undrawn == {*domain.of("robot"), "foam", "time_constant"}
+    assert undrawn == {*domain.of("robot"), "foam", "time_constant", "feet"}
     assert set(WORDS) == {*columns, *undrawn}
     again = outcomes([made(np.arange(20))])
     for i, one in again.items():

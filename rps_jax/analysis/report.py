@@ -7,15 +7,16 @@ import html
 import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import markdown
 import numpy as np
-from matplotlib.figure import Figure
-from PIL import Image
 
 from rps_jax.analysis import tables
 from rps_jax.record import files
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 72em; margin: 2em auto; padding: 0 1em; }
@@ -36,10 +37,12 @@ class Picture(NamedTuple):
     def png(self) -> bytes:
         """The picture as a PNG file, equal for equal figures."""
         drawn, file = self.draw(), io.BytesIO()
-        if isinstance(drawn, Figure):
-            drawn.savefig(file, dpi=150, metadata={"Software": None})
-        else:
+        if isinstance(drawn, np.ndarray):
+            from PIL import Image
+
             Image.fromarray(drawn).save(file, "png")
+        else:
+            drawn.savefig(file, dpi=150, metadata={"Software": None})
         return file.getvalue()
 
     def _repr_png_(self) -> bytes:

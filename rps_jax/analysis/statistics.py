@@ -1,14 +1,19 @@
-"""What outcomes say: rates and their intervals, differences, kinds of failure, hard worlds."""
+"""What outcomes say: rates and their intervals, differences, kinds of failure, hard worlds.
+
+Of SciPy only its special functions are used here: to import `scipy.stats` takes a second of every
+command. A test holds these to it.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
-from scipy import stats
+from scipy import special
 
 from rps_jax.world.domain import WORDS
 
@@ -50,7 +55,14 @@ class Influence(NamedTuple):
 
 def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
     """Wilson score interval of a success rate, each end in [0, 1]; all of it without trials."""
-    return _interval(successes, trials, confidence, "wilson")
+    if trials == 0:
+        return 0.0, 1.0
+    z = float(special.ndtri((1 + confidence) / 2))
+    rate, room = successes / trials, z * z / trials
+    middle = (rate + room / 2) / (1 + room)
+    reach = z / (1 + room) * math.sqrt(rate * (1 - rate) / trials + room / trials / 4)
+    low = 0.0 if successes == 0 else middle - reach
+    return low, 1.0 if successes == trials else middle + reach
 
 
 def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -58,16 +70,9 @@ def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> tu
 
     Each end by itself is a bound of confidence (1 + `confidence`) / 2 (Clopper and Pearson, 1934).
     """
-    return _interval(successes, trials, confidence, "exact")
-
-
-def _interval(
-    successes: int, trials: int, confidence: float, method: Literal["wilson", "exact"]
-) -> tuple[float, float]:
-    if trials == 0:
-        return 0.0, 1.0
-    interval = stats.binomtest(successes, trials).proportion_ci(confidence, method=method)
-    return float(interval.low), float(interval.high)
+    k, n, tail = successes, trials, (1 - confidence) / 2
+    low = float(special.betaincinv(k, n - k + 1, tail)) if k else 0.0
+    return low, float(special.betaincinv(k + 1, n - k, 1 - tail)) if k < n else 1.0
 
 
 def fails_at_most(failures: int, trials: int, picked_of: int = 1) -> float:
@@ -85,7 +90,7 @@ def compare(first: xr.DataArray, second: xr.DataArray) -> Comparison:
     a, b = first.values.astype(bool).ravel(), second.values.astype(bool).ravel()
     gained, lost = int(np.sum(~a & b)), int(np.sum(a & ~b))
     equal = a.size - gained - lost
-    p = float(stats.binomtest(gained, gained + lost).pvalue) if gained + lost else 1.0
+    p = min(1.0, 2 * float(special.bdtr(min(gained, lost), gained + lost, 0.5)))
     return Comparison(equal / a.size, wilson(equal, a.size), gained, lost, p)
 
 
@@ -124,7 +129,7 @@ def cvar_interval(values: np.ndarray) -> tuple[float, float]:
     mean, quantile = cvar(values), np.partition(values, -worst)[-worst]
     terms = quantile + np.maximum(values - quantile, 0) / _TAIL
     error = float(np.std(terms, ddof=1)) / np.sqrt(values.size)
-    error *= float(stats.t.ppf(0.975, worst - 1))
+    error *= float(special.stdtrit(worst - 1, 0.975))
     if mean <= 0:
         return mean - error, mean + error
     return float(mean * np.exp(-error / mean)), float(mean * np.exp(error / mean))
@@ -191,12 +196,21 @@ def one_rate(found: Bins) -> float:
     counts = np.stack([found.won, found.of - found.won])
     if len(found.of) < 2 or not counts.sum(axis=1).all():
         return 1.0
-    return float(stats.chi2_contingency(counts).pvalue)
+    expected = np.outer(counts.sum(axis=1), counts.sum(axis=0)) / counts.sum()
+    off = np.abs(counts - expected)
+    if len(found.of) == 2:  # Yates
+        off = np.maximum(off - 0.5, 0.0)
+    return float(special.chdtrc(len(found.of) - 1, np.sum(off**2 / expected)))
 
 
 def false_discovery(p: Sequence[float]) -> np.ndarray:
     """The false discovery rates q (n,) of tests with these p, by Benjamini and Hochberg."""
-    return np.asarray(stats.false_discovery_control(p) if len(p) else [])
+    values = np.asarray(p, float)
+    order = np.argsort(values)[::-1]  # the greatest first
+    rank = np.arange(values.size, 0, -1)
+    found = np.empty_like(values)
+    found[order] = np.minimum(np.minimum.accumulate(values[order] * values.size / rank), 1.0)
+    return found
 
 
 def holm(p: Sequence[float]) -> np.ndarray:

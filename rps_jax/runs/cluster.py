@@ -28,12 +28,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import xarray as xr
+
 from rps_jax import engines
 from rps_jax.engines import device as devices
 from rps_jax.engines.device import Device
 from rps_jax.errors import InputError
+from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
-from rps_jax.record import provenance
 from rps_jax.runs import sweep
 from rps_jax.runs.board import Board
 from rps_jax.runs.sweep import Plan, Shard
@@ -72,8 +74,8 @@ def _work(
     ask("enter", environment)
     tell, before = board.tell.remote, Progress(0, 0.0)
 
-    def keep(number: int, content: bytes) -> None:
-        ask("deliver", number, plan.parts[number].size, content)
+    def keep(number: int, part: xr.Dataset) -> None:
+        ask("deliver", number, plan.parts[number].size, files.encoded(part))
 
     def report(progress: Progress) -> None:
         nonlocal before

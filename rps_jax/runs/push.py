@@ -11,14 +11,13 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 import xarray as xr
 
 from rps_jax import engines, errors
-from rps_jax.analysis.figures.style import Figure
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.control.base import Law
@@ -37,6 +36,9 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome, object_pose, p_world_contact
 from rps_jax.world import paper
 from rps_jax.world.scene import Scene
+
+if TYPE_CHECKING:
+    from rps_jax.analysis.figures.style import Figure
 
 
 @dataclass(frozen=True, repr=False)

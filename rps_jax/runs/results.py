@@ -20,7 +20,7 @@ from rps_jax.trials.results import UNITS
 from rps_jax.trials.trial import Outcome
 from rps_jax.world.domain import WORDS
 
-Keep = Callable[[int, bytes], Any]  # called with the number and the content of a part
+Keep = Callable[[int, xr.Dataset], Any]  # called with the number and the rows of a part
 Columns = Mapping[str, tuple[np.ndarray, str]]  # what was drawn: values (n,) and unit, by name
 # Of an outcome; the others are float32.
 _TYPES = dict.fromkeys(("success", "tipped", "diverged", "stalled"), np.int8) | {
@@ -63,23 +63,29 @@ class Collector:
             self._missing[part] -= at.size
             if not self._missing[part]:
                 drawn = self.drawn.pop(part, {})
-                self._keep(part, _content(trials, self._open.pop(part), drawn))
+                self._keep(part, _part(trials, self._open.pop(part), drawn))
 
 
-def _content(trials: np.ndarray, leaves: dict[str, np.ndarray], drawn: Columns) -> bytes:
-    """The file of a part."""
+def _part(trials: np.ndarray, leaves: dict[str, np.ndarray], drawn: Columns) -> xr.Dataset:
+    """The rows of a part."""
     columns: dict[str, Any] = {"trial": ("row", trials)}
     for name, leaf in leaves.items():
         columns[name] = (("row", "pose")[: leaf.ndim], leaf)
     for name, (values, unit) in drawn.items():
         columns[name] = ("row", values.astype(np.float32), {"units": unit})
-    return files.encoded(xr.Dataset(columns))
+    return xr.Dataset(columns)
 
 
-def gather(plan: Plan, folders: Sequence[Path], out: Path) -> xr.Dataset:
-    """All parts of a plan as one Dataset, and as `results.nc` in `out`; InputError if some lack."""
+def gather(
+    plan: Plan, folders: Sequence[Path], out: Path, made: Mapping[int, xr.Dataset] = {}
+) -> xr.Dataset:
+    """All parts of a plan as one Dataset, and as `results.nc` in `out`; InputError if some lack.
+
+    What was `made` in this process is not decoded again.
+    """
     kept = {name: part for one in folders for name, part in Parts(one).contents().items()}
-    contents = {n: kept[name_of(n)] for n in plan.parts if name_of(n) in kept}
+    contents: dict[int, Any] = {n: kept[name_of(n)] for n in plan.parts if name_of(n) in kept}
+    contents |= made
     if missing := len(plan.parts) - len(contents):
         raise InputError(
             f"run = {', '.join(map(str, folders))} lacks {missing} of {len(plan.parts)} parts: run "
@@ -90,8 +96,8 @@ def gather(plan: Plan, folders: Sequence[Path], out: Path) -> xr.Dataset:
     return results
 
 
-def dataset(plan: Plan, contents: Mapping[int, bytes]) -> xr.Dataset:
-    """All results of a plan, from the contents of its parts: (law, world), and (world) drawn."""
+def dataset(plan: Plan, contents: Mapping[int, bytes | xr.Dataset]) -> xr.Dataset:
+    """All results of a plan, from its parts or their files: (law, world), and (world) drawn."""
     every = np.arange(plan.worlds)
     which = {"units": "1", "long_name": "index of the object in the coordinate object"}
     objects = plan.object_of(every).astype(np.int16)
@@ -103,7 +109,9 @@ def dataset(plan: Plan, contents: Mapping[int, bytes]) -> xr.Dataset:
         columns[name] = xr.Variable(dims, values, {"units": unit, "long_name": meaning})
     for number, content in contents.items():
         law, _ = plan.law_and_object(number)
-        part = files.decoded(content, f"part {number}", own=True)
+        part = content
+        if not isinstance(part, xr.Dataset):
+            part = files.decoded(part, f"part {number}", own=True)
         drawn = [str(name) for name in part if name not in ("trial", *UNITS)]
         lacking = {"trial", *UNITS} - set(part) | ({"drawn"} if not (law or drawn) else set())
         if lacking:

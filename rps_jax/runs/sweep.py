@@ -117,7 +117,7 @@ def report_of(plan: Plan, found: xr.Dataset, folder: Path | None) -> list[Sectio
         rows = tables.difference_table(found)
         told.append(Section("Differences, world by world", "", rows))
     if statistics.drawn(found):
-        picture = Picture("success", functools.partial(figures.success_curves, found))
+        picture = Picture("success", lambda: figures.success_curves(found))
         told.append(Section("Success against what was drawn", "", (), picture))
     text = "Worlds in which most laws fail, and most distance is left."
     rows = tables.hardest_table(found, "RUN" if folder is None else str(folder))
@@ -311,7 +311,7 @@ def whole(plan: Plan, out: Path | None, *, report: Report = unheard, **shape: An
         found = complete(out, plan, report=report, **shape)
         assert found is not None
         return labelled(found)
-    contents: dict[int, bytes] = {}
+    contents: dict[int, xr.Dataset] = {}
     every: dict[Kind, list[int]] = {}
     for number in plan.parts:
         every.setdefault(plan.kind(number), []).append(number)
@@ -335,8 +335,12 @@ def run_missing(
     shard: Shard = Shard(),
     report: Report = unheard,
     **shape: Any,
-) -> None:
-    """Run what is missing of a plan, or of one shard of it, in a folder that `open_run` opened."""
+) -> dict[int, xr.Dataset]:
+    """Run what is missing of a plan, or of one shard of it, in a folder that `open_run` opened.
+
+    Returns the parts that were made, of a whole plan.
+    """
+    made = {}
     missing, before = remaining(folder, plan, shard)
     report(Progress(before, 0.0))
     if missing:
@@ -345,7 +349,13 @@ def run_missing(
     def tell(progress: Progress) -> None:
         report(replace(progress, finished=before + progress.finished))
 
-    work(plan, missing, functools.partial(store, folder), report=tell, **shape)
+    def keep(number: int, part: xr.Dataset) -> None:
+        store(folder, number, files.encoded(part))
+        if shard.of == 1:
+            made[number] = part
+
+    work(plan, missing, keep, report=tell, **shape)
+    return made
 
 
 def complete(
@@ -362,8 +372,8 @@ def complete(
     """
     open_run(folder, plan)
     with run_folder.hold(folder, shard.number, shard.of):
-        by(folder, plan, shard=shard, **options)
-        return results.gather(plan, [folder], folder) if shard.of == 1 else None
+        made = by(folder, plan, shard=shard, **options) or {}
+        return results.gather(plan, [folder], folder, made) if shard.of == 1 else None
 
 
 def work(

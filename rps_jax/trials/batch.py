@@ -510,8 +510,8 @@ class _Worker:
                 after, seen = program(stages, worlds, tuple(each.trials for each in every), rules)
                 for each, trials in zip(every, after, strict=True):
                     each.trials = trials
-                # Where no trial waits for room, the device goes on while the host looks.
-                ahead = not any(queue.waits for queue in batch.queues)
+                # Where no trial waits for room, a GPU goes on while the host looks.
+                ahead = _most_aside() and not any(queue.waits for queue in batch.queues)
                 seen, unseen = (unseen, seen) if ahead else (seen, None)
                 if seen is not None:
                     telling = look(seen)

@@ -1,7 +1,24 @@
-"""Figures by theme. Every function returns a figure of matplotlib."""
+"""Figures by theme. Every function returns a figure of matplotlib.
 
-# ruff: noqa: F401
+A function is loaded when it is first used: to import matplotlib takes half a second.
+"""
 
-from rps_jax.analysis.figures.paper import min_distance, one_trial, profile, stills
-from rps_jax.analysis.figures.sweeps import success_curves
-from rps_jax.analysis.figures.tuning import search
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rps_jax.analysis.figures.paper import min_distance, one_trial, profile, stills
+    from rps_jax.analysis.figures.sweeps import success_curves
+    from rps_jax.analysis.figures.tuning import search
+
+__all__ = ["min_distance", "one_trial", "profile", "search", "stills", "success_curves"]
+
+
+def __getattr__(name: str) -> Any:
+    for theme in ("paper", "sweeps", "tuning") if name in __all__ else ():
+        module = importlib.import_module(f"{__name__}.{theme}")
+        if hasattr(module, name):
+            return getattr(module, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import errno
 import functools
+import importlib
 import io
 import os
 import signal
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from rps_jax.trials.progress import Bar
 
 _MEND = "make room, then run the same command again; what is done is kept"
+_DRAWS = "rps_jax.analysis.figures.sweeps"
 _stopped: list[bool] = []  # interrupts of this command
 
 
@@ -128,6 +130,8 @@ def carry_out(question: Any, beside: Beside) -> None:
         folder.clear(Path(asked.out))
     with asked.bar() as bar:
         _go_on()
+        # What draws the report is imported while the run goes on.
+        threading.Thread(target=importlib.import_module, args=(_DRAWS,), daemon=True).start()
         found = asked.answered(bar)
         timed = bar.timing.simulated > 0 and bar.over != "clock"
         spent = told(bar.timing, device.kind()) if timed else ""
