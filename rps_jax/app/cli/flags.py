@@ -147,33 +147,29 @@ def _flat(kind: type[Any]) -> tuple[list[Any], list[str]]:
     extra = [_made(n, hints[n], Beside._field_defaults[n], texts[n]) for n in beside]
     every = [*own, *last, *extra]
     # Required ones must come first in a dataclass, and so must positional ones here.
-    every.sort(key=lambda one: (not one.required, not one.positional))
-    return [(one.name, one.kind, one.field) for one in every], beside
+    every.sort(key=lambda one: (one[2].default is not MISSING, _POSITIONAL not in get_args(one[1])))
+    return every, beside
 
 
 def _default(one: Field[Any]) -> Any:
     return one.default if one.default_factory is MISSING else one.default_factory()
 
 
-class _Made(NamedTuple):
-    """A field of the flat dataclass."""
-
-    name: str
-    kind: Any
-    field: Any
-    positional: bool
-    required: bool
-
-
-def _made(name: str, kind: Any, default: Any, text: str, positional: bool = False) -> _Made:
+def _made(
+    name: str, kind: Any, default: Any, text: str, positional: bool = False
+) -> tuple[str, Any, Field[Any]]:
+    """Name, annotated type and default of a field of the flat dataclass."""
     metavar = name.upper() if positional else _METAVARS.get(_bare(kind))
-    marks = [tyro.conf.arg(help=" ".join(text.split()), metavar=metavar)]
-    full = typing.Annotated[(kind, *marks, *([tyro.conf.Positional] if positional else []))]
+    marks = [
+        tyro.conf.arg(help=" ".join(text.split()), metavar=metavar),
+        *[_POSITIONAL] * positional,
+    ]
+    full = typing.Annotated[(kind, *marks)]
     if isinstance(default, Sequence) and not isinstance(default, str):
         default = tuple(default)
     required = positional and default in ("", ())
-    field = dataclasses.field() if required else dataclasses.field(default=default)
-    return _Made(name, full, field, positional, required)
+    field: Any = dataclasses.field() if required else dataclasses.field(default=default)
+    return name, full, field
 
 
 def _bare(kind: Any) -> Any:
@@ -182,10 +178,11 @@ def _bare(kind: Any) -> Any:
     return inner[0] if type(None) in get_args(kind) and len(inner) == 1 else kind
 
 
+_POSITIONAL = tyro.conf.Positional
 _METAVARS = {str: "TEXT", int: "INT", float: "FLOAT", Path: "PATH"}
 
 
-def _of_setting(default: Setting) -> list[_Made]:
+def _of_setting(default: Setting) -> list[Any]:
     """Flags of a setting and its rules."""
     found = []
     for kind, own in ((Setting, default), (Rules, default.rules)):
