@@ -222,7 +222,7 @@ def scripts() -> str:
         "RECORDED": json.loads(RECORDED.read_text("utf-8")),
     }
     told = [f"const {name} = {js.text(value)};" for name, value in numbers.items()]
-    return "\n".join([*told, js.HELPERS, js.weights(tables), *functions])
+    return "\n".join([*told, js.HELPERS, *tables.values(), *functions])
 
 
 def recorded(every: int = 3) -> dict[str, Any]:

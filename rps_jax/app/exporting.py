@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,7 +60,7 @@ class Export(Question[Path]):
         """No run folder."""
         yield None
 
-    def texts(self) -> dict[str, str | bytes]:
+    def texts(self) -> Mapping[str, str | bytes]:
         """Contents of the files, by name."""
         raise NotImplementedError
 
@@ -76,18 +76,18 @@ class Export(Question[Path]):
 class ExportC(Export):
     """Write a law and a skin as one C99 header, with an example that measures itself."""
 
-    def texts(self) -> dict[str, str | bytes]:
+    def texts(self) -> Mapping[str, str | bytes]:
         """Header, example and CMake file."""
         from rps_jax.app.export import folder
 
-        return dict(folder.files(self.program, self.named))
+        return folder.files(self.program, self.named)
 
 
 @dataclass(frozen=True)
 class ExportJs(Export):
     """Write a law and a skin as one JavaScript module."""
 
-    def texts(self) -> dict[str, str | bytes]:
+    def texts(self) -> Mapping[str, str | bytes]:
         """The module."""
         from rps_jax.app.export import js
 
@@ -101,7 +101,7 @@ class ExportOnnx(Export):
     batch: int | None = option(None, 1, 100_000, kw_only=True)
     """How many worlds a model steps at once, along a first axis; by default one, without it."""
 
-    def texts(self) -> dict[str, str | bytes]:
+    def texts(self) -> Mapping[str, str | bytes]:
         """The models of the step and of the memory before it."""
         from rps_jax.app.export import graph
 

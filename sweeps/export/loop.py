@@ -85,7 +85,8 @@ def nudged(name: str) -> Any:
 
     def step(own: Any, memory: Any, seen: Any) -> Any:
         memory, twist, details = law.step(own.law, memory, seen)
-        return memory, Twist(*(x * np.float32(1 + 2**-23) for x in twist)), details
+        more: list[Any] = [x * np.float32(1 + 2**-23) for x in twist]
+        return memory, Twist(*more), details
 
     return _registered(f"{program.identifier(label)}_nudged", law, step, params)
 
@@ -119,11 +120,10 @@ def _ends(name: str, where: Path, run: Any) -> Ends:
     times = [np.asarray(one.time).ravel() for one in outcomes]
     both = won[0] & won[1]
     apart = np.abs(times[0] - times[1])[both]
-    return Ends(
-        won[0].size, *(int(one.sum()) for one in won),
-        *(int((won[0] == one).sum()) for one in won[1:]),
-        float(np.quantile(apart, 0.99)) if both.any() else 0.0,
-    )  # fmt: skip
+    in_jax, in_c, off = (int(one.sum()) for one in won)
+    alike, off_alike = (int((won[0] == one).sum()) for one in won[1:])
+    most = float(np.quantile(apart, 0.99)) if both.any() else 0.0
+    return Ends(won[0].size, in_jax, in_c, off, alike, off_alike, most)
 
 
 def papers_trials(name: str, setting: Setting, where: Path) -> Ends:
@@ -163,7 +163,7 @@ def bags(name: str, domain: str, worlds: int, setting: Setting, where: Path) -> 
     errors, strange = [], 0
     for world in range(worlds):
         path = where / f"{world}.mcap"
-        rps_jax.replay(where / "run", world, bag=path)
+        rps_jax.replay(run=where / "run", world=world, bag=path)
         found = shadow(path, law)
         twists = np.stack([found[one].values for one in ("v_x", "v_y", "omega")], -1)
         errors.append((np.abs(twists[1] - twists[0]) / scale_of(law)).max(-1))

@@ -141,7 +141,7 @@ def module(program: Program, prefix: str) -> str:
     }
     return _MODULE.format(
         **lines,
-        TABLES=weights(tables),
+        TABLES="\n".join(tables.values()),
         **{"label": program.label, "robot": program.robot, "version": __version__},
         **{"p": prefix, "taxels": program.taxels},
     )
@@ -153,11 +153,6 @@ def function(name: str, routine: Routine, tables: dict[str, str]) -> str:
     found = ", ".join(f"{group}: {_object(group, routine.found)}" for group in routine.found)
     head = f"function {name}({', '.join(routine.given)}) {{"
     return f"{head}\n{lines}\n  return {{ {found} }};\n}}\n"
-
-
-def weights(tables: Mapping[str, str]) -> str:
-    """The constants of functions, which stand before them."""
-    return "\n".join(tables.values())
 
 
 def text(value: object) -> str:

@@ -315,8 +315,8 @@ class Scalars:
         return _shaped(parts, (len(rows), matrix.shape[1]))
 
 
-def _shaped(nodes: Sequence[Node], shape: tuple[int, ...]) -> np.ndarray:
-    found = np.empty(shape, object)
+def _shaped(nodes: Sequence[Node], shape: Sequence[int]) -> np.ndarray:
+    found = np.empty(tuple(shape), object)
     found.reshape(-1)[:] = nodes
     return found
 
