@@ -24,8 +24,9 @@ def pytest_configure(config):
 
 # The files that take longest, to be begun first: what is begun last leaves a processor idle.
 LONGEST = (
-    *("sweep", "notebooks", "cluster", "scene", "cli", "quasistatic", "view", "physics"),
-    "library",
+    *("learning", "ladder", "push_page", "failures", "gym", "house", "examples", "sweep"),
+    *("quasistatic", "library", "fit", "cli", "view", "isolation", "physics", "real_pushes"),
+    *("export", "notebooks", "limits", "cluster", "scene"),
 )
 
 

@@ -76,7 +76,7 @@ ENGINE = Dummy()
 SWEEP = """
 import rps_jax
 setting = rps_jax.Setting("dummy", rules=rps_jax.Rules(horizon=0.5))
-found = rps_jax.sweep("rps", "wide", worlds=1, setting=setting)
+found = rps_jax.sweep("rps", "wide,objects=random_cylinder", worlds=1, setting=setting)
 print(rps_jax.__file__, found.success.size)
 """
 
@@ -90,7 +90,8 @@ EVERYWHERE = """
 import rps_jax
 from rps_jax.studies.ladder import Ladder
 setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=0.5))
-found = rps_jax.sweep("straight,K_h=0.5", "wide,max_compression=0.3:0.9", worlds=8, setting=setting)
+drums = "wide,objects=random_cylinder,max_compression=0.3:0.9"
+found = rps_jax.sweep("straight,K_h=0.5", drums, worlds=8, setting=setting)
 drawn = found.max_compression
 assert drawn.attrs["units"] == "1" and drawn.attrs["long_name"] == "greatest compression"
 assert ((drawn >= 0.3) & (drawn <= 0.9)).all() and drawn.std() > 0.1, drawn

@@ -182,7 +182,7 @@ def test_a_law_of_ones_own_is_scored_in_the_ladders_worlds(tmp_path, capsys, reg
     mine, out = tmp_path / "mine.py", tmp_path / "score"
     mine.write_text(MINE.format(name="Straight"))
     asked = ["--domain", "wide,objects=random_cylinder", "--worlds", 6, "--engine", "quasistatic"]
-    asked += ["--slots", 6, "--workers", 1]
+    asked += ["--slots", 6, "--workers", 1, "--horizon", 80]
     assert rps("score", f"{mine},v=0.04", *asked, "--out", out) == 0
     text, found = capsys.readouterr().out, load(out)
     assert found.law.values.tolist() == ["Straight,v=0.04", "rps", "rps_plus"]

@@ -535,7 +535,7 @@ def test_the_command_learns_and_the_ladder_takes_what_it_leaves(tmp_path, capsys
     assert "Compile" in said
     assert (out / "curve.png").stat().st_size > 10_000
     assert "success in validation" in said
-    asked = ["ladder", "--domain", "paper", "--worlds", 2, "--engine", "quasistatic", "--slots", 2]
+    asked = ["ladder", *asked[:2], "--worlds", 2, "--engine", "quasistatic", "--slots", 2]
     asked += ["--laws", "pursuit", out / "policy.npz", "--workers", 1, "--out", tmp_path / "ladder"]
     assert rps(*asked) == 0
     assert "learned_mlp_" in capsys.readouterr().out

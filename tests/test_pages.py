@@ -81,6 +81,9 @@ def test_a_number_in_a_sentence_follows_its_data(tmp_path):
         rendered
         == f"It wins {cell.format('rps', '93.1 %')},\nand NPS {cell.format('nps', '16.7 %')}."
     )
+    every = "".join(one.read_text() for one in PAGES)
+    assert "<!-- cell: headline" in every
+    assert not re.search(r"^\s*<!-- cell", every, re.MULTILINE)  # it would begin a paragraph
     page.write_text(cell.format("none", ""))
     with pytest.raises(ValueError, match="does not name one cell"):
         TABLES["render"](page, tmp_path)

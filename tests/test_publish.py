@@ -1,14 +1,23 @@
 """Published numbers are made anew by one command, which says what each takes and goes on."""
 
 import json
+import re
 import shlex
 import shutil
+from dataclasses import replace
 from fnmatch import fnmatch
 
+import numpy as np
 import pytest
 from helpers import ROOT, rps
 
+from rps_jax import sweep
 from rps_jax.app.cli import flags, names
+from rps_jax.record import files
+from rps_jax.runs.question import seed_of
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+from sweeps.million import study as million
 from sweeps.publish import study
 from sweeps.publish.recipes import BY_HAND, RECIPES, Recipe
 
@@ -72,3 +81,29 @@ def test_only_what_needs_such_a_device_is_made(few, capsys):
     assert rps(SWEEPS / "publish", "--only", "first", "--needs", "gpu", "--out", few / "run") == 0
     assert "Published numbers" in capsys.readouterr().out
     assert not (few / "study" / "results" / "first.json").exists()
+
+
+def test_a_million_outcomes_are_kept_small_and_read_as_the_page_says(tmp_path, monkeypatch, capsys):
+    setting = Setting("quasistatic", rules=Rules(horizon=16.0), seed=37)
+    near = "wide,objects=random_cylinder,distance=0.7:0.8,bearing=0:0.1"
+    asked = million.Million(("rps", "nps"), near, 19, setting=setting, out=tmp_path / "run")
+    found = asked()
+    files.write_results(tmp_path / "million.nc", million.packed(found))
+    seeded = replace(setting, seed=seed_of(37, "test"))
+    usual = sweep(("rps", "nps"), near, 19, setting=seeded)
+    bits = np.unpackbits(found.success.values, axis=1, count=19)
+    np.testing.assert_array_equal(bits, usual.success)
+    np.testing.assert_array_equal(found.how == 0, usual.success)
+    assert 0 < bits.sum() < bits.size
+    period = found.attrs["control_period"]
+    np.testing.assert_allclose(found.steps * period, usual.time, atol=1e-4)
+    touched = np.isfinite(usual.min_distance.values)
+    np.testing.assert_array_equal(found.missed.values < million.UNTOUCHED, touched)
+    off = 1000 * usual.min_distance.values
+    np.testing.assert_allclose(found.missed.values[touched], off[touched], atol=0.51)
+    page = (SWEEPS / "million" / "README.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code.replace("slice(100_000)", "slice(19)"), "page", "exec"), {})
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["rps", "nps"]

@@ -89,8 +89,8 @@ class SB3(Study[xr.Dataset]):
             head, *rows = table(found)
             names = ("stable-baselines3", "torch", "gymnasium")
             versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in names)
-            made, columns = [provenance.signed(run.folder)], [{"name": text} for text in head]
-            columns[0]["merge"] = True
+            made = [provenance.signed(run.folder)]
+            columns = [{"name": text, "merge": text == "worlds"} for text in head]
             path = Path(__file__).parent / "results" / "sb3.json"
             note = f"{versions}; a run of its own seed, with noise in the actions."
             publish(path, made, self.machine, columns, rows, note)

@@ -65,8 +65,10 @@ class Recipe(NamedTuple):
     @property
     def device(self) -> Literal["cpu", "gpu"]:
         """Where it is made: on a GPU if two cores need more than an hour, or thrice as long."""
-        slow = self.two_cores is None or self.two_cores > 60
-        return "gpu" if self.one_gpu and (slow or self.two_cores > 3 * self.one_gpu) else "cpu"
+        if self.one_gpu is None:
+            return "cpu"
+        cores = self.two_cores
+        return "gpu" if cores is None or cores > min(60, 3 * self.one_gpu) else "cpu"
 
 
 def _each(command: str, *names: str) -> tuple[str, ...]:
@@ -79,8 +81,8 @@ _AGAINST = ("", "success", "against rps_tuned", "p (Holm)")
 _RATES = ("", "boxes", "cylinders", "prisms", "all", "CVaR 5 % of distance", "median time")
 _MACHINE = "--machine MACHINE"  # in its place come the words for the machine
 _IDEAL = (
-    '{"skin": "ideal", "pose_noise": [0, 0], "yaw_noise": [0, 0], "pose_latency": [0, 0], '
-    '"command_delay": [0, 0], "velocity_error": [0, 0]}'
+    "wide,skin=ideal,pose_noise=0:0,yaw_noise=0:0,pose_latency=0:0,command_delay=0:0,"
+    "velocity_error=0:0"
 )
 _PLUS = {
     "wide, 10,000": _LADDERS[0],
@@ -238,14 +240,12 @@ RECIPES: dict[str, Recipe] = {
     ),
     "engines_ideal": Recipe(
         (
-            f"echo '{_IDEAL}' > ideal.json",
-            "rps sweeps/engines --domain ideal.json --worlds 240 --engines 'C, reference' "
+            f"rps sweeps/engines --domain {_IDEAL} --worlds 240 --engines 'C, reference' "
             "'fused, standard' 'fused, 5 ms' 'C, standard' 'MJX, standard'",
         ),
         25,
         4,
         "Equal outcomes",
-        ("", ""),
     ),
     "ground": Recipe(("rps sweeps/ground",), 30, None, "Grounds beside a rigid object"),
     "force_push_grid": Recipe(("rps sweeps/force_push_grid",), 4, None, "Pushes that succeed"),

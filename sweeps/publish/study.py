@@ -9,12 +9,12 @@ rps sweeps/publish --only '*' --needs gpu
 from __future__ import annotations
 
 import fnmatch
+import hashlib
 import json
 import os
 import platform
 import re
 import shlex
-import subprocess
 import sys
 import time
 from collections.abc import Sequence
@@ -171,16 +171,15 @@ def make(name: str, recipe: Recipe, runs: Path, device: str) -> None:
     labels = recipe.of or ("",) * len(recipe.commands)
     for label, command in zip(labels, recipe.commands, strict=False):
         words = shlex.split(command.replace("MACHINE", shlex.quote(device)))
-        if words[0] != "rps":
-            subprocess.run(command, shell=True, check=True)  # it writes a file that others read
-            continue
         sections, answer, signed = _carried_out(words, runs)
         made.append(signed)
-        if callable(recipe.section):
-            tables.append((label, recipe.section(answer)))
-        for section in sections if isinstance(recipe.section, str) else ():
-            if section.table and fnmatch.fnmatch(section.title, recipe.section):
-                kept = label or (section.title if "in *" in recipe.section else "")
+        wanted = recipe.section
+        if not isinstance(wanted, str):
+            tables.append((label, wanted(answer)))
+            continue
+        for section in sections:
+            if section.table and fnmatch.fnmatch(section.title, wanted):
+                kept = label or (section.title.split(" in ")[1] if " in *" in wanted else "")
                 tables.append((kept, [list(row) for row in section.table]))
     if recipe.section:
         columns, rows = joined(tables, recipe.columns)
@@ -192,7 +191,7 @@ def make(name: str, recipe: Recipe, runs: Path, device: str) -> None:
 def _carried_out(words: list[str], runs: Path) -> tuple[Sequence[Section], Any, dict[str, Any]]:
     """Sections of the report of a command, its answer, and what it was made by."""
     named = words.index("--out") if "--out" in words else None
-    place = f"runs/{digest_of(words)}" if named is None else words[named + 1]
+    place = f"runs/{_named(words)}" if named is None else words[named + 1]
     rest = words[1:] if named is None else [*words[1:named], *words[named + 2 :]]
     here = [re.sub(r"\bruns/", f"{runs}/", word) for word in rest]
     name, options = names.split(here)
@@ -209,10 +208,10 @@ def _carried_out(words: list[str], runs: Path) -> tuple[Sequence[Section], Any, 
     return sections, found, provenance.signed(out) | {"command": words}
 
 
-def digest_of(words: Sequence[str]) -> str:
-    """A short name for a command."""
-    told = re.sub(r"\W+", "_", " ".join(words[1:]))
-    return told[:80]
+def _named(words: Sequence[str]) -> str:
+    """Name of the run folder of a command."""
+    told, whole = re.sub(r"\W+", "_", " ".join(words[1:])), " ".join(words)
+    return f"{told[:60]}-{hashlib.sha256(whole.encode()).hexdigest()[:8]}"
 
 
 def joined(tables: Sequence[tuple[str, Rows]], columns: Sequence[str]) -> tuple[Any, Rows]:
