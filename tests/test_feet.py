@@ -32,7 +32,7 @@ XML = """
   </worldbody>
 </mujoco>"""
 FEET = np.array([[0.1, 0.1], [-0.15, 0.05], [0.05, -0.2]])
-FINE = Physics(control_period=0.01, iterations=30, ls_iterations=20)
+FINE = Physics(timestep=0.01, control_period=0.01, iterations=30, ls_iterations=20)
 FRICTION = Friction(0.3, 0.4)
 TWIST = (0.05, 0.0, 0.03)
 

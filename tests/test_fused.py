@@ -21,7 +21,7 @@ from rps_jax.world.physics import Physics
 from rps_jax.world.scene import Friction
 
 TWIST = (0.05, 0.01, 0.05)  # [m/s, m/s, rad/s]
-FINE = Physics(control_period=0.01, iterations=30, ls_iterations=20)
+FINE = Physics(timestep=0.01, control_period=0.01, iterations=30, ls_iterations=20)
 # Object, yaw [rad] and lateral offset [m]: flat on the face, corner first, the base's corner first.
 STARTS = (
     ("box", 0.0, 0.0),

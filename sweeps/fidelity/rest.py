@@ -1,0 +1,126 @@
+"""Does what nobody touches stay where it is? Random objects at rest in C MuJoCo, in several steps.
+
+rps sweeps/fidelity/rest.py
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import xarray as xr
+
+from rps_jax import engines
+from rps_jax.analysis.report import Section
+from rps_jax.record import provenance
+from rps_jax.record.options import option
+from rps_jax.robot.robot import Robot
+from rps_jax.runs.question import Run, call_of
+from rps_jax.trials.progress import Progress
+from rps_jax.trials.worlds import starts
+from rps_jax.world import domain as domains
+from rps_jax.world import draws
+from rps_jax.world.physics import Physics, preset
+from sweeps.shared import Study, publish
+
+DOMAINS = ("wide", "hostile", "hostile,friction_ground=0.05:0.1,com_offset=0.5:0.7")
+_AWAY = 5.0  # [m] stands the base
+_FAR = 0.01  # [m] that what is at rest does not move, but for settling
+STEPS: Mapping[str, Physics] = {
+    **{f"{ms} ms": replace(preset(), timestep=ms / 1000) for ms in (2, 5, 10)},
+    "20 ms (`fast`)": preset(fidelity="fast"),
+}
+
+
+@dataclass(frozen=True)
+class Rest(Study[xr.Dataset]):
+    """Leave random objects alone, and tell how far they have moved (domain, step, world) [m]."""
+
+    TITLE: ClassVar[str] = "Does what is at rest stay?"
+    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 9, "seconds": 1.0}
+
+    worlds: int = option(150, 3, 100_000)
+    """Number of worlds of each domain."""
+    seconds: float = option(5.0, 0.1, 300, unit="s")
+    """How long they are left alone [s]."""
+    seed: int = option(1, 0, 2**32 - 1)
+    """Seed of the worlds."""
+    machine: str = ""
+    """What it runs on, in words; with these the table is published."""
+    quick: bool = False
+    """Whether to make a small run of seconds."""
+
+    def trials(self) -> int | None:
+        """How many worlds are stepped."""
+        return len(DOMAINS) * len(STEPS) * self.worlds
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Step the worlds that are missing."""
+        found, done = [], 0
+        for i, name in enumerate(DOMAINS):
+            for step in STEPS:
+                make = partial(self._moved, domains.named(name), STEPS[step])
+                part = run.part(f"{i}-{STEPS[step].timestep:g}", make)
+                found.append(part.expand_dims(domain=[name], step=[step]))
+                done += self.worlds
+                run.report(Progress(done, done * self.seconds))
+        whole = xr.combine_by_coords(found, combine_attrs="drop")
+        assert isinstance(whole, xr.Dataset)
+        whole = whole.sel(domain=list(DOMAINS), step=list(STEPS))
+        if self.machine and run.folder is not None:
+            head, *rows = table(whole)
+            columns = [{"name": text, **({"merge": True} if not i else {})}
+                       for i, text in enumerate(head)]  # fmt: skip
+            path = Path(__file__).parent / "results" / "rest.json"
+            publish(path, [provenance.signed(run.folder)], self.machine, columns, rows)
+        return whole
+
+    def _moved(self, ranges: domains.Domain, physics: Physics) -> xr.Dataset:
+        index, c = np.arange(self.worlds), engines.get("mujoco")
+        moved, family = np.zeros(self.worlds), np.empty(self.worlds, object)
+        for thing in range(len(ranges.objects)):
+            own = index[ranges.object_of(index) == thing]
+            drawn = draws.draw(ranges, self.seed, own)
+            family[own] = ranges.families[thing]
+            stage, _ = c.stage_of_solids(
+                ranges.families[thing], drawn.solid, drawn.friction, physics, Robot()
+            )
+            qpos = starts(drawn)
+            qpos[:, 0] -= _AWAY
+            batch = c.stepper(stage, qpos, 1)
+            still = np.zeros((own.size, 3))
+            batch.drive(np.arange(own.size), still, round(self.seconds / physics.timestep))
+            moved[own] = np.linalg.norm(batch.qpos[:, 3:5] - qpos[:, 3:5], axis=1)
+            batch.close()
+        return xr.Dataset({"moved": ("world", moved)}, {"family": ("world", family.astype(str))})
+
+    def intro(self, found: xr.Dataset) -> str:
+        """What was asked."""
+        return (
+            f"How many of {self.worlds} random objects that nothing touches are more than "
+            f"{100 * _FAR:g} cm away after {self.seconds:g} s, in C MuJoCo on the package's ground."
+        )
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """How many moved, by domain, step and shape."""
+        return [Section("Objects that wander off", "", table(found))]
+
+
+rest = call_of(Rest)
+
+
+def table(found: xr.Dataset) -> list[list[str]]:
+    """Header and one row for each domain and step."""
+    families = list(dict.fromkeys(map(str, found.family.values)))
+    rows = [["domain", "step", *(f"moved, {name}" for name in families), "the farthest"]]
+    for name in map(str, found.domain.values):
+        for step in map(str, found.step.values):
+            moved = found.moved.sel(domain=name, step=step)
+            each = [moved.values[found.family.values == one] for one in families]
+            counts = [f"{int((one > _FAR).sum())} of {one.size}" for one in each]
+            rows.append([f"`{name}`", step, *counts, f"{100 * float(moved.max()):.1f} cm"])
+    return rows
