@@ -161,7 +161,7 @@ class MJX(Engine):
         models, solids = [s.physics for s in scenes], scene.solids_of(scenes)
         model, fields = stack(models)
         if solids.feet is not None:
-            fields[OUTLINE] = solids.vertices
+            fields[OUTLINE] = jnp.asarray(solids.vertices)
         return MJXStage(model, mjx.make_data(models[0])), taken(jax.device_get(fields), which)
 
     def stage_of_solids(

@@ -211,7 +211,9 @@ def check_like(results: xr.Dataset, like: xr.Dataset, source: Any) -> xr.Dataset
     if odd := sorted(map(str, {*like.variables} ^ {*results.variables})):
         raise corrupt(source, f"it {'holds' if odd[0] in results.variables else 'lacks'} {odd[0]}")
     every = like.variables.items()
-    numbers = {str(name): one.dims for name, one in every if one.dtype.kind in "biuf"}
+    numbers = {
+        str(name): list(map(str, one.dims)) for name, one in every if one.dtype.kind in "biuf"
+    }
     check_columns(results, source, numbers, like.sizes)
     for name in like.coords:
         if not np.array_equal(results[name].values, like[name].values):

@@ -257,9 +257,9 @@ class _Schedule:
             if width:
                 groups.setdefault(queue.law if together else number, []).append((queue, width))
         self.last = [
-            _Batch(*zip(*group[i : i + _SIDE_BY_SIDE], strict=True), setting)
+            _Batch([queue for queue, _ in some], [width for _, width in some], setting)
             for group in groups.values()
-            for i in range(0, len(group), _SIDE_BY_SIDE)
+            for some in (group[i : i + _SIDE_BY_SIDE] for i in range(0, len(group), _SIDE_BY_SIDE))
         ]
 
 

@@ -210,4 +210,4 @@ def _share(successes: np.ndarray) -> str:
 def _rank_correlation(a: np.ndarray, b: np.ndarray) -> str:
     there = np.isfinite(b)
     ranks = [np.argsort(np.argsort(one[there])) for one in (a, b)]
-    return f"{np.corrcoef(ranks)[0, 1]:+.2f}"
+    return f"{float(np.asarray(np.corrcoef(ranks)).flat[1]):+.2f}"
