@@ -182,7 +182,7 @@ def decoded(content: bytes, source: Any, *, own: bool = False) -> xr.Dataset:
 def check_columns(
     results: xr.Dataset,
     source: Any,
-    dims: Mapping[str, Sequence[str]],
+    dims: Mapping[str, Sequence[Any]],
     sizes: Mapping[Any, int],
 ) -> xr.Dataset:
     """Return the results from `source` if they have these variables of numbers, or InputError.

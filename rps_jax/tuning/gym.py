@@ -169,7 +169,7 @@ class PushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def act(self, actions: Any) -> np.ndarray:
         """Carry out actions (num_envs, 3); returns the rewards (num_envs,). What is done stays."""
         actions = np.asarray(actions, np.float32)
-        shape = (self.num_envs, 3)
+        shape = (self.num_envs, self.push_env.action_size)
         if actions.shape != shape or not np.isfinite(actions).all():
             told = actions.tolist() if actions.shape == shape else f"of shape {actions.shape}"
             raise errors.InputError(
