@@ -45,7 +45,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Trial, World
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws, paper
-from rps_jax.world.domain import DOMAINS, Range
+from rps_jax.world.domain import DOMAINS, QUANTITIES, Range
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
 from rps_jax.world.scene import FRICTION, Friction
@@ -461,8 +461,9 @@ def digest(commands: Sequence[Sequence[str]]) -> str:
 
 def _declared(value: Any) -> Any:
     """A configuration, with the names of laws and domains followed by what they stand for."""
-    if isinstance(value, dict):
-        return {key: _declared(one) for key, one in value.items()}
+    if isinstance(value, dict):  # a quantity that is not drawn is none, also one that is new
+        drawn = (item for item in value.items() if item[1] is not None or item[0] not in QUANTITIES)
+        return {key: _declared(one) for key, one in drawn}
     if isinstance(value, list | tuple):
         return [_declared(one) for one in value]
     if isinstance(value, str) and value in DOMAINS:
