@@ -332,7 +332,7 @@ BY_HAND = {
     "real": "the worlds of robots.json, by the limits of their robots",
     "table_time": "wall clocks of whole commands, by the shell",
     "speed_goals": "wall clocks of whole commands before and after changes",
-    "sweep_speed": "one change after the other, each with the code of its day",
+    "gpu_sweeps": "wall clocks of whole commands before and after changes",
     "refilling": "said by `rps sweeps/speed --refill` in a sentence",
     "compile": "said by the column `compile` of `rps sweeps/speed`",
     "fast": "two runs of `rps sweep`, whose rates of simulation are printed",
