@@ -103,7 +103,19 @@ _ROBOTS = ("ideal", "kairos", "ridgeback", "mpo_500")
 RECIPES: dict[str, Recipe] = {
     "headline": Recipe((f"rps sweeps/headline {_MACHINE}",), None, 30),
     "models": Recipe((f"rps sweeps/headline {_MACHINE}",), None, 30),
-    "million": Recipe((f"rps sweeps/million {_MACHINE}",), None, 10),
+    "million": Recipe((f"rps sweeps/million --laws rps_tuned {_MACHINE}",), None, 3),
+    "rest": Recipe((f"rps sweeps/fidelity/rest.py {_MACHINE}",), 5, None),
+    "hardware_[qr]*": Recipe((f"rps sweeps/hardware {_MACHINE}",), None, 20),
+    "feet": Recipe(
+        (
+            "rps sweep --domain wide --laws rps rps_tuned rps_plus --worlds 400",
+            "rps sweep --domain wide,feet=0.5:0.9 --laws rps rps_tuned rps_plus --worlds 400",
+        ),
+        10,
+        None,
+        "Success",
+        ("the outline", "feet"),
+    ),
     "table": Recipe(("rps table",), 4, None, "Table II*"),
     "grid": Recipe(
         ("rps table --laws rps rps_tuned rps_plus learned_gru --engine fused",),
@@ -187,8 +199,9 @@ RECIPES: dict[str, Recipe] = {
     ),
     "rare": Recipe(
         (
-            "rps rare --law rps --domain wide,distance=1:1.2 --engine quasistatic --horizon 100 "
-            "--beyond 0.3 --particles 200 --groups 5 --repetitions 20 --brute 2000",
+            "rps sweeps/failures/drawn.py --law rps --domain wide,distance=1:1.2 --engine "
+            "quasistatic --horizon 100 --beyond 0.3 --particles 200 --groups 5 --repetitions 20 "
+            "--brute 2000",
         ),
         5,
         None,
