@@ -65,7 +65,7 @@ def never_stepping() -> Iterator[None]:
     def stop(*_: Any, **__: Any) -> None:
         raise Accepted
 
-    starts = ((trial, "start_all"), (rollout, "begin"), (film, "shoot"))
+    starts = ((trial, "start_all"), (rollout, "begin"), (film, "_shots"))
     before = [(module, name, getattr(module, name)) for module, name in starts]
     for module, name, _ in before:
         setattr(module, name, stop)
