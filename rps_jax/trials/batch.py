@@ -222,7 +222,7 @@ class _Queue:
         self.like: Part = next(self._parts)
         self._waiting: Part | None = self.like  # what is left of it
         self._lock = threading.Lock()
-        self.aside: list[tuple[Part, Trial]] = []
+        self.aside: list[tuple[Part, Trial, np.ndarray]] = []  # with which are to be begun
 
     @property
     def waits(self) -> bool:
@@ -411,20 +411,19 @@ class _Slots:
         self._before = np.zeros(slots, int)  # steps at the last look
         like = queue.like.worlds
         self._host = jax.tree.map(lambda leaf: np.repeat(leaf[:1], slots, axis=0), like)
-        self._fresh = np.ones(
-            slots, bool
-        )  # begin with the next segment; what is not live has ended
+        self._fresh = np.ones(slots, bool)  # begin with the next segment
         blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), batch.blank[number])
         self.trials = batch.put(blank)
         if not (aside := queue.aside if resumed else ()):
             self.worlds = self._put(np.arange(slots), queue.take(slots))
             return
-        parts, states = zip(*aside, strict=True)
+        parts, states, fresh = zip(*aside, strict=True)
         self.worlds = self._put(np.arange(slots), parts)
         running = jax.tree.map(lambda *leaves: np.concatenate(leaves), *states)
         # What fills the other slots has ended.
-        running = rows(running, np.resize(np.arange(len(running.steps)), slots))
-        self._before, self._fresh = running.steps.copy(), np.zeros(slots, bool)
+        which = np.resize(np.arange(len(running.steps)), slots)
+        running, self._fresh = rows(running, which), self.live & np.concatenate(fresh)[which]
+        self._before = running.steps.copy()
         self.trials = batch.put(running._replace(done=~self.live))
 
     def _put(self, at: np.ndarray, taken: Sequence[Part]) -> World:
@@ -462,10 +461,10 @@ class _Slots:
 
     def set_aside(self) -> None:
         """Hand what runs over to the queue."""
-        at = np.flatnonzero(self.live)
-        part = Part(self._numbers[at], rows(self._host, at), self._queue.like.stage)
-        if at.size:
-            self._queue.aside.append((part, rows(jax.device_get(self.trials), at)))
+        if (at := np.flatnonzero(self.live)).size:
+            part = Part(self._numbers[at], rows(self._host, at), self._queue.like.stage)
+            trials = rows(jax.device_get(self.trials), at)
+            self._queue.aside.append((part, trials, self._fresh[at]))
 
 
 class _Worker:
