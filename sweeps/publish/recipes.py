@@ -260,6 +260,15 @@ RECIPES: dict[str, Recipe] = {
         4,
         "Equal outcomes",
     ),
+    "engines_wide": Recipe(
+        (
+            "rps sweeps/engines --domain wide --worlds 240 --engines 'C, reference' "
+            "'C, reference, moved' 'fused, 10 ms' 'fused, 5 ms'",
+        ),
+        25,
+        4,
+        "Equal outcomes",
+    ),
     "ground": Recipe(("rps sweeps/ground",), 30, None, "Grounds beside a rigid object"),
     "force_push_grid": Recipe(("rps sweeps/force_push_grid",), 4, None, "Pushes that succeed"),
     "mends": Recipe(
@@ -316,6 +325,7 @@ RECIPES: dict[str, Recipe] = {
         6,
         "Simulated seconds in a second",
     ),
+    "commands": Recipe((f"rps sweeps/speed/commands.py {_MACHINE}",), 8, None),
     "costs": Recipe(("rps sweeps/speed/costs.py --families box prism",), 2, None, "Functions"),
     "levers": Recipe(
         (
