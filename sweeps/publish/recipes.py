@@ -356,7 +356,6 @@ BY_HAND = {
     "table_time": "wall clocks of whole commands, by the shell",
     "speed_goals": "wall clocks of whole commands before and after changes",
     "gpu_sweeps": "wall clocks of whole commands before and after changes",
-    "refilling": "said by `rps sweeps/speed --refill` in a sentence",
     "compile": "said by the column `compile` of `rps sweeps/speed`",
     "fast": "two runs of `rps sweep`, whose rates of simulation are printed",
     "tuned_elsewhere": "rows of 0.1.0, for comparison",
