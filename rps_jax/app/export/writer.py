@@ -14,7 +14,7 @@ from rps_jax.app.export.walk import unsupported
 
 # Inputs of a product with a matrix that are taken together: compilers then vectorise the loop over
 # the outputs, and a sum is loaded and stored once for all of them.
-_TOGETHER = 4
+_TOGETHER = 8
 FUNCTIONS = {*UNARY, "atan2", "pow", "rem", "round", "rint", "max", "min"}
 _INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "gt": ">"}
 _INFIX |= {"ge": ">=", "eq": "==", "ne": "!=", "and": "&&", "or": "||", "xor": "!="}
