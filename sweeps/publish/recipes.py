@@ -103,7 +103,7 @@ _ROBOTS = ("ideal", "kairos", "ridgeback", "mpo_500")
 RECIPES: dict[str, Recipe] = {
     "headline": Recipe((f"rps sweeps/headline {_MACHINE}",), None, 30),
     "models": Recipe((f"rps sweeps/headline {_MACHINE}",), None, 30),
-    "million": Recipe((f"rps sweeps/million --laws rps_tuned {_MACHINE}",), None, 3),
+    "million": Recipe((f"rps sweeps/million {_MACHINE}",), None, 9),
     "rest": Recipe((f"rps sweeps/fidelity/rest.py {_MACHINE}",), 5, None),
     "hardware_[qr]*": Recipe((f"rps sweeps/hardware {_MACHINE}",), None, 20),
     "feet": Recipe(
@@ -301,7 +301,9 @@ RECIPES: dict[str, Recipe] = {
         _RATES,
     ),
     "speed": Recipe(
-        ("rps sweeps/speed --worlds 64 4096 65536 262144 --mujocos 4096 --at-once 16 --refill 0",),
+        (
+            "rps sweeps/speed --worlds 64 336 4096 65536 262144 --mujocos 4096 --at-once 16 --refill 0",
+        ),
         None,
         6,
         "Simulated seconds in a second",
@@ -326,6 +328,15 @@ RECIPES: dict[str, Recipe] = {
         "Simulated seconds in a second",
     ),
     "commands": Recipe((f"rps sweeps/speed/commands.py {_MACHINE}",), 8, None),
+    "commands_gpu": Recipe(
+        (
+            "rps sweeps/speed/commands.py --commands 'sweep --laws rps_tuned --domain wide --worlds "
+            "1000' 'sweep --laws rps_tuned --domain wide --worlds 10000' 'sweep --laws rps_tuned "
+            "--domain wide --worlds 262144' --warm 1000 10000 --file commands_gpu " + _MACHINE,
+        ),
+        None,
+        5,
+    ),
     "costs": Recipe(("rps sweeps/speed/costs.py --families box prism",), 2, None, "Functions"),
     "levers": Recipe(
         (

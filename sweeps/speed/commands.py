@@ -45,7 +45,7 @@ class Commands(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "How long a user waits for a whole command"
-    GROWS: ClassVar[tuple[str, ...]] = ("commands", "machine")
+    GROWS: ClassVar[tuple[str, ...]] = ("commands", "warm", "machine")
 
     commands: tuple[str, ...] = (
         "push --object box --target -2 0 --no-video",
@@ -54,6 +54,9 @@ class Commands(Study[xr.Dataset]):
         "sweep --laws rps_tuned --domain wide --worlds 1000",
     )
     """What is asked of `rps`."""
+    warm: tuple[int, ...] = ()
+    """Numbers of worlds that are swept three times in one process: the first time with an empty
+    cache, and the last."""
     limit: float = option(1800.0, 1, 86400)
     """Time after which a command is stopped [s]."""
     machine: str = ""
@@ -63,7 +66,7 @@ class Commands(Study[xr.Dataset]):
 
     def trials(self) -> int | None:
         """How many commands there are."""
-        return len(self.commands)
+        return len(self.commands) + len(self.warm)
 
     def answer(self, run: Run) -> xr.Dataset:
         """Time what was not timed before."""
@@ -72,7 +75,9 @@ class Commands(Study[xr.Dataset]):
             safe = re.sub(r"\W+", "_", command)
             found.append(run.part(safe, partial(timed, command, self.limit)))
             run.report(Progress(number + 1, 0.0))
-        whole: Any = xr.concat(found, "command").assign_coords(command=list(self.commands))
+        found += [run.part(f"warm_{n}", partial(_warm, n, self.limit)) for n in self.warm]
+        told = [*(f"rps {one}" for one in self.commands), *map(_call, self.warm)]
+        whole: Any = xr.concat(found, "command").assign_coords(command=told)
         if self.machine and run.folder is not None:
             path = Path(__file__).parent / "results" / f"{self.file}.json"
             columns = [{"name": one} for one in _COLUMNS]
@@ -100,26 +105,55 @@ def timed(command: str, limit: float) -> xr.Dataset:
     """
     seconds, output = [], ""
     with tempfile.TemporaryDirectory() as folder:
-        kept = os.environ | {"RPS_CACHE": f"{folder}/cache"}
         for number in range(2):
-            words = [sys.executable, "-m", "rps_jax", *shlex.split(command)]
+            words = ["-m", "rps_jax", *shlex.split(command), "--out", f"{folder}/run_{number}"]
             begun = time.perf_counter()
-            try:
-                ended = subprocess.run(
-                    [*words, "--out", f"{folder}/run_{number}"],
-                    env=kept, capture_output=True, text=True, timeout=limit, check=False,
-                )  # fmt: skip
-            except subprocess.TimeoutExpired as error:
-                raise InputError(f"commands = {command} took more than {limit:g} s.") from error
+            output = _output(words, command, folder, limit)
             seconds.append(time.perf_counter() - begun)
-            if ended.returncode:
-                last = ended.stderr.strip().splitlines()[-1:]
-                raise InputError(f"commands = {command} failed: {' '.join(last)}")
-            output = ended.stdout
     told = _TOLD.search(output)
     compile_, run, rate = map(float, told.groups()) if told else (float("nan"),) * 3
-    values = {"empty": seconds[0], "again": seconds[1], "compile": compile_, "run": run}
-    return xr.Dataset({name: ((), value) for name, value in (values | {"rate": rate}).items()})
+    return _row(*seconds, compile_, run, rate)
+
+
+def _call(worlds: int) -> str:
+    """The call by which worlds are swept, as a row names it."""
+    return f'rps_jax.sweep("rps_tuned", "wide", worlds={worlds}) in one process'
+
+
+def _warm(worlds: int, limit: float) -> xr.Dataset:
+    """Seconds of a sweep with an empty cache, and the third time in that process."""
+    code = (
+        "import time, rps_jax\n"
+        "for _ in range(3):\n"
+        "    begun = time.perf_counter()\n"
+        f'    rps_jax.sweep("rps_tuned", "wide", worlds={worlds})\n'
+        "    print(time.perf_counter() - begun)\n"
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        first, *_, last = map(float, _output(["-c", code], _call(worlds), folder, limit).split())
+    return _row(first, last)
+
+
+def _output(words: Sequence[str], asked: str, folder: str, limit: float) -> str:
+    """What Python prints, with its cache in a folder; InputError if it fails or takes too long."""
+    try:
+        ended = subprocess.run(
+            [sys.executable, *words], env=os.environ | {"RPS_CACHE": f"{folder}/cache"},
+            capture_output=True, text=True, timeout=limit, check=False,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired as error:
+        raise InputError(f"commands = {asked} took more than {limit:g} s.") from error
+    if ended.returncode:
+        last = ended.stderr.strip().splitlines()[-1:]
+        raise InputError(f"commands = {asked} failed: {' '.join(last)}")
+    return ended.stdout
+
+
+def _row(empty: float, again: float, *told: float) -> xr.Dataset:
+    """Seconds of both runs, and what the second told: compile and run [s], rate [s/s]."""
+    values = (empty, again, *told, *(float("nan"),) * (3 - len(told)))
+    names = ("empty", "again", "compile", "run", "rate")
+    return xr.Dataset({name: ((), value) for name, value in zip(names, values, strict=True)})
 
 
 def table(found: xr.Dataset) -> list[list[str]]:
@@ -129,6 +163,6 @@ def table(found: xr.Dataset) -> list[list[str]]:
         one = found.sel(command=command)
         cells = [f"{one[name].item():.1f} s" for name in ("empty", "again", "compile", "run")]
         told = f"{one.rate.item():,.0f}"
-        rows.append([f"`rps {command}`", *(cell.replace("nan s", "") for cell in (*cells, told))])
+        rows.append([f"`{command}`", *(cell.replace("nan s", "") for cell in (*cells, told))])
         rows[-1][-1] = rows[-1][-1].replace("nan", "")
     return rows
