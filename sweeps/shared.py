@@ -12,7 +12,6 @@ import contextlib
 import dataclasses
 import hashlib
 import json
-import os
 import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -33,7 +32,7 @@ from rps_jax.control import registry
 from rps_jax.control.base import Params
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.errors import InputError
-from rps_jax.record import files
+from rps_jax.record import files, provenance
 from rps_jax.record.checkpoint import Parts
 from rps_jax.record.options import option
 from rps_jax.runs.question import Question, Run
@@ -393,7 +392,7 @@ def side_by_side(
 
 def machine() -> str:
     """Where speeds were measured, in a sentence."""
-    return f"On {jax.devices()[0].device_kind}, {os.cpu_count()} processors."
+    return f"On {jax.devices()[0].device_kind}, {provenance.processors()} processors."
 
 
 # --- published tables ----------------------------------------------------------------------

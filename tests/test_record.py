@@ -16,6 +16,7 @@ import pytest
 import xarray as xr
 from helpers import ROOT
 
+from rps_jax import engines
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
@@ -366,3 +367,11 @@ def test_names_that_are_no_utf8_keep_their_bytes(tmp_path):
     name = "\N{SNOWMAN}".encode().decode("ascii", errors="surrogateescape")
     path = files.write_text(tmp_path / "report.md", f"run folder: {name}")
     assert path.read_bytes() == "run folder: \N{SNOWMAN}".encode()
+
+
+def test_only_processors_that_a_process_may_use_are_counted(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {3, 7, 8}, raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 128)
+    assert engines.get("fused").workers("cpu") == 3
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert provenance.processors() == 128

@@ -11,7 +11,6 @@ every world has its own, by chance.
 
 from __future__ import annotations
 
-import os
 import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -31,7 +30,7 @@ from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import Figure, quantity, words
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.errors import InputError
-from rps_jax.record import files
+from rps_jax.record import files, provenance
 from rps_jax.record.options import option
 from rps_jax.runs import sweep as sweeps
 from rps_jax.runs.plan import Plan
@@ -157,7 +156,7 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         fine = replace(self.setting, engine="mujoco", physics="default", fidelity="reference")
         folder = None if run.folder is None else run.folder / "check"
         probe = Probe(self.ranges, self.params, fine, folder, **run.shape)
-        some = max(1, run.workers or os.cpu_count() or 1)
+        some = max(1, run.workers or provenance.processors())
         for first in range(0, len(order), some):
             if not left():
                 break

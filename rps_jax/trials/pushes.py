@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from rps_jax.control import registry
 from rps_jax.control.base import Law, Params
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.geometry.footprint import Footprint
+from rps_jax.record import provenance
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.shell import Shell
 from rps_jax.trials import batch, host, trial
@@ -255,7 +255,7 @@ def _follow_on_host(
         physics=setting.physics,
         rules=setting.rules,
         law=law,
-        threads=1 if part.numbers.size == 1 else os.cpu_count() or 1,
+        threads=1 if part.numbers.size == 1 else provenance.processors(),
         report=tell,
         watch=watch,
     )

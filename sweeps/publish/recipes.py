@@ -302,7 +302,8 @@ RECIPES: dict[str, Recipe] = {
     ),
     "speed": Recipe(
         (
-            "rps sweeps/speed --worlds 64 336 4096 65536 262144 --mujocos 4096 --at-once 16 --refill 0",
+            "rps sweeps/speed --worlds 64 336 4096 65536 262144 --mujocos 4096 --at-once 16 "
+            "--refill 0",
         ),
         None,
         6,
@@ -330,9 +331,11 @@ RECIPES: dict[str, Recipe] = {
     "commands": Recipe((f"rps sweeps/speed/commands.py {_MACHINE}",), 8, None),
     "commands_gpu": Recipe(
         (
-            "rps sweeps/speed/commands.py --commands 'sweep --laws rps_tuned --domain wide --worlds "
-            "1000' 'sweep --laws rps_tuned --domain wide --worlds 10000' 'sweep --laws rps_tuned "
-            "--domain wide --worlds 262144' --warm 1000 10000 --file commands_gpu " + _MACHINE,
+            "rps sweeps/speed/commands.py --commands "
+            "'sweep --laws rps_tuned --domain wide --worlds 1000' "
+            "'sweep --laws rps_tuned --domain wide --worlds 10000' "
+            "'sweep --laws rps_tuned --domain wide --worlds 262144' "
+            "--warm 1000 10000 --file commands_gpu " + _MACHINE,
         ),
         None,
         5,

@@ -236,7 +236,7 @@ def joined(tables: Sequence[tuple[str, Rows]], columns: Sequence[str]) -> tuple[
 
 def machine() -> str:
     """What this process runs on, in words."""
-    device, count = jax.devices()[0], os.cpu_count() or 1
+    device, count = jax.devices()[0], provenance.processors()
     if device.platform != "cpu":
         return f"one {device.device_kind} and {count} processors"
     model = platform.processor() or platform.machine()
@@ -244,7 +244,7 @@ def machine() -> str:
         if line.startswith("model name"):
             model = line.partition(":")[2].strip()
             break
-    return f"{len(os.sched_getaffinity(0))} of {count} processors, {model}"
+    return f"{count} of {os.cpu_count()} processors, {model}"
 
 
 def _processors() -> str:
