@@ -75,7 +75,6 @@ class Models(OfPlan):
     SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 24}
 
     def trials(self) -> int | None:
-        """How many trials there are on all models."""
         return self.plan.trials * len(plans(self.plan))
 
     def answer(self, run: Run) -> xr.Dataset:
@@ -83,7 +82,6 @@ class Models(OfPlan):
         return complete(self.plan, run.folder, **run.shape)
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Rates on each model, and their range."""
         return sweeps.spread(with_models(found.isel(model=0), found))
 
 

@@ -279,7 +279,6 @@ class Pushes(Question[T]):
     """Whether to make a small run of minutes on two cores: what is not asked for becomes small."""
 
     def run_in(self, out: Path | None, report: Report) -> Run:
-        """Where and how the answer is made."""
         return Run(out, report, self.slots, self.workers)
 
 

@@ -47,16 +47,13 @@ class Planned(Pushes[xr.Dataset]):
     plan: Plan | functools.cached_property[Plan]  # what is run
 
     def check(self) -> None:
-        """Check the plan, and that the engine can step its worlds here."""
         self.plan.check_here()
         batch.check_shape(self.slots, self.workers)
 
     def trials(self) -> int | None:
-        """How many trials there are."""
         return self.plan.trials
 
     def configuration(self) -> dict[str, Any]:
-        """All that the results depend on, as JSON."""
         return self.plan.configuration()
 
     def answered(self, report: Report) -> xr.Dataset:
@@ -64,7 +61,6 @@ class Planned(Pushes[xr.Dataset]):
         return self.answer(self.run_in(None if self.out is None else Path(self.out), report))
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Run what is missing of the plan."""
         return whole(self.plan, run.folder, **run.shape)
 
 
@@ -87,11 +83,9 @@ class OfPlan(Planned, InDomain[xr.Dataset], OfLaws[xr.Dataset]):
         return Plan(self.ranges, count, self.chosen, self.setting, self.part or _part_of(count))
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         return intro_of(self.plan)
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Rates, differences, what success depends on, and the hardest worlds."""
         return report_of(self.plan, found, run.folder)
 
 
@@ -172,7 +166,6 @@ class Sweep(OfPlan):
 
     @functools.cached_property
     def plan(self) -> Plan:
-        """What is run."""
         plan = super().plan
         if self.points is None:
             return plan
@@ -189,7 +182,6 @@ class Sweep(OfPlan):
         return Shard.named(self.shard)
 
     def check(self) -> None:
-        """Check what cannot be asked for together."""
         if self.points is not None and self.worlds is not None:
             raise InputError("worlds is not allowed with points: these say how many.")
         if self.table is not None:
@@ -208,7 +200,6 @@ class Sweep(OfPlan):
         return sum(numbers.size for numbers in share(self.plan, self.share).values())
 
     def answered(self, report: Report) -> xr.Dataset:
-        """Outcomes, written as a table, too, where that is asked for."""
         found = super().answered(report)
         if self.table is not None:
             results.write_table(found, Path(self.table))
@@ -235,7 +226,6 @@ class Sweep(OfPlan):
         return found
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Rates, their range over models, differences, dependence, and the hardest worlds."""
         if "row" in found.dims:
             text = f"When all shards are done: `rps merge {shlex.quote(str(self.out))} --out ...`."
             return [Section(f"Share {self.shard}", text)]
@@ -270,14 +260,12 @@ class Merge(Question[xr.Dataset]):
     """Run folder of the whole."""
 
     def check(self) -> None:
-        """Check that there are shards, and where they go."""
         if not self.folders:
             raise InputError("folders = () is not allowed: give the run folders of the shards.")
         if self.out is None:
             raise InputError("out = None is not allowed: name the run folder of the whole.")
 
     def answered(self, report: Report) -> xr.Dataset:
-        """Gather the parts of all shards."""
         folders = [Path(one) for one in self.folders]
         out = run_folder.writable(Path(str(self.out)))
         manifest = run_folder.manifest(folders[0])
@@ -294,11 +282,9 @@ class Merge(Question[xr.Dataset]):
         return labelled(found)
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         return intro_of(load_plan(Path(str(self.out))))
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """What a sweep reports."""
         return report_of(load_plan(Path(str(self.out))), found, run.folder)
 
 

@@ -112,7 +112,6 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     """Whether the command films the worst twelve."""
 
     def check(self) -> None:
-        """Check axes, engine and pyribs."""
         if len(self.axes) != 3:
             raise InputError(f"axes = {self.axes} is not allowed: name three quantities.")
         errors.check_each_once("axes", self.axes)
@@ -130,7 +129,6 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         return found
 
     def bar(self) -> Bar:
-        """A bar over wall clock."""
         return Bar(self.name, 60 * self.minutes, "clock", shown=self.shown)
 
     def answer(self, run: Run) -> xr.Dataset:
@@ -174,14 +172,12 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
             sweeps.complete(run.folder / "worlds", plan, **run.shape)
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         return (
             f"{self.label} in the domain {name_of(self.domain)}: axes {', '.join(self.axes)}, "
             f"{self.repeats} noises each."
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Failing cells, their margins, and whether they fail elsewhere."""
         gain, cells = yields(found), found.margin.size
         text = (
             f"{int(found.failing[-1])} of {cells} cells hold a failure, after "

@@ -66,22 +66,18 @@ class Compare(OfLaws[xr.DataTree]):
         return found
 
     def check(self) -> None:
-        """Check every domain, and that the engine can step its worlds here."""
         if not self.parts:
             raise errors.InputError("domain = () is not allowed: name at least one.")
         for part in self.parts.values():
             part.check()
 
     def trials(self) -> int | None:
-        """How many trials there are."""
         return sum(part.plan.trials for part in self.parts.values())
 
     def configuration(self) -> dict[str, Any]:
-        """All that the results depend on, as JSON."""
         return {"compare": {name: one.plan.configuration() for name, one in self.parts.items()}}
 
     def answer(self, run: Run) -> xr.DataTree:
-        """Run what is missing in each domain."""
         heard, found = InTurn(run.report), {}
         shape = run._replace(report=heard).shape
         for name, one in self.parts.items():
@@ -90,14 +86,12 @@ class Compare(OfLaws[xr.DataTree]):
         return xr.DataTree.from_dict(found)
 
     def intro(self, found: xr.DataTree) -> str:
-        """What was asked."""
         return (
             f"Seed {self.setting.seed} of the worlds for testing, engine {self.setting.engine}; "
             "every law meets the same worlds. Intervals: Wilson 95 %."
         )
 
     def report(self, found: xr.DataTree, run: Run) -> Sequence[Section]:
-        """Rates and differences in each domain."""
         sections = []
         for name in self.parts:
             results = found[name].to_dataset()

@@ -104,35 +104,28 @@ class Gallery(Question[xr.Dataset]):
 
     @property
     def title(self) -> str:
-        """Title of the report."""
         return f"Losses of {chosen(Path(self.run), 0, self.law)[1]}"
 
     @property
     def place(self) -> Path:
-        """A folder in that of the run."""
         return Path(self.run) / "gallery"
 
     def check(self) -> None:
-        """Check that the folder holds a sweep with this law."""
         chosen(Path(self.run), 0, self.law)
 
     def note(self) -> str:
-        """Whether another engine than the sweep's follows its worlds."""
         return another_engine(Path(self.run))
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Tell the kinds apart."""
         plan, name = chosen(Path(self.run), 0, self.law)
         one = files.read_results(Path(self.run)).sel(law=name)
         found = kinds(one, float(plan.setting.rules.max_lost))
         return one.assign(kind=("world", found))
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         return f"Run {self.run}; kinds and maps."
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Follow some trials of each kind again, and draw them."""
         plan, name = chosen(Path(self.run), 0, self.law)
         kind_of = found.kind.values
         there = {k: np.flatnonzero(kind_of == k) for k in MECHANISMS if (kind_of == k).any()}

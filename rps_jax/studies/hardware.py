@@ -90,19 +90,16 @@ class Hardware(OfLaw[xr.Dataset]):
         return HARDWARE_LAYOUTS[self.layout]
 
     def check(self) -> None:
-        """Check the trials and the engine."""
         engine = engines.get(self.setting.engine)
         engine.check()
         engine.check_robot(self.base.base)
         engine.check_senses(registry.law_of(self.params).senses)
 
     def trials(self) -> int | None:
-        """How many trials there are."""
         each = len(HARDWARE_OBJECTS) * len(self.targets)
         return each * (len(frictions()) + 2 * len(self.shifts) + 1)
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Run the experiments, the shoves, and the trials of Fig. 7."""
         heard, found = InTurn(run.report), []
         run = run._replace(report=heard)
         parts = {"hardware": self._pushed, "shifted": self._shifted, "paths": self._paths}
@@ -179,7 +176,6 @@ class Hardware(OfLaw[xr.Dataset]):
         return xr.Dataset(variables, coords, {"trials": len(HARDWARE_OBJECTS) * len(self.targets)})
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         ground, robot = HARDWARE_GROUND, HARDWARE_ROBOT
         return (
             f"{self.label}, skin {name_of(self.skin)}, engine {self.setting.engine}. "
@@ -188,7 +184,6 @@ class Hardware(OfLaw[xr.Dataset]):
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Success, D and time beside the paper's; Fig. 7; and the shove."""
         ground, robot = MIDDLE
         text = (
             "D is the mean of |l| over the time in contact, where l is how far the contact point "

@@ -134,14 +134,12 @@ class Sensitivity(Planned, InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         return Plan(self.ranges, self.design.worlds, {"law": self.params}, self.setting, points=at)
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Run the worlds that are missing, and analyse them."""
         found = analysed(self.design, super().answer(run))
         if run.folder is not None:
             files.write_results(run.folder / "sobol.nc", found)
         return found
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         each = f"{self.design.base} for each of {len(self.design.factors)} quantities and two more"
         return (
             f"{self.label} in the domain {name_of(self.domain)}: {self.design.worlds:,} worlds, "
@@ -149,7 +147,6 @@ class Sensitivity(Planned, InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Indices, and pairs of quantities."""
         order = ranked(found)
         said = {one: in_words(one) for one in order}
         drawn = [one for one in order if one in found.quantity.values][:5]

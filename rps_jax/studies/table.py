@@ -71,7 +71,6 @@ class Table(Given, OfLaws[xr.Dataset]):
         ]
 
     def check(self) -> None:
-        """Check every trial, and the engine."""
         if not self.cases:
             raise errors.InputError("targets = () is not allowed: name at least one.")
         engine = engines.get(self.setting.engine)
@@ -81,11 +80,9 @@ class Table(Given, OfLaws[xr.Dataset]):
             engine.check_senses(registry.law_of(params).senses)
 
     def trials(self) -> int | None:
-        """How many trials there are."""
         return len(self.cases)
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Run every trial."""
         return run.part("table", partial(self._run, run))
 
     def _run(self, run: Run) -> xr.Dataset:
@@ -95,14 +92,12 @@ class Table(Given, OfLaws[xr.Dataset]):
         return results.outcome_dataset(outcome, *names, labels, self.targets)
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         return (
             f"{found.success.size} trials, engine {self.setting.engine}, steps of "
             f"{1000 * self.setting.physics.timestep:g} ms. Intervals: Wilson 95 %, in percent."
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Table II beside the paper's, and Fig. 5."""
         return sections(found)
 
 

@@ -108,7 +108,6 @@ class TuneGrad(Tuning):
             ) from error
 
     def tuner(self) -> DescentState:
-        """The search."""
         return DescentState(self)
 
     @property

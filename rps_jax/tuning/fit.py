@@ -136,7 +136,6 @@ class Fit(OfLaw[Fitted], InDomain[Fitted], OfLogs):
         return found, has
 
     def check(self) -> None:
-        """Check the logs, the law and the engine."""
         self.check_engine([self.params])
         check_law(self.label, self.bank.law, self.setting)
         if len({one.exact for one in self.given}) > 1:
@@ -152,7 +151,6 @@ class Fit(OfLaw[Fitted], InDomain[Fitted], OfLogs):
                 )
 
     def trials(self) -> int | None:
-        """How many worlds are simulated."""
         return self.worlds
 
     def described(self) -> dict[str, Any]:
@@ -184,7 +182,6 @@ class Fit(OfLaw[Fitted], InDomain[Fitted], OfLogs):
         return Fitted(data, fitted)
 
     def intro(self, found: Fitted) -> str:
-        """What was asked."""
         has = self.observed[1]
         return (
             f"Logs: {len(self.given)}, the first {self.bank.window:g} s of each at "
@@ -193,7 +190,6 @@ class Fit(OfLaw[Fitted], InDomain[Fitted], OfLogs):
         )
 
     def report(self, found: Fitted, run: Run) -> Sequence[Section]:
-        """Each quantity's posterior beside its prior."""
         data = found.data
         text = (
             "Median and 90 % interval. A quantity is undetermined if its interval is at least "

@@ -123,7 +123,6 @@ class Learn(PPO, Pushes[xr.Dataset]):
         return tuple(domains.named(text) for text in several)
 
     def check(self) -> None:
-        """Check that something can be learned in this way."""
         if self.out is None:
             raise errors.InputError("out = None is not allowed: the policy is written there.")
         if not (self.minutes or self.updates):
@@ -167,26 +166,22 @@ class Learn(PPO, Pushes[xr.Dataset]):
         ]
 
     def bar(self) -> Bar:
-        """A bar over wall clock or updates."""
         if self.updates:
             return Bar(self.name, self.updates, "updates", shown=self.shown)
         return Bar(self.name, 60 * self.minutes, "clock", shown=self.shown)
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Learn."""
         assert run.folder is not None
         learning = _Learning(run.folder, self, run.report, time.perf_counter())
         return learning.through(60 * self.minutes, self.updates, 60 * self.every)
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         return (
             f"{self.network.upper()} of {self.width} pairs of units, PPO in {self.num_envs} worlds "
             f"of each shape; judged in the domain itself, without noise, by the paper's rules."
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Validations, where the time went, and the curve."""
         simulated = float(found.simulated[-1]) if found.sizes["update"] else 0.0
         took = found.attrs["run"]
         judged = found.validation.dropna("update")

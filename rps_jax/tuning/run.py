@@ -101,7 +101,6 @@ class Tuning(OfLaw[xr.Dataset]):
 
     @property
     def title(self) -> str:
-        """Title of the report."""
         return f"{self.label}, tuned"
 
     @functools.cached_property
@@ -129,7 +128,6 @@ class Tuning(OfLaw[xr.Dataset]):
         return {k: v for k, v in self.SMALL.items() if k != "tuned" or alike}
 
     def check(self) -> None:
-        """Check the space, the search, and that the engine can step the worlds here."""
         errors.check_count("seed", self.setting.seed, at_least=0, at_most=2**30)
         known = [n for n, own in registry.LAWS.items() if registry.law_of(own).bounds]
         if not registry.law_of(self.params).bounds:
@@ -151,18 +149,15 @@ class Tuning(OfLaw[xr.Dataset]):
         return found
 
     def bar(self) -> Bar:
-        """A bar over generations."""
         count = self.tuner().generations
         return Bar(self.name.replace("_", " "), count, "generations", shown=self.shown)
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Tune."""
         tuner = self.tuner()
         log = tune(run.folder, tuner, report=run.report, slots=run.slots, workers=run.workers)
         return labelled(log, tuner)
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         names = ", ".join(self.space.names)
         return (
             f"{self.label}: {names}; {self.worlds} worlds of each generation and "
@@ -170,7 +165,6 @@ class Tuning(OfLaw[xr.Dataset]):
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """What was found, where the time went, and the search over its generations."""
         best = int(found.validation.argmin("generation"))
         rate = [tables.percent(float(won)) for won in found.validation_success.values]
         total = {name: float(found[name].sum()) for name in ("compile", "run", "simulated")}
