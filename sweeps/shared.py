@@ -36,12 +36,12 @@ from rps_jax.record import files, provenance
 from rps_jax.record.checkpoint import Parts
 from rps_jax.record.options import option
 from rps_jax.runs.question import Question, Run
-from rps_jax.trials import batch, pushes, trial
+from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.progress import Progress, Report, unheard
 from rps_jax.trials.results import outcome_dataset
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Trial, World
+from rps_jax.trials.trial import Loop, Trial, World
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws, paper
 from rps_jax.world.domain import DOMAINS, QUANTITIES, Range
@@ -77,7 +77,6 @@ class Trials(Study[T]):
 
     def check(self) -> None:
         """Check slots and workers."""
-        batch.check_shape(self.slots, self.workers)
 
     def run_in(self, out: Path | None, report: Report) -> Run:
         """Where and how the answer is made."""
@@ -351,8 +350,11 @@ def traced(
     start = trial.start_all(batch, np.ones(worlds, bool))
     shared, steps = stage(usual), round(simulated / physics.control_period)
     began = time.perf_counter()
-    # Not as it is jitted: that gives back what it has traced before for such arguments.
-    advance = partial(trial.advance.__wrapped__, physics=physics, steps=steps)
+
+    # A new one: what was jitted before gives back what it has traced for such arguments.
+    def advance(stage: Any, worlds: World, trials: Trial) -> Trial:
+        return trial.advance((stage,), (worlds,), (trials,), Loop(physics), steps)[0]
+
     lowered = jax.jit(advance, donate_argnums=2 if donated else ()).lower(shared, batch, start)
     tracing = time.perf_counter() - began
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import read_log
 
 from rps_jax.app import cli
 from rps_jax.control.laws.rps import RPSParams
@@ -18,7 +19,6 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import descent, gradients
 from rps_jax.tuning.descent import TuneGrad
-from rps_jax.tuning.run import read_log
 
 SETTING = Setting("quasistatic", rules=Rules(horizon=20.0, max_lost=10.0))
 OBJECTIVE = Objective(time=0.3, lost=0.1, miss=0.5)

@@ -28,7 +28,7 @@ from rps_jax.robot.skin import NONE, CapacitiveSkin, IdealSkin, SmoothSkin
 from rps_jax.trials import host, pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
+from rps_jax.trials.trial import Loop, Rules
 from rps_jax.world.scene import FRICTION
 
 PAPER = RPSParams.paper()
@@ -566,8 +566,8 @@ def push(case: Case, law, horizon: float):
         seen.append(trials)
         return True
 
-    options = {"physics": setting.physics, "rules": setting.rules, "threads": 1}
-    host.run(engines.get("mujoco"), models, worlds, law=law, report=report, **options)
+    loop = Loop(setting.physics, setting.rules, law)
+    host.run(engines.get("mujoco"), models, worlds, loop, threads=1, report=report)
     return jax.tree.map(lambda x: np.asarray(x)[0], seen[-1])
 
 

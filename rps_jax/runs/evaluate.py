@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.base import Params
 from rps_jax.control.laws.rps import RPSParams
@@ -26,7 +26,7 @@ from rps_jax.runs.question import Split, seed_of
 from rps_jax.trials import batch
 from rps_jax.trials.batch import Job, Part
 from rps_jax.trials.progress import Bar, Report, Timing, unheard, watched
-from rps_jax.trials.results import UNITS
+from rps_jax.trials.results import variable
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
@@ -95,9 +95,7 @@ def evaluate(
     count = worlds if at is None else len(at.u)
     errors.check_count("worlds", count, at_most=10_000_000)
     errors.check_count("seed", setting.seed, at_least=0, at_most=2**30)
-    engines.get(setting.engine).check(ranges.families)
-    engines.get(setting.engine).check_senses(registry.law_of(params).senses)
-    batch.check_shape(slots, workers)
+    setting.check_here(ranges.families, ranges.weakest, [params])
     ask = Ask(_checked(params), seed_of(setting.seed, split), np.arange(count), at)
     device.use_cache_if_asked()
     shown = watched() if progress is None else progress
@@ -108,10 +106,7 @@ def evaluate(
         "score": (("candidate", "world"), answer.score, {"units": "1", "long_name": "objective"})
     }
     for name, values in answer.outcome._asdict().items():
-        unit, meaning = UNITS[name]
-        dims = ("candidate", "world", "pose")[: values.ndim]
-        plain = values.astype(np.int8) if values.dtype == bool else values
-        variables[name] = (dims, plain, {"units": unit, "long_name": meaning})
+        variables[name] = variable(name, ("candidate", "world"), values)
     drawn = points_.coordinates(ranges, ask.object_of(ranges), partial(ask.draw, ranges))
     return xr.Dataset(variables, {"pose": ["x", "y", "yaw"], "world": ask.worlds} | drawn)
 

@@ -20,7 +20,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.base import Params
 from rps_jax.errors import InputError
@@ -64,11 +64,8 @@ class Plan:
 
     def check_here(self) -> None:
         """Raises InputError unless the engine can step these worlds on this machine."""
-        engine = engines.get(self.setting.engine)
-        engine.check(self.domain.families)
-        engine.check_robot(self.domain.weakest)
-        for params in self.laws.values():
-            engine.check_senses(registry.law_of(params).senses)
+        domain = self.domain
+        self.setting.check_here(domain.families, domain.weakest, self.laws.values())
 
     @property
     def trials(self) -> int:

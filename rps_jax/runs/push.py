@@ -255,9 +255,7 @@ class Push(Case, FollowsOne, Pushes[Trace]):
 
     def check(self) -> None:
         super().check()
-        engine = engines.get(self.setting.engine)
-        engine.check()
-        engine.check_robot(self.case.base)
+        self.setting.check_here((), self.case.base, [self.case.params])
 
     def answer(self, run: Run) -> Trace:
         case, setting = self.case, self.setting

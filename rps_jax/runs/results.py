@@ -16,7 +16,7 @@ from rps_jax.record import files
 from rps_jax.record.checkpoint import Parts
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import labelled
-from rps_jax.trials.results import UNITS
+from rps_jax.trials.results import UNITS, variable
 from rps_jax.trials.trial import Outcome
 from rps_jax.world.domain import WORDS
 
@@ -62,18 +62,12 @@ class Collector:
                 rows[name][at] = leaf[ended]
             self._missing[part] -= at.size
             if not self._missing[part]:
-                drawn = self.drawn.pop(part, {})
-                self._keep(part, _part(trials, self._open.pop(part), drawn))
-
-
-def _part(trials: np.ndarray, leaves: dict[str, np.ndarray], drawn: Columns) -> xr.Dataset:
-    """The rows of a part."""
-    columns: dict[str, Any] = {"trial": ("row", trials)}
-    for name, leaf in leaves.items():
-        columns[name] = (("row", "pose")[: leaf.ndim], leaf)
-    for name, (values, unit) in drawn.items():
-        columns[name] = ("row", values.astype(np.float32), {"units": unit})
-    return xr.Dataset(columns)
+                columns: dict[str, Any] = {"trial": ("row", trials)}
+                for name, leaf in self._open.pop(part).items():
+                    columns[name] = (("row", "pose")[: leaf.ndim], leaf)
+                for name, (values, unit) in self.drawn.pop(part, {}).items():
+                    columns[name] = ("row", values.astype(np.float32), {"units": unit})
+                self._keep(part, xr.Dataset(columns))
 
 
 def gather(
@@ -102,11 +96,10 @@ def dataset(plan: Plan, contents: Mapping[int, bytes | xr.Dataset]) -> xr.Datase
     which = {"units": "1", "long_name": "index of the object in the coordinate object"}
     objects = plan.object_of(every).astype(np.int16)
     columns = {"which_object": xr.Variable("world", objects, which)}
-    for name, (unit, meaning) in UNITS.items():
-        dims = ("law", "world", "pose") if name.endswith("pose") else ("law", "world")
-        shape = (len(plan.laws), plan.worlds, 3)[: len(dims)]
+    for name in UNITS:
+        shape = (len(plan.laws), plan.worlds, 3)[: 3 if name.endswith("pose") else 2]
         values = np.zeros(shape, _TYPES.get(name, np.float32))
-        columns[name] = xr.Variable(dims, values, {"units": unit, "long_name": meaning})
+        columns[name] = variable(name, ("law", "world"), values)
     for number, content in contents.items():
         law, _ = plan.law_and_object(number)
         part = content

@@ -48,7 +48,6 @@ class Planned(Pushes[xr.Dataset]):
 
     def check(self) -> None:
         self.plan.check_here()
-        batch.check_shape(self.slots, self.workers)
 
     def trials(self) -> int | None:
         return self.plan.trials
@@ -380,7 +379,7 @@ def work(
         parts = _made(plan, some, collector)
         if isinstance(some, Sequence):  # what is asked for elsewhere is asked for when it is needed
             parts = _ahead(parts, max(1, _AHEAD // plan.part))
-        jobs.append(Job(registry.of_class(kind[1]), plan.sizes[kind], parts))
+        jobs.append(Job(registry.law_of(kind[1]), plan.sizes[kind], parts))
     batch.run(jobs, plan.setting, collect=collector.collect, report=report, **shape)
 
 

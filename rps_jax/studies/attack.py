@@ -81,6 +81,7 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "A search for failures"
+    LEFT_OUT: ClassVar[tuple[str, ...]] = ("minutes", "generations", "check_again", "worst")
     SMALL: ClassVar[Mapping[str, Any]] = {"minutes": 2.0, "drawn": 128, "check_again": 4}
 
     axes: tuple[str, ...] = ("size", "com_offset", "friction_robot")
@@ -120,13 +121,6 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         errors.check_count("seed", self.setting.seed, at_least=0, at_most=2**30)
         self.check_engine([self.params])
         need("ribs", "ribs")
-
-    def configuration(self) -> dict[str, Any]:
-        """All that the answer depends on, but how long it is searched."""
-        found = super().configuration()
-        for name in ("minutes", "generations", "check_again", "worst"):
-            del found[name]
-        return found
 
     def bar(self) -> Bar:
         return Bar(self.name, 60 * self.minutes, "clock", shown=self.shown)

@@ -6,7 +6,6 @@ import functools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, ClassVar
 
 import xarray as xr
@@ -81,7 +80,8 @@ class Compare(OfLaws[xr.DataTree]):
         heard, found = InTurn(run.report), {}
         shape = run._replace(report=heard).shape
         for name, one in self.parts.items():
-            found[name] = sweeps.whole(one.plan, _folder(run.folder, name), **shape)
+            out = run.folder and run.folder / re.sub(r"[^\w.=,-]", "_", name)
+            found[name] = sweeps.whole(one.plan, out, **shape)
             heard.ended(one.plan.trials)
         return xr.DataTree.from_dict(found)
 
@@ -104,7 +104,3 @@ class Compare(OfLaws[xr.DataTree]):
 
 
 compare = call_of(Compare)
-
-
-def _folder(out: Path | None, name: str) -> Path | None:
-    return None if out is None else out / re.sub(r"[^\w.=,-]", "_", name)

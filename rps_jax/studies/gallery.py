@@ -133,7 +133,11 @@ class Gallery(Question[xr.Dataset]):
         seen, sections = _followed(plan, name, some, InTurn(run.report)), []
         for kind, worlds in there.items():
             tracks = [seen[int(i)] for i in worlds[: self.each]]
-            labels = [f"world {i}, {_left(found, i)}" for i in worlds[: self.each]]
+            left = found.min_distance.values[worlds[: self.each]]
+            labels = [
+                f"world {i}, " + (f"{x:.2f} m left" if np.isfinite(x) else "untouched")
+                for i, x in zip(worlds, left, strict=False)
+            ]
             title = f"{name}: {kind}, {len(labels)} of {worlds.size} in {kind_of.size} worlds"
             drawn = functools.partial(figure_of, tracks, labels, title)
             picture = Picture(kind.replace(" ", "_"), drawn)
@@ -144,11 +148,6 @@ class Gallery(Question[xr.Dataset]):
 
 
 gallery = call_of(Gallery)
-
-
-def _left(one: xr.Dataset, world: int) -> str:
-    left = float(one.min_distance.values[world])
-    return f"{left:.2f} m left" if np.isfinite(left) else "untouched"
 
 
 def _told(run: str | Path, law: str, one: xr.Dataset, mask: np.ndarray, kind: str) -> str:

@@ -12,11 +12,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import xarray as xr
 
-from rps_jax import engines
 from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import OBJECT_COLOURS, Figure, base_patch, success_rates, words
 from rps_jax.analysis.report import Picture, Section
-from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
@@ -90,10 +88,7 @@ class Hardware(OfLaw[xr.Dataset]):
         return HARDWARE_LAYOUTS[self.layout]
 
     def check(self) -> None:
-        engine = engines.get(self.setting.engine)
-        engine.check()
-        engine.check_robot(self.base.base)
-        engine.check_senses(registry.law_of(self.params).senses)
+        self.setting.check_here((), self.base.base, [self.params])
 
     def trials(self) -> int | None:
         each = len(HARDWARE_OBJECTS) * len(self.targets)

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import xarray as xr
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.analysis import figures, tables
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
@@ -73,11 +73,7 @@ class Table(Given, OfLaws[xr.Dataset]):
     def check(self) -> None:
         if not self.cases:
             raise errors.InputError("targets = () is not allowed: name at least one.")
-        engine = engines.get(self.setting.engine)
-        engine.check()
-        engine.check_robot(self.cases[0].base)
-        for params in self.chosen.values():
-            engine.check_senses(registry.law_of(params).senses)
+        self.setting.check_here((), self.cases[0].base, self.chosen.values())
 
     def trials(self) -> int | None:
         return len(self.cases)
@@ -88,7 +84,10 @@ class Table(Given, OfLaws[xr.Dataset]):
     def _run(self, run: Run) -> xr.Dataset:
         outcome, _ = pushes.run(self.cases, self.setting, **run.shape)
         labels = [label_of(one) for one in self.friction]
-        names = list(self.chosen), [case_name(one) for one in self.objects]
+        names = (
+            list(self.chosen),
+            [Path(one).stem if one.endswith(".xml") else one for one in self.objects],
+        )
         return results.outcome_dataset(outcome, *names, labels, self.targets)
 
     def intro(self, found: xr.Dataset) -> str:
@@ -102,11 +101,6 @@ class Table(Given, OfLaws[xr.Dataset]):
 
 
 table = call_of(Table)
-
-
-def case_name(thing: str) -> str:
-    """Name of an object, or of a file's."""
-    return Path(thing).stem if thing.endswith(".xml") else thing
 
 
 def sections(found: xr.Dataset) -> list[Section]:

@@ -26,7 +26,7 @@ from rps_jax.trials.batch import SEGMENT, Job, Part, rows, warn_of_lost
 from rps_jax.trials.case import Case
 from rps_jax.trials.progress import Progress, Report, Timing, unheard
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Outcome, Shift, Snapshot, World
+from rps_jax.trials.trial import Loop, Outcome, Shift, Snapshot, World
 from rps_jax.world import scene
 from rps_jax.world.objects import FAMILIES
 from rps_jax.world.physics import Physics
@@ -146,23 +146,12 @@ def _stack(trees: Sequence[Any], dtype: np.dtype, which: np.ndarray | None = Non
 
 
 def run(
-    cases: Sequence[Case],
-    setting: Setting = Setting(engine="mjx"),
-    *,
-    slots: int | None = None,
-    workers: int | None = None,
-    report: Report = unheard,
+    cases: Sequence[Case], setting: Setting = Setting(engine="mjx"), **shape: Any
 ) -> tuple[Outcome, Timing]:
-    """Run every case to its end.
+    """Run every case to its end, in any mixture of objects, frictions, targets and parameters.
 
-    Args:
-      cases: in any mixture of objects, frictions, targets and parameters.
-      setting: what they share.
-      slots: worlds stepped at once by one worker. Results are bit-identical for equal slots on
-        one kind of device, whatever shares the batch.
-      workers: host threads that each drive a batch of their own, or that step worlds, if JAX does
-        not trace the engine; by default as many as suit the engine and the device.
-      report: called after every segment, from worker threads, one at a time.
+    Slots, workers and report are those of `batch.run`. Results are bit-identical for equal slots on
+    one kind of device, whatever shares the batch.
 
     Returns:
       Outcomes as numpy arrays (len(cases), ...), in the order of `cases`; and the timing.
@@ -173,7 +162,7 @@ def run(
         stage, worlds = build(mine, setting, indices)
         part = Part(np.array(indices), worlds, stage)
         jobs.append(Job(registry.law_of(mine[0].params), len(mine), [part]))
-    return batch.gathered(jobs, setting, len(cases), slots=slots, workers=workers, report=report)
+    return batch.gathered(jobs, setting, len(cases), **shape)
 
 
 def follow(
@@ -252,9 +241,7 @@ def _follow_on_host(
         engines.get(setting.engine),
         part.stage,
         part.worlds,
-        physics=setting.physics,
-        rules=setting.rules,
-        law=law,
+        Loop(setting.physics, setting.rules, law),
         threads=1 if part.numbers.size == 1 else provenance.processors(),
         report=tell,
         watch=watch,

@@ -35,13 +35,15 @@ def drawn_worlds(domain: Domain, drawn: Draw, params: Params, setting: Setting) 
     stage, own = engine.stage_of_solids(
         family, drawn.solid, drawn.friction, setting.physics, robots
     )
+    outline: Any = drawn.solid.vertices, drawn.solid.radius
+    never: Any = np.full(count, np.inf), np.zeros((count, 2))
     world: Any = {
         "fields": own,
-        "footprint": Footprint(*_any(drawn.solid.vertices, drawn.solid.radius)),
+        "footprint": Footprint(*outline),
         "skin": _skin(domain, drawn),
         "params": jax.tree.map(lambda x: np.full((count, *np.shape(x)), x), params),
         "p_world_target": drawn.p_world_target,
-        "shift": Shift(*_any(np.full(count, np.inf), np.zeros((count, 2)))),
+        "shift": Shift(*never),
         "qpos": starts(drawn),
         "key": drawn.key,
         "odometry": _odometry(domain, drawn, setting.physics.control_period),
@@ -49,11 +51,6 @@ def drawn_worlds(domain: Domain, drawn: Draw, params: Params, setting: Setting) 
     }
     narrow = jax.tree.map(lambda x: x if x.dtype == np.uint32 else x.astype(dtype), world)
     return Part(drawn.number, World(**narrow), stage)
-
-
-def _any(*arrays: Any) -> tuple[Any, ...]:
-    """Host arrays where a type asks for those of the device."""
-    return arrays
 
 
 def _skin(domain: Domain, drawn: Draw) -> Skin:

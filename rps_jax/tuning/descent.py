@@ -27,7 +27,7 @@ from rps_jax.runs import evaluate
 from rps_jax.runs.question import call_of
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Snapshot, Trial, World, control_step, start_all
+from rps_jax.trials.trial import Loop, Snapshot, Trial, World, control_step, start_all
 from rps_jax.tuning import gradients
 from rps_jax.tuning.gradients import Estimate
 from rps_jax.tuning.run import Metrics, Problem, TryOut, Tuning, finite
@@ -197,7 +197,7 @@ def scores_of(how: Windows, stage: Any) -> gradients.Scores:
     """
     space, problem = how.space, how.problem
     law = registry.smooth_law(registry.law_of(space.base))
-    setting, physics = problem.setting, preset(fidelity="fast")
+    setting, loop = problem.setting, Loop(preset(fidelity="fast"), law=law)
 
     def cost(seen: Snapshot) -> jax.Array:
         return soft_score(seen, space.base, setting, problem.objective, how.arrive)
@@ -205,14 +205,7 @@ def scores_of(how: Windows, stage: Any) -> gradients.Scores:
     def steps(seconds: float) -> int:
         return round(seconds / setting.physics.control_period)
 
-    score = gradients.window(
-        stage,
-        space.params,
-        cost,
-        physics=physics,
-        law=law,
-        steps=max(1, steps(how.window)),
-    )
+    score = gradients.window(stage, space.params, cost, loop, max(1, steps(how.window)))
 
     def begun(thetas: jax.Array, worlds: World, late: jax.Array) -> Trial:
         worlds = worlds._replace(params=jax.vmap(space.params)(thetas))
@@ -221,7 +214,7 @@ def scores_of(how: Windows, stage: Any) -> gradients.Scores:
             return first
 
         def one(i: jax.Array, trials: Trial) -> Trial:
-            after, _ = control_step(stage, worlds, trials, physics=physics, law=law)
+            after, _ = control_step(stage, worlds, trials, loop)
             return jax.vmap(switches.select)(i < late * steps(how.within), after, trials)
 
         return jax.lax.fori_loop(0, steps(how.within), one, first)

@@ -25,14 +25,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax.control import registry
-from rps_jax.control.base import Law, Params
-from rps_jax.control.laws import rps
+from rps_jax.control.base import Params
 from rps_jax.geometry import planar
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Snapshot, Trial
-from rps_jax.world.physics import Physics
+from rps_jax.trials.trial import Loop, Snapshot, Trial
 
 Scores = Callable[[jax.Array, Any], jax.Array]
 
@@ -97,11 +95,7 @@ def differences(
 ) -> Estimate:
     """By central differences in each world: 2 p n scores.
 
-    Args:
-      scores: see above.
-      theta: (p,).
-      worlds: (n, ...).
-      step: () or (p,), in the units of theta.
+    A `step` is () or (p,), in the units of theta.
     """
     n, p = _for_each(theta, worlds).shape
     steps = jnp.repeat(jnp.diag(jnp.broadcast_to(jnp.asarray(step, theta.dtype), p)), n, axis=0)
@@ -125,15 +119,7 @@ def evolution(
 
     Each world tries `pairs` normal directions of its own, each both ways, and both in the same
     world: 2 pairs n scores. Without bias it is the gradient of E[score(theta + sigma e)], which
-    exists even where scores jump.
-
-    Args:
-      scores: see above.
-      theta: (p,).
-      worlds: (n, ...).
-      key: of the directions.
-      sigma: () or (p,) standard deviation of the steps, in the units of theta.
-      pairs: directions in each world.
+    exists even where scores jump. `sigma`, () or (p,), is in the units of theta.
 
     Reference: Nesterov and Spokoiny, "Random gradient-free minimization of convex functions",
     Foundations of Computational Mathematics 17, 2017.
@@ -181,9 +167,7 @@ def window(
     stage: Any,
     params_of: Callable[[jax.Array], Params],
     cost: Callable[[Snapshot], jax.Array],
-    *,
-    physics: Physics,
-    law: Law = registry.smooth_law(rps.LAW),
+    loop: Loop,
     steps: int,
 ) -> Scores:
     """Scores of trials driven on for some control steps from where they are.
@@ -192,8 +176,7 @@ def window(
       stage: of an engine with derivatives: see `Engine.check_derivatives`.
       params_of: parameters from theta (p,), differentiable.
       cost: () or (...) of the snapshots (steps, ...) of one trial, such as its mean distance.
-      physics: how the worlds are stepped.
-      law: that the parameters belong to.
+      loop: with the smooth law that the parameters belong to.
       steps: control steps.
 
     Returns:
@@ -206,7 +189,7 @@ def window(
 
         @partial(jax.checkpoint, prevent_cse=False)  # in reverse, memory of one state a step
         def one(trials: Trial, _: None) -> tuple[Trial, Snapshot]:
-            return trial.control_step(stage, worlds, trials, physics=physics, law=law)
+            return trial.control_step(stage, worlds, trials, loop)
 
         _, seen = jax.lax.scan(one, trials, length=steps)
         return jax.vmap(cost, in_axes=1)(seen)
@@ -245,12 +228,12 @@ def distances(
       (2, 2)
     """
     stage, worlds = pushes.build(cases, setting)
-    law, physics = registry.smooth_law(registry.law_of(cases[0].params)), setting.physics
-    at = np.round(np.asarray(horizons) / physics.control_period).astype(int)
+    law = registry.smooth_law(registry.law_of(cases[0].params))
+    at = np.round(np.asarray(horizons) / setting.physics.control_period).astype(int)
 
     def left(seen: Snapshot) -> jax.Array:
         return seen.details.distance[at]
 
-    options: dict[str, Any] = {"physics": physics, "law": law, "steps": int(at[-1]) + 1}
-    scores = jax.jit(window(stage, params_of, left, **options))
+    loop = Loop(setting.physics, law=law)
+    scores = jax.jit(window(stage, params_of, left, loop, int(at[-1]) + 1))
     return scores, (worlds, trial.start_all(worlds, np.ones(len(cases), bool), law=law))

@@ -82,6 +82,7 @@ class Learn(PPO, Pushes[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "A law, learned"
+    LEFT_OUT: ClassVar[tuple[str, ...]] = ("minutes", "updates", "every")
     SMALL: ClassVar[Mapping[str, Any]] = {
         "domain": ("wide,objects=random_box",),
         "network": "mlp",
@@ -147,12 +148,9 @@ class Learn(PPO, Pushes[xr.Dataset]):
                 f"least, {period:g} s."
             )
 
-    def configuration(self) -> dict[str, Any]:
-        """All that the law depends on, but how long it is learned."""
-        found = super().configuration() | {"domain": [asdict(one) for one in self.domains]}
-        for name in ("minutes", "updates", "every"):
-            del found[name]
-        return found
+    def described(self) -> dict[str, Any]:
+        """Own fields as JSON, with domains by their ranges."""
+        return super().described() | {"domain": [asdict(one) for one in self.domains]}
 
     def environments(self, split: Split = "tune") -> list[PushEnv]:
         """Those in which it is learned; or those for validation, by the rules of the paper."""

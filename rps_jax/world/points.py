@@ -134,16 +134,13 @@ class Points:
         """The points of this digest that a run folder holds; InputError if it does not."""
         if not (folder / FILE).exists():
             raise InputError(f"run = {folder} lacks its {FILE}: run the same command again.")
-        found = Points(_numbers(folder / FILE))
+        kept = files.check_columns(
+            files.read(folder / FILE), folder / FILE, {"u": ("world", "quantity")}, {}
+        )
+        found = Points(kept.u.values)
         if found.digest != digest:
             raise files.corrupt(folder / FILE, "its points are not those of the run")
         return found
-
-
-def _numbers(path: Path) -> np.ndarray:
-    """The points (n, q) of a file."""
-    found = files.check_columns(files.read(path), path, {"u": ("world", "quantity")}, {})
-    return found.u.values
 
 
 def _counts(domain: Domain) -> tuple[int, int, int]:
@@ -301,7 +298,7 @@ def _labelled(domain: Domain, u: np.ndarray) -> xr.Dataset:
     coordinates |= {"quantity": [one.name for one in every], "world": np.arange(len(u))}
     text = {"units": "1", "long_name": "point of the unit cube"}
     return xr.Dataset(
-        {"u": (("world", "quantity"), u, text)}, coordinates, {"domain": _told(domain)}
+        {"u": (("world", "quantity"), u, text)}, coordinates, {"domain": json.dumps(asdict(domain))}
     )
 
 
@@ -311,7 +308,3 @@ def _tells(text: Any, domain: Domain) -> bool:
         return from_json(json.loads(text)) == domain
     except (TypeError, ValueError, AttributeError, RecursionError):
         return False
-
-
-def _told(domain: Domain) -> str:
-    return json.dumps(asdict(domain))

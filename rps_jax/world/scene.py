@@ -65,24 +65,15 @@ JOINTS = Joints()
 
 
 def load(
-    name: str,
+    name: str,  # of an object, as `objects.OBJECTS` has them
     physics: Physics = PHYSICS["default"]["standard"],
     friction: Friction = FRICTION["S1"],
     *,
-    rear: Side = "near",
-    mass: float | None = None,
-    robot: Robot = Robot(),
+    rear: Side = "near",  # where the nonuniform box's load stands: "rear left corner", the paper
+    mass: float | None = None,  # [kg], its inertia scaled along; None: the object's own
+    robot: Robot = Robot(),  # contact can slow and stop it, if its force is limited
 ) -> Scene:
-    """Compile a scene.
-
-    Args:
-      name: of an object, as `rps_jax.world.objects.OBJECTS` has them.
-      physics: how it will be stepped.
-      friction: coefficients of its two contacts.
-      rear: which side the nonuniform box's load stands on, nearest the robot or farthest; the
-        paper says "rear left corner".
-      mass: of the object [kg], its inertia scaled along; None: the object's own.
-      robot: whose base it is; contact can slow and stop it, if its force is limited.
+    """Compile a scene of an object.
 
     Raises:
       InputError: unknown name, or friction or mass that is not a positive finite number.
@@ -303,15 +294,9 @@ def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
 
 
 def _set_options(option: mujoco.MjOption, physics: Physics) -> None:
-    option.timestep = physics.timestep
-    option.cone = {
-        "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC,
-        "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL,
-    }[physics.cone]
-    option.impratio = physics.impratio
-    option.iterations = physics.iterations
-    option.ls_iterations = physics.ls_iterations
-    option.tolerance = physics.tolerance
+    option.cone = getattr(mujoco.mjtCone, f"mjCONE_{physics.cone.upper()}")
+    for name in ("timestep", "impratio", "iterations", "ls_iterations", "tolerance"):
+        setattr(option, name, getattr(physics, name))
 
 
 def _strip(spec: mujoco.MjSpec, full: mujoco.MjModel) -> mujoco.MjModel:

@@ -34,7 +34,7 @@ from rps_jax.trials.batch import Job
 from rps_jax.trials.batch import run as run_batch
 from rps_jax.trials.progress import Progress
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
+from rps_jax.trials.trial import Loop, Rules
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws
 from rps_jax.world.domain import DOMAINS
@@ -258,11 +258,10 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
     setting, engine = Setting(engine="mujoco", physics=physics), engines.get("mujoco")
     stage, batch = shared.timed_worlds(family, worlds, setting)
     if how != "open":
-        options = {"law": rps.LAW, "threads": threads, "report": lambda *_: True}
-        rules = Rules(horizon=simulated)
+        loop = Loop(physics, Rules(horizon=simulated))
 
         def once() -> None:
-            host.run(engine, stage, batch, physics=physics, rules=rules, **options)
+            host.run(engine, stage, batch, loop, threads=threads, report=lambda *_: True)
 
     else:
         stepper = engine.stepper(stage, np.asarray(batch.qpos, float), threads)
