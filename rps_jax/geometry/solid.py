@@ -24,9 +24,8 @@ _CELLS = 8  # into which the evenly borne parts of an outline are split, along a
 class Solid(NamedTuple):
     """Outline, height and mass properties of solids of one shape family."""
 
-    vertices: (
-        np.ndarray
-    )  # (n, N, 2) [m] counter-clockwise, padded by repetition; (n, 1, 2) if round
+    # (n, N, 2) [m] counter-clockwise, padded by repetition; (n, 1, 2) if round
+    vertices: np.ndarray
     radius: np.ndarray  # (n,) [m] of a cylinder; 0 of a prism
     height: np.ndarray  # (n,) [m]
     mass: np.ndarray  # (n,) [kg]

@@ -48,9 +48,8 @@ from rps_jax.world.scene import Scene
 class Reward(NamedTuple):
     """What a step is worth."""
 
-    progress: float = (
-        1.0  # [1/m] that the contact point is nearer to the target than when last felt
-    )
+    # [1/m] that the contact point is nearer to the target than when last felt
+    progress: float = 1.0
     no_contact: float = 0.05  # [1/s] cost of being out of contact: that of progress at 5 cm/s
     success: float = 1.0  # [1] for arriving, once
     # Of what the law is not told, for loops that ask for it.
