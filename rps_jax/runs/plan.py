@@ -52,7 +52,6 @@ class Plan:
     points: Points | None = None  # of the unit cube at which the worlds lie; None: drawn ones
 
     def __post_init__(self) -> None:
-        """Raises InputError for no worlds, no laws, or parameters that mean nothing."""
         errors.check_count("worlds", self.worlds, at_most=1_000_000_000)
         errors.check_count("part", self.part, at_most=1_000_000)
         if not self.laws:
@@ -146,7 +145,6 @@ class Shard:
         return cls(int(found[1]), int(found[2]))
 
     def __post_init__(self) -> None:
-        """Raises InputError unless 1 <= number <= of."""
         errors.check_count("shard", self.of, at_most=1_000_000)
         errors.check_count("shard", self.number, at_most=self.of)
 

@@ -51,7 +51,6 @@ class Trace:
     engine: str
 
     def __repr__(self) -> str:
-        """What it was, and how it ended."""
         title = self.title.replace("$\\mu$", "friction")
         return f"<Trace of {title}: {self.told}>"
 

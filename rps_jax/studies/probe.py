@@ -65,7 +65,6 @@ class Probe:
     _heard: InTurn = field(init=False)
 
     def __post_init__(self) -> None:
-        """Hear of the progress of all calls in turn."""
         self._heard = InTurn(self.report)
 
     def __call__(self, u: np.ndarray) -> xr.Dataset:

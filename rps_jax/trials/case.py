@@ -65,7 +65,6 @@ class Case(Given):
     """How the object is moved by a hand during the push."""
 
     def __post_init__(self) -> None:
-        """Check all of it."""
         errors.check_name("object", objects.named(self.object), objects.OBJECTS)
         registry.checked(self.params)
         scene.check(self.contact, self.mass)

@@ -55,7 +55,6 @@ class Objective:
     """[1/m] The score of each metre by which a failure missed, up to one metre."""
 
     def __post_init__(self) -> None:
-        """Raises InputError for weights or a risk that mean nothing."""
         check_fields(self)
 
     def score(

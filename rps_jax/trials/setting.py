@@ -23,14 +23,12 @@ class PhysicsField:
     """
 
     def __get__(self, instance: Any, owner: type | None = None) -> Physics:
-        """The physics; of the class, the default of the field."""
         if instance is None:
             return "default"  # pyright: ignore[reportReturnType]  # of the dataclass's field
         given = instance.__dict__["physics"]
         return physics_.named(given, instance.fidelity)
 
     def __set__(self, instance: Any, value: str | Physics) -> None:
-        """Keep what was given."""
         instance.__dict__["physics"] = value
 
 
@@ -58,7 +56,6 @@ class Setting:
     """Seed of random worlds, and of the imperfections of skins."""
 
     def __post_init__(self) -> None:
-        """Check each field, and that the engine knows the physics."""
         errors.check_name("engine", self.engine, engines.ENGINES)
         self.rules.check()
         errors.check_count("seed", self.seed, at_least=0, at_most=2**32 - 1)

@@ -49,7 +49,6 @@ class Live:
     """
 
     def __init__(self, part: Part, law: Law, setting: Setting) -> None:
-        """The first world of a part, at its start."""
         engines.get(setting.engine).check_traced()
         self._stage, self._loop = part.stage, Loop(setting.physics, setting.rules, law)
         self._first: World = rows(part.worlds, slice(1))

@@ -36,7 +36,6 @@ class Space:
     base: Any = RPSParams()  # parameters of any law that has bounds
 
     def __post_init__(self) -> None:
-        """Raises InputError for unknown or repeated names, or a base outside the bounds."""
         if not self.names or len(set(self.names)) < len(self.names):
             raise errors.InputError(
                 f"tuned = {self.names} is not allowed: name each parameter once, at least one."

@@ -140,7 +140,6 @@ class Domain:
     robot_slip: Range | None = drawn(None, 42, "1", 0, 0.5, "slip of the wheels", "robot", "slip")
 
     def __post_init__(self) -> None:
-        """Raises InputError for ranges that are empty or leave what is possible."""
         if not self.objects:
             raise InputError("domain objects = () is not allowed: name at least one.")
         for name in self.objects:

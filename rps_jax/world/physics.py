@@ -34,7 +34,6 @@ class Physics:
     ground_impedance: float = option(0.7, above=0, at_most=0.9999)
 
     def __post_init__(self) -> None:
-        """Raises InputError for values that MuJoCo would accept and that mean nothing."""
         check_fields(self)
         steps = self.control_period / self.timestep
         if steps < 0.5 or not math.isclose(steps, round(steps), rel_tol=1e-6):

@@ -98,7 +98,6 @@ class Points:
     u: np.ndarray  # (n, q)
 
     def __eq__(self, other: object) -> bool:
-        """Two tables are equal if all their numbers are."""
         return isinstance(other, Points) and self.digest == other.digest
 
     @property
