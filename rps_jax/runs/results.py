@@ -143,14 +143,10 @@ def dataset(plan: Plan, contents: Mapping[int, bytes | xr.Dataset]) -> xr.Datase
 
 
 def long_table(found: xr.Dataset) -> pd.DataFrame:
-    """One row for each law and world: outcomes, and what was drawn, with units in `attrs`.
+    """One row for each law and world of a sweep: its outcomes, and what was drawn.
 
-    Args:
-      found: outcomes (law, world, ...) as a sweep or `load` returns them.
-
-    Returns:
-      Columns law, world, object, the outcomes (poses as base_x, base_y [m], base_yaw [rad], and so
-      on) and the drawn quantities. `attrs["columns"]` holds the unit and the meaning of each.
+    Columns are law, world, object, the outcomes (poses as base_x, base_y [m], base_yaw [rad], and
+    so on) and the drawn quantities. `attrs["columns"]` holds the unit and the meaning of each.
     """
     pose = {"x": "m", "y": "m", "yaw": "rad"}
     flat = found.reset_coords().drop_vars(["which_object", "object", "pose"], errors="ignore")

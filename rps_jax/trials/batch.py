@@ -61,21 +61,15 @@ def run(
     jobs: Sequence[Job],
     setting: Setting,
     *,
-    slots: int | None = None,
+    slots: int | None = None,  # worlds stepped at once by a worker on each device of the host
     workers: int | None = None,
-    collect: Collect,
-    report: Report = unheard,
+    collect: Collect,  # called with trials that ended, in any order, one call at a time
+    report: Report = unheard,  # called after every segment, likewise
 ) -> Timing:
     """Run every trial of every job to its end.
 
-    Args:
-      jobs: what to run.
-      setting: what they share.
-      slots: worlds stepped at once by one worker on each of the host's devices.
-      workers: host threads that each drive a batch of their own, or that step worlds, if JAX does
-        not trace the engine.
-      collect: called with the outcomes of trials that ended, in any order, one call at a time.
-      report: called after every segment, likewise.
+    Workers are host threads that each drive a batch of their own, or that step worlds, if JAX does
+    not trace the engine.
     """
     engine, backend = engines.get(setting.engine), jax.default_backend()
     slots = engine.slots(backend) if slots is None else slots

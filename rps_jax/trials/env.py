@@ -274,21 +274,15 @@ class PushEnv:
     def render(
         self,
         trajectory: State | Sequence[State],
-        height: int = 240,
-        width: int = 320,
+        height: int = 240,  # [px]
+        width: int = 320,  # [px]
         camera: str | None = None,
-        scene_option: None = None,
-        modify_scene_fns: None = None,
+        scene_option: None = None,  # unused
+        modify_scene_fns: None = None,  # unused
     ) -> Any:
         """Images (height, width, 3) uint8 of states without a batch axis: a list, or one of one.
 
-        Args:
-          trajectory: one state, or many; each is drawn in its own world.
-          height: of an image [px].
-          width: of an image [px].
-          camera: oblique (the default) or above.
-          scene_option: unused.
-          modify_scene_fns: unused.
+        Each is drawn in its own world, by the camera oblique (the default) or above.
         """
         del scene_option, modify_scene_fns
         if isinstance(trajectory, State):

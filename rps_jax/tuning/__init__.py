@@ -1,1 +1,1 @@
-"""Tuning the law: a space of its parameters, searched by evolution or by gradients; and learning."""
+"""Tuning a law: a space of its parameters, searched by evolution or by gradients; and learning."""

@@ -164,23 +164,15 @@ def _repeated(worlds: Any, times: int) -> Any:
 
 
 def window(
-    stage: Any,
-    params_of: Callable[[jax.Array], Params],
-    cost: Callable[[Snapshot], jax.Array],
-    loop: Loop,
+    stage: Any,  # of an engine with derivatives: see `Engine.check_derivatives`
+    params_of: Callable[[jax.Array], Params],  # from theta (p,), differentiable
+    cost: Callable[[Snapshot], jax.Array],  # () or (...) of snapshots (steps, ...) of one trial
+    loop: Loop,  # with the smooth law that the parameters belong to
     steps: int,
 ) -> Scores:
     """Scores of trials driven on for some control steps from where they are.
 
-    Args:
-      stage: of an engine with derivatives: see `Engine.check_derivatives`.
-      params_of: parameters from theta (p,), differentiable.
-      cost: () or (...) of the snapshots (steps, ...) of one trial, such as its mean distance.
-      loop: with the smooth law that the parameters belong to.
-      steps: control steps.
-
-    Returns:
-      Scores whose worlds are pairs (World, Trial), batched: the trials say where to start.
+    Their worlds are pairs (World, Trial), batched: the trials say where to start.
     """
 
     def scores(thetas: jax.Array, starts: Any) -> jax.Array:

@@ -190,23 +190,9 @@ def draw(domain: Domain, seed: int, points: Points | None, index: Any) -> Draw:
 
 
 def points_of(domain: Domain | str, index: ArrayLike, seed: int = 0) -> np.ndarray:
-    """The points (n, q) of the unit cube at which drawn worlds lie.
+    """The points (n, q) of the unit cube at which the drawn worlds `index` (n,) lie.
 
-    Args:
-      domain: ranges of what differs between worlds, or their name, as wide.
-      index: (n,) of the worlds.
-      seed: of the worlds, as of `sweep`.
-
-    Returns:
-      Points (n, q); `worlds_at` makes the same worlds of them, bit for bit.
-
-    Raises:
-      InputError: an argument is not allowed.
-
-    Example:
-      >>> from rps_jax.world.points import points_of
-      >>> points_of("wide", [0, 1, 2]).shape
-      (3, 36)
+    `worlds_at` makes the same worlds of them, bit for bit.
     """
     domain = named(domain)
     errors.check_count("seed", seed, at_least=0, at_most=2**32 - 1)
