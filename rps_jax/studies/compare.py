@@ -65,8 +65,6 @@ class Compare(OfLaws[xr.DataTree]):
         return found
 
     def check(self) -> None:
-        if not self.parts:
-            raise errors.InputError("domain = () is not allowed: name at least one.")
         for part in self.parts.values():
             part.check()
 

@@ -36,10 +36,7 @@ class Space:
     base: Any = RPSParams()  # parameters of any law that has bounds
 
     def __post_init__(self) -> None:
-        if not self.names or len(set(self.names)) < len(self.names):
-            raise errors.InputError(
-                f"tuned = {self.names} is not allowed: name each parameter once, at least one."
-            )
+        errors.check_each_once("tuned", self.names)
         base = registry.numbers(self.base)
         for name in self.names:
             bound = self._bounds[errors.check_name("tuned parameter", name, self._bounds)]

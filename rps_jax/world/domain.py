@@ -140,12 +140,9 @@ class Domain:
     robot_slip: Range | None = drawn(None, 42, "1", 0, 0.5, "slip of the wheels", "robot", "slip")
 
     def __post_init__(self) -> None:
-        if not self.objects:
-            raise InputError("domain objects = () is not allowed: name at least one.")
         for name in self.objects:
             errors.check_name("domain object", name, (*RANDOM, *OBJECTS))
-        if len(set(self.objects)) < len(self.objects):
-            raise InputError(f"domain objects = {self.objects} is not allowed: name each once.")
+        errors.check_each_once("domain objects", self.objects)
         for friction in self.frictions:
             scene.check(friction, None)
         errors.check_name("domain skin", self.skin, ("ideal", "capacitive"))
