@@ -5,8 +5,6 @@ of text names a law everywhere (`named`): `rps`, `rps_tuned`, `mine.py:P`, `poli
 changes, as `rps,K_h=0.3` or `pursuit,mine.json`.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib
 import importlib.util

@@ -5,8 +5,6 @@ and `step` once with `jax.eval_shape`, which computes nothing, and compares what
 what a trial needs.
 """
 
-from __future__ import annotations
-
 import functools
 import inspect
 import linecache

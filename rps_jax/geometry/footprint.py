@@ -4,8 +4,6 @@ A rectangle is four vertices and radius 0, a circle one vertex and its radius, a
 its vertices: one formula serves all, batches over sizes, and has finite derivatives everywhere.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax.numpy as jnp

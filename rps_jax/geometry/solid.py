@@ -5,8 +5,6 @@ its origin in the middle of its height above the centroid of its outline; z is u
 NumPy in double precision and lead with the number of solids, n.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

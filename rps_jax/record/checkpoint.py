@@ -1,7 +1,5 @@
 """Checkpoints: the finished parts of a run, which are not run again when it is continued."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ own checksum or with none, but never with that of the other. A file without a ch
 unchecked, as are the files of older versions, which had none.
 """
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import hashlib

@@ -1,7 +1,5 @@
 """What a run was made by: command, versions, device and commit, noted in its folder."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import os
 import platform

@@ -6,8 +6,6 @@ own frame, that pushes with a force and a torque up to their limits. Without a l
 below the limit it loses no speed for long; beyond the limit it stalls.
 """
 
-from __future__ import annotations
-
 import math
 from types import ModuleType
 from typing import Any, NamedTuple

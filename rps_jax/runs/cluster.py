@@ -13,8 +13,6 @@ other parts. That asks for devices of one kind; versions and commit are compared
 begins.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

@@ -3,8 +3,6 @@
 Worlds for tuning, validation and testing come from seeds that never meet.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple

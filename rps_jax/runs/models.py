@@ -5,8 +5,6 @@ A rate has two errors. Its statistical interval says what other worlds would hav
 over models says what another simulation would have.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

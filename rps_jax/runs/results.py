@@ -1,7 +1,5 @@
 """Outcomes on their way into the parts of a sweep, and the parts into one labelled Dataset."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

@@ -5,8 +5,6 @@ written whole as soon as its last trial has ended, named by the hash of its cont
 there is not run again.
 """
 
-from __future__ import annotations
-
 import functools
 import shlex
 from collections import deque

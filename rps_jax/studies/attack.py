@@ -9,8 +9,6 @@ normal quantiles of what the domain draws from ranges; of the others, noise and 
 every world has its own, by chance.
 """
 
-from __future__ import annotations
-
 import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence

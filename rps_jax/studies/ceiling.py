@@ -14,8 +14,6 @@ was seen, which is perturbed next. A world is solved as soon as one sample wins 
 the world can be won, and no number of rounds proves that it cannot.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Laws in worlds that are kept for testing, domain after domain."""
 
-from __future__ import annotations
-
 import functools
 import re
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """What the losses of a law look like: maps of them by kind, and what each kind has in common."""
 
-from __future__ import annotations
-
 import functools
 import shlex
 from collections.abc import Mapping, Sequence

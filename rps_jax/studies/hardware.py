@@ -2,8 +2,6 @@
 shove of its video. Friction was never measured, so a plausible range is run.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial

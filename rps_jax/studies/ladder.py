@@ -4,8 +4,6 @@ On the first rungs a law senses only where its skin is touched, on the next also
 then where the object is.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

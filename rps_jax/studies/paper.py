@@ -4,8 +4,6 @@ What the paper leaves open is named in `world.paper.CHOICES`; what each reading 
 in `sweeps/ambiguities`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial

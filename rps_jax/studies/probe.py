@@ -1,7 +1,5 @@
 """One law at points of a domain's unit cube, again and again, through the same programs."""
 
-from __future__ import annotations
-
 import importlib
 import time
 from collections.abc import Iterator

@@ -6,8 +6,6 @@ and how these laws did there. The worlds were picked because some law is bad in 
 them says nothing about rates elsewhere, and only differences between laws count.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ chaotic in a quantity has a large total index of it and a small first one.
 The blocks of Saltelli's design are worlds at points of the unit cube, and their trials a sweep.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

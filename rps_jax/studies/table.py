@@ -1,7 +1,5 @@
 """The paper's Table II: every law pushes every object to every target, under each friction."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

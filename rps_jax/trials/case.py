@@ -1,7 +1,5 @@
 """One trial as it is asked for by name: what is pushed where, by which law, on which ground."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

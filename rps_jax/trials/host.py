@@ -4,8 +4,6 @@ Sensing, deciding and the rules are those of `trial`; the engine is the only dif
 are handed over in JAX's precision and stepped in the engine's own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The trials that are asked for one by one: cases -> worlds -> outcomes, or traces over time."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Hashable, Sequence

@@ -1,7 +1,5 @@
 """What trials came to, as labelled data: a grid of outcomes, or one trial over time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -17,8 +17,6 @@ law failed.
 `plan_costs` is what the planner of `rps ceiling` minimises.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """What all trials of a run share: what steps them, when they end, and the seed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,6 @@
 is frozen, and a batch whose worlds have all ended stops.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """A draw becomes worlds, for every engine and for pictures."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

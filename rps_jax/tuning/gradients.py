@@ -14,8 +14,6 @@ Derivatives of chaotic worlds may be finite and yet say nothing: their variance 
 and `differences` need no derivative.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple

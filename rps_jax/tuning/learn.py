@@ -1,7 +1,5 @@
 """Learning a law in a run folder that can be killed and continued, within a time that is given."""
 
-from __future__ import annotations
-
 import functools
 import json
 import time

@@ -6,8 +6,6 @@ coordinates and statistics by the logarithm of that density, until it no longer 
 are kept apart, and several are averaged. (Papamakarios and Murray 2016; autoregressive in bins.)
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """The parameters that are tuned, as a vector without bounds."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

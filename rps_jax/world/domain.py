@@ -1,7 +1,5 @@
 """Domains: from which ranges random worlds are drawn (see `draws`), by name and as JSON."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace

@@ -4,8 +4,6 @@ Whatever the batch, whatever the device, the same address gives the same world: 
 a counter-based generator, and everything after them is computed on the host in double precision.
 """
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """What the paper ran and what it reports, as data."""
 
-from __future__ import annotations
-
 import math
 from itertools import product
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """How worlds are stepped: the timestep, the cone, the solver, the softness of contacts; by name."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields, replace
 from typing import Literal

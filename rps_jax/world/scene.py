@@ -4,8 +4,6 @@ The physics model holds the three geoms that touch and nothing else; it is what 
 both step.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple

@@ -19,8 +19,6 @@ is the bound of RPS, half of theirs, and so k_f is half of theirs. A step of our
 so `converge` is a rate. Without their first second of acceleration.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import NamedTuple
 

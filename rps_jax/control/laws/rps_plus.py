@@ -28,8 +28,6 @@ with its own parameters. RPS+ senses what RPS senses; beyond what RPS remembers 
 in the world it felt the object last, and for how many steps it has not.
 """
 
-from __future__ import annotations
-
 import operator
 from typing import Any, NamedTuple
 

@@ -5,8 +5,6 @@ each of the network's weights, and `digest`, the SHA-256 of all these. `SHIPPED`
 that come with the package.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping
