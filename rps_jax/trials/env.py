@@ -234,7 +234,8 @@ class PushEnv:
     @property
     def xml_path(self) -> str:
         """The MJCF file of the object, or of the family of a random one."""
-        return str(objects.path_of(self.object if self.object in objects.OBJECTS else self._family))
+        known = self.object in objects.OBJECTS
+        return str(objects.path_of(self.object if known else self._alone.family_of(0)))
 
     @property
     def mj_model(self) -> mujoco.MjModel:
@@ -249,10 +250,6 @@ class PushEnv:
     @functools.cached_property
     def _alone(self) -> Domain:
         return dataclasses.replace(domain.named(self.domain, self.robot), objects=(self.object,))
-
-    @property
-    def _family(self) -> str:
-        return self._alone.family_of(0)
 
     @functools.cached_property
     def _drawn(self) -> Draw:

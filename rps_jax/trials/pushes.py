@@ -14,7 +14,6 @@ import numpy as np
 from rps_jax import engines
 from rps_jax.control import registry
 from rps_jax.control.base import Law, Params
-from rps_jax.control.laws.rps import RPSParams
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.record import provenance
 from rps_jax.robot.base import Odometry
@@ -128,13 +127,10 @@ def _by_kind(cases: Sequence[Case]) -> list[list[int]]:
     that the last slots to run are not theirs.
     """
     kinds: dict[Hashable, list[int]] = {}
-    for i in sorted(range(len(cases)), key=lambda i: _expected_success(cases[i])):
+    lasts = [float(getattr(case.params, "reactive", 0.0)) for case in cases]
+    for i in np.argsort(lasts, kind="stable").tolist():
         kinds.setdefault(kind(cases[i]), []).append(i)
     return list(kinds.values())
-
-
-def _expected_success(case: Case) -> float:
-    return float(case.params.reactive) if isinstance(case.params, RPSParams) else 0.0
 
 
 def _stack(trees: Sequence[Any], dtype: np.dtype, which: np.ndarray | None = None) -> Any:

@@ -246,7 +246,9 @@ def _compile(
             pair.solref[:] = physics.ground_solref
             pair.solimp[:2] = physics.ground_impedance
         pair.friction[:2] = friction.robot if pair.name == "base_object" else friction.ground
-    _set_options(spec.option, physics)
+    spec.option.cone = getattr(mujoco.mjtCone, f"mjCONE_{physics.cone.upper()}")
+    for name in ("timestep", "impratio", "iterations", "ls_iterations", "tolerance"):
+        setattr(spec.option, name, getattr(physics, name))
     model = spec.compile()
     return model, _strip(spec, model)
 
@@ -289,12 +291,6 @@ def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
     base.inertia[:] = float(robot.inertia)  # about the other axes it never turns
     for joint in base.joints:
         joint.armature = 0.0
-
-
-def _set_options(option: mujoco.MjOption, physics: Physics) -> None:
-    option.cone = getattr(mujoco.mjtCone, f"mjCONE_{physics.cone.upper()}")
-    for name in ("timestep", "impratio", "iterations", "ls_iterations", "tolerance"):
-        setattr(option, name, getattr(physics, name))
 
 
 def _strip(spec: mujoco.MjSpec, full: mujoco.MjModel) -> mujoco.MjModel:
