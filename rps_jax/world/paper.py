@@ -20,7 +20,7 @@ _SUCCESSES = {  # of 24, with box, cylinder and nonuniform_box, each under S1 an
 }
 _COLUMNS = tuple(product(("box", "cylinder", "nonuniform_box"), ("S1", "S2")))
 # Table II, keyed by law, object and friction set.
-TABLE_II = {
+TABLE_II: dict[tuple[str, str, str], int] = {
     (law, *column): won
     for law, row in _SUCCESSES.items()
     for column, won in zip(_COLUMNS, row, strict=True)
