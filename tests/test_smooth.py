@@ -620,7 +620,8 @@ def plus_moments(count=40):
 
 
 def test_without_heat_smooth_rps_plus_is_the_hard_one(monkeypatch):
-    monkeypatch.setattr(rps_plus, "_WARM", rps_plus._Warm(1e-6, 1e-6))
+    for name in ("_WARM_FACING", "_WARM_LOST"):
+        monkeypatch.setattr(rps_plus, name, 1e-6)
     params = RPSPlusParams(n_lost=2.5)  # a count meets no threshold that is a count
     hard, cold = registry.law_of(params), registry.smooth_law(rps_plus.LAW, COLD)
     for anew, told in plus_moments():

@@ -244,7 +244,11 @@ def try_out(
         ask = ask._replace(params=jax.tree.map(narrow, jax.device_get(ask.params)))
         for part, column, distance in parts(ask, domains, setting):
             away[first:end].reshape(count, width)[:, column] = distance
-            part = _prepared(part, longest, ask.params)
+            # As many steps of odometry in all domains let their worlds share a batch.
+            past = np.zeros((part.numbers.size, longest), part.worlds.odometry.past.dtype)
+            odometry = part.worlds.odometry._replace(past=past)
+            worlds = part.worlds._replace(odometry=odometry, params=ask.params)
+            part = part._replace(worlds=worlds)
             leaves, tree = jax.tree.flatten(part.worlds)
             kind = (tree, *(leaf.shape[1:] for leaf in leaves))
             jobs.setdefault(kind, []).append(_Group(ask, part, first, width, column))
@@ -269,17 +273,6 @@ def parts(
             drawn = ask.draw(one, rows)
             part = drawn_worlds(one, drawn, RPSParams(), setting)
             yield part, d * ask.worlds.size + rows, np.linalg.norm(drawn.p_world_target, axis=1)
-
-
-def _prepared(part: Part, steps: int, params: Params) -> Part:
-    """The part with the parameters (P, ...) of all candidates, and with so many steps of odometry.
-
-    As many steps in all domains let their worlds share a batch.
-    """
-    odometry = part.worlds.odometry
-    past = np.zeros((part.numbers.size, steps), odometry.past.dtype)
-    worlds = part.worlds._replace(odometry=odometry._replace(past=past), params=params)
-    return part._replace(worlds=worlds)
 
 
 def _job(groups: Sequence[_Group]) -> Job:

@@ -163,25 +163,6 @@ class Windows(NamedTuple):
     arrive: float  # [m]
 
 
-class Batch(NamedTuple):
-    """Softened worlds of one shape family."""
-
-    stage: Any
-    worlds: World  # (n, ...), with smooth skins
-    late: jax.Array  # (n,) [1] when a window begins, as a share of the latest time
-
-
-def softened(problem: Problem, engine: Any, seed: int, step: int) -> list[Batch]:
-    """The worlds of one step as smooth ones, by domain and object."""
-    setting = replace(problem.setting, engine=engine)
-    ask = problem.ask(jax.tree.map(lambda x: np.array([x]), RPSParams()), seed, step)
-    random = np.random.default_rng((seed, step))
-    return [
-        Batch(part.stage, soften(part.worlds), jnp.asarray(random.uniform(size=column.size)))
-        for part, column, _ in evaluate.parts(ask, problem.domains, setting)
-    ]
-
-
 def soften(worlds: World) -> World:
     """Give worlds (n, ...) smooth skins."""
     sensor: Any = worlds.skin
@@ -227,11 +208,12 @@ def scores_of(how: Windows, stage: Any) -> gradients.Scores:
 
 
 @functools.partial(jax.jit, static_argnames="how")
-def _differentiated(thetas: jax.Array, batch: Batch, *, how: Windows) -> Estimate:
-    """Estimates (S, p) at thetas (S, p), each from all the worlds of a batch."""
-    scores = scores_of(how, batch.stage)
+def _differentiated(
+    thetas: jax.Array, stage: Any, worlds: tuple[World, jax.Array], *, how: Windows
+) -> Estimate:
+    """Estimates (S, p) at thetas (S, p), each from all the worlds (n, ...) of one shape family."""
+    scores = scores_of(how, stage)
     mode = gradients.forward if how.estimator == "forward" else gradients.reverse
-    worlds = (batch.worlds, batch.late)
     return jax.vmap(lambda theta: mode(scores, theta, worlds, clip=how.world_clip))(thetas)
 
 
@@ -240,8 +222,13 @@ def differentiated(thetas: jax.Array, how: Windows, seed: int, step: int) -> tup
 
     Counted is what leads to a window, too, but not that worlds wait there for the latest to begin.
     """
-    batches = softened(how.problem, _ENGINE[how.estimator], seed, step)
-    found = [(_differentiated(thetas, b, how=how), len(b.worlds.key)) for b in batches]
+    problem, found = how.problem, []
+    setting = replace(problem.setting, engine=_ENGINE[how.estimator])
+    ask = problem.ask(jax.tree.map(lambda x: np.array([x]), RPSParams()), seed, step)
+    random = np.random.default_rng((seed, step))
+    for part, column, _ in evaluate.parts(ask, problem.domains, setting):
+        worlds = soften(part.worlds), jnp.asarray(random.uniform(size=column.size))
+        found.append((_differentiated(thetas, part.stage, worlds, how=how), column.size))
     total = sum(n for _, n in found)
     return Estimate(
         sum(e.gradient * (n / total) for e, n in found),  # type: ignore[arg-type]
