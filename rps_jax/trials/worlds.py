@@ -17,7 +17,7 @@ from rps_jax.trials.batch import Part
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Shift, World
 from rps_jax.world import scene
-from rps_jax.world.domain import QUANTITIES, RANDOM, Domain, Range, of
+from rps_jax.world.domain import RANDOM, Domain, Range, of
 from rps_jax.world.draws import Draw
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction, Scene
@@ -57,9 +57,7 @@ def _skin(domain: Domain, drawn: Draw) -> Skin:
     full: Any = jax.tree.map(lambda value: np.full(count, value, float), plain)
     if isinstance(full, IdealSkin):
         return full.on(drawn.robot.shell)
-    own: dict[str, Any] = {
-        QUANTITIES[name].sets: drawn.at[name] for name in of("skin") if name in drawn.at
-    }
+    own: dict[str, Any] = {name: drawn.at[name] for name in of("skin") if name in drawn.at}
     return full.on(drawn.robot.shell)._replace(**own)
 
 
@@ -84,9 +82,7 @@ def remembered_steps(domain: Domain, period: float) -> int:
 
 def _odometry(domain: Domain, drawn: Draw, period: float) -> Odometry:
     past: Any = np.zeros((drawn.number.size, remembered_steps(domain, period)))
-    own: dict[str, Any] = {
-        QUANTITIES[name].sets: drawn.at[name] for name in of("base") if name in drawn.at
-    }
+    own: dict[str, Any] = {name: drawn.at[name] for name in of("base") if name in drawn.at}
     error: Any = drawn.velocity_error
     return Odometry(**own, velocity_error=error, past=past)
 
