@@ -10,7 +10,6 @@ unchecked, as are the files of older versions, which had none.
 """
 
 import contextlib
-import csv
 import hashlib
 import io
 import json
@@ -22,6 +21,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from rps_jax.errors import InputError
@@ -79,13 +79,8 @@ def write_bytes(path: Path, content: bytes, *, checked: bool = False) -> Path:
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
-    """A table with a header, which pandas reads: the names of all rows; None and NaN stay empty."""
-    text = io.StringIO()
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({k: v for k, v in row.items() if v == v} for row in rows)  # NaN is not itself
-    return write_text(path, text.getvalue())
+    """A table with a header: the names of all rows; None and NaN stay empty."""
+    return write_text(path, pd.DataFrame(list(rows)).to_csv(index=False, lineterminator="\n"))
 
 
 def write_json(path: Path, content: Any, *, checked: bool = False) -> Path:
