@@ -115,7 +115,7 @@ def test_windows_begin_where_their_trials_are_by_then(monkeypatch):
         params: Any
 
     monkeypatch.setattr(descent, "start_all", lambda worlds, live, law: jnp.zeros(live.size))
-    monkeypatch.setattr(descent, "control_step", lambda _, worlds, trials, **__: (trials + 1, None))
+    monkeypatch.setattr(descent, "control_step", lambda _, worlds, trials, loop: (trials + 1, None))
     monkeypatch.setattr(gradients, "window", lambda *_, **__: lambda thetas, starts: starts[1])
     late = jnp.array([0.0, 0.5, 1.0])
     for within, steps in ((10.0, [0, 250, 500]), (0.0, [0, 0, 0])):
