@@ -4,8 +4,6 @@ Of SciPy only its special functions are used here: to import `scipy.stats` takes
 command. A test holds these to it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

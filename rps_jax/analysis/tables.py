@@ -1,7 +1,5 @@
 """Tables of results: a header and rows of texts, and how they read in Markdown."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Sequence
 from itertools import combinations
