@@ -29,9 +29,8 @@ REFERENCE = "rps_tuned"  # what the others are compared with
 
 def every_law() -> tuple[str, ...]:
     """Names of all laws that are known, by what they sense."""
-    order = get_args(Senses)
-    known = registry.LAWS
-    return tuple(sorted(known, key=lambda name: order.index(_senses(registry.LAWS[name]))))
+    order, known = get_args(Senses), registry.LAWS
+    return tuple(sorted(known, key=lambda name: order.index(_senses(known[name]))))
 
 
 def _senses(params: Params) -> Senses:

@@ -14,6 +14,7 @@ import numpy as np
 from rps_jax import engines
 from rps_jax.control import registry
 from rps_jax.control.base import Law, Params
+from rps_jax.control.laws.rps import RPSParams
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.record import provenance
 from rps_jax.robot.base import Odometry
@@ -120,19 +121,6 @@ def kind(case: Case) -> Hashable:
     )
 
 
-def _by_kind(cases: Sequence[Case]) -> list[list[int]]:
-    """Indices of the cases of each kind.
-
-    Without reaction most trials lose the object and wait for their end: the longest go first, so
-    that the last slots to run are not theirs.
-    """
-    kinds: dict[Hashable, list[int]] = {}
-    lasts = [float(getattr(case.params, "reactive", 0.0)) for case in cases]
-    for i in np.argsort(lasts, kind="stable").tolist():
-        kinds.setdefault(kind(cases[i]), []).append(i)
-    return list(kinds.values())
-
-
 def _stack(trees: Sequence[Any], dtype: np.dtype, which: np.ndarray | None = None) -> Any:
     """Pytrees of floats stacked leaf by leaf, then rows taken in the order `which`."""
     stacked = jax.tree.map(lambda *leaves: np.array([np.asarray(x) for x in leaves], dtype), *trees)
@@ -150,8 +138,13 @@ def run(
     Returns:
       Outcomes as numpy arrays (len(cases), ...), in the order of `cases`; and the timing.
     """
-    jobs = []
-    for indices in _by_kind(cases):
+    # Without reaction most trials lose the object and wait for their end: the longest go first, so
+    # that the last slots to run are not theirs.
+    lasts = [float(c.params.reactive) if isinstance(c.params, RPSParams) else 0.0 for c in cases]
+    jobs, kinds = [], dict[Hashable, list[int]]()
+    for i in np.argsort(lasts, kind="stable").tolist():
+        kinds.setdefault(kind(cases[i]), []).append(i)
+    for indices in kinds.values():
         mine = [cases[i] for i in indices]
         stage, worlds = build(mine, setting, indices)
         part = Part(np.array(indices), worlds, stage)
