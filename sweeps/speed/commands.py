@@ -1,7 +1,8 @@
 """How long does a user wait for a whole command, from return to the report?
 
 Each command is a process of its own, run with an empty cache and then once more with what the first
-left in it. One that is about the GPU is run where there is one.
+left in it. One that is about the GPU is run where there is one; `--device cpu` keeps the process
+that times them off it.
 
     rps sweeps/speed/commands.py --machine "2 cores of an AMD EPYC"
 """
@@ -50,8 +51,11 @@ class Commands(Study[xr.Dataset]):
     commands: tuple[str, ...] = (
         "push --object box --target -2 0 --no-video",
         "push --object box --target -2 0",
+        "push --object box --target -2 0 --engine fused",
         "sweep --laws rps_tuned --domain wide --worlds 100",
         "sweep --laws rps_tuned --domain wide --worlds 1000",
+        "table --engine fused",
+        "table",
     )
     """What is asked of `rps`."""
     limit: float = option(1800.0, 1, 86400)
