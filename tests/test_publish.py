@@ -148,6 +148,35 @@ def test_worlds_of_robots_are_told_by_force_lag_and_acceleration():
         assert sum(parts) == int((margin >= 1.5).sum())
 
 
+def test_speeds_stand_by_engine_and_batch_beside_c():
+    measured = [("C in closed loop", 64, "box", 100.0), ("C in closed loop", 64, "prism", 50.0),
+                ("fused", 4096, "box", 2000.0), ("fused", 8, "box", 50.0),
+                ("fused", 8, "prism", 25.0)]  # fmt: skip
+    fields = zip(("name", "worlds", "family", "rate"), zip(*measured, strict=True), strict=True)
+    found = xr.Dataset({name: ("measurement", list(values)) for name, values in fields})
+    assert rows.speeds(found) == [
+        ["engine", "worlds", "box", "prism", "against C in closed loop"],
+        ["C in closed loop", "64", "100", "50", "1, 1"],
+        ["fused", "4,096", "2,000", "", "20"],
+        ["fused", "8", "50", "25", "0.5, 0.5"],
+    ]
+
+
+def test_a_rare_failure_is_told_by_its_median_and_all_of_it():
+    each = {"p": [0.1, 0.2, 0.6], "low": [0.0, 0.1, 0.3], "high": [0.2, 0.3, 0.9],
+            "variation": [0.5, 0.4, 0.3], "trials": [100, 200, 300]}  # fmt: skip
+    found = xr.Dataset({name: ("repetition", values) for name, values in each.items()})
+    drawn = {"p": 0.25, "low": 0.2, "high": 0.3, "variation": 0.1, "trials": 400}
+    beside = found.assign({f"drawn_{name}": value for name, value in drawn.items()})
+    head, middle, together, last = rows.rarely(beside)
+    assert head[1:] == ["probability of failure", "95 %", "variation", "worlds"]
+    assert middle == ["splitting, median of 3", "0.2", "[0.1, 0.3]", "0.40", "200"]
+    assert together[1] == "0.3"
+    assert together[-1] == "600"
+    assert last == ["drawn worlds", "0.25", "[0.2, 0.3]", "0.10", "400"]
+    assert len(rows.rarely(found)) == 3
+
+
 def test_cosines_stand_under_the_time_simulated():
     cosine = xr.DataArray([[0.5, -0.25]], dims=("estimator", "horizon"))
     found = xr.Dataset({"cosine": cosine, "doubt": ("horizon", [0.1, 0.2])},

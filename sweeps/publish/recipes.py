@@ -171,7 +171,7 @@ RECIPES: dict[str, Recipe] = {
         ),
         None,
         4,
-        "Which quantity is to blame",
+        rows.blamed,
         ("rps_tuned, hostile", "rps_plus, hostile", "rps_tuned, real"),
     ),
     "rare": Recipe(
@@ -182,7 +182,7 @@ RECIPES: dict[str, Recipe] = {
         ),
         5,
         None,
-        "How rare is a failure",
+        rows.rarely,
     ),
     "rare_million": Recipe(
         (
@@ -191,7 +191,7 @@ RECIPES: dict[str, Recipe] = {
         ),
         None,
         3,
-        "How rare is a failure",
+        rows.rarely,
     ),
     "attack": Recipe(
         (
@@ -216,7 +216,22 @@ RECIPES: dict[str, Recipe] = {
         2,
         "Cells of Table II",
     ),
-    "fidelity": Recipe(("rps sweeps/fidelity",), 60, 10, "Settings of the solver*"),
+    "fidelity": Recipe(
+        ("rps sweeps/fidelity",),
+        60,
+        10,
+        "Settings of the solver*",
+        (),
+        (
+            "setting",
+            "equal outcomes",
+            "95 %",
+            "+/-",
+            "McNemar p",
+            "5 s error: median, 95 %",
+            "cost",
+        ),
+    ),
     "engines_random": Recipe(
         (
             "rps sweeps/engines --objects random_box random_cylinder --worlds 600",
@@ -334,7 +349,7 @@ RECIPES: dict[str, Recipe] = {
         ("rps sweeps/speed --worlds 64 4096 65536 262144 --mujocos 4096 --at-once 16 --refill 0",),
         None,
         6,
-        "Simulated seconds in a second",
+        rows.speeds,
     ),
     "speed_cores": Recipe(
         (
@@ -343,7 +358,7 @@ RECIPES: dict[str, Recipe] = {
         ),
         3,
         None,
-        "Simulated seconds in a second",
+        rows.speeds,
     ),
     "speed_peers": Recipe(
         (
@@ -353,7 +368,7 @@ RECIPES: dict[str, Recipe] = {
         ),
         None,
         6,
-        "Simulated seconds in a second",
+        rows.speeds,
     ),
     "commands": Recipe((f"rps sweeps/speed/commands.py {_MACHINE}",), 14, None),
     "commands_gpu": Recipe(

@@ -12,6 +12,7 @@ import xarray as xr
 from rps_jax.analysis import statistics, tables
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.robot.robot import Robot
+from rps_jax.studies import rare, sensitivity
 from rps_jax.studies.attack import yields
 
 Rows = list[list[str]]
@@ -97,6 +98,50 @@ def tuned_beside(found: Any) -> Rows:
         rates = [tables.share(int(won.sum()), won.size) for won in pair]
         rows.append([law, *rates, f"+{one.gained} -{one.lost}", f"{p:.2g}"])
     return rows
+
+
+def speeds(found: xr.Dataset) -> Rows:
+    """Header and a row for each engine and batch: simulated seconds in a second, by object."""
+    families = list(dict.fromkeys(map(str, found.family.values)))
+    known = {
+        (str(name), int(worlds), str(family)): float(rate)
+        for name, worlds, family, rate in zip(
+            found["name"].values, found.worlds.values, found.family.values, found.rate.values,
+            strict=True,
+        )
+    }  # fmt: skip
+    in_c = {of: rate for (name, _, of), rate in known.items() if name == "C in closed loop"}
+    rows = [["engine", "worlds", *families, "against C in closed loop"]]
+    for name, worlds in dict.fromkeys((name, worlds) for name, worlds, _ in known):
+        rates = {of: known[name, worlds, of] for of in families if (name, worlds, of) in known}
+        cells = [f"{rates[of]:,.0f}" if of in rates else "" for of in families]
+        ratios = [f"{rate / in_c[of]:.3g}" for of, rate in rates.items() if of in in_c]
+        rows.append([name, f"{worlds:,}", *cells, ", ".join(ratios)])
+    return rows
+
+
+def blamed(found: xr.Dataset) -> Rows:
+    """Header and a row for each of the five factors that explain most of success with all."""
+    (_, *head), *body = sensitivity.table(found)
+    kept = [i for i, name in enumerate(head, 1) if name in _INDICES]
+    return [["quantity", *_INDICES], *([row[0], *(row[i] for i in kept)] for row in body[:5])]
+
+
+_INDICES = ("success: first", "success: total", "time: total")
+
+
+def rarely(found: xr.Dataset) -> Rows:
+    """Header and rows of a rare failure: the median repetition, all together, and drawn worlds."""
+    head, *_, together = rare.table(found)
+    middle = found[list(rare.Estimate._fields)].median("repetition")
+    p, low, high, variation, trials = (float(middle[name]) for name in rare.Estimate._fields)
+    median = rare.Estimate(p, low, high, variation, round(trials))
+    rows = [head, rare.row(f"splitting, median of {found.sizes['repetition']}", median), together]
+    if "drawn_p" in found:
+        drawn = (float(found[f"drawn_{name}"]) for name in rare.Estimate._fields)
+        *told, trials = drawn
+        rows.append(rare.row("drawn worlds", rare.Estimate(*told, int(trials))))
+    return [row[:-1] for row in rows]
 
 
 _OF_A_ROBOT = (("robot_lag", "lag", "s"), ("robot_acceleration", "acceleration", "m/s²"))
