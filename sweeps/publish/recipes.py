@@ -45,7 +45,7 @@ _WIDE, _ALL = ("wide", "hostile"), ("wide", "real", "hostile")
 _LADDERS = _each("rps ladder --domain {0} --worlds 10000 --seed 10 --out runs/ladder_{0}", *_WIDE)
 _AGAINST = ("", "success", "against rps_tuned", "p (Holm)")
 _OBJECTS = ("random_box", "random_cylinder", "random_prism")
-_RATES = ("", *_OBJECTS, "all", "CVaR 5 % of distance", "median time")
+_RATES = ("", *_OBJECTS, "all", "median time", "timeout", "lost contact", "fell over")
 _MACHINE = "--machine MACHINE"  # in its place come the words for the machine
 _IDEAL = (
     "wide,skin=ideal,pose_noise=0:0,yaw_noise=0:0,pose_latency=0:0,command_delay=0:0,"
@@ -90,7 +90,7 @@ RECIPES: dict[str, Recipe] = {
         None,
         "Success",
         ("corners and rims", "three or four feet"),
-        ("", *_OBJECTS, "all", "median time", "fell over"),
+        _RATES,
     ),
     "table": Recipe(("rps table",), 4, None, "Table II*"),
     "grid": Recipe(
@@ -124,9 +124,7 @@ RECIPES: dict[str, Recipe] = {
         ("rps compare --laws rps rps_tuned --domain wide hostile real --seed 4",),
         None,
         4,
-        "Success in *",
-        (),
-        _RATES,
+        rows.compared,
     ),
     "random_worlds": Recipe(
         ("rps sweep --domain wide --worlds 36000 --laws rps nps aps",),
@@ -337,14 +335,6 @@ RECIPES: dict[str, Recipe] = {
     ),
     "sb3": Recipe((f"rps sweeps/learned/sb3.py {_MACHINE}",), 3, None),
     # --- speed, with nothing else running ---
-    "gpus": Recipe(
-        ("rps sweep --domain wide --laws rps --worlds 262144 --part 16384",),
-        None,
-        2,
-        "Success",
-        (),
-        _RATES,
-    ),
     "speed": Recipe(
         ("rps sweeps/speed --worlds 64 4096 65536 262144 --mujocos 4096 --at-once 16 --refill 0",),
         None,
@@ -373,12 +363,21 @@ RECIPES: dict[str, Recipe] = {
     "commands": Recipe((f"rps sweeps/speed/commands.py {_MACHINE}",), 14, None),
     "commands_gpu": Recipe(
         (
-            "rps sweeps/speed/commands.py --file commands_gpu --commands "
-            + " ".join(f"'{_SWEPT} --worlds {n}'" for n in (1000, 10_000, 262_144, 1_048_576))
+            "rps sweeps/speed/commands.py --file commands_gpu --gpus 1 --commands "
+            + " ".join(f"'{_SWEPT} --worlds {n}'" for n in (1000, 10_000, 262_144))
             + f" {_MACHINE}",
         ),
         None,
         8,
+    ),
+    "gpus": Recipe(
+        (
+            f"rps sweeps/speed/commands.py --file gpus --gpus 1 2 --commands '{_SWEPT} "
+            f"--worlds 1048576' {_MACHINE}",
+        ),
+        None,
+        6,
+        folder="speed",
     ),
     "costs": Recipe(("rps sweeps/speed/costs.py --families box prism",), 2, None, "Functions"),
     "levers": Recipe(

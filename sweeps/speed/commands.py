@@ -46,7 +46,7 @@ class Commands(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "How long a user waits for a whole command"
-    GROWS: ClassVar[tuple[str, ...]] = ("commands", "machine")
+    GROWS: ClassVar[tuple[str, ...]] = ("commands", "gpus", "machine")
 
     commands: tuple[str, ...] = (
         "push --object box --target -2 0 --no-video",
@@ -58,6 +58,8 @@ class Commands(Study[xr.Dataset]):
         "table",
     )
     """What is asked of `rps`."""
+    gpus: tuple[int, ...] = option((), 1, 64)
+    """Numbers of GPUs with which each is timed; by default with what this process sees."""
     limit: float = option(1800.0, 1, 86400)
     """Time after which a command is stopped [s]."""
     machine: str = ""
@@ -67,16 +69,21 @@ class Commands(Study[xr.Dataset]):
 
     def trials(self) -> int | None:
         """How many commands there are."""
-        return len(self.commands)
+        return len(self.wanted)
+
+    @property
+    def wanted(self) -> list[tuple[str, int | None]]:
+        """Commands, each with the numbers of GPUs that it sees."""
+        return [(command, count) for command in self.commands for count in self.gpus or (None,)]
 
     def answer(self, run: Run) -> xr.Dataset:
         """Time what was not timed before."""
         found = []
-        for number, command in enumerate(self.commands):
-            safe = re.sub(r"\W+", "_", command)
-            found.append(run.part(safe, partial(timed, command, self.limit)))
+        for number, (command, gpus) in enumerate(self.wanted):
+            safe = re.sub(r"\W+", "_", command) + ("" if gpus is None else f"_{gpus}")
+            found.append(run.part(safe, partial(timed, command, self.limit, gpus)))
             run.report(Progress(number + 1, 0.0))
-        whole: Any = xr.concat(found, "command").assign_coords(command=list(self.commands))
+        whole: Any = xr.concat(found, "command").assign_coords(command=_labels(self.wanted))
         if self.machine and run.folder is not None:
             path = Path(__file__).parent / "results" / f"{self.file}.json"
             columns = [{"name": one} for one in _COLUMNS]
@@ -96,7 +103,13 @@ class Commands(Study[xr.Dataset]):
 commands = call_of(Commands)
 
 
-def timed(command: str, limit: float) -> xr.Dataset:
+def _labels(wanted: Sequence[tuple[str, int | None]]) -> list[str]:
+    """What the rows are of: commands, and GPUs where these are said."""
+    said = {None: "", 1: ", one GPU"}
+    return [f"`rps {one}`{said.get(gpus, f', {gpus} GPUs')}" for one, gpus in wanted]
+
+
+def timed(command: str, limit: float, gpus: int | None = None) -> xr.Dataset:
     """Seconds of a command with an empty cache and once more, and what the second told.
 
     Raises:
@@ -105,6 +118,8 @@ def timed(command: str, limit: float) -> xr.Dataset:
     seconds, output = [], ""
     with tempfile.TemporaryDirectory() as folder:
         kept = os.environ | {"RPS_CACHE": f"{folder}/cache"}
+        if gpus is not None:
+            kept["CUDA_VISIBLE_DEVICES"] = ",".join(map(str, range(gpus)))
         for number in range(2):
             words = [sys.executable, "-m", "rps_jax", *shlex.split(command)]
             begun = time.perf_counter()
@@ -133,6 +148,6 @@ def table(found: xr.Dataset) -> list[list[str]]:
         one = found.sel(command=command)
         cells = [f"{one[name].item():.1f} s" for name in ("empty", "again", "compile", "run")]
         told = f"{one.rate.item():,.0f}"
-        rows.append([f"`rps {command}`", *(cell.replace("nan s", "") for cell in (*cells, told))])
+        rows.append([command, *(cell.replace("nan s", "") for cell in (*cells, told))])
         rows[-1][-1] = rows[-1][-1].replace("nan", "")
     return rows
