@@ -118,6 +118,8 @@ def test_a_comparison_names_laws_by_the_runs_that_tuned_them():
     assert len(by_object) == 2
     assert first[-2:] == ["", ""]
     assert re.fullmatch(r"\+\d+ -\d+", second[-2])
+    lost = 12 - sum(map(int, first[5].split(", ")))
+    assert first[2].startswith(f"{100 * lost / 12:.1f} %")
 
 
 def test_worlds_of_robots_are_told_by_force_lag_and_acceleration():
@@ -150,14 +152,14 @@ def test_worlds_of_robots_are_told_by_force_lag_and_acceleration():
 
 def test_speeds_stand_by_engine_and_batch_beside_c():
     measured = [("C in closed loop", 64, "box", 100.0), ("C in closed loop", 64, "prism", 50.0),
-                ("fused", 4096, "box", 2000.0), ("fused", 8, "box", 50.0),
+                ("fused", 4096, "box", 200_000.0), ("fused", 8, "box", 50.0),
                 ("fused", 8, "prism", 25.0)]  # fmt: skip
     fields = zip(("name", "worlds", "family", "rate"), zip(*measured, strict=True), strict=True)
     found = xr.Dataset({name: ("measurement", list(values)) for name, values in fields})
     assert rows.speeds(found) == [
         ["engine", "worlds", "box", "prism", "against C in closed loop"],
         ["C in closed loop", "64", "100", "50", "1, 1"],
-        ["fused", "4,096", "2,000", "", "20"],
+        ["fused", "4,096", "200,000", "", "2,000"],
         ["fused", "8", "50", "25", "0.5, 0.5"],
     ]
 

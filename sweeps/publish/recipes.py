@@ -78,7 +78,7 @@ _GRADIENTS = "rps sweeps/gradients --worlds 32 --estimators"
 RECIPES: dict[str, Recipe] = {
     "headline": Recipe((f"rps sweeps/headline {_MACHINE}",), None, 30),
     "models": Recipe((f"rps sweeps/headline {_MACHINE}",), None, 30),
-    "million": Recipe((f"rps sweeps/million --laws rps_tuned {_MACHINE}",), None, 3),
+    "million": Recipe((f"rps sweeps/million {_MACHINE}",), None, 8),
     "rest": Recipe((f"rps sweeps/fidelity/rest.py {_MACHINE}",), 5, None),
     "hardware_[qr]*": Recipe((f"rps sweeps/hardware {_MACHINE}",), None, 20),
     "feet": Recipe(
@@ -112,14 +112,7 @@ RECIPES: dict[str, Recipe] = {
         "A planner that knows the world",
         ("", "", *_WIDE),
     ),
-    "plus": Recipe(
-        tuple(_PLUS.values()),
-        None,
-        12,
-        "Against rps_tuned*",
-        tuple(_PLUS),
-        _AGAINST,
-    ),
+    "plus": Recipe(tuple(_PLUS.values()), None, 12, rows.mended, tuple(_PLUS)),
     "tuned": Recipe(
         ("rps compare --laws rps rps_tuned --domain wide hostile real --seed 4",),
         None,

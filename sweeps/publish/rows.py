@@ -14,8 +14,10 @@ from rps_jax.geometry.solid import GRAVITY
 from rps_jax.robot.robot import Robot
 from rps_jax.studies import rare, sensitivity
 from rps_jax.studies.attack import yields
+from rps_jax.trials.trial import Rules
 
 Rows = list[list[str]]
+_MAX_LOST = float(Rules().max_lost)  # of all commands that are published
 
 
 def by_bearing(found: xr.Dataset) -> Rows:
@@ -65,18 +67,42 @@ def cosines(found: xr.Dataset) -> Rows:
 def compared(found: xr.DataTree | Any) -> Rows:
     """Header and a row for each law in each domain of a comparison, world by world with the first;
     none of what a tuner found."""
-    rows = [["test worlds", "law", "success", "by object [%]", "median time", "gained, lost", "p"]]
+    rows = [["test worlds", *_HEADER]]
     for domain, node in found.children.items() if isinstance(found, xr.DataTree) else ():
         one = node.to_dataset()
-        groups = statistics.worlds_by_object(one).values()
-        for i, law in enumerate(map(_run_of, one.law.values)):
-            won, took = one.success[i].values > 0, one.time[i].values
-            by_object = ", ".join(tables.percent(won[of].sum(), of.sum()) for of in groups)
-            against = statistics.compare(one.success[0], one.success[i])
-            beside = [f"+{against.gained} -{against.lost}", f"{against.p:.2g}"] if i else ["", ""]
-            rows.append([f"`{domain}`, {won.size:,}", law, tables.share(int(won.sum()), won.size),
-                         by_object, f"{np.median(took[won]):.1f} s", *beside])  # fmt: skip
+        what = f"`{domain}`, {one.sizes['world']:,}"
+        rows += [[what, *_outcomes(one, i, 0)] for i in range(one.sizes["law"])]
     return rows if len(rows) > 1 else []
+
+
+def mended(found: xr.Dataset) -> Rows:
+    """Header and the rows of RPS+ and of the tuned law in a ladder, world by world."""
+    names = list(map(str, found.law.values))
+    base = names.index("rps_tuned")
+    return [list(_HEADER), *(_outcomes(found, i, base) for i in (names.index("rps_plus"), base))]
+
+
+_WAYS = ("fell over", "never touched", "lost contact", "timeout", "diverged", "stalled")
+_HEADER = ("law", "success", "by object [%]", "median time", ", ".join(_WAYS), "gained, lost", "p")
+
+
+def _outcomes(found: xr.Dataset, law: int, base: int) -> list[str]:
+    """The row of a law: rates, median time, failures by kind, and against another of the laws."""
+    one = found.isel(law=law)
+    won, took = one.success.values > 0, one.time.values
+    groups = statistics.worlds_by_object(found).values()
+    kinds = statistics.failure(one, _MAX_LOST)
+    lost = [int((kinds == statistics.FAILURES.index(way)).sum()) for way in _WAYS]
+    against = statistics.compare(found.success[base], found.success[law])
+    beside = [f"+{against.gained} -{against.lost}", f"{against.p:.2g}"]
+    return [
+        _run_of(one.law.item()),
+        tables.share(int(won.sum()), won.size),
+        ", ".join(tables.percent(won[of].sum(), of.sum()) for of in groups),
+        f"{np.median(took[won]):.1f} s" if won.any() else "-",
+        ", ".join(map(str, lost)),
+        *(["", ""] if law == base else beside),
+    ]
 
 
 def _run_of(law: Any) -> str:
@@ -116,6 +142,7 @@ def speeds(found: xr.Dataset) -> Rows:
         rates = {of: known[name, worlds, of] for of in families if (name, worlds, of) in known}
         cells = [f"{rates[of]:,.0f}" if of in rates else "" for of in families]
         ratios = [f"{rate / in_c[of]:.3g}" for of, rate in rates.items() if of in in_c]
+        ratios = [f"{float(ratio):,g}" for ratio in ratios]
         rows.append([name, f"{worlds:,}", *cells, ", ".join(ratios)])
     return rows
 
