@@ -159,15 +159,16 @@ _INDICES = ("success: first", "success: total", "time: total")
 
 def rarely(found: xr.Dataset) -> Rows:
     """Header and rows of a rare failure: the median repetition, all together, and drawn worlds."""
+
+    def told(name: str, of: xr.Dataset, prefix: str = "") -> list[str]:
+        p, low, high, off, trials = (float(of[prefix + one]) for one in rare.Estimate._fields)
+        return rare.row(name, rare.Estimate(p, low, high, off, round(trials)))
+
     head, *_, together = rare.table(found)
     middle = found[list(rare.Estimate._fields)].median("repetition")
-    p, low, high, variation, trials = (float(middle[name]) for name in rare.Estimate._fields)
-    median = rare.Estimate(p, low, high, variation, round(trials))
-    rows = [head, rare.row(f"splitting, median of {found.sizes['repetition']}", median), together]
+    rows = [head, told(f"splitting, median of {found.sizes['repetition']}", middle), together]
     if "drawn_p" in found:
-        drawn = (float(found[f"drawn_{name}"]) for name in rare.Estimate._fields)
-        *told, trials = drawn
-        rows.append(rare.row("drawn worlds", rare.Estimate(*told, int(trials))))
+        rows.append(told("drawn worlds", found, "drawn_"))
     return [row[:-1] for row in rows]
 
 
