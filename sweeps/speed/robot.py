@@ -28,7 +28,7 @@ from sweeps.shared import Study
 
 _ROOT = Path(__file__).parents[2]
 _EXAMPLE = "notebooks/examples/on_a_robot.py"
-_TOLD = re.compile(r"median (\d+) us, 99.9th percentile (\d+) us, worst (\d+) us; ([\d.]+)%")
+TOLD = re.compile(r"median (\d+) us, 99.9th percentile (\d+) us, worst (\d+) us; ([\d.]+)%")
 _FOUND = {
     "median": ("us", "median time of a step"),
     "slow": ("us", "99.9th percentile of the times"),
@@ -84,7 +84,7 @@ class OnARobot(Study[xr.Dataset]):
         ended = subprocess.run(
             [sys.executable, *words], cwd=_ROOT, capture_output=True, text=True, check=False
         )
-        told = _TOLD.search(ended.stdout)
+        told = TOLD.search(ended.stdout)
         if ended.returncode or not told:
             last = ended.stderr.strip().splitlines()[-1:]
             raise InputError(f"core = {self.core} is not allowed here: {' '.join(last)}")
