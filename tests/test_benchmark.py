@@ -172,12 +172,14 @@ def test_whole_commands_are_timed_twice_with_so_many_gpus(monkeypatch):
     seen = []
 
     def run(words, env, **how):
-        seen.append((words[2:6], env["RPS_CACHE"], env.get("CUDA_VISIBLE_DEVICES")))
+        assert "JAX_PLATFORMS" not in env
+        seen.append((words[2:6], env["RPS_CACHE"], env["CUDA_VISIBLE_DEVICES"]))
         return subprocess.CompletedProcess(
             words, 0, "compile 1.5 s, run 2.0 s (1234 simulated s per s)", ""
         )
 
     monkeypatch.setattr(subprocess, "run", run)
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")  # of the process that times them
     found = commands.commands(("push --seed 1",), (1, 2))
     assert found.command.values.tolist() == ["`rps push --seed 1`, one GPU",
                                              "`rps push --seed 1`, 2 GPUs"]  # fmt: skip

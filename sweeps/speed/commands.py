@@ -1,8 +1,8 @@
 """How long does a user wait for a whole command, from return to the report?
 
 Each command is a process of its own, run with an empty cache and then once more with what the first
-left in it. One that is about the GPU is run where there is one; `--device cpu` keeps the process
-that times them off it.
+left in it. With `--gpus` they see so many, and `JAX_PLATFORMS=cpu` is for the process that times
+them alone, so that it leaves the GPUs to them.
 
     rps sweeps/speed/commands.py --machine "2 cores of an AMD EPYC"
 """
@@ -120,6 +120,7 @@ def timed(command: str, limit: float, gpus: int | None = None) -> xr.Dataset:
         kept = os.environ | {"RPS_CACHE": f"{folder}/cache"}
         if gpus is not None:
             kept["CUDA_VISIBLE_DEVICES"] = ",".join(map(str, range(gpus)))
+            kept.pop("JAX_PLATFORMS", None)
         for number in range(2):
             words = [sys.executable, "-m", "rps_jax", *shlex.split(command)]
             begun = time.perf_counter()
