@@ -127,7 +127,7 @@ dependencies = call_of(Dependencies)
 
 _NOTE = (
     "own: size of the installed files of the package itself, compiled bytecode included. packages "
-    "and their size: what would go if the dependency went, so what only it needs."
+    "and their size: what else would go if the dependency went, so what only it needs."
 )
 
 
