@@ -18,6 +18,7 @@ from rps_jax.record import files
 from rps_jax.runs.question import seed_of
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
+from rps_jax.world.domain import DOMAINS, Range
 from sweeps import shared
 from sweeps.million import study as million
 from sweeps.publish import dependencies, rows, study
@@ -108,7 +109,8 @@ def test_a_law_is_beside_itself_as_it_was_tuned():
 
 
 def test_a_comparison_names_laws_by_the_runs_that_tuned_them():
-    domain = "wide,objects=random_cylinder random_box,distance=0.7:0.8"
+    near = DOMAINS["wide"]
+    domain = replace(near, objects=("random_cylinder", "random_box"), distance=Range(0.7, 0.8))
     setting = Setting("quasistatic", rules=Rules(horizon=20.0))
     laws = {"rps": "rps", "rps,a/runs/gradient/tuned.json": "rps_tuned"}
     found = xr.DataTree.from_dict({"near": sweep(laws, domain, 12, setting=setting)})

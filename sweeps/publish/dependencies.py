@@ -39,6 +39,7 @@ ROOT = Path(__file__).parents[2]
 OWN = "rps-jax"
 FOR = {
     "jax": "one program for thousands of worlds, on processors and GPUs, and its derivatives",
+    "flatbuffers": "programs of JAX that are kept between processes",
     "mujoco": "scenes, C MuJoCo as an engine, pictures; pinned to the version of mujoco-mjx, which "
     "has no 4.x",
     "mujoco-mjx": "the engine in which the paper is replicated",
