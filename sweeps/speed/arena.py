@@ -1,0 +1,381 @@
+"""How fast are the engines of others on the same scene, and how right?
+
+A base pushes a box straight on at a constant speed, in one scene, on one device, in one run. Each
+engine is a process of its own. All make themselves ready side by side; then they are timed one
+after the other. Beside the speed stands how far the objects end from where C MuJoCo in fine steps
+leaves them.
+
+    python sweeps/speed/peers.py peers
+    rps sweeps/speed/arena.py --peers peers --machine "one NVIDIA H100"
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import IO, Any, ClassVar
+
+import mujoco
+import numpy as np
+import xarray as xr
+
+from rps_jax import errors
+from rps_jax.analysis.report import Section
+from rps_jax.record import provenance
+from rps_jax.record.options import option
+from rps_jax.runs.question import Run, call_of
+from rps_jax.trials.progress import Progress
+from rps_jax.world import scene
+from rps_jax.world.physics import preset
+from sweeps import shared
+from sweeps.shared import Study
+from sweeps.speed import racers
+from sweeps.speed.racers import ON_CORES, RACERS
+
+_HERE = Path(__file__).parent
+_COLUMNS = (
+    *("engine", "version", "worlds", "simulated s/s", "fused over it"),
+    *("error, median", "error, largest", "turned, median", "ready after", "why not"),
+)
+# Engines that are not in the arena, and why.
+EXCLUDED = {
+    "Brax 0.14.2": (
+        "its generalized, positional and spring pipelines refuse the scene (`Only pyramidal cone "
+        "friction is supported`, `Only impratio=1 is supported`), and its mjx pipeline is MJX"
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Arena(Study[xr.Dataset]):
+    """Race engines on one scene, each with its error against converged C MuJoCo.
+
+    The answer holds simulated seconds in a second of wall clock, `rate` [1], and how far the
+    objects end from the converged poses, `error` [m] and `turned` [rad], for each engine and
+    number of worlds; and in words why an engine has no rate.
+    """
+
+    TITLE: ClassVar[str] = "Engines on one scene"
+    SMALL: ClassVar[Mapping[str, Any]] = {
+        "names": ("C MuJoCo, rollout", "fused"),
+        "worlds": (8,),
+        "starts": 4,
+        "seconds": 0.5,
+        "step": 1e-3,
+    }
+    GROWS: ClassVar[tuple[str, ...]] = ("names", "worlds", "peers", "limit", "machine")
+
+    names: tuple[str, ...] = tuple(RACERS)
+    """Engines; by default all."""
+    worlds: tuple[int, ...] = option((8192, 65536), 1, 10_000_000)
+    """Numbers of worlds; on the processor as many as suit it, but no more than the largest."""
+    seconds: float = option(5.0, 0.1, 600, unit="s")
+    """How long each world is pushed [s]."""
+    starts: int = option(64, 1, 4096)
+    """Number of different places and headings of the box, which the worlds repeat."""
+    step: float = option(1e-4, 1e-6, 1e-2, unit="s")
+    """Of converged C MuJoCo [s]."""
+    peers: Path | None = None
+    """Folder of the packages of others, as `peers.py` makes it."""
+    limit: float = option(150.0, 1, 3600)
+    """Time in which an engine must be ready, and time in which it must then run [s]."""
+    machine: str = ""
+    """What it runs on, in words; with these the table is published."""
+
+    def check(self) -> None:
+        """Check the names."""
+        for name in self.names:
+            errors.check_name("name", name, tuple(RACERS))
+
+    def trials(self) -> int | None:
+        """How many engines there are."""
+        return len(self.names)
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Race the engines that were not raced before."""
+        with tempfile.TemporaryDirectory() as place:
+            folder = Path(place)
+            (folder / "scene.xml").write_text(mjcf())
+            np.save(folder / "starts.npy", placed(self.starts))
+            truth = run.part("converged", partial(self._converged, folder)).pose.values
+            kept = {} if run.parts is None else {n: run.parts.get(_part(n)) for n in self.names}
+            missing = [name for name in self.names if kept.get(name) is None]
+            made = self._raced(missing, folder, truth)
+            found: list[xr.Dataset] = []
+            for number, name in enumerate(self.names):
+                found.append(self._kept(run, name, made if name in missing else iter(())))
+                whole: Any = xr.concat(found, "row")
+                if self.machine and run.folder is not None:
+                    self._publish(run.folder, whole)
+                run.report(Progress(number + 1, 0.0))
+        return whole
+
+    def _kept(self, run: Run, name: str, made: Iterator[xr.Dataset]) -> xr.Dataset:
+        """The rows of an engine; kept, unless it failed, so that a failure can be mended."""
+        if run.parts is not None and run.parts.get(_part(name)) is not None:
+            return run.part(_part(name), partial(next, made))
+        rows = next(made)
+        return rows if (rows.why != "").any() else run.part(_part(name), lambda: rows)
+
+    def _converged(self, folder: Path) -> xr.Dataset:
+        starts = np.load(folder / "starts.npy")
+        poses = racers.converged(folder / "scene.xml", starts, self.seconds, self.step)
+        return xr.Dataset({"pose": (("start", "coordinate"), poses)})
+
+    def _raced(
+        self, names: Sequence[str], folder: Path, truth: np.ndarray
+    ) -> Iterator[xr.Dataset]:
+        """Rows of each engine: all are made ready first, and then timed one after the other."""
+        given = _environment(self.peers)
+        started = [
+            _Process(name, self._counts(name), folder, self.seconds, given) for name in names
+        ]
+        try:
+            until = time.perf_counter() + self.limit
+            for process in started:
+                process.prepare(until)
+            for process in started:
+                yield process.rows(time.perf_counter() + self.limit, truth)
+        finally:
+            for process in started:
+                process.end()
+
+    def _counts(self, name: str) -> tuple[int, ...]:
+        return (max(self.worlds),) if name in ON_CORES else self.worlds
+
+    def _publish(self, folder: Path, found: xr.Dataset) -> None:
+        columns = [{"name": one} for one in _COLUMNS]
+        made = [provenance.signed(folder)]
+        note = ". ".join(f"Not in the arena: {name}, because {why}" for name, why in
+                         EXCLUDED.items())  # fmt: skip
+        path = _HERE / "results" / "arena.json"
+        shared.publish(path, made, self.machine, columns, table(found), note + ".")
+
+    def intro(self, found: xr.Dataset) -> str:
+        """Where it was measured."""
+        return shared.machine()
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """Speeds and errors."""
+        told = " ".join(f"{name} is not in the arena: {why}." for name, why in EXCLUDED.items())
+        return [Section("Engines on one scene", told, [list(_COLUMNS), *table(found)])]
+
+
+arena = call_of(Arena)
+
+
+def _part(name: str) -> str:
+    return "".join(c if c.isalnum() else "_" for c in name)
+
+
+# --- the scene -----------------------------------------------------------------------------
+
+
+def placed(count: int) -> np.ndarray:
+    """Where bases and boxes start (count, 10): the box turned and to a side, touching the base."""
+    box, rng = scene.load("box"), np.random.default_rng(0)
+    yaws, sides = rng.uniform(-0.3, 0.3, count), rng.uniform(-0.12, 0.12, count)
+    qpos = np.array([scene.initial_qpos(box, 0.0, yaw) for yaw in yaws])
+    qpos[:, scene.JOINTS.object.start + 1] = sides
+    return qpos
+
+
+def mjcf() -> str:
+    """The scene that the project's engines step, as a file that others read too."""
+    model = scene.load("box", preset()).physics
+    base, box, o = model.body("base"), model.body("object"), model.opt
+
+    def text(values: Any) -> str:
+        return " ".join(f"{v:.12g}" for v in np.ravel(values))
+
+    def inertial(body: Any) -> str:
+        return (
+            f'<inertial pos="{text(body.ipos)}" quat="{text(body.iquat)}" mass="{text(body.mass)}" '
+            f'diaginertia="{text(body.inertia)}"/>'
+        )
+
+    def geom(name: str, kind: str) -> str:
+        one = model.geom(name)
+        return (
+            f'<geom name="{name}" type="{kind}" size="{text(one.size)}" pos="{text(one.pos)}" '
+            'contype="0" conaffinity="0"/>'
+        )
+
+    joints = "".join(
+        f'<joint name="base_{name}" type="{kind}" axis="{axis}" armature="{text(mass)}"/>'
+        for (name, kind, axis), mass in zip(
+            [("x", "slide", "1 0 0"), ("y", "slide", "0 1 0"), ("yaw", "hinge", "0 0 1")],
+            model.dof_armature,
+            strict=False,
+        )
+    )
+    pairs = "".join(
+        f'<pair geom1="{model.geom(int(model.pair_geom1[i])).name}" '
+        f'geom2="{model.geom(int(model.pair_geom2[i])).name}" condim="{model.pair_dim[i]}" '
+        f'friction="{text(model.pair_friction[i])}" solref="{text(model.pair_solref[i])}" '
+        f'solreffriction="{text(model.pair_solreffriction[i])}" '  # Newton has another default
+        f'solimp="{text(model.pair_solimp[i])}"/>'
+        for i in range(model.npair)
+    )
+    assert (o.integrator, o.solver, o.cone) == (
+        mujoco.mjtIntegrator.mjINT_EULER,
+        mujoco.mjtSolver.mjSOL_NEWTON,
+        mujoco.mjtCone.mjCONE_ELLIPTIC,
+    )
+    return (
+        '<mujoco model="arena"><compiler angle="radian" autolimits="true"/>'
+        f'<option timestep="{o.timestep:g}" integrator="Euler" solver="Newton" cone="elliptic" '
+        f'impratio="{o.impratio:g}" iterations="{o.iterations}" '
+        f'ls_iterations="{o.ls_iterations}" tolerance="{o.tolerance:g}" jacobian="dense"/>'
+        f'<worldbody>{geom("ground", "plane")}'
+        f'<body name="base">{joints}{inertial(base)}{geom("base", "box")}</body>'
+        f'<body name="object" pos="{text(box.pos)}"><freejoint name="object"/>{inertial(box)}'
+        f'{geom("object", "box")}</body></worldbody><contact>{pairs}</contact></mujoco>'
+    )
+
+
+# --- the processes -------------------------------------------------------------------------
+
+
+def _environment(peers: Path | None) -> dict[str, str]:
+    """Of an engine's process: the packages of others come last, and JAX takes what it needs."""
+    places = [str(_HERE.parents[1]), os.environ.get("PYTHONPATH", ""), str(peers or "")]
+    return os.environ | {
+        "PYTHONPATH": os.pathsep.join(filter(None, places)),
+        "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
+    }
+
+
+class _Process:
+    """The process of an engine."""
+
+    def __init__(
+        self,
+        name: str,
+        counts: Sequence[int],
+        folder: Path,
+        seconds: float,
+        environment: Mapping[str, str],
+    ):
+        """Start it."""
+        words = [sys.executable, str(_HERE / "racers.py"), name, str(folder), str(seconds)]
+        self.name, self.counts, self.failed, self.ready = name, counts, "", np.nan
+        self._errors = tempfile.TemporaryFile("w+")
+        self._child = subprocess.Popen(
+            [*words, *map(str, counts)], env=environment, text=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
+        )  # fmt: skip
+        assert self._child.stdout is not None
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        threading.Thread(target=_read, args=(self._child.stdout, self._lines), daemon=True).start()
+
+    def _told(self, until: float) -> dict[str, Any] | None:
+        """What it says next; None if it says nothing more, which is a failure in words."""
+        while True:
+            try:
+                line = self._lines.get(timeout=max(until - time.perf_counter(), 0.01))
+            except queue.Empty:
+                self.failed = "took longer than the limit"
+                return None
+            if line is None:
+                self._child.wait()
+                self._errors.seek(0)
+                last = self._errors.read().strip().splitlines()[-1:]
+                self.failed = " ".join(last) or f"ended with {self._child.returncode}"
+                return None
+            if line.startswith("{"):
+                return json.loads(line)
+
+    def prepare(self, until: float) -> None:
+        """Wait until it is ready."""
+        if (told := self._told(until)) is not None:
+            self.ready = told["ready"]
+        else:
+            self.end()
+
+    def rows(self, until: float, truth: np.ndarray) -> xr.Dataset:
+        """Let it run, and tell a row for each number of worlds."""
+        rows = []
+        if not self.failed:
+            assert self._child.stdin is not None
+            print("go", file=self._child.stdin, flush=True)
+        for count in self.counts:
+            told = None if self.failed else self._told(until)
+            rows.append(_row(self, count, told or {"poses": []}, truth))
+        self.end()
+        whole: Any = xr.concat(rows, "row")
+        return whole
+
+    def end(self) -> None:
+        """End it, if it has not ended."""
+        self._child.kill()
+        self._child.wait()
+
+
+def _read(stream: IO[str], lines: queue.SimpleQueue[str | None]) -> None:
+    for line in stream:
+        lines.put(line)
+    lines.put(None)
+
+
+def _row(
+    process: _Process, count: int, told: Mapping[str, Any], truth: np.ndarray
+) -> xr.Dataset:
+    """A row: what was told, and how far it is from the converged poses (n, 7)."""
+    poses = np.array(told["poses"], float).reshape(-1, 7)
+    error, turned = np.array([np.nan]), np.array([np.nan])
+    if len(poses):
+        true = truth[np.arange(len(poses)) % len(truth)]
+        error = np.linalg.norm(poses[:, :2] - true[:, :2], axis=1)
+        turned = 2 * np.arccos(np.clip(np.abs(np.sum(poses[:, 3:] * true[:, 3:], 1)), 0, 1))
+    values = {
+        "engine": process.name,
+        "version": told.get("version", ""),
+        "worlds": told.get("worlds", count),
+        "rate": told.get("rate", np.nan),
+        "error": np.median(error),
+        "largest": np.max(error),
+        "turned": np.median(turned),
+        "ready": process.ready,
+        "why": process.failed,
+    }
+    return xr.Dataset({name: ((), value) for name, value in values.items()})
+
+
+# --- what is shown -------------------------------------------------------------------------
+
+
+def table(found: xr.Dataset) -> list[list[str]]:
+    """A row for each engine and number of worlds, the slowest first and failures last."""
+    rows = [found.isel(row=i) for i in range(found.sizes["row"])]
+    fused = {int(r.worlds): float(r.rate) for r in rows if r.engine.item() == "fused"}
+    most = max(fused.values(), default=np.nan)
+
+    def cell(value: xr.DataArray, form: str, times: float = 1.0) -> str:
+        return "" if np.isnan(value) else form.format(times * float(value))
+
+    return [
+        [
+            str(r.engine.item()),
+            str(r.version.item()),
+            f"{int(r.worlds):,}",
+            cell(r.rate, "{:,.0f}"),
+            cell(fused.get(int(r.worlds), most) / r.rate, "{:.3g}"),
+            cell(r.error, "{:.2g} mm", 1000),
+            cell(r.largest, "{:.2g} mm", 1000),
+            cell(r.turned, "{:.2g}°", 180 / np.pi),
+            cell(r.ready, "{:.0f} s"),
+            str(r.why.item()),
+        ]
+        for r in sorted(rows, key=lambda r: np.nan_to_num(float(r.rate), nan=np.inf))
+    ]
