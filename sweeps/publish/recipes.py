@@ -326,6 +326,8 @@ RECIPES: dict[str, Recipe] = {
         "Simulated seconds in a second",
     ),
     "commands": Recipe((f"rps sweeps/speed/commands.py {_MACHINE}",), 8, None),
+    # After `python sweeps/speed/peers.py peers`.
+    "arena": Recipe((f"rps sweeps/speed/arena.py --peers peers {_MACHINE}",), None, 5),
     "costs": Recipe(("rps sweeps/speed/costs.py --families box prism",), 2, None, "Functions"),
     "levers": Recipe(
         (

@@ -1,11 +1,10 @@
 """What one process of the arena runs: one engine, from the starts to the end, as fast as it goes.
 
-    python racers.py ENGINE FOLDER SECONDS WORLDS...
+    python racers.py ENGINE FOLDER SECONDS WORLDS
 
 `FOLDER` holds `scene.xml` and `starts.npy`. The process makes everything ready, says so, waits for
-a line, and then says for each number of worlds how fast it was and where the objects ended. It
-needs nothing of this project but for the project's own engines, so that others can live in an
-environment of their own.
+a line, and then says how fast it was and where the objects ended. It needs nothing of this project
+but for the project's own engines, so that others can live in an environment of their own.
 """
 
 from __future__ import annotations
@@ -207,8 +206,10 @@ def _captured(warp: Any, step: Callable[[], None], count: int) -> Callable[[], N
     return launch
 
 
-def _commanded(warp: Any) -> Any:
+@functools.cache
+def _commanded() -> Any:
     """A kernel that sets the velocity of every base."""
+    import warp
 
     @warp.kernel
     def command(qvel: warp.array2d(dtype=float), speed: float):  # pyright: ignore
@@ -233,7 +234,7 @@ def mujoco_warp(task: Task) -> Racer:
     data = mjw.put_data(
         host, mujoco.MjData(host), nworld=worlds, nconmax=CONTACTS, njmax=ROWS
     )  # fmt: skip
-    command = _commanded(wp)
+    command = _commanded()
     start = wp.array(task.qpos.astype(np.float32), dtype=float)
 
     def step() -> None:
@@ -278,7 +279,7 @@ def newton(task: Task) -> Racer:
     q = task.qpos.copy()
     q[:, OBJECT] = q[:, OBJECT][:, [0, 1, 2, 4, 5, 6, 3]]  # scalar last
     start = wp.array(q.astype(np.float32).ravel(), dtype=float)
-    command = _commanded(wp)
+    command = _commanded()
     shape = (worlds, 9)
 
     def step() -> None:  # two of them, so that the states are in their places again
@@ -321,36 +322,34 @@ def _say(**told: Any) -> None:
     print(json.dumps(told), flush=True)
 
 
-def race(name: str, folder: Path, seconds: float, counts: list[int]) -> None:
-    """Make an engine ready for some numbers of worlds, wait for a line, and time it."""
+def race(name: str, folder: Path, seconds: float, count: int) -> None:
+    """Make an engine ready for a number of worlds, wait for a line, and time it."""
     prepare, package = RACERS[name]
-    starts = np.load(folder / "starts.npy")
-    version = importlib.metadata.version(package)
-    begun, ready = time.perf_counter(), []
-    for count in counts:
-        qpos = starts[np.arange(count) % len(starts)]
-        racer = prepare(Task(folder / "scene.xml", qpos, seconds))
-        racer.warm()
-        ready.append(racer)
+    begun, starts = time.perf_counter(), np.load(folder / "starts.npy")
+    try:
+        version = importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        sys.exit(f"{package} is not installed")
+    qpos = starts[np.arange(count) % len(starts)]
+    racer = prepare(Task(folder / "scene.xml", qpos, seconds))
+    racer.warm()
     _say(ready=time.perf_counter() - begun)
     input()
-    for racer in ready:
-        times, poses = [], np.empty(0)
-        while len(times) < _GOES and sum(times) < _ENOUGH:
-            begun = time.perf_counter()
-            poses = racer.go()
-            times.append(time.perf_counter() - begun)
-        few = min(len(starts), racer.worlds)
-        rate = racer.worlds * seconds / min(times)
-        _say(worlds=racer.worlds, rate=rate, version=version, poses=poses[:few].tolist())
+    times, poses = [], np.empty(0)
+    while len(times) < _GOES and sum(times) < _ENOUGH:
+        begun = time.perf_counter()
+        poses = racer.go()
+        times.append(time.perf_counter() - begun)
+    rate, few = racer.worlds * seconds / min(times), min(len(starts), racer.worlds)
+    _say(worlds=racer.worlds, rate=rate, version=version, poses=poses[:few].tolist())
 
 
 if __name__ == "__main__":
-    name, folder, seconds, *counts = sys.argv[1:]
+    name, folder, seconds, count = sys.argv[1:]
     if name == "trial":
         xml, starts = Path(folder) / "scene.xml", np.load(Path(folder) / "starts.npy")
         task = Task(xml, starts, float(seconds))
-        pose = in_c(_model(task), starts[int(counts[0]) % len(starts)], task.seconds)
+        pose = in_c(_model(task), starts[int(count) % len(starts)], task.seconds)
         print(json.dumps(pose.tolist()))
     else:
-        race(name, Path(folder), float(seconds), [int(one) for one in counts])
+        race(name, Path(folder), float(seconds), int(count))
