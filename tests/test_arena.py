@@ -44,7 +44,7 @@ def test_engines_are_right_and_what_is_not_installed_says_so(tmp_path):
         assert one.turned < 0.01
     absent = rows["MuJoCo Warp"]
     assert np.isnan(absent.rate)
-    assert absent.why.item() == "mujoco-warp is not installed"
+    assert absent.why.item() == "mujoco_warp is not installed"
     assert arena.table(found)[-1][0] == "MuJoCo Warp"
     kept = {path.name.rpartition("-")[0] for path in (tmp_path / "run" / "parts").glob("*.nc")}
     assert kept == {"converged", "C_MuJoCo_rollout_4", "one_process_a_trial_4", "fused_4"}

@@ -99,6 +99,8 @@ class Arena(Study[xr.Dataset]):
 
     def check(self) -> None:
         """Check the names."""
+        if not self.names:
+            raise errors.InputError("names = () leave nothing to race.")
         for name in self.names:
             errors.check_name("name", name, tuple(RACERS))
 
@@ -124,12 +126,13 @@ class Arena(Study[xr.Dataset]):
             ]
             made = self._raced(missing, folder, truth)
             found: list[xr.Dataset] = []
+            whole: Any = xr.Dataset()
             for number, one in enumerate(self.wanted):
                 row = next(made) if one in missing else run.part(_part(one), xr.Dataset)
                 if one in missing and not row.why.item():  # what failed is tried again
                     run.part(_part(one), partial(xr.Dataset.copy, row))
                 found.append(row)
-                whole: Any = xr.concat(found, "row")
+                whole = xr.concat(found, "row")
                 if self.machine and run.folder is not None:
                     self._publish(run.folder, whole)
                 run.report(Progress(number + 1, 0.0))

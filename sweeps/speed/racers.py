@@ -192,7 +192,12 @@ def with_law(task: Task) -> Racer:
 def _captured(warp: Any, step: Callable[[], None], count: int) -> Callable[[], None]:
     """Launches of a CUDA graph that make `count` steps; on a processor, the steps."""
     if not warp.get_device().is_cuda:
-        return lambda: [step() for _ in range(count)] and None
+
+        def steps() -> None:
+            for _ in range(count):
+                step()
+
+        return steps
     graph_steps = next(n for n in range(min(_GRAPH, count), 0, -1) if count % n == 0)
     step()  # builds the kernels
     with warp.ScopedCapture() as capture:
@@ -209,7 +214,7 @@ def _captured(warp: Any, step: Callable[[], None], count: int) -> Callable[[], N
 @functools.cache
 def _commanded() -> Any:
     """A kernel that sets the velocity of every base."""
-    import warp
+    import warp  # pyright: ignore[reportMissingImports]
 
     @warp.kernel
     def command(qvel: warp.array2d(dtype=float), speed: float):  # pyright: ignore
@@ -224,8 +229,8 @@ def _commanded() -> Any:
 def mujoco_warp(task: Task) -> Racer:
     """MuJoCo Warp as it is, its steps captured as a graph."""
     import mujoco
-    import mujoco_warp as mjw
-    import warp as wp
+    import mujoco_warp as mjw  # pyright: ignore[reportMissingImports]
+    import warp as wp  # pyright: ignore[reportMissingImports]
 
     wp.config.log_level = wp.LOG_WARNING
     host, worlds = _model(task), len(task.qpos)
@@ -256,9 +261,9 @@ def mujoco_warp(task: Task) -> Racer:
 
 def newton(task: Task) -> Racer:
     """Newton's solver that is made of MuJoCo Warp, as its examples run it."""
-    import newton
-    import warp as wp
-    from newton.solvers import SolverMuJoCo
+    import newton  # pyright: ignore[reportMissingImports]
+    import warp as wp  # pyright: ignore[reportMissingImports]
+    from newton.solvers import SolverMuJoCo  # pyright: ignore[reportMissingImports]
 
     wp.config.log_level = wp.LOG_WARNING
     worlds, option = len(task.qpos), _model(task).opt
@@ -322,16 +327,23 @@ def _say(**told: Any) -> None:
     print(json.dumps(told), flush=True)
 
 
+def _version(package: str) -> str:
+    """Its version; none of this project where it runs from its sources."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+
+
 def race(name: str, folder: Path, seconds: float, count: int) -> None:
     """Make an engine ready for a number of worlds, wait for a line, and time it."""
     prepare, package = RACERS[name]
     begun, starts = time.perf_counter(), np.load(folder / "starts.npy")
-    try:
-        version = importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        sys.exit(f"{package} is not installed")
     qpos = starts[np.arange(count) % len(starts)]
-    racer = prepare(Task(folder / "scene.xml", qpos, seconds))
+    try:
+        racer = prepare(Task(folder / "scene.xml", qpos, seconds))
+    except ModuleNotFoundError as error:
+        sys.exit(f"{error.name} is not installed")
     racer.warm()
     _say(ready=time.perf_counter() - begun)
     input()
@@ -341,7 +353,7 @@ def race(name: str, folder: Path, seconds: float, count: int) -> None:
         poses = racer.go()
         times.append(time.perf_counter() - begun)
     rate, few = racer.worlds * seconds / min(times), min(len(starts), racer.worlds)
-    _say(worlds=racer.worlds, rate=rate, version=version, poses=poses[:few].tolist())
+    _say(worlds=racer.worlds, rate=rate, version=_version(package), poses=poses[:few].tolist())
 
 
 if __name__ == "__main__":
