@@ -375,6 +375,8 @@ RECIPES: dict[str, Recipe] = {
         6,
         folder="speed",
     ),
+    # After `python sweeps/speed/peers.py peers`.
+    "arena": Recipe((f"rps sweeps/speed/arena.py --peers peers {_MACHINE}",), None, 5),
     "costs": Recipe(("rps sweeps/speed/costs.py --families box prism",), 2, None, "Functions"),
     "levers": Recipe(
         (
