@@ -12,6 +12,7 @@ import contextlib
 import dataclasses
 import hashlib
 import json
+import re
 import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -420,7 +421,8 @@ def publish(
       rows: one cell for each column.
       note: what a reader of the numbers should know.
     """
-    last, commands = made[-1], [_placeless(one["command"]) for one in made]
+    last, asked = made[-1], [one["command"] for one in made]
+    commands = [_placeless(one, asked) for one in asked]
     noted = {}
     with contextlib.suppress(InputError):  # a script of one's own has no digest, and loses no run
         noted["digest"] = digest(commands)
@@ -448,12 +450,15 @@ def digest(commands: Sequence[Sequence[str]]) -> str:
     Raises:
       InputError: a command asks no question of today, or asks it in other words.
     """
-    found = []
+    found: list[Any] = []
     for program, *words in commands:
         if program != "rps":
             raise InputError(
                 f"command = {program} is not allowed: a digest is of rps NAME or PATH."
             )
+        if _reads(_apart(words)[0]):  # a run, whose command stands beside it
+            found.append(words)
+            continue
         name, rest = names.split(words)
         asked, _ = flags.parse(names.question_of(name), name, rest)
         found.append(_declared(asked.asked().configuration()))
@@ -475,7 +480,22 @@ def _declared(value: Any) -> Any:
     return value
 
 
-def _placeless(command: Sequence[str]) -> list[str]:
-    """Words of a command without its run folder, which is a place of one machine."""
-    words = iter(command)
-    return [word for word in words if word != "--out" or not next(words, None)]
+def _apart(command: Sequence[str]) -> tuple[list[str], str]:
+    """Words of a command without its run folder, and that."""
+    if "--out" not in command:
+        return list(command), ""
+    at = list(command).index("--out")
+    return [*command[:at], *command[at + 2 :]], "".join(command[at + 1 : at + 2])
+
+
+def _reads(words: Sequence[str], folder: str = "runs") -> bool:
+    """Whether a command reads a run folder, or a file of it."""
+    return any(re.search(rf"(^|,){re.escape(folder)}(/|$)", word) for word in words)
+
+
+def _placeless(command: Sequence[str], others: Sequence[Sequence[str]]) -> list[str]:
+    """Words of a command without its run folder, which is a place of one machine, unless others
+    read it."""
+    words, folder = _apart(command)
+    read = folder and any(_reads(_apart(other)[0], folder) for other in others)
+    return list(command) if read else words

@@ -173,12 +173,13 @@ def _row(found: xr.Dataset, domain: str, law: str) -> dict[str, str]:
 
 
 def panel_table(found: xr.Dataset) -> list[list[str]]:
-    """Header and rows: the rate of a law in a domain on each model."""
+    """Header and rows: the rate of a law in a domain on each model, and their range."""
     names = [str(name) for name in found.model.values]
-    rows = [["domain", "law", *names]]
+    rows = [["domain", "law", *names, "over these models"]]
     for domain in found.domain.values:
         for law in found.law.values:
             by_model = rates(found, domain, law)
             told = [tables.share(*by_model[name]) if name in by_model else "" for name in names]
-            rows.append([str(domain), str(law), *told])
+            spread = tables.spread([won / of for won, of in by_model.values()])
+            rows.append([str(domain), str(law), *told, spread])
     return rows

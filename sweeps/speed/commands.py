@@ -1,7 +1,8 @@
 """How long does a user wait for a whole command, from return to the report?
 
 Each command is a process of its own, run with an empty cache and then once more with what the first
-left in it. One that is about the GPU is run where there is one.
+left in it. With `--gpus` they see so many, and `JAX_PLATFORMS=cpu` is for the process that times
+them alone, so that it leaves the GPUs to them.
 
     rps sweeps/speed/commands.py --machine "2 cores of an AMD EPYC"
 """
@@ -45,18 +46,23 @@ class Commands(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "How long a user waits for a whole command"
-    GROWS: ClassVar[tuple[str, ...]] = ("commands", "warm", "machine")
+    GROWS: ClassVar[tuple[str, ...]] = ("commands", "warm", "gpus", "machine")
 
     commands: tuple[str, ...] = (
         "push --object box --target -2 0 --no-video",
         "push --object box --target -2 0",
+        "push --object box --target -2 0 --engine fused",
         "sweep --laws rps_tuned --domain wide --worlds 100",
         "sweep --laws rps_tuned --domain wide --worlds 1000",
+        "table --engine fused",
+        "table",
     )
     """What is asked of `rps`."""
     warm: tuple[int, ...] = ()
     """Numbers of worlds that are swept three times in one process: the first time with an empty
     cache, and the last."""
+    gpus: tuple[int, ...] = option((), 1, 64)
+    """Numbers of GPUs with which each is timed; by default with what this process sees."""
     limit: float = option(1800.0, 1, 86400)
     """Time after which a command is stopped [s]."""
     machine: str = ""
@@ -66,17 +72,22 @@ class Commands(Study[xr.Dataset]):
 
     def trials(self) -> int | None:
         """How many commands there are."""
-        return len(self.commands) + len(self.warm)
+        return len(self.wanted) + len(self.warm)
+
+    @property
+    def wanted(self) -> list[tuple[str, int | None]]:
+        """Commands, each with the numbers of GPUs that it sees."""
+        return [(command, count) for command in self.commands for count in self.gpus or (None,)]
 
     def answer(self, run: Run) -> xr.Dataset:
         """Time what was not timed before."""
         found = []
-        for number, command in enumerate(self.commands):
-            safe = re.sub(r"\W+", "_", command)
-            found.append(run.part(safe, partial(timed, command, self.limit)))
+        for number, (command, gpus) in enumerate(self.wanted):
+            safe = re.sub(r"\W+", "_", command) + ("" if gpus is None else f"_{gpus}")
+            found.append(run.part(safe, partial(timed, command, self.limit, gpus)))
             run.report(Progress(number + 1, 0.0))
         found += [run.part(f"warm_{n}", partial(_warm, n, self.limit)) for n in self.warm]
-        told = [*(f"rps {one}" for one in self.commands), *map(_call, self.warm)]
+        told = [*_labels(self.wanted), *(f"`{_call(n)}`, in one process" for n in self.warm)]
         whole: Any = xr.concat(found, "command").assign_coords(command=told)
         if self.machine and run.folder is not None:
             path = Path(__file__).parent / "results" / f"{self.file}.json"
@@ -97,7 +108,13 @@ class Commands(Study[xr.Dataset]):
 commands = call_of(Commands)
 
 
-def timed(command: str, limit: float) -> xr.Dataset:
+def _labels(wanted: Sequence[tuple[str, int | None]]) -> list[str]:
+    """What the rows are of: commands, and GPUs where these are said."""
+    said = {None: "", 1: ", one GPU"}
+    return [f"`rps {one}`{said.get(gpus, f', {gpus} GPUs')}" for one, gpus in wanted]
+
+
+def timed(command: str, limit: float, gpus: int | None = None) -> xr.Dataset:
     """Seconds of a command with an empty cache and once more, and what the second told.
 
     Raises:
@@ -108,7 +125,7 @@ def timed(command: str, limit: float) -> xr.Dataset:
         for number in range(2):
             words = ["-m", "rps_jax", *shlex.split(command), "--out", f"{folder}/run_{number}"]
             begun = time.perf_counter()
-            output = _output(words, command, folder, limit)
+            output = _output(words, command, folder, limit, gpus)
             seconds.append(time.perf_counter() - begun)
     told = _TOLD.search(output)
     compile_, run, rate = map(float, told.groups()) if told else (float("nan"),) * 3
@@ -117,7 +134,7 @@ def timed(command: str, limit: float) -> xr.Dataset:
 
 def _call(worlds: int) -> str:
     """The call by which worlds are swept, as a row names it."""
-    return f'rps_jax.sweep("rps_tuned", "wide", worlds={worlds}) in one process'
+    return f'rps_jax.sweep("rps_tuned", "wide", worlds={worlds})'
 
 
 def _warm(worlds: int, limit: float) -> xr.Dataset:
@@ -126,7 +143,7 @@ def _warm(worlds: int, limit: float) -> xr.Dataset:
         "import time, rps_jax\n"
         "for _ in range(3):\n"
         "    begun = time.perf_counter()\n"
-        f'    rps_jax.sweep("rps_tuned", "wide", worlds={worlds})\n'
+        f"    {_call(worlds)}\n"
         "    print(time.perf_counter() - begun)\n"
     )
     with tempfile.TemporaryDirectory() as folder:
@@ -134,12 +151,18 @@ def _warm(worlds: int, limit: float) -> xr.Dataset:
     return _row(first, last)
 
 
-def _output(words: Sequence[str], asked: str, folder: str, limit: float) -> str:
+def _output(
+    words: Sequence[str], asked: str, folder: str, limit: float, gpus: int | None = None
+) -> str:
     """What Python prints, with its cache in a folder; InputError if it fails or takes too long."""
+    kept = os.environ | {"RPS_CACHE": f"{folder}/cache"}
+    if gpus is not None:
+        kept["CUDA_VISIBLE_DEVICES"] = ",".join(map(str, range(gpus)))
+        kept.pop("JAX_PLATFORMS", None)
     try:
         ended = subprocess.run(
-            [sys.executable, *words], env=os.environ | {"RPS_CACHE": f"{folder}/cache"},
-            capture_output=True, text=True, timeout=limit, check=False,
+            [sys.executable, *words],
+            env=kept, capture_output=True, text=True, timeout=limit, check=False,
         )  # fmt: skip
     except subprocess.TimeoutExpired as error:
         raise InputError(f"commands = {asked} took more than {limit:g} s.") from error
@@ -163,6 +186,6 @@ def table(found: xr.Dataset) -> list[list[str]]:
         one = found.sel(command=command)
         cells = [f"{one[name].item():.1f} s" for name in ("empty", "again", "compile", "run")]
         told = f"{one.rate.item():,.0f}"
-        rows.append([f"`{command}`", *(cell.replace("nan s", "") for cell in (*cells, told))])
+        rows.append([command, *(cell.replace("nan s", "") for cell in (*cells, told))])
         rows[-1][-1] = rows[-1][-1].replace("nan", "")
     return rows
