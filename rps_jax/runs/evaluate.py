@@ -212,16 +212,6 @@ class Answer(NamedTuple):
     score: np.ndarray  # (P, D * W) [1]
 
 
-class _Group(NamedTuple):
-    """Worlds of an ask that can be batched: those of one object of one domain."""
-
-    ask: Ask  # whose parameters are on the host
-    part: Part  # the worlds, but with the parameters (P, ...) of all candidates
-    first: int  # number of the ask's first trial
-    width: int  # trials of each candidate
-    column: np.ndarray  # (n,) of the worlds among those
-
-
 def try_out(
     asks: Sequence[Ask],
     domains: Sequence[Domain],
@@ -238,7 +228,7 @@ def try_out(
     narrow = partial(np.asarray, dtype=jnp.zeros(()).dtype)
     longest = max(remembered_steps(one, setting.physics.control_period) for one in domains)
     away = np.empty(ends[-1])  # [m] of the target from the start
-    jobs: dict[Any, list[_Group]] = {}
+    jobs: dict[Any, list[Part]] = {}
     for ask, width, count, end in zip(asks, widths, counts, ends, strict=True):
         first = int(end) - count * width
         ask = ask._replace(params=jax.tree.map(narrow, jax.device_get(ask.params)))
@@ -248,12 +238,13 @@ def try_out(
             past = np.zeros((part.numbers.size, longest), part.worlds.odometry.past.dtype)
             odometry = part.worlds.odometry._replace(past=past)
             worlds = part.worlds._replace(odometry=odometry, params=ask.params)
-            part = part._replace(worlds=worlds)
-            leaves, tree = jax.tree.flatten(part.worlds)
+            leaves, tree = jax.tree.flatten(worlds)
             kind = (tree, *(leaf.shape[1:] for leaf in leaves))
-            jobs.setdefault(kind, []).append(_Group(ask, part, first, width, column))
-    jobs_ = [_job(groups) for groups in jobs.values()]
-    every, timing = batch.gathered(jobs_, setting, away.size, report=report, **shape)
+            numbers = first + width * np.arange(count)[:, None] + column
+            jobs.setdefault(kind, []).append(Part(numbers, worlds, part.stage))
+    every, timing = batch.gathered(
+        list(map(_job, jobs.values())), setting, away.size, report=report, **shape
+    )
     score = objective.scores(every, away, setting.rules)
     answers = []
     for width, count, end in zip(widths, counts, ends, strict=True):
@@ -275,15 +266,17 @@ def parts(
             yield part, d * ask.worlds.size + rows, np.linalg.norm(drawn.p_world_target, axis=1)
 
 
-def _job(groups: Sequence[_Group]) -> Job:
-    """The job of groups of one shape family, candidate after candidate."""
+def _job(every: Sequence[Part]) -> Job:
+    """The job of worlds (n, ...) of one shape family, candidate after candidate.
+
+    A part has the numbers (P, n) of the trials of all candidates, and their parameters (P, ...).
+    """
 
     def filled() -> Iterator[Part]:
-        for ask, part, first, width, column in groups:
-            for p in range(ask.candidates):
-                same = np.full(column.size, p)
-                worlds = part.worlds._replace(params=batch.rows(ask.params, same))
-                yield Part(first + p * width + column, worlds, part.stage)
+        for numbers, worlds, stage in every:
+            for p, own in enumerate(numbers):
+                params = batch.rows(worlds.params, np.full(own.size, p))
+                yield Part(own, worlds._replace(params=params), stage)
 
-    trials = sum(group.ask.candidates * group.column.size for group in groups)
-    return Job(registry.law_of(groups[0].ask.params), trials, filled())
+    trials = sum(part.numbers.size for part in every)
+    return Job(registry.law_of(every[0].worlds.params), trials, filled())
