@@ -97,9 +97,11 @@ class View(PushQuestion):
         return Case(**own)
 
     def note(self) -> str:
+        """Whether another engine than the run's is shown."""
         return "" if self.run is None else another_engine(Path(self.run))
 
     def check(self) -> None:
+        """Check the push, or the world."""
         super().check()
         engines.get(self.setting.engine).check_traced()
         if self.run is not None:
