@@ -346,16 +346,6 @@ RECIPES: dict[str, Recipe] = {
         None,
         rows.speeds,
     ),
-    "speed_peers": Recipe(
-        (
-            "rps sweeps/speed --names 'fused standard' 'mjx standard' 'C in closed loop' "
-            "'C, mj_step alone' 'C, one trial at a time' --worlds 32768 --mujocos 32768 "
-            "--families box cylinder --at-once 16 --refill 0",
-        ),
-        None,
-        6,
-        rows.speeds,
-    ),
     "commands": Recipe((f"rps sweeps/speed/commands.py {_MACHINE}",), 14, None),
     "commands_gpu": Recipe(
         (
@@ -392,7 +382,6 @@ RECIPES: dict[str, Recipe] = {
 
 # What is history, and is not made anew.
 HISTORY = {
-    "gpu_sweeps": "wall clocks before and after changes; commands_gpu is what is so today",
     "tuning_runs": "the runs of 0.1.0 and 0.2.0 that made the tuned law",
     "learned": "the runs of 0.2.0 that made the learned laws; `rps sweeps/learned` reads such runs",
 }

@@ -358,6 +358,11 @@ def _yaw(poses: np.ndarray) -> np.ndarray:
 # --- what is shown -------------------------------------------------------------------------
 
 
+def _times(ratio: float) -> str:
+    """How many times as fast, in three digits, or in whole numbers."""
+    return "" if np.isnan(ratio) else f"{ratio:,.0f}" if ratio >= 100 else f"{ratio:.3g}"
+
+
 def table(found: xr.Dataset) -> list[list[str]]:
     """A row for each engine and number of worlds, the slowest first and failures last."""
     rows = [found.isel(row=i) for i in range(found.sizes["row"])]
@@ -373,7 +378,7 @@ def table(found: xr.Dataset) -> list[list[str]]:
             str(r.version.item()),
             f"{int(r.worlds):,}",
             cell(r.rate, "{:,.0f}"),
-            cell(fused.get(int(r.worlds), most) / r.rate, "{:.3g}"),
+            _times(fused.get(int(r.worlds), most) / float(r.rate)),
             cell(r.error, "{:.2g} mm", 1000),
             cell(r.largest, "{:.2g} mm", 1000),
             cell(r.turned, "{:.2g}°", 180 / np.pi),
