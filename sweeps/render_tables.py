@@ -82,7 +82,12 @@ def table(data: dict[str, Any], root: Path = SWEEPS) -> str:
         lines.append(texts)
         before = row
     lines.insert(1, ["---"] * len(data["columns"]))
-    return "".join(f"| {' | '.join(texts)} |\n" for texts in lines)
+    return "".join(f"| {' | '.join(map(_escaped, texts))} |\n" for texts in lines)
+
+
+def _escaped(text: str) -> str:
+    """A cell whose bars, as of |l|, do not end it."""
+    return re.sub(r"(?<!\\)\|", r"\|", text)
 
 
 def _text(cell: Any, column: dict[str, Any], root: Path) -> str:

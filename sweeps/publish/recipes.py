@@ -262,18 +262,6 @@ RECIPES: dict[str, Recipe] = {
         _WIDE[::-1],
         ("", "success", "against P1, P2 outside the Realignment State", "p (Holm)"),
     ),
-    "mends_together": Recipe(
-        (
-            "rps sweeps/mends --domain hostile --worlds 1500 --seed 82 --laws 'the tuned law' "
-            "'P1 while realigning to 0.25 m' 'that, and P3 back and aside' "
-            "'that, and approach at 0.03 m/s'",
-        ),
-        None,
-        2,
-        "Against*",
-        (),
-        ("", "success", "against P1, P2 outside the Realignment State", "p (Holm)"),
-    ),
     "rivals_tuned": Recipe(
         (
             *_each(

@@ -31,10 +31,10 @@ from rps_jax.analysis.report import Section
 from rps_jax.app.cli import flags, names
 from rps_jax.errors import InputError
 from rps_jax.record import provenance
-from rps_jax.runs.question import Question, Run, call_of
+from rps_jax.runs.question import Run, call_of
 from sweeps.publish.recipes import HISTORY, RECIPES, Recipe
 from sweeps.publish.rows import Rows
-from sweeps.shared import digest
+from sweeps.shared import Study, digest
 from sweeps.shared import publish as write
 
 _SWEEPS = Path(__file__).parents[1]
@@ -42,10 +42,11 @@ CURRENT = "of today's code"
 
 
 @dataclass(frozen=True)
-class Publish(Question[xr.Dataset]):
+class Publish(Study[xr.Dataset]):
     """Say of every published number whether it is of today's code, and make anew what is asked."""
 
     TITLE: ClassVar[str] = "Published numbers, and what they hang on"
+    GROWS: ClassVar[tuple[str, ...]] = ("only", "needs", "machine", "check_digests")
 
     only: tuple[str, ...] = ()
     """Data files to be made anew, as fit_coverage or fit_*; by default none."""
