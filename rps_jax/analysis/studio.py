@@ -31,10 +31,13 @@ if TYPE_CHECKING:
 _TRAIL_STEP = 0.02  # [m] between the points of a trail
 _TRAIL_POINTS = 1500  # at most, so that memory stays flat: 30 m; the oldest go first
 _TRAIL_WIDTH = 0.007  # [1] of the image's height
+_AROUND = 8  # [px] beside what is drawn anew: twice the width of a trail in a usual film
 BASE_RGBA = (0.08, 0.09, 0.11, 1.0)
 CONTACT_RGBA = (0.62, 0.04, 0.46, 1.0)
 CONTACT_HEIGHT = 0.36  # [m] just above the chassis, which would hide the marker from above
 CONTACT_RADIUS = 0.04  # [m]
+_MARKER_BOX = (CONTACT_RADIUS, CONTACT_RADIUS, CONTACT_HEIGHT / 2 + CONTACT_RADIUS)  # [m]
+_CORNERS = np.array(list(itertools.product((-1, 1), repeat=3)))  # of a cube
 NO_CONTACT = np.full(2, np.nan)
 _SHADOWS_FROM = 240  # [px] height of an image: they take most of the time without a GPU
 
@@ -90,9 +93,18 @@ class Studio:
         self.camera = camera
         self.base_trail = _Trail(BASE_RGBA, 0.006)
         self.contact_trail = _Trail(CONTACT_RGBA, 0.010)
+        self._size = np.array([renderer.width, renderer.height])
+        self._image = np.zeros((renderer.height, renderer.width, 3), np.uint8)
+        self._eye, self._box = np.zeros(0), np.zeros((2, 2), int)  # of the last image
+        self._moving = np.flatnonzero(scene.model.body_dofnum[scene.model.geom_bodyid])
+        middle, half = np.split(scene.model.geom_aabb[self._moving], 2, axis=1)
+        self._corners = middle + _CORNERS[:, None] * half  # (8, geoms, 3) [m]
 
     def draw(self, qpos: ArrayLike, p_world_contact: ArrayLike) -> np.ndarray:
-        """One image (height, width, 3) uint8, and a step further along the trails."""
+        """One image (height, width, 3) uint8, and a step further along the trails.
+
+        As long as the camera stands, only the part in which something moves is drawn anew.
+        """
         qpos = _checked("qpos", qpos, self.model.nq)
         contact = np.array(p_world_contact, float)  # a copy: the trail keeps it
         self.data.qpos[:] = qpos
@@ -108,7 +120,63 @@ class Studio:
                 self._add_line(a, b, trail)
         if not np.isnan(contact).any():
             self._add_marker(contact)
-        return self.renderer.render()
+        one = self.mujoco.mjv_averageCamera(*view.camera)
+        before, self._eye = self._eye, np.concatenate([one.pos, one.forward, one.up])
+        boxes = [self._box, self._box_of_what_moves(one, contact)]
+        self._box = boxes[1]
+        if not np.array_equal(before, self._eye):
+            boxes.append(np.array([[0, 0], self._size]))
+        self._draw_part(one, np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1])
+        return self._image.copy()
+
+    def _box_of_what_moves(self, eye: Any, p_world_contact: np.ndarray) -> np.ndarray:
+        """Lowest and highest pixel (2, 2), from left and below, of bodies, marker and shadows."""
+        data, model = self.data, self.model
+        rotation = data.geom_xmat[self._moving].reshape(-1, 3, 3)
+        points = np.einsum("gij,cgj->cgi", rotation, self._corners) + data.geom_xpos[self._moving]
+        points = points.reshape(-1, 3)
+        if not np.isnan(p_world_contact).any():  # the marker, and the trail below it
+            marker = [*p_world_contact, CONTACT_HEIGHT / 2] + _CORNERS * _MARKER_BOX
+            points = np.concatenate([points, marker])
+        for sun, way, kind in zip(data.light_xpos, data.light_xdir, model.light_type, strict=True):
+            far = kind == self.mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+            ray = np.broadcast_to(way, points.shape) if far else points - sun
+            shadow = points - ray * (points[:, 2:] / ray[:, 2:])  # where it meets the ground
+            points = np.concatenate([points, shadow])
+        away = points - eye.pos
+        depth = away @ eye.forward / eye.frustum_near
+        if eye.orthographic:
+            depth = np.ones_like(depth)
+        if (depth < 1).any():  # beside the camera
+            return np.array([[0, 0], self._size])
+        flat = np.stack([away @ np.cross(eye.forward, eye.up), away @ eye.up], axis=-1)
+        pixels = self._size / 2 + flat / depth[:, None] / self._pixel(eye)
+        margin = 3 + _TRAIL_WIDTH * self._size[1]
+        box = [pixels.min(axis=0) - margin, pixels.max(axis=0) + margin]
+        return np.clip(box, 0, self._size).astype(int)
+
+    def _pixel(self, eye: Any) -> float:
+        """Size of a pixel where the field of view begins [m]."""
+        return 2 * eye.frustum_top / self._size[1]
+
+    def _draw_part(self, eye: Any, low: np.ndarray, high: np.ndarray) -> None:
+        """Draw the pixels from `low` to `high`, with some around, at which lines are cut off."""
+        if (low >= high).any():
+            return
+        first, last = np.clip([low - _AROUND, high + _AROUND], 0, self._size)
+        left, bottom, right, top = self._pixel(eye) * np.ravel([first, last] - self._size / 2)
+        mujoco, renderer = self.mujoco, self.renderer
+        for one in renderer.scene.camera:
+            one.frustum_bottom, one.frustum_top = bottom, top
+            one.frustum_center, one.frustum_width = (left + right) / 2, (right - left) / 2
+        part = mujoco.MjrRect(0, 0, *(last - first))
+        drawn = np.empty((part.height, part.width, 3), np.uint8)
+        renderer._gl_context.make_current()
+        mujoco.mjr_render(part, renderer.scene, renderer._mjr_context)
+        mujoco.mjr_readPixels(drawn, None, part, renderer._mjr_context)
+        (x, y), (end_x, end_y) = low, high
+        drawn = drawn[y - first[1] : end_y - first[1], x - first[0] : end_x - first[0]]
+        self._image[::-1][y:end_y, x:end_x] = drawn  # OpenGL's rows go up
 
     def _add_line(self, a: np.ndarray, b: np.ndarray, trail: _Trail) -> None:
         """A line on the ground from `a` to `b`: quicker to draw than any solid."""
