@@ -71,7 +71,7 @@ def write_text(path: Path, text: str) -> Path:
     return write_bytes(path, text.encode(errors="surrogateescape"))
 
 
-def write_bytes(path: Path, content: bytes, *, checked: bool = False) -> Path:
+def write_bytes(path: Path, content: bytes | memoryview, *, checked: bool = False) -> Path:
     """A file of this content, whole or not at all; if `checked`, with its checksum."""
     atomic(path, lambda partial: partial.write_bytes(content))
     if checked:
@@ -98,7 +98,7 @@ def write_json(path: Path, content: Any, *, checked: bool = False) -> Path:
 
 def write_results(path: Path, results: xr.Dataset) -> Path:
     """A NetCDF 4 file of labelled results, with its checksum."""
-    return write_bytes(path, encoded(results), checked=True)
+    return write_bytes(path, _netcdf(results), checked=True)
 
 
 def checksum(path: Path) -> Path:
@@ -106,7 +106,7 @@ def checksum(path: Path) -> Path:
     return path.with_name(f"{path.name}.sha256")
 
 
-def digest(content: bytes) -> str:
+def digest(content: bytes | memoryview) -> str:
     """SHA-256 in hexadecimal."""
     return hashlib.sha256(content).hexdigest()
 
@@ -117,8 +117,12 @@ def encoded(results: xr.Dataset) -> bytes:
     It is made in memory, since HDF5 crashes the process when its disk is full. An attribute holds
     the digest of its structure, by which `decoded` knows what somebody has edited.
     """
+    return bytes(_netcdf(results))
+
+
+def _netcdf(results: xr.Dataset) -> memoryview:
     signed = results.assign_attrs({_STRUCTURE: _structure(results)})
-    return bytes(signed.to_netcdf(engine="h5netcdf"))
+    return signed.to_netcdf(engine="h5netcdf")
 
 
 def _structure(results: xr.Dataset) -> str:

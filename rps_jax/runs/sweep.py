@@ -316,13 +316,14 @@ def whole(plan: Plan, out: Path | None, *, report: Report = unheard, **shape: An
     for number in plan.parts:
         every.setdefault(plan.kind(number), []).append(number)
     work(plan, every, contents.__setitem__, report=report, **shape)
-    return labelled(results.dataset(plan, contents))
+    return labelled(results.dataset(plan, contents.items()))
 
 
 def own_trials(folder: Path, plan: Plan, shard: Shard) -> xr.Dataset:
     """Outcomes (row) of a shard's own trials, with the law and the world of each."""
-    own, kept = share(plan, shard), Parts(folder).contents()
-    found = results.dataset(plan, {number: kept[results.name_of(number)] for number in own})
+    own = share(plan, shard)
+    kept = Parts(folder).each([results.name_of(number) for number in own])
+    found = results.dataset(plan, ((int(name), content) for name, content in kept))
     law, world = np.divmod(np.concatenate(list(own.values())), plan.worlds)
     at = {"law": xr.DataArray(law, dims="row"), "world": xr.DataArray(world, dims="row")}
     return found[list(results.UNITS)].isel(at)
