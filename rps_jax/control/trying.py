@@ -61,7 +61,7 @@ _MENDS: tuple[tuple[type[Exception], str], ...] = (
 
 def observation_of(senses: str) -> Any:
     """What a law observes that senses this, as shapes and types alone."""
-    dtype = jnp.zeros(()).dtype
+    dtype = jnp.result_type(float)
 
     def number(*shape: int) -> Any:
         return jax.ShapeDtypeStruct(shape, dtype)

@@ -369,13 +369,18 @@ def solids_of(scenes: Sequence[Scene]) -> Solid:
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *every)
 
 
+@jax.jit
+def _reach(outline: Footprint, yaw: float) -> jax.Array:
+    placed = fp.place(outline, jnp.zeros(2), jnp.asarray(yaw, float))
+    return fp.extent(placed, jnp.array([-1.0, 0.0]))
+
+
 def initial_qpos(scene: Scene, gap: float = 0.02, yaw: float = 0.0) -> np.ndarray:
     """Base at the origin, object `gap` [m] in front of the middle of its front face: (10,).
 
     `yaw` [rad] turns the object.
     """
-    placed = fp.place(scene.footprint, jnp.zeros(2), jnp.asarray(yaw, float))
-    reach = float(fp.extent(placed, jnp.array([-1.0, 0.0])))
+    reach = float(_reach(scene.footprint, yaw))
     qpos = scene.physics.qpos0.copy()
     qpos[JOINTS.base] = 0.0
     height = qpos[JOINTS.object][2]
