@@ -18,7 +18,6 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import descent, gradients
 from rps_jax.tuning.descent import TuneGrad
-from rps_jax.tuning.run import read_log
 
 SETTING = Setting("quasistatic", rules=Rules(horizon=20.0, max_lost=10.0))
 OBJECTIVE = Objective(time=0.3, lost=0.1, miss=0.5)
@@ -139,7 +138,7 @@ class TestRuns:
     @pytest.mark.slow
     def test_the_command_line_and_a_run_of_another_kind(self, tmp_path, capsys):
         assert cli.main(self.arguments(tmp_path, 2)) == 0
-        log = read_log(tmp_path)
+        log = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
         assert len(log) == 3
         for line in log[:2]:
             assert line["finite"] == 1.0

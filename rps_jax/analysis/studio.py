@@ -171,23 +171,17 @@ class Studio:
     def _add_line(self, a: np.ndarray, b: np.ndarray, trail: _Trail) -> None:
         """A line on the ground from `a` to `b`: quicker to draw than any solid."""
         geom = self._new_geom("mjGEOM_LINE", np.zeros(3), np.zeros(3), trail.rgba)
-        if geom is not None:
-            width = _TRAIL_WIDTH * self.renderer.height
-            ends = ([*point, trail.height] for point in (a, b))
-            self.mujoco.mjv_connector(geom, geom.type, width, *ends)
+        ends = ([*point, trail.height] for point in (a, b))
+        self.mujoco.mjv_connector(geom, geom.type, _TRAIL_WIDTH * self.renderer.height, *ends)
 
     def _add_marker(self, point: np.ndarray) -> None:
-        position = np.array([*point, CONTACT_HEIGHT])
-        size = np.full(3, CONTACT_RADIUS)
+        position, size = np.array([*point, CONTACT_HEIGHT]), np.full(3, CONTACT_RADIUS)
         geom = self._new_geom("mjGEOM_SPHERE", size, position, CONTACT_RGBA)
-        if geom is not None:
-            geom.emission = 1.0  # seen in the shadow of the object too
+        geom.emission = 1.0  # seen in the shadow of the object too
 
     def _new_geom(self, kind: str, size: np.ndarray, position: np.ndarray, rgba: Any) -> Any:
-        """Another geom of this frame; None if there is no room for it."""
+        """Another geom of this frame, which has room for 10,000."""
         view = self.renderer.scene
-        if view.ngeom == view.maxgeom:
-            return None
         geom = view.geoms[view.ngeom]
         kind = getattr(self.mujoco.mjtGeom, kind)
         colour = np.array(rgba, np.float32)

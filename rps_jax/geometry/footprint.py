@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -24,11 +23,10 @@ class Footprint(NamedTuple):
     radius: Float[Array, "*B"]  # [m]
 
 
-@jax.jit
-def rectangle(half_x: Scalar, half_y: Scalar) -> Footprint:
+def rectangle(half_x: float, half_y: float) -> Footprint:
     """Rectangle of sides 2 half_x by 2 half_y [m] about the origin."""
-    signs = jnp.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
-    return Footprint(signs * jnp.stack([jnp.asarray(half_x), jnp.asarray(half_y)]), jnp.zeros(()))
+    signs = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+    return Footprint(jnp.asarray(signs * [half_x, half_y], float), jnp.zeros(()))
 
 
 def circle(radius: Scalar) -> Footprint:

@@ -35,20 +35,18 @@ class Parts:
         """The files of all parts, in the order of their names."""
         return {name: path for name, path, _ in self._sound()}
 
-    def contents(self) -> dict[str, bytes]:
-        """The contents of all parts, in the order of their names."""
-        return {name: content for name, _, content in self._sound()}
-
-    def each(self, names: Container[str]) -> Iterator[tuple[str, bytes]]:
-        """The contents of the parts of these names, in their order, read one by one."""
+    def each(self, names: Container[str] | None = None) -> Iterator[tuple[str, bytes]]:
+        """Names and contents of all parts, or of these, in the order of their names."""
         for name, _, content in self._sound(names):
             yield name, content
 
     def get(self, name: str) -> bytes | None:
         """The content of one part, if it is finished."""
-        return next((content for _, _, content in self._sound((name,))), None)
+        return next((content for _, content in self.each((name,))), None)
 
-    def put(self, name: str, content: bytes, suffix: str = ".nc", *, new: bool = False) -> Path:
+    def put(
+        self, name: str, content: bytes | memoryview, suffix: str = ".nc", *, new: bool = False
+    ) -> Path:
         """Write the file of a part, whole or not at all, and then remove what it had before.
 
         A process that is killed in between leaves both, of which the newer counts. Nothing is

@@ -98,7 +98,7 @@ def write_json(path: Path, content: Any, *, checked: bool = False) -> Path:
 
 def write_results(path: Path, results: xr.Dataset) -> Path:
     """A NetCDF 4 file of labelled results, with its checksum."""
-    return write_bytes(path, _netcdf(results), checked=True)
+    return write_bytes(path, encoded(results), checked=True)
 
 
 def checksum(path: Path) -> Path:
@@ -111,16 +111,12 @@ def digest(content: bytes | memoryview) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def encoded(results: xr.Dataset) -> bytes:
+def encoded(results: xr.Dataset) -> memoryview:
     """NetCDF 4, which depends on the results alone, not on when or where it is made.
 
     It is made in memory, since HDF5 crashes the process when its disk is full. An attribute holds
     the digest of its structure, by which `decoded` knows what somebody has edited.
     """
-    return bytes(_netcdf(results))
-
-
-def _netcdf(results: xr.Dataset) -> memoryview:
     signed = results.assign_attrs({_STRUCTURE: _structure(results)})
     return signed.to_netcdf(engine="h5netcdf")
 

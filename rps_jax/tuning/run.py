@@ -300,16 +300,6 @@ def finite(value: Any) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def read_log(folder: Path) -> list[dict[str, Any]]:
-    """The lines of a run's log, one for each generation."""
-    path = folder / "log.jsonl"
-    content = files.content_of(path, "json")
-    try:
-        return [files.parsed(line) for line in content.splitlines()]
-    except ValueError as error:
-        raise files.corrupt(path, error) from error
-
-
 def _write(folder: Path, tuner: Tuner, log: Sequence[dict[str, Any]]) -> None:
     files.write_json(folder / TUNED, tuner.space.named(tuner.best))
     files.write_text(folder / "log.jsonl", "".join(json.dumps(line) + "\n" for line in log))

@@ -16,7 +16,6 @@ import mujoco
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import Solid
@@ -369,18 +368,13 @@ def solids_of(scenes: Sequence[Scene]) -> Solid:
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *every)
 
 
-@jax.jit
-def _reach(outline: Footprint, yaw: float) -> jax.Array:
-    placed = fp.place(outline, jnp.zeros(2), jnp.asarray(yaw, float))
-    return fp.extent(placed, jnp.array([-1.0, 0.0]))
-
-
 def initial_qpos(scene: Scene, gap: float = 0.02, yaw: float = 0.0) -> np.ndarray:
     """Base at the origin, object `gap` [m] in front of the middle of its front face: (10,).
 
     `yaw` [rad] turns the object.
     """
-    reach = float(_reach(scene.footprint, yaw))
+    x, y = np.asarray(scene.footprint.vertices).T
+    reach = np.max(math.sin(yaw) * y - math.cos(yaw) * x) + float(scene.footprint.radius)
     qpos = scene.physics.qpos0.copy()
     qpos[JOINTS.base] = 0.0
     height = qpos[JOINTS.object][2]
