@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -23,10 +24,11 @@ class Footprint(NamedTuple):
     radius: Float[Array, "*B"]  # [m]
 
 
-def rectangle(half_x: float, half_y: float) -> Footprint:
+@jax.jit
+def rectangle(half_x: Scalar, half_y: Scalar) -> Footprint:
     """Rectangle of sides 2 half_x by 2 half_y [m] about the origin."""
-    signs = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
-    return Footprint(jnp.asarray(signs * [half_x, half_y], float), jnp.zeros(()))
+    signs = jnp.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+    return Footprint(signs * jnp.stack([jnp.asarray(half_x), jnp.asarray(half_y)]), jnp.zeros(()))
 
 
 def circle(radius: Scalar) -> Footprint:
