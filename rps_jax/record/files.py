@@ -160,7 +160,7 @@ def _check_regular(path: Path, mode: int) -> None:
         raise InputError(f"{path} cannot be read (it is {what}): give a regular file.")
 
 
-def decoded(content: bytes, source: Any, *, own: bool = False) -> xr.Dataset:
+def decoded(content: bytes | memoryview, source: Any, *, own: bool = False) -> xr.Dataset:
     """The labelled results that `encoded` made into bytes; InputError names the `source`.
 
     If they are `own`, only `encoded` can have made them, and so signed their structure.

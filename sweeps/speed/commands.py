@@ -14,6 +14,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,15 +34,18 @@ from sweeps import shared
 from sweeps.shared import Study
 
 _TOLD = re.compile(r"compile ([\d.]+) s, run ([\d.]+) s \((\d+) simulated s per s\)")
-_COLUMNS = ("command", "empty cache", "once more", "of it compile", "run", "simulated s/s")
+_COLUMNS = (
+    *("command", "empty cache", "once more", "of it compile", "run", "simulated s/s"),
+    *("memory, empty cache", "memory, once more"),
+)
 
 
 @dataclass(frozen=True)
 class Commands(Study[xr.Dataset]):
     """Time whole commands, with an empty cache and once more.
 
-    The answer holds seconds from return to the end of the process, and what the second told of
-    itself, for each command.
+    The answer holds seconds from return to the end of the process, the most memory that it held,
+    and what the second told of itself, for each command.
     """
 
     TITLE: ClassVar[str] = "How long a user waits for a whole command"
@@ -50,8 +54,11 @@ class Commands(Study[xr.Dataset]):
     commands: tuple[str, ...] = (
         "push --object box --target -2 0 --no-video",
         "push --object box --target -2 0",
+        "push --object box --target -2 0 --engine fused",
         "sweep --laws rps_tuned --domain wide --worlds 100",
         "sweep --laws rps_tuned --domain wide --worlds 1000",
+        "table --engine fused",
+        "sweep --laws rps --domain wide --worlds 1048576 --horizon 0.02 --slots 2048",
     )
     """What is asked of `rps`."""
     limit: float = option(1800.0, 1, 86400)
@@ -93,33 +100,38 @@ commands = call_of(Commands)
 
 
 def timed(command: str, limit: float) -> xr.Dataset:
-    """Seconds of a command with an empty cache and once more, and what the second told.
+    """Seconds and memory [GB] of a command with an empty cache and once more, and what it told.
 
     Raises:
       InputError: it failed, or took longer than the limit [s].
     """
-    seconds, output = [], ""
+    seconds, memory, output = [], [], ""
     with tempfile.TemporaryDirectory() as folder:
         kept = os.environ | {"RPS_CACHE": f"{folder}/cache"}
         for number in range(2):
             words = [sys.executable, "-m", "rps_jax", *shlex.split(command)]
+            words += ["--out", f"{folder}/run_{number}"]
+            said, wrong = Path(folder, "said"), Path(folder, "wrong")
             begun = time.perf_counter()
-            try:
-                ended = subprocess.run(
-                    [*words, "--out", f"{folder}/run_{number}"],
-                    env=kept, capture_output=True, text=True, timeout=limit, check=False,
-                )  # fmt: skip
-            except subprocess.TimeoutExpired as error:
-                raise InputError(f"commands = {command} took more than {limit:g} s.") from error
+            with open(said, "w") as out, open(wrong, "w") as errors:
+                process = subprocess.Popen(words, env=kept, stdout=out, stderr=errors)
+                stop = threading.Timer(limit, process.kill)
+                stop.start()
+                _, process.returncode, used = os.wait4(process.pid, 0)
             seconds.append(time.perf_counter() - begun)
-            if ended.returncode:
-                last = ended.stderr.strip().splitlines()[-1:]
+            if not stop.is_alive():
+                raise InputError(f"commands = {command} took more than {limit:g} s.")
+            stop.cancel()
+            memory.append(used.ru_maxrss * 1024 / 1e9)  # Linux tells of KiB
+            if process.returncode:
+                last = wrong.read_text().strip().splitlines()[-1:]
                 raise InputError(f"commands = {command} failed: {' '.join(last)}")
-            output = ended.stdout
+            output = said.read_text()
     told = _TOLD.search(output)
     compile_, run, rate = map(float, told.groups()) if told else (float("nan"),) * 3
     values = {"empty": seconds[0], "again": seconds[1], "compile": compile_, "run": run}
-    return xr.Dataset({name: ((), value) for name, value in (values | {"rate": rate}).items()})
+    values |= {"rate": rate, "memory_empty": memory[0], "memory_again": memory[1]}
+    return xr.Dataset({name: ((), value) for name, value in values.items()})
 
 
 def table(found: xr.Dataset) -> list[list[str]]:
@@ -129,6 +141,7 @@ def table(found: xr.Dataset) -> list[list[str]]:
         one = found.sel(command=command)
         cells = [f"{one[name].item():.1f} s" for name in ("empty", "again", "compile", "run")]
         told = f"{one.rate.item():,.0f}"
-        rows.append([f"`rps {command}`", *(cell.replace("nan s", "") for cell in (*cells, told))])
-        rows[-1][-1] = rows[-1][-1].replace("nan", "")
+        held = [f"{one[f'memory_{name}'].item():.1f} GB" for name in ("empty", "again")]
+        shown = [cell.removeprefix("nan").removeprefix(" s") for cell in (*cells, told)]
+        rows.append([f"`rps {command}`", *shown, *held])
     return rows
