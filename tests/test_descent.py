@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import read_log
 
 from rps_jax.app import cli
 from rps_jax.control.laws.rps import RPSParams
@@ -139,7 +138,7 @@ class TestRuns:
     @pytest.mark.slow
     def test_the_command_line_and_a_run_of_another_kind(self, tmp_path, capsys):
         assert cli.main(self.arguments(tmp_path, 2)) == 0
-        log = read_log(tmp_path)
+        log = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
         assert len(log) == 3
         for line in log[:2]:
             assert line["finite"] == 1.0

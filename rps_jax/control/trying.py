@@ -47,7 +47,7 @@ _MENDS: dict[type[Exception], str] = {
 
 def observation_of(senses: str) -> Any:
     """What a law observes that senses this, as shapes and types alone."""
-    dtype = jnp.zeros(()).dtype
+    dtype = jnp.result_type(float)
 
     def number(*shape: int) -> Any:
         return jax.ShapeDtypeStruct(shape, dtype)

@@ -6,6 +6,7 @@ its vertices: one formula serves all, batches over sizes, and has finite derivat
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -21,6 +22,7 @@ class Footprint(NamedTuple):
     radius: Float[Array, "*B"]  # [m]
 
 
+@jax.jit
 def rectangle(half_x: Scalar, half_y: Scalar) -> Footprint:
     """Rectangle of sides 2 half_x by 2 half_y [m] about the origin."""
     signs = jnp.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])

@@ -73,7 +73,7 @@ def _work(
     tell, before = board.tell.remote, Progress(0, 0.0)
 
     def keep(number: int, part: xr.Dataset) -> None:
-        ask("deliver", number, plan.parts[number].size, files.encoded(part))
+        ask("deliver", number, plan.parts[number].size, bytes(files.encoded(part)))
 
     def report(progress: Progress) -> None:
         nonlocal before

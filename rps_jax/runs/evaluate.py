@@ -225,7 +225,7 @@ def try_out(
     widths = [len(domains) * ask.worlds.size for ask in asks]
     counts = [ask.candidates for ask in asks]
     ends = np.cumsum(np.multiply(widths, counts))
-    narrow = partial(np.asarray, dtype=jnp.zeros(()).dtype)
+    narrow = partial(np.asarray, dtype=jnp.result_type(float))
     longest = max(remembered_steps(one, setting.physics.control_period) for one in domains)
     away = np.empty(ends[-1])  # [m] of the target from the start
     jobs: dict[Any, list[Part]] = {}

@@ -90,11 +90,14 @@ class Trace:
         Raises:
           VideoError: this machine cannot draw.
         """
-        from rps_jax.analysis import figures, video
+        from rps_jax.analysis import figures, studio, video
 
-        seen, target = self.followed.snapshots, np.array(self.followed.p_world_target)
+        seen = self.followed.snapshots
         shown = _evenly(len(seen.time), count)
-        images = [video.snapshot(self.scene, seen.qpos[i], p_world_target=target) for i in shown]
+        tiles = [studio.Tile(self.scene, self.followed.p_world_target)] * len(shown)
+        with studio.open_studios(tiles, video.SIZE, "oblique") as each:
+            drawn = zip(each, seen.qpos[shown], strict=True)
+            images = [one.draw(qpos, studio.NO_CONTACT) for one, qpos in drawn]
         return figures.stills(images, [f"{seen.time[i]:.0f} s" for i in shown])
 
     def film(

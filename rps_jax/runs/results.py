@@ -1,7 +1,7 @@
 """Outcomes on their way into the parts of a sweep, and the parts into one labelled Dataset."""
 
 import importlib.util
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,26 +69,33 @@ class Collector:
 
 
 def gather(
-    plan: Plan, folders: Sequence[Path], out: Path, made: Mapping[int, xr.Dataset] = {}
+    plan: Plan, folders: Sequence[Path], out: Path, made: dict[int, xr.Dataset] | None = None
 ) -> xr.Dataset:
     """All parts of a plan as one Dataset, and as `results.nc` in `out`; InputError if some lack.
 
-    What was `made` in this process is not decoded again.
+    What was `made` in this process is not read again; it is taken out, to spare memory.
     """
-    kept = {name: part for one in folders for name, part in Parts(one).contents().items()}
-    contents: dict[int, Any] = {n: kept[name_of(n)] for n in plan.parts if name_of(n) in kept}
-    contents |= made
-    if missing := len(plan.parts) - len(contents):
+    made = made or {}
+    lacking = {name_of(n): n for n in plan.parts if n not in made}
+
+    def contents() -> Iterator[tuple[int, bytes | xr.Dataset]]:
+        for number in list(made):
+            yield number, made.pop(number)
+        for folder in folders:
+            for name, content in Parts(folder).each(lacking):
+                yield lacking.pop(name), content
+
+    results = dataset(plan, contents())
+    if lacking:
         raise InputError(
-            f"run = {', '.join(map(str, folders))} lacks {missing} of {len(plan.parts)} parts: run "
-            "the same command again, or give the folders of all shards."
+            f"run = {', '.join(map(str, folders))} lacks {len(lacking)} of {len(plan.parts)} parts:"
+            " run the same command again, or give the folders of all shards."
         )
-    results = dataset(plan, contents)
     files.write_results(out / "results.nc", results)
     return results
 
 
-def dataset(plan: Plan, contents: Mapping[int, bytes | xr.Dataset]) -> xr.Dataset:
+def dataset(plan: Plan, contents: Iterable[tuple[int, bytes | xr.Dataset]]) -> xr.Dataset:
     """All results of a plan, from its parts or their files: (law, world), and (world) drawn."""
     every = np.arange(plan.worlds)
     which = {"units": "1", "long_name": "index of the object in the coordinate object"}
@@ -98,7 +105,7 @@ def dataset(plan: Plan, contents: Mapping[int, bytes | xr.Dataset]) -> xr.Datase
         shape = (len(plan.laws), plan.worlds, 3)[: 3 if name.endswith("pose") else 2]
         values = np.zeros(shape, _TYPES.get(name, np.float32))
         columns[name] = variable(name, ("law", "world"), values)
-    for number, content in contents.items():
+    for number, content in contents:
         law, _ = plan.law_and_object(number)
         part = content
         if not isinstance(part, xr.Dataset):

@@ -299,13 +299,14 @@ def whole(plan: Plan, out: Path | None, *, report: Report = unheard, **shape: An
     for number in plan.parts:
         every.setdefault(plan.kind(number), []).append(number)
     work(plan, every, contents.__setitem__, report=report, **shape)
-    return labelled(results.dataset(plan, contents))
+    return labelled(results.dataset(plan, contents.items()))
 
 
 def own_trials(folder: Path, plan: Plan, shard: Shard) -> xr.Dataset:
     """Outcomes (row) of a shard's own trials, with the law and the world of each."""
-    own, kept = share(plan, shard), Parts(folder).contents()
-    found = results.dataset(plan, {number: kept[results.name_of(number)] for number in own})
+    own = share(plan, shard)
+    kept = Parts(folder).each([results.name_of(number) for number in own])
+    found = results.dataset(plan, ((int(name), content) for name, content in kept))
     law, world = np.divmod(np.concatenate(list(own.values())), plan.worlds)
     at = {"law": xr.DataArray(law, dims="row"), "world": xr.DataArray(world, dims="row")}
     return found[list(results.UNITS)].isel(at)
@@ -413,6 +414,6 @@ def _ahead(parts: Iterator[Part], count: int) -> Iterator[Part]:
             yield part
 
 
-def store(folder: Path, part: int, content: bytes) -> Path:
+def store(folder: Path, part: int, content: bytes | memoryview) -> Path:
     """Write the file of a part into a run folder, whole or not at all."""
     return Parts(folder).put(results.name_of(part), content, new=True)

@@ -197,7 +197,7 @@ class Ceiling(InDomain[xr.Dataset]):
 
         There are as many slots as `most` worlds have use for, so that every round has one program.
         """
-        flat = offsets.reshape(-1, *offsets.shape[2:]).astype(jnp.zeros(()).dtype)
+        flat = offsets.reshape(-1, *offsets.shape[2:]).astype(jnp.result_type(float))
         guided = registry.law_of(GuidedParams())
         which = self.plan.domain.object_of(numbers)
         of_objects = [np.flatnonzero(which == one) for one in np.unique(which)]

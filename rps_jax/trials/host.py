@@ -48,11 +48,12 @@ def run(
         before, passes, dtype = 0, 0, trials.qpos.dtype
         while not told_of.all():
             told, twist, seen = _decide(worlds, trials, loop)
+            now = np.asarray(told.qpos)
             watch(passes, seen)
             going = np.flatnonzero(~np.asarray(told.done))
             # Only a hand that shifts the object moves it outside the engine.
-            shifted = np.flatnonzero(np.any(np.asarray(told.qpos != trials.qpos), axis=1))
-            batch.qpos[shifted] = np.asarray(told.qpos)[shifted]
+            shifted = np.flatnonzero(np.any(now != np.asarray(trials.qpos), axis=1))
+            batch.qpos[shifted] = now[shifted]
             if going.size:
                 batch.drive(going, np.stack(twist, axis=1)[going].astype(float), physics.substeps)
             after = Motion(batch.qpos, batch.qvel, batch.warmstart, batch.integral)

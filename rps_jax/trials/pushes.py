@@ -91,7 +91,7 @@ def build(
     scenes, which = _scenes(cases, setting.physics)
     stage, fields = engines.get(setting.engine).stage_of_scenes(scenes, which)
     starts = [_start_of(case, scenes[i]) for case, i in zip(cases, which, strict=True)]
-    dtype = jnp.zeros(()).dtype
+    dtype = jnp.result_type(float)
     numbers = np.arange(len(cases)) if indices is None else np.asarray(indices)
     root = jax.random.PRNGKey(setting.seed)
     world = World(
@@ -221,7 +221,7 @@ def _follow_on_host(
     def tell(_: np.ndarray, trials: trial.Trial, simulated: float) -> bool:
         nonlocal total
         total += simulated
-        report(Progress(int(trials.done.sum()), total, compiled))
+        report(Progress(int(np.asarray(trials.done).sum()), total, compiled))
         return True
 
     trials = host.run(

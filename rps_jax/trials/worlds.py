@@ -26,7 +26,7 @@ from rps_jax.world.scene import JOINTS, Friction, Scene
 def drawn_worlds(domain: Domain, drawn: Draw, params: Params, setting: Setting) -> Part:
     """The worlds of a draw as a part of a job, all with the same parameters."""
     family = domain.family_of(drawn.case[0])
-    count, dtype = drawn.number.size, jnp.zeros(()).dtype
+    count, dtype = drawn.number.size, jnp.result_type(float)
     engine, robots = engines.get(setting.engine), drawn.robot
     engine.check_robot(robots)
     engine.check_senses(registry.law_of(params).senses)

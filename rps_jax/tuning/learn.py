@@ -348,7 +348,7 @@ class _Learning:
     def _restore(self) -> None:
         """Take up what was kept last, if it is sound."""
         found = []
-        for name, content in Parts(self.folder).contents().items():
+        for name, content in Parts(self.folder).each():
             path = Parts(self.folder).folder / name
             try:
                 arrays = files.arrays_of(content)

@@ -14,7 +14,6 @@ import mujoco
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import Solid
@@ -353,8 +352,8 @@ def initial_qpos(scene: Scene, gap: float = 0.02, yaw: float = 0.0) -> np.ndarra
 
     `yaw` [rad] turns the object.
     """
-    placed = fp.place(scene.footprint, jnp.zeros(2), jnp.asarray(yaw, float))
-    reach = float(fp.extent(placed, jnp.array([-1.0, 0.0])))
+    x, y = np.asarray(scene.footprint.vertices).T
+    reach = np.max(math.sin(yaw) * y - math.cos(yaw) * x) + float(scene.footprint.radius)
     qpos = scene.physics.qpos0.copy()
     qpos[JOINTS.base] = 0.0
     height = qpos[JOINTS.object][2]

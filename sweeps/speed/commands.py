@@ -15,6 +15,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,15 +35,18 @@ from sweeps import shared
 from sweeps.shared import Study
 
 _TOLD = re.compile(r"compile ([\d.]+) s, run ([\d.]+) s \((\d+) simulated s per s\)")
-_COLUMNS = ("command", "empty cache", "once more", "of it compile", "run", "simulated s/s")
+_COLUMNS = (
+    *("command", "empty cache", "once more", "of it compile", "run", "simulated s/s"),
+    *("memory, empty cache", "memory, once more"),
+)
 
 
 @dataclass(frozen=True)
 class Commands(Study[xr.Dataset]):
     """Time whole commands, with an empty cache and once more.
 
-    The answer holds seconds from return to the end of the process, and what the second told of
-    itself, for each command.
+    The answer holds seconds from return to the end of the process, the most memory that it held,
+    and what the second told of itself, for each command.
     """
 
     TITLE: ClassVar[str] = "How long a user waits for a whole command"
@@ -56,6 +60,7 @@ class Commands(Study[xr.Dataset]):
         "sweep --laws rps_tuned --domain wide --worlds 1000",
         "table --engine fused",
         "table",
+        "sweep --laws rps --domain wide --worlds 1048576 --horizon 0.02 --slots 2048",
     )
     """What is asked of `rps`."""
     warm: tuple[int, ...] = ()
@@ -115,21 +120,22 @@ def _labels(wanted: Sequence[tuple[str, int | None]]) -> list[str]:
 
 
 def timed(command: str, limit: float, gpus: int | None = None) -> xr.Dataset:
-    """Seconds of a command with an empty cache and once more, and what the second told.
+    """Seconds and memory [GB] of a command with an empty cache and once more, and what it told.
 
     Raises:
       InputError: it failed, or took longer than the limit [s].
     """
-    seconds, output = [], ""
+    seconds, memory, output = [], [], ""
     with tempfile.TemporaryDirectory() as folder:
         for number in range(2):
             words = ["-m", "rps_jax", *shlex.split(command), "--out", f"{folder}/run_{number}"]
             begun = time.perf_counter()
-            output = _output(words, command, folder, limit, gpus)
+            output, held = _output(words, command, folder, limit, gpus)
             seconds.append(time.perf_counter() - begun)
+            memory.append(held)
     told = _TOLD.search(output)
     compile_, run, rate = map(float, told.groups()) if told else (float("nan"),) * 3
-    return _row(*seconds, compile_, run, rate)
+    return _row(*seconds, compile_, run, rate, *memory)
 
 
 def _call(worlds: int) -> str:
@@ -147,35 +153,42 @@ def _warm(worlds: int, limit: float) -> xr.Dataset:
         "    print(time.perf_counter() - begun)\n"
     )
     with tempfile.TemporaryDirectory() as folder:
-        first, *_, last = map(float, _output(["-c", code], _call(worlds), folder, limit).split())
-    return _row(first, last)
+        told, held = _output(["-c", code], _call(worlds), folder, limit)
+    first, *_, last = map(float, told.split())
+    return _row(first, last, *(float("nan"),) * 3, held)
 
 
 def _output(
     words: Sequence[str], asked: str, folder: str, limit: float, gpus: int | None = None
-) -> str:
-    """What Python prints, with its cache in a folder; InputError if it fails or takes too long."""
+) -> tuple[str, float]:
+    """What Python prints, with its cache in a folder, and the most memory that it held [GB].
+
+    Raises:
+      InputError: it failed, or took longer than the limit [s].
+    """
     kept = os.environ | {"RPS_CACHE": f"{folder}/cache"}
     if gpus is not None:
         kept["CUDA_VISIBLE_DEVICES"] = ",".join(map(str, range(gpus)))
         kept.pop("JAX_PLATFORMS", None)
-    try:
-        ended = subprocess.run(
-            [sys.executable, *words],
-            env=kept, capture_output=True, text=True, timeout=limit, check=False,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired as error:
-        raise InputError(f"commands = {asked} took more than {limit:g} s.") from error
-    if ended.returncode:
-        last = ended.stderr.strip().splitlines()[-1:]
+    said, wrong = Path(folder, "said"), Path(folder, "wrong")
+    with open(said, "w") as out, open(wrong, "w") as errors:
+        process = subprocess.Popen([sys.executable, *words], env=kept, stdout=out, stderr=errors)
+        stop = threading.Timer(limit, process.kill)
+        stop.start()
+        _, process.returncode, used = os.wait4(process.pid, 0)
+    if not stop.is_alive():
+        raise InputError(f"commands = {asked} took more than {limit:g} s.")
+    stop.cancel()
+    if process.returncode:
+        last = wrong.read_text().strip().splitlines()[-1:]
         raise InputError(f"commands = {asked} failed: {' '.join(last)}")
-    return ended.stdout
+    return said.read_text(), used.ru_maxrss * 1024 / 1e9  # Linux tells of KiB
 
 
-def _row(empty: float, again: float, *told: float) -> xr.Dataset:
-    """Seconds of both runs, and what the second told: compile and run [s], rate [s/s]."""
-    values = (empty, again, *told, *(float("nan"),) * (3 - len(told)))
-    names = ("empty", "again", "compile", "run", "rate")
+def _row(*told: float) -> xr.Dataset:
+    """Seconds of both runs, what the second told (compile and run [s], rate [s/s]), and memory."""
+    names = ("empty", "again", "compile", "run", "rate", "memory_empty", "memory_again")
+    values = (*told, *(float("nan"),) * (len(names) - len(told)))
     return xr.Dataset({name: ((), value) for name, value in zip(names, values, strict=True)})
 
 
@@ -186,6 +199,7 @@ def table(found: xr.Dataset) -> list[list[str]]:
         one = found.sel(command=command)
         cells = [f"{one[name].item():.1f} s" for name in ("empty", "again", "compile", "run")]
         told = f"{one.rate.item():,.0f}"
-        rows.append([command, *(cell.replace("nan s", "") for cell in (*cells, told))])
-        rows[-1][-1] = rows[-1][-1].replace("nan", "")
+        held = [f"{one[f'memory_{name}'].item():.1f} GB" for name in ("empty", "again")]
+        shown = [cell.removeprefix("nan").removeprefix(" s") for cell in (*cells, told)]
+        rows.append([command, *shown, *(cell.replace("nan GB", "") for cell in held)])
     return rows
