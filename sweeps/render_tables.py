@@ -6,14 +6,15 @@
 command, device, versions, commit and date that made it, its columns and its rows. A page shows it
 between `<!-- table: NAME -->` and `<!-- end -->`, and its commands between `<!-- command: NAME -->`
 and `<!-- end -->`. Within a sentence `<!-- cell: NAME | ROW | COLUMN -->...<!-- end -->` is a cell
-without its interval; ROW are the first cells of its row, also divided by bars. With `--check`
-nothing is written, and the exit code is 1 if a page differs from the data. Only the standard
-library is needed.
+without its interval; ROW are the first cells of its row, also divided by bars, and a COLUMN whose
+name others have, too, follows one to its left, as `both / 90 %`. With `--check` nothing is written,
+and the exit code is 1 if a page differs from the data. Only the standard library is needed.
 
 A cell is a text, a number, a list of numbers (a rate and the ends of its interval), or null. The
 `format` of a column is applied to a number and to the first of a list, its `rest` to those that
 follow. A column with `merge` shows no text twice below itself. A cell `{"from": NAME, "row": [...],
-"column": ...}` shows a cell of another table, in the row that begins with the values given.
+"column": ...}` shows a cell of another table, in the row that begins with the values given. A table
+of such cells alone was made by no command, and has no more than columns and rows.
 """
 
 import json
@@ -50,6 +51,8 @@ def load(name: str, root: Path = SWEEPS) -> dict[str, Any]:
         raise ValueError(f"{path} cannot be read: {error.strerror}.") from error
     except json.JSONDecodeError as error:
         raise ValueError(f"{path} is not JSON: {error}.") from error
+    if any(isinstance(cell, dict) for row in data.get("rows", ()) for cell in row):
+        data = dict.fromkeys(KEYS) | data
     missing = [key for key in KEYS if key not in data]
     if missing:
         raise ValueError(f"{path} lacks {', '.join(missing)}.")
@@ -79,7 +82,12 @@ def table(data: dict[str, Any], root: Path = SWEEPS) -> str:
         lines.append(texts)
         before = row
     lines.insert(1, ["---"] * len(data["columns"]))
-    return "".join(f"| {' | '.join(texts)} |\n" for texts in lines)
+    return "".join(f"| {' | '.join(map(_escaped, texts))} |\n" for texts in lines)
+
+
+def _escaped(text: str) -> str:
+    """A cell whose bars, as of |l|, do not end it."""
+    return re.sub(r"(?<!\\)\|", r"\|", text)
 
 
 def _text(cell: Any, column: dict[str, Any], root: Path) -> str:
@@ -99,14 +107,18 @@ def _cited(cell: dict[str, Any], root: Path) -> str:
     data, first = load(cell["from"], root), cell["row"]
     names = [column["name"] for column in data["columns"]]
     rows = [row for row in data["rows"] if row[: len(first)] == first]
-    if len(rows) != 1 or cell["column"] not in names:
+    *left, column = cell["column"].split(" / ")
+    begin = names.index(left[0]) if left and left[0] in names else 0
+    if len(rows) != 1 or column not in names[begin:]:
         raise ValueError(f"{cell} does not name one cell of {cell['from']}.json.")
-    i = names.index(cell["column"])
+    i = names.index(column, begin)
     return _text(rows[0][i], data["columns"][i], root)
 
 
 def caption(data: dict[str, Any], link: str) -> str:
     """One line that says where the numbers were made and links to all that is known of them."""
+    if data["command"] is None:
+        return f"\n<sub>Every number is cited: [from which table]({link}).</sub>\n"
     known = [f"Device: {data['device']}"] if data["device"] else []
     known += [f"date: {data['date']}"] if data["date"] else []
     return f"\n<sub>{'; '.join([*known, f'[command, versions and values]({link})'])}.</sub>\n"

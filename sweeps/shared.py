@@ -12,7 +12,7 @@ import contextlib
 import dataclasses
 import hashlib
 import json
-import os
+import re
 import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -33,16 +33,16 @@ from rps_jax.control import registry
 from rps_jax.control.base import Params
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.errors import InputError
-from rps_jax.record import files
+from rps_jax.record import files, provenance
 from rps_jax.record.checkpoint import Parts
 from rps_jax.record.options import option
 from rps_jax.runs.question import Question, Run
-from rps_jax.trials import batch, pushes, trial
+from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.progress import Progress, Report, unheard
 from rps_jax.trials.results import outcome_dataset
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Trial, World
+from rps_jax.trials.trial import Loop, Trial, World
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws, paper
 from rps_jax.world.domain import DOMAINS, QUANTITIES, Range
@@ -78,7 +78,6 @@ class Trials(Study[T]):
 
     def check(self) -> None:
         """Check slots and workers."""
-        batch.check_shape(self.slots, self.workers)
 
     def run_in(self, out: Path | None, report: Report) -> Run:
         """Where and how the answer is made."""
@@ -352,8 +351,11 @@ def traced(
     start = trial.start_all(batch, np.ones(worlds, bool))
     shared, steps = stage(usual), round(simulated / physics.control_period)
     began = time.perf_counter()
-    # Not as it is jitted: that gives back what it has traced before for such arguments.
-    advance = partial(trial.advance.__wrapped__, physics=physics, steps=steps)
+
+    # A new one: what was jitted before gives back what it has traced for such arguments.
+    def advance(stage: Any, worlds: World, trials: Trial) -> Trial:
+        return trial.advance((stage,), (worlds,), (trials,), Loop(physics), steps)[0]
+
     lowered = jax.jit(advance, donate_argnums=2 if donated else ()).lower(shared, batch, start)
     tracing = time.perf_counter() - began
 
@@ -393,7 +395,7 @@ def side_by_side(
 
 def machine() -> str:
     """Where speeds were measured, in a sentence."""
-    return f"On {jax.devices()[0].device_kind}, {os.cpu_count()} processors."
+    return f"On {jax.devices()[0].device_kind}, {provenance.processors()} processors."
 
 
 # --- published tables ----------------------------------------------------------------------
@@ -419,7 +421,8 @@ def publish(
       rows: one cell for each column.
       note: what a reader of the numbers should know.
     """
-    last, commands = made[-1], [_placeless(one["command"]) for one in made]
+    last, asked = made[-1], [one["command"] for one in made]
+    commands = [_placeless(one, asked) for one in asked]
     noted = {}
     with contextlib.suppress(InputError):  # a script of one's own has no digest, and loses no run
         noted["digest"] = digest(commands)
@@ -447,12 +450,15 @@ def digest(commands: Sequence[Sequence[str]]) -> str:
     Raises:
       InputError: a command asks no question of today, or asks it in other words.
     """
-    found = []
+    found: list[Any] = []
     for program, *words in commands:
         if program != "rps":
             raise InputError(
                 f"command = {program} is not allowed: a digest is of rps NAME or PATH."
             )
+        if _reads(_apart(words)[0]):  # a run, whose command stands beside it
+            found.append(words)
+            continue
         name, rest = names.split(words)
         asked, _ = flags.parse(names.question_of(name), name, rest)
         found.append(_declared(asked.asked().configuration()))
@@ -474,7 +480,22 @@ def _declared(value: Any) -> Any:
     return value
 
 
-def _placeless(command: Sequence[str]) -> list[str]:
-    """Words of a command without its run folder, which is a place of one machine."""
-    words = iter(command)
-    return [word for word in words if word != "--out" or not next(words, None)]
+def _apart(command: Sequence[str]) -> tuple[list[str], str]:
+    """Words of a command without its run folder, and that."""
+    if "--out" not in command:
+        return list(command), ""
+    at = list(command).index("--out")
+    return [*command[:at], *command[at + 2 :]], "".join(command[at + 1 : at + 2])
+
+
+def _reads(words: Sequence[str], folder: str = "runs") -> bool:
+    """Whether a command reads a run folder, or a file of it."""
+    return any(re.search(rf"(^|,){re.escape(folder)}(/|$)", word) for word in words)
+
+
+def _placeless(command: Sequence[str], others: Sequence[Sequence[str]]) -> list[str]:
+    """Words of a command without its run folder, which is a place of one machine, unless others
+    read it."""
+    words, folder = _apart(command)
+    read = folder and any(_reads(_apart(other)[0], folder) for other in others)
+    return list(command) if read else words

@@ -2,9 +2,11 @@
 
 import ast
 import contextlib
+import json
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +23,10 @@ from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.shell import HALF_LENGTH, HALF_WIDTH
 from rps_jax.runs import sweep
 from rps_jax.runs.plan import Plan
+from rps_jax.trials import trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
+from rps_jax.trials.trial import Loop, Rules, Trial
 from rps_jax.world import domain, objects
 from rps_jax.world.domain import DOMAINS, Range
 from rps_jax.world.physics import preset
@@ -55,9 +58,22 @@ def one_sentence(error: str) -> str:
     return error
 
 
+def read_log(folder: Path) -> list[dict[str, Any]]:
+    """The lines of a tuner's log, one for each generation."""
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+
+
 # --- trials and sweeps ---------------------------------------------------------------------
 
 FAST = preset(fidelity="fast")
+
+
+@partial(jax.jit, static_argnames="steps")
+def advance(stage: Any, worlds: Any, trials: Trial, loop: Loop, steps: int) -> Trial:
+    """Up to so many control steps of one batch of worlds."""
+    return trial.advance((stage,), (worlds,), (trials,), loop, steps)[0]
+
+
 # The fused engine, which compiles soonest of those that solve for contact.
 SHORT = Setting("fused", FAST, rules=Rules(horizon=20.0))
 # Targets ahead, so near that a push of a few seconds arrives; a perfect base.

@@ -262,7 +262,7 @@ TUNE = {
     "es --domain narrow": "unknown domain 'narrow': choose from paper",
     "es --objects sphere": "unknown domain object 'sphere'",
     "es --tuned mass": "unknown tuned parameter 'mass': choose from eta",
-    "es --tuned L L": "tuned = .* is not allowed: name each parameter once",
+    "es --tuned L L": "tuned = .* is not allowed: name each once",
     "es --law rps,lost.json": "lost.json cannot be read",
     "es --law rps,L.json": "L = -1.0 is not allowed: it must be a number and above 0",
     "es --algorithm CMA_ES": "invalid choice 'CMA_ES'",

@@ -1,5 +1,6 @@
 """A speed is of what was timed, and is compared with C MuJoCo in the closed loop."""
 
+import subprocess
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ from rps_jax.world.physics import preset
 from rps_jax.world.scene import FRICTION
 from sweeps import shared
 from sweeps.levers import study as levers
-from sweeps.speed import costs
+from sweeps.speed import commands, costs, robot
 from sweeps.speed import study as speeds
 
 
@@ -165,3 +166,33 @@ def test_a_box_found_as_a_prism_is_where_mjx_finds_it():
     assert ours.dist.shape == theirs.dist.shape == (2, 8)
     for mine, other in zip(deepest(ours), deepest(theirs), strict=True):
         np.testing.assert_allclose(mine, other, atol=1e-6)
+
+
+def test_whole_commands_are_timed_twice_with_so_many_gpus(monkeypatch):
+    seen = []
+
+    def run(words, env, **how):
+        assert "JAX_PLATFORMS" not in env
+        seen.append((words[2:6], env["RPS_CACHE"], env["CUDA_VISIBLE_DEVICES"]))
+        return subprocess.CompletedProcess(
+            words, 0, "compile 1.5 s, run 2.0 s (1234 simulated s per s)", ""
+        )
+
+    monkeypatch.setattr(subprocess, "run", run)
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")  # of the process that times them
+    found = commands.commands(("push --seed 1",), (1, 2))
+    assert found.command.values.tolist() == ["`rps push --seed 1`, one GPU",
+                                             "`rps push --seed 1`, 2 GPUs"]  # fmt: skip
+    assert [gpus for *_, gpus in seen] == ["0", "0", "0,1", "0,1"]
+    assert [seen[0][1] == seen[1][1], seen[1][1] == seen[2][1]] == [True, False]  # an empty cache
+    assert seen[0][0] == ["rps_jax", "push", "--seed", "1"]
+    assert commands.table(found)[1][3:] == ["1.5 s", "2.0 s", "1,234"]
+
+
+def test_steps_on_a_robot_are_told_as_the_example_tells_them(monkeypatch):
+    printed = "500 steps: median 146 us, 99.9th percentile 2512 us, worst 9041 us; "
+    printed += "0.60% took longer than 1 ms"
+    ended = subprocess.CompletedProcess([], 0, printed, "")
+    monkeypatch.setattr(subprocess, "run", lambda *_, **how: ended)
+    rows = robot.table(robot.on_a_robot(1))
+    assert rows == [["1", "146 µs", "2.5 ms", "9.0 ms", "0.6 %"]]

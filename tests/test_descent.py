@@ -18,7 +18,6 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import descent, gradients
 from rps_jax.tuning.descent import TuneGrad
-from rps_jax.tuning.run import read_log
 
 SETTING = Setting("quasistatic", rules=Rules(horizon=20.0, max_lost=10.0))
 OBJECTIVE = Objective(time=0.3, lost=0.1, miss=0.5)
@@ -115,7 +114,7 @@ def test_windows_begin_where_their_trials_are_by_then(monkeypatch):
         params: Any
 
     monkeypatch.setattr(descent, "start_all", lambda worlds, live, law: jnp.zeros(live.size))
-    monkeypatch.setattr(descent, "control_step", lambda _, worlds, trials, **__: (trials + 1, None))
+    monkeypatch.setattr(descent, "control_step", lambda _, worlds, trials, loop: (trials + 1, None))
     monkeypatch.setattr(gradients, "window", lambda *_, **__: lambda thetas, starts: starts[1])
     late = jnp.array([0.0, 0.5, 1.0])
     for within, steps in ((10.0, [0, 250, 500]), (0.0, [0, 0, 0])):
@@ -139,7 +138,7 @@ class TestRuns:
     @pytest.mark.slow
     def test_the_command_line_and_a_run_of_another_kind(self, tmp_path, capsys):
         assert cli.main(self.arguments(tmp_path, 2)) == 0
-        log = read_log(tmp_path)
+        log = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
         assert len(log) == 3
         for line in log[:2]:
             assert line["finite"] == 1.0

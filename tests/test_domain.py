@@ -232,7 +232,7 @@ def test_a_load_moves_the_centre_of_mass_by_the_share_that_is_asked_for():
         ({"distance": Range(0.1, 1)}, "distance"),
         ({"pose_latency": Range(0, 5)}, "pose_latency"),
         ({"objects": ("ball",)}, "unknown domain object 'ball'"),
-        ({"objects": ()}, "name at least one"),
+        ({"objects": ()}, "name each once, at least one"),
         ({"skin": "fur"}, "unknown domain skin"),
     ],
 )

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import FAST, NEAR
+from helpers import FAST, NEAR, advance
 
 from rps_jax.control.base import Law
 from rps_jax.control.laws.rps import RPSParams
@@ -187,11 +187,11 @@ def test_it_moves_as_a_trial_that_is_driven_by_the_same_twist(pushing):
     dull = Law(lambda params: (), lambda params, memory, seen: (memory, constant, Details.of(seen)))
     worlds = state.info["world"]
     trials = trial.start_all(worlds, np.ones(mine.done.size, bool), law=dull)
-    options = {"physics": FAST, "rules": push.setting.rules, "law": dull}
+    loop = trial.Loop(FAST, push.setting.rules, dull)
     alone = replace(NEAR, objects=(push.object,))
     drawn = draws.draw(alone, 0, np.arange(1))
     stage = drawn_worlds(alone, drawn, push.params, push.setting).stage
-    theirs = trial.advance(stage, worlds, trials, **options, steps=STEPS)
+    theirs = advance(stage, worlds, trials, loop, STEPS)
     np.testing.assert_array_equal(mine.data.steps, STEPS)
     np.testing.assert_allclose(mine.data.qpos, theirs.qpos, atol=2e-5)
     assert (theirs.contact_steps > 0).all()

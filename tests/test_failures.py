@@ -282,7 +282,7 @@ def test_the_command_searches_checks_lists_and_draws(tmp_path, capsys):
 
 def outcomes(blocks, won):
     """Results of a design whose trials succeed where `won` (worlds,) says."""
-    count = blocks.worlds
+    count = blocks.plan.worlds
     columns = {
         "success": (("law", "world"), won.astype(np.int8)[None]),
         "time": (("law", "world"), np.where(won, 80.0, 300.0)[None]),
@@ -293,13 +293,13 @@ def outcomes(blocks, won):
 
 
 def test_the_quantity_that_decides_takes_all_the_blame():
-    blocks = sensitivity.design(DOMAINS["wide"], 8192)
+    blocks = sensitivity.Sensitivity("rps", "wide", 8192)
     assert blocks.factors[-1] == "shape"
     assert {"noise", "key", "object", "mass", "com_bearing"} <= set(blocks.factors)
     assert blocks.groups.count("key") == 2  # both numbers of it
     assert blocks.groups.count("noise") == 1  # of the skin
     assert len(blocks.factors) == 23 + 1 + 2  # ranges, the object, corners and the key
-    assert (blocks.base, blocks.worlds) == (256, 256 * (len(blocks.factors) + 2))
+    assert (blocks.base, blocks.plan.worlds) == (256, 256 * (len(blocks.factors) + 2))
     column = blocks.groups.index("mass")
     found = sensitivity.analysed(blocks, outcomes(blocks, blocks.u()[:, column] < 0.8))
     assert sensitivity.ranked(found)[0] == "mass"
@@ -317,14 +317,14 @@ def test_the_quantity_that_decides_takes_all_the_blame():
     assert sensitivity.table(found)[1][0] == "mass of the object"
     assert sensitivity.reliable(found).startswith("Trials fail at ")
     assert "run more worlds" not in sensitivity.reliable(found)
-    never = sensitivity.analysed(blocks, outcomes(blocks, np.ones(blocks.worlds, bool)))
+    never = sensitivity.analysed(blocks, outcomes(blocks, np.ones(blocks.plan.worlds, bool)))
     assert sensitivity.reliable(never).endswith("run more worlds.")
     assert (never.total.sel(output="success") == 0).all()
 
 
 def test_two_quantities_that_only_matter_together_have_totals_alone():
     """Success where both are on the same side: first indices 0, totals 1 (the XOR of two)."""
-    blocks = sensitivity.design(DOMAINS["wide"], 16_384)
+    blocks = sensitivity.Sensitivity("rps", "wide", 16_384)
     u = blocks.u()
     a, b = (u[:, blocks.groups.index(name)] > 0.5 for name in ("mass", "gap"))
     found = sensitivity.analysed(blocks, outcomes(blocks, a == b)).sel(output="success")
@@ -334,11 +334,11 @@ def test_two_quantities_that_only_matter_together_have_totals_alone():
 
 
 def test_noise_and_shapes_are_told_apart_if_asked():
-    apart = sensitivity.design(DOMAINS["wide"], 8192, apart=True)
+    apart = sensitivity.Sensitivity("rps", "wide", 8192, apart=True)
     assert {"key_0", "key_1", "sides", "corner_7"} <= set(apart.factors)
     assert len(apart.factors) == len(points.names(DOMAINS["wide"]))
     with pytest.raises(InputError, match=r"worlds = 50 is not allowed: 36 quantities need"):
-        sensitivity.design(DOMAINS["wide"], 50, apart=True)
+        sensitivity.Sensitivity("rps", "wide", 50, apart=True).check()
 
 
 def test_the_command_of_sensitivity_draws_and_continues(tmp_path, capsys):

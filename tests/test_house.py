@@ -35,6 +35,38 @@ def test_a_room_says_what_it_is_for_and_stays_small(room):
         assert len(path.read_text().splitlines()) <= 530, path
 
 
+def documented() -> dict[str, tuple[list[str], dict[str, bool]]]:
+    """The bases of each class of the package, and whether each of its methods says what it does."""
+    found = {}
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef):
+                plain = [getattr(base, "value", base) for base in node.bases]
+                bases = [getattr(base, "attr", getattr(base, "id", "")) for base in plain]
+                bases += [getattr(base, "id", "") for base in node.bases]
+                methods = [one for one in node.body if isinstance(one, ast.FunctionDef)]
+                said = {one.name: ast.get_docstring(one) is not None for one in methods}
+                found[node.name] = bases, said
+    return found
+
+
+def test_a_public_method_says_what_it_does_or_inherits_it():
+    every = documented()
+
+    def says(name: str, method: str) -> bool:
+        bases, said = every.get(name, ([], {}))
+        return said.get(method, False) or any(says(base, method) for base in bases)
+
+    public = [
+        (name, method)
+        for name, (_, said) in every.items()
+        for method in said
+        if not name.startswith("_") and not method.startswith("_")
+    ]
+    assert len(public) > 300
+    assert [(name, method) for name, method in public if not says(name, method)] == []
+
+
 def test_the_test_command_of_the_readme_is_that_of_ci():
     of_ci = re.findall(r"^python3 -m venv .*pytest$", (ROOT / ".ci" / "run").read_text(), re.M)
     assert len(of_ci) == 1

@@ -41,7 +41,8 @@ def test_a_table_follows_its_data_and_those_it_cites(tmp_path):
         {"name": "rate", "format": "{:.1f} %", "rest": " [{}]"},
     ]
     one = dict.fromkeys(TABLES["KEYS"], "") | {"device": "a core", "columns": columns}
-    two = one | {"rows": [["b", {"from": "one", "row": ["a", 1.0], "column": "rate"}]]}
+    cited = {"from": "one", "row": ["a", 1.0], "column": "rate"}
+    two = {"columns": columns, "rows": [["b", cited]]}  # it was made by no command
     page = tmp_path / "page.md"
     page.write_text("<!-- table: one -->\n<!-- end -->\n<!-- table: two -->\n<!-- end -->\n")
 
@@ -55,6 +56,7 @@ def test_a_table_follows_its_data_and_those_it_cites(tmp_path):
     text = rendered([["a", 1.0], ["a", [2.26, 3]]])
     assert "| a | 1.0 % |\n|  | 2.3 % [3] |\n" in text
     assert "| b | 1.0 % |" in text
+    assert "[from which table](two/results/two.json)" in text
     assert "Device: a core" in text
     assert "(one/results/one.json)" in text
     with pytest.raises(ValueError, match=r"does not name one cell of one\.json"):
@@ -81,6 +83,13 @@ def test_a_number_in_a_sentence_follows_its_data(tmp_path):
         rendered
         == f"It wins {cell.format('rps', '93.1 %')},\nand NPS {cell.format('nps', '16.7 %')}."
     )
+    columns += [{"name": name} for name in ("time", "90 %", "way", "90 %")]
+    rows[:] = [[*row, "9 s", "11 s", "2 m [1, 3]", "4 m"] for row in rows]
+    (tmp_path / "results" / "one.json").write_text(json.dumps(data))
+    twice = "<!-- cell: one | wide | nps | {} -->{}<!-- end -->"
+    page.write_text(f"{twice.format('90 %', '')} and {twice.format('way / 90 %', '')}")
+    rendered = TABLES["render"](page, tmp_path)
+    assert rendered == f"{twice.format('90 %', '11 s')} and {twice.format('way / 90 %', '4 m')}"
     every = "".join(one.read_text() for one in PAGES)
     assert "<!-- cell: headline" in every
     assert not re.search(r"^\s*<!-- cell", every, re.MULTILINE)  # it would begin a paragraph

@@ -9,6 +9,7 @@ from fnmatch import fnmatch
 
 import numpy as np
 import pytest
+import xarray as xr
 from helpers import ROOT, rps
 
 from rps_jax import sweep
@@ -17,9 +18,11 @@ from rps_jax.record import files
 from rps_jax.runs.question import seed_of
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
+from rps_jax.world.domain import DOMAINS, Range
+from sweeps import shared
 from sweeps.million import study as million
-from sweeps.publish import study
-from sweeps.publish.recipes import BY_HAND, RECIPES, Recipe
+from sweeps.publish import dependencies, rows, study
+from sweeps.publish.recipes import HISTORY, RECIPES, Recipe
 
 SWEEPS = ROOT / "sweeps"
 PUSH = "rps sweep --domain wide,objects=random_cylinder --worlds 3 --engine quasistatic --horizon 1"
@@ -27,9 +30,10 @@ COMMANDS = [one for recipe in RECIPES.values() for one in recipe.commands if one
 
 
 @pytest.mark.parametrize("path", study.published(), ids=lambda path: path.stem)
-def test_a_data_file_is_made_by_one_recipe_or_says_why_by_none(path):
+def test_a_data_file_is_made_by_one_recipe_or_cites_others_or_is_history(path):
     ways = [name for name in RECIPES if fnmatch(path.stem, name)]
-    assert len(ways) + (path.stem in BY_HAND) == 1
+    cites = "command" not in json.loads(path.read_text())
+    assert len(ways) + cites + (path.stem in HISTORY) == 1
 
 
 @pytest.mark.parametrize("command", sorted(set(COMMANDS)))
@@ -75,6 +79,126 @@ def test_what_fails_is_named_and_the_others_are_made(few, capsys):
     assert first["device"] == "a core"
     assert len(first["digest"]) == 16
     assert [path.name for path in (few / "run" / "runs").iterdir()] == ["one"]  # run once
+
+
+def test_a_run_that_another_command_reads_keeps_its_name_and_is_hung_upon(tmp_path):
+    tuned = "rps tune es --worlds 16 --law pursuit --out runs/tuned"
+    ladder = "rps ladder --worlds 9 --laws pursuit pursuit,runs/tuned/tuned.json --out runs/other"
+    commands = [shlex.split(one) for one in (tuned, ladder)]
+    signed = {"packages": dict.fromkeys(shared._VERSIONS, "1"), "commit": "", "time": "2026-01-01"}
+    made = [signed | {"command": words} for words in commands]
+    path = shared.publish(tmp_path / "results" / "one.json", made, "a core", [{"name": "x"}], [])
+    data = json.loads(path.read_text())
+    assert data["command"] == [tuned, ladder.removesuffix(" --out runs/other")]
+    assert data["digest"] == shared.digest([shlex.split(one) for one in data["command"]])
+    other = tuned.replace("16", "17"), ladder
+    assert data["digest"] != shared.digest([shlex.split(one) for one in other])
+
+
+def test_a_law_is_beside_itself_as_it_was_tuned():
+    laws = ["rps", "rps,tuned", "pursuit", "pursuit,tuned"]
+    won = np.repeat([[1, 0], [1, 1], [0, 1], [0, 1]], [8, 8], axis=1)
+    found = xr.Dataset({"success": (("law", "world"), won)}, {"law": laws})
+    head, *body = rows.tuned_beside(found)
+    assert head[0] == "law"
+    assert [row[0] for row in body] == ["rps", "pursuit"]
+    assert body[0][1].startswith("50.0 %")
+    assert body[0][2].startswith("100.0 %")
+    assert [row[3] for row in body] == ["+8 -0", "+0 -0"]
+    assert rows.tuned_beside({"a": "tuner's"}) == []
+
+
+def test_a_comparison_names_laws_by_the_runs_that_tuned_them():
+    near = DOMAINS["wide"]
+    domain = replace(near, objects=("random_cylinder", "random_box"), distance=Range(0.7, 0.8))
+    setting = Setting("quasistatic", rules=Rules(horizon=20.0))
+    laws = {"rps": "rps", "rps,a/runs/gradient/tuned.json": "rps_tuned"}
+    found = xr.DataTree.from_dict({"near": sweep(laws, domain, 12, setting=setting)})
+    head, first, second = rows.compared(found)
+    assert (first[0], first[1], second[1]) == ("`near`, 12", "rps", "gradient")
+    by_object = first[head.index("by object [%]")].split(", ")
+    assert len(by_object) == 2
+    assert first[-2:] == ["", ""]
+    assert re.fullmatch(r"\+\d+ -\d+", second[-2])
+    lost = 12 - sum(map(int, first[5].split(", ")))
+    assert first[2].startswith(f"{100 * lost / 12:.1f} %")
+
+
+def test_worlds_of_robots_are_told_by_force_lag_and_acceleration():
+    rng = np.random.default_rng(3)
+    many = {
+        "robot_force": (150, 800),
+        "robot_traction": (0.3, 0.8),
+        "robot_lag": (0, 0.5),
+        "robot_acceleration": (0.1, 1),
+        "friction_ground": (0.1, 0.7),
+        "mass": (3, 60),
+    }
+    drawn = {name: ("world", rng.uniform(*ends, 4000)) for name, ends in many.items()}
+    found = xr.Dataset(drawn, {"law": ["rps"]})
+    force = np.minimum(found.robot_force, found.robot_traction * 130 * 9.81)
+    margin = force / (found.friction_ground * found.mass * 9.81)
+    found["success"] = ("law", "world"), (margin.values[None] >= 1).astype(np.int8)
+    _, *body = rows.by_robot(found)
+    count = {what: int(of.replace(",", "")) for what, of, _ in body}
+    told = {what: rate.split(" [")[0] for what, _, rate in body}
+    assert told["0.8 to 1"] == "0.0 %"
+    assert told["1 to 1.25"] == "100.0 %"
+    margins = [what for what in count if "enough" not in what]
+    assert sum(count[what] for what in margins) == int((margin >= 0.5).sum())
+    for what in ("lag", "acceleration"):
+        parts = [n for name, n in count.items() if name.startswith(what)]
+        assert len(parts) == 5
+        assert sum(parts) == int((margin >= 1.5).sum())
+
+
+def test_speeds_stand_by_engine_and_batch_beside_c():
+    measured = [("C in closed loop", 64, "box", 100.0), ("C in closed loop", 64, "prism", 50.0),
+                ("fused", 4096, "box", 200_000.0), ("fused", 8, "box", 50.0),
+                ("fused", 8, "prism", 25.0)]  # fmt: skip
+    fields = zip(("name", "worlds", "family", "rate"), zip(*measured, strict=True), strict=True)
+    found = xr.Dataset({name: ("measurement", list(values)) for name, values in fields})
+    assert rows.speeds(found) == [
+        ["engine", "worlds", "box", "prism", "against C in closed loop"],
+        ["C in closed loop", "64", "100", "50", "1, 1"],
+        ["fused", "4,096", "200,000", "", "2,000"],
+        ["fused", "8", "50", "25", "0.5, 0.5"],
+    ]
+
+
+def test_a_rare_failure_is_told_by_its_median_and_all_of_it():
+    each = {"p": [0.1, 0.2, 0.6], "low": [0.0, 0.1, 0.3], "high": [0.2, 0.3, 0.9],
+            "variation": [0.5, 0.4, 0.3], "trials": [100, 200, 300]}  # fmt: skip
+    found = xr.Dataset({name: ("repetition", values) for name, values in each.items()})
+    drawn = {"p": 0.25, "low": 0.2, "high": 0.3, "variation": 0.1, "trials": 400}
+    beside = found.assign({f"drawn_{name}": value for name, value in drawn.items()})
+    head, middle, together, last = rows.rarely(beside)
+    assert head[1:] == ["probability of failure", "95 %", "variation", "worlds"]
+    assert middle == ["splitting, median of 3", "0.2", "[0.1, 0.3]", "0.40", "200"]
+    assert together[1] == "0.3"
+    assert together[-1] == "600"
+    assert last == ["drawn worlds", "0.25", "[0.2, 0.3]", "0.10", "400"]
+    assert len(rows.rarely(found)) == 3
+
+
+def test_cosines_stand_under_the_time_simulated():
+    cosine = xr.DataArray([[0.5, -0.25]], dims=("estimator", "horizon"))
+    found = xr.Dataset({"cosine": cosine, "doubt": ("horizon", [0.1, 0.2])},
+                       {"estimator": ["forward"], "horizon": [2.0, 30.0]})  # fmt: skip
+    assert rows.cosines(found)[1:] == [["forward", "", "0.50", "", "-0.25", "", ""]]
+
+
+def test_what_only_a_dependency_brings_goes_with_it():
+    needs = {"a": ["b", "c"], "b": ["d"], "c": [], "d": ["b"], "e": ["c", "not there"]}
+    assert dependencies.reached(needs, ["a", "e"]) == {*"abcde"}
+    assert dependencies.reached(needs, ["e"]) == {"c", "e"}
+
+
+def test_every_dependency_and_extra_says_what_it_is_for():
+    declared = dependencies.declared()
+    needed = [re.match(r"[\w-]+", one).group() for one in declared["dependencies"]]
+    assert set(needed) == set(dependencies.FOR)
+    assert set(declared["optional-dependencies"]) == set(dependencies.EXTRAS)
 
 
 def test_only_what_needs_such_a_device_is_made(few, capsys):

@@ -16,6 +16,7 @@ import pytest
 import xarray as xr
 from helpers import ROOT
 
+from rps_jax import engines
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
@@ -114,7 +115,7 @@ def in_one_sentence(path, read, *arguments):
 
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_damage_is_known_before_anything_reads_it_and_nothing_else_is_lost(damage, folder):
-    parts, before = Parts(folder), Parts(folder).contents()
+    parts, before = Parts(folder), dict(Parts(folder).each())
     began = time.perf_counter()
     for name, path in parts.found().items():
         damaged = DAMAGE[damage](before[name])
@@ -122,9 +123,9 @@ def test_damage_is_known_before_anything_reads_it_and_nothing_else_is_lost(damag
         assert parts.get(name) is None
         assert path.with_name(f"{path.name}.corrupt").read_bytes() == damaged
         others = {other: content for other, content in before.items() if other != name}
-        assert parts.contents() == others
+        assert dict(parts.each()) == others
         parts.put(name, before[name], path.suffix)
-    assert parts.contents() == before
+    assert dict(parts.each()) == before
     for name, *readers in (
         ("results.nc", files.read_results),
         ("manifest.json", run_folder.manifest, lambda f: run_folder.claim(f, {"worlds": 300})),
@@ -184,7 +185,7 @@ def test_a_part_is_named_by_its_number_and_digest(tmp_path):
     digest = hashlib.sha256(content).hexdigest()[:16]
     (tmp_path / "parts").mkdir()
     (tmp_path / "parts" / f"0000012-{digest}.nc").write_bytes(content)
-    assert Parts(tmp_path).contents() == {"0000012": content}
+    assert dict(Parts(tmp_path).each()) == {"0000012": content}
     assert Parts(tmp_path).put("0000012", content) == Parts(tmp_path).found()["0000012"]
     results = Parts(tmp_path).results("0000012", lambda: pytest.fail("it was made again"))
     xr.testing.assert_identical(results, RESULTS)
@@ -274,9 +275,9 @@ def test_of_two_files_of_a_part_the_newer_counts_if_it_is_sound(tmp_path):
     for age, content in ((100, b"old"), (0, b"new")):
         path = parts.put("state", content, new=True)
         os.utime(path, (time.time() - age,) * 2)
-    assert parts.contents() == {"state": b"new"}
+    assert dict(parts.each()) == {"state": b"new"}
     parts.found()["state"].write_bytes(b"torn")
-    assert parts.contents() == {"state": b"old"}
+    assert dict(parts.each()) == {"state": b"old"}
 
 
 # --- one at a time -------------------------------------------------------------------------
@@ -366,3 +367,11 @@ def test_names_that_are_no_utf8_keep_their_bytes(tmp_path):
     name = "\N{SNOWMAN}".encode().decode("ascii", errors="surrogateescape")
     path = files.write_text(tmp_path / "report.md", f"run folder: {name}")
     assert path.read_bytes() == "run folder: \N{SNOWMAN}".encode()
+
+
+def test_only_processors_that_a_process_may_use_are_counted(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {3, 7, 8}, raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 128)
+    assert engines.get("fused").workers("cpu") == 3
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert provenance.processors() == 128

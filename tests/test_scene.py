@@ -9,6 +9,7 @@ import pytest
 from rps_jax import errors
 from rps_jax.engines import mjx as mjx_engine
 from rps_jax.engines.mjx_colliders import mjx
+from rps_jax.geometry import footprint as fp
 from rps_jax.robot import shell
 from rps_jax.world import scene
 from rps_jax.world.objects import FAMILIES, OBJECTS
@@ -112,7 +113,7 @@ def test_objects_have_the_papers_mass_and_size_and_stand_on_the_ground(name, mas
     loaded = load(name)
     assert loaded.physics.body("object").mass[0] == pytest.approx(mass)
     for axis, half in zip(np.eye(2), half_extents, strict=True):
-        assert float(scene.fp.extent(loaded.footprint, jnp.asarray(axis))) == pytest.approx(half)
+        assert float(fp.extent(loaded.footprint, jnp.asarray(axis))) == pytest.approx(half)
     geom = loaded.model.geom("object")
     half_height = geom.size[2] if geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX else geom.size[1]
     assert loaded.model.body("object").pos[2] == pytest.approx(half_height)
@@ -152,7 +153,7 @@ def test_a_given_mass_scales_the_inertia_and_keeps_the_centre():
 def test_the_object_starts_the_gap_in_front_of_the_face(yaw):
     loaded = load("box")
     qpos = scene.initial_qpos(loaded, gap=0.02, yaw=yaw)
-    placed = scene.fp.place(loaded.footprint, jnp.asarray(qpos[3:5]), jnp.asarray(yaw))
+    placed = fp.place(loaded.footprint, jnp.asarray(qpos[3:5]), jnp.asarray(yaw))
     assert float(placed.vertices[:, 0].min()) == pytest.approx(shell.HALF_LENGTH + 0.02, abs=1e-6)
 
 

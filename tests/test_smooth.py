@@ -28,7 +28,7 @@ from rps_jax.robot.skin import NONE, CapacitiveSkin, IdealSkin, SmoothSkin
 from rps_jax.trials import host, pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
+from rps_jax.trials.trial import Loop, Rules
 from rps_jax.world.scene import FRICTION
 
 PAPER = RPSParams.paper()
@@ -566,8 +566,8 @@ def push(case: Case, law, horizon: float):
         seen.append(trials)
         return True
 
-    options = {"physics": setting.physics, "rules": setting.rules, "threads": 1}
-    host.run(engines.get("mujoco"), models, worlds, law=law, report=report, **options)
+    loop = Loop(setting.physics, setting.rules, law)
+    host.run(engines.get("mujoco"), models, worlds, loop, threads=1, report=report)
     return jax.tree.map(lambda x: np.asarray(x)[0], seen[-1])
 
 
@@ -620,7 +620,8 @@ def plus_moments(count=40):
 
 
 def test_without_heat_smooth_rps_plus_is_the_hard_one(monkeypatch):
-    monkeypatch.setattr(rps_plus, "_WARM", rps_plus._Warm(1e-6, 1e-6))
+    for name in ("_WARM_FACING", "_WARM_LOST"):
+        monkeypatch.setattr(rps_plus, name, 1e-6)
     params = RPSPlusParams(n_lost=2.5)  # a count meets no threshold that is a count
     hard, cold = registry.law_of(params), registry.smooth_law(rps_plus.LAW, COLD)
     for anew, told in plus_moments():

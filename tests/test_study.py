@@ -72,7 +72,7 @@ def test_a_study_labels_its_conditions_and_compares_them(folder):
 
 def test_a_study_continues_and_redoes_alone_what_is_corrupt(folder, monkeypatch):
     parts = Parts(folder)
-    before, others = parts.contents(), parts.found()
+    before, others = dict(parts.each()), parts.found()
     thin = others.pop("thin")
     thin.write_bytes(b"torn")
     ran = []
@@ -85,7 +85,7 @@ def test_a_study_continues_and_redoes_alone_what_is_corrupt(folder, monkeypatch)
     monkeypatch.setattr(pushes, "run", counted)
     shared.run_conditions(CONDITIONS, GRID, folder)
     assert ran == CONDITIONS["thin"].cases(GRID)
-    again = [files.decoded(content["thin"], "thin") for content in (before, parts.contents())]
+    again = [files.decoded(content["thin"], "thin") for content in (before, dict(parts.each()))]
     xr.testing.assert_identical(*(results.drop_attrs() for results in again))
     assert others.items() <= parts.found().items()
 

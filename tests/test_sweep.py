@@ -96,7 +96,7 @@ def test_late_poses_and_late_commands_are_late_by_as_much(error):
     part = drawn_worlds(late, draws.draw(late, 0, [0]), PAPER, SHORT)
     world = row(part.worlds, 0)
     now = jax.tree.map(jnp.asarray, trial.start(world))
-    decide = jax.jit(partial(trial.decide, physics=SHORT.physics))
+    decide = jax.jit(partial(trial.decide, loop=trial.Loop(SHORT.physics)))
     told, done = [], []
     for step in range(8):
         now = now._replace(qpos=now.qpos.at[2].set(0.01 * step))  # turned by hand

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import advance
 
 from rps_jax import errors
 from rps_jax.control.laws.rps import RPSParams
@@ -17,7 +18,7 @@ from rps_jax.robot.skin import CapacitiveSkin
 from rps_jax.trials import batch, pushes, trial
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules, Shift
+from rps_jax.trials.trial import Loop, Rules, Shift
 from rps_jax.world.physics import preset
 from rps_jax.world.scene import FRICTION
 
@@ -69,9 +70,9 @@ def test_a_gpu_that_seldom_asks_who_still_runs_finds_the_same(monkeypatch):
 
     def run(backend):
         monkeypatch.setattr(jax, "default_backend", lambda: backend)
-        traced = partial(trial.advance.__wrapped__, physics=setting.physics, steps=40)
-        program = jax.jit(traced)
-        return [program(stage, worlds, start, rules=Rules(horizon=t)) for t in (0.29, 300.0)]
+        program = jax.jit(partial(advance.__wrapped__, steps=40))
+        loops = [Loop(setting.physics, Rules(horizon=t)) for t in (0.29, 300.0)]
+        return [program(stage, worlds, start, loop) for loop in loops]
 
     ended, running = seldom = run("gpu")
     assert ended.done.all()
@@ -164,10 +165,9 @@ def advanced():
     """Three healthy worlds beside one whose object starts as NaN, after 0.4 s."""
     stage, worlds = world_batch(SLOTS)
     broken = worlds._replace(qpos=worlds.qpos.at[1, 4].set(jnp.nan))
-    options = {"physics": preset(), "steps": 20}
     live = jnp.ones(SLOTS, bool)
-    healthy = trial.advance(stage, worlds, trial.start_all(worlds, live), **options)
-    mixed = trial.advance(stage, broken, trial.start_all(broken, live), **options)
+    healthy = advance(stage, worlds, trial.start_all(worlds, live), Loop(preset()), 20)
+    mixed = advance(stage, broken, trial.start_all(broken, live), Loop(preset()), 20)
     return healthy, mixed
 
 
@@ -207,7 +207,7 @@ def test_the_way_of_the_base_is_its_speed_times_time(outcomes, advanced):
 def test_padding_never_moves_and_a_finished_batch_stops_at_once():
     stage, worlds = world_batch(SLOTS)
     trials = trial.start_all(worlds, jnp.zeros(SLOTS, bool))
-    after = trial.advance(stage, worlds, trials, physics=preset(), steps=20)
+    after = advance(stage, worlds, trials, Loop(preset()), 20)
     np.testing.assert_array_equal(after.qpos, worlds.qpos)
     assert (np.asarray(after.steps) == 0).all()
 

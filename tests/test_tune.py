@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import refusal
+from helpers import read_log, refusal
 from helpers import rps as command
 
 from rps_jax.control.laws import rps
@@ -280,13 +280,13 @@ class TestRuns:
             for name in ("log.jsonl", "tuned.json", "curve.csv"):
                 one, other = ((tmp_path / run / name).read_text() for run in ("whole", f"{done}"))
                 assert one == other
-        assert len(run.read_log(tmp_path / "whole")) == 6
+        assert len(read_log(tmp_path / "whole")) == 6
 
     @pytest.mark.parametrize("algorithm", get_args(Algorithm))
     def test_every_algorithm_is_continued_over_restarts(self, tmp_path, pretended, algorithm):
         options = {"algorithm": algorithm, "patience": 1}
         whole = tuned(tmp_path / "whole", evolution(12, **options))
-        assert run.read_log(tmp_path / "whole")[-1]["restarts"] > 0
+        assert read_log(tmp_path / "whole")[-1]["restarts"] > 0
         for generations in (5, 12):
             parts = tuned(tmp_path / "parts", evolution(generations, **options))
         assert parts == whole
@@ -315,12 +315,12 @@ class TestRuns:
     def test_what_is_done_stays_when_less_is_asked_for(self, tmp_path, pretended):
         whole = tuned(tmp_path, evolution(6))
         assert tuned(tmp_path, evolution(2)) == whole
-        assert len(run.read_log(tmp_path)) == 6
+        assert len(read_log(tmp_path)) == 6
 
     def test_the_curve_is_a_table_that_grows_with_the_run(self, tmp_path, pretended):
         for done in (2, 6):
             tuned(tmp_path, evolution(done))
-            log = run.read_log(tmp_path)
+            log = read_log(tmp_path)
             curve = pd.read_csv(tmp_path / "curve.csv", index_col="generation")
             assert curve.index.tolist() == list(range(done))
             for name in ("validation_success", "simulated"):
@@ -330,7 +330,7 @@ class TestRuns:
     def test_it_ends_when_its_budget_is_spent_and_goes_on_with_more(self, tmp_path, pretended):
         for budget, done in ((2.5, 3), (4.0, 4), (0.0, 6)):  # 1 s a generation
             tuned(tmp_path, evolution(budget=budget))
-            assert len(run.read_log(tmp_path)) == done
+            assert len(read_log(tmp_path)) == done
 
     def test_it_finds_the_place_and_writes_it_down(self, tmp_path, pretended):
         tuned(tmp_path, evolution(20))

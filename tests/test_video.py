@@ -93,6 +93,26 @@ def test_the_contact_point_leaves_a_path_with_gaps(box: scene.Scene, tmp_path: P
     assert 0 < len(changed(blank, gap)) < len(changed(blank, whole))
 
 
+@pytest.mark.parametrize("camera", ["above", "oblique"])
+def test_an_image_drawn_anew_in_part_is_the_whole_image(box: scene.Scene, camera: str) -> None:
+    thing = {"p_world_target": (1.0, 1.0), "size": (480, 270), "camera": camera}
+    frames = np.tile(scene.initial_qpos(box), (6, 1))
+    frames[:, 3:5] += [(0.1 * i, 0.12 * i) for i in range(5)] + [(30, 30)]  # past the flag, away
+    for drawn, qpos in zip(video.images(box, frames, **thing), frames, strict=True):
+        assert len(changed(drawn, video.snapshot(box, qpos, **thing))) < 6
+
+
+def test_a_trail_is_drawn_alike_in_parts_and_as_a_whole(box: scene.Scene) -> None:
+    thing = {"p_world_target": FAR, "size": (960, 540), "camera": "oblique"}
+    frames = np.tile(scene.initial_qpos(box), (90, 1))
+    frames[:, [0, 3]] += np.linspace(0, 1, 90)[:, None]
+    frames[:, [1, 4]] += np.linspace(0, -1, 90)[:, None]
+    far = frames.copy()
+    far[:-1, 3:5] = (-2.9, -2.9)  # behind the trail, so that all of it is drawn anew at last
+    parts, whole = (video.images(box, some, **thing)[-1] for some in (frames, far))
+    assert len(changed(parts, whole)) < 6
+
+
 def test_above_is_a_map_with_x_up_and_y_left(box: scene.Scene) -> None:
     qpos = scene.initial_qpos(box)
     image = video.snapshot(box, qpos, p_world_target=(1.5, 2.0), size=(320, 180), camera="above")

@@ -46,7 +46,6 @@ class Picture(NamedTuple):
         return file.getvalue()
 
     def _repr_png_(self) -> bytes:
-        """What Jupyter shows."""
         return self.png()
 
 

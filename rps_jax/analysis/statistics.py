@@ -4,16 +4,14 @@ Of SciPy only its special functions are used here: to import `scipy.stats` takes
 command. A test holds these to it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 import xarray as xr
 from numpy.typing import ArrayLike
-from scipy import special
 
 from rps_jax.world.domain import WORDS
 
@@ -57,7 +55,7 @@ def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float
     """Wilson score interval of a success rate, each end in [0, 1]; all of it without trials."""
     if trials == 0:
         return 0.0, 1.0
-    z = float(special.ndtri((1 + confidence) / 2))
+    z = float(scipy.special.ndtri((1 + confidence) / 2))
     rate, room = successes / trials, z * z / trials
     middle = (rate + room / 2) / (1 + room)
     reach = z / (1 + room) * math.sqrt(rate * (1 - rate) / trials + room / trials / 4)
@@ -71,8 +69,8 @@ def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> tu
     Each end by itself is a bound of confidence (1 + `confidence`) / 2 (Clopper and Pearson, 1934).
     """
     k, n, tail = successes, trials, (1 - confidence) / 2
-    low = float(special.betaincinv(k, n - k + 1, tail)) if k else 0.0
-    return low, float(special.betaincinv(k + 1, n - k, 1 - tail)) if k < n else 1.0
+    low = float(scipy.special.betaincinv(k, n - k + 1, tail)) if k else 0.0
+    return low, float(scipy.special.betaincinv(k + 1, n - k, 1 - tail)) if k < n else 1.0
 
 
 def fails_at_most(failures: int, trials: int, picked_of: int = 1) -> float:
@@ -90,7 +88,7 @@ def compare(first: xr.DataArray, second: xr.DataArray) -> Comparison:
     a, b = first.values.astype(bool).ravel(), second.values.astype(bool).ravel()
     gained, lost = int(np.sum(~a & b)), int(np.sum(a & ~b))
     equal = a.size - gained - lost
-    p = min(1.0, 2 * float(special.bdtr(min(gained, lost), gained + lost, 0.5)))
+    p = min(1.0, 2 * float(scipy.special.bdtr(min(gained, lost), gained + lost, 0.5)))
     return Comparison(equal / a.size, wilson(equal, a.size), gained, lost, p)
 
 
@@ -129,7 +127,7 @@ def cvar_interval(values: np.ndarray) -> tuple[float, float]:
     mean, quantile = cvar(values), np.partition(values, -worst)[-worst]
     terms = quantile + np.maximum(values - quantile, 0) / _TAIL
     error = float(np.std(terms, ddof=1)) / np.sqrt(values.size)
-    error *= float(special.stdtrit(worst - 1, 0.975))
+    error *= float(scipy.special.stdtrit(worst - 1, 0.975))
     if mean <= 0:
         return mean - error, mean + error
     return float(mean * np.exp(-error / mean)), float(mean * np.exp(error / mean))
@@ -200,7 +198,7 @@ def one_rate(found: Bins) -> float:
     off = np.abs(counts - expected)
     if len(found.of) == 2:  # Yates
         off = np.maximum(off - 0.5, 0.0)
-    return float(special.chdtrc(len(found.of) - 1, np.sum(off**2 / expected)))
+    return float(scipy.special.chdtrc(len(found.of) - 1, np.sum(off**2 / expected)))
 
 
 def false_discovery(p: Sequence[float]) -> np.ndarray:

@@ -31,10 +31,12 @@ if TYPE_CHECKING:
 _TRAIL_STEP = 0.02  # [m] between the points of a trail
 _TRAIL_POINTS = 1500  # at most, so that memory stays flat: 30 m; the oldest go first
 _TRAIL_WIDTH = 0.007  # [1] of the image's height
+_TRAIL_ROOM = 8  # [px] more than the width of a trail in the largest image
 BASE_RGBA = (0.08, 0.09, 0.11, 1.0)
 CONTACT_RGBA = (0.62, 0.04, 0.46, 1.0)
 CONTACT_HEIGHT = 0.36  # [m] just above the chassis, which would hide the marker from above
 CONTACT_RADIUS = 0.04  # [m]
+_CORNERS = np.array(list(itertools.product((-1, 1), repeat=3)))  # of a cube
 NO_CONTACT = np.full(2, np.nan)
 _SHADOWS_FROM = 240  # [px] height of an image: they take most of the time without a GPU
 
@@ -90,9 +92,18 @@ class Studio:
         self.camera = camera
         self.base_trail = _Trail(BASE_RGBA, 0.006)
         self.contact_trail = _Trail(CONTACT_RGBA, 0.010)
+        self._image = np.zeros((renderer.height, renderer.width, 3), np.uint8)
+        self._size = np.array([renderer.width, renderer.height])
+        self._eye, self._box = np.zeros(0), np.zeros((2, 2))  # of the last image
+        self._moving = np.flatnonzero(scene.model.body_dofnum[scene.model.geom_bodyid])
+        middle, half = np.split(scene.model.geom_aabb[self._moving], 2, axis=1)
+        self._corners = middle + _CORNERS[:, None] * half  # (8, geoms, 3) [m]
 
     def draw(self, qpos: ArrayLike, p_world_contact: ArrayLike) -> np.ndarray:
-        """One image (height, width, 3) uint8, and a step further along the trails."""
+        """One image (height, width, 3) uint8, and a step further along the trails.
+
+        As long as the camera stands, only the part in which something moves is drawn anew.
+        """
         qpos = _checked("qpos", qpos, self.model.nq)
         contact = np.array(p_world_contact, float)  # a copy: the trail keeps it
         self.data.qpos[:] = qpos
@@ -108,28 +119,69 @@ class Studio:
                 self._add_line(a, b, trail)
         if not np.isnan(contact).any():
             self._add_marker(contact)
-        return self.renderer.render()
+        self._draw_what_changed(np.where(np.isnan(contact), qpos[:2], contact))
+        return self._image.copy()
+
+    def _draw_what_changed(self, p_world_marker: np.ndarray) -> None:
+        """Draw the box of what moves, now and in the last image; all if the camera moved."""
+        eye = self.mujoco.mjv_averageCamera(*self.renderer.scene.camera)
+        pixel = 2 * eye.frustum_top / self.renderer.height  # [m] where the field of view begins
+        before, self._eye = self._eye, np.concatenate([eye.pos, eye.forward, eye.up])
+        still = np.array_equal(before, self._eye)
+        boxes = [self._box if still else np.array([[0, 0], self._size])]
+        away = self._points(p_world_marker) - eye.pos
+        depth = 1 if eye.orthographic else away @ eye.forward / eye.frustum_near
+        flat = away @ np.transpose([np.cross(eye.forward, eye.up), eye.up])
+        flat = self._size / 2 + flat / np.maximum(depth, 1)[..., None] / pixel
+        self._box = np.array([flat.min(axis=0) - _TRAIL_ROOM, flat.max(axis=0) + _TRAIL_ROOM])
+        boxes.append(self._box)
+        low, high = np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]
+        (x, y), (end_x, end_y) = np.clip([low, high], 0, self._size).astype(int)
+        if x == end_x or y == end_y:
+            return
+        # Around it, where lines are cut off, some more.
+        first, last = np.clip([[x - 8, y - 8], [end_x + 8, end_y + 8]], 0, self._size)
+        left, bottom, right, top = pixel * np.ravel([first, last] - self._size / 2)
+        for one in self.renderer.scene.camera:
+            one.frustum_bottom, one.frustum_top = bottom, top
+            one.frustum_center, one.frustum_width = (left + right) / 2, (right - left) / 2
+        part = self.mujoco.MjrRect(0, 0, *(last - first))
+        drawn = np.empty((part.height, part.width, 3), np.uint8)
+        self.renderer._gl_context.make_current()
+        self.mujoco.mjr_render(part, self.renderer.scene, self.renderer._mjr_context)
+        self.mujoco.mjr_readPixels(drawn, None, part, self.renderer._mjr_context)
+        drawn = drawn[y - first[1] :, x - first[0] :][: end_y - y, : end_x - x]
+        self._image[::-1][y:end_y, x:end_x] = drawn  # OpenGL's rows go up
+
+    def _points(self, p_world_marker: np.ndarray) -> np.ndarray:
+        """Points (n, 3) [m] around the bodies, the marker and all shadows on the ground."""
+        data, which = self.data, self._moving
+        rotation = data.geom_xmat[which].reshape(-1, 3, 3)
+        bodies = np.einsum("gij,cgj->cgi", rotation, self._corners) + data.geom_xpos[which]
+        marker = [*p_world_marker, CONTACT_HEIGHT / 2] + _CORNERS * (
+            CONTACT_HEIGHT / 2 + CONTACT_RADIUS
+        )
+        points = np.concatenate([bodies.reshape(-1, 3), marker])
+        for i, sun in enumerate(data.light_xpos):
+            far = self.model.light_type[i] == self.mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+            ray = data.light_xdir[i] if far else points - sun
+            points = np.concatenate([points, points - ray * (points[:, 2:] / ray[..., 2:])])
+        return points
 
     def _add_line(self, a: np.ndarray, b: np.ndarray, trail: _Trail) -> None:
         """A line on the ground from `a` to `b`: quicker to draw than any solid."""
         geom = self._new_geom("mjGEOM_LINE", np.zeros(3), np.zeros(3), trail.rgba)
-        if geom is not None:
-            width = _TRAIL_WIDTH * self.renderer.height
-            ends = ([*point, trail.height] for point in (a, b))
-            self.mujoco.mjv_connector(geom, geom.type, width, *ends)
+        ends = ([*point, trail.height] for point in (a, b))
+        self.mujoco.mjv_connector(geom, geom.type, _TRAIL_WIDTH * self.renderer.height, *ends)
 
     def _add_marker(self, point: np.ndarray) -> None:
-        position = np.array([*point, CONTACT_HEIGHT])
-        size = np.full(3, CONTACT_RADIUS)
+        position, size = np.array([*point, CONTACT_HEIGHT]), np.full(3, CONTACT_RADIUS)
         geom = self._new_geom("mjGEOM_SPHERE", size, position, CONTACT_RGBA)
-        if geom is not None:
-            geom.emission = 1.0  # seen in the shadow of the object too
+        geom.emission = 1.0  # seen in the shadow of the object too
 
     def _new_geom(self, kind: str, size: np.ndarray, position: np.ndarray, rgba: Any) -> Any:
-        """Another geom of this frame; None if there is no room for it."""
+        """Another geom of this frame, which has room for 10,000."""
         view = self.renderer.scene
-        if view.ngeom == view.maxgeom:
-            return None
         geom = view.geoms[view.ngeom]
         kind = getattr(self.mujoco.mjtGeom, kind)
         colour = np.array(rgba, np.float32)

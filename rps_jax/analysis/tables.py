@@ -1,7 +1,5 @@
 """Tables of results: a header and rows of texts, and how they read in Markdown."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Sequence
 from itertools import combinations
@@ -160,6 +158,11 @@ def spread(rates: ArrayLike) -> str:
     return f"{100 * least:.{digits}f} to {100 * most:.{digits}f} %"
 
 
+def _p(value: float) -> str:
+    """A p-value; one below the smallest number is not zero."""
+    return f"{value:.2g}" if value > 0 else "< 1e-300"
+
+
 def difference_table(results: xr.Dataset) -> list[list[str]]:
     """Header and one row for each pair of laws, world by world, with McNemar's exact test."""
     rows = [["second against first", "gained", "lost", "difference", "McNemar p"]]
@@ -168,7 +171,7 @@ def difference_table(results: xr.Dataset) -> list[list[str]]:
         c = statistics.compare(a, b)
         share = f"{100 * (c.gained - c.lost) / a.size:+.2f} %"
         counts = str(c.gained), str(c.lost)
-        rows.append([f"{second} against {first}", *counts, share, f"{c.p:.2g}"])
+        rows.append([f"{second} against {first}", *counts, share, _p(c.p)])
     return rows
 
 
@@ -191,7 +194,7 @@ def against_table(results: xr.Dataset, reference: str) -> list[list[str]]:
         if law != reference:
             c = found[law]
             share = 100 * (c.gained - c.lost) / base.size
-            cells = [f"{share:+.2f} % (+{c.gained} -{c.lost})", f"{adjusted[law]:.2g}"]
+            cells = [f"{share:+.2f} % (+{c.gained} -{c.lost})", _p(adjusted[law])]
             cells.append(str(c.gained))
         rows.append([law, _rate(results.success.sel(law=law).values > 0), *cells])
     return rows

@@ -106,25 +106,16 @@ def render(
     Frames are drawn and encoded one by one as they come, so memory does not grow with them. The
     file appears at `path` when it is complete, and a file already there stays until then.
 
-    Args:
-      scene: as `scene.load` gives it.
-      frames: qpos of each frame, (10,), as for `snapshot`; at least one.
-      path: the file to write.
-      p_world_target: (2,) [m] where the flag stands.
-      fps: frames per second of the video.
-      size: width and height [px], even numbers.
-      camera: name of a camera of the scene: oblique or above.
-      p_world_contacts: contact point of each frame, (2,) [m], NaN without contact.
+    Frames are qpos (10,) as for `snapshot`, at least one, with contact points (2,) [m], NaN
+    without contact, of as many; the rest is as for `render_grid`.
 
     Raises:
       InputError: no frames, or a frame, target, rate, size or camera that cannot be used.
-      ValueError: not as many contacts as frames.
       VideoError: this machine cannot draw or encode, or `path` cannot be written.
     """
-    if p_world_contacts is None:
-        pairs = zip(frames, itertools.repeat(NO_CONTACT), strict=False)
-    else:
-        pairs = zip(frames, p_world_contacts, strict=True)
+    none = p_world_contacts is None
+    contacts = itertools.repeat(NO_CONTACT) if none else p_world_contacts
+    pairs = zip(frames, contacts, strict=not none)
     if (first := next(pairs, None)) is None:
         raise errors.InputError("frames = [] is not allowed: a video needs at least one frame.")
     shots = ([Shot(*pair, "")] for pair in itertools.chain([first], pairs))

@@ -1,7 +1,5 @@
 """What works on this machine, and how to mend what does not."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Laws for robots and browsers: `rps export c`, `rps export js`, `rps export onnx`."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 from collections.abc import Iterator, Mapping
@@ -47,7 +45,6 @@ class Export(Question[Path]):
         return self.prefix or programs.identifier(self.program.label)
 
     def check(self) -> None:
-        """Check the law, the robot, the prefix and the folder."""
         if self.prefix and programs.identifier(self.prefix) != self.prefix:
             raise InputError(
                 f"prefix = {self.prefix} is not allowed: it must be a name of C, as my_law."
@@ -57,7 +54,6 @@ class Export(Question[Path]):
 
     @contextlib.contextmanager
     def opened(self) -> Iterator[None]:
-        """No run folder."""
         yield None
 
     def texts(self) -> Mapping[str, str | bytes]:
@@ -65,7 +61,6 @@ class Export(Question[Path]):
         raise NotImplementedError
 
     def answer(self, run: Run) -> Path:
-        """Write the files."""
         out, texts = Path(self.out or self.place), self.texts()
         for name, text in texts.items():
             files.write_bytes(out / name, text if isinstance(text, bytes) else text.encode())
@@ -88,7 +83,6 @@ class ExportJs(Export):
     """Write a law and a skin as one JavaScript module."""
 
     def texts(self) -> Mapping[str, str | bytes]:
-        """The module."""
         from rps_jax.app.export import js
 
         return {f"{self.named}.mjs": js.module(self.program, self.named)}

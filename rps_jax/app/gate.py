@@ -6,8 +6,6 @@ whose name was pointed at this machine (DNS rebinding) gets in; and a message mu
 page's own controls can send.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import http

@@ -1,7 +1,5 @@
 """What a law is: two pure functions, what it senses, and within which bounds it is tuned."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import sys

@@ -5,8 +5,6 @@ of text names a law everywhere (`named`): `rps`, `rps_tuned`, `mine.py:P`, `poli
 changes, as `rps,K_h=0.3` or `pursuit,mine.json`.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib
 import importlib.util
@@ -68,20 +66,15 @@ def changed(params: Params, changes: Mapping[str, Any]) -> Params:
     return jax.tree.unflatten(jax.tree.structure(params), leaves)
 
 
-def law_of(params: Params) -> Law:
-    """Look up the law that parameters belong to, by their class; InputError if there is none."""
-    kind = type(params)
+def law_of(params: Params | type) -> Law:
+    """Look up the law that parameters, or their class, belong to; InputError if there is none."""
+    kind = params if isinstance(params, type) else type(params)
     if kind not in _OF:
         known = ", ".join(known.__name__ for known in _OF)
         raise InputError(
             f"params of class {kind.__name__} belong to no law: give {known}, or register theirs "
             "with register_law."
         )
-    return _OF[kind]
-
-
-def of_class(kind: type) -> Law:
-    """Look up the law that a class of parameters belongs to."""
     return _OF[kind]
 
 

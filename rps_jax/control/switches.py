@@ -1,7 +1,5 @@
 """Switches of laws: a bool, or in a smooth law a weight from 0 to 1, which mixes."""
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable
 from typing import Any

@@ -5,8 +5,6 @@ and `step` once with `jax.eval_shape`, which computes nothing, and compares what
 what a trial needs.
 """
 
-from __future__ import annotations
-
 import functools
 import inspect
 import linecache
@@ -33,35 +31,23 @@ from rps_jax.errors import InputError
 _PACKAGE = str(Path(__file__).resolve().parent.parent)
 _TAXELS = 42  # of the paper's skin
 # What a law did that JAX cannot trace, and what to write instead.
-_MENDS: tuple[tuple[type[Exception], str], ...] = (
-    (
-        jax.errors.TracerBoolConversionError,
-        "branches on a value that is not known while JAX traces: write "
-        "jnp.where(condition, this, that)",
-    ),
-    (
-        jax.errors.TracerArrayConversionError,
-        "hands NumPy a value that is not known while JAX traces: use jax.numpy",
-    ),
-    (
-        jax.errors.TracerIntegerConversionError,
-        "uses a value as an index or a length that is not known while JAX traces: index with "
-        "jnp.take or jnp.where",
-    ),
-    (
-        jax.errors.NonConcreteBooleanIndexError,
-        "indexes by a condition that is not known while JAX traces: write jnp.where",
-    ),
-    (
-        jax.errors.ConcretizationTypeError,
-        "needs a number that is not known while JAX traces: keep it a jax.Array",
-    ),
-)
+_MENDS: dict[type[Exception], str] = {
+    jax.errors.TracerBoolConversionError: "branches on a value that is not known while JAX traces: "
+    "write jnp.where(condition, this, that)",
+    jax.errors.TracerArrayConversionError: "hands NumPy a value that is not known while JAX "
+    "traces: use jax.numpy",
+    jax.errors.TracerIntegerConversionError: "uses a value as an index or a length that is not "
+    "known while JAX traces: index with jnp.take or jnp.where",
+    jax.errors.NonConcreteBooleanIndexError: "indexes by a condition that is not known while JAX "
+    "traces: write jnp.where",
+    jax.errors.ConcretizationTypeError: "needs a number that is not known while JAX traces: keep "
+    "it a jax.Array",
+}
 
 
 def observation_of(senses: str) -> Any:
     """What a law observes that senses this, as shapes and types alone."""
-    dtype = jnp.zeros(()).dtype
+    dtype = jnp.result_type(float)
 
     def number(*shape: int) -> Any:
         return jax.ShapeDtypeStruct(shape, dtype)
@@ -159,7 +145,7 @@ def _called(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # whatever a user's file raises
-        said = next((mend for kind, mend in _MENDS if isinstance(error, kind)), None)
+        said = next((mend for kind, mend in _MENDS.items() if isinstance(error, kind)), None)
         if said is None:
             reason = " ".join(str(error).split())[:300].rstrip(".")
             said = f"raises {type(error).__name__}" + (f" ({reason})" if reason else "")

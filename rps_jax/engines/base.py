@@ -8,7 +8,6 @@ program. One that is not (`traced = False`) steps worlds on the host, by `steppe
 from __future__ import annotations
 
 import abc
-import os
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
@@ -19,6 +18,7 @@ from rps_jax import errors
 from rps_jax.control.observation import Twist
 from rps_jax.geometry.arrays import Bool, Float
 from rps_jax.geometry.solid import Solid
+from rps_jax.record import provenance
 from rps_jax.robot.robot import Robot
 from rps_jax.world.objects import SHAPES
 from rps_jax.world.physics import Physics
@@ -200,7 +200,7 @@ class Engine(abc.ABC):
 
         A processor gets one for each core, since XLA steps a small batch on one core.
         """
-        return (os.cpu_count() or 1) if backend == "cpu" else 1
+        return provenance.processors() if backend == "cpu" else 1
 
     def levers(self, family: str) -> dict[str, Callable[[Any], Any]]:
         """Changes of the stage that are worth timing, by name: see `sweeps/levers`."""

@@ -33,7 +33,7 @@ from rps_jax.engines.base import Driven, Engine, Motion, taken
 from rps_jax.engines.fused.contacts import Point, circle_and_rectangle, polygon_and_rectangle
 from rps_jax.geometry import planar, solid
 from rps_jax.geometry import vectors as sp
-from rps_jax.geometry.solid import Solid, Support
+from rps_jax.geometry.solid import Solid
 from rps_jax.geometry.vectors import Vec
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
@@ -56,17 +56,15 @@ class Slider(NamedTuple):
     radius: Any  # () [m] of the outline
 
 
-def sliders(
-    solids: Solid, friction_robot: np.ndarray, base_half: np.ndarray, support: Support = "feet"
-) -> Slider:
-    """Solids (n,), their friction (n,) with a base of half length and width (2,) [m].
+def sliders(solids: Solid, friction_robot: np.ndarray, base_half: np.ndarray) -> Slider:
+    """Solids (n,) on the points on which the other engines stand them.
 
-    By default they stand on the points on which the other engines stand them.
+    Their friction (n,) is that with a base of half length and width (2,) [m].
     """
     count = solids.mass.size
     return Slider(
         p_object_com=solids.p_object_com[:, :2],
-        arm=solid.friction_arm(solids, support),
+        arm=solid.friction_arm(solids),
         friction_robot=np.broadcast_to(friction_robot, count),
         base_half=np.broadcast_to(base_half, (count, 2)),
         vertices=solids.vertices,

@@ -5,8 +5,6 @@ with `#` an axis may also be 1, and `...` is any axes at all. Nothing is checked
 runs: the tests look into the calls of some modules, as `tests/shapes.py` says.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 from jaxtyping import Bool as Bool

@@ -4,10 +4,9 @@ A rectangle is four vertices and radius 0, a circle one vertex and its radius, a
 its vertices: one formula serves all, batches over sizes, and has finite derivatives everywhere.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -23,6 +22,7 @@ class Footprint(NamedTuple):
     radius: Float[Array, "*B"]  # [m]
 
 
+@jax.jit
 def rectangle(half_x: Scalar, half_y: Scalar) -> Footprint:
     """Rectangle of sides 2 half_x by 2 half_y [m] about the origin."""
     signs = jnp.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])

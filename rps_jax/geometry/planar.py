@@ -4,8 +4,6 @@ Every singularity of the project is guarded here and nowhere else: the norm at z
 direction of a zero vector, the wrap at pi, the greatest of several.
 """
 
-from __future__ import annotations
-
 import functools
 
 import jax

@@ -5,28 +5,22 @@ its origin in the middle of its height above the centroid of its outline; z is u
 NumPy in double precision and lead with the number of solids, n.
 """
 
-from __future__ import annotations
-
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 
-from rps_jax import errors
 from rps_jax.geometry import vectors
 
-Support = Literal["feet", "even"]  # what bears a solid on the ground
 GRAVITY = 9.81  # [m/s^2]
 SIDES = 8  # vertices of a prism at most; those of fewer sides repeat some
 _LOAD_AT = 0.8  # of the way from the middle to the outline stands the load
-_CELLS = 8  # into which the evenly borne parts of an outline are split, along and across
 
 
 class Solid(NamedTuple):
     """Outline, height and mass properties of solids of one shape family."""
 
-    vertices: (
-        np.ndarray
-    )  # (n, N, 2) [m] counter-clockwise, padded by repetition; (n, 1, 2) if round
+    # (n, N, 2) [m] counter-clockwise, padded by repetition; (n, 1, 2) if round
+    vertices: np.ndarray
     radius: np.ndarray  # (n,) [m] of a cylinder; 0 of a prism
     height: np.ndarray  # (n,) [m]
     mass: np.ndarray  # (n,) [kg]
@@ -160,16 +154,14 @@ def axes(solid: Solid) -> np.ndarray:
     return np.stack([entry for row in rows for entry in row], axis=-1).reshape(-1, 3, 3)
 
 
-def friction_arm(solid: Solid, support: Support = "feet") -> np.ndarray:
+def friction_arm(solid: Solid) -> np.ndarray:
     """Arms m_max / f_max (n,) [m] of the ground's friction about the centres of mass.
 
-    That is the mean distance of the load from its centre. The load is what springs under `support`
-    bear that give way alike and only push: `feet`, points as engines stand solids on (the corners
-    of a prism, three points of a cylinder's rim, one where it leans to); `even`, all of the ground
-    that is covered.
+    That is the mean distance of the load from its centre. The load is what springs bear that give
+    way alike and only push, under the points on which engines stand solids: the corners of a prism,
+    three points of a cylinder's rim, one where it leans to.
     """
-    errors.check_name("support", support, get_args(Support))
-    at, share = _feet(solid) if support == "feet" else _bed(solid)
+    at, share = _feet(solid)
     com = solid.p_object_com[:, :2]
     rows = np.concatenate([np.ones((*share.shape, 1)), at - com[:, None]], axis=-1)
     bears = np.ones(share.shape, bool)
@@ -194,7 +186,8 @@ def _feet(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
         return at, np.any(at != np.roll(at, 1, axis=1), axis=2).astype(float)
     x, y, _ = solid.p_object_com.T
     lean = np.arctan2(y, x)[:, None] + np.array([0, 2, 4]) * np.pi / 3
-    return _on_circle(solid.radius, lean), np.ones(lean.shape)
+    rim = solid.radius[:, None, None] * np.stack([np.cos(lean), np.sin(lean)], axis=-1)
+    return rim, np.ones(lean.shape)
 
 
 def standing(solid: Solid) -> Solid:
@@ -203,25 +196,6 @@ def standing(solid: Solid) -> Solid:
         return solid
     at, share = _feet(solid)
     return solid._replace(feet=np.concatenate([at, share[..., None]], axis=-1))
-
-
-def _bed(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, M, 2) [m] all over the outlines, and the area (n, M) [m^2] of each."""
-    vertices = solid.vertices
-    if vertices.shape[1] == 1:
-        angles = np.arange(8 * _CELLS) * np.pi / (4 * _CELLS)
-        vertices = _on_circle(solid.radius, np.tile(angles, (len(vertices), 1)))
-    cross, ahead = _triangles(vertices)
-    along, out = np.meshgrid(*[(np.arange(_CELLS) + 0.5) / _CELLS] * 2)
-    edge = vertices[:, :, None] + along.ravel()[:, None] * (ahead - vertices)[:, :, None]
-    at = out.ravel()[:, None] * edge
-    area = cross[:, :, None] * out.ravel() / _CELLS**2
-    return at.reshape(len(at), -1, 2), area.reshape(len(at), -1)
-
-
-def _on_circle(radius: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Points (n, M, 2) [m] at angles (n, M) [rad]."""
-    return radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def _triangles(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

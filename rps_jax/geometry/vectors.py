@@ -4,8 +4,6 @@ An entry is a number or an array; all arrays have one shape. Literal zeros and o
 which halves a program that has axis-aligned directions in it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar

@@ -1,9 +1,7 @@
 """Checkpoints: the finished parts of a run, which are not run again when it is continued."""
 
-from __future__ import annotations
-
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,22 +33,25 @@ class Parts:
         """The files of all parts, in the order of their names."""
         return {name: path for name, path, _ in self._sound()}
 
-    def contents(self) -> dict[str, bytes]:
-        """The contents of all parts, in the order of their names."""
-        return {name: content for name, _, content in self._sound()}
+    def each(self, names: Container[str] | None = None) -> Iterator[tuple[str, bytes]]:
+        """Names and contents of all parts, or of these, in the order of their names."""
+        for name, _, content in self._sound(names):
+            yield name, content
 
     def get(self, name: str) -> bytes | None:
         """The content of one part, if it is finished."""
-        return next((content for _, _, content in self._sound(name)), None)
+        return next((content for _, content in self.each((name,))), None)
 
-    def put(self, name: str, content: bytes, suffix: str = ".nc", *, new: bool = False) -> Path:
+    def put(
+        self, name: str, content: bytes | memoryview, suffix: str = ".nc", *, new: bool = False
+    ) -> Path:
         """Write the file of a part, whole or not at all, and then remove what it had before.
 
         A process that is killed in between leaves both, of which the newer counts. Nothing is
         removed for a part that the caller knows to be `new`, which spares a look at the folder.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        older = [] if new else self._files(name)
+        older = [] if new else self._files((name,))
         path = self.folder / f"{name}-{files.digest(content)[:_DIGITS]}{suffix}"
         files.write_bytes(path, content)
         for one in older:
@@ -68,20 +69,20 @@ class Parts:
             raise files.corrupt(self.folder / name, "it holds another part")
         return found
 
-    def _files(self, name: str | None = None) -> list[Path]:
-        """Files of one part, or of all, by name, and of one name the newest first."""
+    def _files(self, names: Container[str] | None = None) -> list[Path]:
+        """Files of some parts, or of all, by name, and of one name the newest first."""
         found = []
         for path in self.folder.glob("*-*"):
             whole = path.name[0] != "." and path.suffix != ".corrupt"
-            if whole and name in (None, _name(path)):
+            if whole and (names is None or _name(path) in names):
                 with contextlib.suppress(FileNotFoundError):  # another process has set it aside
                     found.append((_name(path), -path.stat().st_mtime_ns, path))
         return [path for *_, path in sorted(found)]
 
-    def _sound(self, name: str | None = None) -> Iterator[tuple[str, Path, bytes]]:
-        """The newest sound file of every part, or of one: name, path and content."""
+    def _sound(self, names: Container[str] | None = None) -> Iterator[tuple[str, Path, bytes]]:
+        """The newest sound file of every part, or of some: name, path and content."""
         last = None
-        for path in self._files(name):
+        for path in self._files(names):
             if _name(path) != last and (content := _content(path)) is not None:
                 last = _name(path)
                 yield last, path, content

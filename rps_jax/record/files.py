@@ -9,10 +9,7 @@ own checksum or with none, but never with that of the other. A file without a ch
 unchecked, as are the files of older versions, which had none.
 """
 
-from __future__ import annotations
-
 import contextlib
-import csv
 import hashlib
 import io
 import json
@@ -24,6 +21,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from rps_jax.errors import InputError
@@ -71,7 +69,7 @@ def write_text(path: Path, text: str) -> Path:
     return write_bytes(path, text.encode(errors="surrogateescape"))
 
 
-def write_bytes(path: Path, content: bytes, *, checked: bool = False) -> Path:
+def write_bytes(path: Path, content: bytes | memoryview, *, checked: bool = False) -> Path:
     """A file of this content, whole or not at all; if `checked`, with its checksum."""
     atomic(path, lambda partial: partial.write_bytes(content))
     if checked:
@@ -81,13 +79,8 @@ def write_bytes(path: Path, content: bytes, *, checked: bool = False) -> Path:
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
-    """A table with a header, which pandas reads: the names of all rows; None and NaN stay empty."""
-    text = io.StringIO()
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({k: v for k, v in row.items() if v == v} for row in rows)  # NaN is not itself
-    return write_text(path, text.getvalue())
+    """A table with a header: the names of all rows; None and NaN stay empty."""
+    return write_text(path, pd.DataFrame(list(rows)).to_csv(index=False, lineterminator="\n"))
 
 
 def write_json(path: Path, content: Any, *, checked: bool = False) -> Path:
@@ -106,19 +99,19 @@ def checksum(path: Path) -> Path:
     return path.with_name(f"{path.name}.sha256")
 
 
-def digest(content: bytes) -> str:
+def digest(content: bytes | memoryview) -> str:
     """SHA-256 in hexadecimal."""
     return hashlib.sha256(content).hexdigest()
 
 
-def encoded(results: xr.Dataset) -> bytes:
+def encoded(results: xr.Dataset) -> memoryview:
     """NetCDF 4, which depends on the results alone, not on when or where it is made.
 
     It is made in memory, since HDF5 crashes the process when its disk is full. An attribute holds
     the digest of its structure, by which `decoded` knows what somebody has edited.
     """
     signed = results.assign_attrs({_STRUCTURE: _structure(results)})
-    return bytes(signed.to_netcdf(engine="h5netcdf"))
+    return signed.to_netcdf(engine="h5netcdf")
 
 
 def _structure(results: xr.Dataset) -> str:
@@ -160,7 +153,7 @@ def _check_regular(path: Path, mode: int) -> None:
         raise InputError(f"{path} cannot be read (it is {what}): give a regular file.")
 
 
-def decoded(content: bytes, source: Any, *, own: bool = False) -> xr.Dataset:
+def decoded(content: bytes | memoryview, source: Any, *, own: bool = False) -> xr.Dataset:
     """The labelled results that `encoded` made into bytes; InputError names the `source`.
 
     If they are `own`, only `encoded` can have made them, and so signed their structure.

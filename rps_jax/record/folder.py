@@ -1,7 +1,5 @@
 """Run folders: what was asked, and who may write there now."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import reprlib

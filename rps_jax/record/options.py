@@ -4,8 +4,6 @@ A field's annotation is its type, the string below it is its help, and `option` 
 The command line, the checks and the manifests of runs are made from these declarations.
 """
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import functools

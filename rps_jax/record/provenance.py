@@ -1,7 +1,5 @@
 """What a run was made by: command, versions, device and commit, noted in its folder."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import os
 import platform
@@ -35,7 +33,7 @@ def environment() -> dict[str, Any]:
         "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "processors": os.cpu_count(),
+        "processors": processors(),
         "device": {
             "platform": device.platform,
             "kind": device.device_kind,
@@ -44,6 +42,13 @@ def environment() -> dict[str, Any]:
         "x64": bool(jax.config.jax_enable_x64),
         "packages": {name: _version(name) for name in _PACKAGES},
     }
+
+
+def processors() -> int:
+    """Number of processors that this process may use, which a cluster may hold below the host's."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS and Windows
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _command() -> list[str]:

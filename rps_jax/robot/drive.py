@@ -6,8 +6,6 @@ own frame, that pushes with a force and a torque up to their limits. Without a l
 below the limit it loses no speed for long; beyond the limit it stalls.
 """
 
-from __future__ import annotations
-
 import math
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -69,27 +67,17 @@ def carried_out(robot: Robot, aim: jax.Array) -> jax.Array:
 
 
 def push(
-    robot: Robot,
-    integral: Triple,
-    twist: Triple,
-    velocity: Triple,
-    turn: tuple[Any, Any],
-    timestep: float,
-    xp: ModuleType = jnp,
+    robot: Robot,  # whose force is limited
+    integral: Triple,  # [N, N, N m] of the servo, in the base's frame
+    twist: Triple,  # [m/s, m/s, rad/s] wanted, in the base's frame
+    velocity: Triple,  # [m/s, m/s, rad/s] of the base in the world
+    turn: tuple[Any, Any],  # cosine and sine of the base's heading
+    timestep: float,  # [s] of the physics
+    xp: ModuleType = jnp,  # or numpy, whichever the numbers are of
 ) -> tuple[Triple, Triple]:
-    """Force of the drive on the base in one physics step, and the servo's integral after it.
+    """Force and torque of the drive [N, N, N m] on the base in one physics step, in the world.
 
-    Args:
-      robot: whose force is limited.
-      integral: [N, N, N m] of the servo, in the base's frame.
-      twist: [m/s, m/s, rad/s] wanted, in the base's frame.
-      velocity: [m/s, m/s, rad/s] of the base in the world.
-      turn: cosine and sine of the base's heading.
-      timestep: [s] of the physics.
-      xp: numpy or jax.numpy, whichever the numbers are of.
-
-    Returns:
-      Force and torque [N, N, N m] in the world, and the new integral.
+    Returns them, and the servo's integral after the step.
     """
     c, s = turn
     errors = (

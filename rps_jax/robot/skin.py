@@ -300,11 +300,6 @@ def signals(skin: Skin, state: SkinState, footprint: Footprint) -> Float[Array, 
     return perfect._scan(perfect.init(state.key), footprint)[1]
 
 
-def own(sensor: Any) -> list[str]:
-    """Names of the numbers of a sensor itself; where it feels is the robot's."""
-    return [name for name in sensor._fields if name != "shell"]
-
-
 SkinName = Literal["ideal", "thin", "capacitive", "hardware"]
 # "thin" chatters between the corners of a box, as a rigid contact sensor does.
 SKINS: dict[SkinName, Skin] = {
@@ -325,8 +320,9 @@ def named(skin: SkinLike) -> Any:
         return skin
     name, changes = with_changes("skin", skin)
     usual: Any = SKINS[errors.check_name("skin", name, SKINS)]  # pyright: ignore
+    own = [field for field in usual._fields if field != "shell"]  # which is the robot's
     for field, value in changes.items():
-        errors.check_name(f"number of the skin {name}", field, own(usual))
+        errors.check_name(f"number of the skin {name}", field, own)
         errors.check_number(f"skin {field}", value)
     found = usual._replace(**changes)
     found.check()

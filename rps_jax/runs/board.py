@@ -1,7 +1,5 @@
 """Which parts of a run wait, which worker has begun which, and what came back. No JAX, no Ray."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Sequence

@@ -13,8 +13,6 @@ other parts. That asks for devices of one kind; versions and commit are compared
 begins.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools
@@ -75,7 +73,7 @@ def _work(
     tell, before = board.tell.remote, Progress(0, 0.0)
 
     def keep(number: int, part: xr.Dataset) -> None:
-        ask("deliver", number, plan.parts[number].size, files.encoded(part))
+        ask("deliver", number, plan.parts[number].size, bytes(files.encoded(part)))
 
     def report(progress: Progress) -> None:
         nonlocal before

@@ -3,8 +3,6 @@
 Worlds for tuning, validation and testing come from seeds that never meet.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -14,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.base import Params
 from rps_jax.control.laws.rps import RPSParams
@@ -26,7 +24,7 @@ from rps_jax.runs.question import Split, seed_of
 from rps_jax.trials import batch
 from rps_jax.trials.batch import Job, Part
 from rps_jax.trials.progress import Bar, Report, Timing, unheard, watched
-from rps_jax.trials.results import UNITS
+from rps_jax.trials.results import variable
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
@@ -95,9 +93,7 @@ def evaluate(
     count = worlds if at is None else len(at.u)
     errors.check_count("worlds", count, at_most=10_000_000)
     errors.check_count("seed", setting.seed, at_least=0, at_most=2**30)
-    engines.get(setting.engine).check(ranges.families)
-    engines.get(setting.engine).check_senses(registry.law_of(params).senses)
-    batch.check_shape(slots, workers)
+    setting.check_here(ranges.families, ranges.weakest, [params])
     ask = Ask(_checked(params), seed_of(setting.seed, split), np.arange(count), at)
     device.use_cache_if_asked()
     shown = watched() if progress is None else progress
@@ -108,10 +104,7 @@ def evaluate(
         "score": (("candidate", "world"), answer.score, {"units": "1", "long_name": "objective"})
     }
     for name, values in answer.outcome._asdict().items():
-        unit, meaning = UNITS[name]
-        dims = ("candidate", "world", "pose")[: values.ndim]
-        plain = values.astype(np.int8) if values.dtype == bool else values
-        variables[name] = (dims, plain, {"units": unit, "long_name": meaning})
+        variables[name] = variable(name, ("candidate", "world"), values)
     drawn = points_.coordinates(ranges, ask.object_of(ranges), partial(ask.draw, ranges))
     return xr.Dataset(variables, {"pose": ["x", "y", "yaw"], "world": ask.worlds} | drawn)
 
@@ -219,16 +212,6 @@ class Answer(NamedTuple):
     score: np.ndarray  # (P, D * W) [1]
 
 
-class _Group(NamedTuple):
-    """Worlds of an ask that can be batched: those of one object of one domain."""
-
-    ask: Ask  # whose parameters are on the host
-    part: Part  # the worlds, but with the parameters (P, ...) of all candidates
-    first: int  # number of the ask's first trial
-    width: int  # trials of each candidate
-    column: np.ndarray  # (n,) of the worlds among those
-
-
 def try_out(
     asks: Sequence[Ask],
     domains: Sequence[Domain],
@@ -242,21 +225,26 @@ def try_out(
     widths = [len(domains) * ask.worlds.size for ask in asks]
     counts = [ask.candidates for ask in asks]
     ends = np.cumsum(np.multiply(widths, counts))
-    narrow = partial(np.asarray, dtype=jnp.zeros(()).dtype)
+    narrow = partial(np.asarray, dtype=jnp.result_type(float))
     longest = max(remembered_steps(one, setting.physics.control_period) for one in domains)
     away = np.empty(ends[-1])  # [m] of the target from the start
-    jobs: dict[Any, list[_Group]] = {}
+    jobs: dict[Any, list[Part]] = {}
     for ask, width, count, end in zip(asks, widths, counts, ends, strict=True):
         first = int(end) - count * width
         ask = ask._replace(params=jax.tree.map(narrow, jax.device_get(ask.params)))
         for part, column, distance in parts(ask, domains, setting):
             away[first:end].reshape(count, width)[:, column] = distance
-            part = _prepared(part, longest, ask.params)
-            leaves, tree = jax.tree.flatten(part.worlds)
+            # As many steps of odometry in all domains let their worlds share a batch.
+            past = np.zeros((part.numbers.size, longest), part.worlds.odometry.past.dtype)
+            odometry = part.worlds.odometry._replace(past=past)
+            worlds = part.worlds._replace(odometry=odometry, params=ask.params)
+            leaves, tree = jax.tree.flatten(worlds)
             kind = (tree, *(leaf.shape[1:] for leaf in leaves))
-            jobs.setdefault(kind, []).append(_Group(ask, part, first, width, column))
-    jobs_ = [_job(groups) for groups in jobs.values()]
-    every, timing = batch.gathered(jobs_, setting, away.size, report=report, **shape)
+            numbers = first + width * np.arange(count)[:, None] + column
+            jobs.setdefault(kind, []).append(Part(numbers, worlds, part.stage))
+    every, timing = batch.gathered(
+        list(map(_job, jobs.values())), setting, away.size, report=report, **shape
+    )
     score = objective.scores(every, away, setting.rules)
     answers = []
     for width, count, end in zip(widths, counts, ends, strict=True):
@@ -278,26 +266,17 @@ def parts(
             yield part, d * ask.worlds.size + rows, np.linalg.norm(drawn.p_world_target, axis=1)
 
 
-def _prepared(part: Part, steps: int, params: Params) -> Part:
-    """The part with the parameters (P, ...) of all candidates, and with so many steps of odometry.
+def _job(every: Sequence[Part]) -> Job:
+    """The job of worlds (n, ...) of one shape family, candidate after candidate.
 
-    As many steps in all domains let their worlds share a batch.
+    A part has the numbers (P, n) of the trials of all candidates, and their parameters (P, ...).
     """
-    odometry = part.worlds.odometry
-    past = np.zeros((part.numbers.size, steps), odometry.past.dtype)
-    worlds = part.worlds._replace(odometry=odometry._replace(past=past), params=params)
-    return part._replace(worlds=worlds)
-
-
-def _job(groups: Sequence[_Group]) -> Job:
-    """The job of groups of one shape family, candidate after candidate."""
 
     def filled() -> Iterator[Part]:
-        for ask, part, first, width, column in groups:
-            for p in range(ask.candidates):
-                same = np.full(column.size, p)
-                worlds = part.worlds._replace(params=batch.rows(ask.params, same))
-                yield Part(first + p * width + column, worlds, part.stage)
+        for numbers, worlds, stage in every:
+            for p, own in enumerate(numbers):
+                params = batch.rows(worlds.params, np.full(own.size, p))
+                yield Part(own, worlds._replace(params=params), stage)
 
-    trials = sum(group.ask.candidates * group.column.size for group in groups)
-    return Job(registry.law_of(groups[0].ask.params), trials, filled())
+    trials = sum(part.numbers.size for part in every)
+    return Job(registry.law_of(every[0].worlds.params), trials, filled())

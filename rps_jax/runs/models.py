@@ -5,8 +5,6 @@ A rate has two errors. Its statistical interval says what other worlds would hav
 over models says what another simulation would have.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -75,7 +73,6 @@ class Models(OfPlan):
     SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 24}
 
     def trials(self) -> int | None:
-        """How many trials there are on all models."""
         return self.plan.trials * len(plans(self.plan))
 
     def answer(self, run: Run) -> xr.Dataset:
@@ -83,7 +80,6 @@ class Models(OfPlan):
         return complete(self.plan, run.folder, **run.shape)
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Rates on each model, and their range."""
         return sweeps.spread(with_models(found.isel(model=0), found))
 
 

@@ -20,7 +20,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.base import Params
 from rps_jax.errors import InputError
@@ -52,7 +52,6 @@ class Plan:
     points: Points | None = None  # of the unit cube at which the worlds lie; None: drawn ones
 
     def __post_init__(self) -> None:
-        """Raises InputError for no worlds, no laws, or parameters that mean nothing."""
         errors.check_count("worlds", self.worlds, at_most=1_000_000_000)
         errors.check_count("part", self.part, at_most=1_000_000)
         if not self.laws:
@@ -64,11 +63,8 @@ class Plan:
 
     def check_here(self) -> None:
         """Raises InputError unless the engine can step these worlds on this machine."""
-        engine = engines.get(self.setting.engine)
-        engine.check(self.domain.families)
-        engine.check_robot(self.domain.weakest)
-        for params in self.laws.values():
-            engine.check_senses(registry.law_of(params).senses)
+        domain = self.domain
+        self.setting.check_here(domain.families, domain.weakest, self.laws.values())
 
     @property
     def trials(self) -> int:
@@ -149,7 +145,6 @@ class Shard:
         return cls(int(found[1]), int(found[2]))
 
     def __post_init__(self) -> None:
-        """Raises InputError unless 1 <= number <= of."""
         errors.check_count("shard", self.of, at_most=1_000_000)
         errors.check_count("shard", self.number, at_most=self.of)
 

@@ -51,7 +51,6 @@ class Trace:
     engine: str
 
     def __repr__(self) -> str:
-        """What it was, and how it ended."""
         title = self.title.replace("$\\mu$", "friction")
         return f"<Trace of {title}: {self.told}>"
 
@@ -91,11 +90,14 @@ class Trace:
         Raises:
           VideoError: this machine cannot draw.
         """
-        from rps_jax.analysis import figures, video
+        from rps_jax.analysis import figures, studio, video
 
-        seen, target = self.followed.snapshots, np.array(self.followed.p_world_target)
+        seen = self.followed.snapshots
         shown = _evenly(len(seen.time), count)
-        images = [video.snapshot(self.scene, seen.qpos[i], p_world_target=target) for i in shown]
+        tiles = [studio.Tile(self.scene, self.followed.p_world_target)] * len(shown)
+        with studio.open_studios(tiles, video.SIZE, "oblique") as each:
+            drawn = zip(each, seen.qpos[shown], strict=True)
+            images = [one.draw(qpos, studio.NO_CONTACT) for one, qpos in drawn]
         return figures.stills(images, [f"{seen.time[i]:.0f} s" for i in shown])
 
     def film(
@@ -150,7 +152,6 @@ class FollowsOne(Question[Trace]):
     """MCAP file to write: the trial as messages of ROS 2, which Foxglove shows (extra bags)."""
 
     def check(self) -> None:
-        """Check that the bag can be written."""
         if self.bag is not None:
             bags.check()
             folder.writable(Path(self.bag).parent)
@@ -177,11 +178,9 @@ class FollowsOne(Question[Trace]):
         raise NotImplementedError
 
     def bar(self) -> Bar:
-        """A bar over simulated seconds."""
         return Bar(self.name, self.horizon, "simulated", shown=self.shown)
 
     def report(self, found: Trace, run: Run) -> Sequence[Section]:
-        """How it ended, and its figure."""
         return [Section("The push", f"{found.told}.", (), Picture("trial", found.plot))]
 
 
@@ -244,12 +243,10 @@ class Push(Case, FollowsOne, Pushes[Trace]):
 
     @property
     def horizon(self) -> float:
-        """Time [s] after which the trial ends."""
         return float(self.setting.rules.horizon)
 
     @property
     def title(self) -> str:
-        """What is pushed."""
         return self.case.title.replace("$\\mu$", "friction")
 
     @property
@@ -259,14 +256,10 @@ class Push(Case, FollowsOne, Pushes[Trace]):
         return Case(**own | sensed(self, self.setting))
 
     def check(self) -> None:
-        """Check the trial, and that its engine can be followed."""
         super().check()
-        engine = engines.get(self.setting.engine)
-        engine.check()
-        engine.check_robot(self.case.base)
+        self.setting.check_here((), self.case.base, [self.case.params])
 
     def answer(self, run: Run) -> Trace:
-        """Follow the trial."""
         case, setting = self.case, self.setting
         stage, worlds = pushes.build([case], setting)
         part = Part(np.arange(1), worlds, stage)
@@ -303,12 +296,10 @@ class Replay(FollowsOne):
 
     @property
     def place(self) -> Path:
-        """A folder in that of the sweep."""
         return Path(self.run) / f"replay-{self.world}"
 
     @property
     def horizon(self) -> float:
-        """Time [s] after which the trial ends."""
         return float(self._chosen[0].setting.rules.horizon)
 
     @functools.cached_property
@@ -317,20 +308,16 @@ class Replay(FollowsOne):
 
     @property
     def title(self) -> str:
-        """Which world is followed."""
         return f"World {self.world} of {self.run}, {self._chosen[1]}"
 
     def check(self) -> None:
-        """Check that the folder holds this world and law."""
         super().check()
         _ = self._chosen
 
     def note(self) -> str:
-        """Whether another engine than the sweep's follows the world."""
         return another_engine(Path(self.run))
 
     def answer(self, run: Run) -> Trace:
-        """Follow the world."""
         plan, name = self._chosen
         part = world_part(plan, list(plan.laws).index(name), [self.world])
         law = registry.law_of(plan.laws[name])

@@ -26,7 +26,7 @@ from typing import Any, ClassVar, Generic, Literal, NamedTuple, ParamSpec, TypeV
 import numpy as np
 import xarray as xr
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.control import registry
 from rps_jax.control.base import Params
@@ -36,7 +36,6 @@ from rps_jax.record import files, folder, options, provenance
 from rps_jax.record.checkpoint import Parts
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
-from rps_jax.trials import batch
 from rps_jax.trials.progress import Bar, Report, Timing, watched
 from rps_jax.trials.setting import Setting
 from rps_jax.world import domain as domains
@@ -110,6 +109,7 @@ class Question(Generic[T]):
 
     SMALL: ClassVar[Mapping[str, Any]] = {}  # values of `quick`, by the field's name
     TITLE: ClassVar[str] = ""  # of the report
+    LEFT_OUT: ClassVar[tuple[str, ...]] = ()  # fields on which the answer does not depend
 
     @property
     def name(self) -> str:
@@ -229,7 +229,7 @@ class Question(Generic[T]):
         """Own fields as JSON, with laws by their parameters and a domain by its ranges."""
         found: dict[str, Any] = {}
         for one in fields(self):
-            if one.name in _NOT_ASKED:
+            if one.name in (*_NOT_ASKED, *self.LEFT_OUT):
                 continue
             value = getattr(self, one.name)
             if one.name == "law" and (params := getattr(self, "params", None)) is not None:
@@ -279,7 +279,6 @@ class Pushes(Question[T]):
     """Whether to make a small run of minutes on two cores: what is not asked for becomes small."""
 
     def run_in(self, out: Path | None, report: Report) -> Run:
-        """Where and how the answer is made."""
         return Run(out, report, self.slots, self.workers)
 
 
@@ -340,12 +339,7 @@ class InDomain(Pushes[T]):
 
     def check_engine(self, laws: Sequence[Params] = ()) -> None:
         """Raises InputError unless the engine can step these worlds with these laws here."""
-        engine = engines.get(self.setting.engine)
-        engine.check(self.ranges.families)
-        engine.check_robot(self.ranges.weakest)
-        for params in laws:
-            engine.check_senses(registry.law_of(params).senses)
-        batch.check_shape(self.slots, self.workers)
+        self.setting.check_here(self.ranges.families, self.ranges.weakest, laws)
 
 
 def told(timing: Timing, device: str) -> str:

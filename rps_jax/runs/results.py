@@ -1,9 +1,7 @@
 """Outcomes on their way into the parts of a sweep, and the parts into one labelled Dataset."""
 
-from __future__ import annotations
-
 import importlib.util
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,7 @@ from rps_jax.record import files
 from rps_jax.record.checkpoint import Parts
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import labelled
-from rps_jax.trials.results import UNITS
+from rps_jax.trials.results import UNITS, variable
 from rps_jax.trials.trial import Outcome
 from rps_jax.world.domain import WORDS
 
@@ -62,52 +60,52 @@ class Collector:
                 rows[name][at] = leaf[ended]
             self._missing[part] -= at.size
             if not self._missing[part]:
-                drawn = self.drawn.pop(part, {})
-                self._keep(part, _part(trials, self._open.pop(part), drawn))
-
-
-def _part(trials: np.ndarray, leaves: dict[str, np.ndarray], drawn: Columns) -> xr.Dataset:
-    """The rows of a part."""
-    columns: dict[str, Any] = {"trial": ("row", trials)}
-    for name, leaf in leaves.items():
-        columns[name] = (("row", "pose")[: leaf.ndim], leaf)
-    for name, (values, unit) in drawn.items():
-        columns[name] = ("row", values.astype(np.float32), {"units": unit})
-    return xr.Dataset(columns)
+                columns: dict[str, Any] = {"trial": ("row", trials)}
+                for name, leaf in self._open.pop(part).items():
+                    columns[name] = (("row", "pose")[: leaf.ndim], leaf)
+                for name, (values, unit) in self.drawn.pop(part, {}).items():
+                    columns[name] = ("row", values.astype(np.float32), {"units": unit})
+                self._keep(part, xr.Dataset(columns))
 
 
 def gather(
-    plan: Plan, folders: Sequence[Path], out: Path, made: Mapping[int, xr.Dataset] = {}
+    plan: Plan, folders: Sequence[Path], out: Path, made: dict[int, xr.Dataset] | None = None
 ) -> xr.Dataset:
     """All parts of a plan as one Dataset, and as `results.nc` in `out`; InputError if some lack.
 
-    What was `made` in this process is not decoded again.
+    What was `made` in this process is not read again; it is taken out, to spare memory.
     """
-    kept = {name: part for one in folders for name, part in Parts(one).contents().items()}
-    contents: dict[int, Any] = {n: kept[name_of(n)] for n in plan.parts if name_of(n) in kept}
-    contents |= made
-    if missing := len(plan.parts) - len(contents):
+    made = made or {}
+    lacking = {name_of(n): n for n in plan.parts if n not in made}
+
+    def contents() -> Iterator[tuple[int, bytes | xr.Dataset]]:
+        for number in list(made):
+            yield number, made.pop(number)
+        for folder in folders:
+            for name, content in Parts(folder).each(lacking):
+                yield lacking.pop(name), content
+
+    results = dataset(plan, contents())
+    if lacking:
         raise InputError(
-            f"run = {', '.join(map(str, folders))} lacks {missing} of {len(plan.parts)} parts: run "
-            "the same command again, or give the folders of all shards."
+            f"run = {', '.join(map(str, folders))} lacks {len(lacking)} of {len(plan.parts)} parts:"
+            " run the same command again, or give the folders of all shards."
         )
-    results = dataset(plan, contents)
     files.write_results(out / "results.nc", results)
     return results
 
 
-def dataset(plan: Plan, contents: Mapping[int, bytes | xr.Dataset]) -> xr.Dataset:
+def dataset(plan: Plan, contents: Iterable[tuple[int, bytes | xr.Dataset]]) -> xr.Dataset:
     """All results of a plan, from its parts or their files: (law, world), and (world) drawn."""
     every = np.arange(plan.worlds)
     which = {"units": "1", "long_name": "index of the object in the coordinate object"}
     objects = plan.object_of(every).astype(np.int16)
     columns = {"which_object": xr.Variable("world", objects, which)}
-    for name, (unit, meaning) in UNITS.items():
-        dims = ("law", "world", "pose") if name.endswith("pose") else ("law", "world")
-        shape = (len(plan.laws), plan.worlds, 3)[: len(dims)]
+    for name in UNITS:
+        shape = (len(plan.laws), plan.worlds, 3)[: 3 if name.endswith("pose") else 2]
         values = np.zeros(shape, _TYPES.get(name, np.float32))
-        columns[name] = xr.Variable(dims, values, {"units": unit, "long_name": meaning})
-    for number, content in contents.items():
+        columns[name] = variable(name, ("law", "world"), values)
+    for number, content in contents:
         law, _ = plan.law_and_object(number)
         part = content
         if not isinstance(part, xr.Dataset):
@@ -150,14 +148,10 @@ def dataset(plan: Plan, contents: Mapping[int, bytes | xr.Dataset]) -> xr.Datase
 
 
 def long_table(found: xr.Dataset) -> pd.DataFrame:
-    """One row for each law and world: outcomes, and what was drawn, with units in `attrs`.
+    """One row for each law and world of a sweep: its outcomes, and what was drawn.
 
-    Args:
-      found: outcomes (law, world, ...) as a sweep or `load` returns them.
-
-    Returns:
-      Columns law, world, object, the outcomes (poses as base_x, base_y [m], base_yaw [rad], and so
-      on) and the drawn quantities. `attrs["columns"]` holds the unit and the meaning of each.
+    Columns are law, world, object, the outcomes (poses as base_x, base_y [m], base_yaw [rad], and
+    so on) and the drawn quantities. `attrs["columns"]` holds the unit and the meaning of each.
     """
     pose = {"x": "m", "y": "m", "yaw": "rad"}
     flat = found.reset_coords().drop_vars(["which_object", "object", "pose"], errors="ignore")

@@ -5,8 +5,6 @@ written whole as soon as its last trial has ended, named by the hash of its cont
 there is not run again.
 """
 
-from __future__ import annotations
-
 import functools
 import shlex
 from collections import deque
@@ -47,16 +45,12 @@ class Planned(Pushes[xr.Dataset]):
     plan: Plan | functools.cached_property[Plan]  # what is run
 
     def check(self) -> None:
-        """Check the plan, and that the engine can step its worlds here."""
         self.plan.check_here()
-        batch.check_shape(self.slots, self.workers)
 
     def trials(self) -> int | None:
-        """How many trials there are."""
         return self.plan.trials
 
     def configuration(self) -> dict[str, Any]:
-        """All that the results depend on, as JSON."""
         return self.plan.configuration()
 
     def answered(self, report: Report) -> xr.Dataset:
@@ -64,7 +58,6 @@ class Planned(Pushes[xr.Dataset]):
         return self.answer(self.run_in(None if self.out is None else Path(self.out), report))
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Run what is missing of the plan."""
         return whole(self.plan, run.folder, **run.shape)
 
 
@@ -87,11 +80,9 @@ class OfPlan(Planned, InDomain[xr.Dataset], OfLaws[xr.Dataset]):
         return Plan(self.ranges, count, self.chosen, self.setting, self.part or _part_of(count))
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         return intro_of(self.plan)
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Rates, differences, what success depends on, and the hardest worlds."""
         return report_of(self.plan, found, run.folder)
 
 
@@ -172,7 +163,6 @@ class Sweep(OfPlan):
 
     @functools.cached_property
     def plan(self) -> Plan:
-        """What is run."""
         plan = super().plan
         if self.points is None:
             return plan
@@ -189,7 +179,6 @@ class Sweep(OfPlan):
         return Shard.named(self.shard)
 
     def check(self) -> None:
-        """Check what cannot be asked for together."""
         if self.points is not None and self.worlds is not None:
             raise InputError("worlds is not allowed with points: these say how many.")
         if self.table is not None:
@@ -208,7 +197,6 @@ class Sweep(OfPlan):
         return sum(numbers.size for numbers in share(self.plan, self.share).values())
 
     def answered(self, report: Report) -> xr.Dataset:
-        """Outcomes, written as a table, too, where that is asked for."""
         found = super().answered(report)
         if self.table is not None:
             results.write_table(found, Path(self.table))
@@ -235,7 +223,6 @@ class Sweep(OfPlan):
         return found
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Rates, their range over models, differences, dependence, and the hardest worlds."""
         if "row" in found.dims:
             text = f"When all shards are done: `rps merge {shlex.quote(str(self.out))} --out ...`."
             return [Section(f"Share {self.shard}", text)]
@@ -270,14 +257,12 @@ class Merge(Question[xr.Dataset]):
     """Run folder of the whole."""
 
     def check(self) -> None:
-        """Check that there are shards, and where they go."""
         if not self.folders:
             raise InputError("folders = () is not allowed: give the run folders of the shards.")
         if self.out is None:
             raise InputError("out = None is not allowed: name the run folder of the whole.")
 
     def answered(self, report: Report) -> xr.Dataset:
-        """Gather the parts of all shards."""
         folders = [Path(one) for one in self.folders]
         out = run_folder.writable(Path(str(self.out)))
         manifest = run_folder.manifest(folders[0])
@@ -294,11 +279,9 @@ class Merge(Question[xr.Dataset]):
         return labelled(found)
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         return intro_of(load_plan(Path(str(self.out))))
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """What a sweep reports."""
         return report_of(load_plan(Path(str(self.out))), found, run.folder)
 
 
@@ -316,13 +299,14 @@ def whole(plan: Plan, out: Path | None, *, report: Report = unheard, **shape: An
     for number in plan.parts:
         every.setdefault(plan.kind(number), []).append(number)
     work(plan, every, contents.__setitem__, report=report, **shape)
-    return labelled(results.dataset(plan, contents))
+    return labelled(results.dataset(plan, contents.items()))
 
 
 def own_trials(folder: Path, plan: Plan, shard: Shard) -> xr.Dataset:
     """Outcomes (row) of a shard's own trials, with the law and the world of each."""
-    own, kept = share(plan, shard), Parts(folder).contents()
-    found = results.dataset(plan, {number: kept[results.name_of(number)] for number in own})
+    own = share(plan, shard)
+    kept = Parts(folder).each([results.name_of(number) for number in own])
+    found = results.dataset(plan, ((int(name), content) for name, content in kept))
     law, world = np.divmod(np.concatenate(list(own.values())), plan.worlds)
     at = {"law": xr.DataArray(law, dims="row"), "world": xr.DataArray(world, dims="row")}
     return found[list(results.UNITS)].isel(at)
@@ -394,7 +378,7 @@ def work(
         parts = _made(plan, some, collector)
         if isinstance(some, Sequence):  # what is asked for elsewhere is asked for when it is needed
             parts = _ahead(parts, max(1, _AHEAD // plan.part))
-        jobs.append(Job(registry.of_class(kind[1]), plan.sizes[kind], parts))
+        jobs.append(Job(registry.law_of(kind[1]), plan.sizes[kind], parts))
     batch.run(jobs, plan.setting, collect=collector.collect, report=report, **shape)
 
 
@@ -430,6 +414,6 @@ def _ahead(parts: Iterator[Part], count: int) -> Iterator[Part]:
             yield part
 
 
-def store(folder: Path, part: int, content: bytes) -> Path:
+def store(folder: Path, part: int, content: bytes | memoryview) -> Path:
     """Write the file of a part into a run folder, whole or not at all."""
     return Parts(folder).put(results.name_of(part), content, new=True)

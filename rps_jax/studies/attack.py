@@ -9,9 +9,6 @@ normal quantiles of what the domain draws from ranges; of the others, noise and 
 every world has its own, by chance.
 """
 
-from __future__ import annotations
-
-import os
 import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -31,7 +28,7 @@ from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import Figure, quantity, words
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.errors import InputError
-from rps_jax.record import files
+from rps_jax.record import files, provenance
 from rps_jax.record.options import option
 from rps_jax.runs import sweep as sweeps
 from rps_jax.runs.plan import Plan
@@ -82,6 +79,7 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "A search for failures"
+    LEFT_OUT: ClassVar[tuple[str, ...]] = ("minutes", "generations", "check_again", "worst")
     SMALL: ClassVar[Mapping[str, Any]] = {"minutes": 2.0, "drawn": 128, "check_again": 4}
 
     axes: tuple[str, ...] = ("size", "com_offset", "friction_robot")
@@ -113,7 +111,6 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     """Whether the command films the worst twelve."""
 
     def check(self) -> None:
-        """Check axes, engine and pyribs."""
         if len(self.axes) != 3:
             raise InputError(f"axes = {self.axes} is not allowed: name three quantities.")
         errors.check_each_once("axes", self.axes)
@@ -123,15 +120,7 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         self.check_engine([self.params])
         need("ribs", "ribs")
 
-    def configuration(self) -> dict[str, Any]:
-        """All that the answer depends on, but how long it is searched."""
-        found = super().configuration()
-        for name in ("minutes", "generations", "check_again", "worst"):
-            del found[name]
-        return found
-
     def bar(self) -> Bar:
-        """A bar over wall clock."""
         return Bar(self.name, 60 * self.minutes, "clock", shown=self.shown)
 
     def answer(self, run: Run) -> xr.Dataset:
@@ -157,7 +146,7 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         fine = replace(self.setting, engine="mujoco", physics="default", fidelity="reference")
         folder = None if run.folder is None else run.folder / "check"
         probe = Probe(self.ranges, self.params, fine, folder, **run.shape)
-        some = max(1, run.workers or os.cpu_count() or 1)
+        some = max(1, run.workers or provenance.processors())
         for first in range(0, len(order), some):
             if not left():
                 break
@@ -175,14 +164,12 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
             sweeps.complete(run.folder / "worlds", plan, **run.shape)
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         return (
             f"{self.label} in the domain {name_of(self.domain)}: axes {', '.join(self.axes)}, "
             f"{self.repeats} noises each."
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Failing cells, their margins, and whether they fail elsewhere."""
         gain, cells = yields(found), found.margin.size
         text = (
             f"{int(found.failing[-1])} of {cells} cells hold a failure, after "

@@ -14,8 +14,6 @@ was seen, which is perturbed next. A world is solved as soon as one sample wins 
 the world can be won, and no number of rounds proves that it cannot.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -87,7 +85,6 @@ class Ceiling(InDomain[xr.Dataset]):
 
     @property
     def place(self) -> Path:
-        """A folder in that of the run, if there is one."""
         return super().place if self.run is None else Path(self.run) / "ceiling"
 
     @functools.cached_property
@@ -116,7 +113,6 @@ class Ceiling(InDomain[xr.Dataset]):
         return Plan(theirs.domain, count, law, theirs.setting, points=theirs.points)
 
     def check(self) -> None:
-        """Check that there are worlds, and that the engine can step them here."""
         if not self.numbers.size:
             raise errors.InputError(
                 f"sample = {self.sample} is not allowed: no world would be tried."
@@ -128,7 +124,6 @@ class Ceiling(InDomain[xr.Dataset]):
         return self.numbers.size * self.samples * self.rounds
 
     def configuration(self) -> dict[str, Any]:
-        """All that the answer depends on, as JSON."""
         own = {name: getattr(self, name) for name in _SEARCH}
         return {"ceiling": self.plan.configuration(), "worlds": self.numbers.tolist()} | own
 
@@ -202,7 +197,7 @@ class Ceiling(InDomain[xr.Dataset]):
 
         There are as many slots as `most` worlds have use for, so that every round has one program.
         """
-        flat = offsets.reshape(-1, *offsets.shape[2:]).astype(jnp.zeros(()).dtype)
+        flat = offsets.reshape(-1, *offsets.shape[2:]).astype(jnp.result_type(float))
         guided = registry.law_of(GuidedParams())
         which = self.plan.domain.object_of(numbers)
         of_objects = [np.flatnonzero(which == one) for one in np.unique(which)]
@@ -222,12 +217,10 @@ class Ceiling(InDomain[xr.Dataset]):
         yield Part(trials, worlds._replace(params=params), part.stage)
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         where = "the domain, kept for testing" if self.run is None else str(self.run)
         return f"{found.sizes['world']} worlds of {where}, {int(found.trials.sum()):,} trials."
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """How many were won, and by whom else."""
         text, table = _sampled_told(found), []
         if self.results is not None:
             lost = " and ".join(self.lost_by)

@@ -1,12 +1,9 @@
 """Laws in worlds that are kept for testing, domain after domain."""
 
-from __future__ import annotations
-
 import functools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, ClassVar
 
 import xarray as xr
@@ -66,38 +63,31 @@ class Compare(OfLaws[xr.DataTree]):
         return found
 
     def check(self) -> None:
-        """Check every domain, and that the engine can step its worlds here."""
-        if not self.parts:
-            raise errors.InputError("domain = () is not allowed: name at least one.")
         for part in self.parts.values():
             part.check()
 
     def trials(self) -> int | None:
-        """How many trials there are."""
         return sum(part.plan.trials for part in self.parts.values())
 
     def configuration(self) -> dict[str, Any]:
-        """All that the results depend on, as JSON."""
         return {"compare": {name: one.plan.configuration() for name, one in self.parts.items()}}
 
     def answer(self, run: Run) -> xr.DataTree:
-        """Run what is missing in each domain."""
         heard, found = InTurn(run.report), {}
         shape = run._replace(report=heard).shape
         for name, one in self.parts.items():
-            found[name] = sweeps.whole(one.plan, _folder(run.folder, name), **shape)
+            out = run.folder and run.folder / re.sub(r"[^\w.=,-]", "_", name)
+            found[name] = sweeps.whole(one.plan, out, **shape)
             heard.ended(one.plan.trials)
         return xr.DataTree.from_dict(found)
 
     def intro(self, found: xr.DataTree) -> str:
-        """What was asked."""
         return (
             f"Seed {self.setting.seed} of the worlds for testing, engine {self.setting.engine}; "
             "every law meets the same worlds. Intervals: Wilson 95 %."
         )
 
     def report(self, found: xr.DataTree, run: Run) -> Sequence[Section]:
-        """Rates and differences in each domain."""
         sections = []
         for name in self.parts:
             results = found[name].to_dataset()
@@ -110,7 +100,3 @@ class Compare(OfLaws[xr.DataTree]):
 
 
 compare = call_of(Compare)
-
-
-def _folder(out: Path | None, name: str) -> Path | None:
-    return None if out is None else out / re.sub(r"[^\w.=,-]", "_", name)

@@ -1,7 +1,5 @@
 """What the losses of a law look like: maps of them by kind, and what each kind has in common."""
 
-from __future__ import annotations
-
 import functools
 import shlex
 from collections.abc import Mapping, Sequence
@@ -104,35 +102,28 @@ class Gallery(Question[xr.Dataset]):
 
     @property
     def title(self) -> str:
-        """Title of the report."""
         return f"Losses of {chosen(Path(self.run), 0, self.law)[1]}"
 
     @property
     def place(self) -> Path:
-        """A folder in that of the run."""
         return Path(self.run) / "gallery"
 
     def check(self) -> None:
-        """Check that the folder holds a sweep with this law."""
         chosen(Path(self.run), 0, self.law)
 
     def note(self) -> str:
-        """Whether another engine than the sweep's follows its worlds."""
         return another_engine(Path(self.run))
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Tell the kinds apart."""
         plan, name = chosen(Path(self.run), 0, self.law)
         one = files.read_results(Path(self.run)).sel(law=name)
         found = kinds(one, float(plan.setting.rules.max_lost))
         return one.assign(kind=("world", found))
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         return f"Run {self.run}; kinds and maps."
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Follow some trials of each kind again, and draw them."""
         plan, name = chosen(Path(self.run), 0, self.law)
         kind_of = found.kind.values
         there = {k: np.flatnonzero(kind_of == k) for k in MECHANISMS if (kind_of == k).any()}
@@ -140,7 +131,11 @@ class Gallery(Question[xr.Dataset]):
         seen, sections = _followed(plan, name, some, InTurn(run.report)), []
         for kind, worlds in there.items():
             tracks = [seen[int(i)] for i in worlds[: self.each]]
-            labels = [f"world {i}, {_left(found, i)}" for i in worlds[: self.each]]
+            left = found.min_distance.values[worlds[: self.each]]
+            labels = [
+                f"world {i}, " + (f"{x:.2f} m left" if np.isfinite(x) else "untouched")
+                for i, x in zip(worlds, left, strict=False)
+            ]
             title = f"{name}: {kind}, {len(labels)} of {worlds.size} in {kind_of.size} worlds"
             drawn = functools.partial(figure_of, tracks, labels, title)
             picture = Picture(kind.replace(" ", "_"), drawn)
@@ -151,11 +146,6 @@ class Gallery(Question[xr.Dataset]):
 
 
 gallery = call_of(Gallery)
-
-
-def _left(one: xr.Dataset, world: int) -> str:
-    left = float(one.min_distance.values[world])
-    return f"{left:.2f} m left" if np.isfinite(left) else "untouched"
 
 
 def _told(run: str | Path, law: str, one: xr.Dataset, mask: np.ndarray, kind: str) -> str:

@@ -2,8 +2,6 @@
 shove of its video. Friction was never measured, so a plausible range is run.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -12,11 +10,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import xarray as xr
 
-from rps_jax import engines
 from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import OBJECT_COLOURS, Figure, base_patch, success_rates, words
 from rps_jax.analysis.report import Picture, Section
-from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
@@ -90,19 +86,13 @@ class Hardware(OfLaw[xr.Dataset]):
         return HARDWARE_LAYOUTS[self.layout]
 
     def check(self) -> None:
-        """Check the trials and the engine."""
-        engine = engines.get(self.setting.engine)
-        engine.check()
-        engine.check_robot(self.base.base)
-        engine.check_senses(registry.law_of(self.params).senses)
+        self.setting.check_here((), self.base.base, [self.params])
 
     def trials(self) -> int | None:
-        """How many trials there are."""
         each = len(HARDWARE_OBJECTS) * len(self.targets)
         return each * (len(frictions()) + 2 * len(self.shifts) + 1)
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Run the experiments, the shoves, and the trials of Fig. 7."""
         heard, found = InTurn(run.report), []
         run = run._replace(report=heard)
         parts = {"hardware": self._pushed, "shifted": self._shifted, "paths": self._paths}
@@ -179,7 +169,6 @@ class Hardware(OfLaw[xr.Dataset]):
         return xr.Dataset(variables, coords, {"trials": len(HARDWARE_OBJECTS) * len(self.targets)})
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         ground, robot = HARDWARE_GROUND, HARDWARE_ROBOT
         return (
             f"{self.label}, skin {name_of(self.skin)}, engine {self.setting.engine}. "
@@ -188,7 +177,6 @@ class Hardware(OfLaw[xr.Dataset]):
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Success, D and time beside the paper's; Fig. 7; and the shove."""
         ground, robot = MIDDLE
         text = (
             "D is the mean of |l| over the time in contact, where l is how far the contact point "

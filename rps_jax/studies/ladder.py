@@ -4,8 +4,6 @@ On the first rungs a law senses only where its skin is touched, on the next also
 then where the object is.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -31,9 +29,8 @@ REFERENCE = "rps_tuned"  # what the others are compared with
 
 def every_law() -> tuple[str, ...]:
     """Names of all laws that are known, by what they sense."""
-    order = get_args(Senses)
-    known = registry.LAWS
-    return tuple(sorted(known, key=lambda name: order.index(_senses(registry.LAWS[name]))))
+    order, known = get_args(Senses), registry.LAWS
+    return tuple(sorted(known, key=lambda name: order.index(_senses(known[name]))))
 
 
 def _senses(params: Params) -> Senses:
@@ -66,19 +63,16 @@ class Ladder(Sweep):
 
     @cached_property
     def chosen(self) -> dict[str, Params]:
-        """Parameters of the laws, by label."""
         asked = self.laws
         return registry.laws_of(every_law() if isinstance(asked, tuple) and not asked else asked)
 
     @cached_property
     def plan(self) -> Plan:
-        """What is run: in the worlds for testing."""
         plan = super().plan
         seed = seed_of(self.setting.seed, "test")
         return dataclasses.replace(plan, setting=dataclasses.replace(plan.setting, seed=seed))
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Push with every law."""
         found = super().answer(run)
         if "row" in found.dims:  # but a share of it
             return found
@@ -86,7 +80,6 @@ class Ladder(Sweep):
         return found.assign_coords(senses=("law", senses, {"long_name": "what the law senses"}))
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """What information is worth, beside what a sweep reports."""
         usual = super().report(found, run)
         return usual if "row" in found.dims else [*usual[:1], *_rungs(found), *usual[1:]]
 
@@ -126,13 +119,11 @@ class Score(Ladder, _Own):
 
     @cached_property
     def chosen(self) -> dict[str, Params]:
-        """Parameters of the law, then of those beside it, by label."""
         label, params = registry.read_law(self.law)
         others = registry.laws_of(self.laws)
         return {label: registry.checked(params)} | {k: v for k, v in others.items() if k != label}
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """The line for a table, and what a sweep reports."""
         usual = Sweep.report(self, found, run)
         if "row" in found.dims:
             return usual

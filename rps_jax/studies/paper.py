@@ -4,8 +4,6 @@ What the paper leaves open is named in `world.paper.CHOICES`; what each reading 
 in `sweeps/ambiguities`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -60,16 +58,13 @@ class Paper(Pushes[xr.DataTree]):
         )
 
     def check(self) -> None:
-        """Check what it consists of."""
         for part in self.parts:
             part.check()
 
     def trials(self) -> int | None:
-        """How many trials there are."""
         return sum(part.trials() or 1 for part in self.parts)
 
     def answer(self, run: Run) -> xr.DataTree:
-        """Answer its questions, one after the other."""
         heard = InTurn(run.report)
         run = run._replace(report=heard)
         tables, push, hardware = self.parts
@@ -84,11 +79,9 @@ class Paper(Pushes[xr.DataTree]):
         return xr.DataTree.from_dict(found)
 
     def intro(self, found: xr.DataTree) -> str:
-        """What was asked."""
         return "The numbers of the paper *Pushing in the Dark* beside ours. Intervals: Wilson 95 %."
 
     def report(self, found: xr.DataTree, run: Run) -> Sequence[Section]:
-        """All tables and figures."""
         trial, (_, push, hardware) = found["trial"].to_dataset(), self.parts
         reached = "reached" if int(trial.outcome_success) else "not reached"
         text = f"The target is {reached} at {float(trial.outcome_time):.1f} s."

@@ -1,7 +1,5 @@
 """One law at points of a domain's unit cube, again and again, through the same programs."""
 
-from __future__ import annotations
-
 import importlib
 import time
 from collections.abc import Iterator
@@ -65,7 +63,6 @@ class Probe:
     _heard: InTurn = field(init=False)
 
     def __post_init__(self) -> None:
-        """Hear of the progress of all calls in turn."""
         self._heard = InTurn(self.report)
 
     def __call__(self, u: np.ndarray) -> xr.Dataset:

@@ -201,7 +201,6 @@ class Rare(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     """How often all of it is done, side by side, each time with points of its own."""
 
     def check(self) -> None:
-        """Check that the groups are large enough, and the engine."""
         least = self.groups * 2 * round(1 / self.share)
         errors.check_count("particles", self.particles, at_least=least, at_most=10_000_000)
         errors.check_count("seed", self.setting.seed, at_least=0, at_most=2**30)
@@ -213,7 +212,6 @@ class Rare(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         return 1 + self.beyond
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Run the repetitions."""
         domain, seed = self.ranges, self.setting.seed
         probe = Probe(domain, self.params, self.setting, run.folder, **run.shape)
         kinds = [one.kind for one in points.quantities(domain)]
@@ -222,14 +220,12 @@ class Rare(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         return _labelled(domain, together(lambda u: probe(u).severity.values, every))
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         what = "a failure is a trial that does not reach its target."
         if self.beyond:
             what = f"a failure misses the target by more than {self.beyond:g} m."
         return f"{self.label} in the domain {name_of(self.domain)}: {what}"
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """The estimates."""
         text = (
             "Intervals of 95 %, from the spread of the groups. The last column is the number of "
             "worlds over that of drawn worlds with the same coefficient of variation. A kind of "

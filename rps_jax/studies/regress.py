@@ -6,8 +6,6 @@ and how these laws did there. The worlds were picked because some law is bad in 
 them says nothing about rates elsewhere, and only differences between laws count.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -69,7 +67,6 @@ class Regress(Planned, OfLaws[xr.Dataset]):
         return Plan(DOMAINS[DOMAIN], len(at.u), self.chosen, self.setting, points=at)
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Push in these worlds."""
         found = super().answer(run)
         known = worlds().isel(world=slice(found.sizes["world"]))
         return found.assign(
@@ -78,14 +75,12 @@ class Regress(Planned, OfLaws[xr.Dataset]):
         ).assign_coords(known=known.known.values)
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         return (
             f"The first {found.sizes['world']} of 200 worlds in which some law failed, or almost "
             "did. A rate in them says nothing about rates elsewhere; only differences count."
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """What each law gains and loses, and the worlds in which it does."""
         sections = [Section("Wins", "", table(found))]
         for law in self.chosen:
             rows = changes(found, law, self.against, self.setting.rules)

@@ -8,8 +8,6 @@ chaotic in a quantity has a large total index of it and a small first one.
 The blocks of Saltelli's design are worlds at points of the unit cube, and their trials a sweep.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +19,6 @@ import numpy as np
 import xarray as xr
 from matplotlib.axis import Axis
 
-from rps_jax import errors
 from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import Figure
 from rps_jax.analysis.report import Picture, Section
@@ -33,7 +30,7 @@ from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, count_of, name_
 from rps_jax.runs.sweep import Planned
 from rps_jax.studies.probe import need
 from rps_jax.world import points
-from rps_jax.world.domain import WORDS, Domain
+from rps_jax.world.domain import WORDS
 
 OUTPUTS = {
     "success": "success",
@@ -48,54 +45,6 @@ _WORDS = {
     "com_bearing": "bearing of the centre of mass",
 }
 ENOUGH = 30  # base points at which a trial fails, for indices that mean something
-
-
-@dataclass(frozen=True)
-class Design:
-    """The worlds of Saltelli's design in a domain."""
-
-    domain: Domain
-    base: int  # number N of base points, a power of 2; there are N (factors + 2) worlds
-    factors: tuple[str, ...]
-    groups: tuple[str, ...]  # (q,) the factor of each quantity
-    seed: int = 0
-
-    @property
-    def worlds(self) -> int:
-        """How many worlds there are."""
-        return self.base * (len(self.factors) + 2)
-
-    def problem(self) -> dict[str, Any]:
-        """Describe the problem as SALib does."""
-        names = list(points.names(self.domain))
-        bounds = [[0.0, 1.0]] * len(names)
-        return {
-            "num_vars": len(names), "names": names, "bounds": bounds, "groups": list(self.groups)
-        }  # fmt: skip
-
-    def u(self) -> np.ndarray:
-        """The points (worlds, q), block by block of one base point."""
-        sample = need("SALib.sample.sobol", "SALib").sample
-        values = sample(self.problem(), self.base, calc_second_order=False, seed=self.seed)
-        return np.clip(values, 0, np.nextafter(1, 0))
-
-
-def design(domain: Domain, worlds: int, seed: int = 0, apart: bool = False) -> Design:
-    """The greatest design of at most so many worlds.
-
-    If `apart`, each number of the noise and of a prism's corners is a factor of its own.
-    """
-    every = points.quantities(domain)
-    groups = tuple(one.name if apart else _TOGETHER.get(one.kind, one.name) for one in every)
-    factors = tuple(dict.fromkeys(groups))
-    errors.check_count("worlds", worlds, at_most=100_000_000)
-    least = 4 * (len(factors) + 2)
-    if worlds < least:
-        raise InputError(
-            f"worlds = {worlds} is not allowed: {len(factors)} quantities need at least {least}."
-        )
-    base = 2 ** int(np.log2(worlds / (len(factors) + 2)))
-    return Design(domain, base, factors, groups, seed_of(seed, "tune"))
 
 
 @dataclass(frozen=True)
@@ -123,33 +72,67 @@ class Sensitivity(Planned, InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     """Whether each number of the noise and of a prism's corners is a quantity of its own."""
 
     @functools.cached_property
-    def design(self) -> Design:
-        """The worlds of Saltelli's design."""
-        return design(self.ranges, self.worlds, self.setting.seed, self.apart)
+    def groups(self) -> tuple[str, ...]:
+        """The factor of each quantity (q,)."""
+        every = points.quantities(self.ranges)
+        return tuple(x.name if self.apart else _TOGETHER.get(x.kind, x.name) for x in every)
+
+    @property
+    def factors(self) -> tuple[str, ...]:
+        """What shares the blame."""
+        return tuple(dict.fromkeys(self.groups))
+
+    @property
+    def base(self) -> int:
+        """Number N of base points, a power of 2; Saltelli's design has N (factors + 2) worlds."""
+        count = len(self.factors)
+        if self.worlds < 4 * (count + 2):
+            raise InputError(
+                f"worlds = {self.worlds} is not allowed: {count} quantities need at least "
+                f"{4 * (count + 2)}."
+            )
+        return 2 ** int(np.log2(self.worlds / (count + 2)))
+
+    @property
+    def seeded(self) -> int:
+        """Seed of the design, and one less than that of the intervals."""
+        return seed_of(self.setting.seed, "tune")
+
+    @property
+    def problem(self) -> dict[str, Any]:
+        """The problem as SALib has it."""
+        names = list(points.names(self.ranges))
+        bounds = [[0.0, 1.0]] * len(names)
+        return {
+            "num_vars": len(names), "names": names, "bounds": bounds, "groups": list(self.groups)
+        }  # fmt: skip
+
+    def u(self) -> np.ndarray:
+        """The points (worlds, q) of the design, block by block of one base point."""
+        sample = need("SALib.sample.sobol", "SALib").sample
+        values = sample(self.problem, self.base, calc_second_order=False, seed=self.seeded)
+        return np.clip(values, 0, np.nextafter(1, 0))
 
     @functools.cached_property
     def plan(self) -> Plan:
         """The sweep of the design."""
-        at = points.checked(self.ranges, self.design.u())
-        return Plan(self.ranges, self.design.worlds, {"law": self.params}, self.setting, points=at)
+        at = points.checked(self.ranges, self.u())
+        return Plan(self.ranges, len(at.u), {"law": self.params}, self.setting, points=at)
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Run the worlds that are missing, and analyse them."""
-        found = analysed(self.design, super().answer(run))
+        found = analysed(self, super().answer(run))
         if run.folder is not None:
             files.write_results(run.folder / "sobol.nc", found)
         return found
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
-        each = f"{self.design.base} for each of {len(self.design.factors)} quantities and two more"
+        each = f"{self.base} for each of {len(self.factors)} quantities and two more"
         return (
-            f"{self.label} in the domain {name_of(self.domain)}: {self.design.worlds:,} worlds, "
+            f"{self.label} in the domain {name_of(self.domain)}: {self.plan.worlds:,} worlds, "
             f"{each}; {count_of(found.success.values == 0)} fail."
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Indices, and pairs of quantities."""
         order = ranked(found)
         said = {one: in_words(one) for one in order}
         drawn = [one for one in order if one in found.quantity.values][:5]
@@ -174,7 +157,7 @@ class Sensitivity(Planned, InDomain[xr.Dataset], OfLaw[xr.Dataset]):
 sensitivity = call_of(Sensitivity)
 
 
-def analysed(blocks: Design, results: xr.Dataset) -> xr.Dataset:
+def analysed(asked: Sensitivity, results: xr.Dataset) -> xr.Dataset:
     """Indices of a design whose sweep is done."""
     analyze = need("SALib.analyze.sobol", "SALib").analyze
     one = results.sel(law="law")
@@ -183,26 +166,26 @@ def analysed(blocks: Design, results: xr.Dataset) -> xr.Dataset:
         "time": one.time.values.astype(float),
         "left": statistics.left_over(one),
     }
-    shape = (len(OUTPUTS), len(blocks.factors))
+    shape = (len(OUTPUTS), len(asked.factors))
     columns = {name: np.zeros(shape) for name in ("first", "first_reach", "total", "total_reach")}
     for i, name in enumerate(OUTPUTS):
         if np.ptp(values[name]) == 0:
             continue  # nothing varies, and nothing explains it
         told = analyze(
-            blocks.problem(), values[name], calc_second_order=False, seed=blocks.seed + 1,
+            asked.problem, values[name], calc_second_order=False, seed=asked.seeded + 1,
             num_resamples=200,
         )  # fmt: skip
         for column, key in zip(columns, ("S1", "S1_conf", "ST", "ST_conf"), strict=True):
             columns[column][i] = told[key]
     found: dict[str, Any] = {name: (("output", "factor"), v) for name, v in columns.items()}
-    found["u"] = (("world", "quantity"), blocks.u())
+    found["u"] = (("world", "quantity"), asked.u())
     found |= {name: ("world", v) for name, v in values.items()}
     coordinates = {
         "output": list(OUTPUTS),
-        "factor": list(blocks.factors),
-        "quantity": list(points.names(blocks.domain)),
+        "factor": list(asked.factors),
+        "quantity": list(points.names(asked.ranges)),
     }
-    return xr.Dataset(found, coordinates, {"base": blocks.base})
+    return xr.Dataset(found, coordinates, {"base": asked.base})
 
 
 def ranked(found: xr.Dataset, output: str = "success") -> list[str]:

@@ -1,7 +1,5 @@
 """The paper's Table II: every law pushes every object to every target, under each friction."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,7 +9,7 @@ from typing import Any, ClassVar
 
 import xarray as xr
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.analysis import figures, tables
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
@@ -71,47 +69,36 @@ class Table(Given, OfLaws[xr.Dataset]):
         ]
 
     def check(self) -> None:
-        """Check every trial, and the engine."""
         if not self.cases:
             raise errors.InputError("targets = () is not allowed: name at least one.")
-        engine = engines.get(self.setting.engine)
-        engine.check()
-        engine.check_robot(self.cases[0].base)
-        for params in self.chosen.values():
-            engine.check_senses(registry.law_of(params).senses)
+        self.setting.check_here((), self.cases[0].base, self.chosen.values())
 
     def trials(self) -> int | None:
-        """How many trials there are."""
         return len(self.cases)
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Run every trial."""
         return run.part("table", partial(self._run, run))
 
     def _run(self, run: Run) -> xr.Dataset:
         outcome, _ = pushes.run(self.cases, self.setting, **run.shape)
         labels = [label_of(one) for one in self.friction]
-        names = list(self.chosen), [case_name(one) for one in self.objects]
+        names = (
+            list(self.chosen),
+            [Path(one).stem if one.endswith(".xml") else one for one in self.objects],
+        )
         return results.outcome_dataset(outcome, *names, labels, self.targets)
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         return (
             f"{found.success.size} trials, engine {self.setting.engine}, steps of "
             f"{1000 * self.setting.physics.timestep:g} ms. Intervals: Wilson 95 %, in percent."
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Table II beside the paper's, and Fig. 5."""
         return sections(found)
 
 
 table = call_of(Table)
-
-
-def case_name(thing: str) -> str:
-    """Name of an object, or of a file's."""
-    return Path(thing).stem if thing.endswith(".xml") else thing
 
 
 def sections(found: xr.Dataset) -> list[Section]:

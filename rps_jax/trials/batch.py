@@ -27,7 +27,7 @@ from rps_jax.engines import programs
 from rps_jax.trials import host, trial
 from rps_jax.trials.progress import Progress, Report, Timing, unheard
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Outcome, Rules, Trial, World
+from rps_jax.trials.trial import Loop, Outcome, Rules, Trial, World
 from rps_jax.world.physics import Physics
 
 SEGMENT = 10.0  # [s] simulated between two looks at which trials have ended
@@ -57,38 +57,25 @@ class Job(NamedTuple):
 Collect = Callable[[np.ndarray, Outcome], Any]  # numbers (m,) of trials and their outcomes
 
 
-def check_shape(slots: int | None, workers: int | None) -> None:
-    """Raises InputError unless each is left open or a sensible number."""
-    if slots is not None:
-        errors.check_count("slots", slots, at_most=10_000_000)
-    if workers is not None:
-        errors.check_count("workers", workers, at_most=1024)
-
-
 def run(
     jobs: Sequence[Job],
     setting: Setting,
     *,
-    slots: int | None = None,
+    slots: int | None = None,  # worlds stepped at once by a worker on each device of the host
     workers: int | None = None,
-    collect: Collect,
-    report: Report = unheard,
+    collect: Collect,  # called with trials that ended, in any order, one call at a time
+    report: Report = unheard,  # called after every segment, likewise
 ) -> Timing:
     """Run every trial of every job to its end.
 
-    Args:
-      jobs: what to run.
-      setting: what they share.
-      slots: worlds stepped at once by one worker on each of the host's devices.
-      workers: host threads that each drive a batch of their own, or that step worlds, if JAX does
-        not trace the engine.
-      collect: called with the outcomes of trials that ended, in any order, one call at a time.
-      report: called after every segment, likewise.
+    Workers are host threads that each drive a batch of their own, or that step worlds, if JAX does
+    not trace the engine.
     """
-    check_shape(slots, workers)
     engine, backend = engines.get(setting.engine), jax.default_backend()
-    slots = slots or engine.slots(backend)
-    workers = workers or engine.workers(backend)
+    slots = engine.slots(backend) if slots is None else slots
+    workers = engine.workers(backend) if workers is None else workers
+    errors.check_count("slots", slots, at_most=10_000_000)
+    errors.check_count("workers", workers, at_most=1024)
     shared = _Shared(collect, report, workers)
     began = time.perf_counter()
     if not engine.traced:
@@ -109,16 +96,9 @@ def run(
 def gathered(
     jobs: Sequence[Job], setting: Setting, count: int, **shape: Any
 ) -> tuple[Outcome, Timing]:
-    """Run every trial of every job, and gather the outcomes in the order of their numbers.
+    """Run every trial of every job, whose numbers are 0 to `count` - 1, by the `shape` of `run`.
 
-    Args:
-      jobs: what to run, trials of the numbers 0 to `count` - 1.
-      setting: what they share.
-      count: how many trials there are.
-      shape: `slots`, `workers` and `report` of `run`.
-
-    Returns:
-      Outcomes as numpy arrays (count, ...); and the timing.
+    Returns their outcomes as numpy arrays (count, ...), and the timing.
     """
     found: dict[str, np.ndarray] = {}
 
@@ -198,16 +178,9 @@ def _run_on_host(job: Job, setting: Setting, threads: int, shared: _Shared) -> N
 
         if shared.stop:
             return
-        host.run(
-            engines.get(setting.engine),
-            part.stage,
-            part.worlds,
-            physics=setting.physics,
-            rules=setting.rules,
-            law=job.law,
-            threads=max(1, threads),
-            report=tell,
-        )
+        loop = Loop(setting.physics, setting.rules, job.law)
+        engine = engines.get(setting.engine)
+        host.run(engine, part.stage, part.worlds, loop, threads=max(1, threads), report=tell)
 
 
 # --- on a device -----------------------------------------------------------------------------
@@ -331,7 +304,7 @@ def _compiled(
     tree: Any,
     leaves: tuple[jax.ShapeDtypeStruct, ...],
 ) -> Any:
-    """`trial.advance_all` compiled for arguments of these shapes; later runs of the kind reuse it.
+    """`trial.advance` compiled for arguments of these shapes; later runs of the kind reuse it.
 
     With the trials of each batch come their steps, who has ended, and how.
     """
@@ -346,15 +319,8 @@ def _compiled(
     ) -> tuple[tuple[Trial, ...], tuple[tuple[jax.Array, jax.Array, Outcome], ...]]:
         started = [trial.start_all(*each, law=law) for each in zip(worlds, live, strict=True)]
         begun = tuple(map(_pick, fresh, started, trials))
-        after = trial.advance_all(
-            stages,
-            worlds,
-            begun,
-            physics=physics,
-            rules=rules,
-            law=law,
-            steps=max(1, round(SEGMENT / physics.control_period)),
-        )
+        steps = max(1, round(SEGMENT / physics.control_period))
+        after = trial.advance(stages, worlds, begun, Loop(physics, rules, law), steps)
         # Of the same program: one of its own would wait for the other workers' segments.
         return after, tuple(
             (one.steps, one.done, trial.outcome(one, physics.control_period)) for one in after

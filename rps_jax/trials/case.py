@@ -1,7 +1,5 @@
 """One trial as it is asked for by name: what is pushed where, by which law, on which ground."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -65,7 +63,6 @@ class Case(Given):
     """How the object is moved by a hand during the push."""
 
     def __post_init__(self) -> None:
-        """Check all of it."""
         errors.check_name("object", objects.named(self.object), objects.OBJECTS)
         registry.checked(self.params)
         scene.check(self.contact, self.mass)

@@ -48,9 +48,8 @@ from rps_jax.world.scene import Scene
 class Reward(NamedTuple):
     """What a step is worth."""
 
-    progress: float = (
-        1.0  # [1/m] that the contact point is nearer to the target than when last felt
-    )
+    # [1/m] that the contact point is nearer to the target than when last felt
+    progress: float = 1.0
     no_contact: float = 0.05  # [1/s] cost of being out of contact: that of progress at 5 cm/s
     success: float = 1.0  # [1] for arriving, once
     # Of what the law is not told, for loops that ask for it.
@@ -235,7 +234,8 @@ class PushEnv:
     @property
     def xml_path(self) -> str:
         """The MJCF file of the object, or of the family of a random one."""
-        return str(objects.path_of(self.object if self.object in objects.OBJECTS else self._family))
+        known = self.object in objects.OBJECTS
+        return str(objects.path_of(self.object if known else self._alone.family_of(0)))
 
     @property
     def mj_model(self) -> mujoco.MjModel:
@@ -250,10 +250,6 @@ class PushEnv:
     @functools.cached_property
     def _alone(self) -> Domain:
         return dataclasses.replace(domain.named(self.domain, self.robot), objects=(self.object,))
-
-    @property
-    def _family(self) -> str:
-        return self._alone.family_of(0)
 
     @functools.cached_property
     def _drawn(self) -> Draw:
@@ -275,21 +271,15 @@ class PushEnv:
     def render(
         self,
         trajectory: State | Sequence[State],
-        height: int = 240,
-        width: int = 320,
+        height: int = 240,  # [px]
+        width: int = 320,  # [px]
         camera: str | None = None,
-        scene_option: None = None,
-        modify_scene_fns: None = None,
+        scene_option: None = None,  # unused
+        modify_scene_fns: None = None,  # unused
     ) -> Any:
         """Images (height, width, 3) uint8 of states without a batch axis: a list, or one of one.
 
-        Args:
-          trajectory: one state, or many; each is drawn in its own world.
-          height: of an image [px].
-          width: of an image [px].
-          camera: oblique (the default) or above.
-          scene_option: unused.
-          modify_scene_fns: unused.
+        Each is drawn in its own world, by the camera oblique (the default) or above.
         """
         del scene_option, modify_scene_fns
         if isinstance(trajectory, State):

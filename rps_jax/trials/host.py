@@ -4,29 +4,20 @@ Sensing, deciding and the rules are those of `trial`; the engine is the only dif
 are handed over in JAX's precision and stepped in the engine's own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
 
-from rps_jax.control.base import Law
 from rps_jax.engines.base import Driven, Engine, Motion
 from rps_jax.trials import trial
-from rps_jax.trials.trial import Rules, Snapshot, Trial, World
-from rps_jax.world.physics import Physics
+from rps_jax.trials.trial import Loop, Snapshot, Trial, World
 
 _LOOK = 500  # control steps between two reports
 
 
-@partial(jax.jit, static_argnames=("physics", "law"))
-def _decide(worlds: World, trials: Trial, **options: Any):
-    return jax.vmap(partial(trial.decide, **options))(worlds, trials)
-
-
+_decide = jax.jit(jax.vmap(trial.decide, (0, 0, None)))
 _settle = jax.jit(jax.vmap(trial.settle))
 
 
@@ -34,10 +25,8 @@ def run(
     engine: Engine,
     stage: Any,
     worlds: World,
+    loop: Loop,
     *,
-    physics: Physics,
-    rules: Rules,
-    law: Law,
     threads: int,
     report: Callable[[np.ndarray, Trial, float], bool],
     watch: Callable[[int, Snapshot], Any] = lambda step, seen: None,
@@ -48,7 +37,7 @@ def run(
     how many seconds were simulated, summed over all; it answers whether to go on. `watch` is handed
     every control step, with what all trials looked like at its beginning.
     """
-    options = {"physics": physics, "rules": rules, "law": law}
+    physics, law = loop.physics, loop.law
     count = len(worlds.qpos)
     host = jax.devices("cpu")[0]  # where the engine is
     worlds = jax.device_put(worlds, host)
@@ -58,12 +47,13 @@ def run(
         told_of = np.zeros(count, bool)
         before, passes, dtype = 0, 0, trials.qpos.dtype
         while not told_of.all():
-            told, twist, seen = _decide(worlds, trials, **options)
+            told, twist, seen = _decide(worlds, trials, loop)
+            now = np.asarray(told.qpos)
             watch(passes, seen)
             going = np.flatnonzero(~np.asarray(told.done))
             # Only a hand that shifts the object moves it outside the engine.
-            shifted = np.flatnonzero(np.any(np.asarray(told.qpos != trials.qpos), axis=1))
-            batch.qpos[shifted] = np.asarray(told.qpos)[shifted]
+            shifted = np.flatnonzero(np.any(now != np.asarray(trials.qpos), axis=1))
+            batch.qpos[shifted] = now[shifted]
             if going.size:
                 batch.drive(going, np.stack(twist, axis=1)[going].astype(float), physics.substeps)
             after = Motion(batch.qpos, batch.qvel, batch.warmstart, batch.integral)

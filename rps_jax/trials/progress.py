@@ -31,12 +31,10 @@ class InTurn:
     """Report of runs that follow one another, as if they were one."""
 
     def __init__(self, report: Report):
-        """`report` hears of them all."""
         self._report = report
         self._before = self._now = Progress(0, 0.0)
 
     def __call__(self, progress: Progress) -> None:
-        """Tell of the run under way."""
         before = self._before
         self._now = Progress(
             before.finished + progress.finished,
@@ -91,14 +89,12 @@ class Bar:
         self._last = Progress(0, 0.0)
 
     def __enter__(self) -> Bar:
-        """Show it, if it has a total."""
         self._began = time.perf_counter()
         if self._total is not None:
             self._open("compile")
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leave its last state on the screen."""
         if self._bar is not None:
             self._bar.close()
 
@@ -126,7 +122,6 @@ class Bar:
             self._bar.set_description(what)
 
     def __call__(self, progress: Progress) -> None:
-        """Show how far the run is."""
         self._last = progress
         note = f"{progress.simulated:.0f} s simulated"
         if self.over == "trials":

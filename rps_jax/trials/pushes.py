@@ -1,9 +1,6 @@
 """The trials that are asked for one by one: cases -> worlds -> outcomes, or traces over time."""
 
-from __future__ import annotations
-
 import math
-import os
 import time
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
@@ -19,6 +16,7 @@ from rps_jax.control import registry
 from rps_jax.control.base import Law, Params
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.geometry.footprint import Footprint
+from rps_jax.record import provenance
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.shell import Shell
 from rps_jax.trials import batch, host, trial
@@ -26,7 +24,7 @@ from rps_jax.trials.batch import SEGMENT, Job, Part, rows, warn_of_lost
 from rps_jax.trials.case import Case
 from rps_jax.trials.progress import Progress, Report, Timing, unheard
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Outcome, Shift, Snapshot, World
+from rps_jax.trials.trial import Loop, Outcome, Shift, Snapshot, World
 from rps_jax.world import scene
 from rps_jax.world.objects import FAMILIES
 from rps_jax.world.physics import Physics
@@ -93,7 +91,7 @@ def build(
     scenes, which = _scenes(cases, setting.physics)
     stage, fields = engines.get(setting.engine).stage_of_scenes(scenes, which)
     starts = [_start_of(case, scenes[i]) for case, i in zip(cases, which, strict=True)]
-    dtype = jnp.zeros(()).dtype
+    dtype = jnp.result_type(float)
     numbers = np.arange(len(cases)) if indices is None else np.asarray(indices)
     root = jax.random.PRNGKey(setting.seed)
     world = World(
@@ -123,22 +121,6 @@ def kind(case: Case) -> Hashable:
     )
 
 
-def _by_kind(cases: Sequence[Case]) -> list[list[int]]:
-    """Indices of the cases of each kind.
-
-    Without reaction most trials lose the object and wait for their end: the longest go first, so
-    that the last slots to run are not theirs.
-    """
-    kinds: dict[Hashable, list[int]] = {}
-    for i in sorted(range(len(cases)), key=lambda i: _expected_success(cases[i])):
-        kinds.setdefault(kind(cases[i]), []).append(i)
-    return list(kinds.values())
-
-
-def _expected_success(case: Case) -> float:
-    return float(case.params.reactive) if isinstance(case.params, RPSParams) else 0.0
-
-
 def _stack(trees: Sequence[Any], dtype: np.dtype, which: np.ndarray | None = None) -> Any:
     """Pytrees of floats stacked leaf by leaf, then rows taken in the order `which`."""
     stacked = jax.tree.map(lambda *leaves: np.array([np.asarray(x) for x in leaves], dtype), *trees)
@@ -146,34 +128,28 @@ def _stack(trees: Sequence[Any], dtype: np.dtype, which: np.ndarray | None = Non
 
 
 def run(
-    cases: Sequence[Case],
-    setting: Setting = Setting(engine="mjx"),
-    *,
-    slots: int | None = None,
-    workers: int | None = None,
-    report: Report = unheard,
+    cases: Sequence[Case], setting: Setting = Setting(engine="mjx"), **shape: Any
 ) -> tuple[Outcome, Timing]:
-    """Run every case to its end.
+    """Run every case to its end, in any mixture of objects, frictions, targets and parameters.
 
-    Args:
-      cases: in any mixture of objects, frictions, targets and parameters.
-      setting: what they share.
-      slots: worlds stepped at once by one worker. Results are bit-identical for equal slots on
-        one kind of device, whatever shares the batch.
-      workers: host threads that each drive a batch of their own, or that step worlds, if JAX does
-        not trace the engine; by default as many as suit the engine and the device.
-      report: called after every segment, from worker threads, one at a time.
+    Slots, workers and report are those of `batch.run`. Results are bit-identical for equal slots on
+    one kind of device, whatever shares the batch.
 
     Returns:
       Outcomes as numpy arrays (len(cases), ...), in the order of `cases`; and the timing.
     """
-    jobs = []
-    for indices in _by_kind(cases):
+    # Without reaction most trials lose the object and wait for their end: the longest go first, so
+    # that the last slots to run are not theirs.
+    lasts = [float(c.params.reactive) if isinstance(c.params, RPSParams) else 0.0 for c in cases]
+    jobs, kinds = [], dict[Hashable, list[int]]()
+    for i in np.argsort(lasts, kind="stable").tolist():
+        kinds.setdefault(kind(cases[i]), []).append(i)
+    for indices in kinds.values():
         mine = [cases[i] for i in indices]
         stage, worlds = build(mine, setting, indices)
         part = Part(np.array(indices), worlds, stage)
         jobs.append(Job(registry.law_of(mine[0].params), len(mine), [part]))
-    return batch.gathered(jobs, setting, len(cases), slots=slots, workers=workers, report=report)
+    return batch.gathered(jobs, setting, len(cases), **shape)
 
 
 def follow(
@@ -245,17 +221,15 @@ def _follow_on_host(
     def tell(_: np.ndarray, trials: trial.Trial, simulated: float) -> bool:
         nonlocal total
         total += simulated
-        report(Progress(int(trials.done.sum()), total, compiled))
+        report(Progress(int(np.asarray(trials.done).sum()), total, compiled))
         return True
 
     trials = host.run(
         engines.get(setting.engine),
         part.stage,
         part.worlds,
-        physics=setting.physics,
-        rules=setting.rules,
-        law=law,
-        threads=1 if part.numbers.size == 1 else os.cpu_count() or 1,
+        Loop(setting.physics, setting.rules, law),
+        threads=1 if part.numbers.size == 1 else provenance.processors(),
         report=tell,
         watch=watch,
     )

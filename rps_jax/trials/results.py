@@ -1,7 +1,5 @@
 """What trials came to, as labelled data: a grid of outcomes, or one trial over time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -42,11 +40,7 @@ def outcome_dataset(
     shape = (len(laws), len(objects), len(frictions), len(targets))
     variables = {}
     for name, values in outcome._asdict().items():
-        values = _plain(values)
-        dims = DIMS + ("pose",) * (values.ndim - 1)
-        unit, meaning = UNITS[name]
-        attrs = {"units": unit, "long_name": meaning}
-        variables[name] = xr.Variable(dims, values.reshape(shape + values.shape[1:]), attrs)
+        variables[name] = variable(name, DIMS, values.reshape(shape + values.shape[1:]))
     position = np.asarray(targets, float)
     return xr.Dataset(
         variables,
@@ -60,6 +54,13 @@ def outcome_dataset(
             "pose": ["x", "y", "yaw"],
         },
     )
+
+
+def variable(name: str, dims: Sequence[str], values: np.ndarray) -> xr.Variable:
+    """What outcomes are in one respect, with its unit; poses (..., 3) have a dimension more."""
+    unit, meaning = UNITS[name]
+    attrs = {"units": unit, "long_name": meaning}
+    return xr.Variable((*dims, "pose")[: values.ndim], _plain(values), attrs)
 
 
 def _plain(values: Any) -> np.ndarray:
@@ -89,9 +90,7 @@ def trace_dataset(trace: Followed) -> xr.Dataset:
         "realigning": over_time(seen.details.realigning, "1"),
     }
     for name, value in trace.outcome._asdict().items():
-        value = _plain(value)
-        attrs = {"units": UNITS[name][0], "long_name": UNITS[name][1]}
-        variables[f"outcome_{name}"] = xr.Variable(("pose",) * value.ndim, value, attrs)
+        variables[f"outcome_{name}"] = variable(name, (), np.asarray(value))
     variables["p_world_contact"] = over_time(trial.p_world_contact(seen), "m", "axis")
     variables["p_world_target"] = xr.Variable("axis", list(trace.p_world_target), {"units": "m"})
     for name in ("d_success", *(("l_cr",) if isinstance(trace.params, RPSParams) else ())):

@@ -2,8 +2,7 @@
 
 All three begin with how far a trial missed its target (`missed`).
 
-`Objective`, which tuners minimise: a success scores its time, a failure one more and how far it
-missed; both score the time without contact.
+`Objective` is what tuners minimise.
 
 `severity`, by which failures are searched, is below 1 for a success and at least 1 for a failure:
 
@@ -17,8 +16,6 @@ law failed.
 
 `plan_costs` is what the planner of `rps ceiling` minimises.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -56,19 +53,17 @@ class Objective:
     """[1/m] The score of each metre by which a failure missed, up to one metre."""
 
     def __post_init__(self) -> None:
-        """Raises InputError for weights or a risk that mean nothing."""
         check_fields(self)
 
-    def score(self, success: Any, time: Any, lost: Any, missed: Any, rules: Rules) -> Any:
-        """Scores (...) [1] of trials, from about 0 to 2; less is better.
-
-        Args:
-          success: (...) [1] 0 or 1, or between for a softened trial.
-          time: (...) [s] until the trial's end.
-          lost: (...) [s] without contact.
-          missed: (...) [m] least distance to the target.
-          rules: when a trial ends.
-        """
+    def score(
+        self,
+        success: Any,  # (...) [1] 0 or 1, or between for a softened trial
+        time: Any,  # (...) [s] until the trial's end
+        lost: Any,  # (...) [s] without contact
+        missed: Any,  # (...) [m] least distance to the target
+        rules: Rules,
+    ) -> Any:
+        """Scores (...) [1] of trials, from about 0 to 2; less is better."""
         failed = 1 + self.miss * jnp.minimum(missed, 1.0)
         return (
             self.time * time / rules.horizon
@@ -77,12 +72,9 @@ class Objective:
         )
 
     def scores(self, outcome: Outcome, distance: np.ndarray, rules: Rules) -> np.ndarray:
-        """Scores (...) [1] of outcomes on the host; a trial without contact missed by `distance`.
+        """Scores (...) [1] of outcomes (...) on the host.
 
-        Args:
-          outcome: how the trials ended, leaves (...).
-          distance: (...) [m] of the target from the start.
-          rules: when a trial ends.
+        A trial without contact missed by the `distance` (...) [m] of the target from the start.
         """
         told = (outcome.success, outcome.time, outcome.contact_lost_time)
         success, time, lost = (np.asarray(leaf, float) for leaf in told)
@@ -98,17 +90,15 @@ class Objective:
         return jnp.mean(jnp.sort(scores, axis=-1)[..., -worst:], axis=-1)
 
 
-def severity(success: Any, took: Any, left: Any, lost: Any, tilt: Any, rules: Rules) -> np.ndarray:
-    """Severity (...) [1] of trials: below 1 for a success, 1 and more for a failure.
-
-    Args:
-      success: (...) [1] 0 or 1.
-      took: (...) [s] until the trial's end.
-      left: (...) [m] least distance to the target; of an object never touched, the whole way.
-      lost: (...) [s] without contact.
-      tilt: (...) [rad] greatest tilt of the object.
-      rules: when a trial ends.
-    """
+def severity(
+    success: Any,  # (...) [1] 0 or 1
+    took: Any,  # (...) [s] until the trial's end
+    left: Any,  # (...) [m] by which it `missed`
+    lost: Any,  # (...) [s] without contact
+    tilt: Any,  # (...) [rad] greatest tilt of the object
+    rules: Rules,
+) -> np.ndarray:
+    """Severity (...) [1] of trials: below 1 for a success, 1 and more for a failure."""
     took, lost = np.asarray(took, float), np.asarray(lost, float)
     slow = np.maximum(took / rules.horizon, lost / max(float(rules.max_lost), 1e-6))
     leant = np.log(np.maximum(np.asarray(tilt, float), _STILL) / _STILL)

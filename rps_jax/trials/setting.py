@@ -1,12 +1,14 @@
 """What all trials of a run share: what steps them, when they end, and the seed."""
 
-from __future__ import annotations
-
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 from rps_jax import engines, errors
+from rps_jax.control import registry
+from rps_jax.control.base import Params
 from rps_jax.engines import EngineName
+from rps_jax.robot.robot import Robot
 from rps_jax.trials.trial import Rules
 from rps_jax.world import physics as physics_
 from rps_jax.world.physics import Fidelity, Physics
@@ -19,14 +21,12 @@ class PhysicsField:
     """
 
     def __get__(self, instance: Any, owner: type | None = None) -> Physics:
-        """The physics; of the class, the default of the field."""
         if instance is None:
             return "default"  # pyright: ignore[reportReturnType]  # of the dataclass's field
         given = instance.__dict__["physics"]
         return physics_.named(given, instance.fidelity)
 
     def __set__(self, instance: Any, value: str | Physics) -> None:
-        """Keep what was given."""
         instance.__dict__["physics"] = value
 
 
@@ -54,12 +54,21 @@ class Setting:
     """Seed of random worlds, and of the imperfections of skins."""
 
     def __post_init__(self) -> None:
-        """Check each field, and that the engine knows the physics."""
         errors.check_name("engine", self.engine, engines.ENGINES)
         self.rules.check()
         errors.check_count("seed", self.seed, at_least=0, at_most=2**32 - 1)
         if self.physics.cone != "elliptic":  # which all know: an engine is imported when needed
             engines.get(self.engine).check_physics(self.physics)
+
+    def check_here(
+        self, families: Iterable[str], robot: Robot, laws: Iterable[Params] = ()
+    ) -> None:
+        """Raises InputError unless the engine steps such worlds with these laws on this machine."""
+        engine = engines.get(self.engine)
+        engine.check(families)
+        engine.check_robot(robot)
+        for params in laws:
+            engine.check_senses(registry.law_of(params).senses)
 
     @property
     def physics_name(self) -> str:

@@ -8,7 +8,6 @@ live.shove((0.0, 0.2))
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -24,8 +23,7 @@ from rps_jax.trials import pushes, trial
 from rps_jax.trials.batch import Part, rows
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Outcome, Rules, Shift, Snapshot, Trial, World
-from rps_jax.world.physics import Physics
+from rps_jax.trials.trial import Loop, Outcome, Shift, Snapshot, Trial, World
 
 CHUNK = 25  # steps, at most, that one call of the compiled program takes
 
@@ -51,9 +49,8 @@ class Live:
     """
 
     def __init__(self, part: Part, law: Law, setting: Setting) -> None:
-        """The first world of a part, at its start."""
         engines.get(setting.engine).check_traced()
-        self._stage, self._law, self._setting = part.stage, law, setting
+        self._stage, self._loop = part.stage, Loop(setting.physics, setting.rules, law)
         self._first: World = rows(part.worlds, slice(1))
         self.past: list[Moment] = []
         self.reset()
@@ -69,7 +66,7 @@ class Live:
     @property
     def period(self) -> float:
         """Between two steps [s]."""
-        return self._setting.physics.control_period
+        return self._loop.physics.control_period
 
     @property
     def done(self) -> bool:
@@ -91,7 +88,7 @@ class Live:
     def reset(self) -> None:
         """Back to the start, and the target with it."""
         self._worlds = self._first
-        started = trial.start_all(self._worlds, np.ones(1, bool), law=self._law)
+        started = trial.start_all(self._worlds, np.ones(1, bool), law=self._loop.law)
         self._now: Trial = jax.device_get(started)
         self.past.clear()
 
@@ -99,17 +96,8 @@ class Live:
         """Some control periods, fewer if the trial ends before."""
         while count > 0 and not self.done:
             some = min(count, CHUNK)
-            self._now, kept = jax.device_get(
-                _steps(
-                    self._stage,
-                    self._worlds,
-                    self._now,
-                    some,
-                    physics=self._setting.physics,
-                    rules=self._setting.rules,
-                    law=self._law,
-                )
-            )
+            made = _steps(self._stage, self._worlds, self._now, some, self._loop)
+            self._now, kept = jax.device_get(made)
             some -= int(kept[0].done[:some].sum())  # it ended before these
             self.past += [Moment(self._worlds, *rows(kept, i)) for i in range(some)]
             # Done: an ended trial's clock stands, and would meet the moment of the shove again.
@@ -161,23 +149,14 @@ class Live:
         self._now = self._now._replace(done=ended, success=arrived, **changes)
 
 
-@partial(jax.jit, static_argnames=("physics", "law"))
+@jax.jit
 def _steps(
-    stage: Any,
-    worlds: World,
-    trials: Trial,
-    count: int,
-    *,
-    physics: Physics,
-    rules: Rules,
-    law: Law,
+    stage: Any, worlds: World, trials: Trial, count: int, loop: Loop
 ) -> tuple[Trial, tuple[Trial, Snapshot, jax.Array, jax.Array]]:
     """Up to CHUNK control steps of a world (1, ...), and what each was: rows (CHUNK, ...)."""
 
     def one(trials: Trial) -> tuple[Trial, Any]:
-        after, seen = trial.control_step(
-            stage, worlds, trials, physics=physics, rules=rules, law=law
-        )
+        after, seen = trial.control_step(stage, worlds, trials, loop)
         placed = jax.vmap(trial.outline)(worlds, seen.qpos)
         compression = jax.vmap(_compression)(worlds.skin, placed)
         contact = trial.p_world_contact(seen)

@@ -5,9 +5,8 @@
 is frozen, and a batch whose worlds have all ended stops.
 """
 
-from __future__ import annotations
-
 import math
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -60,6 +59,16 @@ class Rules(NamedTuple):
         errors.check_finite("horizon", self.horizon, above=0, at_most=1e5, unit="s")
         errors.check_finite("max_lost", self.max_lost, at_least=0, unit="s")
         errors.check_finite("max_tilt", self.max_tilt, above=0, at_most=1.4, unit="rad")
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["rules"], meta_fields=["physics", "law"])
+@dataclass(frozen=True)
+class Loop:
+    """The loop of sensing, deciding and stepping; a pytree of the rules, the rest is static."""
+
+    physics: Physics
+    rules: Rules = Rules()
+    law: Law = rps.LAW
 
 
 class Shift(NamedTuple):
@@ -285,20 +294,13 @@ def execute(world: World, trial: Trial, twist: Twist, period: float) -> tuple[Tr
     return trial, Twist(*drive.carried_out(world.robot, aim))
 
 
-def decide(
-    world: World,
-    trial: Trial,
-    *,
-    physics: Physics,
-    rules: Rules = Rules(),
-    law: Law = rps.LAW,
-) -> tuple[Trial, Twist, Snapshot]:
+def decide(world: World, trial: Trial, loop: Loop) -> tuple[Trial, Twist, Snapshot]:
     """What happens between two control periods of one world: sense, judge, decide.
 
     Returns the trial as it is driven on, or ended; the twist carried out; and what was seen.
     """
-    period = physics.control_period
-    told, seen = observe(world, trial, physics=physics, rules=rules)
+    period, law = loop.physics.control_period, loop.law
+    told, seen = observe(world, trial, physics=loop.physics, rules=loop.rules)
     observation: Any = seen.observation
     if not law.smooth:
         observation = observation._replace(in_contact=seen.reading.contact_type != NONE)
@@ -347,20 +349,11 @@ def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
     return switches.select(before.done, before, switches.select(told.done | ~sane, stopped, moved))
 
 
-def control_step(
-    stage: Stage,
-    worlds: World,
-    trials: Trial,
-    *,
-    physics: Physics,
-    rules: Rules = Rules(),
-    law: Law = rps.LAW,
-) -> tuple[Trial, Snapshot]:
+def control_step(stage: Stage, worlds: World, trials: Trial, loop: Loop) -> tuple[Trial, Snapshot]:
     """One pass of the loop of a batch of worlds. One that has ended comes back as it is."""
-    think = partial(decide, physics=physics, rules=rules, law=law)
-    told, twists, snapshots = jax.vmap(think)(worlds, trials)
-    asked = law.senses == "force"
-    driven = stage.drive(worlds.fields, motion(told), twists, physics, pushing(worlds), asked)
+    told, twists, snapshots = jax.vmap(decide, (0, 0, None))(worlds, trials, loop)
+    asked = loop.law.senses == "force"
+    driven = stage.drive(worlds.fields, motion(told), twists, loop.physics, pushing(worlds), asked)
     return jax.vmap(settle)(trials, told, driven), snapshots
 
 
@@ -405,45 +398,28 @@ def start_all(worlds: World, live: Bool[Array, " B"], law: Law = rps.LAW) -> Tri
     return trials._replace(done=~live)
 
 
-_STATIC = ("physics", "law", "steps")
 _UNASKED = 20  # control steps of a GPU between two looks at whether any trial runs, at most
 
 
-@partial(jax.jit, static_argnames=_STATIC, donate_argnames=("trials",))
 def advance(
-    stage: Stage,
-    worlds: World,
-    trials: Trial,
-    *,
-    physics: Physics,
-    rules: Rules = Rules(),
-    law: Law = rps.LAW,
-    steps: int,
-) -> Trial:
-    """Up to `steps` control steps of a batch of worlds; fewer if all of them end before."""
-    options = {"physics": physics, "rules": rules, "law": law, "steps": steps}
-    return advance_all((stage,), (worlds,), (trials,), **options)[0]
-
-
-def advance_all(
     stages: tuple[Stage, ...],
     worlds: tuple[World, ...],
     trials: tuple[Trial, ...],
-    *,
-    physics: Physics,
-    rules: Rules = Rules(),
-    law: Law = rps.LAW,
+    loop: Loop,
     steps: int,
 ) -> tuple[Trial, ...]:
-    """`advance` several batches side by side, each of a stage and a shape family of its own."""
-    one = partial(control_step, physics=physics, rules=rules, law=law)
+    """Up to `steps` control steps of batches side by side; fewer if all of them end before.
+
+    Each batch is of a stage and a shape family of its own.
+    """
 
     def some_run(carry):
         count, batches = carry
         return (count < steps) & ~jnp.all(jnp.stack([jnp.all(each.done) for each in batches]))
 
     def on(_, batches):
-        return tuple(one(*each)[0] for each in zip(stages, worlds, batches, strict=True))
+        every = zip(stages, worlds, batches, strict=True)
+        return tuple(control_step(*each, loop)[0] for each in every)
 
     # A GPU waits for the host whenever it is asked whether any still runs.
     between = 1 if jax.default_backend() == "cpu" else math.gcd(steps, _UNASKED)
@@ -456,7 +432,7 @@ def advance_all(
     return jax.lax.while_loop(some_run, body, (0, trials))[1]
 
 
-@partial(jax.jit, static_argnames=(*_STATIC, "every"), donate_argnames=("trials",))
+@partial(jax.jit, static_argnames=("physics", "law", "steps", "every"), donate_argnames="trials")
 def record(
     stage: Stage,
     worlds: World,
@@ -469,10 +445,10 @@ def record(
     every: int = 1,
 ) -> tuple[Trial, Snapshot]:
     """`steps` control steps of a batch, and every `every`-th snapshot (steps // every, B, ...)."""
-    one = partial(control_step, stage, physics=physics, rules=rules, law=law)
+    loop = Loop(physics, rules, law)
 
     def body(trials, _):
-        return one(worlds, trials)
+        return control_step(stage, worlds, trials, loop)
 
     def interval(trials, _):
         trials, snapshots = jax.lax.scan(body, trials, length=every)

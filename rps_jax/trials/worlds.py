@@ -1,7 +1,5 @@
 """A draw becomes worlds, for every engine and for pictures."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax
@@ -19,7 +17,7 @@ from rps_jax.trials.batch import Part
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Shift, World
 from rps_jax.world import scene
-from rps_jax.world.domain import QUANTITIES, RANDOM, Domain, Range, of
+from rps_jax.world.domain import RANDOM, Domain, Range, of
 from rps_jax.world.draws import Draw
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction, Scene
@@ -28,20 +26,22 @@ from rps_jax.world.scene import JOINTS, Friction, Scene
 def drawn_worlds(domain: Domain, drawn: Draw, params: Params, setting: Setting) -> Part:
     """The worlds of a draw as a part of a job, all with the same parameters."""
     family = domain.family_of(drawn.case[0])
-    count, dtype = drawn.number.size, jnp.zeros(()).dtype
+    count, dtype = drawn.number.size, jnp.result_type(float)
     engine, robots = engines.get(setting.engine), drawn.robot
     engine.check_robot(robots)
     engine.check_senses(registry.law_of(params).senses)
     stage, own = engine.stage_of_solids(
         family, drawn.solid, drawn.friction, setting.physics, robots
     )
+    outline: Any = drawn.solid.vertices, drawn.solid.radius
+    never: Any = np.full(count, np.inf), np.zeros((count, 2))
     world: Any = {
         "fields": own,
-        "footprint": Footprint(*_any(drawn.solid.vertices, drawn.solid.radius)),
+        "footprint": Footprint(*outline),
         "skin": _skin(domain, drawn),
         "params": jax.tree.map(lambda x: np.full((count, *np.shape(x)), x), params),
         "p_world_target": drawn.p_world_target,
-        "shift": Shift(*_any(np.full(count, np.inf), np.zeros((count, 2)))),
+        "shift": Shift(*never),
         "qpos": starts(drawn),
         "key": drawn.key,
         "odometry": _odometry(domain, drawn, setting.physics.control_period),
@@ -51,20 +51,13 @@ def drawn_worlds(domain: Domain, drawn: Draw, params: Params, setting: Setting) 
     return Part(drawn.number, World(**narrow), stage)
 
 
-def _any(*arrays: Any) -> tuple[Any, ...]:
-    """Host arrays where a type asks for those of the device."""
-    return arrays
-
-
 def _skin(domain: Domain, drawn: Draw) -> Skin:
     count = drawn.number.size
     plain = IdealSkin() if domain.skin == "ideal" else CapacitiveSkin()
     full: Any = jax.tree.map(lambda value: np.full(count, value, float), plain)
     if isinstance(full, IdealSkin):
         return full.on(drawn.robot.shell)
-    own: dict[str, Any] = {
-        QUANTITIES[name].sets: drawn.at[name] for name in of("skin") if name in drawn.at
-    }
+    own: dict[str, Any] = {name: drawn.at[name] for name in of("skin") if name in drawn.at}
     return full.on(drawn.robot.shell)._replace(**own)
 
 
@@ -89,9 +82,7 @@ def remembered_steps(domain: Domain, period: float) -> int:
 
 def _odometry(domain: Domain, drawn: Draw, period: float) -> Odometry:
     past: Any = np.zeros((drawn.number.size, remembered_steps(domain, period)))
-    own: dict[str, Any] = {
-        QUANTITIES[name].sets: drawn.at[name] for name in of("base") if name in drawn.at
-    }
+    own: dict[str, Any] = {name: drawn.at[name] for name in of("base") if name in drawn.at}
     error: Any = drawn.velocity_error
     return Odometry(**own, velocity_error=error, past=past)
 

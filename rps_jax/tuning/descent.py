@@ -27,7 +27,7 @@ from rps_jax.runs import evaluate
 from rps_jax.runs.question import call_of
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Snapshot, Trial, World, control_step, start_all
+from rps_jax.trials.trial import Loop, Snapshot, Trial, World, control_step, start_all
 from rps_jax.tuning import gradients
 from rps_jax.tuning.gradients import Estimate
 from rps_jax.tuning.run import Metrics, Problem, TryOut, Tuning, finite
@@ -108,7 +108,6 @@ class TuneGrad(Tuning):
             ) from error
 
     def tuner(self) -> DescentState:
-        """The search."""
         return DescentState(self)
 
     @property
@@ -164,25 +163,6 @@ class Windows(NamedTuple):
     arrive: float  # [m]
 
 
-class Batch(NamedTuple):
-    """Softened worlds of one shape family."""
-
-    stage: Any
-    worlds: World  # (n, ...), with smooth skins
-    late: jax.Array  # (n,) [1] when a window begins, as a share of the latest time
-
-
-def softened(problem: Problem, engine: Any, seed: int, step: int) -> list[Batch]:
-    """The worlds of one step as smooth ones, by domain and object."""
-    setting = replace(problem.setting, engine=engine)
-    ask = problem.ask(jax.tree.map(lambda x: np.array([x]), RPSParams()), seed, step)
-    random = np.random.default_rng((seed, step))
-    return [
-        Batch(part.stage, soften(part.worlds), jnp.asarray(random.uniform(size=column.size)))
-        for part, column, _ in evaluate.parts(ask, problem.domains, setting)
-    ]
-
-
 def soften(worlds: World) -> World:
     """Give worlds (n, ...) smooth skins."""
     sensor: Any = worlds.skin
@@ -198,7 +178,7 @@ def scores_of(how: Windows, stage: Any) -> gradients.Scores:
     """
     space, problem = how.space, how.problem
     law = registry.smooth_law(registry.law_of(space.base))
-    setting, physics = problem.setting, preset(fidelity="fast")
+    setting, loop = problem.setting, Loop(preset(fidelity="fast"), law=law)
 
     def cost(seen: Snapshot) -> jax.Array:
         return soft_score(seen, space.base, setting, problem.objective, how.arrive)
@@ -206,14 +186,7 @@ def scores_of(how: Windows, stage: Any) -> gradients.Scores:
     def steps(seconds: float) -> int:
         return round(seconds / setting.physics.control_period)
 
-    score = gradients.window(
-        stage,
-        space.params,
-        cost,
-        physics=physics,
-        law=law,
-        steps=max(1, steps(how.window)),
-    )
+    score = gradients.window(stage, space.params, cost, loop, max(1, steps(how.window)))
 
     def begun(thetas: jax.Array, worlds: World, late: jax.Array) -> Trial:
         worlds = worlds._replace(params=jax.vmap(space.params)(thetas))
@@ -222,7 +195,7 @@ def scores_of(how: Windows, stage: Any) -> gradients.Scores:
             return first
 
         def one(i: jax.Array, trials: Trial) -> Trial:
-            after, _ = control_step(stage, worlds, trials, physics=physics, law=law)
+            after, _ = control_step(stage, worlds, trials, loop)
             return jax.vmap(switches.select)(i < late * steps(how.within), after, trials)
 
         return jax.lax.fori_loop(0, steps(how.within), one, first)
@@ -235,11 +208,12 @@ def scores_of(how: Windows, stage: Any) -> gradients.Scores:
 
 
 @functools.partial(jax.jit, static_argnames="how")
-def _differentiated(thetas: jax.Array, batch: Batch, *, how: Windows) -> Estimate:
-    """Estimates (S, p) at thetas (S, p), each from all the worlds of a batch."""
-    scores = scores_of(how, batch.stage)
+def _differentiated(
+    thetas: jax.Array, stage: Any, worlds: tuple[World, jax.Array], *, how: Windows
+) -> Estimate:
+    """Estimates (S, p) at thetas (S, p), each from all the worlds (n, ...) of one shape family."""
+    scores = scores_of(how, stage)
     mode = gradients.forward if how.estimator == "forward" else gradients.reverse
-    worlds = (batch.worlds, batch.late)
     return jax.vmap(lambda theta: mode(scores, theta, worlds, clip=how.world_clip))(thetas)
 
 
@@ -248,8 +222,13 @@ def differentiated(thetas: jax.Array, how: Windows, seed: int, step: int) -> tup
 
     Counted is what leads to a window, too, but not that worlds wait there for the latest to begin.
     """
-    batches = softened(how.problem, _ENGINE[how.estimator], seed, step)
-    found = [(_differentiated(thetas, b, how=how), len(b.worlds.key)) for b in batches]
+    problem, found = how.problem, []
+    setting = replace(problem.setting, engine=_ENGINE[how.estimator])
+    ask = problem.ask(jax.tree.map(lambda x: np.array([x]), RPSParams()), seed, step)
+    random = np.random.default_rng((seed, step))
+    for part, column, _ in evaluate.parts(ask, problem.domains, setting):
+        worlds = soften(part.worlds), jnp.asarray(random.uniform(size=column.size))
+        found.append((_differentiated(thetas, part.stage, worlds, how=how), column.size))
     total = sum(n for _, n in found)
     return Estimate(
         sum(e.gradient * (n / total) for e, n in found),  # type: ignore[arg-type]

@@ -67,7 +67,6 @@ class TuneES(Tuning):
     elsewhere; 0 stands for never."""
 
     def tuner(self) -> EvolutionState:
-        """The search."""
         return EvolutionState(self)
 
 

@@ -38,7 +38,7 @@ from rps_jax.trials import trial
 from rps_jax.trials.batch import rows
 from rps_jax.trials.progress import Progress, phase
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import object_pose
+from rps_jax.trials.trial import Loop, object_pose
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.tuning import logs as logs_
 from rps_jax.tuning import posterior
@@ -136,7 +136,6 @@ class Fit(OfLaw[Fitted], InDomain[Fitted], OfLogs):
         return found, has
 
     def check(self) -> None:
-        """Check the logs, the law and the engine."""
         self.check_engine([self.params])
         check_law(self.label, self.bank.law, self.setting)
         if len({one.exact for one in self.given}) > 1:
@@ -152,7 +151,6 @@ class Fit(OfLaw[Fitted], InDomain[Fitted], OfLogs):
                 )
 
     def trials(self) -> int | None:
-        """How many worlds are simulated."""
         return self.worlds
 
     def described(self) -> dict[str, Any]:
@@ -184,7 +182,6 @@ class Fit(OfLaw[Fitted], InDomain[Fitted], OfLogs):
         return Fitted(data, fitted)
 
     def intro(self, found: Fitted) -> str:
-        """What was asked."""
         has = self.observed[1]
         return (
             f"Logs: {len(self.given)}, the first {self.bank.window:g} s of each at "
@@ -193,7 +190,6 @@ class Fit(OfLaw[Fitted], InDomain[Fitted], OfLogs):
         )
 
     def report(self, found: Fitted, run: Run) -> Sequence[Section]:
-        """Each quantity's posterior beside its prior."""
         data = found.data
         text = (
             "Median and 90 % interval. A quantity is undetermined if its interval is at least "
@@ -283,8 +279,8 @@ class Bank:
         period = self.setting.physics.control_period
         every = max(1, round(self.interval / period))
         seen = _tracks(
-            part.stage, full, physics=self.setting.physics, rules=self.setting.rules,
-            law=_telling(self.law), steps=round(self.window / self.interval), every=every,
+            part.stage, full, Loop(self.setting.physics, self.setting.rules, _telling(self.law)),
+            steps=round(self.window / self.interval), every=every,
         )  # fmt: skip
         seen = jax.tree.map(lambda x: np.swapaxes(np.asarray(x, float), 0, 1), seen)
         kept: dict[str, Any] = rows(seen, slice(count))
@@ -316,13 +312,11 @@ def _tell(law: Law, params: Any, memory: Any, seen: Any) -> Any:
     return memory, twist, seen
 
 
-@partial(jax.jit, static_argnames=("physics", "law", "steps", "every"))
-def _tracks(
-    stage: Any, worlds: Any, *, physics: Any, rules: Any, law: Law, steps: int, every: int
-) -> dict[str, jax.Array]:
+@partial(jax.jit, static_argnames=("steps", "every"))
+def _tracks(stage: Any, worlds: Any, loop: Loop, *, steps: int, every: int) -> dict[str, jax.Array]:
     """Logs of a batch, (steps, B, ...), one row every so many control steps."""
     jnp = jax.numpy
-    one = partial(trial.control_step, stage, physics=physics, rules=rules, law=law)
+    one = partial(trial.control_step, stage, loop=loop)
 
     def row(trials: Any, _: Any) -> Any:
         after, seen = one(worlds, trials)
@@ -343,7 +337,7 @@ def _tracks(
             found["signal"] = jnp.where(after.skin.alive, after.skin.signal, 0.0)
         return after, found
 
-    trials = trial.start_all(worlds, jnp.ones(len(worlds.qpos), bool), law=law)
+    trials = trial.start_all(worlds, jnp.ones(len(worlds.qpos), bool), law=loop.law)
     return jax.lax.scan(row, trials, length=steps)[1]
 
 

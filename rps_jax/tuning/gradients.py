@@ -14,8 +14,6 @@ Derivatives of chaotic worlds may be finite and yet say nothing: their variance 
 and `differences` need no derivative.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -25,14 +23,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax.control import registry
-from rps_jax.control.base import Law, Params
-from rps_jax.control.laws import rps
+from rps_jax.control.base import Params
 from rps_jax.geometry import planar
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Snapshot, Trial
-from rps_jax.world.physics import Physics
+from rps_jax.trials.trial import Loop, Snapshot, Trial
 
 Scores = Callable[[jax.Array, Any], jax.Array]
 
@@ -97,11 +93,7 @@ def differences(
 ) -> Estimate:
     """By central differences in each world: 2 p n scores.
 
-    Args:
-      scores: see above.
-      theta: (p,).
-      worlds: (n, ...).
-      step: () or (p,), in the units of theta.
+    A `step` is () or (p,), in the units of theta.
     """
     n, p = _for_each(theta, worlds).shape
     steps = jnp.repeat(jnp.diag(jnp.broadcast_to(jnp.asarray(step, theta.dtype), p)), n, axis=0)
@@ -125,15 +117,7 @@ def evolution(
 
     Each world tries `pairs` normal directions of its own, each both ways, and both in the same
     world: 2 pairs n scores. Without bias it is the gradient of E[score(theta + sigma e)], which
-    exists even where scores jump.
-
-    Args:
-      scores: see above.
-      theta: (p,).
-      worlds: (n, ...).
-      key: of the directions.
-      sigma: () or (p,) standard deviation of the steps, in the units of theta.
-      pairs: directions in each world.
+    exists even where scores jump. `sigma`, () or (p,), is in the units of theta.
 
     Reference: Nesterov and Spokoiny, "Random gradient-free minimization of convex functions",
     Foundations of Computational Mathematics 17, 2017.
@@ -178,26 +162,15 @@ def _repeated(worlds: Any, times: int) -> Any:
 
 
 def window(
-    stage: Any,
-    params_of: Callable[[jax.Array], Params],
-    cost: Callable[[Snapshot], jax.Array],
-    *,
-    physics: Physics,
-    law: Law = registry.smooth_law(rps.LAW),
+    stage: Any,  # of an engine with derivatives: see `Engine.check_derivatives`
+    params_of: Callable[[jax.Array], Params],  # from theta (p,), differentiable
+    cost: Callable[[Snapshot], jax.Array],  # () or (...) of snapshots (steps, ...) of one trial
+    loop: Loop,  # with the smooth law that the parameters belong to
     steps: int,
 ) -> Scores:
     """Scores of trials driven on for some control steps from where they are.
 
-    Args:
-      stage: of an engine with derivatives: see `Engine.check_derivatives`.
-      params_of: parameters from theta (p,), differentiable.
-      cost: () or (...) of the snapshots (steps, ...) of one trial, such as its mean distance.
-      physics: how the worlds are stepped.
-      law: that the parameters belong to.
-      steps: control steps.
-
-    Returns:
-      Scores whose worlds are pairs (World, Trial), batched: the trials say where to start.
+    Their worlds are pairs (World, Trial), batched: the trials say where to start.
     """
 
     def scores(thetas: jax.Array, starts: Any) -> jax.Array:
@@ -206,7 +179,7 @@ def window(
 
         @partial(jax.checkpoint, prevent_cse=False)  # in reverse, memory of one state a step
         def one(trials: Trial, _: None) -> tuple[Trial, Snapshot]:
-            return trial.control_step(stage, worlds, trials, physics=physics, law=law)
+            return trial.control_step(stage, worlds, trials, loop)
 
         _, seen = jax.lax.scan(one, trials, length=steps)
         return jax.vmap(cost, in_axes=1)(seen)
@@ -245,12 +218,12 @@ def distances(
       (2, 2)
     """
     stage, worlds = pushes.build(cases, setting)
-    law, physics = registry.smooth_law(registry.law_of(cases[0].params)), setting.physics
-    at = np.round(np.asarray(horizons) / physics.control_period).astype(int)
+    law = registry.smooth_law(registry.law_of(cases[0].params))
+    at = np.round(np.asarray(horizons) / setting.physics.control_period).astype(int)
 
     def left(seen: Snapshot) -> jax.Array:
         return seen.details.distance[at]
 
-    options: dict[str, Any] = {"physics": physics, "law": law, "steps": int(at[-1]) + 1}
-    scores = jax.jit(window(stage, params_of, left, **options))
+    loop = Loop(setting.physics, law=law)
+    scores = jax.jit(window(stage, params_of, left, loop, int(at[-1]) + 1))
     return scores, (worlds, trial.start_all(worlds, np.ones(len(cases), bool), law=law))

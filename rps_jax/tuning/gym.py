@@ -10,8 +10,6 @@ Both step a `PushEnv`, whose options they take by name: object, setting, robot, 
 worlds. `gymnasium.make("rps_jax.tuning.gym:rps_jax/Push-v0")` needs no second import.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import partial
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """Learning a law in a run folder that can be killed and continued, within a time that is given."""
 
-from __future__ import annotations
-
 import functools
 import json
 import time
@@ -82,6 +80,7 @@ class Learn(PPO, Pushes[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "A law, learned"
+    LEFT_OUT: ClassVar[tuple[str, ...]] = ("minutes", "updates", "every")
     SMALL: ClassVar[Mapping[str, Any]] = {
         "domain": ("wide,objects=random_box",),
         "network": "mlp",
@@ -123,7 +122,6 @@ class Learn(PPO, Pushes[xr.Dataset]):
         return tuple(domains.named(text) for text in several)
 
     def check(self) -> None:
-        """Check that something can be learned in this way."""
         if self.out is None:
             raise errors.InputError("out = None is not allowed: the policy is written there.")
         if not (self.minutes or self.updates):
@@ -148,12 +146,9 @@ class Learn(PPO, Pushes[xr.Dataset]):
                 f"least, {period:g} s."
             )
 
-    def configuration(self) -> dict[str, Any]:
-        """All that the law depends on, but how long it is learned."""
-        found = super().configuration() | {"domain": [asdict(one) for one in self.domains]}
-        for name in ("minutes", "updates", "every"):
-            del found[name]
-        return found
+    def described(self) -> dict[str, Any]:
+        """Own fields as JSON, with domains by their ranges."""
+        return super().described() | {"domain": [asdict(one) for one in self.domains]}
 
     def environments(self, split: Split = "tune") -> list[PushEnv]:
         """Those in which it is learned; or those for validation, by the rules of the paper."""
@@ -167,26 +162,22 @@ class Learn(PPO, Pushes[xr.Dataset]):
         ]
 
     def bar(self) -> Bar:
-        """A bar over wall clock or updates."""
         if self.updates:
             return Bar(self.name, self.updates, "updates", shown=self.shown)
         return Bar(self.name, 60 * self.minutes, "clock", shown=self.shown)
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Learn."""
         assert run.folder is not None
         learning = _Learning(run.folder, self, run.report, time.perf_counter())
         return learning.through(60 * self.minutes, self.updates, 60 * self.every)
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         return (
             f"{self.network.upper()} of {self.width} pairs of units, PPO in {self.num_envs} worlds "
             f"of each shape; judged in the domain itself, without noise, by the paper's rules."
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Validations, where the time went, and the curve."""
         simulated = float(found.simulated[-1]) if found.sizes["update"] else 0.0
         took = found.attrs["run"]
         judged = found.validation.dropna("update")
@@ -357,7 +348,7 @@ class _Learning:
     def _restore(self) -> None:
         """Take up what was kept last, if it is sound."""
         found = []
-        for name, content in Parts(self.folder).contents().items():
+        for name, content in Parts(self.folder).each():
             path = Parts(self.folder).folder / name
             try:
                 arrays = files.arrays_of(content)

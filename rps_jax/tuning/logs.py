@@ -16,8 +16,6 @@ A log is a trace, as `push` and `replay` return it or keep it in their run folde
     force_x, force_y                 [N] of the object on the base, if known, in the robot frame
 """
 
-from __future__ import annotations
-
 import re
 from itertools import pairwise
 from pathlib import Path

@@ -6,8 +6,6 @@ coordinates and statistics by the logarithm of that density, until it no longer 
 are kept apart, and several are averaged. (Papamakarios and Murray 2016; autoregressive in bins.)
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -141,14 +139,10 @@ def sample(posterior: Posterior, statistics: np.ndarray, count: int, seed: int =
     return np.asarray(_drawn(posterior.params, x, jax.random.PRNGKey(seed), count))
 
 
-def _counted(observations: int) -> float:
-    """Power of each density in the product."""
-    return (1 + _FURTHER * (observations - 1)) / observations
-
-
 @partial(jax.jit, static_argnames="count")
 def _drawn(params: Any, x: jax.Array, key: jax.Array, count: int) -> jax.Array:
     seen = jax.vmap(_trunk, (0, None))(params, x)  # (members, m, W)
+    power = (1 + _FURTHER * (len(x) - 1)) / len(x)  # of each density in the product
     size = params["bias"].shape[1]
     before = params["before"] * _mask(size)
 
@@ -162,7 +156,7 @@ def _drawn(params: Any, x: jax.Array, key: jax.Array, count: int) -> jax.Array:
         each = jnp.einsum("emch,ehk->emck", hidden, out) + bias[:, None, None]
         each = jax.nn.log_softmax(each)
         log = jax.nn.logsumexp(each, 0) - jnp.log(len(each)) + jnp.log(BINS)
-        product = _counted(len(x)) * jnp.sum(log, 0) - jnp.log(BINS)
+        product = power * jnp.sum(log, 0) - jnp.log(BINS)
         bins = jax.random.categorical(pick, product)
         value = (bins + jax.random.uniform(within, (count,))) / BINS
         weight = jax.nn.logsumexp(product, -1)

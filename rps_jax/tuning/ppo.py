@@ -166,23 +166,13 @@ def means(network: Network, actor: Weights, hidden: jax.Array, steps: Transition
 def loss(
     ppo: PPO,
     network: Network,
-    weights: Weights,
-    hidden: jax.Array,
-    steps: Transition,
-    advantage: jax.Array,
-    target: jax.Array,
+    weights: Weights,  # as in `TrainState`
+    hidden: jax.Array,  # (N, 2, H) of the network before the first transition
+    steps: Transition,  # leaves (T, N, ...)
+    advantage: jax.Array,  # (T, N) [1], normalised
+    target: jax.Array,  # (T, N) [1] of the value function
 ) -> tuple[jax.Array, jax.Array]:
-    """Loss of a minibatch of worlds, and the KL divergence from the policy that acted.
-
-    Args:
-      ppo: the algorithm's numbers.
-      network: of the law.
-      weights: as in `TrainState`.
-      hidden: (N, 2, H) hidden state of the network before the first transition.
-      steps: transitions, leaves (T, N, ...).
-      advantage: (T, N) [1], normalised.
-      target: (T, N) [1] of the value function.
-    """
+    """Loss of a minibatch of worlds, and the KL divergence from the policy that acted."""
     mean = means(network, weights["actor"], hidden, steps)
     change = log_prob(steps.action, mean, weights["log_std"]) - steps.log_prob
     ratio = jnp.exp(change)

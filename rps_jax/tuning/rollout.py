@@ -7,8 +7,6 @@ Curriculum: targets come from nearer and from more ahead, until the share of suc
 is reached; then the level rises, up to the domain's own targets.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple

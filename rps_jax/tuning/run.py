@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.analysis import figures, tables
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
@@ -68,6 +68,7 @@ class Problem:
 class Tuning(OfLaw[xr.Dataset]):
     """A question for better parameters of a law."""
 
+    LEFT_OUT: ClassVar[tuple[str, ...]] = ("budget", "generations")
     SMALL: ClassVar[dict[str, Any]] = {
         # Few parameters, those that matter most, since few trials tell no more; and cylinders on
         # the quasi-static model, which compile and run fastest.
@@ -101,7 +102,6 @@ class Tuning(OfLaw[xr.Dataset]):
 
     @property
     def title(self) -> str:
-        """Title of the report."""
         return f"{self.label}, tuned"
 
     @functools.cached_property
@@ -129,7 +129,6 @@ class Tuning(OfLaw[xr.Dataset]):
         return {k: v for k, v in self.SMALL.items() if k != "tuned" or alike}
 
     def check(self) -> None:
-        """Check the space, the search, and that the engine can step the worlds here."""
         errors.check_count("seed", self.setting.seed, at_least=0, at_most=2**30)
         known = [n for n, own in registry.LAWS.items() if registry.law_of(own).bounds]
         if not registry.law_of(self.params).bounds:
@@ -137,32 +136,25 @@ class Tuning(OfLaw[xr.Dataset]):
                 f"law = {self.label} is not allowed: it has no bounds to tune within; "
                 f"{', '.join(known)} have."
             )
-        engine = engines.get(self.setting.engine)
-        engine.check([family for one in self.problem.domains for family in one.families])
-        engine.check_senses(registry.law_of(self.space.base).senses)
+        for one in self.problem.domains:
+            self.setting.check_here(one.families, one.weakest, [self.space.base])
         self.tuner()
 
-    def configuration(self) -> dict[str, Any]:
-        """All that the answer depends on, but how long it is searched."""
-        found = self.described() | {"question": self.name, "tuned": self.space.names}
-        found["domain"] = [asdict(one) for one in self.problem.domains]
-        for name in ("budget", "generations"):
-            found.pop(name, None)
-        return found
+    def described(self) -> dict[str, Any]:
+        """Own fields as JSON, with all that is tuned, and domains by their ranges."""
+        ranges = [asdict(one) for one in self.problem.domains]
+        return super().described() | {"tuned": self.space.names, "domain": ranges}
 
     def bar(self) -> Bar:
-        """A bar over generations."""
         count = self.tuner().generations
         return Bar(self.name.replace("_", " "), count, "generations", shown=self.shown)
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Tune."""
         tuner = self.tuner()
         log = tune(run.folder, tuner, report=run.report, slots=run.slots, workers=run.workers)
         return labelled(log, tuner)
 
     def intro(self, found: xr.Dataset) -> str:
-        """What was asked."""
         names = ", ".join(self.space.names)
         return (
             f"{self.label}: {names}; {self.worlds} worlds of each generation and "
@@ -170,7 +162,6 @@ class Tuning(OfLaw[xr.Dataset]):
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        """What was found, where the time went, and the search over its generations."""
         best = int(found.validation.argmin("generation"))
         rate = [tables.percent(float(won)) for won in found.validation_success.values]
         total = {name: float(found[name].sum()) for name in ("compile", "run", "simulated")}
@@ -245,7 +236,7 @@ def tune(
         report(replace(progress, simulated=simulated + progress.simulated, rounds=len(log)))
 
     while (name := f"{len(log):06d}") in kept or (
-        len(log) < tuner.generations and not spent(log, tuner.budget)
+        len(log) < tuner.generations and not 0 < tuner.budget <= simulated
     ):
         vectors = tuner.propose()
         if name in kept:
@@ -290,24 +281,9 @@ def _tried(
     return metrics, {"generation": generation} | line | took
 
 
-def spent(log: Sequence[dict[str, Any]], budget: float) -> bool:
-    """Whether the generations of a log have simulated a budget [s]; never one of 0."""
-    return 0 < budget <= sum(line["simulated"] for line in log)
-
-
 def finite(value: Any) -> float | None:
     """A number as JSON has it: None for what is not finite."""
     return float(value) if np.isfinite(value) else None
-
-
-def read_log(folder: Path) -> list[dict[str, Any]]:
-    """The lines of a run's log, one for each generation."""
-    path = folder / "log.jsonl"
-    content = files.content_of(path, "json")
-    try:
-        return [files.parsed(line) for line in content.splitlines()]
-    except ValueError as error:
-        raise files.corrupt(path, error) from error
 
 
 def _write(folder: Path, tuner: Tuner, log: Sequence[dict[str, Any]]) -> None:

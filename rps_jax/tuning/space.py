@@ -1,7 +1,5 @@
 """The parameters that are tuned, as a vector without bounds."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -36,11 +34,7 @@ class Space:
     base: Any = RPSParams()  # parameters of any law that has bounds
 
     def __post_init__(self) -> None:
-        """Raises InputError for unknown or repeated names, or a base outside the bounds."""
-        if not self.names or len(set(self.names)) < len(self.names):
-            raise errors.InputError(
-                f"tuned = {self.names} is not allowed: name each parameter once, at least one."
-            )
+        errors.check_each_once("tuned", self.names)
         base = registry.numbers(self.base)
         for name in self.names:
             bound = self._bounds[errors.check_name("tuned parameter", name, self._bounds)]

@@ -1,7 +1,5 @@
 """Domains: from which ranges random worlds are drawn (see `draws`), by name and as JSON."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -49,7 +47,7 @@ class Quantity(NamedTuple):
     most: float
     words: str  # what it is called in reports; empty: it is in none
     of: Part = "object"
-    sets: str = ""  # number of the skin, of odometry or of the robot that is drawn
+    sets: str = ""  # number of the robot that is drawn; of skin and odometry it is called alike
 
 
 def drawn(usual: Range | None, *about: Any) -> Any:
@@ -98,29 +96,19 @@ class Domain:
     # The skin: ideal, or 42 capacitive taxels with these imperfections.
     skin: str = "capacitive"
     # Of each raw reading, as a change of capacitance.
-    noise: Range = drawn(Range(0, 0.05), 13, "1", 0, 1, "noise of the skin", "skin", "noise")
-    gain_spread: Range = drawn(
-        Range(0, 0.1), 14, "1", 0, 1, "spread of the taxels' gains", "skin", "gain_spread"
-    )
-    dead_share: Range = drawn(Range(0, 0.05), 15, "1", 0, 1, "dead taxels", "skin", "dead_share")
+    noise: Range = drawn(Range(0, 0.05), 13, "1", 0, 1, "noise of the skin", "skin")
+    gain_spread: Range = drawn(Range(0, 0.1), 14, "1", 0, 1, "spread of the taxels' gains", "skin")
+    dead_share: Range = drawn(Range(0, 0.05), 15, "1", 0, 1, "dead taxels", "skin")
     # None: as the skin has it.
-    foam: Range | None = drawn(None, 40, "m", 0.002, 0.05, "foam of the skin", "skin", "foam")
+    foam: Range | None = drawn(None, 40, "m", 0.002, 0.05, "foam of the skin", "skin")
     time_constant: Range | None = drawn(
-        None, 41, "s", _POSITIVE, 1, "time constant of the skin", "skin", "time_constant"
+        None, 41, "s", _POSITIVE, 1, "time constant of the skin", "skin"
     )
     # The base: where it believes it is, and how it does what it is told.
-    pose_noise: Range = drawn(
-        Range(0, 0.005), 16, "m", 0, 1, "noise of the position", "base", "pose_noise"
-    )
-    yaw_noise: Range = drawn(
-        Range(0, 0.01), 17, "rad", 0, 1, "noise of the heading", "base", "yaw_noise"
-    )
-    pose_latency: Range = drawn(
-        Range(0, 0.1), 18, "s", 0, 1, "latency of the pose", "base", "pose_latency"
-    )
-    command_delay: Range = drawn(
-        Range(0, 0.1), 19, "s", 0, 1, "delay of the command", "base", "command_delay"
-    )
+    pose_noise: Range = drawn(Range(0, 0.005), 16, "m", 0, 1, "noise of the position", "base")
+    yaw_noise: Range = drawn(Range(0, 0.01), 17, "rad", 0, 1, "noise of the heading", "base")
+    pose_latency: Range = drawn(Range(0, 0.1), 18, "s", 0, 1, "latency of the pose", "base")
+    command_delay: Range = drawn(Range(0, 0.1), 19, "s", 0, 1, "delay of the command", "base")
     # Of each component of the twist, all trial long: columns 20, 21 and 22.
     velocity_error: Range = drawn(Range(-0.03, 0.03), 20, "1", -0.9, 0.9, "", "base")
     # The robot, and what of it differs between worlds; None: as the robot has it.
@@ -140,13 +128,9 @@ class Domain:
     robot_slip: Range | None = drawn(None, 42, "1", 0, 0.5, "slip of the wheels", "robot", "slip")
 
     def __post_init__(self) -> None:
-        """Raises InputError for ranges that are empty or leave what is possible."""
-        if not self.objects:
-            raise InputError("domain objects = () is not allowed: name at least one.")
         for name in self.objects:
             errors.check_name("domain object", name, (*RANDOM, *OBJECTS))
-        if len(set(self.objects)) < len(self.objects):
-            raise InputError(f"domain objects = {self.objects} is not allowed: name each once.")
+        errors.check_each_once("domain objects", self.objects)
         for friction in self.frictions:
             scene.check(friction, None)
         errors.check_name("domain skin", self.skin, ("ideal", "capacitive"))

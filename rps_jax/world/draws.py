@@ -4,8 +4,6 @@ Whatever the batch, whatever the device, the same address gives the same world: 
 a counter-based generator, and everything after them is computed on the host in double precision.
 """
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
@@ -45,16 +43,9 @@ _OTHERS = {
     **{f"corner_{i}": 27 + i for i in range(SIDES)},
     **{"feet_number": 44, "feet_turn": 45},
 }
+_OWN = {name: one.column for name, one in QUANTITIES.items() if name != "velocity_error"}
 # Which random number of a world is what, in the order of the columns.
-USES: dict[str, int] = dict(
-    sorted(
-        {
-            **{name: one.column for name, one in QUANTITIES.items() if name != "velocity_error"},
-            **_OTHERS,
-        }.items(),
-        key=lambda item: item[1],
-    )
-)
+USES: dict[str, int] = dict(sorted((_OWN | _OTHERS).items(), key=lambda item: item[1]))
 
 
 def draw(domain: Domain, seed: int, index: ArrayLike) -> Draw:

@@ -4,8 +4,6 @@ An object of one's own is an MJCF file, which gives its looks and its mass, and 
 touches is the upright solid over it, in every engine and for the skin alike.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,8 +1,7 @@
 """What the paper ran and what it reports, as data."""
 
-from __future__ import annotations
-
 import math
+from itertools import product
 from typing import NamedTuple
 
 TARGETS = tuple(
@@ -14,26 +13,17 @@ FEW_TARGETS = ((2.0, 0.0), (1.0, 1.0), (0.0, -2.0), (-2.0, 1.0))  # of them, for
 LAWS = ("rps", "nps", "aps")
 SKIN = {"default": "ideal", "paper_gazebo": "thin"}  # that goes with each physics
 
-# Table II: successes of 24, keyed by law, object and friction set.
-TABLE_II = {
-    ("rps", "box", "S1"): 23,
-    ("rps", "box", "S2"): 24,
-    ("rps", "cylinder", "S1"): 19,
-    ("rps", "cylinder", "S2"): 19,
-    ("rps", "nonuniform_box", "S1"): 19,
-    ("rps", "nonuniform_box", "S2"): 23,
-    ("nps", "box", "S1"): 2,
-    ("nps", "box", "S2"): 5,
-    ("nps", "cylinder", "S1"): 2,
-    ("nps", "cylinder", "S2"): 2,
-    ("nps", "nonuniform_box", "S1"): 6,
-    ("nps", "nonuniform_box", "S2"): 6,
-    ("aps", "box", "S1"): 2,
-    ("aps", "box", "S2"): 2,
-    ("aps", "cylinder", "S1"): 2,
-    ("aps", "cylinder", "S2"): 2,
-    ("aps", "nonuniform_box", "S1"): 0,
-    ("aps", "nonuniform_box", "S2"): 0,
+_SUCCESSES = {  # of 24, with box, cylinder and nonuniform_box, each under S1 and S2
+    "rps": (23, 24, 19, 19, 19, 23),
+    "nps": (2, 5, 2, 2, 6, 6),
+    "aps": (2, 2, 2, 2, 0, 0),
+}
+_COLUMNS = tuple(product(("box", "cylinder", "nonuniform_box"), ("S1", "S2")))
+# Table II, keyed by law, object and friction set.
+TABLE_II: dict[tuple[str, str, str], int] = {
+    (law, *column): won
+    for law, row in _SUCCESSES.items()
+    for column, won in zip(_COLUMNS, row, strict=True)
 }
 
 # Sec. III-C, on the robot itself.

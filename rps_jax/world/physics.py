@@ -1,49 +1,38 @@
 """How worlds are stepped: the timestep, the cone, the solver, the softness of contacts; by name."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 from rps_jax import errors
-from rps_jax.record.options import with_changes
+from rps_jax.record.options import check_fields, option, with_changes
 
 
 @dataclass(frozen=True)
 class Physics:
     """How the world is stepped. Static: a change compiles another program."""
 
-    timestep: float = 0.01  # [s]
-    control_period: float = 0.02  # [s] between two decisions of the law; left open by the paper
+    timestep: float = option(0.01, 1e-5, 0.1, unit="s")
+    # Between two decisions of the law; left open by the paper.
+    control_period: float = option(0.02, above=0, at_most=1, unit="s")
     cone: Literal["elliptic", "pyramidal"] = "elliptic"
-    impratio: float = 10.0  # [1] friction stiffness over normal stiffness
-    iterations: int = 8  # of the Newton solver, at most; with 4 the object is lost
-    ls_iterations: int = 10  # of its line search, at most
+    impratio: float = option(10.0, above=0)  # [1] friction stiffness over normal stiffness
+    # Of the Newton solver, at most; with 4 the object is lost.
+    iterations: int = option(8, 1, 10_000)
+    ls_iterations: int = option(10, 1, 10_000)  # of its line search, at most
     # Of the solver, relative to the trace of the mass matrix: that is 3e6 by the base's armature,
     # so MuJoCo's own 1e-8 would end the solver far from an object's solution.
-    tolerance: float = 1e-13  # [1]
+    tolerance: float = option(1e-13, 0)  # [1]
     # Time constant and damping ratio [s, 1] of the two contacts (MuJoCo's solref) and the ground's
     # impedance [1] (its solimp). MuJoCo's cone lifts what slides; on its own ground, (0.02, 1) and
     # 0.9, objects hop at 5 cm/s and the push force chatters by three quarters of its mean. This
     # softer and less damped ground carries them steadily, 0.5 mm deep.
-    base_solref: tuple[float, float] = (0.02, 1.0)  # MuJoCo's own
-    ground_solref: tuple[float, float] = (0.1, 0.3)
-    ground_impedance: float = 0.7
+    base_solref: tuple[float, float] = option((0.02, 1.0), above=0)  # MuJoCo's own
+    ground_solref: tuple[float, float] = option((0.1, 0.3), above=0)
+    ground_impedance: float = option(0.7, above=0, at_most=0.9999)
 
     def __post_init__(self) -> None:
-        """Raises InputError for values that MuJoCo would accept and that mean nothing."""
-        errors.check_finite("timestep", self.timestep, at_least=1e-5, at_most=0.1, unit="s")
-        errors.check_finite("control_period", self.control_period, above=0, at_most=1, unit="s")
-        errors.check_finite("impratio", self.impratio, above=0)
-        errors.check_count("iterations", self.iterations, at_most=10_000)
-        errors.check_count("ls_iterations", self.ls_iterations, at_most=10_000)
-        errors.check_finite("tolerance", self.tolerance, at_least=0)
-        for name, solref in (("base", self.base_solref), ("ground", self.ground_solref)):
-            for what, value in zip(("time constant", "damping ratio"), solref, strict=True):
-                errors.check_finite(f"{name} contact's {what}", value, above=0)
-        errors.check_finite("ground_impedance", self.ground_impedance, above=0, at_most=0.9999)
-        errors.check_name("cone", self.cone, ("elliptic", "pyramidal"))
+        check_fields(self)
         steps = self.control_period / self.timestep
         if steps < 0.5 or not math.isclose(steps, round(steps), rel_tol=1e-6):
             raise errors.InputError(

@@ -98,7 +98,6 @@ class Points:
     u: np.ndarray  # (n, q)
 
     def __eq__(self, other: object) -> bool:
-        """Two tables are equal if all their numbers are."""
         return isinstance(other, Points) and self.digest == other.digest
 
     @property
@@ -134,16 +133,13 @@ class Points:
         """The points of this digest that a run folder holds; InputError if it does not."""
         if not (folder / FILE).exists():
             raise InputError(f"run = {folder} lacks its {FILE}: run the same command again.")
-        found = Points(_numbers(folder / FILE))
+        kept = files.check_columns(
+            files.read(folder / FILE), folder / FILE, {"u": ("world", "quantity")}, {}
+        )
+        found = Points(kept.u.values)
         if found.digest != digest:
             raise files.corrupt(folder / FILE, "its points are not those of the run")
         return found
-
-
-def _numbers(path: Path) -> np.ndarray:
-    """The points (n, q) of a file."""
-    found = files.check_columns(files.read(path), path, {"u": ("world", "quantity")}, {})
-    return found.u.values
 
 
 def _counts(domain: Domain) -> tuple[int, int, int]:
@@ -194,23 +190,9 @@ def draw(domain: Domain, seed: int, points: Points | None, index: Any) -> Draw:
 
 
 def points_of(domain: Domain | str, index: ArrayLike, seed: int = 0) -> np.ndarray:
-    """The points (n, q) of the unit cube at which drawn worlds lie.
+    """The points (n, q) of the unit cube at which the drawn worlds `index` (n,) lie.
 
-    Args:
-      domain: ranges of what differs between worlds, or their name, as wide.
-      index: (n,) of the worlds.
-      seed: of the worlds, as of `sweep`.
-
-    Returns:
-      Points (n, q); `worlds_at` makes the same worlds of them, bit for bit.
-
-    Raises:
-      InputError: an argument is not allowed.
-
-    Example:
-      >>> from rps_jax.world.points import points_of
-      >>> points_of("wide", [0, 1, 2]).shape
-      (3, 36)
+    `worlds_at` makes the same worlds of them, bit for bit.
     """
     domain = named(domain)
     errors.check_count("seed", seed, at_least=0, at_most=2**32 - 1)
@@ -301,7 +283,7 @@ def _labelled(domain: Domain, u: np.ndarray) -> xr.Dataset:
     coordinates |= {"quantity": [one.name for one in every], "world": np.arange(len(u))}
     text = {"units": "1", "long_name": "point of the unit cube"}
     return xr.Dataset(
-        {"u": (("world", "quantity"), u, text)}, coordinates, {"domain": _told(domain)}
+        {"u": (("world", "quantity"), u, text)}, coordinates, {"domain": json.dumps(asdict(domain))}
     )
 
 
@@ -311,7 +293,3 @@ def _tells(text: Any, domain: Domain) -> bool:
         return from_json(json.loads(text)) == domain
     except (TypeError, ValueError, AttributeError, RecursionError):
         return False
-
-
-def _told(domain: Domain) -> str:
-    return json.dumps(asdict(domain))

@@ -4,8 +4,6 @@ The physics model holds the three geoms that touch and nothing else; it is what 
 both step.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
@@ -16,7 +14,6 @@ import mujoco
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import Solid
@@ -65,24 +62,15 @@ JOINTS = Joints()
 
 
 def load(
-    name: str,
+    name: str,  # of an object, as `objects.OBJECTS` has them
     physics: Physics = PHYSICS["default"]["standard"],
     friction: Friction = FRICTION["S1"],
     *,
-    rear: Side = "near",
-    mass: float | None = None,
-    robot: Robot = Robot(),
+    rear: Side = "near",  # where the nonuniform box's load stands: "rear left corner", the paper
+    mass: float | None = None,  # [kg], its inertia scaled along; None: the object's own
+    robot: Robot = Robot(),  # contact can slow and stop it, if its force is limited
 ) -> Scene:
-    """Compile a scene.
-
-    Args:
-      name: of an object, as `rps_jax.world.objects.OBJECTS` has them.
-      physics: how it will be stepped.
-      friction: coefficients of its two contacts.
-      rear: which side the nonuniform box's load stands on, nearest the robot or farthest; the
-        paper says "rear left corner".
-      mass: of the object [kg], its inertia scaled along; None: the object's own.
-      robot: whose base it is; contact can slow and stop it, if its force is limited.
+    """Compile a scene of an object.
 
     Raises:
       InputError: unknown name, or friction or mass that is not a positive finite number.
@@ -257,7 +245,9 @@ def _compile(
             pair.solref[:] = physics.ground_solref
             pair.solimp[:2] = physics.ground_impedance
         pair.friction[:2] = friction.robot if pair.name == "base_object" else friction.ground
-    _set_options(spec.option, physics)
+    spec.option.cone = getattr(mujoco.mjtCone, f"mjCONE_{physics.cone.upper()}")
+    for name in ("timestep", "impratio", "iterations", "ls_iterations", "tolerance"):
+        setattr(spec.option, name, getattr(physics, name))
     model = spec.compile()
     return model, _strip(spec, model)
 
@@ -300,18 +290,6 @@ def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
     base.inertia[:] = float(robot.inertia)  # about the other axes it never turns
     for joint in base.joints:
         joint.armature = 0.0
-
-
-def _set_options(option: mujoco.MjOption, physics: Physics) -> None:
-    option.timestep = physics.timestep
-    option.cone = {
-        "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC,
-        "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL,
-    }[physics.cone]
-    option.impratio = physics.impratio
-    option.iterations = physics.iterations
-    option.ls_iterations = physics.ls_iterations
-    option.tolerance = physics.tolerance
 
 
 def _strip(spec: mujoco.MjSpec, full: mujoco.MjModel) -> mujoco.MjModel:
@@ -374,8 +352,8 @@ def initial_qpos(scene: Scene, gap: float = 0.02, yaw: float = 0.0) -> np.ndarra
 
     `yaw` [rad] turns the object.
     """
-    placed = fp.place(scene.footprint, jnp.zeros(2), jnp.asarray(yaw, float))
-    reach = float(fp.extent(placed, jnp.array([-1.0, 0.0])))
+    x, y = np.asarray(scene.footprint.vertices).T
+    reach = np.max(math.sin(yaw) * y - math.cos(yaw) * x) + float(scene.footprint.radius)
     qpos = scene.physics.qpos0.copy()
     qpos[JOINTS.base] = 0.0
     height = qpos[JOINTS.object][2]

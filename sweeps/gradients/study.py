@@ -172,9 +172,8 @@ def _distances(study: Gradients, stage: Any, physics: Any, smooth: bool) -> esti
     def left(seen: Snapshot) -> jax.Array:
         return seen.details.distance[at]
 
-    score = estimates.window(
-        stage, study.space.params, left, physics=physics, law=law, steps=int(at[-1]) + 1
-    )
+    loop = trial.Loop(physics, law=law)
+    score = estimates.window(stage, study.space.params, left, loop, int(at[-1]) + 1)
 
     def scores(thetas: jax.Array, worlds: World) -> jax.Array:
         live = jnp.ones(thetas.shape[0], bool)

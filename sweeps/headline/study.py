@@ -39,7 +39,10 @@ class Headline(Study[xr.Dataset]):
 
     TITLE: ClassVar[str] = "The headline: four laws in random worlds"
     SMALL: ClassVar[dict[str, Any]] = {"worlds": 24, "panel": 0, "in_c": 0}
-    GROWS: ClassVar[tuple[str, ...]] = ("domains", "machine", "panel", "in_c", "only")
+    GROWS: ClassVar[tuple[str, ...]] = (
+        *("domains", "machine", "panel", "in_c"),
+        *("only", "run_missing"),
+    )
 
     laws: tuple[str, ...] = ("rps", "rps_tuned", "rps_plus", "learned_gru")
     """Laws that are compared."""
@@ -54,6 +57,8 @@ class Headline(Study[xr.Dataset]):
     only: tuple[str, ...] = ()
     """Models that are run now, as "C MuJoCo*" or "quasi-static"; by default all. So a run can be
     shared by a GPU and processors; its parts are then put together in one folder."""
+    run_missing: bool = True
+    """Whether models that a run folder lacks in a domain are run; else they are left out."""
     machine: str = ""
     """What it runs on, in words; with these the table is published."""
     setting: Setting = field(default=Setting("fused", seed=3119), kw_only=True)
@@ -76,7 +81,10 @@ class Headline(Study[xr.Dataset]):
         for name in self.domains:
             for model, plan in self.plans(name).items():
                 safe = "".join(c if c.isalnum() else "_" for c in f"{name} {model}")
-                part = run.part(f"{safe}-{plan.worlds}", partial(_outcomes, plan, run))
+                named = f"{safe}-{plan.worlds}"
+                if not self.run_missing and run.parts is not None and not run.parts.get(named):
+                    continue
+                part = run.part(named, partial(_outcomes, plan, run))
                 found.append(part.expand_dims(domain=[name], model=[model]))
         whole = xr.combine_by_coords(found, join="outer", combine_attrs="drop")
         assert isinstance(whole, xr.Dataset)
@@ -173,12 +181,13 @@ def _row(found: xr.Dataset, domain: str, law: str) -> dict[str, str]:
 
 
 def panel_table(found: xr.Dataset) -> list[list[str]]:
-    """Header and rows: the rate of a law in a domain on each model."""
+    """Header and rows: the rate of a law in a domain on each model, and their range."""
     names = [str(name) for name in found.model.values]
-    rows = [["domain", "law", *names]]
+    rows = [["domain", "law", *names, "over these models"]]
     for domain in found.domain.values:
         for law in found.law.values:
             by_model = rates(found, domain, law)
             told = [tables.share(*by_model[name]) if name in by_model else "" for name in names]
-            rows.append([str(domain), str(law), *told])
+            spread = tables.spread([won / of for won, of in by_model.values()])
+            rows.append([str(domain), str(law), *told, spread])
     return rows

@@ -22,7 +22,6 @@ from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.laws.rps import BOUNDS, RPSParams
 from rps_jax.record.options import option
 from rps_jax.runs.question import OfLaws, Run, call_of
-from rps_jax.trials import batch
 from rps_jax.trials.progress import InTurn
 from rps_jax.tuning.run import Problem
 from rps_jax.tuning.space import SUBSETS
@@ -68,7 +67,6 @@ class Landscape(OfLaws[xr.DataTree]):
                 raise errors.InputError(f"law = {label} is not allowed: give parameters of rps.")
         engine = engines.get(self.setting.engine)
         engine.check([family for one in self.problem.domains for family in one.families])
-        batch.check_shape(self.slots, self.workers)
 
     @property
     def _shares(self) -> tuple[int, int]:

@@ -30,6 +30,7 @@ from sweeps.shared import Study, publish
 RESULTS = Path(__file__).parent / "results"
 COLUMNS = (
     {"name": "network"},
+    {"name": "version"},
     {"name": "device"},
     {"name": "objects"},
     {"name": "worlds at once", "format": "{:,}"},
@@ -123,6 +124,7 @@ def row(folder: Path, device: str) -> list[Any]:
     ends = statistics.wilson(round(rate * tried), tried)
     return [
         f"`{asked['network']}`",
+        provenance.signed(folder)["packages"]["rps_jax"],
         device,
         ", ".join(dict.fromkeys(objects)),
         asked["num_envs"] * len(objects),

@@ -7,45 +7,11 @@ the report, so that a page shows what the run of a reader prints.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
-import xarray as xr
-
-from rps_jax.studies.attack import yields
-
-Rows = list[list[str]]
-
-
-def _by_bearing(found: xr.Dataset) -> Rows:
-    """Header and a row for each law of a ladder: success by the target's bearing."""
-    ends, off = (0.0, 0.3, 0.8, 1.6, np.inf), np.abs(found.bearing.values)
-    parts = [(off >= low) & (off < high) for low, high in itertools.pairwise(ends)]
-    rows = [["law", "senses", "target within 0.3 rad of ahead", "0.3 to 0.8 rad", "0.8 to 1.6 rad",
-             "beside and behind, above 1.6 rad"]]  # fmt: skip
-    laws = sorted(map(str, found.law.values), key=lambda n: -float(found.success.sel(law=n).mean()))
-    for law in laws:
-        one = found.sel(law=law)
-        rates = [f"{100 * (one.success.values[part] > 0).mean():.0f} %" for part in parts]
-        rows.append([law, str(one.senses.item()), *rates])
-    return rows
-
-
-def _searched(found: xr.Dataset) -> Rows:
-    """Header and rows of an attack: its search, and the drawn worlds beside it."""
-    gain, tried = yields(found), np.isfinite(found.again.values)
-    bad = int((found.again.values == 1).sum())
-    return [
-        ["", "trials", "simulated [h]", "cells with a failure", "such cells for each simulated "
-         "hour", "elites that fail again in converged C MuJoCo"],
-        ["search", f"{int(found.trials[-1]):,}", f"{float(found.simulated[-1]) / 3600:.1f}",
-         str(int(found.failing[-1])), f"{gain['search']:.2g}", f"{bad} of {int(tried.sum())}"],
-        ["drawn worlds", f"{found.attrs['drawn_trials']:,}",
-         f"{found.attrs['drawn_simulated'] / 3600:.1f}", str(found.attrs["drawn_failing"]),
-         f"{gain['drawn']:.2g}", ""],
-    ]  # fmt: skip
+from sweeps.publish import rows
+from sweeps.publish.rows import Rows
 
 
 class Recipe(NamedTuple):
@@ -78,32 +44,41 @@ def _each(command: str, *names: str) -> tuple[str, ...]:
 _WIDE, _ALL = ("wide", "hostile"), ("wide", "real", "hostile")
 _LADDERS = _each("rps ladder --domain {0} --worlds 10000 --seed 10 --out runs/ladder_{0}", *_WIDE)
 _AGAINST = ("", "success", "against rps_tuned", "p (Holm)")
-_RATES = ("", "boxes", "cylinders", "prisms", "all", "CVaR 5 % of distance", "median time")
+_OBJECTS = ("random_box", "random_cylinder", "random_prism")
+_RATES = ("", *_OBJECTS, "all", "median time", "timeout", "lost contact", "fell over")
 _MACHINE = "--machine MACHINE"  # in its place come the words for the machine
 _IDEAL = (
     "wide,skin=ideal,pose_noise=0:0,yaw_noise=0:0,pose_latency=0:0,command_delay=0:0,"
     "velocity_error=0:0"
 )
 _PLUS = {
-    "wide, 10,000": _LADDERS[0],
-    "wide in C MuJoCo, 500": "rps ladder --domain wide --worlds 500 --seed 11 --engine mujoco "
+    "`wide`, 10,000": _LADDERS[0],
+    "`wide` in C MuJoCo, 500": "rps ladder --domain wide --worlds 500 --seed 11 --engine mujoco "
     "--laws rps_plus rps_tuned learned_gru",
-    "hostile, 10,000": _LADDERS[1],
-    "hostile in C MuJoCo, 500": "rps ladder --domain hostile --worlds 500 --seed 11 "
+    "`hostile`, 10,000": _LADDERS[1],
+    "`hostile` in C MuJoCo, 500": "rps ladder --domain hostile --worlds 500 --seed 11 "
     "--engine mujoco --laws rps_plus rps_tuned learned_gru",
-    "hostile, quasi-static, 1,000": "rps ladder --domain hostile --worlds 1000 --seed 8 "
+    "`hostile`, quasi-static, 1,000": "rps ladder --domain hostile --worlds 1000 --seed 8 "
     "--engine quasistatic --laws rps_plus rps_tuned",
-    "real, 10,000": "rps ladder --domain real --worlds 10000 --seed 10 "
+    "`real`, 10,000": "rps ladder --domain real --worlds 10000 --seed 10 "
     "--laws rps rps_tuned rps_plus",
-    "the paper's grid": "rps ladder --domain paper --seed 7 --laws rps_plus rps_tuned",
+    "`paper`, the paper's grid, 144": "rps ladder --domain paper --seed 7 "
+    "--laws rps_plus rps_tuned",
 }
 _ROBOTS = ("ideal", "kairos", "ridgeback", "mpo_500")
+_REAL = "rps sweep --domain real --worlds 4096 --seed 11 --laws rps rps_tuned"
+_RACE = "--tuned K_h K_v L beta l_cr d_th --horizon 150 --validation 256 --seed 5"
+_DESCENT = f"rps tune grad {_RACE} --starts 2 --worlds 512 --steps 20 --learning-rate 0.2"
+_RACERS = " ".join(f"rps,runs/{name}/tuned.json" for name in ("evolution", "gradient", "hybrid"))
+_RIVALS = ("rps", "pursuit", "dipole", "force_push", "force_push_published")
+_SWEPT = "sweep --laws rps_tuned --domain wide"
+_GRADIENTS = "rps sweeps/gradients --worlds 32 --estimators"
 
 # In the order of their weight, in which they are made.
 RECIPES: dict[str, Recipe] = {
     "headline": Recipe((f"rps sweeps/headline {_MACHINE}",), None, 30),
     "models": Recipe((f"rps sweeps/headline {_MACHINE}",), None, 30),
-    "million": Recipe((f"rps sweeps/million --laws rps_tuned {_MACHINE}",), None, 3),
+    "million": Recipe((f"rps sweeps/million {_MACHINE}",), None, 9),
     "rest": Recipe((f"rps sweeps/fidelity/rest.py {_MACHINE}",), 5, None),
     "hardware_[qr]*": Recipe((f"rps sweeps/hardware {_MACHINE}",), None, 20),
     "feet": Recipe(
@@ -114,7 +89,8 @@ RECIPES: dict[str, Recipe] = {
         10,
         None,
         "Success",
-        ("the outline", "feet"),
+        ("corners and rims", "three or four feet"),
+        _RATES,
     ),
     "table": Recipe(("rps table",), 4, None, "Table II*"),
     "grid": Recipe(
@@ -128,7 +104,7 @@ RECIPES: dict[str, Recipe] = {
     "shoves": Recipe(("rps hardware --engine fused",), 4, 2, "The object shoved aside"),
     "real_pushes_*": Recipe((f"rps sweeps/real_pushes {_MACHINE}",), 15, None),
     "ladder": Recipe(_LADDERS, None, 6, "Against rps_tuned*", _WIDE, _AGAINST),
-    "bearings": Recipe(_LADDERS[:1], None, 3, _by_bearing),
+    "bearings": Recipe(_LADDERS[:1], None, 3, rows.by_bearing),
     "ceiling": Recipe(
         (*_LADDERS, *_each("rps ceiling runs/ladder_{} --samples 32 --rounds 6", *_WIDE)),
         None,
@@ -136,21 +112,12 @@ RECIPES: dict[str, Recipe] = {
         "A planner that knows the world",
         ("", "", *_WIDE),
     ),
-    "plus": Recipe(
-        tuple(_PLUS.values()),
-        None,
-        12,
-        "Against rps_tuned*",
-        tuple(_PLUS),
-        _AGAINST,
-    ),
+    "plus": Recipe(tuple(_PLUS.values()), None, 12, rows.mended, tuple(_PLUS)),
     "tuned": Recipe(
         ("rps compare --laws rps rps_tuned --domain wide hostile real --seed 4",),
         None,
         4,
-        "Success in *",
-        (),
-        _RATES,
+        rows.compared,
     ),
     "random_worlds": Recipe(
         ("rps sweep --domain wide --worlds 36000 --laws rps nps aps",),
@@ -166,7 +133,7 @@ RECIPES: dict[str, Recipe] = {
                 "rps sweep --domain wide --worlds 4096 --seed 11 --laws rps rps_tuned --robot {}",
                 *_ROBOTS,
             ),
-            "rps sweep --domain real --worlds 4096 --seed 11 --laws rps rps_tuned",
+            _REAL,
         ),
         None,
         5,
@@ -174,6 +141,7 @@ RECIPES: dict[str, Recipe] = {
         (*_ROBOTS, "drawn (real)"),
         ("", "all", "median time"),
     ),
+    "real": Recipe((_REAL,), None, 1, rows.by_robot),
     "limits": Recipe(
         ("rps sweeps/limits --limits force lag acceleration --worlds 4096",),
         None,
@@ -194,7 +162,7 @@ RECIPES: dict[str, Recipe] = {
         ),
         None,
         4,
-        "Which quantity is to blame",
+        rows.blamed,
         ("rps_tuned, hostile", "rps_plus, hostile", "rps_tuned, real"),
     ),
     "rare": Recipe(
@@ -205,7 +173,7 @@ RECIPES: dict[str, Recipe] = {
         ),
         5,
         None,
-        "How rare is a failure",
+        rows.rarely,
     ),
     "rare_million": Recipe(
         (
@@ -214,7 +182,7 @@ RECIPES: dict[str, Recipe] = {
         ),
         None,
         3,
-        "How rare is a failure",
+        rows.rarely,
     ),
     "attack": Recipe(
         (
@@ -227,7 +195,7 @@ RECIPES: dict[str, Recipe] = {
         ),
         30,
         None,
-        _searched,
+        rows.searched,
         ("rps_tuned", "rps_plus", "rps_plus, three axes"),
     ),
     "regression": Recipe(("rps regress --laws rps rps_tuned rps_plus learned_gru",), 3, 1, "Wins"),
@@ -239,7 +207,22 @@ RECIPES: dict[str, Recipe] = {
         2,
         "Cells of Table II",
     ),
-    "fidelity": Recipe(("rps sweeps/fidelity",), 60, 10, "Settings of the solver*"),
+    "fidelity": Recipe(
+        ("rps sweeps/fidelity",),
+        60,
+        10,
+        "Settings of the solver*",
+        (),
+        (
+            "setting",
+            "equal outcomes",
+            "95 %",
+            "+/-",
+            "McNemar p",
+            "5 s error: median, 95 %",
+            "cost",
+        ),
+    ),
     "engines_random": Recipe(
         (
             "rps sweeps/engines --objects random_box random_cylinder --worlds 600",
@@ -279,6 +262,47 @@ RECIPES: dict[str, Recipe] = {
         _WIDE[::-1],
         ("", "success", "against P1, P2 outside the Realignment State", "p (Holm)"),
     ),
+    "rivals_tuned": Recipe(
+        (
+            *_each(
+                "rps tune es --law {0} --domain wide hostile --worlds 16 --population 12 "
+                "--generations 200 --budget 400000 --validation 64 --out runs/tuned_{0}",
+                *_RIVALS,
+            ),
+            "rps ladder --domain wide --worlds 1000 --seed 10 --laws "
+            + " ".join(f"{law} {law},runs/tuned_{law}/tuned.json" for law in _RIVALS),
+        ),
+        None,
+        10,
+        rows.tuned_beside,
+    ),
+    "race": Recipe(
+        (
+            f"rps tune es {_RACE} --population 16 --worlds 64 --budget 2.4e6 --out runs/evolution",
+            f"{_DESCENT} --budget 2.4e6 --out runs/gradient",
+            f"{_DESCENT} --budget 1.2e6 --out runs/half",
+            f"rps tune es {_RACE} --law rps,runs/half/tuned.json --spread 0.2 --prior 0.01 "
+            "--population 16 --worlds 64 --budget 1.2e6 --out runs/hybrid",
+            f"rps compare --laws rps {_RACERS} --domain paper wide hostile --worlds 1000 --seed 3",
+        ),
+        None,
+        15,
+        rows.compared,
+    ),
+    "gradients": Recipe(
+        (
+            f"{_GRADIENTS} reverse clipped evolution combined",
+            f"{_GRADIENTS} reverse clipped evolution combined --object random_cylinder",
+            f"{_GRADIENTS} forward --horizons 0.5 2 8 30",
+        ),
+        None,
+        30,
+        rows.cosines,
+        ("boxes", "cylinders", "boxes"),
+    ),
+    "robot": Recipe((f"rps sweeps/speed/robot.py {_MACHINE}",), 1, None),
+    "dependencies": Recipe((f"rps sweeps/publish/dependencies.py {_MACHINE}",), 15, None),
+    "extras": Recipe((f"rps sweeps/publish/dependencies.py {_MACHINE}",), 15, None),
     "fit_*": Recipe((f"rps sweeps/fit {_MACHINE}",), 40, None),
     "export_*": Recipe(
         (
@@ -292,19 +316,14 @@ RECIPES: dict[str, Recipe] = {
     ),
     "sb3": Recipe((f"rps sweeps/learned/sb3.py {_MACHINE}",), 3, None),
     # --- speed, with nothing else running ---
-    "gpus": Recipe(
-        ("rps sweep --domain wide --laws rps --worlds 262144 --part 16384",),
-        None,
-        2,
-        "Success",
-        (),
-        _RATES,
-    ),
     "speed": Recipe(
-        ("rps sweeps/speed --worlds 64 4096 65536 262144 --mujocos 4096 --at-once 16 --refill 0",),
+        (
+            "rps sweeps/speed --worlds 64 336 4096 65536 262144 --mujocos 4096 --at-once 16 "
+            "--refill 0",
+        ),
         None,
         6,
-        "Simulated seconds in a second",
+        rows.speeds,
     ),
     "speed_cores": Recipe(
         (
@@ -313,19 +332,29 @@ RECIPES: dict[str, Recipe] = {
         ),
         3,
         None,
-        "Simulated seconds in a second",
+        rows.speeds,
     ),
-    "speed_peers": Recipe(
+    "commands": Recipe((f"rps sweeps/speed/commands.py {_MACHINE}",), 14, None),
+    "commands_gpu": Recipe(
         (
-            "rps sweeps/speed --names 'fused standard' 'mjx standard' 'C in closed loop' "
-            "'C, mj_step alone' 'C, one trial at a time' --worlds 32768 --mujocos 32768 "
-            "--families box cylinder --at-once 16 --refill 0",
+            "rps sweeps/speed/commands.py --commands "
+            + " ".join(f"'{_SWEPT} --worlds {n}'" for n in (1000, 10_000, 262_144))
+            + f" --warm 1000 10000 --file commands_gpu {_MACHINE}",
+        ),
+        None,
+        8,
+    ),
+    "gpus": Recipe(
+        (
+            f"rps sweeps/speed/commands.py --file gpus --gpus 1 2 --commands '{_SWEPT} "
+            f"--worlds 1048576' {_MACHINE}",
         ),
         None,
         6,
-        "Simulated seconds in a second",
+        folder="speed",
     ),
-    "commands": Recipe((f"rps sweeps/speed/commands.py {_MACHINE}",), 8, None),
+    # After `python sweeps/speed/peers.py peers`.
+    "arena": Recipe((f"rps sweeps/speed/arena.py --peers peers {_MACHINE}",), None, 5),
     "costs": Recipe(("rps sweeps/speed/costs.py --families box prism",), 2, None, "Functions"),
     "levers": Recipe(
         (
@@ -339,25 +368,8 @@ RECIPES: dict[str, Recipe] = {
     ),
 }
 
-# What is not made anew, and why.
-BY_HAND = {
-    "summary": "cites other tables",
-    "notebook_runs": "lists what the notebooks read",
-    "dependencies": "sizes of what pip installs in an empty environment",
-    "extras": "sizes of what pip installs in an empty environment",
-    "robot": "times of notebooks/examples/on_a_robot.py, which prints them",
+# What is history, and is not made anew.
+HISTORY = {
     "tuning_runs": "the runs of 0.1.0 and 0.2.0 that made the tuned law",
-    "learned": "the runs of 0.2.0 that made the learned laws; `rps sweeps/learned` reads them",
-    "race": "a race of 0.1.0, by an optimiser that is no longer used",
-    "gradients": "three runs of 0.1.0, of which one takes more than an hour",
-    "rivals_tuned": "five runs of `rps tune es`, whose laws were then compared",
-    "mends_together": "mends of 0.2.0 upon each other, of which RPS+ was made",
-    "real": "the worlds of robots.json, by the limits of their robots",
-    "table_time": "wall clocks of whole commands, by the shell",
-    "speed_goals": "wall clocks of whole commands before and after changes",
-    "gpu_sweeps": "wall clocks of whole commands before and after changes",
-    "compile": "said by the column `compile` of `rps sweeps/speed`",
-    "fast": "two runs of `rps sweep`, whose rates of simulation are printed",
-    "tuned_elsewhere": "rows of 0.1.0, for comparison",
-    "engines": "the first column is prose; its rates are those of fidelity.json",
+    "learned": "the runs of 0.2.0 that made the learned laws; `rps sweeps/learned` reads such runs",
 }

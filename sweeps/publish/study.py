@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import fnmatch
 import hashlib
+import itertools
 import json
 import os
 import platform
@@ -30,9 +31,10 @@ from rps_jax.analysis.report import Section
 from rps_jax.app.cli import flags, names
 from rps_jax.errors import InputError
 from rps_jax.record import provenance
-from rps_jax.runs.question import Question, Run, call_of
-from sweeps.publish.recipes import BY_HAND, RECIPES, Recipe, Rows
-from sweeps.shared import digest
+from rps_jax.runs.question import Run, call_of
+from sweeps.publish.recipes import HISTORY, RECIPES, Recipe
+from sweeps.publish.rows import Rows
+from sweeps.shared import Study, digest
 from sweeps.shared import publish as write
 
 _SWEEPS = Path(__file__).parents[1]
@@ -40,10 +42,11 @@ CURRENT = "of today's code"
 
 
 @dataclass(frozen=True)
-class Publish(Question[xr.Dataset]):
+class Publish(Study[xr.Dataset]):
     """Say of every published number whether it is of today's code, and make anew what is asked."""
 
     TITLE: ClassVar[str] = "Published numbers, and what they hang on"
+    GROWS: ClassVar[tuple[str, ...]] = ("only", "needs", "machine", "check_digests")
 
     only: tuple[str, ...] = ()
     """Data files to be made anew, as fit_coverage or fit_*; by default none."""
@@ -130,8 +133,17 @@ def _commands(data: dict[str, Any]) -> list[str]:
 
 
 def _told(path: Path) -> dict[str, str]:
-    """Version, date, device, command and state of a data file."""
+    """Version, date, device, command, state and what it takes of a data file."""
     data = json.loads(path.read_text())
+    recipe = next((r for name, r in RECIPES.items() if fnmatch.fnmatch(path.stem, name)), None)
+    takes = {"made": "", "two cores": "", "one H100": ""}
+    if recipe is not None:
+        times = (recipe.two_cores, recipe.one_gpu)
+        cores, gpu = ("" if t is None else f"{t:g} min" for t in times)
+        takes = {"made": f"on {recipe.device}", "two cores": cores, "one H100": gpu}
+    if "command" not in data:
+        known = dict.fromkeys(("version", "date", "device", "command"), "")
+        return known | takes | {"state": f"cites {', '.join(sorted(_cited(data)))}"}
     commands = _commands(data)
     known = {
         "version": str(data["versions"]["rps_jax"]),
@@ -139,13 +151,14 @@ def _told(path: Path) -> dict[str, str]:
         "device": str(data["device"] or ""),
         "command": "; ".join(commands),
     }
-    recipe = next((r for name, r in RECIPES.items() if fnmatch.fnmatch(path.stem, name)), None)
-    takes = {"made": BY_HAND.get(path.stem, ""), "two cores": "", "one H100": ""}
-    if recipe is not None:
-        times = (recipe.two_cores, recipe.one_gpu)
-        cores, gpu = ("" if t is None else f"{t:g} min" for t in times)
-        takes = {"made": f"on {recipe.device}", "two cores": cores, "one H100": gpu}
+    if path.stem in HISTORY:
+        return known | takes | {"state": f"history: {HISTORY[path.stem]}"}
     return known | takes | {"state": _state(data.get("digest"), commands, known["version"])}
+
+
+def _cited(data: dict[str, Any]) -> set[str]:
+    """Names of the data files that a table cites."""
+    return {cell["from"] for row in data["rows"] for cell in row if isinstance(cell, dict)}
 
 
 def _state(noted: str | None, commands: Sequence[str], version: str) -> str:
@@ -175,7 +188,7 @@ def make(name: str, recipe: Recipe, runs: Path, device: str) -> None:
         made.append(signed)
         wanted = recipe.section
         if not isinstance(wanted, str):
-            tables.append((label, wanted(answer)))
+            tables += [(label, rows)] if (rows := wanted(answer)) else []
             continue
         for section in sections:
             if section.table and fnmatch.fnmatch(section.title, wanted):
@@ -228,15 +241,19 @@ def joined(tables: Sequence[tuple[str, Rows]], columns: Sequence[str]) -> tuple[
     for label, (header, *body) in tables:
         if [header[i] for i in kept if i < len(header)] != [head[i] for i in kept]:
             raise InputError(f"columns = {header} are not allowed beside {head}.")
-        rows += [[*[label] * several, *(row[i] for i in kept)] for row in body]
+        told = [[*[label] * several, *(row[i] for i in kept)] for row in body]
+        for above, row in itertools.pairwise(told):  # a blank at the left repeats what is above
+            row[0] = row[0] or above[0]
+        rows += told
     nameless = iter(("law", "whose"))
     shown = [head[i] or next(nameless) for i in kept]
-    return [{"name": "", "merge": True}] * several + [{"name": one} for one in shown], rows
+    columns = [*[""] * several, *shown]
+    return [{"name": one, **({} if i else {"merge": True})} for i, one in enumerate(columns)], rows
 
 
 def machine() -> str:
     """What this process runs on, in words."""
-    device, count = jax.devices()[0], os.cpu_count() or 1
+    device, count = jax.devices()[0], provenance.processors()
     if device.platform != "cpu":
         return f"one {device.device_kind} and {count} processors"
     model = platform.processor() or platform.machine()
@@ -244,7 +261,7 @@ def machine() -> str:
         if line.startswith("model name"):
             model = line.partition(":")[2].strip()
             break
-    return f"{len(os.sched_getaffinity(0))} of {count} processors, {model}"
+    return f"{count} of {os.cpu_count()} processors, {model}"
 
 
 def _processors() -> str:

@@ -1,7 +1,8 @@
 """How long does a user wait for a whole command, from return to the report?
 
 Each command is a process of its own, run with an empty cache and then once more with what the first
-left in it. One that is about the GPU is run where there is one.
+left in it. With `--gpus` they see so many, and `JAX_PLATFORMS=cpu` is for the process that times
+them alone, so that it leaves the GPUs to them.
 
     rps sweeps/speed/commands.py --machine "2 cores of an AMD EPYC"
 """
@@ -14,6 +15,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,27 +35,39 @@ from sweeps import shared
 from sweeps.shared import Study
 
 _TOLD = re.compile(r"compile ([\d.]+) s, run ([\d.]+) s \((\d+) simulated s per s\)")
-_COLUMNS = ("command", "empty cache", "once more", "of it compile", "run", "simulated s/s")
+_COLUMNS = (
+    *("command", "empty cache", "once more", "of it compile", "run", "simulated s/s"),
+    *("memory, empty cache", "memory, once more"),
+)
 
 
 @dataclass(frozen=True)
 class Commands(Study[xr.Dataset]):
     """Time whole commands, with an empty cache and once more.
 
-    The answer holds seconds from return to the end of the process, and what the second told of
-    itself, for each command.
+    The answer holds seconds from return to the end of the process, the most memory that it held,
+    and what the second told of itself, for each command.
     """
 
     TITLE: ClassVar[str] = "How long a user waits for a whole command"
-    GROWS: ClassVar[tuple[str, ...]] = ("commands", "machine")
+    GROWS: ClassVar[tuple[str, ...]] = ("commands", "warm", "gpus", "machine")
 
     commands: tuple[str, ...] = (
         "push --object box --target -2 0 --no-video",
         "push --object box --target -2 0",
+        "push --object box --target -2 0 --engine fused",
         "sweep --laws rps_tuned --domain wide --worlds 100",
         "sweep --laws rps_tuned --domain wide --worlds 1000",
+        "table --engine fused",
+        "table",
+        "sweep --laws rps --domain wide --worlds 1048576 --horizon 0.02 --slots 2048",
     )
     """What is asked of `rps`."""
+    warm: tuple[int, ...] = ()
+    """Numbers of worlds that are swept three times in one process: the first time with an empty
+    cache, and the last."""
+    gpus: tuple[int, ...] = option((), 1, 64)
+    """Numbers of GPUs with which each is timed; by default with what this process sees."""
     limit: float = option(1800.0, 1, 86400)
     """Time after which a command is stopped [s]."""
     machine: str = ""
@@ -63,16 +77,23 @@ class Commands(Study[xr.Dataset]):
 
     def trials(self) -> int | None:
         """How many commands there are."""
-        return len(self.commands)
+        return len(self.wanted) + len(self.warm)
+
+    @property
+    def wanted(self) -> list[tuple[str, int | None]]:
+        """Commands, each with the numbers of GPUs that it sees."""
+        return [(command, count) for command in self.commands for count in self.gpus or (None,)]
 
     def answer(self, run: Run) -> xr.Dataset:
         """Time what was not timed before."""
         found = []
-        for number, command in enumerate(self.commands):
-            safe = re.sub(r"\W+", "_", command)
-            found.append(run.part(safe, partial(timed, command, self.limit)))
+        for number, (command, gpus) in enumerate(self.wanted):
+            safe = re.sub(r"\W+", "_", command) + ("" if gpus is None else f"_{gpus}")
+            found.append(run.part(safe, partial(timed, command, self.limit, gpus)))
             run.report(Progress(number + 1, 0.0))
-        whole: Any = xr.concat(found, "command").assign_coords(command=list(self.commands))
+        found += [run.part(f"warm_{n}", partial(_warm, n, self.limit)) for n in self.warm]
+        told = [*_labels(self.wanted), *(f"`{_call(n)}`, in one process" for n in self.warm)]
+        whole: Any = xr.concat(found, "command").assign_coords(command=told)
         if self.machine and run.folder is not None:
             path = Path(__file__).parent / "results" / f"{self.file}.json"
             columns = [{"name": one} for one in _COLUMNS]
@@ -92,34 +113,83 @@ class Commands(Study[xr.Dataset]):
 commands = call_of(Commands)
 
 
-def timed(command: str, limit: float) -> xr.Dataset:
-    """Seconds of a command with an empty cache and once more, and what the second told.
+def _labels(wanted: Sequence[tuple[str, int | None]]) -> list[str]:
+    """What the rows are of: commands, and GPUs where these are said."""
+    said = {None: "", 1: ", one GPU"}
+    return [f"`rps {one}`{said.get(gpus, f', {gpus} GPUs')}" for one, gpus in wanted]
+
+
+def timed(command: str, limit: float, gpus: int | None = None) -> xr.Dataset:
+    """Seconds and memory [GB] of a command with an empty cache and once more, and what it told.
 
     Raises:
       InputError: it failed, or took longer than the limit [s].
     """
-    seconds, output = [], ""
+    seconds, memory, output = [], [], ""
     with tempfile.TemporaryDirectory() as folder:
-        kept = os.environ | {"RPS_CACHE": f"{folder}/cache"}
         for number in range(2):
-            words = [sys.executable, "-m", "rps_jax", *shlex.split(command)]
+            words = ["-m", "rps_jax", *shlex.split(command), "--out", f"{folder}/run_{number}"]
             begun = time.perf_counter()
-            try:
-                ended = subprocess.run(
-                    [*words, "--out", f"{folder}/run_{number}"],
-                    env=kept, capture_output=True, text=True, timeout=limit, check=False,
-                )  # fmt: skip
-            except subprocess.TimeoutExpired as error:
-                raise InputError(f"commands = {command} took more than {limit:g} s.") from error
+            output, held = _output(words, command, folder, limit, gpus)
             seconds.append(time.perf_counter() - begun)
-            if ended.returncode:
-                last = ended.stderr.strip().splitlines()[-1:]
-                raise InputError(f"commands = {command} failed: {' '.join(last)}")
-            output = ended.stdout
+            memory.append(held)
     told = _TOLD.search(output)
     compile_, run, rate = map(float, told.groups()) if told else (float("nan"),) * 3
-    values = {"empty": seconds[0], "again": seconds[1], "compile": compile_, "run": run}
-    return xr.Dataset({name: ((), value) for name, value in (values | {"rate": rate}).items()})
+    return _row(*seconds, compile_, run, rate, *memory)
+
+
+def _call(worlds: int) -> str:
+    """The call by which worlds are swept, as a row names it."""
+    return f'rps_jax.sweep("rps_tuned", "wide", worlds={worlds})'
+
+
+def _warm(worlds: int, limit: float) -> xr.Dataset:
+    """Seconds of a sweep with an empty cache, and the third time in that process."""
+    code = (
+        "import time, rps_jax\n"
+        "for _ in range(3):\n"
+        "    begun = time.perf_counter()\n"
+        f"    {_call(worlds)}\n"
+        "    print(time.perf_counter() - begun)\n"
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        told, held = _output(["-c", code], _call(worlds), folder, limit)
+    first, *_, last = map(float, told.split())
+    return _row(first, last, *(float("nan"),) * 3, held)
+
+
+def _output(
+    words: Sequence[str], asked: str, folder: str, limit: float, gpus: int | None = None
+) -> tuple[str, float]:
+    """What Python prints, with its cache in a folder, and the most memory that it held [GB].
+
+    Raises:
+      InputError: it failed, or took longer than the limit [s].
+    """
+    kept = os.environ | {"RPS_CACHE": f"{folder}/cache"}
+    if gpus is not None:
+        kept["CUDA_VISIBLE_DEVICES"] = ",".join(map(str, range(gpus)))
+        kept.pop("JAX_PLATFORMS", None)
+    said, wrong = Path(folder, "said"), Path(folder, "wrong")
+    with open(said, "w") as out, open(wrong, "w") as errors:
+        process = subprocess.Popen([sys.executable, *words], env=kept, stdout=out, stderr=errors)
+        stop = threading.Timer(limit, process.kill)
+        stop.start()
+        _, process.returncode, used = os.wait4(process.pid, 0)
+    if not stop.is_alive():
+        raise InputError(f"commands = {asked} took more than {limit:g} s.")
+    stop.cancel()
+    if process.returncode:
+        last = wrong.read_text().strip().splitlines()[-1:]
+        raise InputError(f"commands = {asked} failed: {' '.join(last)}")
+    return said.read_text(), used.ru_maxrss * 1024 / 1e9  # Linux tells of KiB
+
+
+def _row(*told: float) -> xr.Dataset:
+    """Seconds of both runs, what the second told (compile and run [s], rate [s/s]), and memory."""
+    names = ("empty", "again", "compile", "run", "rate", "memory_empty", "memory_again")
+    values = (*told, *(float("nan"),) * (len(names) - len(told)))
+    return xr.Dataset({name: ((), value) for name, value in zip(names, values, strict=True)})
 
 
 def table(found: xr.Dataset) -> list[list[str]]:
@@ -129,6 +199,7 @@ def table(found: xr.Dataset) -> list[list[str]]:
         one = found.sel(command=command)
         cells = [f"{one[name].item():.1f} s" for name in ("empty", "again", "compile", "run")]
         told = f"{one.rate.item():,.0f}"
-        rows.append([f"`rps {command}`", *(cell.replace("nan s", "") for cell in (*cells, told))])
-        rows[-1][-1] = rows[-1][-1].replace("nan", "")
+        held = [f"{one[f'memory_{name}'].item():.1f} GB" for name in ("empty", "again")]
+        shown = [cell.removeprefix("nan").removeprefix(" s") for cell in (*cells, told)]
+        rows.append([command, *shown, *(cell.replace("nan GB", "") for cell in held)])
     return rows

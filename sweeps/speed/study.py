@@ -8,7 +8,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import re
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -27,6 +26,7 @@ from rps_jax.analysis.figures.style import Figure, words
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
+from rps_jax.record import provenance
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials import host
@@ -34,7 +34,7 @@ from rps_jax.trials.batch import Job
 from rps_jax.trials.batch import run as run_batch
 from rps_jax.trials.progress import Progress
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
+from rps_jax.trials.trial import Loop, Rules
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws
 from rps_jax.world.domain import DOMAINS
@@ -253,16 +253,15 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
     """Time C MuJoCo: on all cores in the closed loop of the law or stepping alone, or one trial."""
     physics = preset()
     how = IN_C[name]
-    threads = 1 if how == "serial" else os.cpu_count() or 1
+    threads = 1 if how == "serial" else provenance.processors()
     worlds = 1 if how == "serial" else 64 * threads
     setting, engine = Setting(engine="mujoco", physics=physics), engines.get("mujoco")
     stage, batch = shared.timed_worlds(family, worlds, setting)
     if how != "open":
-        options = {"law": rps.LAW, "threads": threads, "report": lambda *_: True}
-        rules = Rules(horizon=simulated)
+        loop = Loop(physics, Rules(horizon=simulated))
 
         def once() -> None:
-            host.run(engine, stage, batch, physics=physics, rules=rules, **options)
+            host.run(engine, stage, batch, loop, threads=threads, report=lambda *_: True)
 
     else:
         stepper = engine.stepper(stage, np.asarray(batch.qpos, float), threads)

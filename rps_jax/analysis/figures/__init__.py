@@ -3,8 +3,6 @@
 A function is loaded when it is first used: to import matplotlib takes half a second.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING, Any
 

@@ -1,7 +1,5 @@
 """The paper's figures, from its grid of trials and from traces over time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

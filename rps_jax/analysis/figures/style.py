@@ -1,7 +1,5 @@
 """What the figures have in common: colours, and parts of a panel."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

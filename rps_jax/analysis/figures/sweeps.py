@@ -1,7 +1,5 @@
 """Random worlds: what success depends on, how the law fails, and one law against another."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Sequence
 

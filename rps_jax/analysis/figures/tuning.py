@@ -1,7 +1,5 @@
 """What a tuner did, and where it went."""
 
-from __future__ import annotations
-
 import xarray as xr
 
 from rps_jax.analysis.figures.style import Figure

@@ -4,8 +4,6 @@ A question's fields are the options (`flags`), found by its file's text (`names`
 `rps --help` imports neither JAX nor MuJoCo. Input is checked before anything compiles (`running`).
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ tyro reads a flat dataclass that is made here. A law, a domain, a robot and the 
 there, `Setting` and its rules become flags of their own, and what is asked for is made of them.
 """
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import dataclasses

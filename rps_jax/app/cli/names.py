@@ -4,8 +4,6 @@ A module of the package is a command if it says `name = call_of(Class)`; a file 
 user's own is one if it does.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib
 import re

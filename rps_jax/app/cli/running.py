@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rps_jax.trials.progress import Bar
 
 _MEND = "make room, then run the same command again; what is done is kept"
-_DRAWS = "rps_jax.analysis.figures.sweeps"
+_AFTER = ("rps_jax.analysis.figures.sweeps", "h5netcdf", "scipy.special")  # of results and report
 _stopped: list[bool] = []  # interrupts of this command
 
 
@@ -130,8 +130,9 @@ def carry_out(question: Any, beside: Beside) -> None:
         folder.clear(Path(asked.out))
     with asked.bar() as bar:
         _go_on()
-        # What draws the report is imported while the run goes on.
-        threading.Thread(target=importlib.import_module, args=(_DRAWS,), daemon=True).start()
+        # What the report needs is imported while the run goes on.
+        later = map(importlib.import_module, _AFTER)
+        threading.Thread(target=list, args=(later,), daemon=True).start()
         found = asked.answered(bar)
         timed = bar.timing.simulated > 0 and bar.over != "clock"
         spent = told(bar.timing, device.kind()) if timed else ""

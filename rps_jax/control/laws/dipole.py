@@ -12,8 +12,6 @@ target and on, so that the contact point, too, passes the target; it is laid ane
 has passed it by `beyond` radii; the base turns to face the object.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import NamedTuple
 

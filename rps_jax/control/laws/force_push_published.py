@@ -19,8 +19,6 @@ is the bound of RPS, half of theirs, and so k_f is half of theirs. A step of our
 so `converge` is a rate. Without their first second of acceleration.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import NamedTuple
 
@@ -82,22 +80,13 @@ def init(params: PublishedForcePushParams) -> PublishedForcePushState:
 
 def steered(
     params: PublishedForcePushParams,
-    theta_p: jax.Array,
-    f_world: jax.Array,
-    theta_d: jax.Array,
-    offset: jax.Array,
-    period: float | jax.Array,
+    theta_p: jax.Array,  # () [rad] of the last step
+    f_world: jax.Array,  # (2,) [N] of the base on the object
+    theta_d: jax.Array,  # () [rad] the path's direction in the world
+    offset: jax.Array,  # () [m] of the contact, to the path's left
+    period: float | jax.Array,  # () [s] since the last step
 ) -> jax.Array:
-    """The push's angle () [rad] from the path's direction.
-
-    Args:
-      params: k_theta, k_y, f_min and converge.
-      theta_p: () [rad] of the last step.
-      f_world: (2,) [N] of the base on the object.
-      theta_d: () [rad] the path's direction in the world.
-      offset: () [m] of the contact, to the path's left.
-      period: () [s] since the last step.
-    """
+    """The push's angle () [rad] from the path's direction."""
     theta_f = planar.wrap(planar.direction(f_world) - theta_d)
     pushed = (1 + params.k_theta) * theta_f + params.k_y * offset
     most = params.converge * period

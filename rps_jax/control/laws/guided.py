@@ -9,8 +9,6 @@ in the n-th control step, sat being the saturation of Sec. III; after the last o
 alone. What the law felt under the offsets it remembers.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax

@@ -6,8 +6,6 @@ the object nor realigns: what it loses is what RPS adds. The law and its numbers
 Symbols are those of `law`: C contact point, T target, d from C to T, e the heading error.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import NamedTuple
 

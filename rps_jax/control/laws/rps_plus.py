@@ -28,8 +28,6 @@ with its own parameters. RPS+ senses what RPS senses; beyond what RPS remembers 
 in the world it felt the object last, and for how many steps it has not.
 """
 
-from __future__ import annotations
-
 import operator
 from typing import Any, NamedTuple
 
@@ -47,16 +45,9 @@ from rps_jax.geometry.arrays import Scalar
 
 FACING = 0.3  # [rad] P3's facing
 REACH = 0.45  # [m] P3's reach: the base's front is 0.36 m before its middle
-
-
-class _Warm(NamedTuple):
-    """How far switches of the smooth law reach that are not of lengths."""
-
-    facing: float = 0.03  # [rad] P3's |angle of p| < facing
-    lost: float = 5.0  # [1] control steps, n_lost
-
-
-_WARM = _Warm()
+# How far switches of the smooth law reach that are not of lengths.
+_WARM_FACING = 0.03  # [rad] P3's |angle of p| < facing
+_WARM_LOST = 5.0  # [1] control steps, n_lost
 
 
 @documented
@@ -137,7 +128,7 @@ def search(
     """
     soft = temperatures or rps.HARD
     angle, v_max = planar.direction(p_robot_felt), jnp.asarray(params.law.v_max)
-    faces = switches.below(jnp.abs(angle), FACING, temperatures and _WARM.facing)
+    faces = switches.below(jnp.abs(angle), FACING, temperatures and _WARM_FACING)
     ahead = switches.choose(faces, params.ahead * v_max, 0.0)
     far = switches.above(planar.norm(p_robot_felt), REACH, soft.d_th)
     side = jnp.sign(l) if temperatures is None else jnp.tanh(l / soft.sgn)
@@ -174,7 +165,7 @@ def step(
     for condition, other in (
         (switches.both(near, away), translation(params, d, seen.yaw)),
         (
-            switches.above(lost, params.n_lost, temperatures and _WARM.lost),
+            switches.above(lost, params.n_lost, temperatures and _WARM_LOST),
             search(params, p_robot_felt, contact[1], temperatures),
         ),
     ):

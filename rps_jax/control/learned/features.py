@@ -111,12 +111,9 @@ def size(taxels: int) -> int:
 
 
 def features(felt: Felt, action: jax.Array, seen: TaxelObservation) -> jax.Array:
-    """The numbers (F,) that a network sees at a decision.
+    """The numbers (F,) that a network sees at a decision, after the last `action` (3,) [1].
 
-    Args:
-      felt: what is remembered, after it has followed `seen`.
-      action: (3,) [1] the last one.
-      seen: what it observes.
+    What is remembered, `felt`, has followed `seen`.
     """
     touch = seen.touch
     contact = felt.p_robot_contact(seen)

@@ -5,8 +5,6 @@ each of the network's weights, and `digest`, the SHA-256 of all these. `SHIPPED`
 that come with the package.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping
@@ -81,7 +79,12 @@ def decoded(content: bytes, source: Any) -> Policy:
     if not isinstance(learned, dict):
         why = f"its note on how it was learned is {learned!r}, and must be names with values"
         raise _refused(source, why)
-    return Policy(_network(about, arrays, source), arrays, _task(about, source), learned)
+    given = _named("task", tuple(_TASK), about, source)
+    task = {
+        name: errors.check_finite(f"policy {name}", given[name], above=0, at_most=100)
+        for name in _TASK
+    }
+    return Policy(_network(about, arrays, source), arrays, task, learned)
 
 
 def _refused(source: Any, why: str) -> InputError:
@@ -110,14 +113,6 @@ def _network(about: Mapping[str, Any], weights: Weights, source: Any) -> Network
         if array.dtype != np.float32 or not np.isfinite(array).all():
             raise _refused(source, f"its {name} must hold finite numbers of 32 bits")
     return network
-
-
-def _task(about: Mapping[str, Any], source: Any) -> dict[str, float]:
-    given = _named("task", tuple(_TASK), about, source)
-    return {
-        name: errors.check_finite(f"policy {name}", given[name], above=0, at_most=100)
-        for name in _TASK
-    }
 
 
 def _named(

@@ -1,0 +1,389 @@
+"""How fast are the engines of others on the same scene, and how right?
+
+A base pushes a box straight on at a constant speed, in one scene, on one device, in one run. Each
+engine is a process of its own. All make themselves ready side by side; then they are timed one
+after the other. Beside the speed stands how far the objects end from where C MuJoCo in fine steps
+leaves them.
+
+    python sweeps/speed/peers.py peers
+    rps sweeps/speed/arena.py --peers peers --machine "one NVIDIA H100"
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import re
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import IO, Any, ClassVar
+
+import mujoco
+import numpy as np
+import xarray as xr
+
+from rps_jax import errors
+from rps_jax.analysis.report import Section
+from rps_jax.record import provenance
+from rps_jax.record.options import option
+from rps_jax.runs.question import Run, call_of
+from rps_jax.trials.progress import Progress
+from rps_jax.world import scene
+from rps_jax.world.physics import preset
+from sweeps import shared
+from sweeps.shared import Study
+from sweeps.speed import racers
+from sweeps.speed.racers import ON_CORES, RACERS
+
+_HERE = Path(__file__).parent
+_COLUMNS = (
+    *("engine", "version", "worlds", "simulated s/s", "fused over it"),
+    *("error, median", "error, largest", "turned, median", "ready after", "why not"),
+)
+# Engines that are not in the arena, and why.
+EXCLUDED = {
+    "Brax 0.14.2": (
+        "its `validate_model` refuses the scene for its own pipelines (`Only pyramidal cone "
+        "friction is supported`, `Only impratio=1 is supported`), and its fourth pipeline is MJX"
+    ),
+    "Genesis 1.4.5": (
+        "it reads no contact pairs, so that its contacts would not be these (each has the mean of "
+        "what its two geoms say), and it needs thirty packages more, VTK and OpenCV among them"
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Arena(Study[xr.Dataset]):
+    """Race engines on one scene, each with its error against converged C MuJoCo.
+
+    The answer holds simulated seconds in a second of wall clock, `rate` [1], and how far the
+    objects end from the converged poses, `error` [m] and `turned` [rad], for each engine and
+    number of worlds; and in words why an engine has no rate.
+    """
+
+    TITLE: ClassVar[str] = "Engines on one scene"
+    SMALL: ClassVar[Mapping[str, Any]] = {
+        "names": ("C MuJoCo, rollout", "fused"),
+        "worlds": (8,),
+        "starts": 4,
+        "seconds": 0.5,
+        "step": 1e-3,
+    }
+    GROWS: ClassVar[tuple[str, ...]] = ("names", "worlds", "peers", "limit", "machine")
+
+    names: tuple[str, ...] = tuple(RACERS)
+    """Engines; by default all."""
+    worlds: tuple[int, ...] = option((8192, 65536), 1, 10_000_000)
+    """Numbers of worlds; on the processor as many as suit it, but no more than the largest."""
+    seconds: float = option(5.0, 0.1, 600, unit="s")
+    """How long each world is pushed [s]."""
+    starts: int = option(64, 1, 4096)
+    """Number of different places and headings of the box, which the worlds repeat."""
+    step: float = option(1e-4, 1e-6, 1e-2, unit="s")
+    """Of converged C MuJoCo [s]."""
+    peers: Path | None = None
+    """Folder of the packages of others, as `peers.py` makes it."""
+    limit: float = option(150.0, 1, 3600)
+    """Time in which an engine must be ready, and time in which it must then run [s]."""
+    machine: str = ""
+    """What it runs on, in words; with these the table is published."""
+
+    def check(self) -> None:
+        """Check the names."""
+        if not self.names:
+            raise errors.InputError("names = () leave nothing to race.")
+        for name in self.names:
+            errors.check_name("name", name, tuple(RACERS))
+
+    @property
+    def wanted(self) -> list[tuple[str, int]]:
+        """Engines and numbers of worlds: a row each."""
+        counts = {name: (max(self.worlds),) for name in ON_CORES}
+        return [(name, n) for name in self.names for n in counts.get(name, self.worlds)]
+
+    def trials(self) -> int | None:
+        """How many rows there are."""
+        return len(self.wanted)
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Race the engines that were not raced before."""
+        with tempfile.TemporaryDirectory() as place:
+            folder = Path(place)
+            (folder / "scene.xml").write_text(mjcf())
+            np.save(folder / "starts.npy", placed(self.starts))
+            truth = run.part("converged", partial(self._converged, folder)).pose.values
+            missing = [
+                one for one in self.wanted if run.parts is None or run.parts.get(_part(one)) is None
+            ]
+            made = self._raced(missing, folder, truth)
+            found: list[xr.Dataset] = []
+            whole: Any = xr.Dataset()
+            for number, one in enumerate(self.wanted):
+                row = next(made) if one in missing else run.part(_part(one), xr.Dataset)
+                if one in missing and not row.why.item():  # what failed is tried again
+                    run.part(_part(one), partial(xr.Dataset.copy, row))
+                found.append(row)
+                whole = xr.concat(found, "row")
+                if self.machine and run.folder is not None:
+                    self._publish(run.folder, whole)
+                run.report(Progress(number + 1, 0.0))
+            made.close()
+        return whole
+
+    def _converged(self, folder: Path) -> xr.Dataset:
+        starts = np.load(folder / "starts.npy")
+        poses = racers.converged(folder / "scene.xml", starts, self.seconds, self.step)
+        return xr.Dataset({"pose": (("start", "coordinate"), poses)})
+
+    def _raced(
+        self, wanted: Sequence[tuple[str, int]], folder: Path, truth: np.ndarray
+    ) -> Generator[xr.Dataset]:
+        """Rows: all are made ready first, and then timed one after the other."""
+        given = _environment(self.peers)
+        started = [_Process(*one, folder, self.seconds, given) for one in wanted]
+        try:
+            until = time.perf_counter() + self.limit
+            for process in started:
+                process.prepare(until)
+            for process in started:
+                yield process.row(time.perf_counter() + self.limit, truth)
+        finally:
+            for process in started:
+                process.end()
+
+    def _publish(self, folder: Path, found: xr.Dataset) -> None:
+        columns = [{"name": one} for one in _COLUMNS]
+        made = [provenance.signed(folder)]
+        note = ". ".join(f"Not in the arena: {name}, because {why}" for name, why in
+                         EXCLUDED.items())  # fmt: skip
+        path = _HERE / "results" / "arena.json"
+        shared.publish(path, made, self.machine, columns, table(found), note + ".")
+
+    def intro(self, found: xr.Dataset) -> str:
+        """Where it was measured."""
+        return shared.machine()
+
+    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+        """Speeds and errors."""
+        told = " ".join(f"{name} is not in the arena: {why}." for name, why in EXCLUDED.items())
+        return [Section("Engines on one scene", told, [list(_COLUMNS), *table(found)])]
+
+
+arena = call_of(Arena)
+
+
+def _part(wanted: tuple[str, int]) -> str:
+    return "_".join([re.sub(r"\W+", "_", wanted[0]), str(wanted[1])])
+
+
+# --- the scene -----------------------------------------------------------------------------
+
+
+def placed(count: int) -> np.ndarray:
+    """Where bases and boxes start (count, 10): the box turned and to a side, touching the base."""
+    box, rng = scene.load("box"), np.random.default_rng(0)
+    yaws, sides = rng.uniform(-0.3, 0.3, count), rng.uniform(-0.08, 0.08, count)
+    qpos = np.array([scene.initial_qpos(box, 0.0, yaw) for yaw in yaws])
+    qpos[:, scene.JOINTS.object.start + 1] = sides
+    return qpos
+
+
+def mjcf() -> str:
+    """The scene that the project's engines step, as a file that others read too."""
+    model = scene.load("box", preset()).physics
+    base, box, o = model.body("base"), model.body("object"), model.opt
+
+    def text(values: Any) -> str:
+        return " ".join(f"{v:.12g}" for v in np.ravel(values))
+
+    def inertial(body: Any) -> str:
+        return (
+            f'<inertial pos="{text(body.ipos)}" quat="{text(body.iquat)}" mass="{text(body.mass)}" '
+            f'diaginertia="{text(body.inertia)}"/>'
+        )
+
+    def geom(name: str, kind: str) -> str:
+        one = model.geom(name)
+        return (
+            f'<geom name="{name}" type="{kind}" size="{text(one.size)}" pos="{text(one.pos)}" '
+            'contype="0" conaffinity="0"/>'
+        )
+
+    joints = "".join(
+        f'<joint name="base_{name}" type="{kind}" axis="{axis}" armature="{text(mass)}"/>'
+        for (name, kind, axis), mass in zip(
+            [("x", "slide", "1 0 0"), ("y", "slide", "0 1 0"), ("yaw", "hinge", "0 0 1")],
+            model.dof_armature,
+            strict=False,
+        )
+    )
+    pairs = "".join(
+        f'<pair geom1="{model.geom(int(model.pair_geom1[i])).name}" '
+        f'geom2="{model.geom(int(model.pair_geom2[i])).name}" condim="{model.pair_dim[i]}" '
+        f'friction="{text(model.pair_friction[i])}" solref="{text(model.pair_solref[i])}" '
+        f'solreffriction="{text(model.pair_solreffriction[i])}" '  # Newton has another default
+        f'solimp="{text(model.pair_solimp[i])}"/>'
+        for i in range(model.npair)
+    )
+    assert (o.integrator, o.solver, o.cone) == (
+        mujoco.mjtIntegrator.mjINT_EULER,
+        mujoco.mjtSolver.mjSOL_NEWTON,
+        mujoco.mjtCone.mjCONE_ELLIPTIC,
+    )
+    return (
+        '<mujoco model="arena"><compiler angle="radian" autolimits="true"/>'
+        f'<option timestep="{o.timestep:g}" integrator="Euler" solver="Newton" cone="elliptic" '
+        f'impratio="{o.impratio:g}" iterations="{o.iterations}" '
+        f'ls_iterations="{o.ls_iterations}" tolerance="{o.tolerance:g}" jacobian="dense"/>'
+        f"<worldbody>{geom('ground', 'plane')}"
+        f'<body name="base">{joints}{inertial(base)}{geom("base", "box")}</body>'
+        f'<body name="object" pos="{text(box.pos)}"><freejoint name="object"/>{inertial(box)}'
+        f"{geom('object', 'box')}</body></worldbody><contact>{pairs}</contact></mujoco>"
+    )
+
+
+# --- the processes -------------------------------------------------------------------------
+
+
+def _environment(peers: Path | None) -> dict[str, str]:
+    """Of an engine's process: the packages of others come last, and JAX takes what it needs."""
+    places = [str(_HERE.parents[1]), os.environ.get("PYTHONPATH", ""), str(peers or "")]
+    return os.environ | {
+        "PYTHONPATH": os.pathsep.join(filter(None, places)),
+        "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
+    }
+
+
+class _Process:
+    """The process of an engine."""
+
+    def __init__(
+        self, name: str, count: int, folder: Path, seconds: float, environment: Mapping[str, str]
+    ):
+        """Start it."""
+        words = [name, str(folder), str(seconds), str(count)]
+        self.name, self.count, self.failed, self.ready = name, count, "", np.nan
+        self._errors = folder / f"{_part((name, count))}.txt"
+        with self._errors.open("w") as file:
+            self._child = subprocess.Popen(
+                [sys.executable, str(_HERE / "racers.py"), *words], env=environment, text=True,
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=file,
+            )  # fmt: skip
+        assert self._child.stdout is not None
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        threading.Thread(target=_read, args=(self._child.stdout, self._lines), daemon=True).start()
+
+    def _told(self, until: float) -> dict[str, Any] | None:
+        """What it says next; None if it says nothing more, which is a failure in words."""
+        while True:
+            try:
+                line = self._lines.get(timeout=max(until - time.perf_counter(), 0.01))
+            except queue.Empty:
+                self.failed = "took longer than the limit"
+                return None
+            if line is None:
+                self._child.wait()
+                last = self._errors.read_text().strip().splitlines()[-1:]
+                self.failed = " ".join(last) or f"ended with {self._child.returncode}"
+                return None
+            if line.startswith("{"):
+                return json.loads(line)
+
+    def prepare(self, until: float) -> None:
+        """Wait until it is ready."""
+        if (told := self._told(until)) is not None:
+            self.ready = told["ready"]
+        else:
+            self.end()
+
+    def row(self, until: float, truth: np.ndarray) -> xr.Dataset:
+        """Let it run, and tell its row."""
+        told = None
+        if not self.failed:
+            assert self._child.stdin is not None
+            print("go", file=self._child.stdin, flush=True)
+            told = self._told(until)
+        self.end()
+        return _row(self, told or {"poses": []}, truth)
+
+    def end(self) -> None:
+        """End it, if it has not ended."""
+        self._child.kill()
+        self._child.wait()
+
+
+def _read(stream: IO[str], lines: queue.SimpleQueue[str | None]) -> None:
+    for line in stream:
+        lines.put(line)
+    lines.put(None)
+
+
+def _row(process: _Process, told: Mapping[str, Any], truth: np.ndarray) -> xr.Dataset:
+    """A row: what was told, and how far it is from the converged poses (n, 7)."""
+    poses = np.array(told["poses"], float).reshape(-1, 7)
+    error, turned = np.array([np.nan]), np.array([np.nan])
+    if len(poses):
+        true = truth[np.arange(len(poses)) % len(truth)]
+        error = np.linalg.norm(poses[:, :2] - true[:, :2], axis=1)
+        turned = np.abs((_yaw(poses) - _yaw(true) + np.pi) % (2 * np.pi) - np.pi)
+    values = {
+        "engine": process.name,
+        "version": told.get("version", ""),
+        "worlds": told.get("worlds", process.count),
+        "rate": told.get("rate", np.nan),
+        "error": np.median(error),
+        "largest": np.max(error),
+        "turned": np.median(turned),
+        "ready": process.ready,
+        "why": process.failed,
+    }
+    return xr.Dataset({name: ((), value) for name, value in values.items()})
+
+
+def _yaw(poses: np.ndarray) -> np.ndarray:
+    """Headings (n,) [rad] of poses (n, 7)."""
+    w, x, y, z = poses[:, 3:].T
+    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+# --- what is shown -------------------------------------------------------------------------
+
+
+def _times(ratio: float) -> str:
+    """How many times as fast, in three digits, or in whole numbers."""
+    return "" if np.isnan(ratio) else f"{ratio:,.0f}" if ratio >= 100 else f"{ratio:.3g}"
+
+
+def table(found: xr.Dataset) -> list[list[str]]:
+    """A row for each engine and number of worlds, the slowest first and failures last."""
+    rows = [found.isel(row=i) for i in range(found.sizes["row"])]
+    fused = {int(r.worlds): float(r.rate) for r in rows if r.engine.item() == "fused"}
+    most = max(fused.values(), default=np.nan)
+
+    def cell(value: xr.DataArray, form: str, times: float = 1.0) -> str:
+        return "" if np.isnan(value) else form.format(times * float(value))
+
+    return [
+        [
+            str(r.engine.item()),
+            str(r.version.item()),
+            f"{int(r.worlds):,}",
+            cell(r.rate, "{:,.0f}"),
+            _times(fused.get(int(r.worlds), most) / float(r.rate)),
+            cell(r.error, "{:.2g} mm", 1000),
+            cell(r.largest, "{:.2g} mm", 1000),
+            cell(r.turned, "{:.2g}°", 180 / np.pi),
+            cell(r.ready, "{:.0f} s"),
+            str(r.why.item()),
+        ]
+        for r in sorted(rows, key=lambda r: np.nan_to_num(float(r.rate), nan=np.inf))
+    ]

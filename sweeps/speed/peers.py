@@ -1,0 +1,33 @@
+"""Set up the environment of the arena's engines that are not this project's.
+
+    python sweeps/speed/peers.py FOLDER
+    rps sweeps/speed/arena.py --peers FOLDER
+
+They are installed into a folder of their own, beside JAX, NumPy and MuJoCo as they are here.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+# MuJoCo Warp and Newton on the Warp that MJX of the same version asks for, with what they import.
+PACKAGES = (
+    "mujoco-warp==3.17.0",
+    "newton==1.8.0",
+    "warp-lang==1.18.0",
+    "absl-py",
+    "etils",
+)
+
+
+def install(folder: str) -> int:
+    """Install the packages into a folder; the exit status of pip."""
+    words = [sys.executable, "-m", "pip", "install", "--no-deps", "--upgrade", "--target", folder]
+    return subprocess.run([*words, *PACKAGES], check=False).returncode
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit(f"usage: python {sys.argv[0]} FOLDER")
+    sys.exit(install(sys.argv[1]))

@@ -1,0 +1,367 @@
+"""What one process of the arena runs: one engine, from the starts to the end, as fast as it goes.
+
+    python racers.py ENGINE FOLDER SECONDS WORLDS
+
+`FOLDER` holds `scene.xml` and `starts.npy`. The process makes everything ready, says so, waits for
+a line, and then says how fast it was and where the objects ended. It needs nothing of this project
+but for the project's own engines, so that others can live in an environment of their own.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.metadata
+import json
+import multiprocessing
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+SPEED = 0.05  # [m/s] of the base, straight on
+BASE = slice(0, 3)  # of qpos and qvel: x, y, yaw
+OBJECT = slice(3, 10)  # of qpos: position and quaternion, scalar first
+# Room for a world's points of contact (four of each of two pairs), and for their rows.
+CONTACTS, ROWS = 8, 24
+_GRAPH = 50  # steps that are captured as one graph
+_ENOUGH = 6.0  # [s] after which no further go is made
+_GOES = 4
+
+
+class Task(NamedTuple):
+    """What is asked of an engine."""
+
+    scene: Path  # MJCF
+    qpos: np.ndarray  # (worlds, 10) where they start, at rest
+    seconds: float  # of each world
+
+
+class Racer(NamedTuple):
+    """An engine that is ready."""
+
+    go: Callable[[], np.ndarray]  # poses (few, 7) of the first objects after a whole run
+    warm: Callable[[], Any]  # compiles what `go` needs
+    worlds: int
+
+
+# --- MuJoCo on the processor ---------------------------------------------------------------
+
+
+def _model(task: Task) -> Any:
+    import mujoco
+
+    return mujoco.MjModel.from_xml_path(str(task.scene))
+
+
+def rollout(task: Task) -> Racer:
+    """MuJoCo's `rollout` on all cores, whose base is set on its way once in a control period."""
+    import mujoco
+    from mujoco.rollout import Rollout
+
+    cores = os.cpu_count() or 1
+    model, substeps = _model(task), 2
+    worlds = min(len(task.qpos), 64 * cores)
+    datas, pool = [mujoco.MjData(model) for _ in range(cores)], Rollout(nthread=cores)
+    nq, periods = model.nq, round(task.seconds / model.opt.timestep / substeps)
+
+    def go(periods: int = periods) -> np.ndarray:
+        state = np.zeros((worlds, 1 + nq + model.nv))
+        state[:, 1 : 1 + nq] = task.qpos[:worlds]
+        warmstart = np.zeros((worlds, model.nv))
+        for _ in range(periods):
+            state[:, 1 + nq :][:, BASE] = [SPEED, 0.0, 0.0]
+            after = np.asarray(
+                pool.rollout(
+                    model, datas, state, nstep=substeps, initial_warmstart=warmstart
+                )[0]
+            )  # fmt: skip
+            gained = after[:, -1, 1 + nq :] - after[:, -2, 1 + nq :]
+            state, warmstart = after[:, -1], gained / model.opt.timestep
+        return state[:, 1:][:, OBJECT]
+
+    return Racer(go, functools.partial(go, 1), worlds)
+
+
+def in_c(model: Any, qpos: np.ndarray, seconds: float) -> np.ndarray:
+    """Pose (7,) of the object after one world was stepped by `mj_step`."""
+    import mujoco
+
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    for _ in range(round(seconds / model.opt.timestep)):
+        data.qvel[BASE] = [SPEED, 0.0, 0.0]
+        mujoco.mj_step(model, data)
+    return data.qpos[OBJECT].copy()
+
+
+def single(task: Task) -> Racer:
+    """One process a trial, as many at a time as there are cores."""
+    cores = os.cpu_count() or 1
+    worlds = min(len(task.qpos), 8 * cores)
+    words = [sys.executable, __file__, "trial", str(task.scene.parent), str(task.seconds)]
+
+    def trial(number: int) -> list[float]:
+        done = subprocess.run(
+            [*words, str(number)], stdout=subprocess.PIPE, text=True, check=True
+        )  # fmt: skip
+        return json.loads(done.stdout)
+
+    def go() -> np.ndarray:
+        from multiprocessing.pool import ThreadPool
+
+        with ThreadPool(cores) as pool:
+            return np.array(pool.map(trial, range(worlds), chunksize=1))
+
+    return Racer(go, functools.partial(trial, 0), worlds)
+
+
+def converged(scene: Path, starts: np.ndarray, seconds: float, step: float) -> np.ndarray:
+    """Poses (n, 7) of the objects by C MuJoCo in fine steps, solved to the end."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_path(str(scene))
+    model.opt.timestep, model.opt.tolerance = step, 1e-15
+    model.opt.iterations, model.opt.ls_iterations = 100, 50
+    with multiprocessing.get_context("spawn").Pool(os.cpu_count()) as pool:
+        return np.array(pool.starmap(in_c, [(model, qpos, seconds) for qpos in starts]))
+
+
+# --- this project's engines, through JAX ---------------------------------------------------
+
+
+def jax_engine(task: Task, name: str) -> Racer:
+    """An engine of this project: all of a run is one program."""
+    import jax
+    import jax.numpy as jnp
+
+    from rps_jax import engines
+    from rps_jax.control.observation import Twist
+    from rps_jax.engines.base import Motion
+    from rps_jax.world import scene
+    from rps_jax.world.physics import preset
+
+    physics = preset()
+    worlds, periods = len(task.qpos), round(task.seconds / physics.control_period)
+    stage, fields = engines.get(name).stage_of_scenes(
+        [scene.load("box", physics)], np.zeros(worlds, int)
+    )
+    fields, qpos = jax.device_put((fields, task.qpos.astype(np.float32)))
+    twists = Twist(*(jnp.full(worlds, v, jnp.float32) for v in (SPEED, 0.0, 0.0)))
+
+    @jax.jit
+    def run(fields: Any, qpos: jax.Array, periods: int) -> jax.Array:
+        still = jnp.zeros((worlds, 9), qpos.dtype)
+
+        def one(_: int, motion: Motion) -> Motion:
+            return stage.drive(fields, motion, twists, physics).motion
+
+        return jax.lax.fori_loop(0, periods, one, Motion(qpos, still, still)).qpos
+
+    def go(periods: int = periods) -> np.ndarray:
+        return np.asarray(jax.block_until_ready(run(fields, qpos, periods))[:, OBJECT])
+
+    return Racer(go, functools.partial(go, 1), worlds)
+
+
+def with_law(task: Task) -> Racer:
+    """The fused engine with the law RPS, its skin and the rules of a trial around it."""
+    import jax
+
+    from sweeps import shared
+
+    made = shared.traced(
+        "fused", shared.BATCHED["fused standard"], "box", len(task.qpos),
+        simulated=task.seconds, donated=False,
+    )()  # fmt: skip
+
+    def go() -> np.ndarray:
+        jax.block_until_ready(made.go(made.start))
+        return np.full((1, 7), np.nan)  # the law pushes elsewhere
+
+    return Racer(go, go, made.worlds)
+
+
+# --- engines of others ---------------------------------------------------------------------
+
+
+def _captured(warp: Any, step: Callable[[], None], count: int) -> Callable[[], None]:
+    """Launches of a CUDA graph that make `count` steps; on a processor, the steps."""
+    if not warp.get_device().is_cuda:
+
+        def steps() -> None:
+            for _ in range(count):
+                step()
+
+        return steps
+    graph_steps = next(n for n in range(min(_GRAPH, count), 0, -1) if count % n == 0)
+    step()  # builds the kernels
+    with warp.ScopedCapture() as capture:
+        for _ in range(graph_steps):
+            step()
+
+    def launch() -> None:
+        for _ in range(count // graph_steps):
+            warp.capture_launch(capture.graph)
+
+    return launch
+
+
+@functools.cache
+def _commanded() -> Any:
+    """A kernel that sets the velocity of every base."""
+    import warp  # pyright: ignore[reportMissingImports]
+
+    @warp.kernel
+    def command(qvel: warp.array2d(dtype=float), speed: float):  # pyright: ignore
+        world = warp.tid()
+        qvel[world, 0] = speed
+        qvel[world, 1] = 0.0
+        qvel[world, 2] = 0.0
+
+    return command
+
+
+def mujoco_warp(task: Task) -> Racer:
+    """MuJoCo Warp as it is, its steps captured as a graph."""
+    import mujoco
+    import mujoco_warp as mjw  # pyright: ignore[reportMissingImports]
+    import warp as wp  # pyright: ignore[reportMissingImports]
+
+    wp.config.log_level = wp.LOG_WARNING
+    host, worlds = _model(task), len(task.qpos)
+    model = mjw.put_model(host)
+    model.opt.warn_overflow = False
+    data = mjw.put_data(
+        host, mujoco.MjData(host), nworld=worlds, nconmax=CONTACTS, njmax=ROWS
+    )  # fmt: skip
+    command = _commanded()
+    start = wp.array(task.qpos.astype(np.float32), dtype=float)
+
+    def step() -> None:
+        wp.launch(command, dim=worlds, inputs=[data.qvel, SPEED])
+        mjw.step(model, data)
+
+    launch = _captured(wp, step, round(task.seconds / host.opt.timestep))
+
+    def go() -> np.ndarray:
+        wp.copy(data.qpos, start)
+        for array in (data.qvel, data.qacc_warmstart, data.time):
+            array.zero_()
+        launch()
+        wp.synchronize()
+        return data.qpos.numpy()[:, OBJECT]
+
+    return Racer(go, step, worlds)
+
+
+def newton(task: Task) -> Racer:
+    """Newton's solver that is made of MuJoCo Warp, as its examples run it."""
+    import newton  # pyright: ignore[reportMissingImports]
+    import warp as wp  # pyright: ignore[reportMissingImports]
+    from newton.solvers import SolverMuJoCo  # pyright: ignore[reportMissingImports]
+
+    wp.config.log_level = wp.LOG_WARNING
+    worlds, option = len(task.qpos), _model(task).opt
+    one = newton.ModelBuilder()
+    SolverMuJoCo.register_custom_attributes(one)
+    one.add_mjcf(str(task.scene))
+    every = newton.ModelBuilder()
+    every.replicate(one, worlds)
+    model = every.finalize()
+    solver = SolverMuJoCo(
+        model, nconmax=CONTACTS, njmax=ROWS, iterations=option.iterations,
+        ls_iterations=option.ls_iterations, cone="elliptic", impratio=option.impratio,
+        tolerance=option.tolerance, integrator="euler", solver="newton",
+        kinematic_switchable_roots=False,  # else each body has a weld that is never switched on
+    )  # fmt: skip
+    solver.mjw_model.opt.warn_overflow = False
+    states, control = [model.state(), model.state()], model.control()
+    q = task.qpos.copy()
+    q[:, OBJECT] = q[:, OBJECT][:, [0, 1, 2, 4, 5, 6, 3]]  # scalar last
+    start = wp.array(q.astype(np.float32).ravel(), dtype=float)
+    command = _commanded()
+    shape = (worlds, 9)
+
+    def step() -> None:  # two of them, so that the states are in their places again
+        for _ in range(2):
+            now, after = states
+            now.clear_forces()
+            wp.launch(command, dim=worlds, inputs=[now.joint_qd.reshape(shape), SPEED])
+            solver.step(now, after, control, None, option.timestep)
+            states.reverse()
+
+    launch = _captured(wp, step, round(task.seconds / option.timestep / 2))
+
+    def go() -> np.ndarray:
+        wp.copy(states[0].joint_q, start)
+        states[0].joint_qd.zero_()
+        newton.eval_fk(model, states[0].joint_q, states[0].joint_qd, states[0])
+        launch()
+        wp.synchronize()
+        found = states[0].joint_q.numpy().reshape(worlds, -1)[:, OBJECT]
+        return found[:, [0, 1, 2, 6, 3, 4, 5]]
+
+    return Racer(go, step, worlds)
+
+
+# Engines by name: what makes one ready, and the package whose version is told.
+RACERS: dict[str, tuple[Callable[[Task], Racer], str]] = {
+    "one process a trial": (single, "mujoco"),
+    "C MuJoCo, rollout": (rollout, "mujoco"),
+    "MJX": (functools.partial(jax_engine, name="mjx"), "mujoco-mjx"),
+    "MJX-Warp": (functools.partial(jax_engine, name="warp"), "mujoco-mjx"),
+    "MuJoCo Warp": (mujoco_warp, "mujoco-warp"),
+    "Newton, SolverMuJoCo": (newton, "newton"),
+    "fused": (functools.partial(jax_engine, name="fused"), "rps_jax"),
+    "fused, law and skin": (with_law, "rps_jax"),
+}
+ON_CORES = ("one process a trial", "C MuJoCo, rollout")  # with as many worlds as suit them
+
+
+def _say(**told: Any) -> None:
+    print(json.dumps(told), flush=True)
+
+
+def _version(package: str) -> str:
+    """Its version; none of this project where it runs from its sources."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+
+
+def race(name: str, folder: Path, seconds: float, count: int) -> None:
+    """Make an engine ready for a number of worlds, wait for a line, and time it."""
+    prepare, package = RACERS[name]
+    begun, starts = time.perf_counter(), np.load(folder / "starts.npy")
+    qpos = starts[np.arange(count) % len(starts)]
+    try:
+        racer = prepare(Task(folder / "scene.xml", qpos, seconds))
+    except ModuleNotFoundError as error:
+        sys.exit(f"{error.name} is not installed")
+    racer.warm()
+    _say(ready=time.perf_counter() - begun)
+    input()
+    times, poses = [], np.empty(0)
+    while len(times) < _GOES and sum(times) < _ENOUGH:
+        begun = time.perf_counter()
+        poses = racer.go()
+        times.append(time.perf_counter() - begun)
+    rate, few = racer.worlds * seconds / min(times), min(len(starts), racer.worlds)
+    _say(worlds=racer.worlds, rate=rate, version=_version(package), poses=poses[:few].tolist())
+
+
+if __name__ == "__main__":
+    name, folder, seconds, count = sys.argv[1:]
+    if name == "trial":
+        xml, starts = Path(folder) / "scene.xml", np.load(Path(folder) / "starts.npy")
+        task = Task(xml, starts, float(seconds))
+        pose = in_c(_model(task), starts[int(count) % len(starts)], task.seconds)
+        print(json.dumps(pose.tolist()))
+    else:
+        race(name, Path(folder), float(seconds), int(count))
