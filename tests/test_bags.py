@@ -51,6 +51,16 @@ def test_a_law_that_senses_force_gives_its_twists_back(tmp_path):
     assert np.abs(bag.read(path)["f_robot"]).max() > 1
 
 
+@pytest.mark.parametrize("law", ["learned_gru", "learned_mlp"])
+def test_a_law_that_observes_its_last_twist_gives_its_twists_back(tmp_path, law):
+    path = tmp_path / "push.mcap"
+    push("cylinder", target=(-1.0, 0.5), law=law, bag=path, setting=BRIEF)
+    found = shadow(path, law)
+    for name in ("v_x", "v_y", "omega"):
+        np.testing.assert_allclose(found[name][1], found[name][0], atol=1e-6)
+    assert float(np.abs(found.v_x).max()) > 0.005
+
+
 def test_a_bag_does_not_change_the_trial(recorded):
     path, trace = recorded
     other = push("cylinder", target=(-1.0, 0.5), law="rps_plus", setting=BRIEF)

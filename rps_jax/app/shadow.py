@@ -96,6 +96,9 @@ shadow = call_of(Shadow)
 def shadowed(law: Law, params: Params, recorded: dict[str, np.ndarray]) -> np.ndarray:
     """Twists (N, 3) [m/s, m/s, rad/s] that a law would have commanded.
 
+    A law that observes its last twist hears what was commanded: that moved the base, and so no
+    rounding grows from one decision to the next.
+
     Raises:
       InputError: the bag lacks what the law senses.
     """
@@ -120,12 +123,16 @@ def shadowed(law: Law, params: Params, recorded: dict[str, np.ndarray]) -> np.nd
 
     @jax.jit
     def whole(params: Any, seen: Any) -> jax.Array:
-        def one(memory: Any, now: Any) -> Any:
+        def one(memory: Any, row: Any) -> Any:
+            now, before = row
+            if law.heard is not None:
+                memory = law.heard(params, memory, now, Twist(*before))
             memory, twist, _ = law.step(params, memory, now)
             return memory, jnp.stack([jnp.asarray(x, float) for x in Twist(*twist)])
 
-        return jax.lax.scan(one, law.init(params), seen)[1]
+        return jax.lax.scan(one, law.init(params), (seen, sent))[1]
 
+    sent = jnp.asarray(np.pad(recorded["twist"][:-1], ((1, 0), (0, 0))), float)
     params = jax.tree.map(lambda x: jnp.asarray(x, float), params)
     return np.asarray(whole(params, filled(trying.observation_of(law.senses))))
 

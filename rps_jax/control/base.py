@@ -88,3 +88,5 @@ class Law(NamedTuple):
     temperatures: Any = None
     smooth: bool = False  # it is that form, and observes the weight of a contact
     cell: LoadCell = LoadCell()  # by which it senses a force
+    # Of a law that observes its last twist: params, memory, observation, twist sent -> memory.
+    heard: Callable[[Any, Any, Any, Twist], Any] | None = None

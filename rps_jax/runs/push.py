@@ -167,7 +167,7 @@ class FollowsOne(Question[Trace]):
         details, seen = tuple(whole.snapshots.details)  # of `recorded_law`
         whole = dataclasses.replace(whole, snapshots=whole.snapshots._replace(details=details))
         about = {"law": json.dumps(registry.recorded(whole.params)), "period": str(period)}
-        bags.write(Path(self.bag), steps_of(whole, seen), about)
+        bags.write(Path(self.bag), steps_of(whole, seen, period), about)
         every = max(1, round(0.1 / period))
         thin = jax.tree.map(lambda x: x[::every], whole.snapshots)
         return dataclasses.replace(whole, snapshots=thin)
@@ -198,14 +198,14 @@ def recorded_law(law: Law) -> Law:
     return law._replace(step=step, senses="taxels" if touch else law.senses)
 
 
-def steps_of(followed: Followed, seen: Any) -> Iterator[Step]:
-    """Steps of a bag of a trial that was followed, with its observations (T, ...)."""
+def steps_of(followed: Followed, seen: Any, period: float) -> Iterator[Step]:
+    """Steps of a bag of a trial that was followed, with its observations (T, ...) at each."""
     snapshots, touch = followed.snapshots, seen.touch
     beside = {"signal", "f_robot", "p_world_object", "r_object"} & set(seen._fields)
-    for i, time in enumerate(np.asarray(snapshots.time, float)):
+    for i in range(len(snapshots.time)):
         thing, yaw = object_pose(snapshots.qpos[i])
         yield Step(
-            float(time),
+            i * period,
             [*touch.p_world_robot[i], touch.yaw[i]],
             touch.p_world_target[i],
             int(snapshots.reading.contact_type[i]),

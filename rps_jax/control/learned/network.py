@@ -149,6 +149,10 @@ class Memory(NamedTuple):
         hidden = network.hidden(dtype=dtype)
         return cls(Felt.nothing(dtype), hidden, jnp.zeros(3, dtype), zero)
 
+    def due(self, seen: TaxelObservation) -> jax.Array:
+        """Whether the next action is decided now."""
+        return self.waiting < 0.5 * seen.touch.period
+
 
 def decide(
     network: Network, weights: Weights, memory: Memory, seen: TaxelObservation
@@ -160,6 +164,16 @@ def decide(
     numbers = features.features(memory.felt, memory.action, seen)
     hidden, mean = network.apply(weights, memory.hidden, numbers)
     return memory._replace(felt=memory.felt.decided(seen), hidden=hidden), mean
+
+
+def heard(params: Any, memory: Memory, seen: TaxelObservation, sent: Twist) -> Memory:
+    """The memory to which the last action is what was sent to the base, if it decides now."""
+    action = features.executed(jnp.stack(sent) / _greatest(params))
+    return memory._replace(action=jnp.where(memory.due(seen), action, memory.action))
+
+
+def _greatest(params: Any) -> jax.Array:
+    return jnp.stack([params.v_max, params.v_max, params.omega_max])
 
 
 def step(
@@ -176,13 +190,12 @@ def step(
             "choose a robot with the boards that it was learned with."
         )
     memory = memory._replace(felt=memory.felt.follow(seen))
-    due = memory.waiting < 0.5 * seen.touch.period
+    due = memory.due(seen)
     told, mean = decide(network, weights, memory, seen)
     told = told._replace(action=features.executed(mean))
     told = told._replace(waiting=jnp.full_like(memory.waiting, network.hold))
     after = jax.tree.map(partial(jnp.where, due), told, memory)
-    scale = jnp.stack([params.v_max, params.v_max, params.omega_max])
-    twist = Twist(*(scale * after.action))
+    twist = Twist(*(_greatest(params) * after.action))
     contact = after.felt.p_robot_contact(seen)
     details = Details.of(seen.touch._replace(p_robot_contact=contact))
     return after._replace(waiting=after.waiting - seen.touch.period), twist, details
