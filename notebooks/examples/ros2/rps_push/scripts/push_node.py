@@ -73,6 +73,10 @@ class PushNode(LifecycleNode):
         self._controller.odometry(now(), pose.position.x, pose.position.y, yaw)
 
     def _taxels(self, message):
+        expected = self._controller.taxels
+        if len(message.data) != expected:
+            said = f"{len(message.data)} taxels instead of {expected}"
+            self.get_logger().error(said, throttle_duration_sec=1.0)
         self._controller.skin(now(), message.data)
 
     def _target(self, message):
