@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Try push_node: inputs at 50 Hz, then one falls silent or is not finite; how soon is it zero?
 
-    ros2 run rps_push try_node.py 51   # taxels of the law's skin
+ros2 run rps_push try_node.py 51   # taxels of the law's skin
 """
 
 import math
