@@ -313,10 +313,8 @@ class Scalars:
         matrix = np.ascontiguousarray(matrix, float)
         half, odd = divmod(rows.shape[1], 2)
         if len(rows) == 2 and not odd and (rows[0] == np.roll(rows[1], half)).all():
-            add, sub = (
-                np.frompyfunc(lambda x, y, op=op: self.node(op, (x, y), "f"), 2, 1)
-                for op in ("add", "sub")
-            )
+            add: Any = np.frompyfunc(lambda x, y: self.node("add", (x, y), "f"), 2, 1)
+            sub: Any = np.frompyfunc(lambda x, y: self.node("sub", (x, y), "f"), 2, 1)
             (a, b), (p, q) = rows[0].reshape(2, half), matrix.reshape(2, half, -1) / 2
             both, apart = add(a, b)[None], sub(a, b)[None]
             even, odd = self._loops(both, p + q), self._loops(apart, p - q)
