@@ -63,11 +63,11 @@ class Commands(Study[xr.Dataset]):
         "sweep --laws rps --domain wide --worlds 1048576 --horizon 0.02 --slots 2048",
     )
     """What is asked of `rps`."""
+    gpus: tuple[int, ...] = option((), 1, 64)
+    """Numbers of GPUs with which each is timed; by default with what this process sees."""
     warm: tuple[int, ...] = ()
     """Numbers of worlds that are swept three times in one process: the first time with an empty
     cache, and the last."""
-    gpus: tuple[int, ...] = option((), 1, 64)
-    """Numbers of GPUs with which each is timed; by default with what this process sees."""
     limit: float = option(1800.0, 1, 86400)
     """Time after which a command is stopped [s]."""
     machine: str = ""
