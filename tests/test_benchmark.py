@@ -1,7 +1,9 @@
 """A speed is of what was timed, and is compared with C MuJoCo in the closed loop."""
 
+import os
 import subprocess
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import jax
@@ -171,14 +173,17 @@ def test_a_box_found_as_a_prism_is_where_mjx_finds_it():
 def test_whole_commands_are_timed_twice_with_so_many_gpus(monkeypatch):
     seen = []
 
-    def run(words, env, **how):
-        assert "JAX_PLATFORMS" not in env
-        seen.append((words[2:6], env["RPS_CACHE"], env["CUDA_VISIBLE_DEVICES"]))
-        return subprocess.CompletedProcess(
-            words, 0, "compile 1.5 s, run 2.0 s (1234 simulated s per s)", ""
-        )
+    class Process:
+        pid = 0
 
-    monkeypatch.setattr(subprocess, "run", run)
+        def __init__(self, words, env, stdout, stderr):
+            assert "JAX_PLATFORMS" not in env
+            seen.append((words[2:6], env["RPS_CACHE"], env["CUDA_VISIBLE_DEVICES"]))
+            stdout.write("compile 1.5 s, run 2.0 s (1234 simulated s per s)")
+
+    used = SimpleNamespace(ru_maxrss=2**20)  # KiB
+    monkeypatch.setattr(subprocess, "Popen", Process)
+    monkeypatch.setattr(os, "wait4", lambda pid, options: (pid, 0, used))
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")  # of the process that times them
     found = commands.commands(("push --seed 1",), (1, 2))
     assert found.command.values.tolist() == ["`rps push --seed 1`, one GPU",
@@ -186,7 +191,7 @@ def test_whole_commands_are_timed_twice_with_so_many_gpus(monkeypatch):
     assert [gpus for *_, gpus in seen] == ["0", "0", "0,1", "0,1"]
     assert [seen[0][1] == seen[1][1], seen[1][1] == seen[2][1]] == [True, False]  # an empty cache
     assert seen[0][0] == ["rps_jax", "push", "--seed", "1"]
-    assert commands.table(found)[1][3:] == ["1.5 s", "2.0 s", "1,234"]
+    assert commands.table(found)[1][3:] == ["1.5 s", "2.0 s", "1,234", "1.1 GB", "1.1 GB"]
 
 
 def test_steps_on_a_robot_are_told_as_the_example_tells_them(monkeypatch):
