@@ -174,7 +174,7 @@ def test_whole_commands_are_timed_twice_with_so_many_gpus(monkeypatch):
     seen = []
 
     class Process:
-        pid = 0
+        pid, kill = 0, print
 
         def __init__(self, words, env, stdout, stderr):
             assert "JAX_PLATFORMS" not in env
