@@ -143,6 +143,11 @@ def law_of(policy: Policy) -> tuple[str, Law, Any]:
     own = NamedTuple(name, [(field, Any) for field in _TASK])  # pyright: ignore
     own.__doc__ = "Parameters of a learned law: what is asked of it."
     step = partial(networks.step, policy.network, policy.weights)
-    begin = lambda params: Memory.init(policy.network)  # noqa: E731
-    law = Law(begin, step, "taxels", check=check, heard=networks.heard)
+    law = Law(
+        lambda params: Memory.init(policy.network),
+        step,
+        "taxels",
+        check=check,
+        heard=networks.heard,
+    )
     return f"learned_{kind}_{digest}", law, own(**policy.task)
