@@ -200,7 +200,15 @@ RECIPES: dict[str, Recipe] = {
     ),
     "regression": Recipe(("rps regress --laws rps rps_tuned rps_plus learned_gru",), 3, 1, "Wins"),
     "readings": Recipe(("rps sweeps/ambiguities",), 15, 4, "Readings, *"),
-    "readings_plus": Recipe(("rps sweeps/ambiguities --laws rps_plus",), 15, 4, "Readings, *"),
+    "readings_plus": Recipe(
+        (
+            "rps sweeps/ambiguities --laws rps_plus",
+            "rps sweeps/ambiguities --gazebo --laws rps_plus --readings paper_gazebo pyramid thin",
+        ),
+        15,
+        4,
+        "Readings, *",
+    ),
     "gazebo": Recipe(
         ("rps sweeps/ambiguities --gazebo --readings paper_gazebo",),
         12,
