@@ -70,6 +70,7 @@ _REAL = "rps sweep --domain real --worlds 4096 --seed 11 --laws rps rps_tuned"
 _RACE = "--tuned K_h K_v L beta l_cr d_th --horizon 150 --validation 256 --seed 5"
 _DESCENT = f"rps tune grad {_RACE} --starts 2 --worlds 512 --steps 20 --learning-rate 0.2"
 _RACERS = " ".join(f"rps,runs/{name}/tuned.json" for name in ("evolution", "gradient", "hybrid"))
+_GROUNDS = ("error", "push over mu m g")
 _RIVALS = ("rps", "pursuit", "dipole", "force_push", "force_push_published")
 _SWEPT = "sweep --laws rps_tuned --domain wide"
 _GRADIENTS = "rps sweeps/gradients --worlds 32 --estimators"
@@ -215,6 +216,13 @@ RECIPES: dict[str, Recipe] = {
         2,
         "Cells of Table II",
     ),
+    "gazebo_parts": Recipe(
+        ("rps sweeps/ambiguities --gazebo --laws rps --readings paper_gazebo pyramid thin",),
+        8,
+        None,
+        "Readings, *",
+        folder="ambiguities",
+    ),
     "fidelity": Recipe(
         ("rps sweeps/fidelity",),
         60,
@@ -260,7 +268,20 @@ RECIPES: dict[str, Recipe] = {
         4,
         "Equal outcomes",
     ),
-    "ground": Recipe(("rps sweeps/ground",), 30, None, "Grounds beside a rigid object"),
+    "ground": Recipe(
+        ("rps sweeps/ground",),
+        30,
+        None,
+        "Grounds beside a rigid object",
+        (),
+        (
+            "ground",
+            *(f"{what}, {speed} cm/s" for speed in (1, 5, 20) for what in _GROUNDS),
+            "height of the push",
+            "largest hop",
+            "aloft",
+        ),
+    ),
     "force_push_grid": Recipe(("rps sweeps/force_push_grid",), 4, None, "Pushes that succeed"),
     "mends": Recipe(
         _each("rps sweeps/mends --domain {} --worlds 4096 --seed 80", *_WIDE[::-1]),
@@ -372,7 +393,8 @@ RECIPES: dict[str, Recipe] = {
         None,
         8,
         "*, box",
-        ("fused standard", "mjx standard"),
+        (),
+        ("what", "lever", "worlds", "simulated s/s", "times"),
     ),
 }
 
