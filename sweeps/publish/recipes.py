@@ -241,10 +241,10 @@ RECIPES: dict[str, Recipe] = {
     ),
     "engines_random": Recipe(
         (
-            "rps sweeps/engines --objects random_box random_cylinder --worlds 600",
-            "rps sweeps/engines --objects random_prism --worlds 300",
+            "rps sweeps/engines --objects random_box random_cylinder --worlds 240",
+            "rps sweeps/engines --objects random_prism --worlds 120",
         ),
-        60,
+        40,
         8,
         "Equal outcomes",
         ("boxes and cylinders", "prisms"),
@@ -253,7 +253,7 @@ RECIPES: dict[str, Recipe] = {
     "engines_ideal": Recipe(
         (
             f"rps sweeps/engines --domain {_IDEAL} --worlds 240 --engines 'C, reference' "
-            "'fused, standard' 'fused, 5 ms' 'C, standard' 'MJX, standard'",
+            "'C, reference, moved' 'fused, standard' 'fused, 5 ms' 'C, standard' 'MJX, standard'",
         ),
         25,
         4,
