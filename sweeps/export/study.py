@@ -18,6 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+import jax
 import numpy as np
 import xarray as xr
 
@@ -106,7 +107,9 @@ class Export(Study[xr.Dataset]):
 
     def _kept(self, make: Callable[[str, Path], xr.Dataset], law: str) -> xr.Dataset:
         with tempfile.TemporaryDirectory() as where:
-            return make(law, Path(where))
+            found = make(law, Path(where))
+        jax.clear_caches()  # the programs of all tables take more mappings than a process may have
+        return found
 
     # --- what is asked of each law ---
 
