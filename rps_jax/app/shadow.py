@@ -83,11 +83,8 @@ class Shadow(Question[xr.Dataset]):
             f"between what {found.attrs['law']} would have commanded and what was commanded, at "
             "the same observations."
         )
-        return [
-            Section(
-                "Beside what was commanded", text, rows, Picture("shadow", lambda: figure(found))
-            )
-        ]
+        picture = Picture("shadow", lambda: figure(found))
+        return [Section("Beside what was commanded", text, rows, picture)]
 
 
 shadow = call_of(Shadow)

@@ -190,12 +190,10 @@ class Question(Generic[T]):
         for name, value in self.small().items():
             owner, _, inner = name.partition(".")
             now, usual = getattr(self, owner), _default(type(self), owner)
-            if (inner or owner) in self.said:
-                continue
-            if not inner and now == usual:
-                small[owner] = value
-            elif inner and getattr(now, inner) == getattr(usual, inner):
-                small[owner] = replace(small.get(owner, now), **{inner: value})
+            same = getattr(now, inner) == getattr(usual, inner) if inner else now == usual
+            if same and (inner or owner) not in self.said:
+                part = {inner: value}
+                small[owner] = replace(small.get(owner, now), **part) if inner else value
         return replace(self, **small)
 
     def checked(self) -> None:
