@@ -305,10 +305,11 @@ def _decoded(file: Any) -> Iterator[tuple[str, int, Any]]:
             elif isinstance(record, records.Message):
                 channel = channels[record.channel_id]
                 wanted, schema = TOPICS.get(channel.topic), schemas.get(channel.schema_id)
+                kind = schema.name if schema else "no type"
                 if wanted is None:
                     continue
-                if schema.name.replace("/msg/", "/") != wanted:
-                    raise ValueError(f"{channel.topic} has {schema.name[:60]} for {wanted}")
+                if kind.replace("/msg/", "/") != wanted:
+                    raise ValueError(f"{channel.topic} has {kind[:60]} for {wanted}")
                 decode = decoders.decoder_for(channel.message_encoding, schema)
                 if decode is None:
                     raise ValueError(f"{channel.topic} is not encoded as ROS 2 does")
