@@ -332,15 +332,14 @@ RECIPES: dict[str, Recipe] = {
     "robot": Recipe((f"rps sweeps/speed/robot.py {_MACHINE}",), 1, None),
     "dependencies": Recipe((f"rps sweeps/publish/dependencies.py {_MACHINE}",), 15, None),
     "extras": Recipe((f"rps sweeps/publish/dependencies.py {_MACHINE}",), 15, None),
-    "fit_*": Recipe((f"rps sweeps/fit {_MACHINE}",), 40, None),
+    "fit_*": Recipe((f"rps sweeps/fit {_MACHINE}", f"rps sweeps/fit/bags.py {_MACHINE}"), 45, None),
     "export_*": Recipe(
         (
-            f"rps sweeps/export --tables inputs trials speed odd {_MACHINE}",
-            f"rps sweeps/export --tables paper --laws rps rps_tuned rps_plus learned_mlp "
-            f"{_MACHINE}",
-            f"rps sweeps/export --tables worlds --laws rps_plus --worlds 200 {_MACHINE}",
+            f"rps sweeps/export --tables speed {_MACHINE}",
+            f"rps sweeps/export --tables trials paper worlds bags odd {_MACHINE}",
+            f"rps sweeps/export --tables inputs {_MACHINE}",
         ),
-        40,
+        60,
         None,
     ),
     "sb3": Recipe((f"rps sweeps/learned/sb3.py {_MACHINE}",), 3, None),
