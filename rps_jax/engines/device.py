@@ -9,7 +9,7 @@ from typing import Literal
 
 from rps_jax.errors import InputError
 
-Device = Literal["auto", "cpu", "gpu"]
+Device = Literal["auto", "cpu", "gpu", "xla"]
 
 
 def be_deterministic() -> None:
@@ -75,7 +75,7 @@ def kind() -> str:
 
 
 def choose(name: Device) -> None:
-    """Have JAX use this kind of device.
+    """Have JAX use this kind of device; `xla` is the processor without the C compiler.
 
     Raises:
       InputError: there is no such device.
@@ -92,9 +92,11 @@ def choose(name: Device) -> None:
             ) from error
         return
     before = jax.config.jax_platforms
-    jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[name])
+    jax.config.update("jax_platforms", "cuda" if name == "gpu" else "cpu")
     with contextlib.suppress(RuntimeError, AssertionError):  # whichever JAX raises
-        if jax.default_backend() == name:
+        if jax.default_backend() == ("cpu" if name == "xla" else name):
+            if name == "xla":
+                os.environ["RPS_COMPILER"] = "none"
             return
     jax.config.update("jax_platforms", before)
     raise InputError(

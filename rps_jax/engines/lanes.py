@@ -18,6 +18,7 @@ import numpy as np
 
 from rps_jax.engines.walk import PAIRED, is_constant, kind_of, unsupported, walk
 
+HANDLER = "rps_lanes"  # what its name is replaced by is known to XLA
 _TYPES = {"f": "V", "i": "I", "u": "U", "b": "I"}  # of a vector
 _STORED = {"f": "float", "i": "int", "u": "unsigned", "b": "unsigned char"}  # of a world's number
 _INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "and": "&", "or": "|", "xor": "^"}
@@ -694,8 +695,8 @@ def _literal(value: Any, kind: str) -> str:
     return str(int(value)) if value > -(2**31) else "-2147483647 - 1"
 
 
-def source(function_jaxpr: Any, shapes: Sequence[Any], outs: Sequence[Any], name: str) -> str:
-    """C of a closed jaxpr of arguments of these shapes and types, as a handler of XLA's of a name.
+def source(closed: Any, shapes: Sequence[Any], outs: Sequence[Any]) -> str:
+    """C of a closed jaxpr of arguments of these shapes and types, as the handler `HANDLER` of XLA's.
 
     Raises:
       InputError: it has an operation that is not known here.
@@ -706,7 +707,7 @@ def source(function_jaxpr: Any, shapes: Sequence[Any], outs: Sequence[Any], name
         for i, x in enumerate(shapes)
     ]
     found = [
-        _flat(one, _size(like.shape)) for one, like in zip(walk(function_jaxpr, given, target), outs, strict=True)
+        _flat(one, _size(like.shape)) for one, like in zip(walk(closed, given, target), outs, strict=True)
     ]
     ends = [a.node for a in found if isinstance(a, Array)]
     lines = writer.lines(_reached(ends), ends, set())
@@ -729,7 +730,7 @@ def source(function_jaxpr: Any, shapes: Sequence[Any], outs: Sequence[Any], name
         "EACH": "\n".join(sorted(writer.each)),
         "TABLES": "\n".join(writer.tables.values()),
         "LINES": "\n".join(f"  {line}" for line in lines),
-        "NAME": name, "COUNT": len(shapes), "FOUND": len(outs), "ONE": one,
+        "NAME": HANDLER, "COUNT": len(shapes), "FOUND": len(outs), "ONE": one,
         "SIZE": _size(shapes[one].shape),
     }
     return _HEAD + _BODY.format(**fill)

@@ -62,13 +62,15 @@ def compiled(
     def flat(*given: Any) -> list[Any]:
         return jax.tree.leaves(function(*jax.tree.unflatten(tree, given)))
 
-    kept = _kept(repr((str(tree), [(x.shape, str(x.dtype)) for x in leaves], donated, static)))
-    exported = None if kept is None else _read(kept, leaves)
+    place = _place(repr((str(tree), [(x.shape, str(x.dtype)) for x in leaves], donated, static)))
+    exported = None if place is None else _read(place, leaves)
     if exported is None:
-        lowered = export.export(jax.jit(flat, donate_argnums=donated), disabled_checks=_KERNELS)
+        names = native.needed(jax.jit(flat).lower(*leaves).as_text().encode())
+        safe = [*_KERNELS, *map(export.DisabledSafetyCheck.custom_call, names)]
+        lowered = export.export(jax.jit(flat, donate_argnums=donated), disabled_checks=safe)
         exported = lowered(*leaves)
-        if kept is not None:
-            _write(kept, exported)
+        with contextlib.suppress(ValueError):  # what cannot be kept
+            keep(place, bytes(exported.serialize()))
     program = built(jax.jit(exported.call, donate_argnums=donated).lower(*leaves))
     outcome = jax.tree.structure(result)
     return lambda *given: jax.tree.unflatten(outcome, program(*jax.tree.leaves(given)))
@@ -110,7 +112,7 @@ def _source() -> str:
     return told.hexdigest()
 
 
-def _kept(told: str) -> Path | None:
+def _place(told: str) -> Path | None:
     """Where a program is kept of which this says all; None if nowhere.
 
     An address in memory, or what was left out of a long array, says nothing.
@@ -119,7 +121,7 @@ def _kept(told: str) -> Path | None:
     if not folder or " at 0x" in told or "..." in told:
         return None
     device = jax.devices()[0]
-    flags = [jax.config.jax_enable_x64, jax.config.jax_default_matmul_precision]
+    flags = [jax.config.jax_enable_x64, jax.config.jax_default_matmul_precision, native.target()]
     where = [device.platform, device.device_kind, os.environ.get("XLA_FLAGS", ""), flags]
     key = hashlib.sha256(repr((_source(), where, told)).encode()).hexdigest()
     return Path(folder) / "traced" / key
@@ -127,19 +129,31 @@ def _kept(told: str) -> Path | None:
 
 def _read(path: Path, leaves: Sequence[Any]) -> export.Exported | None:
     """A program that was kept, if it is whole and of these arguments."""
+
+    def told(body: bytes) -> export.Exported:
+        found = export.deserialize(bytearray(body))
+        if [(x.shape, x.dtype) for x in found.in_avals] != [(x.shape, x.dtype) for x in leaves]:
+            raise ValueError("it is of other shapes")
+        if not all(map(native.load, native.needed(found.mlir_module_serialized))):
+            raise ValueError("it needs a compiled function that is not there")
+        return found
+
+    return kept(path, "traced", told)
+
+
+def kept(path: Path, done: str, read: Callable[[bytes], Any] = len) -> Any:
+    """What `keep` kept, as it is read; None if it is not there, or damaged: then it is dropped."""
     try:
         content = path.read_bytes()
     except OSError:
         return None
-    body = content[_DIGEST:]
+    body = content[:-_DIGEST]
     try:
-        if hashlib.sha256(body).digest() != content[:_DIGEST]:
+        if hashlib.sha256(body).digest() != content[-_DIGEST:]:
             raise ValueError("its checksum differs")
-        found = export.deserialize(bytearray(body))
-        if [(x.shape, x.dtype) for x in found.in_avals] != [(x.shape, x.dtype) for x in leaves]:
-            raise ValueError("it is of other shapes")
+        found = read(body)
     except Exception as error:  # whatever a damaged file leads to
-        warnings.warn(f"{path} is dropped, and traced again: {error}", stacklevel=2)
+        warnings.warn(f"{path} is dropped, and {done} again: {error}", stacklevel=2)
         with contextlib.suppress(OSError):
             path.unlink()
         return None
@@ -148,12 +162,13 @@ def _read(path: Path, leaves: Sequence[Any]) -> export.Exported | None:
     return found
 
 
-def _write(path: Path, exported: export.Exported) -> None:
-    """Keep a program, and drop what was not used for longest; a run needs neither."""
-    with contextlib.suppress(OSError, ValueError):
-        body = bytes(exported.serialize())
+def keep(path: Path | None, body: bytes) -> None:
+    """Keep bytes and drop what was not used for longest; a run needs neither."""
+    if path is None:
+        return
+    with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        files.write_bytes(path, hashlib.sha256(body).digest() + body)
+        files.write_bytes(path, body + hashlib.sha256(body).digest())
         every = sorted(path.parent.iterdir(), key=lambda one: -one.stat().st_mtime)
         total = 0
         for one in every:
