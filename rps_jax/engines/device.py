@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
+import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from rps_jax.errors import InputError
+from rps_jax.record import files
 
+MOST = 512 * 2**20  # bytes of a kind that are kept
+_DIGEST = hashlib.sha256().digest_size
 Device = Literal["auto", "cpu", "gpu", "xla"]
 
 
@@ -103,3 +109,39 @@ def choose(name: Device) -> None:
         f"device = {name} is not there: install rps_jax[cuda] on a machine with an NVIDIA GPU, or "
         "choose cpu."
     )
+
+
+def kept(path: Path, done: str, read: Callable[[bytes], Any] = len) -> Any:
+    """What `keep` kept, as it is read; None if it is not there, or damaged: then it is dropped."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    body = content[:-_DIGEST]
+    try:
+        if hashlib.sha256(body).digest() != content[-_DIGEST:]:
+            raise ValueError("its checksum differs")
+        found = read(body)
+    except Exception as error:  # whatever a damaged file leads to
+        warnings.warn(f"{path} is dropped, and {done} again: {error}", stacklevel=2)
+        with contextlib.suppress(OSError):
+            path.unlink()
+        return None
+    with contextlib.suppress(OSError):
+        os.utime(path)
+    return found
+
+
+def keep(path: Path | None, body: bytes) -> None:
+    """Keep bytes and drop what was not used for longest; a run needs neither."""
+    if path is None:
+        return
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        files.write_bytes(path, body + hashlib.sha256(body).digest())
+        every = sorted(path.parent.iterdir(), key=lambda one: -one.stat().st_mtime)
+        total = 0
+        for one in every:
+            total += one.stat().st_size
+            if total > MOST:
+                one.unlink()

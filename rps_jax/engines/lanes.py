@@ -470,9 +470,8 @@ def _flat(value: Any, size: int) -> Any:
     if isinstance(value, Array):
         many = _size(value.shape)
         return value._replace(shape=(size,), step=value.step if many == size else 0)
-    array = np.asarray(value).reshape(-1)
-    return array[:1] if array.size and (array.view(np.uint8).reshape(array.size, -1)
-                                        == array[:1].view(np.uint8)).all() else array  # fmt: skip
+    array = np.ascontiguousarray(value).reshape(-1)
+    return array[:1] if len({x.tobytes() for x in array}) == 1 else array
 
 
 def _reached(nodes: Iterable[Node]) -> list[Node]:

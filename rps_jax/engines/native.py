@@ -27,7 +27,7 @@ from typing import Any
 
 import jax
 
-from rps_jax.engines import lanes, programs
+from rps_jax.engines import device, lanes
 from rps_jax.errors import InputError
 from rps_jax.geometry import vectors
 from rps_jax.record import provenance
@@ -42,8 +42,7 @@ _locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
 
 def usable() -> bool:
     """Whether functions are compiled here, and not within one that is."""
-    here = jax.default_backend() == "cpu" and not jax.config.jax_enable_x64
-    return here and not _OF_ONE.get() and target() is not None
+    return not jax.config.jax_enable_x64 and not _OF_ONE.get() and target() is not None
 
 
 @functools.cache
@@ -58,7 +57,7 @@ def _macros(compiler: str) -> str | None:
 
 def target() -> str | None:
     """What says for which compiler and processor functions are compiled here; None: they are not."""
-    compiler = provenance.compiler()
+    compiler = provenance.compiler() if jax.default_backend() == "cpu" else None
     return None if compiler is None else _macros(compiler)
 
 
@@ -116,9 +115,14 @@ def _made(closed: Any, given: Sequence[Any], found: Sequence[Any]) -> str | None
                 said = [*done.stderr.splitlines(), "it does not say why"]
                 warnings.warn(f"{words[0]} fails, so XLA compiles: {said[0]}", stacklevel=2)
                 return None
-            programs.keep(_place(name), binary.read_bytes())
+            device.keep(_place(name), binary.read_bytes())
             _register(name, binary)
     return name
+
+
+def names() -> list[str]:
+    """Names of all functions that XLA knows by now."""
+    return list(_loaded)
 
 
 def needed(program: bytes) -> list[str]:
@@ -131,7 +135,7 @@ def load(name: str) -> bool:
     if name in _loaded:
         return True
     path = _place(name)
-    if path is None or programs.kept(path, "compiled") is None:
+    if path is None or device.kept(path, "compiled") is None:
         return False
     _register(name, path)
     return True

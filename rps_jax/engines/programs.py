@@ -13,7 +13,6 @@ import ctypes
 import functools
 import hashlib
 import os
-import warnings
 from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -23,10 +22,8 @@ import jax
 from jax import export
 
 from rps_jax.control.base import Law
-from rps_jax.record import files
+from rps_jax.engines import device, native
 
-MOST = 512 * 2**20  # bytes that are kept; the entries that were not used for longest go first
-_DIGEST = hashlib.sha256().digest_size
 # Calls of kernels, which `jax.export` does not promise to other versions: the key has the versions.
 _KERNELS = [
     export.DisabledSafetyCheck.custom_call(name)
@@ -65,12 +62,12 @@ def compiled(
     place = _place(repr((str(tree), [(x.shape, str(x.dtype)) for x in leaves], donated, static)))
     exported = None if place is None else _read(place, leaves)
     if exported is None:
-        names = native.needed(jax.jit(flat).lower(*leaves).as_text().encode())
-        safe = [*_KERNELS, *map(export.DisabledSafetyCheck.custom_call, names)]
-        lowered = export.export(jax.jit(flat, donate_argnums=donated), disabled_checks=safe)
-        exported = lowered(*leaves)
+        jitted = jax.jit(flat, donate_argnums=donated)
+        jitted.trace(*leaves)  # in which functions are compiled that it calls
+        safe = [*_KERNELS, *map(export.DisabledSafetyCheck.custom_call, native.names())]
+        exported = export.export(jitted, disabled_checks=safe)(*leaves)
         with contextlib.suppress(ValueError):  # what cannot be kept
-            keep(place, bytes(exported.serialize()))
+            device.keep(place, bytes(exported.serialize()))
     program = built(jax.jit(exported.call, donate_argnums=donated).lower(*leaves))
     outcome = jax.tree.structure(result)
     return lambda *given: jax.tree.unflatten(outcome, program(*jax.tree.leaves(given)))
@@ -120,9 +117,9 @@ def _place(told: str) -> Path | None:
     folder = jax.config.jax_compilation_cache_dir
     if not folder or " at 0x" in told or "..." in told:
         return None
-    device = jax.devices()[0]
+    found = jax.devices()[0]
     flags = [jax.config.jax_enable_x64, jax.config.jax_default_matmul_precision, native.target()]
-    where = [device.platform, device.device_kind, os.environ.get("XLA_FLAGS", ""), flags]
+    where = [found.platform, found.device_kind, os.environ.get("XLA_FLAGS", ""), flags]
     key = hashlib.sha256(repr((_source(), where, told)).encode()).hexdigest()
     return Path(folder) / "traced" / key
 
@@ -138,40 +135,4 @@ def _read(path: Path, leaves: Sequence[Any]) -> export.Exported | None:
             raise ValueError("it needs a compiled function that is not there")
         return found
 
-    return kept(path, "traced", told)
-
-
-def kept(path: Path, done: str, read: Callable[[bytes], Any] = len) -> Any:
-    """What `keep` kept, as it is read; None if it is not there, or damaged: then it is dropped."""
-    try:
-        content = path.read_bytes()
-    except OSError:
-        return None
-    body = content[:-_DIGEST]
-    try:
-        if hashlib.sha256(body).digest() != content[-_DIGEST:]:
-            raise ValueError("its checksum differs")
-        found = read(body)
-    except Exception as error:  # whatever a damaged file leads to
-        warnings.warn(f"{path} is dropped, and {done} again: {error}", stacklevel=2)
-        with contextlib.suppress(OSError):
-            path.unlink()
-        return None
-    with contextlib.suppress(OSError):
-        os.utime(path)
-    return found
-
-
-def keep(path: Path | None, body: bytes) -> None:
-    """Keep bytes and drop what was not used for longest; a run needs neither."""
-    if path is None:
-        return
-    with contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        files.write_bytes(path, body + hashlib.sha256(body).digest())
-        every = sorted(path.parent.iterdir(), key=lambda one: -one.stat().st_mtime)
-        total = 0
-        for one in every:
-            total += one.stat().st_size
-            if total > MOST:
-                one.unlink()
+    return device.kept(path, "traced", told)

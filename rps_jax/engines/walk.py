@@ -120,6 +120,8 @@ def _results(eqn: Any, values: list[Any], target: Target) -> Sequence[Any]:
     if name in _SAME:
         return values
     if all(map(is_constant, values)):
+        if (several := _simply(eqn, values)) is not None:
+            return several
         found = eqn.primitive.bind(*map(jnp.asarray, values), **params)
         several = found if eqn.primitive.multiple_results else [found]
         return [
@@ -195,7 +197,7 @@ def _moved(eqn: Any, values: list[Any], which: list[int], target: Target) -> lis
 
 
 def _simply(eqn: Any, places: list[Any]) -> list[Any] | None:
-    """Move places by NumPy, if it knows how: JAX would compile each move."""
+    """Move places or constants by NumPy, if it knows how: JAX would compile each move."""
     name, params, out = eqn.primitive.name, eqn.params, eqn.outvars[0].aval.shape
     if name == "broadcast_in_dim":
         sizes = iter(np.shape(places[0]))
@@ -203,6 +205,8 @@ def _simply(eqn: Any, places: list[Any]) -> list[Any] | None:
         return [np.broadcast_to(np.reshape(places[0], kept), out)]
     if name in ("reshape", "squeeze", "expand_dims"):
         return [np.reshape(places[0], out)]
+    if name == "convert_element_type":
+        return [np.asarray(places[0]).astype(params["new_dtype"])]
     if name == "slice":
         limits = zip(params["start_indices"], params["limit_indices"], strict=True)
         steps = params["strides"] or (1,) * len(out)
