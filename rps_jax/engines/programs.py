@@ -104,7 +104,8 @@ def _source() -> str:
     """Digest of this package's source and of the versions that make a program of it."""
     versions = [metadata.version(name) for name in ("jax", "jaxlib", "numpy")]
     told = hashlib.sha256(repr(versions).encode())
-    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+    root = Path(__file__).parents[1]
+    for path in sorted([*root.rglob("*.py"), *root.rglob("*.h")]):
         told.update(path.read_bytes())
     return told.hexdigest()
 

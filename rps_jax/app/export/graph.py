@@ -13,9 +13,9 @@ import numpy as np
 from jax.extend.core import jaxpr_as_fun
 
 from rps_jax import __version__
-from rps_jax.engines import walk
+from rps_jax.engines.native import walk
 from rps_jax.app.export.program import Program
-from rps_jax.engines.walk import PAIRED, kind_of, unsupported
+from rps_jax.engines.native.walk import PAIRED, kind_of, unsupported
 from rps_jax.errors import InputError
 
 _OPSET, _FORMAT = 18, 9  # of ONNX, and of its files

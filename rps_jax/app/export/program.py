@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.engines import walk
+from rps_jax.engines.native import walk
 from rps_jax.app.export.scalars import Node, Scalars
 from rps_jax.control import registry, trying
 from rps_jax.control.observation import TaxelObservation, Twist

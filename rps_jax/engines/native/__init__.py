@@ -1,7 +1,7 @@
 """Functions of one world, compiled by the C compiler of this machine for the lanes of a processor.
 
 XLA begins every operation on a few worlds anew, which takes longer than the operation. Here the
-same source, as a jaxpr, is one function of C: see `lanes`. It is kept in the program cache, under a
+same source, as a jaxpr, is one function of C: see `nodes`. It is kept in the program cache, under a
 key of its text, the compiler and the processor, and verified before it is used. Where there is no
 compiler, in double precision, and where a function is differentiated, XLA compiles it, as it does
 with the device `xla`.
@@ -27,7 +27,8 @@ from typing import Any
 
 import jax
 
-from rps_jax.engines import device, lanes
+from rps_jax.engines import device
+from rps_jax.engines.native import writer
 from rps_jax.errors import InputError
 from rps_jax.geometry import vectors
 from rps_jax.record import provenance
@@ -97,7 +98,7 @@ def _made(closed: Any, given: Sequence[Any], found: Sequence[Any]) -> str | None
     """The name under which XLA knows a function; None if it cannot be compiled here."""
     try:
         with jax.ensure_compile_time_eval():
-            text = lanes.source(closed, given, found)
+            text = writer.source(closed, given, found)
     except InputError:  # a law's operation that has no form in C
         return None
     key = repr((text, target(), jax.__version__))
@@ -107,7 +108,7 @@ def _made(closed: Any, given: Sequence[Any], found: Sequence[Any]) -> str | None
             return name
         with tempfile.TemporaryDirectory() as folder:
             source, binary = Path(folder) / f"{name}.c", Path(folder) / f"{name}.so"
-            source.write_text(text.replace(lanes.HANDLER, name))
+            source.write_text(text.replace(writer.HANDLER, name))
             words = [str(provenance.compiler()), *_FLAGS, "-shared", "-fPIC"]
             words += [f"-I{jax.ffi.include_dir()}", str(source), "-o", str(binary), "-lm"]
             done = subprocess.run(words, capture_output=True, text=True)
