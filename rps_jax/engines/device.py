@@ -111,7 +111,7 @@ def choose(name: Device) -> None:
     )
 
 
-def kept(path: Path, done: str, read: Callable[[bytes], Any] = len) -> Any:
+def kept(path: Path, done: str, read: Callable[[bytes], Any]) -> Any:
     """What `keep` kept, as it is read; None if it is not there, or damaged: then it is dropped."""
     try:
         content = path.read_bytes()

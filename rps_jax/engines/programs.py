@@ -64,7 +64,7 @@ def compiled(
     if exported is None:
         jitted = jax.jit(flat, donate_argnums=donated)
         jitted.trace(*leaves)  # in which functions are compiled that it calls
-        safe = [*_KERNELS, *map(export.DisabledSafetyCheck.custom_call, native.names())]
+        safe = [*_KERNELS, *map(export.DisabledSafetyCheck.custom_call, native.known())]
         exported = export.export(jitted, disabled_checks=safe)(*leaves)
         with contextlib.suppress(ValueError):  # what cannot be kept
             device.keep(place, bytes(exported.serialize()))

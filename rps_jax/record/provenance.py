@@ -41,7 +41,7 @@ def environment() -> dict[str, Any]:
             "count": jax.device_count(),
         },
         "x64": bool(jax.config.jax_enable_x64),
-        "compiler": compiler() if device.platform == "cpu" else None,
+        "compiler": _compiled_by() if device.platform == "cpu" else None,
         "packages": {name: _version(name) for name in _PACKAGES},
     }
 
@@ -53,6 +53,14 @@ def compiler() -> str | None:
     """
     named = os.environ.get("RPS_COMPILER", "cc" if os.name == "posix" else "none")
     return None if named == "none" else shutil.which(named)
+
+
+def _compiled_by() -> str | None:
+    """The compiler as it calls itself."""
+    if (name := compiler()) is None:
+        return None
+    said = subprocess.run([name, "--version"], capture_output=True, text=True, timeout=60).stdout
+    return said.partition("\n")[0] or name
 
 
 def processors() -> int:

@@ -423,14 +423,14 @@ def advance(
     if not all(getattr(stage, "native", False) for stage in stages):
         return _side_by_side(stages, worlds, trials, loop, steps)
 
-    def one(stage: Stage, world: World, now: Trial, rules: Rules) -> Trial:
+    def one(stage: Stage, world: World, now: Trial, rules: Any) -> Trial:
         def on(carry: tuple[Any, Trial]) -> tuple[Any, Trial]:
             own = dataclasses.replace(loop, rules=rules)
             return carry[0] + 1, control_step(stage, world, carry[1], own, lambda f, *_: f)[0]
 
         return jax.lax.while_loop(lambda c: (c[0] < steps) & ~c[1].done, on, (0, now))[1]
 
-    def whole(stage: Stage, worlds: World, trials: Trial, rules: Rules) -> Trial:
+    def whole(stage: Stage, worlds: World, trials: Trial, rules: Any) -> Trial:
         own = dataclasses.replace(loop, rules=jax.tree.map(lambda x: x[0], rules))
         return _side_by_side((stage,), (worlds,), (trials,), own, steps)[0]
 

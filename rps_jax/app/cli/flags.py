@@ -19,10 +19,10 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin
 
 import tyro
 
+from rps_jax.engines.device import Device
 from rps_jax.errors import InputError
 from rps_jax.record import options
 from rps_jax.runs.push import FollowsOne
-from rps_jax.engines.device import Device
 from rps_jax.runs.question import Pushes
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules

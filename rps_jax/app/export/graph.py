@@ -13,8 +13,8 @@ import numpy as np
 from jax.extend.core import jaxpr_as_fun
 
 from rps_jax import __version__
-from rps_jax.engines.native import walk
 from rps_jax.app.export.program import Program
+from rps_jax.engines.native import walk
 from rps_jax.engines.native.walk import PAIRED, kind_of, unsupported
 from rps_jax.errors import InputError
 

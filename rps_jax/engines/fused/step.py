@@ -177,7 +177,8 @@ def drive(
     elsewhere, and where it is differentiated, XLA compiles it.
     """
     driven = partial(_driven, physics=physics, force=force)
-    return native.mapped(driven, driven)(body, motion, twist, robot)
+    run = native.mapped(driven, driven) if motion.qpos.ndim == 2 else driven
+    return run(body, motion, twist, robot)
 
 
 def _driven(

@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from rps_jax.engines import device
 from rps_jax.engines.native import writer
@@ -57,7 +58,7 @@ def _macros(compiler: str) -> str | None:
 
 
 def target() -> str | None:
-    """What says for which compiler and processor functions are compiled here; None: they are not."""
+    """What tells compilers and processors apart that functions are compiled by and for, if any."""
     compiler = provenance.compiler() if jax.default_backend() == "cpu" else None
     return None if compiler is None else _macros(compiler)
 
@@ -74,21 +75,23 @@ def mapped(one: Callable[..., Any], whole: Callable[..., Any]) -> Callable[..., 
 
     @jax.custom_jvp
     def run(*arguments: Any) -> Any:
-        leaves = jax.tree.leaves(arguments)
-        like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), arguments)
+        leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, arguments))
+        given = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in leaves]
         token = _OF_ONE.set(True)
         try:
             with vectors.reductions_in_one():
-                closed, out = jax.make_jaxpr(one, return_shape=True)(*like)
+                closed, out = jax.make_jaxpr(one, return_shape=True)(
+                    *jax.tree.unflatten(tree, given)
+                )
         finally:
             _OF_ONE.reset(token)
-        name = _made(closed, jax.tree.leaves(like), jax.tree.leaves(out))
+        results, structure = jax.tree.flatten(out)
+        name = _made(closed, given, results)
         if name is None:
             return whole(*arguments)
-        count = leaves[0].shape[0]
-        shapes = [jax.ShapeDtypeStruct((count, *x.shape), x.dtype) for x in jax.tree.leaves(out)]
+        shapes = [jax.ShapeDtypeStruct((len(leaves[0]), *x.shape), x.dtype) for x in results]
         found = jax.ffi.ffi_call(name, shapes, vmap_method="broadcast_all")(*leaves)
-        return jax.tree.unflatten(jax.tree.structure(out), found)
+        return jax.tree.unflatten(structure, found)
 
     run.defjvp(lambda primals, tangents: jax.jvp(whole, primals, tangents))
     return run
@@ -99,8 +102,8 @@ def _made(closed: Any, given: Sequence[Any], found: Sequence[Any]) -> str | None
     try:
         with jax.ensure_compile_time_eval():
             text = writer.source(closed, given, found)
-    except InputError:  # a law's operation that has no form in C
-        return None
+    except (InputError, jax.errors.TracerArrayConversionError):
+        return None  # a law has an operation without a form in C, or holds what is being traced
     key = repr((text, target(), jax.__version__))
     name = _NAME + hashlib.sha256(key.encode()).hexdigest()[:32]
     with _locks[name]:
@@ -116,12 +119,13 @@ def _made(closed: Any, given: Sequence[Any], found: Sequence[Any]) -> str | None
                 said = [*done.stderr.splitlines(), "it does not say why"]
                 warnings.warn(f"{words[0]} fails, so XLA compiles: {said[0]}", stacklevel=2)
                 return None
-            device.keep(_place(name), binary.read_bytes())
-            _register(name, binary)
+            body = binary.read_bytes()
+        device.keep(_place(name), body)
+        _register(name, body)
     return name
 
 
-def names() -> list[str]:
+def known() -> list[str]:
     """Names of all functions that XLA knows by now."""
     return list(_loaded)
 
@@ -135,11 +139,10 @@ def load(name: str) -> bool:
     """Have XLA know a function that was kept, if it is whole."""
     if name in _loaded:
         return True
-    path = _place(name)
-    if path is None or device.kept(path, "compiled") is None:
-        return False
-    _register(name, path)
-    return True
+    place = _place(name)
+    return place is not None and bool(
+        device.kept(place, "compiled", functools.partial(_register, name))
+    )
 
 
 def _place(name: str) -> Path | None:
@@ -148,7 +151,11 @@ def _place(name: str) -> Path | None:
     return Path(folder) / "native" / name if folder else None
 
 
-def _register(name: str, binary: Path) -> None:
-    library = ctypes.CDLL(str(binary))
+def _register(name: str, body: bytes) -> bool:
+    with tempfile.TemporaryDirectory() as folder:
+        binary = Path(folder) / f"{name}.so"
+        binary.write_bytes(body)
+        library = ctypes.CDLL(str(binary))
     jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(getattr(library, name)), platform="cpu")
     _loaded[name] = library
+    return True

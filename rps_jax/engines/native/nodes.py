@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,7 +47,7 @@ class Node:
     size: int
     extra: Any = None
     inner: tuple[Node, ...] = ()  # of a loop: what it computes, in any order that suits
-    free: tuple[Node, ...] = field(default=())  # of a loop: what it takes from outside
+    free: tuple[Node, ...] = ()  # of a loop: what it takes from outside
 
     @property
     def name(self) -> str:
@@ -105,6 +105,7 @@ class Loop(NamedTuple):
 
 
 def size_of(shape: Sequence[int]) -> int:
+    """How many numbers."""
     return int(np.prod(shape, dtype=int))
 
 
@@ -208,10 +209,8 @@ class Lanes:
         """A reduction: of all numbers beside what else loops over them, else row by row."""
         shape = np.shape(value)
         if len(axes) == len(shape) and size_of(shape) > 1 and (pair, kind) in STARTS:
-            made = self.node(
-                f"fold {pair}_{kind}", [flat(value, size_of(shape))], kind, size_of(shape)
-            )
-            return Array(made, 0, 0, ())
+            size, op = size_of(shape), f"fold {pair}_{kind}"
+            return Array(self.node(op, [flat(value, size)], kind, size), 0, 0, ())
         kept = [i for i in range(len(shape)) if i not in axes]
         places = np.transpose(np.arange(size_of(shape)).reshape(shape), [*axes, *kept])
         rows = places.reshape(-1, *out.shape)
@@ -223,11 +222,10 @@ class Lanes:
     def _slice(self, value: Any, starts: Sequence[Any], sizes: Sequence[int], kind: str) -> Any:
         """A slice from a place that differs between worlds, held within the array."""
         shape = np.shape(value)
-        windows = np.lib.stride_tricks.sliding_window_view(
-            np.arange(size_of(shape)).reshape(shape), tuple(sizes)
-        )
+        numbers = np.arange(size_of(shape)).reshape(shape)
+        windows = np.lib.stride_tricks.sliding_window_view(numbers, tuple(sizes))
         place: Any = np.zeros((), np.int32)
-        like = np.zeros((), np.int32)
+        like = place
         for start, room in zip(starts, windows.shape, strict=False):
             held = like
             if room > 1:
@@ -237,9 +235,8 @@ class Lanes:
             place = self.emit("add", [place, held], {}, like)
         table = windows.reshape(-1, size_of(sizes))
         if is_constant(value):
-            value = Array(
-                self.node("move", list(np.reshape(value, -1)), kind, value.size), 0, 1, shape
-            )
+            made = self.node("move", list(np.reshape(value, -1)), kind, value.size)
+            value = Array(made, 0, 1, shape)
         if value.step != 1 or value.node.size == 1:
             return self.moved([value], windows[(0,) * len(shape)], like)
         extra = tuple(map(tuple, (table + value.first).tolist()))
@@ -291,12 +288,11 @@ class Lanes:
             if node in inside or any(one in inside for one in node.after):
                 inside.add(node)
                 inner += [node] if node.op != "carried" else []
-        free = {one for node in (*inner,) for one in node.after if one not in inside}
-        free |= {one for one in made if one not in inside}
+        free = {one for node in inner for one in node.after} | set(made)
         starts = [flat(one, size_of(np.shape(one))) for one in carry]
         loop = Node(
             next(self._count), "for" if length else "while", tuple(starts), "f", 0,
-            Loop(tuple(carried), tuple(results), goes, length), tuple(inner), tuple(free),
+            Loop(tuple(carried), tuple(results), goes, length), tuple(inner), tuple(free - inside),
         )  # fmt: skip
         found = []
         for node, one in zip(carried, carry, strict=True):
@@ -306,6 +302,7 @@ class Lanes:
 
 
 def kind_in(dtype: Any, name: str) -> str:
+    """The kind of a type that has a vector; InputError names what has none."""
     kind = kind_of(np.dtype(dtype), name, Lanes.kinds)
     if np.dtype(dtype).itemsize != (1 if kind == "b" else 4):
         raise unsupported(f"{name} of {dtype}")

@@ -87,14 +87,13 @@ class _Writer:
         return lines
 
     def _next(self, waiting: Sequence[Node], there: set[Node]) -> list[Node]:
-        """What can be made next: all that stands alone, else one loop, else what loops by itself."""
+        """What can be made next: all that stands alone, else one loop, else one of JAX's loops."""
         for wanted in ("alone", "together", "loop"):
             group: list[Node] = []
             have, size = set(there), 0
             for node in waiting:
-                kind = (
-                    "loop" if node.op in ("while", "for") else "alone" if node.alone else "together"
-                )
+                kind = "alone" if node.alone else "together"
+                kind = "loop" if isinstance(node.extra, Loop) else kind
                 if kind != wanted or (size and node.size != size):
                     continue
                 whole = there if kind == "together" else have
@@ -116,10 +115,9 @@ class _Writer:
             text = self._expression(node, mine)
             if node.op.startswith("fold"):
                 op = node.op[5:]
-                start = STARTS[op.rpartition("_")[0], node.kind]
-                before.append(f"{kind} {name} = {_all(node.kind, _literal(start, node.kind))};")
-                text = f"{op}({name}, {text})"
-                lines.append(f"  {name} = {text};")
+                start = STARTS[op[:-2], node.kind]
+                before.append(f"{kind} {name} = {_all(node.kind, start)};")
+                lines.append(f"  {name} = {op}({name}, {text});")
                 continue
             lines.append(f"  const {kind} e{node.number} = {text};")
             if node in kept:
@@ -147,16 +145,15 @@ class _Writer:
             ]
         if node.op == "take":
             place, source = node.args
-            table = self._table(np.array(node.extra))
+            row, table = self.read(place, node, set()), self._table(np.array(node.extra))
             return [
                 f"{declared};",
                 f"for (int i = 0; i < {size}; i++)",
-                f"  for (int l = 0; l < LANES; l++)",
-                f"    {name}{at}[l] = {source.node.name}[{table}[{self._read(place, node, set())}[l]"
-                f" * {size} + i]][l];",
+                "  for (int l = 0; l < LANES; l++)",
+                f"    {name}{at}[l] = {source.node.name}[{table}[{row}[l] * {size} + i]][l];",
             ]
         if node.op == "move":
-            reads = [self._read(a, node, set()) for a in node.args]
+            reads = [self.read(a, node, set()) for a in node.args]
             if size == 1:
                 return [f"const {declared} = {reads[0]};"]
             return [f"{declared};", *(f"{name}[{i}] = {x};" for i, x in enumerate(reads))]
@@ -173,7 +170,7 @@ class _Writer:
             before = [n for n in reached([loop.holds.node]) if n in node.inner]
             body += self.lines(before, node.inner, there)
             body += [
-                f"const I goes = {self._read(loop.holds, node, set())};",
+                f"const I goes = {self.read(loop.holds, node, set())};",
                 "if (!any(goes)) break;",
             ]
             there |= set(before)
@@ -184,29 +181,27 @@ class _Writer:
         for own, result in zip(loop.carried, loop.results, strict=True):
             if own.size and not (isinstance(result, Array) and result.node is own):
                 body += self._set(own, result, "", node, masked=loop.holds is not None)
-        head = (
-            f"for (int turn = 0; turn < {loop.length}; turn++) {{" if loop.length else "for (;;) {"
-        )
-        return [*lines, head, *(f"  {line}" for line in body), "}"]
+        often = f"int turn = 0; turn < {loop.length}; turn++" if loop.length else ";;"
+        return [*lines, f"for ({often}) {{", *(f"  {line}" for line in body), "}"]
 
     def _set(self, own: Node, to: Any, head: str, node: Node, masked: bool = False) -> list[str]:
         """Statements that give a carried node its numbers, in the lanes that go on."""
         each = Node(0, "set", (to,), own.kind, own.size)
-        text, at = self._read(to, each, set()), "" if own.size == 1 else "[i]"
+        text, at = self.read(to, each, set()), "" if own.size == 1 else "[i]"
         text = f"choose_{own.kind}(goes, {text}, {own.name}{at})" if masked else text
         if own.size == 1:
             return [f"{head}{own.name} = {text};"]
         declared = [f"{head}{own.name}[{own.size}];"] if head else []
         return [*declared, f"for (int i = 0; i < {own.size}; i++) {own.name}[i] = {text};"]
 
-    def _read(self, a: Any, node: Node, mine: set[Node]) -> str:
+    def read(self, a: Any, node: Node, mine: set[Node]) -> str:
         """How a node reads an operand."""
         if not isinstance(a, Array):
             array = np.asarray(a).reshape(-1)
             kind = kind_of(array.dtype, "", Lanes.kinds)
             if array.size == 1:
-                return _all(kind, _literal(array[0], kind))
-            return _all(kind, f"{self._table(array)}[i]")
+                return _all(kind, array[0])
+            return f"all_{kind}({self._table(array)}[i])"
         if a.node.width == 1:
             return a.node.name
         if a.node in mine and node.in_turn(a):
@@ -216,7 +211,7 @@ class _Writer:
         return f"{a.node.name}[i + {a.first}]" if a.first else f"{a.node.name}[i]"
 
     def _expression(self, node: Node, mine: set[Node]) -> str:
-        reads = [self._read(a, node, mine) for a in node.args]
+        reads = [self.read(a, node, mine) for a in node.args]
         return reads[0] if node.op.startswith("fold") else f"{node.op}({', '.join(reads)})"
 
     def _table(self, array: np.ndarray) -> str:
@@ -231,31 +226,24 @@ class _Writer:
         return self.tables[key].split("[")[0].split()[-1]
 
 
-def _all(kind: str, text: str) -> str:
-    return f"all_{kind}({text})"
+def _all(kind: str, value: Any) -> str:
+    """A constant in every lane."""
+    return f"all_{kind}({_literal(value, kind)})"
 
 
 def _literal(value: Any, kind: str) -> str:
     if kind == "f":
         number = float(value)
-        if math.isnan(number):
-            return "NAN"
-        return (
-            "-INFINITY"
-            if number == -math.inf
-            else "INFINITY"
-            if number == math.inf
-            else f"{number!r}f"
-        )
+        text = f"{number!r}f" if math.isfinite(number) else repr(number).replace("inf", "INFINITY")
+        return "NAN" if math.isnan(number) else text
     if kind == "b":
         return str(-int(value))
-    if kind == "u":
-        return f"{int(value)}u"
-    return str(int(value)) if value > -(2**31) else "-2147483647 - 1"
+    whole = int(value)
+    return f"{whole}u" if kind == "u" else str(whole) if whole > -(2**31) else "-2147483647 - 1"
 
 
 def source(closed: Any, shapes: Sequence[Any], outs: Sequence[Any]) -> str:
-    """C of a closed jaxpr of arguments of these shapes and types, as the handler `HANDLER` of XLA's.
+    """C of a closed jaxpr of arguments of these shapes and types: the handler `HANDLER` of XLA's.
 
     Raises:
       InputError: it has an operation that is not known here.
@@ -276,12 +264,12 @@ def source(closed: Any, shapes: Sequence[Any], outs: Sequence[Any]) -> str:
         if not size:
             continue
         end = Node(0, "end", (a,), kind, size)
-        read = writer._read(a, end, set())
+        read = writer.read(a, end, set())
         stored = _STORED[kind]
         lines += [
             f"for (int i = 0; i < {size}; i++) {{",
             f"  const {_TYPES[kind]} e = {read};",
-            f"  for (int l = 0; l < LANES && first + l < worlds; l++)",
+            "  for (int l = 0; l < LANES && first + l < worlds; l++)",
             f"    (({stored} *)found[{i}])[at[l] * {size} + i] = e[l]{' != 0' * (kind == 'b')};",
             "}",
         ]
