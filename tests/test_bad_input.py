@@ -174,7 +174,7 @@ SWEEP = {
     "--horizon 0": "horizon = 0.0 is not allowed",
     "--seed -1": "seed = -1 is not allowed",
     "--engine bullet": unlike("--engine", "bullet", *ENGINES),
-    "--device tpu": unlike("--device", "tpu", "auto", "cpu", "gpu"),
+    "--device tpu": unlike("--device", "tpu", "auto", "cpu", "gpu", "xla"),
     "--device gpu": "device = gpu is not there: install .*, or choose cpu",
     "--shard ²/2": "shard = ²/2 is not allowed: write k/n, as 3/8",
     "--shard 3": "shard = 3 is not allowed: write k/n, as 3/8",

@@ -36,6 +36,8 @@ def report(cache: Path) -> str:
         **{name: version or "not installed" for name, version in environment["packages"].items()},
         "device": f"{found['count']} x {found['kind']} ({found['platform']}), "
         f"{environment['processors']} processors",
+        "compiler": environment["compiler"]
+        or "none: XLA steps the fused engine, more slowly than a C compiler's program would",
         "commit": environment["commit"] or "not in a checkout",
         "cached in": str(cache),
         **{what: "ok" if works else f"FAILS: {mend}" for what, works, mend in checks},

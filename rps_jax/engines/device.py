@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
+import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from rps_jax.errors import InputError
+from rps_jax.record import files
 
-Device = Literal["auto", "cpu", "gpu"]
+MOST = 512 * 2**20  # bytes of a kind that are kept
+_DIGEST = hashlib.sha256().digest_size
+Device = Literal["auto", "cpu", "gpu", "xla"]
 
 
 def be_deterministic() -> None:
@@ -75,7 +81,7 @@ def kind() -> str:
 
 
 def choose(name: Device) -> None:
-    """Have JAX use this kind of device.
+    """Have JAX use this kind of device; `xla` is the processor without the C compiler.
 
     Raises:
       InputError: there is no such device.
@@ -92,12 +98,50 @@ def choose(name: Device) -> None:
             ) from error
         return
     before = jax.config.jax_platforms
-    jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[name])
+    jax.config.update("jax_platforms", "cuda" if name == "gpu" else "cpu")
     with contextlib.suppress(RuntimeError, AssertionError):  # whichever JAX raises
-        if jax.default_backend() == name:
+        if jax.default_backend() == ("cpu" if name == "xla" else name):
+            if name == "xla":
+                os.environ["RPS_COMPILER"] = "none"
             return
     jax.config.update("jax_platforms", before)
     raise InputError(
         f"device = {name} is not there: install rps_jax[cuda] on a machine with an NVIDIA GPU, or "
         "choose cpu."
     )
+
+
+def kept(path: Path, done: str, read: Callable[[bytes], Any]) -> Any:
+    """What `keep` kept, as it is read; None if it is not there, or damaged: then it is dropped."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    body = content[:-_DIGEST]
+    try:
+        if hashlib.sha256(body).digest() != content[-_DIGEST:]:
+            raise ValueError("its checksum differs")
+        found = read(body)
+    except Exception as error:  # whatever a damaged file leads to
+        warnings.warn(f"{path} is dropped, and {done} again: {error}", stacklevel=2)
+        with contextlib.suppress(OSError):
+            path.unlink()
+        return None
+    with contextlib.suppress(OSError):
+        os.utime(path)
+    return found
+
+
+def keep(path: Path | None, body: bytes) -> None:
+    """Keep bytes and drop what was not used for longest; a run needs neither."""
+    if path is None:
+        return
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        files.write_bytes(path, body + hashlib.sha256(body).digest())
+        every = sorted(path.parent.iterdir(), key=lambda one: -one.stat().st_mtime)
+        total = 0
+        for one in every:
+            total += one.stat().st_size
+            if total > MOST:
+                one.unlink()

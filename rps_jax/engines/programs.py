@@ -13,7 +13,6 @@ import ctypes
 import functools
 import hashlib
 import os
-import warnings
 from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -23,10 +22,8 @@ import jax
 from jax import export
 
 from rps_jax.control.base import Law
-from rps_jax.record import files
+from rps_jax.engines import device, native
 
-MOST = 512 * 2**20  # bytes that are kept; the entries that were not used for longest go first
-_DIGEST = hashlib.sha256().digest_size
 # Calls of kernels, which `jax.export` does not promise to other versions: the key has the versions.
 _KERNELS = [
     export.DisabledSafetyCheck.custom_call(name)
@@ -62,13 +59,15 @@ def compiled(
     def flat(*given: Any) -> list[Any]:
         return jax.tree.leaves(function(*jax.tree.unflatten(tree, given)))
 
-    kept = _kept(repr((str(tree), [(x.shape, str(x.dtype)) for x in leaves], donated, static)))
-    exported = None if kept is None else _read(kept, leaves)
+    place = _place(repr((str(tree), [(x.shape, str(x.dtype)) for x in leaves], donated, static)))
+    exported = None if place is None else _read(place, leaves)
     if exported is None:
-        lowered = export.export(jax.jit(flat, donate_argnums=donated), disabled_checks=_KERNELS)
-        exported = lowered(*leaves)
-        if kept is not None:
-            _write(kept, exported)
+        jitted = jax.jit(flat, donate_argnums=donated)
+        jitted.trace(*leaves)  # in which functions are compiled that it calls
+        safe = [*_KERNELS, *map(export.DisabledSafetyCheck.custom_call, native.known())]
+        exported = export.export(jitted, disabled_checks=safe)(*leaves)
+        with contextlib.suppress(ValueError):  # what cannot be kept
+            device.keep(place, bytes(exported.serialize()))
     program = built(jax.jit(exported.call, donate_argnums=donated).lower(*leaves))
     outcome = jax.tree.structure(result)
     return lambda *given: jax.tree.unflatten(outcome, program(*jax.tree.leaves(given)))
@@ -105,12 +104,13 @@ def _source() -> str:
     """Digest of this package's source and of the versions that make a program of it."""
     versions = [metadata.version(name) for name in ("jax", "jaxlib", "numpy")]
     told = hashlib.sha256(repr(versions).encode())
-    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+    root = Path(__file__).parents[1]
+    for path in sorted([*root.rglob("*.py"), *root.rglob("*.h")]):
         told.update(path.read_bytes())
     return told.hexdigest()
 
 
-def _kept(told: str) -> Path | None:
+def _place(told: str) -> Path | None:
     """Where a program is kept of which this says all; None if nowhere.
 
     An address in memory, or what was left out of a long array, says nothing.
@@ -118,45 +118,22 @@ def _kept(told: str) -> Path | None:
     folder = jax.config.jax_compilation_cache_dir
     if not folder or " at 0x" in told or "..." in told:
         return None
-    device = jax.devices()[0]
-    flags = [jax.config.jax_enable_x64, jax.config.jax_default_matmul_precision]
-    where = [device.platform, device.device_kind, os.environ.get("XLA_FLAGS", ""), flags]
+    found = jax.devices()[0]
+    flags = [jax.config.jax_enable_x64, jax.config.jax_default_matmul_precision, native.target()]
+    where = [found.platform, found.device_kind, os.environ.get("XLA_FLAGS", ""), flags]
     key = hashlib.sha256(repr((_source(), where, told)).encode()).hexdigest()
     return Path(folder) / "traced" / key
 
 
 def _read(path: Path, leaves: Sequence[Any]) -> export.Exported | None:
     """A program that was kept, if it is whole and of these arguments."""
-    try:
-        content = path.read_bytes()
-    except OSError:
-        return None
-    body = content[_DIGEST:]
-    try:
-        if hashlib.sha256(body).digest() != content[:_DIGEST]:
-            raise ValueError("its checksum differs")
+
+    def told(body: bytes) -> export.Exported:
         found = export.deserialize(bytearray(body))
         if [(x.shape, x.dtype) for x in found.in_avals] != [(x.shape, x.dtype) for x in leaves]:
             raise ValueError("it is of other shapes")
-    except Exception as error:  # whatever a damaged file leads to
-        warnings.warn(f"{path} is dropped, and traced again: {error}", stacklevel=2)
-        with contextlib.suppress(OSError):
-            path.unlink()
-        return None
-    with contextlib.suppress(OSError):
-        os.utime(path)
-    return found
+        if not all(map(native.load, native.needed(found.mlir_module_serialized))):
+            raise ValueError("it needs a compiled function that is not there")
+        return found
 
-
-def _write(path: Path, exported: export.Exported) -> None:
-    """Keep a program, and drop what was not used for longest; a run needs neither."""
-    with contextlib.suppress(OSError, ValueError):
-        body = bytes(exported.serialize())
-        path.parent.mkdir(parents=True, exist_ok=True)
-        files.write_bytes(path, hashlib.sha256(body).digest() + body)
-        every = sorted(path.parent.iterdir(), key=lambda one: -one.stat().st_mtime)
-        total = 0
-        for one in every:
-            total += one.stat().st_size
-            if total > MOST:
-                one.unlink()
+    return device.kept(path, "traced", told)

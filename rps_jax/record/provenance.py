@@ -4,6 +4,7 @@ import importlib.metadata
 import os
 import platform
 import shlex
+import shutil
 import subprocess
 import sys
 import time
@@ -40,8 +41,26 @@ def environment() -> dict[str, Any]:
             "count": jax.device_count(),
         },
         "x64": bool(jax.config.jax_enable_x64),
+        "compiler": _compiled_by() if device.platform == "cpu" else None,
         "packages": {name: _version(name) for name in _PACKAGES},
     }
+
+
+def compiler() -> str | None:
+    """The C compiler by which functions are compiled on a processor; None: XLA compiles them.
+
+    The environment variable RPS_COMPILER names another, or `none`.
+    """
+    named = os.environ.get("RPS_COMPILER", "cc" if os.name == "posix" else "none")
+    return None if named == "none" else shutil.which(named)
+
+
+def _compiled_by() -> str | None:
+    """The compiler as it calls itself."""
+    if (name := compiler()) is None:
+        return None
+    said = subprocess.run([name, "--version"], capture_output=True, text=True, timeout=60).stdout
+    return said.partition("\n")[0] or name
 
 
 def processors() -> int:

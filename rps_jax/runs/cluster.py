@@ -197,7 +197,7 @@ def on_cluster(address: str, device: Device) -> Callable[..., None]:
         run_on_cluster,
         address=address,
         prepare=functools.partial(_prepare, device, bool(jax.config.jax_enable_x64)),
-        gpus=device != "cpu",
+        gpus=device in ("auto", "gpu"),
     )
 
 

@@ -5,7 +5,9 @@
 is frozen, and a batch whose worlds have all ended stops.
 """
 
+import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -26,6 +28,7 @@ from rps_jax.control.observation import (
     Twist,
     displacement,
 )
+from rps_jax.engines import native
 from rps_jax.engines.base import Driven, Motion, Stage
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
@@ -349,12 +352,17 @@ def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
     return switches.select(before.done, before, switches.select(told.done | ~sane, stopped, moved))
 
 
-def control_step(stage: Stage, worlds: World, trials: Trial, loop: Loop) -> tuple[Trial, Snapshot]:
-    """One pass of the loop of a batch of worlds. One that has ended comes back as it is."""
-    told, twists, snapshots = jax.vmap(decide, (0, 0, None))(worlds, trials, loop)
+def control_step(
+    stage: Stage, worlds: World, trials: Trial, loop: Loop, mapped: Callable[..., Any] = jax.vmap
+) -> tuple[Trial, Snapshot]:
+    """One pass of the loop of a batch of worlds. One that has ended comes back as it is.
+
+    Of one world alone, where a stage drives that, `mapped` gives back what it is given.
+    """
+    told, twists, snapshots = mapped(decide, (0, 0, None))(worlds, trials, loop)
     asked = loop.law.senses == "force"
     driven = stage.drive(worlds.fields, motion(told), twists, loop.physics, pushing(worlds), asked)
-    return jax.vmap(settle)(trials, told, driven), snapshots
+    return mapped(settle)(trials, told, driven), snapshots
 
 
 def motion(trials: Trial) -> Motion:
@@ -412,6 +420,36 @@ def advance(
 
     Each batch is of a stage and a shape family of its own.
     """
+    if not all(getattr(stage, "native", False) for stage in stages):
+        return _side_by_side(stages, worlds, trials, loop, steps)
+
+    def one(stage: Stage, world: World, now: Trial, rules: Any) -> Trial:
+        def on(carry: tuple[Any, Trial]) -> tuple[Any, Trial]:
+            own = dataclasses.replace(loop, rules=rules)
+            return carry[0] + 1, control_step(stage, world, carry[1], own, lambda f, *_: f)[0]
+
+        return jax.lax.while_loop(lambda c: (c[0] < steps) & ~c[1].done, on, (0, now))[1]
+
+    def whole(stage: Stage, worlds: World, trials: Trial, rules: Any) -> Trial:
+        own = dataclasses.replace(loop, rules=jax.tree.map(lambda x: x[0], rules))
+        return _side_by_side((stage,), (worlds,), (trials,), own, steps)[0]
+
+    after = []
+    for stage, some, now in zip(stages, worlds, trials, strict=True):
+        rules = jax.tree.map(lambda x, n=now.done.size: jnp.full(n, x, float), loop.rules)
+        run = native.mapped(partial(one, stage), partial(whole, stage))
+        after.append(run(some, now, rules))
+    return tuple(after)
+
+
+def _side_by_side(
+    stages: tuple[Stage, ...],
+    worlds: tuple[World, ...],
+    trials: tuple[Trial, ...],
+    loop: Loop,
+    steps: int,
+) -> tuple[Trial, ...]:
+    """`advance` as XLA compiles it."""
 
     def some_run(carry):
         count, batches = carry

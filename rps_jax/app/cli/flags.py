@@ -19,6 +19,7 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin
 
 import tyro
 
+from rps_jax.engines.device import Device
 from rps_jax.errors import InputError
 from rps_jax.record import options
 from rps_jax.runs.push import FollowsOne
@@ -32,8 +33,9 @@ _PLAIN = (int, float, bool, str, Path, type(None))
 class Beside(NamedTuple):
     """Options of the command line alone."""
 
-    device: Literal["auto", "cpu", "gpu"] = "auto"
-    """Where the worlds are stepped; auto takes what JAX finds."""
+    device: Device = "auto"
+    """Where the worlds are stepped: auto takes what JAX finds. On a processor the fused engine is
+    compiled by the machine's C compiler if it has one, with xla by XLA alone."""
     overwrite: bool = False
     """Whether a run that the folder already holds is removed first."""
     video: bool = True

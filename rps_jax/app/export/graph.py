@@ -13,9 +13,9 @@ import numpy as np
 from jax.extend.core import jaxpr_as_fun
 
 from rps_jax import __version__
-from rps_jax.app.export import walk
 from rps_jax.app.export.program import Program
-from rps_jax.app.export.walk import PAIRED, kind_of, unsupported
+from rps_jax.engines.native import walk
+from rps_jax.engines.native.walk import PAIRED, kind_of, unsupported
 from rps_jax.errors import InputError
 
 _OPSET, _FORMAT = 18, 9  # of ONNX, and of its files
@@ -47,6 +47,8 @@ class Tensor(NamedTuple):
 
 class Graph:
     """The target of tensors."""
+
+    kinds = "fib"
 
     def __init__(self, onnx: Any) -> None:
         """Begin without nodes."""
@@ -103,6 +105,10 @@ class Graph:
 
     def repeated(self, once: Any, carry: Sequence[Any], length: int) -> None:
         """Loops are unrolled."""
+
+    def repeated_while(self, holds: Any, once: Any, carry: Sequence[Any]) -> list[Any]:
+        """It has no such loop."""
+        raise unsupported("while")
 
     def emit(self, name: str, values: Sequence[Any], params: Mapping[str, Any], out: Any) -> Tensor:
         """Apply a primitive."""

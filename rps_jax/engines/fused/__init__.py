@@ -27,6 +27,8 @@ from rps_jax.world.scene import OFF_CENTRE, Friction, Scene
 class FusedStage(NamedTuple):
     """Worlds of the fused engine share nothing."""
 
+    native = True
+
     def drive(
         self,
         fields: Body,

@@ -21,6 +21,7 @@ import numpy as np
 from jax.experimental import pallas
 from jax.experimental.pallas import triton
 
+from rps_jax.engines import native
 from rps_jax.engines.base import Driven, Motion
 from rps_jax.engines.fused.contacts import Body, Corners, Pushed, State, on_base, on_ground
 from rps_jax.engines.fused.newton import Base, accelerations, felt_by_base
@@ -172,8 +173,18 @@ def drive(
 ) -> Driven:
     """One control period of a batch of worlds (B,) at `twist` (B,), with robots (B,) if limited.
 
-    On an NVIDIA GPU it is one kernel; elsewhere, and where it is differentiated, XLA compiles it.
+    On an NVIDIA GPU it is one kernel, on a processor a function of C if there is a compiler;
+    elsewhere, and where it is differentiated, XLA compiles it.
     """
+    driven = partial(_driven, physics=physics, force=force)
+    run = native.mapped(driven, driven) if motion.qpos.ndim == 2 else driven
+    return run(body, motion, twist, robot)
+
+
+def _driven(
+    body: Body, motion: Motion, twist: Vec, robot: Robot | None, *, physics: Physics, force: bool
+) -> Driven:
+    """`drive` of a batch, or of one world."""
     state = _period(physics, spread(body), enter(body, motion, robot, force), twist, robot)
     felt = state.felt and jnp.stack(state.felt, axis=-1) / physics.substeps
     return Driven(leave(body, state, twist), force=felt)
@@ -183,6 +194,8 @@ def drive(
 def _period(
     physics: Physics, scalars: Body, state: State, twist: Vec, robot: Robot | None
 ) -> State:
+    if jax.default_backend() == "cpu":
+        return in_xla(scalars, state, twist, robot, physics=physics)
     return jax.lax.platform_dependent(
         scalars,
         state,

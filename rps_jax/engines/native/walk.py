@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -36,11 +36,18 @@ _MOVES = {
     "gather": 1,
     "scatter": 1,  # its updates, the third operand, are moved as well
 }
+# What draws by a key, and the function of its algorithm that does so.
+_OF_KEYS = {
+    **dict.fromkeys(("random_wrap", "random_unwrap")),
+    **{"random_bits": "random_bits", "random_split": "split", "random_fold_in": "fold_in"},
+}
 _SAME = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "pvary", "reduce_precision")
 
 
 class Target(Protocol):
     """What a jaxpr is written for."""
+
+    kinds: ClassVar[str]  # of numbers that it knows, as `kind_of` names them
 
     def moved(self, values: Sequence[Any], places: np.ndarray, like: Any) -> Any:
         """Take numbers of the values, laid end to end, at constant places."""
@@ -54,6 +61,15 @@ class Target(Protocol):
         self, once: Callable[[Sequence[Any]], list[Any]], carry: Sequence[Any], length: int
     ) -> list[Any] | None:
         """What `carry` is after a function of it was applied so often; None: unroll it."""
+        ...
+
+    def repeated_while(
+        self,
+        holds: Callable[[Sequence[Any]], list[Any]],
+        once: Callable[[Sequence[Any]], list[Any]],
+        carry: Sequence[Any],
+    ) -> list[Any]:
+        """What `carry` is after a function of it was applied as long as a condition held."""
         ...
 
 
@@ -104,20 +120,32 @@ def _results(eqn: Any, values: list[Any], target: Target) -> Sequence[Any]:
     if name in _SAME:
         return values
     if all(map(is_constant, values)):
+        if (several := _simply(eqn, values)) is not None:
+            return several
         found = eqn.primitive.bind(*map(jnp.asarray, values), **params)
         several = found if eqn.primitive.multiple_results else [found]
         return [
             one if jnp.issubdtype(one.dtype, jax.dtypes.prng_key) else np.asarray(one)
             for one in several
         ]
+    if name in _OF_KEYS and "u" in target.kinds:
+        return _drawn(eqn, values, target)
     for one in outs:
-        kind_of(one.dtype, name)
+        kind_of(one.dtype, name, target.kinds)
     if name == "cond":
         return _chosen(values[0], params["branches"], values[1:], target)
     if name == "scan":
         return _unrolled(values, params, target)
+    if name == "while":
+        first, second = params["cond_nconsts"], params["body_nconsts"]
+        ways = zip(("cond", "body"), (values[:first], values[first : first + second]), strict=True)
+        holds, once = (
+            functools.partial(_entered, params[f"{way}_jaxpr"], consts, target=target)
+            for way, consts in ways
+        )
+        return target.repeated_while(holds, once, values[first + second :])
     inner = params.get("call_jaxpr", params.get("jaxpr"))
-    if inner is not None and name != "while":
+    if inner is not None:
         closed = hasattr(inner, "consts")
         consts = inner.consts if closed else ()
         return _walk(inner.jaxpr if closed else inner, consts, values, target)
@@ -128,9 +156,26 @@ def _results(eqn: Any, values: list[Any], target: Target) -> Sequence[Any]:
             return _moved(eqn, values, list(which), target)
     if name == "scatter-add" and is_constant(values[1]) and params["unique_indices"]:
         return [_added(eqn, values, target)]
+    if name == "threefry2x32":  # of which the two results are told apart
+        return [target.emit(f"{name}_{i}", values, params, out) for i, out in enumerate(outs)]
     if len(outs) != 1:
         raise unsupported(name)
     return [target.emit(name, values, params, outs[0])]
+
+
+def _entered(closed: Any, consts: Sequence[Any], carry: Sequence[Any], target: Target) -> list[Any]:
+    return _walk(closed.jaxpr, closed.consts, [*consts, *carry], target)
+
+
+def _drawn(eqn: Any, values: list[Any], target: Target) -> Sequence[Any]:
+    """What is drawn by a key, of which the whole numbers are known: as its algorithm does it."""
+    name, params = eqn.primitive.name, dict(eqn.params)
+    if name in ("random_wrap", "random_unwrap"):
+        return values
+    how = getattr(eqn.invars[0].aval.dtype._impl, _OF_KEYS[name])
+    shapes = [jax.ShapeDtypeStruct(np.shape(x), x.dtype) for x in values]
+    closed = jax.make_jaxpr(functools.partial(how, **params))(*shapes)
+    return _walk(closed.jaxpr, closed.consts, values, target)
 
 
 def _moved(eqn: Any, values: list[Any], which: list[int], target: Target) -> list[Any]:
@@ -140,13 +185,40 @@ def _moved(eqn: Any, values: list[Any], which: list[int], target: Target) -> lis
         size = int(np.prod(np.shape(values[i])))
         places[i] = np.arange(start, start + size).reshape(np.shape(values[i]))
         start += size
-    found = eqn.primitive.bind(*map(jnp.asarray, places), **eqn.params)
-    several = found if eqn.primitive.multiple_results else [found]
+    several = _simply(eqn, places)
+    if several is None:
+        found = eqn.primitive.bind(*map(jnp.asarray, places), **eqn.params)
+        several = found if eqn.primitive.multiple_results else [found]
     sources = [values[i] for i in which]
     return [
         target.moved(sources, np.asarray(one), out.aval)
         for one, out in zip(several, eqn.outvars, strict=True)
     ]
+
+
+def _simply(eqn: Any, places: list[Any]) -> list[Any] | None:
+    """Move places or constants by NumPy, if it knows how: JAX would compile each move."""
+    name, params, out = eqn.primitive.name, eqn.params, eqn.outvars[0].aval.shape
+    if name == "broadcast_in_dim":
+        sizes = iter(np.shape(places[0]))
+        kept = [next(sizes) if i in params["broadcast_dimensions"] else 1 for i in range(len(out))]
+        return [np.broadcast_to(np.reshape(places[0], kept), out)]
+    if name in ("reshape", "squeeze", "expand_dims"):
+        return [np.reshape(places[0], out)]
+    if name == "convert_element_type":
+        return [np.asarray(places[0]).astype(params["new_dtype"])]
+    if name == "slice":
+        limits = zip(params["start_indices"], params["limit_indices"], strict=True)
+        steps = params["strides"] or (1,) * len(out)
+        return [places[0][tuple(slice(*ab, c) for ab, c in zip(limits, steps, strict=True))]]
+    if name in ("concatenate", "stack"):
+        axis = params.get("dimension", params.get("axis"))
+        return [getattr(np, name)(places, axis)]
+    if name == "transpose":
+        return [np.transpose(places[0], params["permutation"])]
+    if name == "split":
+        return np.split(places[0], np.cumsum(params["sizes"])[:-1], params["axis"])
+    return None
 
 
 def _added(eqn: Any, values: list[Any], target: Target) -> Any:
@@ -211,14 +283,14 @@ def _array(value: Any) -> Any:
     return np.asarray(value) if isinstance(value, np.generic) else value
 
 
-def kind_of(dtype: Any, name: str = "") -> str:
-    """`f`, `i` or `b`: a real number, a whole one, or a bool.
+def kind_of(dtype: Any, name: str = "", kinds: str = "fib") -> str:
+    """`f`, `i`, `b` or `u`: a real number, a whole one, a bool, or one without a sign.
 
     Raises:
-      InputError: it is none of these.
+      InputError: it is none of `kinds`.
     """
     kind = np.dtype(dtype).kind if isinstance(dtype, np.dtype) else "?"
-    if kind not in "fib":
+    if kind not in kinds:
         raise unsupported(f"{name} of {dtype}".strip())
     return kind
 

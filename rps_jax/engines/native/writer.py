@@ -1,0 +1,286 @@
+"""Writes the nodes of a function of one world as C, which XLA calls with a batch of worlds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from rps_jax.engines.native.nodes import (
+    HEADER,
+    STARTS,
+    Array,
+    Lanes,
+    Loop,
+    Node,
+    flat,
+    kind_in,
+    reached,
+    size_of,
+)
+from rps_jax.engines.native.walk import kind_of, walk
+
+HANDLER = "rps_lanes"  # what its name is replaced by is known to XLA
+_TYPES = {"f": "V", "i": "I", "u": "U", "b": "I"}  # of a vector
+_STORED = {"f": "float", "i": "int", "u": "unsigned", "b": "unsigned char"}  # of a world's number
+# Placeholders in capitals are lines that are written for a function.
+_BODY = """\
+
+{TABLES}
+static void some(void **given, void **found, int64_t first, int64_t worlds) {{
+  int64_t at[LANES];
+  for (int l = 0; l < LANES; l++) at[l] = first + l < worlds ? first + l : worlds - 1;
+{LINES}
+}}
+
+XLA_FFI_Error *{NAME}(XLA_FFI_CallFrame *frame) {{
+  XLA_FFI_Extension_Base *asks = frame->extension_start;
+  if (asks && asks->type == XLA_FFI_Extension_Metadata) {{
+    XLA_FFI_Metadata *metadata = ((XLA_FFI_Metadata_Extension *)asks)->metadata;
+    metadata->api_version.major_version = XLA_FFI_API_MAJOR;
+    metadata->api_version.minor_version = XLA_FFI_API_MINOR;
+    return 0;
+  }}
+  void *given[{COUNT}], *found[{FOUND}];
+  for (int i = 0; i < {COUNT}; i++) given[i] = ((XLA_FFI_Buffer *)frame->args.args[i])->data;
+  for (int i = 0; i < {FOUND}; i++) found[i] = ((XLA_FFI_Buffer *)frame->rets.rets[i])->data;
+  XLA_FFI_Buffer *one = frame->args.args[{ONE}];
+  int64_t worlds = 1;
+  for (int i = 0; i < one->rank; i++) worlds *= one->dims[i];
+  worlds /= {SIZE};
+  for (int64_t first = 0; first < worlds; first += LANES) some(given, found, first, worlds);
+  return 0;
+}}
+"""
+
+
+class _Writer:
+    """Statements of nodes, in an order in which few loops are needed."""
+
+    def __init__(self) -> None:
+        self.tables: dict[bytes, str] = {}
+
+    def lines(self, nodes: Iterable[Node], wanted: Iterable[Node], there: set[Node]) -> list[str]:
+        """Statements that make nodes, where some are there; `wanted` are used afterwards."""
+        waiting, there, groups = list(nodes), set(there), []
+        while waiting:
+            group = self._next(waiting, there)
+            there |= set(group)
+            waiting = [node for node in waiting if node not in there]
+            groups.append(group)
+        lines, wanted = [], set(wanted)
+        users: dict[Node, set[int]] = {}
+        for i, group in enumerate(groups):
+            for node in group:
+                for one in node.after:
+                    users.setdefault(one, set()).add(i)
+        for i, group in enumerate(groups):
+            if group[0].alone:
+                for node in group:
+                    lines += self._alone(node)
+                continue
+            kept = [n for n in group if n in wanted or users.get(n, set()) - {i}
+                    or any(n in other.entire for other in group)]  # fmt: skip
+            lines += self._together(group, set(kept))
+        return lines
+
+    def _next(self, waiting: Sequence[Node], there: set[Node]) -> list[Node]:
+        """What can be made next: all that stands alone, else one loop, else one of JAX's loops."""
+        for wanted in ("alone", "together", "loop"):
+            group: list[Node] = []
+            have, size = set(there), 0
+            for node in waiting:
+                kind = "alone" if node.alone else "together"
+                kind = "loop" if isinstance(node.extra, Loop) else kind
+                if kind != wanted or (size and node.size != size):
+                    continue
+                whole = there if kind == "together" else have
+                if node.entire <= whole and set(node.after) <= have:
+                    size = node.size if kind == "together" else 0
+                    group.append(node)
+                    have.add(node)
+                    if kind == "loop":
+                        break
+            if group:
+                return group
+        raise AssertionError("nodes wait for one another")
+
+    def _together(self, group: Sequence[Node], kept: set[Node]) -> list[str]:
+        """One loop over the numbers of nodes."""
+        before, lines, mine = [], [], set(group)
+        for node in group:
+            kind, name = _TYPES[node.kind], node.name
+            text = self._expression(node, mine)
+            if node.op.startswith("fold"):
+                op = node.op[5:]
+                start = STARTS[op[:-2], node.kind]
+                before.append(f"{kind} {name} = {_all(node.kind, start)};")
+                lines.append(f"  {name} = {op}({name}, {text});")
+                continue
+            lines.append(f"  const {kind} e{node.number} = {text};")
+            if node in kept:
+                before.append(f"{kind} {name}[{node.size}];")
+                lines.append(f"  {name}[i] = e{node.number};")
+        return [*before, f"for (int i = 0; i < {group[0].size}; i++) {{", *lines, "}"]
+
+    def _alone(self, node: Node) -> list[str]:
+        kind, name, size = _TYPES[node.kind], node.name, node.size
+        if isinstance(node.extra, Loop):
+            return self._loop(node, node.extra)
+        if node.op == "part":
+            if size == 1:
+                return [f"const {kind} {name} = {node.extra.name};"]
+            return [f"const {kind} *const {name} = {node.extra.name};"]
+        declared = f"{kind} {name}" + ("" if size == 1 else f"[{size}]")
+        at = "" if size == 1 else "[i]"
+        if node.op == "given":
+            stored = f"((const {_STORED[node.kind]} *)given[{node.extra}])[at[l] * {size} + i]"
+            stored = f"-(int){stored}" if node.kind == "b" else stored
+            return [
+                f"{declared};",
+                f"for (int i = 0; i < {size}; i++)",
+                f"  for (int l = 0; l < LANES; l++) {name}{at}[l] = {stored};",
+            ]
+        if node.op == "take":
+            place, source = node.args
+            row, table = self.read(place, node, set()), self._table(np.array(node.extra))
+            return [
+                f"{declared};",
+                f"for (int i = 0; i < {size}; i++)",
+                "  for (int l = 0; l < LANES; l++)",
+                f"    {name}{at}[l] = {source.node.name}[{table}[{row}[l] * {size} + i]][l];",
+            ]
+        if node.op == "move":
+            reads = [self.read(a, node, set()) for a in node.args]
+            if size == 1:
+                return [f"const {declared} = {reads[0]};"]
+            return [f"{declared};", *(f"{name}[{i}] = {x};" for i, x in enumerate(reads))]
+        return [f"const {declared} = {self._expression(node, set())};"]
+
+    def _loop(self, node: Node, loop: Loop) -> list[str]:
+        lines, body = [], []
+        for own, start in zip(loop.carried, node.args, strict=True):
+            if own.size:
+                lines += self._set(own, start, f"{_TYPES[own.kind]} ", node)
+        results = [a.node for a in (*loop.results, loop.holds) if isinstance(a, Array)]
+        there = {*node.free, *loop.carried, *(n for n in results if n not in node.inner)}
+        if loop.holds is not None:
+            before = [n for n in reached([loop.holds.node]) if n in node.inner]
+            body += self.lines(before, node.inner, there)
+            body += [
+                f"const I goes = {self.read(loop.holds, node, set())};",
+                "if (!any(goes)) break;",
+            ]
+            there |= set(before)
+            rest = [n for n in node.inner if n not in set(before)]
+        else:
+            rest = list(node.inner)
+        body += self.lines(rest, results, there)
+        for own, result in zip(loop.carried, loop.results, strict=True):
+            if own.size and not (isinstance(result, Array) and result.node is own):
+                body += self._set(own, result, "", node, masked=loop.holds is not None)
+        often = f"int turn = 0; turn < {loop.length}; turn++" if loop.length else ";;"
+        return [*lines, f"for ({often}) {{", *(f"  {line}" for line in body), "}"]
+
+    def _set(self, own: Node, to: Any, head: str, node: Node, masked: bool = False) -> list[str]:
+        """Statements that give a carried node its numbers, in the lanes that go on."""
+        each = Node(0, "set", (to,), own.kind, own.size)
+        text, at = self.read(to, each, set()), "" if own.size == 1 else "[i]"
+        text = f"choose_{own.kind}(goes, {text}, {own.name}{at})" if masked else text
+        if own.size == 1:
+            return [f"{head}{own.name} = {text};"]
+        declared = [f"{head}{own.name}[{own.size}];"] if head else []
+        return [*declared, f"for (int i = 0; i < {own.size}; i++) {own.name}[i] = {text};"]
+
+    def read(self, a: Any, node: Node, mine: set[Node]) -> str:
+        """How a node reads an operand."""
+        if not isinstance(a, Array):
+            array = np.asarray(a).reshape(-1)
+            kind = kind_of(array.dtype, "", Lanes.kinds)
+            if array.size == 1:
+                return _all(kind, array[0])
+            return f"all_{kind}({self._table(array)}[i])"
+        if a.node.width == 1:
+            return a.node.name
+        if a.node in mine and node.in_turn(a):
+            return f"e{a.node.number}"
+        if not a.step or node.size == 1 or node.op in ("move", "take"):
+            return f"{a.node.name}[{a.first}]"
+        return f"{a.node.name}[i + {a.first}]" if a.first else f"{a.node.name}[i]"
+
+    def _expression(self, node: Node, mine: set[Node]) -> str:
+        reads = [self.read(a, node, mine) for a in node.args]
+        return reads[0] if node.op.startswith("fold") else f"{node.op}({', '.join(reads)})"
+
+    def _table(self, array: np.ndarray) -> str:
+        """The name of constants that stand before the function."""
+        key = array.tobytes() + array.dtype.str.encode()
+        kind = kind_of(array.dtype, "", Lanes.kinds)
+        if key not in self.tables:
+            texts = ", ".join(_literal(x, kind) for x in array.reshape(-1))
+            stored = "int" if kind == "b" else _STORED[kind]
+            name = f"t{len(self.tables)}"
+            self.tables[key] = f"static const {stored} {name}[{array.size}] = {{{texts}}};"
+        return self.tables[key].split("[")[0].split()[-1]
+
+
+def _all(kind: str, value: Any) -> str:
+    """A constant in every lane."""
+    return f"all_{kind}({_literal(value, kind)})"
+
+
+def _literal(value: Any, kind: str) -> str:
+    if kind == "f":
+        number = float(value)
+        text = f"{number!r}f" if math.isfinite(number) else repr(number).replace("inf", "INFINITY")
+        return "NAN" if math.isnan(number) else text
+    if kind == "b":
+        return str(-int(value))
+    whole = int(value)
+    return f"{whole}u" if kind == "u" else str(whole) if whole > -(2**31) else "-2147483647 - 1"
+
+
+def source(closed: Any, shapes: Sequence[Any], outs: Sequence[Any]) -> str:
+    """C of a closed jaxpr of arguments of these shapes and types: the handler `HANDLER` of XLA's.
+
+    Raises:
+      InputError: it has an operation that is not known here.
+    """
+    target, writer = Lanes(), _Writer()
+    given = [
+        target.given(i, x.shape, x.dtype) if size_of(x.shape) else np.zeros(x.shape, x.dtype)
+        for i, x in enumerate(shapes)
+    ]
+    found = [
+        flat(one, size_of(like.shape))
+        for one, like in zip(walk(closed, given, target), outs, strict=True)
+    ]
+    ends = [a.node for a in found if isinstance(a, Array)]
+    lines = writer.lines(reached(ends), ends, set())
+    for i, (a, like) in enumerate(zip(found, outs, strict=True)):
+        size, kind = size_of(like.shape), kind_in(like.dtype, "a result")
+        if not size:
+            continue
+        end = Node(0, "end", (a,), kind, size)
+        read = writer.read(a, end, set())
+        stored = _STORED[kind]
+        lines += [
+            f"for (int i = 0; i < {size}; i++) {{",
+            f"  const {_TYPES[kind]} e = {read};",
+            "  for (int l = 0; l < LANES && first + l < worlds; l++)",
+            f"    (({stored} *)found[{i}])[at[l] * {size} + i] = e[l]{' != 0' * (kind == 'b')};",
+            "}",
+        ]
+    one = next(i for i, x in enumerate(shapes) if size_of(x.shape))
+    fill = {
+        "TABLES": "\n".join(writer.tables.values()),
+        "LINES": "\n".join(f"  {line}" for line in lines),
+        "NAME": HANDLER,
+        "COUNT": len(shapes),
+        "FOUND": len(outs),
+        "ONE": one,
+        "SIZE": size_of(shapes[one].shape),
+    }
+    return HEADER + _BODY.format(**fill)

@@ -1,0 +1,185 @@
+"""What the C compiler makes of a function of one world is what XLA makes of it."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rps_jax import engines
+from rps_jax.control import registry
+from rps_jax.engines import native
+from rps_jax.trials import trial
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Loop
+from rps_jax.trials.worlds import drawn_worlds
+from rps_jax.world import draws
+from rps_jax.world.domain import DOMAINS
+
+pytestmark = pytest.mark.skipif(native.target() is None, reason="there is no C compiler")
+SETTING = Setting()
+
+
+@pytest.fixture
+def cache(tmp_path):
+    """A cache of its own, and nothing that was compiled before."""
+    before, loaded = jax.config.jax_compilation_cache_dir, dict(native._loaded)
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    native._loaded.clear()
+    yield tmp_path / "native"
+    native._loaded.update(loaded)
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+def batch(shape, skin="capacitive", count=21, law="rps_tuned"):
+    """Stage, worlds and loop of random objects, each at another place before the robot."""
+    _, params = registry.read_law(law)
+    domain = replace(DOMAINS["wide"], objects=(f"random_{shape}",), skin=skin)
+    part = drawn_worlds(domain, draws.draw(domain, 3, np.arange(count)), params, SETTING)
+    worlds = jax.tree.map(jnp.asarray, part.worlds)
+    return part.stage, worlds, Loop(SETTING.physics, SETTING.rules, registry.law_of(params))
+
+
+def advanced(stage, worlds, trials, loop, steps):
+    """Trials after some control steps."""
+    run = jax.jit(lambda w, t: trial.advance((stage,), (w,), (t,), loop, steps)[0])
+    return jax.device_get(run(worlds, trials))
+
+
+def begun(worlds, loop):
+    return trial.start_all(worlds, jnp.ones(len(worlds.qpos), bool), loop.law)
+
+
+def same(one, other):
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("skin", ["capacitive", "ideal"])
+@pytest.mark.parametrize("shape", ["box", "cylinder", "prism"])
+def test_a_control_step_ends_where_xla_ends_it(shape, skin, monkeypatch):
+    """Of worlds in the middle of a push, after 8 s."""
+    stage, worlds, loop = batch(shape, skin)
+    pushing = advanced(stage, worlds, begun(worlds, loop), loop, 400)
+    assert np.mean(pushing.contact_steps > 0) > 0.5
+    found = advanced(stage, worlds, pushing, loop, 1)
+    monkeypatch.setenv("RPS_COMPILER", "none")
+    expected = advanced(stage, worlds, pushing, loop, 1)
+    warm = found.warmstart, expected.warmstart  # [m/s^2] which the solver leaves to 1e-4
+    np.testing.assert_allclose(*warm, atol=2e-3)
+    for a, b in zip(*(jax.tree.leaves(x._replace(warmstart=0)) for x in (found, expected)),
+                    strict=True):  # fmt: skip
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-5)
+
+
+@pytest.mark.parametrize("shape", ["box", "cylinder", "prism"])
+def test_the_bits_of_a_world_depend_on_no_other_world(shape):
+    stage, worlds, loop = batch(shape)
+    together = advanced(stage, worlds, begun(worlds, loop), loop, 300)
+    for order in (np.arange(20, -1, -1), np.array([17]), np.array([5, 17, 5])):
+        some = jax.tree.map(lambda x, order=order: x[order], worlds)
+        found = advanced(stage, some, begun(some, loop), loop, 300)
+        same(found, jax.tree.map(lambda x, order=order: x[order], together))
+
+
+def test_a_drive_is_compiled_and_its_derivative_is_xlas(monkeypatch):
+    stage, worlds, loop = batch("box", count=3)
+    start = trial.motion(begun(worlds, loop))
+    still = jnp.zeros(3)
+
+    def moved(speed):
+        twist = trial.Twist(speed, still, still)
+        return stage.drive(worlds.fields, start, twist, loop.physics).motion.qpos[:, 0]
+
+    def slope():
+        return jax.jit(lambda x: jax.jvp(moved, (x,), (jnp.ones(3),)))(still + 0.05)
+
+    assert "rps_lanes" in jax.jit(moved).lower(still).as_text()
+    found = slope()
+    monkeypatch.setenv("RPS_COMPILER", "none")
+    assert "rps_lanes" not in jax.jit(moved).lower(still).as_text()
+    same(found, slope())
+
+
+def test_a_compiler_that_fails_is_told_once_and_xla_steps(monkeypatch, tmp_path, cache):
+    stage, worlds, loop = batch("box", count=2)
+    monkeypatch.setenv("RPS_COMPILER", "none")
+    expected = advanced(stage, worlds, begun(worlds, loop), loop, 3)
+    broken = tmp_path / "broken"
+    broken.write_text('#!/bin/sh\ncase "$*" in *-dM*) exit 0;; esac\necho it is broken >&2\nexit 1\n')
+    broken.chmod(0o755)
+    monkeypatch.setenv("RPS_COMPILER", str(broken))
+    with pytest.warns(UserWarning, match="fails, so XLA compiles: it is broken") as told:
+        found = advanced(stage, worlds, begun(worlds, loop), loop, 3)
+    assert len({str(one.message) for one in told}) == 1
+    same(found, expected)
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "empty"])
+def test_a_damaged_function_is_dropped_with_one_line(damage, cache):
+    x = jnp.arange(5.0)
+
+    def made():
+        return np.asarray(jax.jit(native.mapped(lambda x: 2 * x + 1, None))(x)).tolist()
+
+    assert made() == [1.0, 3.0, 5.0, 7.0, 9.0]
+    (kept,) = cache.iterdir()
+    content = kept.read_bytes()
+    changed = {"cut": content[:100], "empty": b"", "flipped": content[:-1] + b"?"}
+    kept.write_bytes(changed[damage])
+    native._loaded.clear()
+    with pytest.warns(UserWarning, match="is dropped, and compiled again: its checksum") as told:
+        assert made() == [1.0, 3.0, 5.0, 7.0, 9.0]
+    assert len(told) == 1
+    native._loaded.clear()
+    assert made() == [1.0, 3.0, 5.0, 7.0, 9.0]
+    assert kept.read_bytes() == content
+
+
+def halvings(x):
+    """How often x can be halved until it is below one: each world goes on for another time."""
+    return jax.lax.while_loop(lambda c: c[1] >= 1, lambda c: (c[0] + 1, c[1] / 2), (0, x))
+
+
+def drawn(x):
+    key = jax.random.fold_in(jax.random.key(7), x.astype(jnp.uint32))
+    return jax.random.normal(key, (5,)), jax.random.bits(jax.random.split(key)[1])
+
+
+OPERATIONS = {
+    "a loop": halvings,
+    "a loop of a known length": lambda x: jax.lax.fori_loop(0, 3, lambda i, c: c * x + i, x),
+    "a swap in a loop": lambda x: jax.lax.fori_loop(0, 3, lambda _, c: (c[1], c[0]), (x, -x)),
+    "draws": drawn,
+    "a place that differs": lambda x: jax.lax.dynamic_slice(
+        jnp.arange(12.0).reshape(4, 3), (x.astype(int), 1), (2, 2)
+    ),
+    "rows": lambda x: (x * jnp.arange(6.0).reshape(2, 3)).sum(axis=0).max(),
+    "a table": lambda x: jnp.concatenate([x * jnp.array([1.0, -2.0, 3.0]), x[None]])[::-1],
+    "whole numbers": lambda x: (x.astype(int) // 3, x.astype(int) % 3, -x.astype(int) // 0),
+    "choices": lambda x: jnp.where((x > 3) & ~(x > 5), jnp.maximum(x, jnp.nan), jnp.sign(x)),
+    "functions": lambda x: (jnp.sin(x), jnp.arctan2(x, 2), jnp.exp(-x), x**3, jax.lax.rsqrt(x)),
+    "whole from real": lambda x: (jnp.inf * x).astype(jnp.int32) + jnp.round(x / 2).astype(int),
+    "inverse error function": lambda x: jax.lax.erf_inv((x - 9) * jnp.array([0.0, 0.1, 0.111111])),
+}
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_an_operation_is_what_jax_says(name):
+    x, function = jnp.arange(19.0), OPERATIONS[name]
+    run = native.mapped(function, lambda _: pytest.fail("it was not compiled"))
+    for a, b in zip(*map(jax.tree.leaves, (jax.jit(run)(x), jax.vmap(function)(x))), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_allclose(a, b, rtol=3e-6, atol=1e-6)
+
+
+def test_what_has_no_form_in_c_xla_compiles():
+    """As a law of matrices."""
+    found = native.mapped(None, None) if not native.usable() else native.mapped(
+        lambda x: jnp.ones((3, 3)) * x @ jnp.ones(3), lambda x: 3 * x)  # fmt: skip
+    assert np.asarray(found(jnp.arange(2.0))).tolist() == [0.0, 3.0]
+
+
+def test_other_engines_are_xlas():
+    assert not any(getattr(engines.get(name), "native", False) for name in ("mjx", "quasistatic"))
