@@ -125,7 +125,7 @@ def _ends(name: str, where: Path, run: Any, roundings: Sequence[int]) -> Ends:
     counts = [int(one.sum()) for one in won]
     alike = [int((won[0] == one).sum()) for one in won]
     most = float(np.quantile(apart, 0.99)) if both.any() else 0.0
-    return Ends(won[0].size, *counts[:2], min(counts[2:]), alike[1], min(alike[2:]), most)
+    return Ends(won[0].size, counts[0], counts[1], min(counts[2:]), alike[1], min(alike[2:]), most)
 
 
 def papers_trials(name: str, setting: Setting, where: Path) -> Ends:
