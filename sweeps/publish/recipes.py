@@ -239,17 +239,6 @@ RECIPES: dict[str, Recipe] = {
             "cost",
         ),
     ),
-    "engines_random": Recipe(
-        (
-            "rps sweeps/engines --objects random_box random_cylinder --worlds 240",
-            "rps sweeps/engines --objects random_prism --worlds 120",
-        ),
-        40,
-        8,
-        "Equal outcomes",
-        ("boxes and cylinders", "prisms"),
-        ("engine", "equal outcomes", "95 %", "+/-"),
-    ),
     "engines_ideal": Recipe(
         (
             f"rps sweeps/engines --domain {_IDEAL} --worlds 240 --engines 'C, reference' "
@@ -262,7 +251,8 @@ RECIPES: dict[str, Recipe] = {
     "engines_wide": Recipe(
         (
             "rps sweeps/engines --domain wide --worlds 240 --engines 'C, reference' "
-            "'C, reference, moved' 'fused, 10 ms' 'fused, 5 ms'",
+            "'C, reference, moved' 'C, standard' 'fused, standard' 'fused, 5 ms' 'fused, fast' "
+            "'MJX, standard' quasistatic",
         ),
         25,
         4,
