@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rps_jax import engines
 from rps_jax.control import registry
 from rps_jax.engines import native
 from rps_jax.trials import trial
@@ -95,10 +94,13 @@ def test_a_drive_is_compiled_and_its_derivative_is_xlas(monkeypatch):
     def slope():
         return jax.jit(lambda x: jax.jvp(moved, (x,), (jnp.ones(3),)))(still + 0.05)
 
-    assert "rps_lanes" in jax.jit(moved).lower(still).as_text()
+    def text():
+        return jax.jit(lambda x: moved(x)).lower(still).as_text()
+
+    assert "rps_lanes" in text()
     found = slope()
     monkeypatch.setenv("RPS_COMPILER", "none")
-    assert "rps_lanes" not in jax.jit(moved).lower(still).as_text()
+    assert "rps_lanes" not in text()
     same(found, slope())
 
 
@@ -107,7 +109,9 @@ def test_a_compiler_that_fails_is_told_once_and_xla_steps(monkeypatch, tmp_path,
     monkeypatch.setenv("RPS_COMPILER", "none")
     expected = advanced(stage, worlds, begun(worlds, loop), loop, 3)
     broken = tmp_path / "broken"
-    broken.write_text('#!/bin/sh\ncase "$*" in *-dM*) exit 0;; esac\necho it is broken >&2\nexit 1\n')
+    broken.write_text(
+        '#!/bin/sh\ncase "$*" in *-dM*) exit 0;; esac\necho it is broken >&2\nexit 1\n'
+    )
     broken.chmod(0o755)
     monkeypatch.setenv("RPS_COMPILER", str(broken))
     with pytest.warns(UserWarning, match="fails, so XLA compiles: it is broken") as told:
@@ -116,24 +120,27 @@ def test_a_compiler_that_fails_is_told_once_and_xla_steps(monkeypatch, tmp_path,
     same(found, expected)
 
 
-@pytest.mark.parametrize("damage", ["cut", "flipped", "empty"])
-def test_a_damaged_function_is_dropped_with_one_line(damage, cache):
+@pytest.mark.parametrize("damage", ["cut", "a bit", "empty"])
+def test_a_damaged_function_is_dropped_with_one_line(damage, cache, monkeypatch):
     x = jnp.arange(5.0)
+    expected = [2.0 * i + len(damage) for i in range(5)]
 
     def made():
-        return np.asarray(jax.jit(native.mapped(lambda x: 2 * x + 1, None))(x)).tolist()
+        return np.asarray(jax.jit(native.mapped(lambda x: 2 * x + len(damage), None))(x)).tolist()
 
-    assert made() == [1.0, 3.0, 5.0, 7.0, 9.0]
+    assert made() == expected
     (kept,) = cache.iterdir()
+    # A process knows a function once; here it stands for the next process as well.
+    monkeypatch.setattr(jax.ffi, "register_ffi_target", lambda *_, **__: None)
     content = kept.read_bytes()
-    changed = {"cut": content[:100], "empty": b"", "flipped": content[:-1] + b"?"}
+    changed = {"cut": content[:100], "empty": b"", "a bit": content[:-1] + b"?"}
     kept.write_bytes(changed[damage])
     native._loaded.clear()
     with pytest.warns(UserWarning, match="is dropped, and compiled again: its checksum") as told:
-        assert made() == [1.0, 3.0, 5.0, 7.0, 9.0]
+        assert made() == expected
     assert len(told) == 1
     native._loaded.clear()
-    assert made() == [1.0, 3.0, 5.0, 7.0, 9.0]
+    assert made() == expected
     assert kept.read_bytes() == content
 
 
@@ -143,7 +150,7 @@ def halvings(x):
 
 
 def drawn(x):
-    key = jax.random.fold_in(jax.random.key(7), x.astype(jnp.uint32))
+    key = jax.random.fold_in(jax.random.key(7), x.astype(int))
     return jax.random.normal(key, (5,)), jax.random.bits(jax.random.split(key)[1])
 
 
@@ -176,10 +183,5 @@ def test_an_operation_is_what_jax_says(name):
 
 def test_what_has_no_form_in_c_xla_compiles():
     """As a law of matrices."""
-    found = native.mapped(None, None) if not native.usable() else native.mapped(
-        lambda x: jnp.ones((3, 3)) * x @ jnp.ones(3), lambda x: 3 * x)  # fmt: skip
+    found = native.mapped(lambda x: jnp.ones((3, 3)) * x @ jnp.ones(3), lambda x: 3 * x)
     assert np.asarray(found(jnp.arange(2.0))).tolist() == [0.0, 3.0]
-
-
-def test_other_engines_are_xlas():
-    assert not any(getattr(engines.get(name), "native", False) for name in ("mjx", "quasistatic"))

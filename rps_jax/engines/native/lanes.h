@@ -122,6 +122,7 @@ FUNCTION I div_i(I a, I b) {
   I odd = (b == 0) | (b == -1), found = a / choose_i(odd, all_i(1), b);
   return choose_i(b == 0, all_i(-1), choose_i(odd, neg_i(a), found));
 }
+FUNCTION I sign_i(I x) { return (x < 0) - (x > 0); }
 FUNCTION I rem_i(I a, I b) {
   return choose_i(b == 0, a, a % choose_i((b == 0) | (b == -1), all_i(1), b));
 }
