@@ -124,6 +124,15 @@ class Condition:
             for target in grid.targets
         ]
 
+    def allowed(self, laws: Sequence[str]) -> bool:
+        """Whether the changed parameters mean something to every law."""
+        try:
+            for params in (self._changed(registry.LAWS[name]) for name in laws):
+                registry.law_of(params).check(params)
+        except InputError:
+            return False
+        return True
+
     def _changed(self, params: Params) -> Params:
         """Parameters of RPS, or of a law that has RPS within, with the changes; others as is."""
         if isinstance(params, RPSParams):

@@ -231,8 +231,10 @@ def test_what_is_huge_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
     assert "is not what it says" in said_of(path)
     path.write_bytes(magic + header + struct.pack("<BQ", 5, 2**40) + bytes(1000))
     assert "bomb.mcap" in said_of(path)
-    monkeypatch.setattr(bag, "_MOST_STEPS", 10)
-    assert "more than 10 commands" in said_of(bag.write(path, steps(12), {}))
+    monkeypatch.setattr(bag, "_MOST_NUMBERS", 2000)
+    bag.read(bag.write(path, steps(12), {}))  # 12 times 11 numbers in 6 fields
+    many = steps(12, signal=np.zeros(500))
+    assert "more than 2000 numbers" in said_of(bag.write(path, many, {}))
 
 
 def test_what_a_bag_lacks_is_named(tmp_path, capsys, monkeypatch):

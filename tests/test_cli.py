@@ -13,8 +13,9 @@ import xarray as xr
 from helpers import refusal, rps
 
 import rps_jax
-from rps_jax.app.cli import running
+from rps_jax.app.cli import flags, running
 from rps_jax.control import registry
+from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.trials.results import DIMS
 from rps_jax.tuning.evolution import TuneES
@@ -133,6 +134,18 @@ def test_a_quick_run_makes_small_only_what_was_not_asked_for():
     assert quick.population == small["population"] < TuneES().population
     assert quick.setting.engine == small["setting.engine"]
     assert TuneES().asked() == TuneES()
+
+
+def test_what_was_said_stays_in_a_quick_run_though_it_equals_its_default():
+    words = ["--quick", "--engine", "fused", "--worlds=512", "--horizon", "300.0"]
+    assert (TuneES().setting.engine, TuneES().worlds) == ("fused", 512)
+    quick = flags.parse(TuneES, "tune es", words)[0].asked()
+    assert quick.setting == TuneES().setting
+    assert (quick.worlds, quick.validation) == (512, TuneES.SMALL["validation"])
+    robot = [*words[:3], "--domain", "real,robot=ridgeback"]
+    flags.parse(TuneES, "tune es", robot)[0].asked().checked()
+    with pytest.raises(InputError, match="engine = quasistatic"):
+        flags.parse(TuneES, "tune es", [robot[0], *robot[3:]])[0].asked().checked()
 
 
 def test_files_of_the_same_name_are_told_apart_by_their_folders(tmp_path):

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import refusal, rps
+from helpers import ROOT, refusal, rps
 
 from rps_jax.app.export import c, folder, graph, js, program
 from rps_jax.control import registry
@@ -30,6 +30,7 @@ from sweeps.export.native import (
     trial_errors,
 )
 
+EXAMPLE = ROOT / "notebooks/examples/own_law.py"
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"]
 LAWS = [
     *("rps", "nps", "rps_plus", "aps", "pursuit", "dipole", "force_push", "force_push_published"),
@@ -136,14 +137,14 @@ def test_a_fault_in_c_is_found(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
-@pytest.mark.parametrize("name", ["rps_plus", "learned_mlp"])
-def test_the_folder_compiles_without_a_warning_and_runs(name, compiler, tmp_path):
+@pytest.mark.parametrize("name", ["rps_plus", "learned_mlp", f"{EXAMPLE}:PParams"])
+def test_the_folder_compiles_without_a_warning_and_runs(name, compiler, tmp_path, registries):
     made = program.program(name, "kairos")
     texts = folder.files(made, "law")
     for file, text in texts.items():
         (tmp_path / file).write_text(text)
     (tmp_path / "main.c").write_text(texts["main.c"].replace("STEPS 200000", "STEPS 3000"))
-    for options in ([], ["-DLAW_DOUBLE"], SANE):
+    for options in (["-O2"], ["-O2", "-DLAW_DOUBLE"], SANE):
         run = [str(compiled(compiler, tmp_path / "main.c", *options))]
         said = subprocess.run(run, check=True, capture_output=True, text=True).stdout
         assert re.match(r"3000 steps: median [\d.]+ us, 99.9th percentile [\d.]+ us\n", said)

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 from helpers import refusal, rps
 
 import rps_jax
@@ -13,6 +14,7 @@ from rps_jax.record import bag, files
 from rps_jax.robot.robot import Robot
 from rps_jax.tuning import fit, logs, posterior
 from rps_jax.world import domain as domains
+from sweeps.fit import bags
 
 SHELL = Robot().shell
 HEAD = "time,x,y,yaw,contact_type,contact_x,contact_y,v_x,v_y,omega,target_x,target_y"
@@ -258,3 +260,22 @@ def test_a_log_is_fitted_from_the_shell(tmp_path, capsys):
     assert rps(*ask, "--physics", "default,timestep=0.01", "--out", tmp_path / "bag") == 0
     both = [files.read_results(tmp_path / name) for name in ("run", "bag")]
     np.testing.assert_allclose(both[1]["median"], both[0]["median"], rtol=0.05, atol=1e-3)
+
+
+def test_the_table_of_bags_counts_intervals_that_hold_the_truth_and_ends_that_moved():
+    rank = [[[0.5, 0.01], [0.5, 0.5]], [[0.5, 0.5], [0.5, 0.5]]]  # (source, log, quantity)
+    low = np.zeros((2, 2, 2))
+    low[0, 1, 1] = -0.03
+    found = xr.Dataset(
+        {
+            "rank": (("source", "log", "quantity"), rank),
+            "undetermined": (("source", "log", "quantity"), np.zeros((2, 2, 2))),
+            "low": (("source", "log", "quantity"), low),
+            "high": (("source", "log", "quantity"), np.ones((2, 2, 2))),
+        },
+        {"source": ["bag", "the log itself"]},
+    )
+    found["undetermined"][:, 1] = 1
+    _, ours, theirs = bags.table(found)
+    assert ours[1:] == ["2", "3 of 4, 75.0 %", "1 of 2, 50.0 %", "3 of 4, 75.0 %", "3 of 4, 75.0 %"]
+    assert theirs[1:] == ["2", "4 of 4, 100.0 %", "2 of 2, 100.0 %", "", ""]

@@ -57,6 +57,8 @@ REFUSED = [
     ("real_pushes", "--mujoco -1", "mujoco = -1 is not allowed"),
     ("fit", "--logs 1", "logs = 1 is not allowed"),
     ("fit", "--law aps", "fit knows laws that sense touch"),
+    ("fit/bags.py", "--logs 0", "logs = 0 is not allowed"),
+    ("fit/bags.py", "--law aps", "fit knows laws that sense touch"),
     ("export", "--laws nune", "unknown law 'nune'"),
     ("export", "--tables sped", "sped"),
     ("export", "--inputs 0", "inputs = 0 is not allowed"),

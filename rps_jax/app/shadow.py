@@ -57,8 +57,7 @@ class Shadow(Question[xr.Dataset]):
     def answer(self, run: Run) -> xr.Dataset:
         """Run the law over the bag."""
         recorded = logs.read_bag(Path(self.file), robots.named(self.robot).shell)
-        params = self.params
-        twists = shadowed(registry.law_of(params), params, recorded)
+        twists = shadowed(registry.law_of(self.params), self.params, recorded)
         both = np.stack([recorded["twist"], twists])
         return xr.Dataset(
             {
@@ -75,19 +74,16 @@ class Shadow(Question[xr.Dataset]):
         for name, unit in _UNITS.items():
             apart = np.abs(found[name].sel(source="law") - found[name].sel(source="commanded"))
             worst, when = float(apart.max()), float(found.time[int(np.argmax(apart.values))])
-            mean = float(np.sqrt(np.mean(apart**2)))
-            rows.append([f"{name} [{unit}]", f"{mean:.2g}", f"{worst:.2g}", f"{when:.2f}"])
+            mean = f"{float(np.sqrt(np.mean(apart**2))):.2g}"
+            rows.append([f"{name} [{unit}]", mean, f"{worst:.2g}", f"{when:.2f}"])
         start, end = float(found.time[0]), float(found.time[-1])
         text = (
             f"{found.sizes['time']} commands in {end - start:.1f} s. The table has differences "
             f"between what {found.attrs['law']} would have commanded and what was commanded, at "
             "the same observations."
         )
-        return [
-            Section(
-                "Beside what was commanded", text, rows, Picture("shadow", lambda: figure(found))
-            )
-        ]
+        picture = Picture("shadow", lambda: figure(found))
+        return [Section("Beside what was commanded", text, rows, picture)]
 
 
 shadow = call_of(Shadow)

@@ -28,9 +28,13 @@ LawLike = str | Any  # a law's text, or parameters of its class
 LawsLike = str | Any | Sequence[Any] | Mapping[str, Any]  # one or several of them, or with names
 
 LAWS: dict[str, Params] = {}  # parameters of all laws that are offered, by name
-_INNER: dict[str, Params] = {}  # those of the package that are not offered, likewise
+_INNER: dict[str, Params] = {}  # of those that are not, whose names begin with an underscore
 _OF: dict[type, Law] = {}  # by class of parameters
 _SOURCES: dict[type, dict[str, str]] = {}  # by class of parameters: the file it was loaded from
+
+
+def _among(name: str) -> dict[str, Params]:
+    return _INNER if name.startswith("_") else LAWS
 
 
 def _find() -> None:
@@ -39,7 +43,7 @@ def _find() -> None:
         module = importlib.import_module(f"{laws.__name__}.{found.name}")
         for name, params in module.PRESETS.items():
             _OF[type(params)] = module.LAW
-            (_INNER if name.startswith("_") else LAWS)[name] = params
+            _among(name)[name] = params
     for name, path in policy.SHIPPED.items():
         _, law, params = policy.law_of(policy.decoded(path.read_bytes(), path))
         _OF[type(params)], LAWS[name] = law, params
@@ -117,7 +121,8 @@ def register_law(name: str, law: Law, params: Params) -> None:
     """Make a law of one's own known, to be used as `rps` is.
 
     Args:
-      name: what it is called; registered again, it replaces what was called so.
+      name: what it is called; registered again, it replaces what was called so. A law whose name
+        begins with an underscore is known by its parameters alone, and is offered nowhere.
       law: its two functions, and what it is.
       params: its parameters: a pytree of finite numbers (or arrays of them) of a class of its own,
         as a NamedTuple, which may be nested, with a field or property `d_success` [m].
@@ -151,15 +156,15 @@ def register_law(name: str, law: Law, params: Params) -> None:
         )
     errors.check_finite(f"d_success of law '{name}'", params.d_success, above=0, unit="m")
     law.check(params)
-    for other, theirs in LAWS.items():
+    for other, theirs in (_INNER | LAWS).items():
         if other != name and type(theirs).__name__ == kind.__name__ and law_of(theirs) != law:
             raise InputError(
                 f"params of law '{name}' are not allowed: their class {kind.__name__} is that of "
                 f"'{other}'; give them one with a name of its own."
             )
-    before = LAWS.get(name)
-    LAWS[name], _OF[kind] = params, law
-    if before is not None and type(before) not in map(type, LAWS.values()):
+    before = _among(name).get(name)
+    _among(name)[name], _OF[kind] = params, law
+    if before is not None and type(before) not in map(type, (_INNER | LAWS).values()):
         del _OF[type(before)]
 
 

@@ -34,7 +34,7 @@ from rps_jax.errors import InputError
 from rps_jax.record import files
 
 _MOST = 64 * 2**20  # bytes of a record, and of a chunk when it is unpacked
-_MOST_STEPS = 2_000_000
+_MOST_NUMBERS = 2**28  # of all steps, where a field counts 8 more, which Python adds to it
 _SHOWN = 1.0  # [s] between two markers
 _FIELDS = {
     "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
@@ -242,6 +242,7 @@ def read(path: Path) -> dict[str, np.ndarray]:
     """
     columns: dict[str, list[Any]] = {}
     latest: dict[str, Any] = {}
+    held = 0
     try:
         with open(path, "rb") as file:
             for topic, time, message in _decoded(file):
@@ -251,8 +252,9 @@ def read(path: Path) -> dict[str, np.ndarray]:
                 if topic == "/cmd_vel" and not _missing(latest):
                     for name, value in _observed(1e-9 * time, latest).items():
                         columns.setdefault(name, []).append(value)
-                    if len(columns["time"]) > _MOST_STEPS:
-                        raise ValueError(f"it has more than {_MOST_STEPS} commands")
+                        held += 8 + np.size(value)
+                    if held > _MOST_NUMBERS:
+                        raise ValueError(f"it has more than {_MOST_NUMBERS} numbers")
         if missing := _missing(latest):
             raise ValueError(f"it has no messages on {', '.join(missing)}")
         if not columns:
@@ -302,12 +304,12 @@ def _decoded(file: Any) -> Iterator[tuple[str, int, Any]]:
                 channels[record.id] = record
             elif isinstance(record, records.Message):
                 channel = channels[record.channel_id]
-                if channel.topic not in TOPICS:
+                wanted, schema = TOPICS.get(channel.topic), schemas.get(channel.schema_id)
+                kind = schema.name if schema else "no type"
+                if wanted is None:
                     continue
-                schema = schemas[channel.schema_id]
-                wanted = TOPICS[channel.topic]
-                if schema.name.replace("/msg/", "/") != wanted:
-                    raise ValueError(f"{channel.topic} has {schema.name[:60]} for {wanted}")
+                if kind.replace("/msg/", "/") != wanted:
+                    raise ValueError(f"{channel.topic} has {kind[:60]} for {wanted}")
                 decode = decoders.decoder_for(channel.message_encoding, schema)
                 if decode is None:
                     raise ValueError(f"{channel.topic} is not encoded as ROS 2 does")

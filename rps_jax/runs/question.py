@@ -106,6 +106,8 @@ class Question(Generic[T]):
     """Whether a bar shows the progress; by default in a terminal and in a notebook."""
     report_to: Report | None = option(None, kw_only=True, hidden=True)
     """What hears of the progress instead of a bar."""
+    said: tuple[str, ...] = option((), kw_only=True, hidden=True)
+    """Options that were asked for by name, which `quick` leaves alone even at their defaults."""
 
     SMALL: ClassVar[Mapping[str, Any]] = {}  # values of `quick`, by the field's name
     TITLE: ClassVar[str] = ""  # of the report
@@ -184,16 +186,14 @@ class Question(Generic[T]):
         """What is asked in the end: with `quick`, small where nothing else was asked for."""
         if not getattr(self, "quick", False):
             return self
-        small, usual = {}, type(self)
+        small: dict[str, Any] = {}
         for name, value in self.small().items():
             owner, _, inner = name.partition(".")
-            now = getattr(self, owner)
-            if inner:
-                default = getattr(_default(usual, owner), inner)
-                if getattr(now, inner) == default:
-                    small[owner] = replace(small.get(owner, now), **{inner: value})
-            elif now == _default(usual, owner):
-                small[owner] = value
+            now, usual = getattr(self, owner), _default(type(self), owner)
+            same = getattr(now, inner) == getattr(usual, inner) if inner else now == usual
+            if same and (inner or owner) not in self.said:
+                part = {inner: value}
+                small[owner] = replace(small.get(owner, now), **part) if inner else value
         return replace(self, **small)
 
     def checked(self) -> None:
@@ -246,7 +246,7 @@ class Question(Generic[T]):
         return found
 
 
-_NOT_ASKED = ("out", "bag", "slots", "workers", "quick", "progress", "report_to", "device")
+_NOT_ASKED = ("out", "bag", "slots", "workers", "quick", "progress", "report_to", "said")
 
 
 def _default(kind: type, name: str) -> Any:

@@ -36,8 +36,9 @@ def need(module: str, package: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError as error:
+        lacks = "" if error.name in (None, package) else f" ({error.name} cannot be imported)"
         raise InputError(
-            f"package {package} is missing: pip install 'rps_jax[failures]'."
+            f"package {package} is missing{lacks}: pip install 'rps_jax[failures]'."
         ) from error
 
 

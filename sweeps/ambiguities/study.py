@@ -40,7 +40,7 @@ class Ambiguities(Trials[xr.Dataset]):
     laws: tuple[str, ...] = ()
     """Names of laws; by default rps, and with --gazebo also nps and aps."""
     readings: tuple[str, ...] = ()
-    """Names of the readings; by default all."""
+    """Names of the readings; by default all that the laws allow."""
     gazebo: bool = False
     """Whether to run the ingredients of the paper's simulator instead, with all three laws."""
     curve: bool = False
@@ -64,8 +64,14 @@ class Ambiguities(Trials[xr.Dataset]):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the readings, the defaults first."""
-        names = self.readings or tuple(self.known)
+        names = self.readings or [name for name in self.known if name not in self.refused]
         return names if self.curve else tuple(dict.fromkeys([readings.DEFAULT, *names]))
+
+    @property
+    def refused(self) -> tuple[str, ...]:
+        """The readings whose parameters a law refuses; they run only if they are asked for."""
+        laws = self.grid.laws
+        return tuple(name for name, one in self.known.items() if not one.allowed(laws))
 
     @property
     def grid(self) -> Grid:
@@ -94,9 +100,11 @@ class Ambiguities(Trials[xr.Dataset]):
 
     def intro(self, found: xr.Dataset) -> str:
         """What was asked."""
+        without = [self.known[name].what for name in self.refused if name not in self.names]
+        left_out = f" Left out, since the law refuses it: {', '.join(without)}." if without else ""
         return (
             f"{self.grid.size} trials in every row, in the fused engine. Differences: McNemar's "
-            "exact test, false discoveries held at 5 %."
+            f"exact test, false discoveries held at 5 %.{left_out}"
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:

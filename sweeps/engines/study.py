@@ -124,10 +124,6 @@ class Engines(Trials[xr.DataTree]):
         """How many trials there are."""
         return sum(plan.trials for plan in self.plans.values())
 
-    def configuration(self) -> dict[str, Any]:
-        """Nothing: the plan of each engine stands in its own folder."""
-        return {"question": self.name}
-
     def answer(self, run: Run) -> xr.DataTree:
         """Run what is missing in each engine."""
         heard, found = InTurn(run.report), {}

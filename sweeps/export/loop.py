@@ -26,6 +26,8 @@ from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.scene import FRICTION
 from sweeps.export.native import TOLERANCE, Native, scale_of
 
+OFF = (1, -1, 2, -2, 4, -4, 8, -8)  # roundings of a twist, of 2^-23 each
+
 
 def recorded(cases: Sequence[Case], setting: Setting) -> list[Any]:
     """What the law of each case observed in each control step: leaves (T, ...), by trial."""
@@ -78,17 +80,18 @@ def in_the_loop(name: str, where: Path) -> Any:
     return _registered(f"{program.identifier(label)}_in_c", law, step, params)
 
 
-def nudged(name: str) -> Any:
-    """Parameters of a law of this process whose every twist is greater by one rounding."""
+def nudged(name: str, roundings: int) -> Any:
+    """Parameters of a law of this process whose every twist is greater by some roundings."""
     label, params = registry.read_law(name)
     law = registry.law_of(params)
 
     def step(own: Any, memory: Any, seen: Any) -> Any:
         memory, twist, details = law.step(own.law, memory, seen)
-        more: list[Any] = [x * np.float32(1 + 2**-23) for x in twist]
+        more: list[Any] = [x * np.float32(1 + roundings * 2**-23) for x in twist]
         return memory, Twist(*more), details
 
-    return _registered(f"{program.identifier(label)}_nudged", law, step, params)
+    off = f"{abs(roundings)}_{'down' if roundings < 0 else 'up'}"
+    return _registered(f"{program.identifier(label)}_{off}", law, step, params)
 
 
 def _registered(name: str, law: Law, step: Any, params: Any) -> Any:
@@ -100,38 +103,39 @@ def _registered(name: str, law: Law, step: Any, params: Any) -> Any:
 
 
 class Ends(NamedTuple):
-    """How trials end with a law of JAX, with that of C in the loop, and with JAX a rounding off."""
+    """How trials end with a law of JAX, with that of C in the loop, and with JAX roundings off."""
 
     trials: int
     in_jax: int  # succeed
     in_c: int
-    nudged: int
+    nudged: int  # the least of JAX with every twist off by some roundings
     alike: int  # succeed with JAX and C, or with neither
-    nudged_alike: int  # the same of JAX, and of JAX with every twist greater by one rounding
+    nudged_alike: int  # the least of JAX, and of JAX roundings off
     apart: float  # [s] 99th percentile of the difference of the times of those that both succeed in
 
 
-def _ends(name: str, where: Path, run: Any) -> Ends:
+def _ends(name: str, where: Path, run: Any, roundings: Sequence[int]) -> Ends:
     """Ends of the trials that `run` makes with a law's parameters."""
-    outcomes = [
-        run(p) for p in (registry.read_law(name)[1], in_the_loop(name, where), nudged(name))
-    ]
+    laws = [registry.read_law(name)[1], in_the_loop(name, where)]
+    outcomes = [run(p) for p in [*laws, *(nudged(name, n) for n in roundings)]]
     won = [np.asarray(one.success).astype(bool).ravel() for one in outcomes]
-    times = [np.asarray(one.time).ravel() for one in outcomes]
+    times = [np.asarray(one.time).ravel() for one in outcomes[:2]]
     both = won[0] & won[1]
     apart = np.abs(times[0] - times[1])[both]
-    in_jax, in_c, off = (int(one.sum()) for one in won)
-    alike, off_alike = (int((won[0] == one).sum()) for one in won[1:])
+    counts = [int(one.sum()) for one in won]
+    alike = [int((won[0] == one).sum()) for one in won]
     most = float(np.quantile(apart, 0.99)) if both.any() else 0.0
-    return Ends(won[0].size, in_jax, in_c, off, alike, off_alike, most)
+    return Ends(won[0].size, counts[0], counts[1], min(counts[2:]), alike[1], min(alike[2:]), most)
 
 
 def papers_trials(name: str, setting: Setting, where: Path) -> Ends:
     """How the paper's 144 trials end."""
     cases = [(o, f, t) for o in PAPER_OBJECTS for f in FRICTION for t in paper.TARGETS]
-    return _ends(
-        name, where, lambda p: pushes.run([Case(*one, law=p) for one in cases], setting)[0]
-    )
+
+    def run(params: Any) -> Any:
+        return pushes.run([Case(*one, law=params) for one in cases], setting)[0]
+
+    return _ends(name, where, run, OFF)
 
 
 def random_worlds(name: str, domain: str, worlds: int, setting: Setting, where: Path) -> Ends:
@@ -140,7 +144,7 @@ def random_worlds(name: str, domain: str, worlds: int, setting: Setting, where: 
     def run(params: Any) -> Any:
         return rps_jax.sweep({"law": params}, domain, worlds, setting=setting, progress=False)
 
-    return _ends(name, where, run)
+    return _ends(name, where, run, OFF[:1])
 
 
 class Bags(NamedTuple):
@@ -149,7 +153,8 @@ class Bags(NamedTuple):
     bags: int
     commands: int
     greatest: float  # difference of the law that is fed the bag from what it commanded, as a share
-    beyond: int  # commands that differ by more than 1e-6
+    beyond: int  # commands whose share is more than 1e-6
+    plain: float  # [m/s, rad/s] greatest difference
     strange: int  # messages that a reader which we did not write finds otherwise than they were
 
 
@@ -166,7 +171,7 @@ def bags(name: str, domain: str, worlds: int, setting: Setting, where: Path) -> 
         rps_jax.replay(run=where / "run", world=world, bag=path)
         found = shadow(path, law)
         twists = np.stack([found[one].values for one in ("v_x", "v_y", "omega")], -1)
-        errors.append((np.abs(twists[1] - twists[0]) / scale_of(law)).max(-1))
+        errors.append(np.abs(twists[1] - twists[0]))
         sent: list[tuple[float, ...]] = []
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             for connection, _, raw in reader.messages():
@@ -176,6 +181,7 @@ def bags(name: str, domain: str, worlds: int, setting: Setting, where: Path) -> 
                     sent.append((twist.linear.x, twist.linear.y, twist.angular.z))
         lost = abs(len(sent) - len(twists[0]))
         strange += lost or int((np.array(sent) != twists[0]).any(-1).sum())
-    error = np.concatenate(errors)
+    plain = np.concatenate(errors)
+    error = (plain / scale_of(law)).max(-1)
     beyond = int((error > TOLERANCE["float"]).sum())
-    return Bags(worlds, error.size, float(error.max()), beyond, strange)
+    return Bags(worlds, error.size, float(error.max()), beyond, float(plain.max()), strange)

@@ -127,24 +127,7 @@ class Coverage(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
             x = np.concatenate([x, self._again(names, run)], 1)
         found = []
         for log in range(self.logs):
-            u = posterior.sample(networks, x[log], fit.SAMPLES, log)
-            told = fit.summary(self.ranges, u)
-            truth = fit.values_of(self.ranges, held.u.values[log : log + 1])
-            names_ = list(map(str, told.quantity.values))
-            own = np.array([truth[name][0] for name in names_])
-            found.append(
-                xr.Dataset(
-                    {
-                        "truth": ("quantity", own),
-                        "rank": ("quantity", (told["sample"].values < own).mean(0)),
-                        "shrinkage": told.shrinkage, "undetermined": told.undetermined,
-                        "low": told.low, "high": told.high,
-                        "object_told": told.probability.isel(
-                            object=self.ranges.object_of(np.array(log))
-                        ).drop_vars("object"),
-                    }
-                )
-            )  # fmt: skip
+            found.append(judged(self.ranges, networks, x[log], held, log))
             run.report(Progress(self.worlds, 0.0))
         return xr.concat(found, "log").drop_vars("unit")
 
@@ -233,6 +216,25 @@ class Coverage(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
 coverage = call_of(Coverage)
 
 
+def judged(
+    ranges: domains.Domain, networks: posterior.Posterior, x: np.ndarray, held: xr.Dataset, log: int
+) -> xr.Dataset:
+    """What is fitted to statistics (N, F) of one of the worlds held, beside its truth."""
+    told = fit.summary(ranges, posterior.sample(networks, x, fit.SAMPLES, log))
+    truth = fit.values_of(ranges, held.u.values[log : log + 1])
+    own = np.array([truth[str(name)][0] for name in told.quantity.values])
+    right = told.probability.isel(object=ranges.object_of(np.array(log)))
+    return xr.Dataset(
+        {
+            "truth": ("quantity", own),
+            "rank": ("quantity", (told["sample"].values < own).mean(0)),
+            "shrinkage": told.shrinkage, "undetermined": told.undetermined,
+            "low": told.low, "high": told.high,
+            "object_told": right.drop_vars("object"),
+        }
+    )  # fmt: skip
+
+
 def tables(found: xr.Dataset) -> dict[str, list[list[str]]]:
     """Header and rows of each table of the page."""
     first = ["log", "90 % intervals hold the truth", "those of told quantities",
@@ -246,7 +248,7 @@ def tables(found: xr.Dataset) -> dict[str, list[list[str]]]:
     }
 
 
-def _holds(one: xr.Dataset) -> xr.DataArray:
+def within(one: xr.Dataset) -> xr.DataArray:
     """Whether the truth is within the 5 and 95 % quantiles."""
     return (one["rank"] >= 0.05) & (one["rank"] <= 0.95)
 
@@ -256,7 +258,7 @@ def coverage_rows(found: xr.Dataset) -> list[list[str]]:
     rows = []
     for kind in map(str, found.kind.values):
         one = found.sel(kind=kind)
-        holds, told = _holds(one), one.undetermined == 0
+        holds, told = within(one), one.undetermined == 0
         each = holds.mean("log")
         shares = (holds.mean(), holds.where(told).mean(), each.min(), each.max())
         cells = [f"{100 * float(share):.1f} %" for share in shares]
@@ -271,7 +273,7 @@ def quantity_rows(found: xr.Dataset) -> list[list[str]]:
     rows = []
     for name in map(str, found.quantity.values):
         one = found.sel(quantity=name)
-        holds, told = _holds(one).mean("log"), (one.undetermined == 0).mean("log")
+        holds, told = within(one).mean("log"), (one.undetermined == 0).mean("log")
         cells = [f"{100 * float(h):.0f} %, {100 * float(t):.0f} %"
                  for h, t in zip(holds, told, strict=True)]  # fmt: skip
         rows.append([fit.words(name), *cells])

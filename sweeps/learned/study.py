@@ -51,6 +51,7 @@ class Learned(Study[list[list[Any]]]):
     """
 
     TITLE: ClassVar[str] = "A law learned from touch"
+    LEFT_OUT: ClassVar[tuple[str, ...]] = ("device",)
 
     runs: tuple[str, ...] = option((), positional=True)
     """Run folders of `rps learn`."""

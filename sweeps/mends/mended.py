@@ -124,4 +124,4 @@ MENDS = {
     ),
 }  # fmt: skip
 
-registry.register_law("mended", Law(init, step), Mended())
+registry.register_law("_mended", Law(init, step), Mended())

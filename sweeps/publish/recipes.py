@@ -70,6 +70,7 @@ _REAL = "rps sweep --domain real --worlds 4096 --seed 11 --laws rps rps_tuned"
 _RACE = "--tuned K_h K_v L beta l_cr d_th --horizon 150 --validation 256 --seed 5"
 _DESCENT = f"rps tune grad {_RACE} --starts 2 --worlds 512 --steps 20 --learning-rate 0.2"
 _RACERS = " ".join(f"rps,runs/{name}/tuned.json" for name in ("evolution", "gradient", "hybrid"))
+_GROUNDS = ("error", "push over mu m g")
 _RIVALS = ("rps", "pursuit", "dipole", "force_push", "force_push_published")
 _SWEPT = "sweep --laws rps_tuned --domain wide"
 _GRADIENTS = "rps sweeps/gradients --worlds 32 --estimators"
@@ -200,12 +201,27 @@ RECIPES: dict[str, Recipe] = {
     ),
     "regression": Recipe(("rps regress --laws rps rps_tuned rps_plus learned_gru",), 3, 1, "Wins"),
     "readings": Recipe(("rps sweeps/ambiguities",), 15, 4, "Readings, *"),
-    "readings_plus": Recipe(("rps sweeps/ambiguities --laws rps_plus",), 15, 4, "Readings, *"),
+    "readings_plus": Recipe(
+        (
+            "rps sweeps/ambiguities --laws rps_plus",
+            "rps sweeps/ambiguities --gazebo --laws rps_plus --readings paper_gazebo pyramid thin",
+        ),
+        15,
+        4,
+        "Readings, *",
+    ),
     "gazebo": Recipe(
         ("rps sweeps/ambiguities --gazebo --readings paper_gazebo",),
         12,
         2,
         "Cells of Table II",
+    ),
+    "gazebo_parts": Recipe(
+        ("rps sweeps/ambiguities --gazebo --laws rps --readings paper_gazebo pyramid thin",),
+        8,
+        None,
+        "Readings, *",
+        folder="ambiguities",
     ),
     "fidelity": Recipe(
         ("rps sweeps/fidelity",),
@@ -225,10 +241,10 @@ RECIPES: dict[str, Recipe] = {
     ),
     "engines_random": Recipe(
         (
-            "rps sweeps/engines --objects random_box random_cylinder --worlds 600",
-            "rps sweeps/engines --objects random_prism --worlds 300",
+            "rps sweeps/engines --objects random_box random_cylinder --worlds 240",
+            "rps sweeps/engines --objects random_prism --worlds 120",
         ),
-        60,
+        40,
         8,
         "Equal outcomes",
         ("boxes and cylinders", "prisms"),
@@ -237,7 +253,7 @@ RECIPES: dict[str, Recipe] = {
     "engines_ideal": Recipe(
         (
             f"rps sweeps/engines --domain {_IDEAL} --worlds 240 --engines 'C, reference' "
-            "'fused, standard' 'fused, 5 ms' 'C, standard' 'MJX, standard'",
+            "'C, reference, moved' 'fused, standard' 'fused, 5 ms' 'C, standard' 'MJX, standard'",
         ),
         25,
         4,
@@ -252,7 +268,20 @@ RECIPES: dict[str, Recipe] = {
         4,
         "Equal outcomes",
     ),
-    "ground": Recipe(("rps sweeps/ground",), 30, None, "Grounds beside a rigid object"),
+    "ground": Recipe(
+        ("rps sweeps/ground",),
+        30,
+        None,
+        "Grounds beside a rigid object",
+        (),
+        (
+            "ground",
+            *(f"{what}, {speed} cm/s" for speed in (1, 5, 20) for what in _GROUNDS),
+            "height of the push",
+            "largest hop",
+            "aloft",
+        ),
+    ),
     "force_push_grid": Recipe(("rps sweeps/force_push_grid",), 4, None, "Pushes that succeed"),
     "mends": Recipe(
         _each("rps sweeps/mends --domain {} --worlds 4096 --seed 80", *_WIDE[::-1]),
@@ -303,15 +332,14 @@ RECIPES: dict[str, Recipe] = {
     "robot": Recipe((f"rps sweeps/speed/robot.py {_MACHINE}",), 1, None),
     "dependencies": Recipe((f"rps sweeps/publish/dependencies.py {_MACHINE}",), 15, None),
     "extras": Recipe((f"rps sweeps/publish/dependencies.py {_MACHINE}",), 15, None),
-    "fit_*": Recipe((f"rps sweeps/fit {_MACHINE}",), 40, None),
+    "fit_*": Recipe((f"rps sweeps/fit {_MACHINE}", f"rps sweeps/fit/bags.py {_MACHINE}"), 45, None),
     "export_*": Recipe(
         (
-            f"rps sweeps/export --tables inputs trials speed odd {_MACHINE}",
-            f"rps sweeps/export --tables paper --laws rps rps_tuned rps_plus learned_mlp "
-            f"{_MACHINE}",
-            f"rps sweeps/export --tables worlds --laws rps_plus --worlds 200 {_MACHINE}",
+            f"rps sweeps/export --tables speed {_MACHINE}",
+            f"rps sweeps/export --tables trials paper worlds bags odd {_MACHINE}",
+            f"rps sweeps/export --tables inputs {_MACHINE}",
         ),
-        40,
+        60,
         None,
     ),
     "sb3": Recipe((f"rps sweeps/learned/sb3.py {_MACHINE}",), 3, None),
@@ -364,7 +392,8 @@ RECIPES: dict[str, Recipe] = {
         None,
         8,
         "*, box",
-        ("fused standard", "mjx standard"),
+        (),
+        ("what", "lever", "worlds", "simulated s/s", "times"),
     ),
 }
 

@@ -52,7 +52,9 @@ def parse(kind: type[Any], name: str, words: Sequence[str]) -> tuple[Any, Beside
     asked = _read(made, f"rps {name}", words, summary)
     given = {one.name: getattr(asked, one.name) for one in dataclasses.fields(asked)}
     extra = Beside(**{key: given.pop(key) for key in beside})
-    return kind(**_gathered(kind, given)), extra
+    said = [re.sub(r"\W", "_", word[2:].split("=")[0]) for word in words if word[:2] == "--"]
+    said += ["rules"] if {*said} & {*Rules._fields} else []
+    return kind(**_gathered(kind, given), said=tuple(said)), extra
 
 
 def _read(made: type[Any], program: str, words: Sequence[str], summary: str) -> Any:

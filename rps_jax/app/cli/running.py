@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rps_jax.trials.progress import Bar
 
 _MEND = "make room, then run the same command again; what is done is kept"
-_AFTER = ("rps_jax.analysis.figures.sweeps", "h5netcdf", "scipy.special")  # of results and report
+_AFTER = ("rps_jax.analysis.figures.sweeps", "h5netcdf")  # of results and report
 _stopped: list[bool] = []  # interrupts of this command
 
 
@@ -108,6 +108,8 @@ def _told(sentence: str | InputError) -> int:
 
 def carry_out(question: Any, beside: Beside) -> None:
     """Check a question, answer it, and write and print its report."""
+    from tqdm import tqdm
+
     from rps_jax.engines import device
     from rps_jax.record import folder
     from rps_jax.runs.push import check_length
@@ -128,9 +130,11 @@ def carry_out(question: Any, beside: Beside) -> None:
         return
     if beside.overwrite:
         folder.clear(Path(asked.out))
+    tqdm.set_lock(threading.RLock())  # of this process alone: no semaphore is left if it is stopped
     with asked.bar() as bar:
         _go_on()
         # What the report needs is imported while the run goes on.
+        importlib.import_module("scipy.special")  # JAX does, too: in two threads they could meet
         later = map(importlib.import_module, _AFTER)
         threading.Thread(target=list, args=(later,), daemon=True).start()
         found = asked.answered(bar)

@@ -47,7 +47,7 @@ int main(void) {{
   {p}_skin skin;
   {p}_contact contact;
   {p}_observation seen = {{0}};
-  {p}_twist twist;
+  {p}_twist twist = {{0}};
   {p}_init(&params, &memory);
   {p}_skin_init(&skin);
   for (int k = 16; k < 20 && k < {P}_TAXELS; k++) taxels[k] = ({p}_real)0.6;
