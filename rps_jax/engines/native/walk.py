@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +47,7 @@ _SAME = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "pvary", "re
 class Target(Protocol):
     """What a jaxpr is written for."""
 
-    kinds: ClassVar[str]  # of numbers that it knows, as `kind_of` names them
+    kinds: str  # of numbers that it knows, as `kind_of` names them
 
     def moved(self, values: Sequence[Any], places: np.ndarray, like: Any) -> Any:
         """Take numbers of the values, laid end to end, at constant places."""
