@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rps_jax.engines import programs
+from rps_jax.engines import device, programs
 
 
 @pytest.fixture
@@ -81,7 +81,7 @@ def test_programs_that_were_not_used_for_longest_go_first(cache, made, monkeypat
     make, traced = made
     make(n=1)
     size = next(cache.iterdir()).stat().st_size
-    monkeypatch.setattr(programs, "MOST", int(2.5 * size))
+    monkeypatch.setattr(device, "MOST", int(2.5 * size))
     for n in (2, 3, 4):
         make(n=n)
     assert len(list(cache.iterdir())) == 2

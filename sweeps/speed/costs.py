@@ -4,11 +4,14 @@ XLA's profiler times every operation that a device carries out; the compiled pro
 line of source each operation comes from. An operation that XLA has fused from several is counted
 where its result is computed, so neighbours may be charged for one another.
 
+On a processor these are the operations of XLA, without a C compiler.
+
     rps sweeps/speed/costs.py --families box prism
 """
 
 from __future__ import annotations
 
+import os
 import re
 import tempfile
 import time
@@ -89,11 +92,16 @@ class Costs(Study[list[Profile]]):
 
     def answer(self, run: Run) -> list[Profile]:
         """Profile each program."""
-        found = []
-        for name in self.names:
-            for family in self.families:
-                found.append(measure(name, family, self.worlds, steps=self.steps))
-                run.report(Progress(len(found), 0.0))
+        found, compiler = [], os.environ.get("RPS_COMPILER")
+        os.environ["RPS_COMPILER"] = "none"  # the profiler sees the operations of XLA alone
+        try:
+            for name in self.names:
+                for family in self.families:
+                    found.append(measure(name, family, self.worlds, steps=self.steps))
+                    run.report(Progress(len(found), 0.0))
+        finally:
+            os.environ.pop("RPS_COMPILER")
+            os.environ.update({} if compiler is None else {"RPS_COMPILER": compiler})
         return found
 
     def intro(self, found: list[Profile]) -> str:

@@ -39,7 +39,7 @@ _FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-w")
 _NAME = "rps_lanes_"
 _OF_ONE: ContextVar[bool] = ContextVar("rps_jax_of_one_world", default=False)
 _loaded: dict[str, Any] = {}
-_locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
+_locks: defaultdict[str, threading.RLock] = defaultdict(threading.RLock)
 
 
 def usable() -> bool:
@@ -137,12 +137,11 @@ def needed(program: bytes) -> list[str]:
 
 def load(name: str) -> bool:
     """Have XLA know a function that was kept, if it is whole."""
-    if name in _loaded:
-        return True
-    place = _place(name)
-    return place is not None and bool(
-        device.kept(place, "compiled", functools.partial(_register, name))
-    )
+    with _locks[name]:
+        place = _place(name)
+        if name in _loaded or place is None:
+            return name in _loaded
+        return bool(device.kept(place, "compiled", functools.partial(_register, name)))
 
 
 def _place(name: str) -> Path | None:

@@ -96,6 +96,12 @@ FUNCTION I i_of_b(I x) { return -x; }
 FUNCTION I i_of_u(U x) { return (I)x; }
 FUNCTION U u_of_i(I x) { return (U)x; }
 FUNCTION U u_of_b(I x) { return (U)-x; }
+FUNCTION U u_of_f(V x) {
+  U found;
+  for (int l = 0; l < LANES; l++)
+    found[l] = !(x[l] > 0) ? 0u : x[l] < 4294967296.0f ? (uint32_t)x[l] : 4294967295u;
+  return found;
+}
 FUNCTION I b_of_f(V x) { return x != 0.0f; }
 FUNCTION I b_of_i(I x) { return x != 0; }
 FUNCTION V bits_f_of_u(U x) { return (V)x; }
@@ -118,6 +124,7 @@ FUNCTION V min_f(V a, V b) { return choose_f((a <= b) | (a != a), a, b); }
 FUNCTION I max_i(I a, I b) { return choose_i(a > b, a, b); }
 FUNCTION I min_i(I a, I b) { return choose_i(a < b, a, b); }
 FUNCTION I abs_i(I x) { return max_i(x, neg_i(x)); }
+FUNCTION I sign_i(I x) { return (x < 0) - (x > 0); }
 FUNCTION I div_i(I a, I b) {
   I odd = (b == 0) | (b == -1), found = a / choose_i(odd, all_i(1), b);
   return choose_i(b == 0, all_i(-1), choose_i(odd, neg_i(a), found));

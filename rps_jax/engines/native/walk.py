@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +47,7 @@ _SAME = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "pvary", "re
 class Target(Protocol):
     """What a jaxpr is written for."""
 
-    kinds: ClassVar[str]  # of numbers that it knows, as `kind_of` names them
+    kinds: str  # of numbers that it knows, as `kind_of` names them
 
     def moved(self, values: Sequence[Any], places: np.ndarray, like: Any) -> Any:
         """Take numbers of the values, laid end to end, at constant places."""
@@ -101,6 +101,10 @@ def is_constant(value: Any) -> bool:
     return isinstance(value, jax.Array) or (isinstance(value, np.ndarray) and value.dtype != object)
 
 
+def _is_key(value: Any) -> bool:
+    return isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
+
+
 def _walk(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any], target: Target) -> list[Any]:
     known: dict[Any, Any] = dict(zip(jaxpr.constvars, map(np.asarray, consts), strict=True))
     known |= dict(zip(jaxpr.invars, arguments, strict=True))
@@ -124,10 +128,7 @@ def _results(eqn: Any, values: list[Any], target: Target) -> Sequence[Any]:
             return several
         found = eqn.primitive.bind(*map(jnp.asarray, values), **params)
         several = found if eqn.primitive.multiple_results else [found]
-        return [
-            one if jnp.issubdtype(one.dtype, jax.dtypes.prng_key) else np.asarray(one)
-            for one in several
-        ]
+        return [one if _is_key(one) else np.asarray(one) for one in several]
     if name in _OF_KEYS and "u" in target.kinds:
         return _drawn(eqn, values, target)
     for one in outs:
@@ -172,6 +173,7 @@ def _drawn(eqn: Any, values: list[Any], target: Target) -> Sequence[Any]:
     name, params = eqn.primitive.name, dict(eqn.params)
     if name in ("random_wrap", "random_unwrap"):
         return values
+    values = [np.asarray(jax.random.key_data(x)) if _is_key(x) else x for x in values]
     how = getattr(eqn.invars[0].aval.dtype._impl, _OF_KEYS[name])
     shapes = [jax.ShapeDtypeStruct(np.shape(x), x.dtype) for x in values]
     closed = jax.make_jaxpr(functools.partial(how, **params))(*shapes)
