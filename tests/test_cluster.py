@@ -2,7 +2,6 @@
 
 import json
 import os
-import random
 import signal
 import socket
 import sys
@@ -16,7 +15,6 @@ from rps_jax.engines.device import use_cache
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.runs import cluster, sweep
-from rps_jax.runs.board import Board
 from rps_jax.trials.progress import Bar
 from rps_jax.world.domain import from_json
 
@@ -28,62 +26,15 @@ SWEEP = [
 ]
 
 
-# --- the board -----------------------------------------------------------------------------
+# --- by hand -------------------------------------------------------------------------------
 
 
-def test_every_part_comes_back_once_whoever_dies():
-    """Workers ask, deliver and die in random order; the last two live."""
-    dice = random.Random(0)
+def test_a_task_has_parts_of_one_kind_and_every_part_one_task():
     kinds = [list(range(0, 20)), list(range(20, 27))]
-    board, held, returned = Board(kinds, 3), {}, []
-    for worker in range(3):
-        board.enter(worker, {})
-        held[worker] = []
-    for turn in range(2000):
-        worker = dice.randrange(3)
-        mine = held[worker]
-        act = dice.random()
-        if act < 0.02 and turn < 1000:
-            board.enter(worker, {})
-            mine.clear()
-        elif mine and act < 0.5:
-            _, number = mine.pop(dice.randrange(len(mine)))
-            board.tell(worker, 10, 1.0)
-            board.deliver(worker, number, 10, b"")
-        elif mine:
-            number = board.next(worker, mine[0][0])
-            mine += [] if number is None else [(mine[0][0], number)]
-        elif (found := board.first(worker)) is not None:
-            mine.append(found)
-        assert len(mine) <= 9  # a third
-        assert all(number in kinds[kind] for kind, number in mine)
-        begun = [number for others in held.values() for _, number in others]
-        assert len(set(begun)) == len(begun)
-        news = board.news()
-        returned += [number for number, _ in news.parts]
-        assert news.ended == 10 * len(returned)
-    assert sorted(returned) == list(range(27))
-
-
-def test_trials_that_are_lost_with_a_worker_do_not_count():
-    board = Board([[3, 4]], 1)
-    board.enter(0, {"pid": 1})
-    assert board.first(0) == (0, 3)
-    assert board.next(0, 0) == 4
-    board.tell(0, 8, 80.0)
-    board.deliver(0, 3, 7, b"three")
-    assert board.news()[:3] == ([(3, b"three")], 8, 80.0)
-    board.enter(0, {"pid": 2})
-    assert board.news() == ([], 7, 80.0, {0: {"pid": 2}})
-    assert board.first(0) == (0, 4)
-    assert board.first(0) is None
-
-
-def test_workers_begin_with_different_kinds():
-    board = Board([[1, 2], [3, 4], [5, 6]], 3)
-    for worker in range(3):
-        board.enter(worker, {})
-    assert [board.first(worker) for worker in range(3)] == [(0, 1), (1, 3), (2, 5)]
+    tasks = list(cluster._divided(kinds, 3))
+    assert [number for task in tasks for number in task] == list(range(27))
+    assert all(set(task) <= set(kinds[0]) or set(task) <= set(kinds[1]) for task in tasks)
+    assert len(tasks) == 10 + 7  # four of each worker and kind, at most
 
 
 def test_room_for_workers_by_hand():
@@ -150,17 +101,16 @@ def opened(folder):
 
 @pytest.mark.slow
 def test_a_worker_killed_at_work_changes_nothing(domain, tmp_path, two_workers, monkeypatch):
-    """SIGKILL after some of its trials; the parts are those of one process without Ray."""
+    """SIGKILL after one of its tasks; the parts are those of one process without Ray."""
     out, plan = opened(tmp_path / "run")
     use_cache()
     plain = swept(tmp_path / "plain", plan)
-    seen, killed = set(), []
+    killed = []
 
     def killing(bar, progress):
         assert bar._total == plan.trials
         environment = json.loads((out / "environment.json").read_text())
         pids = [worker["pid"] for worker in environment.get("workers", ())]
-        seen.update(pids)
         if 0 < progress.finished < plan.trials and not killed:
             killed.append(pids[0])
             os.kill(pids[0], signal.SIGKILL)
@@ -169,7 +119,7 @@ def test_a_worker_killed_at_work_changes_nothing(domain, tmp_path, two_workers, 
     assert rps(*SWEEP, "--domain", domain, "--out", out, "--ray", "local") == 0
     assert killed
     workers = json.loads((out / "environment.json").read_text())["workers"]
-    assert killed[0] in seen - {worker["pid"] for worker in workers}  # another took its place
+    assert {worker["pid"] for worker in workers} - set(killed)  # another went on
     assert len(parts_of(plain)) == 6
     assert parts_of(out) == parts_of(plain)
     assert files.read_results(out).success.shape == (2, 20)

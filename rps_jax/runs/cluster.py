@@ -1,32 +1,27 @@
 """A sweep on several hosts, through Ray: its parts go to workers, and their files come back.
 
-A worker is a Ray task that claims one GPU, or processors where the cluster has no GPU. It asks for
-one part after the other while its slots run, so that it compiles each kind once and its slots stay
-full, and it sends the content of every part that is complete. The hosts need not share a file
-system: the process that was started by the user, alone, writes into the run folder.
+A task runs some parts of one kind on one GPU, or on processors where the cluster has no GPU, and
+returns their contents. Ray gives tasks to whichever worker is free, and begins a task again when
+its worker dies. The hosts need not share a file system: the process that was started by the user,
+alone, writes into the run folder.
 
-What holds: a part that came back is there as after `sweep.run_missing`. When a worker dies, Ray
-starts its task again, on whatever host has room, and the parts it had begun are run again. A part
-has the bits that one process gives it which sees one GPU, or processors alone, with as many
+A part has the bits that one process gives it which sees one GPU, or processors alone, with as many
 `slots`: whatever the number of workers and threads, whichever worker runs it, and with whatever
-other parts. That asks for devices of one kind; versions and commit are compared when a worker
-begins.
+other parts. That asks for devices of one kind; versions and commit are compared in every task.
 """
 
 import contextlib
 import dataclasses
 import functools
-import itertools
 import logging
+import math
 import os
 import socket
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
-
-import xarray as xr
 
 from rps_jax import engines
 from rps_jax.engines import device as devices
@@ -35,33 +30,26 @@ from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
 from rps_jax.runs import sweep
-from rps_jax.runs.board import Board
 from rps_jax.runs.sweep import Plan, Shard
 from rps_jax.trials.progress import Progress, Report, unheard
 
-POLL = 0.5  # [s] between two looks at what the workers have done
 PATIENCE = 10.0  # [s] to reach a cluster
-RETRIES = 16  # how often the task of one worker is begun again
+RETRIES = 16  # how often a task is begun again
+_TASKS = 4  # of each worker and kind, so that little is lost with a worker
 
 
 # --- a worker ------------------------------------------------------------------------------
 
 
 def _work(
-    board: Any,
-    worker: int,
     plan: Plan,
-    threads: int,
+    numbers: Sequence[int],
     same: dict[str, Any],
     prepare: Callable[[], Any],
     slots: int | None,
-) -> None:
-    """Run parts until none waits; a Ray task."""
-    import ray
-
-    def ask(what: str, *arguments: Any) -> Any:
-        return ray.get(getattr(board, what).remote(worker, *arguments))
-
+    threads: int,
+) -> tuple[dict[int, bytes], Progress, dict[str, Any]]:
+    """Run parts of one kind, as a task of Ray: their contents, progress, and the environment."""
     prepare()
     environment = provenance.environment() | {"host": socket.gethostname(), "pid": os.getpid()}
     if _same(environment) != same:
@@ -69,23 +57,16 @@ def _work(
             f"ray: host {environment['host']} has other software "
             f"({run_folder.difference(_same(environment), same)}): install the same on all hosts."
         )
-    ask("enter", environment)
-    tell, before = board.tell.remote, Progress(0, 0.0)
-
-    def keep(number: int, part: xr.Dataset) -> None:
-        ask("deliver", number, plan.parts[number].size, bytes(files.encoded(part)))
-
-    def report(progress: Progress) -> None:
-        nonlocal before
-        tell(worker, progress.finished - before.finished, progress.simulated - before.simulated)
-        before = progress
-
-    while (found := ask("first")) is not None:  # and then what the board gives of its kind
-        kind, first = found
-        numbers = itertools.chain([first], iter(functools.partial(ask, "next", kind), None))
-        before = Progress(0, 0.0)
-        own = {plan.kind(first): numbers}
-        sweep.work(plan, own, keep, report=report, slots=slots, workers=threads)
+    found, heard = dict[int, bytes](), [Progress(0, 0.0)]
+    sweep.work(
+        plan,
+        {plan.kind(numbers[0]): numbers},
+        lambda number, part: found.update({number: bytes(files.encoded(part))}),
+        report=heard.append,
+        slots=slots,
+        workers=threads,
+    )
+    return found, heard[-1], environment
 
 
 # --- the process that the user started -----------------------------------------------------
@@ -154,39 +135,64 @@ def run_on_cluster(
     """Run what is missing of a plan, as `sweep.run_missing` does, on the workers of a cluster.
 
     What came back is kept whatever error ends the run, and `environment.json` names the workers.
-    Each calls `prepare` first, to choose its device and its cache of programs. It has as many
+    Each task calls `prepare` first, to choose its device and its cache of programs. It has as many
     threads as `workers` says, by default one, and claims as many processors, and with `gpus` a GPU
     if the cluster has any and the engine can use one.
     """
-    own, known = provenance.environment(), {}
+    own, known = provenance.environment(), dict[tuple[str, int], dict[str, Any]]()
     missing, before = sweep.remaining(folder, plan, shard)
     if missing:
         provenance.sign(folder, own)
-    report(Progress(before, 0.0))
+    done = Progress(before, 0.0)
+    report(done)
     if not missing:
         return
-    waiting = list(missing.values())
-    lacking = set(itertools.chain.from_iterable(waiting))
-    claim = {
-        "num_cpus": workers or 1,
-        "num_gpus": int(gpus and engines.get(plan.setting.engine).traced),
-    }
-    given = (_same(own), prepare, slots)
-    with connected(address) as ray, _started(ray, plan, waiting, claim, given) as (board, tasks):
-        while tasks and lacking:
-            ended, tasks = ray.wait(tasks, num_returns=len(tasks), timeout=POLL)
-            news = ray.get(board.news.remote())
-            for number, content in news.parts:
-                sweep.store(folder, number, content)
-                lacking.discard(number)
-            if news.workers != known:
-                known = news.workers
-                provenance.sign(folder, own | _environment(known))
-            report(Progress(before + news.ended, news.simulated))
-            if lacking:
-                ray.get(ended)  # raises what ended a worker
-    if lacking:
-        raise InputError(f"ray = {address} lost {len(lacking)} parts: run the same command again.")
+    threads = workers or 1
+    with connected(address) as ray:
+        gpu = gpus and engines.get(plan.setting.engine).traced
+        gpu = gpu and bool(ray.cluster_resources().get("GPU"))
+        room = _room(ray.nodes(), threads, int(gpu))
+        # A process of a GPU's task would else end with it, and compile again.
+        kept = {"max_calls": 0, "max_retries": RETRIES, "scheduling_strategy": "SPREAD"}
+        task = ray.remote(num_cpus=threads, num_gpus=int(gpu), **kept)(_work)
+        bare = ray.put(dataclasses.replace(plan))  # without what it has worked out
+        given = _same(own), prepare, slots, threads
+        waiting = [task.remote(bare, some, *given) for some in _divided(missing.values(), room)]
+        with _told_in_a_sentence(ray, waiting):
+            while waiting:
+                (ended,), waiting[:] = ray.wait(waiting)
+                contents, progress, environment = ray.get(ended)
+                for number, content in contents.items():
+                    sweep.store(folder, number, content)
+                known[environment["host"], environment["pid"]] = environment
+                provenance.sign(folder, own | _environment(list(known.values())))
+                simulated = done.simulated + progress.simulated
+                done = Progress(done.finished + progress.finished, simulated)
+                report(done)
+
+
+def _divided(kinds: Iterable[Sequence[int]], workers: int) -> Iterator[Sequence[int]]:
+    """Parts of each kind in equal shares, one after the other: a task has parts of one kind."""
+    for numbers in kinds:
+        size = math.ceil(len(numbers) / (workers * _TASKS))
+        yield from (numbers[i : i + size] for i in range(0, len(numbers), size))
+
+
+@contextlib.contextmanager
+def _told_in_a_sentence(ray: ModuleType, waiting: Sequence[Any]) -> Iterator[None]:
+    """Raise what went wrong in a task as itself; no other task runs on then."""
+    try:
+        yield
+    except ray.exceptions.RayError as error:
+        cause = getattr(error, "cause", None)
+        if cause is not None and not isinstance(cause, ray.exceptions.RayError):
+            raise cause from error
+        raise InputError(
+            f"ray has failed ({_line(error)}): what came back is kept; run the same command again."
+        ) from error
+    finally:
+        for task in waiting:
+            ray.cancel(task, force=True)
 
 
 def on_cluster(address: str, device: Device) -> Callable[..., None]:
@@ -211,37 +217,6 @@ def _prepare(device: Device, x64: bool) -> None:
     devices.use_cache()
 
 
-@contextlib.contextmanager
-def _started(
-    ray: ModuleType,
-    plan: Plan,
-    waiting: Sequence[Sequence[int]],
-    claim: dict[str, int],
-    given: tuple[Any, ...],
-) -> Iterator[tuple[Any, list[Any]]]:
-    """The board, on this host, and the tasks of as many workers as the cluster has room for."""
-    if not ray.cluster_resources().get("GPU"):
-        claim = claim | {"num_gpus": 0}
-    count = min(_room(ray.nodes(), **claim), sum(map(len, waiting)))
-    here = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
-        ray.get_runtime_context().get_node_id(), soft=False
-    )
-    board = ray.remote(num_cpus=0, scheduling_strategy=here)(Board).remote(waiting, count)
-    task = ray.remote(**claim, max_retries=RETRIES, scheduling_strategy="SPREAD")(_work)
-    bare = ray.put(dataclasses.replace(plan))  # without what it has worked out
-    try:
-        yield board, [task.remote(board, i, bare, claim["num_cpus"], *given) for i in range(count)]
-    except ray.exceptions.RayError as error:
-        cause = getattr(error, "cause", None)
-        if cause is not None and not isinstance(cause, ray.exceptions.RayError):
-            raise cause from error  # what went wrong in a worker
-        raise InputError(
-            f"ray has failed ({_line(error)}): what came back is kept; run the same command again."
-        ) from error
-    finally:
-        ray.kill(board)  # workers that still run have nobody to work for
-
-
 def _room(hosts: Sequence[Mapping[str, Any]], num_cpus: int, num_gpus: int) -> int:
     """How many workers with such claims the hosts of a cluster hold."""
     count = 0
@@ -258,16 +233,15 @@ def _room(hosts: Sequence[Mapping[str, Any]], num_cpus: int, num_gpus: int) -> i
     return count
 
 
-def _environment(workers: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
+def _environment(workers: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """What `provenance.environment` says of one process, of all workers; and who they are."""
-    some = next(iter(workers.values()))
-    processors = {worker["host"]: worker["processors"] for worker in workers.values()}
+    some = workers[0]
+    processors = {worker["host"]: worker["processors"] for worker in workers}
     return {
         "processors": sum(processors.values()),
         "device": some["device"] | {"count": len(workers)},
         "workers": [
-            {name: worker[name] for name in ("host", "pid", "device")}
-            for worker in workers.values()
+            {name: worker[name] for name in ("host", "pid", "device")} for worker in workers
         ],
     }
 

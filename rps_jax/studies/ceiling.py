@@ -137,14 +137,8 @@ class Ceiling(InDomain[xr.Dataset]):
             if not open_.size:
                 break
             name = f"round-{r:04d}"
-            if run.parts is None:
-                state = self._round(state, open_, r, run)
-            elif (content := run.parts.get(name)) is None:
-                state = self._round(state, open_, r, run)
-                run.parts.put(name, files.encoded(state))
-            else:
-                source = run.parts.folder / name
-                state = files.check_like(files.decoded(content, source, own=True), start, source)
+            state = run.part(name, functools.partial(self._round, state, open_, r, run))
+            files.check_like(state, start, name if run.parts is None else run.parts.folder / name)
             heard.ended(open_.size * self.samples)
         return state
 

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from scipy import stats
 
 from rps_jax.analysis import statistics
-from rps_jax.analysis.figures.style import Figure, base_patch
+from rps_jax.analysis.figures.style import Figure, base_patch, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.record import files
@@ -178,12 +178,7 @@ def _followed(plan: Plan, law: str, worlds: np.ndarray, heard: InTurn) -> Mappin
 
 def figure_of(seen: Sequence[xr.Dataset], labels: Sequence[str], title: str) -> Figure:
     """Draw a map of each trial: the ways of base and object, and the base at ten moments."""
-    columns = min(_COLUMNS, len(seen))
-    rows = -(-len(seen) // columns)
-    figure = Figure(figsize=(0.4 + 2.3 * columns, 0.9 + 2.4 * rows), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False)
-    for ax in axes.ravel()[len(seen) :]:
-        ax.axis("off")
+    figure, axes = tiles(len(seen), _COLUMNS, (2.3, 2.4), (0.4, 0.9))
     for ax, one, label in zip(axes.ravel(), seen, labels, strict=False):
         _map(ax, one)
         ax.set_title(label, fontsize=7)

@@ -28,7 +28,6 @@ from rps_jax.world.points import Points
 _SLOTS = 64  # of a program, at least
 _KEPT = ("success", "time", "contact_lost_time", "tilt")
 _ANSWERED = ("success", "time", "left", "severity")
-_STILL = 0.002  # [rad] tilt that says nothing: half of all pushes tilt their object by more
 
 
 def need(module: str, package: str) -> ModuleType:

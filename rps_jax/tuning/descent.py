@@ -61,7 +61,6 @@ class TuneGrad(Tuning):
     worlds: int = option(64, 1, 10_000_000)
     """Number of worlds of a step, in each domain; every step has its own."""
     validation: int = option(128, 1, 10_000_000)
-    """Number of worlds for validation, in each domain."""
     estimator: Estimator = "reverse"
     """reverse differentiates windows through the quasi-static model, forward through the fused
     engine; evolution takes antithetic steps in whole trials of the setting's engine; combined

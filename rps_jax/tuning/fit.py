@@ -24,7 +24,7 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import engines
-from rps_jax.analysis.figures.style import Figure, quantity
+from rps_jax.analysis.figures.style import Figure, quantity, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.control.base import Law
@@ -458,11 +458,8 @@ def together(data: xr.Dataset) -> list[list[str]]:
 def marginals(data: xr.Dataset) -> Figure:
     """Draw each quantity's posterior (blue) over its prior's 90 % (grey)."""
     names = [str(q) for q in data.quantity.values]
-    across = 4
-    down = -(-len(names) // across)
-    drawn = Figure(figsize=(3 * across, 1.9 * down), layout="constrained")
-    axes = drawn.subplots(down, across, squeeze=False).ravel()
-    for ax, name in zip(axes, names, strict=False):
+    drawn, axes = tiles(len(names), 4, (3, 1.9), (0, 0))
+    for ax, name in zip(axes.ravel(), names, strict=False):
         one = data.sel(quantity=name)
         ax.axvspan(float(one.prior_low), float(one.prior_high), color="0.88")
         flat = bool(one.undetermined)
@@ -470,6 +467,4 @@ def marginals(data: xr.Dataset) -> Figure:
         ax.set_title(words(name) + (" (undetermined)" if flat else ""), fontsize=8)
         ax.set(yticks=[], xlabel=f"[{one.unit.values}]")
         ax.tick_params(labelsize=7)
-    for ax in axes[len(names) :]:
-        ax.set_axis_off()
     return drawn

@@ -1,6 +1,7 @@
 """What the figures have in common: colours, and parts of a panel."""
 
 import io
+from typing import Any
 
 import numpy as np
 from matplotlib import figure, patches, transforms
@@ -32,6 +33,19 @@ def words(name: str) -> str:
 def quantity(name: str) -> str:
     """A drawn quantity in words."""
     return WORDS.get(name) or words(name)
+
+
+def tiles(
+    count: int, columns: int, size: tuple[float, float], margin: tuple[float, float], **shared: Any
+) -> tuple[Figure, np.ndarray]:
+    """A figure of panels (rows, columns) of one size [in], row by row; those left over are off."""
+    columns = min(columns, count)
+    shape = np.array([columns, -(-count // columns)])
+    sheet = Figure(figsize=tuple(np.array(margin) + size * shape), layout="constrained")
+    axes = sheet.subplots(*shape[::-1], squeeze=False, **shared)
+    for ax in axes.ravel()[count:]:
+        ax.axis("off")
+    return sheet, axes
 
 
 def base_patch(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import xarray as xr
 
 from rps_jax.analysis import statistics
-from rps_jax.analysis.figures.style import Figure, success_rates
+from rps_jax.analysis.figures.style import Figure, success_rates, tiles
 from rps_jax.world.domain import WORDS
 
 
@@ -22,12 +22,8 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
     found = statistics.influences(results)
     shown = [one for one in found[:count] if one.variance > 0 and not _is_flat(one)] or found[:1]
     others = [one for one in found if one not in shown]
-    columns = min(3, len(shown))
-    rows = -(-len(shown) // columns)
-    figure = Figure(figsize=(1 + 3.5 * columns, 1.6 + 2.5 * rows), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False, sharey=True)
-    for ax in axes.ravel()[len(shown) :]:
-        ax.axis("off")
+    figure, axes = tiles(len(shown), 3, (3.5, 2.5), (1, 1.6), sharey=True)
+    columns = axes.shape[1]
     for ax, one in zip(axes.ravel(), shown, strict=False):
         for i, law in enumerate(map(str, results.law.values)):
             won = results.success.sel(law=law).values > 0
