@@ -64,7 +64,7 @@ class Ambiguities(Trials[xr.Dataset]):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the readings, the defaults first."""
-        names = self.readings or [name for name in self.known if name not in self.refused]
+        names = self.readings or tuple(name for name in self.known if name not in self.refused)
         return names if self.curve else tuple(dict.fromkeys([readings.DEFAULT, *names]))
 
     @property
