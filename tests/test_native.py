@@ -149,7 +149,8 @@ def halvings(x):
 
 
 def drawn(x):
-    key = jax.random.fold_in(jax.random.key(7), x.astype(jnp.uint32))
+    raw = jnp.stack([x.astype(jnp.uint32), jnp.uint32(7)])
+    key = jax.random.fold_in(raw, x.astype(jnp.uint32))
     return jax.random.normal(key, (5,)), jax.random.bits(jax.random.split(key)[1])
 
 

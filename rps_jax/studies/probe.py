@@ -35,9 +35,10 @@ def need(module: str, package: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        lacks = "" if error.name in (None, package) else f" ({error.name} cannot be imported)"
+        lacking = str(error.name).partition(".")[0]
+        missing = package if lacking in (module.partition(".")[0], "None") else lacking
         raise InputError(
-            f"package {package} is missing{lacks}: pip install 'rps_jax[failures]'."
+            f"package {missing} is missing: pip install 'rps_jax[failures]'."
         ) from error
 
 
