@@ -45,10 +45,8 @@ class Tensor(NamedTuple):
     about: str = ""
 
 
-class Graph:
+class Graph(walk.Target):
     """The target of tensors."""
-
-    kinds = "fib"
 
     def __init__(self, onnx: Any) -> None:
         """Begin without nodes."""
@@ -102,13 +100,6 @@ class Graph:
             at = self.held(places.reshape(-1).astype(np.int64))
             whole = self.node("Gather", [whole, at], (places.size,), kind, axis=0)
         return self.shaped(whole, places.shape)
-
-    def repeated(self, once: Any, carry: Sequence[Any], length: int) -> None:
-        """Loops are unrolled."""
-
-    def repeated_while(self, holds: Any, once: Any, carry: Sequence[Any]) -> list[Any]:
-        """It has no such loop."""
-        raise unsupported("while")
 
     def emit(self, name: str, values: Sequence[Any], params: Mapping[str, Any], out: Any) -> Tensor:
         """Apply a primitive."""

@@ -12,6 +12,7 @@ import numpy as np
 from rps_jax.engines.native.walk import (
     COMPARISONS,
     PAIRED,
+    Target,
     is_constant,
     kind_of,
     unsupported,
@@ -57,10 +58,8 @@ class Loop(NamedTuple):
     nodes: tuple[Node, ...]  # that depend on what is carried, in their order
 
 
-class Scalars:
+class Scalars(Target):
     """The target of single numbers; equal ones are one node."""
-
-    kinds = "fib"
 
     def __init__(self) -> None:
         """Begin without nodes."""
@@ -161,10 +160,6 @@ class Scalars:
         loop, place = self.node("loop", args, "array", extra), itertools.count()
         parts = [[self.node("part", (loop,), n.kind, next(place)) for n in row] for row in carried]
         return [_shaped(mine, one.shape) for mine, one in zip(parts, starts, strict=True)]
-
-    def repeated_while(self, holds: Any, once: Any, carry: Sequence[Any]) -> list[Any]:
-        """It has no such loop."""
-        raise unsupported("while")
 
     def _one(self, name: str, args: Sequence[Node], params: Mapping[str, Any], kind: str) -> Node:
         """One number of an operation that works number by number."""

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rps_jax.engines.native.walk import PAIRED, is_constant, kind_of, unsupported
+from rps_jax.engines.native.walk import PAIRED, Target, is_constant, kind_of, unsupported
 
 HEADER = Path(__file__).with_name("lanes.h").read_text()
 # Kinds of numbers for which each macro of the header writes an operation.
@@ -109,7 +109,7 @@ def size_of(shape: Sequence[int]) -> int:
     return int(np.prod(shape, dtype=int))
 
 
-class Lanes:
+class Lanes(Target):
     """The target of a jaxpr of one world: nodes, of which equal ones are one."""
 
     kinds = "fibu"

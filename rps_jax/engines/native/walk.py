@@ -45,9 +45,9 @@ _SAME = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "pvary", "re
 
 
 class Target(Protocol):
-    """What a jaxpr is written for."""
+    """What a jaxpr is written for; one that has no loops has them unrolled, or refused."""
 
-    kinds: str  # of numbers that it knows, as `kind_of` names them
+    kinds = "fib"  # of numbers that it knows, as `kind_of` names them
 
     def moved(self, values: Sequence[Any], places: np.ndarray, like: Any) -> Any:
         """Take numbers of the values, laid end to end, at constant places."""
@@ -61,7 +61,7 @@ class Target(Protocol):
         self, once: Callable[[Sequence[Any]], list[Any]], carry: Sequence[Any], length: int
     ) -> list[Any] | None:
         """What `carry` is after a function of it was applied so often; None: unroll it."""
-        ...
+        return None
 
     def repeated_while(
         self,
@@ -70,7 +70,7 @@ class Target(Protocol):
         carry: Sequence[Any],
     ) -> list[Any]:
         """What `carry` is after a function of it was applied as long as a condition held."""
-        ...
+        raise unsupported("while")
 
 
 def unsupported(name: str) -> InputError:
