@@ -3,12 +3,14 @@
 import json
 import re
 import shlex
+import shutil
 
 import pytest
 from helpers import ROOT, refusal
 
 from rps_jax.app.cli import flags, names
 from rps_jax.control import registry
+from rps_jax.control.learned import policy
 from sweeps.publish.study import published as data_files
 from sweeps.shared import digest, publish
 
@@ -154,3 +156,10 @@ def test_no_published_number_is_stale(monkeypatch):
         if "digest" in data:
             commands = [shlex.split(one) for one in data["command"]]
             assert digest(commands) == data["digest"], f"{path.name} is stale: make it anew"
+
+
+def test_a_copy_of_a_shipped_policy_leaves_the_law_what_it_is(tmp_path):
+    shutil.copy(policy.SHIPPED["learned_mlp"], tmp_path / "copy.npz")
+    before = registry.recorded(registry.LAWS["learned_mlp"])
+    assert registry.named(str(tmp_path / "copy.npz"))[0] == "learned_mlp"
+    assert registry.recorded(registry.LAWS["learned_mlp"]) == before

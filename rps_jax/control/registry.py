@@ -280,7 +280,8 @@ def _learned(path: Path) -> tuple[str, Params]:
     if name not in LAWS:
         register_law(name, law, params)
     found, digest = LAWS[name], files.digest(content)[:16]
-    _SOURCES[type(found)] = {"file": str(path.resolve()), "digest": digest}
+    if name not in _OWN:  # a copy of a shipped policy leaves that what it is
+        _SOURCES[type(found)] = {"file": str(path.resolve()), "digest": digest}
     return name, found
 
 
