@@ -136,7 +136,7 @@ def _results(eqn: Any, values: list[Any], target: Target) -> Sequence[Any]:
     if name == "cond":
         return _chosen(values[0], params["branches"], values[1:], target)
     if name == "scan":
-        return _unrolled(values, params, target)
+        return _unrolled(eqn, values, target)
     if name == "while":
         first, second = params["cond_nconsts"], params["body_nconsts"]
         ways = zip(("cond", "body"), (values[:first], values[first : first + second]), strict=True)
@@ -249,11 +249,18 @@ def _chosen(index: Any, branches: Sequence[Any], values: list[Any], target: Targ
     return found
 
 
-def _unrolled(values: list[Any], params: Mapping[str, Any], target: Target) -> list[Any]:
+def _unrolled(eqn: Any, values: list[Any], target: Target) -> list[Any]:
     """A `scan`, step by step."""
+    params = eqn.params
     if params["length"] > _MOST_STEPS:
         raise unsupported(f"scan of {params['length']} steps")
-    body, fixed, carried = params["jaxpr"], params["num_consts"], params["num_carry"]
+    body = params["jaxpr"]
+    # What is carried has one shape inside and outside; what is scanned or stacked has not. Versions
+    # of JAX differ in the names under which they count it.
+    ends = zip(eqn.outvars, body.jaxpr.outvars, strict=True)
+    carried = sum(out.aval.shape == one.aval.shape for out, one in ends)
+    starts = zip(values, body.jaxpr.invars, strict=True)
+    fixed = sum(np.shape(value) == one.aval.shape for value, one in starts) - carried
     consts, carry = values[:fixed], values[fixed : fixed + carried]
     if len(values) == fixed + carried == fixed + len(body.jaxpr.outvars):  # as of `fori_loop`
         once = functools.partial(_walk, body.jaxpr, body.consts, target=target)

@@ -36,11 +36,10 @@ static void some(void **given, void **found, int64_t first, int64_t worlds) {{
 }}
 
 XLA_FFI_Error *{NAME}(XLA_FFI_CallFrame *frame) {{
-  XLA_FFI_Extension_Base *asks = frame->extension_start;
-  if (asks && asks->type == XLA_FFI_Extension_Metadata) {{
-    XLA_FFI_Metadata *metadata = ((XLA_FFI_Metadata_Extension *)asks)->metadata;
-    metadata->api_version.major_version = XLA_FFI_API_MAJOR;
-    metadata->api_version.minor_version = XLA_FFI_API_MINOR;
+  XLA_FFI_Metadata_Extension *asks = (void *)frame->extension_start;
+  if (asks && asks->extension_base.type == XLA_FFI_Extension_Metadata) {{
+    asks->metadata->api_version.major_version = XLA_FFI_API_MAJOR;
+    asks->metadata->api_version.minor_version = XLA_FFI_API_MINOR;
     return 0;
   }}
   void *given[{COUNT}], *found[{FOUND}];
