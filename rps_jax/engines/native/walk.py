@@ -28,6 +28,7 @@ _MOVES = {
     "rev": 1,
     "transpose": 1,
     "split": 1,
+    "unstack": 1,
     "pad": 2,
     "stack": None,
     "concatenate": None,
