@@ -120,6 +120,13 @@ def test_a_compiler_that_fails_is_told_once_and_xla_steps(monkeypatch, tmp_path,
     same(found, expected)
 
 
+def test_operations_that_cannot_be_read_are_told_and_xla_steps(monkeypatch, cache):
+    monkeypatch.setattr(native.writer, "walk", lambda *_: {}["num_consts"])
+    run = native.mapped(lambda x: 2 * x, lambda x: 3 * x)
+    with pytest.warns(UserWarning, match="no C can be written, so XLA compiles: KeyError"):
+        assert jax.jit(run)(jnp.ones(2)).tolist() == [3.0, 3.0]
+
+
 @pytest.mark.parametrize("damage", ["cut", "turned", "empty"])
 def test_a_damaged_function_is_dropped_with_one_line(damage, cache, monkeypatch):
     x, more = jnp.arange(5.0), float(len(damage))  # so that each has a function of its own
@@ -158,6 +165,10 @@ OPERATIONS = {
     "a loop": halvings,
     "a loop of a known length": lambda x: jax.lax.fori_loop(0, 3, lambda i, c: c * x + i, x),
     "a swap in a loop": lambda x: jax.lax.fori_loop(0, 3, lambda _, c: (c[1], c[0]), (x, -x)),
+    "a scan": lambda x: jax.lax.scan(
+        lambda c, y: (c + y * x, (c, y)), jnp.zeros(2), jnp.arange(6.0).reshape(3, 2)
+    ),
+    "pieces": lambda x: jnp.sum(jnp.stack([x, 2 * x, x - 1])[:, None], axis=1)[0] * x,
     "draws": drawn,
     "a place that differs": lambda x: jax.lax.dynamic_slice(
         jnp.arange(12.0).reshape(4, 3), (x.astype(int), 1), (2, 2)

@@ -104,6 +104,10 @@ def _made(closed: Any, given: Sequence[Any], found: Sequence[Any]) -> str | None
             text = writer.source(closed, given, found)
     except (InputError, jax.errors.TracerArrayConversionError):
         return None  # a law has an operation without a form in C, or holds what is being traced
+    except Exception as error:  # of a version of JAX that writes its operations otherwise
+        said = f"{type(error).__name__}: {error}"
+        warnings.warn(f"no C can be written, so XLA compiles: {said}", stacklevel=2)
+        return None
     key = repr((text, target(), jax.__version__))
     name = _NAME + hashlib.sha256(key.encode()).hexdigest()[:32]
     with _locks[name]:
