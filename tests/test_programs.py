@@ -1,11 +1,17 @@
 """Traced programs that are kept between processes: used again, verified, dropped, bounded."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from rps_jax.engines import device, programs
+from rps_jax.record import provenance
+from rps_jax.runs.push import Push
+from rps_jax.runs.sweep import Sweep
+from rps_jax.trials.setting import Setting
 
 
 @pytest.fixture
@@ -90,3 +96,24 @@ def test_programs_that_were_not_used_for_longest_go_first(cache, made, monkeypat
     assert len(traced) == count
     make(n=1)
     assert len(traced) == count + 1
+
+
+def test_a_few_trials_stay_on_processors(monkeypatch):
+    """A thousand for each processor, where there is a C compiler; in C MuJoCo all."""
+    monkeypatch.setattr(provenance, "processors", lambda: 2)
+    monkeypatch.setattr(provenance, "compiler", lambda: "cc")
+    before = jax.config.jax_platforms
+    jax.config.update("jax_platforms", None)
+    try:
+        few = Sweep("rps", worlds=2000)
+        assert device.suits_processors(few)
+        assert device.suits_processors(Push(setting=Setting("fused")))
+        assert not device.suits_processors(replace(few, worlds=2001))
+        assert not device.suits_processors(replace(few, setting=Setting("mjx")))
+        assert device.suits_processors(replace(few, worlds=9000, setting=Setting("mujoco")))
+        monkeypatch.setattr(provenance, "compiler", lambda: None)
+        assert not device.suits_processors(few)
+        jax.config.update("jax_platforms", "cuda")  # asked for by name
+        assert not device.suits_processors(Push())
+    finally:
+        jax.config.update("jax_platforms", before)

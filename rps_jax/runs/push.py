@@ -105,7 +105,7 @@ class Trace:
         path: str | Path,
         seconds: float = 12.0,
         *,
-        fps: int = 25,
+        fps: int = 20,
         size: tuple[int, int] = (960, 540),
         watch: Callable[[Iterable[Any]], Iterable[Any]] = iter,
     ) -> Path:
@@ -176,6 +176,9 @@ class FollowsOne(Question[Trace]):
     def horizon(self) -> float:
         """Time [s] after which the trial ends."""
         raise NotImplementedError
+
+    def trials(self) -> int | None:
+        return 1
 
     def bar(self) -> Bar:
         return Bar(self.name, self.horizon, "simulated", shown=self.shown)

@@ -5,7 +5,7 @@ in `sweeps/ambiguities`.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import ClassVar
 
@@ -22,7 +22,6 @@ from rps_jax.studies import table
 from rps_jax.studies.hardware import Hardware
 from rps_jax.studies.table import Table
 from rps_jax.trials.progress import InTurn
-from rps_jax.trials.setting import Setting
 from rps_jax.world import paper as papers
 from rps_jax.world import scene
 from rps_jax.world.objects import PAPER_OBJECTS
@@ -44,17 +43,13 @@ class Paper(Pushes[xr.DataTree]):
 
     TITLE: ClassVar[str] = "Pushing in the Dark, reproduced"
 
-    setting: Setting = field(default=Setting(engine="mjx"), kw_only=True)
-
     @cached_property
     def parts(self) -> tuple[Table, Push, Hardware]:
         """The questions that it consists of."""
-        engine = replace(self.setting, engine="fused") if self.quick else self.setting
-        hardware = replace(self.setting, engine="fused")  # as fine, and many more trials
         return (
-            Table(setting=engine),
-            Push(target=(-2.0, 0.0), setting=engine),
-            Hardware(setting=hardware, quick=self.quick).asked(),
+            Table(setting=self.setting),
+            Push(target=(-2.0, 0.0), setting=self.setting),
+            Hardware(setting=self.setting, quick=self.quick).asked(),
         )
 
     def check(self) -> None:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -21,7 +21,6 @@ from rps_jax.runs.push import sensed
 from rps_jax.runs.question import OfLaws, Run, call_of
 from rps_jax.trials import pushes, results
 from rps_jax.trials.case import Case, FrictionLike, Given, label_of
-from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
 
@@ -52,7 +51,6 @@ class Table(Given, OfLaws[xr.Dataset]):
     targets: Sequence[tuple[float, float]] = paper.TARGETS
     """Targets X Y [m], one pair after the other, in the world, where the base starts at the
     origin; by default the paper's 24."""
-    setting: Setting = field(default=Setting(engine="mjx"), kw_only=True)
 
     @cached_property
     def cases(self) -> list[Case]:

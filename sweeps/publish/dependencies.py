@@ -42,7 +42,7 @@ FOR = {
     "flatbuffers": "programs of JAX that are kept between processes",
     "mujoco": "scenes, C MuJoCo as an engine, pictures; pinned to the version of mujoco-mjx, which "
     "has no 4.x",
-    "mujoco-mjx": "the engine in which the paper is replicated",
+    "mujoco-mjx": "MuJoCo's own engine in JAX, to which the fused one is held",
     "numpy": "arrays on the host",
     "scipy": "Wilson intervals and exact tests; JAX needs it too",
     "xarray": "labelled results",

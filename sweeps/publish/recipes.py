@@ -93,9 +93,10 @@ RECIPES: dict[str, Recipe] = {
         ("corners and rims", "three or four feet"),
         _RATES,
     ),
-    "table": Recipe(("rps table",), 4, None, "Table II*"),
+    "table": Recipe(("rps table",), 1, None, "Table II*"),
+    "table_mjx": Recipe(("rps table --engine mjx",), 4, None, "Table II*", folder="table"),
     "grid": Recipe(
-        ("rps table --laws rps rps_tuned rps_plus learned_gru --engine fused",),
+        ("rps table --laws rps rps_tuned rps_plus learned_gru",),
         3,
         1,
         "Table II*",

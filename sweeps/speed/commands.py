@@ -58,8 +58,8 @@ class Commands(Study[xr.Dataset]):
         "push --object box --target -2 0 --engine fused",
         "sweep --laws rps_tuned --domain wide --worlds 100",
         "sweep --laws rps_tuned --domain wide --worlds 1000",
-        "table --engine fused",
         "table",
+        "table --engine mjx",
         "sweep --laws rps --domain wide --worlds 1048576 --horizon 0.02 --slots 2048",
     )
     """What is asked of `rps`."""

@@ -34,7 +34,8 @@ class Beside(NamedTuple):
     """Options of the command line alone."""
 
     device: Device = "auto"
-    """Where the worlds are stepped: auto takes what JAX finds. On a processor the fused engine is
+    """Where the worlds are stepped: auto takes the GPU if JAX finds one, and processors for a few
+    trials, which they have ended before a GPU has begun. On a processor the fused engine is
     compiled by the machine's C compiler if it has one, with xla by XLA alone."""
     overwrite: bool = False
     """Whether a run that the folder already holds is removed first."""

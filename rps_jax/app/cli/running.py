@@ -115,10 +115,11 @@ def carry_out(question: Any, beside: Beside) -> None:
     from rps_jax.runs.push import check_length
     from rps_jax.runs.question import told
 
-    device.choose("cpu" if getattr(question, "ray", None) else beside.device)
     if question.out is None and not hasattr(question, "in_shell"):
         question = dataclasses.replace(question, out=question.place)
     asked = question.asked()
+    few = beside.device == "auto" and device.suits_processors(asked)
+    device.choose("cpu" if few or getattr(asked, "ray", None) else beside.device)
     asked.checked()
     check_length(beside.film_length)
     _go_on()
