@@ -98,7 +98,7 @@ def test_a_push_is_plotted_and_filmed(tmp_path):
     assert (tmp_path / "push.png").stat().st_size > 10_000
     assert seen.film(tmp_path / "push.mp4", 0.4) == tmp_path / "push.mp4"
     images = decode(tmp_path / "push.mp4")
-    assert len(images) == 10
+    assert len(images) == 8
     assert np.abs(images[0].astype(int) - images[-1]).max() > 60
     with pytest.raises(InputError, match="film_length = 0 is not allowed"):
         seen.film(tmp_path / "none.mp4", 0)

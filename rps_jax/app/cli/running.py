@@ -6,14 +6,15 @@ import _thread
 import contextlib
 import dataclasses
 import errno
-import functools
 import importlib
 import io
 import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -132,6 +133,7 @@ def carry_out(question: Any, beside: Beside) -> None:
     if beside.overwrite:
         folder.clear(Path(asked.out))
     tqdm.set_lock(threading.RLock())  # of this process alone: no semaphore is left if it is stopped
+    film = None
     with asked.bar() as bar:
         _go_on()
         # What the report needs is imported while the run goes on.
@@ -144,12 +146,14 @@ def carry_out(question: Any, beside: Beside) -> None:
         if isinstance(found, Path):
             print(f"{asked.name}: {found}")
             return
+        if beside.video and hasattr(found, "film"):
+            film = _Film(found, Path(asked.out), beside.film_length)
         path = _report(asked, found, bar)
     print(path.read_text(encoding="utf-8"))
     if spent:
         print(spent)
-    if beside.video and hasattr(found, "film"):
-        _film(found, Path(asked.out), beside.film_length)
+    if film is not None:
+        film.end()
     if getattr(asked, "film", False) and (Path(asked.out) / "worlds").is_dir():
         from rps_jax.app.film import Film
 
@@ -171,16 +175,37 @@ def _report(asked: Any, found: Any, bar: Bar) -> Path:
     return write_report(out, asked.title, "\n\n".join(filter(None, parts)), sections)
 
 
-def _film(trace: Trace, out: Path, seconds: float) -> None:
-    """Stills and film of one trial."""
-    from tqdm import tqdm
+class _Film:
+    """Stills and film of one trial; the film is drawn while the report is written."""
 
-    from rps_jax.analysis import video
-    from rps_jax.analysis.report import save
+    def __init__(self, trace: Trace, out: Path, seconds: float):
+        self._trace, self._out = trace, out
+        self._total, self._drawn = 0, 0
+        pool = ThreadPoolExecutor(1)
+        self._film = pool.submit(trace.film, out / "push.mp4", seconds, watch=self._watched)
+        pool.shutdown(wait=False)
 
-    watch = functools.partial(tqdm, unit="frame", desc="film")
-    try:
-        save(trace.stills(), out / "stills.png")
-        print(f"film: {trace.film(out / 'push.mp4', seconds, watch=watch)}")
-    except video.VideoError as error:
-        print(f"no film: {error}")
+    def _watched(self, frames: Any) -> Iterator[Any]:
+        self._total = len(frames)
+        for self._drawn, frame in enumerate(frames):
+            if _stopped:
+                raise KeyboardInterrupt
+            yield frame
+
+    def end(self) -> None:
+        """Wait for the film, with a bar, and draw the stills."""
+        from tqdm import tqdm
+
+        from rps_jax.analysis import video
+        from rps_jax.analysis.report import save
+
+        try:
+            with tqdm(unit="frame", desc="film") as bar:
+                while not self._film.done():
+                    bar.total, bar.n = self._total, self._drawn
+                    bar.refresh()
+                    time.sleep(0.1)
+            save(self._trace.stills(), self._out / "stills.png")
+            print(f"film: {self._film.result()}")
+        except video.VideoError as error:
+            print(f"no film: {error}")
