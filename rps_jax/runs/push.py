@@ -103,7 +103,7 @@ class Trace:
     def film(
         self,
         path: str | Path,
-        seconds: float = 12.0,
+        seconds: float = 10.0,
         *,
         fps: int = 20,
         size: tuple[int, int] = (960, 540),

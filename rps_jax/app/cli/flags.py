@@ -41,7 +41,7 @@ class Beside(NamedTuple):
     """Whether a run that the folder already holds is removed first."""
     video: bool = True
     """Whether the push is filmed."""
-    film_length: float = 12.0
+    film_length: float = 10.0
     """Length of the film [s], whatever the trial's."""
 
 

@@ -77,9 +77,13 @@ def _interruptible() -> Iterator[None]:
 
     def again(unraisable: Any) -> None:
         if isinstance(unraisable.exc_value, KeyboardInterrupt):
-            threading.Timer(0.05, _thread.interrupt_main).start()
+            threading.Timer(0.05, repeated).start()
         else:
             told(unraisable)
+
+    def repeated() -> None:
+        if sys.unraisablehook is again:  # and not when the command has ended
+            _thread.interrupt_main()
 
     _stopped.clear()
     usual = threading.current_thread() is threading.main_thread() and (
@@ -200,12 +204,12 @@ class _Film:
         from rps_jax.analysis.report import save
 
         try:
+            save(self._trace.stills(), self._out / "stills.png")
             with tqdm(unit="frame", desc="film") as bar:
                 while not self._film.done():
                     bar.total, bar.n = self._total, self._drawn
                     bar.refresh()
                     time.sleep(0.1)
-            save(self._trace.stills(), self._out / "stills.png")
             print(f"film: {self._film.result()}")
         except video.VideoError as error:
             print(f"no film: {error}")
