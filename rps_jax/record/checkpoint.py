@@ -42,9 +42,7 @@ class Parts:
         """The content of one part, if it is finished."""
         return next((content for _, content in self.each((name,))), None)
 
-    def put(
-        self, name: str, content: bytes | memoryview, suffix: str = ".nc", *, new: bool = False
-    ) -> Path:
+    def put(self, name: str, content: bytes, suffix: str = ".nc", *, new: bool = False) -> Path:
         """Write the file of a part, whole or not at all, and then remove what it had before.
 
         A process that is killed in between leaves both, of which the newer counts. Nothing is

@@ -69,7 +69,7 @@ def write_text(path: Path, text: str) -> Path:
     return write_bytes(path, text.encode(errors="surrogateescape"))
 
 
-def write_bytes(path: Path, content: bytes | memoryview, *, checked: bool = False) -> Path:
+def write_bytes(path: Path, content: bytes, *, checked: bool = False) -> Path:
     """A file of this content, whole or not at all; if `checked`, with its checksum."""
     atomic(path, lambda partial: partial.write_bytes(content))
     if checked:
@@ -99,19 +99,21 @@ def checksum(path: Path) -> Path:
     return path.with_name(f"{path.name}.sha256")
 
 
-def digest(content: bytes | memoryview) -> str:
+def digest(content: bytes) -> str:
     """SHA-256 in hexadecimal."""
     return hashlib.sha256(content).hexdigest()
 
 
-def encoded(results: xr.Dataset) -> memoryview:
+def encoded(results: xr.Dataset) -> bytes:
     """NetCDF 4, which depends on the results alone, not on when or where it is made.
 
     It is made in memory, since HDF5 crashes the process when its disk is full. An attribute holds
     the digest of its structure, by which `decoded` knows what somebody has edited.
     """
     signed = results.assign_attrs({_STRUCTURE: _structure(results)})
-    return signed.to_netcdf(engine="h5netcdf")
+    # A view that Python's garbage collector finds first crashes Python before 3.12.2.
+    with signed.to_netcdf(engine="h5netcdf") as view:
+        return bytes(view)
 
 
 def _structure(results: xr.Dataset) -> str:
@@ -153,7 +155,7 @@ def _check_regular(path: Path, mode: int) -> None:
         raise InputError(f"{path} cannot be read (it is {what}): give a regular file.")
 
 
-def decoded(content: bytes | memoryview, source: Any, *, own: bool = False) -> xr.Dataset:
+def decoded(content: bytes, source: Any, *, own: bool = False) -> xr.Dataset:
     """The labelled results that `encoded` made into bytes; InputError names the `source`.
 
     If they are `own`, only `encoded` can have made them, and so signed their structure.

@@ -414,6 +414,6 @@ def _ahead(parts: Iterator[Part], count: int) -> Iterator[Part]:
             yield part
 
 
-def store(folder: Path, part: int, content: bytes | memoryview) -> Path:
+def store(folder: Path, part: int, content: bytes) -> Path:
     """Write the file of a part into a run folder, whole or not at all."""
     return Parts(folder).put(results.name_of(part), content, new=True)
