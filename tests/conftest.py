@@ -13,8 +13,10 @@ def pytest_configure(config):
     import jax
 
     from rps_jax.analysis import studio
+    from rps_jax.engines import device
 
     studio.choose_gl()
+    device.be_deterministic()
     cache = config.rootpath / ".jax_cache"
     os.environ.setdefault("RPS_CACHE", str(cache))  # of commands, also in processes of their own
     jax.config.update("jax_compilation_cache_dir", os.environ["RPS_CACHE"])

@@ -1,5 +1,6 @@
 """Traced programs that are kept between processes: used again, verified, dropped, bounded."""
 
+import os
 from dataclasses import replace
 
 import jax
@@ -117,3 +118,17 @@ def test_a_few_trials_stay_on_processors(monkeypatch):
         assert not device.suits_processors(Push())
     finally:
         jax.config.update("jax_platforms", before)
+
+
+@pytest.mark.parametrize(("release", "machine", "asked"), [
+    ("0.11.2", "x86_64", False), ("0.12.0.1", "x86_64", True), ("0.13.1", "arm64", False),
+])  # fmt: skip
+def test_a_jax_that_fuses_by_slot_is_asked_for_avx(release, machine, asked, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_of_ones_own")
+    monkeypatch.setattr(device.metadata, "version", lambda _: release)
+    monkeypatch.setattr(device.platform, "machine", lambda: machine)
+    for _ in range(2):
+        device.be_deterministic()
+        words = os.environ["XLA_FLAGS"].split()
+        assert words[:2] == ["--xla_of_ones_own", "--xla_gpu_deterministic_ops=true"]
+        assert words[2:] == ["--xla_cpu_max_isa=AVX"] * asked
