@@ -323,7 +323,7 @@ RECIPES: dict[str, Recipe] = {
     "robot": Recipe((f"rps sweeps/speed/robot.py {_MACHINE}",), 1, None),
     "dependencies": Recipe((f"rps sweeps/publish/dependencies.py {_MACHINE}",), 15, None),
     "extras": Recipe((f"rps sweeps/publish/dependencies.py {_MACHINE}",), 15, None),
-    "fit_*": Recipe((f"rps sweeps/fit {_MACHINE}", f"rps sweeps/fit/bags.py {_MACHINE}"), 45, None),
+    "fit_*": Recipe((f"rps sweeps/fit {_MACHINE}", f"rps sweeps/fit/bags.py {_MACHINE}"), 20, None),
     "export_*": Recipe(
         (
             f"rps sweeps/export --tables speed {_MACHINE}",
