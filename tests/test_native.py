@@ -105,6 +105,15 @@ def test_a_drive_is_compiled_and_its_derivative_is_xlas(monkeypatch):
     same(found, slope())
 
 
+def test_without_a_compiler_batches_run_side_by_side_in_one_loop(monkeypatch):
+    stages, worlds, loops = zip(*(batch(shape, count=2) for shape in ("box", "prism")), strict=True)
+    trials = tuple(begun(some, loops[0]) for some in worlds)
+    monkeypatch.setenv("RPS_COMPILER", "none")
+    run = jax.make_jaxpr(lambda w, t: trial.advance(stages, w, t, loops[0], 3))
+    primitives = [eqn.primitive.name for eqn in run(worlds, trials).eqns]
+    assert primitives.count("while") == 1
+
+
 def test_a_compiler_that_fails_is_told_once_and_xla_steps(monkeypatch, tmp_path, cache):
     stage, worlds, loop = batch("box", count=2)
     monkeypatch.setenv("RPS_COMPILER", "none")
