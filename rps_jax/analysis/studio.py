@@ -14,6 +14,7 @@ import itertools
 import math
 import os
 import sys
+import threading
 import warnings
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -38,6 +39,7 @@ CONTACT_HEIGHT = 0.36  # [m] just above the chassis, which would hide the marker
 CONTACT_RADIUS = 0.04  # [m]
 _CORNERS = np.array(list(itertools.product((-1, 1), repeat=3)))  # of a cube
 NO_CONTACT = np.full(2, np.nan)
+_OPENING = threading.Lock()
 _SHADOWS_FROM = 240  # [px] height of an image: they take most of the time without a GPU
 
 _MEND_GL = (
@@ -254,16 +256,17 @@ def _renderer(model: Any, size: tuple[int, int]) -> Iterator[Any]:
     mujoco = _import_mujoco()
     width, height = size
     buffer = model.vis.global_
-    limits = buffer.offwidth, buffer.offheight
-    buffer.offwidth, buffer.offheight = size  # else each renderer holds images of the limits
-    try:
-        with warnings.catch_warnings():  # GLFW warns before it fails
-            warnings.simplefilter("ignore")
-            renderer = mujoco.Renderer(model, height=height, width=width)
-    except Exception as error:  # likewise
-        raise VideoError(_MEND_GL) from error
-    finally:
-        buffer.offwidth, buffer.offheight = limits
+    with _OPENING:  # a film and stills of one model may be drawn on two threads
+        limits = buffer.offwidth, buffer.offheight
+        buffer.offwidth, buffer.offheight = size  # else each renderer holds images of the limits
+        try:
+            with warnings.catch_warnings():  # GLFW warns before it fails
+                warnings.simplefilter("ignore")
+                renderer = mujoco.Renderer(model, height=height, width=width)
+        except Exception as error:  # likewise
+            raise VideoError(_MEND_GL) from error
+        finally:
+            buffer.offwidth, buffer.offheight = limits
     with contextlib.closing(renderer):
         yield renderer
 

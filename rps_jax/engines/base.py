@@ -202,6 +202,10 @@ class Engine(abc.ABC):
         """
         return provenance.processors() if backend == "cpu" else 1
 
+    def suits_processors(self, trials: int | None) -> bool:
+        """Whether processors end so many trials sooner than a GPU; None: nobody knows how many."""
+        return False
+
     def levers(self, family: str) -> dict[str, Callable[[Any], Any]]:
         """Changes of the stage that are worth timing, by name: see `sweeps/levers`."""
         return {}

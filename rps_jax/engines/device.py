@@ -12,10 +12,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
+from rps_jax import engines
 from rps_jax.errors import InputError
-from rps_jax.record import files, provenance
+from rps_jax.record import files
 
-_FEW = 1000  # trials for each processor
 MOST = 512 * 2**20  # bytes of a kind that are kept
 _DIGEST = hashlib.sha256().digest_size
 Device = Literal["auto", "cpu", "gpu", "xla"]
@@ -122,19 +122,13 @@ def choose(name: Device) -> None:
 
 
 def suits_processors(question: Any) -> bool:
-    """Whether processors answer a question sooner than a GPU.
-
-    They do in C MuJoCo, and with a few trials of the fused engine, compiled in C: a processor steps
-    some 10,000 simulated seconds in a second, while a GPU takes some 8 s to begin.
-    """
+    """Whether processors answer a question sooner than a GPU, as its engine says."""
     import jax
 
-    engine = getattr(getattr(question, "setting", None), "engine", None)
-    if jax.config.jax_platforms or engine not in ("fused", "mujoco"):
+    setting = getattr(question, "setting", None)
+    if setting is None or jax.config.jax_platforms:
         return False
-    trials = question.trials() if engine == "fused" and provenance.compiler() else None
-    few = trials is not None and trials <= _FEW * provenance.processors()
-    return few or engine == "mujoco"
+    return engines.get(setting.engine).suits_processors(question.trials())
 
 
 def kept(path: Path, done: str, read: Callable[[bytes], Any]) -> Any:

@@ -147,6 +147,10 @@ class MuJoCo(Engine):
     name = "mujoco"
     traced = False
 
+    def suits_processors(self, trials: int | None) -> bool:
+        """It steps worlds on the host."""
+        return True
+
     def stage_of_scenes(self, scenes: Sequence[Scene], which: np.ndarray) -> tuple[Any, Any]:
         """The models of worlds in scenes of one shape family."""
         return [scenes[i].physics for i in which], {}

@@ -41,6 +41,9 @@ if TYPE_CHECKING:
     from rps_jax.analysis.figures.style import Figure
 
 
+FILM_LENGTH = 10.0  # [s] by default, whatever the trial's
+
+
 @dataclass(frozen=True, repr=False)
 class Trace:
     """One trial that was followed."""
@@ -103,7 +106,7 @@ class Trace:
     def film(
         self,
         path: str | Path,
-        seconds: float = 10.0,
+        seconds: float = FILM_LENGTH,
         *,
         fps: int = 20,
         size: tuple[int, int] = (960, 540),

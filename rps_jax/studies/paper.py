@@ -57,7 +57,7 @@ class Paper(Pushes[xr.DataTree]):
             part.check()
 
     def trials(self) -> int | None:
-        return sum(part.trials() or 1 for part in self.parts)
+        return sum(part.trials() or 0 for part in self.parts)
 
     def answer(self, run: Run) -> xr.DataTree:
         heard = InTurn(run.report)

@@ -22,7 +22,7 @@ import tyro
 from rps_jax.engines.device import Device
 from rps_jax.errors import InputError
 from rps_jax.record import options
-from rps_jax.runs.push import FollowsOne
+from rps_jax.runs.push import FILM_LENGTH, FollowsOne
 from rps_jax.runs.question import Pushes
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
@@ -41,7 +41,7 @@ class Beside(NamedTuple):
     """Whether a run that the folder already holds is removed first."""
     video: bool = True
     """Whether the push is filmed."""
-    film_length: float = 10.0
+    film_length: float = FILM_LENGTH
     """Length of the film [s], whatever the trial's."""
 
 

@@ -18,10 +18,13 @@ from rps_jax.engines.fused import step
 from rps_jax.engines.fused.contacts import Body
 from rps_jax.geometry import solid
 from rps_jax.geometry.solid import Solid
+from rps_jax.record import provenance
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import OFF_CENTRE, Friction, Scene
+
+_FEW = 1000  # trials for each processor
 
 
 class FusedStage(NamedTuple):
@@ -77,6 +80,14 @@ class Fused(Engine):
     def workers(self, backend: str) -> int:
         """Two for a GPU, which steps one's worlds while the host sees to the other's."""
         return super().workers(backend) if backend == "cpu" else 2
+
+    def suits_processors(self, trials: int | None) -> bool:
+        """A few trials, by the function in C.
+
+        A processor steps some 10,000 simulated seconds in a second; a GPU takes 8 s to begin.
+        """
+        few = trials is not None and trials <= _FEW * provenance.processors()
+        return few and provenance.compiler() is not None
 
 
 @functools.cache
