@@ -70,7 +70,7 @@ class OfPlan(Planned, InDomain[xr.Dataset], OfLaws[xr.Dataset]):
     listed targets."""
     part: int | None = option(None, 1, 1_000_000, kw_only=True)
     """Number of trials in a part: what is lost of each law and object when killed, at most; by
-    default 1024, and of many worlds a 64th, up to 16384."""
+    default 1024, and of many worlds a 16th, up to 16384."""
 
     @functools.cached_property
     def plan(self) -> Plan:
@@ -88,7 +88,7 @@ class OfPlan(Planned, InDomain[xr.Dataset], OfLaws[xr.Dataset]):
 
 def _part_of(worlds: int) -> int:
     """How many trials a part has: a file costs more than the trials in it."""
-    return min(max(worlds // 64, 1024), 16384)
+    return min(max(worlds // 16, 1024), 16384)
 
 
 def intro_of(plan: Plan) -> str:
