@@ -337,8 +337,8 @@ RECIPES: dict[str, Recipe] = {
     # --- speed, with nothing else running ---
     "speed": Recipe(
         (
-            "rps sweeps/speed --worlds 64 336 4096 65536 262144 --mujocos 4096 --at-once 16 "
-            "--refill 0",
+            "rps sweeps/speed --names 'C in closed loop' 'fused standard' 'fused fast' quasistatic "
+            "--worlds 64 4096 262144 --at-once 16 --refill 0",
         ),
         None,
         6,
@@ -357,8 +357,11 @@ RECIPES: dict[str, Recipe] = {
     "commands_gpu": Recipe(
         (
             "rps sweeps/speed/commands.py --commands "
-            + " ".join(f"'{_SWEPT} --worlds {n}'" for n in (1000, 10_000, 262_144))
-            + f" --warm 1000 10000 --file commands_gpu {_MACHINE}",
+            + " ".join(
+                f"'{_SWEPT} --worlds {n}'"
+                for n in (1000, 10_000, "1000 --device gpu", "10000 --device gpu", 262_144)
+            )
+            + f" --gpus 1 --warm 1000 10000 --file commands_gpu {_MACHINE}",
         ),
         None,
         8,

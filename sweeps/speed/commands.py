@@ -91,7 +91,8 @@ class Commands(Study[xr.Dataset]):
             safe = re.sub(r"\W+", "_", command) + ("" if gpus is None else f"_{gpus}")
             found.append(run.part(safe, partial(timed, command, self.limit, gpus)))
             run.report(Progress(number + 1, 0.0))
-        found += [run.part(f"warm_{n}", partial(_warm, n, self.limit)) for n in self.warm]
+        gpus = max(self.gpus, default=None)
+        found += [run.part(f"warm_{n}", partial(_warm, n, self.limit, gpus)) for n in self.warm]
         told = [*_labels(self.wanted), *(f"`{_call(n)}`, in one process" for n in self.warm)]
         whole: Any = xr.concat(found, "command").assign_coords(command=told)
         if self.machine and run.folder is not None:
@@ -143,7 +144,7 @@ def _call(worlds: int) -> str:
     return f'rps_jax.sweep("rps_tuned", "wide", worlds={worlds})'
 
 
-def _warm(worlds: int, limit: float) -> xr.Dataset:
+def _warm(worlds: int, limit: float, gpus: int | None = None) -> xr.Dataset:
     """Seconds of a sweep with an empty cache, and the third time in that process."""
     code = (
         "import time, rps_jax\n"
@@ -153,7 +154,7 @@ def _warm(worlds: int, limit: float) -> xr.Dataset:
         "    print(time.perf_counter() - begun)\n"
     )
     with tempfile.TemporaryDirectory() as folder:
-        told, held = _output(["-c", code], _call(worlds), folder, limit)
+        told, held = _output(["-c", code], _call(worlds), folder, limit, gpus)
     first, *_, last = map(float, told.split())
     return _row(first, last, *(float("nan"),) * 3, held)
 
