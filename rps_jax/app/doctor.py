@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rps_jax.analysis import video
-from rps_jax.engines import device
+from rps_jax.engines import device, native
 from rps_jax.errors import InputError
 from rps_jax.record import folder as run_folder
 from rps_jax.record import provenance
@@ -38,11 +38,19 @@ def report(cache: Path) -> str:
         f"{environment['processors']} processors",
         "compiler": environment["compiler"]
         or "none: XLA steps the fused engine, more slowly than a C compiler's program would",
+        "kernels": _kernels(found["platform"]),
         "commit": environment["commit"] or "not in a checkout",
         "cached in": str(cache),
         **{what: "ok" if works else f"FAILS: {mend}" for what, works, mend in checks},
     }
     return "\n".join(f"{name:<12}{text}" for name, text in rows.items())
+
+
+def _kernels(platform: str) -> str:
+    if platform != "gpu":
+        return "of a GPU, of which JAX finds none here"
+    made = native.target() and native.cuda.target()
+    return f"by NVRTC {made}" if made else "none: XLA steps the fused engine, by Triton"
 
 
 def _writable(folder: Path) -> tuple[bool, str]:

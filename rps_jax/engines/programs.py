@@ -105,7 +105,7 @@ def _source() -> str:
     versions = [metadata.version(name) for name in ("jax", "jaxlib", "numpy")]
     told = hashlib.sha256(repr(versions).encode())
     root = Path(__file__).parents[1]
-    for path in sorted([*root.rglob("*.py"), *root.rglob("*.h")]):
+    for path in sorted([*root.rglob("*.py"), *root.rglob("*.[ch]")]):
         told.update(path.read_bytes())
     return told.hexdigest()
 

@@ -41,13 +41,13 @@ def environment() -> dict[str, Any]:
             "count": jax.device_count(),
         },
         "x64": bool(jax.config.jax_enable_x64),
-        "compiler": _compiled_by() if device.platform == "cpu" else None,
+        "compiler": _compiled_by() if device.platform in ("cpu", "gpu") else None,
         "packages": {name: _version(name) for name in _PACKAGES},
     }
 
 
 def compiler() -> str | None:
-    """The C compiler by which functions are compiled on a processor; None: XLA compiles them.
+    """The C compiler by which functions are compiled, and launched on a GPU; None: XLA does it.
 
     The environment variable RPS_COMPILER names another, or `none`.
     """

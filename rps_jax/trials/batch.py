@@ -34,7 +34,7 @@ SEGMENT = 10.0  # [s] simulated between two looks at which trials have ended
 # A GPU steps a few thousand worlds in hardly less time than a few. So a worker there sets aside
 # what runs of a job when none of its trials waits and no more than this many run, and takes the
 # next job; in the end what was set aside of all jobs is run side by side.
-_ASIDE = 4096
+_ASIDE = 8192
 _SIDE_BY_SIDE = 4  # jobs, at most: a program of more would be long in compiling
 
 

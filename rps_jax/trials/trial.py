@@ -430,16 +430,22 @@ def advance(
 
         return jax.lax.while_loop(lambda c: (c[0] < steps) & ~c[1].done, on, (0, now))[1]
 
-    def whole(stage: Stage, worlds: World, trials: Trial, rules: Any) -> Trial:
-        own = dataclasses.replace(loop, rules=jax.tree.map(lambda x: x[0], rules))
-        return _side_by_side((stage,), (worlds,), (trials,), own, steps)[0]
+    def whole(*given: Any) -> tuple[Trial, ...]:
+        some, now, rules = zip(*given, strict=True)
+        own = dataclasses.replace(loop, rules=jax.tree.map(lambda x: x[0], rules[0]))
+        return _side_by_side(stages, some, now, own, steps)
 
-    after = []
-    for stage, some, now in zip(stages, worlds, trials, strict=True):
-        rules = jax.tree.map(lambda x, n=now.done.size: jnp.full(n, x, float), loop.rules)
-        run = native.mapped(partial(one, stage), partial(whole, stage))
-        after.append(run(some, now, rules))
-    return tuple(after)
+    given = [
+        (some, now, jax.tree.map(lambda x, n=now.done.size: jnp.full(n, x, float), loop.rules))
+        for some, now in zip(worlds, trials, strict=True)
+    ]
+
+    def kind(some: World, now: Trial, rules: Any) -> Any:
+        """Those that push, those that are still on their way, and those that have ended."""
+        return 2 * now.done + (now.contact_steps == 0)
+
+    ones = [partial(one, stage) for stage in stages]
+    return tuple(native.side_by_side(ones, whole, kind)(*given))
 
 
 def _side_by_side(

@@ -173,11 +173,12 @@ def drive(
 ) -> Driven:
     """One control period of a batch of worlds (B,) at `twist` (B,), with robots (B,) if limited.
 
-    On an NVIDIA GPU it is one kernel, on a processor a function of C if there is a compiler;
+    On an NVIDIA GPU it is a kernel, on a processor a function of C if there is a compiler;
     elsewhere, and where it is differentiated, XLA compiles it.
     """
     driven = partial(_driven, physics=physics, force=force)
-    run = native.mapped(driven, driven) if motion.qpos.ndim == 2 else driven
+    in_c = motion.qpos.ndim == 2 and jax.default_backend() == "cpu"
+    run = native.mapped(driven, driven) if in_c else driven
     return run(body, motion, twist, robot)
 
 
@@ -194,7 +195,7 @@ def _driven(
 def _period(
     physics: Physics, scalars: Body, state: State, twist: Vec, robot: Robot | None
 ) -> State:
-    if jax.default_backend() == "cpu":
+    if jax.default_backend() == "cpu" or jnp.ndim(scalars.mass) == 0:  # one world alone
         return in_xla(scalars, state, twist, robot, physics=physics)
     return jax.lax.platform_dependent(
         scalars,

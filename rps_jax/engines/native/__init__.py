@@ -1,7 +1,8 @@
-"""Functions of one world, compiled by the C compiler of this machine for the lanes of a processor.
+"""Functions of one world, compiled for the lanes of a processor or the threads of a GPU.
 
 XLA begins every operation on a few worlds anew, which takes longer than the operation. Here the
-same source, as a jaxpr, is one function of C: see `nodes`. It is kept in the program cache, under a
+same source, as a jaxpr, is one function: see `nodes`; `writer` writes it in C, `threads` in CUDA,
+which `cuda` has compiled. It is kept in the program cache, under a
 key of its text, the compiler and the processor, and verified before it is used. Where there is no
 compiler, in double precision, and where a function is differentiated, XLA compiles it, as it does
 with the device `xla`.
@@ -13,6 +14,7 @@ import contextlib
 import ctypes
 import functools
 import hashlib
+import math
 import os
 import re
 import subprocess
@@ -29,7 +31,7 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax.engines import device
-from rps_jax.engines.native import writer
+from rps_jax.engines.native import cuda, threads, writer
 from rps_jax.errors import InputError
 from rps_jax.geometry import vectors
 from rps_jax.record import provenance
@@ -37,6 +39,8 @@ from rps_jax.record import provenance
 # A sum is fused with the product before it, as XLA does; nothing else is taken for something else.
 _FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-w")
 _NAME = "rps_lanes_"
+_THREADS = 4  # of a GPU that hold a world
+_PLATFORMS = {"cpu": "cpu", "gpu": "CUDA"}
 _OF_ONE: ContextVar[bool] = ContextVar("rps_jax_of_one_world", default=False)
 _loaded: dict[str, Any] = {}
 _locks: defaultdict[str, threading.RLock] = defaultdict(threading.RLock)
@@ -58,9 +62,12 @@ def _macros(compiler: str) -> str | None:
 
 
 def target() -> str | None:
-    """What tells compilers and processors apart that functions are compiled by and for, if any."""
-    compiler = provenance.compiler() if jax.default_backend() == "cpu" else None
-    return None if compiler is None else _macros(compiler)
+    """What tells compilers and devices apart that functions are compiled by and for, if any."""
+    if (compiler := provenance.compiler()) is None or (macros := _macros(compiler)) is None:
+        return None
+    if jax.default_backend() == "cpu":
+        return macros
+    return (found := cuda.target()) and f"{macros} {found}"
 
 
 def mapped(one: Callable[..., Any], whole: Callable[..., Any]) -> Callable[..., Any]:
@@ -70,63 +77,134 @@ def mapped(one: Callable[..., Any], whole: Callable[..., Any]) -> Callable[..., 
       one: the function of one world; pure.
       whole: the same of a batch, which XLA compiles where `one` is not compiled here.
     """
+    run = side_by_side([one], lambda given: [whole(*given)])
+    return lambda *arguments: run(arguments)[0]
+
+
+def side_by_side(
+    ones: Sequence[Callable[..., Any]],
+    whole: Callable[..., Any],
+    kind: Callable[..., Any] | None = None,
+) -> Any:
+    """Functions of batches of worlds, one of each, which a GPU runs at the same time.
+
+    Args:
+      ones: the functions of one world; pure.
+      whole: of a tuple of arguments for each of them, all their results; XLA compiles it where
+        `ones` are not compiled here.
+      kind: of a batch's arguments, numbers (B,): worlds of equal ones are computed side by side,
+        those of the lowest first. No result depends on it, but how long they take.
+    """
     if not usable():
         return whole
 
     @jax.custom_jvp
-    def run(*arguments: Any) -> Any:
-        leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, arguments))
-        given = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in leaves]
-        token = _OF_ONE.set(True)
-        try:
-            with vectors.reductions_in_one():
-                closed, out = jax.make_jaxpr(one, return_shape=True)(
-                    *jax.tree.unflatten(tree, given)
-                )
-        finally:
-            _OF_ONE.reset(token)
-        results, structure = jax.tree.flatten(out)
-        name = _made(closed, given, results)
-        if name is None:
-            return whole(*arguments)
-        shapes = [jax.ShapeDtypeStruct((len(leaves[0]), *x.shape), x.dtype) for x in results]
-        found = jax.ffi.ffi_call(name, shapes, vmap_method="broadcast_all")(*leaves)
-        return jax.tree.unflatten(structure, found)
+    def run(*arguments: Any) -> list[Any]:
+        every = [_Function(*each, kind) for each in zip(ones, arguments, strict=True)]
+        calls = [every] if jax.default_backend() == "gpu" else [[each] for each in every]
+        names = [_made(call) for call in calls]
+        if None in names:
+            return list(whole(*arguments))
+        found: list[Any] = []
+        for call, name in zip(calls, names, strict=True):
+            shapes = [x for each in call for x in each.shapes]
+            given = [x for each in call for x in each.leaves]
+            called = jax.ffi.ffi_call(str(name), shapes, vmap_method="broadcast_all")
+            results = iter(called(*given))
+            found += [
+                jax.tree.unflatten(each.structure, [next(results) for _ in each.results])
+                for each in call
+            ]
+        return found
 
-    run.defjvp(lambda primals, tangents: jax.jvp(whole, primals, tangents))
+    run.defjvp(lambda primals, tangents: jax.jvp(lambda *x: list(whole(*x)), primals, tangents))
     return run
 
 
-def _made(closed: Any, given: Sequence[Any], found: Sequence[Any]) -> str | None:
-    """The name under which XLA knows a function; None if it cannot be compiled here."""
+class _Function:
+    """A function of one world as a jaxpr, and what a batch of worlds gives it."""
+
+    def __init__(self, one: Callable[..., Any], arguments: Any, kind: Any) -> None:
+        self.leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, arguments))
+        self.given = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in self.leaves]
+        token = _OF_ONE.set(True)
+        try:
+            with vectors.reductions_in_one():
+                self.jaxpr, out = jax.make_jaxpr(one, return_shape=True)(
+                    *jax.tree.unflatten(tree, self.given)
+                )
+        finally:
+            _OF_ONE.reset(token)
+        self.results, self.structure = jax.tree.flatten(out)
+        count, self.ordered = len(self.leaves[0]), kind is not None
+        if kind is not None:
+            self.leaves.append(jnp.argsort(kind(*arguments)).astype(jnp.int32))
+        self.shapes = [jax.ShapeDtypeStruct((count, *x.shape), x.dtype) for x in self.results]
+
+
+def _made(functions: Sequence[_Function]) -> str | None:
+    """The name under which XLA knows functions; None if they cannot be compiled here."""
+    on_gpu = jax.default_backend() == "gpu"
+    write = functools.partial(threads.source, threads=_THREADS) if on_gpu else writer.source
     try:
         with jax.ensure_compile_time_eval():
-            text = writer.source(closed, given, found)
+            texts = [write(x.jaxpr, x.given, x.results, x.ordered) for x in functions]
     except (InputError, jax.errors.TracerArrayConversionError):
         return None  # a law has an operation without a form in C, or holds what is being traced
     except Exception as error:  # of a version of JAX that writes its operations otherwise
         said = f"{type(error).__name__}: {error}"
         warnings.warn(f"no C can be written, so XLA compiles: {said}", stacklevel=2)
         return None
-    key = repr((text, target(), jax.__version__))
+    key = repr((texts, target(), jax.__version__))
     name = _NAME + hashlib.sha256(key.encode()).hexdigest()[:32]
     with _locks[name]:
         if load(name):
             return name
-        with tempfile.TemporaryDirectory() as folder:
-            source, binary = Path(folder) / f"{name}.c", Path(folder) / f"{name}.so"
-            source.write_text(text.replace(writer.HANDLER, name))
-            words = [str(provenance.compiler()), *_FLAGS, "-shared", "-fPIC"]
-            words += [f"-I{jax.ffi.include_dir()}", str(source), "-o", str(binary), "-lm"]
-            done = subprocess.run(words, capture_output=True, text=True)
-            if done.returncode:
-                said = [*done.stderr.splitlines(), "it does not say why"]
-                warnings.warn(f"{words[0]} fails, so XLA compiles: {said[0]}", stacklevel=2)
-                return None
-            body = binary.read_bytes()
+        try:
+            body = _launching(name, texts, functions) if on_gpu else _binary(
+                texts[0].replace(writer.HANDLER, name), name)  # fmt: skip
+        except RuntimeError as error:
+            what, why = error.args
+            warnings.warn(f"{what} fails, so XLA compiles: {why}", stacklevel=2)
+            return None
         device.keep(_place(name), body)
         _register(name, body)
     return name
+
+
+def _binary(text: str, name: str) -> bytes:
+    """A library of a text of C.
+
+    Raises:
+      RuntimeError: the compiler, which fails, and why.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        source, binary = Path(folder) / f"{name}.c", Path(folder) / f"{name}.so"
+        source.write_text(text)
+        words = [str(provenance.compiler()), *_FLAGS, "-shared", "-fPIC"]
+        words += [f"-I{jax.ffi.include_dir()}", str(source), "-o", str(binary), "-lm", "-ldl"]
+        done = subprocess.run(words, capture_output=True, text=True)
+        if done.returncode:
+            said = [*done.stderr.splitlines(), "it does not say why"]
+            raise RuntimeError(words[0], said[0])
+        return binary.read_bytes()
+
+
+def _launching(name: str, texts: Sequence[str], functions: Sequence[_Function]) -> bytes:
+    """A library of kernels and of the function that launches them.
+
+    Raises:
+      RuntimeError: the compiler that fails, and why.
+    """
+    shapes = []
+    for each in functions:
+        one, size = next((i, n) for i, x in enumerate(each.given) if (n := math.prod(x.shape)))
+        shapes.append((len(each.leaves), len(each.results), one, size))
+    with tempfile.TemporaryDirectory() as folder:
+        codes = [Path(folder) / f"{k}.cubin" for k in range(len(texts))]
+        for code, image in zip(codes, cuda.images(texts), strict=True):
+            code.write_bytes(image)
+        return _binary(cuda.launcher(name, codes, shapes, threads.WARP // _THREADS), name)
 
 
 def known() -> list[str]:
@@ -159,6 +237,7 @@ def _register(name: str, body: bytes) -> bool:
         binary = Path(folder) / f"{name}.so"
         binary.write_bytes(body)
         library = ctypes.CDLL(str(binary))
-    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(getattr(library, name)), platform="cpu")
+    function = jax.ffi.pycapsule(getattr(library, name))
+    jax.ffi.register_ffi_target(name, function, platform=_PLATFORMS[jax.default_backend()])
     _loaded[name] = library
     return True

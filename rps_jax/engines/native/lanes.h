@@ -1,6 +1,5 @@
 /* Vectors with a lane for each of some worlds: real numbers (f), whole ones (i), those without a
-   sign (u), and bools (b), whose lanes are 0 or -1. The operations that stand here are those that
-   `nodes` knows, under JAX's names for them and the kind of their first operand. */
+   sign (u), and bools (b), whose lanes are 0 or -1. `operations.h` follows. */
 
 #include <math.h>
 #include <stdint.h>
@@ -12,6 +11,7 @@
 #define LANES 8
 #endif
 #define FUNCTION static inline __attribute__((always_inline))
+#define UNROLL _Pragma("GCC unroll 8")
 typedef float V __attribute__((vector_size(4 * LANES)));
 typedef int32_t I __attribute__((vector_size(4 * LANES)));
 typedef uint32_t U __attribute__((vector_size(4 * LANES)));
@@ -28,21 +28,7 @@ FUNCTION int32_t any(I m) {
 FUNCTION V choose_f(I m, V a, V b) { return (V)((m & (I)a) | (~m & (I)b)); }
 FUNCTION I choose_i(I m, I a, I b) { return (m & a) | (~m & b); }
 FUNCTION U choose_u(I m, U a, U b) { return ((U)m & a) | (~(U)m & b); }
-FUNCTION I choose_b(I m, I a, I b) { return choose_i(m, a, b); }
 
-#define INFIX(name, sign) \
-  FUNCTION V name##_f(V a, V b) { return a sign b; } \
-  FUNCTION I name##_i(I a, I b) { return (I)((U)a sign (U)b); } \
-  FUNCTION U name##_u(U a, U b) { return a sign b; }
-#define COMPARE(name, sign) \
-  FUNCTION I name##_f(V a, V b) { return a sign b; } \
-  FUNCTION I name##_i(I a, I b) { return a sign b; } \
-  FUNCTION I name##_u(U a, U b) { return a sign b; } \
-  FUNCTION I name##_b(I a, I b) { return a sign b; }
-#define BITS(name, sign) \
-  FUNCTION I name##_b(I a, I b) { return a sign b; } \
-  FUNCTION I name##_i(I a, I b) { return a sign b; } \
-  FUNCTION U name##_u(U a, U b) { return a sign b; }
 #define EACH(name) \
   FUNCTION V name##_f(V x) { \
     V found; \
@@ -55,133 +41,20 @@ FUNCTION I choose_b(I m, I a, I b) { return choose_i(m, a, b); }
     for (int l = 0; l < LANES; l++) found[l] = of(x[l], y[l]); \
     return found; \
   }
-INFIX(add, +)
-INFIX(sub, -)
-INFIX(mul, *)
-COMPARE(eq, ==)
-COMPARE(ne, !=)
-COMPARE(lt, <)
-COMPARE(le, <=)
-COMPARE(gt, >)
-COMPARE(ge, >=)
-BITS(and, &)
-BITS(or, |)
-BITS(xor, ^)
 EACH(sqrt)
-EACH(exp)
-EACH(log)
-EACH(sin)
-EACH(cos)
-EACH(tan)
-EACH(asin)
-EACH(acos)
-EACH(atan)
-EACH(sinh)
-EACH(cosh)
-EACH(tanh)
-EACH(log1p)
-EACH(expm1)
-EACH(floor)
-EACH(ceil)
-EACH(round)
-EACH(rint)
-EACH_OF_TWO(atan2, atan2f)
-EACH_OF_TWO(pow, powf)
-EACH_OF_TWO(rem, fmodf)
-
+FUNCTION V rsqrt_f(V x) { return 1.0f / sqrt_f(x); }
 FUNCTION V f_of_i(I x) { return __builtin_convertvector(x, V); }
 FUNCTION V f_of_u(U x) { return __builtin_convertvector(x, V); }
 FUNCTION V f_of_b(I x) { return (V)(x & (I)all_f(1.0f)); }
 FUNCTION I i_of_b(I x) { return -x; }
-FUNCTION I i_of_u(U x) { return (I)x; }
-FUNCTION U u_of_i(I x) { return (U)x; }
-FUNCTION U u_of_b(I x) { return (U)-x; }
+FUNCTION I not_b(I x) { return ~x; }
+FUNCTION I whole(V x) { return __builtin_convertvector(x, I); }
 FUNCTION U u_of_f(V x) {
   U found;
   for (int l = 0; l < LANES; l++)
     found[l] = !(x[l] > 0) ? 0u : x[l] < 4294967296.0f ? (uint32_t)x[l] : 4294967295u;
   return found;
 }
-FUNCTION I b_of_f(V x) { return x != 0.0f; }
-FUNCTION I b_of_i(I x) { return x != 0; }
-FUNCTION V bits_f_of_u(U x) { return (V)x; }
-FUNCTION U bits_u_of_f(V x) { return (U)x; }
-FUNCTION I not_b(I x) { return ~x; }
-FUNCTION V neg_f(V x) { return -x; }
-FUNCTION I neg_i(I x) { return (I)(0u - (U)x); }
-FUNCTION V abs_f(V x) { return (V)((I)x & 0x7fffffff); }
-FUNCTION V div_f(V a, V b) { return a / b; }
-FUNCTION V square_f(V x) { return x * x; }
-FUNCTION V rsqrt_f(V x) { return 1.0f / sqrt_f(x); }
-FUNCTION V logistic_f(V x) { return 1.0f / (1.0f + exp_f(-x)); }
-FUNCTION I is_finite_f(V x) { return abs_f(x) < INFINITY; }
-FUNCTION V sign_f(V x) {
-  return choose_f(x > 0.0f, all_f(1.0f), choose_f(x < 0.0f, all_f(-1.0f), x));
-}
-/* As JAX has them: NaN goes on, and no whole number overflows. */
-FUNCTION V max_f(V a, V b) { return choose_f((a >= b) | (a != a), a, b); }
-FUNCTION V min_f(V a, V b) { return choose_f((a <= b) | (a != a), a, b); }
-FUNCTION I max_i(I a, I b) { return choose_i(a > b, a, b); }
-FUNCTION I min_i(I a, I b) { return choose_i(a < b, a, b); }
-FUNCTION I abs_i(I x) { return max_i(x, neg_i(x)); }
-FUNCTION I sign_i(I x) { return (x < 0) - (x > 0); }
-FUNCTION I div_i(I a, I b) {
-  I odd = (b == 0) | (b == -1), found = a / choose_i(odd, all_i(1), b);
-  return choose_i(b == 0, all_i(-1), choose_i(odd, neg_i(a), found));
-}
-FUNCTION I rem_i(I a, I b) {
-  return choose_i(b == 0, a, a % choose_i((b == 0) | (b == -1), all_i(1), b));
-}
-FUNCTION I i_of_f(V x) {
-  V held = choose_f(x == x, x, all_f(0.0f));
-  held = min_f(max_f(held, all_f(-2147483648.0f)), all_f(2147483520.0f));
-  return choose_i(x >= 2147483648.0f, all_i(2147483647), __builtin_convertvector(held, I));
-}
-FUNCTION U shift_right_logical_u(U x, U by) {
-  return choose_u(by < 32u, x >> (by & 31u), all_u(0u));
-}
-FUNCTION U shift_left_u(U x, U by) { return choose_u(by < 32u, x << (by & 31u), all_u(0u)); }
+FUNCTION V bits_f_of_i(I x) { return (V)x; }
+FUNCTION I bits_i_of_f(V x) { return (I)x; }
 
-/* One of the two words of the block cipher Threefry, by which JAX draws. */
-FUNCTION U threefry(U key, U other, U x, U y, int which) {
-  static const int turns[8] = {13, 15, 26, 6, 17, 29, 16, 24};
-  const U keys[3] = {key, other, key ^ other ^ 0x1BD11BDAu};
-  x += keys[0];
-  y += keys[1];
-#pragma GCC unroll 5
-  for (int i = 0; i < 5; i++) {
-#pragma GCC unroll 4
-    for (int j = 0; j < 4; j++) {
-      const int by = turns[4 * (i & 1) + j];
-      x += y;
-      y = ((y << by) | (y >> (32 - by))) ^ x;
-    }
-    x += keys[(i + 1) % 3];
-    y += keys[(i + 2) % 3] + (uint32_t)(i + 1);
-  }
-  return which ? y : x;
-}
-FUNCTION U threefry2x32_0_u(U a, U b, U x, U y) { return threefry(a, b, x, y, 0); }
-FUNCTION U threefry2x32_1_u(U a, U b, U x, U y) { return threefry(a, b, x, y, 1); }
-
-/* Giles's approximation, as XLA has it; by a logarithm to a few roundings of its largest value. */
-FUNCTION V erf_inv_f(V x) {
-  static const float near[9] = {2.81022636e-08f, 3.43273939e-07f, -3.5233877e-06f,
-      -4.39150654e-06f, 0.00021858087f, -0.00125372503f, -0.00417768164f, 0.246640727f,
-      1.50140941f};
-  static const float far[9] = {-0.000200214257f, 0.000100950558f, 0.00134934322f,
-      -0.00367342844f, 0.00573950773f, -0.0076224613f, 0.00943887047f, 1.00167406f, 2.83297682f};
-  /* (1 - x)(1 + x) = 2^n (1 + r) with r from sqrt(1/2) - 1 to sqrt(2) - 1, and s = r / (2 + r). */
-  V left = (1.0f - x) * (1.0f + x);
-  I n = ((I)left - 0x3f3504f3) >> 23;
-  V r = (V)((I)left - (n << 23)) - 1.0f, s = r / (2.0f + r), t = s * s;
-  V series = t * (1.0f / 3 + t * (1.0f / 5 + t * (1.0f / 7 + t * (1.0f / 9))));
-  V w = -(f_of_i(n) * 0.693147181f + 2.0f * (s + s * series));
-  I inner = w < 5.0f;
-  w = choose_f(inner, w - 2.5f, sqrt_f(w) - 3.0f);
-  V found = choose_f(inner, all_f(near[0]), all_f(far[0]));
-#pragma GCC unroll 8
-  for (int i = 1; i < 9; i++)
-    found = choose_f(inner, all_f(near[i]), all_f(far[i])) + found * w;
-  return choose_f(abs_f(x) == 1.0f, x * INFINITY, found * x);
-}

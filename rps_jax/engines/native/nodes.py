@@ -8,6 +8,7 @@ depend on the other lanes.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -19,7 +20,10 @@ import numpy as np
 
 from rps_jax.engines.native.walk import PAIRED, Target, is_constant, kind_of, unsupported
 
-HEADER = Path(__file__).with_name("lanes.h").read_text()
+_HERE = Path(__file__).parent
+OPERATIONS = (_HERE / "operations.h").read_text()
+HEADER = (_HERE / "lanes.h").read_text() + OPERATIONS
+THREADS = (_HERE / "threads.h").read_text() + OPERATIONS
 # Kinds of numbers for which each macro of the header writes an operation.
 _WRITTEN = {"INFIX": "fiu", "COMPARE": "fiub", "BITS": "iub", "EACH": "f", "EACH_OF_TWO": "f"}
 _KNOWN = set(re.findall(r"^FUNCTION \w+ (\w+)\(", HEADER, re.M)) | {
@@ -69,7 +73,7 @@ class Node:
         """Whether it stands in no loop over its numbers."""
         return self.size < 2 or self.op in ("move", "take", "while", "for", "given", "part")
 
-    @property
+    @functools.cached_property
     def entire(self) -> set[Node]:
         """Of these what must be there with all its numbers, not only the one in turn."""
         arrays = [a for a in self.args if isinstance(a, Array)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -23,15 +24,18 @@ from rps_jax.engines.native.nodes import (
 from rps_jax.engines.native.walk import kind_of, walk
 
 HANDLER = "rps_lanes"  # what its name is replaced by is known to XLA
-_TYPES = {"f": "V", "i": "I", "u": "U", "b": "I"}  # of a vector
-_STORED = {"f": "float", "i": "int", "u": "unsigned", "b": "unsigned char"}  # of a world's number
+TYPES = {"f": "V", "i": "I", "u": "U", "b": "I"}  # of a vector
+STORED = {"f": "float", "i": "int", "u": "unsigned", "b": "unsigned char"}  # of a world's number
 # Placeholders in capitals are lines that are written for a function.
 _BODY = """\
 
 {TABLES}
 static void some(void **given, void **found, int64_t first, int64_t worlds) {{
   int64_t at[LANES];
-  for (int l = 0; l < LANES; l++) at[l] = first + l < worlds ? first + l : worlds - 1;
+  for (int l = 0; l < LANES; l++) {{
+    const int64_t mine = first + l < worlds ? first + l : worlds - 1;
+    at[l] = {PLACE};
+  }}
 {LINES}
 }}
 
@@ -55,11 +59,15 @@ XLA_FFI_Error *{NAME}(XLA_FFI_CallFrame *frame) {{
 """
 
 
-class _Writer:
+class Writer:
     """Statements of nodes, in an order in which few loops are needed."""
 
+    table_of = "static const"
+
     def __init__(self) -> None:
-        self.tables: dict[bytes, str] = {}
+        """Begin without statements."""
+        self.tables: dict[bytes, str] = {}  # of constants, which stand before the function
+        self.names = itertools.count()
 
     def lines(self, nodes: Iterable[Node], wanted: Iterable[Node], there: set[Node]) -> list[str]:
         """Statements that make nodes, where some are there; `wanted` are used afterwards."""
@@ -75,42 +83,62 @@ class _Writer:
             for node in group:
                 for one in node.after:
                     users.setdefault(one, set()).add(i)
+        last: dict[int, list[Node]] = {}
         for i, group in enumerate(groups):
-            if group[0].alone:
+            for node in group:
+                if node not in wanted:
+                    last.setdefault(max(users.get(node, {i})), []).append(node)
+        for i, group in enumerate(groups):
+            if self.apart(group[0]):
                 for node in group:
                     lines += self._alone(node)
-                continue
-            kept = [n for n in group if n in wanted or users.get(n, set()) - {i}
-                    or any(n in other.entire for other in group)]  # fmt: skip
-            lines += self._together(group, set(kept))
+            else:
+                whole = set().union(*(node.entire for node in group))
+                kept = {n for n in group if n in wanted or n in whole or users.get(n, set()) - {i}}
+                lines += self._together(group, kept)
+            self.done(last.get(i, ()))
         return lines
+
+    def apart(self, node: Node) -> bool:
+        """Whether a node stands in no loop over its numbers."""
+        return node.alone
+
+    def first_of(self, sizes: Iterable[int]) -> int:
+        """Of which size the first of several loops over numbers is."""
+        return next(iter(sizes))
+
+    def done(self, nodes: Iterable[Node]) -> None:
+        """Hear of nodes that no statement to come reads."""
+
+    def statement(self, lines: Sequence[str]) -> list[str]:
+        """Statements, after those that they need."""
+        return list(lines)
 
     def _next(self, waiting: Sequence[Node], there: set[Node]) -> list[Node]:
         """What can be made next: all that stands alone, else one loop, else one of JAX's loops."""
         for wanted in ("alone", "together", "loop"):
-            group: list[Node] = []
-            have, size = set(there), 0
+            groups: dict[int, list[Node]] = {}
+            have = set(there)
             for node in waiting:
-                kind = "alone" if node.alone else "together"
+                kind = "alone" if self.apart(node) else "together"
                 kind = "loop" if isinstance(node.extra, Loop) else kind
-                if kind != wanted or (size and node.size != size):
+                if kind != wanted:
                     continue
                 whole = there if kind == "together" else have
                 if node.entire <= whole and set(node.after) <= have:
-                    size = node.size if kind == "together" else 0
-                    group.append(node)
+                    groups.setdefault(node.size if kind == "together" else 0, []).append(node)
                     have.add(node)
                     if kind == "loop":
                         break
-            if group:
-                return group
+            if groups:
+                return groups[self.first_of(groups)]
         raise AssertionError("nodes wait for one another")
 
     def _together(self, group: Sequence[Node], kept: set[Node]) -> list[str]:
         """One loop over the numbers of nodes."""
         before, lines, mine = [], [], set(group)
         for node in group:
-            kind, name = _TYPES[node.kind], node.name
+            kind, name = TYPES[node.kind], node.name
             text = self._expression(node, mine)
             if node.op.startswith("fold"):
                 op = node.op[5:]
@@ -125,7 +153,7 @@ class _Writer:
         return [*before, f"for (int i = 0; i < {group[0].size}; i++) {{", *lines, "}"]
 
     def _alone(self, node: Node) -> list[str]:
-        kind, name, size = _TYPES[node.kind], node.name, node.size
+        kind, name, size = TYPES[node.kind], node.name, node.size
         if isinstance(node.extra, Loop):
             return self._loop(node, node.extra)
         if node.op == "part":
@@ -135,7 +163,7 @@ class _Writer:
         declared = f"{kind} {name}" + ("" if size == 1 else f"[{size}]")
         at = "" if size == 1 else "[i]"
         if node.op == "given":
-            stored = f"((const {_STORED[node.kind]} *)given[{node.extra}])[at[l] * {size} + i]"
+            stored = f"((const {STORED[node.kind]} *)given[{node.extra}])[at[l] * {size} + i]"
             stored = f"-(int){stored}" if node.kind == "b" else stored
             return [
                 f"{declared};",
@@ -144,7 +172,7 @@ class _Writer:
             ]
         if node.op == "take":
             place, source = node.args
-            row, table = self.read(place, node, set()), self._table(np.array(node.extra))
+            row, table = self.read(place, node, set()), self.table(np.array(node.extra))
             return [
                 f"{declared};",
                 f"for (int i = 0; i < {size}; i++)",
@@ -162,16 +190,14 @@ class _Writer:
         lines, body = [], []
         for own, start in zip(loop.carried, node.args, strict=True):
             if own.size:
-                lines += self._set(own, start, f"{_TYPES[own.kind]} ", node)
+                lines += self._set(own, start, f"{TYPES[own.kind]} ", node)
         results = [a.node for a in (*loop.results, loop.holds) if isinstance(a, Array)]
         there = {*node.free, *loop.carried, *(n for n in results if n not in node.inner)}
         if loop.holds is not None:
             before = [n for n in reached([loop.holds.node]) if n in node.inner]
             body += self.lines(before, node.inner, there)
-            body += [
-                f"const I goes = {self.read(loop.holds, node, set())};",
-                "if (!any(goes)) break;",
-            ]
+            goes = self.read(loop.holds, Node(0, "goes", (), "b", 1), set())
+            body += self.statement([f"const I goes = {goes};", "if (!any(goes)) break;"])
             there |= set(before)
             rest = [n for n in node.inner if n not in set(before)]
         else:
@@ -196,11 +222,7 @@ class _Writer:
     def read(self, a: Any, node: Node, mine: set[Node]) -> str:
         """How a node reads an operand."""
         if not isinstance(a, Array):
-            array = np.asarray(a).reshape(-1)
-            kind = kind_of(array.dtype, "", Lanes.kinds)
-            if array.size == 1:
-                return _all(kind, array[0])
-            return f"all_{kind}({self._table(array)}[i])"
+            return constant(a, self)
         if a.node.width == 1:
             return a.node.name
         if a.node in mine and node.in_turn(a):
@@ -213,24 +235,34 @@ class _Writer:
         reads = [self.read(a, node, mine) for a in node.args]
         return reads[0] if node.op.startswith("fold") else f"{node.op}({', '.join(reads)})"
 
-    def _table(self, array: np.ndarray) -> str:
+    def table(self, array: np.ndarray) -> str:
         """The name of constants that stand before the function."""
         key = array.tobytes() + array.dtype.str.encode()
         kind = kind_of(array.dtype, "", Lanes.kinds)
         if key not in self.tables:
-            texts = ", ".join(_literal(x, kind) for x in array.reshape(-1))
-            stored = "int" if kind == "b" else _STORED[kind]
+            texts = ", ".join(literal(x, kind) for x in array.reshape(-1))
+            stored = "int" if kind == "b" else STORED[kind]
             name = f"t{len(self.tables)}"
-            self.tables[key] = f"static const {stored} {name}[{array.size}] = {{{texts}}};"
+            self.tables[key] = f"{self.table_of} {stored} {name}[{array.size}] = {{{texts}}};"
         return self.tables[key].split("[")[0].split()[-1]
+
+
+def constant(a: Any, writer: Writer) -> str:
+    """A constant, or the one in turn of several."""
+    array = np.asarray(a).reshape(-1)
+    kind = kind_of(array.dtype, "", Lanes.kinds)
+    if array.size == 1:
+        return _all(kind, array[0])
+    return f"all_{kind}({writer.table(array)}[i])"
 
 
 def _all(kind: str, value: Any) -> str:
     """A constant in every lane."""
-    return f"all_{kind}({_literal(value, kind)})"
+    return f"all_{kind}({literal(value, kind)})"
 
 
-def _literal(value: Any, kind: str) -> str:
+def literal(value: Any, kind: str) -> str:
+    """A number in C."""
     if kind == "f":
         number = float(value)
         text = f"{number!r}f" if math.isfinite(number) else repr(number).replace("inf", "INFINITY")
@@ -241,13 +273,15 @@ def _literal(value: Any, kind: str) -> str:
     return f"{whole}u" if kind == "u" else str(whole) if whole > -(2**31) else "-2147483647 - 1"
 
 
-def source(closed: Any, shapes: Sequence[Any], outs: Sequence[Any]) -> str:
+def source(closed: Any, shapes: Sequence[Any], outs: Sequence[Any], ordered: bool = False) -> str:
     """C of a closed jaxpr of arguments of these shapes and types: the handler `HANDLER` of XLA's.
+
+    Of `ordered` worlds one more argument tells which come first.
 
     Raises:
       InputError: it has an operation that is not known here.
     """
-    target, writer = Lanes(), _Writer()
+    target, writer = Lanes(), Writer()
     given = [
         target.given(i, x.shape, x.dtype) if size_of(x.shape) else np.zeros(x.shape, x.dtype)
         for i, x in enumerate(shapes)
@@ -264,10 +298,10 @@ def source(closed: Any, shapes: Sequence[Any], outs: Sequence[Any]) -> str:
             continue
         end = Node(0, "end", (a,), kind, size)
         read = writer.read(a, end, set())
-        stored = _STORED[kind]
+        stored = STORED[kind]
         lines += [
             f"for (int i = 0; i < {size}; i++) {{",
-            f"  const {_TYPES[kind]} e = {read};",
+            f"  const {TYPES[kind]} e = {read};",
             "  for (int l = 0; l < LANES && first + l < worlds; l++)",
             f"    (({stored} *)found[{i}])[at[l] * {size} + i] = e[l]{' != 0' * (kind == 'b')};",
             "}",
@@ -277,8 +311,9 @@ def source(closed: Any, shapes: Sequence[Any], outs: Sequence[Any]) -> str:
         "TABLES": "\n".join(writer.tables.values()),
         "LINES": "\n".join(f"  {line}" for line in lines),
         "NAME": HANDLER,
-        "COUNT": len(shapes),
+        "COUNT": len(shapes) + ordered,
         "FOUND": len(outs),
+        "PLACE": f"((const int *)given[{len(shapes)}])[mine]" if ordered else "mine",
         "ONE": one,
         "SIZE": size_of(shapes[one].shape),
     }

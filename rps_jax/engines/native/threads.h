@@ -1,0 +1,57 @@
+/* A number of each world of a warp, where THREADS threads hold a world: real numbers (f), whole
+   ones (i), those without a sign (u), and bools (b, 0 or 1). A single number is the same in all
+   threads of its world; of an array, thread t holds the numbers t, t + THREADS, ... All threads of
+   a warp take every turn together. `operations.h` follows. */
+
+#ifndef INFINITY
+#define INFINITY __int_as_float(0x7f800000)
+#define NAN __int_as_float(0x7fffffff)
+#endif
+#define WORLDS (32 / THREADS)
+#define ALL 0xffffffffu
+#define FUNCTION static __device__ __forceinline__
+#define UNROLL _Pragma("unroll")
+typedef float V;
+typedef int I;
+typedef unsigned U;
+
+FUNCTION V all_f(float x) { return x; }
+FUNCTION I all_i(int x) { return x; }
+FUNCTION U all_u(unsigned x) { return x; }
+FUNCTION I all_b(int x) { return x != 0; }
+FUNCTION int any(I m) { return __any_sync(ALL, m); }
+FUNCTION V choose_f(I m, V a, V b) { return m ? a : b; }
+FUNCTION I choose_i(I m, I a, I b) { return m ? a : b; }
+FUNCTION U choose_u(I m, U a, U b) { return m ? a : b; }
+
+#define EACH(name) FUNCTION V name##_f(V x) { return name##f(x); }
+#define EACH_OF_TWO(name, of) FUNCTION V name##_f(V x, V y) { return of(x, y); }
+EACH(sqrt)
+EACH(rsqrt)
+FUNCTION V f_of_i(I x) { return (V)x; }
+FUNCTION V f_of_u(U x) { return (V)x; }
+FUNCTION V f_of_b(I x) { return x ? 1.0f : 0.0f; }
+FUNCTION I i_of_b(I x) { return x; }
+FUNCTION I not_b(I x) { return !x; }
+FUNCTION I whole(V x) { return (I)x; }
+FUNCTION U u_of_f(V x) { return !(x > 0) ? 0u : x < 4294967296.0f ? (U)x : 4294967295u; }
+FUNCTION V bits_f_of_i(I x) { return __int_as_float(x); }
+FUNCTION I bits_i_of_f(V x) { return __float_as_int(x); }
+
+/* What is reduced over the threads of a world, in all of which it is the same then. */
+#define FOLD(name, kind, type) \
+  FUNCTION type name##_over_threads_##kind(type x) { \
+    for (int by = THREADS / 2; by; by /= 2) x = name##_##kind(x, __shfl_xor_sync(ALL, x, by)); \
+    return __shfl_sync(ALL, x, 0, THREADS); \
+  }
+#define OF_THREAD(kind, type) \
+  FUNCTION type of_thread_##kind(type x, int t) { return __shfl_sync(ALL, x, t, THREADS); }
+OF_THREAD(f, V)
+OF_THREAD(i, I)
+OF_THREAD(u, U)
+OF_THREAD(b, I)
+FUNCTION V sum_over_threads_f(V x) {
+  for (int by = THREADS / 2; by; by /= 2) x += __shfl_xor_sync(ALL, x, by);
+  return x;
+}
+
