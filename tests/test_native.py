@@ -14,7 +14,7 @@ from rps_jax.trials import trial
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Loop
 from rps_jax.trials.worlds import drawn_worlds
-from rps_jax.world import draws
+from rps_jax.world import draws, scene
 from rps_jax.world.domain import DOMAINS
 
 pytestmark = pytest.mark.skipif(native.target() is None, reason="there is no C compiler")
@@ -188,6 +188,16 @@ OPERATIONS = {
     "choices": lambda x: jnp.where((x > 3) & ~(x > 5), jnp.maximum(x, jnp.nan), jnp.sign(x)),
     "functions": lambda x: (jnp.sin(x), jnp.arctan2(x, 2), jnp.exp(-x), x**3, jax.lax.rsqrt(x)),
     "whole from real": lambda x: (jnp.inf * x).astype(jnp.int32) + jnp.round(x / 2).astype(int),
+    "products of matrices": lambda x: (
+        (x * jnp.arange(12.0).reshape(4, 3)) @ (x - jnp.arange(3.0)),
+        jnp.arange(3.0) @ (x * jnp.arange(6.0).reshape(3, 2)),
+        jnp.einsum("bij,bjk->bik", jnp.ones((2, 2, 3)) * x, jnp.arange(24.0).reshape(2, 3, 4)),
+    ),
+    "the furthest": lambda x: (
+        jnp.argmax((x - jnp.arange(6.0)) ** 2),
+        jnp.argmin(jnp.array([2.0, x, jnp.nan, 1.0])),
+        jnp.argmax((x.astype(int) * jnp.arange(6) % 5).reshape(2, 3), axis=1),
+    ),
     "inverse error function": lambda x: jax.lax.erf_inv((x - 9) * jnp.array([0.0, 0.1, 0.111111])),
 }
 
@@ -201,12 +211,27 @@ def test_an_operation_is_what_jax_says(name):
         np.testing.assert_allclose(a, b, rtol=3e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("skin", ["capacitive", "ideal"])
+@pytest.mark.parametrize("law", ["rps", "nps", "aps", "rps_plus", "pursuit", "dipole"])
+def test_the_loop_of_an_equation_is_compiled_as_a_whole(law, skin):
+    stage, worlds, loop = batch("box", skin, 2, law)
+    run = jax.make_jaxpr(lambda w, t: trial.advance((stage,), (w,), (t,), loop, 3))
+    primitives = str(run(worlds, begun(worlds, loop)))
+    assert "rps_lanes" in primitives
+    assert "while" not in primitives
+
+
 def test_what_has_no_form_in_c_xla_compiles():
-    """As a law of matrices."""
+    """As a law of large matrices."""
     found = native.mapped(None, None) if not native.usable() else native.mapped(
-        lambda x: jnp.ones((3, 3)) * x @ jnp.ones(3), lambda x: 3 * x)  # fmt: skip
+        lambda x: jnp.ones((99, 3)) * x @ jnp.ones(3), lambda x: 3 * x)  # fmt: skip
     assert np.asarray(found(jnp.arange(2.0))).tolist() == [0.0, 3.0]
 
 
 def test_other_engines_are_xlas():
-    assert not any(getattr(engines.get(name), "native", False) for name in ("mjx", "quasistatic"))
+    box = scene.load("box", SETTING.physics)
+    marked = set()
+    for name in ("fused", "mjx", "quasistatic"):
+        stage, _ = engines.get(name).stage_of_scenes([box], np.zeros(1, int))
+        marked |= {name} if getattr(stage, "native", False) else set()
+    assert marked == {"fused"}

@@ -100,16 +100,15 @@ def test_programs_that_were_not_used_for_longest_go_first(cache, made, monkeypat
 
 
 def test_a_few_trials_stay_on_processors(monkeypatch):
-    """A thousand for each processor, where there is a C compiler; in C MuJoCo all."""
-    monkeypatch.setattr(provenance, "processors", lambda: 2)
+    """Five hundred, where there is a C compiler; in C MuJoCo all."""
     monkeypatch.setattr(provenance, "compiler", lambda: "cc")
     before = jax.config.jax_platforms
     jax.config.update("jax_platforms", None)
     try:
-        few = Sweep("rps", worlds=2000)
+        few = Sweep("rps", worlds=500)
         assert device.suits_processors(few)
         assert device.suits_processors(Push(setting=Setting("fused")))
-        assert not device.suits_processors(replace(few, worlds=2001))
+        assert not device.suits_processors(replace(few, worlds=501))
         assert not device.suits_processors(replace(few, setting=Setting("mjx")))
         assert device.suits_processors(replace(few, worlds=9000, setting=Setting("mujoco")))
         monkeypatch.setattr(provenance, "compiler", lambda: None)

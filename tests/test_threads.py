@@ -9,13 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_native import OPERATIONS, advanced, batch, begun
+from test_native import OPERATIONS as ALL
+from test_native import advanced, batch, begun
 
 from rps_jax.engines.native import threads
 from rps_jax.errors import InputError
 from rps_jax.geometry import vectors
 from rps_jax.trials import trial
 
+# On a GPU, products of matrices are XLA's.
+OPERATIONS = {name: one for name, one in ALL.items() if name != "products of matrices"}
 COMPILER = shutil.which("g++")
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="there is no g++: apt install g++")
 _RUN = """
@@ -108,6 +111,11 @@ def test_a_control_step_is_the_processors(shape, tmp_path):
     other = run(worlds, pushing, order=np.roll(np.arange(21)[::-1], 5))
     for a, b in zip(*map(jax.tree.leaves, (found, other)), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_products_of_matrices_are_refused(tmp_path):
+    with pytest.raises(InputError, match="a product of matrices"):
+        Emulated(ALL["products of matrices"], (jnp.float32(1.0),), tmp_path, 4)
 
 
 def test_what_threads_share_has_an_end(tmp_path):

@@ -354,6 +354,7 @@ RECIPES: dict[str, Recipe] = {
         rows.speeds,
     ),
     "commands": Recipe((f"rps sweeps/speed/commands.py {_MACHINE}",), 14, None),
+    "compilers": Recipe((f"rps sweeps/speed/compilers.py {_MACHINE}",), 5, None),
     "commands_gpu": Recipe(
         (
             "rps sweeps/speed/commands.py --commands "

@@ -37,6 +37,7 @@ STARTS = {
     **{("add", "f"): 0.0, ("add", "i"): 0, ("max", "f"): -np.inf, ("min", "f"): np.inf},
     **{("max", "i"): -(2**31), ("min", "i"): 2**31 - 1, ("and", "b"): True, ("or", "b"): False},
 }
+_MOST_PRODUCTS = 256  # of numbers, in one product of matrices
 _DTYPES = {"f": "float32", "i": "int32", "u": "uint32", "b": "bool"}
 
 
@@ -167,6 +168,10 @@ class Lanes(Target):
             return self._folded(PAIRED[name], values[0], params["axes"], kind, out)
         if name == "dynamic_slice":
             return self._slice(values[0], values[1:], params["slice_sizes"], kind)
+        if name in ("argmax", "argmin"):
+            return self._furthest(name, values[0], params["axes"][0], out)
+        if name == "dot_general":
+            return self._product(*values, params["dimension_numbers"], out)
         if name == "clamp":
             return self.emit("min", [self.emit("max", values[1::-1], {}, out), values[2]], {}, out)
         if name == "integer_pow":
@@ -222,6 +227,63 @@ class Lanes(Target):
         for row in rows[1:]:
             found = self.emit(pair, [found, self.moved([value], row, out)], {}, out)
         return found
+
+    def _furthest(self, name: str, value: Any, axis: int, out: Any) -> Any:
+        """The first place of the greatest or least of an axis, or of the first that is none."""
+        shape = np.shape(value)
+        rows = np.moveaxis(np.arange(size_of(shape)).reshape(shape), axis, 0)
+        like, yes = np.empty(out.shape, value.dtype), np.empty(out.shape, bool)
+        best, found = self.moved([value], rows[0], like), np.zeros(out.shape, out.dtype)
+        for k, row in enumerate(rows[1:], 1):
+            one = self.moved([value], row, like)
+            better = self.emit("gt" if name == "argmax" else "lt", [one, best], {}, yes)
+            if value.node.kind == "f":
+                lost = self.emit("eq", [best, best], {}, yes)
+                none = self.emit("and", [self.emit("ne", [one, one], {}, yes), lost], {}, yes)
+                better = self.emit("or", [better, none], {}, yes)
+            best = self.emit("select_n", [better, best, one], {}, like)
+            at = np.full(out.shape, k, out.dtype)
+            found = self.emit("select_n", [better, found, at], {}, out)
+        return found
+
+    def _product(self, left: Any, right: Any, dimensions: Any, out: Any) -> Any:
+        """A product of matrices: of one, rows at a time, sums over the numbers of the other."""
+        (of_left, of_right), (with_left, with_right) = dimensions
+        sides = [
+            (left, _rows(left, with_left, of_left)),
+            (right, _rows(right, with_right, of_right)),
+        ]
+        sizes = [places.shape[1] for _, places in sides]
+        if size_of(out.shape) * sides[0][1].shape[2] > _MOST_PRODUCTS:
+            raise unsupported(
+                "a product of large matrices"
+            )  # which XLA makes of many worlds faster
+        # In one loop goes what is constant, else the longer.
+        known = [is_constant(value) for value, _ in sides]
+        long = known.index(True) if any(known) else int(sizes[1] > sizes[0])
+        (many, ways), (few, single) = sides[long], sides[1 - long]
+        like = np.empty(sizes[long], out.dtype)
+        parts = []
+        for batch, turn in np.ndindex(*single.shape[:2]):
+            found = None
+            for k in range(single.shape[2]):
+                pair = [
+                    self._at(many, ways[batch, :, k], like),
+                    self._at(few, np.full(like.shape, single[batch, turn, k]), like),
+                ]
+                term = self.emit("mul", pair, {}, like)
+                found = term if found is None else self.emit("add", [found, term], {}, like)
+            parts.append(np.zeros_like(like) if found is None else found)
+        places = np.arange(size_of(out.shape)).reshape(*single.shape[:2], sizes[long])
+        if long == 0:  # of left, whose rows come before those of right
+            places = places.swapaxes(1, 2)
+        return self.moved(parts, places.reshape(out.shape), out)
+
+    def _at(self, value: Any, places: np.ndarray, like: Any) -> Any:
+        """Numbers of a value, at constant places."""
+        if is_constant(value):
+            return np.reshape(value, -1)[places]
+        return self.moved([value], places, like)
 
     def _slice(self, value: Any, starts: Sequence[Any], sizes: Sequence[int], kind: str) -> Any:
         """A slice from a place that differs between worlds, held within the array."""
@@ -311,6 +373,15 @@ def kind_in(dtype: Any, name: str) -> str:
     if np.dtype(dtype).itemsize != (1 if kind == "b" else 4):
         raise unsupported(f"{name} of {dtype}")
     return kind
+
+
+def _rows(value: Any, batch: Sequence[int], summed: Sequence[int]) -> np.ndarray:
+    """Places of an operand of a product of matrices: (batch, rows, what is summed over)."""
+    shape = np.shape(value)
+    free = [i for i in range(len(shape)) if i not in (*batch, *summed)]
+    places = np.arange(size_of(shape)).reshape(shape).transpose([*batch, *free, *summed])
+    sizes = [size_of([shape[i] for i in some]) for some in (batch, free, summed)]
+    return places.reshape(sizes)
 
 
 def _key(value: Any) -> Any:
