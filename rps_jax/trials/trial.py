@@ -440,12 +440,12 @@ def advance(
         for some, now in zip(worlds, trials, strict=True)
     ]
 
-    def kind(some: World, now: Trial, rules: Any) -> Any:
+    def phase(some: World, now: Trial, rules: Any) -> Any:
         """Those that push, those that are still on their way, and those that have ended."""
         return 2 * now.done + (now.contact_steps == 0)
 
     ones = [partial(one, stage) for stage in stages]
-    return tuple(native.side_by_side(ones, whole, kind)(*given))
+    return tuple(native.side_by_side(ones, whole, phase)(*given))
 
 
 def _side_by_side(

@@ -84,7 +84,7 @@ def mapped(one: Callable[..., Any], whole: Callable[..., Any]) -> Callable[..., 
 def side_by_side(
     ones: Sequence[Callable[..., Any]],
     whole: Callable[..., Any],
-    kind: Callable[..., Any] | None = None,
+    sort_by: Callable[..., Any] | None = None,
 ) -> Any:
     """Functions of batches of worlds, one of each, which a GPU runs at the same time.
 
@@ -92,15 +92,15 @@ def side_by_side(
       ones: the functions of one world; pure.
       whole: of a tuple of arguments for each of them, all their results; XLA compiles it where
         `ones` are not compiled here.
-      kind: of a batch's arguments, numbers (B,): worlds of equal ones are computed side by side,
-        those of the lowest first. No result depends on it, but how long they take.
+      sort_by: of a batch's arguments, numbers (B,) by which worlds are sorted, so that alike ones
+        are computed side by side. No result depends on it, only how long they take.
     """
     if not usable():
         return whole
 
     @jax.custom_jvp
     def run(*arguments: Any) -> list[Any]:
-        every = [_Function(*each, kind) for each in zip(ones, arguments, strict=True)]
+        every = [_Function(*each, sort_by) for each in zip(ones, arguments, strict=True)]
         calls = [every] if jax.default_backend() == "gpu" else [[each] for each in every]
         names = [_made(call) for call in calls]
         if None in names:
@@ -124,7 +124,7 @@ def side_by_side(
 class _Function:
     """A function of one world as a jaxpr, and what a batch of worlds gives it."""
 
-    def __init__(self, one: Callable[..., Any], arguments: Any, kind: Any) -> None:
+    def __init__(self, one: Callable[..., Any], arguments: Any, sort_by: Any) -> None:
         self.leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, arguments))
         self.given = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in self.leaves]
         token = _OF_ONE.set(True)
@@ -136,9 +136,9 @@ class _Function:
         finally:
             _OF_ONE.reset(token)
         self.results, self.structure = jax.tree.flatten(out)
-        count, self.ordered = len(self.leaves[0]), kind is not None
-        if kind is not None:
-            self.leaves.append(jnp.argsort(kind(*arguments)).astype(jnp.int32))
+        count, self.ordered = len(self.leaves[0]), sort_by is not None
+        if sort_by is not None:
+            self.leaves.append(jnp.argsort(sort_by(*arguments)).astype(jnp.int32))
         self.shapes = [jax.ShapeDtypeStruct((count, *x.shape), x.dtype) for x in self.results]
 
 
@@ -155,7 +155,7 @@ def _made(functions: Sequence[_Function]) -> str | None:
         said = f"{type(error).__name__}: {error}"
         warnings.warn(f"no C can be written, so XLA compiles: {said}", stacklevel=2)
         return None
-    key = repr((texts, target(), jax.__version__))
+    key = repr((texts, on_gpu and cuda.LAUNCH, target(), jax.__version__))
     name = _NAME + hashlib.sha256(key.encode()).hexdigest()[:32]
     with _locks[name]:
         if load(name):

@@ -14,7 +14,7 @@ import jax
 
 # Quotients and roots to two roundings, as Triton and XLA's fast paths have them.
 _FLAGS = ("--prec-div=false", "--prec-sqrt=false")
-_LAUNCH = Path(__file__).with_name("launch.c").read_text()
+LAUNCH = Path(__file__).with_name("launch.c").read_text()
 
 
 @functools.cache
@@ -100,4 +100,4 @@ def launcher(
     for k, code in enumerate(codes):
         place = f'.section .rodata\\n.balign 64\\nimage_{k}: .incbin \\"{code}\\"\\n.text'
         lines += [f'__asm__("{place}");', f"extern const char image_{k}[];"]
-    return "\n".join([*lines, _LAUNCH])
+    return "\n".join([*lines, LAUNCH])
