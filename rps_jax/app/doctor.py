@@ -48,7 +48,7 @@ def report(cache: Path) -> str:
 
 def _kernels(platform: str) -> str:
     if platform != "gpu":
-        return "of a GPU, of which JAX finds none here"
+        return "none: JAX finds no GPU"
     made = native.target() and native.cuda.target()
     return f"by NVRTC {made}" if made else "none: XLA steps the fused engine, by Triton"
 

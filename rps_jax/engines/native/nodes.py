@@ -171,7 +171,7 @@ class Lanes(Target):
         if name in ("argmax", "argmin"):
             return self._furthest(name, values[0], params["axes"][0], out)
         if name == "dot_general":
-            return self._product(*values, params["dimension_numbers"], out)
+            return self._product(values[0], values[1], params["dimension_numbers"], out)
         if name == "clamp":
             return self.emit("min", [self.emit("max", values[1::-1], {}, out), values[2]], {}, out)
         if name == "integer_pow":
