@@ -130,7 +130,7 @@ def test_a_compiler_that_fails_is_told_once_and_xla_steps(monkeypatch, tmp_path,
 
 
 def test_operations_that_cannot_be_read_are_told_and_xla_steps(monkeypatch, cache):
-    monkeypatch.setattr(native.writer, "walk", lambda *_: {}["num_consts"])
+    monkeypatch.setattr(native.nodes, "walk", lambda *_: {}["num_consts"])
     run = native.mapped(lambda x: 2 * x, lambda x: 3 * x)
     with pytest.warns(UserWarning, match="no C can be written, so XLA compiles: KeyError"):
         assert jax.jit(run)(jnp.ones(2)).tolist() == [3.0, 3.0]

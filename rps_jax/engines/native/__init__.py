@@ -2,10 +2,9 @@
 
 XLA begins every operation on a few worlds anew, which takes longer than the operation. Here the
 same source, as a jaxpr, is one function: see `nodes`; `writer` writes it in C, `threads` in CUDA,
-which `cuda` has compiled. It is kept in the program cache, under a
-key of its text, the compiler and the processor, and verified before it is used. Where there is no
-compiler, in double precision, and where a function is differentiated, XLA compiles it, as it does
-with the device `xla`.
+which `cuda` has compiled. It is kept in the program cache, under a key of its text, the compiler
+and the device, and verified before it is used. Where there is no compiler, in double precision, and
+where a function is differentiated, XLA compiles it, as it does with the device `xla`.
 """
 
 from __future__ import annotations

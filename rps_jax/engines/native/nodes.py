@@ -18,7 +18,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rps_jax.engines.native.walk import PAIRED, Target, is_constant, kind_of, unsupported
+from rps_jax.engines.native.walk import (
+    PAIRED,
+    Target,
+    is_constant,
+    kind_of,
+    unsupported,
+    walk,
+)
 
 _HERE = Path(__file__).parent
 OPERATIONS = (_HERE / "operations.h").read_text()
@@ -255,9 +262,7 @@ class Lanes(Target):
         ]
         sizes = [places.shape[1] for _, places in sides]
         if size_of(out.shape) * sides[0][1].shape[2] > _MOST_PRODUCTS:
-            raise unsupported(
-                "a product of large matrices"
-            )  # which XLA makes of many worlds faster
+            raise unsupported("a product of large matrices")  # in which XLA is faster
         # In one loop goes what is constant, else the longer.
         known = [is_constant(value) for value, _ in sides]
         long = known.index(True) if any(known) else int(sizes[1] > sizes[0])
@@ -365,6 +370,30 @@ class Lanes(Target):
             part = Node(next(self._count), "part", (), node.kind, node.size, node, free=(loop,))
             found.append(Array(part, 0, 1, np.shape(one)) if node.size else one)
         return found
+
+
+class Result(NamedTuple):
+    """A result that has numbers, and its place among all results."""
+
+    place: int
+    value: Any  # `Array`, or a constant
+    size: int
+    kind: str
+
+
+def results(
+    closed: Any, shapes: Sequence[Any], outs: Sequence[Any], target: Lanes
+) -> tuple[list[Result], list[Node]]:
+    """Results of a closed jaxpr of arguments of these shapes and types, and the nodes of them."""
+    given = [
+        target.given(i, x.shape, x.dtype) if size_of(x.shape) else np.zeros(x.shape, x.dtype)
+        for i, x in enumerate(shapes)
+    ]
+    found = []
+    for i, (one, like) in enumerate(zip(walk(closed, given, target), outs, strict=True)):
+        if size := size_of(like.shape):
+            found.append(Result(i, flat(one, size), size, kind_in(like.dtype, "a result")))
+    return found, [each.value.node for each in found if isinstance(each.value, Array)]
 
 
 def kind_in(dtype: Any, name: str) -> str:

@@ -6,6 +6,7 @@ every so-many-th number. Arrays that a thread reads where another has written ar
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -18,12 +19,14 @@ from rps_jax.engines.native.nodes import (
     Lanes,
     Loop,
     Node,
+    Result,
     flat,
     kind_in,
     reached,
+    results,
     size_of,
 )
-from rps_jax.engines.native.walk import unsupported, walk
+from rps_jax.engines.native.walk import unsupported
 from rps_jax.engines.native.writer import STORED, TYPES, Writer, constant, literal
 
 WARP = 32
@@ -158,6 +161,7 @@ class Threads(Writer):
         super().__init__()
         self._threads, self._worlds = threads, WARP // threads
         self._crossed = {node for node in crossed if node.width > threads}
+        self._names = itertools.count()
         self._before: list[str] = []  # statements that those to come need
         self._picked: dict[tuple[int, int], str] = {}
         self._room: dict[Node, int] = {}  # places in shared memory
@@ -215,7 +219,7 @@ class Threads(Writer):
             return self._other(node, str(place))
         key = node.number, place
         if key not in self._picked:
-            name = self._picked[key] = f"p{next(self.names)}"
+            name = self._picked[key] = f"p{next(self._names)}"
             text = self._other(node, str(place))
             self._before.append(f"const {TYPES[node.kind]} {name} = {text};")
         return self._picked[key]
@@ -313,7 +317,7 @@ class Threads(Writer):
                 texts.append(self._other(source, self._numbers([a.first for a in taken])))
         if len(texts) == 1:
             return [], texts[0]
-        names, way = [f"p{next(self.names)}" for _ in texts], f"w{next(self.names)}"
+        names, way = [f"p{next(self._names)}" for _ in texts], f"w{next(self._names)}"
         chosen = names[0]
         for number, name in enumerate(names[1:], 1):
             chosen = f"{way} == {number} ? {name} : {chosen}"
@@ -356,10 +360,11 @@ class Threads(Writer):
         lines = [line] if own.size == 1 else self._each(own.size, [f"  {line}"])
         return self.statement([*([self._declared(own)] if head else []), *lines], [own])
 
-    def end(self, number: int, a: Any, size: int, kind: str) -> list[str]:
+    def end(self, result: Result) -> list[str]:
         """Statements that store a result."""
+        place, a, size, kind = result
         text = self.read(a, Node(0, "end", (a,), kind, size), set())
-        stored = f"(({STORED[kind]} *)a.found[{number}])[at * {size} + i]"
+        stored = f"(({STORED[kind]} *)a.found[{place}])[at * {size} + i]"
         lines = [
             f"  const {TYPES[kind]} e = {text};",
             f"  if (there && s * THREADS + thread < {size}) {stored} = e;",
@@ -367,7 +372,7 @@ class Threads(Writer):
         return self.statement(self._each(size, lines))
 
 
-def _crossed(nodes: Iterable[Node], ends: Iterable[tuple[Any, int]]) -> set[Node]:
+def _crossed(nodes: Iterable[Node], ends: Iterable[Result]) -> set[Node]:
     """Arrays of which a thread reads what another has written."""
     found: set[Node] = set()
     parts: list[tuple[Node, Node]] = []
@@ -394,8 +399,8 @@ def _crossed(nodes: Iterable[Node], ends: Iterable[tuple[Any, int]]) -> set[Node
                 read(a, node.size, node.op not in ("move", "take"))
 
     see(nodes)
-    for a, size in ends:
-        read(a, size)
+    for each in ends:
+        read(each.value, each.size)
     for part, own in parts:
         if part in found or own in found:
             found |= {part, own}
@@ -403,7 +408,7 @@ def _crossed(nodes: Iterable[Node], ends: Iterable[tuple[Any, int]]) -> set[Node
 
 
 def source(
-    closed: Any, shapes: Sequence[Any], outs: Sequence[Any], ordered: bool, threads: int = 4
+    closed: Any, shapes: Sequence[Any], outs: Sequence[Any], ordered: bool, threads: int
 ) -> str:
     """CUDA of a closed jaxpr of arguments of these shapes and types: the kernel `step`.
 
@@ -412,22 +417,12 @@ def source(
     Raises:
       InputError: it has an operation that is not known here, or needs too much shared memory.
     """
-    target = Spread()
-    given = [
-        target.given(i, x.shape, x.dtype) if size_of(x.shape) else np.zeros(x.shape, x.dtype)
-        for i, x in enumerate(shapes)
-    ]
-    found = [
-        (i, flat(one, size_of(like.shape)), size_of(like.shape), kind_in(like.dtype, "a result"))
-        for i, (one, like) in enumerate(zip(walk(closed, given, target), outs, strict=True))
-        if size_of(like.shape)
-    ]
-    ends = [a.node for _, a, *_ in found if isinstance(a, Array)]
+    found, ends = results(closed, shapes, outs, Spread())
     nodes = reached(ends)
-    writer = Threads(threads, _crossed(nodes, [(a, size) for _, a, size, _ in found]))
+    writer = Threads(threads, _crossed(nodes, found))
     lines = writer.lines(nodes, ends, set())
     for each in found:
-        lines += writer.end(*each)
+        lines += writer.end(each)
     if 4 * writer.shared * (WARP // threads) > _MOST_SHARED:
         raise unsupported("so many numbers at once")
     last = "there ? mine : a.worlds - 1"

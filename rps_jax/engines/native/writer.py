@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -16,12 +15,11 @@ from rps_jax.engines.native.nodes import (
     Lanes,
     Loop,
     Node,
-    flat,
-    kind_in,
     reached,
+    results,
     size_of,
 )
-from rps_jax.engines.native.walk import kind_of, walk
+from rps_jax.engines.native.walk import kind_of
 
 HANDLER = "rps_lanes"  # what its name is replaced by is known to XLA
 TYPES = {"f": "V", "i": "I", "u": "U", "b": "I"}  # of a vector
@@ -67,7 +65,6 @@ class Writer:
     def __init__(self) -> None:
         """Begin without statements."""
         self.tables: dict[bytes, str] = {}  # of constants, which stand before the function
-        self.names = itertools.count()
 
     def lines(self, nodes: Iterable[Node], wanted: Iterable[Node], there: set[Node]) -> list[str]:
         """Statements that make nodes, where some are there; `wanted` are used afterwards."""
@@ -281,29 +278,16 @@ def source(closed: Any, shapes: Sequence[Any], outs: Sequence[Any], ordered: boo
     Raises:
       InputError: it has an operation that is not known here.
     """
-    target, writer = Lanes(), Writer()
-    given = [
-        target.given(i, x.shape, x.dtype) if size_of(x.shape) else np.zeros(x.shape, x.dtype)
-        for i, x in enumerate(shapes)
-    ]
-    found = [
-        flat(one, size_of(like.shape))
-        for one, like in zip(walk(closed, given, target), outs, strict=True)
-    ]
-    ends = [a.node for a in found if isinstance(a, Array)]
+    (found, ends), writer = results(closed, shapes, outs, Lanes()), Writer()
     lines = writer.lines(reached(ends), ends, set())
-    for i, (a, like) in enumerate(zip(found, outs, strict=True)):
-        size, kind = size_of(like.shape), kind_in(like.dtype, "a result")
-        if not size:
-            continue
-        end = Node(0, "end", (a,), kind, size)
-        read = writer.read(a, end, set())
-        stored = STORED[kind]
+    for place, a, size, kind in found:
+        read = writer.read(a, Node(0, "end", (a,), kind, size), set())
+        stored, truth = STORED[kind], " != 0" * (kind == "b")
         lines += [
             f"for (int i = 0; i < {size}; i++) {{",
             f"  const {TYPES[kind]} e = {read};",
             "  for (int l = 0; l < LANES && first + l < worlds; l++)",
-            f"    (({stored} *)found[{i}])[at[l] * {size} + i] = e[l]{' != 0' * (kind == 'b')};",
+            f"    (({stored} *)found[{place}])[at[l] * {size} + i] = e[l]{truth};",
             "}",
         ]
     one = next(i for i, x in enumerate(shapes) if size_of(x.shape))
