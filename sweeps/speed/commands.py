@@ -17,7 +17,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -34,7 +34,7 @@ from rps_jax.trials.progress import Progress
 from sweeps import shared
 from sweeps.shared import Study
 
-_TOLD = re.compile(r"compile ([\d.]+) s, run ([\d.]+) s \((\d+) simulated s per s\)")
+TOLD = re.compile(r"compile ([\d.]+) s, run ([\d.]+) s \((\d+) simulated s per s\)")
 _COLUMNS = (
     *("command", "empty cache", "once more", "of it compile", "run", "simulated s/s"),
     *("memory, empty cache", "memory, once more"),
@@ -131,10 +131,10 @@ def timed(command: str, limit: float, gpus: int | None = None) -> xr.Dataset:
         for number in range(2):
             words = ["-m", "rps_jax", *shlex.split(command), "--out", f"{folder}/run_{number}"]
             begun = time.perf_counter()
-            output, held = _output(words, command, folder, limit, gpus)
+            output, held = printed(words, command, folder, limit, gpus)
             seconds.append(time.perf_counter() - begun)
             memory.append(held)
-    told = _TOLD.search(output)
+    told = TOLD.search(output)
     compile_, run, rate = map(float, told.groups()) if told else (float("nan"),) * 3
     return _row(*seconds, compile_, run, rate, *memory)
 
@@ -154,20 +154,25 @@ def _warm(worlds: int, limit: float, gpus: int | None = None) -> xr.Dataset:
         "    print(time.perf_counter() - begun)\n"
     )
     with tempfile.TemporaryDirectory() as folder:
-        told, held = _output(["-c", code], _call(worlds), folder, limit, gpus)
+        told, held = printed(["-c", code], _call(worlds), folder, limit, gpus)
     first, *_, last = map(float, told.split())
     return _row(first, last, *(float("nan"),) * 3, held)
 
 
-def _output(
-    words: Sequence[str], asked: str, folder: str, limit: float, gpus: int | None = None
+def printed(
+    words: Sequence[str],
+    asked: str,
+    folder: str,
+    limit: float,
+    gpus: int | None = None,
+    environment: Mapping[str, str] | None = None,
 ) -> tuple[str, float]:
     """What Python prints, with its cache in a folder, and the most memory that it held [GB].
 
     Raises:
       InputError: it failed, or took longer than the limit [s].
     """
-    kept = os.environ | {"RPS_CACHE": f"{folder}/cache"}
+    kept = os.environ | {"RPS_CACHE": f"{folder}/cache"} | dict(environment or {})
     if gpus is not None:
         kept["CUDA_VISIBLE_DEVICES"] = ",".join(map(str, range(gpus)))
         kept.pop("JAX_PLATFORMS", None)

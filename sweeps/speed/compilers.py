@@ -8,10 +8,6 @@ a GPU NVRTC), and by XLA, as where there is no compiler.
 
 from __future__ import annotations
 
-import os
-import re
-import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,8 +26,9 @@ from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import Progress
 from sweeps import shared
 from sweeps.shared import Study
+from sweeps.speed.commands import TOLD, printed
 
-_RATE = re.compile(r"run ([\d.]+) s \((\d+) simulated s per s\)")
+_LIMIT = 3600.0  # [s] of a sweep
 _COLUMNS = ("law", "skin", "worlds", "equal outcomes", "compiled here", "by XLA", "simulated s/s")
 
 
@@ -122,16 +119,13 @@ def _swept(law: str, skin: str, worlds: int, folder: Path, by: str | None) -> tu
     Raises:
       InputError: the sweep failed.
     """
-    kept = os.environ | {"RPS_CACHE": str(folder / "cache")}
-    kept |= {} if by is None else {"RPS_COMPILER": by}
-    rate, out = float("nan"), folder / "run"
+    chosen = {} if by is None else {"RPS_COMPILER": by}
+    asked = f"sweep --laws {law} --domain wide,skin={skin} --worlds {worlds}"
+    said, out = "", folder
     for number in range(2):  # the first compiles
         out = folder / f"run_{by}_{number}"
-        words = ["sweep", "--laws", law, "--domain", f"wide,skin={skin}", "--worlds", str(worlds)]
-        words = [sys.executable, "-m", "rps_jax", *words, "--out", str(out)]
-        done = subprocess.run(words, env=kept, capture_output=True, text=True)
-        told = _RATE.search(done.stdout)
-        if done.returncode or told is None:
-            raise InputError(f"skins = {skin}: {' '.join(done.stderr.split()[-20:])}")
-        rate = float(told.group(2))
-    return rps_jax.load(out).success.values, rate
+        words = ["-m", "rps_jax", *asked.split(), "--out", str(out)]
+        said, _ = printed(words, asked, str(folder), _LIMIT, environment=chosen)
+    if (told := TOLD.search(said)) is None:
+        raise InputError(f"skins = {skin}: the sweep does not tell how long it ran.")
+    return rps_jax.load(out).success.values, float(told.group(3))
