@@ -9,7 +9,6 @@ import pytest
 from rps_jax import engines
 from rps_jax.control.observation import Twist
 from rps_jax.engines.base import Motion
-from rps_jax.engines.fused import step as fused
 from rps_jax.errors import InputError
 from rps_jax.geometry import solid
 from rps_jax.geometry.solid import SIDES
@@ -106,22 +105,6 @@ def test_quasistatic_ends_nearer_to_c_mujoco_with_the_same_feet():
     assert found[0, Y] - found[1, Y] > 0.005
     for one, same, other in ((found[0], feet, corners), (found[1], corners, feet)):
         assert abs(one[Y] - same[Y]) < abs(one[Y] - other[Y])
-
-
-@pytest.mark.slow
-def test_the_kernel_stands_on_feet_too():
-    """In Pallas's interpreter, beside XLA."""
-    loaded, qpos = start("on_feet")
-    _, bodies = engines.get("fused").stage_of_scenes([loaded], np.zeros(1, int))
-    bodies = jax.tree.map(lambda x: jnp.asarray(x, float), bodies)
-    still, physics = jnp.zeros((1, 9)), Physics(timestep=0.02)
-    scalars = fused.spread(bodies)
-    state = fused.enter(bodies, Motion(jnp.asarray(qpos, float)[None], still, still))
-    twist = tuple(jnp.full(1, x) for x in TWIST)
-    expected = fused.in_xla(scalars, state, twist, physics=physics)
-    found = fused.in_a_kernel(scalars, state, twist, physics=physics, interpret=True)
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
 
 
 def test_a_scene_gives_its_feet_back():

@@ -13,7 +13,6 @@ from rps_jax.control import registry
 from rps_jax.control.laws.force_push_published import PublishedForcePushParams
 from rps_jax.control.observation import Twist
 from rps_jax.engines.base import Motion
-from rps_jax.engines.fused import step as fused
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.robot.base import LoadCell, unloaded
@@ -105,24 +104,6 @@ def test_the_fused_engine_tells_the_force_of_c_mujoco():
     size = np.hypot(*theirs[25:, :2].mean(axis=0))
     assert size > 20
     np.testing.assert_allclose(ours[25:].mean(axis=0), theirs[25:].mean(axis=0), atol=0.03 * size)
-
-
-def test_the_kernel_tells_the_force_that_xla_tells():
-    at = scene.load("box", STANDARD, S1)
-    qpos = np.repeat(scene.initial_qpos(at, gap=-0.0005)[None], 3, axis=0)
-    qpos[:, 4] += (0.0, 0.05, -0.1)
-    qpos[:, 5] -= 0.0005
-    body = fused.body(at.physics, np.asarray(at.footprint.vertices))
-    bodies = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x, float)[None], 3, axis=0), body)
-    still = jnp.zeros((3, 9))
-    motion = Motion(jnp.asarray(qpos, float), still, still)
-    given = fused.spread(bodies), fused.enter(bodies, motion, force=True)
-    twist = tuple(jnp.full(3, x) for x in TURNING)
-    inside = functools.partial(fused.in_a_kernel, physics=STANDARD, interpret=True)
-    plain = functools.partial(fused.in_xla, physics=STANDARD)
-    felt, expected = (np.array(jax.jit(f)(*given, twist).felt) for f in (inside, plain))
-    assert np.all(expected[0] < -1)
-    np.testing.assert_allclose(felt, expected, rtol=1e-3, atol=1e-2)
 
 
 def test_who_does_not_ask_is_told_no_force():

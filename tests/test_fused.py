@@ -1,9 +1,7 @@
-"""The fused engine computes what C MuJoCo computes, in one kernel as outside it."""
+"""The fused engine computes what C MuJoCo computes, written out."""
 
-import contextlib
 import functools
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -98,52 +96,6 @@ def test_a_push_of_three_seconds_ends_where_c_mujoco_ends_it(name, yaw, offset):
     pose, _, _ = drive(name, body, FINE, qpos, 300)
     assert np.hypot(*(expected - qpos)[3:5]) > 0.1
     np.testing.assert_allclose(pose, expected, atol=2e-3)
-
-
-def some_worlds(name, physics, count=5):
-    bodies, states = [], []
-    for i in range(count):
-        _, body, qpos = start(name, 0.2 * i if name == "box" else 0.0, 0.03 * i, physics)
-        bodies.append(body)
-        states.append(jnp.asarray(qpos, float)[None])
-    body, qpos = jax.tree.map(lambda *x: jnp.concatenate(x), *bodies), jnp.concatenate(states)
-    still = jnp.zeros((count, 9))
-    scalars = fused.spread(body)
-    return scalars, fused.enter(body, Motion(qpos, still, still))
-
-
-@pytest.mark.parametrize("name", ["box", "cylinder"])
-def test_the_kernel_computes_what_xla_computes(name):
-    """In Pallas's interpreter; five worlds, padded to whole blocks."""
-    physics = Physics(timestep=0.02)
-    scalars, state = some_worlds(name, physics)
-    twist = tuple(jnp.full(5, x) for x in TWIST)
-    expected = jax.jit(partial(fused.in_xla, physics=physics))(scalars, state, twist)
-    kernel = partial(fused.in_a_kernel, physics=physics, interpret=True)
-    for a, b in zip(jax.tree.leaves(jax.jit(kernel)(scalars, state, twist)),
-                    jax.tree.leaves(expected), strict=True):  # fmt: skip
-        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.parametrize("name", ["box", "cylinder"])
-def test_the_kernel_compiles_for_an_nvidia_gpu(name):
-    scalars, state = some_worlds(name, Physics())
-    twist = tuple(jnp.full(5, x) for x in TWIST)
-    with as_if_there_were_a_gpu():
-        traced = jax.jit(partial(fused.in_a_kernel, physics=Physics())).trace(scalars, state, twist)
-        assert "triton" in traced.lower(lowering_platforms=("cuda",)).as_text()
-    # Each load and store lengthens the compilation: see `fused.rows_taken`.
-    assert 2 < str(traced.jaxpr).count("<-") < 20
-
-
-def as_if_there_were_a_gpu():
-    """Later versions of JAX ask which one; earlier ones have no name for it."""
-    if not hasattr(jax.sharding, "AbstractDevice"):
-        return contextlib.nullcontext()
-    device = jax.sharding.AbstractDevice("NVIDIA H200", None, "gpu")
-    return jax.sharding.use_abstract_mesh(
-        jax.sharding.AbstractMesh((1,), ("worlds",), abstract_device=device)
-    )
 
 
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])

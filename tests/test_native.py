@@ -32,10 +32,10 @@ def cache(tmp_path):
     jax.config.update("jax_compilation_cache_dir", before)
 
 
-def batch(shape, skin="capacitive", count=21, law="rps_tuned"):
+def batch(shape, skin="capacitive", count=21, law="rps_tuned", domain="wide", **drawn):
     """Stage, worlds and loop of random objects, each at another place before the robot."""
     _, params = registry.read_law(law)
-    domain = replace(DOMAINS["wide"], objects=(f"random_{shape}",), skin=skin)
+    domain = replace(DOMAINS[domain], objects=(f"random_{shape}",), skin=skin, **drawn)
     part = drawn_worlds(domain, draws.draw(domain, 3, np.arange(count)), params, SETTING)
     worlds = jax.tree.map(jnp.asarray, part.worlds)
     return part.stage, worlds, Loop(SETTING.physics, SETTING.rules, registry.law_of(params))
@@ -134,6 +134,16 @@ def test_operations_that_cannot_be_read_are_told_and_xla_steps(monkeypatch, cach
     run = native.mapped(lambda x: 2 * x, lambda x: 3 * x)
     with pytest.warns(UserWarning, match="no C can be written, so XLA compiles: KeyError"):
         assert jax.jit(run)(jnp.ones(2)).tolist() == [3.0, 3.0]
+
+
+def test_a_gpu_without_a_compiler_is_told(monkeypatch):
+    monkeypatch.setattr(native, "target", lambda: None)
+    assert not native.usable()  # a processor without one is a usual thing
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    with pytest.warns(UserWarning, match="a C compiler .* is not here, so XLA compiles"):
+        assert not native.usable()
+    monkeypatch.setenv("RPS_COMPILER", "none")
+    assert not native.usable()  # nor is one who asks for it told
 
 
 @pytest.mark.parametrize("damage", ["cut", "turned", "empty"])

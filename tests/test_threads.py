@@ -9,16 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_native import OPERATIONS as ALL
-from test_native import advanced, batch, begun
+from test_native import OPERATIONS, advanced, batch, begun
 
 from rps_jax.engines.native import threads
 from rps_jax.errors import InputError
 from rps_jax.geometry import vectors
 from rps_jax.trials import trial
+from rps_jax.world.domain import Range
 
-# On a GPU, products of matrices are XLA's.
-OPERATIONS = {name: one for name, one in ALL.items() if name != "products of matrices"}
 COMPILER = shutil.which("g++")
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="there is no g++: apt install g++")
 _RUN = """
@@ -90,10 +88,11 @@ def test_operations_are_what_jax_says(each, tmp_path):
             np.testing.assert_allclose(one, other, rtol=3e-6, atol=1e-6, err_msg=name)
 
 
+@pytest.mark.parametrize("skin", ["capacitive", "ideal"])
 @pytest.mark.parametrize("shape", ["box", "cylinder", "prism"])
-def test_a_control_step_is_the_processors(shape, tmp_path):
+def test_a_control_step_is_the_processors(shape, skin, tmp_path):
     """Of worlds in the middle of a push, after 8 s; whichever worlds a warp has side by side."""
-    stage, worlds, loop = batch(shape)
+    stage, worlds, loop = batch(shape, skin)
     pushing = advanced(stage, worlds, begun(worlds, loop), loop, 400)
     assert np.mean(pushing.contact_steps > 0) > 0.5
 
@@ -113,9 +112,22 @@ def test_a_control_step_is_the_processors(shape, tmp_path):
         np.testing.assert_array_equal(a, b)
 
 
-def test_products_of_matrices_are_refused(tmp_path):
-    with pytest.raises(InputError, match="a product of matrices"):
-        Emulated(ALL["products of matrices"], (jnp.float32(1.0),), tmp_path, 4)
+def test_a_control_period_is_the_processors(tmp_path):
+    """Of bases whose force is limited, before objects on feet; and what they feel."""
+    stage, worlds, loop = batch("prism", domain="real", feet=Range(0.3, 1.0))
+    pushing = trial.motion(advanced(stage, worlds, begun(worlds, loop), loop, 400))
+    twists = trial.Twist(*(np.full(21, x, np.float32) for x in (0.05, 0.01, 0.05)))
+
+    def one(fields, motion, twist, robot):
+        return stage.drive(fields, motion, twist, loop.physics, robot, True)
+
+    given = worlds.fields, pushing, twists, trial.pushing(worlds)
+    run = Emulated(one, jax.tree.map(lambda x: jnp.asarray(x)[0], given), tmp_path, 4)
+    found, expected = run(*given), jax.jit(one)(*given)
+    assert np.mean(np.linalg.norm(expected.force[:, :2], axis=1) > 1) > 0.5  # [N]
+    np.testing.assert_allclose(found.force, expected.force, rtol=1e-3, atol=2e-2)
+    np.testing.assert_allclose(found.motion.qpos, expected.motion.qpos, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(found.motion.qvel, expected.motion.qvel, rtol=1e-3, atol=1e-4)
 
 
 def test_what_threads_share_has_an_end(tmp_path):

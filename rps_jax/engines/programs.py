@@ -24,12 +24,6 @@ from jax import export
 from rps_jax.control.base import Law
 from rps_jax.engines import device, native
 
-# Calls of kernels, which `jax.export` does not promise to other versions: the key has the versions.
-_KERNELS = [
-    export.DisabledSafetyCheck.custom_call(name)
-    for name in ("__gpu$xla.gpu.triton", "triton_kernel_call")
-]
-
 
 def compiled(
     function: Callable[..., Any],
@@ -64,7 +58,7 @@ def compiled(
     if exported is None:
         jitted = jax.jit(flat, donate_argnums=donated)
         jitted.trace(*leaves)  # in which functions are compiled that it calls
-        safe = [*_KERNELS, *map(export.DisabledSafetyCheck.custom_call, native.known())]
+        safe = list(map(export.DisabledSafetyCheck.custom_call, native.known()))
         exported = export.export(jitted, disabled_checks=safe)(*leaves)
         with contextlib.suppress(ValueError):  # what cannot be kept
             device.keep(place, bytes(exported.serialize()))

@@ -92,7 +92,7 @@ class Arena(Study[xr.Dataset]):
     """Of converged C MuJoCo [s]."""
     peers: Path | None = None
     """Folder of the packages of others, as `peers.py` makes it."""
-    limit: float = option(150.0, 1, 3600)
+    limit: float = option(300.0, 1, 3600)
     """Time in which an engine must be ready, and time in which it must then run [s]."""
     machine: str = ""
     """What it runs on, in words; with these the table is published."""

@@ -251,7 +251,7 @@ def _sums(vector: Vec) -> Vec:
 
 
 def _some(active: jax.Array) -> jax.Array:
-    """Whether any is above zero, in a form that Triton knows."""
+    """Whether any is above zero."""
     return jnp.sum(active) > 0
 
 

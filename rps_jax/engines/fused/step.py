@@ -10,7 +10,6 @@ scalars, so that a compiler can keep a whole world in registers: `contacts.py` f
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -18,8 +17,6 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jax.experimental import pallas
-from jax.experimental.pallas import triton
 
 from rps_jax.engines import native
 from rps_jax.engines.base import Driven, Motion
@@ -31,11 +28,6 @@ from rps_jax.robot import drive as drives
 from rps_jax.robot.robot import Robot
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS
-
-_ROWS = 8  # numbers of a world read by one load of the kernel
-# Worlds of one program of the kernel, which is one warp and goes on until the last has converged:
-# of an object of up to so many corners, and of one of more. A world's bits do not hang on them.
-_FEW, _WORLDS_OF_FEW, _WORLDS_OF_MANY = 4, 8, 4
 
 
 def body(model: mujoco.MjModel, vertices: np.ndarray) -> Body:
@@ -173,12 +165,11 @@ def drive(
 ) -> Driven:
     """One control period of a batch of worlds (B,) at `twist` (B,), with robots (B,) if limited.
 
-    On an NVIDIA GPU it is a kernel, on a processor a function of C if there is a compiler;
-    elsewhere, and where it is differentiated, XLA compiles it.
+    It is a function of C, or a kernel on an NVIDIA GPU, where they can be compiled; elsewhere, and
+    where it is differentiated, XLA compiles it.
     """
     driven = partial(_driven, physics=physics, force=force)
-    in_c = motion.qpos.ndim == 2 and jax.default_backend() == "cpu"
-    run = native.mapped(driven, driven) if in_c else driven
+    run = native.mapped(driven, driven) if motion.qpos.ndim == 2 else driven
     return run(body, motion, twist, robot)
 
 
@@ -186,137 +177,15 @@ def _driven(
     body: Body, motion: Motion, twist: Vec, robot: Robot | None, *, physics: Physics, force: bool
 ) -> Driven:
     """`drive` of a batch, or of one world."""
-    state = _period(physics, spread(body), enter(body, motion, robot, force), twist, robot)
+    scalars = spread(body)
+    state = jax.lax.fori_loop(
+        0,
+        physics.substeps,
+        lambda _, now: step(scalars, now, twist, physics, robot),
+        enter(body, motion, robot, force),
+    )
     felt = state.felt and jnp.stack(state.felt, axis=-1) / physics.substeps
     return Driven(leave(body, state, twist), force=felt)
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _period(
-    physics: Physics, scalars: Body, state: State, twist: Vec, robot: Robot | None
-) -> State:
-    if jax.default_backend() == "cpu" or jnp.ndim(scalars.mass) == 0:  # one world alone
-        return in_xla(scalars, state, twist, robot, physics=physics)
-    return jax.lax.platform_dependent(
-        scalars,
-        state,
-        twist,
-        robot,
-        cuda=partial(in_a_kernel, physics=physics),
-        default=partial(in_xla, physics=physics),
-    )
-
-
-@_period.defjvp
-def _period_jvp(physics: Physics, primals: Any, tangents: Any) -> tuple[State, State]:
-    """Forward mode: a kernel has none, and the solver's loop no other."""
-    return jax.jvp(partial(in_xla, physics=physics), primals, tangents)
-
-
-def in_xla(
-    scalars: Body, state: State, twist: Vec, robot: Robot | None = None, *, physics: Physics
-) -> State:
-    """The steps of one control period, as XLA compiles them."""
-    return jax.lax.fori_loop(
-        0, physics.substeps, lambda _, s: step(scalars, s, twist, physics, robot), state
-    )
-
-
-def in_a_kernel(
-    scalars: Body,
-    state: State,
-    twist: Vec,
-    robot: Robot | None = None,
-    *,
-    physics: Physics,
-    interpret: bool = False,
-) -> State:
-    """`in_xla` as one kernel, a world to a thread, which keeps its world in registers."""
-    count, moving = state.p[0].size, (state, twist, robot)
-    together = _together(scalars)
-    bodies, motion = _packed(scalars, together), _packed(moving, together)
-
-    def kernel(*refs):
-        *given, out = refs
-        body = _unpacked(scalars, given[: len(bodies)])
-        now, wanted, pushing = _unpacked(moving, given[len(bodies) :])
-        with sp.reductions_in_one():
-            after = in_xla(body, now, wanted, pushing, physics=physics)
-        _give(out, jax.tree.leaves(after))
-
-    def block(outer: tuple[int, ...]) -> pallas.BlockSpec:
-        return pallas.BlockSpec((*outer, together), lambda i: (*(0,) * len(outer), i))
-
-    inputs = [*bodies, *motion]
-    numbers, worlds = len(jax.tree.leaves(state)), motion[0].shape[-1]
-    after = pallas.pallas_call(
-        kernel,
-        grid=(worlds // together,),
-        in_specs=[block(x.shape[:-1]) for x in inputs],
-        out_specs=block((numbers,)),
-        out_shape=jax.ShapeDtypeStruct((numbers, worlds), motion[0].dtype),
-        interpret=interpret,
-        compiler_params=triton.CompilerParams(num_warps=1),
-    )(*inputs)
-    return jax.tree.unflatten(jax.tree.structure(state), list(after[:, :count]))
-
-
-def _together(scalars: Body) -> int:
-    """How many worlds one program of the kernel steps."""
-    corners = max(leaf.shape[0] if leaf.ndim > 1 else 1 for leaf in jax.tree.leaves(scalars))
-    return _WORLDS_OF_FEW if corners <= _FEW else _WORLDS_OF_MANY
-
-
-def _packed(tree: Any, together: int) -> list[jax.Array]:
-    """Numbers of worlds (B,), and those of their corners (N, B), as arrays (K, B) and (K, N, B).
-
-    The worlds are filled up to whole blocks of `together` by copies of the last.
-    """
-    kinds: dict[int, list[jax.Array]] = {}
-    for leaf in jax.tree.leaves(tree):
-        kinds.setdefault(leaf.ndim, []).append(leaf)
-    stacks = [jnp.stack(leaves) for leaves in kinds.values()]
-    over = -stacks[0].shape[-1] % together
-    return [jnp.pad(x, (*((0, 0),) * (x.ndim - 1), (0, over)), mode="edge") for x in stacks]
-
-
-def _unpacked(tree: Any, refs: Sequence[Any]) -> Any:
-    """A block of what `_packed` has packed, of the form and the types of `tree`."""
-    rows = {len(ref.shape) - 1: iter(_taken(ref)) for ref in refs}
-    return jax.tree.map(lambda leaf: next(rows[leaf.ndim]).astype(leaf.dtype), tree)
-
-
-# A kernel's compiler takes a time that grows with its loads and stores times the square of all it
-# does (Triton's pass `coalesce`): with one for each number that is three quarters of the whole.
-
-
-def _taken(ref: Any) -> list[jax.Array]:
-    """The rows of a reference (K, ...), by few loads."""
-    rows = []
-    for first in range(0, ref.shape[0], _ROWS):
-        some = range(first, min(first + _ROWS, ref.shape[0]))
-
-        def take(i: Any, taken: list[jax.Array], some: range = some) -> list[jax.Array]:
-            row = ref[i]
-            return [jnp.where(i == j, row, x) for j, x in zip(some, taken, strict=True)]
-
-        nothing = [jnp.zeros(ref.shape[1:], ref.dtype)] * len(some)
-        rows += jax.lax.fori_loop(some.start, some.stop, take, nothing)
-    return rows
-
-
-def _give(ref: Any, rows: list[jax.Array]) -> None:
-    """The opposite of `_taken`."""
-    for first in range(0, len(rows), _ROWS):
-        some = range(first, min(first + _ROWS, len(rows)))
-
-        def give(i: Any, _: None, some: range = some) -> None:
-            row = rows[some.start]
-            for j in some[1:]:
-                row = jnp.where(i == j, rows[j], row)
-            ref[i] = row
-
-        jax.lax.fori_loop(some.start, some.stop, give, None)
 
 
 def spread(body: Body) -> Body:

@@ -39,6 +39,7 @@ from rps_jax.record import provenance
 _FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-w")
 _NAME = "rps_lanes_"
 _THREADS = 4  # of a GPU that hold a world
+_LACKING = "a C compiler (apt install gcc) or NVRTC (pip install nvidia-cuda-nvrtc) is not here"
 _PLATFORMS = {"cpu": "cpu", "gpu": "CUDA"}
 _OF_ONE: ContextVar[bool] = ContextVar("rps_jax_of_one_world", default=False)
 _loaded: dict[str, Any] = {}
@@ -46,8 +47,16 @@ _locks: defaultdict[str, threading.RLock] = defaultdict(threading.RLock)
 
 
 def usable() -> bool:
-    """Whether functions are compiled here, and not within one that is."""
-    return not jax.config.jax_enable_x64 and not _OF_ONE.get() and target() is not None
+    """Whether functions are compiled here, and not within one that is.
+
+    Warns if a GPU does without, which nobody has asked for.
+    """
+    if jax.config.jax_enable_x64 or _OF_ONE.get():
+        return False
+    found, asked = target(), os.environ.get("RPS_COMPILER")
+    if found is None and asked != "none" and jax.default_backend() == "gpu":
+        warnings.warn(f"{_LACKING}, so XLA compiles, which is much slower", stacklevel=2)
+    return found is not None
 
 
 @functools.cache
