@@ -244,7 +244,7 @@ def test_a_run_killed_six_times_ends_as_one_that_was_not(tmp_path, monkeypatch):
     folder, dice, interrupted = tmp_path / "run", random.Random(0), 0
 
     def done():
-        return len(list(folder.glob("parts/*.nc")))
+        return len(list(folder.glob("parts/*.npz")))
 
     for kill in range(7):
         before = done()
@@ -305,8 +305,10 @@ def test_a_device_out_of_memory_loses_nothing(whole, tmp_path, capsys, monkeypat
 
 def test_a_corrupt_part_is_set_aside_and_done_again_alone(whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "run")
-    victim = sorted(folder.glob("parts/*.nc"))[2]
-    others = {path: path.stat().st_mtime_ns for path in folder.glob("parts/*.nc") if path != victim}
+    victim = sorted(folder.glob("parts/*.npz"))[2]
+    others = {
+        path: path.stat().st_mtime_ns for path in folder.glob("parts/*.npz") if path != victim
+    }
     content = bytearray(victim.read_bytes())
     content[len(content) // 2] ^= 1
     victim.write_bytes(content)
@@ -314,7 +316,7 @@ def test_a_corrupt_part_is_set_aside_and_done_again_alone(whole, tmp_path):
     swept(folder, report=lambda progress: finished.append(progress.finished))
     assert finished[0] == PLAN.trials - PLAN.parts[2].size
     assert {path: path.stat().st_mtime_ns for path in others} == others
-    aside = victim.with_suffix(".nc.corrupt")
+    aside = victim.with_suffix(".npz.corrupt")
     assert aside.read_bytes() == bytes(content)
     aside.unlink()
     assert parts_of(folder) == parts_of(whole)
@@ -322,12 +324,15 @@ def test_a_corrupt_part_is_set_aside_and_done_again_alone(whole, tmp_path):
 
 def test_a_part_of_an_older_version_is_named(whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "run")
-    victim = sorted(folder.glob("parts/*.nc"))[0]
-    older = files.encoded(files.read(victim).drop_vars("overflows"))
-    victim.unlink()
-    sweep.store(folder, 0, older)
-    with pytest.raises(InputError, match=r"part 0 .* another version .it lacks overflows"):
-        merge([folder], out=folder)
+    victim = sorted(folder.glob("parts/*.npz"))[0]
+    kept = files.arrays_of(victim.read_bytes())
+    del kept["overflows"]
+    older = files.encoded(xr.Dataset({name: xr.Variable((), 0) for name in kept}))
+    for content, lacks in ((files.archive(**kept), "lacks overflows"), (older, "is a NetCDF file")):
+        victim.unlink()
+        victim = sweep.store(folder, 0, content)
+        with pytest.raises(InputError, match=f"part 0 .* another version .it {lacks}"):
+            merge([folder], out=folder)
 
 
 def test_the_report_of_one_world_tells_what_was_lost_and_how_to_see_it(whole, tmp_path):

@@ -27,9 +27,9 @@ from rps_jax import engines
 from rps_jax.engines import device as devices
 from rps_jax.engines.device import Device
 from rps_jax.errors import InputError
-from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
-from rps_jax.runs import sweep
+from rps_jax.record import provenance
+from rps_jax.runs import results, sweep
 from rps_jax.runs.sweep import Plan, Shard
 from rps_jax.trials.progress import Progress, Report, unheard
 
@@ -61,7 +61,7 @@ def _work(
     sweep.work(
         plan,
         {plan.kind(numbers[0]): numbers},
-        lambda number, part: found.update({number: bytes(files.encoded(part))}),
+        lambda number, part: found.update({number: results.written(part)}),
         report=heard.append,
         slots=slots,
         workers=threads,

@@ -294,19 +294,20 @@ def whole(plan: Plan, out: Path | None, *, report: Report = unheard, **shape: An
         found = complete(out, plan, report=report, **shape)
         assert found is not None
         return labelled(found)
-    contents: dict[int, xr.Dataset] = {}
+    made: dict[int, results.Part] = {}
     every: dict[Kind, list[int]] = {}
     for number in plan.parts:
         every.setdefault(plan.kind(number), []).append(number)
-    work(plan, every, contents.__setitem__, report=report, **shape)
-    return labelled(results.dataset(plan, contents.items()))
+    work(plan, every, made.__setitem__, report=report, **shape)
+    return labelled(results.dataset(plan, made.items()))
 
 
 def own_trials(folder: Path, plan: Plan, shard: Shard) -> xr.Dataset:
     """Outcomes (row) of a shard's own trials, with the law and the world of each."""
     own = share(plan, shard)
     kept = Parts(folder).each([results.name_of(number) for number in own])
-    found = results.dataset(plan, ((int(name), content) for name, content in kept))
+    parts = ((int(name), results.read(int(name), content)) for name, content in kept)
+    found = results.dataset(plan, parts)
     law, world = np.divmod(np.concatenate(list(own.values())), plan.worlds)
     at = {"law": xr.DataArray(law, dims="row"), "world": xr.DataArray(world, dims="row")}
     return found[list(results.UNITS)].isel(at)
@@ -319,7 +320,7 @@ def run_missing(
     shard: Shard = Shard(),
     report: Report = unheard,
     **shape: Any,
-) -> dict[int, xr.Dataset]:
+) -> dict[int, results.Part]:
     """Run what is missing of a plan, or of one shard of it, in a folder that `open_run` opened.
 
     Returns the parts that were made, of a whole plan.
@@ -333,8 +334,8 @@ def run_missing(
     def tell(progress: Progress) -> None:
         report(replace(progress, finished=before + progress.finished))
 
-    def keep(number: int, part: xr.Dataset) -> None:
-        store(folder, number, files.encoded(part))
+    def keep(number: int, part: results.Part) -> None:
+        store(folder, number, results.written(part))
         if shard.of == 1:
             made[number] = part
 
@@ -416,4 +417,4 @@ def _ahead(parts: Iterator[Part], count: int) -> Iterator[Part]:
 
 def store(folder: Path, part: int, content: bytes) -> Path:
     """Write the file of a part into a run folder, whole or not at all."""
-    return Parts(folder).put(results.name_of(part), content, new=True)
+    return Parts(folder).put(results.name_of(part), content, ".npz", new=True)
