@@ -11,7 +11,7 @@
 # # One push
 #
 # This is the trial of the paper's Fig. 6: the box under the friction set S1, with its target 2 m
-# behind the robot. The fused engine steps it here; `rps push` runs this trial in C MuJoCo.
+# behind the robot. The fused engine steps it, as it does for `rps push`.
 
 # %%
 import tempfile

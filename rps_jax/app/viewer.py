@@ -34,7 +34,6 @@ from rps_jax.runs.push import another_engine, chosen, sensed
 from rps_jax.runs.question import call_of
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case, label_of
-from rps_jax.trials.setting import Setting
 from rps_jax.trials.stepper import CHUNK, Live
 from rps_jax.world import objects
 from rps_jax.world.scene import Scene
@@ -69,7 +68,6 @@ class View(PushQuestion):
     """The law: its name, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
     policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json. With a run, one of its laws, by
     default the first."""
-    setting: Setting = field(default=Setting(), kw_only=True)
     run: str | Path | None = option(None, positional=True, kw_only=True)
     """Run folder of a sweep, to begin with one of its worlds; by default the options' push."""
     world: int = option(0, 0, positional=True, kw_only=True)

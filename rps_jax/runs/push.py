@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -240,9 +240,6 @@ class Push(Case, FollowsOne, Pushes[Trace]):
       >>> trace.data.v_x.dims
       ('time',)
     """
-
-    # What compiles least: the other engines pay from some dozens of trials on.
-    setting: Setting = field(default=Setting(engine="mujoco"), kw_only=True)
 
     def __post_init__(self) -> None:
         """Check the trial when it is asked for, and not before."""

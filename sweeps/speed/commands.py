@@ -55,7 +55,7 @@ class Commands(Study[xr.Dataset]):
     commands: tuple[str, ...] = (
         "push --object box --target -2 0 --no-video",
         "push --object box --target -2 0",
-        "push --object box --target -2 0 --engine fused",
+        "push --object box --target -2 0 --engine mujoco",
         "sweep --laws rps_tuned --domain wide --worlds 100",
         "sweep --laws rps_tuned --domain wide --worlds 1000",
         "table",
