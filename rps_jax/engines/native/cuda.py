@@ -12,8 +12,8 @@ from typing import Any
 
 import jax
 
-# Quotients and roots to two roundings, as Triton and XLA's fast paths have them.
-_FLAGS = ("--prec-div=false", "--prec-sqrt=false")
+# Quotients and roots to two roundings, and zero for what is less than 1e-38.
+_FLAGS = ("--prec-div=false", "--prec-sqrt=false", "--ftz=true")
 LAUNCH = Path(__file__).with_name("launch.c").read_text()
 
 

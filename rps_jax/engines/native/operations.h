@@ -61,16 +61,19 @@ FUNCTION U bits_u_of_f(V x) { return (U)bits_i_of_f(x); }
 FUNCTION V neg_f(V x) { return -x; }
 FUNCTION I neg_i(I x) { return (I)(0u - (U)x); }
 FUNCTION V abs_f(V x) { return bits_f_of_i(bits_i_of_f(x) & 0x7fffffff); }
+#ifndef OF_A_GPU
 FUNCTION V div_f(V a, V b) { return a / b; }
+/* As JAX has them: NaN goes on. */
+FUNCTION V max_f(V a, V b) { return choose_f((a >= b) | (a != a), a, b); }
+FUNCTION V min_f(V a, V b) { return choose_f((a <= b) | (a != a), a, b); }
+#endif
 FUNCTION V square_f(V x) { return x * x; }
 FUNCTION V logistic_f(V x) { return 1.0f / (1.0f + exp_f(-x)); }
 FUNCTION I is_finite_f(V x) { return abs_f(x) < INFINITY; }
 FUNCTION V sign_f(V x) {
   return choose_f(x > 0.0f, all_f(1.0f), choose_f(x < 0.0f, all_f(-1.0f), x));
 }
-/* As JAX has them: NaN goes on, and no whole number overflows. */
-FUNCTION V max_f(V a, V b) { return choose_f((a >= b) | (a != a), a, b); }
-FUNCTION V min_f(V a, V b) { return choose_f((a <= b) | (a != a), a, b); }
+/* As JAX has them: no whole number overflows. */
 FUNCTION I max_i(I a, I b) { return choose_i(a > b, a, b); }
 FUNCTION I min_i(I a, I b) { return choose_i(a < b, a, b); }
 FUNCTION I abs_i(I x) { return max_i(x, neg_i(x)); }
