@@ -16,7 +16,7 @@ def pytest_configure(config):
     from rps_jax.engines import device
 
     studio.choose_gl()
-    device.be_deterministic()
+    device.configure_xla()
     cache = config.rootpath / ".jax_cache"
     os.environ.setdefault("RPS_CACHE", str(cache))  # of commands, also in processes of their own
     jax.config.update("jax_compilation_cache_dir", os.environ["RPS_CACHE"])

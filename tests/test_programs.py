@@ -127,7 +127,7 @@ def test_a_jax_that_fuses_by_slot_is_asked_for_avx(release, machine, asked, monk
     monkeypatch.setattr(device.metadata, "version", lambda _: release)
     monkeypatch.setattr(device.platform, "machine", lambda: machine)
     for _ in range(2):
-        device.be_deterministic()
+        device.configure_xla()
         words = os.environ["XLA_FLAGS"].split()
         assert words[:2] == ["--xla_of_ones_own", "--xla_gpu_deterministic_ops=true"]
         assert words[2:] == ["--xla_cpu_max_isa=AVX"] * asked

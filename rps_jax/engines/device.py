@@ -21,12 +21,14 @@ _DIGEST = hashlib.sha256().digest_size
 Device = Literal["auto", "cpu", "gpu", "xla"]
 
 
-def be_deterministic() -> None:
-    """Ask XLA for sums in a fixed order: the same command must give the same results.
+def configure_xla() -> None:
+    """Ask XLA for sums in a fixed order, and to take a GPU's memory as it is needed.
 
+    The same command must give the same results. To take most of the memory at once takes a second.
     From JAX 0.12 on it multiplies and adds in one step in the body of a vectorised loop, but not in
     its remainder, so that bits would depend on a trial's slot: AVX has no such instruction.
     """
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     flags = {"--xla_gpu_deterministic_ops": "true"}
     release = tuple(map(int, metadata.version("jax").split(".")[:2]))
     if release >= (0, 12) and platform.machine().lower() in ("x86_64", "amd64"):

@@ -211,7 +211,7 @@ def _prepare(device: Device, x64: bool) -> None:
     """Make a worker's process compute as this one would."""
     import jax
 
-    devices.be_deterministic()
+    devices.configure_xla()
     jax.config.update("jax_enable_x64", x64)
     devices.choose(device)
     devices.use_cache()

@@ -355,13 +355,18 @@ RECIPES: dict[str, Recipe] = {
     ),
     "commands": Recipe((f"rps sweeps/speed/commands.py {_MACHINE}",), 14, None),
     "compilers": Recipe((f"rps sweeps/speed/compilers.py {_MACHINE}",), 5, None),
+    "compilers_gpu": Recipe(
+        (
+            f"rps sweeps/speed/compilers.py --against cpu --worlds 4000 --file compilers_gpu "
+            f"{_MACHINE}",
+        ),
+        None,
+        2,
+    ),
     "commands_gpu": Recipe(
         (
             "rps sweeps/speed/commands.py --commands "
-            + " ".join(
-                f"'{_SWEPT} --worlds {n}'"
-                for n in (1000, 10_000, "1000 --device gpu", "10000 --device gpu", 262_144)
-            )
+            + " ".join(f"'{_SWEPT} --worlds {n}'" for n in (1000, 10_000, 262_144))
             + f" --gpus 1 --warm 1000 10000 --file commands_gpu {_MACHINE}",
         ),
         None,

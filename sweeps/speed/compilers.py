@@ -1,19 +1,20 @@
 """Do outcomes hang on who compiles the loop, and how much faster is it compiled here than by XLA?
 
 The same worlds are swept twice, each time in a process of its own: the loop compiled here (`cc`, on
-a GPU NVRTC), and by XLA, as where there is no compiler.
+a GPU NVRTC), and by XLA, as where there is no compiler; or on a GPU, and on processors.
 
     rps sweeps/speed/compilers.py --machine "2 cores of an AMD EPYC"
+    rps sweeps/speed/compilers.py --against cpu --worlds 4000 --machine "one NVIDIA H100"
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import xarray as xr
 
@@ -29,19 +30,23 @@ from sweeps.shared import Study
 from sweeps.speed.commands import TOLD, printed
 
 _LIMIT = 3600.0  # [s] of a sweep
-_COLUMNS = ("law", "skin", "worlds", "equal outcomes", "compiled here", "by XLA", "simulated s/s")
+# Which are compared: their names, and the environment and options of the second.
+_PAIRS: dict[str, tuple[tuple[str, str], dict[str, str], str]] = {
+    "xla": (("compiled here", "by XLA"), {"RPS_COMPILER": "none"}, ""),
+    "cpu": (("on the GPU", "on processors"), {}, " --device cpu"),
+}
 
 
 @dataclass(frozen=True)
 class Compilers(Study[xr.Dataset]):
-    """Compare sweeps whose loop was compiled here with sweeps that XLA compiled.
+    """Compare sweeps whose loop was compiled here with sweeps by XLA, or on processors.
 
     The answer holds the share of equal outcomes, the rates of success, and simulated seconds in a
     second of both, for each skin.
     """
 
     TITLE: ClassVar[str] = "The loop compiled here, and by XLA"
-    GROWS: ClassVar[tuple[str, ...]] = ("skins", "machine")
+    GROWS: ClassVar[tuple[str, ...]] = ("skins", "machine", "file")
 
     law: str = "rps_tuned"
     """What decides."""
@@ -49,6 +54,8 @@ class Compilers(Study[xr.Dataset]):
     """Skins, as a domain has them."""
     worlds: int = option(1000, 1, 1_000_000)
     """Number of worlds of `wide`."""
+    against: Literal["xla", "cpu"] = "xla"
+    """With what the sweep as this machine runs it is compared: one by XLA, or on processors."""
     machine: str = ""
     """What it runs on, in words; with these the table is published."""
     file: str = "compilers"
@@ -62,12 +69,12 @@ class Compilers(Study[xr.Dataset]):
         """Sweep what was not swept before."""
         found = []
         for number, skin in enumerate(self.skins):
-            found.append(run.part(skin, partial(_compared, self.law, skin, self.worlds)))
+            found.append(run.part(skin, partial(self._compared, skin)))
             run.report(Progress(number + 1, 0.0))
         whole: Any = xr.concat(found, "skin").assign_coords(skin=list(self.skins))
         if self.machine and run.folder is not None:
             path = Path(__file__).parent / "results" / f"{self.file}.json"
-            columns = [{"name": one} for one in _COLUMNS]
+            columns = [{"name": one} for one in self._columns]
             made = [provenance.signed(run.folder)]
             shared.publish(path, made, self.machine, columns, self.table(whole))
         return whole
@@ -78,54 +85,58 @@ class Compilers(Study[xr.Dataset]):
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
         """Outcomes and speeds of both."""
-        return [Section("Outcomes and speeds", "", [list(_COLUMNS), *self.table(found)])]
+        return [Section("Outcomes and speeds", "", [self._columns, *self.table(found)])]
+
+    @property
+    def _columns(self) -> list[str]:
+        names, *_ = _PAIRS[self.against]
+        return ["law", "skin", "worlds", "equal outcomes", *names, "simulated s/s"]
 
     def table(self, found: xr.Dataset) -> list[list[str]]:
         """A row for each skin."""
         rows = []
         for skin in map(str, found.skin.values):
             one = {name: leaf.item() for name, leaf in found.sel(skin=skin).items()}
-            rates = f"{one['rate_here']:,.0f} and {one['rate_xla']:,.0f}"
+            rates = f"{one['rate_here']:,.0f} and {one['rate_other']:,.0f}"
             rows.append([
                 self.law, skin, f"{self.worlds:,}", f"{100 * one['equal']:.1f} %",
-                f"{100 * one['here']:.1f} %", f"{100 * one['xla']:.1f} %", rates,
+                f"{100 * one['here']:.1f} %", f"{100 * one['other']:.1f} %", rates,
             ])  # fmt: skip
         return rows
+
+    def _compared(self, skin: str) -> xr.Dataset:
+        """The same sweep by both."""
+        _, environment, more = _PAIRS[self.against]
+        asked = f"sweep --laws {self.law} --domain wide,skin={skin} --worlds {self.worlds}"
+        with tempfile.TemporaryDirectory() as folder:
+            here, rate_here = _swept(asked, Path(folder), "here", {})
+            other, rate_other = _swept(asked + more, Path(folder), "other", environment)
+        told = {
+            "equal": float((here == other).mean()),
+            "here": float(here.mean()),
+            "other": float(other.mean()),
+            "rate_here": rate_here,
+            "rate_other": rate_other,
+        }
+        return xr.Dataset({name: ((), value) for name, value in told.items()})
 
 
 compilers = call_of(Compilers)
 
 
-def _compared(law: str, skin: str, worlds: int) -> xr.Dataset:
-    """The same sweep compiled by both."""
-    with tempfile.TemporaryDirectory() as folder:
-        outcomes, rates = zip(
-            *(_swept(law, skin, worlds, Path(folder), by) for by in (None, "none")), strict=True
-        )
-    here, xla = outcomes
-    told = {
-        "equal": float((here == xla).mean()),
-        "here": float(here.mean()),
-        "xla": float(xla.mean()),
-        "rate_here": rates[0],
-        "rate_xla": rates[1],
-    }
-    return xr.Dataset({name: ((), value) for name, value in told.items()})
-
-
-def _swept(law: str, skin: str, worlds: int, folder: Path, by: str | None) -> tuple[Any, float]:
+def _swept(
+    asked: str, folder: Path, name: str, environment: Mapping[str, str]
+) -> tuple[Any, float]:
     """Which worlds are won, and simulated seconds in a second once all is compiled.
 
     Raises:
       InputError: the sweep failed.
     """
-    chosen = {} if by is None else {"RPS_COMPILER": by}
-    asked = f"sweep --laws {law} --domain wide,skin={skin} --worlds {worlds}"
     said, out = "", folder
     for number in range(2):  # the first compiles
-        out = folder / f"run_{by}_{number}"
+        out = folder / f"run_{name}_{number}"
         words = ["-m", "rps_jax", *asked.split(), "--out", str(out)]
-        said, _ = printed(words, asked, str(folder), _LIMIT, environment=chosen)
+        said, _ = printed(words, asked, str(folder), _LIMIT, environment=environment)
     if (told := TOLD.search(said)) is None:
-        raise InputError(f"skins = {skin}: the sweep does not tell how long it ran.")
+        raise InputError(f"{asked} does not tell how long it ran.")
     return rps_jax.load(out).success.values, float(told.group(3))

@@ -43,6 +43,6 @@ def _ask(words: list[str]) -> None:
     from rps_jax.engines import device
 
     name, rest = names.split(words)
-    device.be_deterministic()
+    device.configure_xla()
     question = names.question_of(name)
     running.carry_out(*flags.parse(question, name, rest))
