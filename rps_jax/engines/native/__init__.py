@@ -163,7 +163,7 @@ def _made(functions: Sequence[_Function]) -> str | None:
         said = f"{type(error).__name__}: {error}"
         warnings.warn(f"no C can be written, so XLA compiles: {said}", stacklevel=2)
         return None
-    key = repr((texts, on_gpu and cuda.LAUNCH, target(), jax.__version__))
+    key = repr((texts, on_gpu and (cuda.LAUNCH, cuda.FLAGS), target(), jax.__version__))
     name = _NAME + hashlib.sha256(key.encode()).hexdigest()[:32]
     with _locks[name]:
         if load(name):

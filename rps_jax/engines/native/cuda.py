@@ -13,7 +13,7 @@ from typing import Any
 import jax
 
 # Quotients and roots to two roundings, and zero for what is less than 1e-38.
-_FLAGS = ("--prec-div=false", "--prec-sqrt=false", "--ftz=true")
+FLAGS = ("--prec-div=false", "--prec-sqrt=false", "--ftz=true")
 LAUNCH = Path(__file__).with_name("launch.c").read_text()
 
 
@@ -55,7 +55,7 @@ def images(texts: Sequence[str]) -> list[bytes]:
 
 def _image(text: str) -> bytes:
     library, program = _library(), ctypes.c_void_p()
-    flags = [*_FLAGS, f"--gpu-architecture={str(target()).split()[-1]}"]
+    flags = [*FLAGS, f"--gpu-architecture={str(target()).split()[-1]}"]
     given = (ctypes.c_char_p * len(flags))(*(x.encode() for x in flags))
 
     def said(name: str) -> bytes:
