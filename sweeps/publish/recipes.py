@@ -375,7 +375,7 @@ RECIPES: dict[str, Recipe] = {
     "gpus": Recipe(
         (
             f"rps sweeps/speed/commands.py --file gpus --gpus 1 2 --commands '{_SWEPT} "
-            f"--worlds 1048576' {_MACHINE}",
+            f"--worlds 262144' {_MACHINE}",
         ),
         None,
         6,
