@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import markdown
 import numpy as np
 
 from rps_jax.analysis import tables
@@ -70,6 +69,8 @@ class Section(NamedTuple):
 
 def write_report(folder: Path, title: str, intro: str, sections: Sequence[Section]) -> Path:
     """Write `report.md` and `report.html`, which needs no other file; returns the first."""
+    import markdown  # while a run goes on: it takes as long as all of this module's others
+
     texts, pictures = [f"# {title}", intro], {}
     for section in sections:
         texts += section.lines
