@@ -12,9 +12,11 @@ from typing import Any
 
 import jax
 
+from rps_jax.engines.native.nodes import PRELUDE
+
 # Quotients and roots to two roundings, and zero for what is less than 1e-38.
 FLAGS = ("--prec-div=false", "--prec-sqrt=false", "--ftz=true")
-LAUNCH = Path(__file__).with_name("launch.c").read_text()
+LAUNCH = PRELUDE + Path(__file__).with_name("launch.c").read_text()
 
 
 @functools.cache

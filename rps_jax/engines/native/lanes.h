@@ -2,8 +2,6 @@
    sign (u), and bools (b), whose lanes are 0 or -1. `operations.h` follows. */
 
 #include <math.h>
-#include <stdint.h>
-#include "xla/ffi/api/c_api.h"
 
 #ifdef __AVX512F__
 #define LANES 16

@@ -1,12 +1,10 @@
 /* Launches kernels for XLA, each on a stream of its own, so that they run side by side. What stands
-   before this text defines their number KERNELS, their IMAGES, how many arguments
+   before this text and `handler.h` defines their number KERNELS, their IMAGES, how many arguments
    of each are GIVEN and results FOUND, MOST of them and one more, which ONE of its arguments tells
    the number of worlds, by its SIZE of each, how many WORLDS a block holds, and the NAME of this. */
 
 #include <dlfcn.h>
 #include <pthread.h>
-#include <stdint.h>
-#include "xla/ffi/api/c_api.h"
 
 static const char *const images[KERNELS] = {IMAGES};
 static const int given[KERNELS] = {GIVEN}, found[KERNELS] = {FOUND};
@@ -49,7 +47,8 @@ static void begin(void) {
 static int launch_all(void **arguments, const int64_t *worlds, void *stream) {
   void *before, *beside[KERNELS], *done[KERNELS];
   int code = make_event(&before, 2), made = 1;
-  if (!code) code = record(before, stream);
+  if (code) return code;
+  code = record(before, stream);
   for (int k = 0; k < KERNELS && !code; k++) {
     void *on = stream, *with[] = {arguments[k]};
     if (k) {
@@ -76,12 +75,7 @@ static XLA_FFI_Error *say(XLA_FFI_CallFrame *frame, const char *what) {
 }
 
 XLA_FFI_Error *NAME(XLA_FFI_CallFrame *frame) {
-  XLA_FFI_Metadata_Extension *asks = (void *)frame->extension_start;
-  if (asks && asks->extension_base.type == XLA_FFI_Extension_Metadata) {
-    asks->metadata->api_version.major_version = XLA_FFI_API_MAJOR;
-    asks->metadata->api_version.minor_version = XLA_FFI_API_MINOR;
-    return 0;
-  }
+  if (is_told(frame)) return 0;
   pthread_once(&once, begin);
   if (failed) return say(frame, "the GPU's driver cannot load a kernel");
   XLA_FFI_Stream_Get_Args asked = {sizeof asked, 0, frame->ctx, 0};
@@ -93,10 +87,7 @@ XLA_FFI_Error *NAME(XLA_FFI_CallFrame *frame) {
   void *arguments[KERNELS], **args = frame->args.args, **rets = frame->rets.rets;
   for (int k = 0; k < KERNELS; k++) {
     int n = 0;
-    worlds[k] = 1;
-    XLA_FFI_Buffer *some = args[one[k]];
-    for (int i = 0; i < some->rank; i++) worlds[k] *= some->dims[i];
-    worlds[k] /= size[k];
+    worlds[k] = worlds_of(args[one[k]], size[k]);
     for (int i = 0; i < given[k]; i++)
       room[k][n++] = (int64_t)((XLA_FFI_Buffer *)*args++)->data;
     for (int i = 0; i < found[k]; i++)

@@ -29,7 +29,8 @@ from rps_jax.engines.native.walk import (
 
 _HERE = Path(__file__).parent
 OPERATIONS = (_HERE / "operations.h").read_text()
-HEADER = (_HERE / "lanes.h").read_text() + OPERATIONS
+PRELUDE = (_HERE / "handler.h").read_text()
+HEADER = PRELUDE + (_HERE / "lanes.h").read_text() + OPERATIONS
 THREADS = (_HERE / "threads.h").read_text() + OPERATIONS
 # Kinds of numbers for which each macro of the header writes an operation.
 _WRITTEN = {"INFIX": "fiu", "COMPARE": "fiub", "BITS": "iub", "EACH": "f", "EACH_OF_TWO": "f"}

@@ -38,19 +38,11 @@ static void some(void **given, void **found, int64_t first, int64_t worlds) {{
 }}
 
 XLA_FFI_Error *{NAME}(XLA_FFI_CallFrame *frame) {{
-  XLA_FFI_Metadata_Extension *asks = (void *)frame->extension_start;
-  if (asks && asks->extension_base.type == XLA_FFI_Extension_Metadata) {{
-    asks->metadata->api_version.major_version = XLA_FFI_API_MAJOR;
-    asks->metadata->api_version.minor_version = XLA_FFI_API_MINOR;
-    return 0;
-  }}
+  if (is_told(frame)) return 0;
   void *given[{COUNT}], *found[{FOUND}];
   for (int i = 0; i < {COUNT}; i++) given[i] = ((XLA_FFI_Buffer *)frame->args.args[i])->data;
   for (int i = 0; i < {FOUND}; i++) found[i] = ((XLA_FFI_Buffer *)frame->rets.rets[i])->data;
-  XLA_FFI_Buffer *one = frame->args.args[{ONE}];
-  int64_t worlds = 1;
-  for (int i = 0; i < one->rank; i++) worlds *= one->dims[i];
-  worlds /= {SIZE};
+  const int64_t worlds = worlds_of(frame->args.args[{ONE}], {SIZE});
   for (int64_t first = 0; first < worlds; first += LANES) some(given, found, first, worlds);
   return 0;
 }}

@@ -1,0 +1,114 @@
+"""Kernels are launched side by side, on streams of their own: with a driver that writes it down."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from rps_jax.engines import native
+from rps_jax.engines.native import cuda
+from rps_jax.record import provenance
+
+COMPILER = provenance.compiler()
+pytestmark = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler: apt install gcc")
+NAME = "rps_lanes_launched"
+# In a process of its own, which has no other driver: two worlds of one kind, twenty of another.
+RUN = """
+import ctypes, json, sys
+import numpy as np
+folder, fails = sys.argv[1:]
+driver = ctypes.CDLL(f"{folder}/libcuda.so.1")
+launcher = ctypes.CDLL(f"{folder}/launcher.so")
+worlds = np.array([2, 20])
+arrays = [x for n in worlds for x in (np.arange(n, dtype=np.float32), np.arange(n),
+                                      np.zeros(n, np.float32))]
+pointers = (ctypes.c_void_p * 6)(*(x.ctypes.data for x in arrays))
+driver.call.restype = driver.said.restype = ctypes.c_char_p
+handler = getattr(launcher, "rps_lanes_launched")
+told = []
+for _ in range(2):
+    error = driver.call(handler, pointers, ctypes.c_void_p(worlds.ctypes.data), fails.encode())
+    told.append([error.decode(), driver.said().decode().splitlines()])
+print(json.dumps([told, arrays[2].tolist(), arrays[5].tolist()]))
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The driver, and the launcher of kernels that are single digits."""
+    folder = tmp_path_factory.mktemp("launch")
+    codes = []
+    for digit in "35":
+        codes.append(folder / f"{digit}.cubin")
+        codes[-1].write_text(digit)
+    text = cuda.launcher(NAME, codes, [(2, 1, 0, 1), (2, 1, 0, 1)], worlds=8)
+    (folder / "launcher.so").write_bytes(native._binary(text, NAME))
+    words = [str(COMPILER), "-O1", "-w", "-shared", "-fPIC", "-Wl,-soname,libcuda.so.1"]
+    words += [f"-I{jax.ffi.include_dir()}", str(Path(__file__).with_name("launch.c"))]
+    subprocess.run([*words, "-o", str(folder / "libcuda.so.1")], check=True)
+    return folder
+
+
+def launched(folder, fails="nothing"):
+    """What two calls in turn say, the driver's notes of each, and the results of both kernels."""
+    words = [sys.executable, "-c", RUN, str(folder), fails]
+    given = os.environ | {"LD_LIBRARY_PATH": str(folder)}
+    done = subprocess.run(words, capture_output=True, text=True, env=given, check=True)
+    return json.loads(done.stdout)
+
+
+def test_kernels_run_beside_each_other_and_what_follows_waits_for_all(folder):
+    ((error, first), (_, second)), *results = launched(folder)
+    assert error == ""
+    np.testing.assert_array_equal(results[0], 3 * np.arange(2))
+    np.testing.assert_array_equal(results[1], 5 * np.arange(20))
+    loaded = ["load 3", "kernel step", "load 5", "kernel step"]
+    assert first == [
+        *loaded,
+        "context",
+        "push 7",
+        "event 201",
+        "record 201 on 7",
+        "launch 3 on 7: 1 of 32",  # 8 worlds in a block of 32 threads
+        "stream 101",
+        "event 202",
+        "await 201 on 101",  # what was asked of XLA's stream before comes first
+        "launch 5 on 101: 3 of 32",
+        "record 202 on 101",
+        "await 202 on 7",
+        "end event 202",
+        "end stream 101",
+        "end event 201",
+        "pop",
+    ]
+    assert [line.split()[0] for line in second] == [line.split()[0] for line in first[4:]]
+
+
+@pytest.mark.parametrize(("fails", "error"), [
+    ("load", "the GPU's driver cannot load a kernel"),
+    ("context", "no GPU is there"),
+    ("stream", "a kernel could not be launched"),
+    ("event", "a kernel could not be launched"),
+    ("launch", "a kernel could not be launched"),
+])  # fmt: skip
+def test_a_failure_is_told_and_leaves_nothing_open(fails, error, folder):
+    for told, notes in launched(folder, fails)[0]:
+        assert told == error
+        for kind in ("stream", "event"):
+            made = sum(line.startswith(f"{kind} ") for line in notes)
+            ended = sum(line.startswith(f"end {kind} ") for line in notes)
+            assert made - ended == (fails == kind)  # what failed to be made is not ended
+        assert ("pop" in notes) == any(line.startswith("push") for line in notes)
+
+
+def test_xla_knows_the_version_of_the_interface(folder):
+    """Else it refuses to register the function."""
+    import ctypes
+
+    function = getattr(ctypes.CDLL(str(folder / "launcher.so")), NAME)
+    jax.ffi.register_ffi_target(NAME, jax.ffi.pycapsule(function), platform="cpu")
