@@ -55,6 +55,18 @@ def test_mcnemars_exact_test_by_hand():
     assert statistics.compare(a, a).p == 1.0
 
 
+def test_numbers_are_ranked_as_by_a_stable_sort():
+    rng = np.random.default_rng(0)
+    many = rng.normal(size=5000) * 10.0 ** rng.integers(-40, 38, 5000)
+    for values in (many, rng.integers(-3, 4, 5000), np.array([0.0, -0.0, np.inf, -np.inf, -0.0])):
+        few = values.astype(np.float32)
+        found = statistics.ascending(few)
+        np.testing.assert_array_equal(found, np.argsort(few, kind="stable"))
+        np.testing.assert_array_equal(
+            statistics.ascending(values), np.argsort(values, kind="stable")
+        )
+
+
 def test_what_a_sweep_says_is_what_happened():
     """Worked out by hand on four worlds."""
     inf = np.inf

@@ -420,7 +420,7 @@ def advance(
 
     Each batch is of a stage and a shape family of its own.
     """
-    if not (native.usable() and all(getattr(stage, "native", False) for stage in stages)):
+    if not (all(getattr(stage, "native", False) for stage in stages) and native.usable()):
         return _side_by_side(stages, worlds, trials, loop, steps)
 
     def one(stage: Stage, world: World, now: Trial, rules: Any) -> Trial:
