@@ -187,7 +187,8 @@ class FollowsOne(Question[Trace]):
         return Bar(self.name, self.horizon, "simulated", shown=self.shown)
 
     def report(self, found: Trace, run: Run) -> Sequence[Section]:
-        return [Section("The push", f"{found.told}.", (), Picture("trial", found.plot))]
+        text = f"{found.told}. Stepped by the engine {found.engine}."
+        return [Section("The push", text, (), Picture("trial", found.plot))]
 
 
 def recorded_law(law: Law) -> Law:
