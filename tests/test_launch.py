@@ -1,5 +1,6 @@
 """Kernels are launched side by side, on streams of their own: with a driver that writes it down."""
 
+import ctypes
 import json
 import os
 import subprocess
@@ -108,7 +109,5 @@ def test_a_failure_is_told_and_leaves_nothing_open(fails, error, folder):
 
 def test_xla_knows_the_version_of_the_interface(folder):
     """Else it refuses to register the function."""
-    import ctypes
-
     function = getattr(ctypes.CDLL(str(folder / "launcher.so")), NAME)
     jax.ffi.register_ffi_target(NAME, jax.ffi.pycapsule(function), platform="cpu")

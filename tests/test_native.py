@@ -51,26 +51,35 @@ def begun(worlds, loop):
     return trial.start_all(worlds, jnp.ones(len(worlds.qpos), bool), loop.law)
 
 
+def in_a_push(*asked, **drawn):
+    """Stage, worlds and loop as of `batch`, and trials in the middle of a push, after 8 s."""
+    stage, worlds, loop = batch(*asked, **drawn)
+    pushing = advanced(stage, worlds, begun(worlds, loop), loop, 400)
+    assert np.mean(pushing.contact_steps > 0) > 0.5
+    return stage, worlds, loop, pushing
+
+
 def same(one, other):
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
+def close(one, other, warm, rest):
+    """Trials, whose accelerations [m/s^2] the solver leaves to 1e-4, and all else."""
+    np.testing.assert_allclose(one.warmstart, other.warmstart, atol=warm)
+    for a, b in zip(*(jax.tree.leaves(x._replace(warmstart=0)) for x in (one, other)),
+                    strict=True):  # fmt: skip
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=rest)
+
+
 @pytest.mark.parametrize("skin", ["capacitive", "ideal"])
 @pytest.mark.parametrize("shape", ["box", "cylinder", "prism"])
 def test_a_control_step_ends_where_xla_ends_it(shape, skin, monkeypatch):
-    """Of worlds in the middle of a push, after 8 s."""
-    stage, worlds, loop = batch(shape, skin)
-    pushing = advanced(stage, worlds, begun(worlds, loop), loop, 400)
-    assert np.mean(pushing.contact_steps > 0) > 0.5
+    stage, worlds, loop, pushing = in_a_push(shape, skin)
     found = advanced(stage, worlds, pushing, loop, 1)
     monkeypatch.setenv("RPS_COMPILER", "none")
     expected = advanced(stage, worlds, pushing, loop, 1)
-    warm = found.warmstart, expected.warmstart  # [m/s^2] which the solver leaves to 1e-4
-    np.testing.assert_allclose(*warm, atol=2e-3)
-    for a, b in zip(*(jax.tree.leaves(x._replace(warmstart=0)) for x in (found, expected)),
-                    strict=True):  # fmt: skip
-        np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-5)
+    close(found, expected, warm=2e-3, rest=2e-5)
 
 
 @pytest.mark.parametrize("shape", ["box", "cylinder", "prism"])
