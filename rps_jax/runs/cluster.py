@@ -61,7 +61,7 @@ def _work(
     sweep.work(
         plan,
         {plan.kind(numbers[0]): numbers},
-        lambda number, part: found.update({number: results.written(part)}),
+        lambda number, part: found.update({number: results.encoded(part)}),
         report=heard.append,
         slots=slots,
         workers=threads,

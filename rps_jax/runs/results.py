@@ -16,7 +16,7 @@ from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import labelled
 from rps_jax.trials.results import UNITS, variable
 from rps_jax.trials.trial import Outcome
-from rps_jax.world.domain import QUANTITIES, WORDS
+from rps_jax.world.domain import WORDS, unit_of
 
 Part = Mapping[str, np.ndarray]  # columns of some trials, whose numbers are `trial`
 Keep = Callable[[int, Part], Any]  # called with the number of a part
@@ -28,12 +28,12 @@ _TYPES = dict.fromkeys(("success", "tipped", "diverged", "stalled"), np.int8) | 
 _HDF5 = b"\x89HDF"  # with which a NetCDF file begins
 
 
-def written(part: Part) -> bytes:
-    """The file of a part: a NumPy archive, which takes a tenth of a NetCDF file's time."""
+def encoded(part: Part) -> bytes:
+    """The file of a part: a NumPy archive, which is made much faster than NetCDF."""
     return files.archive(**part)
 
 
-def read(number: int, content: bytes) -> Part:
+def decoded(number: int, content: bytes) -> Part:
     """A part from its file; InputError if it is damaged, or of another version."""
     try:
         return files.arrays_of(content)
@@ -104,7 +104,7 @@ def gather(
         for folder in folders:
             for name, content in Parts(folder).each(lacking):
                 number = lacking.pop(name)
-                yield number, read(number, content)
+                yield number, decoded(number, content)
 
     results = dataset(plan, contents())
     if lacking:
@@ -145,8 +145,10 @@ def dataset(plan: Plan, parts: Iterable[tuple[int, Part]]) -> xr.Dataset:
         for name in drawn:
             if name not in columns:
                 empty = np.zeros(plan.worlds, np.float32)
-                unit = QUANTITIES[name].unit if name in QUANTITIES else "1"
-                attrs = {"units": unit, "long_name": WORDS.get(name, name.replace("_", " "))}
+                attrs = {
+                    "units": unit_of(name),
+                    "long_name": WORDS.get(name, name.replace("_", " ")),
+                }
                 columns[name] = xr.Variable("world", empty, attrs)
             columns[name].values[world] = part[name]
     for column in columns.values():

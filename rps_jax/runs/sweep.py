@@ -306,7 +306,7 @@ def own_trials(folder: Path, plan: Plan, shard: Shard) -> xr.Dataset:
     """Outcomes (row) of a shard's own trials, with the law and the world of each."""
     own = share(plan, shard)
     kept = Parts(folder).each([results.name_of(number) for number in own])
-    parts = ((int(name), results.read(int(name), content)) for name, content in kept)
+    parts = ((int(name), results.decoded(int(name), content)) for name, content in kept)
     found = results.dataset(plan, parts)
     law, world = np.divmod(np.concatenate(list(own.values())), plan.worlds)
     at = {"law": xr.DataArray(law, dims="row"), "world": xr.DataArray(world, dims="row")}
@@ -335,7 +335,7 @@ def run_missing(
         report(replace(progress, finished=before + progress.finished))
 
     def keep(number: int, part: results.Part) -> None:
-        store(folder, number, results.written(part))
+        store(folder, number, results.encoded(part))
         if shard.of == 1:
             made[number] = part
 

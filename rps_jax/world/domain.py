@@ -231,6 +231,11 @@ WORDS: dict[str, str] = {
 }
 
 
+def unit_of(name: str) -> str:
+    """The unit of a column of a table of worlds."""
+    return QUANTITIES[name].unit if name in QUANTITIES else "1"
+
+
 def _only(value: float) -> Range:
     return Range(value, value)
 

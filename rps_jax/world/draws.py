@@ -15,7 +15,7 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.solid import SIDES, Solid
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
-from rps_jax.world.domain import ERRORS, QUANTITIES, RANDOM, Domain, of
+from rps_jax.world.domain import ERRORS, QUANTITIES, RANDOM, Domain, of, unit_of
 from rps_jax.world.scene import Friction
 
 COLUMNS = 64  # random numbers of a world, more than are used, so that new ones change no old ones
@@ -181,11 +181,11 @@ def table(drawn: Draw) -> dict[str, tuple[np.ndarray, str]]:
         else:
             values = derived.get(name, drawn.at.get(name))
         if about.words and values is not None:
-            found[name] = (values, about.unit)
-    found["corners"] = (solid.corners(shape), "1")
+            found[name] = values
+    found["corners"] = solid.corners(shape)
     for name, values in zip(ERRORS, drawn.velocity_error.T, strict=True):
-        found[name] = (values, "1")
-    return found
+        found[name] = values
+    return {name: (values, unit_of(name)) for name, values in found.items()}
 
 
 def _limit(robots: Robot, name: str) -> np.ndarray | None:
