@@ -50,7 +50,7 @@ def _kernels(platform: str) -> str:
     if platform != "gpu":
         return "none: JAX finds no GPU"
     made = native.target() and native.cuda.target()
-    return f"by NVRTC {made}" if made else "none: XLA steps the fused engine, some 15 times slower"
+    return f"by NVRTC {made}" if made else "none: XLA steps the fused engine, many times slower"
 
 
 def _writable(folder: Path) -> tuple[bool, str]:

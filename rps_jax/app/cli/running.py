@@ -26,11 +26,8 @@ if TYPE_CHECKING:
     from rps_jax.trials.progress import Bar
 
 _MEND = "make room, then run the same command again; what is done is kept"
-_AFTER = (
-    "rps_jax.analysis.figures.sweeps",
-    "h5netcdf",
-    "markdown.extensions.tables",
-)  # of results and report
+# Of results and report.
+_AFTER = ("rps_jax.analysis.figures.sweeps", "h5netcdf", "markdown.extensions.tables")
 _stopped: list[bool] = []  # interrupts of this command
 
 
