@@ -163,6 +163,7 @@ class _Shared:
         """One worker had no program for this long."""
         with self._lock:
             self.compile = max(self.compile, seconds)
+            self._report(Progress(self._finished, self.simulated, self.compile))
 
 
 # --- on the host ---------------------------------------------------------------------------

@@ -87,6 +87,7 @@ class Bar:
         self._bar: Any = None
         self._began = time.perf_counter()
         self._last = Progress(0, 0.0)
+        self.when_compiled: Callable[[], object] | None = None  # called once, when trials run
 
     def __enter__(self) -> Bar:
         self._began = time.perf_counter()
@@ -123,6 +124,9 @@ class Bar:
 
     def __call__(self, progress: Progress) -> None:
         self._last = progress
+        if progress.compile and self.when_compiled is not None:
+            called, self.when_compiled = self.when_compiled, None
+            called()
         note = f"{progress.simulated:.0f} s simulated"
         if self.over == "trials":
             self.move(progress.finished, note)

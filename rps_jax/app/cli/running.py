@@ -141,10 +141,8 @@ def carry_out(question: Any, beside: Beside) -> None:
     film = None
     with asked.bar() as bar:
         _go_on()
-        # What the report needs is imported while the run goes on.
         importlib.import_module("scipy.special")  # JAX does, too: in two threads they could meet
-        later = map(importlib.import_module, _AFTER)
-        threading.Thread(target=list, args=(later,), daemon=True).start()
+        bar.when_compiled = _import_ahead
         found = asked.answered(bar)
         timed = bar.timing.simulated > 0 and bar.over != "clock"
         spent = told(bar.timing, device.kind()) if timed else ""
@@ -164,6 +162,12 @@ def carry_out(question: Any, beside: Beside) -> None:
 
         print(f"film: {Film(Path(asked.out) / 'worlds', grid='3x4', which='hardest')()}")
     print(f"run folder: {asked.out}")
+
+
+def _import_ahead() -> None:
+    """Import what the report needs while trials run, which leaves Python to others."""
+    later = map(importlib.import_module, _AFTER)
+    threading.Thread(target=list, args=(later,), daemon=True).start()
 
 
 def _report(asked: Any, found: Any, bar: Bar) -> Path:
