@@ -2,17 +2,22 @@
 
 import os
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rps_jax.control.laws import rps
 from rps_jax.engines import device, programs
 from rps_jax.record import provenance
 from rps_jax.runs.push import Push
 from rps_jax.runs.sweep import Sweep
+from rps_jax.trials import pushes, trial
+from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
 
 
 @pytest.fixture
@@ -36,7 +41,8 @@ def made():
 
         shape = jax.ShapeDtypeStruct((n,), jnp.float32)
         known = [factor] if static is None else [static]
-        program = programs.compiled(function, (shape, shape), {"sum": 0}, donate=0, static=known)
+        given = (shape, shape)
+        program = programs.compiled(function, given, law=rps.LAW, donate=0, static=known)
         return np.asarray(program(jnp.ones(n), jnp.ones(n))["sum"]).tolist()
 
     return make, traced
@@ -50,6 +56,35 @@ def test_a_program_is_traced_once_for_all_processes(cache, made):
     assert make(n=2) == [3.0] * 2
     assert len(traced) == 3
     assert len(list(cache.iterdir())) == 3
+
+
+def test_a_trial_that_is_followed_is_traced_once_for_all_processes(cache, monkeypatch):
+    """And what it returns is as named as if it had been traced."""
+    traced, record = [], trial.record
+    monkeypatch.setattr(trial, "record", lambda *a, **k: traced.append(1) or record(*a, **k))
+    setting = Setting("quasistatic", rules=Rules(horizon=0.2))
+    first, again = (pushes.follow([Case("box")], setting)[0] for _ in range(2))
+    assert len(traced) == 1
+    assert jax.tree.structure(first.snapshots) == jax.tree.structure(again.snapshots)
+    assert jax.tree.structure(first.outcome) == jax.tree.structure(again.outcome)
+    np.testing.assert_array_equal(first.snapshots.qpos, again.snapshots.qpos)
+
+
+@pytest.mark.parametrize("result", [
+    lambda x: NamedTuple("Made", [("own", Any)])(x), lambda x: [x],
+])  # fmt: skip
+def test_a_program_whose_results_cannot_be_named_is_not_kept(result, cache):
+    shape, traced = jax.ShapeDtypeStruct((3,), jnp.float32), []
+
+    def function(x):
+        traced.append(1)
+        return result(x)
+
+    for _ in range(2):
+        program = programs.compiled(function, [shape], law=rps.LAW, donate=0, static=[])
+        assert jax.tree.leaves(program(jnp.ones(3)))[0].tolist() == [1.0] * 3
+    assert len(traced) == 2
+    assert not cache.exists()
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "of another program"])

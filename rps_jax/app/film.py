@@ -10,7 +10,6 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -289,21 +288,13 @@ def _shots(take: Take, setting: Setting, every: int) -> Iterator[tuple[bool, lis
     """Whether all of a take's trials have ended, and what they show, each `every` steps."""
     worlds = jax.device_put(take.part.worlds)
     trials = trial.start_all(worlds, np.ones(len(take.labels), bool), law=take.law)
-    advance = partial(
-        trial.record,
-        take.part.stage,
-        worlds,
-        physics=setting.physics,
-        rules=setting.rules,
-        law=take.law,
-        steps=every,
-        every=every,
-    )
+    given = take.part.stage, worlds, trials, setting, take.law
+    advance = pushes.recorder(*given, steps=every, every=every)
     shots: list[Shot] = []
     ended = np.zeros(len(take.labels), bool)
     while True:
         done, success, steps = jax.device_get((trials.done, trials.success, trials.steps))
-        trials, snapshots = advance(trials)
+        trials, snapshots, _ = advance(trials)
         seen = rows(jax.device_get(snapshots), 0)
         contacts = np.asarray(trial.p_world_contact(seen))
         time = steps * setting.physics.control_period

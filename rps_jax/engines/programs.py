@@ -12,6 +12,8 @@ import contextlib
 import ctypes
 import functools
 import hashlib
+import importlib
+import json
 import os
 from collections.abc import Callable, Sequence
 from importlib import metadata
@@ -28,43 +30,86 @@ from rps_jax.engines import device, native
 def compiled(
     function: Callable[..., Any],
     arguments: Sequence[Any],
-    result: Any,
     *,
+    law: Law,
     donate: int,
     static: Sequence[Any],
 ) -> Callable[..., Any]:
     """Compile a function for arguments of these shapes, from what was kept of it if there is.
 
     Args:
-      function: pure; it may depend on nothing but its arguments and `static`.
-      arguments: pytrees of `jax.ShapeDtypeStruct`.
-      result: a pytree with the structure of what the function returns.
+      function: pure; it may depend on nothing but its arguments, the law and `static`.
+      arguments: pytrees of arrays or `jax.ShapeDtypeStruct`.
+      law: which it calls; of one that no name says (see `identity`), nothing is kept.
       donate: position of the argument whose memory may be used again.
       static: what else it depends on; each with a `repr` that says all of it.
 
     Returns:
       The compiled function. It is the same program whether it was kept or not.
     """
-    leaves, tree = jax.tree.flatten(tuple(arguments))
+    if (who := identity(law)) is None:
+        return built(jax.jit(function, donate_argnums=donate).lower(*arguments))
+    leaves, tree = jax.tree.flatten(jax.eval_shape(lambda *given: given, *arguments))
     sizes = [jax.tree.structure(one).num_leaves for one in arguments]
     first = sum(sizes[:donate])
     donated = tuple(range(first, first + sizes[donate]))
+    shapes: list[Any] = []  # of what it returns
 
     def flat(*given: Any) -> list[Any]:
-        return jax.tree.leaves(function(*jax.tree.unflatten(tree, given)))
+        found, structure = jax.tree.flatten(function(*jax.tree.unflatten(tree, given)))
+        shapes[:] = [structure]
+        return found
 
-    place = _place(repr((str(tree), [(x.shape, str(x.dtype)) for x in leaves], donated, static)))
-    exported = None if place is None else _read(place, leaves)
-    if exported is None:
+    told = (str(tree), [(x.shape, str(x.dtype)) for x in leaves], donated, who, static)
+    place = _place(repr(told))
+    found = None if place is None else _read(place, leaves)
+    if found is None:
         jitted = jax.jit(flat, donate_argnums=donated)
         jitted.trace(*leaves)  # in which functions are compiled that it calls
         safe = list(map(export.DisabledSafetyCheck.custom_call, native.known()))
         exported = export.export(jitted, disabled_checks=safe)(*leaves)
+        (structure,) = shapes
         with contextlib.suppress(ValueError):  # what cannot be kept
-            device.keep(place, bytes(exported.serialize()))
+            head = json.dumps(_words(structure.unflatten([0] * structure.num_leaves)))
+            device.keep(place, head.encode() + b"\n" + bytes(exported.serialize()))
+    else:
+        structure, exported = found
     program = built(jax.jit(exported.call, donate_argnums=donated).lower(*leaves))
-    outcome = jax.tree.structure(result)
-    return lambda *given: jax.tree.unflatten(outcome, program(*jax.tree.leaves(given)))
+    return lambda *given: jax.tree.unflatten(structure, program(*jax.tree.leaves(given)))
+
+
+def _words(tree: Any) -> Any:
+    """A pytree of tuples, those with names too, dicts and None as JSON has it.
+
+    Raises:
+      ValueError: it has another node, or a NamedTuple that does not stand in a module.
+    """
+    if isinstance(tree, dict):
+        return {key: _words(one) for key, one in tree.items()}
+    if isinstance(tree, tuple):
+        kind = type(tree)
+        words = [f"{kind.__module__}:{kind.__name__}", *map(_words, tree)]
+        if kind is not tuple and _kind(words[0]) is not kind:
+            raise ValueError(f"{words[0]} is made while a program runs")
+        return words
+    if tree is None or isinstance(tree, int):
+        return tree
+    raise ValueError(f"{type(tree).__name__} is not kept")
+
+
+def _kind(name: str) -> Any:
+    module, _, own = name.partition(":")
+    return getattr(importlib.import_module(module), own, None)
+
+
+def _tree(words: Any) -> Any:
+    """The pytree of which these are the words."""
+    if isinstance(words, dict):
+        return {key: _tree(one) for key, one in words.items()}
+    if isinstance(words, list):
+        kind, leaves = _kind(words[0]), map(_tree, words[1:])
+        return tuple(leaves) if kind is tuple else kind(*leaves)
+    return words
 
 
 def built(lowered: Any) -> Any:
@@ -119,15 +164,16 @@ def _place(told: str) -> Path | None:
     return Path(folder) / "traced" / key
 
 
-def _read(path: Path, leaves: Sequence[Any]) -> export.Exported | None:
-    """A program that was kept, if it is whole and of these arguments."""
+def _read(path: Path, leaves: Sequence[Any]) -> tuple[Any, export.Exported] | None:
+    """A program that was kept and the structure of its results, if it is of these arguments."""
 
-    def told(body: bytes) -> export.Exported:
-        found = export.deserialize(bytearray(body))
+    def told(body: bytes) -> tuple[Any, export.Exported]:
+        head, _, program = body.partition(b"\n")
+        found = export.deserialize(bytearray(program))
         if [(x.shape, x.dtype) for x in found.in_avals] != [(x.shape, x.dtype) for x in leaves]:
             raise ValueError("it is of other shapes")
         if not all(map(native.load, native.needed(found.mlir_module_serialized))):
             raise ValueError("it needs a compiled function that is not there")
-        return found
+        return jax.tree.structure(_tree(json.loads(head))), found
 
     return device.kept(path, "traced", told)

@@ -336,13 +336,9 @@ def _compiled(
             check_vma=False,
         )
     arguments = jax.tree.unflatten(tree, leaves)
-    who = programs.identity(law)
-    if sharding is None and who is not None:
-        trials = arguments[2]
-        names: tuple[Any, ...] = Outcome._fields  # any leaves: what counts is the structure
-        result = trials, tuple((one.steps, one.done, Outcome(*names)) for one in trials)
-        static = (physics, who, SEGMENT)
-        return programs.compiled(advance, arguments, result, donate=2, static=static)
+    if sharding is None:
+        static = (physics, SEGMENT)
+        return programs.compiled(advance, arguments, law=law, donate=2, static=static)
     return programs.built(jax.jit(advance, donate_argnums=2).lower(*arguments))
 
 

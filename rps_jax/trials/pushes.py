@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -15,6 +15,7 @@ from rps_jax import engines
 from rps_jax.control import registry
 from rps_jax.control.base import Law, Params
 from rps_jax.control.laws.rps import RPSParams
+from rps_jax.engines import programs
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.record import provenance
 from rps_jax.robot.base import Odometry
@@ -24,7 +25,7 @@ from rps_jax.trials.batch import SEGMENT, Job, Part, rows, warn_of_lost
 from rps_jax.trials.case import Case
 from rps_jax.trials.progress import Progress, Report, Timing, unheard
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Loop, Outcome, Shift, Snapshot, World
+from rps_jax.trials.trial import Loop, Outcome, Shift, Snapshot, Trial, World
 from rps_jax.world import scene
 from rps_jax.world.objects import FAMILIES
 from rps_jax.world.physics import Physics
@@ -187,22 +188,39 @@ def follow_part(
     steps = every * max(1, round(SEGMENT / (every * period)))
     worlds = jax.device_put(part.worlds)
     trials = trial.start_all(worlds, np.ones(part.numbers.size, bool), law=law)
-    options = {"physics": setting.physics, "rules": setting.rules, "law": law}
     began = time.perf_counter()
-    program = trial.record.lower(
-        part.stage, worlds, trials, **options, steps=steps, every=every
-    ).compile()
+    record = recorder(part.stage, worlds, trials, setting, law, steps=steps, every=every)
     compiled = time.perf_counter()
     parts = []
-    while not bool(trials.done.all()):
-        trials, snapshots = program(part.stage, worlds, trials, rules=setting.rules)
-        parts.append(jax.device_get(snapshots))
-        done, simulated = int(trials.done.sum()), float(trials.steps.sum()) * period
-        report(Progress(done, simulated, compiled - began))
+    while True:
+        trials, snapshots, outcomes = record(trials)
+        done, steps_done, snapshots, outcomes = jax.device_get(
+            (trials.done, trials.steps, snapshots, outcomes)
+        )
+        parts.append(snapshots)
+        report(Progress(int(done.sum()), float(steps_done.sum()) * period, compiled - began))
+        if done.all():
+            break
     whole = jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
-    outcomes = jax.device_get(trial.outcome(trials, period))
     timing = Timing(compiled - began, time.perf_counter() - compiled, float(np.sum(outcomes.time)))
     return _followed(part, whole, outcomes, timing)
+
+
+def recorder(
+    stage: Any, worlds: World, trials: Trial, setting: Setting, law: Law, *, steps: int, every: int
+) -> Callable[[Trial], tuple[Trial, Snapshot, Outcome]]:
+    """`trial.record` of a batch and how its trials stand then, compiled, or kept by a process."""
+    own = {"physics": setting.physics, "law": law, "steps": steps, "every": every}
+
+    def record(*given: Any) -> tuple[Trial, Snapshot, Outcome]:
+        *batch, rules = given
+        after, snapshots = trial.record(*batch, rules=rules, **own)
+        return after, snapshots, trial.outcome(after, setting.physics.control_period)
+
+    given = stage, worlds, trials, setting.rules
+    static = (setting.physics, steps, every)
+    program = programs.compiled(record, given, law=law, donate=2, static=static)
+    return lambda now: program(stage, worlds, now, setting.rules)
 
 
 def _follow_on_host(
@@ -218,7 +236,7 @@ def _follow_on_host(
         if step % every == 0:
             seen.append(jax.device_get(now))
 
-    def tell(_: np.ndarray, trials: trial.Trial, simulated: float) -> bool:
+    def tell(_: np.ndarray, trials: Trial, simulated: float) -> bool:
         nonlocal total
         total += simulated
         report(Progress(int(np.asarray(trials.done).sum()), total, compiled))

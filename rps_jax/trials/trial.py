@@ -160,6 +160,7 @@ def object_pose(qpos: Float[Array, "10"]) -> tuple[Float[Array, "2"], Float[Arra
     return free[:2], planar.yaw_of_quaternion(free[3:])
 
 
+@jax.jit
 def p_world_contact(seen: Snapshot) -> Float[Array, "T 2"]:
     """Contact points of snapshots (T, ...) in the world [m]; NaN without contact."""
     point = seen.qpos[:, :2] + planar.rotate(seen.qpos[:, 2], seen.reading.p_robot_contact)
