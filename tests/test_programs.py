@@ -119,6 +119,18 @@ def test_what_says_not_all_that_a_program_depends_on_keeps_none(cache, made):
     assert not cache.exists()
 
 
+def test_a_model_of_mjx_is_known_again_by_its_numbers(cache):
+    """Its static arrays, which JAX names by their addresses, too."""
+    setting = Setting("mjx")
+    stages = [pushes.build([Case(name)], setting)[0] for name in ("box", "box", "cylinder")]
+    said = [repr(programs._said(jax.tree.structure(one))) for one in stages]
+    assert said[0] == said[1] != said[2]
+    assert programs._place(said[0]) is not None
+    model = stages[0].model
+    changed = stages[0]._replace(model=model.replace(geom_bodyid=model.geom_bodyid + 1))
+    assert repr(programs._said(jax.tree.structure(changed))) != said[0]
+
+
 def test_programs_that_were_not_used_for_longest_go_first(cache, made, monkeypatch):
     make, traced = made
     make(n=1)

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from jax import export
 
 from rps_jax.control.base import Law
@@ -60,7 +61,7 @@ def compiled(
         shapes[:] = [structure]
         return found
 
-    told = (str(tree), [(x.shape, str(x.dtype)) for x in leaves], donated, who, static)
+    told = (_said(tree), [(x.shape, str(x.dtype)) for x in leaves], donated, who, static)
     place = _place(repr(told))
     found = None if place is None else _read(place, leaves)
     if found is None:
@@ -76,6 +77,22 @@ def compiled(
         structure, exported = found
     program = built(jax.jit(exported.call, donate_argnums=donated).lower(*leaves))
     return lambda *given: jax.tree.unflatten(structure, program(*jax.tree.leaves(given)))
+
+
+def _said(structure: Any) -> Any:
+    """All that the structure of a pytree holds, with a digest of every static array."""
+    data = structure.node_data()
+    held = data and (data[0], _digests(data[1]))
+    return held, structure.num_leaves, [_said(child) for child in structure.children()]
+
+
+def _digests(data: Any) -> Any:
+    if isinstance(data, tuple):
+        return tuple(map(_digests, data))
+    array = getattr(data, "array", None)  # so MJX wraps what a model has of fixed numbers
+    if isinstance(array, np.ndarray):
+        return array.shape, str(array.dtype), hashlib.sha256(array.tobytes()).hexdigest()
+    return data
 
 
 def _words(tree: Any) -> Any:
@@ -141,7 +158,8 @@ def identity(law: Law) -> str | None:
 @functools.cache
 def _source() -> str:
     """Digest of this package's source and of the versions that make a program of it."""
-    versions = [metadata.version(name) for name in ("jax", "jaxlib", "numpy")]
+    names = ("jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx")
+    versions = [metadata.version(name) for name in names]
     told = hashlib.sha256(repr(versions).encode())
     root = Path(__file__).parents[1]
     for path in sorted([*root.rglob("*.py"), *root.rglob("*.[ch]")]):
