@@ -61,6 +61,7 @@ def test_an_instruction_comes_from_the_innermost_function():
 FileNames
 1 "/somewhere/rps_jax/control/laws/rps.py"
 2 "/somewhere/rps_jax/trials/trial.py"
+3 "/somewhere/rps_jax/lib/site-packages/mujoco/mjx/_src/solver.py"
 
 FunctionNames
 1 "step"

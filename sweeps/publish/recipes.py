@@ -363,6 +363,7 @@ RECIPES: dict[str, Recipe] = {
         None,
         2,
     ),
+    "kernel": Recipe((f"rps sweeps/speed/kernel.py {_MACHINE}",), None, 3),
     "commands_gpu": Recipe(
         (
             "rps sweeps/speed/commands.py --commands "

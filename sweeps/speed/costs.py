@@ -32,7 +32,7 @@ from rps_jax.trials.progress import Progress
 from sweeps import shared
 from sweeps.shared import FAMILIES, Study
 
-_PACKAGE = "rps_jax/"
+_ABOVE = re.compile(r".*(?:rps_jax|site-packages)/")  # of a file, what says not which it is
 _INSTRUCTION = re.compile(r"^\s*(?:ROOT )?%([\w.\-]+) = .* ([\w\-]+)\(.*stack_frame_id=(\d+)", re.M)
 _HOLLOW = ("while", "call", "conditional")  # what is within them is timed by itself
 ELSEWHERE = "moved by XLA"
@@ -197,7 +197,7 @@ def sources(text: str) -> dict[str, str]:
         where = ELSEWHERE
         if int(frame) in frames:
             file, function = places[frames[int(frame)]]
-            short = files[file].rpartition(_PACKAGE)[2]
+            short = _ABOVE.sub("", files[file])
             where = f"{short}: {functions[function].replace('.<locals>', '')}"
         found[name] = where
     return found
