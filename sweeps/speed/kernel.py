@@ -45,7 +45,7 @@ _COUNTED = {
     _STALLED.format("wait"): ("latency", "of them for as long as an instruction takes anyway"),
     _STALLED.format("short_scoreboard"): ("shared", "of them for shared memory, roots, quotients"),
     _STALLED.format("long_scoreboard"): ("memory", "of them for memory"),
-    _STALLED.format("branch_resolve"): ("branch", "of them for a branch"),
+    _STALLED.format("branch_resolving"): ("branch", "of them for a branch"),
 }
 _WAITS = ("fetch", "latency", "shared", "memory", "branch")
 _COLUMNS = (
