@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rps_jax.control import registry
 from rps_jax.control.laws import rps
 from rps_jax.engines import device, programs
 from rps_jax.record import provenance
@@ -117,6 +119,20 @@ def test_what_says_not_all_that_a_program_depends_on_keeps_none(cache, made):
         make(static=static)
     assert len(traced) == 4
     assert not cache.exists()
+
+
+def test_every_law_of_the_package_is_known_again_by_its_functions_and_weights():
+    laws = {name: registry.law_of(params) for name, params in registry.LAWS.items()}
+    said = {name: programs.identity(law) for name, law in laws.items()}
+    assert None not in said.values()
+    assert said["learned_gru"] != said["learned_mlp"]
+    assert said["rps"] == said["rps_tuned"] != said["rps_plus"]
+    gru = laws["learned_gru"]
+    network, weights = gru.step.args
+    other = weights | {"first.b": weights["first.b"] + 1}
+    changed = gru._replace(step=partial(gru.step.func, network, other))
+    assert programs.identity(changed) != said["learned_gru"]
+    assert programs.identity(gru._replace(init=lambda params: None)) is None
 
 
 def test_a_model_of_mjx_is_known_again_by_its_numbers(cache):

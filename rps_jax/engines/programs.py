@@ -15,7 +15,7 @@ import hashlib
 import importlib
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -87,9 +87,12 @@ def _said(structure: Any) -> Any:
 
 
 def _digests(data: Any) -> Any:
+    """Static data with a digest in the place of every array."""
     if isinstance(data, tuple):
         return tuple(map(_digests, data))
-    array = getattr(data, "array", None)  # so MJX wraps what a model has of fixed numbers
+    if isinstance(data, Mapping):
+        return {name: _digests(one) for name, one in data.items()}
+    array = getattr(data, "array", data)  # so MJX wraps what a model has of fixed numbers
     if isinstance(array, np.ndarray):
         return array.shape, str(array.dtype), hashlib.sha256(array.tobytes()).hexdigest()
     return data
@@ -143,16 +146,21 @@ def built(lowered: Any) -> Any:
 def identity(law: Law) -> str | None:
     """What says in any process which law this is; None if nothing does.
 
-    A law of this package whose functions stand at the top of their modules is said by their names;
-    its source is a part of every key.
+    A law of this package whose functions stand at the top of their modules is said by their names,
+    and by what is bound to them, as the weights of a network; its source is a part of every key.
     """
-    names = []
-    for function in (law.init, law.step):
-        module, name = getattr(function, "__module__", ""), getattr(function, "__qualname__", "<")
-        if not module.startswith("rps_jax.") or "<" in name:
-            return None
-        names.append(f"{module}.{name}")
+    names = list(map(_named, (law.init, law.step)))
+    if None in names:
+        return None
     return repr((names, law.senses, law.temperatures, law.smooth, law.cell))
+
+
+def _named(function: Any) -> Any:
+    if isinstance(function, functools.partial):
+        own = _named(function.func)
+        return own and (own, _digests(function.args), _digests(function.keywords))
+    module, name = getattr(function, "__module__", ""), getattr(function, "__qualname__", "<")
+    return f"{module}.{name}" if module.startswith("rps_jax.") and "<" not in name else None
 
 
 @functools.cache

@@ -176,6 +176,11 @@ def _greatest(params: Any) -> jax.Array:
     return jnp.stack([params.v_max, params.v_max, params.omega_max])
 
 
+def init(network: Network, params: Any) -> Memory:
+    """What a learned law remembers before its first step."""
+    return Memory.init(network)
+
+
 def step(
     network: Network, weights: Weights, params: Any, memory: Memory, seen: TaxelObservation
 ) -> tuple[Memory, Twist, Details]:

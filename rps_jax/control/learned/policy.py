@@ -17,7 +17,7 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.control.base import Law
 from rps_jax.control.learned import network as networks
-from rps_jax.control.learned.network import Memory, Network, Weights
+from rps_jax.control.learned.network import Network, Weights
 from rps_jax.errors import InputError
 from rps_jax.record import files
 
@@ -144,7 +144,7 @@ def law_of(policy: Policy) -> tuple[str, Law, Any]:
     own.__doc__ = "Parameters of a learned law: what is asked of it."
     step = partial(networks.step, policy.network, policy.weights)
     law = Law(
-        lambda params: Memory.init(policy.network),
+        partial(networks.init, policy.network),
         step,
         "taxels",
         check=check,
