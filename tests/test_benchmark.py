@@ -15,6 +15,7 @@ from rps_jax.control.observation import Twist
 from rps_jax.engines import mjx_colliders
 from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.engines.quasistatic import Quasistatic
+from rps_jax.errors import InputError
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
@@ -23,7 +24,7 @@ from rps_jax.world.physics import preset
 from rps_jax.world.scene import FRICTION
 from sweeps import shared
 from sweeps.levers import study as levers
-from sweeps.speed import commands, costs, robot
+from sweeps.speed import commands, costs, kernel, robot
 from sweeps.speed import study as speeds
 
 
@@ -70,10 +71,12 @@ FunctionNames
 FileLocations
 1 {file_name_id=2 function_name_id=2 line=1 end_line=1 column=1 end_column=2}
 2 {file_name_id=1 function_name_id=1 line=9 end_line=9 column=1 end_column=2}
+3 {file_name_id=3 function_name_id=1 line=3 end_line=3 column=1 end_column=2}
 
 StackFrames
 1 {file_location_id=1 parent_frame_id=1}
 2 {file_location_id=2 parent_frame_id=1}
+3 {file_location_id=3 parent_frame_id=1}
 
 ENTRY %main (a: f32[]) -> f32[] {
   %a = f32[] parameter(0)
@@ -81,13 +84,36 @@ ENTRY %main (a: f32[]) -> f32[] {
   %while.2 = f32[] while(%add.1), body=%b, metadata={op_name="w" stack_frame_id=1}
   ROOT %mul.3 = f32[] multiply(%add.1, %a), metadata={op_name="mul" stack_frame_id=1}
   %neg.4 = f32[] negate(%a), metadata={op_name="neg" stack_frame_id=7}
+  %abs.5 = f32[] abs(%a), metadata={op_name="abs" stack_frame_id=3}
 }
 """
     assert costs.sources(text) == {
         "add.1": "control/laws/rps.py: step",
         "mul.3": "trials/trial.py: decide.think",
         "neg.4": costs.ELSEWHERE,
+        "abs.5": "mujoco/mjx/_src/solver.py: step",
     }
+
+
+def test_what_nsight_counts_becomes_a_row():
+    """Of the last launch that its table holds, after what the program itself printed."""
+    names = ["ID", *kernel._COUNTED]
+    units = ["", "ns", *[""] * (len(names) - 2)]
+    waits = ["5.0", "1.6", "1.1", "0.5", "0.4", "0.0"]
+    launches = [
+        ["0", *["1"] * (len(names) - 1)],
+        ["1", "67,000,000", "2,000,000,000", "2,000", "251", *waits],
+    ]
+    lines = [",".join(f'"{x}"' for x in row) for row in (names, units, *launches)]
+    found = kernel.counts("\n".join(["==PROF== Connected", "success", *lines]))
+    whole = found.expand_dims(family=["box"])
+    (row,) = kernel.Kernel(families=("box",)).table(whole)
+    assert row == [
+        *("box", "16,384", "134 µs", "2,000", "251", "5.0"),
+        *("1.6", "1.1", "0.5", "0.4", "0.0", "1.4"),
+    ]
+    with pytest.raises(InputError, match="counted nothing: ==ERROR== No kernels"):
+        kernel.counts("==ERROR== No kernels")
 
 
 def test_every_measurement_is_of_an_engine_or_of_c():

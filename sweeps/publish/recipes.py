@@ -384,7 +384,15 @@ RECIPES: dict[str, Recipe] = {
     ),
     # After `python sweeps/speed/peers.py peers`.
     "arena": Recipe((f"rps sweeps/speed/arena.py --peers peers {_MACHINE}",), None, 5),
-    "costs": Recipe(("rps sweeps/speed/costs.py --families box prism",), 2, None, "Functions"),
+    "costs": Recipe(
+        (
+            "rps sweeps/speed/costs.py --names 'fused standard' 'mjx standard' --families box "
+            "prism --most 8",
+        ),
+        4,
+        None,
+        "Functions",
+    ),
     "levers": Recipe(
         (
             "rps sweeps/levers --program 'fused standard' --worlds 65536 --at-once 16",
