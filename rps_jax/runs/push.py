@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from rps_jax.analysis.figures.style import Figure
 
 
+_STILL = (640, 360)  # [px] width and height of one of several pictures side by side
 FILM_LENGTH = 10.0  # [s] by default, whatever the trial's
 
 
@@ -93,12 +94,12 @@ class Trace:
         Raises:
           VideoError: this machine cannot draw.
         """
-        from rps_jax.analysis import figures, studio, video
+        from rps_jax.analysis import figures, studio
 
         seen = self.followed.snapshots
         shown = _evenly(len(seen.time), count)
         tiles = [studio.Tile(self.scene, self.followed.p_world_target)] * len(shown)
-        with studio.open_studios(tiles, video.SIZE, "oblique") as each:
+        with studio.open_studios(tiles, _STILL, "oblique") as each:
             drawn = zip(each, seen.qpos[shown], strict=True)
             images = [one.draw(qpos, studio.NO_CONTACT) for one, qpos in drawn]
         return figures.stills(images, [f"{seen.time[i]:.0f} s" for i in shown])
