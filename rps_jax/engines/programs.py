@@ -61,8 +61,8 @@ def compiled(
         shapes[:] = [structure]
         return found
 
-    told = (_said(tree), [(x.shape, str(x.dtype)) for x in leaves], donated, who, static)
-    place = _place(repr(told))
+    shown = [(x.shape, str(x.dtype)) for x in leaves]
+    place = _place(repr((function.__qualname__, _said(tree), shown, donated, who, static)))
     found = None if place is None else _read(place, leaves)
     if found is None:
         jitted = jax.jit(flat, donate_argnums=donated)
@@ -70,9 +70,8 @@ def compiled(
         safe = list(map(export.DisabledSafetyCheck.custom_call, native.known()))
         exported = export.export(jitted, disabled_checks=safe)(*leaves)
         (structure,) = shapes
-        with contextlib.suppress(ValueError):  # what cannot be kept
-            head = json.dumps(_words(structure.unflatten([0] * structure.num_leaves)))
-            device.keep(place, head.encode() + b"\n" + bytes(exported.serialize()))
+        with contextlib.suppress(ValueError, TypeError, AttributeError):  # what cannot be kept
+            device.keep(place, _head(structure) + b"\n" + bytes(exported.serialize()))
     else:
         structure, exported = found
     program = built(jax.jit(exported.call, donate_argnums=donated).lower(*leaves))
@@ -98,28 +97,24 @@ def _digests(data: Any) -> Any:
     return data
 
 
-def _words(tree: Any) -> Any:
-    """A pytree of tuples, those with names too, dicts and None as JSON has it.
+def _head(structure: Any) -> bytes:
+    """The structure of a pytree as JSON has it, from which `_tree` makes it again.
 
     Raises:
-      ValueError: it has another node, or a NamedTuple that does not stand in a module.
+      ValueError, TypeError, AttributeError: it has nodes that are made otherwise.
     """
+    head = json.dumps(_words(structure.unflatten([0] * structure.num_leaves)))
+    if jax.tree.structure(_tree(json.loads(head))) != structure:
+        raise ValueError(f"{structure} is not kept")
+    return head.encode()
+
+
+def _words(tree: Any) -> Any:
     if isinstance(tree, dict):
         return {key: _words(one) for key, one in tree.items()}
     if isinstance(tree, tuple):
-        kind = type(tree)
-        words = [f"{kind.__module__}:{kind.__name__}", *map(_words, tree)]
-        if kind is not tuple and _kind(words[0]) is not kind:
-            raise ValueError(f"{words[0]} is made while a program runs")
-        return words
-    if tree is None or isinstance(tree, int):
-        return tree
-    raise ValueError(f"{type(tree).__name__} is not kept")
-
-
-def _kind(name: str) -> Any:
-    module, _, own = name.partition(":")
-    return getattr(importlib.import_module(module), own, None)
+        return [f"{type(tree).__module__}:{type(tree).__name__}", *map(_words, tree)]
+    return tree
 
 
 def _tree(words: Any) -> Any:
@@ -127,7 +122,8 @@ def _tree(words: Any) -> Any:
     if isinstance(words, dict):
         return {key: _tree(one) for key, one in words.items()}
     if isinstance(words, list):
-        kind, leaves = _kind(words[0]), map(_tree, words[1:])
+        module, _, name = words[0].partition(":")
+        kind, leaves = getattr(importlib.import_module(module), name), map(_tree, words[1:])
         return tuple(leaves) if kind is tuple else kind(*leaves)
     return words
 
