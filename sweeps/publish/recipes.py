@@ -387,7 +387,7 @@ RECIPES: dict[str, Recipe] = {
     "costs": Recipe(
         (
             "rps sweeps/speed/costs.py --names 'fused standard' 'mjx standard' --families box "
-            "prism --most 4",
+            "prism --most 3",
         ),
         4,
         None,
