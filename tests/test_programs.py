@@ -121,6 +121,13 @@ def test_what_says_not_all_that_a_program_depends_on_keeps_none(cache, made):
     assert not cache.exists()
 
 
+def test_a_cache_stays_where_it_was_when_its_process_goes_elsewhere(cache, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("WARP_CACHE_PATH", "warp")
+    assert device.use_cache("programs") == tmp_path / "programs"
+    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "programs")
+
+
 def test_every_law_of_the_package_is_known_again_by_its_functions_and_weights():
     laws = {name: registry.law_of(params) for name, params in registry.LAWS.items()}
     said = {name: programs.identity(law) for name, law in laws.items()}

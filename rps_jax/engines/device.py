@@ -64,7 +64,7 @@ def use_cache(folder: str | Path | None = None) -> Path | None:
     """
     import jax
 
-    where = cache_folder() if folder is None else Path(folder)
+    where = (cache_folder() if folder is None else Path(folder)).absolute()
     try:
         where.mkdir(parents=True, exist_ok=True)
     except OSError:
