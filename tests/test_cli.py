@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 
+import command_line
 import numpy as np
 import pytest
 import xarray as xr
@@ -98,6 +99,19 @@ def test_the_doctor_names_versions_device_cache_rendering_and_ffmpeg(capsys):
     printed = capsys.readouterr().out
     for word in ("python", "mujoco-mjx", "device", "cache", "rendering", "ffmpeg"):
         assert word in printed
+
+
+def test_commands_flags_and_defaults_are_those_of_the_record():
+    """What changes on purpose is recorded anew: `python tests/command_line.py`."""
+
+    def defaults(commands):
+        return {
+            name: {flag: field["default"] for flag, field in flags.items()}
+            for name, flags in commands.items()
+        }
+
+    recorded = json.loads(command_line.RECORD.read_text())
+    assert defaults(command_line.all_flags()) == defaults(recorded)
 
 
 IMPORT = """
