@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from rps_jax.engines import native
-from rps_jax.engines.native import cuda
+from rps_jax.lowering import nvrtc
 from rps_jax.record import provenance
 
 COMPILER = provenance.compiler()
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler: apt install gcc")
-NAME = "rps_lanes_launched"
+NAME = "rps_native_launched"
 # In a process of its own, which has no other driver: two worlds of one kind, twenty of another.
 RUN = """
 import ctypes, json, sys
@@ -30,7 +30,7 @@ arrays = [x for n in worlds for x in (np.arange(n, dtype=np.float32), np.arange(
                                       np.zeros(n, np.float32))]
 pointers = (ctypes.c_void_p * 6)(*(x.ctypes.data for x in arrays))
 driver.call.restype = driver.said.restype = ctypes.c_char_p
-handler = getattr(launcher, "rps_lanes_launched")
+handler = getattr(launcher, "rps_native_launched")
 told = []
 for _ in range(2):
     error = driver.call(handler, pointers, ctypes.c_void_p(worlds.ctypes.data), fails.encode())
@@ -47,7 +47,7 @@ def folder(tmp_path_factory):
     for digit in "35":
         codes.append(folder / f"{digit}.cubin")
         codes[-1].write_text(digit)
-    text = cuda.launcher(NAME, codes, [(2, 1, 0, 1), (2, 1, 0, 1)], worlds=8)
+    text = nvrtc.launcher(NAME, codes, [(2, 1, 0, 1), (2, 1, 0, 1)], worlds=8)
     (folder / "launcher.so").write_bytes(native._binary(text, NAME))
     words = [str(COMPILER), "-O1", "-w", "-shared", "-fPIC", "-Wl,-soname,libcuda.so.1"]
     words += [f"-I{jax.ffi.include_dir()}", str(Path(__file__).with_name("launch.c"))]

@@ -10,6 +10,7 @@ import pytest
 from rps_jax import engines
 from rps_jax.control import registry
 from rps_jax.engines import native
+from rps_jax.lowering import nodes
 from rps_jax.trials import trial
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Loop
@@ -107,10 +108,10 @@ def test_a_drive_is_compiled_and_its_derivative_is_xlas(monkeypatch):
     def lowered():
         return jax.jit(lambda x: moved(x)).lower(still).as_text()
 
-    assert "rps_lanes" in lowered()
+    assert "rps_native" in lowered()
     found = slope()
     monkeypatch.setenv("RPS_COMPILER", "none")
-    assert "rps_lanes" not in lowered()
+    assert "rps_native" not in lowered()
     same(found, slope())
 
 
@@ -139,20 +140,20 @@ def test_a_compiler_that_fails_is_told_once_and_xla_steps(monkeypatch, tmp_path,
 
 
 def test_operations_that_cannot_be_read_are_told_and_xla_steps(monkeypatch, cache):
-    monkeypatch.setattr(native.nodes, "walk", lambda *_: {}["num_consts"])
-    run = native.mapped(lambda x: 2 * x, lambda x: 3 * x)
+    monkeypatch.setattr(nodes, "walk", lambda *_: {}["num_consts"])
+    run = native.batched(lambda x: 2 * x, lambda x: 3 * x)
     with pytest.warns(UserWarning, match="no C can be written, so XLA compiles: KeyError"):
         assert jax.jit(run)(jnp.ones(2)).tolist() == [3.0, 3.0]
 
 
 def test_a_gpu_without_a_compiler_is_told(monkeypatch):
     monkeypatch.setattr(native, "target", lambda: None)
-    assert not native.usable()  # a processor without one is a usual thing
+    assert not native.is_available()  # a processor without one is a usual thing
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     with pytest.warns(UserWarning, match="a C compiler .* is not here, so XLA compiles"):
-        assert not native.usable()
+        assert not native.is_available()
     monkeypatch.setenv("RPS_COMPILER", "none")
-    assert not native.usable()  # nor is one who asks for it told
+    assert not native.is_available()  # nor is one who asks for it told
 
 
 @pytest.mark.parametrize("damage", ["cut", "turned", "empty"])
@@ -161,7 +162,7 @@ def test_a_damaged_function_is_dropped_with_one_line(damage, cache, monkeypatch)
     expected = (2 * x + more).tolist()
 
     def made():
-        return np.asarray(jax.jit(native.mapped(lambda x: 2 * x + more, None))(x)).tolist()
+        return np.asarray(jax.jit(native.batched(lambda x: 2 * x + more, None))(x)).tolist()
 
     assert made() == expected
     monkeypatch.setattr(jax.ffi, "register_ffi_target", lambda *_, **__: None)  # once a process
@@ -224,7 +225,7 @@ OPERATIONS = {
 @pytest.mark.parametrize("name", OPERATIONS)
 def test_an_operation_is_what_jax_says(name):
     x, function = jnp.arange(19.0), OPERATIONS[name]
-    run = native.mapped(function, lambda _: pytest.fail("it was not compiled"))
+    run = native.batched(function, lambda _: pytest.fail("it was not compiled"))
     for a, b in zip(*map(jax.tree.leaves, (jax.jit(run)(x), jax.vmap(function)(x))), strict=True):
         assert a.dtype == b.dtype
         np.testing.assert_allclose(a, b, rtol=3e-6, atol=1e-6)
@@ -236,13 +237,13 @@ def test_the_loop_of_an_equation_is_compiled_as_a_whole(law, skin):
     stage, worlds, loop = batch("box", skin, 2, law)
     run = jax.make_jaxpr(lambda w, t: trial.advance((stage,), (w,), (t,), loop, 3))
     primitives = str(run(worlds, begun(worlds, loop)))
-    assert "rps_lanes" in primitives
+    assert "rps_native" in primitives
     assert "while" not in primitives
 
 
 def test_what_has_no_form_in_c_xla_compiles():
     """As a law of large matrices."""
-    found = native.mapped(None, None) if not native.usable() else native.mapped(
+    found = native.batched(None, None) if not native.is_available() else native.batched(
         lambda x: jnp.ones((99, 3)) * x @ jnp.ones(3), lambda x: 3 * x)  # fmt: skip
     assert np.asarray(found(jnp.arange(2.0))).tolist() == [0.0, 3.0]
 

@@ -1,4 +1,4 @@
-/* A warp of a GPU, whose threads are fibers of one thread of a processor: what `threads.h` asks of
+/* A warp of a GPU, whose threads are fibers of one thread of a processor: what `gpu.h` asks of
    CUDA. At every shuffle, vote and barrier each thread waits for the 31 others; threads that meet at
    different ones are told, and end the process. */
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from rps_jax.analysis import video
 from rps_jax.engines import device, native
 from rps_jax.errors import InputError
+from rps_jax.lowering import nvrtc
 from rps_jax.record import folder as run_folder
 from rps_jax.record import provenance
 from rps_jax.record.options import option
@@ -49,7 +50,7 @@ def report(cache: Path) -> str:
 def _kernels(platform: str) -> str:
     if platform != "gpu":
         return "none: JAX finds no GPU"
-    made = native.target() and native.cuda.target()
+    made = native.target() and nvrtc.target()
     return f"by NVRTC {made}" if made else "none: XLA steps the fused engine, many times slower"
 
 

@@ -67,7 +67,7 @@ def compiled(
     if found is None:
         jitted = jax.jit(flat, donate_argnums=donated)
         jitted.trace(*leaves)  # in which functions are compiled that it calls
-        safe = list(map(export.DisabledSafetyCheck.custom_call, native.known()))
+        safe = list(map(export.DisabledSafetyCheck.custom_call, native.loaded_names()))
         exported = export.export(jitted, disabled_checks=safe)(*leaves)
         (structure,) = shapes
         with contextlib.suppress(ValueError, TypeError, AttributeError):  # what cannot be kept
@@ -194,7 +194,7 @@ def _read(path: Path, leaves: Sequence[Any]) -> tuple[Any, export.Exported] | No
         found = export.deserialize(bytearray(program))
         if [(x.shape, x.dtype) for x in found.in_avals] != [(x.shape, x.dtype) for x in leaves]:
             raise ValueError("it is of other shapes")
-        if not all(map(native.load, native.needed(found.mlir_module_serialized))):
+        if not all(map(native.load, native.called_names(found.mlir_module_serialized))):
             raise ValueError("it needs a compiled function that is not there")
         return jax.tree.structure(_tree(json.loads(head))), found
 

@@ -112,7 +112,7 @@ _IN_ONE = ContextVar("rps_jax_reductions_in_one", default=False)
 
 @contextmanager
 def reductions_in_one() -> Iterator[None]:
-    """While this is traced, reduce as one operation, of which `engines.native` makes one loop.
+    """While this is traced, reduce as one operation, of which `lowering` makes one loop.
 
     XLA makes on a processor a loop over the leading axis of it, one world at a time; of slices
     that are added it makes vectors of worlds.

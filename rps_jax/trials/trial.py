@@ -421,7 +421,7 @@ def advance(
 
     Each batch is of a stage and a shape family of its own.
     """
-    if not (all(getattr(stage, "native", False) for stage in stages) and native.usable()):
+    if not (all(getattr(stage, "native", False) for stage in stages) and native.is_available()):
         return _side_by_side(stages, worlds, trials, loop, steps)
 
     def one(stage: Stage, world: World, now: Trial, rules: Any) -> Trial:
@@ -446,7 +446,7 @@ def advance(
         return 2 * now.done + (now.contact_steps == 0)
 
     ones = [partial(one, stage) for stage in stages]
-    return tuple(native.side_by_side(ones, whole, phase)(*given))
+    return tuple(native.concurrent(ones, whole, phase)(*given))
 
 
 def _side_by_side(

@@ -14,9 +14,9 @@ from jax.extend.core import jaxpr_as_fun
 
 from rps_jax import __version__
 from rps_jax.app.export.program import Program
-from rps_jax.engines.native import walk
-from rps_jax.engines.native.walk import PAIRED, kind_of, unsupported
 from rps_jax.errors import InputError
+from rps_jax.lowering import walk
+from rps_jax.lowering.walk import PAIRED, kind_of, unsupported
 
 _OPSET, _FORMAT = 18, 9  # of ONNX, and of its files
 _TYPES = {"f": np.float32, "i": np.int32, "b": np.bool_}

@@ -15,8 +15,8 @@ from rps_jax import errors
 from rps_jax.app.export.scalars import Node, Scalars
 from rps_jax.control import registry, trying
 from rps_jax.control.observation import TaxelObservation, Twist
-from rps_jax.engines.native import walk
 from rps_jax.errors import InputError
+from rps_jax.lowering import walk
 from rps_jax.robot import robot as robots
 from rps_jax.robot import skin as skins
 from rps_jax.robot.skin import LINE, CapacitiveSkin

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rps_jax.engines.native.walk import (
+from rps_jax.lowering.walk import (
     COMPARISONS,
     PAIRED,
     Target,

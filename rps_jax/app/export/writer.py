@@ -10,7 +10,7 @@ import numpy as np
 
 from rps_jax.app.export.program import Field, Routine
 from rps_jax.app.export.scalars import UNARY, Block, Loop, Node, ordered
-from rps_jax.engines.native.walk import unsupported
+from rps_jax.lowering.walk import unsupported
 
 # Inputs of a product with a matrix that are taken together: compilers then vectorise the loop over
 # the outputs, and a sum is loaded and stored once for all of them.

@@ -169,7 +169,7 @@ def drive(
     where it is differentiated, XLA compiles it.
     """
     driven = partial(_driven, physics=physics, force=force)
-    run = native.mapped(driven, driven) if motion.qpos.ndim == 2 else driven
+    run = native.batched(driven, driven) if motion.qpos.ndim == 2 else driven
     return run(body, motion, twist, robot)
 
 

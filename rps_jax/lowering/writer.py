@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from rps_jax.engines.native.nodes import (
+from rps_jax.lowering.nodes import (
     HEADER,
     STARTS,
     Array,
-    Lanes,
     Loop,
     Node,
+    SimdNodes,
     reached,
     results,
     size_of,
 )
-from rps_jax.engines.native.walk import kind_of
+from rps_jax.lowering.walk import kind_of
 
-HANDLER = "rps_lanes"  # what its name is replaced by is known to XLA
+HANDLER = "rps_native"  # what its name is replaced by is known to XLA
 TYPES = {"f": "V", "i": "I", "u": "U", "b": "I"}  # of a vector
 STORED = {"f": "float", "i": "int", "u": "unsigned", "b": "unsigned char"}  # of a world's number
 # Placeholders in capitals are lines that are written for a function.
@@ -49,7 +49,7 @@ XLA_FFI_Error *{NAME}(XLA_FFI_CallFrame *frame) {{
 """
 
 
-class Writer:
+class SimdWriter:
     """Statements of nodes, in an order in which few loops are needed."""
 
     table_of = "static const"
@@ -227,7 +227,7 @@ class Writer:
     def table(self, array: np.ndarray) -> str:
         """The name of constants that stand before the function."""
         key = array.tobytes() + array.dtype.str.encode()
-        kind = kind_of(array.dtype, "", Lanes.kinds)
+        kind = kind_of(array.dtype, "", SimdNodes.kinds)
         if key not in self.tables:
             texts = ", ".join(literal(x, kind) for x in array.reshape(-1))
             stored = "int" if kind == "b" else STORED[kind]
@@ -236,10 +236,10 @@ class Writer:
         return self.tables[key].split("[")[0].split()[-1]
 
 
-def constant(a: Any, writer: Writer) -> str:
+def constant(a: Any, writer: SimdWriter) -> str:
     """A constant, or the one in turn of several."""
     array = np.asarray(a).reshape(-1)
-    kind = kind_of(array.dtype, "", Lanes.kinds)
+    kind = kind_of(array.dtype, "", SimdNodes.kinds)
     if array.size == 1:
         return _all(kind, array[0])
     return f"all_{kind}({writer.table(array)}[i])"
@@ -270,7 +270,7 @@ def source(closed: Any, shapes: Sequence[Any], outs: Sequence[Any], ordered: boo
     Raises:
       InputError: it has an operation that is not known here.
     """
-    (found, ends), writer = results(closed, shapes, outs, Lanes()), Writer()
+    (found, ends), writer = results(closed, shapes, outs, SimdNodes()), SimdWriter()
     lines = writer.lines(reached(ends), ends, set())
     for place, a, size, kind in found:
         read = writer.read(a, Node(0, "end", (a,), kind, size), set())

@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 
-from rps_jax.engines.native.nodes import PRELUDE
+from rps_jax.lowering.nodes import PRELUDE
 
 # Quotients and roots to two roundings, and zero for what is less than 1e-38.
 FLAGS = ("--prec-div=false", "--prec-sqrt=false", "--ftz=true")

@@ -1,5 +1,5 @@
 /* Launches kernels for XLA, each on a stream of its own, so that they run side by side. What stands
-   before this text and `handler.h` defines their number KERNELS, their IMAGES, how many arguments
+   before this text and `xla_call.h` defines their number KERNELS, their IMAGES, how many arguments
    of each are GIVEN and results FOUND, MOST of them and one more, which ONE of its arguments tells
    the number of worlds, by its SIZE of each, how many WORLDS a block holds, and the NAME of this. */
 

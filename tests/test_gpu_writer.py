@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from test_native import OPERATIONS, advanced, close, in_a_push, same
 
-from rps_jax.engines.native import threads
 from rps_jax.errors import InputError
 from rps_jax.geometry import vectors
+from rps_jax.lowering import gpu_writer
 from rps_jax.trials import trial
 from rps_jax.world.domain import Range
 
@@ -56,7 +56,7 @@ class Emulated:
             closed, found = jax.make_jaxpr(function, return_shape=True)(*like)
         self.outs, self.structure = jax.tree.flatten(found)
         self.each, shapes = each, [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
-        self.text = threads.source(closed, shapes, self.outs, True, each)
+        self.text = gpu_writer.source(closed, shapes, self.outs, True, each)
         source, binary = folder / "step.cpp", folder / "step.so"
         source.write_text(f'#include "{Path(__file__).with_name("warp.h")}"\n{self.text}{_RUN}')
         flags = ["-O1", "-march=native", "-w", "-shared", "-fPIC", "-Wl,-Bsymbolic"]

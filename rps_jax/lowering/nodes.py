@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rps_jax.engines.native.walk import (
+from rps_jax.lowering.walk import (
     PAIRED,
     Target,
     is_constant,
@@ -29,9 +29,9 @@ from rps_jax.engines.native.walk import (
 
 _HERE = Path(__file__).parent
 OPERATIONS = (_HERE / "operations.h").read_text()
-PRELUDE = (_HERE / "handler.h").read_text()
-HEADER = PRELUDE + (_HERE / "lanes.h").read_text() + OPERATIONS
-THREADS = (_HERE / "threads.h").read_text() + OPERATIONS
+PRELUDE = (_HERE / "xla_call.h").read_text()
+HEADER = PRELUDE + (_HERE / "simd.h").read_text() + OPERATIONS
+THREADS = (_HERE / "gpu.h").read_text() + OPERATIONS
 # Kinds of numbers for which each macro of the header writes an operation.
 _WRITTEN = {"INFIX": "fiu", "COMPARE": "fiub", "BITS": "iub", "EACH": "f", "EACH_OF_TWO": "f"}
 _KNOWN = set(re.findall(r"^FUNCTION \w+ (\w+)\(", HEADER, re.M)) | {
@@ -122,7 +122,7 @@ def size_of(shape: Sequence[int]) -> int:
     return int(np.prod(shape, dtype=int))
 
 
-class Lanes(Target):
+class SimdNodes(Target):
     """The target of a jaxpr of one world: nodes, of which equal ones are one."""
 
     kinds = "fibu"
@@ -383,7 +383,7 @@ class Result(NamedTuple):
 
 
 def results(
-    closed: Any, shapes: Sequence[Any], outs: Sequence[Any], target: Lanes
+    closed: Any, shapes: Sequence[Any], outs: Sequence[Any], target: SimdNodes
 ) -> tuple[list[Result], list[Node]]:
     """Results of a closed jaxpr of arguments of these shapes and types, and the nodes of them."""
     given = [
@@ -399,7 +399,7 @@ def results(
 
 def kind_in(dtype: Any, name: str) -> str:
     """The kind of a type that has a vector; InputError names what has none."""
-    kind = kind_of(np.dtype(dtype), name, Lanes.kinds)
+    kind = kind_of(np.dtype(dtype), name, SimdNodes.kinds)
     if np.dtype(dtype).itemsize != (1 if kind == "b" else 4):
         raise unsupported(f"{name} of {dtype}")
     return kind

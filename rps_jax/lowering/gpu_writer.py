@@ -12,22 +12,22 @@ from typing import Any
 
 import numpy as np
 
-from rps_jax.engines.native.nodes import (
+from rps_jax.lowering.nodes import (
     STARTS,
     THREADS,
     Array,
-    Lanes,
     Loop,
     Node,
     Result,
+    SimdNodes,
     flat,
     kind_in,
     reached,
     results,
     size_of,
 )
-from rps_jax.engines.native.walk import unsupported
-from rps_jax.engines.native.writer import STORED, TYPES, Writer, constant, literal
+from rps_jax.lowering.walk import unsupported
+from rps_jax.lowering.writer import STORED, TYPES, SimdWriter, constant, literal
 
 WARP = 32
 _INLINE = ("given", "move", "take")  # what a thread makes as any other number in turn
@@ -62,7 +62,7 @@ extern "C" __global__ void __launch_bounds__(32) step(const __grid_constant__ Ar
 """
 
 
-class Spread(Lanes):
+class GpuNodes(SimdNodes):
     """Nodes as they suit threads that hold a world together."""
 
     def __init__(self) -> None:
@@ -149,7 +149,7 @@ def _made_by(value: Any) -> Node | None:
     return value.node if isinstance(value, Array) and value.node.width == 1 else None
 
 
-class Threads(Writer):
+class GpuWriter(SimdWriter):
     """Statements of nodes for some threads of a warp that hold a world together."""
 
     table_of = "static __device__ const"
@@ -415,9 +415,9 @@ def source(
     Raises:
       InputError: it has an operation that is not known here, or needs too much shared memory.
     """
-    found, ends = results(closed, shapes, outs, Spread())
+    found, ends = results(closed, shapes, outs, GpuNodes())
     nodes = reached(ends)
-    writer = Threads(threads, _crossed(nodes, found))
+    writer = GpuWriter(threads, _crossed(nodes, found))
     lines = writer.lines(nodes, ends, set())
     for each in found:
         lines += writer.end(each)

@@ -1,5 +1,5 @@
 /* Operations on numbers of worlds, under JAX's names for them and the kind of their first operand;
-   what a number of worlds is stands in `lanes.h` and in `threads.h`. */
+   what a number of worlds is stands in `simd.h` and in `gpu.h`. */
 
 #define INFIX(name, sign) \
   FUNCTION V name##_f(V a, V b) { return a sign b; } \

@@ -30,14 +30,14 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax.engines import device
-from rps_jax.engines.native import cuda, threads, writer
 from rps_jax.errors import InputError
 from rps_jax.geometry import vectors
+from rps_jax.lowering import gpu_writer, nvrtc, writer
 from rps_jax.record import provenance
 
 # A sum is fused with the product before it, as XLA does; nothing else is taken for something else.
 _FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-w")
-_NAME = "rps_lanes_"
+_NAME = "rps_native_"
 _THREADS = 4  # of a GPU that hold a world
 _LACKING = "a C compiler (apt install gcc) or NVRTC (pip install nvidia-cuda-nvrtc) is not here"
 _PLATFORMS = {"cpu": "cpu", "gpu": "CUDA"}
@@ -46,7 +46,7 @@ _loaded: dict[str, Any] = {}
 _locks: defaultdict[str, threading.RLock] = defaultdict(threading.RLock)
 
 
-def usable() -> bool:
+def is_available() -> bool:
     """Whether functions are compiled here, and not within one that is.
 
     Warns if a GPU does without, which nobody has asked for.
@@ -75,21 +75,21 @@ def target() -> str | None:
         return None
     if jax.default_backend() == "cpu":
         return macros
-    return (found := cuda.target()) and f"{macros} {found}"
+    return (found := nvrtc.target()) and f"{macros} {found}"
 
 
-def mapped(one: Callable[..., Any], whole: Callable[..., Any]) -> Callable[..., Any]:
+def batched(one: Callable[..., Any], whole: Callable[..., Any]) -> Callable[..., Any]:
     """A function of a batch of worlds (B, ...), world by world.
 
     Args:
       one: the function of one world; pure.
       whole: the same of a batch, which XLA compiles where `one` is not compiled here.
     """
-    run = side_by_side([one], lambda given: [whole(*given)])
+    run = concurrent([one], lambda given: [whole(*given)])
     return lambda *arguments: run(arguments)[0]
 
 
-def side_by_side(
+def concurrent(
     ones: Sequence[Callable[..., Any]],
     whole: Callable[..., Any],
     sort_by: Callable[..., Any] | None = None,
@@ -103,7 +103,7 @@ def side_by_side(
       sort_by: of a batch's arguments, numbers (B,) by which worlds are sorted, so that alike ones
         are computed side by side. No result depends on it, only how long they take.
     """
-    if not usable():
+    if not is_available():
         return whole
 
     @jax.custom_jvp
@@ -153,7 +153,7 @@ class _Function:
 def _made(functions: Sequence[_Function]) -> str | None:
     """The name under which XLA knows functions; None if they cannot be compiled here."""
     on_gpu = jax.default_backend() == "gpu"
-    write = functools.partial(threads.source, threads=_THREADS) if on_gpu else writer.source
+    write = functools.partial(gpu_writer.source, threads=_THREADS) if on_gpu else writer.source
     try:
         with jax.ensure_compile_time_eval():
             texts = [write(x.jaxpr, x.given, x.results, x.ordered) for x in functions]
@@ -163,7 +163,7 @@ def _made(functions: Sequence[_Function]) -> str | None:
         said = f"{type(error).__name__}: {error}"
         warnings.warn(f"no C can be written, so XLA compiles: {said}", stacklevel=2)
         return None
-    key = repr((texts, on_gpu and (cuda.LAUNCH, cuda.FLAGS), target(), jax.__version__))
+    key = repr((texts, on_gpu and (nvrtc.LAUNCH, nvrtc.FLAGS), target(), jax.__version__))
     name = _NAME + hashlib.sha256(key.encode()).hexdigest()[:32]
     with _locks[name]:
         if load(name):
@@ -210,17 +210,17 @@ def _launching(name: str, texts: Sequence[str], functions: Sequence[_Function]) 
         shapes.append((len(each.leaves), len(each.results), one, size))
     with tempfile.TemporaryDirectory() as folder:
         codes = [Path(folder) / f"{k}.cubin" for k in range(len(texts))]
-        for code, image in zip(codes, cuda.images(texts), strict=True):
+        for code, image in zip(codes, nvrtc.images(texts), strict=True):
             code.write_bytes(image)
-        return _binary(cuda.launcher(name, codes, shapes, threads.WARP // _THREADS), name)
+        return _binary(nvrtc.launcher(name, codes, shapes, gpu_writer.WARP // _THREADS), name)
 
 
-def known() -> list[str]:
+def loaded_names() -> list[str]:
     """Names of all functions that XLA knows by now."""
     return list(_loaded)
 
 
-def needed(program: bytes) -> list[str]:
+def called_names(program: bytes) -> list[str]:
     """Names of the functions that a program calls."""
     return sorted({x.decode() for x in re.findall(rf"{_NAME}[0-9a-f]{{32}}".encode(), program)})
 
