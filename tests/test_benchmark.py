@@ -22,15 +22,15 @@ from rps_jax.trials.setting import Setting
 from rps_jax.world import scene
 from rps_jax.world.physics import preset
 from rps_jax.world.scene import FRICTION
-from sweeps import shared
+from sweeps import programs
 from sweeps.levers import study as levers
 from sweeps.speed import commands, costs, kernel, robot
 from sweeps.speed import study as speeds
 
 
 def test_a_program_is_timed_and_compared_with_c_in_the_closed_loop():
-    setting = shared.BATCHED["quasistatic"]
-    program = shared.traced("quasistatic", setting, "cylinder", 2, simulated=0.1)()
+    setting = programs.BATCHED["quasistatic"]
+    program = programs.traced("quasistatic", setting, "cylinder", 2, simulated=0.1)()
     assert program.compile > 0
     speed = speeds.batched(program)
     assert (speed.name, speed.family, speed.worlds) == ("quasistatic", "cylinder", 2)
@@ -117,7 +117,7 @@ def test_what_nsight_counts_becomes_a_row():
 
 
 def test_every_measurement_is_of_an_engine_or_of_c():
-    assert not set(shared.BATCHED) & set(speeds.IN_C)
+    assert not set(programs.BATCHED) & set(speeds.IN_C)
     assert speeds.can("C in closed loop", "prism")
     assert not speeds.can("warp standard", "prism")  # whose worlds share a mesh's corners
 
@@ -163,11 +163,11 @@ def test_a_program_is_traced_anew_for_each_lever():
             asked.append(args)
             return Quasistatic().drive(*args)
 
-    setting = shared.BATCHED["quasistatic"]
+    setting = programs.BATCHED["quasistatic"]
     counts = []
     for _ in range(2):
         options = {"simulated": 0.1, "stage": lambda _: Told()}
-        shared.traced("quasistatic", setting, "cylinder", 2, **options)
+        programs.traced("quasistatic", setting, "cylinder", 2, **options)
         counts.append(len(asked))
     assert counts[1] == 2 * counts[0] > 0
 

@@ -12,7 +12,7 @@ from rps_jax.app.cli import flags, names
 from rps_jax.control import registry
 from rps_jax.control.learned import policy
 from sweeps.publish.study import published as data_files
-from sweeps.shared import digest, publish
+from sweeps.study_base import Table, digest, write_table
 
 SWEEPS = ROOT / "sweeps"
 FOLDERS = sorted(path.parent for path in SWEEPS.glob("*/README.md"))
@@ -130,12 +130,12 @@ def test_a_published_command_names_no_place_of_a_machine(tmp_path):
         "commit": None,
         "time": "2026-01-01T00:00:00",
     }
-    path = publish(tmp_path / "results" / "x.json", [made], "", [{"name": "what"}], [])
+    path = write_table(tmp_path / "results" / "x.json", [made], "", Table([["what"]]))
     told = json.loads(path.read_text())
     assert told["command"] == ["rps sweep --worlds 3"]
     assert told["digest"] == digest([["rps", "sweep", "--worlds", "3"]])
     script = [made | {"command": ["python", "mine.py"]}]  # has none, and is published
-    assert "digest" not in json.loads(publish(path, script, "", [{"name": "what"}], []).read_text())
+    assert "digest" not in json.loads(write_table(path, script, "", Table([["what"]])).read_text())
     for path in SWEEPS.rglob("results/*.json"):
         assert "--out /" not in path.read_text(), path
 

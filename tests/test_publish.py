@@ -19,7 +19,7 @@ from rps_jax.runs.question import seed_of
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import DOMAINS, Range
-from sweeps import shared
+from sweeps import study_base
 from sweeps.million import study as million
 from sweeps.publish import dependencies, rows, study
 from sweeps.publish.recipes import HISTORY, RECIPES, Recipe
@@ -85,14 +85,20 @@ def test_a_run_that_another_command_reads_keeps_its_name_and_is_hung_upon(tmp_pa
     tuned = "rps tune es --worlds 16 --law pursuit --out runs/tuned"
     ladder = "rps ladder --worlds 9 --laws pursuit pursuit,runs/tuned/tuned.json --out runs/other"
     commands = [shlex.split(one) for one in (tuned, ladder)]
-    signed = {"packages": dict.fromkeys(shared._VERSIONS, "1"), "commit": "", "time": "2026-01-01"}
+    signed = {
+        "packages": dict.fromkeys(study_base._PACKAGES, "1"),
+        "commit": "",
+        "time": "2026-01-01",
+    }
     made = [signed | {"command": words} for words in commands]
-    path = shared.publish(tmp_path / "results" / "one.json", made, "a core", [{"name": "x"}], [])
+    path = study_base.write_table(
+        tmp_path / "results" / "one.json", made, "a core", study_base.Table([["x"]])
+    )
     data = json.loads(path.read_text())
     assert data["command"] == [tuned, ladder.removesuffix(" --out runs/other")]
-    assert data["digest"] == shared.digest([shlex.split(one) for one in data["command"]])
+    assert data["digest"] == study_base.digest([shlex.split(one) for one in data["command"]])
     other = tuned.replace("16", "17"), ladder
-    assert data["digest"] != shared.digest([shlex.split(one) for one in other])
+    assert data["digest"] != study_base.digest([shlex.split(one) for one in other])
 
 
 def test_a_law_is_beside_itself_as_it_was_tuned():

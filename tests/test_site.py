@@ -35,7 +35,7 @@ def test_every_study_and_notebook_stands_in_one_tab():
         ("rps_jax/record", "README.md", "reference/record.md"),
         ("notebooks/03_paper.ipynb", "README.md", "notebooks/03_paper.md"),
         ("../notebooks/03_paper.py", "rps_jax/README.md", "../notebooks/03_paper.md"),
-        ("../shared.py", "sweeps/table/README.md", "../shared.py.md"),
+        ("../study_base.py", "sweeps/table/README.md", "../study_base.py.md"),
         ("results/table.json", "sweeps/table/README.md", "results/table.json"),
     ],
 )  # fmt: skip

@@ -26,11 +26,11 @@ from rps_jax.world import paper, points, scene
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.physics import preset
 from rps_jax.world.scene import FRICTION
-from sweeps import shared
+from sweeps import conditions
 from sweeps.ambiguities import readings
+from sweeps.conditions import Condition, Grid
 from sweeps.fidelity import study as fidelity
 from sweeps.hardware import study as reproduce
-from sweeps.shared import Condition, Grid
 
 NEAR = ((0.6, 0.0), (0.62, 0.03))
 SHORT = Setting(engine="mujoco", rules=Rules(horizon=18.0))
@@ -55,16 +55,16 @@ def test_a_condition_changes_rps_wherever_it_is_part_of_a_law():
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("study")
-    shared.run_conditions(CONDITIONS, GRID, path)
+    conditions.run_conditions(CONDITIONS, GRID, path)
     return path
 
 
 def test_a_study_labels_its_conditions_and_compares_them(folder):
-    results = shared.run_conditions(CONDITIONS, GRID, folder)
+    results = conditions.run_conditions(CONDITIONS, GRID, folder)
     assert results.success.dims == ("condition", *DIMS)
     won = results.success.sum(DIMS).values
     np.testing.assert_array_equal(won, [2, 0, 2])
-    rows = shared.condition_rows(results, "default")
+    rows = conditions.condition_rows(results, "default")
     assert [row[0] for row in rows] == ["reading", "the defaults", "slow", "thin skin"]
     assert rows[1][1:3] == ["2", "2 of 2"]
     assert rows[2][-1].startswith("+0 -2")
@@ -83,7 +83,7 @@ def test_a_study_continues_and_redoes_alone_what_is_corrupt(folder, monkeypatch)
         return run(cases, *args, **options)
 
     monkeypatch.setattr(pushes, "run", counted)
-    shared.run_conditions(CONDITIONS, GRID, folder)
+    conditions.run_conditions(CONDITIONS, GRID, folder)
     assert ran == CONDITIONS["thin"].cases(GRID)
     again = [files.decoded(content["thin"], "thin") for content in (before, dict(parts.each()))]
     xr.testing.assert_identical(*(results.drop_attrs() for results in again))
@@ -93,7 +93,7 @@ def test_a_study_continues_and_redoes_alone_what_is_corrupt(folder, monkeypatch)
 def test_a_study_refuses_a_folder_of_other_conditions(folder):
     other = {"slow": Condition("slow", SHORT, params={"v_max": 0.002})}
     with pytest.raises(errors.InputError, match=r"slow.* was run with other options"):
-        shared.run_conditions(other, GRID, folder)
+        conditions.run_conditions(other, GRID, folder)
 
 
 def test_c_mujoco_driven_by_periods_matches_c_mujoco_driven_by_steps():
@@ -191,8 +191,8 @@ def test_the_hardware_targets_are_2_1_m_from_the_start():
 
 def test_every_condition_is_a_study_that_could_run():
     ours = fidelity.CONDITIONS, fidelity.IN_WARP, readings.READINGS, readings.GAZEBO
-    for conditions in ours:
-        for condition in conditions.values():
+    for studied in ours:
+        for condition in studied.values():
             assert len(condition.cases(Grid(targets=NEAR))) == 12
     assert len(readings.curve()) == 3 * len(readings.TOLERANCES)
     assert set(fidelity.QUICK) <= set(fidelity.CONDITIONS)

@@ -20,7 +20,7 @@ from rps_jax.robot.skin import CapacitiveSkin, IdealSkin
 from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
 from rps_jax.world.physics import PHYSICS, Physics
-from sweeps.shared import Condition
+from sweeps.conditions import Condition
 
 DEFAULT = "default"
 _CONVERGED = replace(PHYSICS["default"]["standard"], timestep=0.005, iterations=30)

@@ -24,11 +24,12 @@ from rps_jax.runs.question import Run, call_of
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
 from sweeps.ambiguities import readings
-from sweeps.shared import Condition, Grid, Trials, condition_rows, run_conditions
+from sweeps.conditions import Condition, Grid, condition_rows, run_conditions
+from sweeps.study_base import TrialStudy
 
 
 @dataclass(frozen=True)
-class Ambiguities(Trials[xr.Dataset]):
+class Ambiguities(TrialStudy[xr.Dataset]):
     """Run the paper's trials under each reading of what it leaves open, one at a time.
 
     The answer holds outcomes (condition, law, object, friction, target).

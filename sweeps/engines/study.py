@@ -31,7 +31,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import DomainLike, Range
 from rps_jax.world.physics import preset
-from sweeps.shared import Trials
+from sweeps.study_base import TrialStudy
 
 _CONVERGED = Setting(physics=preset(fidelity="reference"), engine="mujoco")
 
@@ -63,7 +63,7 @@ ENGINES = {
 
 
 @dataclass(frozen=True)
-class Engines(Trials[xr.DataTree]):
+class Engines(TrialStudy[xr.DataTree]):
     """Tell whether the engines agree in random worlds, outcome by outcome.
 
     The answer is a tree with the outcomes (world) of each engine.

@@ -26,7 +26,6 @@ from rps_jax.analysis.report import Section
 from rps_jax.app.export import program
 from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
-from rps_jax.record import provenance
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.case import Case
@@ -35,13 +34,12 @@ from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
 from sweeps.export import loop, native
-from sweeps.shared import Study, publish
+from sweeps.study_base import Study, Table
 
-Table = Literal["inputs", "trials", "paper", "worlds", "bags", "odd", "speed"]
-_TABLES: tuple[Table, ...] = ("speed", "inputs", "trials", "paper", "worlds", "bags", "odd")
+TableName = Literal["inputs", "trials", "paper", "worlds", "bags", "odd", "speed"]
+_TABLES: tuple[TableName, ...] = ("speed", "inputs", "trials", "paper", "worlds", "bags", "odd")
 _FORMS: tuple[native.Form, ...] = ("double", "float", "onnx")
 _PRECISIONS: tuple[native.Precision, ...] = ("double", "float")
-_HERE = Path(__file__).parent
 _WORDS = {"double": "C, double", "float": "C, float", "onnx": "ONNX, float"}
 
 
@@ -50,7 +48,7 @@ class Export(Study[xr.Dataset]):
     """Compare exported laws with those in JAX, and time them."""
 
     TITLE: ClassVar[str] = "Laws in C and ONNX beside those in JAX"
-    GROWS: ClassVar[tuple[str, ...]] = ("laws", "tables", "machine", "in_worlds")
+    GROWS: ClassVar[tuple[str, ...]] = ("laws", "tables", "in_worlds")
     SMALL: ClassVar[Mapping[str, Any]] = {
         "laws": ("rps_plus",),
         **{"inputs": 20_000, "states": 20_000, "worlds": 4, "bags": 1},
@@ -58,7 +56,7 @@ class Export(Study[xr.Dataset]):
 
     laws: tuple[str, ...] = ("rps", "rps_tuned", "rps_plus", "learned_mlp", "learned_gru")
     """Laws that are compared."""
-    tables: tuple[Table, ...] = _TABLES
+    tables: tuple[TableName, ...] = _TABLES
     """What is asked: chance inputs, whole trials, the paper's trials and random worlds with C in
     the loop, bags of random worlds, odd inputs, and speed."""
     in_worlds: tuple[str, ...] = ("rps_plus",)
@@ -73,8 +71,6 @@ class Export(Study[xr.Dataset]):
     """Number of random worlds that become bags, for each law."""
     domain: str = "real"
     """Domain of these worlds."""
-    machine: str = ""
-    """What it runs on, in words; with these the tables are published."""
     quick: bool = False
     """Whether to make a small run of minutes on two cores: what is not asked for becomes small."""
 
@@ -101,8 +97,6 @@ class Export(Study[xr.Dataset]):
                 found.append(joined.assign_coords(law=laws))
         whole = xr.merge(found, join="outer").reindex(law=list(self.laws))
         assert isinstance(whole, xr.Dataset)
-        if self.machine and run.folder is not None:
-            self._publish(whole, run.folder)
         return whole
 
     def _kept(self, make: Callable[[str, Path], xr.Dataset], law: str) -> xr.Dataset:
@@ -176,12 +170,12 @@ class Export(Study[xr.Dataset]):
 
     # --- how it is told ---
 
-    def _publish(self, found: xr.Dataset, out: Path) -> None:
-        made = [provenance.signed(out)]
-        for name, (_, note, (head, *rows)) in tables(found, self).items():
-            columns = [{"name": text} for text in head]
-            path = _HERE / "results" / f"export_{name}.json"
-            publish(path, made, self.machine, columns, rows, note)
+    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+        """Return all tables."""
+        return {
+            f"export_{name}": Table(rows, note)
+            for name, (_, note, rows) in tables(results, self).items()
+        }
 
     def report(self, found: Any, run: Run) -> Sequence[Section]:
         """One section for each table."""
@@ -192,7 +186,7 @@ export = call_of(Export)
 
 
 def _columns(
-    table: Table, rows: Sequence[Any], dim: str = "", names: Sequence[str] = (),
+    table: TableName, rows: Sequence[Any], dim: str = "", names: Sequence[str] = (),
     but: Sequence[str] = (),
 ) -> xr.Dataset:  # fmt: skip
     """Rows of named tuples as variables of their fields, along a dimension if it has a name."""
@@ -221,7 +215,7 @@ def tables(found: xr.Dataset, asked: Export) -> dict[str, tuple[str, str, list[l
     return {name: made[name](found) for name in asked.tables}
 
 
-def _each(found: xr.Dataset, table: Table, dim: str) -> list[tuple[str, str, Any]]:
+def _each(found: xr.Dataset, table: TableName, dim: str) -> list[tuple[str, str, Any]]:
     """Law, name along a dimension, and the numbers of a table there."""
     prefix = f"{table}_"
     own = found[[name for name in map(str, found) if name.startswith(prefix)]]
@@ -270,7 +264,7 @@ def _trial_rows(found: xr.Dataset) -> tuple[str, str, list[list[str]]]:
     return "Whole trials", note, rows
 
 
-def _end_rows(found: xr.Dataset, table: Table) -> list[list[str]]:
+def _end_rows(found: xr.Dataset, table: TableName) -> list[list[str]]:
     rows = [["law", "succeed with JAX", "with C in the loop", "with JAX, roundings off",
              "C ends alike", "roundings off end alike", "99 % of times are within"]]  # fmt: skip
     counts = ("in_jax", "in_c", "nudged", "alike", "nudged_alike")

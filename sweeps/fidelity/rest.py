@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,7 +15,6 @@ import xarray as xr
 
 from rps_jax import engines
 from rps_jax.analysis.report import Section
-from rps_jax.record import provenance
 from rps_jax.record.options import option
 from rps_jax.robot.robot import Robot
 from rps_jax.runs.question import Run, call_of
@@ -25,7 +23,7 @@ from rps_jax.trials.worlds import starts
 from rps_jax.world import domain as domains
 from rps_jax.world import draws
 from rps_jax.world.physics import Physics, preset
-from sweeps.shared import Study, publish
+from sweeps.study_base import Study, Table
 
 DOMAINS = ("wide", "hostile", "hostile,friction_ground=0.05:0.1,com_offset=0.5:0.7")
 _AWAY = 5.0  # [m] stands the base
@@ -49,8 +47,6 @@ class Rest(Study[xr.Dataset]):
     """How long they are left alone [s]."""
     seed: int = option(1, 0, 2**32 - 1)
     """Seed of the worlds."""
-    machine: str = ""
-    """What it runs on, in words; with these the table is published."""
     quick: bool = False
     """Whether to make a small run of seconds."""
 
@@ -71,13 +67,11 @@ class Rest(Study[xr.Dataset]):
         whole = xr.combine_by_coords(found, combine_attrs="drop")
         assert isinstance(whole, xr.Dataset)
         whole = whole.sel(domain=list(DOMAINS), step=list(STEPS))
-        if self.machine and run.folder is not None:
-            head, *rows = table(whole)
-            columns = [{"name": text, **({"merge": True} if not i else {})}
-                       for i, text in enumerate(head)]  # fmt: skip
-            path = Path(__file__).parent / "results" / "rest.json"
-            publish(path, [provenance.signed(run.folder)], self.machine, columns, rows)
         return whole
+
+    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+        """Return the counts of objects that moved."""
+        return {"rest": Table(table(results), merge="domain")}
 
     def _moved(self, ranges: domains.Domain, physics: Physics) -> xr.Dataset:
         index, c = np.arange(self.worlds), engines.get("mujoco")

@@ -25,7 +25,8 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import paper
 from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
-from sweeps.shared import Condition, Grid, Trials, run_conditions
+from sweeps.conditions import Condition, Grid, run_conditions
+from sweeps.study_base import TrialStudy
 
 REFERENCE = "reference"
 _EARLY = 5.0  # [s] after which the object's place is compared
@@ -89,7 +90,7 @@ QUICK = (REFERENCE, "fused_standard", "fused_fast")
 
 
 @dataclass(frozen=True)
-class Fidelity(Trials[xr.Dataset]):
+class Fidelity(TrialStudy[xr.Dataset]):
     """Tell how finely the physics must be solved: the paper's trials against converged C MuJoCo.
 
     The answer holds outcomes (condition, law, object, friction, target), and `early_error` [m]: how

@@ -23,13 +23,13 @@ import rps_jax
 from rps_jax.analysis.report import Section
 from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
-from rps_jax.record import bag, provenance
+from rps_jax.record import bag
 from rps_jax.record.options import option
 from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, seed_of
 from rps_jax.tuning import fit, logs, posterior
 from rps_jax.world import domain as domains
 from sweeps.fit.study import judged, within
-from sweeps.shared import publish
+from sweeps.study_base import Study, Table
 
 _SOURCES = ("bag", "the log itself")
 _HAS = ("signal",)  # that bags have beside touch, odometry and commands
@@ -37,7 +37,7 @@ _NEAR = 0.02  # [1] of the interval's width, within which two of its ends are th
 
 
 @dataclass(frozen=True)
-class Bagged(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
+class Bagged(Study[xr.Dataset], InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     """Count how often intervals fitted to bags hold the truth, beside those of the logs."""
 
     TITLE: ClassVar[str] = "Worlds fitted to bags"
@@ -52,8 +52,6 @@ class Bagged(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     """Number of worlds that are recorded and fitted."""
     window: float = option(20.0, 5, 300, unit="s", kw_only=True)
     """Length of a log [s]."""
-    machine: str = ""
-    """What it runs on, in words; with these the table is published."""
     setting: rps_jax.Setting = field(default=rps_jax.Setting("fused"), kw_only=True)
 
     def check(self) -> None:
@@ -81,12 +79,11 @@ class Bagged(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
             for x in (bags.statistics.values, own)
         ]
         whole = xr.concat(found, "source").drop_vars("unit").assign_coords(source=list(_SOURCES))
-        if self.machine and run.folder is not None:
-            head, *rows = table(whole)
-            path = Path(__file__).parent / "results" / "fit_bags.json"
-            columns = [{"name": text} for text in head]
-            publish(path, [provenance.signed(run.folder)], self.machine, columns, rows)
         return whole
+
+    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+        """Return the coverage of bags and logs."""
+        return {"fit_bags": Table(table(results))}
 
     def _bags(self, bank: fit.Bank, names: Sequence[str]) -> xr.Dataset:
         """Statistics (log, F) of the bags of the worlds that are held out."""

@@ -24,16 +24,13 @@ from rps_jax.analysis.figures.style import Figure
 from rps_jax.analysis.report import Picture, Section, save
 from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
-from rps_jax.record import provenance
 from rps_jax.record.options import option
 from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, seed_of
 from rps_jax.trials.progress import Progress, phase, unheard
 from rps_jax.tuning import fit, posterior
 from rps_jax.world import domain as domains
 from rps_jax.world import draws, points
-from sweeps.shared import publish
-
-_HERE = Path(__file__).parent
+from sweeps.study_base import Study, Table
 
 KINDS: dict[str, tuple[str, ...]] = {  # of logs: what they have beside touch, odometry and commands
     "touch": (),
@@ -48,7 +45,7 @@ _TASK = (*domains.of("task"), "key_0", "key_1")
 
 
 @dataclass(frozen=True)
-class Coverage(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
+class Coverage(Study[xr.Dataset], InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     """Count how often the intervals of fitted worlds hold the truth, and what fitting is worth."""
 
     TITLE: ClassVar[str] = "Worlds fitted to logs"
@@ -71,8 +68,6 @@ class Coverage(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     """Number of worlds in which success and time are predicted."""
     tasks: int = option(32, 8, 1000, kw_only=True)
     """Number of pushes behind each of these."""
-    machine: str = ""
-    """What it runs on, in words; with these the tables and the figure are published."""
     setting: rps_jax.Setting = field(default=rps_jax.Setting("fused"), kw_only=True)
 
     @cached_property
@@ -106,8 +101,6 @@ class Coverage(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         whole = xr.concat(found, "kind").assign_coords(kind=[*KINDS, FOUR])
         worth = run.part("worth", partial(self._worth, learned, held, run))
         whole = xr.merge([whole, worth])
-        if self.machine and run.folder is not None:
-            self._publish(whole, run.folder)
         return whole
 
     def _learned(self, kind: str, learned: xr.Dataset, run: Run) -> tuple[Any, list[str]]:
@@ -196,12 +189,14 @@ class Coverage(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
 
     # --- how it is told ---
 
-    def _publish(self, found: xr.Dataset, folder: Path) -> None:
-        made = [provenance.signed(folder)]
-        for name, (head, *rows) in tables(found).items():
-            columns = [{"name": text} for text in head]
-            publish(_HERE / "results" / f"fit_{name}.json", made, self.machine, columns, rows)
-        save(figure(found), _HERE / "coverage.png")
+    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+        """Return all tables."""
+        return {f"fit_{name}": Table(rows) for name, rows in tables(results).items()}
+
+    def publish(self, results: xr.Dataset, run_folder: Path) -> None:
+        """Write the data files and the figure."""
+        super().publish(results, run_folder)
+        save(figure(results), self.folder / "coverage.png")
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
         """Coverage by kind of log, by quantity, and what fitting is worth."""

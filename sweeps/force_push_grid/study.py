@@ -23,7 +23,7 @@ from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import InTurn
 from sweeps.force_push_grid import grid
-from sweeps.shared import Study
+from sweeps.study_base import Study
 
 
 @dataclass(frozen=True)

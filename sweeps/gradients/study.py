@@ -41,7 +41,7 @@ from rps_jax.tuning.space import Space, expanded
 from rps_jax.world import domain as domains
 from rps_jax.world import draws
 from rps_jax.world.domain import RANDOM, DomainLike
-from sweeps.shared import Study
+from sweeps.study_base import Study
 
 TRUTH = "truth"
 # clipped is reverse with a bound on each world's gradient; combined, of reverse and evolution.

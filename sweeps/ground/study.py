@@ -23,7 +23,7 @@ from rps_jax.analysis.report import Picture, Section
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from sweeps.ground import grounds
-from sweeps.shared import Study
+from sweeps.study_base import Study
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,7 +21,6 @@ import xarray as xr
 from rps_jax.analysis.report import Section
 from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
-from rps_jax.record import provenance
 from rps_jax.record.options import option
 from rps_jax.runs import sweep as sweeps
 from rps_jax.runs.plan import Plan
@@ -32,7 +30,7 @@ from rps_jax.tuning import fit
 from rps_jax.world import domain as domains
 from rps_jax.world import paper, points
 from rps_jax.world.domain import Domain
-from sweeps.shared import Trials, publish
+from sweeps.study_base import Table, TrialStudy
 
 RANGES = (
     "hardware,friction_ground=0.1:0.8,friction_robot=0.15:1.2,lateral=-0.05:0.05,yaw=-0.2:0.2,"
@@ -47,7 +45,7 @@ _SHORT = {_BOX: "box", _CYLINDER: "cylinder"}
 
 
 @dataclass(frozen=True)
-class Reproduce(Trials[xr.Dataset]):
+class Reproduce(TrialStudy[xr.Dataset]):
     """Look for frictions, skins and robots that give the paper's hardware results together.
 
     The answer holds the means `D` [m] and `time` [s] over the successes, and `success`, of each
@@ -63,8 +61,6 @@ class Reproduce(Trials[xr.Dataset]):
     """Ranges from which setups are drawn; the targets are the paper's."""
     setups: int = option(160, 4, 1_000_000)
     """Number of setups, of sixteen pushes each."""
-    machine: str = ""
-    """What it runs on, in words; with these the tables are published."""
     setting: Setting = field(default=Setting("fused"), kw_only=True)
 
     @cached_property
@@ -91,7 +87,6 @@ class Reproduce(Trials[xr.Dataset]):
 
     def check(self) -> None:
         """Check the domain and that the engine can step its worlds here."""
-        super().check()
         self.plan.check_here()
 
     def trials(self) -> int | None:
@@ -127,13 +122,11 @@ class Reproduce(Trials[xr.Dataset]):
                     columns[fit.words(name)] = values[:, i]
         found["off"] = "setup", np.where(won.all((1, 2)), np.sqrt(off / 4), np.inf)
         found["drawn"] = ("setup", "quantity"), np.stack(list(columns.values()), 1)
-        whole = xr.Dataset(found, {"object": list(_SHORT.values()), "quantity": list(columns)})
-        if self.machine and run.folder is not None:
-            made = [provenance.signed(run.folder)]
-            for name, (head, *rows) in tables(whole).items():
-                path = Path(__file__).parent / "results" / f"hardware_{name}.json"
-                publish(path, made, self.machine, [{"name": text} for text in head], rows)
-        return whole
+        return xr.Dataset(found, {"object": list(_SHORT.values()), "quantity": list(columns)})
+
+    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+        """Return both tables."""
+        return {f"hardware_{name}": Table(rows) for name, rows in tables(results).items()}
 
     def _drawn(self, name: str) -> np.ndarray:
         """A quantity (setup, object) in its unit."""

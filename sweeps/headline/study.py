@@ -8,10 +8,9 @@ rps sweeps/headline --machine "one NVIDIA H200"
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,29 +19,24 @@ import xarray as xr
 from rps_jax.analysis import tables
 from rps_jax.analysis.report import Section
 from rps_jax.control import registry
-from rps_jax.record import provenance
 from rps_jax.record.options import option
 from rps_jax.runs import models, sweep
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of, setting_as_json
 from rps_jax.trials.setting import Setting
 from rps_jax.world import domain as domains
-from sweeps.shared import Study, publish
+from sweeps.study_base import Table, TrialStudy
 
-_HERE = Path(__file__).parent
 C = "C MuJoCo, this ground, 10 ms"
 
 
 @dataclass(frozen=True)
-class Headline(Study[xr.Dataset]):
+class Headline(TrialStudy[xr.Dataset]):
     """Push with four laws in worlds that nobody looked at, and in fewer on a panel of models."""
 
     TITLE: ClassVar[str] = "The headline: four laws in random worlds"
     SMALL: ClassVar[dict[str, Any]] = {"worlds": 24, "panel": 0, "in_c": 0}
-    GROWS: ClassVar[tuple[str, ...]] = (
-        *("domains", "machine", "panel", "in_c"),
-        *("only", "run_missing"),
-    )
+    GROWS: ClassVar[tuple[str, ...]] = (*("domains", "panel", "in_c", "only", "run_missing"),)
 
     laws: tuple[str, ...] = ("rps", "rps_tuned", "rps_plus", "learned_gru")
     """Laws that are compared."""
@@ -59,11 +53,7 @@ class Headline(Study[xr.Dataset]):
     shared by a GPU and processors; its parts are then put together in one folder."""
     run_missing: bool = True
     """Whether models that a run folder lacks in a domain are run; else they are left out."""
-    machine: str = ""
-    """What it runs on, in words; with these the table is published."""
     setting: Setting = field(default=Setting("fused", seed=3119), kw_only=True)
-    quick: bool = False
-    """Whether to make a small run of a minute on two cores."""
 
     def check(self) -> None:
         """Check that the laws and the domains are known."""
@@ -90,17 +80,16 @@ class Headline(Study[xr.Dataset]):
         assert isinstance(whole, xr.Dataset)
         names = list(dict.fromkeys(str(one.model.item()) for one in found))
         whole = whole.sel(law=list(self.laws), domain=list(self.domains), model=names)
-        if self.machine and run.folder is not None and not self.only:
-            self._publish("headline/results/headline.json", table(whole), run.folder)
-            if whole.sizes["model"] > 1:
-                self._publish("models/results/models.json", panel_table(whole), run.folder)
         return whole
 
-    def _publish(self, path: str, told: list[list[Any]], folder: Path) -> None:
-        """Write a table as a data file of a folder beside this one."""
-        head, *rows = told
-        columns = [{"name": name, "merge": name == "domain"} for name in head]
-        publish(_HERE.parent / path, [provenance.signed(folder)], self.machine, columns, rows)
+    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+        """Return the rates, and those on each model of the panel."""
+        if self.only:
+            return {}
+        tables = {"headline": Table(table(results), merge="domain")}
+        if results.sizes["model"] > 1:
+            tables["models"] = Table(panel_table(results), merge="domain")
+        return tables
 
     def plans(self, name: str) -> dict[str, Plan]:
         """What is run in a domain: on each model, the default's worlds first."""

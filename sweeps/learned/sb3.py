@@ -14,11 +14,10 @@ import importlib
 import importlib.metadata
 import importlib.util
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -28,13 +27,12 @@ from matplotlib.figure import Figure
 from rps_jax import errors
 from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.report import Picture, Section
-from rps_jax.record import provenance
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import domain as domains
-from sweeps.shared import Study, publish
+from sweeps.study_base import Study, Table
 
 _FOUND = {
     "time": ("s", "wall clock since learning began"),
@@ -66,8 +64,6 @@ class SB3(Study[xr.Dataset]):
     """Wall clock of learning [s], without the compilation of the worlds."""
     rows: int = option(6, 1, 1000)
     """Number of rows of the curve."""
-    machine: str = ""
-    """What it runs on, in words; with these the table is published."""
     setting: Setting = field(
         default=Setting(fidelity="fast", rules=Rules(horizon=60.0, max_lost=20.0)), kw_only=True
     )
@@ -85,16 +81,14 @@ class SB3(Study[xr.Dataset]):
         """Learn with each number of worlds."""
         each = [run.part(f"curve_{n}", partial(self._learned, n)) for n in self.num_envs]
         found = xr.concat(each, xr.IndexVariable("envs", list(self.num_envs)))
-        if self.machine and run.folder is not None:
-            head, *rows = table(found)
-            names = ("stable-baselines3", "torch", "gymnasium")
-            versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in names)
-            made = [provenance.signed(run.folder)]
-            columns = [{"name": text, "merge": text == "worlds"} for text in head]
-            path = Path(__file__).parent / "results" / "sb3.json"
-            note = f"{versions}; a run of its own seed, with noise in the actions."
-            publish(path, made, self.machine, columns, rows, note)
         return found
+
+    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+        """Return the learning curves."""
+        names = ("stable-baselines3", "torch", "gymnasium")
+        versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in names)
+        note = f"{versions}; one run with one seed, with noise in the actions."
+        return {"sb3": Table(table(results), note, merge="worlds")}
 
     def _learned(self, count: int) -> xr.Dataset:
         names = ("", ".common.vec_env", ".common.callbacks")

@@ -25,7 +25,7 @@ from rps_jax.record import folder as run_folder
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.tuning import learn
-from sweeps.shared import Study, publish
+from sweeps.study_base import Study, Table, write_table
 
 RESULTS = Path(__file__).parent / "results"
 COLUMNS = (
@@ -77,15 +77,16 @@ class Learned(Study[list[list[Any]]]):
         """Gather the rows, and publish them."""
         folders = [Path(one) for one in self.runs]
         rows = [row(one, device) for one, device in zip(folders, self.devices, strict=True)]
-        publish(
+        note = (
+            "Validation: worlds of the domain that no update has met, by the rules of the paper, "
+            "without noise in the actions; of each run the law that did best there, which "
+            "flatters it. The interval is Wilson's."
+        )
+        write_table(
             RESULTS / "learned.json",
             [provenance.signed(one) for one in folders],
             "; ".join(dict.fromkeys(self.devices)),
-            COLUMNS,
-            rows,
-            "Validation: worlds of the domain that no update has met, by the rules of the paper, "
-            "without noise in the actions; of each run the law that did best there, which "
-            "flatters it. The interval is Wilson's.",
+            Table(rows, note, COLUMNS),
         )
         return rows
 

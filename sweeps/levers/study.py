@@ -29,12 +29,13 @@ from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import Progress
 from rps_jax.world.physics import Physics
-from sweeps import shared
-from sweeps.shared import Program, Study
+from sweeps import programs
+from sweeps.programs import Program
+from sweeps.study_base import Study
 
 
 class Lever(NamedTuple):
-    """One change to a program of `shared.BATCHED`."""
+    """One change to a program of `programs.BATCHED`."""
 
     physics: Mapping[str, Any] = {}  # fields of `Physics` to change
     stage: Callable[[Any], Any] = lambda stage: stage
@@ -93,8 +94,8 @@ _FLAGS = {
 
 
 def levers_of(name: str, family: str) -> dict[str, Lever]:
-    """All that can be changed about one of `shared.BATCHED` on this machine."""
-    engine = engines.get(shared.BATCHED[name].engine)
+    """All that can be changed about one of `programs.BATCHED` on this machine."""
+    engine = engines.get(programs.BATCHED[name].engine)
     found = _OF_ALL | (_OF_SOLVERS if engine.newton else {})
     found |= {what: Lever(stage=change) for what, change in engine.levers(family).items()}
     flags = _FLAGS.get(jax.default_backend(), {})
@@ -138,8 +139,8 @@ class Levers(Study[xr.Dataset]):
 
     def check(self) -> None:
         """Check the program, and that its engine has these objects here."""
-        errors.check_name("program", self.program, shared.BATCHED)
-        engines.get(shared.BATCHED[self.program].engine).check([self.family])
+        errors.check_name("program", self.program, programs.BATCHED)
+        engines.get(programs.BATCHED[self.program].engine).check([self.family])
 
     def trials(self) -> int | None:
         """How many programs there are."""
@@ -160,7 +161,7 @@ class Levers(Study[xr.Dataset]):
 
     def intro(self, found: xr.Dataset) -> str:
         """Where it was measured."""
-        return shared.machine()
+        return programs.machine()
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
         """How many times as fast each lever makes the program."""
@@ -194,13 +195,13 @@ def measure(
     goes: int = 5,
     at_once: int = 1,
 ) -> Iterator[Gain]:
-    """Pull every lever of one of `shared.BATCHED` in turn, first none.
+    """Pull every lever of one of `programs.BATCHED` in turn, first none.
 
     Program and program with a lever are timed in turns, `goes` times each, since a machine that
     others use is now faster, now slower; the gain is the median of the ratios.
 
     Args:
-      name: of `shared.BATCHED`.
+      name: of `programs.BATCHED`.
       family: of its worlds.
       worlds: how many, but for the levers that change that.
       simulated: [s] at a go.
@@ -210,7 +211,7 @@ def measure(
     wanted = {AS_IT_IS: Lever()} | levers_of(name, family)
     calls = [partial(_traced, name, family, worlds, lever, simulated) for lever in wanted.values()]
     usual = None
-    for what, program in zip(wanted, shared.side_by_side(calls, at_once), strict=True):
+    for what, program in zip(wanted, programs.side_by_side(calls, at_once), strict=True):
         usual = usual or program
         yield _gain(what, usual, program, goes)
 
@@ -218,11 +219,11 @@ def measure(
 def _traced(
     name: str, family: str, worlds: int, lever: Lever, simulated: float
 ) -> Callable[[], Program]:
-    setting = shared.BATCHED[name]
+    setting = programs.BATCHED[name]
     changed = replace(setting, physics=replace(setting.physics, **lever.physics))
     count = max(1, round(worlds * lever.worlds))
     how = {"stage": lever.stage, "donated": lever.donated, "flags": lever.flags}
-    return shared.traced(name, changed, family, count, simulated=simulated, **how)
+    return programs.traced(name, changed, family, count, simulated=simulated, **how)
 
 
 def _rate(program: Program) -> float:

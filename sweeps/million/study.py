@@ -10,7 +10,7 @@ trial ended, when, and how near it came. What was drawn follows from seed and in
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -22,16 +22,15 @@ import xarray as xr
 from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.report import Section
 from rps_jax.control import registry
-from rps_jax.record import files, provenance
+from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs import sweep
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of, seed_of
 from rps_jax.trials.setting import Setting
 from rps_jax.world import domain as domains
-from sweeps.shared import Trials, publish
+from sweeps.study_base import Table, TrialStudy
 
-_HERE = Path(__file__).parent
 ENDS = ("success", *statistics.FAILURES)  # numbers of `how`
 UNTOUCHED = 65_535  # `missed` of an object that was never touched
 _WORDS = {
@@ -43,7 +42,7 @@ _WORDS = {
 
 
 @dataclass(frozen=True)
-class Million(Trials[xr.Dataset]):
+class Million(TrialStudy[xr.Dataset]):
     """Push in a million worlds, and keep of each trial how it ended, when and how near it came.
 
     The answer holds `success` (law, byte), `how`, `steps` and `missed` (law, world).
@@ -51,7 +50,7 @@ class Million(Trials[xr.Dataset]):
 
     TITLE: ClassVar[str] = "A million outcomes"
     SMALL: ClassVar[dict[str, Any]] = {"worlds": 64}
-    GROWS: ClassVar[tuple[str, ...]] = ("laws", "machine")
+    GROWS: ClassVar[tuple[str, ...]] = ("laws",)
 
     laws: tuple[str, ...] = ("rps_tuned", "rps_plus", "learned_gru")
     """Laws, which all meet the same worlds."""
@@ -59,13 +58,10 @@ class Million(Trials[xr.Dataset]):
     """Ranges from which worlds are drawn."""
     worlds: int = option(2**20, 1, 2**30)
     """Number of worlds."""
-    machine: str = ""
-    """What it runs on, in words; with these the data file is published."""
     setting: Setting = field(default=Setting("fused", seed=37), kw_only=True)
 
     def check(self) -> None:
         """Check that the laws and the domain are known."""
-        super().check()
         registry.laws_of(self.laws)
         domains.named(self.domain)
 
@@ -92,11 +88,16 @@ class Million(Trials[xr.Dataset]):
             "control_period": self.setting.physics.control_period,
             "max_lost": float(self.setting.rules.max_lost),
         }
-        if self.machine and run.folder is not None:
-            files.write_results(_HERE / "million.nc", packed(found))
-            columns, made = [{"name": name} for name in HEADER], [provenance.signed(run.folder)]
-            publish(_HERE / "results" / "million.json", made, self.machine, columns, table(found))
         return found
+
+    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+        """Return the rates of the laws."""
+        return {"million": Table([HEADER, *table(results)])}
+
+    def publish(self, results: xr.Dataset, run_folder: Path) -> None:
+        """Write the data file of the table, and all outcomes."""
+        super().publish(results, run_folder)
+        files.write_results(self.folder / "million.nc", packed(results))
 
     def _of(self, law: str, run: Run) -> xr.Dataset:
         """Outcomes of one law, small."""

@@ -30,10 +30,9 @@ from packaging.utils import canonicalize_name
 from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.errors import InputError
-from rps_jax.record import provenance
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import Progress
-from sweeps.shared import Study, publish
+from sweeps.study_base import Study, Table
 
 ROOT = Path(__file__).parents[2]
 OWN = "rps-jax"
@@ -85,12 +84,11 @@ class Dependencies(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "What the dependencies bring"
-    GROWS: ClassVar[tuple[str, ...]] = ("extras", "machine")
+    GROWS: ClassVar[tuple[str, ...]] = ("extras",)
+    RESULTS: ClassVar[str] = "../results"
 
     extras: tuple[str, ...] = tuple(EXTRAS)
     """Extras that are measured; by default all."""
-    machine: str = ""
-    """What it runs on, in words; with these the tables are published."""
 
     def check(self) -> None:
         """Check the names of the extras."""
@@ -112,12 +110,11 @@ class Dependencies(Study[xr.Dataset]):
             run.report(Progress(len(found), 0.0))
         index = xr.IndexVariable("installed", list(found))
         whole: Any = xr.concat(list(found.values()), index, join="outer", fill_value={"size": 0.0})
-        if self.machine and run.folder is not None:
-            for name, rows in tables(whole).items():
-                made, columns = [provenance.signed(run.folder)], [{"name": n} for n in rows[0]]
-                path = ROOT / "sweeps" / "results" / f"{name}.json"
-                publish(path, made, self.machine, columns, rows[1:], _NOTE)
         return whole
+
+    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+        """Return both tables."""
+        return {name: Table(rows, _NOTE) for name, rows in tables(results).items()}
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
         """Both tables."""

@@ -34,8 +34,7 @@ from rps_jax.record import provenance
 from rps_jax.runs.question import Run, call_of
 from sweeps.publish.recipes import HISTORY, RECIPES, Recipe
 from sweeps.publish.rows import Rows
-from sweeps.shared import Study, digest
-from sweeps.shared import publish as write
+from sweeps.study_base import Study, Table, digest, write_table
 
 _SWEEPS = Path(__file__).parents[1]
 CURRENT = "of today's code"
@@ -46,14 +45,12 @@ class Publish(Study[xr.Dataset]):
     """Say of every published number whether it is of today's code, and make anew what is asked."""
 
     TITLE: ClassVar[str] = "Published numbers, and what they hang on"
-    GROWS: ClassVar[tuple[str, ...]] = ("only", "needs", "machine", "check_digests")
+    GROWS: ClassVar[tuple[str, ...]] = ("only", "needs", "check_digests")
 
     only: tuple[str, ...] = ()
     """Data files to be made anew, as fit_coverage or fit_*; by default none."""
     needs: Literal["any", "cpu", "gpu"] = "any"
     """Which of these: those that are made on processors, or those that take a GPU."""
-    machine: str = ""
-    """What it runs on, in words; by default as the system names its device."""
     check_digests: bool = False
     """Whether to fail if a number hangs on what has changed since it was made."""
 
@@ -198,7 +195,7 @@ def make(name: str, recipe: Recipe, runs: Path, device: str) -> None:
         columns, rows = joined(tables, recipe.columns)
         path = next((p for p in published() if p.stem == name), None)
         new = _SWEEPS / recipe.folder / "results" / f"{name}.json"
-        write(path or new, made, device, columns, rows, recipe.note)
+        write_table(path or new, made, device, Table(rows, recipe.note, columns))
 
 
 def _carried_out(words: list[str], runs: Path) -> tuple[Sequence[Section], Any, dict[str, Any]]:

@@ -19,7 +19,7 @@ from rps_jax.errors import InputError
 from sweeps.real_pushes import sliding
 from sweeps.real_pushes.sliding import Ground, turned
 
-Table = pd.DataFrame | xr.Dataset | Path | str
+PushTable = pd.DataFrame | xr.Dataset | Path | str
 DATA = Path(__file__).parent / "data"
 OUTLINE = np.array([[0.0, 0.0], [0.15, 0.0], [0.0, 0.15]])  # [m] counter-clockwise
 COM = np.array([0.05, 0.05])  # [m] the centroid
@@ -44,7 +44,7 @@ _NEEDED = {
 }  # fmt: skip
 
 
-def read(table: Table | None = None) -> pd.DataFrame:
+def read(table: PushTable | None = None) -> pd.DataFrame:
     """Read a table of pushes; by default the project's own.
 
     Args:

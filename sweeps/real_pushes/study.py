@@ -25,14 +25,14 @@ import xarray as xr
 
 from rps_jax import errors
 from rps_jax.analysis.report import Picture, Section, save
-from rps_jax.record import files, provenance
+from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import Progress
 from sweeps.real_pushes import contact, pushes
 from sweeps.real_pushes.drawing import figure
-from sweeps.real_pushes.pushes import DATA, Errors, Table
-from sweeps.shared import Study, publish
+from sweeps.real_pushes.pushes import Errors
+from sweeps.study_base import Study, Table
 
 Model = Literal[
     "no_motion",
@@ -95,7 +95,7 @@ _SPLIT = 2015  # seed of the halves
 
 
 def predict(
-    table: Table | None = None,
+    table: pushes.PushTable | None = None,
     model: Model = "rigid_feet",
     *,
     friction: Mapping[str, float] = FRICTION,
@@ -180,8 +180,6 @@ class RealPushes(Study[xr.Dataset]):
     """Number of pushes on three feet that C MuJoCo predicts, with one finger and with two each."""
     few: int | None = option(None, 10, 100_000)
     """Number of pushes, every so many of the table; by default all."""
-    machine: str = ""
-    """What it runs on, in words; with these the tables and the figure are published."""
     quick: bool = False
     """Whether to try only a few pushes, in less than a minute."""
 
@@ -257,8 +255,6 @@ class RealPushes(Study[xr.Dataset]):
             whole = whole.merge(friction)
         if run.folder is not None:
             files.write_text(run.folder / "predictions.csv", _csv(whole))
-            if self.machine:
-                self._publish(whole, run.folder)
         return whole
 
     def _fitted(self, run: Run) -> xr.Dataset:
@@ -348,12 +344,17 @@ class RealPushes(Study[xr.Dataset]):
             sections[0] = sections[0]._replace(picture=Picture("real_pushes", draw))
         return sections
 
-    def _publish(self, found: xr.Dataset, folder: Path) -> None:
-        made, here = [provenance.signed(folder)], DATA.parent
-        for name, (columns, rows) in tables(found).items():
-            path = here / "results" / f"real_pushes_{name}.json"
-            publish(path, made, self.machine, columns, rows)
-        save(figure(found, self.table, WORDS), here / "real_pushes.png")
+    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+        """Return all tables."""
+        return {
+            f"real_pushes_{name}": Table(rows, columns=columns)
+            for name, (columns, rows) in tables(results).items()
+        }
+
+    def publish(self, results: xr.Dataset, run_folder: Path) -> None:
+        """Write the data files and the figure."""
+        super().publish(results, run_folder)
+        save(figure(results, self.table, WORDS), self.folder / "real_pushes.png")
 
 
 real_pushes = call_of(RealPushes)

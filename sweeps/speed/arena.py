@@ -32,16 +32,15 @@ import xarray as xr
 
 from rps_jax import errors
 from rps_jax.analysis.report import Section
-from rps_jax.record import provenance
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import Progress
 from rps_jax.world import scene
 from rps_jax.world.physics import preset
-from sweeps import shared
-from sweeps.shared import Study
+from sweeps import programs
 from sweeps.speed import racers
 from sweeps.speed.racers import ON_CORES, RACERS
+from sweeps.study_base import Study, Table
 
 _HERE = Path(__file__).parent
 _COLUMNS = (
@@ -78,7 +77,7 @@ class Arena(Study[xr.Dataset]):
         "seconds": 0.5,
         "step": 1e-3,
     }
-    GROWS: ClassVar[tuple[str, ...]] = ("names", "worlds", "peers", "limit", "machine")
+    GROWS: ClassVar[tuple[str, ...]] = ("names", "worlds", "peers", "limit")
 
     names: tuple[str, ...] = tuple(RACERS)
     """Engines; by default all."""
@@ -94,8 +93,6 @@ class Arena(Study[xr.Dataset]):
     """Folder of the packages of others, as `peers.py` makes it."""
     limit: float = option(300.0, 1, 3600)
     """Time in which an engine must be ready, and time in which it must then run [s]."""
-    machine: str = ""
-    """What it runs on, in words; with these the table is published."""
 
     def check(self) -> None:
         """Check the names."""
@@ -134,7 +131,7 @@ class Arena(Study[xr.Dataset]):
                 found.append(row)
                 whole = xr.concat(found, "row")
                 if self.machine and run.folder is not None:
-                    self._publish(run.folder, whole)
+                    self.publish(whole, run.folder)
                 run.report(Progress(number + 1, 0.0))
             made.close()
         return whole
@@ -160,17 +157,14 @@ class Arena(Study[xr.Dataset]):
             for process in started:
                 process.end()
 
-    def _publish(self, folder: Path, found: xr.Dataset) -> None:
-        columns = [{"name": one} for one in _COLUMNS]
-        made = [provenance.signed(folder)]
-        note = ". ".join(f"Not in the arena: {name}, because {why}" for name, why in
-                         EXCLUDED.items())  # fmt: skip
-        path = _HERE / "results" / "arena.json"
-        shared.publish(path, made, self.machine, columns, table(found), note + ".")
+    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+        """Return the race, and why other engines are not in it."""
+        excluded = (f"Not in the arena: {name}, because {why}." for name, why in EXCLUDED.items())
+        return {"arena": Table([_COLUMNS, *table(results)], " ".join(excluded))}
 
     def intro(self, found: xr.Dataset) -> str:
         """Where it was measured."""
-        return shared.machine()
+        return programs.machine()
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
         """Speeds and errors."""

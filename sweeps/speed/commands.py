@@ -27,12 +27,11 @@ import xarray as xr
 
 from rps_jax.analysis.report import Section
 from rps_jax.errors import InputError
-from rps_jax.record import provenance
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import Progress
-from sweeps import shared
-from sweeps.shared import Study
+from sweeps import programs
+from sweeps.study_base import Study, Table
 
 TOLD = re.compile(r"compile ([\d.]+) s, run ([\d.]+) s \((\d+) simulated s per s\)")
 _COLUMNS = (
@@ -50,7 +49,7 @@ class Commands(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "How long a user waits for a whole command"
-    GROWS: ClassVar[tuple[str, ...]] = ("commands", "warm", "gpus", "machine")
+    GROWS: ClassVar[tuple[str, ...]] = ("commands", "warm", "gpus")
 
     commands: tuple[str, ...] = (
         "push --object box --target -2 0 --no-video",
@@ -70,8 +69,6 @@ class Commands(Study[xr.Dataset]):
     cache, and the last."""
     limit: float = option(1800.0, 1, 86400)
     """Time after which a command is stopped [s]."""
-    machine: str = ""
-    """What it runs on, in words; with these the table is published."""
     file: str = "commands"
     """Name of the data file."""
 
@@ -95,16 +92,15 @@ class Commands(Study[xr.Dataset]):
         found += [run.part(f"warm_{n}", partial(_warm, n, self.limit, gpus)) for n in self.warm]
         told = [*_labels(self.wanted), *(f"`{_call(n)}`, in one process" for n in self.warm)]
         whole: Any = xr.concat(found, "command").assign_coords(command=told)
-        if self.machine and run.folder is not None:
-            path = Path(__file__).parent / "results" / f"{self.file}.json"
-            columns = [{"name": one} for one in _COLUMNS]
-            made = [provenance.signed(run.folder)]
-            shared.publish(path, made, self.machine, columns, table(whole))
         return whole
+
+    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+        """Return the times of the commands."""
+        return {self.file: Table([_COLUMNS, *table(results)])}
 
     def intro(self, found: xr.Dataset) -> str:
         """Where it was measured."""
-        return shared.machine()
+        return programs.machine()
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
         """Wall clocks of both processes."""

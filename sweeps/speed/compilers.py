@@ -21,13 +21,12 @@ import xarray as xr
 import rps_jax
 from rps_jax.analysis.report import Section
 from rps_jax.errors import InputError
-from rps_jax.record import provenance
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import Progress
-from sweeps import shared
-from sweeps.shared import Study
+from sweeps import programs
 from sweeps.speed.commands import TOLD, printed
+from sweeps.study_base import Study, Table
 
 _LIMIT = 3600.0  # [s] of a sweep
 # Which are compared: their names, and the environment and options of the second.
@@ -46,7 +45,7 @@ class Compilers(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "The loop compiled here, and by XLA"
-    GROWS: ClassVar[tuple[str, ...]] = ("skins", "machine", "file")
+    GROWS: ClassVar[tuple[str, ...]] = ("skins", "file")
 
     law: str = "rps_tuned"
     """What decides."""
@@ -56,8 +55,6 @@ class Compilers(Study[xr.Dataset]):
     """Number of worlds of `wide`."""
     against: Literal["xla", "cpu"] = "xla"
     """With what the sweep as this machine runs it is compared: one by XLA, or on processors."""
-    machine: str = ""
-    """What it runs on, in words; with these the table is published."""
     file: str = "compilers"
     """Name of the data file."""
 
@@ -72,16 +69,15 @@ class Compilers(Study[xr.Dataset]):
             found.append(run.part(skin, partial(self._compared, skin)))
             run.report(Progress(number + 1, 0.0))
         whole: Any = xr.concat(found, "skin").assign_coords(skin=list(self.skins))
-        if self.machine and run.folder is not None:
-            path = Path(__file__).parent / "results" / f"{self.file}.json"
-            columns = [{"name": one} for one in self._columns]
-            made = [provenance.signed(run.folder)]
-            shared.publish(path, made, self.machine, columns, self.table(whole))
         return whole
+
+    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+        """Return the comparison."""
+        return {self.file: Table([self._columns, *self.table(results)])}
 
     def intro(self, found: xr.Dataset) -> str:
         """Where it was compared."""
-        return shared.machine()
+        return programs.machine()
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
         """Outcomes and speeds of both."""

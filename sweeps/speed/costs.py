@@ -29,8 +29,9 @@ from rps_jax.analysis.report import Section
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import Progress
-from sweeps import shared
-from sweeps.shared import FAMILIES, Study
+from sweeps import programs
+from sweeps.programs import FAMILIES
+from sweeps.study_base import Study
 
 _ABOVE = re.compile(r".*(?:rps_jax|site-packages)/")  # of a file, what says not which it is
 _INSTRUCTION = re.compile(r"^\s*(?:ROOT )?%([\w.\-]+) = .* ([\w\-]+)\(.*stack_frame_id=(\d+)", re.M)
@@ -50,7 +51,7 @@ class Cost(NamedTuple):
 class Profile(NamedTuple):
     """Where the time of a program goes."""
 
-    name: str  # of `shared.BATCHED`
+    name: str  # of `programs.BATCHED`
     family: str
     worlds: int
     step: float  # [s] of wall clock in a control step, without the profiler
@@ -83,8 +84,8 @@ class Costs(Study[list[Profile]]):
         for family in self.families:
             errors.check_name("families", family, FAMILIES)
         for name in self.names:
-            errors.check_name("names", name, shared.BATCHED)
-            engines.get(shared.BATCHED[name].engine).check(self.families)
+            errors.check_name("names", name, programs.BATCHED)
+            engines.get(programs.BATCHED[name].engine).check(self.families)
 
     def trials(self) -> int | None:
         """How many programs there are."""
@@ -111,7 +112,7 @@ class Costs(Study[list[Profile]]):
             f"{1e6 * p.timed:,.0f} us in operations while the profiler ran."
             for p in found
         )
-        return f"{shared.machine()}\n\n{whole}"
+        return f"{programs.machine()}\n\n{whole}"
 
     def report(self, found: list[Profile], run: Run) -> Sequence[Section]:
         """The most expensive functions of each program."""
@@ -122,17 +123,17 @@ costs = call_of(Costs)
 
 
 def measure(name: str, family: str, worlds: int, *, steps: int = 20) -> Profile:
-    """Profile one of `shared.BATCHED`, every world being pushed.
+    """Profile one of `programs.BATCHED`, every world being pushed.
 
     Args:
-      name: of `shared.BATCHED`.
+      name: of `programs.BATCHED`.
       family: of its worlds.
       worlds: how many.
       steps: control steps that are timed.
     """
-    setting = shared.BATCHED[name]
+    setting = programs.BATCHED[name]
     simulated = steps * setting.physics.control_period
-    program = shared.traced(name, setting, family, worlds, simulated=simulated)()
+    program = programs.traced(name, setting, family, worlds, simulated=simulated)()
     state = jax.block_until_ready(program.go(jax.tree.map(jnp.copy, program.start)))
     began = time.perf_counter()
     state = jax.block_until_ready(program.go(state))

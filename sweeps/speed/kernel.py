@@ -14,7 +14,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,14 +24,14 @@ import xarray as xr
 
 from rps_jax.analysis.report import Section
 from rps_jax.errors import InputError
-from rps_jax.record import provenance
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.batch import SEGMENT
 from rps_jax.trials.progress import Progress
 from rps_jax.trials.setting import Setting
-from sweeps import shared
-from sweeps.shared import FAMILIES, Study
+from sweeps import programs
+from sweeps.programs import FAMILIES
+from sweeps.study_base import Study, Table
 
 _STALLED = "smsp__average_warps_issue_stalled_{}_per_issue_active.ratio"
 # Of what is counted: Nsight's name, ours, and what it is.
@@ -63,7 +63,7 @@ class Kernel(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "What the kernel waits for"
-    GROWS: ClassVar[tuple[str, ...]] = ("families", "machine")
+    GROWS: ClassVar[tuple[str, ...]] = ("families",)
 
     law: str = "rps_tuned"
     """What decides."""
@@ -71,8 +71,6 @@ class Kernel(Study[xr.Dataset]):
     """Families of the objects: box, cylinder, prism."""
     worlds: int = option(16_384, 8193, 10_000_000)
     """Number of worlds of `wide`; more than are set aside for the end."""
-    machine: str = ""
-    """What it runs on, in words; with these the table is published."""
 
     def check(self) -> None:
         """Check that the profiler is there."""
@@ -90,15 +88,15 @@ class Kernel(Study[xr.Dataset]):
             found.append(run.part(family, partial(self._counted, family)))
             run.report(Progress(number + 1, 0.0))
         whole: Any = xr.concat(found, "family").assign_coords(family=list(self.families))
-        if self.machine and run.folder is not None:
-            path = Path(__file__).parent / "results" / "kernel.json"
-            made, columns = [provenance.signed(run.folder)], [{"name": one} for one in _COLUMNS]
-            shared.publish(path, made, self.machine, columns, self.table(whole))
         return whole
+
+    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+        """Return the counts of each family."""
+        return {"kernel": Table([_COLUMNS, *self.table(results)])}
 
     def intro(self, found: xr.Dataset) -> str:
         """Where it was measured."""
-        return shared.machine()
+        return programs.machine()
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
         """What the kernel of each family waits for."""

@@ -172,10 +172,10 @@ def with_law(task: Task) -> Racer:
     """The fused engine with the law RPS, its skin and the rules of a trial around it."""
     import jax
 
-    from sweeps import shared
+    from sweeps import programs
 
-    made = shared.traced(
-        "fused", shared.BATCHED["fused standard"], "box", len(task.qpos),
+    made = programs.traced(
+        "fused", programs.BATCHED["fused standard"], "box", len(task.qpos),
         simulated=task.seconds, donated=False,
     )()  # fmt: skip
 

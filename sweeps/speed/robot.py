@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,12 +19,10 @@ import xarray as xr
 
 from rps_jax.analysis.report import Section
 from rps_jax.errors import InputError
-from rps_jax.record import provenance
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import Progress
-from sweeps import shared
-from sweeps.shared import Study
+from sweeps.study_base import Study, Table
 
 _ROOT = Path(__file__).parents[2]
 _EXAMPLE = "notebooks/examples/on_a_robot.py"
@@ -46,7 +44,8 @@ class OnARobot(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "How long a step takes on a robot"
-    GROWS: ClassVar[tuple[str, ...]] = ("runs", "core", "machine")
+    GROWS: ClassVar[tuple[str, ...]] = ("runs", "core")
+    RESULTS: ClassVar[str] = "../results"
 
     runs: int = option(2, 1, 100)
     """Number of runs."""
@@ -54,8 +53,6 @@ class OnARobot(Study[xr.Dataset]):
     """Length of a run [s]."""
     core: int = option(0, 0, 4095)
     """Core to stay on."""
-    machine: str = ""
-    """What it runs on, in words; with these the table is published."""
 
     def trials(self) -> int | None:
         """How many runs there are."""
@@ -68,11 +65,11 @@ class OnARobot(Study[xr.Dataset]):
             found.append(run.part(f"run_{number}", self._timed))
             run.report(Progress(number + 1, 0.0))
         whole: Any = xr.concat(found, "run")
-        if self.machine and run.folder is not None:
-            path = Path(__file__).parents[1] / "results" / "robot.json"
-            made, columns = [provenance.signed(run.folder)], [{"name": one} for one in _COLUMNS]
-            shared.publish(path, made, self.machine, columns, table(whole))
         return whole
+
+    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+        """Return the times of each run."""
+        return {"robot": Table([_COLUMNS, *table(results)])}
 
     def _timed(self) -> xr.Dataset:
         """What one run told.

@@ -40,8 +40,9 @@ from rps_jax.world import draws
 from rps_jax.world.domain import DOMAINS
 from rps_jax.world.physics import preset
 from rps_jax.world.scene import JOINTS
-from sweeps import shared
-from sweeps.shared import BATCHED, FAMILIES, Program, Study
+from sweeps import programs
+from sweeps.programs import BATCHED, FAMILIES, Program
+from sweeps.study_base import Study
 
 _SPEED = 0.05  # [m/s] at which C MuJoCo alone pushes
 _SLOW = ("mjx", "warp")  # engines whose batches are bounded
@@ -155,7 +156,7 @@ class Speed(Study[xr.Dataset]):
 
     def intro(self, found: xr.Dataset) -> str:
         """Where it was measured."""
-        return shared.machine()
+        return programs.machine()
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
         """Speeds beside C MuJoCo's, and against the batch."""
@@ -191,8 +192,8 @@ def _measured(wanted: Sequence[tuple[str, str, int]], at_once: int) -> Iterator[
     for name, family, _ in (one for one in wanted if one[0] in IN_C):
         yield in_c(name, family)
     batched_ = [one for one in wanted if one[0] in BATCHED]
-    calls = [partial(shared.traced, n, BATCHED[n], *rest) for n, *rest in batched_]
-    for program in shared.side_by_side(calls, at_once):
+    calls = [partial(programs.traced, n, BATCHED[n], *rest) for n, *rest in batched_]
+    for program in programs.side_by_side(calls, at_once):
         yield batched(program)
 
 
@@ -256,7 +257,7 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
     threads = 1 if how == "serial" else provenance.processors()
     worlds = 1 if how == "serial" else 64 * threads
     setting, engine = Setting(engine="mujoco", physics=physics), engines.get("mujoco")
-    stage, batch = shared.timed_worlds(family, worlds, setting)
+    stage, batch = programs.timed_worlds(family, worlds, setting)
     if how != "open":
         loop = Loop(physics, Rules(horizon=simulated))
 
@@ -338,8 +339,8 @@ def throughput(speeds: Iterable[tuple[str, str, int, float]], steady: Collection
         found.setdefault(family, {}).setdefault(name, []).append((worlds, rate))
     figure = Figure(figsize=(4.5 * len(found), 4.0), layout="constrained")
     axes = figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
-    for ax, (family, programs) in zip(axes, found.items(), strict=True):
-        for i, (name, points) in enumerate(programs.items()):
+    for ax, (family, by_name) in zip(axes, found.items(), strict=True):
+        for i, (name, points) in enumerate(by_name.items()):
             if name in steady:
                 ax.axhline(points[0][1], color=f"C{i}", ls="--", label=name)
             else:

@@ -1,0 +1,220 @@
+"""The paper's trials under changed conditions, compared trial by trial.
+
+A study runs one `Grid` of trials under several `Condition`s. `run_conditions` runs the conditions
+that its folder lacks, and `condition_rows` compares them with a baseline.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import xarray as xr
+
+from rps_jax.analysis import statistics
+from rps_jax.control import registry
+from rps_jax.control.base import Params
+from rps_jax.control.laws.rps import RPSParams
+from rps_jax.errors import InputError
+from rps_jax.record import files
+from rps_jax.record.checkpoint import Parts
+from rps_jax.trials import pushes
+from rps_jax.trials.case import Case
+from rps_jax.trials.progress import Progress, Report, unheard
+from rps_jax.trials.results import outcome_dataset
+from rps_jax.trials.setting import Setting
+from rps_jax.world import paper
+from rps_jax.world.objects import PAPER_OBJECTS
+from rps_jax.world.scene import FRICTION, Friction
+
+# Trials run at once: more keep the device busier, fewer lose less when killed.
+_TOGETHER = {"cpu": 600, "gpu": 100_000}
+
+
+class Grid(NamedTuple):
+    """Which trials, in the nesting order of `outcome_dataset`."""
+
+    laws: tuple[str, ...] = ("rps",)
+    objects: tuple[str, ...] = PAPER_OBJECTS
+    friction: Mapping[str, Friction] = FRICTION
+    targets: tuple[tuple[float, float], ...] = paper.TARGETS
+
+    @property
+    def size(self) -> int:
+        """Trials."""
+        return len(self.laws) * len(self.objects) * len(self.friction) * len(self.targets)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What one row changes: of the setting, of the law's parameters, of every case."""
+
+    what: str
+    setting: Setting = Setting(engine="mjx")
+    params: Mapping[str, float] = field(default_factory=dict)  # of RPS, also within other laws
+    case: Mapping[str, Any] = field(default_factory=dict)  # skin, gap, rear, bearing, ...
+
+    def cases(self, grid: Grid) -> list[Case]:
+        """The trials of a grid under this condition."""
+        changed = {name: self._changed(registry.LAWS[name]) for name in grid.laws}
+        return [
+            Case(name, friction, target, changed[law], **self.case)
+            for law in grid.laws
+            for name in grid.objects
+            for friction in grid.friction.values()
+            for target in grid.targets
+        ]
+
+    def allowed(self, laws: Sequence[str]) -> bool:
+        """Whether the changed parameters mean something to every law."""
+        try:
+            for params in (self._changed(registry.LAWS[name]) for name in laws):
+                registry.law_of(params).check(params)
+        except InputError:
+            return False
+        return True
+
+    def _changed(self, params: Params) -> Params:
+        """Parameters of RPS, or of a law that has RPS within, with the changes; others as is."""
+        if isinstance(params, RPSParams):
+            return params._replace(**self.params)
+        within = getattr(params, "law", None)
+        if isinstance(within, RPSParams):
+            return params._replace(law=within._replace(**self.params))
+        return params
+
+
+def run_conditions(
+    conditions: Mapping[str, Condition],
+    grid: Grid,
+    folder: Path | None,
+    *,
+    slots: int | None = None,
+    workers: int | None = None,
+    report: Report = unheard,
+) -> xr.Dataset:
+    """Outcomes (condition, law, object, friction, target), run or found in `folder`.
+
+    Without a folder all is kept in memory. Each condition is a part of the folder as soon as it is
+    done; the same call computes only what is missing.
+
+    Raises:
+      InputError: the folder holds a condition of the same name that was run otherwise.
+    """
+    parts = None if folder is None else Parts(folder)
+    found = {name: parts and _load(parts, name, c, grid) for name, c in conditions.items()}
+    missing = [name for name, results in found.items() if results is None]
+    finished, simulated = grid.size * (len(found) - len(missing)), 0.0
+    report(Progress(finished, simulated))
+    for chunk in _chunks(missing, conditions, grid):
+        cases = [case for name in chunk for case in conditions[name].cases(grid)]
+
+        def tell(progress: Progress, before=(finished, simulated)) -> None:
+            report(Progress(before[0] + progress.finished, before[1] + progress.simulated))
+
+        outcome, timing = pushes.run(
+            cases, conditions[chunk[0]].setting, slots=slots, workers=workers, report=tell
+        )
+        finished, simulated = finished + len(cases), simulated + timing.simulated
+        for i, name in enumerate(chunk):
+            rows = slice(i * grid.size, (i + 1) * grid.size)
+            part = type(outcome)(*(values[rows] for values in outcome))
+            results = outcome_dataset(
+                part, grid.laws, grid.objects, tuple(grid.friction), grid.targets
+            )
+            # Shared by all that ran together.
+            share = grid.size / len(cases)
+            results.attrs = {
+                "run_as": _fingerprint(conditions[name], grid),
+                "run_time": timing.run * share,
+                "simulated": timing.simulated * share,
+            }
+            if parts is not None:
+                parts.put(name, files.encoded(results))
+            found[name] = results
+    done = {name: results for name, results in found.items() if results is not None}
+    whole = xr.concat(
+        [results.drop_attrs(deep=False) for results in done.values()],
+        xr.DataArray(list(done), dims="condition", name="condition"),
+    )
+    for attribute in ("run_time", "simulated"):
+        values = [results.attrs[attribute] for results in done.values()]
+        whole = whole.assign_coords({attribute: ("condition", values)})
+    return whole.assign_coords(what=("condition", [conditions[name].what for name in done]))
+
+
+def _fingerprint(condition: Condition, grid: Grid) -> str:
+    """All that the outcomes depend on, as text."""
+    same = replace(condition, what="", params=dict(condition.params), case=dict(condition.case))
+    return f"{same!r} {grid._replace(friction=dict(grid.friction))!r}"
+
+
+def _load(parts: Parts, name: str, condition: Condition, grid: Grid) -> xr.Dataset | None:
+    """A condition's results, if it is among the finished parts."""
+    if (content := parts.get(name)) is None:
+        return None
+    results = files.decoded(content, parts.folder / name, own=True)
+    if results.attrs.get("run_as") != _fingerprint(condition, grid):
+        raise InputError(
+            f"{parts.folder / name}-*.nc was run with other options: choose another folder, or "
+            "delete it to run again."
+        )
+    return results
+
+
+def _chunks(
+    names: Sequence[str], conditions: Mapping[str, Condition], grid: Grid
+) -> list[list[str]]:
+    """Names of conditions to run together: of one setting, and not too many."""
+    groups: dict[Setting, list[str]] = {}
+    for name in names:
+        groups.setdefault(conditions[name].setting, []).append(name)
+    at_once = max(1, _TOGETHER.get(jax.default_backend(), 600) // grid.size)
+    return [
+        group[i : i + at_once] for group in groups.values() for i in range(0, len(group), at_once)
+    ]
+
+
+def condition_rows(results: xr.Dataset, baseline: str, law: str = "rps") -> list[list[str]]:
+    """Header and one row for each condition: counts, interval, median time, and the difference.
+
+    The last column says how outcomes differ from the baseline's, and whether significantly:
+    McNemar's exact test, false discoveries among all rows held at 5 % (Benjamini-Hochberg).
+    """
+    part = results.sel(law=law)
+    base = part.success.sel(condition=baseline)
+    names = [str(name) for name in part.condition.values]
+    against = [statistics.compare(base, part.success.sel(condition=name)) for name in names]
+    others = [i for i, name in enumerate(names) if name != baseline]
+    q = np.ones(len(names))
+    q[others] = statistics.false_discovery([against[i].p for i in others])
+    objects = [str(o) for o in part.object.values]
+    header = ["reading", *objects, "all", "95 %", "median time", "against the first"]
+    table = [header]
+    for i, name in enumerate(names):
+        one = part.sel(condition=name)
+        won = one.success.values.astype(bool)
+        counts = one.success.sum("target").transpose("object", "friction").values.astype(int)
+        low, high = statistics.wilson(int(won.sum()), won.size)
+        time = one.time.values[won]
+        difference = (
+            ""
+            if name == baseline
+            else f"+{against[i].gained} -{against[i].lost}, q = {q[i]:.2g}"
+            + (" *" if q[i] < 0.05 else "")
+        )
+        table.append(
+            [
+                str(one.what.values),
+                *(" ".join(map(str, row)) for row in counts),
+                f"{won.sum()} of {won.size}",
+                f"{100 * low:.0f}-{100 * high:.0f} %",
+                f"{np.median(time):.1f} s" if time.size else "-",
+                difference,
+            ]
+        )
+    return table
