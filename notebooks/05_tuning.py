@@ -12,7 +12,7 @@
 #
 # The paper's parameters were chosen by hand. `RPSParams.tuned()` was found by evolution in three
 # runs of CMA-ES, a coarse one, a fine one, and one with robots that have limits, whose commands
-# stand in `sweeps/tuned`; `runs/coarse`, `runs/fine` and `runs/robots` hold their logs.
+# stand in `sweeps/random_worlds`; `runs/coarse`, `runs/fine` and `runs/robots` hold their logs.
 # `runs/compare/wide` has both sets of parameters in 1000 worlds that no tuner has seen. One switch
 # was added by hand to what the fine run found: when contact is lost, the tuned law acts upon the
 # last one (`keep_contact`). Only the section about gradients simulates anything.

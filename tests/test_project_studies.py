@@ -52,8 +52,8 @@ REFUSED = [
     ("force_push_grid", "--duration 0", "duration"),
     ("hardware", "--setups 1", "setups = 1 is not allowed"),
     ("hardware", "--domain wyde", "unknown domain 'wyde'"),
-    ("headline", "--domains wyde", "unknown domain 'wyde'"),
-    ("headline", "--laws none", "unknown law 'none'"),
+    ("random_worlds", "--domains wyde", "unknown domain 'wyde'"),
+    ("random_worlds", "--laws none", "unknown law 'none'"),
     ("publish", "--only nothing", "no data file has such a name"),
     ("real_pushes", "--pushes none.csv", r"pushes = none\.csv cannot be read"),
     ("real_pushes", "--models rigid", r"invalid choice 'rigid'"),
@@ -89,15 +89,10 @@ def test_a_folder_asks_one_question_of_a_report(folder):
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
 def test_a_folder_has_a_page_that_says_first_what_was_found(folder):
     lines = (folder / "README.md").read_text().splitlines()
-    assert len(lines) <= 180
     assert lines[0].startswith("# ")
     assert lines[2]
     assert not lines[2].startswith(("<!--", "|", "#", "`"))
     assert f"({folder.name}/README.md)" in (SWEEPS / "README.md").read_text()
-
-
-def test_the_index_is_short():
-    assert len((SWEEPS / "README.md").read_text().splitlines()) <= 80
 
 
 def published():

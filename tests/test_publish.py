@@ -20,9 +20,9 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import DOMAINS, Range
 from sweeps import study_base
-from sweeps.million import study as million
 from sweeps.publish import dependencies, rows, study
 from sweeps.publish.recipes import HISTORY, RECIPES, Recipe
+from sweeps.random_worlds import million
 
 SWEEPS = ROOT / "sweeps"
 PUSH = "rps sweep --domain wide,objects=random_cylinder --worlds 3 --engine quasistatic --horizon 1"
@@ -231,7 +231,7 @@ def test_a_million_outcomes_are_kept_small_and_read_as_the_page_says(tmp_path, m
     np.testing.assert_array_equal(found.missed.values < million.UNTOUCHED, touched)
     off = 1000 * usual.min_distance.values
     np.testing.assert_allclose(found.missed.values[touched], off[touched], atol=0.51)
-    page = (SWEEPS / "million" / "README.md").read_text()
+    page = (SWEEPS / "random_worlds" / "README.md").read_text()
     (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     exec(compile(code.replace("slice(100_000)", "slice(19)"), "page", "exec"), {})

@@ -77,9 +77,9 @@ _GRADIENTS = "rps sweeps/gradients --worlds 32 --estimators"
 
 # In the order of their weight, in which they are made.
 RECIPES: dict[str, Recipe] = {
-    "headline": Recipe((f"rps sweeps/headline {_MACHINE}",), None, 30),
-    "models": Recipe((f"rps sweeps/headline {_MACHINE}",), None, 30),
-    "million": Recipe((f"rps sweeps/million {_MACHINE}",), None, 9),
+    "headline": Recipe((f"rps sweeps/random_worlds {_MACHINE}",), None, 30),
+    "models": Recipe((f"rps sweeps/random_worlds {_MACHINE}",), None, 30),
+    "million": Recipe((f"rps sweeps/random_worlds/million.py {_MACHINE}",), None, 9),
     "rest": Recipe((f"rps sweeps/fidelity/rest.py {_MACHINE}",), 5, None),
     "hardware_[qr]*": Recipe((f"rps sweeps/hardware {_MACHINE}",), None, 20),
     "feet": Recipe(

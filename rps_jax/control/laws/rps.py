@@ -65,7 +65,7 @@ class RPSParams(NamedTuple):
 
     @classmethod
     def tuned(cls) -> RPSParams:
-        """Tuned by evolution in random worlds of boxes and cylinders (`sweeps/tuned` says how).
+        """Tuned by evolution in random worlds of boxes and cylinders (see `sweeps/random_worlds`).
 
         Full speed until the target. Nearer than d_th it drives straight on or, beyond l_cr, almost
         purely sideways; Eq. 5 acts only farther away. A contact that is lost is acted upon as if it

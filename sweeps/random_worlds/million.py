@@ -1,6 +1,6 @@
 """A million outcomes in one file, so that failures can be studied without a GPU.
 
-    rps sweeps/million --machine "one NVIDIA H100"
+    rps sweeps/random_worlds/million.py --machine "one NVIDIA H100"
 
 pushes with three laws in the same 1,048,576 worlds of `wide`, and writes `million.nc`: how each
 trial ended, when, and how near it came. What was drawn follows from seed and index, by

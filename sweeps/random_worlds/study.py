@@ -2,7 +2,7 @@
 
 One sample a row: all laws meet the same worlds, and a panel of models the first of these.
 
-rps sweeps/headline --machine "one NVIDIA H200"
+rps sweeps/random_worlds --machine "one NVIDIA H200"
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ C = "C MuJoCo, this ground, 10 ms"
 
 
 @dataclass(frozen=True)
-class Headline(TrialStudy[xr.Dataset]):
+class RandomWorlds(TrialStudy[xr.Dataset]):
     """Push with four laws in worlds that nobody looked at, and in fewer on a panel of models."""
 
-    TITLE: ClassVar[str] = "The headline: four laws in random worlds"
+    TITLE: ClassVar[str] = "Four laws in random worlds"
     SMALL: ClassVar[dict[str, Any]] = {"worlds": 24, "panel": 0, "in_c": 0}
     GROWS: ClassVar[tuple[str, ...]] = (*("domains", "panel", "in_c", "only", "run_missing"),)
 
@@ -121,7 +121,7 @@ class Headline(TrialStudy[xr.Dataset]):
         return [Section("Success", text, table(found)), Section("Models", "", panel_table(found))]
 
 
-headline = call_of(Headline)
+random_worlds = call_of(RandomWorlds)
 
 
 def _meets(name: str, patterns: Sequence[str]) -> bool:
