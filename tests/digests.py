@@ -30,9 +30,9 @@ RUNS = {
     "table_mjx": "table --engine mjx --objects box --friction S1 --targets -2 0 2 0 --horizon 1",
     "push_mujoco": "push --object box --target 0.6 0 --no-video",
     "push_fused": "push --object cylinder --target 0.8 0.3 --engine fused --no-video",
-    "push_quasistatic": "push --object nonuniform --target 0.6 0 --engine quasistatic --no-video",
+    "push_quasistatic": "push --object box --target 0.6 0 --engine quasistatic --no-video",
     "hardware": "hardware --quick --engine fused --horizon 20 --shifts 0.1",
-    "sweep_fused": "sweep --worlds 48 --laws rps nps aps rps_plus learned_gru --domain hostile",
+    "sweep_fused": "sweep --worlds 24 --laws rps aps learned_gru --domain hostile --horizon 60",
     "sweep_mujoco": f"sweep --worlds 12 --laws rps rps_tuned --engine mujoco {SHORT}",
     "sweep_quasistatic": f"sweep --worlds 32 --laws rps --engine quasistatic --domain {BOX}",
     "sweep_mjx": f"sweep --worlds 8 --laws rps --engine mjx --domain {BOX} --horizon 1",
@@ -124,6 +124,8 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         current = record(arguments.pattern, Path(folder))
     if arguments.action == "record":
+        if arguments.file.exists():
+            current = json.loads(arguments.file.read_text()) | current
         arguments.file.write_text(json.dumps(current, indent=1))
         print(f"{sum(map(len, current.values()))} digests of {len(current)} runs")
         return 0
