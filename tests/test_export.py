@@ -238,7 +238,8 @@ def test_an_operation_that_cannot_be_written_is_named(tmp_path, capsys, registri
         path.write_text(head + rest)
         for kind in ("c", "js", "onnx"):
             said = refusal(capsys, "export", kind, "--law", f"{path}:OwnParams", "--out", tmp_path)
-            assert f"its operation `{operation}`" in said
+            name = {"c": "C", "js": "JavaScript", "onnx": "ONNX"}[kind]
+            assert f"operation `{operation}` is not supported by the {name} exporter" in said
     said = refusal(capsys, "export", "c", "--law", "rps", "--skin", "ideal", "--out", tmp_path)
     assert "name one with taxels" in said
     said = refusal(capsys, "export", "c", "--law", "rps", "--prefix", "2 laws", "--out", tmp_path)

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rps_jax import engines
 from rps_jax.control import registry
 from rps_jax.engines import native
 from rps_jax.lowering import nodes
@@ -15,7 +14,7 @@ from rps_jax.trials import trial
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Loop
 from rps_jax.trials.worlds import drawn_worlds
-from rps_jax.world import draws, scene
+from rps_jax.world import draws
 from rps_jax.world.domain import DOMAINS
 
 pytestmark = pytest.mark.skipif(native.target() is None, reason="there is no C compiler")
@@ -241,17 +240,32 @@ def test_the_loop_of_an_equation_is_compiled_as_a_whole(law, skin):
     assert "while" not in primitives
 
 
-def test_what_has_no_form_in_c_xla_compiles():
-    """As a law of large matrices."""
-    found = native.batched(None, None) if not native.is_available() else native.batched(
-        lambda x: jnp.ones((99, 3)) * x @ jnp.ones(3), lambda x: 3 * x)  # fmt: skip
-    assert np.asarray(found(jnp.arange(2.0))).tolist() == [0.0, 3.0]
+def test_xla_compiles_large_products_without_a_warning(recwarn):
+    """As those of a learned law."""
+    run = native.batched(lambda x: jnp.ones((99, 3)) * x @ jnp.ones(3), lambda x: 3 * x)
+    assert np.asarray(run(jnp.arange(2.0))).tolist() == [0.0, 3.0]
+    assert not len(recwarn)
 
 
-def test_other_engines_are_xlas():
-    box = scene.load("box", SETTING.physics)
-    marked = set()
-    for name in ("fused", "mjx", "quasistatic"):
-        stage, _ = engines.get(name).stage_of_scenes([box], np.zeros(1, int))
-        marked |= {name} if getattr(stage, "native", False) else set()
-    assert marked == {"fused"}
+def test_an_unsupported_operation_is_named_once(monkeypatch, recwarn):
+    monkeypatch.setattr(native, "_warned", set())
+    run = native.batched(lambda x: jnp.sort(jnp.stack([x, -x]))[0], lambda x: 3 * x)
+    for _ in range(2):
+        assert np.asarray(run(jnp.arange(2.0))).tolist() == [0.0, 3.0]
+    (warning,) = recwarn
+    assert str(warning.message) == (
+        "operation `sort` is not supported by the native compiler; use arithmetic, comparisons, "
+        "jnp.where and elementary functions. XLA compiles this law, which is some ten times slower."
+    )
+
+
+@pytest.mark.parametrize("engine", ["fused", "mjx", "quasistatic"])
+def test_only_the_fused_engine_calls_compiled_functions(engine):
+    _, params = registry.read_law("rps")
+    domain = replace(DOMAINS["wide"], objects=("random_box",))
+    setting = Setting(engine)
+    part = drawn_worlds(domain, draws.draw(domain, 3, np.arange(2)), params, setting)
+    loop = Loop(setting.physics, setting.rules, registry.law_of(params))
+    worlds = jax.tree.map(jnp.asarray, part.worlds)
+    run = jax.make_jaxpr(lambda w, t: trial.advance((part.stage,), (w,), (t,), loop, 1))
+    assert ("rps_native" in str(run(worlds, begun(worlds, loop)))) == (engine == "fused")

@@ -30,9 +30,9 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax.engines import device
-from rps_jax.errors import InputError
 from rps_jax.geometry import vectors
 from rps_jax.lowering import gpu_writer, nvrtc, writer
+from rps_jax.lowering.walk import TooLargeError, UnsupportedError
 from rps_jax.record import provenance
 
 # A sum is fused with the product before it, as XLA does; nothing else is taken for something else.
@@ -42,6 +42,7 @@ _THREADS = 4  # of a GPU that hold a world
 _LACKING = "a C compiler (apt install gcc) or NVRTC (pip install nvidia-cuda-nvrtc) is not here"
 _PLATFORMS = {"cpu": "cpu", "gpu": "CUDA"}
 _OF_ONE: ContextVar[bool] = ContextVar("rps_jax_of_one_world", default=False)
+_warned: set[str] = set()
 _loaded: dict[str, Any] = {}
 _locks: defaultdict[str, threading.RLock] = defaultdict(threading.RLock)
 
@@ -157,8 +158,13 @@ def _made(functions: Sequence[_Function]) -> str | None:
     try:
         with jax.ensure_compile_time_eval():
             texts = [write(x.jaxpr, x.given, x.results, x.ordered) for x in functions]
-    except (InputError, jax.errors.TracerArrayConversionError):
-        return None  # a law has an operation without a form in C, or holds what is being traced
+    except UnsupportedError as error:
+        _warn_once(
+            f"{str(error).rstrip('.')}. XLA compiles this law, which is some ten times slower"
+        )
+        return None
+    except (TooLargeError, jax.errors.TracerArrayConversionError):
+        return None  # XLA is faster, or the law holds a value that is being traced
     except Exception as error:  # of a version of JAX that writes its operations otherwise
         said = f"{type(error).__name__}: {error}"
         warnings.warn(f"no C can be written, so XLA compiles: {said}", stacklevel=2)
@@ -178,6 +184,13 @@ def _made(functions: Sequence[_Function]) -> str | None:
         device.keep(_place(name), body)
         _register(name, body)
     return name
+
+
+def _warn_once(message: str) -> None:
+    """Warn of a slow program, once in a process."""
+    if message not in _warned:
+        _warned.add(message)
+        warnings.warn(message, stacklevel=2)
 
 
 def _binary(text: str, name: str) -> bytes:

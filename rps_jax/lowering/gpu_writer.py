@@ -26,7 +26,7 @@ from rps_jax.lowering.nodes import (
     results,
     size_of,
 )
-from rps_jax.lowering.walk import unsupported
+from rps_jax.lowering.walk import TooLargeError
 from rps_jax.lowering.writer import STORED, TYPES, SimdWriter, constant, literal
 
 WARP = 32
@@ -422,7 +422,7 @@ def source(
     for each in found:
         lines += writer.end(each)
     if 4 * writer.shared * (WARP // threads) > _MOST_SHARED:
-        raise unsupported("so many numbers at once")
+        raise TooLargeError("the arrays of a world exceed the shared memory of a block.")
     last = "there ? mine : a.worlds - 1"
     fill = {
         "TABLES": "\n".join(writer.tables.values()),

@@ -21,9 +21,10 @@ import numpy as np
 from rps_jax.lowering.walk import (
     PAIRED,
     Target,
+    TooLargeError,
+    UnsupportedError,
     is_constant,
     kind_of,
-    unsupported,
     walk,
 )
 
@@ -125,6 +126,7 @@ def size_of(shape: Sequence[int]) -> int:
 class SimdNodes(Target):
     """The target of a jaxpr of one world: nodes, of which equal ones are one."""
 
+    compiler = "the native compiler"
     kinds = "fibu"
 
     def __init__(self) -> None:
@@ -197,7 +199,7 @@ class SimdNodes(Target):
         else:
             op = f"{name}_{first}"
         if op not in _KNOWN:
-            raise unsupported(f"{name} of {values[0].dtype}")
+            raise UnsupportedError(name)
         return self._made(op, values, kind, out.shape)
 
     def _made(self, op: str, values: Sequence[Any], kind: str, shape: tuple[int, ...]) -> Array:
@@ -263,7 +265,7 @@ class SimdNodes(Target):
         ]
         sizes = [places.shape[1] for _, places in sides]
         if size_of(out.shape) * sides[0][1].shape[2] > _MOST_PRODUCTS:
-            raise unsupported("a product of large matrices")  # in which XLA is faster
+            raise TooLargeError("XLA compiles large products of matrices to faster code.")
         # In one loop goes what is constant, else the longer.
         known = [is_constant(value) for value, _ in sides]
         long = known.index(True) if any(known) else int(sizes[1] > sizes[0])
@@ -401,7 +403,7 @@ def kind_in(dtype: Any, name: str) -> str:
     """The kind of a type that has a vector; InputError names what has none."""
     kind = kind_of(np.dtype(dtype), name, SimdNodes.kinds)
     if np.dtype(dtype).itemsize != (1 if kind == "b" else 4):
-        raise unsupported(f"{name} of {dtype}")
+        raise UnsupportedError(f"{name} of {dtype}")
     return kind
 
 

@@ -48,6 +48,7 @@ _SAME = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "pvary", "re
 class Target(Protocol):
     """What a jaxpr is written for; one that has no loops has them unrolled, or refused."""
 
+    compiler = "the compiler"  # its name in errors
     kinds = "fib"  # of numbers that it knows, as `kind_of` names them
 
     def moved(self, values: Sequence[Any], places: np.ndarray, like: Any) -> Any:
@@ -71,15 +72,22 @@ class Target(Protocol):
         carry: Sequence[Any],
     ) -> list[Any]:
         """What `carry` is after a function of it was applied as long as a condition held."""
-        raise unsupported("while")
+        raise UnsupportedError("while")
 
 
-def unsupported(name: str) -> InputError:
-    """The one sentence about an operation that cannot be written."""
-    return InputError(
-        f"the law cannot be exported: its operation `{name}` has no form outside of JAX here; "
-        "write it with arithmetic, comparisons, jnp.where and elementary functions."
-    )
+class UnsupportedError(InputError):
+    """A primitive that a target cannot express."""
+
+    def __init__(self, operation: str, compiler: str = "the compiler") -> None:
+        self.operation = operation
+        super().__init__(
+            f"operation `{operation}` is not supported by {compiler}; "
+            "use arithmetic, comparisons, jnp.where and elementary functions."
+        )
+
+
+class TooLargeError(InputError):
+    """A function that XLA compiles better than this package: its arrays are too large."""
 
 
 def traced(function: Callable[..., Any], *arguments: Any) -> tuple[Any, Any]:
@@ -93,8 +101,11 @@ def traced(function: Callable[..., Any], *arguments: Any) -> tuple[Any, Any]:
 
 def walk(closed: Any, arguments: Sequence[Any], target: Target) -> list[Any]:
     """The results of a closed jaxpr of some arguments, as a target has them."""
-    with jax.enable_x64(True):
-        return _walk(closed.jaxpr, closed.consts, arguments, target)
+    try:
+        with jax.enable_x64(True):
+            return _walk(closed.jaxpr, closed.consts, arguments, target)
+    except UnsupportedError as error:
+        raise UnsupportedError(error.operation, target.compiler) from None
 
 
 def is_constant(value: Any) -> bool:
@@ -161,7 +172,7 @@ def _results(eqn: Any, values: list[Any], target: Target) -> Sequence[Any]:
     if name == "threefry2x32":  # of which the two results are told apart
         return [target.emit(f"{name}_{i}", values, params, out) for i, out in enumerate(outs)]
     if len(outs) != 1:
-        raise unsupported(name)
+        raise UnsupportedError(name)
     return [target.emit(name, values, params, outs[0])]
 
 
@@ -254,7 +265,7 @@ def _unrolled(eqn: Any, values: list[Any], target: Target) -> list[Any]:
     """A `scan`, step by step."""
     params = eqn.params
     if params["length"] > _MOST_STEPS:
-        raise unsupported(f"scan of {params['length']} steps")
+        raise UnsupportedError(f"scan of more than {_MOST_STEPS} steps")
     body = params["jaxpr"]
     # What is carried has one shape inside and outside; what is scanned or stacked has not. Versions
     # of JAX differ in the names under which they count it.
@@ -301,7 +312,7 @@ def kind_of(dtype: Any, name: str = "", kinds: str = "fib") -> str:
     """
     kind = np.dtype(dtype).kind if isinstance(dtype, np.dtype) else "?"
     if kind not in kinds:
-        raise unsupported(f"{name} of {dtype}".strip())
+        raise UnsupportedError(f"{name} of {dtype}".strip())
     return kind
 
 

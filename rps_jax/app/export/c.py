@@ -85,30 +85,7 @@ enum {{
 
 {STRUCTS}
 {INITIALISERS}
-/* As JAX has them: NaN goes on, and no whole number overflows. */
-static inline {p}_real {p}_max({p}_real a, {p}_real b) {{ return a >= b || a != a ? a : b; }}
-static inline {p}_real {p}_min({p}_real a, {p}_real b) {{ return a <= b || a != a ? a : b; }}
-static inline {p}_real {p}_sign({p}_real x) {{
-  return x > 0 ? ({p}_real)1 : x < 0 ? ({p}_real)-1 : x;
-}}
-static inline {p}_real {p}_logistic({p}_real x) {{ return 1 / (1 + {P}_F(exp)(-x)); }}
-/* Lambert's fraction near zero, which is exact to a rounding there and spares a call of tanh. */
-static inline {p}_real {p}_tanh({p}_real x) {{
-  const {p}_real a = {P}_F(fabs)(x), s = x * x;
-  if (a < ({p}_real)0.5)
-    return x * (135135 + s * (17325 + s * (378 + s)))
-         / (135135 + s * (62370 + s * (3150 + s * 28)));
-  return {P}_F(copysign)(1 - 2 / (1 + {P}_F(exp)(2 * a)), x);
-}}
-static inline int {p}_int({p}_real x) {{
-  return x != x ? 0 : x >= ({p}_real)2147483647 ? 2147483647
-       : x <= ({p}_real)-2147483647 ? -2147483647 - 1 : (int)x;
-}}
-static inline int {p}_idiv(int a, int b) {{
-  return b == 0 ? -1 : b == -1 ? (int)(0u - (unsigned)a) : a / b;
-}}
-static inline int {p}_irem(int a, int b) {{ return b == 0 ? a : b == -1 ? 0 : a % b; }}
-
+{HELPERS}
 {TABLES}
 /* The memory before the first step. */
 static inline void {p}_init(const {p}_params *params, {p}_memory *memory) {{
@@ -156,10 +133,37 @@ static inline int {p}_skin_step(const {p}_skin_params *params, {p}_skin *skin,
 #endif /* {P}_H */
 """
 
+HELPERS = """\
+/* As JAX has them: NaN goes on, and no whole number overflows. */
+static inline {p}_real {p}_max({p}_real a, {p}_real b) {{ return a >= b || a != a ? a : b; }}
+static inline {p}_real {p}_min({p}_real a, {p}_real b) {{ return a <= b || a != a ? a : b; }}
+static inline {p}_real {p}_sign({p}_real x) {{
+  return x > 0 ? ({p}_real)1 : x < 0 ? ({p}_real)-1 : x;
+}}
+static inline {p}_real {p}_logistic({p}_real x) {{ return 1 / (1 + {P}_F(exp)(-x)); }}
+/* Lambert's fraction near zero, which is exact to a rounding there and spares a call of tanh. */
+static inline {p}_real {p}_tanh({p}_real x) {{
+  const {p}_real a = {P}_F(fabs)(x), s = x * x;
+  if (a < ({p}_real)0.5)
+    return x * (135135 + s * (17325 + s * (378 + s)))
+         / (135135 + s * (62370 + s * (3150 + s * 28)));
+  return {P}_F(copysign)(1 - 2 / (1 + {P}_F(exp)(2 * a)), x);
+}}
+static inline int {p}_int({p}_real x) {{
+  return x != x ? 0 : x >= ({p}_real)2147483648.0 ? 2147483647
+       : x <= ({p}_real)-2147483648.0 ? -2147483647 - 1 : (int)x;
+}}
+static inline int {p}_idiv(int a, int b) {{
+  return b == 0 ? -1 : b == -1 ? (int)(0u - (unsigned)a) : a / b;
+}}
+static inline int {p}_irem(int a, int b) {{ return b == 0 ? a : b == -1 ? 0 : a % b; }}
+"""
+
 
 class _Writer(Writer):
     """One routine as statements of C."""
 
+    compiler = "the C exporter"
     forms = _FORMS
     call = "{P}_F({0})({1})"
     heads = ("{kind} {sized}", "const {kind} {sized}")
@@ -284,6 +288,7 @@ def header(program: Program, prefix: str) -> str:
     }
     return _HEADER.format(
         **lines,
+        HELPERS=HELPERS.format(p=p, P=upper),
         TABLES="\n".join([*tables.values(), ""] if tables else []),
         **{"label": program.label, "robot": program.robot, "version": __version__},
         **{"p": p, "P": upper, "taxels": program.taxels},

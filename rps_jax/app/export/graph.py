@@ -16,7 +16,7 @@ from rps_jax import __version__
 from rps_jax.app.export.program import Program
 from rps_jax.errors import InputError
 from rps_jax.lowering import walk
-from rps_jax.lowering.walk import PAIRED, kind_of, unsupported
+from rps_jax.lowering.walk import PAIRED, UnsupportedError, kind_of
 
 _OPSET, _FORMAT = 18, 9  # of ONNX, and of its files
 _TYPES = {"f": np.float32, "i": np.int32, "b": np.bool_}
@@ -47,6 +47,8 @@ class Tensor(NamedTuple):
 
 class Graph(walk.Target):
     """The target of tensors."""
+
+    compiler = "the ONNX exporter"
 
     def __init__(self, onnx: Any) -> None:
         """Begin without nodes."""
@@ -159,7 +161,7 @@ class Graph(walk.Target):
             return make("CumSum", x[0], axis, reverse=int(params["reverse"]))
         if name == "dot_general":
             return make("Einsum", *x, equation=_equation(x, params["dimension_numbers"]))
-        raise unsupported(name)
+        raise UnsupportedError(name)
 
     def _cast(self, x: Tensor, kind: str) -> Tensor:
         return self.node("Cast", [x], x.shape, kind, to=self.type_of(kind))

@@ -99,6 +99,7 @@ export function skinStep(params, skin, taxels, period) {{
 class _Writer(Writer):
     """One routine as statements of JavaScript."""
 
+    compiler = "the JavaScript exporter"
     forms = _FORMS
     functions = FUNCTIONS - {"erf"}
     call = "Math.{0}({1})"

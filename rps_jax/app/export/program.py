@@ -55,9 +55,9 @@ class Routine(NamedTuple):
         flat = iter(walk.walk(self.jaxpr, arguments, target))
         return {name: [next(flat) for _ in group] for name, group in self.found.items()}
 
-    def scalars(self) -> tuple[Scalars, dict[str, list[list[Node]]]]:
+    def scalars(self, compiler: str) -> tuple[Scalars, dict[str, list[list[Node]]]]:
         """The routine as single numbers: of each group the nodes of each field."""
-        target = Scalars()
+        target = Scalars(compiler)
         given = [
             target.inputs(group, one.name, one.shape, one.kind)
             for group, fields in self.given.items()

@@ -13,9 +13,9 @@ from rps_jax.lowering.walk import (
     COMPARISONS,
     PAIRED,
     Target,
+    UnsupportedError,
     is_constant,
     kind_of,
-    unsupported,
 )
 
 _MANY = 256  # weights from which on a product with a matrix is a loop
@@ -61,8 +61,9 @@ class Loop(NamedTuple):
 class Scalars(Target):
     """The target of single numbers; equal ones are one node."""
 
-    def __init__(self) -> None:
-        """Begin without nodes."""
+    def __init__(self, compiler: str) -> None:
+        """Begin without nodes; errors name the compiler."""
+        self.compiler = compiler
         self._known: dict[Any, Node] = {}
         self._count = itertools.count()
         self.tables: dict[bytes, np.ndarray] = {}
@@ -187,7 +188,7 @@ class Scalars(Target):
             return self.node(f"i{name}", args, "i")
         if first == "f" and (name in UNARY or name in BINARY):
             return self.node(name, args, kind)
-        raise unsupported(name)
+        raise UnsupportedError(name)
 
     def _select(self, args: Sequence[Node], kind: str) -> Node:
         which, *cases = args
@@ -231,13 +232,17 @@ class Scalars(Target):
         return fold.accumulate(array, axis)
 
     def _place_of(self, name: str, array: np.ndarray, axis: int) -> np.ndarray:
-        """Where the greatest or the least number is, the first of equal ones."""
+        """Return the index of the first maximum or minimum, or of the first NaN."""
         rows = np.moveaxis(array, axis, -1)
         found = np.empty(rows.shape[:-1], object)
         for at in np.ndindex(found.shape):
             best, place = rows[at][0], self.constant(0, "i")
             for i, one in enumerate(rows[at][1:], 1):
                 better = self.node("gt" if name == "argmax" else "lt", (one, best), "b")
+                if one.kind == "f":
+                    number = self.node("eq", (best, best), "b")
+                    first_nan = self.node("and", (self.node("ne", (one, one), "b"), number), "b")
+                    better = self.node("or", (better, first_nan), "b")
                 place = self.node("select", (better, place, self.constant(i, "i")), "i")
                 best = self.node("select", (better, best, one), one.kind)
             found[at] = place
@@ -264,7 +269,7 @@ class Scalars(Target):
         """Rows at places that are known only when it runs; NaN outside where JAX fills so."""
         numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
         if numbers.operand_batching_dims:
-            raise unsupported("gather in a batch")
+            raise UnsupportedError("gather in a batch")
         kind, zero = kind_of(out.dtype, "gather"), self.constant(0, "i")
         fill = self.constant({"f": np.nan, "i": -(2**31), "b": True}[kind], kind)
         blocks = []
@@ -289,7 +294,7 @@ class Scalars(Target):
         """A product of matrices: a loop if one of them is large and constant."""
         (left, right), (batch, _) = params["dimension_numbers"]
         if batch or kind_of(out.dtype, "dot_general") != "f":
-            raise unsupported("dot_general in a batch")
+            raise UnsupportedError("dot_general in a batch")
         a, b = (
             _with_last(value, axes) if i == 0 else _with_first(value, axes)
             for i, (value, axes) in enumerate(zip(values, (left, right), strict=True))

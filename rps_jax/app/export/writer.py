@@ -10,7 +10,7 @@ import numpy as np
 
 from rps_jax.app.export.program import Field, Routine
 from rps_jax.app.export.scalars import UNARY, Block, Loop, Node, ordered
-from rps_jax.lowering.walk import unsupported
+from rps_jax.lowering.walk import UnsupportedError
 
 # Inputs of a product with a matrix that are taken together: compilers then vectorise the loop over
 # the outputs, and a sum is loaded and stored once for all of them.
@@ -33,6 +33,7 @@ FORMS = {name: f"{{0}} {sign} {{1}}" for name, sign in _INFIX.items()} | {
 class Writer:
     """One routine as statements of a language, which is what stands in these tables."""
 
+    compiler: ClassVar[str]  # its name in errors
     forms: ClassVar[Mapping[str, str]]  # of operations that are no function
     functions: ClassVar[set[str]] = FUNCTIONS
     call: ClassVar[str]  # of a function
@@ -54,7 +55,7 @@ class Writer:
           prefix: what names begin with.
         """
         self.groups, self.tables, self.prefix = groups, tables, prefix
-        self.target, found = routine.scalars()
+        self.target, found = routine.scalars(self.compiler)
         every = [node for fields in found.values() for nodes in fields for node in nodes]
         self.body = self.lines(ordered(every))
         self.results: list[tuple[str, Field, list[str]]] = [
@@ -111,7 +112,7 @@ class Writer:
             return self.forms[node.op].format(*names, p=self.prefix, P=self.prefix.upper())
         if node.op in self.functions:
             return self.call.format(node.op, ", ".join(names), P=self.prefix.upper())
-        raise unsupported(node.op)
+        raise UnsupportedError(node.op, self.compiler)
 
     def lines(self, items: Sequence[Node | Block], indent: str = "  ") -> list[str]:
         """The statements of nodes, in their order."""
