@@ -16,8 +16,8 @@
 # meet the same worlds.
 #
 # This notebook computes nothing; it reads `runs/compare/wide`, the first 1000 of 10,000 worlds of
-# `rps compare --laws rps rps_tuned --domain wide hostile real --seed 4` (one H200). Name
-# another folder as `run` to read a sweep of your own.
+# `rps ladder --laws rps rps_tuned --domain wide hostile real --worlds 10000 --seed 4` (one H200).
+# Name another folder as `run` to read a custom sweep.
 
 # %%
 import drawing

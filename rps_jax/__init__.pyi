@@ -16,7 +16,6 @@ from rps_jax.runs.evaluate import stack as stack
 from rps_jax.runs.models import models as models
 from rps_jax.studies.ladder import ladder as ladder
 from rps_jax.studies.ladder import score as score
-from rps_jax.studies.compare import compare as compare
 from rps_jax.studies.ceiling import ceiling as ceiling
 from rps_jax.studies.gallery import gallery as gallery
 from rps_jax.studies.attack import attack as attack

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import difflib
+import importlib
 import math
 import numbers
 import re
 from collections.abc import Iterable, Sequence
+from types import ModuleType
 from typing import Any
 
 
@@ -104,3 +106,21 @@ def check_each_once(field: str, given: Sequence[Any], labels: Sequence[Any] | No
     """Raises InputError if nothing is given, or one twice, by its label if it has one."""
     if not given or len(set(given if labels is None else labels)) < len(given):
         raise InputError(f"{field} = {given} is not allowed: name each once, at least one.")
+
+
+def require(module: str, extra: str) -> ModuleType:
+    """Import a module of an optional dependency.
+
+    Raises:
+      InputError: it is not installed; the sentence names the extra of `rps_jax` that has it.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise not_installed(error.name or module, extra) from error
+
+
+def not_installed(module: str, extra: str) -> InputError:
+    """Return the error of a missing optional dependency, with the command that installs it."""
+    package = module.partition(".")[0]
+    return InputError(f"{package} is not installed: run pip install 'rps_jax[{extra}]'.")

@@ -285,9 +285,13 @@ TUNE = {
     "grad --window -1": "window = -1.0 is not allowed",
     "grad --starts 0": "starts = 0 is not allowed",
 }
-COMPARE = {
+LADDER = {
     "--laws rps,lost.json": "lost.json cannot be read",
     "--domain narrow": "unknown domain 'narrow'",
+    "--domain wide narrow": "unknown domain 'narrow'",
+    "--domain wide wide": "name each once",
+    "--domain wide paper --shard 1/2": "shard is not allowed with several domains",
+    "--domain wide paper --table t.csv": "table is not allowed with several domains",
     "--worlds 0": "worlds = 0 is not allowed",
     "--out file": "out = file cannot be written",
 }
@@ -302,7 +306,8 @@ COMMANDS = {
     "view": VIEW,
     "film": FILM,
     "tune": TUNE,
-    "compare": COMPARE,
+    "ladder": LADDER,
+    "compare": {"--domain wide": "unknown command 'compare': use `rps ladder --domain DOMAIN ...`"},
     "doctor": {"--loudly": "--loudly"},
     "puhs": {"": "puhs"},
 }

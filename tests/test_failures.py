@@ -257,7 +257,7 @@ def test_the_command_refuses_what_cannot_be_searched(options, words, tmp_path, c
 def test_a_missing_package_gets_one_sentence(asked, module, package, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
     said = refusal(capsys, *asked, "--out", tmp_path / "run")
-    assert f"package {package} is missing: pip install 'rps_jax[failures]'" in said
+    assert f"{package} is not installed: run pip install 'rps_jax[failures]'" in said
 
 
 def test_the_command_searches_checks_lists_and_draws(tmp_path, capsys):

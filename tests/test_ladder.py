@@ -48,7 +48,7 @@ def test_laws_are_compared_with_one_of_them_world_by_world():
 
 
 def test_every_rung_is_a_law_of_the_package_with_what_it_senses():
-    senses = {name: registry.law_of(registry.LAWS[name]).senses for name in ladder.every_law()}
+    senses = {name: registry.law_of(registry.LAWS[name]).senses for name in ladder.all_laws()}
     assert set(senses) == set(registry.LAWS) == set(ladder.Ladder().chosen)
     order = ["touch", "taxels", "force", "pose"]
     assert list(dict.fromkeys(senses.values())) == order  # from what senses least
@@ -104,6 +104,27 @@ def test_every_law_meets_the_same_worlds_which_no_tuner_has_seen():
     again = climb({"mine": RPSParams.tuned()}, CYLINDERS, 6, **asked)
     np.testing.assert_array_equal(again.time.sel(law="mine"), found.time.sel(law="rps_tuned"))
     np.testing.assert_array_equal(again.mass, found.mass)
+
+
+def test_several_domains_are_several_ladders(tmp_path, capsys):
+    setting = Setting("quasistatic", rules=Rules(horizon=2.0))
+    domains = ("wide,objects=random_cylinder", "paper")
+    tree = climb(("rps", "dipole"), domains, 3, setting=setting, slots=6, out=tmp_path / "run")
+    assert list(tree.children) == list(domains)
+    for domain in domains:
+        alone = climb(("rps", "dipole"), domain, 3, setting=setting, slots=6)
+        xr.testing.assert_identical(tree[domain].to_dataset(), alone)
+        np.testing.assert_array_equal(load(tmp_path / "run" / domain).success, alone.success)
+    asked = ["ladder", "--laws", "rps", "dipole", "--domain", *domains, "--worlds", 3]
+    asked += ["--engine", "quasistatic", "--horizon", 2, "--slots", 6, "--out", tmp_path / "run"]
+    assert rps(*asked) == 0  # reads the finished sweeps
+    text = capsys.readouterr().out
+    for domain in domains:
+        assert f"## Success, {domain}" in text
+        assert f"## Differences, world by world, {domain}" in text
+        assert (tmp_path / "run" / f"ladder_{domain}.png").stat().st_size > 10_000
+    full = ladder.Ladder("rps", ("paper", "wide"), 1000)
+    assert [sweep.plan.worlds for sweep in full.sweeps.values()] == [144, 1000]
 
 
 def test_the_command_reports_information_against_success(tmp_path, capsys):

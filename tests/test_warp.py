@@ -15,7 +15,7 @@ WANTED = [
     ("hardware",),
     ("sweep", "--domain", "paper"),
     ("tune", "es"),
-    ("compare", "--domain", "paper"),
+    ("ladder", "--domain", "paper"),
 ]
 
 

@@ -21,7 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rps_jax import engines
+from rps_jax import engines, errors
 from rps_jax.app.drawing import TARGET, Drawing, furnish
 from rps_jax.app.gate import Gate, check_guarded, updates_of
 from rps_jax.control import registry
@@ -419,10 +419,7 @@ def _ending(live: Live) -> str:
 
 def open_page(host: str, port: int, asked: Asked, make: Callable[[Asked], Push]) -> Page:
     """A page, served from now on; InputError if viser is missing, or it can't be served there."""
-    try:
-        import viser
-    except ImportError as error:
-        raise InputError("viser is not installed: run pip install 'rps_jax[viz]'.") from error
+    viser = errors.require("viser", "viz")
     try:
         with socket.create_server((host, port)):  # viser would quietly take another port
             pass

@@ -21,15 +21,16 @@ Topics, each with one message a control step but `/tf` and the marker, which are
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import io
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from rps_jax import errors
 from rps_jax.errors import InputError
 from rps_jax.record import files
 
@@ -106,18 +107,12 @@ class Step(NamedTuple):
     object_pose: Any = None  # (3,) [m, m, rad] for looking alone
 
 
-def _needed(module: str) -> Any:
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise InputError(
-            "bags need MCAP, which is not installed: run pip install 'rps_jax[bags]'."
-        ) from error
+_require = partial(errors.require, extra="bags")
 
 
 def check() -> None:
     """Raises InputError unless what bags need is installed."""
-    _needed("mcap_ros2.writer")
+    _require("mcap_ros2.writer")
 
 
 def _definition(kind: str) -> str:
@@ -137,7 +132,7 @@ def _definition(kind: str) -> str:
 
 def write(path: Path, steps: Iterable[Step], about: Mapping[str, str]) -> Path:
     """Write a bag, whole or not at all; `about` is kept as its metadata."""
-    module = _needed("mcap_ros2.writer")
+    module = _require("mcap_ros2.writer")
 
     def fill(partial: Path) -> None:
         with open(partial, "wb") as file, module.Writer(file) as writer:
@@ -290,8 +285,8 @@ def _missing(latest: Mapping[str, Any]) -> list[str]:
 
 def _decoded(file: Any) -> Iterator[tuple[str, int, Any]]:
     """Topics, times [ns] and messages of a file, chunk by chunk."""
-    stream, records = _needed("mcap.stream_reader"), _needed("mcap.records")
-    decoders = _needed("mcap_ros2.decoder").DecoderFactory()
+    stream, records = _require("mcap.stream_reader"), _require("mcap.records")
+    decoders = _require("mcap_ros2.decoder").DecoderFactory()
     schemas: dict[int, Any] = {}
     channels: dict[int, Any] = {}
     reader = stream.StreamReader(file, emit_chunks=True, record_size_limit=_MOST)
@@ -319,10 +314,10 @@ def _decoded(file: Any) -> Iterator[tuple[str, int, Any]]:
 def _unpacked(chunk: Any) -> Any:
     """A chunk without compression, of a bounded size whatever it says."""
     if chunk.compression == "zstd":
-        reader = _needed("zstandard").ZstdDecompressor().stream_reader(io.BytesIO(chunk.data))
+        reader = _require("zstandard").ZstdDecompressor().stream_reader(io.BytesIO(chunk.data))
         data = reader.read(_MOST + 1)
     elif chunk.compression == "lz4":
-        data = _needed("lz4.frame").LZ4FrameDecompressor().decompress(chunk.data, _MOST + 1)
+        data = _require("lz4.frame").LZ4FrameDecompressor().decompress(chunk.data, _MOST + 1)
     else:
         return chunk
     if len(data) > _MOST or len(data) != chunk.uncompressed_size:

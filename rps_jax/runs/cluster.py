@@ -23,7 +23,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from rps_jax import engines
+from rps_jax import engines, errors
 from rps_jax.engines import device as devices
 from rps_jax.engines.device import Device
 from rps_jax.errors import InputError
@@ -81,10 +81,7 @@ def connected(address: str, **options: Any) -> Iterator[ModuleType]:
     `ray.init`.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    try:
-        import ray
-    except ImportError as error:
-        raise InputError("ray is not installed: pip install 'rps_jax[cluster]'.") from error
+    ray = errors.require("ray", "cluster")
     if ray.is_initialized():
         yield ray
         return

@@ -128,22 +128,9 @@ def rates(found: xr.Dataset, max_lost: float) -> Section:
 
 
 @dataclass(frozen=True)
-class Sweep(OfPlan):
-    """Push in many random worlds, every law in the same ones; the run can be continued.
+class SweepOptions:
+    """Options of a sweep besides its laws and worlds."""
 
-    Example:
-      >>> import rps_jax
-      >>> setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
-      >>> laws = ("rps", "rps,v_max=0.03")
-      >>> found = rps_jax.sweep(laws, "wide,objects=random_box", worlds=4, setting=setting)
-      >>> dict(found.success.sizes), found.mass.dims
-      ({'law': 2, 'world': 4}, ('world',))
-    """
-
-    TITLE: ClassVar[str] = "Sweep over random worlds"
-    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 64}
-
-    laws: LawsLike = ("rps", "nps", "aps")
     points: str | Path | xr.Dataset | np.ndarray | None = field(default=None, kw_only=True)
     """Points of the domain's unit cube at which the worlds lie, instead of drawn ones: what
     world.points.worlds_at returned, or a NetCDF file of it, as points.nc of a run folder."""
@@ -160,6 +147,25 @@ class Sweep(OfPlan):
     table: Path | str | None = field(default=None, kw_only=True)
     """File for a table with one row for each law and world: NAME.csv, or NAME.parquet (needs
     pyarrow). NAME.columns.csv beside it tells units and meanings of the columns."""
+
+
+@dataclass(frozen=True)
+class Sweep(SweepOptions, OfPlan):
+    """Push in many random worlds, every law in the same ones; the run can be continued.
+
+    Example:
+      >>> import rps_jax
+      >>> setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
+      >>> laws = ("rps", "rps,v_max=0.03")
+      >>> found = rps_jax.sweep(laws, "wide,objects=random_box", worlds=4, setting=setting)
+      >>> dict(found.success.sizes), found.mass.dims
+      ({'law': 2, 'world': 4}, ('world',))
+    """
+
+    TITLE: ClassVar[str] = "Sweep over random worlds"
+    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 64}
+
+    laws: LawsLike = ("rps", "nps", "aps")
 
     @functools.cached_property
     def plan(self) -> Plan:

@@ -42,7 +42,7 @@ from rps_jax.runs.question import (
     name_of,
     seed_of,
 )
-from rps_jax.studies.probe import Probe, need
+from rps_jax.studies.probe import Probe
 from rps_jax.trials.progress import Bar, phase
 from rps_jax.world import points
 from rps_jax.world.domain import Domain
@@ -118,7 +118,7 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
             points.check_drawn("axes", name, self.ranges)
         errors.check_count("seed", self.setting.seed, at_least=0, at_most=2**30)
         self.check_engine([self.params])
-        need("ribs", "ribs")
+        errors.require("ribs", "failures")
 
     def bar(self) -> Bar:
         return Bar(self.name, 60 * self.minutes, "clock", shown=self.shown)
@@ -355,7 +355,10 @@ class _Search:
 
     def _scheduler(self, which: int, archive: _Archive, bar: float) -> Any:
         """New emitters for one object, whose archive holds the elites from a severity on."""
-        archives, emitters = need("ribs.archives", "ribs"), need("ribs.emitters", "ribs")
+        archives, emitters = (
+            errors.require("ribs.archives", "failures"),
+            errors.require("ribs.emitters", "failures"),
+        )
         hunt, kept = self.hunt, archive.worst[which] >= bar
         v, worth = archive.u[which][kept][:, self.moved], archive.worst[which][kept]
         z = stats.norm.ppf(np.clip(v, _EDGE, 1 - _EDGE)) / self._reach
@@ -378,7 +381,7 @@ class _Search:
             rules = {"selection_rule": "mu" if mae else "filter"}
             rules |= {"restart_rule": "basic" if mae else "no_improvement"}
             made.append(emitters.EvolutionStrategyEmitter(own, **ranked, **rules, **start))
-        return need("ribs.schedulers", "ribs").Scheduler(own, made)
+        return errors.require("ribs.schedulers", "failures").Scheduler(own, made)
 
     def _labelled(
         self, archive: _Archive, history: Sequence[tuple[int, int, float]], chance: dict[str, Any]

@@ -1,36 +1,45 @@
-"""A ladder of laws: every law of the package in the same worlds, by what it senses.
+"""The ladder of laws: all laws in the same test worlds, ordered by what each law senses.
 
-On the first rungs a law senses only where its skin is touched, on the next also with which force,
-then where the object is.
+The order of the senses is `touch` (where the skin is touched), `taxels` (each taxel's signal),
+`force` (the contact force) and `pose` (where the object is). The worlds are test worlds: their
+seed is one that no tuner uses.
 """
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any, ClassVar, get_args
 
 import numpy as np
 import xarray as xr
 
+from rps_jax import errors
 from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import Figure
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.control.base import Params, Senses
 from rps_jax.control.registry import LawLike, LawsLike
+from rps_jax.errors import InputError
 from rps_jax.record.options import option
+from rps_jax.robot.robot import RobotLike
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Run, call_of, name_of, seed_of
-from rps_jax.runs.sweep import Sweep
+from rps_jax.runs.question import OfLaws, Run, call_of, name_of, seed_of
+from rps_jax.runs.sweep import Sweep, SweepOptions
+from rps_jax.trials.progress import InTurn, Report
+from rps_jax.world.domain import Domain, DomainLike
 
-REFERENCE = "rps_tuned"  # what the others are compared with
+REFERENCE = "rps_tuned"  # the law that all others are compared with
+_OF_ONE_DOMAIN = ("points", "table", "ray")  # options that need a single domain
 
 
-def every_law() -> tuple[str, ...]:
-    """Names of all laws that are known, by what they sense."""
-    order, known = get_args(Senses), registry.LAWS
-    return tuple(sorted(known, key=lambda name: order.index(_senses(known[name]))))
+def all_laws() -> tuple[str, ...]:
+    """Return the names of all registered laws, ordered by what they sense."""
+    order, laws = get_args(Senses), registry.LAWS
+    return tuple(sorted(laws, key=lambda name: order.index(_senses(laws[name]))))
 
 
 def _senses(params: Params) -> Senses:
@@ -38,58 +47,165 @@ def _senses(params: Params) -> Senses:
 
 
 @dataclass(frozen=True)
-class Ladder(Sweep):
-    """Push with every law of the package in the same worlds, and compare by what each law senses.
-
-    The worlds are kept for testing: no tuner has seen them. The answer holds outcomes (law, world),
-    and as coordinates what was drawn (world) and `senses` (law).
-
-    Example:
-      >>> import rps_jax
-      >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
-      >>> setting = rps_jax.Setting("quasistatic", rules=rules)
-      >>> found = rps_jax.ladder(("rps", "pursuit"), drums, worlds=4, setting=setting)
-      >>> dict(found.success.sizes), found.senses.values.tolist()
-      ({'law': 2, 'world': 4}, ['touch', 'touch'])
-    """
-
-    TITLE: ClassVar[str] = "Laws in the same worlds"
-    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 64, "domain": "wide,objects=random_box"}
-
-    laws: LawsLike = ()
-    """The laws, by default every law of the package: names, as rps, rps_tuned or rps_plus, or a
-    file's, as my_law.py:MyParams or policy.npz; changes follow each, as rps,K_h=0.3 or
-    rps,tuned.json."""
-
-    @cached_property
-    def chosen(self) -> dict[str, Params]:
-        asked = self.laws
-        return registry.laws_of(every_law() if isinstance(asked, tuple) and not asked else asked)
+class _TestSweep(Sweep):
+    """Sweep over the test worlds of one domain, labelled with what each law senses."""
 
     @cached_property
     def plan(self) -> Plan:
         plan = super().plan
         seed = seed_of(self.setting.seed, "test")
-        return dataclasses.replace(plan, setting=dataclasses.replace(plan.setting, seed=seed))
+        return replace(plan, setting=replace(plan.setting, seed=seed))
 
     def answer(self, run: Run) -> xr.Dataset:
-        found = super().answer(run)
-        if "row" in found.dims:  # but a share of it
-            return found
-        senses = [_senses(self.chosen[str(law)]) for law in found.law.values]
-        return found.assign_coords(senses=("law", senses, {"long_name": "what the law senses"}))
+        results = super().answer(run)
+        if "row" in results.dims:  # trials of one shard
+            return results
+        senses = [_senses(self.chosen[str(law)]) for law in results.law.values]
+        return results.assign_coords(senses=("law", senses, {"long_name": "what the law senses"}))
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        usual = super().report(found, run)
-        return usual if "row" in found.dims else [*usual[:1], *_rungs(found), *usual[1:]]
+        first, *rest = super().report(found, run)
+        return [first, *rest] if "row" in found.dims else [first, *_comparison(found), *rest]
+
+
+@dataclass(frozen=True)
+class Ladder(SweepOptions, OfLaws[xr.Dataset | xr.DataTree]):
+    """Compare laws in the same test worlds, ordered by what each law senses.
+
+    No tuner sees test worlds. The result for one domain has the outcomes (law, world), and as
+    coordinates the drawn quantities (world) and `senses` (law). The result for several domains is
+    a tree with one such dataset for each domain.
+
+    Example:
+      >>> import rps_jax
+      >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
+      >>> setting = rps_jax.Setting("quasistatic", rules=rules)
+      >>> results = rps_jax.ladder(("rps", "pursuit"), drums, worlds=4, setting=setting)
+      >>> dict(results.success.sizes), results.senses.values.tolist()
+      ({'law': 2, 'world': 4}, ['touch', 'touch'])
+    """
+
+    TITLE: ClassVar[str] = "Laws in the same worlds"
+    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 64, "domain": ("wide,objects=random_box",)}
+
+    laws: LawsLike = ()
+    """The laws, by default all laws of the package: names, as rps, rps_tuned or rps_plus, or a
+    file's, as my_law.py:MyParams or policy.npz; changes follow each, as rps,K_h=0.3 or
+    rps,tuned.json."""
+    domain: DomainLike | Sequence[DomainLike] = ("wide",)
+    """Domains: paper, hardware, wide, real (wide, but with limited robots), prisms or hostile, or
+    JSON files of ranges. Changes follow each, as wide,mass=3:10."""
+    worlds: int | None = option(None, 1, 1_000_000_000)
+    """Number of worlds of each domain, by default 1000. A domain with listed targets has at most
+    its grid where several domains are named; the grid of paper has 144 worlds."""
+    robot: RobotLike | None = field(default=None, kw_only=True)
+    """The robot: ideal, kairos (the paper's), ridgeback or mpo_500, or a JSON file of its size,
+    boards and limits. By default the domain's."""
+    part: int | None = option(None, 1, 1_000_000, kw_only=True)
+    """Checkpoint interval: at most this many trials per law and object are repeated after a kill.
+    By default 1024, and with many worlds a 16th of them, up to 16384."""
+
+    @cached_property
+    def chosen(self) -> dict[str, Params]:
+        default = isinstance(self.laws, tuple) and not self.laws
+        return registry.laws_of(all_laws() if default else self.laws)
+
+    @cached_property
+    def sweeps(self) -> dict[str, _TestSweep]:
+        """The sweep of each domain, by the domain's name."""
+        domains = [self.domain] if isinstance(self.domain, str | Domain) else list(self.domain)
+        labels = [
+            domain if isinstance(domain, str) else f"domain_{i}" for i, domain in enumerate(domains)
+        ]
+        errors.check_each_once("domain", domains, labels)
+        fields = [*dataclasses.fields(SweepOptions), *dataclasses.fields(OfLaws)]
+        shared = {f.name: getattr(self, f.name) for f in fields if f.name != "laws"}
+        shared |= {"robot": self.robot, "part": self.part}
+        sweeps = {}
+        for label, domain in zip(labels, domains, strict=True):
+            sweep = _TestSweep(self.chosen, domain, self.worlds, **shared)
+            if len(domains) > 1 and self.worlds is not None and sweep.ranges.targets:
+                sweep = replace(sweep, worlds=min(self.worlds, sweep.ranges.combinations))
+            sweeps[label.replace("/", "_")] = sweep
+        return sweeps
+
+    @property
+    def single(self) -> _TestSweep | None:
+        """The sweep, if there is only one domain."""
+        first, *rest = self.sweeps.values()
+        return None if rest else first
+
+    def check(self) -> None:
+        for name in () if self.single else _OF_ONE_DOMAIN:
+            if getattr(self, name) is not None:
+                raise InputError(f"{name} is not allowed with several domains: name one domain.")
+        if self.single is None and self.shard != "1/1":
+            raise InputError("shard is not allowed with several domains: name one domain.")
+        for sweep in self.sweeps.values():
+            sweep.check()
+
+    def trials(self) -> int | None:
+        return sum(sweep.trials() or 0 for sweep in self.sweeps.values())
+
+    def configuration(self) -> dict[str, Any]:
+        if self.single:
+            return self.single.configuration()
+        return {"ladder": {name: sweep.configuration() for name, sweep in self.sweeps.items()}}
+
+    def answered(self, report: Report) -> xr.Dataset | xr.DataTree:
+        return self.single.answered(report) if self.single else super().answered(report)
+
+    def answer(self, run: Run) -> xr.DataTree:
+        progress = InTurn(run.report)
+        results = {}
+        for name, sweep in self.sweeps.items():
+            results[name] = sweep.answer(
+                run._replace(report=progress, folder=_subfolder(run, name))
+            )
+            progress.ended(sweep.plan.trials)
+        return xr.DataTree.from_dict(results)
+
+    def intro(self, found: xr.Dataset | xr.DataTree) -> str:
+        if self.single and isinstance(found, xr.Dataset):
+            return self.single.intro(found)
+        return (
+            f"Seed {self.setting.seed} of the test worlds, engine {self.setting.engine}; all laws "
+            "meet the same worlds. Intervals: Wilson 95 %."
+        )
+
+    def report(self, found: xr.Dataset | xr.DataTree, run: Run) -> Sequence[Section]:
+        if self.single and isinstance(found, xr.Dataset):
+            return self.sections(self.single, found, run)
+        sections = []
+        for name, sweep in self.sweeps.items():
+            run_in_domain = run._replace(folder=_subfolder(run, name))
+            for section in self.sections(sweep, found[name].to_dataset(), run_in_domain):
+                picture = section.picture
+                if picture:  # pictures of all domains are in one folder
+                    picture = picture._replace(name=f"{picture.name}_{_file_name(name)}")
+                title = f"{section.title}, {name}"
+                sections.append(section._replace(title=title, picture=picture))
+        return sections
+
+    def sections(self, sweep: Sweep, results: xr.Dataset, run: Run) -> Sequence[Section]:
+        """Return the sections of the report about one domain."""
+        return sweep.report(results, run)
 
 
 ladder = call_of(Ladder)
 
 
+def _subfolder(run: Run, name: str) -> Path | None:
+    return run.folder and run.folder / _file_name(name)
+
+
+def _file_name(domain: str) -> str:
+    return re.sub(r"[^\w.=,-]", "_", domain)
+
+
 @dataclass(frozen=True)
-class _Own:
-    """A law of one's own."""
+class _ScoredLaw:
+    """Option of the scored law, which comes before all others."""
 
     law: LawLike = option("", positional=True)
     """The law: FILE.py, FILE.py:CLASS where the file registers several, policy.npz, or a law of the
@@ -97,18 +213,18 @@ class _Own:
 
 
 @dataclass(frozen=True)
-class Score(Ladder, _Own):
-    """Score a law of one's own in the test worlds of the ladder, beside rps and rps_plus.
+class Score(Ladder, _ScoredLaw):
+    """Score a custom law in the test worlds of the ladder, beside rps and rps_plus.
 
-    The worlds depend on domain, number and seed alone, so scores of several people compare. The
-    report has one line for a Markdown table; the answer is that of `rps_jax.ladder`.
+    The worlds depend only on domain, number and seed, so scores of several people compare. The
+    report has one line for a Markdown table. The result is that of `rps_jax.ladder`.
 
     Example:
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
       >>> setting = rps_jax.Setting("quasistatic", rules=rules)
-      >>> found = rps_jax.score("pursuit", domain=drums, worlds=4, setting=setting)
-      >>> found.law.values.tolist()
+      >>> results = rps_jax.score("pursuit", domain=drums, worlds=4, setting=setting)
+      >>> results.law.values.tolist()
       ['pursuit', 'rps', 'rps_plus']
     """
 
@@ -123,90 +239,93 @@ class Score(Ladder, _Own):
         others = registry.laws_of(self.laws)
         return {label: registry.checked(params)} | {k: v for k, v in others.items() if k != label}
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        usual = Sweep.report(self, found, run)
-        if "row" in found.dims:
-            return usual
-        head, own = self.line(found)
-        text = "To be pasted into a table in Markdown:\n\n"
-        lines = (head, ["---"] * len(head), own)
-        text += "\n".join(f"    | {' | '.join(row)} |" for row in lines)
-        return [Section("Score", text), *usual]
-
-    def line(self, found: xr.Dataset) -> list[list[str]]:
-        """Header and the row of the law: success, its median time, the others, and the worlds."""
-        won = found.success.values > 0
-        rates = [tables.share(int(one.sum()), one.size) for one in won]
-        own, *others = map(str, found.law.values)
-        took = found.time.values[0][won[0]]
-        median = f"{np.median(took):.1f} s" if took.size else "-"
-        drawn = f"seed {self.setting.seed}" if self.points is None else "given points"
-        worlds = f"{won.shape[1]:,} test worlds of {name_of(self.domain)}, {drawn}"
-        header = ["law", "success", "median time", *others, "worlds"]
-        return [header, [own, rates[0], median, *rates[1:], f"{worlds}, {self.setting.engine}"]]
+    def sections(self, sweep: Sweep, results: xr.Dataset, run: Run) -> Sequence[Section]:
+        sections = super().sections(sweep, results, run)
+        if "row" in results.dims:
+            return sections
+        header, row = score_row(sweep, results)
+        lines = (header, ["---"] * len(header), row)
+        table = "\n".join(f"    | {' | '.join(line)} |" for line in lines)
+        return [Section("Score", f"For a Markdown table:\n\n{table}"), *sections]
 
 
 score = call_of(Score)
 
 
-def _rungs(found: xr.Dataset) -> list[Section]:
-    """Success by what the laws sense, and against the reference."""
+def score_row(sweep: Sweep, results: xr.Dataset) -> list[list[str]]:
+    """Return a header and the row of the first law: rates of all laws, median time and worlds."""
+    successes = results.success.values > 0
+    rates = [tables.share(int(success.sum()), success.size) for success in successes]
+    law, *others = map(str, results.law.values)
+    times = results.time.values[0][successes[0]]
+    median = f"{np.median(times):.1f} s" if times.size else "-"
+    source = f"seed {sweep.setting.seed}" if sweep.points is None else "given points"
+    worlds = f"{successes.shape[1]:,} test worlds of {name_of(sweep.domain)}, {source}"
+    header = ["law", "success", "median time", *others, "worlds"]
+    return [header, [law, rates[0], median, *rates[1:], f"{worlds}, {sweep.setting.engine}"]]
+
+
+def _comparison(results: xr.Dataset) -> list[Section]:
+    """Return the sections about success by senses, and about differences from the reference."""
     text = (
-        "Laws by what they sense: `touch` is where the skin is touched, `taxels` also what each "
-        "taxel answers, `force` also the contact's force, and `pose` also where the object is and "
-        "how large."
+        "Laws by what they sense: `touch` is where the skin is touched, `taxels` adds the signal "
+        "of each taxel, `force` adds the contact force, and `pose` adds the object's position and "
+        "size."
     )
-    picture = Picture("ladder", partial(figure_of, found))
+    picture = Picture("ladder", partial(draw_ladder, results))
     sections = [Section("Information against success", text, (), picture)]
-    if REFERENCE in found.law and found.sizes["law"] > 1:
+    if REFERENCE in results.law and results.sizes["law"] > 1:
         title = f"Against {REFERENCE}, world by world"
-        rows = tables.against_table(found, REFERENCE)
-        sections.append(Section(title, _shared(found), rows))
+        rows = tables.against_table(results, REFERENCE)
+        sections.append(Section(title, _solved_failures(results), rows))
     return sections
 
 
-def _shared(found: xr.Dataset) -> str:
-    """How many failures of the reference any law of each kind wins, in a sentence."""
-    failed = found.success.sel(law=REFERENCE).values == 0
-    senses = dict(zip(map(str, found.law.values), map(str, found.senses.values), strict=True))
-    parts = []
+def _senses_by_law(results: xr.Dataset) -> dict[str, str]:
+    return dict(zip(map(str, results.law.values), map(str, results.senses.values), strict=True))
+
+
+def _solved_failures(results: xr.Dataset) -> str:
+    """Count in a sentence the reference's failures in which other laws succeed, by senses."""
+    failed = results.success.sel(law=REFERENCE).values == 0
+    senses = _senses_by_law(results)
+    counts = []
     for kind in dict.fromkeys(senses.values()):
         others = [name for name in senses if senses[name] == kind and name != REFERENCE]
         if others:
-            won = (found.success.sel(law=others).values > 0).any(axis=0)
-            count = int((won & failed).sum())
-            parts.append(f"{count} are won by some other law that senses {kind}")
-    won = (found.success.values > 0).any(axis=0)
-    parts.append(f"{int((~won).sum())} by none")
+            solved = (results.success.sel(law=others).values > 0).any(axis=0)
+            count = int((solved & failed).sum())
+            counts.append(f"another law that senses {kind} succeeds in {count}")
+    solved = (results.success.values > 0).any(axis=0)
+    counts.append(f"no law succeeds in {int((~solved).sum())}")
     worlds = f"{failed.sum()} worlds" if failed.sum() != 1 else "one world"
-    return f"Of the {worlds} that {REFERENCE} loses, {', '.join(parts)}."
+    return f"Of the {worlds} in which {REFERENCE} fails, {', '.join(counts)}."
 
 
-def figure_of(found: xr.Dataset) -> Figure:
+def draw_ladder(results: xr.Dataset) -> Figure:
     """Draw the success of each law, grouped by what it senses, with Wilson's 95 % intervals."""
-    senses = dict(zip(map(str, found.law.values), map(str, found.senses.values), strict=True))
+    senses = _senses_by_law(results)
     kinds = [kind for kind in get_args(Senses) if kind in senses.values()]
     colours = {kind: f"C{i}" for i, kind in enumerate(get_args(Senses))}
-    rates = {law: float(found.success.sel(law=law).mean()) for law in senses}
+    rates = {law: float(results.success.sel(law=law).mean()) for law in senses}
     order = sorted(rates, key=lambda law: (-kinds.index(senses[law]), rates[law]))
     figure = Figure(figsize=(7, 1.2 + 0.34 * len(order)), layout="constrained")
     ax = figure.subplots()
-    for at, law in enumerate(order):
-        won = found.success.sel(law=law).values > 0
-        low, high = statistics.wilson(int(won.sum()), won.size)
-        ax.plot([100 * low, 100 * high], [at, at], color=colours[senses[law]], lw=3, alpha=0.4)
-        ax.plot(100 * rates[law], at, "o", color=colours[senses[law]])
-        ax.annotate(
-            tables.percent(int(won.sum()), won.size), (100 * rates[law], at), (0, 6), fontsize=8,
-            textcoords="offset points", ha="center",
-        )  # fmt: skip
+    for y, law in enumerate(order):
+        successes = results.success.sel(law=law).values > 0
+        low, high = statistics.wilson(int(successes.sum()), successes.size)
+        ax.plot([100 * low, 100 * high], [y, y], color=colours[senses[law]], lw=3, alpha=0.4)
+        ax.plot(100 * rates[law], y, "o", color=colours[senses[law]])
+        label = tables.percent(int(successes.sum()), successes.size)
+        above = {"xytext": (0, 6), "textcoords": "offset points", "ha": "center"}
+        ax.annotate(label, (100 * rates[law], y), fontsize=8, **above)
     for kind in kinds:
         ax.plot([], [], "o", color=colours[kind], label=f"senses {kind}")
     ax.set_yticks(range(len(order)), order)
     ax.set_ylim(-0.6, len(order) - 0.3)
     ax.set_xlim(-3, 103)
     ax.set_xlabel("success [%]")
-    ax.set_title(f"{found.sizes['world']:,} equal worlds for every law", fontsize=10)
+    ax.set_title(f"{results.sizes['world']:,} equal worlds for every law", fontsize=10)
     ax.grid(axis="x", alpha=0.3)
     ax.legend(fontsize=8, loc="best")
     return figure

@@ -1,11 +1,9 @@
 """One law at points of a domain's unit cube, again and again, through the same programs."""
 
-import importlib
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import xarray as xr
@@ -28,18 +26,6 @@ from rps_jax.world.points import Points
 _SLOTS = 64  # of a program, at least
 _KEPT = ("success", "time", "contact_lost_time", "tilt")
 _ANSWERED = ("success", "time", "left", "severity")
-
-
-def need(module: str, package: str) -> ModuleType:
-    """A module of the optional packages, or an InputError."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        lacking = str(error.name).partition(".")[0]
-        missing = package if lacking in (module.partition(".")[0], "None") else lacking
-        raise InputError(
-            f"package {missing} is missing: pip install 'rps_jax[failures]'."
-        ) from error
 
 
 @dataclass

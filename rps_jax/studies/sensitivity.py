@@ -19,6 +19,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axis import Axis
 
+from rps_jax import errors
 from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import Figure
 from rps_jax.analysis.report import Picture, Section
@@ -28,7 +29,6 @@ from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, count_of, name_of, seed_of
 from rps_jax.runs.sweep import Planned
-from rps_jax.studies.probe import need
 from rps_jax.world import points
 from rps_jax.world.domain import WORDS
 
@@ -109,7 +109,7 @@ class Sensitivity(Planned, InDomain[xr.Dataset], OfLaw[xr.Dataset]):
 
     def u(self) -> np.ndarray:
         """The points (worlds, q) of the design, block by block of one base point."""
-        sample = need("SALib.sample.sobol", "SALib").sample
+        sample = errors.require("SALib.sample.sobol", "failures").sample
         values = sample(self.problem, self.base, calc_second_order=False, seed=self.seeded)
         return np.clip(values, 0, np.nextafter(1, 0))
 
@@ -159,7 +159,7 @@ sensitivity = call_of(Sensitivity)
 
 def analysed(asked: Sensitivity, results: xr.Dataset) -> xr.Dataset:
     """Indices of a design whose sweep is done."""
-    analyze = need("SALib.analyze.sobol", "SALib").analyze
+    analyze = errors.require("SALib.analyze.sobol", "failures").analyze
     one = results.sel(law="law")
     values = {
         "success": one.success.values.astype(float),

@@ -31,9 +31,7 @@ try:
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 except ImportError as error:
-    raise errors.InputError(
-        "Gymnasium is not installed: run pip install 'rps_jax[gym]'."
-    ) from error
+    raise errors.not_installed("gymnasium", "gym") from error
 
 _SEEDS = 2**31
 

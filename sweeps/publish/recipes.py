@@ -116,7 +116,7 @@ RECIPES: dict[str, Recipe] = {
     ),
     "plus": Recipe(tuple(_PLUS.values()), None, 12, rows.mended, tuple(_PLUS)),
     "tuned": Recipe(
-        ("rps compare --laws rps rps_tuned --domain wide hostile real --seed 4",),
+        ("rps ladder --laws rps rps_tuned --domain wide hostile real --worlds 10000 --seed 4",),
         None,
         4,
         rows.compared,
@@ -303,7 +303,7 @@ RECIPES: dict[str, Recipe] = {
             f"{_DESCENT} --budget 1.2e6 --out runs/half",
             f"rps tune es {_RACE} --law rps,runs/half/tuned.json --spread 0.2 --prior 0.01 "
             "--population 16 --worlds 64 --budget 1.2e6 --out runs/hybrid",
-            f"rps compare --laws rps {_RACERS} --domain paper wide hostile --worlds 1000 --seed 3",
+            f"rps ladder --laws rps {_RACERS} --domain paper wide hostile --worlds 1000 --seed 3",
         ),
         None,
         15,

@@ -21,6 +21,7 @@ _ROOMS = {  # where questions live, and under which heading of the help
     "app": "look",
 }
 _MAKES = re.compile(r"^(\w+) = call_of\((\w+)\)$", re.MULTILINE)
+_REPLACED = {"compare": "rps ladder --domain DOMAIN ..."}  # removed commands
 _PACKAGE = Path(__file__).parents[2]
 
 
@@ -80,6 +81,8 @@ def split(words: list[str]) -> tuple[str, list[str]]:
         if name in known():
             return name, words[count:]
     first = words[0]
+    if first in _REPLACED:
+        raise InputError(f"unknown command '{first}': use `{_REPLACED[first]}`.")
     if first.endswith(".py") or "/" in first or Path(first).is_dir():
         return first, words[1:]
     check_name("command", " ".join(words[:2]) if first in ("tune", "export") else first, known())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import string
 from collections.abc import Mapping, Sequence
@@ -12,9 +11,8 @@ import jax
 import numpy as np
 from jax.extend.core import jaxpr_as_fun
 
-from rps_jax import __version__
+from rps_jax import __version__, errors
 from rps_jax.app.export.program import Program
-from rps_jax.errors import InputError
 from rps_jax.lowering import walk
 from rps_jax.lowering.walk import PAIRED, UnsupportedError, kind_of
 
@@ -199,12 +197,7 @@ def models(program: Program, prefix: str, batch: int | None = None) -> dict[str,
     Raises:
       InputError: ONNX is not installed, or an operation has no form in it.
     """
-    try:
-        onnx = importlib.import_module("onnx")
-    except ImportError as error:
-        raise InputError(
-            "ONNX is not installed: install it with `pip install 'rps_jax[export]'`."
-        ) from error
+    onnx = errors.require("onnx", "export")
     groups, lead = program.groups, () if batch is None else (batch,)
     target, closed = Graph(onnx), program.step.jaxpr
     params = [np.asarray(one.value, float) for one in groups["params"]]
