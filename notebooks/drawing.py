@@ -159,7 +159,7 @@ def failures(results: xr.Dataset, max_lost: float) -> Figure:
     """
     groups = statistics.worlds_by_object(results)
     laws = {str(name): results.sel(law=name) for name in results.law.values}
-    kinds = {name: statistics.failure(one, max_lost) for name, one in laws.items()}
+    kinds = {name: statistics.failure_modes(one, max_lost) for name, one in laws.items()}
     figure = Figure(figsize=(1 + 2.8 * len(groups), 5.2), layout="constrained")
     axes = figure.subplots(2, len(groups), squeeze=False, sharey="row")
     most = 1.0
@@ -172,7 +172,7 @@ def failures(results: xr.Dataset, max_lost: float) -> Figure:
             most = max(most, under.max())
             for marker, (law, one) in zip("ox+s", laws.items(), strict=False):
                 here = mask & (kinds[law] == i)
-                width, left = results["size"].values[here], statistics.left_over(one)[here]
+                width, left = results["size"].values[here], statistics.distance_left(one)[here]
                 below.semilogy(width, left, marker, ms=4, color=f"C{i}")
         above.set_title(f"{words(name)}, {mask.sum()} worlds", fontsize=9)
         above.grid(alpha=0.3, axis="y")

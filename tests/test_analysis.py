@@ -60,10 +60,10 @@ def test_numbers_are_ranked_as_by_a_stable_sort():
     many = rng.normal(size=5000) * 10.0 ** rng.integers(-40, 38, 5000)
     for values in (many, rng.integers(-3, 4, 5000), np.array([0.0, -0.0, np.inf, -np.inf, -0.0])):
         few = values.astype(np.float32)
-        found = statistics.ascending(few)
+        found = statistics.ascending_order(few)
         np.testing.assert_array_equal(found, np.argsort(few, kind="stable"))
         np.testing.assert_array_equal(
-            statistics.ascending(values), np.argsort(values, kind="stable")
+            statistics.ascending_order(values), np.argsort(values, kind="stable")
         )
 
 
@@ -85,11 +85,12 @@ def test_what_a_sweep_says_is_what_happened():
         coords={"law": ["a", "b"], "object": ["box", "drum"], "world": range(4)},
     )
     first, second = (results.sel(law=law) for law in "ab")
-    assert [statistics.FAILURES[k] if k >= 0 else "" for k in statistics.failure(first, 150)] == [
+    modes = [*statistics.FAILURES, ""]
+    assert [modes[k] for k in statistics.failure_modes(first, 150)] == [
         "", "timeout", "never touched", "diverged"]  # fmt: skip
-    assert [statistics.FAILURES[k] for k in statistics.failure(second, 150)[2:]] == [
+    assert [statistics.FAILURES[k] for k in statistics.failure_modes(second, 150)[2:]] == [
         "lost contact", "fell over"]  # fmt: skip
-    assert statistics.left_over(first).tolist() == [0.04, 0.5, 3.0, 1.0]
+    assert statistics.distance_left(first).tolist() == [0.04, 0.5, 3.0, 1.0]
     assert statistics.cvar(np.arange(100.0)) == pytest.approx(97.0)  # mean of 95 .. 99
     assert statistics.cvar(np.array([1.0, 3.0])) == 3.0
     assert tables.difference_table(results)[1][1:4] == ["1", "0", "+25.00 %"]
@@ -99,8 +100,8 @@ def test_what_a_sweep_says_is_what_happened():
     assert rates[1][1].startswith("50.0 %")  # of a with the box
     assert rates[2][3].startswith("50.0 %")  # of b in all
     bins = statistics.bins(np.arange(16.0), np.arange(16) < 4, count=4)
-    assert bins.won.tolist() == [4, 0, 0, 0]
-    assert bins.of.tolist() == [4] * 4
+    assert bins.successes.tolist() == [4, 0, 0, 0]
+    assert bins.trials.tolist() == [4] * 4
     assert statistics.bins(np.array([1.0, 1, 2]), np.array([True, False, True])).of.tolist() == [
         2,
         1,
@@ -125,8 +126,8 @@ def test_rates_of_more_than_99_percent_have_two_decimals():
     assert tables.share(3, 1000) == "0.30 % [0.10, 0.88]"
     assert tables.share(0, 0) == "-"
     assert (tables.percent(0.9937), tables.percent(0.5)) == ("99.37", "50.0")
-    assert tables.spread([0.988, 0.994, 0.99]) == "98.80 to 99.40 %"
-    assert tables.spread([0.92, 0.94]) == "92.0 to 94.0 %"
+    assert tables.rate_range([0.988, 0.994, 0.99]) == "98.80 to 99.40 %"
+    assert tables.rate_range([0.92, 0.94]) == "92.0 to 94.0 %"
 
 
 def test_a_validated_law_has_two_decimals_above_99_percent():
@@ -153,7 +154,7 @@ def test_what_success_depends_on_stands_first():
     assert float(mass[5]) < 1e-10
     constant = results.assign(yaw=("world", np.full(400, 0.1, np.float32), {"units": "rad"}))
     assert np.nanstd(constant.yaw.values) > 0  # by rounding
-    assert statistics.drawn(constant) == ["mass", "friction_ground"]
+    assert statistics.varied_quantities(constant) == ["mass", "friction_ground"]
     assert friction[0] == "friction object-ground"
     assert float(friction[5]) > 0.5
 
@@ -164,11 +165,11 @@ def test_chance_alone_leaves_no_spread_unexplained_on_average():
     for chosen in itertools.combinations(range(9), 3):
         won = np.isin(np.arange(9), chosen)
         counts = np.array([part.sum() for part in np.split(won, (2, 5))])
-        found.append(statistics.unexplained(Bins(np.arange(3), counts, np.array([2, 3, 4]))))
+        found.append(statistics.excess_variance(Bins(np.arange(3), counts, np.array([2, 3, 4]))))
     assert np.mean(found) == pytest.approx(0, abs=1e-15)
     # Rates of 1 and 0 have a variance of 1/4, of which 1/28 is noise.
     apart = Bins(np.arange(2), np.array([4, 0]), np.array([4, 4]))
-    assert statistics.unexplained(apart) == pytest.approx(1 / 4 - 1 / 28)
+    assert statistics.excess_variance(apart) == pytest.approx(1 / 4 - 1 / 28)
 
 
 def test_of_what_was_drawn_the_figure_shows_what_matters(drawn):
@@ -354,9 +355,9 @@ def test_statistics_are_those_of_scipy():
     for bins in (2, 3, 12):
         of = rng.integers(5, 50, bins)
         found = statistics.Bins(np.zeros(bins), rng.binomial(of, 0.8), of)
-        table = np.stack([found.won, of - found.won])
+        table = np.stack([found.successes, of - found.successes])
         expected = stats.chi2_contingency(table).pvalue
-        np.testing.assert_allclose(statistics.one_rate(found), expected, rtol=1e-9)
+        np.testing.assert_allclose(statistics.equal_rates_p(found), expected, rtol=1e-9)
     p = rng.uniform(size=20) ** 3
     expected = stats.false_discovery_control(p)
     np.testing.assert_allclose(statistics.false_discovery(p), expected, rtol=1e-12)

@@ -142,7 +142,7 @@ def test_searches_without_worlds_or_perturbations_are_refused(options, words):
 def test_the_first_worlds_and_what_all_named_laws_lose_are_chosen(monkeypatch):
     won = np.array([[0, 0, 1, 0, 0], [1, 0, 1, 0, 1]])
     found = xr.Dataset({"success": (("law", "world"), won)}, {"law": ["a", "b"]})
-    assert ceiling.lost_worlds(found, ["a", "b"]).tolist() == [1, 3]
+    assert ceiling.failed_worlds(found, ["a", "b"]).tolist() == [1, 3]
     monkeypatch.setattr(ceiling.files, "read_results", lambda path: found)
 
     def numbers(*lost_by, **options):

@@ -84,7 +84,7 @@ def beyond(p, kinds):
 
 def split(score, kinds, how, seed=0):
     """One subset simulation."""
-    (found,) = rare.together(score, [rare.steps(kinds, how, seed)])
+    (found,) = rare.run_together(score, [rare.subset_simulation(kinds, how, seed)])
     return found
 
 
@@ -108,7 +108,9 @@ def test_several_splittings_side_by_side_are_what_each_is_alone():
         asked.append(len(u))
         return score(u)
 
-    found = rare.together(counted, [rare.steps(kinds, sizes, seed) for seed in seeds])
+    found = rare.run_together(
+        counted, [rare.subset_simulation(kinds, sizes, seed) for seed in seeds]
+    )
     alone = [split(score, kinds, sizes, seed) for seed in seeds]
     assert [one.estimate for one in found] == [one.estimate for one in alone]
     assert asked[:2] == [600, 300]
@@ -133,12 +135,12 @@ def test_splitting_says_nothing_where_nothing_fails_or_everything():
     assert always.estimate.p == 1
     assert always.u.shape == (200, 3)
     found = xr.Dataset({k: ("repetition", [v]) for k, v in always.estimate._asdict().items()})
-    assert rare.table(found)[1][1:] == ["1", "[1, 1]", "0.00", "200", ""]
+    assert rare.estimate_table(found)[1][1:] == ["1", "[1, 1]", "0.00", "200", ""]
 
 
 def test_estimates_by_hand():
     # Three groups of mean 2 and standard deviation 1: t with two degrees of freedom is 4.303.
-    one = rare.joined(np.array([1.0, 2.0, 3.0]), 30)
+    one = rare.combine(np.array([1.0, 2.0, 3.0]), 30)
     assert one.variation == pytest.approx(1 / (2 * 3**0.5))
     assert one.high == 1  # a probability
     assert one.low == pytest.approx(2 * np.exp(-4.3027 * one.variation), rel=1e-4)
@@ -301,8 +303,8 @@ def test_the_quantity_that_decides_takes_all_the_blame():
     assert len(blocks.factors) == 23 + 1 + 2  # ranges, the object, corners and the key
     assert (blocks.base, blocks.plan.worlds) == (256, 256 * (len(blocks.factors) + 2))
     column = blocks.groups.index("mass")
-    found = sensitivity.analysed(blocks, outcomes(blocks, blocks.u()[:, column] < 0.8))
-    assert sensitivity.ranked(found)[0] == "mass"
+    found = sensitivity.analyze(blocks, outcomes(blocks, blocks.u()[:, column] < 0.8))
+    assert sensitivity.rank_factors(found)[0] == "mass"
     first, total = (getattr(found, name).sel(output="success") for name in ("first", "total"))
     assert float(first.sel(factor="mass")) == pytest.approx(1, abs=0.2)
     assert float(total.sel(factor="mass")) == pytest.approx(1, abs=0.2)
@@ -314,11 +316,11 @@ def test_the_quantity_that_decides_takes_all_the_blame():
     assert study.said(found).startswith("More mass costs success")
     assert study.said(found, "gap").startswith("No cost of gap is seen")
     assert "draws no robot_force" in study.said(found, "robot_force")
-    assert sensitivity.table(found)[1][0] == "mass of the object"
-    assert sensitivity.reliable(found).startswith("Trials fail at ")
-    assert "run more worlds" not in sensitivity.reliable(found)
-    never = sensitivity.analysed(blocks, outcomes(blocks, np.ones(blocks.plan.worlds, bool)))
-    assert sensitivity.reliable(never).endswith("run more worlds.")
+    assert sensitivity.index_table(found)[1][0] == "mass of the object"
+    assert sensitivity.reliability(found).startswith("Trials fail at ")
+    assert "run more worlds" not in sensitivity.reliability(found)
+    never = sensitivity.analyze(blocks, outcomes(blocks, np.ones(blocks.plan.worlds, bool)))
+    assert sensitivity.reliability(never).endswith("run more worlds.")
     assert (never.total.sel(output="success") == 0).all()
 
 
@@ -327,7 +329,7 @@ def test_two_quantities_that_only_matter_together_have_totals_alone():
     blocks = sensitivity.Sensitivity("rps", "wide", 16_384)
     u = blocks.u()
     a, b = (u[:, blocks.groups.index(name)] > 0.5 for name in ("mass", "gap"))
-    found = sensitivity.analysed(blocks, outcomes(blocks, a == b)).sel(output="success")
+    found = sensitivity.analyze(blocks, outcomes(blocks, a == b)).sel(output="success")
     for name in ("mass", "gap"):
         assert float(found.first.sel(factor=name)) == pytest.approx(0, abs=0.1)
         assert float(found.total.sel(factor=name)) == pytest.approx(1, abs=0.1)

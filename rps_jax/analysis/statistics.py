@@ -39,15 +39,15 @@ class Bins(NamedTuple):
     """Success of one law against one quantity."""
 
     middle: np.ndarray  # (n,) of each bin: the median of its worlds
-    won: np.ndarray  # (n,)
-    of: np.ndarray  # (n,)
+    successes: np.ndarray  # (n,)
+    trials: np.ndarray  # (n,)
 
 
 class Influence(NamedTuple):
     """How far success hangs on one quantity."""
 
     name: str  # of `WORDS`
-    variance: float  # [1] of the success rate over its bins, as of `unexplained`
+    variance: float  # [1] of the success rate over its bins, as of `excess_variance`
     q: float  # [1] false discovery rate of the test that all bins have one rate
 
 
@@ -98,7 +98,7 @@ def worlds_by_object(results: xr.Dataset) -> dict[str, np.ndarray]:
     return {str(name): which == i for i, name in enumerate(results.object.values)}
 
 
-def drawn(results: xr.Dataset) -> list[str]:
+def varied_quantities(results: xr.Dataset) -> list[str]:
     """Names of those quantities of `WORDS` that differ between worlds."""
 
     def differs(values: np.ndarray) -> bool:
@@ -133,7 +133,7 @@ def cvar_interval(values: np.ndarray) -> tuple[float, float]:
     return float(mean * np.exp(-error / mean)), float(mean * np.exp(error / mean))
 
 
-def missed(min_distance: ArrayLike, way: ArrayLike) -> np.ndarray:
+def miss_distance(min_distance: ArrayLike, way: ArrayLike) -> np.ndarray:
     """How far (...) [m] trials missed their targets, by `min_distance` of the contact point.
 
     A trial whose distance is infinite never touched its object, and missed by the whole `way`.
@@ -142,12 +142,12 @@ def missed(min_distance: ArrayLike, way: ArrayLike) -> np.ndarray:
     return np.where(np.isfinite(near), near, way)
 
 
-def left_over(one: xr.Dataset) -> np.ndarray:
+def distance_left(one: xr.Dataset) -> np.ndarray:
     """How far (world,) [m] the trials of one law missed their targets."""
-    return missed(one.min_distance.values, one.distance.values)
+    return miss_distance(one.min_distance.values, one.distance.values)
 
 
-def failure(one: xr.Dataset, max_lost: float) -> np.ndarray:
+def failure_modes(one: xr.Dataset, max_lost: float) -> np.ndarray:
     """Index into `FAILURES` (worlds,), -1 for a success."""
     kinds = np.select(
         [
@@ -168,7 +168,7 @@ def hardest(results: xr.Dataset, count: int = 10) -> np.ndarray:
     """Worlds (count,) in which most laws fail, and among these the most distance is left."""
     laws = [results.sel(law=law) for law in results.law.values]
     failed = sum((one.success.values == 0).astype(float) for one in laws)
-    left = np.mean([left_over(one) for one in laws], axis=0)
+    left = np.mean([distance_left(one) for one in laws], axis=0)
     order = np.lexsort((-left, -np.asarray(failed)))
     return order[: min(count, int((np.asarray(failed) > 0).sum()))]
 
@@ -181,7 +181,7 @@ def bins(values: np.ndarray, won: np.ndarray, count: int = 8) -> Bins:
     if different.size <= count:
         groups: Sequence[np.ndarray] = [np.flatnonzero(values == v) for v in different]
     else:
-        groups = [g for g in np.array_split(ascending(values), count) if g.size]
+        groups = [g for g in np.array_split(ascending_order(values), count) if g.size]
     return Bins(
         np.array([np.median(values[g]) for g in groups]),
         np.array([int(won[g].sum()) for g in groups]),
@@ -189,7 +189,7 @@ def bins(values: np.ndarray, won: np.ndarray, count: int = 8) -> Bins:
     )
 
 
-def ascending(values: np.ndarray) -> np.ndarray:
+def ascending_order(values: np.ndarray) -> np.ndarray:
     """Places (n,) of numbers in ascending order, of equal ones the first first; none is NaN.
 
     As NumPy's stable `argsort`; of float32 in a fifth of its time.
@@ -201,16 +201,16 @@ def ascending(values: np.ndarray) -> np.ndarray:
     return np.sort((bits << 32) | np.arange(values.size)) & 0xFFFFFFFF
 
 
-def one_rate(found: Bins) -> float:
+def equal_rates_p(found: Bins) -> float:
     """The p of a chi-squared test that all bins have one success rate."""
-    counts = np.stack([found.won, found.of - found.won])
-    if len(found.of) < 2 or not counts.sum(axis=1).all():
+    counts = np.stack([found.successes, found.trials - found.successes])
+    if len(found.trials) < 2 or not counts.sum(axis=1).all():
         return 1.0
     expected = np.outer(counts.sum(axis=1), counts.sum(axis=0)) / counts.sum()
     off = np.abs(counts - expected)
-    if len(found.of) == 2:  # Yates
+    if len(found.trials) == 2:  # Yates
         off = np.maximum(off - 0.5, 0.0)
-    return float(scipy.special.chdtrc(len(found.of) - 1, np.sum(off**2 / expected)))
+    return float(scipy.special.chdtrc(len(found.trials) - 1, np.sum(off**2 / expected)))
 
 
 def false_discovery(p: Sequence[float]) -> np.ndarray:
@@ -233,30 +233,32 @@ def holm(p: Sequence[float]) -> np.ndarray:
     return adjusted
 
 
-def unexplained(found: Bins) -> float:
+def excess_variance(found: Bins) -> float:
     """Variance [1] of the success rate over bins, less what binomial noise puts there.
 
     It is negative where bins differ less than the noise of one rate lets them differ on average.
     """
-    trials, mean = found.of.sum(), found.won.sum() / found.of.sum()
-    noise = (len(found.of) - 1) * mean * (1 - mean) / max(trials - 1, 1)
-    return float(np.sum(found.of * (found.won / found.of - mean) ** 2) / trials - noise)
+    trials, mean = found.trials.sum(), found.successes.sum() / found.trials.sum()
+    noise = (len(found.trials) - 1) * mean * (1 - mean) / max(trials - 1, 1)
+    return float(
+        np.sum(found.trials * (found.successes / found.trials - mean) ** 2) / trials - noise
+    )
 
 
 def influences(results: xr.Dataset) -> list[Influence]:
-    """How far success hangs on each of `drawn`, the greatest spread first.
+    """How far success hangs on each of `varied_quantities`, the greatest spread first.
 
     Each has the spread of the law in which it is greatest, and the least q of all laws.
     """
     laws = results.law.values
     binned = {
         name: [bins(results[name].values, results.success.sel(law=law).values > 0) for law in laws]
-        for name in drawn(results)
+        for name in varied_quantities(results)
     }
-    q = false_discovery([one_rate(found) for each in binned.values() for found in each])
+    q = false_discovery([equal_rates_p(found) for each in binned.values() for found in each])
     q = q.reshape(len(binned), len(laws))
     found = [
-        Influence(name, max(map(unexplained, each)), float(least))
+        Influence(name, max(map(excess_variance, each)), float(least))
         for (name, each), least in zip(binned.items(), q.min(axis=1), strict=True)
     ]
     return sorted(found, key=lambda one: -one.variance)

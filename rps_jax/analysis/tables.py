@@ -84,14 +84,14 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
     for law in map(str, results.law.values):
         one = results.sel(law=law)
         won = one.success.values > 0
-        kinds = statistics.failure(one, max_lost)
+        kinds = statistics.failure_modes(one, max_lost)
         rows.append(
             [
                 law,
                 *(_rate(won[mask]) for mask in groups.values()),
                 _rate(won),
                 _at_most(statistics.fails_at_most(int((~won).sum()), won.size, laws)),
-                _cvar(statistics.left_over(one)),
+                _cvar(statistics.distance_left(one)),
                 f"{np.median(one.time.values[won]):.1f} s" if won.any() else "-",
                 f"{np.median(one.path_length.values[won]):.2f} m" if won.any() else "-",
                 *(str(int((kinds == i).sum())) for i in range(len(ways))),
@@ -125,7 +125,7 @@ def models_table(results: xr.Dataset) -> list[list[str]]:
         rates = won.mean(axis=1)
         equal = 100 * (won == won[0]).mean(axis=1)[1:]
         least = f"{equal.min():.1f} % and more" if equal.size else "-"
-        rows.append([law, *map(_rate, won), spread(rates), least])
+        rows.append([law, *map(_rate, won), rate_range(rates), least])
     return rows
 
 
@@ -151,7 +151,7 @@ def share(won: int, of: int) -> str:
     return f"{percent(won, of)} % [{', '.join(ends)}]"
 
 
-def spread(rates: ArrayLike) -> str:
+def rate_range(rates: ArrayLike) -> str:
     """The least and the greatest of some rates, as models of the physics give them."""
     least, most = float(np.min(rates)), float(np.max(rates))
     digits = max(_digits(least, 1), _digits(most, 1))
@@ -238,16 +238,20 @@ def influence_table(results: xr.Dataset, law: str) -> list[list[str]]:
     """
     won = results.success.sel(law=law).values > 0
     binned = {
-        name: statistics.bins(results[name].values, won) for name in statistics.drawn(results)
+        name: statistics.bins(results[name].values, won)
+        for name in statistics.varied_quantities(results)
     }
-    q = statistics.false_discovery([statistics.one_rate(found) for found in binned.values()])
+    q = statistics.false_discovery([statistics.equal_rates_p(found) for found in binned.values()])
     rows = [["", "worst bin, about", "success", "best bin, about", "success", "q"]]
     for i in np.argsort(q, kind="stable"):
         name, found = list(binned.items())[i]
-        order, unit = np.argsort(found.won / found.of, kind="stable"), results[name].attrs["units"]
+        order, unit = (
+            np.argsort(found.successes / found.trials, kind="stable"),
+            results[name].attrs["units"],
+        )
         told = [f"{value:.3g} {unit}".removesuffix(" 1") for value in found.middle]
         ends = []
         for n in (order[0], order[-1]):
-            ends += [told[n], share(int(found.won[n]), int(found.of[n]))]
+            ends += [told[n], share(int(found.successes[n]), int(found.trials[n]))]
         rows.append([WORDS[name], *ends, f"{q[i]:.2g}"])
     return rows

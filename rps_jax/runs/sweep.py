@@ -107,7 +107,7 @@ def report_of(plan: Plan, found: xr.Dataset, folder: Path | None) -> list[Sectio
     if found.sizes["law"] > 1:
         rows = tables.difference_table(found)
         told.append(Section("Differences, world by world", "", rows))
-    if statistics.drawn(found):
+    if statistics.varied_quantities(found):
         picture = Picture("success", lambda: figures.success_curves(found))
         told.append(Section("Success against what was drawn", "", (), picture))
     text = "Worlds in which most laws fail, and most distance is left."

@@ -97,7 +97,7 @@ class Ceiling(InDomain[xr.Dataset]):
         """Indices of the worlds that are tried."""
         if self.results is None:
             return np.arange(self.sample)
-        lost = lost_worlds(self.results, self.lost_by)
+        lost = failed_worlds(self.results, self.lost_by)
         first = np.arange(min(self.sample, self.results.sizes["world"]))
         return np.union1d(lost[: self.most], first).astype(int)
 
@@ -258,7 +258,7 @@ def _weights(cost: np.ndarray, temperature: float) -> np.ndarray:
 # --- beside a sweep or a ladder ------------------------------------------------------------
 
 
-def lost_worlds(results: xr.Dataset, lost_by: Sequence[str]) -> np.ndarray:
+def failed_worlds(results: xr.Dataset, lost_by: Sequence[str]) -> np.ndarray:
     """Worlds of a sweep (law, world) that some laws all lose."""
     laws = results.law.values.tolist()
     for name in lost_by:
@@ -270,7 +270,7 @@ def won_table(found: xr.Dataset, results: xr.Dataset, lost_by: Sequence[str]) ->
     """Header and a row for each object: who wins the worlds of a sweep that some laws lose."""
     solved = dict(zip(found.world.values.tolist(), found.solved.values.tolist(), strict=True))
     lost = np.zeros(results.sizes["world"], bool)
-    lost[np.intersect1d(lost_worlds(results, lost_by), found.world.values)] = True
+    lost[np.intersect1d(failed_worlds(results, lost_by), found.world.values)] = True
     table = [["object", "worlds lost", "won by the planner", "by another law alone", "by nobody"]]
     any_law = (results.success.values > 0).any(axis=0)
     kinds = statistics.worlds_by_object(results) | {"all": np.ones_like(lost)}

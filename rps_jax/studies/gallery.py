@@ -48,7 +48,7 @@ MECHANISMS = {
 def kinds(one: xr.Dataset, max_lost: float) -> np.ndarray:
     """What kind of loss each world (world,) is, of `MECHANISMS`; empty for a success."""
     names = np.array([*statistics.FAILURES, ""], dtype=object)
-    found = names[statistics.failure(one, max_lost)]
+    found = names[statistics.failure_modes(one, max_lost)]
     near = one.min_distance.values < NEAR
     timeout = found == "timeout"
     found[timeout & near] = "timeout near the target"
@@ -63,7 +63,7 @@ def in_common(one: xr.Dataset, mask: np.ndarray, most: int = 4) -> list[tuple[st
     away from one half (the statistic of Mann and Whitney); less than 0.1 away is not told.
     """
     found = []
-    for name in statistics.drawn(one):
+    for name in statistics.varied_quantities(one):
         values = one[name].values.astype(float)
         mine = values[mask & np.isfinite(values)]
         if mine.size < 3:

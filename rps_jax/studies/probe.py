@@ -81,7 +81,7 @@ class Probe:
         began = time.perf_counter()
         outcome, _ = batch.gathered(jobs, self.setting, len(at.u), **shape)
         found = {name: np.asarray(getattr(outcome, name), float) for name in _KEPT}
-        found["left"] = statistics.missed(outcome.min_distance, away)
+        found["left"] = statistics.miss_distance(outcome.min_distance, away)
         told = [found[name] for name in ("success", "time", "left", "contact_lost_time", "tilt")]
         found["severity"] = score.severity(*told, rules=self.setting.rules)
         columns = {name: ("world", values) for name, values in found.items()}

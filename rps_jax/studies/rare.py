@@ -61,7 +61,7 @@ class Found(NamedTuple):
 Steps = Generator[np.ndarray, np.ndarray, Found]
 
 
-def joined(groups: np.ndarray, trials: int, least: float = 0.0) -> Estimate:
+def combine(groups: np.ndarray, trials: int, least: float = 0.0) -> Estimate:
     """The mean of groups' estimates, with Student's interval, even in the logarithm.
 
     A few groups agree by luck now and then, so the coefficient of variation is at least `least`.
@@ -74,7 +74,7 @@ def joined(groups: np.ndarray, trials: int, least: float = 0.0) -> Estimate:
     return Estimate(p, p * np.exp(-reach), min(1.0, p * np.exp(reach)), variation, trials)
 
 
-def together(score: Severity, every: Sequence[Steps]) -> list[Found]:
+def run_together(score: Severity, every: Sequence[Steps]) -> list[Found]:
     """Several of them side by side, which are asked for one batch of all of them at a time."""
     found: dict[int, Found] = {}
     asked = dict(enumerate(map(next, every)))
@@ -90,7 +90,7 @@ def together(score: Severity, every: Sequence[Steps]) -> list[Found]:
     return [found[i] for i in sorted(found)]
 
 
-def steps(kinds: Sequence[str], how: Rare, seed: int) -> Steps:
+def subset_simulation(kinds: Sequence[str], how: Rare, seed: int) -> Steps:
     """Subset simulation, which asks for the severities (n,) of points (n, q) as it goes on."""
     rng = np.random.Generator(np.random.Philox(key=seed))
     noise = np.array([kind == "noise" for kind in kinds])
@@ -131,7 +131,7 @@ def steps(kinds: Sequence[str], how: Rare, seed: int) -> Steps:
     failed = (s >= how.level) & (p > 0)[:, None]
     least += _variation(s >= how.level)
     return Found(
-        joined(p, trials, least**0.5), p, [*levels, how.level], _uniform(z[failed]), s[failed]
+        combine(p, trials, least**0.5), p, [*levels, how.level], _uniform(z[failed]), s[failed]
     )
 
 
@@ -216,8 +216,8 @@ class Rare(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         probe = Probe(domain, self.params, self.setting, run.folder, **run.shape)
         kinds = [one.kind for one in points.quantities(domain)]
         first = seed_of(seed, "tune") * 10_000
-        every = [steps(kinds, self, first + i) for i in range(self.repetitions)]
-        return _labelled(domain, together(lambda u: probe(u).severity.values, every))
+        every = [subset_simulation(kinds, self, first + i) for i in range(self.repetitions)]
+        return _labelled(domain, run_together(lambda u: probe(u).severity.values, every))
 
     def intro(self, found: xr.Dataset) -> str:
         what = "a failure is a trial that does not reach its target."
@@ -231,8 +231,8 @@ class Rare(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
             "worlds over that of drawn worlds with the same coefficient of variation. A kind of "
             "failure that no group has met is in no interval."
         )
-        picture = Picture("rare", partial(figure_of, found))
-        return [Section("How rare is a failure", text, table(found), picture)]
+        picture = Picture("rare", partial(draw_estimates, found))
+        return [Section("How rare is a failure", text, estimate_table(found), picture)]
 
 
 rare = call_of(Rare)
@@ -256,19 +256,23 @@ def worlds_needed(p: float, variation: float) -> float:
     return (1 - p) / (p * variation**2) if p > 0 else float("inf")
 
 
-def table(found: xr.Dataset) -> list[list[str]]:
+def estimate_table(found: xr.Dataset) -> list[list[str]]:
     """Header and a row for each repetition, and one for all of them together."""
     rows = [["", "probability of failure", "95 %", "variation", "worlds", "share of drawn worlds"]]
     for i in range(found.sizes["repetition"]):
         one = found.isel(repetition=i)
         p, low, high, variation, trials = (float(one[name]) for name in Estimate._fields)
-        rows.append(row(f"splitting, {i + 1}", Estimate(p, low, high, variation, int(trials))))
+        rows.append(
+            estimate_row(f"splitting, {i + 1}", Estimate(p, low, high, variation, int(trials)))
+        )
     if found.sizes["repetition"] > 1:
-        rows.append(row("splitting, all", joined(found.p.values, int(found.trials.sum()))))
+        rows.append(
+            estimate_row("splitting, all", combine(found.p.values, int(found.trials.sum())))
+        )
     return rows
 
 
-def row(name: str, one: Estimate) -> list[str]:
+def estimate_row(name: str, one: Estimate) -> list[str]:
     """An estimate, and its number of worlds over that of drawn ones."""
     said = ""
     if 0 < one.p < 1:
@@ -277,7 +281,7 @@ def row(name: str, one: Estimate) -> list[str]:
     return [name, f"{one.p:.3g}", ends, f"{one.variation:.2f}", f"{one.trials:,}", said]
 
 
-def figure_of(found: xr.Dataset) -> Figure:
+def draw_estimates(found: xr.Dataset) -> Figure:
     """Estimates of every repetition with their intervals."""
     figure = Figure(figsize=(6.5, 3.4), layout="constrained")
     ax = figure.subplots()

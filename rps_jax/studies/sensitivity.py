@@ -44,7 +44,7 @@ _WORDS = {
     "key": "key of all noise",
     "com_bearing": "bearing of the centre of mass",
 }
-ENOUGH = 30  # base points at which a trial fails, for indices that mean something
+MIN_FAILING_POINTS = 30  # base points at which a trial fails, for indices that mean something
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class Sensitivity(Planned, InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         return Plan(self.ranges, len(at.u), {"law": self.params}, self.setting, points=at)
 
     def answer(self, run: Run) -> xr.Dataset:
-        found = analysed(self, super().answer(run))
+        found = analyze(self, super().answer(run))
         if run.folder is not None:
             files.write_results(run.folder / "sobol.nc", found)
         return found
@@ -133,23 +133,24 @@ class Sensitivity(Planned, InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        order = ranked(found)
-        said = {one: in_words(one) for one in order}
+        order = rank_factors(found)
+        said = {one: factor_words(one) for one in order}
         drawn = [one for one in order if one in found.quantity.values][:5]
         failed = found.success.values == 0
         title = f"{self.label}, {name_of(self.domain)}: failures over pairs, {failed.size:,} worlds"
         kinds = [one.removeprefix("random_") for one in self.ranges.objects]
         u, names = found.u.sel(quantity=drawn).values, [said[one] for one in drawn]
-        pairs = partial(interactions, u, failed, names, {in_words("object"): kinds}, title)
+        pairs = partial(interactions, u, failed, names, {factor_words("object"): kinds}, title)
         text = (
             "The first index is the share of the variance that a quantity explains alone, the "
             "total one what goes with it and all its interactions; noise and the corners of "
-            f"prisms are one quantity each. Intervals are bootstrapped, of 95 %. {reliable(found)}"
+            "prisms are one quantity each. Intervals are bootstrapped, of 95 %. "
+            f"{reliability(found)}"
         )
         indices = Picture("sobol", partial(indices_figure, found, said))
         maps = Picture("interactions", pairs)
         return [
-            Section("Which quantity is to blame", text, table(found), indices),
+            Section("Which quantity is to blame", text, index_table(found), indices),
             Section("Interactions of the first five", "", (), maps),
         ]
 
@@ -157,14 +158,14 @@ class Sensitivity(Planned, InDomain[xr.Dataset], OfLaw[xr.Dataset]):
 sensitivity = call_of(Sensitivity)
 
 
-def analysed(asked: Sensitivity, results: xr.Dataset) -> xr.Dataset:
+def analyze(asked: Sensitivity, results: xr.Dataset) -> xr.Dataset:
     """Indices of a design whose sweep is done."""
     analyze = errors.require("SALib.analyze.sobol", "failures").analyze
     one = results.sel(law="law")
     values = {
         "success": one.success.values.astype(float),
         "time": one.time.values.astype(float),
-        "left": statistics.left_over(one),
+        "left": statistics.distance_left(one),
     }
     shape = (len(OUTPUTS), len(asked.factors))
     columns = {name: np.zeros(shape) for name in ("first", "first_reach", "total", "total_reach")}
@@ -188,41 +189,41 @@ def analysed(asked: Sensitivity, results: xr.Dataset) -> xr.Dataset:
     return xr.Dataset(found, coordinates, {"base": asked.base})
 
 
-def ranked(found: xr.Dataset, output: str = "success") -> list[str]:
+def rank_factors(found: xr.Dataset, output: str = "success") -> list[str]:
     """The factors, by their total index for an output, the greatest first."""
     total = found.total.sel(output=output)
     return [str(name) for name in total.factor.values[np.argsort(-total.values, kind="stable")]]
 
 
-def table(found: xr.Dataset) -> list[list[str]]:
+def index_table(found: xr.Dataset) -> list[list[str]]:
     """Header and a row for each factor, by the total index of success."""
     header = ["", *(f"{what}: {order}" for what in OUTPUTS for order in ("first", "total"))]
     rows = [header]
-    for name in ranked(found):
+    for name in rank_factors(found):
         cells = []
         for what in OUTPUTS:
             one = found.sel(output=what, factor=name)
             cells += [f"{one.first:.2f} ± {one.first_reach:.2f}"]
             cells += [f"{one.total:.2f} ± {one.total_reach:.2f}"]
-        rows.append([in_words(name), *cells])
+        rows.append([factor_words(name), *cells])
     return rows
 
 
-def in_words(name: str) -> str:
+def factor_words(name: str) -> str:
     """What a factor is."""
     return WORDS.get(name) or _WORDS.get(name, name.replace("_", " "))
 
 
-def failing(found: xr.Dataset) -> int:
+def count_failing_points(found: xr.Dataset) -> int:
     """At how many base points the trial of either of the two base samples fails."""
     blocks = found.success.values.reshape(found.attrs["base"], -1)[:, [0, -1]]
     return int((blocks == 0).any(axis=1).sum())
 
 
-def reliable(found: xr.Dataset) -> str:
+def reliability(found: xr.Dataset) -> str:
     """Whether there are failures enough, in a sentence."""
-    told = f"Trials fail at {failing(found)} of {found.attrs['base']} base points"
-    if failing(found) < ENOUGH:
+    told = f"Trials fail at {count_failing_points(found)} of {found.attrs['base']} base points"
+    if count_failing_points(found) < MIN_FAILING_POINTS:
         return f"{told}, too few for indices of success to mean anything: run more worlds."
     return f"{told}."
 

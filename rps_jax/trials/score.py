@@ -78,7 +78,7 @@ class Objective:
         """
         told = (outcome.success, outcome.time, outcome.contact_lost_time)
         success, time, lost = (np.asarray(leaf, float) for leaf in told)
-        away = statistics.missed(outcome.min_distance, distance)
+        away = statistics.miss_distance(outcome.min_distance, distance)
         return np.asarray(self.score(success, time, lost, away, rules), float)
 
     def value(self, scores: ArrayLike) -> jax.Array:
@@ -109,7 +109,7 @@ def severity(
 
 def severity_of(results: xr.Dataset, rules: Rules) -> np.ndarray:
     """Severity (..., world) of a sweep's outcomes."""
-    left = statistics.missed(results.min_distance.values, results.distance.values)
+    left = statistics.miss_distance(results.min_distance.values, results.distance.values)
     lost = results.contact_lost_time.values
     told = results.success.values, results.time.values, left, lost, results.tilt.values
     return severity(*told, rules)
@@ -126,6 +126,6 @@ def plan_costs(outcome: Outcome, rules: Rules) -> np.ndarray:
     apart = np.asarray(outcome.object_pose, float)[:, :2] - np.asarray(outcome.base_pose)[:, :2]
     apart = np.minimum(np.nan_to_num(np.linalg.norm(apart, axis=1), nan=5.0), 5.0)
     ended = np.asarray(outcome.tipped) | np.asarray(outcome.diverged)
-    missed = np.minimum(statistics.missed(outcome.min_distance, 5.0), 5.0)
+    missed = np.minimum(statistics.miss_distance(outcome.min_distance, 5.0), 5.0)
     failed = 1 + missed + 0.1 * apart + ended * (1 - time)
     return np.where(np.asarray(outcome.success), np.minimum(time, 1.0), failed)

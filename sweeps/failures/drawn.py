@@ -22,7 +22,7 @@ from rps_jax.record.options import option
 from rps_jax.runs import sweep as sweeps
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of, count_of, seed_of
-from rps_jax.studies.rare import Estimate, Rare, figure_of, row, table
+from rps_jax.studies.rare import Estimate, Rare, draw_estimates, estimate_row, estimate_table
 from rps_jax.trials.progress import phase
 from rps_jax.trials.score import severity_of
 
@@ -74,7 +74,7 @@ class Drawn(Rare):
             )
         else:
             text += " None of the drawn worlds fails."
-        rows = [*table(found), [*row("drawn worlds", against)[:-1], ""]]
+        rows = [*estimate_table(found), [*estimate_row("drawn worlds", against)[:-1], ""]]
         picture = Picture("rare", partial(figure, found, against))
         return [usual._replace(text=text, table=rows, picture=picture)]
 
@@ -92,7 +92,7 @@ def of_drawn(failures: int, trials: int) -> Estimate:
 
 def figure(found: xr.Dataset, against: Estimate) -> Figure:
     """Estimates of every repetition with their intervals, and drawn worlds' behind them."""
-    made = figure_of(found)
+    made = draw_estimates(found)
     (ax,) = made.axes
     ax.axhspan(against.low, against.high, color="C0", alpha=0.2, lw=0)
     ax.axhline(against.p, color="C0", label="drawn worlds")

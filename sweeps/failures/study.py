@@ -16,7 +16,7 @@ import xarray as xr
 
 from rps_jax.analysis.report import Section
 from rps_jax.runs.question import Run, call_of
-from rps_jax.studies.sensitivity import ENOUGH, Sensitivity, failing
+from rps_jax.studies.sensitivity import MIN_FAILING_POINTS, Sensitivity, count_failing_points
 
 _RESAMPLES = 1000
 _NOTHING = 0.05  # [1] a total index that is not worth a word
@@ -76,6 +76,9 @@ def said(found: xr.Dataset, name: str = "mass") -> str:
         return f"More {name} costs success: {numbers}."
     if low > 0:
         return f"More {name} helps: {numbers}."
-    if float(one.total - one.total_reach) > _NOTHING and failing(found) >= ENOUGH:
+    if (
+        float(one.total - one.total_reach) > _NOTHING
+        and count_failing_points(found) >= MIN_FAILING_POINTS
+    ):
         return f"On average {name} costs nothing, but together with others it matters: {numbers}."
     return f"No cost of {name} is seen in {found.sizes['world']:,} worlds: {numbers}."

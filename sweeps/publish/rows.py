@@ -91,7 +91,7 @@ def _outcomes(found: xr.Dataset, law: int, base: int) -> list[str]:
     one = found.isel(law=law)
     won, took = one.success.values > 0, one.time.values
     groups = statistics.worlds_by_object(found).values()
-    kinds = statistics.failure(one, _MAX_LOST)
+    kinds = statistics.failure_modes(one, _MAX_LOST)
     lost = [int((kinds == statistics.FAILURES.index(way)).sum()) for way in _WAYS]
     against = statistics.compare(found.success[base], found.success[law])
     beside = [f"+{against.gained} -{against.lost}", f"{against.p:.2g}"]
@@ -149,7 +149,7 @@ def speeds(found: xr.Dataset) -> Rows:
 
 def blamed(found: xr.Dataset) -> Rows:
     """Header and a row for each of the five factors that explain most of success with all."""
-    (_, *head), *body = sensitivity.table(found)
+    (_, *head), *body = sensitivity.index_table(found)
     kept = [i for i, name in enumerate(head, 1) if name in _INDICES]
     return [["quantity", *_INDICES], *([row[0], *(row[i] for i in kept)] for row in body[:5])]
 
@@ -162,9 +162,9 @@ def rarely(found: xr.Dataset) -> Rows:
 
     def told(name: str, of: xr.Dataset, prefix: str = "") -> list[str]:
         p, low, high, off, trials = (float(of[prefix + one]) for one in rare.Estimate._fields)
-        return rare.row(name, rare.Estimate(p, low, high, off, round(trials)))
+        return rare.estimate_row(name, rare.Estimate(p, low, high, off, round(trials)))
 
-    head, *_, together = rare.table(found)
+    head, *_, together = rare.estimate_table(found)
     middle = found[list(rare.Estimate._fields)].median("repetition")
     rows = [head, told(f"splitting, median of {found.sizes['repetition']}", middle), together]
     if "drawn_p" in found:

@@ -106,7 +106,7 @@ class Million(TrialStudy[xr.Dataset]):
         folder = None if run.folder is None else run.folder / f"sweep_{law}"
         one = sweep.whole(plan, folder, **run.shape).isel(law=0)
         won, off = one.success.values > 0, one.min_distance.values
-        how = 1 + statistics.failure(one, float(self.setting.rules.max_lost))
+        how = 1 + statistics.failure_modes(one, float(self.setting.rules.max_lost))
         steps = np.rint(one.time.values / self.setting.physics.control_period)
         missed = np.where(np.isfinite(off), np.rint(1000 * np.nan_to_num(off, posinf=0)), UNTOUCHED)
         return xr.Dataset(

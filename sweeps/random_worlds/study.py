@@ -163,7 +163,7 @@ def _row(found: xr.Dataset, domain: str, law: str) -> dict[str, str]:
         "domain": domain,
         "law": law,
         "success": tables.share(*by_model[models.OWN]),
-        "over the models": tables.spread(shares) if len(shares) > 1 else "",
+        "over the models": tables.rate_range(shares) if len(shares) > 1 else "",
         "in C MuJoCo": tables.share(*by_model[C]) if C in by_model else "",
         "median time of a success": f"{median:.1f} s" if np.isfinite(median) else "-",
     }
@@ -177,6 +177,6 @@ def panel_table(found: xr.Dataset) -> list[list[str]]:
         for law in found.law.values:
             by_model = rates(found, domain, law)
             told = [tables.share(*by_model[name]) if name in by_model else "" for name in names]
-            spread = tables.spread([won / of for won, of in by_model.values()])
+            spread = tables.rate_range([won / of for won, of in by_model.values()])
             rows.append([str(domain), str(law), *told, spread])
     return rows

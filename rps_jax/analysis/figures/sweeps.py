@@ -28,7 +28,9 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
         for i, law in enumerate(map(str, results.law.values)):
             won = results.success.sel(law=law).values > 0
             bins = statistics.bins(results[one.name].values, won)
-            success_rates(ax, bins.middle, bins.won, bins.of, color=f"C{i}", label=law, beside=i)
+            success_rates(
+                ax, bins.middle, bins.successes, bins.trials, color=f"C{i}", label=law, beside=i
+            )
         unit = f" [{results[one.name].attrs['units']}]".removesuffix(" [1]")
         ax.set_xlabel(f"{WORDS[one.name]}{unit}", fontsize=9)
         chance = " (may be chance)" * _is_flat(one)
