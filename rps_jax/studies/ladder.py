@@ -96,8 +96,8 @@ class Ladder(SweepOptions, OfLaws[xr.Dataset | xr.DataTree]):
     """Domains: paper, hardware, wide, real (wide, but with limited robots), prisms or hostile, or
     JSON files of ranges. Changes follow each, as wide,mass=3:10."""
     worlds: int | None = option(None, 1, 1_000_000_000)
-    """Number of worlds of each domain, by default 1000. A domain with listed targets has at most
-    its grid where several domains are named; the grid of paper has 144 worlds."""
+    """Number of worlds of each domain; by default 1000, or the grid of a domain with listed targets
+    (paper: 144). With several domains it is at most that grid."""
     robot: RobotLike | None = field(default=None, kw_only=True)
     """The robot: ideal, kairos (the paper's), ridgeback or mpo_500, or a JSON file of its size,
     boards and limits. By default the domain's."""
