@@ -17,7 +17,7 @@ from jupyter_client.manager import AsyncKernelManager
 from nbclient import NotebookClient
 from nbformat import NotebookNode
 
-from rps_jax.analysis import studio
+from rps_jax.world import rendering
 
 HERE = Path(__file__).resolve().parent
 TEXTS = tuple(sorted(HERE.glob("[0-9]*.py")))
@@ -72,7 +72,7 @@ def _number(notebook: NotebookNode) -> None:
 
 def main(names: list[str]) -> None:
     """Execute the notebooks of these names, by default all."""
-    studio.choose_gl()  # before the kernel imports MuJoCo for any of them
+    rendering.choose_gl()  # before the kernel imports MuJoCo for any of them
     texts = [text for text in TEXTS if not names or text.stem in names]
     for text, notebook in zip(texts, execute(texts), strict=True):
         nbformat.write(notebook, text.with_suffix(".ipynb"))

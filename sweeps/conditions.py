@@ -21,7 +21,7 @@ from rps_jax.control.base import Params
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.errors import InputError
 from rps_jax.record import files
-from rps_jax.record.checkpoint import Parts
+from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
 from rps_jax.trials.progress import Progress, Report, unheard
@@ -105,7 +105,7 @@ def run_conditions(
     Raises:
       InputError: the folder holds a condition of the same name that was run otherwise.
     """
-    parts = None if folder is None else Parts(folder)
+    parts = None if folder is None else Checkpoints(folder)
     found = {name: parts and _load(parts, name, c, grid) for name, c in conditions.items()}
     missing = [name for name, results in found.items() if results is None]
     finished, simulated = grid.size * (len(found) - len(missing)), 0.0
@@ -134,7 +134,7 @@ def run_conditions(
                 "simulated": timing.simulated * share,
             }
             if parts is not None:
-                parts.put(name, files.encoded(results))
+                parts.put(name, files.encode_results(results))
             found[name] = results
     done = {name: results for name, results in found.items() if results is not None}
     whole = xr.concat(
@@ -153,11 +153,11 @@ def _fingerprint(condition: Condition, grid: Grid) -> str:
     return f"{same!r} {grid._replace(friction=dict(grid.friction))!r}"
 
 
-def _load(parts: Parts, name: str, condition: Condition, grid: Grid) -> xr.Dataset | None:
+def _load(parts: Checkpoints, name: str, condition: Condition, grid: Grid) -> xr.Dataset | None:
     """A condition's results, if it is among the finished parts."""
     if (content := parts.get(name)) is None:
         return None
-    results = files.decoded(content, parts.folder / name, own=True)
+    results = files.decode_results(content, parts.folder / name, own=True)
     if results.attrs.get("run_as") != _fingerprint(condition, grid):
         raise InputError(
             f"{parts.folder / name}-*.nc was run with other options: choose another folder, or "

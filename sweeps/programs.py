@@ -155,4 +155,4 @@ def side_by_side(
 
 def machine() -> str:
     """Where speeds were measured, in a sentence."""
-    return f"On {jax.devices()[0].device_kind}, {provenance.processors()} processors."
+    return f"On {jax.devices()[0].device_kind}, {provenance.count_processors()} processors."

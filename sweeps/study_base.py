@@ -73,7 +73,7 @@ class Study(Question[T]):
         """Write the data files of all tables."""
         for name, table in self.published_tables(results).items():
             path = self.folder / self.RESULTS / f"{name}.json"
-            write_table(path, [provenance.signed(run_folder)], self.machine, table)
+            write_table(path, [provenance.read_environment(run_folder)], self.machine, table)
 
     @property
     def folder(self) -> Path:
@@ -109,7 +109,7 @@ def write_table(path: Path, runs: Sequence[Mapping[str, Any]], device: str, tabl
 
     Args:
       path: `results/NAME.json` in the folder of a study.
-      runs: provenance of the runs behind the table, as `provenance.signed` returns it.
+      runs: provenance of the runs behind the table, as `provenance.read_environment` returns it.
       device: device of the runs, in words.
       table: header, rows and note.
     """

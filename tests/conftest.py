@@ -12,10 +12,10 @@ def pytest_configure(config):
     shapes.install()
     import jax
 
-    from rps_jax.analysis import studio
     from rps_jax.engines import device
+    from rps_jax.world import rendering
 
-    studio.choose_gl()
+    rendering.choose_gl()
     device.configure_xla()
     cache = config.rootpath / ".jax_cache"
     os.environ.setdefault("RPS_CACHE", str(cache))  # of commands, also in processes of their own

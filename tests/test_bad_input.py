@@ -371,7 +371,7 @@ def folder(tmp_path_factory):
     for name, changes in CHANGED_MANIFESTS.items():
         (root / name).mkdir()
         (root / name / "manifest.json").write_text(json.dumps(good | changes))
-    provenance.sign(root / "arms", {"packages": {"rps_jax": "0.2.0"}})
+    provenance.write_environment(root / "arms", {"packages": {"rps_jax": "0.2.0"}})
     return root
 
 

@@ -14,7 +14,7 @@ from rps_jax import InputError, Observation, RPSParams, Rules, Setting
 from rps_jax.control.laws import guided, rps
 from rps_jax.control.laws.guided import GuidedParams
 from rps_jax.control.laws.rps import RPSState
-from rps_jax.record.checkpoint import Parts
+from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs.question import seed_of
 from rps_jax.studies import ceiling
 from rps_jax.studies.ceiling import Ceiling
@@ -108,7 +108,7 @@ def test_perturbations_belong_to_world_and_round_and_fill_one_window():
 def test_a_search_goes_on_where_it_was_stopped_and_its_plans_win(tmp_path):
     asked = SIZES | {"sample": 6, "setting": SHORT, "slots": 12, "out": tmp_path / "run"}
     whole = rps_jax.ceiling(CYLINDERS, **asked)
-    rounds = list(Parts(tmp_path / "run").found().values())
+    rounds = list(Checkpoints(tmp_path / "run").paths().values())
     assert len(rounds) >= 2
     rounds[-1].unlink()
     again = rps_jax.ceiling(CYLINDERS, **asked)

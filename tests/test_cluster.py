@@ -134,8 +134,8 @@ def test_what_ends_a_worker_ends_the_run_as_itself(tmp_path, two_workers):
 
 
 def test_a_worker_with_other_software_is_refused(tmp_path, two_workers, monkeypatch):
-    here = provenance.environment()
-    monkeypatch.setattr(provenance, "environment", lambda: here | {"commit": "another"})
+    here = provenance.collect_environment()
+    monkeypatch.setattr(provenance, "collect_environment", lambda: here | {"commit": "another"})
     with pytest.raises(
         InputError, match=r"other software \(commit = .* there, .another. asked for"
     ):

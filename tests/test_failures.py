@@ -351,7 +351,7 @@ def test_the_command_of_sensitivity_draws_and_continues(tmp_path, capsys):
     assert "Trials fail at" in text
     for name in ("sobol", "interactions"):
         assert (tmp_path / "run" / f"{name}.png").stat().st_size > 5000
-    assert files.read(tmp_path / "run" / "sobol.nc").total.sizes["factor"] == 5
+    assert files.read_dataset(tmp_path / "run" / "sobol.nc").total.sizes["factor"] == 5
     assert "is not allowed" in refusal(capsys, "sensitivity", "--worlds", 3)
 
 

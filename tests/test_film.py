@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from helpers import decode, rps
 
-from rps_jax.analysis import video
 from rps_jax.app import film
 from rps_jax.app.film import Film
 from rps_jax.control.laws.rps import RPSParams
@@ -18,6 +17,7 @@ from rps_jax.runs.plan import Plan
 from rps_jax.studies.table import Table
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
+from rps_jax.world import video
 from rps_jax.world.domain import DOMAINS
 
 pytestmark = pytest.mark.filterwarnings("ignore:os.fork")  # as in test_video

@@ -21,7 +21,7 @@ CASES = {
     "argmax": lambda x, i: jnp.argmax(jnp.stack([x, jnp.roll(x, 1), x[::-1]]), axis=0),
     "argmin": lambda x, i: jnp.argmin(jnp.stack([x, jnp.roll(x, 1), x[::-1]]), axis=0),
 }
-COMPILER = provenance.compiler()
+COMPILER = provenance.find_compiler()
 
 
 def inputs(real):

@@ -171,7 +171,7 @@ def test_programs_that_were_not_used_for_longest_go_first(cache, made, monkeypat
 
 def test_a_few_trials_stay_on_processors(monkeypatch):
     """Five hundred, where there is a C compiler; in C MuJoCo all."""
-    monkeypatch.setattr(provenance, "compiler", lambda: "cc")
+    monkeypatch.setattr(provenance, "find_compiler", lambda: "cc")
     before = jax.config.jax_platforms
     jax.config.update("jax_platforms", None)
     try:
@@ -181,7 +181,7 @@ def test_a_few_trials_stay_on_processors(monkeypatch):
         assert not device.suits_processors(replace(few, worlds=501))
         assert not device.suits_processors(replace(few, setting=Setting("mjx")))
         assert device.suits_processors(replace(few, worlds=9000, setting=Setting("mujoco")))
-        monkeypatch.setattr(provenance, "compiler", lambda: None)
+        monkeypatch.setattr(provenance, "find_compiler", lambda: None)
         assert not device.suits_processors(few)
         jax.config.update("jax_platforms", "cuda")  # asked for by name
         assert not device.suits_processors(Push())

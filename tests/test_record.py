@@ -20,7 +20,7 @@ from rps_jax import engines
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
-from rps_jax.record.checkpoint import Parts
+from rps_jax.record.checkpoint import Checkpoints
 
 RESULTS = xr.Dataset(
     {"time": (("law", "world"), np.linspace(0, 1, 200, dtype=np.float32).reshape(2, 100))},
@@ -78,7 +78,7 @@ DAMAGE = {
     "zip in name": lambda content: b"PK\x03\x04" + bytes(500),
     "JSON of something else": lambda content: b'{"worlds": 7}\n',
     "deep JSON": lambda content: b"[" * 100_000,
-    "another run's results": lambda content: files.encoded(RESULTS + 1),
+    "another run's results": lambda content: files.encode_results(RESULTS + 1),
     "another search's state": lambda content: state(99),
 }
 
@@ -88,11 +88,11 @@ def sound(tmp_path_factory):
     """A run folder with everything in it."""
     folder = tmp_path_factory.mktemp("run") / "run"
     run_folder.claim(folder, {"worlds": 300, "seed": 0})
-    provenance.sign(folder, {"command": ["rps", "sweep"], "time": "now"})
+    provenance.write_environment(folder, {"command": ["rps", "sweep"], "time": "now"})
     files.write_results(folder / "results.nc", RESULTS)
-    parts = Parts(folder)
+    parts = Checkpoints(folder)
     for number in range(3):
-        parts.put(f"{number:07d}", files.encoded(RESULTS.isel(world=[number])))
+        parts.put(f"{number:07d}", files.encode_results(RESULTS.isel(world=[number])))
     parts.put("state", state(4), ".npz")
     return folder
 
@@ -115,21 +115,25 @@ def in_one_sentence(path, read, *arguments):
 
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_damage_is_known_before_anything_reads_it_and_nothing_else_is_lost(damage, folder):
-    parts, before = Parts(folder), dict(Parts(folder).each())
+    parts, before = Checkpoints(folder), dict(Checkpoints(folder).items())
     began = time.perf_counter()
-    for name, path in parts.found().items():
+    for name, path in parts.paths().items():
         damaged = DAMAGE[damage](before[name])
         path.write_bytes(damaged)
         assert parts.get(name) is None
         assert path.with_name(f"{path.name}.corrupt").read_bytes() == damaged
         others = {other: content for other, content in before.items() if other != name}
-        assert dict(parts.each()) == others
+        assert dict(parts.items()) == others
         parts.put(name, before[name], path.suffix)
-    assert dict(parts.each()) == before
+    assert dict(parts.items()) == before
     for name, *readers in (
         ("results.nc", files.read_results),
-        ("manifest.json", run_folder.manifest, lambda f: run_folder.claim(f, {"worlds": 300})),
-        ("environment.json", provenance.told, lambda f: provenance.sign(f, {"time": "later"})),
+        ("manifest.json", run_folder.read_manifest, lambda f: run_folder.claim(f, {"worlds": 300})),
+        (
+            "environment.json",
+            provenance.describe,
+            lambda f: provenance.write_environment(f, {"time": "later"}),
+        ),
     ):
         path = folder / name
         content = path.read_bytes()
@@ -144,11 +148,11 @@ def test_damage_is_known_before_anything_reads_it_and_nothing_else_is_lost(damag
 
 
 def test_a_wrong_digest_is_damage_too(folder):
-    path = Parts(folder).found()["0000001"]
+    path = Checkpoints(folder).paths()["0000001"]
     path.rename(path.with_name("0000001-0123456789abcdef.nc"))
-    assert list(Parts(folder).found()) == ["0000000", "0000002", "state"]
+    assert list(Checkpoints(folder).paths()) == ["0000000", "0000002", "state"]
     for other in ("0" * 64, "", "\N{SNOWMAN}"):
-        files.checksum(folder / "results.nc").write_text(f"{other}  results.nc\n")
+        files.checksum_path(folder / "results.nc").write_text(f"{other}  results.nc\n")
         in_one_sentence(folder / "results.nc", files.read_results, folder)
 
 
@@ -158,10 +162,10 @@ def test_a_wrong_digest_is_damage_too(folder):
 def test_a_file_without_checksum_that_is_no_json_is_named(content, folder):
     """As an older version left it."""
     for name, read in (
-        ("manifest.json", run_folder.manifest),
-        ("environment.json", provenance.told),
+        ("manifest.json", run_folder.read_manifest),
+        ("environment.json", provenance.describe),
     ):
-        files.checksum(folder / name).unlink()
+        files.checksum_path(folder / name).unlink()
         (folder / name).write_bytes(content)
         in_one_sentence(folder / name, read, folder)
 
@@ -172,25 +176,31 @@ def test_a_file_without_checksum_is_read(sound, tmp_path):
     for path in folder.glob("*.sha256"):
         path.unlink()
     xr.testing.assert_identical(files.read_results(folder), RESULTS)
-    assert run_folder.manifest(folder) == {"worlds": 300, "seed": 0}
-    provenance.sign(folder, {"time": "later"})
-    assert provenance.signed(folder)["before"] == [{"command": ["rps", "sweep"], "time": "now"}]
+    assert run_folder.read_manifest(folder) == {"worlds": 300, "seed": 0}
+    provenance.write_environment(folder, {"time": "later"})
+    assert provenance.read_environment(folder)["before"] == [
+        {"command": ["rps", "sweep"], "time": "now"}
+    ]
     (folder / "results.nc").write_bytes(b"torn")
     in_one_sentence(folder / "results.nc", files.read_results, folder)
 
 
 def test_a_part_is_named_by_its_number_and_digest(tmp_path):
     """As every version names it, so that a sweep goes on that another version began."""
-    content = files.encoded(RESULTS.assign_attrs(part="0000012"))
+    content = files.encode_results(RESULTS.assign_attrs(part="0000012"))
     digest = hashlib.sha256(content).hexdigest()[:16]
     (tmp_path / "parts").mkdir()
     (tmp_path / "parts" / f"0000012-{digest}.nc").write_bytes(content)
-    assert dict(Parts(tmp_path).each()) == {"0000012": content}
-    assert Parts(tmp_path).put("0000012", content) == Parts(tmp_path).found()["0000012"]
-    results = Parts(tmp_path).results("0000012", lambda: pytest.fail("it was made again"))
+    assert dict(Checkpoints(tmp_path).items()) == {"0000012": content}
+    assert Checkpoints(tmp_path).put("0000012", content) == Checkpoints(tmp_path).paths()["0000012"]
+    results = Checkpoints(tmp_path).load_or_compute(
+        "0000012", lambda: pytest.fail("it was made again")
+    )
     xr.testing.assert_identical(results, RESULTS)
-    xr.testing.assert_identical(Parts(tmp_path).results("other", lambda: RESULTS), RESULTS)
-    assert list(Parts(tmp_path).found()) == ["0000012", "other"]
+    xr.testing.assert_identical(
+        Checkpoints(tmp_path).load_or_compute("other", lambda: RESULTS), RESULTS
+    )
+    assert list(Checkpoints(tmp_path).paths()) == ["0000012", "other"]
 
 
 @pytest.mark.skipif(not shutil.which("sha256sum"), reason="there is no sha256sum")
@@ -241,9 +251,9 @@ def test_a_write_killed_at_any_moment_leaves_the_old_file_or_the_new(tmp_path, m
     path, seen = tmp_path / "results.nc", set()
 
     def check():
-        seen.add(files.read_bytes(path))
-        if files.checksum(path).exists():
-            stated = files.checksum(path).read_text().split()[0]
+        seen.add(files.read_checked(path))
+        if files.checksum_path(path).exists():
+            stated = files.checksum_path(path).read_text().split()[0]
             assert stated == hashlib.sha256(path.read_bytes()).hexdigest()
         files.write_bytes(path, b"old", checked=True)
 
@@ -251,12 +261,12 @@ def test_a_write_killed_at_any_moment_leaves_the_old_file_or_the_new(tmp_path, m
     write = lambda: files.write_bytes(path, b"new", checked=True)  # noqa: E731
     assert killed_everywhere(monkeypatch, write, check) > 6
     assert seen == {b"old", b"new"}
-    assert files.checksum(path).exists()
+    assert files.checksum_path(path).exists()
 
 
 def test_a_part_that_is_replaced_is_the_old_one_or_the_new(tmp_path, monkeypatch):
     """Whenever the process is killed."""
-    parts, seen = Parts(tmp_path), set()
+    parts, seen = Checkpoints(tmp_path), set()
 
     def check():
         seen.add(parts.get("state"))
@@ -271,13 +281,13 @@ def test_a_part_that_is_replaced_is_the_old_one_or_the_new(tmp_path, monkeypatch
 
 
 def test_of_two_files_of_a_part_the_newer_counts_if_it_is_sound(tmp_path):
-    parts = Parts(tmp_path)
+    parts = Checkpoints(tmp_path)
     for age, content in ((100, b"old"), (0, b"new")):
         path = parts.put("state", content, new=True)
         os.utime(path, (time.time() - age,) * 2)
-    assert dict(parts.each()) == {"state": b"new"}
-    parts.found()["state"].write_bytes(b"torn")
-    assert dict(parts.each()) == {"state": b"old"}
+    assert dict(parts.items()) == {"state": b"new"}
+    parts.paths()["state"].write_bytes(b"torn")
+    assert dict(parts.items()) == {"state": b"old"}
 
 
 # --- one at a time -------------------------------------------------------------------------
@@ -285,19 +295,19 @@ def test_of_two_files_of_a_part_the_newer_counts_if_it_is_sound(tmp_path):
 
 def refused(folder, number=1, of=1):
     with pytest.raises(InputError, match="in use by another process"):
-        run_folder.hold(folder, number, of).__enter__()
+        run_folder.lock(folder, number, of).__enter__()
 
 
 def test_two_processes_may_not_share_a_run_but_may_share_its_shards(tmp_path):
-    with run_folder.hold(tmp_path):
+    with run_folder.lock(tmp_path):
         refused(tmp_path)
         refused(tmp_path, 1, 2)
-    with run_folder.hold(tmp_path, 1, 2):
-        with run_folder.hold(tmp_path, 2, 2):
+    with run_folder.lock(tmp_path, 1, 2):
+        with run_folder.lock(tmp_path, 2, 2):
             refused(tmp_path, 1, 2)
         refused(tmp_path)
         refused(tmp_path, 2, 3)  # which has parts of both
-    with run_folder.hold(tmp_path, 1, 3):
+    with run_folder.lock(tmp_path, 1, 3):
         pass
 
 
@@ -307,7 +317,7 @@ from pathlib import Path
 from rps_jax.record import checkpoint, files, provenance
 from rps_jax.record import folder as run_folder
 assert "jax" not in sys.modules
-with run_folder.hold(Path(sys.argv[1])):
+with run_folder.lock(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -320,7 +330,7 @@ def test_a_killed_process_holds_nothing_and_the_record_needs_no_jax(tmp_path):
         refused(tmp_path)
         one.kill()
         one.wait()
-        with run_folder.hold(tmp_path):
+        with run_folder.lock(tmp_path):
             pass
 
 
@@ -335,31 +345,31 @@ def test_of_those_that_begin_a_run_at_once_all_agree_or_are_refused(tmp_path):
             run_folder.claim(tmp_path, wanted)
         except InputError as error:
             return str(error)
-        provenance.sign(tmp_path, {"time": number})
+        provenance.write_environment(tmp_path, {"time": number})
         return wanted
 
     with ThreadPoolExecutor(8) as pool:
         told = list(pool.map(begin, range(8)))
-    kept = run_folder.manifest(tmp_path)
+    kept = run_folder.read_manifest(tmp_path)
     assert sorted(t == kept for t in told) == [False] * 4 + [True] * 4
     assert all("holds another run" in t for t in told if t != kept)
-    assert provenance.signed(tmp_path)["time"] in range(8)
+    assert provenance.read_environment(tmp_path)["time"] in range(8)
 
 
 def test_what_a_run_was_made_on_before_is_not_forgotten(tmp_path):
-    this = provenance.environment()
+    this = provenance.collect_environment()
     there = this | {"commit": "abc", "device": this["device"] | {"kind": "H200"}, "time": "then"}
-    provenance.sign(tmp_path, there)
-    provenance.sign(tmp_path, this)
-    provenance.sign(tmp_path, this | {"processors": 99})  # of a cluster that grows
-    provenance.sign(tmp_path, this)
-    provenance.sign(tmp_path, this | {"time": "later"})  # the same command again
-    assert provenance.signed(tmp_path) == this | {"time": "later", "before": [there]}
-    text = provenance.told(tmp_path)
+    provenance.write_environment(tmp_path, there)
+    provenance.write_environment(tmp_path, this)
+    provenance.write_environment(tmp_path, this | {"processors": 99})  # of a cluster that grows
+    provenance.write_environment(tmp_path, this)
+    provenance.write_environment(tmp_path, this | {"time": "later"})  # the same command again
+    assert provenance.read_environment(tmp_path) == this | {"time": "later", "before": [there]}
+    text = provenance.describe(tmp_path)
     assert text.index("later") < text.index("before that by") < text.index("commit abc, then, on H")
     (tmp_path / provenance.ENVIRONMENT).write_text("{}")
     with pytest.raises(InputError, match=r"environment\.json is corrupt"):
-        provenance.told(tmp_path)
+        provenance.describe(tmp_path)
 
 
 def test_names_that_are_no_utf8_keep_their_bytes(tmp_path):
@@ -374,4 +384,4 @@ def test_only_processors_that_a_process_may_use_are_counted(monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 128)
     assert engines.get("fused").workers("cpu") == 3
     monkeypatch.delattr(os, "sched_getaffinity")
-    assert provenance.processors() == 128
+    assert provenance.count_processors() == 128

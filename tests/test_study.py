@@ -14,7 +14,7 @@ from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.laws.rps_plus import RPSPlusParams
 from rps_jax.engines import mujoco as c_mujoco
 from rps_jax.record import files
-from rps_jax.record.checkpoint import Parts
+from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.robot.skin import IdealSkin
 from rps_jax.studies import hardware
 from rps_jax.trials import pushes
@@ -71,8 +71,8 @@ def test_a_study_labels_its_conditions_and_compares_them(folder):
 
 
 def test_a_study_continues_and_redoes_alone_what_is_corrupt(folder, monkeypatch):
-    parts = Parts(folder)
-    before, others = dict(parts.each()), parts.found()
+    parts = Checkpoints(folder)
+    before, others = dict(parts.items()), parts.paths()
     thin = others.pop("thin")
     thin.write_bytes(b"torn")
     ran = []
@@ -85,9 +85,11 @@ def test_a_study_continues_and_redoes_alone_what_is_corrupt(folder, monkeypatch)
     monkeypatch.setattr(pushes, "run", counted)
     conditions.run_conditions(CONDITIONS, GRID, folder)
     assert ran == CONDITIONS["thin"].cases(GRID)
-    again = [files.decoded(content["thin"], "thin") for content in (before, dict(parts.each()))]
+    again = [
+        files.decode_results(content["thin"], "thin") for content in (before, dict(parts.items()))
+    ]
     xr.testing.assert_identical(*(results.drop_attrs() for results in again))
-    assert others.items() <= parts.found().items()
+    assert others.items() <= parts.paths().items()
 
 
 def test_a_study_refuses_a_folder_of_other_conditions(folder):

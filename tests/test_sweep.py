@@ -325,10 +325,13 @@ def test_a_corrupt_part_is_set_aside_and_done_again_alone(whole, tmp_path):
 def test_a_part_of_an_older_version_is_named(whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "run")
     victim = sorted(folder.glob("parts/*.npz"))[0]
-    kept = files.arrays_of(victim.read_bytes())
+    kept = files.decode_arrays(victim.read_bytes())
     del kept["overflows"]
-    older = files.encoded(xr.Dataset({name: xr.Variable((), 0) for name in kept}))
-    for content, lacks in ((files.archive(**kept), "lacks overflows"), (older, "is a NetCDF file")):
+    older = files.encode_results(xr.Dataset({name: xr.Variable((), 0) for name in kept}))
+    for content, lacks in (
+        (files.encode_arrays(**kept), "lacks overflows"),
+        (older, "is a NetCDF file"),
+    ):
         victim.unlink()
         victim = sweep.store(folder, 0, content)
         with pytest.raises(InputError, match=f"part 0 .* another version .it {lacks}"):
@@ -390,6 +393,6 @@ def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys):
     assert "other holds another run (domain.objects = " in error
     assert not (other / "results.nc").exists()
     assert rps("replay", run, 4, "--law", "rps,tuned", "--film-length", 0.1) == 0
-    seen = files.read(run / "replay-4" / "results.nc")
+    seen = files.read_dataset(run / "replay-4" / "results.nc")
     # Followed alone, in another batch than in the sweep.
     assert float(seen.outcome_time) == pytest.approx(float(results.time[1, 4]), abs=0.5)

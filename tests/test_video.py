@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from rps_jax import errors
-from rps_jax.analysis import studio, video
-from rps_jax.world import scene
+from rps_jax.world import rendering, scene, video
 
 # imageio_ffmpeg's reader, used here alone, forks; JAX warns that its threads might then lock.
 pytestmark = pytest.mark.filterwarnings("ignore:os.fork")
@@ -202,7 +201,7 @@ def test_this_machine_can_draw_and_encode() -> None:
 
 
 def test_a_machine_that_cannot_draw_is_told_how_to_mend_it() -> None:
-    code = "from rps_jax.analysis import video; print(video.check()[0])"
+    code = "from rps_jax.world import video; print(video.check()[0])"
     environment = os.environ | {"MUJOCO_GL": "disable"}
     command = [sys.executable, "-c", code]
     told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
@@ -213,7 +212,7 @@ def test_a_machine_that_cannot_draw_is_told_how_to_mend_it() -> None:
 
 def test_importing_the_module_changes_nothing() -> None:
     code = (
-        "import os, sys; before = dict(os.environ); import rps_jax.analysis.video; "
+        "import os, sys; before = dict(os.environ); import rps_jax.world.video; "
         "assert 'mujoco' not in sys.modules and before == dict(os.environ)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -221,13 +220,13 @@ def test_importing_the_module_changes_nothing() -> None:
 
 def test_a_choice_of_gl_already_made_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    studio.choose_gl.__wrapped__()
+    rendering.choose_gl.__wrapped__()
     assert os.environ["MUJOCO_GL"] == "osmesa"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere MuJoCo needs no choice of GL")
 def test_without_a_display_it_can_draw_where_mujoco_was_imported_before() -> None:
-    code = "import mujoco; from rps_jax.analysis import video; print(video.check()[0].ok)"
+    code = "import mujoco; from rps_jax.world import video; print(video.check()[0].ok)"
     environment = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY")}
     command = [sys.executable, "-c", code]
     told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)

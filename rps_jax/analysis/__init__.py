@@ -1,1 +1,1 @@
-"""What labelled results say: statistics, tables, figures, pictures and videos, reports."""
+"""What labelled results say: statistics, tables, figures and reports."""

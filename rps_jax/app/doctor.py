@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from rps_jax.analysis import video
 from rps_jax.engines import device, native
 from rps_jax.errors import InputError
 from rps_jax.lowering import nvrtc
@@ -11,6 +10,7 @@ from rps_jax.record import folder as run_folder
 from rps_jax.record import provenance
 from rps_jax.record.options import option
 from rps_jax.runs.question import Question, call_of
+from rps_jax.world import video
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ doctor = call_of(Doctor)
 def report(cache: Path) -> str:
     """Versions, devices, folders and the state of rendering, one line each."""
     checks = [("cache", *_writable(cache)), *video.check()]
-    environment = provenance.environment()
+    environment = provenance.collect_environment()
     found = environment["device"]
     rows = {
         "python": f"{environment['python']} on {environment['platform']}",
@@ -56,7 +56,7 @@ def _kernels(platform: str) -> str:
 
 def _writable(folder: Path) -> tuple[bool, str]:
     try:
-        run_folder.writable(folder)
+        run_folder.ensure_writable(folder)
     except InputError:
         return False, f"{folder} cannot be written: set RPS_CACHE to a writable folder"
     return True, ""

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from rps_jax.analysis import studio
 from rps_jax.robot.shell import Shell
 from rps_jax.robot.skin import NONE
 from rps_jax.trials.stepper import Moment
+from rps_jax.world import rendering
 from rps_jax.world.scene import Scene
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ class Drawing:
             )
         self._taxels = _add_taxels(world, f"{_ROOT}/base/taxels", scene.shell)
         self._contact = world.add_icosphere(
-            f"{_ROOT}/base/contact", studio.CONTACT_RADIUS, color=_rgb(studio.CONTACT_RGBA)
+            f"{_ROOT}/base/contact", rendering.CONTACT_RADIUS, color=_rgb(rendering.CONTACT_RGBA)
         )
         nowhere = np.zeros((1, 2, 3))
         shape: dict[str, Any] = {"shaft_radius": 0.016, "head_radius": 0.045, "head_length": 0.1}
@@ -97,8 +97,8 @@ class Drawing:
         self._paths = {
             name: line(f"{_ROOT}/{name}", colors=_rgb(rgba), thickness=0.025, position=(0, 0, z))
             for name, rgba, z in (
-                ("base_path", studio.BASE_RGBA, 0.006),
-                ("contact_path", studio.CONTACT_RGBA, 0.012),
+                ("base_path", rendering.BASE_RGBA, 0.006),
+                ("contact_path", rendering.CONTACT_RGBA, 0.012),
             )
         }
 
@@ -121,7 +121,7 @@ class Drawing:
         self._contact.visible = touching
         if touching:
             felt = map(float, moment.seen.reading.p_robot_contact)
-            self._contact.position = (*felt, studio.CONTACT_HEIGHT + 0.03)
+            self._contact.position = (*felt, rendering.CONTACT_HEIGHT + 0.03)
         self._show_twist(*map(float, moment.seen.twist))
         way = [past[i] for i in (*range(0, index, _PATH_STEP), index)]
         self._paths["base_path"].points = _joined(np.array([m.seen.qpos[:2] for m in way]))

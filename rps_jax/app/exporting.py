@@ -50,7 +50,7 @@ class Export(Question[Path]):
                 f"prefix = {self.prefix} is not allowed: it must be a name of C, as my_law."
             )
         _ = self.program
-        folder.writable(Path(self.out or self.place))
+        folder.ensure_writable(Path(self.out or self.place))
 
     @contextlib.contextmanager
     def opened(self) -> Iterator[None]:

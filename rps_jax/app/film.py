@@ -17,8 +17,7 @@ import jax
 import numpy as np
 
 from rps_jax import engines, errors
-from rps_jax.analysis import statistics, video
-from rps_jax.analysis.video import Shot, Tile
+from rps_jax.analysis import statistics
 from rps_jax.control import registry
 from rps_jax.control.base import Law
 from rps_jax.errors import InputError
@@ -33,7 +32,9 @@ from rps_jax.trials.batch import Part, rows
 from rps_jax.trials.case import Case
 from rps_jax.trials.progress import Bar, Progress, Report
 from rps_jax.trials.setting import Setting
+from rps_jax.world import video
 from rps_jax.world.scene import Scene
+from rps_jax.world.video import Shot, Tile
 
 _MOST = 12  # rows, and columns
 _WHOLE = (1920, 1080)  # [px] that the grid is fitted into
@@ -84,12 +85,12 @@ class Film(Question[Path]):
 
     def note(self) -> str:
         """Whether another engine than the run's is filmed."""
-        sweep = "laws" in folder.manifest(Path(self.run)) and not self._of_table
+        sweep = "laws" in folder.read_manifest(Path(self.run)) and not self._of_table
         return another_engine(Path(self.run)) if sweep else ""
 
     @property
     def _of_table(self) -> bool:
-        return folder.manifest(Path(self.run)).get("question") == "table"
+        return folder.read_manifest(Path(self.run)).get("question") == "table"
 
     def check(self) -> None:
         """Check the grid, the file, and what is filmed."""
@@ -97,8 +98,8 @@ class Film(Question[Path]):
         if out.is_dir():
             raise InputError(f"out = {out} is a folder: name a file, as {out / 'film.mp4'}.")
         _ = self.shape
-        folder.manifest(Path(self.run))
-        folder.writable(out.parent)
+        folder.read_manifest(Path(self.run))
+        folder.ensure_writable(out.parent)
         for what in video.check():
             if not what.ok:
                 raise InputError(what.mend)

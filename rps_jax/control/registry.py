@@ -210,7 +210,7 @@ def _known(text: str) -> tuple[str, Params]:
     if not path.endswith(".py"):
         return text, LAWS[errors.check_name("law", text, LAWS)]
     content = _read(Path(path))
-    digest = files.digest(content)[:16]
+    digest = files.sha256(content)[:16]
     module = f"_rps_jax_{Path(path).stem}_{digest}"
     # It is run again if something else was registered by its name since.
     if (found := _registered(module, kind)) is None:
@@ -279,7 +279,7 @@ def _learned(path: Path) -> tuple[str, Params]:
     name = next((known for known, one in LAWS.items() if type(one).__name__ == kind), name)
     if name not in LAWS:
         register_law(name, law, params)
-    found, digest = LAWS[name], files.digest(content)[:16]
+    found, digest = LAWS[name], files.sha256(content)[:16]
     if name not in _OWN:  # a copy of a shipped policy leaves that what it is
         _SOURCES[type(found)] = {"file": str(path.resolve()), "digest": digest}
     return name, found
@@ -300,7 +300,7 @@ def _registered(module: str, kind: str) -> tuple[str, Params] | None:
 
 def _read(path: Path) -> bytes:
     try:
-        return files.content_of(path, "policy" if path.suffix == ".npz" else "python")
+        return files.read_regular(path, "policy" if path.suffix == ".npz" else "python")
     except OSError as error:
         raise InputError(
             f"law = {path} cannot be read ({error.strerror}): give FILE.py:CLASS or a policy's "
@@ -345,7 +345,7 @@ def restored(values: Mapping[str, Any]) -> Params:
     left = dict(values)
     kind, file, digest = (left.pop(key, None) for key in ("law", "file", "digest"))
     if file:  # it is compared before it is run
-        if files.digest(_read(Path(str(file))))[:16] != digest:
+        if files.sha256(_read(Path(str(file))))[:16] != digest:
             raise InputError(
                 f"law = {file} is not what it was when the run was made: restore the file."
             )

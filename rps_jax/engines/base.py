@@ -200,7 +200,7 @@ class Engine(abc.ABC):
 
         A processor gets one for each core, since XLA steps a small batch on one core.
         """
-        return provenance.processors() if backend == "cpu" else 1
+        return provenance.count_processors() if backend == "cpu" else 1
 
     def suits_processors(self, trials: int | None) -> bool:
         """Whether processors end so many trials sooner than a GPU; None: nobody knows how many."""

@@ -72,7 +72,7 @@ def _macros(compiler: str) -> str | None:
 
 def target() -> str | None:
     """What tells compilers and devices apart that functions are compiled by and for, if any."""
-    if (compiler := provenance.compiler()) is None or (macros := _macros(compiler)) is None:
+    if (compiler := provenance.find_compiler()) is None or (macros := _macros(compiler)) is None:
         return None
     if jax.default_backend() == "cpu":
         return macros
@@ -202,7 +202,7 @@ def _binary(text: str, name: str) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         source, binary = Path(folder) / f"{name}.c", Path(folder) / f"{name}.so"
         source.write_text(text)
-        words = [str(provenance.compiler()), *_FLAGS, "-shared", "-fPIC"]
+        words = [str(provenance.find_compiler()), *_FLAGS, "-shared", "-fPIC"]
         words += [f"-I{jax.ffi.include_dir()}", str(source), "-o", str(binary), "-lm", "-ldl"]
         done = subprocess.run(words, capture_output=True, text=True)
         if done.returncode:

@@ -142,7 +142,7 @@ def write(path: Path, steps: Iterable[Step], about: Mapping[str, str]) -> Path:
             for topic, time, message in _messages(steps):
                 writer.write_message(topic, kinds[TOPICS[topic]], message, time, time)
 
-    return files.atomic(path, fill)
+    return files.write_atomically(path, fill)
 
 
 def _messages(steps: Iterable[Step]) -> Iterator[tuple[str, int, dict[str, Any]]]:

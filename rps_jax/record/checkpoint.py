@@ -14,7 +14,7 @@ _DIGITS = 16  # of the digest in a file's name
 
 
 @dataclass(frozen=True)
-class Parts:
+class Checkpoints:
     """The finished parts of a run, each in a file `parts/NAME-DIGEST.SUFFIX` of its folder.
 
     The digest is of the file's content and is compared before anything else looks at the file. A
@@ -50,7 +50,7 @@ class Parts:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         older = [] if new else self._files((name,))
-        path = self.folder / f"{name}-{files.digest(content)[:_DIGITS]}{suffix}"
+        path = self.folder / f"{name}-{files.sha256(content)[:_DIGITS]}{suffix}"
         files.write_bytes(path, content)
         for one in older:
             if one != path:
@@ -60,11 +60,11 @@ class Parts:
     def results(self, name: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
         """The labelled results of a part, which are made and put if it is not finished."""
         if (content := self.get(name)) is None:
-            content = files.encoded(make().assign_attrs(part=name))
+            content = files.encode_results(make().assign_attrs(part=name))
             self.put(name, content)
-        found = files.decoded(content, self.folder / name, own=True)
+        found = files.decode_results(content, self.folder / name, own=True)
         if found.attrs.pop("part", None) != name:
-            raise files.corrupt(self.folder / name, "it holds another part")
+            raise files.CorruptFileError(self.folder / name, "it holds another part")
         return found
 
     def _files(self, names: Container[str] | None = None) -> list[Path]:
@@ -94,8 +94,8 @@ def _content(path: Path) -> bytes | None:
     """What was written into a file; None of one that is damaged, which is set aside, or gone."""
     with contextlib.suppress(FileNotFoundError):  # another process has set it aside
         with contextlib.suppress(InputError):  # no regular file, which is as good as damaged
-            content = files.content_of(path, "part")
-            if files.digest(content)[:_DIGITS] == path.stem.rpartition("-")[2]:
+            content = files.read_regular(path, "part")
+            if files.sha256(content)[:_DIGITS] == path.stem.rpartition("-")[2]:
                 return content
         path.replace(path.with_name(f"{path.name}.corrupt"))
     return None

@@ -26,9 +26,9 @@ import xarray as xr
 
 from rps_jax.errors import InputError
 
-Kind = Literal["json", "python", "xml", "policy", "part", "results"]
+FileKind = Literal["json", "python", "xml", "policy", "part", "results"]
 # [bytes] that a file of a kind may have. What is larger is none of ours, or the wrong file.
-MOST: dict[Kind, int] = {
+MAX_BYTES: dict[FileKind, int] = {
     "json": 2**26,
     "python": 2**22,
     "xml": 2**24,
@@ -47,7 +47,18 @@ _KINDS = {
 }
 
 
-def atomic(path: Path, write: Callable[[Path], Any]) -> Path:
+class CorruptFileError(InputError):
+    """A file, or another source, whose content cannot be decoded."""
+
+    def __init__(self, source: object, reason: object) -> None:
+        text = " ".join(str(reason).split()).rstrip(".")
+        super().__init__(
+            f"{source} is corrupt ({text}): restore it, or delete it and run the same command "
+            "again."
+        )
+
+
+def write_atomically(path: Path, write: Callable[[Path], Any]) -> Path:
     """Have `write` fill a file beside `path`, then put that in place; an OSError names `path`."""
     partial = path.with_name(f".{path.stem}.partial{path.suffix}")
     try:
@@ -55,7 +66,7 @@ def atomic(path: Path, write: Callable[[Path], Any]) -> Path:
         write(partial)
         with open(partial, "rb+") as file:
             os.fsync(file.fileno())
-        checksum(path).unlink(missing_ok=True)
+        checksum_path(path).unlink(missing_ok=True)
         os.replace(partial, path)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
@@ -71,10 +82,10 @@ def write_text(path: Path, text: str) -> Path:
 
 def write_bytes(path: Path, content: bytes, *, checked: bool = False) -> Path:
     """A file of this content, whole or not at all; if `checked`, with its checksum."""
-    atomic(path, lambda partial: partial.write_bytes(content))
+    write_atomically(path, lambda partial: partial.write_bytes(content))
     if checked:
-        line = f"{digest(content)}  {path.name}\n".encode()
-        atomic(checksum(path), lambda partial: partial.write_bytes(line))
+        line = f"{sha256(content)}  {path.name}\n".encode()
+        write_atomically(checksum_path(path), lambda partial: partial.write_bytes(line))
     return path
 
 
@@ -91,24 +102,24 @@ def write_json(path: Path, content: Any, *, checked: bool = False) -> Path:
 
 def write_results(path: Path, results: xr.Dataset) -> Path:
     """A NetCDF 4 file of labelled results, with its checksum."""
-    return write_bytes(path, encoded(results), checked=True)
+    return write_bytes(path, encode_results(results), checked=True)
 
 
-def checksum(path: Path) -> Path:
+def checksum_path(path: Path) -> Path:
     """The file that holds the checksum of another."""
     return path.with_name(f"{path.name}.sha256")
 
 
-def digest(content: bytes) -> str:
+def sha256(content: bytes) -> str:
     """SHA-256 in hexadecimal."""
     return hashlib.sha256(content).hexdigest()
 
 
-def encoded(results: xr.Dataset) -> bytes:
+def encode_results(results: xr.Dataset) -> bytes:
     """NetCDF 4, which depends on the results alone, not on when or where it is made.
 
     It is made in memory, since HDF5 crashes the process when its disk is full. An attribute holds
-    the digest of its structure, by which `decoded` knows what somebody has edited.
+    the digest of its structure, by which `decode_results` knows what somebody has edited.
     """
     signed = results.assign_attrs({_STRUCTURE: _structure(results)})
     # A view that Python's garbage collector finds first crashes Python before 3.12.2.
@@ -122,10 +133,10 @@ def _structure(results: xr.Dataset) -> str:
     for name, one in sorted(results.variables.items(), key=lambda item: str(item[0])):
         kind = "text" if one.dtype.kind in "OUST" else one.dtype.str  # texts of any length
         told.append((str(name), one.dims, one.shape, kind, one.attrs.get("units", "")))
-    return digest(repr(told).encode())[:16]
+    return sha256(repr(told).encode())[:16]
 
 
-def content_of(path: Path, kind: Kind = "results") -> bytes:
+def read_regular(path: Path, kind: FileKind = "results") -> bytes:
     """Read a regular file of bounded size; nothing else is opened, so that nothing blocks.
 
     Raises:
@@ -142,9 +153,9 @@ def content_of(path: Path, kind: Kind = "results") -> bytes:
     with open(os.open(path, flags), "rb") as file:
         status = os.fstat(file.fileno())
         _check_regular(path, status.st_mode)
-        if status.st_size > MOST[kind]:
+        if status.st_size > MAX_BYTES[kind]:
             raise InputError(
-                f"{path} is too large: a {kind} file has at most {MOST[kind] / 2**20:.0f} MiB."
+                f"{path} is too large: a {kind} file has at most {MAX_BYTES[kind] / 2**20:.0f} MiB."
             )
         return file.read(status.st_size or 2**16)  # some files of the system tell no size
 
@@ -155,10 +166,10 @@ def _check_regular(path: Path, mode: int) -> None:
         raise InputError(f"{path} cannot be read (it is {what}): give a regular file.")
 
 
-def decoded(content: bytes, source: Any, *, own: bool = False) -> xr.Dataset:
-    """The labelled results that `encoded` made into bytes; InputError names the `source`.
+def decode_results(content: bytes, source: Any, *, own: bool = False) -> xr.Dataset:
+    """The labelled results that `encode_results` made into bytes; InputError names the `source`.
 
-    If they are `own`, only `encoded` can have made them, and so signed their structure.
+    If they are `own`, only `encode_results` can have made them, and so signed their structure.
     """
     try:
         with xr.open_dataset(io.BytesIO(content), engine="h5netcdf") as found:
@@ -167,10 +178,12 @@ def decoded(content: bytes, source: Any, *, own: bool = False) -> xr.Dataset:
                 raise ValueError(f"it claims {size} bytes of numbers")
             found.load()
     except Exception as error:  # whatever HDF5 raises on a file that is none, or is damaged
-        raise corrupt(source, error) from error
+        raise CorruptFileError(source, error) from error
     signed = found.attrs.pop(_STRUCTURE, None)
     if signed != _structure(found) and (own or signed is not None):
-        raise corrupt(source, "its names, sizes, types or units are not those that were written")
+        raise CorruptFileError(
+            source, "its names, sizes, types or units are not those that were written"
+        )
     return found
 
 
@@ -186,15 +199,19 @@ def check_columns(
     """
     for name, wanted in dims.items():
         if name not in results.variables:
-            raise corrupt(source, f"it lacks {name}")
+            raise CorruptFileError(source, f"it lacks {name}")
         column = results[name]
         if column.dims != tuple(wanted):
-            raise corrupt(source, f"{name} has the dimensions {column.dims}, not {tuple(wanted)}")
+            raise CorruptFileError(
+                source, f"{name} has the dimensions {column.dims}, not {tuple(wanted)}"
+            )
         if column.dtype.kind not in "biuf":
-            raise corrupt(source, f"{name} holds {column.dtype}, not numbers")
+            raise CorruptFileError(source, f"{name} holds {column.dtype}, not numbers")
         for dim in wanted:
             if dim in sizes and column.sizes[dim] != sizes[dim]:
-                raise corrupt(source, f"{dim} has the length {column.sizes[dim]}, not {sizes[dim]}")
+                raise CorruptFileError(
+                    source, f"{dim} has the length {column.sizes[dim]}, not {sizes[dim]}"
+                )
     return results
 
 
@@ -204,7 +221,9 @@ def check_like(results: xr.Dataset, like: xr.Dataset, source: Any) -> xr.Dataset
     The sentence names what is missing, too much or of another kind.
     """
     if odd := sorted(map(str, {*like.variables} ^ {*results.variables})):
-        raise corrupt(source, f"it {'holds' if odd[0] in results.variables else 'lacks'} {odd[0]}")
+        raise CorruptFileError(
+            source, f"it {'holds' if odd[0] in results.variables else 'lacks'} {odd[0]}"
+        )
     every = like.variables.items()
     numbers = {
         str(name): list(map(str, one.dims)) for name, one in every if one.dtype.kind in "biuf"
@@ -212,18 +231,18 @@ def check_like(results: xr.Dataset, like: xr.Dataset, source: Any) -> xr.Dataset
     check_columns(results, source, numbers, like.sizes)
     for name in like.coords:
         if not np.array_equal(results[name].values, like[name].values):
-            raise corrupt(source, f"{name} is of another run")
+            raise CorruptFileError(source, f"{name} is of another run")
     return results
 
 
-def archive(**arrays: Any) -> bytes:
+def encode_arrays(**arrays: Any) -> bytes:
     """The content of a NumPy archive (.npz)."""
     content = io.BytesIO()
     np.savez(content, **arrays)
     return content.getvalue()
 
 
-def arrays_of(content: bytes) -> dict[str, np.ndarray]:
+def decode_arrays(content: bytes) -> dict[str, np.ndarray]:
     """The arrays of a NumPy archive (.npz) without pickled objects.
 
     What the archive says of itself is compared with its size before anything is unpacked.
@@ -233,7 +252,7 @@ def arrays_of(content: bytes) -> dict[str, np.ndarray]:
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            if sum(one.file_size for one in archive.infolist()) > MOST["part"]:
+            if sum(one.file_size for one in archive.infolist()) > MAX_BYTES["part"]:
                 raise ValueError("it claims to hold more than such files do")
             for one in archive.infolist():
                 if one.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
@@ -260,19 +279,19 @@ def _check_member(archive: zipfile.ZipFile, one: zipfile.ZipInfo) -> None:
             raise ValueError(f"{one.filename} is not as long as it says")
 
 
-def read_bytes(path: Path, kind: Kind = "results") -> bytes:
+def read_checked(path: Path, kind: FileKind = "results") -> bytes:
     """The content of a file; InputError if it is not what the checksum beside it says, if any."""
-    content, beside = content_of(path, kind), checksum(path)
+    content, beside = read_regular(path, kind), checksum_path(path)
     with contextlib.suppress(FileNotFoundError):  # there is none
-        if content_of(beside, "json").split(b" ")[0] != digest(content).encode():
-            if content_of(path, kind) != content:  # another process has just written it anew
-                return read_bytes(path, kind)
+        if read_regular(beside, "json").split(b" ")[0] != sha256(content).encode():
+            if read_regular(path, kind) != content:  # another process has just written it anew
+                return read_checked(path, kind)
             why = f"{beside.name} is of another content; delete that if the change was yours"
-            raise corrupt(path, why)
+            raise CorruptFileError(path, why)
     return content
 
 
-def parsed(content: bytes | str) -> Any:
+def parse_json(content: bytes | str) -> Any:
     """What JSON says; ValueError for none, and for one nested deeper than people write."""
     try:
         found = json.loads(content)
@@ -292,32 +311,32 @@ def parsed(content: bytes | str) -> Any:
     return found
 
 
-def noted(path: Path) -> dict[str, Any]:
+def read_checked_json(path: Path) -> dict[str, Any]:
     """What a JSON file of a run folder says, by name; InputError if it is missing or corrupt."""
     try:
-        content = read_bytes(path, "json")
+        content = read_checked(path, "json")
     except (FileNotFoundError, NotADirectoryError) as error:
         raise InputError(
             f"run = {path.parent} holds no {path.name}: give the folder of a run."
         ) from error
     try:
-        found = parsed(content)
+        found = parse_json(content)
     except ValueError as error:
-        raise corrupt(path, error) from error
+        raise CorruptFileError(path, error) from error
     if not isinstance(found, dict):
-        raise corrupt(path, "it holds no names with values")
+        raise CorruptFileError(path, "it holds no names with values")
     return found
 
 
-def read(path: Path) -> xr.Dataset:
+def read_dataset(path: Path) -> xr.Dataset:
     """The labelled results of one file; InputError if it is missing or corrupt."""
     try:
-        content = read_bytes(path)
+        content = read_checked(path)
     except OSError as error:
         raise InputError(
             f"{path} cannot be read ({error.strerror}): give a file of results."
         ) from error
-    return decoded(content, path)
+    return decode_results(content, path)
 
 
 def read_results(folder: Path) -> xr.Dataset:
@@ -325,25 +344,17 @@ def read_results(folder: Path) -> xr.Dataset:
     path = Path(folder) / "results.nc"
     if not path.exists():
         raise InputError(f"run = {folder} holds no results.nc: give the folder of a finished run.")
-    return read(path)
-
-
-def corrupt(source: Any, why: Any) -> InputError:
-    """The error for a file, or another source, that cannot be understood."""
-    reason = " ".join(str(why).split()).rstrip(".")
-    return InputError(
-        f"{source} is corrupt ({reason}): restore it, or delete it and run the same command again."
-    )
+    return read_dataset(path)
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """Names with values from a JSON file that a user wrote; InputError if it is none."""
     try:
-        content = content_of(path, "json")
+        content = read_regular(path, "json")
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}): give a JSON file.") from error
     try:
-        values = parsed(content)
+        values = parse_json(content)
     except ValueError as error:
         raise InputError(f"{path} is not JSON ({error}).") from error
     if not isinstance(values, dict):

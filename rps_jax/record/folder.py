@@ -17,15 +17,15 @@ from rps_jax.record import files
 MANIFEST = "manifest.json"  # of a run that can be continued
 
 
-def clear(folder: Path) -> None:
+def remove_run(folder: Path) -> None:
     """Remove the run that a folder holds, and nothing else; InputError if it is in use."""
     for inner in sorted(folder.rglob(MANIFEST)):  # runs in its folders, as of models
         if inner.parent != folder:
-            clear(inner.parent)
+            remove_run(inner.parent)
     if not (folder / MANIFEST).exists():
         return
-    writable(folder)
-    with hold(folder):
+    ensure_writable(folder)
+    with lock(folder):
         try:
             shutil.rmtree(folder / "parts", ignore_errors=True)
             for name in (MANIFEST, "results.nc", "points.nc", "environment.json"):
@@ -37,7 +37,7 @@ def clear(folder: Path) -> None:
             ) from error
 
 
-def writable(folder: Path) -> Path:
+def ensure_writable(folder: Path) -> Path:
     """The folder, made if need be; InputError if it cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -52,20 +52,20 @@ def writable(folder: Path) -> Path:
 
 def claim(folder: Path, wanted: dict[str, Any]) -> Path:
     """The folder of a run that can be continued, with its configuration as `manifest.json`."""
-    writable(folder)
+    ensure_writable(folder)
     wanted = json.loads(json.dumps(wanted))
-    with alone(folder):
+    with lock_briefly(folder):
         if not (folder / MANIFEST).exists():
             files.write_json(folder / MANIFEST, wanted, checked=True)
-        elif (found := files.noted(folder / MANIFEST)) != wanted:
+        elif (found := files.read_checked_json(folder / MANIFEST)) != wanted:
             raise InputError(
-                f"out = {folder} holds another run ({difference(found, wanted)}): choose another "
-                "folder, ask for the same, or pass --overwrite."
+                f"out = {folder} holds another run ({describe_difference(found, wanted)}): choose "
+                "another folder, ask for the same, or pass --overwrite."
             )
     return folder
 
 
-def alone(folder: Path) -> FileLock:
+def lock_briefly(folder: Path) -> FileLock:
     """A lock for the moment of a look and a note, for which other processes wait.
 
     Like every lock here it is let go by the operating system when its process is killed.
@@ -74,10 +74,10 @@ def alone(folder: Path) -> FileLock:
 
 
 @contextlib.contextmanager
-def hold(folder: Path, number: int = 1, of: int = 1) -> Iterator[None]:
+def lock(folder: Path, number: int = 1, of: int = 1) -> Iterator[None]:
     """Hold a run folder, or one of several equal shares of it; InputError if others do."""
     with contextlib.ExitStack() as held:
-        with alone(folder):
+        with lock_briefly(folder):
             for path in folder.glob(".lock-*-*"):
                 if not path.name.endswith(f"-{of}"):
                     _seize(path, folder).release()
@@ -97,16 +97,16 @@ def _seize(path: Path, folder: Path) -> FileLock:
     return lock
 
 
-def manifest(folder: Path) -> dict[str, Any]:
+def read_manifest(folder: Path) -> dict[str, Any]:
     """The configuration of the run in a folder; InputError if there is none, or it is corrupt."""
-    return files.noted(folder / MANIFEST)
+    return files.read_checked_json(folder / MANIFEST)
 
 
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel = 1
 
 
-def difference(found: Any, wanted: Any) -> str:
+def describe_difference(found: Any, wanted: Any) -> str:
     """The first few differences of two JSON values, in words."""
     differences = list(_differences(found, wanted, ""))
     more = f" and {len(differences) - 3} more" if len(differences) > 3 else ""

@@ -49,7 +49,7 @@ def check_fields(asked: Any) -> None:
     Whole numbers are `int`, finite numbers `float`, closed choices `Literal`; each may be `None`
     where the type says so. Fields of other types are left to their owner.
     """
-    types_ = typed_fields(type(asked))
+    types_ = field_types(type(asked))
     for one in dataclasses.fields(asked):
         _check(one.name, getattr(asked, one.name), types_[one.name], one.metadata.get(_KEY))
 
@@ -65,7 +65,7 @@ def is_positional(field: Any) -> bool:
 
 
 @functools.cache
-def typed_fields(kind: type) -> dict[str, Any]:
+def field_types(kind: type) -> dict[str, Any]:
     """Types of a dataclass's fields, by name."""
     return typing.get_type_hints(kind)
 
@@ -92,7 +92,7 @@ def _check(name: str, value: Any, kind: Any, bounds: dict[str, Any] | None) -> N
 
 
 @functools.cache
-def helps(kind: type) -> dict[str, str]:
+def field_docs(kind: type) -> dict[str, str]:
     """Strings below the fields of a dataclass (or named tuple) and of its bases, by field."""
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__):
@@ -120,14 +120,14 @@ def _below_fields(tree: Any) -> dict[str, str]:
     return found
 
 
-def described(value: Any) -> Any:
+def to_json(value: Any) -> Any:
     """JSON of a value: dataclasses and named tuples by their fields, arrays as lists."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: described(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {f.name: to_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if hasattr(value, "_asdict"):
-        return {name: described(one) for name, one in value._asdict().items()}
+        return {name: to_json(one) for name, one in value._asdict().items()}
     if isinstance(value, Mapping):
-        return {str(name): described(one) for name, one in value.items()}
+        return {str(name): to_json(one) for name, one in value.items()}
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, str | bool | None):
@@ -138,16 +138,16 @@ def described(value: Any) -> Any:
     if isinstance(value, numbers.Real) or getattr(value, "ndim", None) == 0:
         return float(number)
     if isinstance(value, tuple | list):
-        return [described(one) for one in value]
+        return [to_json(one) for one in value]
     if hasattr(value, "tolist"):
-        return described(np.asarray(value).tolist())
+        return to_json(np.asarray(value).tolist())
     raise TypeError(f"{type(value).__name__} cannot be described as JSON")
 
 
 # --- texts with changes --------------------------------------------------------------------
 
 
-def with_changes(kind: str, text: str) -> tuple[str, dict[str, Any]]:
+def parse_changes(kind: str, text: str) -> tuple[str, dict[str, Any]]:
     """Split a text `NAME,FIELD=VALUE,...` into its name and its changes.
 
     A value is a number, several of them with colons between, as 3:10, or a text. `kind` is what is

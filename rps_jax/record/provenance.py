@@ -23,18 +23,18 @@ _PACKAGES = (
 )
 
 
-def environment() -> dict[str, Any]:
+def collect_environment() -> dict[str, Any]:
     """Versions, device, commit and command of this process."""
     import jax
 
     device = jax.devices()[0]
     return {
         "command": _command(),
-        "commit": commit(),
+        "commit": git_commit(),
         "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "processors": processors(),
+        "processors": count_processors(),
         "device": {
             "platform": device.platform,
             "kind": device.device_kind,
@@ -46,7 +46,7 @@ def environment() -> dict[str, Any]:
     }
 
 
-def compiler() -> str | None:
+def find_compiler() -> str | None:
     """The C compiler by which functions are compiled, and launched on a GPU; None: XLA does it.
 
     The environment variable RPS_COMPILER names another, or `none`.
@@ -57,13 +57,13 @@ def compiler() -> str | None:
 
 def _compiled_by() -> str | None:
     """The compiler as it calls itself."""
-    if (name := compiler()) is None:
+    if (name := find_compiler()) is None:
         return None
     said = subprocess.run([name, "--version"], capture_output=True, text=True, timeout=60).stdout
     return said.partition("\n")[0] or name
 
 
-def processors() -> int:
+def count_processors() -> int:
     """Number of processors that this process may use, which a cluster may hold below the host's."""
     if hasattr(os, "sched_getaffinity"):  # not on macOS and Windows
         return len(os.sched_getaffinity(0))
@@ -78,13 +78,13 @@ def _command() -> list[str]:
     return ["python", sys.argv[0], *sys.argv[1:]] if program.suffix == ".py" else list(sys.argv)
 
 
-def sign(folder: Path, signed: Mapping[str, Any] | None = None) -> None:
+def write_environment(folder: Path, signed: Mapping[str, Any] | None = None) -> None:
     """Note in `environment.json` on what a run, or some of it, is made: by default by this process.
 
     What it was made on before stays there, under `before`, if anything but the time differs.
     """
-    new = dict(signed or environment())
-    with run_folder.alone(folder):
+    new = dict(signed or collect_environment())
+    with run_folder.lock_briefly(folder):
         earlier = _history(folder) if (folder / ENVIRONMENT).exists() else []
         earlier = [*new.pop("before", []), *earlier]
         others = [one for one in earlier if not _same(one, new)]
@@ -92,17 +92,17 @@ def sign(folder: Path, signed: Mapping[str, Any] | None = None) -> None:
         files.write_json(folder / ENVIRONMENT, note, checked=True)
 
 
-def signed(folder: Path) -> dict[str, Any]:
-    """What `sign` noted; InputError if there is nothing, or it is corrupt."""
-    return files.noted(folder / ENVIRONMENT)
+def read_environment(folder: Path) -> dict[str, Any]:
+    """What `write_environment` noted; InputError if there is nothing, or it is corrupt."""
+    return files.read_checked_json(folder / ENVIRONMENT)
 
 
 def _history(folder: Path) -> list[dict[str, Any]]:
-    """What `sign` noted, the latest last."""
-    last = signed(folder)
+    """What `write_environment` noted, the latest last."""
+    last = read_environment(folder)
     before = last.pop("before", [])
     if not (isinstance(before, list) and all(isinstance(one, dict) for one in before)):
-        raise files.corrupt(folder / ENVIRONMENT, "before is no list of names with values")
+        raise files.CorruptFileError(folder / ENVIRONMENT, "before is no list of names with values")
     return [*before, last]
 
 
@@ -113,8 +113,8 @@ def _same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     return process or differ <= {"time", "workers", "before"}
 
 
-def told(folder: Path) -> str:
-    """What `sign` noted, in words."""
+def describe(folder: Path) -> str:
+    """What `write_environment` noted, in words."""
     try:
         last, *before = (
             f"`{shlex.join(one['command'])}`, rps_jax {one['packages']['rps_jax']}"
@@ -124,14 +124,14 @@ def told(folder: Path) -> str:
             for one in reversed(_history(folder))
         )
     except (KeyError, TypeError, AttributeError) as error:
-        raise files.corrupt(folder / ENVIRONMENT, error) from error
+        raise files.CorruptFileError(folder / ENVIRONMENT, error) from error
     return f"Made by {'; before that by '.join([last, *before])}."
 
 
-def version(folder: Path) -> str:
+def package_version(folder: Path) -> str:
     """The version of this package that last made some of a run, in words."""
     try:
-        found = signed(folder)["packages"]["rps_jax"]
+        found = read_environment(folder)["packages"]["rps_jax"]
     except (InputError, KeyError, TypeError):
         found = None
     return f"rps_jax {found}" if isinstance(found, str) else "a version that it does not name"
@@ -144,7 +144,7 @@ def _version(package: str) -> str | None:
         return None
 
 
-def commit() -> str | None:
+def git_commit() -> str | None:
     """The git commit of the checkout this code runs from, marked if changed; None elsewhere."""
     root = Path(__file__).resolve().parents[2]
     words = ("describe", "--always", "--exclude=*", "--abbrev=40", "--dirty=-changed")

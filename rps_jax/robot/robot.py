@@ -20,7 +20,7 @@ from rps_jax import errors
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.record import files
-from rps_jax.record.options import with_changes
+from rps_jax.record.options import parse_changes
 from rps_jax.robot.shell import BOARDS, HALF_LENGTH, HALF_WIDTH, Boards, Shell
 
 
@@ -223,7 +223,7 @@ def named(robot: RobotLike) -> Robot:
     Changes may follow a name or a file, as `kairos,force_max=300`.
     """
     if isinstance(robot, str):
-        head, changes = with_changes("robot", robot)
+        head, changes = parse_changes("robot", robot)
         if head.endswith(".json"):
             robot = files.read_json(Path(head)) | changes
         else:

@@ -23,7 +23,7 @@ from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Bool, Float, Int, Scalar
 from rps_jax.geometry.footprint import Footprint
-from rps_jax.record.options import with_changes
+from rps_jax.record.options import parse_changes
 from rps_jax.robot.shell import HALF_WIDTH, Shell
 
 _NODES = 16  # points on each row of boards of the smooth ideal sensor
@@ -318,7 +318,7 @@ def named(skin: SkinLike) -> Any:
     if not isinstance(skin, str):
         skin.check()
         return skin
-    name, changes = with_changes("skin", skin)
+    name, changes = parse_changes("skin", skin)
     usual: Any = SKINS[errors.check_name("skin", name, SKINS)]  # pyright: ignore
     own = [field for field in usual._fields if field != "shell"]  # which is the robot's
     for field, value in changes.items():

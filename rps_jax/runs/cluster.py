@@ -51,11 +51,15 @@ def _work(
 ) -> tuple[dict[int, bytes], Progress, dict[str, Any]]:
     """Run parts of one kind, as a task of Ray: their contents, progress, and the environment."""
     prepare()
-    environment = provenance.environment() | {"host": socket.gethostname(), "pid": os.getpid()}
+    environment = provenance.collect_environment() | {
+        "host": socket.gethostname(),
+        "pid": os.getpid(),
+    }
     if _same(environment) != same:
         raise InputError(
             f"ray: host {environment['host']} has other software "
-            f"({run_folder.difference(_same(environment), same)}): install the same on all hosts."
+            f"({run_folder.describe_difference(_same(environment), same)}): install the same on "
+            "all hosts."
         )
     found, heard = dict[int, bytes](), [Progress(0, 0.0)]
     sweep.work(
@@ -136,10 +140,10 @@ def run_on_cluster(
     threads as `workers` says, by default one, and claims as many processors, and with `gpus` a GPU
     if the cluster has any and the engine can use one.
     """
-    own, known = provenance.environment(), dict[tuple[str, int], dict[str, Any]]()
+    own, known = provenance.collect_environment(), dict[tuple[str, int], dict[str, Any]]()
     missing, before = sweep.remaining(folder, plan, shard)
     if missing:
-        provenance.sign(folder, own)
+        provenance.write_environment(folder, own)
     done = Progress(before, 0.0)
     report(done)
     if not missing:
@@ -162,7 +166,7 @@ def run_on_cluster(
                 for number, content in contents.items():
                     sweep.store(folder, number, content)
                 known[environment["host"], environment["pid"]] = environment
-                provenance.sign(folder, own | _environment(list(known.values())))
+                provenance.write_environment(folder, own | _environment(list(known.values())))
                 simulated = done.simulated + progress.simulated
                 done = Progress(done.finished + progress.finished, simulated)
                 report(done)
@@ -231,7 +235,7 @@ def _room(hosts: Sequence[Mapping[str, Any]], num_cpus: int, num_gpus: int) -> i
 
 
 def _environment(workers: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What `provenance.environment` says of one process, of all workers; and who they are."""
+    """Return the environment record of all workers, and who they are."""
     some = workers[0]
     processors = {worker["host"]: worker["processors"] for worker in workers}
     return {

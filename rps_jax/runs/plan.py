@@ -159,10 +159,10 @@ def open_run(folder: Path, plan: Plan) -> Path:
 
 def load_plan(folder: Path) -> Plan:
     """The plan of a run folder; InputError if it holds none, or one of another version."""
-    found = run_folder.manifest(folder)
+    found = run_folder.read_manifest(folder)
     if "arms" in found or "strategies" in found:  # as 0.2.0 called them
         raise InputError(
-            f"run = {folder} was made by {provenance.version(folder)}: use that version."
+            f"run = {folder} was made by {provenance.package_version(folder)}: use that version."
         )
     if "laws" not in found:
         raise InputError(f"run = {folder} is not of a sweep: give the folder of `rps sweep`.")
@@ -175,14 +175,15 @@ def load_plan(folder: Path) -> Plan:
             found["part"],
         )
     except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
-        raise files.corrupt(folder / run_folder.MANIFEST, error) from error
+        raise files.CorruptFileError(folder / run_folder.MANIFEST, error) from error
     if "points" in found:
         plan = dataclasses.replace(plan, points=Points.read(folder, str(found["points"])))
     # What an older version did not write down would else be what this one does by default.
     if (now := json.loads(json.dumps(plan.configuration()))) != found:
         raise InputError(
-            f"run = {folder} was made by another version ({run_folder.difference(found, now)}), "
-            f"{provenance.version(folder)}: use that one."
+            f"run = {folder} was made by another version "
+            f"({run_folder.describe_difference(found, now)}), "
+            f"{provenance.package_version(folder)}: use that one."
         )
     return plan
 

@@ -94,14 +94,15 @@ class Trace:
         Raises:
           VideoError: this machine cannot draw.
         """
-        from rps_jax.analysis import figures, studio
+        from rps_jax.analysis import figures
+        from rps_jax.world import rendering
 
         seen = self.followed.snapshots
         shown = _evenly(len(seen.time), count)
-        tiles = [studio.Tile(self.scene, self.followed.p_world_target)] * len(shown)
-        with studio.open_studios(tiles, _STILL, "oblique") as each:
+        tiles = [rendering.Tile(self.scene, self.followed.p_world_target)] * len(shown)
+        with rendering.open_renderers(tiles, _STILL, "oblique") as each:
             drawn = zip(each, seen.qpos[shown], strict=True)
-            images = [one.draw(qpos, studio.NO_CONTACT) for one, qpos in drawn]
+            images = [one.draw(qpos, rendering.NO_CONTACT) for one, qpos in drawn]
         return figures.stills(images, [f"{seen.time[i]:.0f} s" for i in shown])
 
     def film(
@@ -126,7 +127,7 @@ class Trace:
           InputError: the length, rate or size is not allowed.
           VideoError: this machine cannot draw or encode.
         """
-        from rps_jax.analysis import video
+        from rps_jax.world import video
 
         check_length(seconds)
         seen = self.followed.snapshots
@@ -158,7 +159,7 @@ class FollowsOne(Question[Trace]):
     def check(self) -> None:
         if self.bag is not None:
             bags.check()
-            folder.writable(Path(self.bag).parent)
+            folder.ensure_writable(Path(self.bag).parent)
 
     def followed(self, part: Part, law: Law, setting: Setting, run: Run) -> Followed:
         """Follow a world, and write its bag."""

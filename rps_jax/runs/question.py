@@ -33,7 +33,7 @@ from rps_jax.control.base import Params
 from rps_jax.control.registry import LawLike, LawsLike
 from rps_jax.engines import device
 from rps_jax.record import files, folder, options, provenance
-from rps_jax.record.checkpoint import Parts
+from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.trials.progress import Bar, Report, Timing, watched
@@ -64,13 +64,13 @@ class Run(NamedTuple):
     workers: int | None = None  # host threads
 
     @property
-    def parts(self) -> Parts | None:
+    def parts(self) -> Checkpoints | None:
         """Finished parts of the run, if it has a folder."""
-        return None if self.folder is None else Parts(self.folder)
+        return None if self.folder is None else Checkpoints(self.folder)
 
     def part(self, name: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
         """Labelled results of a part: those that are kept, or else made and kept."""
-        return make() if self.parts is None else self.parts.results(name, make)
+        return make() if self.parts is None else self.parts.load_or_compute(name, make)
 
     @property
     def shape(self) -> dict[str, Any]:
@@ -221,8 +221,8 @@ class Question(Generic[T]):
             yield None
             return
         out = folder.claim(Path(self.out), self.configuration())
-        with folder.hold(out):
-            provenance.sign(out)
+        with folder.lock(out):
+            provenance.write_environment(out)
             yield out
 
     def described(self) -> dict[str, Any]:
@@ -241,7 +241,7 @@ class Question(Generic[T]):
             elif one.name == "setting":
                 value = setting_as_json(value)
             else:
-                value = options.described(value)
+                value = options.to_json(value)
             found[one.name] = value
         return found
 

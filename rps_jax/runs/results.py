@@ -11,7 +11,7 @@ import xarray as xr
 
 from rps_jax.errors import InputError
 from rps_jax.record import files
-from rps_jax.record.checkpoint import Parts
+from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import labelled
 from rps_jax.trials.results import UNITS, variable
@@ -30,17 +30,17 @@ _HDF5 = b"\x89HDF"  # with which a NetCDF file begins
 
 def encoded(part: Part) -> bytes:
     """The file of a part: a NumPy archive, which is made much faster than NetCDF."""
-    return files.archive(**part)
+    return files.encode_arrays(**part)
 
 
 def decoded(number: int, content: bytes) -> Part:
     """A part from its file; InputError if it is damaged, or of another version."""
     try:
-        return files.arrays_of(content)
+        return files.decode_arrays(content)
     except ValueError as error:
         if content.startswith(_HDF5):
             raise _of_another_version(number, "it is a NetCDF file") from error
-        raise files.corrupt(f"part {number}", error) from error
+        raise files.CorruptFileError(f"part {number}", error) from error
 
 
 def _of_another_version(number: int, why: str) -> InputError:
@@ -102,7 +102,7 @@ def gather(
         for number in list(made):
             yield number, made.pop(number)
         for folder in folders:
-            for name, content in Parts(folder).each(lacking):
+            for name, content in Checkpoints(folder).items(lacking):
                 number = lacking.pop(name)
                 yield number, decoded(number, content)
 
@@ -136,9 +136,9 @@ def dataset(plan: Plan, parts: Iterable[tuple[int, Part]]) -> xr.Dataset:
         for name, values in part.items():
             wanted = trials.size, *(columns[name].shape[2:] if name in UNITS else ())
             if values.shape != wanted or values.dtype.kind not in "biuf":
-                raise files.corrupt(f"part {number}", f"{name} is not numbers of {wanted}")
+                raise files.CorruptFileError(f"part {number}", f"{name} is not numbers of {wanted}")
         if not np.array_equal(part["trial"], trials):
-            raise files.corrupt(f"part {number}", "it holds other trials")
+            raise files.CorruptFileError(f"part {number}", "it holds other trials")
         world = trials % plan.worlds
         for name in UNITS:
             columns[name].values[law, world] = part[name]
@@ -213,10 +213,12 @@ def write_table(found: xr.Dataset, path: Path) -> None:
     told = [[name, *words] for name, words in made.attrs.pop("columns").items()]
     head = pd.DataFrame(told, columns=["column", "unit", "meaning"])
     if path.suffix == ".parquet":
-        files.atomic(path, lambda partial: made.to_parquet(partial, index=False))
+        files.write_atomically(path, lambda partial: made.to_parquet(partial, index=False))
     else:
-        files.atomic(path, lambda partial: made.to_csv(partial, index=False))
-    files.atomic(path.with_suffix(".columns.csv"), lambda one: head.to_csv(one, index=False))
+        files.write_atomically(path, lambda partial: made.to_csv(partial, index=False))
+    files.write_atomically(
+        path.with_suffix(".columns.csv"), lambda one: head.to_csv(one, index=False)
+    )
 
 
 def load(run: str | Path) -> xr.Dataset:

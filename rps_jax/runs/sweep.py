@@ -25,7 +25,7 @@ from rps_jax.engines.device import Device
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
-from rps_jax.record.checkpoint import Parts
+from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.options import option
 from rps_jax.runs import results
 from rps_jax.runs.plan import Kind, Plan, Shard, draw, load_plan, made, open_run, share
@@ -174,7 +174,7 @@ class Sweep(SweepOptions, OfPlan):
             return plan
         given = self.points
         if isinstance(given, str | Path):
-            given = files.read(Path(given))
+            given = files.read_dataset(Path(given))
         at = points.checked(self.ranges, given)
         part = self.part or _part_of(len(at.u))
         return Plan(self.ranges, len(at.u), self.chosen, self.setting, part, at)
@@ -270,18 +270,19 @@ class Merge(Question[xr.Dataset]):
 
     def answered(self, report: Report) -> xr.Dataset:
         folders = [Path(one) for one in self.folders]
-        out = run_folder.writable(Path(str(self.out)))
-        manifest = run_folder.manifest(folders[0])
+        out = run_folder.ensure_writable(Path(str(self.out)))
+        manifest = run_folder.read_manifest(folders[0])
         for other in folders[1:]:
-            if (theirs := run_folder.manifest(other)) != manifest:
+            if (theirs := run_folder.read_manifest(other)) != manifest:
                 raise InputError(
                     f"run = {other} is of another plan than {folders[0]} "
-                    f"({run_folder.difference(manifest, theirs)}): merge shards of one run."
+                    f"({run_folder.describe_difference(manifest, theirs)}): merge shards of one "
+                    "run."
                 )
         plan = load_plan(folders[0])
         found = results.gather(plan, folders, open_run(out, plan))
         for one in folders:
-            provenance.sign(out, provenance.signed(one))
+            provenance.write_environment(out, provenance.read_environment(one))
         return labelled(found)
 
     def intro(self, found: xr.Dataset) -> str:
@@ -311,7 +312,7 @@ def whole(plan: Plan, out: Path | None, *, report: Report = unheard, **shape: An
 def own_trials(folder: Path, plan: Plan, shard: Shard) -> xr.Dataset:
     """Outcomes (row) of a shard's own trials, with the law and the world of each."""
     own = share(plan, shard)
-    kept = Parts(folder).each([results.name_of(number) for number in own])
+    kept = Checkpoints(folder).items([results.name_of(number) for number in own])
     parts = ((int(name), results.decoded(int(name), content)) for name, content in kept)
     found = results.dataset(plan, parts)
     law, world = np.divmod(np.concatenate(list(own.values())), plan.worlds)
@@ -335,7 +336,7 @@ def run_missing(
     missing, before = remaining(folder, plan, shard)
     report(Progress(before, 0.0))
     if missing:
-        provenance.sign(folder)
+        provenance.write_environment(folder)
 
     def tell(progress: Progress) -> None:
         report(replace(progress, finished=before + progress.finished))
@@ -362,7 +363,7 @@ def complete(
     `by` runs it with its `options`, as `run_missing` or `cluster.run_on_cluster`.
     """
     open_run(folder, plan)
-    with run_folder.hold(folder, shard.number, shard.of):
+    with run_folder.lock(folder, shard.number, shard.of):
         made = by(folder, plan, shard=shard, **options) or {}
         return results.gather(plan, [folder], folder, made) if shard.of == 1 else None
 
@@ -391,7 +392,7 @@ def work(
 
 def remaining(folder: Path, plan: Plan, shard: Shard) -> tuple[dict[Kind, list[int]], int]:
     """Parts of a shard that a run folder lacks, by kind, and how many trials it has."""
-    done = Parts(folder).found()
+    done = Checkpoints(folder).paths()
     missing: dict[Kind, list[int]] = {}
     before = 0
     for number, trials in share(plan, shard).items():
@@ -423,4 +424,4 @@ def _ahead(parts: Iterator[Part], count: int) -> Iterator[Part]:
 
 def store(folder: Path, part: int, content: bytes) -> Path:
     """Write the file of a part into a run folder, whole or not at all."""
-    return Parts(folder).put(results.name_of(part), content, ".npz", new=True)
+    return Checkpoints(folder).put(results.name_of(part), content, ".npz", new=True)

@@ -146,7 +146,7 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         fine = replace(self.setting, engine="mujoco", physics="default", fidelity="reference")
         folder = None if run.folder is None else run.folder / "check"
         probe = Probe(self.ranges, self.params, fine, folder, **run.shape)
-        some = max(1, run.workers or provenance.processors())
+        some = max(1, run.workers or provenance.count_processors())
         for first in range(0, len(order), some):
             if not left():
                 break

@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 import xarray as xr
 
-from rps_jax.analysis import figures, video
+from rps_jax.analysis import figures
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.record import files
@@ -23,7 +23,7 @@ from rps_jax.studies.hardware import Hardware
 from rps_jax.studies.table import Table
 from rps_jax.trials.progress import InTurn
 from rps_jax.world import paper as papers
-from rps_jax.world import scene
+from rps_jax.world import scene, video
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.scene import FRICTION
 

@@ -13,7 +13,7 @@ from rps_jax.control import registry
 from rps_jax.control.base import Params
 from rps_jax.errors import InputError
 from rps_jax.record import files
-from rps_jax.record.checkpoint import Parts
+from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.trials import batch, score
 from rps_jax.trials.batch import Job, Part
 from rps_jax.trials.progress import InTurn, Report, unheard
@@ -56,7 +56,7 @@ class Probe:
         """Outcomes and `severity` (world) at points `u` (n, q)."""
         at, name = points.checked(self.domain, u), f"{self.calls:06d}"
         if self.folder is not None:
-            found = Parts(self.folder).results(name, lambda: self._try(at))
+            found = Checkpoints(self.folder).load_or_compute(name, lambda: self._try(at))
             sizes = {"world": len(at.u)}
             kept = {"u": ("world", "quantity")} | dict.fromkeys(_ANSWERED, ("world",))
             files.check_columns(found, self.folder, kept, sizes)

@@ -34,7 +34,7 @@ Known = Literal["rps", "rps_tuned", "rps_plus", "learned_gru"]
 
 def worlds() -> xr.Dataset:
     """Read the points `u` (world, quantity), and `success` and `severity` (known, world)."""
-    return files.read(FILE)
+    return files.read_dataset(FILE)
 
 
 @dataclass(frozen=True)

@@ -116,7 +116,7 @@ def table_of(folder: Path) -> Table:
       InputError: it holds none, or one with a robot or skin of one's own.
     """
     try:
-        found = run_folder.manifest(folder)
+        found = run_folder.read_manifest(folder)
         setting = setting_of(found["setting"])
         laws = {name: registry.restored(law) for name, law in found["laws"].items()}
         pairs = {name: _tuples(found[name]) for name in ("objects", "friction", "targets")}
@@ -124,7 +124,7 @@ def table_of(folder: Path) -> Table:
         if found["question"] != "table":
             raise KeyError("question")
     except (LookupError, TypeError, AttributeError, ValueError) as error:
-        raise files.corrupt(folder / run_folder.MANIFEST, error) from error
+        raise files.CorruptFileError(folder / run_folder.MANIFEST, error) from error
     if any(isinstance(given[name], dict) for name in ("robot", "skin")):
         raise errors.InputError(
             f"run = {folder} has a robot or skin of one's own: film it from Python."

@@ -23,7 +23,6 @@ import mujoco
 import numpy as np
 
 from rps_jax import engines, errors
-from rps_jax.analysis import video
 from rps_jax.control.base import check_finite
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
@@ -39,7 +38,7 @@ from rps_jax.trials.batch import Part, rows
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Seen, Trial, World
 from rps_jax.trials.worlds import drawn_scene, drawn_worlds
-from rps_jax.world import domain, draws, objects
+from rps_jax.world import domain, draws, objects, video
 from rps_jax.world.domain import DOMAINS, Domain
 from rps_jax.world.draws import Draw
 from rps_jax.world.scene import Scene

@@ -247,7 +247,7 @@ def _follow_on_host(
         part.stage,
         part.worlds,
         Loop(setting.physics, setting.rules, law),
-        threads=1 if part.numbers.size == 1 else provenance.processors(),
+        threads=1 if part.numbers.size == 1 else provenance.count_processors(),
         report=tell,
         watch=watch,
     )

@@ -158,7 +158,7 @@ class Fit(OfLaw[Fitted], InDomain[Fitted], OfLogs):
         usual = dataclasses.replace(self, logs=())
         content = [b"".join(np.ascontiguousarray(v).tobytes() for v in g.columns.values())
                    for g in self.given]  # fmt: skip
-        return super(Fit, usual).described() | {"logs": [files.digest(one) for one in content]}
+        return super(Fit, usual).described() | {"logs": [files.sha256(one) for one in content]}
 
     def answer(self, run: Run) -> Fitted:
         """Simulate what is missing of the worlds, learn from them, and judge the logs."""

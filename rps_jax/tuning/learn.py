@@ -25,7 +25,7 @@ from rps_jax.control.learned import policy as policies
 from rps_jax.control.learned.network import Weights
 from rps_jax.control.learned.policy import Policy
 from rps_jax.record import files, provenance
-from rps_jax.record.checkpoint import Parts
+from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.options import option
 from rps_jax.runs.question import Pushes, Run, Split, call_of, seed_of
 from rps_jax.trials.env import PushEnv, Reward
@@ -319,7 +319,7 @@ class _Learning:
 
     def policy(self) -> Policy:
         """The law that validated best, or the latest before any did."""
-        made = provenance.environment()
+        made = provenance.collect_environment()
         how = {
             "success_in_validation": self.best_rate if self.best else None,
             "updates": len(self.curve),
@@ -340,7 +340,9 @@ class _Learning:
         note = {"curve": self.curve, "spent": self.spent, "compile": self.compile}
         arrays["note"] = np.array(json.dumps(note | {"best": self.best_rate}))
         self._kept += 1
-        Parts(self.folder).put(f"learner-{self._kept % 2}", files.archive(**arrays), ".npz")
+        Checkpoints(self.folder).put(
+            f"learner-{self._kept % 2}", files.encode_arrays(**arrays), ".npz"
+        )
         files.write_bytes(self.folder / "policy.npz", policies.encoded(self.policy()))
         rows = [{"update": i + 1} | metrics for i, metrics in enumerate(self.curve)]
         files.write_csv(self.folder / "curve.csv", rows)
@@ -348,13 +350,13 @@ class _Learning:
     def _restore(self) -> None:
         """Take up what was kept last, if it is sound."""
         found = []
-        for name, content in Parts(self.folder).each():
-            path = Parts(self.folder).folder / name
+        for name, content in Checkpoints(self.folder).items():
+            path = Checkpoints(self.folder).folder / name
             try:
-                arrays = files.arrays_of(content)
-                note = _checked_note(files.parsed(str(arrays.pop("note"))))
+                arrays = files.decode_arrays(content)
+                note = _checked_note(files.parse_json(str(arrays.pop("note"))))
             except (ValueError, KeyError, TypeError) as error:
-                raise files.corrupt(path, error) from error
+                raise files.CorruptFileError(path, error) from error
             found.append((len(note["curve"]), note["spent"], name, note, arrays))
         if not found:
             return

@@ -21,7 +21,7 @@ from rps_jax.control import registry
 from rps_jax.control.base import Params
 from rps_jax.control.registry import LawLike
 from rps_jax.record import files
-from rps_jax.record.checkpoint import Parts
+from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.options import option
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Answer, Ask
@@ -228,8 +228,8 @@ def tune(
       InputError: the folder holds generations that this tuner does not propose.
     """
     tuner.begin()
-    parts, log = None if folder is None else Parts(folder), []
-    kept = {} if parts is None else parts.found()
+    parts, log = None if folder is None else Checkpoints(folder), []
+    kept = {} if parts is None else parts.paths()
     simulated = 0.0
 
     def heard(progress: Progress) -> None:
@@ -246,7 +246,7 @@ def tune(
             if parts is not None:
                 own = {f"metric_{key}": value for key, value in metrics.items()}
                 told = np.array(json.dumps(line))
-                parts.put(name, files.archive(vectors=vectors, line=told, **own), ".npz")
+                parts.put(name, files.encode_arrays(vectors=vectors, line=told, **own), ".npz")
         tuner.update(vectors, metrics)
         log.append(line)
         simulated += line["simulated"]
@@ -312,18 +312,20 @@ def _restored(
     tuner: Tuner, path: Path, proposed: np.ndarray, generation: int
 ) -> tuple[np.ndarray, Metrics, dict[str, Any]]:
     """The vectors of a generation that was tried before, their metrics, and the log's line."""
-    content = files.content_of(path, "part")
+    content = files.read_regular(path, "part")
     try:
-        arrays = files.arrays_of(content)
-        line = files.parsed(str(arrays.pop("line")))
+        arrays = files.decode_arrays(content)
+        line = files.parse_json(str(arrays.pop("line")))
         _check_line(line, tuner.space.names)
     except (ValueError, KeyError) as error:
-        raise files.corrupt(path, error) from error
+        raise files.CorruptFileError(path, error) from error
     vectors = arrays.pop("vectors", np.empty(0))
     metrics = {name.removeprefix("metric_"): values for name, values in arrays.items()}
     shapes = {name: values.shape for name, values in metrics.items() if values.dtype.kind == "f"}
     if shapes != tuner.shapes(proposed, generation):
-        raise files.corrupt(path, "its numbers are not those of a generation of this search")
+        raise files.CorruptFileError(
+            path, "its numbers are not those of a generation of this search"
+        )
     # Another machine may round otherwise, so the search goes on from what was tried.
     if (
         vectors.dtype.kind != "f"

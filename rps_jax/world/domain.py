@@ -12,7 +12,7 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.errors import InputError
 from rps_jax.record import files
-from rps_jax.record.options import with_changes
+from rps_jax.record.options import parse_changes
 from rps_jax.robot.robot import Robot, RobotLike
 from rps_jax.robot.robot import named as named_robot
 from rps_jax.world import paper, scene
@@ -312,7 +312,7 @@ def named(domain: DomainLike, robot: RobotLike | None = None) -> Domain:
         return domain
     if not isinstance(domain, str):
         raise InputError(f"domain = {domain!r} is not allowed: give a name or a Domain.")
-    head, changes = with_changes("domain", domain)
+    head, changes = parse_changes("domain", domain)
     if head.endswith(".json"):
         found = from_json(files.read_json(Path(head)))
     else:

@@ -69,7 +69,7 @@ def named(text: str) -> str:
     name = path.stem if path.stem not in _BUILT_IN else str(path)
     if REGISTERED.get(name, (None,))[0] != path:
         try:
-            files.content_of(path, "xml")
+            files.read_regular(path, "xml")
         except OSError as error:
             raise InputError(
                 f"object = {text} cannot be read ({error.strerror}): give an MJCF file."

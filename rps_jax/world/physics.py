@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 from rps_jax import errors
-from rps_jax.record.options import check_fields, option, with_changes
+from rps_jax.record.options import check_fields, option, parse_changes
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def named(physics: PhysicsLike, fidelity: Fidelity = "standard") -> Physics:
         return physics
     if not isinstance(physics, str):
         raise errors.InputError(f"physics = {physics!r} is not allowed: give a name or a Physics.")
-    name, changes = with_changes("physics", physics)
+    name, changes = parse_changes("physics", physics)
     errors.check_name("physics", name, PHYSICS)
     usual = preset(name, fidelity)  # pyright: ignore[reportArgumentType]
     for field, value in changes.items():

@@ -103,7 +103,7 @@ class Points:
     @property
     def digest(self) -> str:
         """SHA-256 of the numbers and of how many each point has."""
-        return files.digest(repr(self.u.shape).encode() + np.ascontiguousarray(self.u).tobytes())
+        return files.sha256(repr(self.u.shape).encode() + np.ascontiguousarray(self.u).tobytes())
 
     def cases(self, domain: Domain, index: Any) -> np.ndarray:
         """Which object, friction and target the worlds `index` have, as indices of the domain."""
@@ -134,11 +134,11 @@ class Points:
         if not (folder / FILE).exists():
             raise InputError(f"run = {folder} lacks its {FILE}: run the same command again.")
         kept = files.check_columns(
-            files.read(folder / FILE), folder / FILE, {"u": ("world", "quantity")}, {}
+            files.read_dataset(folder / FILE), folder / FILE, {"u": ("world", "quantity")}, {}
         )
         found = Points(kept.u.values)
         if found.digest != digest:
-            raise files.corrupt(folder / FILE, "its points are not those of the run")
+            raise files.CorruptFileError(folder / FILE, "its points are not those of the run")
         return found
 
 

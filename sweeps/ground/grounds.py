@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from rps_jax.errors import InputError
-from rps_jax.record.checkpoint import Parts
+from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.trials.progress import Progress, Report, unheard
 from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
 from rps_jax.world.scene import FRICTION
@@ -120,7 +120,7 @@ def run(
     Raises:
       InputError: the folder holds a ground of the same name that was run otherwise.
     """
-    parts = None if folder is None else Parts(folder)
+    parts = None if folder is None else Checkpoints(folder)
     finished, simulated = 0, 0.0
 
     def told(pushed: int, seconds: float) -> None:
@@ -180,12 +180,12 @@ def _count(
 
 
 def _part(
-    parts: Parts | None, name: str, run_as: str, make: Callable[[], xr.Dataset]
+    parts: Checkpoints | None, name: str, run_as: str, make: Callable[[], xr.Dataset]
 ) -> xr.Dataset:
     """A part that was run so, or is now."""
     if parts is None:
         return make()
-    results = parts.results(name, lambda: make().assign_attrs(run_as=run_as))
+    results = parts.load_or_compute(name, lambda: make().assign_attrs(run_as=run_as))
     if results.attrs.get("run_as") != run_as:
         raise InputError(
             f"{parts.folder / name}-*.nc was run with other options: choose another folder, or "

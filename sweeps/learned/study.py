@@ -84,7 +84,7 @@ class Learned(Study[list[list[Any]]]):
         )
         write_table(
             RESULTS / "learned.json",
-            [provenance.signed(one) for one in folders],
+            [provenance.read_environment(one) for one in folders],
             "; ".join(dict.fromkeys(self.devices)),
             Table(rows, note, COLUMNS),
         )
@@ -112,12 +112,12 @@ learned = call_of(Learned)
 
 def curve_of(folder: Path) -> xr.Dataset:
     """What a run found out after each update."""
-    return files.read(folder / "results.nc")
+    return files.read_dataset(folder / "results.nc")
 
 
 def row(folder: Path, device: str) -> list[Any]:
     """The row of a run: its law is the one that validated best."""
-    curve, asked = curve_of(folder), run_folder.manifest(folder)
+    curve, asked = curve_of(folder), run_folder.read_manifest(folder)
     judged = curve.dropna("update", subset=["validation"])
     rates = judged.validation.values
     best = judged.isel(update=len(rates) - 1 - int(np.argmax(rates[::-1])))
@@ -126,7 +126,7 @@ def row(folder: Path, device: str) -> list[Any]:
     ends = statistics.wilson(round(rate * tried), tried)
     return [
         f"`{asked['network']}`",
-        provenance.signed(folder)["packages"]["rps_jax"],
+        provenance.read_environment(folder)["packages"]["rps_jax"],
         device,
         ", ".join(dict.fromkeys(objects)),
         asked["num_envs"] * len(objects),

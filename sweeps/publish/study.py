@@ -215,7 +215,7 @@ def _carried_out(words: list[str], runs: Path) -> tuple[Sequence[Section], Any, 
             sections = asked.report(found, asked.run_in(out, bar))
     finally:
         sys.argv = before
-    return sections, found, provenance.signed(out) | {"command": words}
+    return sections, found, provenance.read_environment(out) | {"command": words}
 
 
 def _named(words: Sequence[str]) -> str:
@@ -250,7 +250,7 @@ def joined(tables: Sequence[tuple[str, Rows]], columns: Sequence[str]) -> tuple[
 
 def machine() -> str:
     """What this process runs on, in words."""
-    device, count = jax.devices()[0], provenance.processors()
+    device, count = jax.devices()[0], provenance.count_processors()
     if device.platform != "cpu":
         return f"one {device.device_kind} and {count} processors"
     model = platform.processor() or platform.machine()

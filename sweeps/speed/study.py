@@ -254,7 +254,7 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
     """Time C MuJoCo: on all cores in the closed loop of the law or stepping alone, or one trial."""
     physics = preset()
     how = IN_C[name]
-    threads = 1 if how == "serial" else provenance.processors()
+    threads = 1 if how == "serial" else provenance.count_processors()
     worlds = 1 if how == "serial" else 64 * threads
     setting, engine = Setting(engine="mujoco", physics=physics), engines.get("mujoco")
     stage, batch = programs.timed_worlds(family, worlds, setting)

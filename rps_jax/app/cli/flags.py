@@ -130,7 +130,7 @@ def _unboxed(line: str) -> str:
 
 def _flat(kind: type[Any]) -> tuple[list[Any], list[str]]:
     """Fields of the flat dataclass, and which of them are the command line's alone."""
-    types_, helps = options.typed_fields(kind), options.helps(kind)
+    types_, helps = options.field_types(kind), options.field_docs(kind)
     shared = [one.name for one in dataclasses.fields(Pushes)]  # told last, but for the setting
     own, last = [], []
     for one in dataclasses.fields(kind):
@@ -146,7 +146,7 @@ def _flat(kind: type[Any]) -> tuple[list[Any], list[str]]:
     if beside and not hasattr(kind, "in_shell"):
         filmed = issubclass(kind, FollowsOne)  # one trial over time
         beside += ["overwrite", "video", "film_length"] if filmed else ["overwrite"]
-    texts, hints = options.helps(Beside), typing.get_type_hints(Beside)
+    texts, hints = options.field_docs(Beside), typing.get_type_hints(Beside)
     extra = [_made(n, hints[n], Beside._field_defaults[n], texts[n]) for n in beside]
     every = [*own, *last, *extra]
     # Required ones must come first in a dataclass, and so must positional ones here.
@@ -189,7 +189,7 @@ def _of_setting(default: Setting) -> list[Any]:
     """Flags of a setting and its rules."""
     found = []
     for kind, own in ((Setting, default), (Rules, default.rules)):
-        types_, helps = typing.get_type_hints(kind), options.helps(kind)
+        types_, helps = typing.get_type_hints(kind), options.field_docs(kind)
         for name, text in helps.items():
             if name in types_:
                 value = own.__dict__.get(name) if kind is Setting else getattr(own, name)
@@ -225,9 +225,9 @@ def _gathered(kind: type[Any], given: Mapping[str, Any]) -> dict[str, Any]:
     """Arguments of a question, of the values of its flags."""
     found = dict(given)
     for one in dataclasses.fields(kind):
-        if options.typed_fields(kind)[one.name] is Setting:
-            rules = {name: found.pop(name) for name in options.helps(Rules) if name in found}
-            own = {name: found.pop(name) for name in options.helps(Setting) if name in found}
+        if options.field_types(kind)[one.name] is Setting:
+            rules = {name: found.pop(name) for name in options.field_docs(Rules) if name in found}
+            own = {name: found.pop(name) for name in options.field_docs(Setting) if name in found}
             usual: Setting = _default(one)
             rules_ = usual.rules._replace(**rules)
             found[one.name] = dataclasses.replace(usual, **own, rules=rules_)

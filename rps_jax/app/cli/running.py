@@ -136,7 +136,7 @@ def carry_out(question: Any, beside: Beside) -> None:
         asked.in_shell()
         return
     if beside.overwrite:
-        folder.clear(Path(asked.out))
+        folder.remove_run(Path(asked.out))
     tqdm.set_lock(threading.RLock())  # of this process alone: no semaphore is left if it is stopped
     film = None
     with asked.bar() as bar:
@@ -180,7 +180,7 @@ def _report(asked: Any, found: Any, bar: Bar) -> Path:
     sections = asked.report(found, asked.run_in(out, bar))
     parts = [asked.intro(found)]
     with contextlib.suppress(InputError):
-        parts.append(provenance.told(out))
+        parts.append(provenance.describe(out))
     return write_report(out, asked.title, "\n\n".join(filter(None, parts)), sections)
 
 
@@ -205,8 +205,8 @@ class _Film:
         """Wait for the film, with a bar, and draw the stills."""
         from tqdm import tqdm
 
-        from rps_jax.analysis import video
         from rps_jax.analysis.report import save
+        from rps_jax.world import video
 
         try:
             save(self._trace.stills(), self._out / "stills.png")

@@ -52,15 +52,15 @@ def encoded(policy: Policy) -> bytes:
     arrays: dict[str, Any] = {"about": np.array(json.dumps(policy.about))}
     for name in policy.network.shapes:
         arrays[name] = np.asarray(policy.weights[name], np.float32)
-    return files.archive(digest=np.array(_digest(arrays)), **arrays)
+    return files.encode_arrays(digest=np.array(_digest(arrays)), **arrays)
 
 
 def decoded(content: bytes, source: Any) -> Policy:
     """The policy of a file's content, which came from `source`; InputError if it is none."""
     try:
-        arrays = files.arrays_of(content)
+        arrays = files.decode_arrays(content)
         digest = str(arrays.pop("digest"))
-        about = files.parsed(str(arrays["about"]))
+        about = files.parse_json(str(arrays["about"]))
         if about["format"] != FORMAT:
             raise ValueError(f"its format is {about['format']}")
     except (ValueError, KeyError, TypeError) as error:

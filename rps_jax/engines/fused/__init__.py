@@ -83,7 +83,7 @@ class Fused(Engine):
 
     def suits_processors(self, trials: int | None) -> bool:
         """A few trials, by the function in C: a GPU takes some 5 s to begin."""
-        return trials is not None and trials <= _FEW and provenance.compiler() is not None
+        return trials is not None and trials <= _FEW and provenance.find_compiler() is not None
 
 
 @functools.cache

@@ -15,7 +15,14 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from rps_jax import errors
-from rps_jax.analysis.studio import NO_CONTACT, Studio, Tile, VideoError, open_studios, try_drawing
+from rps_jax.world.rendering import (
+    NO_CONTACT,
+    SceneRenderer,
+    Tile,
+    VideoError,
+    check_rendering,
+    open_renderers,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -49,7 +56,7 @@ class Check(NamedTuple):
 
 def check() -> list[Check]:
     """Whether this machine can draw and can encode, tried out; never raises VideoError."""
-    return [_attempt("rendering", try_drawing), _attempt("ffmpeg", _try_encoding)]
+    return [_attempt("rendering", check_rendering), _attempt("ffmpeg", _try_encoding)]
 
 
 def snapshot(
@@ -86,8 +93,8 @@ def images(
     camera: str = "oblique",
 ) -> list[np.ndarray]:
     """Pictures as of `snapshot`, each with the path of the base up to there."""
-    with open_studios([Tile(scene, p_world_target)], size, camera) as (studio,):
-        return [studio.draw(qpos, NO_CONTACT) for qpos in frames]
+    with open_renderers([Tile(scene, p_world_target)], size, camera) as (renderer,):
+        return [renderer.draw(qpos, NO_CONTACT) for qpos in frames]
 
 
 def render(
@@ -157,21 +164,21 @@ def render_grid(
     whole = np.full((rows * height, columns * width, 3), _EMPTY, np.uint8)
     cells = whole.reshape(rows, height, columns, width, 3).swapaxes(1, 2)
     with (
-        open_studios(tiles, size, camera) as studios,
+        open_renderers(tiles, size, camera) as renderers,
         _encoder(Path(path), (columns * width, rows * height), fps) as sink,
     ):
         shown: list[Shot | None] = [None] * len(tiles)
         for shots in frames:
-            for i, (studio, shot) in enumerate(zip(studios, shots, strict=True)):
+            for i, (renderer, shot) in enumerate(zip(renderers, shots, strict=True)):
                 if shot is not shown[i]:
-                    cells[divmod(i, columns)] = _labelled(studio, shot)
+                    cells[divmod(i, columns)] = _labelled(renderer, shot)
                     shown[i] = shot
             sink(whole)
 
 
-def _labelled(studio: Studio, shot: Shot) -> np.ndarray:
+def _labelled(renderer: SceneRenderer, shot: Shot) -> np.ndarray:
     """A tile, with its label and a line around it if it has one."""
-    drawn = studio.draw(shot.qpos, shot.p_world_contact)
+    drawn = renderer.draw(shot.qpos, shot.p_world_contact)
     if not shot.label:
         return drawn
     image = Image.fromarray(drawn)

@@ -84,7 +84,7 @@ class _Trail:
                 yield a, b
 
 
-class Studio:
+class SceneRenderer:
     """A scene before a camera, with what has been drawn so far left as trails."""
 
     def __init__(self, renderer: Any, scene: Scene, camera: str, target: np.ndarray) -> None:
@@ -203,8 +203,10 @@ def _averaged(fine: np.ndarray) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def open_studios(tiles: Sequence[Tile], size: tuple[int, int], camera: str) -> Iterator[list]:
-    """A `Studio` for each tile, those of one scene with one renderer.
+def open_renderers(
+    tiles: Sequence[Tile], size: tuple[int, int], camera: str
+) -> Iterator[list[SceneRenderer]]:
+    """A `SceneRenderer` for each tile, those of one scene with one renderer.
 
     Renderers are closed at the end; an open one complains when Python exits.
     """
@@ -222,7 +224,7 @@ def open_studios(tiles: Sequence[Tile], size: tuple[int, int], camera: str) -> I
             if id(scene.model) not in renderers:
                 renderers[id(scene.model)] = stack.enter_context(_renderer(scene.model, size))
         yield [
-            Studio(renderers[id(scene.model)], scene, camera, target)
+            SceneRenderer(renderers[id(scene.model)], scene, camera, target)
             for (scene, _), target in zip(tiles, targets, strict=True)
         ]
 
@@ -282,7 +284,7 @@ def _renderer(model: Any, size: tuple[int, int]) -> Iterator[Any]:
         yield renderer
 
 
-def try_drawing() -> None:
+def check_rendering() -> None:
     """Draw a sphere; raises VideoError where nothing can be drawn, or nothing is seen."""
     mujoco = _import_mujoco()
     model = mujoco.MjModel.from_xml_string(
