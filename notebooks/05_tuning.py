@@ -31,8 +31,8 @@ from rps_jax import RPSParams
 from rps_jax.analysis import figures, tables
 from rps_jax.robot.skin import SmoothSkin
 from rps_jax.trials.case import Case
-from rps_jax.tuning import gradients
 from rps_jax.tuning.space import Space
+from sweeps.gradients import estimators
 
 
 def read_log(run):
@@ -158,12 +158,12 @@ space = Space(names)
 targets = rps_jax.load("runs/table")[["target_x", "target_y"]].to_dataframe().to_numpy()
 cases = [Case("box", "S1", target, gap=0.004, skin=SmoothSkin()) for target in targets]
 horizons = (1.0, 3.0, 10.0)  # [s]
-distances, starts = gradients.distances(cases, space.params, horizons)  # of all three at once
+distances, starts = estimators.distances(cases, space.params, horizons)  # of all three at once
 theta, key = space.vector(RPSParams.paper()), jax.random.key(0)
 found = {
-    "derivative": gradients.forward(distances, theta, starts),
-    "differences": gradients.differences(distances, theta, starts, step=0.01),
-    "evolution": gradients.evolution(distances, theta, starts, key, sigma=0.15, pairs=4),
+    "derivative": estimators.forward(distances, theta, starts),
+    "differences": estimators.differences(distances, theta, starts, step=0.01),
+    "evolution": estimators.evolution(distances, theta, starts, key, sigma=0.15, pairs=4),
 }
 bars = {name: (one.gradient.T, one.variance.T) for name, one in found.items()}
 drawing.estimates(horizons, bars, names)

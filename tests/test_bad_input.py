@@ -28,7 +28,7 @@ def unlike(option, value, *choices):
     return f"invalid choice '{value}' for argument '{option}'. Expected one of{listed}"
 
 
-ESTIMATORS = ("reverse", "forward", "evolution", "combined")
+ESTIMATORS = ("reverse", "evolution")
 # What is asked for, and what the answer says of it.
 TABLE = {
     "--out run": "out = run holds another run .* choose another folder",

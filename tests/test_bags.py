@@ -14,8 +14,8 @@ from rps_jax.app.shadow import Shadow, shadow
 from rps_jax.record import bag
 from rps_jax.record.bag import Step
 from rps_jax.robot.robot import Robot
+from rps_jax.robot.skin import with_contacts
 from rps_jax.runs.push import push
-from rps_jax.tuning import logs
 
 pytest.importorskip("mcap_ros2")
 BRIEF = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=6.0))
@@ -184,7 +184,7 @@ def test_the_skin_feels_the_taxels_of_a_bag_without_contacts(tmp_path, capsys, m
     signal[20] = 0.4
     path = without_contacts(tmp_path / "a.mcap", steps(9, signal=signal), monkeypatch)
     assert "contact_type" not in bag.read(path)
-    found = logs.read_bag(path, Robot().shell)
+    found = with_contacts(bag.read(path), Robot().shell, "bag")
     assert found["contact_type"].tolist() == [0, 0] + [1] * 7
     place = [0.3625, 0.29 - 0.58 * 5.5 / 12]  # the sixth of the front's twelve
     np.testing.assert_allclose(found["p_robot_contact"][2:], [place] * 7, atol=1e-6)

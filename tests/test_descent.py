@@ -76,7 +76,7 @@ class TestDescent:
 
     def test_the_first_start_is_the_base(self):
         one = TuneGrad("rps", starts=3)
-        tuner = one.tuner()
+        tuner = one.tuner
         tuner.begin()
         thetas = tuner.propose()
         np.testing.assert_array_equal(thetas[0], one.space.vector(one.space.base))
@@ -84,8 +84,8 @@ class TestDescent:
 
     def test_a_law_without_a_smooth_form_is_refused(self):
         with pytest.raises(InputError, match="no smooth form"):
-            TuneGrad("pursuit", tuned=("K_v",)).tuner()
-        TuneGrad("pursuit", tuned=("K_v",), estimator="evolution").tuner()
+            TuneGrad("pursuit", tuned=("K_v",)).checked()
+        TuneGrad("pursuit", tuned=("K_v",), estimator="evolution").checked()
 
     def test_steps_go_downhill_and_stay_within_the_clip(self):
         rule = TuneGrad("rps", optimiser="sgd", learning_rate=0.5, clip=1.0, steps=10).rule()

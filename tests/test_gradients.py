@@ -23,6 +23,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.tuning import gradients
 from rps_jax.tuning.gradients import Estimate
 from rps_jax.world.physics import Physics
+from sweeps.gradients import estimators
 
 THETA = jnp.array([0.5, -1.0, 2.0])
 STIFF = jnp.array([1.0, 2.0, 0.5])
@@ -40,12 +41,12 @@ def some_worlds(key, n=32):
 
 
 ESTIMATORS = {
-    "forward": lambda scores, key, worlds: gradients.forward(scores, THETA, worlds),
+    "forward": lambda scores, key, worlds: estimators.forward(scores, THETA, worlds),
     "reverse": lambda scores, key, worlds: gradients.reverse(scores, THETA, worlds),
-    "differences": lambda scores, key, worlds: gradients.differences(
+    "differences": lambda scores, key, worlds: estimators.differences(
         scores, THETA, worlds, step=0.1
     ),
-    "evolution": lambda scores, key, worlds: gradients.evolution(
+    "evolution": lambda scores, key, worlds: estimators.evolution(
         scores, THETA, worlds, key, sigma=0.2, pairs=2
     ),
 }
@@ -104,7 +105,7 @@ def test_evolution_has_the_gradient_of_the_smoothed_score():
         return jnp.sum(thetas**3, axis=-1) + worlds
 
     sigma = jnp.array([0.5, 0.1, 0.3])
-    found = gradients.evolution(
+    found = estimators.evolution(
         cubes, THETA, jnp.zeros(200_000), jax.random.key(3), sigma=sigma, pairs=1
     )
     expected = 3 * THETA**2 + 3 * sigma**2
@@ -185,7 +186,7 @@ def known(gradient, variance) -> Estimate:
 
 def test_a_combination_weighs_by_inverse_variance_by_hand():
     # Weights 1/1 and 1/3: (1 * 0 + 1/3 * 4) / (4/3) = 1, variance 1 / (4/3).
-    both = gradients.combine(known([0.0, 2.0], [1.0, 0.0]), known([4.0, 9.0], [3.0, 1.0]))
+    both = estimators.combine(known([0.0, 2.0], [1.0, 0.0]), known([4.0, 9.0], [3.0, 1.0]))
     np.testing.assert_allclose(both.gradient, [1.0, 2.0])
     np.testing.assert_allclose(both.variance, [0.75, 0.0])
 
@@ -193,10 +194,10 @@ def test_a_combination_weighs_by_inverse_variance_by_hand():
 @pytest.mark.parametrize(("sure", "lost"), [(1.0, np.inf), (0.0, np.inf), (0.0, 0.0)])
 def test_what_knows_nothing_has_no_weight(sure, lost):
     one, other = known([2.0], [sure]), known([2.0 if lost == 0 else 7.0], [lost])
-    for both in (gradients.combine(one, other), gradients.combine(other, one)):
+    for both in (estimators.combine(one, other), estimators.combine(other, one)):
         assert both.gradient == 2.0
         assert both.variance == sure
-    nothing = gradients.combine(known([0.0], [np.inf]), known([0.0], [np.inf]))
+    nothing = estimators.combine(known([0.0], [np.inf]), known([0.0], [np.inf]))
     assert nothing.variance == np.inf
     assert nothing.gradient == 0
 
@@ -205,7 +206,7 @@ def test_what_knows_nothing_has_no_weight(sure, lost):
 @hypothesis.given(st.lists(st.floats(0, 1e6), min_size=4, max_size=4))
 def test_a_combination_claims_to_be_no_worse_than_either_and_is_symmetric(variances):
     one, other = known([1.0, -1.0], variances[:2]), known([3.0, 5.0], variances[2:])
-    both, again = gradients.combine(one, other), gradients.combine(other, one)
+    both, again = estimators.combine(one, other), estimators.combine(other, one)
     least = np.minimum(one.variance, other.variance)
     assert (both.variance <= least * (1 + 1e-6)).all()
     np.testing.assert_allclose(both.gradient, again.gradient, rtol=1e-5, atol=1e-5)
@@ -215,7 +216,7 @@ def test_a_combination_claims_to_be_no_worse_than_either_and_is_symmetric(varian
 def test_a_combination_is_nearer_to_the_truth_than_either():
     """The derivative and the smoothed differences of the same score, in worlds of their own."""
     one, other = repeat("forward", 32), repeat("evolution", 512, seed=2)
-    both = jax.vmap(gradients.combine)(one, other)
+    both = jax.vmap(estimators.combine)(one, other)
     error = [np.mean((found.gradient - STIFF * THETA) ** 2) for found in (both, one, other)]
     assert error[0] < 0.95 * min(error[1:])
     np.testing.assert_allclose(both.variance.mean(), error[0], rtol=0.3)

@@ -12,9 +12,9 @@ from gymnasium.vector import AutoresetMode
 from helpers import NEAR
 
 from rps_jax.errors import InputError
+from rps_jax.trials import gym
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
-from rps_jax.tuning import gym
 
 HOW = {"object": "random_cylinder", "domain": NEAR, "worlds": 6, "hold": 1.0}
 HOW |= {"setting": Setting("fused", fidelity="fast", rules=Rules(horizon=20.0))}
@@ -141,13 +141,13 @@ def test_images_are_drawn_where_they_are_asked_for(one):
 
 def test_what_means_nothing_is_refused(one, several):
     with pytest.raises(InputError, match=r"hold = 0.001 is not allowed"):
-        gym.Push(hold=0.001)
+        gym.GymPush(hold=0.001)
     with pytest.raises(InputError, match="num_envs = 0 is not allowed"):
-        gym.PushVector(0)
+        gym.GymPushVector(0)
     with pytest.raises(InputError, match="unknown autoreset_mode 'Disabled'"):
-        gym.PushVector(2, autoreset_mode=AutoresetMode.DISABLED)
+        gym.GymPushVector(2, autoreset_mode=AutoresetMode.DISABLED)
     with pytest.raises(InputError, match="unknown domain 'wild'"):
-        gym.Push(domain="wild")
+        gym.GymPush(domain="wild")
     several.reset(seed=0)
     with pytest.raises(InputError, match=r"action = of shape \(3,\) is not allowed"):
         several.step(AHEAD[0])
@@ -158,6 +158,13 @@ def test_what_means_nothing_is_refused(one, several):
 
 def test_without_gymnasium_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
-    monkeypatch.delitem(sys.modules, "rps_jax.tuning.gym")
+    monkeypatch.delitem(sys.modules, "rps_jax.trials.gym")
     with pytest.raises(InputError, match=r"run pip install 'rps_jax\[gym\]'"):
-        importlib.import_module("rps_jax.tuning.gym")
+        importlib.import_module("rps_jax.trials.gym")
+
+
+def test_the_previous_module_name_warns_and_has_the_same_classes(monkeypatch):
+    monkeypatch.delitem(sys.modules, "rps_jax.tuning.gym", raising=False)
+    with pytest.warns(DeprecationWarning, match=r"import rps_jax\.trials\.gym instead"):
+        previous = importlib.import_module("rps_jax.tuning.gym")
+    assert (previous.Push, previous.PushVector) == (gym.GymPush, gym.GymPushVector)

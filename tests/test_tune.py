@@ -146,7 +146,7 @@ def rosenbrock(x):
 
 def search(size=4, **options):
     """An evolution about the paper's parameters."""
-    one = TuneES("rps", tuned=SUBSETS["full"][:size], **options).tuner()
+    one = TuneES("rps", tuned=SUBSETS["full"][:size], **options).tuner
     one.begin()
     return one
 
@@ -235,13 +235,13 @@ SMALL = {"tuned": ("L", "K_h"), "worlds": 4, "validation": 4}
 
 
 def evolution(generations=6, **options):
-    return TuneES("rps", population=8, generations=generations, **SMALL, **options).tuner()
+    return TuneES("rps", population=8, generations=generations, **SMALL, **options).tuner
 
 
 def descents(generations=6):
     """Antithetic steps, which need no more than what is pretended."""
     asked = TuneGrad("rps", estimator="evolution", steps=5, starts=2, pairs=3, **SMALL)
-    tuner = asked.tuner()
+    tuner = asked.tuner
     tuner.generations = generations
     return tuner
 

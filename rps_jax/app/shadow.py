@@ -22,8 +22,8 @@ from rps_jax.record import bag as bags
 from rps_jax.record.options import option
 from rps_jax.robot import robot as robots
 from rps_jax.robot.robot import RobotLike
+from rps_jax.robot.skin import with_contacts
 from rps_jax.runs.question import Question, Run, call_of
-from rps_jax.tuning import logs
 
 _UNITS = {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s"}
 
@@ -56,7 +56,8 @@ class Shadow(Question[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run the law over the bag."""
-        recorded = logs.read_bag(Path(self.file), robots.named(self.robot).shell)
+        shell = robots.named(self.robot).shell
+        recorded = with_contacts(bags.read(Path(self.file)), shell, f"bag = {self.file}")
         twists = shadowed(registry.law_of(self.params), self.params, recorded)
         both = np.stack([recorded["twist"], twists])
         return xr.Dataset(

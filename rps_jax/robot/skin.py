@@ -300,6 +300,41 @@ def signals(skin: Skin, state: SkinState, footprint: Footprint) -> Float[Array, 
     return perfect._scan(perfect.init(state.key), footprint)[1]
 
 
+def check_taxels(signal: np.ndarray, shell: Shell, source: str) -> None:
+    """Raise InputError unless recorded signals (N, T) are of as many taxels as the shell's."""
+    if signal.shape[1] != shell.count:
+        raise errors.InputError(
+            f"{source} has {signal.shape[1]} taxels, and the robot {shell.count}: name the log's "
+            "robot by --robot."
+        )
+
+
+def with_contacts(steps: dict[str, np.ndarray], shell: Shell, source: str) -> dict[str, np.ndarray]:
+    """Return the steps of a bag with contacts, computed from its taxels if it has none.
+
+    The default skin on this shell filters one scan for each command, as the exported skin does,
+    and compares it with its threshold.
+
+    Raises:
+      InputError: the taxels of the source are not those of this shell.
+    """
+    if "contact_type" in steps:
+        return steps
+    check_taxels(steps["signal"], shell, source)
+    skin = CapacitiveSkin(shell=shell)
+
+    def scan(
+        state: SkinState, row: tuple[jax.Array, jax.Array]
+    ) -> tuple[SkinState, tuple[jax.Array, ...]]:
+        state, reading = skin.read(state, *row)
+        return state, (state.signal, reading.contact_type, reading.p_robot_contact)
+
+    rows = jnp.asarray(steps["signal"]), jnp.asarray(steps["period"])
+    columns = jax.lax.scan(scan, skin.init(jax.random.PRNGKey(0)), rows)[1]
+    names = "signal", "contact_type", "p_robot_contact"
+    return steps | dict(zip(names, map(np.asarray, columns), strict=True))
+
+
 SkinName = Literal["ideal", "thin", "capacitive", "hardware"]
 # "thin" chatters between the corners of a box, as a rigid contact sensor does.
 SKINS: dict[SkinName, Skin] = {

@@ -56,6 +56,10 @@ class Reward(NamedTuple):
     behind: float = 0.0  # [1] that target and object are seen nearer to one direction: the cosine
 
 
+# Default weights of `rps learn` and of the Gymnasium environment.
+SHAPED_REWARD = Reward(progress=0.5, no_contact=0.02, success=1.0, object=0.5, behind=0.5)
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class State:

@@ -34,8 +34,7 @@ from rps_jax.tuning.run import Metrics, Problem, TryOut, Tuning, finite
 from rps_jax.tuning.space import Space
 from rps_jax.world.physics import preset
 
-Estimator = Literal["reverse", "forward", "evolution", "combined"]
-_ENGINE = {"reverse": "quasistatic", "forward": "fused", "combined": "quasistatic"}
+Estimator = Literal["reverse", "evolution"]
 
 
 @dataclass(frozen=True)
@@ -62,10 +61,8 @@ class TuneGrad(Tuning):
     """Number of worlds of a step, in each domain; every step has its own."""
     validation: int = option(128, 1, 10_000_000)
     estimator: Estimator = "reverse"
-    """reverse differentiates windows through the quasi-static model, forward through the fused
-    engine; evolution takes antithetic steps in whole trials of the setting's engine; combined
-    weighs reverse and evolution by their variances, of which that of the windows is mostly much the
-    smaller, as if they were independent."""
+    """reverse differentiates windows of trials on the quasi-static model; evolution takes
+    antithetic steps in whole trials of the setting's engine."""
     optimiser: str = "adam"
     """Name of an optimiser of optax that needs gradients alone."""
     learning_rate: float = option(0.1, above=0)
@@ -74,7 +71,7 @@ class TuneGrad(Tuning):
     clip: float = option(1.0, above=0)
     """Bound on the norm of a gradient [1]."""
     world_clip: float = option(2.0, above=0)
-    """Bound on the norm of a single world's gradient, for reverse and forward, as a multiple of
+    """Bound on the norm of a single world's gradient, for reverse, as a multiple of
     their median [1]; a few chaotic worlds would outweigh all others."""
     steps: int = option(40, 1, 1_000_000)
     """Number of steps of each descent."""
@@ -84,7 +81,7 @@ class TuneGrad(Tuning):
     spread: float = option(0.5, 0, 10)
     """Standard deviation of these places, in units of the bounded map [1]."""
     window: float = option(8.0, above=0, unit="s")
-    """Length of a window of a softened trial, for reverse and forward [s]."""
+    """Length of a window of a softened trial, for reverse [s]."""
     within: float = option(100.0, 0, unit="s")
     """Windows begin at random times up to this; with 0 they begin with the trials [s]."""
     arrive: float = option(0.005, above=0, unit="m")
@@ -106,13 +103,14 @@ class TuneGrad(Tuning):
                 "gradients alone, as adam or sgd."
             ) from error
 
+    @functools.cached_property
     def tuner(self) -> DescentState:
         return DescentState(self)
 
     @property
     def how(self) -> Windows:
         """Which windows are differentiated, and how."""
-        own = self.estimator, self.world_clip, self.window, self.within, self.arrive
+        own = self.world_clip, self.window, self.within, self.arrive
         return Windows(self.space, self.problem, *own)
 
     def rule(self) -> optax.GradientTransformation:
@@ -155,7 +153,6 @@ class Windows(NamedTuple):
 
     space: Space
     problem: Problem
-    estimator: Estimator
     world_clip: float  # [1]
     window: float  # [s]
     within: float  # [s]
@@ -212,8 +209,9 @@ def _differentiated(
 ) -> Estimate:
     """Estimates (S, p) at thetas (S, p), each from all the worlds (n, ...) of one shape family."""
     scores = scores_of(how, stage)
-    mode = gradients.forward if how.estimator == "forward" else gradients.reverse
-    return jax.vmap(lambda theta: mode(scores, theta, worlds, clip=how.world_clip))(thetas)
+    return jax.vmap(lambda theta: gradients.reverse(scores, theta, worlds, clip=how.world_clip))(
+        thetas
+    )
 
 
 def differentiated(thetas: jax.Array, how: Windows, seed: int, step: int) -> tuple[Estimate, float]:
@@ -222,7 +220,7 @@ def differentiated(thetas: jax.Array, how: Windows, seed: int, step: int) -> tup
     Counted is what leads to a window, too, but not that worlds wait there for the latest to begin.
     """
     problem, found = how.problem, []
-    setting = replace(problem.setting, engine=_ENGINE[how.estimator])
+    setting = replace(problem.setting, engine="quasistatic")
     ask = problem.ask(jax.tree.map(lambda x: np.array([x]), RPSParams()), seed, step)
     random = np.random.default_rng((seed, step))
     for part, column, _ in evaluate.parts(ask, problem.domains, setting):
@@ -327,11 +325,7 @@ class DescentState:
         found, seconds = jax.block_until_ready(
             differentiated(thetas, descent.how, descent.setting.seed, step)
         )
-        more = {"simulated": seconds, "differentiate": time.perf_counter() - began}
-        if descent.estimator == "combined":
-            smooth = smoothed(thetas, descent, step, try_out)
-            found = jax.vmap(gradients.combine)(found, smooth)
-        return found, more
+        return found, {"simulated": seconds, "differentiate": time.perf_counter() - began}
 
     def update(self, vectors: np.ndarray, metrics: Metrics) -> None:
         """Follow the gradients by one step."""

@@ -5,6 +5,7 @@ Every candidate of a generation meets the same worlds; the next generation meets
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -66,6 +67,7 @@ class TuneES(Tuning):
     """Number of generations without a better validation after which the search begins again
     elsewhere; 0 stands for never."""
 
+    @functools.cached_property
     def tuner(self) -> EvolutionState:
         return EvolutionState(self)
 

@@ -28,7 +28,7 @@ from rps_jax.record import files, provenance
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.options import option
 from rps_jax.runs.question import Pushes, Run, Split, call_of, seed_of
-from rps_jax.trials.env import PushEnv, Reward
+from rps_jax.trials.env import SHAPED_REWARD, PushEnv
 from rps_jax.trials.progress import Bar, Progress, Report
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
@@ -38,7 +38,6 @@ from rps_jax.tuning.rollout import RunnerState
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import Domain, DomainLike
 
-REWARD = Reward(progress=0.5, no_contact=0.02, success=1.0, object=0.5, behind=0.5)
 _SPARE = 10  # times as long as a validation takes is learned between two
 Metrics = dict[str, float]  # of an update, by name
 
@@ -156,7 +155,7 @@ class Learn(PPO, Pushes[xr.Dataset]):
         rules, worlds = (self.setting.rules, self.drawn) if tune else (Rules(), self.validation)
         setting = replace(self.setting, rules=rules, seed=seed_of(self.setting.seed, split))
         return [
-            PushEnv(name, one, RPSParams(), setting, weights=REWARD, worlds=worlds)
+            PushEnv(name, one, RPSParams(), setting, weights=SHAPED_REWARD, worlds=worlds)
             for one in self.domains
             for name in one.objects
         ]

@@ -21,7 +21,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
@@ -30,7 +29,7 @@ from rps_jax.errors import InputError
 from rps_jax.geometry import planar
 from rps_jax.record import bag, files
 from rps_jax.robot.shell import Shell
-from rps_jax.robot.skin import CapacitiveSkin
+from rps_jax.robot.skin import CapacitiveSkin, check_taxels, with_contacts
 from rps_jax.runs.push import Trace
 from rps_jax.world.scene import JOINTS
 
@@ -90,9 +89,9 @@ def read(source: Any, shell: Shell) -> Given:
         found = _of_trace(files.read_results(Path(source)), name)
     elif Path(source).suffix == ".mcap" and Path(source).is_file():
         bag.check()
-        read_ = read_bag(Path(source), shell)
+        steps = with_contacts(bag.read(Path(source)), shell, f"bag = {source}")
         known = (*COLUMNS, "signal")
-        found = Given({k: np.asarray(v, float) for k, v in read_.items() if k in known}, False)
+        found = Given({k: np.asarray(v, float) for k, v in steps.items() if k in known}, False)
     elif Path(source).suffix == ".csv" and Path(source).is_file():
         found = _of_table(Path(source), name)
     else:
@@ -101,43 +100,11 @@ def read(source: Any, shell: Shell) -> Given:
         )
     columns = found.columns
     if "signal" in columns:
-        _check_taxels(columns["signal"], name, shell)
+        check_taxels(columns["signal"], shell, name)
     if "contact_type" not in columns:
         columns |= _touch_of(columns["signal"], shell)
     _check(columns, name, shell)
     return found
-
-
-def read_bag(path: Path, shell: Shell) -> dict[str, np.ndarray]:
-    """Read a bag as `bag.read` does; of one without contacts the skin makes them of its taxels.
-
-    The usual skin on this shell filters one scan for each command, as the exported skin does, and
-    compares it to its threshold.
-
-    Raises:
-      InputError: it cannot be read, or its taxels are not those of this shell.
-    """
-    found = bag.read(path)
-    if "contact_type" in found:
-        return found
-    _check_taxels(found["signal"], f"bag = {path}", shell)
-    skin = CapacitiveSkin(shell=shell)
-
-    def scan(state: Any, row: Any) -> Any:
-        state, reading = skin.read(state, *row)
-        return state, (state.signal, reading.contact_type, reading.p_robot_contact)
-
-    rows = jnp.asarray(found["signal"]), jnp.asarray(found["period"])
-    felt = jax.lax.scan(scan, skin.init(jax.random.PRNGKey(0)), rows)[1]
-    return found | dict(zip(("signal", *_TOUCH), map(np.asarray, felt), strict=True))
-
-
-def _check_taxels(signal: np.ndarray, name: str, shell: Shell) -> None:
-    if signal.shape[1] != shell.count:
-        raise InputError(
-            f"{name} has {signal.shape[1]} taxels, and the robot {shell.count}: name the log's "
-            "robot by --robot."
-        )
 
 
 def _of_trace(data: xr.Dataset, name: str) -> Given:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import pandas as pd
@@ -34,13 +34,8 @@ from rps_jax.tuning.space import Space, expanded
 from rps_jax.world import domain as worlds_
 from rps_jax.world.domain import DOMAINS, Domain, DomainLike
 
-if TYPE_CHECKING:
-    from rps_jax.tuning.descent import DescentState
-    from rps_jax.tuning.evolution import EvolutionState
-
-    Tuner = DescentState | EvolutionState
-
-Metrics = dict[str, np.ndarray]  # what was found out about a generation, by name
+Metrics = dict[str, np.ndarray]  # results of the trials of a generation, by name
+LogLine = dict[str, Any]  # a line of `log.jsonl`: numbers or None by name, and `params` by name
 TryOut = Callable[[list[Ask]], list[Answer]]  # in the worlds of a problem
 
 
@@ -62,6 +57,39 @@ class Problem:
     def validate(self, params: Params, seed: int) -> Ask:
         """Candidates with leaves (P,) in the worlds for validation."""
         return Ask(params, seed_of(seed, "validate"), np.arange(self.validation))
+
+
+class Tuner(Protocol):
+    """Search for parameters: one generation after another is proposed, judged and used.
+
+    Its state follows from the vectors (P, p) of all generations and from their metrics.
+    """
+
+    space: Space
+    problem: Problem
+    generations: int  # number of generations, at most
+    budget: float  # [s] simulated time after which no generation begins; 0: no bound
+    best: np.ndarray  # (p,) vector with the best validation
+
+    def begin(self) -> None:
+        """Reset the search to its start; nothing is computed before."""
+
+    def propose(self) -> np.ndarray:
+        """Return the vectors (P, p) of the next generation."""
+        ...
+
+    def shapes(self, vectors: np.ndarray, generation: int) -> dict[str, tuple[int, ...]]:
+        """Return the shapes of a generation's metrics."""
+        ...
+
+    def judge(
+        self, vectors: np.ndarray, generation: int, try_out: TryOut
+    ) -> tuple[Metrics, LogLine]:
+        """Try the vectors of a generation; return its metrics and its line of the log."""
+        ...
+
+    def update(self, vectors: np.ndarray, metrics: Metrics) -> None:
+        """Advance the search by the metrics of a generation."""
 
 
 @dataclass(frozen=True)
@@ -118,6 +146,7 @@ class Tuning(OfLaw[xr.Dataset]):
         errors.check_each_once("domain", domains)
         return Problem(domains, self.worlds, self.validation, self.setting, self.objective)
 
+    @functools.cached_property
     def tuner(self) -> Tuner:
         """The search."""
         raise NotImplementedError
@@ -138,7 +167,7 @@ class Tuning(OfLaw[xr.Dataset]):
             )
         for one in self.problem.domains:
             self.setting.check_here(one.families, one.weakest, [self.space.base])
-        self.tuner()
+        _ = self.tuner
 
     def described(self) -> dict[str, Any]:
         """Own fields as JSON, with all that is tuned, and domains by their ranges."""
@@ -146,13 +175,12 @@ class Tuning(OfLaw[xr.Dataset]):
         return super().described() | {"tuned": self.space.names, "domain": ranges}
 
     def bar(self) -> Bar:
-        count = self.tuner().generations
-        return Bar(self.name.replace("_", " "), count, "generations", shown=self.shown)
+        name, count = self.name.replace("_", " "), self.tuner.generations
+        return Bar(name, count, "generations", shown=self.shown)
 
     def answer(self, run: Run) -> xr.Dataset:
-        tuner = self.tuner()
-        log = tune(run.folder, tuner, report=run.report, slots=run.slots, workers=run.workers)
-        return labelled(log, tuner)
+        log = tune(run.folder, self.tuner, report=run.report, slots=run.slots, workers=run.workers)
+        return labelled(log, self.tuner)
 
     def intro(self, found: xr.Dataset) -> str:
         names = ", ".join(self.space.names)

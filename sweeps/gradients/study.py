@@ -34,13 +34,13 @@ from rps_jax.trials.progress import Progress, phase
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Snapshot, World
 from rps_jax.trials.worlds import drawn_worlds
-from rps_jax.tuning import gradients as estimates
 from rps_jax.tuning.descent import soften
-from rps_jax.tuning.gradients import Estimate
+from rps_jax.tuning.gradients import Estimate, Scores, reverse, window
 from rps_jax.tuning.space import Space, expanded
 from rps_jax.world import domain as domains
 from rps_jax.world import draws
 from rps_jax.world.domain import RANDOM, DomainLike
+from sweeps.gradients import estimators
 from sweeps.study_base import Study
 
 TRUTH = "truth"
@@ -163,7 +163,7 @@ def _stage_and_worlds(study: Gradients, engine: EngineName, split: Split, count:
     return part.stage, part.worlds, setting.physics
 
 
-def _distances(study: Gradients, stage: Any, physics: Any, smooth: bool) -> estimates.Scores:
+def _distances(study: Gradients, stage: Any, physics: Any, smooth: bool) -> Scores:
     """Scores (n, H) [m]: the distances after the horizons."""
     period = physics.control_period
     at = np.array([round(time / period) - 1 for time in study.horizons])
@@ -173,7 +173,7 @@ def _distances(study: Gradients, stage: Any, physics: Any, smooth: bool) -> esti
         return seen.details.distance[at]
 
     loop = trial.Loop(physics, law=law)
-    score = estimates.window(stage, study.space.params, left, loop, int(at[-1]) + 1)
+    score = window(stage, study.space.params, left, loop, int(at[-1]) + 1)
 
     def scores(thetas: jax.Array, worlds: World) -> jax.Array:
         live = jnp.ones(thetas.shape[0], bool)
@@ -186,7 +186,7 @@ def truth(study: Gradients) -> Estimate:
     """Finite differences: gradient (p, H) [m], and its variance, by the number of worlds."""
     stage, worlds, physics = _stage_and_worlds(study, study.engine, "test", study.truth)
     scores = jax.jit(_distances(study, stage, physics, smooth=False))
-    return estimates.differences(scores, study.theta, worlds, step=study.delta)
+    return estimators.differences(scores, study.theta, worlds, step=study.delta)
 
 
 def repeats(study: Gradients, name: str) -> Iterator[Estimate]:
@@ -197,12 +197,10 @@ def repeats(study: Gradients, name: str) -> Iterator[Estimate]:
     stage, worlds, physics = _stage_and_worlds(study, engine, "tune", count)
     scores = _distances(study, stage, physics, smooth)
     act: dict[str, Callable[..., Estimate]] = {
-        "reverse": lambda worlds, key: estimates.reverse(scores, study.theta, worlds),
-        "clipped": lambda worlds, key: estimates.reverse(
-            scores, study.theta, worlds, clip=study.clip
-        ),
-        "forward": lambda worlds, key: estimates.forward(scores, study.theta, worlds),
-        "evolution": partial(estimates.evolution, scores, study.theta, sigma=study.sigma),
+        "reverse": lambda worlds, key: reverse(scores, study.theta, worlds),
+        "clipped": lambda worlds, key: reverse(scores, study.theta, worlds, clip=study.clip),
+        "forward": lambda worlds, key: estimators.forward(scores, study.theta, worlds),
+        "evolution": partial(estimators.evolution, scores, study.theta, sigma=study.sigma),
     }
     one = jax.jit(act[name])
     if smooth:
@@ -221,7 +219,7 @@ def _measured(study: Gradients, name: str, found: dict[str, xr.Dataset]) -> xr.D
             Estimate(*(jnp.asarray(found[n][f].values) for f in Estimate._fields))
             for n in ("reverse", "evolution")
         ]
-        every = jax.vmap(estimates.combine)(*pair)
+        every = jax.vmap(estimators.combine)(*pair)
         all_of = [jax.tree.map(lambda leaf, r=r: leaf[r], every) for r in range(study.repeats)]
     else:
         all_of = list(repeats(study, name))

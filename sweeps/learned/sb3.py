@@ -95,7 +95,7 @@ class SB3(Study[xr.Dataset]):
         modules: list[Any] = [importlib.import_module(f"stable_baselines3{one}") for one in names]
         sb3, vec, back = modules
         gymnasium: Any = importlib.import_module("gymnasium")
-        name = "rps_jax.tuning.gym:rps_jax/Push-v0"
+        name = "rps_jax.trials.gym:rps_jax/Push-v0"
         how = {"object": self.object, "domain": self.domain, "setting": self.setting}
         how |= {"hold": self.hold}
         if count == 1:

@@ -1,0 +1,235 @@
+"""Pushing as an environment of Gymnasium, alone or many worlds at once in the batched engine.
+
+    import gymnasium
+    import rps_jax.trials.gym  # registers rps_jax/Push-v0
+
+    env = gymnasium.make("rps_jax/Push-v0", object="random_cylinder")
+    envs = gymnasium.make_vec("rps_jax/Push-v0", num_envs=64, domain="wide,mass=3:10")
+
+Both step a `PushEnv`, whose options they take by name: object, setting, robot, params, weights and
+worlds. `gymnasium.make("rps_jax.trials.gym:rps_jax/Push-v0")` needs no second import.
+"""
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rps_jax import errors
+from rps_jax.control import switches
+from rps_jax.trials.env import SHAPED_REWARD, PushEnv, State
+from rps_jax.world import domain as domains
+from rps_jax.world.domain import DomainLike
+
+try:
+    import gymnasium
+    from gymnasium.spaces import Box
+    from gymnasium.vector import AutoresetMode, VectorEnv
+    from gymnasium.vector.utils import batch_space
+except ImportError as error:
+    raise errors.not_installed("gymnasium", "gym") from error
+
+_SEEDS = 2**31
+
+
+def _carry_out(
+    env: PushEnv, steps: int, state: State, action: jax.Array
+) -> tuple[State, jax.Array]:
+    """Carry out an action (3,) for so many control steps; returns the sum of the rewards, too."""
+
+    def one(carry: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], None]:
+        after = env.step(carry[0], action)
+        return (after, carry[1] + after.reward), None
+
+    return jax.lax.scan(one, (state, jnp.zeros_like(state.reward)), length=steps)[0]
+
+
+class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
+    """Push an unknown object to a target by touch: `gymnasium.make("rps_jax/Push-v0")`.
+
+    Observation, Box (T + 2,) float32: the T taxels of the robot, the paper's 42, in the order of
+    `Shell.taxels`, each the filtered relative change of its capacitance [1]; then the target (x, y)
+    [m] in the robot's frame (x ahead, y to the left), by odometry.
+
+    Action, Box (3,) float32 within -1 and 1: the twist (v_x, v_y, omega) in the robot's frame, in
+    units of v_max [m/s], v_max and omega_max [rad/s] of `params`. It is carried out for `hold` [s].
+
+    Reward [1]: `weights`, a `Reward` of `rps_jax.trials.env`; by default that of `rps learn`.
+
+    Terminated: the object arrived, or fell over, or the physics diverged. Truncated: the time of
+    the rules was over, or the object was out of touch for longer than they allow.
+
+    Info: `is_success`, `time` [s] since the start, `in_contact`, and `world`, its number.
+
+    Raises:
+      InputError: an option that `PushEnv` does not allow, a `hold` shorter than a control period,
+        or an action that is not finite or of another shape.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012
+
+    def __init__(
+        self,
+        render_mode: str | None = None,
+        *,
+        domain: DomainLike = "wide",
+        hold: float = 0.2,
+        **options: Any,
+    ):
+        """Draw the worlds; nothing is compiled before the first reset."""
+        self._vector = GymPushVector(domain=domain, hold=hold, **options)
+        self.render_mode, self.push_env = render_mode, self._vector.push_env
+        self.observation_space = self._vector.single_observation_space
+        self.action_space = self._vector.single_action_space
+        self.metadata = self.metadata | {"render_fps": round(1 / self._vector.period) or 1}
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin in a world by chance, which the seed decides on; `options` are not used."""
+        super().reset(seed=seed)
+        self._vector.begin(self.np_random)
+        seen, _, _, told = self._vector.seen()
+        return seen[0], {name: values[0].item() for name, values in told.items()}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Carry out an action (3,)."""
+        rewards = self._vector.act(np.asarray(action)[None])
+        seen, terminated, truncated, told = self._vector.seen()
+        info = {name: values[0].item() for name, values in told.items()}
+        return seen[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
+
+    def render(self) -> Any:
+        """Image (240, 320, 3) uint8 of now, in the mode rgb_array."""
+        return self._vector.images()[0] if self.render_mode == "rgb_array" else None
+
+
+class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """Batch of `GymPush` worlds: `gymnasium.make_vec("rps_jax/Push-v0", num_envs=64)`.
+
+    Spaces, rewards and ends are those of `GymPush`, with a first axis of worlds. A trial that has
+    ended restarts in another world, as `autoreset_mode` says. `NextStep`, the default, restarts it
+    in the step after its last; that step ignores the action, and its reward is 0. `SameStep`
+    restarts it at once and returns its last observation and info as `final_obs` and `final_info`.
+
+    Raises:
+      InputError: as `GymPush`, or another mode.
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": ["rgb_array"]}  # noqa: RUF012
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        render_mode: str | None = None,
+        *,
+        autoreset_mode: AutoresetMode | Literal["NextStep", "SameStep"] = "NextStep",
+        domain: DomainLike = "wide",
+        hold: float = 0.2,
+        **options: Any,
+    ):
+        """Draw the worlds; nothing is compiled before the first reset."""
+        self.num_envs = errors.check_count("num_envs", num_envs, at_most=1_000_000)
+        modes = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
+        mode = str(getattr(autoreset_mode, "value", autoreset_mode))
+        errors.check_name("autoreset_mode", mode, [one.value for one in modes])
+        given: dict[str, Any] = {"weights": SHAPED_REWARD} | options
+        self.render_mode = render_mode
+        self.push_env = PushEnv(domain=domains.named(domain), **given)
+        dt = self.push_env.dt
+        hold = errors.check_finite("hold", hold, at_least=0.999 * dt, at_most=1000, unit="s")
+        steps = max(1, round(hold / dt))
+        self.period = steps * dt  # [s] of an action
+        self.metadata = self.metadata | {"autoreset_mode": AutoresetMode(mode)}
+        size = self.push_env.observation_size
+        self.single_observation_space = Box(-np.inf, np.inf, (size,), np.float32)
+        self.single_action_space = Box(-1.0, 1.0, (self.push_env.action_size,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._ended = np.zeros(num_envs, bool)
+        self._state: State | None = None
+        self._begin = jax.jit(jax.vmap(self.push_env.reset))
+        self._act = jax.jit(jax.vmap(partial(_carry_out, self.push_env, steps)))
+        self._pick = jax.jit(jax.vmap(switches.select))
+
+    def begin(self, random: np.random.Generator, where: np.ndarray | None = None) -> None:
+        """Begin in other worlds by chance: in all, or where a mask (num_envs,) says so."""
+        keys = jax.random.split(jax.random.key(int(random.integers(_SEEDS))), self.num_envs)
+        fresh = self._begin(keys)
+        self._state = fresh if where is None else self._pick(where, fresh, self._state)
+
+    def act(self, actions: Any) -> np.ndarray:
+        """Carry out actions (num_envs, 3); returns the rewards (num_envs,). What is done stays."""
+        actions = np.asarray(actions, np.float32)
+        shape = (self.num_envs, self.push_env.action_size)
+        if actions.shape != shape or not np.isfinite(actions).all():
+            told = actions.tolist() if actions.shape == shape else f"of shape {actions.shape}"
+            raise errors.InputError(
+                f"action = {told} is not allowed: it must be finite, of shape {shape}."
+            )
+        self._state, rewards = self._act(self._state, actions)
+        return np.asarray(rewards, float)
+
+    def seen(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """Observations (num_envs, T + 2), what is terminated and truncated, and more, by name."""
+        assert self._state is not None, "reset comes first"
+        data, metrics = self._state.data, self._state.metrics
+        ended = np.array(data.success | data.tipped | data.diverged)
+        more = {
+            "is_success": data.success, "time": data.steps * self.push_env.dt,
+            "in_contact": metrics["in_contact"] > 0, "world": self._state.info["index"],
+        }  # fmt: skip
+        told = {name: np.array(values) for name, values in more.items()}
+        done = np.array(data.done)
+        return np.array(self._state.obs, np.float32), done & ended, done & ~ended, told
+
+    def images(self) -> list[np.ndarray]:
+        """Images (240, 320, 3) uint8."""
+        each = [jax.tree.map(lambda leaf, i=i: leaf[i], self._state) for i in range(self.num_envs)]
+        return self.push_env.render(each)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin in worlds by chance, which the seed decides on; `options` are not used."""
+        super().reset(seed=seed)
+        self.begin(self.np_random)
+        self._ended[:] = False
+        seen, _, _, told = self.seen()
+        return seen, self._masked(told, ~self._ended)
+
+    def step(
+        self, actions: Any
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Carry out actions (num_envs, 3)."""
+        same = self.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+        rewards = self.act(actions)  # 0 where a trial had ended, which stays as it was
+        if not same and self._ended.any():
+            self.begin(self.np_random, self._ended)
+        seen, terminated, truncated, told = self.seen()
+        self._ended, more = terminated | truncated, {}
+        if same and self._ended.any():
+            last = np.full(self.num_envs, None, object)
+            for i in np.flatnonzero(self._ended):
+                last[i] = seen[i]
+            more = {"final_obs": last, "final_info": self._masked(told, self._ended)}
+            self.begin(self.np_random, self._ended)
+            seen, _, _, told = self.seen()
+        whole = self._masked(told, np.ones(self.num_envs, bool)) | self._masked(more, self._ended)
+        return seen, rewards, terminated, truncated, whole
+
+    def render(self) -> Any:
+        """Images (240, 320, 3) uint8 of now, one of each world, in the mode rgb_array."""
+        return tuple(self.images()) if self.render_mode == "rgb_array" else None
+
+    @staticmethod
+    def _masked(told: Mapping[str, Any], where: np.ndarray) -> dict[str, Any]:
+        """Infos, each with the mask of the worlds that have it."""
+        return dict(told) | {f"_{name}": where.copy() for name in told}
+
+
+if "rps_jax/Push-v0" not in gymnasium.registry:
+    gymnasium.register("rps_jax/Push-v0", GymPush, vector_entry_point=GymPushVector)
