@@ -17,7 +17,7 @@ import xarray as xr
 
 from rps_jax.analysis import statistics
 from rps_jax.control import registry
-from rps_jax.control.base import Params
+from rps_jax.control.base import LawParams
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.errors import InputError
 from rps_jax.record import files
@@ -78,7 +78,7 @@ class Condition:
             return False
         return True
 
-    def _changed(self, params: Params) -> Params:
+    def _changed(self, params: LawParams) -> LawParams:
         """Parameters of RPS, or of a law that has RPS within, with the changes; others as is."""
         if isinstance(params, RPSParams):
             return params._replace(**self.params)

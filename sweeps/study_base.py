@@ -171,7 +171,7 @@ def _expanded(value: Any) -> Any:
         ranges = dataclasses.asdict(DOMAINS[value])
         return [value, {name: item for name, item in ranges.items() if item is not None}]
     if isinstance(value, str) and value in registry.LAWS:
-        return [value, registry.recorded(registry.LAWS[value])]
+        return [value, registry.params_to_json(registry.LAWS[value])]
     return value
 
 

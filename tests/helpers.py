@@ -121,7 +121,7 @@ def parts_of(folder: Path) -> dict[str, bytes]:
 @contextlib.contextmanager
 def temporary_names() -> Iterator[None]:
     """Objects and laws that are registered meanwhile are forgotten afterwards."""
-    tables = (objects.FAMILIES, objects.REGISTERED, registry.LAWS, registry._OF)
+    tables = (objects.FAMILIES, objects.REGISTERED, registry.LAWS, registry._LAWS_BY_CLASS)
     before = [dict(table) for table in tables]
     try:
         yield

@@ -339,7 +339,7 @@ PARAMS_FILES = {
 CHANGED_MANIFESTS = {
     "worlds": {"worlds": 2.5},
     "class": {"laws": {"rps": {"law": "Lost"}}},
-    "params": {"laws": {"rps": registry.recorded(RPSParams.paper()) | {"L": "x"}}},
+    "params": {"laws": {"rps": registry.params_to_json(RPSParams.paper()) | {"L": "x"}}},
     "few": {"laws": {"rps": {"law": "RPSParams", "L": 0.2}}},
     "laws": {"laws": []},
     "physics": {"physics": {"timestep": -1}},

@@ -171,8 +171,8 @@ def test_files_of_the_same_name_are_told_apart_by_their_folders(tmp_path):
         path.parent.mkdir()
         path.write_text(json.dumps({"K_h": gain}))
         texts.append(f"rps,{path}")
-    assert list(registry.laws_of(["rps", texts[0]])) == ["rps", "rps,tuned"]
-    assert list(registry.laws_of(["rps", *texts])) == ["rps", *texts]
+    assert list(registry.resolve_laws(["rps", texts[0]])) == ["rps", "rps,tuned"]
+    assert list(registry.resolve_laws(["rps", *texts])) == ["rps", *texts]
 
 
 STUDY = """

@@ -125,7 +125,7 @@ def test_a_push_earns_what_it_brings_nearer_less_the_time_without_contact(pushin
     touch = seen.metrics["in_contact"] > 0
     for i in won:
         end = int(np.argmax(seen.done[:, i]))
-        felt = seen.data.memory[:, i]
+        felt = seen.data.law_state[:, i]
         gained = felt[np.argmax(touch[:, i])] - felt[end]
         without = PERIOD * (~touch[: end + 1, i]).sum()
         assert seen.reward[:, i].sum() == pytest.approx(gained - 0.05 * without + 1, abs=1e-4)
@@ -150,7 +150,7 @@ def test_lost_contact_costs_and_counts_again_from_where_it_was_lost(pushing):
     np.testing.assert_allclose(away.reward[gone], -0.05 * PERIOD, rtol=1e-5)
     again = pushing.go(last(away), AHEAD, times=2)
     progress = np.concatenate([away.metrics["progress"], again.metrics["progress"]]).sum(axis=0)
-    lasting = there.data.memory - last(again).data.memory
+    lasting = there.data.law_state - last(again).data.law_state
     np.testing.assert_allclose(progress, lasting, atol=1e-5)
 
 
@@ -184,7 +184,9 @@ def test_it_moves_as_a_trial_that_is_driven_by_the_same_twist(pushing):
     push, state, action = pushing.env, pushing.start, jnp.array([0.8, 0.2, 0.3])
     mine = last(pushing.go(state, action))
     constant = push.twist(action)
-    dull = Law(lambda params: (), lambda params, memory, seen: (memory, constant, Details.of(seen)))
+    dull = Law(
+        lambda params: (), lambda params, state, obs: (state, constant, Details.from_obs(obs))
+    )
     worlds = state.info["world"]
     trials = trial.start_all(worlds, np.ones(mine.done.size, bool), law=dull)
     loop = trial.Loop(FAST, push.setting.rules, dull)

@@ -129,12 +129,12 @@ class Nested(NamedTuple):
 @pytest.fixture
 def nested():
     """The law is forgotten after the test."""
-    tables = registry.LAWS, registry._OF
+    tables = registry.LAWS, registry._LAWS_BY_CLASS
     before = [dict(table) for table in tables]
 
     def step(params, state, observation):
         v = params.gains["v"] * jnp.sum(params.curve)
-        return state, Twist(v, 0 * v, 0 * v), Details.of(observation)
+        return state, Twist(v, 0 * v, 0 * v), Details.from_obs(observation)
 
     own = Law(lambda params: (), step, check=lambda params: params)
     registry.register_law("nested", own, Nested({"v": 0.01}, np.ones(3)))

@@ -44,7 +44,9 @@ def example(name):
 pytestmark = pytest.mark.usefixtures("registries")
 
 
-@pytest.mark.parametrize("name", ["own_object", "own_law", "own_domain", "own_optimiser"])
+@pytest.mark.parametrize(
+    "name", ["custom_object", "custom_law", "custom_domain", "custom_optimiser"]
+)
 def test_the_short_examples_are_short(name):
     source = (EXAMPLES / f"{name}.py").read_text()
     code = source.split('"""\n', 2)[1]
@@ -56,7 +58,7 @@ def test_the_short_examples_are_short(name):
 
 def test_a_hexagon_of_ones_own_is_pushed(capsys):
     # C MuJoCo, which compiles least; what the other engines step is compared below.
-    outcome = example("own_object")["main"](horizon=8.0, engine="mujoco").squeeze()
+    outcome = example("custom_object")["main"](horizon=8.0, engine="mujoco").squeeze()
     assert "[0 0]" in capsys.readouterr().out
     # The base touches within 2 s, at 1 cm/s, and then pushes at 5 cm/s.
     assert outcome.min_distance[0] < 1.3
@@ -66,7 +68,7 @@ def test_a_hexagon_of_ones_own_is_pushed(capsys):
 @pytest.fixture
 def hexagon():
     objects.register_object(
-        "hexagon", EXAMPLES / "hexagon.xml", polygon(example("own_object")["OUTLINE"])
+        "hexagon", EXAMPLES / "hexagon.xml", polygon(example("custom_object")["OUTLINE"])
     )
     return scene.load("hexagon")
 
@@ -211,7 +213,7 @@ def test_the_papers_names_are_taken():
 
 
 def test_a_law_of_ones_own_runs_beside_the_law(capsys):
-    found = example("own_law")["main"](worlds=1, horizon=3.0)
+    found = example("custom_law")["main"](worlds=1, horizon=3.0)
     assert "mine" in capsys.readouterr().out
     # Both have touched and pushed by then, each in its way.
     moved = found.base_pose.sel(pose="x").values
@@ -220,14 +222,14 @@ def test_a_law_of_ones_own_runs_beside_the_law(capsys):
 
 
 def test_a_domain_of_ones_own_draws_what_it_says(capsys):
-    found = example("own_domain")["main"](worlds=8, horizon=1.0)
+    found = example("custom_domain")["main"](worlds=8, horizon=1.0)
     assert "tuned" in capsys.readouterr().out
     assert ((found.mass >= 30) & (found.mass <= 80)).all()
     assert set(found.object.values) == {"random_box"}
 
 
 def test_an_optimiser_of_ones_own_needs_evaluate_alone(capsys):
-    made = example("own_optimiser")
+    made = example("custom_optimiser")
     best, tested = made["main"](worlds=3, generations=1, horizon=1.0)
     assert "K_h" in capsys.readouterr().out
     for value, (low, high) in zip(best, made["BOUNDS"].values(), strict=True):
@@ -236,7 +238,7 @@ def test_an_optimiser_of_ones_own_needs_evaluate_alone(capsys):
 
 
 def test_registered_names_work_on_the_command_line(tmp_path, capsys, hexagon):
-    example("own_law")  # registers p_control
+    example("custom_law")  # registers p_control
     out = tmp_path / "table"
     command = ["table", "--objects", "hexagon", "--laws", "p_control", "--friction", "S1"]
     command += ["--targets", "2", "0", "--horizon", "4", "--engine", "mujoco", "--out", str(out)]
@@ -252,7 +254,7 @@ def test_registered_names_work_on_the_command_line(tmp_path, capsys, hexagon):
 
 
 def test_a_sweep_finds_a_registered_law_again(tmp_path):
-    kind = example("own_law")["PParams"]
+    kind = example("custom_law")["PParams"]
     plan = Plan(Domain(), 3, {"p": kind(v=0.03)})
     open_run(tmp_path, plan)
     assert load_plan(tmp_path) == plan
@@ -261,7 +263,7 @@ def test_a_sweep_finds_a_registered_law_again(tmp_path):
         load_plan(tmp_path)
 
 
-LAW = EXAMPLES / "own_law.py"
+LAW = EXAMPLES / "custom_law.py"
 
 
 def test_a_law_of_a_file_runs_in_every_command_that_asks_for_laws(tmp_path, capsys):
@@ -273,29 +275,29 @@ def test_a_law_of_a_file_runs_in_every_command_that_asks_for_laws(tmp_path, caps
     sweep = ["sweep", "--worlds", "2", "--laws", name, "--out", str(tmp_path / "sweep")]
     assert cli.main([*sweep, *short]) == 0
     plan = load_plan(tmp_path / "sweep")
-    assert registry.as_json(plan.laws["p_control"])["gains.heading"] == 0.1
+    assert registry.leaves_to_json(plan.laws["p_control"])["gains.heading"] == 0.1
     capsys.readouterr()
 
 
 def test_a_run_made_with_a_file_knows_when_the_file_has_changed(tmp_path):
     law = tmp_path / "mine.py"
     law.write_text(LAW.read_text())
-    _, params = registry.named(f"{law}:PParams")
-    kept = registry.recorded(params)
-    assert registry.restored(kept) == params
+    _, params = registry.parse_law(f"{law}:PParams")
+    kept = registry.params_to_json(params)
+    assert registry.params_from_json(kept) == params
     law.write_text(LAW.read_text().replace("0.15, 0.15", "0.1, 0.1"))
     with pytest.raises(InputError, match="is not what it was when the run was made"):
-        registry.restored(kept)
+        registry.params_from_json(kept)
 
 
 def test_a_file_is_run_again_if_another_law_took_its_name_since():
     """And a law that no file holds is not kept as if one did."""
     kinds = []
     for _ in range(2):
-        _, params = registry.named(f"{LAW}:PParams")
+        _, params = registry.parse_law(f"{LAW}:PParams")
         kinds.append(type(params))
-        in_a_notebook = example("own_law")["PParams"]()  # registers p_control, too
-        assert "file" not in registry.recorded(in_a_notebook)
+        in_a_notebook = example("custom_law")["PParams"]()  # registers p_control, too
+        assert "file" not in registry.params_to_json(in_a_notebook)
     assert kinds[0] is not kinds[1]
 
 
@@ -313,16 +315,16 @@ def test_a_file_without_a_law_is_one_sentence(content, message, tmp_path):
     if content is not None:
         law.write_text(content)
     with pytest.raises(InputError, match=message):
-        registry.named(f"{law}:PParams")
+        registry.parse_law(f"{law}:PParams")
 
 
 def test_parameters_that_are_arrays_and_nested_are_kept_and_found_again(tmp_path):
-    made = example("own_law")
+    made = example("custom_law")
     weights = made["PParams"](gains=made["Gains"](np.ones((2, 3)), np.arange(2.0)))
 
-    def step(params, memory, seen):
+    def step(params, state, obs):
         turn = jnp.sum(params.gains.l) + jnp.max(params.gains.heading)
-        return memory, Twist(params.v, 0.0, turn), Details.of(seen)
+        return state, Twist(params.v, 0.0, turn), Details.from_obs(obs)
 
     registry.register_law("p_control", Law(lambda params: (), step), weights)
     plan = Plan(Domain(), 3, {"p": weights._replace(v=0.03)})
@@ -334,8 +336,8 @@ def test_parameters_that_are_arrays_and_nested_are_kept_and_found_again(tmp_path
 
 def test_a_law_registered_again_replaces_the_old_one():
     """As when a cell of a notebook is run twice, and its class of parameters is made anew."""
-    kinds = [example("own_law")["PParams"] for _ in range(2)]
-    assert kinds[0] not in registry._OF
+    kinds = [example("custom_law")["PParams"] for _ in range(2)]
+    assert kinds[0] not in registry._LAWS_BY_CLASS
     assert type(registry.LAWS["p_control"]) is kinds[1]
     registry.register_law("slow", rps.LAW, RPSParams(v_max=0.01))
     assert registry.law_of(registry.LAWS["slow"]) is rps.LAW
@@ -356,7 +358,7 @@ def test_params_that_mean_nothing_are_refused():
         registry.register_law("p", own, RPSParams())
     with pytest.raises(InputError, match="params of class Ahead belong to no law"):
         Case("box", FRICTION["S1"], (2.0, 0.0), Ahead())
-    details = Details.of(
+    details = Details.from_obs(
         Observation(jnp.zeros(2), 0.0, jnp.array([0.3, 0.1]), jnp.array(True), jnp.ones(2))
     )
     assert float(details.l) == pytest.approx(0.1)

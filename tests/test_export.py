@@ -30,7 +30,7 @@ from sweeps.export.native import (
     trial_errors,
 )
 
-EXAMPLE = ROOT / "notebooks/examples/own_law.py"
+EXAMPLE = ROOT / "notebooks/examples/custom_law.py"
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"]
 LAWS = [
     *("rps", "nps", "rps_plus", "aps", "pursuit", "dipole", "force_push", "force_push_published"),
@@ -81,7 +81,7 @@ def step(params, memory, seen):
     return (
         Memory(trace, memory.count + 1),
         Twist(forward, 0.01 * side * jnp.max(jnp.abs(trace)), 0.1 * jnp.clip(turn, -1, 1)),
-        Details.of(seen),
+        Details.from_obs(seen),
     )
 
 

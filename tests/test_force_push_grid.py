@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rps_jax.control.base import check_finite
+from rps_jax.control.base import check_finite_leaves
 from rps_jax.errors import InputError
 from sweeps.force_push_grid import grid
 from sweeps.force_push_grid.study import ForcePushGrid
@@ -16,7 +16,7 @@ def test_the_grid_is_that_of_their_script():
     every = grid.cells()
     assert every.angle.size == 3**5 == 243
     assert len(set(zip(*every, strict=True))) == 243
-    assert check_finite(grid.PARAMS) is grid.PARAMS
+    assert check_finite_leaves(grid.PARAMS) is grid.PARAMS
 
 
 def test_the_moments_of_inertia_by_hand():

@@ -191,9 +191,9 @@ class {name}(NamedTuple):
     v: float = 0.05
     d_success: float = 0.05
 
-def step(params, memory, seen):
-    details = rps_jax.Details.of(seen)
-    return memory, rps_jax.Twist(params.v, 0.0, 0.0), details
+def step(params, state, obs):
+    details = rps_jax.Details.from_obs(obs)
+    return state, rps_jax.Twist(params.v, 0.0, 0.0), details
 
 rps_jax.register_law("{name}", rps_jax.Law(lambda params: (), step), {name}())
 """
@@ -225,12 +225,14 @@ def test_a_law_of_ones_own_is_scored_in_the_ladders_worlds(tmp_path, capsys, reg
 def test_a_file_of_one_law_is_named_without_its_class(tmp_path, registries):
     mine = tmp_path / "mine.py"
     mine.write_text(MINE.format(name="Straight"))
-    assert registry.named(str(mine))[0] == registry.named(f"{mine}:Straight")[0] == "Straight"
+    assert (
+        registry.parse_law(str(mine))[0] == registry.parse_law(f"{mine}:Straight")[0] == "Straight"
+    )
     assert list(ladder.Score("rps", ("rps", "rps_plus")).chosen) == ["rps", "rps_plus"]
     mine.write_text(MINE.format(name="Straight") + MINE.format(name="Slow"))
-    assert registry.named(f"{mine}:Slow")[0] == "Slow"
+    assert registry.parse_law(f"{mine}:Slow")[0] == "Slow"
     with pytest.raises(InputError, match=r"name one as FILE.py:CLASS"):
-        registry.named(str(mine))
+        registry.parse_law(str(mine))
 
 
 def test_the_command_refuses_an_unknown_law(capsys):

@@ -19,8 +19,8 @@ from rps_jax.control import registry
 from rps_jax.control.learned import features
 from rps_jax.control.learned import network as networks
 from rps_jax.control.learned import policy as policies
-from rps_jax.control.learned.features import Felt
-from rps_jax.control.learned.network import Memory, Network
+from rps_jax.control.learned.features import TouchState
+from rps_jax.control.learned.network import Network, PolicyState
 from rps_jax.control.learned.policy import Policy
 from rps_jax.control.observation import Observation, TaxelObservation
 from rps_jax.record import files
@@ -42,7 +42,7 @@ def network_of(kind, **changes):
 
 def weights_of(network, seed=0):
     """Weights by chance, none of them small."""
-    drawn = networks.start(network.shapes, jax.random.PRNGKey(seed))
+    drawn = networks.init_weights(network.shapes, jax.random.PRNGKey(seed))
     return {name: np.asarray(weight, np.float32) for name, weight in drawn.items()}
 
 
@@ -73,7 +73,7 @@ def test_in_a_mirrored_world_the_law_does_the_mirrored_thing(kind):
     network = network_of(kind)
     _, params = _registered(network)
     law = jax.jit(partial(networks.step, network, weights_of(network)))
-    memories = [Memory.init(network)] * 2
+    memories = [PolicyState.init(network)] * 2
     twists = []
     for seed in range(12):
         for i, mirror in enumerate((False, True)):
@@ -89,7 +89,7 @@ def test_an_action_is_held_and_bounded():
     _, params = _registered(network)
     weights = {name: 30 * weight for name, weight in weights_of(network).items()}
     law = jax.jit(partial(networks.step, network, weights))
-    memory, twists = Memory.init(network), []
+    memory, twists = PolicyState.init(network), []
     for seed in range(20):
         memory, twist, _ = law(params, memory, seen_at(seed))
         twists.append(np.array(twist))
@@ -108,16 +108,16 @@ def test_a_contact_that_is_lost_is_remembered_where_it_was():
         p_robot_contact=jnp.array([0.4, 0.1]), p_world_target=jnp.array([1.0, 1.1]),
     )  # fmt: skip
     told = seen_at(1)._replace(touch=touch)
-    felt = Felt.nothing().follow(told)
+    felt = TouchState.initial().update(told)
     np.testing.assert_allclose(felt.p_robot_contact(told), [0.4, 0.1], atol=1e-6)
     away = touch._replace(
         p_world_robot=jnp.array([0.5, 0.1]), yaw=jnp.array(np.pi / 2), in_contact=jnp.array(False)
     )
     later = told._replace(touch=away)
-    felt = felt.follow(later)
+    felt = felt.update(later)
     np.testing.assert_allclose(felt.p_robot_contact(later), [0.0, -0.5], atol=1e-6)
-    assert float(felt.since) == pytest.approx(0.02)
-    numbers = features.features(felt, jnp.zeros(3), later)[42:]
+    assert float(felt.time_since_contact) == pytest.approx(0.02)
+    numbers = features.compute_features(felt, jnp.zeros(3), later)[42:]
     # Not touched, no line, but once; where it was; 1 m to the target, which lies ahead of it.
     np.testing.assert_allclose(numbers[:3], [0, 0, 1])
     np.testing.assert_allclose(numbers[4:6], [0, -0.5 / 0.36], atol=1e-6)
@@ -130,31 +130,31 @@ def test_a_contact_that_is_lost_is_remembered_where_it_was():
 def _registered(network, seed=0):
     """Name and parameters of a policy by chance, registered by its file."""
     policy = Policy(network, weights_of(network, seed))
-    label, _, params = policies.law_of(policy)
+    label, _, params = policies.build_law(policy)
     return label, params
 
 
 def written(path, kind="gru", **changes):
     policy = Policy(network_of(kind), weights_of(network_of(kind)), **changes)
-    path.write_bytes(policies.encoded(policy))
+    path.write_bytes(policies.encode(policy))
     return policy
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_law_of_a_file_is_the_one_that_was_written(kind, tmp_path, registries):
     policy = written(tmp_path / "policy.npz", kind, learned={"how": "by chance"})
-    found = policies.decoded((tmp_path / "policy.npz").read_bytes(), "policy.npz")
+    found = policies.decode((tmp_path / "policy.npz").read_bytes(), "policy.npz")
     assert (found.network, found.task, found.learned) == (
         policy.network,
         policy.task,
         policy.learned,
     )
-    name, params = registry.named(str(tmp_path / "policy.npz"))
+    name, params = registry.parse_law(str(tmp_path / "policy.npz"))
     assert name.startswith(f"learned_{kind}_")
     law = registry.law_of(params)
     assert law.senses == "taxels"
     before = jax.jit(partial(networks.step, policy.network, policy.weights))
-    told = law.init(params), Memory.init(policy.network)
+    told = law.init(params), PolicyState.init(policy.network)
     for seed in range(12):
         (mine, twist, _), (own, theirs, _) = (
             step(params, memory, seen_at(seed))
@@ -162,9 +162,9 @@ def test_a_law_of_a_file_is_the_one_that_was_written(kind, tmp_path, registries)
         )
         np.testing.assert_array_equal(np.array(twist), np.array(theirs))
         told = mine, own
-    again = registry.recorded(params)
+    again = registry.params_to_json(params)
     assert again["file"] == str(tmp_path / "policy.npz")
-    assert registry.restored(json.loads(json.dumps(again))) == params
+    assert registry.params_from_json(json.loads(json.dumps(again))) == params
 
 
 def damaged(content, **changes):
@@ -231,7 +231,7 @@ def test_a_file_that_is_no_policy_gets_one_sentence(name, tmp_path):
     path = tmp_path / "policy.npz"
     path.write_bytes(spoil(path.read_bytes()))
     with pytest.raises(InputError, match=words) as error:
-        registry.named(str(path))
+        registry.parse_law(str(path))
     assert "\n" not in str(error.value)
 
 
@@ -260,12 +260,12 @@ def test_commands_refuse_bad_policies_before_anything_compiles(tmp_path, capsys,
 def test_a_run_of_a_policy_needs_its_file_as_it_was(tmp_path, registries):
     path = tmp_path / "policy.npz"
     written(path)
-    name, params = registry.named(str(path))
+    name, params = registry.parse_law(str(path))
     setting = Setting("fused", fidelity="fast")
     open_run(tmp_path / "run", Plan(CYLINDERS, 4, {name: params}, setting))
     assert load_plan(tmp_path / "run").laws == {name: params}
     other = Policy(network_of("gru"), weights_of(network_of("gru"), seed=1))
-    path.write_bytes(policies.encoded(other))
+    path.write_bytes(policies.encode(other))
     with pytest.raises(InputError, match="is not what it was when the run was made"):
         load_plan(tmp_path / "run")
 
@@ -310,11 +310,11 @@ def test_the_surrogate_is_that_of_the_paper():
 def batch(network, state, seed=0, steps=5, worlds=4):
     """Transitions by chance, as the policy would have made them."""
     rng = np.random.default_rng(seed)
-    size, extra = features.size(network.taxels), ppo.PRIVATE_SIGNS.size
+    size, extra = features.feature_count(network.taxels), ppo.PRIVATE_SIGNS.size
     numbers = jnp.asarray(rng.normal(size=(steps, worlds, size)), jnp.float32)
     private = jnp.asarray(rng.normal(size=(steps, worlds, extra)), jnp.float32)
     fresh = jnp.asarray(rng.uniform(size=(steps, worlds)) < 0.2)
-    hidden = jnp.asarray(rng.normal(size=network.hidden((worlds,)).shape), jnp.float32)
+    hidden = jnp.asarray(rng.normal(size=network.initial_hidden((worlds,)).shape), jnp.float32)
     zero = jnp.zeros((steps, worlds))
     some = Transition(
         numbers, private, fresh, jnp.zeros((steps, worlds, 3)), *[zero] * 4, *[fresh] * 2
@@ -354,7 +354,7 @@ def test_the_value_of_a_mirrored_world_is_the_same():
     how, network = PPO(network="mlp", width=6), network_of("mlp")
     state = TrainState.init(how, network, jax.random.PRNGKey(0))
     _, some = batch(network, state)
-    mirrored = ppo.critic_inputs(features.mirrored(some.obs), ppo.PRIVATE_SIGNS * some.private)
+    mirrored = ppo.critic_inputs(features.mirror(some.obs), ppo.PRIVATE_SIGNS * some.private)
     pairs = ppo.critic_inputs(some.obs, some.private)
     here, there = (networks.critic(state.weights["critic"], x) for x in (pairs, mirrored))
     np.testing.assert_allclose(here, there, atol=1e-6)
@@ -378,14 +378,14 @@ def test_what_is_best_in_one_step_is_learned(kind):
     @jax.jit
     def on(state, key):
         key_seen, key_act, key_pass = jax.random.split(key, 3)
-        shape = (4, 64, features.size(network.taxels))
+        shape = (4, 64, features.feature_count(network.taxels))
         numbers = (
             jnp.zeros(shape).at[..., [0, 41, 47]].set(jax.random.normal(key_seen, (*shape[:2], 3)))
         )
         yes = jnp.ones(shape[:2], bool)
         blank = jnp.zeros((*shape[:2], ppo.PRIVATE_SIGNS.size))
         zero = jnp.zeros(shape[:2])
-        hidden = network.hidden((64,))
+        hidden = network.initial_hidden((64,))
         some = Transition(numbers, blank, yes, jnp.zeros((4, 64, 3)), *[zero] * 4, yes, yes)
         mean = ppo.means(network, state.weights["actor"], hidden, some)
         noise = jax.random.normal(key_act, mean.shape)
@@ -436,7 +436,7 @@ def test_a_run_that_is_killed_and_continued_learns_the_same(learned, tmp_path):
     again = learn(CYLINDERS, **TINY, updates=4, out=out)
     for name in ("ended", "reward", "value", "kl", "learning_rate", "spread", "simulated"):
         np.testing.assert_array_equal(again[name], whole[name], err_msg=name)
-    mine, theirs = (policies.decoded((f / "policy.npz").read_bytes(), f) for f in (out, folder))
+    mine, theirs = (policies.decode((f / "policy.npz").read_bytes(), f) for f in (out, folder))
     for name in mine.weights:
         np.testing.assert_array_equal(mine.weights[name], theirs.weights[name])
 
@@ -449,7 +449,7 @@ def test_what_a_run_leaves(learned):
     assert np.isfinite(curve.reward).all()
     assert (curve.spread.values > 0).all()
     assert files.read_results(folder).identical(curve)
-    policy = policies.decoded((folder / "policy.npz").read_bytes(), folder)
+    policy = policies.decode((folder / "policy.npz").read_bytes(), folder)
     assert policy.network == Network("gru", 6, 42, 0.1)
     assert policy.learned["updates"] == 4
 
@@ -479,10 +479,10 @@ def test_a_folder_of_another_run_and_damaged_parts(learned, tmp_path):
 
 def test_in_a_sweep_the_law_does_what_it_does_in_its_environment(learned, registries):
     """The same worlds, the same actions, the same sensing: the same end."""
-    name, params = registry.named(str(learned[0] / "policy.npz"))
+    name, params = registry.parse_law(str(learned[0] / "policy.npz"))
     setting = Setting("fused", fidelity="fast", rules=Rules(horizon=12.0), seed=5)
     found = run_sweep({name: params}, CYLINDERS, worlds=4, setting=setting)
-    policy = policies.decoded((learned[0] / "policy.npz").read_bytes(), "policy")
+    policy = policies.decode((learned[0] / "policy.npz").read_bytes(), "policy")
     env = PushEnv("random_cylinder", CYLINDERS, setting=setting, worlds=4)
     run = jax.jit(partial(rollout.rollout, policy.network, env))
     states = run(env.table, policy.weights)

@@ -34,7 +34,7 @@ def cache(tmp_path):
 
 def batch(shape, skin="capacitive", count=21, law="rps_tuned", domain="wide", **drawn):
     """Stage, worlds and loop of random objects, each at another place before the robot."""
-    _, params = registry.read_law(law)
+    _, params = registry.resolve_law(law)
     domain = replace(DOMAINS[domain], objects=(f"random_{shape}",), skin=skin, **drawn)
     part = drawn_worlds(domain, draws.draw(domain, 3, np.arange(count)), params, SETTING)
     worlds = jax.tree.map(jnp.asarray, part.worlds)
@@ -261,7 +261,7 @@ def test_an_unsupported_operation_is_named_once(monkeypatch, recwarn):
 
 @pytest.mark.parametrize("engine", ["fused", "mjx", "quasistatic"])
 def test_only_the_fused_engine_calls_compiled_functions(engine):
-    _, params = registry.read_law("rps")
+    _, params = registry.resolve_law("rps")
     domain = replace(DOMAINS["wide"], objects=("random_box",))
     setting = Setting(engine)
     part = drawn_worlds(domain, draws.draw(domain, 3, np.arange(2)), params, setting)

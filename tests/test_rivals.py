@@ -41,7 +41,7 @@ from rps_jax.world.scene import FRICTION
 # Parameters of the laws that are not the paper's.
 RIVALS = {"guided": GuidedParams()} | {
     name: registry.LAWS[name]
-    for name in registry._OWN
+    for name in registry.PACKAGE_LAWS
     if not isinstance(registry.LAWS[name], RPSParams | APSParams)
 }
 
@@ -63,9 +63,11 @@ def loaded(observation, force=(-20.0, 0.0)):
 
 
 def test_a_twist_moves_a_point_of_the_base_as_asked():
-    twist = Twist.moving(jnp.array([0.36, 0.1]), jnp.array([0.01, 0.05]), jnp.asarray(0.15))
+    twist = Twist.from_point_velocity(
+        jnp.array([0.36, 0.1]), jnp.array([0.01, 0.05]), jnp.asarray(0.15)
+    )
     np.testing.assert_allclose(twist, [0.01 + 0.015, 0.05 - 0.054, 0.15], rtol=1e-5)
-    bounded = Twist(*map(jnp.asarray, (0.06, -0.08, -0.3))).within(0.05, 0.15)
+    bounded = Twist(*map(jnp.asarray, (0.06, -0.08, -0.3))).saturate(0.05, 0.15)
     np.testing.assert_allclose(bounded, [0.03, -0.04, -0.15], rtol=1e-6)
 
 
@@ -373,10 +375,10 @@ def test_a_law_refuses_bounds_that_mean_nothing(name):
     params = RIVALS[name]
     law = registry.law_of(params)
     assert law.check(params) is params
-    wrong = registry.changed(params, {list(registry.numbers(params))[-1]: -0.05})
+    wrong = registry.replace_leaves(params, {list(registry.named_leaves(params))[-1]: -0.05})
     with pytest.raises(InputError, match=r"= -0\.05 is not allowed"):
         law.check(wrong)
-    found = registry.restored(registry.recorded(params))
+    found = registry.params_from_json(registry.params_to_json(params))
     for mine, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(params), strict=True):
         np.testing.assert_array_equal(mine, theirs)
     assert type(found) is type(params)

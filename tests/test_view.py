@@ -73,8 +73,8 @@ class Ahead(NamedTuple):
     d_success: float = 0.05
 
 
-def step(params, memory, seen):
-    return memory, Twist(params.v, 0.0, 0.0), Details.of(seen)
+def step(params, state, obs):
+    return state, Twist(params.v, 0.0, 0.0), Details.from_obs(obs)
 
 
 rps_jax.register_law("ahead", Law(lambda params: (), step), Ahead())

@@ -20,7 +20,7 @@ import numpy as np
 from rps_jax import __version__
 from rps_jax.app.export import js
 from rps_jax.app.export.program import Group, Routine, fields_of, identifier, routine
-from rps_jax.control import registry, trying
+from rps_jax.control import registry, validation
 from rps_jax.control.learned import features
 from rps_jax.control.observation import TaxelObservation, Twist
 from rps_jax.engines import quasistatic
@@ -134,7 +134,7 @@ def of_family(family: str) -> list[Routine]:
         )
         placed = trial.outline(full, told.qpos)
         touch = seen.observation._replace(in_contact=seen.reading.contact_type != NONE)
-        taxels = features.observed(touch, seen.reading, full.skin, told.skin, placed)
+        taxels = features.taxel_observation(touch, seen.reading, full.skin, told.skin, placed)
         return told._replace(**BY_HAND), taxels, {"contact_type": seen.reading.contact_type}
 
     def drive(fields: Any, before: Any, told: Any, twist: Any) -> Any:
@@ -159,9 +159,9 @@ def of_family(family: str) -> list[Routine]:
 
 def of_law(name: str) -> tuple[list[Routine], dict[str, Any]]:
     """How a law begins and decides; and its parameters, with the bounds of those that can slide."""
-    label, params = registry.read_law(name)
+    label, params = registry.resolve_law(name)
     law, kind = registry.law_of(params), type(params).__name__
-    seen = trying.observation_of(law.senses)
+    seen = validation.observation_shapes(law.senses)
     if isinstance(seen, TaxelObservation):
         count = Robot().shell.count
         seen = seen._replace(signal=jax.ShapeDtypeStruct((count,), np.float64))

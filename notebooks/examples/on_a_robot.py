@@ -47,8 +47,8 @@ def controller(params: RPSParams, skin: CapacitiveSkin) -> tuple[Callable, tuple
         skin_state, state = memory
         skin_state, reading = skin.read(skin_state, taxels, period)
         contact = reading.p_robot_contact, reading.in_contact
-        seen = Observation(pose[:2], pose[2], *contact, p_world_target, period)
-        state, twist = step(params, state, seen)
+        obs = Observation(pose[:2], pose[2], *contact, p_world_target, period)
+        state, twist = step(params, state, obs)
         return (skin_state, state), jnp.stack(twist)
 
     memory = skin.init(jax.random.PRNGKey(0)), RPSState.init(params)

@@ -14,8 +14,8 @@ import xarray as xr
 
 from rps_jax.analysis.figures.style import Figure
 from rps_jax.analysis.report import Picture, Section
-from rps_jax.control import registry, trying
-from rps_jax.control.base import Law, Params
+from rps_jax.control import registry, validation
+from rps_jax.control.base import Law, LawParams
 from rps_jax.control.observation import Twist
 from rps_jax.errors import InputError
 from rps_jax.record import bag as bags
@@ -43,9 +43,9 @@ class Shadow(Question[xr.Dataset]):
     TITLE = "A law in the shadow of another"
 
     @property
-    def params(self) -> Params:
+    def params(self) -> LawParams:
         """Parameters of the law."""
-        return registry.checked(registry.read_law(self.law)[1])
+        return registry.check_params(registry.resolve_law(self.law)[1])
 
     def check(self) -> None:
         """Check the law and the robot, and that the file is there."""
@@ -66,7 +66,7 @@ class Shadow(Question[xr.Dataset]):
                 for i, (name, unit) in enumerate(_UNITS.items())
             },
             {"source": ["commanded", "law"], "time": recorded["time"]},
-            {"law": registry.read_law(self.law)[0]},
+            {"law": registry.resolve_law(self.law)[0]},
         )
 
     def report(self, found: Any, run: Run) -> Sequence[Section]:
@@ -90,7 +90,7 @@ class Shadow(Question[xr.Dataset]):
 shadow = call_of(Shadow)
 
 
-def shadowed(law: Law, params: Params, recorded: dict[str, np.ndarray]) -> np.ndarray:
+def shadowed(law: Law, params: LawParams, recorded: dict[str, np.ndarray]) -> np.ndarray:
     """Twists (N, 3) [m/s, m/s, rad/s] that a law would have commanded.
 
     A law that observes its last twist hears what was commanded: that moved the base, and so no
@@ -122,8 +122,8 @@ def shadowed(law: Law, params: Params, recorded: dict[str, np.ndarray]) -> np.nd
     def whole(params: Any, seen: Any) -> jax.Array:
         def one(memory: Any, row: Any) -> Any:
             now, before = row
-            if law.heard is not None:
-                memory = law.heard(params, memory, now, Twist(*before))
+            if law.observe_sent is not None:
+                memory = law.observe_sent(params, memory, now, Twist(*before))
             memory, twist, _ = law.step(params, memory, now)
             return memory, jnp.stack([jnp.asarray(x, float) for x in Twist(*twist)])
 
@@ -131,7 +131,7 @@ def shadowed(law: Law, params: Params, recorded: dict[str, np.ndarray]) -> np.nd
 
     sent = jnp.asarray(np.pad(recorded["twist"][:-1], ((1, 0), (0, 0))), float)
     params = jax.tree.map(lambda x: jnp.asarray(x, float), params)
-    return np.asarray(whole(params, filled(trying.observation_of(law.senses))))
+    return np.asarray(whole(params, filled(validation.observation_shapes(law.senses))))
 
 
 def figure(found: xr.Dataset) -> Figure:

@@ -5,7 +5,7 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
 import numpy as np
@@ -15,7 +15,19 @@ from rps_jax.control.observation import Details, Twist
 from rps_jax.robot.base import LoadCell
 
 T = TypeVar("T")
-Params = Any  # a pytree of numbers, of a class of the law's own, with `d_success` [m]
+
+
+@runtime_checkable
+class LawParams(Protocol):
+    """Parameters of a law: a pytree of numbers whose class selects the law."""
+
+    @property
+    def d_success(self) -> Any:  # a number, or an array of a batch
+        """Distance to the target at which a trial has succeeded [m]."""
+        ...
+
+
+Params = TypeVar("Params", bound=LawParams)
 
 # What a law senses: where the skin is touched (`Observation`), what each taxel answers as well
 # (`TaxelObservation`), the contact's force as well (`ForceObservation`), or the object's place and
@@ -32,7 +44,7 @@ class Bound(NamedTuple):
     of: str = ""  # as a share of this other parameter
 
 
-def documented(kind: type[T]) -> type[T]:
+def document_fields(kind: type[T]) -> type[T]:
     """Give the fields of a NamedTuple the comments behind them as docstrings, for `help`."""
     with contextlib.suppress(OSError):  # there is no source
         text = Path(str(sys.modules[kind.__module__].__file__)).read_text("utf-8")
@@ -42,15 +54,15 @@ def documented(kind: type[T]) -> type[T]:
     return kind
 
 
-def numbers(params: Params, is_leaf: Callable[[Any], bool] | None = None) -> dict[str, Any]:
+def named_leaves(params: Any, is_leaf: Callable[[Any], bool] | None = None) -> dict[str, Any]:
     """Leaves of parameters by their place in the pytree, as `gains.k`."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(params, is_leaf=is_leaf)
     return {jax.tree_util.keystr(at, simple=True, separator="."): leaf for at, leaf in leaves}
 
 
-def check_finite(params: Params) -> Params:
+def check_finite_leaves(params: T) -> T:
     """Return the parameters if all their leaves are finite numbers, or raise InputError."""
-    for name, leaf in numbers(params).items():
+    for name, leaf in named_leaves(params).items():
         for value in np.ravel(leaf):
             errors.check_finite(name, value)
     return params
@@ -79,14 +91,14 @@ class Law(NamedTuple):
     property `d_success` [m] is the distance to the target at which a trial has succeeded.
     """
 
-    init: Callable[[Any], Any]  # params -> memory
-    step: Callable[[Any, Any, Any], tuple[Any, Twist, Details]]  # params, memory, observation
+    init: Callable[[Any], Any]  # params -> state
+    step: Callable[[Any, Any, Any], tuple[Any, Twist, Details]]  # params, state, obs
     senses: Senses = "touch"
-    check: Callable[[Any], Any] = check_finite  # raises InputError for params that mean nothing
+    check: Callable[[Any], Any] = check_finite_leaves  # raises InputError if params are invalid
     bounds: tuple[tuple[str, Bound], ...] = ()  # of the parameters that may be tuned
     # Of the smooth form: `init` and `step` then take them as `temperatures`. None: it has none.
     temperatures: Any = None
     smooth: bool = False  # it is that form, and observes the weight of a contact
     cell: LoadCell = LoadCell()  # by which it senses a force
-    # Of a law that observes its last twist: params, memory, observation, twist sent -> memory.
-    heard: Callable[[Any, Any, Any, Twist], Any] | None = None
+    # Of a law that observes its last twist: params, state, obs, twist sent -> state.
+    observe_sent: Callable[[Any, Any, Any, Twist], Any] | None = None

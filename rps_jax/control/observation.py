@@ -58,11 +58,13 @@ class Twist(NamedTuple):
     omega: float | Float[Array, "*B"]  # [rad/s] counter-clockwise
 
     @classmethod
-    def moving(cls, p_robot: Float[Array, "2"], v_robot: Float[Array, "2"], omega: Scalar) -> Twist:
+    def from_point_velocity(
+        cls, p_robot: Float[Array, "2"], v_robot: Float[Array, "2"], omega: Scalar
+    ) -> Twist:
         """What moves the base's point `p_robot` [m] at `v_robot` [m/s], and turns it."""
         return cls(v_robot[0] + omega * p_robot[1], v_robot[1] - omega * p_robot[0], omega)
 
-    def within(
+    def saturate(
         self, v_max: float | Float[Array, "..."], omega_max: float | Float[Array, "..."]
     ) -> Twist:
         """(v_x, v_y) scaled as a vector to norm v_max [m/s], omega clipped to omega_max [rad/s]."""
@@ -87,18 +89,16 @@ class Details(NamedTuple):
     realigning: Bool[Array, "*B"] | Float[Array, "*B"]  # in the Realignment State; or a weight
 
     @classmethod
-    def of(cls, observation: Observation) -> Details:
+    def from_obs(cls, obs: Observation) -> Details:
         """Details of a law that has neither an adaptive rate nor a steering angle: both are 0."""
-        distance = planar.norm(displacement(observation))
+        distance = planar.norm(displacement(obs))
         zero = jnp.zeros_like(distance)
-        l = observation.p_robot_contact[..., 1]  # noqa: E741
+        l = obs.p_robot_contact[..., 1]  # noqa: E741
         return cls(l, distance, zero, zero, zero > 0)
 
 
-def displacement(observation: Observation) -> Float[Array, "2"]:
+def displacement(obs: Observation) -> Float[Array, "2"]:
     """Eq. 4: d = p^W_T - (p^W_R + R^W_R p^R_C), from contact to target, [m] in the world."""
-    p_world_contact = observation.p_world_robot + planar.rotate(
-        observation.yaw, observation.p_robot_contact
-    )
-    d = observation.p_world_target - p_world_contact
+    p_world_contact = obs.p_world_robot + planar.rotate(obs.yaw, obs.p_robot_contact)
+    d = obs.p_world_target - p_world_contact
     return jnp.clip(d, -_WORLD_SIZE, _WORLD_SIZE)

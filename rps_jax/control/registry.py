@@ -1,8 +1,8 @@
 """Which laws there are: those of this package, those that were registered, and those of files.
 
 Every file of `control.laws` is a law of the package, and every shipped policy is one. One grammar
-of text names a law everywhere (`named`): `rps`, `rps_tuned`, `mine.py:P`, `policy.npz`, each with
-changes, as `rps,K_h=0.3` or `pursuit,mine.json`.
+of text names a law everywhere (`parse_law`): `rps`, `rps_tuned`, `mine.py:P`, `policy.npz`, each
+with changes, as `rps,K_h=0.3` or `pursuit,mine.json`.
 """
 
 import functools
@@ -18,22 +18,22 @@ import jax
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.control import laws, trying
-from rps_jax.control.base import Law, Params, Senses, numbers
+from rps_jax.control import laws, validation
+from rps_jax.control.base import Law, LawParams, Senses, named_leaves
 from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
 from rps_jax.record import files
 
-LawLike = str | Any  # a law's text, or parameters of its class
-LawsLike = str | Any | Sequence[Any] | Mapping[str, Any]  # one or several of them, or with names
+LawLike = str | Any  # text that names a law, or parameters of its class
+LawsLike = str | Any | Sequence[Any] | Mapping[str, Any]  # one or several, or with labels
 
-LAWS: dict[str, Params] = {}  # parameters of all laws that are offered, by name
-_INNER: dict[str, Params] = {}  # of those that are not, whose names begin with an underscore
-_OF: dict[type, Law] = {}  # by class of parameters
+LAWS: dict[str, LawParams] = {}  # parameters of all laws that are offered, by name
+_INNER: dict[str, LawParams] = {}  # of those that are not, whose names begin with an underscore
+_LAWS_BY_CLASS: dict[type, Law] = {}  # by class of parameters
 _SOURCES: dict[type, dict[str, str]] = {}  # by class of parameters: the file it was loaded from
 
 
-def _among(name: str) -> dict[str, Params]:
+def _among(name: str) -> dict[str, LawParams]:
     return _INNER if name.startswith("_") else LAWS
 
 
@@ -42,47 +42,47 @@ def _find() -> None:
     for found in pkgutil.iter_modules(laws.__path__):
         module = importlib.import_module(f"{laws.__name__}.{found.name}")
         for name, params in module.PRESETS.items():
-            _OF[type(params)] = module.LAW
+            _LAWS_BY_CLASS[type(params)] = module.LAW
             _among(name)[name] = params
     for name, path in policy.SHIPPED.items():
-        _, law, params = policy.law_of(policy.decoded(path.read_bytes(), path))
-        _OF[type(params)], LAWS[name] = law, params
+        _, law, params = policy.build_law(policy.decode(path.read_bytes(), path))
+        _LAWS_BY_CLASS[type(params)], LAWS[name] = law, params
 
 
 _find()
-_OWN = tuple(LAWS)
+PACKAGE_LAWS = tuple(LAWS)
 
 
 # --- parameters ----------------------------------------------------------------------------
 
 
-def as_json(params: Params) -> dict[str, Any]:
+def leaves_to_json(params: object) -> dict[str, Any]:
     """Numbers of parameters by their place, as JSON has them: floats, and lists of floats."""
-    return {name: np.asarray(leaf, float).tolist() for name, leaf in numbers(params).items()}
+    return {name: np.asarray(leaf, float).tolist() for name, leaf in named_leaves(params).items()}
 
 
-def changed(params: Params, changes: Mapping[str, Any]) -> Params:
-    """Replace parameters at some places of the pytree, named as in `numbers`."""
-    known = numbers(params)
+def replace_leaves(params: LawParams, changes: Mapping[str, Any]) -> LawParams:
+    """Replace parameters at some places of the pytree, named as in `named_leaves`."""
+    known = named_leaves(params)
     for name in changes:
         errors.check_name(f"parameter of {type(params).__name__}", name, known)
     leaves = [changes.get(name, leaf) for name, leaf in known.items()]
     return jax.tree.unflatten(jax.tree.structure(params), leaves)
 
 
-def law_of(params: Params | type) -> Law:
+def law_of(params: LawParams | type) -> Law:
     """Look up the law that parameters, or their class, belong to; InputError if there is none."""
     kind = params if isinstance(params, type) else type(params)
-    if kind not in _OF:
-        known = ", ".join(known.__name__ for known in _OF)
+    if kind not in _LAWS_BY_CLASS:
+        known = ", ".join(known.__name__ for known in _LAWS_BY_CLASS)
         raise InputError(
             f"params of class {kind.__name__} belong to no law: give {known}, or register theirs "
             "with register_law."
         )
-    return _OF[kind]
+    return _LAWS_BY_CLASS[kind]
 
 
-def checked(params: Params) -> Params:
+def check_params(params: LawParams) -> LawParams:
     """Return the parameters if their law can be traced and they mean something to it.
 
     Raises:
@@ -90,7 +90,7 @@ def checked(params: Params) -> Params:
         a trial needs.
     """
     law = law_of(params)
-    trying.check_law(law.init, law.step, law.senses, params)
+    validation.check_law(law.init, law.step, law.senses, params)
     law.check(params)
     return params
 
@@ -117,7 +117,7 @@ def _smooth(law: Law, temperatures: Any) -> Law:
     return law._replace(init=init, step=step, smooth=True)
 
 
-def register_law(name: str, law: Law, params: Params) -> None:
+def register_law(name: str, law: Law, params: LawParams) -> None:
     """Make a law of one's own known, to be used as `rps` is.
 
     Args:
@@ -137,15 +137,17 @@ def register_law(name: str, law: Law, params: Params) -> None:
       >>> class Ahead(NamedTuple):
       ...     v: float = 0.05  # [m/s]
       ...     d_success: float = 0.05  # [m]
-      >>> def step(params, memory, seen):
-      ...     return memory, Twist(params.v, 0.0, 0.0), Details.of(seen)
+      >>> def step(params, state, obs):
+      ...     return state, Twist(params.v, 0.0, 0.0), Details.from_obs(obs)
       >>> register_law("ahead", Law(lambda params: (), step), Ahead())
     """
     if not isinstance(name, str) or not isinstance(law, Law):
         raise InputError(f"law {name!r} = {law!r} is not allowed: give a name and a Law.")
     errors.check_name(f"senses of law '{name}'", law.senses, get_args(Senses))
-    if name in _OWN:
-        raise InputError(f"law name '{name}' is not allowed: {', '.join(_OWN)} are this package's.")
+    if name in PACKAGE_LAWS:
+        raise InputError(
+            f"law name '{name}' is not allowed: {', '.join(PACKAGE_LAWS)} are this package's."
+        )
     kind, leaves = type(params), jax.tree.leaves(params)
     own = kind not in (dict, list, tuple) and leaves != [params]
     plain = all(np.issubdtype(np.asarray(leaf).dtype, np.number) for leaf in leaves)
@@ -163,15 +165,15 @@ def register_law(name: str, law: Law, params: Params) -> None:
                 f"'{other}'; give them one with a name of its own."
             )
     before = _among(name).get(name)
-    _among(name)[name], _OF[kind] = params, law
+    _among(name)[name], _LAWS_BY_CLASS[kind] = params, law
     if before is not None and type(before) not in map(type, (_INNER | LAWS).values()):
-        del _OF[type(before)]
+        del _LAWS_BY_CLASS[type(before)]
 
 
 # --- laws by their texts -------------------------------------------------------------------
 
 
-def named(text: str) -> tuple[str, Params]:
+def parse_law(text: str) -> tuple[str, LawParams]:
     """Read a law's text: its label and its parameters.
 
     A text is the name of a law, `FILE.py:CLASS` or a policy's `FILE.npz`, followed by any number of
@@ -197,12 +199,12 @@ def named(text: str) -> tuple[str, Params]:
             raise InputError(
                 f"law = {text} is not allowed: write changes as name=value or file.json."
             )
-        params = changed(params, new)
+        params = replace_leaves(params, new)
         label += f",{change if equals else Path(change).stem}"
     return label, params
 
 
-def _known(text: str) -> tuple[str, Params]:
+def _known(text: str) -> tuple[str, LawParams]:
     """The label and the parameters of a law without changes."""
     if text.endswith(".npz"):
         return _learned(Path(text))
@@ -226,37 +228,41 @@ def _known(text: str) -> tuple[str, Params]:
     )
 
 
-def laws_of(asked: LawsLike) -> dict[str, Params]:
+def resolve_laws(asked: LawsLike) -> dict[str, LawParams]:
     """Read one law or several: texts, parameters, or either with names of one's own, by label.
 
     Of parameters without a name the label is that of the law, with a number if they are none of its
     presets.
     """
     if isinstance(asked, Mapping):
-        found = {str(name): read_law(one)[1] for name, one in asked.items()}
+        found = {str(name): resolve_law(one)[1] for name, one in asked.items()}
     else:
-        one = isinstance(asked, str) or type(asked) in _OF or not isinstance(asked, Sequence)
+        one = (
+            isinstance(asked, str)
+            or type(asked) in _LAWS_BY_CLASS
+            or not isinstance(asked, Sequence)
+        )
         several = [asked] if one else list(asked)
-        pairs = [read_law(law, number + 1) for number, law in enumerate(several)]
+        pairs = [resolve_law(law, number + 1) for number, law in enumerate(several)]
         labels = _apart([label for label, _ in pairs], several)
         errors.check_each_once("laws", several, labels)
         found = dict(zip(labels, (params for _, params in pairs), strict=True))
     if not found:
         raise InputError(f"laws = {asked} is not allowed: name at least one law.")
     for params in found.values():
-        checked(params)
+        check_params(params)
     return found
 
 
-def read_law(law: LawLike, number: int = 1) -> tuple[str, Params]:
+def resolve_law(law: LawLike, number: int = 1) -> tuple[str, LawParams]:
     """Read one law: its label and its parameters."""
     if isinstance(law, str):
-        return named(law)
+        return parse_law(law)
     law_of(law)
     alike = [name for name, params in LAWS.items() if type(params) is type(law)]
-    mine = numbers(law)
+    mine = named_leaves(law)
     for name in alike:
-        theirs = numbers(LAWS[name])
+        theirs = named_leaves(LAWS[name])
         if list(theirs) == list(mine) and all(np.array_equal(mine[k], theirs[k]) for k in mine):
             return name, law
     return f"{alike[0] if alike else type(law).__name__}_{number}", law
@@ -271,21 +277,21 @@ def _apart(labels: list[str], asked: Sequence[Any]) -> list[str]:
     ]
 
 
-def _learned(path: Path) -> tuple[str, Params]:
+def _learned(path: Path) -> tuple[str, LawParams]:
     """Name and parameters of a learned law's file, registered by a name of its own."""
     content = _read(path)
-    name, law, params = policy.law_of(policy.decoded(content, path))
+    name, law, params = policy.build_law(policy.decode(content, path))
     kind = type(params).__name__  # it says the file's content: a copy is the law that is known
     name = next((known for known, one in LAWS.items() if type(one).__name__ == kind), name)
     if name not in LAWS:
         register_law(name, law, params)
     found, digest = LAWS[name], files.sha256(content)[:16]
-    if name not in _OWN:  # a copy of a shipped policy leaves that what it is
+    if name not in PACKAGE_LAWS:  # a copy of a shipped policy leaves that what it is
         _SOURCES[type(found)] = {"file": str(path.resolve()), "digest": digest}
     return name, found
 
 
-def _registered(module: str, kind: str) -> tuple[str, Params] | None:
+def _registered(module: str, kind: str) -> tuple[str, LawParams] | None:
     """Name and parameters of the law whose parameters are of a class of a module.
 
     Without the name of a class they are of the one class there that has a law.
@@ -331,17 +337,17 @@ def run_file(path: Path, name: str) -> Any:
 # --- laws in manifests ---------------------------------------------------------------------
 
 
-def recorded(params: Params) -> dict[str, Any]:
+def params_to_json(params: LawParams) -> dict[str, Any]:
     """Parameters as JSON, with the class that selects their law, and its file if it has one.
 
-    `restored` is the opposite.
+    `params_from_json` is the opposite.
     """
     kind = type(params)
-    return {"law": kind.__name__} | _SOURCES.get(kind, {}) | as_json(params)
+    return {"law": kind.__name__} | _SOURCES.get(kind, {}) | leaves_to_json(params)
 
 
-def restored(values: Mapping[str, Any]) -> Params:
-    """Read the parameters that `recorded` wrote; InputError if they cannot be had."""
+def params_from_json(values: Mapping[str, Any]) -> LawParams:
+    """Read the parameters that `params_to_json` wrote; InputError if they cannot be had."""
     left = dict(values)
     kind, file, digest = (left.pop(key, None) for key in ("law", "file", "digest"))
     if file:  # it is compared before it is run
@@ -349,15 +355,15 @@ def restored(values: Mapping[str, Any]) -> Params:
             raise InputError(
                 f"law = {file} is not what it was when the run was made: restore the file."
             )
-        named(file if file.endswith(".npz") else f"{file}:{kind}")
+        parse_law(file if file.endswith(".npz") else f"{file}:{kind}")
     known = {type(params).__name__: params for params in (_INNER | LAWS).values()}
     like = known[errors.check_name("class of parameters", str(kind), known)]
-    if set(left) != set(numbers(like)):
+    if set(left) != set(named_leaves(like)):
         raise InputError(
-            f"parameters of {kind} are {', '.join(numbers(like))}, and not {', '.join(left)}."
+            f"parameters of {kind} are {', '.join(named_leaves(like))}, and not {', '.join(left)}."
         )
     shaped = {
         name: np.asarray(x, float) if np.ndim(x) else errors.check_number(name, x)
         for name, x in left.items()
     }
-    return changed(like, shaped)
+    return replace_leaves(like, shaped)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 EngineName = Literal[
     "mjx",
     "fused",
+    "warp",
     "mujoco",
     "quasistatic",
 ]

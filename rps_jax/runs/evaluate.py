@@ -14,7 +14,7 @@ import xarray as xr
 
 from rps_jax import errors
 from rps_jax.control import registry
-from rps_jax.control.base import Params
+from rps_jax.control.base import LawParams
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.registry import LawLike
 from rps_jax.engines import device
@@ -93,7 +93,7 @@ def evaluate(
     count = worlds if at is None else len(at.u)
     errors.check_count("worlds", count, at_most=10_000_000)
     errors.check_count("seed", setting.seed, at_least=0, at_most=2**30)
-    setting.check_here(ranges.weakest, [params])
+    setting.check_here(ranges.families, ranges.weakest, [params])
     ask = Ask(_checked(params), seed_of(setting.seed, split), np.arange(count), at)
     device.use_cache_if_asked()
     shown = watched() if progress is None else progress
@@ -109,7 +109,7 @@ def evaluate(
     return xr.Dataset(variables, {"pose": ["x", "y", "yaw"], "world": ask.worlds} | drawn)
 
 
-def stack(laws: Sequence[LawLike]) -> Params:
+def stack(laws: Sequence[LawLike]) -> LawParams:
     """Stack parameters of one law: candidates with leaves (P, ...), one entry for each.
 
     Args:
@@ -123,7 +123,7 @@ def stack(laws: Sequence[LawLike]) -> Params:
       >>> rps_jax.stack(["rps", "rps,K_h=0.3"]).K_h.tolist()
       [1.0, 0.3]
     """
-    several = [registry.read_law(law)[1] for law in laws]
+    several = [registry.resolve_law(law)[1] for law in laws]
     kinds = {type(params).__name__ for params in several}
     if len(kinds) != 1:
         raise InputError(
@@ -136,7 +136,7 @@ def stack(laws: Sequence[LawLike]) -> Params:
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *several)
 
 
-def candidates(law: LawLike | Sequence[LawLike]) -> Params:
+def candidates(law: Any) -> LawParams:
     """Parameters with leaves (P, ...) of whatever names or holds candidates."""
     if isinstance(law, str):
         return stack([law])
@@ -150,11 +150,11 @@ def candidates(law: LawLike | Sequence[LawLike]) -> Params:
     return stack([law]) if alone else law
 
 
-def _checked(params: Params) -> Params:
+def _checked(params: LawParams) -> LawParams:
     """Bring parameters of candidates of one law to the host; InputError if they are none."""
     law, name = registry.law_of(params), type(params).__name__
     sizes = {}
-    for place, leaf in registry.numbers(params).items():
+    for place, leaf in registry.named_leaves(params).items():
         field, values = f"{name}.{place}", np.asarray(leaf)
         if values.dtype.kind not in "biuf" or not values.ndim or not len(values):
             raise InputError(
@@ -186,7 +186,7 @@ def _checked(params: Params) -> Params:
 class Ask(NamedTuple):
     """Candidates and the worlds that each of them meets."""
 
-    params: Params  # leaves (P, ...)
+    params: LawParams  # leaves (P, ...)
     seed: int  # of the worlds
     worlds: np.ndarray  # (W,) their indices, in each of the D domains
     points: Points | None = None  # of the unit cube at which the worlds lie; None: drawn ones

@@ -22,7 +22,7 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.control import registry
-from rps_jax.control.base import Params
+from rps_jax.control.base import LawParams
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
@@ -46,7 +46,7 @@ class Plan:
 
     domain: Domain
     worlds: int
-    laws: Mapping[str, Params]
+    laws: Mapping[str, LawParams]
     setting: Setting = Setting()  # its seed draws the worlds, too
     part: int = 1024  # trials of a part, at most
     points: Points | None = None  # of the unit cube at which the worlds lie; None: drawn ones
@@ -57,13 +57,14 @@ class Plan:
         if not self.laws:
             raise InputError("laws = {} is not allowed: name at least one law.")
         for params in self.laws.values():
-            registry.checked(params)
+            registry.check_params(params)
         if self.points is not None and len(self.points.u) != self.worlds:
             raise InputError(f"worlds = {self.worlds} is not allowed: {len(self.points.u)} points.")
 
     def check_here(self) -> None:
         """Raises InputError unless the engine can step these worlds on this machine."""
-        self.setting.check_here(self.domain.weakest, self.laws.values())
+        domain = self.domain
+        self.setting.check_here(domain.families, domain.weakest, self.laws.values())
 
     @property
     def trials(self) -> int:
@@ -116,9 +117,9 @@ class Plan:
         whole = {
             "domain": dataclasses.asdict(self.domain),
             "worlds": self.worlds,
-            "laws": {name: registry.recorded(params) for name, params in self.laws.items()},
+            "laws": {name: registry.params_to_json(params) for name, params in self.laws.items()},
             "physics": dataclasses.asdict(self.setting.physics),
-            "rules": registry.as_json(self.setting.rules),
+            "rules": registry.leaves_to_json(self.setting.rules),
             "seed": self.setting.seed,
             "engine": self.setting.engine,
             "part": self.part,
@@ -169,7 +170,7 @@ def load_plan(folder: Path) -> Plan:
         plan = Plan(
             domain.from_json(found["domain"]),
             found["worlds"],
-            {name: registry.restored(law) for name, law in found["laws"].items()},
+            {name: registry.params_from_json(law) for name, law in found["laws"].items()},
             setting_of(found),
             found["part"],
         )

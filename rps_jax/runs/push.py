@@ -171,7 +171,7 @@ class FollowsOne(Question[Trace]):
         )
         details, seen = tuple(whole.snapshots.details)  # of `recorded_law`
         whole = dataclasses.replace(whole, snapshots=whole.snapshots._replace(details=details))
-        about = {"law": json.dumps(registry.recorded(whole.params)), "period": str(period)}
+        about = {"law": json.dumps(registry.params_to_json(whole.params)), "period": str(period)}
         bags.write(Path(self.bag), steps_of(whole, seen, period), about)
         every = max(1, round(0.1 / period))
         thin = jax.tree.map(lambda x: x[::every], whole.snapshots)
@@ -263,7 +263,7 @@ class Push(Case, FollowsOne, Pushes[Trace]):
 
     def check(self) -> None:
         super().check()
-        self.setting.check_here(self.case.base, [self.case.params])
+        self.setting.check_here((), self.case.base, [self.case.params])
 
     def answer(self, run: Run) -> Trace:
         case, setting = self.case, self.setting
@@ -354,6 +354,7 @@ def chosen(run: Path, world: int, law: str | None = None) -> tuple[Plan, str]:
     errors.check_count("world", world, at_least=0, at_most=plan.worlds - 1)
     if not engines.get(plan.setting.engine).traced:
         plan = dataclasses.replace(plan, setting=dataclasses.replace(plan.setting, engine="fused"))
+    engines.get(plan.setting.engine).check()
     return plan, name
 
 

@@ -29,7 +29,7 @@ import xarray as xr
 from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.control import registry
-from rps_jax.control.base import Params
+from rps_jax.control.base import LawParams
 from rps_jax.control.registry import LawLike, LawsLike
 from rps_jax.engines import device
 from rps_jax.record import files, folder, options, provenance
@@ -233,9 +233,9 @@ class Question(Generic[T]):
                 continue
             value = getattr(self, one.name)
             if one.name == "law" and (params := getattr(self, "params", None)) is not None:
-                value = registry.recorded(params)
+                value = registry.params_to_json(params)
             elif one.name == "laws" and isinstance(self, OfLaws):
-                value = {k: registry.recorded(v) for k, v in self.chosen.items()}
+                value = {k: registry.params_to_json(v) for k, v in self.chosen.items()}
             elif one.name == "domain" and isinstance(value, str | Domain):
                 value = dataclasses.asdict(domains.named(value))
             elif one.name == "setting":
@@ -258,7 +258,7 @@ def setting_as_json(setting: Setting) -> dict[str, Any]:
     return {
         "engine": setting.engine,
         "physics": dataclasses.asdict(setting.physics),
-        "rules": registry.as_json(setting.rules),
+        "rules": registry.leaves_to_json(setting.rules),
         "seed": setting.seed,
     }
 
@@ -291,14 +291,14 @@ class OfLaw(Pushes[T]):
     policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json."""
 
     @functools.cached_property
-    def params(self) -> Params:
+    def params(self) -> LawParams:
         """Parameters of the law."""
-        return registry.checked(registry.read_law(self.law)[1])
+        return registry.check_params(registry.resolve_law(self.law)[1])
 
     @property
     def label(self) -> str:
         """What the law is called."""
-        return registry.read_law(self.law)[0]
+        return registry.resolve_law(self.law)[0]
 
 
 @dataclass(frozen=True)
@@ -310,9 +310,9 @@ class OfLaws(Pushes[T]):
     policy.npz; changes follow each, as rps,K_h=0.3 or rps,tuned.json."""
 
     @functools.cached_property
-    def chosen(self) -> dict[str, Params]:
+    def chosen(self) -> dict[str, LawParams]:
         """Parameters of the laws, by label."""
-        return registry.laws_of(self.laws)
+        return registry.resolve_laws(self.laws)
 
 
 @dataclass(frozen=True)
@@ -337,9 +337,9 @@ class InDomain(Pushes[T]):
         del found["robot"]
         return found
 
-    def check_engine(self, laws: Sequence[Params] = ()) -> None:
+    def check_engine(self, laws: Sequence[LawParams] = ()) -> None:
         """Raises InputError unless the engine can step these worlds with these laws here."""
-        self.setting.check_here(self.ranges.weakest, laws)
+        self.setting.check_here(self.ranges.families, self.ranges.weakest, laws)
 
 
 def told(timing: Timing, device: str) -> str:

@@ -21,7 +21,7 @@ from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import Figure
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
-from rps_jax.control.base import Params, Senses
+from rps_jax.control.base import LawParams, Senses
 from rps_jax.control.registry import LawLike, LawsLike
 from rps_jax.errors import InputError
 from rps_jax.record.options import option
@@ -42,7 +42,7 @@ def all_laws() -> tuple[str, ...]:
     return tuple(sorted(laws, key=lambda name: order.index(_senses(laws[name]))))
 
 
-def _senses(params: Params) -> Senses:
+def _senses(params: LawParams) -> Senses:
     return registry.law_of(params).senses
 
 
@@ -106,9 +106,9 @@ class Ladder(SweepOptions, OfLaws[xr.Dataset | xr.DataTree]):
     By default 1024, and with many worlds a 16th of them, up to 16384."""
 
     @cached_property
-    def chosen(self) -> dict[str, Params]:
+    def chosen(self) -> dict[str, LawParams]:
         default = isinstance(self.laws, tuple) and not self.laws
-        return registry.laws_of(all_laws() if default else self.laws)
+        return registry.resolve_laws(all_laws() if default else self.laws)
 
     @cached_property
     def sweeps(self) -> dict[str, _TestSweep]:
@@ -234,10 +234,12 @@ class Score(Ladder, _ScoredLaw):
     """The laws beside it; changes follow each, as rps,K_h=0.3 or rps,tuned.json."""
 
     @cached_property
-    def chosen(self) -> dict[str, Params]:
-        label, params = registry.read_law(self.law)
-        others = registry.laws_of(self.laws)
-        return {label: registry.checked(params)} | {k: v for k, v in others.items() if k != label}
+    def chosen(self) -> dict[str, LawParams]:
+        label, params = registry.resolve_law(self.law)
+        others = registry.resolve_laws(self.laws)
+        return {label: registry.check_params(params)} | {
+            k: v for k, v in others.items() if k != label
+        }
 
     def sections(self, sweep: Sweep, results: xr.Dataset, run: Run) -> Sequence[Section]:
         sections = super().sections(sweep, results, run)

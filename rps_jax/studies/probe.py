@@ -10,7 +10,7 @@ import xarray as xr
 
 from rps_jax.analysis import statistics
 from rps_jax.control import registry
-from rps_jax.control.base import Params
+from rps_jax.control.base import LawParams
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
@@ -38,7 +38,7 @@ class Probe:
     """
 
     domain: Domain
-    params: Params
+    params: LawParams
     setting: Setting = Setting(engine="fused")
     folder: Path | None = None
     slots: int | None = None

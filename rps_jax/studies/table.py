@@ -69,7 +69,7 @@ class Table(Given, OfLaws[xr.Dataset]):
     def check(self) -> None:
         if not self.cases:
             raise errors.InputError("targets = () is not allowed: name at least one.")
-        self.setting.check_here(self.cases[0].base, self.chosen.values())
+        self.setting.check_here((), self.cases[0].base, self.chosen.values())
 
     def trials(self) -> int | None:
         return len(self.cases)
@@ -118,7 +118,7 @@ def table_of(folder: Path) -> Table:
     try:
         found = run_folder.read_manifest(folder)
         setting = setting_of(found["setting"])
-        laws = {name: registry.restored(law) for name, law in found["laws"].items()}
+        laws = {name: registry.params_from_json(law) for name, law in found["laws"].items()}
         pairs = {name: _tuples(found[name]) for name in ("objects", "friction", "targets")}
         given = {one.name: found[one.name] for one in dataclasses.fields(Given)}
         if found["question"] != "table":

@@ -5,7 +5,7 @@ from functools import cached_property
 
 from rps_jax import errors
 from rps_jax.control import registry
-from rps_jax.control.base import Params
+from rps_jax.control.base import LawParams
 from rps_jax.control.registry import LawLike
 from rps_jax.record.options import option
 from rps_jax.robot import robot as robots
@@ -64,7 +64,7 @@ class Case(Given):
 
     def __post_init__(self) -> None:
         errors.check_name("object", objects.named(self.object), objects.OBJECTS)
-        registry.checked(self.params)
+        registry.check_params(self.params)
         scene.check(self.contact, self.mass)
         skins.named(self.skin or "ideal")
         errors.check_finite("gap", self.gap, at_least=0, at_most=1, unit="m")
@@ -81,9 +81,9 @@ class Case(Given):
         return objects.named(self.object)
 
     @cached_property
-    def params(self) -> Params:
+    def params(self) -> LawParams:
         """Parameters of the law."""
-        return registry.read_law(self.law)[1]
+        return registry.resolve_law(self.law)[1]
 
     @cached_property
     def contact(self) -> Friction:

@@ -23,7 +23,7 @@ import mujoco
 import numpy as np
 
 from rps_jax import engines, errors
-from rps_jax.control.base import check_finite
+from rps_jax.control.base import check_finite_leaves
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.learned import features
@@ -117,7 +117,7 @@ class PushEnv:
         errors.check_name("skin of an environment", self.domain.skin, ("capacitive",))
         errors.check_count("worlds", self.worlds, at_most=1_000_000)
         rps.check(self.params)
-        check_finite(self.weights)
+        check_finite_leaves(self.weights)
         self._drive  # noqa: B018
 
     # --- the loop ---
@@ -138,7 +138,7 @@ class PushEnv:
         """A world, of the index or one that was made of it, at its start."""
         before = trial.start(world)
         never_felt = jnp.full_like(before.min_distance, jnp.inf)
-        now, seen = self._observe(world, before._replace(memory=never_felt))
+        now, seen = self._observe(world, before._replace(law_state=never_felt))
         nothing = jnp.zeros_like(now.min_distance)
         info = {"world": world, "index": index, "observation": self._observation(world, now, seen)}
         return State(now, _obs(now, seen), nothing, nothing, _metrics(now, seen, nothing), info)
@@ -152,7 +152,7 @@ class PushEnv:
         moved = trial.settle(before, told, driven)
         now, seen = self._observe(world, moved)
         gone = moved.done  # it had ended before, or the physics ended it
-        progress = jnp.where(jnp.isfinite(before.memory), before.memory - now.memory, 0.0)
+        progress = jnp.where(jnp.isfinite(before.law_state), before.law_state - now.law_state, 0.0)
         reward = (
             self.weights.progress * progress
             - self.weights.no_contact * self.dt * ~seen.reading.in_contact
@@ -192,15 +192,15 @@ class PushEnv:
         """Sense and judge, unless the trial has ended."""
         physics, rules = self.setting.physics, self.setting.rules
         told, seen = trial.observe(world, before, physics=physics, rules=rules)
-        felt = jnp.where(seen.reading.in_contact, seen.distance, before.memory)
-        told = told._replace(memory=felt)
+        felt = jnp.where(seen.reading.in_contact, seen.distance, before.law_state)
+        told = told._replace(law_state=felt)
         return jax.tree.map(lambda a, b: jnp.where(before.done, a, b), before, told), seen
 
     def _observation(self, world: World, now: Trial, seen: Seen) -> TaxelObservation:
         """What a law that senses taxels is told."""
         felt = world.skin, now.skin, trial.outline(world, now.qpos)
         touch = seen.observation._replace(period=jnp.asarray(self.dt))
-        return features.observed(touch, seen.reading, *felt)
+        return features.taxel_observation(touch, seen.reading, *felt)
 
     # --- what it is made of ---
 

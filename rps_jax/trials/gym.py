@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.control import switches
+from rps_jax.control import soft
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv, State
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import DomainLike
@@ -153,7 +153,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._state: State | None = None
         self._begin = jax.jit(jax.vmap(self.push_env.reset))
         self._act = jax.jit(jax.vmap(partial(_carry_out, self.push_env, steps)))
-        self._pick = jax.jit(jax.vmap(switches.select))
+        self._pick = jax.jit(jax.vmap(soft.tree_where))
 
     def begin(self, random: np.random.Generator, where: np.ndarray | None = None) -> None:
         """Begin in other worlds by chance: in all, or where a mask (num_envs,) says so."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from rps_jax import engines
 from rps_jax.control import registry
-from rps_jax.control.base import Law, Params
+from rps_jax.control.base import Law, LawParams
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.engines import programs
 from rps_jax.geometry.footprint import Footprint
@@ -21,7 +21,7 @@ from rps_jax.record import provenance
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.shell import Shell
 from rps_jax.trials import batch, host, trial
-from rps_jax.trials.batch import SEGMENT, Job, Part, rows
+from rps_jax.trials.batch import SEGMENT, Job, Part, rows, warn_of_lost
 from rps_jax.trials.case import Case
 from rps_jax.trials.progress import Progress, Report, Timing, unheard
 from rps_jax.trials.setting import Setting
@@ -40,7 +40,7 @@ class Followed:
     outcome: Outcome  # without a leading axis
     timing: Timing  # of all trials followed together
     p_world_target: tuple[float, float]  # [m]
-    params: Params
+    params: LawParams
     half: tuple[float, float]  # [m] half length and half width of the base
     outline: np.ndarray  # (N, 2) [m] of the object in its own frame, closed
 
@@ -160,7 +160,12 @@ def follow(
     interval: float = 0.1,
     report: Report = unheard,
 ) -> list[Followed]:
-    """Run trials of one kind to their ends and keep what they looked like every `interval` [s]."""
+    """Run trials of one kind to their ends and keep what they looked like every `interval` [s].
+
+    Raises:
+      InputError: the engine's trials cannot be followed on this machine.
+    """
+    engines.get(setting.engine).check()
     stage, worlds = build(cases, setting)
     part = Part(np.arange(len(cases)), worlds, stage)
     law = registry.law_of(cases[0].params)
@@ -254,6 +259,7 @@ def _follow_on_host(
 
 def _followed(part: Part, whole: Snapshot, outcomes: Outcome, timing: Timing) -> list[Followed]:
     """What was seen (T, B, ...), trial by trial, each until its end."""
+    warn_of_lost(int(np.count_nonzero(outcomes.overflows)))
     return [
         Followed(
             rows(whole, (~whole.done[:, i], i)),

@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax import errors
-from rps_jax.control import switches
-from rps_jax.control.base import Law, Params
+from rps_jax.control import soft
+from rps_jax.control.base import Law, LawParams
 from rps_jax.control.laws import rps
 from rps_jax.control.learned import features
 from rps_jax.control.observation import (
@@ -88,7 +88,7 @@ class World(NamedTuple):
     fields: Any  # for its engine's stage
     footprint: Footprint
     skin: Skin
-    params: Params
+    params: LawParams
     p_world_target: Float[Array, "*B 2"]  # [m]
     shift: Shift
     qpos: Float[Array, "*B 10"]  # at the start, as in `Trial`
@@ -105,7 +105,7 @@ class Trial(NamedTuple):
     # Of these [m/s, rad/s]; the object's angular velocity is in its own frame.
     qvel: Float[Array, "*B 9"]
     warmstart: Float[Array, "*B 9"]  # [m/s^2, rad/s^2] last accelerations, for the solver
-    memory: Any  # what the law remembers
+    law_state: Any  # what the law remembers
     skin: SkinState
     poses: Float[Array, "*B K 3"]  # [m, m, rad] of the base in the last steps, the latest first
     twists: Float[Array, "*B K 3"]  # [m/s, m/s, rad/s] commanded, likewise
@@ -120,6 +120,7 @@ class Trial(NamedTuple):
     tilt: Float[Array, "*B"]  # [rad] greatest tilt of the object so far
     tipped: Bool[Array, "*B"]  # the object has fallen over
     diverged: Bool[Array, "*B"]
+    overflows: Int[Array, "*B"]  # control steps in which contacts were lost for want of room
     drive: Drive | None = None  # of a robot with limits
     load: Load | None = None  # of a law that senses the contact's force
 
@@ -148,6 +149,7 @@ class Outcome(NamedTuple):
     tipped: Bool[Array, "*B"]  # the object has fallen over
     diverged: Bool[Array, "*B"]
     stalled: Bool[Array, "*B"]  # it ended with the base standing still against the object
+    overflows: Int[Array, "*B"]  # control steps in which contacts were lost for want of room
     base_pose: Float[Array, "*B 3"]  # [m, m, rad] in the world, at the end
     object_pose: Float[Array, "*B 3"]  # [m, m, rad] likewise
 
@@ -172,7 +174,7 @@ def start(world: World, law: Law = rps.LAW) -> Trial:
         qpos=world.qpos,
         qvel=jnp.zeros_like(world.qpos[:9]),
         warmstart=jnp.zeros_like(world.qpos[:9]),
-        memory=law.init(world.params),
+        law_state=law.init(world.params),
         skin=world.skin.init(world.key),
         poses=jnp.tile(world.qpos[JOINTS.base], (*world.odometry.past.shape, 1)),
         twists=jnp.zeros((*world.odometry.past.shape, 3), world.qpos.dtype),
@@ -187,6 +189,7 @@ def start(world: World, law: Law = rps.LAW) -> Trial:
         tilt=jnp.zeros_like(world.qpos[0]),
         tipped=false,
         diverged=false,
+        overflows=zero,
         drive=None if world.robot is None else drive.start(world.qpos),
         load=base.unloaded(world.qpos) if law.senses == "force" else None,
     )
@@ -311,13 +314,13 @@ def decide(world: World, trial: Trial, loop: Loop) -> tuple[Trial, Twist, Snapsh
         )
     if law.senses == "taxels":
         skin = world.skin, told.skin, outline(world, told.qpos)
-        observation = features.observed(observation, seen.reading, *skin)
+        observation = features.taxel_observation(observation, seen.reading, *skin)
     if told.load is not None:
         felt, force = law.cell.read(told.load, world.key, told.steps, period)
         told, observation = told._replace(load=felt), ForceObservation(observation, force)
-    state, twist, details = law.step(world.params, trial.memory, observation)
+    state, twist, details = law.step(world.params, trial.law_state, observation)
     snapshot = Snapshot(trial.steps * period, told.qpos, seen.reading, twist, details, trial.done)
-    told, twist = execute(world, told._replace(memory=state), twist, period)
+    told, twist = execute(world, told._replace(law_state=state), twist, period)
     return told, twist, snapshot
 
 
@@ -326,12 +329,14 @@ def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
 
     A trial that had ended `before` comes back as it was.
     """
-    (qpos, qvel, warmstart, integral), force = driven
+    (qpos, qvel, warmstart, integral), overflowed, force = driven
     sane = (
         jnp.all(jnp.isfinite(qpos))
         & jnp.all(jnp.abs(qvel) < _MAX_SPEED)
         & jnp.all(jnp.abs(qpos.at[2].set(0.0)) < _MAX_DISTANCE)  # but for the turns of the base
     )
+    if overflowed is not None:
+        told = told._replace(overflows=told.overflows + (overflowed & ~told.done))
     now = told.drive
     if now is not None:
         now = drive.stalled(now if integral is None else now._replace(integral=integral), qvel)
@@ -345,7 +350,7 @@ def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
         load=told.load and told.load._replace(wrench=force),
     )
     stopped = told._replace(done=jnp.ones((), bool), diverged=~told.done & ~sane)
-    return switches.select(before.done, before, switches.select(told.done | ~sane, stopped, moved))
+    return soft.tree_where(before.done, before, soft.tree_where(told.done | ~sane, stopped, moved))
 
 
 def control_step(
@@ -389,6 +394,7 @@ def outcome(trial: Trial, period: float) -> Outcome:
         tipped=trial.tipped,
         diverged=trial.diverged,
         stalled=drive.has_stalled(trial.drive, period) & ~trial.success & ~trial.diverged,
+        overflows=trial.overflows,
         base_pose=trial.qpos[..., JOINTS.base],
         object_pose=pose.reshape(*trial.qpos.shape[:-1], 3),
     )

@@ -8,7 +8,7 @@ import numpy as np
 
 from rps_jax import engines
 from rps_jax.control import registry
-from rps_jax.control.base import Params
+from rps_jax.control.base import LawParams
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.base import Odometry
@@ -23,7 +23,7 @@ from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction, Scene
 
 
-def drawn_worlds(domain: Domain, drawn: Draw, params: Params, setting: Setting) -> Part:
+def drawn_worlds(domain: Domain, drawn: Draw, params: LawParams, setting: Setting) -> Part:
     """The worlds of a draw as a part of a job, all with the same parameters."""
     family = domain.family_of(drawn.case[0])
     count, dtype = drawn.number.size, jnp.result_type(float)

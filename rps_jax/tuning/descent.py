@@ -18,8 +18,8 @@ import numpy as np
 import optax
 
 from rps_jax import errors
-from rps_jax.control import registry, switches
-from rps_jax.control.base import Params
+from rps_jax.control import registry, soft
+from rps_jax.control.base import LawParams
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.record.options import option
 from rps_jax.robot.skin import CapacitiveSkin, SmoothSkin
@@ -125,7 +125,7 @@ tune_grad = call_of(TuneGrad)
 
 
 def soft_score(
-    seen: Snapshot, params: Params, setting: Setting, objective: Objective, arrive: float
+    seen: Snapshot, params: LawParams, setting: Setting, objective: Objective, arrive: float
 ) -> jax.Array:
     """The objective's score () of a softened window's snapshots (T, ...), differentiable.
 
@@ -192,7 +192,7 @@ def scores_of(how: Windows, stage: Any) -> gradients.Scores:
 
         def one(i: jax.Array, trials: Trial) -> Trial:
             after, _ = control_step(stage, worlds, trials, loop)
-            return jax.vmap(switches.select)(i < late * steps(how.within), after, trials)
+            return jax.vmap(soft.tree_where)(i < late * steps(how.within), after, trials)
 
         return jax.lax.fori_loop(0, steps(how.within), one, first)
 

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax.control.base import Params
+from rps_jax.control.base import LawParams
 from rps_jax.geometry import planar
 from rps_jax.trials import trial
 from rps_jax.trials.trial import Loop, Snapshot, Trial
@@ -77,7 +77,7 @@ def per_world(theta: jax.Array, worlds: Any) -> jax.Array:
 
 def window(
     stage: Any,  # of an engine with derivatives: see `Engine.check_derivatives`
-    params_of: Callable[[jax.Array], Params],  # from theta (p,), differentiable
+    params_of: Callable[[jax.Array], LawParams],  # from theta (p,), differentiable
     cost: Callable[[Snapshot], jax.Array],  # () or (...) of snapshots (steps, ...) of one trial
     loop: Loop,  # with the smooth law that the parameters belong to
     steps: int,

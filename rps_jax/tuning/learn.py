@@ -127,9 +127,11 @@ class Learn(PPO, Pushes[xr.Dataset]):
             raise errors.InputError("minutes = 0 is not allowed without updates: give one of them.")
         errors.check_each_once("domain", self.domains)
         errors.check_count("seed", self.setting.seed, at_least=0, at_most=2**30)
+        engine = engines.get(self.setting.engine)
         for one in self.domains:
             errors.check_name("skin of a domain to learn in", one.skin, ("capacitive",))
-        engines.get(self.setting.engine).check_traced()
+            engine.check(one.families)
+        engine.check_traced()
         count = self.num_envs * sum(len(one.objects) for one in self.domains)
         if self.num_minibatches > count:
             raise errors.InputError(
@@ -340,7 +342,7 @@ class _Learning:
         Checkpoints(self.folder).put(
             f"learner-{self._kept % 2}", files.encode_arrays(**arrays), ".npz"
         )
-        files.write_bytes(self.folder / "policy.npz", policies.encoded(self.policy()))
+        files.write_bytes(self.folder / "policy.npz", policies.encode(self.policy()))
         rows = [{"update": i + 1} | metrics for i, metrics in enumerate(self.curve)]
         files.write_csv(self.folder / "curve.csv", rows)
 

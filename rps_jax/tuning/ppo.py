@@ -20,7 +20,7 @@ import optax
 
 from rps_jax.control.learned import features
 from rps_jax.control.learned import network as networks
-from rps_jax.control.learned.network import Kind, Network, Weights
+from rps_jax.control.learned.network import Network, NetworkKind, Weights
 from rps_jax.record.options import option
 
 PRIVATE_SIGNS = np.array([1, -1, 1, 1, 1], np.float32)  # of what is `private`, under the mirror
@@ -31,7 +31,7 @@ _LOG_STD = (-2.5, 0.5)  # bounds on the logarithm of the standard deviation of a
 class PPO:
     """How a law is learned: the network, and the numbers of the algorithm."""
 
-    network: Kind = "gru"
+    network: NetworkKind = "gru"
     """The network: mlp, two layers without a memory; or gru, with a recurrent layer."""
     width: int = option(64, 1, 1024)
     """Pairs of units in a hidden layer; each pair stands for a world and its mirror image."""
@@ -87,10 +87,10 @@ class TrainState(NamedTuple):
     def init(cls, ppo: PPO, network: Network, key: jax.Array) -> TrainState:
         """State before the first update."""
         actor, critic = jax.random.split(key)
-        inputs = features.size(network.taxels) + PRIVATE_SIGNS.size
+        inputs = features.feature_count(network.taxels) + PRIVATE_SIGNS.size
         weights: Weights = {
             "actor": network.init(actor),
-            "critic": networks.start(networks.critic_shapes(inputs, ppo.width), critic),
+            "critic": networks.init_weights(networks.critic_shapes(inputs, ppo.width), critic),
             "log_std": jnp.full(3, math.log(0.6)),
         }
         ema = jax.tree.map(jnp.copy, weights["actor"])
@@ -135,7 +135,7 @@ def critic_inputs(obs: jax.Array, private: jax.Array) -> jax.Array:
     """Inputs (..., 2, F + P) of the value function, of the world and of its mirror image."""
     signs = jnp.asarray(PRIVATE_SIGNS, private.dtype)
     both = jnp.stack([private, signs * private], axis=-2)
-    return jnp.concatenate([networks.paired(obs), both], axis=-1)
+    return jnp.concatenate([networks.mirror_pairs(obs), both], axis=-1)
 
 
 def log_prob(action: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:

@@ -15,10 +15,10 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax import errors
-from rps_jax.control import switches
+from rps_jax.control import soft
 from rps_jax.control.learned import features
 from rps_jax.control.learned import network as networks
-from rps_jax.control.learned.network import Memory, Network, Weights
+from rps_jax.control.learned.network import Network, PolicyState, Weights
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.trials import trial
@@ -33,7 +33,7 @@ class EnvBatch(NamedTuple):
     """Worlds of one environment under way; leaves (N, ...)."""
 
     states: State
-    memory: Memory
+    memory: PolicyState
     first: jax.Array  # (N,) bool: the trial has just begun
     earned: jax.Array  # (N,) [1] rewards of the trial so far
 
@@ -104,7 +104,7 @@ def _anew(
 ) -> EnvBatch:
     """Random worlds at their start: one in five of a lower level, while there is a lower one."""
 
-    def one(key: jax.Array) -> tuple[State, Memory]:
+    def one(key: jax.Array) -> tuple[State, PolicyState]:
         which, noise, lower = jax.random.split(key, 3)
         index = jax.random.randint(which, (), 0, env.worlds)
         u = jax.random.uniform(lower)
@@ -117,10 +117,10 @@ def _anew(
     return EnvBatch(states, memory, jnp.ones(count, bool), jnp.zeros(count))
 
 
-def _first_felt(network: Network, state: State) -> Memory:
-    """Memory of the law after its first observation."""
-    memory = Memory.init(network, state.obs.dtype)
-    return memory._replace(felt=memory.felt.follow(state.info["observation"]))
+def _first_felt(network: Network, state: State) -> PolicyState:
+    """State of the law after its first observation."""
+    memory = PolicyState.init(network, state.obs.dtype)
+    return memory._replace(touch_state=memory.touch_state.update(state.info["observation"]))
 
 
 def _private(env: PushEnv, state: State) -> jax.Array:
@@ -137,7 +137,7 @@ def _private(env: PushEnv, state: State) -> jax.Array:
 def _seen(env: PushEnv, batch: EnvBatch) -> tuple[jax.Array, jax.Array]:
     """Inputs of the network (N, F), and those of the value function alone (N, P)."""
     memory, seen = batch.memory, batch.states.info["observation"]
-    obs = jax.vmap(features.features)(memory.felt, memory.action, seen)
+    obs = jax.vmap(features.compute_features)(memory.touch_state, memory.action, seen)
     return obs, jax.vmap(partial(_private, env))(batch.states)
 
 
@@ -145,21 +145,21 @@ def carry_out(
     env: PushEnv, network: Network, batch: EnvBatch, hidden: jax.Array, action: jax.Array
 ) -> tuple[EnvBatch, jax.Array]:
     """Carry out an action (N, 3) of each world; returns the batch and the rewards (N,)."""
-    bounded = features.executed(action)
-    felt = jax.vmap(type(batch.memory.felt).decided)(
-        batch.memory.felt, batch.states.info["observation"]
+    bounded = features.clip_action(action)
+    felt = jax.vmap(type(batch.memory.touch_state).mark_decision)(
+        batch.memory.touch_state, batch.states.info["observation"]
     )
-    follow = jax.vmap(type(felt).follow)
+    update = jax.vmap(type(felt).update)
 
     def one(carry: Any, _: None) -> tuple[Any, None]:
         states, felt, reward = carry
         states = jax.vmap(env.step)(states, bounded)
-        return (states, follow(felt, states.info["observation"]), reward + states.reward), None
+        return (states, update(felt, states.info["observation"]), reward + states.reward), None
 
     begun = batch.states, felt, jnp.zeros_like(batch.earned)
     steps = round(network.hold / env.dt)
     (states, felt, reward), _ = jax.lax.scan(one, begun, length=steps)
-    memory = batch.memory._replace(felt=felt, hidden=hidden, action=bounded)
+    memory = batch.memory._replace(touch_state=felt, hidden=hidden, action=bounded)
     earned = batch.earned + reward
     return EnvBatch(states, memory, jnp.zeros_like(batch.first), earned), reward
 
@@ -215,7 +215,7 @@ def _act(
     pairs = ppo_.critic_inputs(*(together(parts) for parts in zip(*after, strict=True)))
     verdicts = [_verdict(env, batch) for env, batch in zip(envs, went, strict=True)]
     stats, terminated = jax.tree.map(lambda *parts: together(parts), *verdicts)
-    pick = jax.vmap(switches.select)
+    pick = jax.vmap(soft.tree_where)
     begun = tuple(
         pick(batch.states.data.done, _anew(network, env, table, runner.level, at, count), batch)
         for env, table, at, batch in zip(envs, tables, starts, went, strict=True)
@@ -280,7 +280,7 @@ def _graded(ppo: PPO, runner: RunnerState, ended: jax.Array, won: jax.Array) -> 
 def rollout(network: Network, env: PushEnv, table: World, actor: Weights) -> State:
     """Push in the worlds of an environment by the policy, noiseless; return their last states."""
 
-    def one(index: jax.Array) -> tuple[State, Memory]:
+    def one(index: jax.Array) -> tuple[State, PolicyState]:
         state = env.begin(rows(table, index), index)
         return state, _first_felt(network, state)
 

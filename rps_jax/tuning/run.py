@@ -18,7 +18,7 @@ from rps_jax import errors
 from rps_jax.analysis import figures, tables
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
-from rps_jax.control.base import Params
+from rps_jax.control.base import LawParams
 from rps_jax.control.registry import LawLike
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
@@ -49,12 +49,12 @@ class Problem:
     setting: Setting = Setting()
     objective: Objective = Objective()
 
-    def ask(self, params: Params, seed: int, generation: int) -> Ask:
+    def ask(self, params: LawParams, seed: int, generation: int) -> Ask:
         """Candidates with leaves (P,) in the worlds of a generation."""
         worlds = generation * self.worlds + np.arange(self.worlds)
         return Ask(params, seed_of(seed, "tune"), worlds)
 
-    def validate(self, params: Params, seed: int) -> Ask:
+    def validate(self, params: LawParams, seed: int) -> Ask:
         """Candidates with leaves (P,) in the worlds for validation."""
         return Ask(params, seed_of(seed, "validate"), np.arange(self.validation))
 
@@ -166,7 +166,7 @@ class Tuning(OfLaw[xr.Dataset]):
                 f"{', '.join(known)} have."
             )
         for one in self.problem.domains:
-            self.setting.check_here(one.weakest, [self.space.base])
+            self.setting.check_here(one.families, one.weakest, [self.space.base])
         _ = self.tuner
 
     def described(self) -> dict[str, Any]:
@@ -206,7 +206,7 @@ class Tuning(OfLaw[xr.Dataset]):
         if run.folder is not None:
             text += f" The law with these parameters is `{self.label},{run.folder / TUNED}`."
         rows = [["parameter", "start", "tuned"]]
-        start = registry.numbers(self.space.base)
+        start = registry.named_leaves(self.space.base)
         for name, value in zip(found.parameter.values, found.tuned.values, strict=True):
             rows.append([str(name), f"{float(start[str(name)]):.4g}", f"{float(value):.4g}"])
         picture = Picture("tuning", partial(figures.search, found))
@@ -226,7 +226,7 @@ def labelled(log: Sequence[Mapping[str, Any]], tuner: Tuner) -> xr.Dataset:
     }
     params = [[line["params"][name] for name in names] for line in log]
     columns["params"] = (("generation", "parameter"), np.array(params, float))
-    best = registry.numbers(tuner.space.params(tuner.best))
+    best = registry.named_leaves(tuner.space.params(tuner.best))
     columns["tuned"] = ("parameter", np.array([float(best[name]) for name in names]))
     return xr.Dataset(columns, {"generation": np.arange(len(log)), "parameter": names})
 

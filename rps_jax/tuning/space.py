@@ -10,13 +10,13 @@ import jax.numpy as jnp
 
 from rps_jax import errors
 from rps_jax.control import registry
-from rps_jax.control.base import Bound, Params
+from rps_jax.control.base import Bound, LawParams
 from rps_jax.control.laws.rps import BOUNDS, RPSParams
 
 SUBSETS = {"logistic": ("eta", "zeta", "beta", "k"), "full": tuple(BOUNDS)}  # of RPS
 
 
-def expanded(names: Sequence[str], base: Params = RPSParams()) -> tuple[str, ...]:
+def expanded(names: Sequence[str], base: LawParams = RPSParams()) -> tuple[str, ...]:
     """Put the members of a subset in its place among names: of `full`, all of the law's."""
     own = isinstance(base, RPSParams)
     subsets = SUBSETS if own else {"full": tuple(dict(registry.law_of(base).bounds))}
@@ -35,7 +35,7 @@ class Space:
 
     def __post_init__(self) -> None:
         errors.check_each_once("tuned", self.names)
-        base = registry.numbers(self.base)
+        base = registry.named_leaves(self.base)
         for name in self.names:
             bound = self._bounds[errors.check_name("tuned parameter", name, self._bounds)]
             share = _share(bound, base, name)
@@ -50,9 +50,9 @@ class Space:
     def _bounds(self) -> dict[str, Bound]:
         return dict(registry.law_of(self.base).bounds)
 
-    def vector(self, params: Params) -> jax.Array:
+    def vector(self, params: LawParams) -> jax.Array:
         """The vector (..., p) of parameters with leaves (...)."""
-        numbers = registry.numbers(params)
+        numbers = registry.named_leaves(params)
         return jnp.stack([self._coordinate(numbers, name) for name in self.names], axis=-1)
 
     def _coordinate(self, numbers: Mapping[str, Any], name: str) -> jax.Array:
@@ -67,7 +67,7 @@ class Space:
         vector, bounds = jnp.asarray(vector, float), self._bounds
         filled = {
             name: jnp.broadcast_to(jnp.asarray(value, vector.dtype), vector.shape[:-1])
-            for name, value in registry.numbers(self.base).items()
+            for name, value in registry.named_leaves(self.base).items()
         }
         for name in sorted(self.names, key=lambda name: bool(bounds[name].of)):
             low, high, log, of = bounds[name]
@@ -77,7 +77,7 @@ class Space:
         for name, bound in bounds.items():
             if bound.of:  # a share of a tuned parameter that is itself fixed must not pass it
                 filled[name] = jnp.minimum(filled[name], filled[bound.of])
-        return registry.changed(self.base, filled)
+        return registry.replace_leaves(self.base, filled)
 
     def named(self, vector: Any) -> dict[str, float]:
         """A vector's tuned parameters by name, and the others that differ from the usual ones."""
@@ -85,7 +85,7 @@ class Space:
         known = next(known for known in registry.LAWS.values() if type(known) is kind)
         found, usual = (
             {name: float(f"{float(value):.7g}") for name, value in numbers.items()}
-            for numbers in map(registry.numbers, (self.params(vector), known))
+            for numbers in map(registry.named_leaves, (self.params(vector), known))
         )
         return {n: x for n, x in found.items() if n in self.names or x != usual[n]}
 

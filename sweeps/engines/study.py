@@ -2,8 +2,9 @@
 
     rps sweeps/engines --worlds 90
 
-runs the same worlds in every engine and compares the outcomes with those of converged C MuJoCo.
-`rps sweep` runs one engine.
+runs the same worlds in every engine that can run them here (MJX-Warp: on an NVIDIA GPU, and without
+prisms, as with `--objects random_box random_cylinder`), and compares outcomes with those of
+converged C MuJoCo. `rps sweep` runs one engine.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any, ClassVar
 
 import xarray as xr
 
+from rps_jax import engines as engines_
 from rps_jax import errors
 from rps_jax.analysis import statistics
 from rps_jax.analysis.report import Section
@@ -56,6 +58,7 @@ ENGINES = {
     "fused, fast": Setting(physics=preset(fidelity="fast"), engine="fused"),
     "quasistatic": Setting(physics=preset(), engine="quasistatic"),
     "MJX, standard": Setting(physics=preset(), engine="mjx"),
+    "MJX-Warp, standard": Setting(physics=preset(), engine="warp"),
 }
 
 
@@ -84,7 +87,7 @@ class Engines(TrialStudy[xr.DataTree]):
     objects: tuple[str, ...] = ()
     """Objects to push, as random_box random_cylinder; by default the domain's."""
     engines: tuple[str, ...] = ()
-    """Engines and physics by name, the first to be compared with; by default all."""
+    """Engines and physics by name, the first to be compared with; by default all that run here."""
     part: int = option(256, 1, 1_000_000)
     """Number of trials in a part: what is lost when killed, at most. C waits for the slowest of
     each."""
@@ -94,7 +97,8 @@ class Engines(TrialStudy[xr.DataTree]):
         """What is run, by the engine's name."""
         ranges = domains.named(self.domain)
         ranges = replace(ranges, objects=self.objects or ranges.objects)
-        label, params = registry.read_law(self.law)
+        label, params = registry.resolve_law(self.law)
+        here = (n for n, s in ENGINES.items() if engines_.get(s.engine).works(ranges.families))
         low, high, log = ranges.gap
         moved = replace(ranges, gap=Range(low + _MOVED, high + _MOVED, log))
         return {
@@ -105,7 +109,7 @@ class Engines(TrialStudy[xr.DataTree]):
                 ENGINES[name],
                 self.part,
             )
-            for name in self.engines or ENGINES
+            for name in self.engines or here
         }
 
     def check(self) -> None:

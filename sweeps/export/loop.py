@@ -45,7 +45,7 @@ def recorded(cases: Sequence[Case], setting: Setting) -> list[Any]:
 
 def in_the_loop(name: str, where: Path) -> Any:
     """Parameters of a law of this process whose step is that in C, in float."""
-    label, params = registry.read_law(name)
+    label, params = registry.resolve_law(name)
     law, native = registry.law_of(params), Native(program.program(name), where, "float")
 
     def called(memory: Any, seen: Any) -> Any:
@@ -74,7 +74,7 @@ def in_the_loop(name: str, where: Path) -> Any:
         return (
             jax.tree.unflatten(tree, after),
             Twist(*twist),
-            Details.of(getattr(seen, "touch", seen)),
+            Details.from_obs(getattr(seen, "touch", seen)),
         )
 
     return _registered(f"{program.identifier(label)}_in_c", law, step, params)
@@ -82,7 +82,7 @@ def in_the_loop(name: str, where: Path) -> Any:
 
 def nudged(name: str, roundings: int) -> Any:
     """Parameters of a law of this process whose every twist is greater by some roundings."""
-    label, params = registry.read_law(name)
+    label, params = registry.resolve_law(name)
     law = registry.law_of(params)
 
     def step(own: Any, memory: Any, seen: Any) -> Any:
@@ -116,7 +116,7 @@ class Ends(NamedTuple):
 
 def _ends(name: str, where: Path, run: Any, roundings: Sequence[int]) -> Ends:
     """Ends of the trials that `run` makes with a law's parameters."""
-    laws = [registry.read_law(name)[1], in_the_loop(name, where)]
+    laws = [registry.resolve_law(name)[1], in_the_loop(name, where)]
     outcomes = [run(p) for p in [*laws, *(nudged(name, n) for n in roundings)]]
     won = [np.asarray(one.success).astype(bool).ravel() for one in outcomes]
     times = [np.asarray(one.time).ravel() for one in outcomes[:2]]
@@ -163,7 +163,7 @@ def bags(name: str, domain: str, worlds: int, setting: Setting, where: Path) -> 
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    law = registry.read_law(name)[1]
+    law = registry.resolve_law(name)[1]
     rps_jax.sweep({"law": law}, domain, worlds, setting=setting, out=where / "run", progress=False)
     errors, strange = [], 0
     for world in range(worlds):

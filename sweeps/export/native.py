@@ -27,7 +27,7 @@ import numpy as np
 
 from rps_jax.app.export import c, folder, graph, program
 from rps_jax.app.export.program import Group, Program
-from rps_jax.control import registry, trying
+from rps_jax.control import registry, validation
 from rps_jax.control.base import Law
 
 Precision = Literal["float", "double"]
@@ -216,13 +216,13 @@ class Agreement(NamedTuple):
 
 def agreement(name: str, form: Form, inputs: int, where: Path, seed: int = 0) -> Agreement:
     """Compare a law's twist and memory in C or ONNX and in JAX."""
-    label, params = registry.read_law(name)
+    label, params = registry.resolve_law(name)
     law, made = registry.law_of(params), program.program(name)
     worlds, real = max(1, min(inputs // STEPS, 5000)), REAL[form]
     native = made_in(form, made, where, worlds)
     with jax.enable_x64(form == "double"):
         params = jax.tree.map(lambda x: jnp.asarray(x, real), params)
-        seen_tree = jax.tree.structure(trying.observation_of(law.senses))
+        seen_tree = jax.tree.structure(validation.observation_shapes(law.senses))
 
         def step(memory: Any, leaves: Any) -> Any:
             memory, twist, _ = law.step(params, memory, jax.tree.unflatten(seen_tree, leaves))
@@ -345,7 +345,7 @@ class Whole(NamedTuple):
 
 def trial_errors(name: str, form: Form, trials: Sequence[Any], where: Path) -> Whole:
     """Errors of the twists over whole trials, observed as `recorded`, in a form's precision."""
-    law_params = registry.read_law(name)[1]
+    law_params = registry.resolve_law(name)[1]
     law, made, real = registry.law_of(law_params), program.program(name), REAL[form]
     native, longest = made_in(form, made, where, len(trials)), max(len(one[0]) for one in trials)
     fields, scale = made.groups["observation"], scale_of(law_params)
@@ -378,7 +378,7 @@ def _in_jax(law: Law, params: Any, seen: Sequence[Any], real: Any) -> tuple[list
     """Memories before each step and twists (T, n, 3) of a law that observes leaves (T, n, ...)."""
     with jax.enable_x64(real == np.float64):
         own = jax.tree.map(lambda x: jnp.asarray(x, real), params)
-        tree = jax.tree.structure(trying.observation_of(law.senses))
+        tree = jax.tree.structure(validation.observation_shapes(law.senses))
         given = [x.astype(real) if x.dtype.kind == "f" else x for x in seen]
 
         def step(memory: Any, leaves: Any) -> Any:

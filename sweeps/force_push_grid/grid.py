@@ -114,7 +114,7 @@ def follow(law: LawName = "force_push", duration: float = DURATION) -> Law:
         longest = jnp.where(going, jnp.maximum(state.longest, silent), state.longest)
         clock = state.clock + jnp.where(pushed, period, 0.0)
         state = Following(theta_p, pushed, clock, silent, longest)
-        return state, Twist(v_robot[0], v_robot[1], zero), Details.of(seen)
+        return state, Twist(v_robot[0], v_robot[1], zero), Details.from_obs(seen)
 
     exact = LoadCell(noise=0.0, time_constant=0.05, threshold=0.0)
     return Law(init, step, "force", check=force_push.check, cell=exact)

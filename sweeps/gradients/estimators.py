@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax.control import registry
-from rps_jax.control.base import Params
+from rps_jax.control.base import LawParams
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
@@ -98,7 +98,7 @@ def combine(one: Estimate, other: Estimate) -> Estimate:
 
 def distances(
     cases: Sequence[Case],
-    params_of: Callable[[jax.Array], Params],
+    params_of: Callable[[jax.Array], LawParams],
     horizons: Sequence[float],
     setting: Setting = Setting(engine="quasistatic"),
 ) -> tuple[Scores, Any]:

@@ -81,7 +81,7 @@ class Reproduce(TrialStudy[xr.Dataset]):
             elif name not in _EACH:
                 rows = slice(None) if name in _OWN else slice(1)
                 u[..., i] = u[:, rows, :1, i]
-        label, params = registry.read_law(self.law)
+        label, params = registry.resolve_law(self.law)
         found = points.checked(self.ranges, u.reshape(-1, len(names)))
         return Plan(self.ranges, len(found.u), {label: params}, self.setting, 256, found)
 

@@ -23,7 +23,7 @@ from rps_jax import errors
 from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import Figure, success_rates
 from rps_jax.analysis.report import Picture, Section
-from rps_jax.control.base import Params
+from rps_jax.control.base import LawParams
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.record.options import option
 from rps_jax.robot.robot import Robot
@@ -266,7 +266,7 @@ def successes(found: Mapping[str, xr.Dataset]) -> list[list[str]]:
 
 def turning(
     robots: Mapping[str, Robot],
-    params: Params,
+    params: LawParams,
     seconds: float = 10.0,
     *,
     object: str = "box",

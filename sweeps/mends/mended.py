@@ -73,7 +73,7 @@ def step(params: Mended, state: Memory, seen: Observation) -> tuple[Memory, Twis
     flush &= (params.agree == 0) | (jnp.sign(l) * error > 0.05)
     omega = jnp.sign(l) * params.flush * params.law.omega_max
     pressing = jnp.array([1.0, 0.0]) * params.forward * params.law.v_max
-    turning = rps.saturate(params.law, Twist.moving(contact, pressing, omega))
+    turning = rps.saturate(params.law, Twist.from_point_velocity(contact, pressing, omega))
     p_world = seen.p_world_robot + planar.rotate(seen.yaw, contact)
     felt = jnp.where(touching, p_world, state.p_world_felt)
     lost = jnp.where(touching, 0.0, state.lost + memory.touched)

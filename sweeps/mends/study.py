@@ -20,7 +20,7 @@ import xarray as xr
 from rps_jax import errors
 from rps_jax.analysis import tables
 from rps_jax.analysis.report import Section
-from rps_jax.control.base import Params
+from rps_jax.control.base import LawParams
 from rps_jax.control.registry import LawsLike
 from rps_jax.record.options import option
 from rps_jax.runs import sweep as sweeps
@@ -53,7 +53,7 @@ class Mends(OfPlan):
     setting: Setting = field(default=Setting(seed=80), kw_only=True)
 
     @cached_property
-    def chosen(self) -> dict[str, Params]:
+    def chosen(self) -> dict[str, LawParams]:
         """Parameters of the mends, by name."""
         asked = [self.laws] if isinstance(self.laws, str) else list(self.laws)
         for name in asked:

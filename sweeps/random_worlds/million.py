@@ -62,7 +62,7 @@ class Million(TrialStudy[xr.Dataset]):
 
     def check(self) -> None:
         """Check that the laws and the domain are known."""
-        registry.laws_of(self.laws)
+        registry.resolve_laws(self.laws)
         domains.named(self.domain)
 
     def trials(self) -> int | None:
@@ -101,7 +101,7 @@ class Million(TrialStudy[xr.Dataset]):
 
     def _of(self, law: str, run: Run) -> xr.Dataset:
         """Outcomes of one law, small."""
-        laws = registry.laws_of([law])
+        laws = registry.resolve_laws([law])
         plan = Plan(domains.named(self.domain), self.worlds, laws, self.seeded, 16_384)
         folder = None if run.folder is None else run.folder / f"sweep_{law}"
         one = sweep.whole(plan, folder, **run.shape).isel(law=0)

@@ -57,7 +57,7 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
 
     def check(self) -> None:
         """Check that the laws and the domains are known."""
-        registry.laws_of(self.laws)
+        registry.resolve_laws(self.laws)
         for name in self.domains:
             domains.named(name)
 
@@ -93,7 +93,7 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
 
     def plans(self, name: str) -> dict[str, Plan]:
         """What is run in a domain: on each model, the default's worlds first."""
-        laws = registry.laws_of(self.laws)
+        laws = registry.resolve_laws(self.laws)
         plan = Plan(domains.named(name), self.worlds, laws, self.setting, 4096)
         found = {models.OWN: plan}
         if self.panel:

@@ -13,7 +13,7 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.app.export.scalars import Node, Scalars
-from rps_jax.control import registry, trying
+from rps_jax.control import registry, validation
 from rps_jax.control.observation import TaxelObservation, Twist
 from rps_jax.errors import InputError
 from rps_jax.lowering import walk
@@ -131,8 +131,8 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
     Raises:
       InputError: there is no such law, robot or skin, or the skin has no taxels.
     """
-    label, params = registry.read_law(law)
-    params = registry.checked(params)
+    label, params = registry.resolve_law(law)
+    params = registry.check_params(params)
     of, base = registry.law_of(params), robots.named(robot)
     sensor = skins.named(skin).on(base.shell)
     if not isinstance(sensor, CapacitiveSkin) or not sensor.shell.count:
@@ -142,7 +142,7 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
         )
     taxels = jax.ShapeDtypeStruct((sensor.shell.count,), np.float64)
     with jax.enable_x64(True):
-        seen = trying.observation_of(of.senses)
+        seen = validation.observation_shapes(of.senses)
         if isinstance(seen, TaxelObservation):
             seen = seen._replace(signal=taxels)
         # Parameters are real numbers, whatever they were written as, as in a trial.

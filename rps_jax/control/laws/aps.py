@@ -20,13 +20,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax.control.base import Law, check_signs, documented
+from rps_jax.control.base import Law, check_signs, document_fields
 from rps_jax.control.observation import Details, PoseObservation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.robot.shell import HALF_LENGTH
 
 
-@documented
+@document_fields
 class APSParams(NamedTuple):
     """Parameters of APS; those marked * are ours, where the publication is silent."""
 
@@ -66,7 +66,7 @@ class APSState(NamedTuple):
 
     @classmethod
     def init(cls, params: APSParams) -> APSState:
-        """Before anything was seen: the prior alone."""
+        """Before the first observation: the prior alone."""
         zero = jnp.zeros_like(jnp.asarray(params.K1, float))
         return cls(
             jnp.zeros(2, zero.dtype),
@@ -129,45 +129,45 @@ def _learn(
     )
 
 
-def _aim(params: APSParams, observation: PoseObservation) -> jax.Array:
+def _aim(params: APSParams, obs: PoseObservation) -> jax.Array:
     """T (2,) [m]: beyond the target, seen from the contact point, or else from the object."""
-    seen = observation.touch
+    touch = obs.touch
     angle = jnp.where(
-        seen.in_contact,
-        planar.direction(displacement(seen)),
-        planar.direction(seen.p_world_target - observation.p_world_object),
+        touch.in_contact,
+        planar.direction(displacement(touch)),
+        planar.direction(touch.p_world_target - obs.p_world_object),
     )
-    beyond = params.aim_beyond * observation.r_object
-    return seen.p_world_target + beyond * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    beyond = params.aim_beyond * obs.r_object
+    return touch.p_world_target + beyond * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
 
 def step(
-    params: APSParams, state: APSState, observation: PoseObservation
+    params: APSParams, state: APSState, obs: PoseObservation
 ) -> tuple[APSState, Twist, Details]:
     """One control step of APS.
 
     On the target's side of the object the robot backs off while it orbits, but not where it is
     so far away that it approaches.
     """
-    seen = observation.touch
-    to_target = _aim(params, observation) - observation.p_world_object
-    from_object = seen.p_world_robot - observation.p_world_object
+    touch = obs.touch
+    to_target = _aim(params, obs) - obs.p_world_object
+    from_object = touch.p_world_robot - obs.p_world_object
     a_OT = planar.direction(to_target)
     first = ~state.started
-    state = _learn(params, state, observation.p_world_object, a_OT)
+    state = _learn(params, state, obs.p_world_object, a_OT)
 
     alpha = jnp.mod(planar.direction(from_object) - a_OT, 2 * jnp.pi)
-    reach = params.r_robot + observation.r_object + params.margin
+    reach = params.r_robot + obs.r_object + params.margin
     near = planar.norm(from_object) <= reach
     push, relocate = activations(params, state, alpha, near)
     radial = -jnp.stack([jnp.cos(alpha), jnp.sin(alpha)])  # towards the object
     orbit = jnp.sign(jnp.sin(alpha)) * jnp.stack([-jnp.sin(alpha), jnp.cos(alpha)])  # to alpha = pi
     heading = planar.direction(push * radial + relocate * orbit)
     correction = params.K1 * state.gamma_mean + params.K2 * state.gamma
-    heading = heading - jnp.where(near, correction, 0.0) + a_OT - seen.yaw
+    heading = heading - jnp.where(near, correction, 0.0) + a_OT - touch.yaw
 
-    yaw_error = planar.wrap(planar.direction(-from_object) - seen.yaw)
-    rate = jnp.where(first, 0.0, planar.wrap(yaw_error - state.yaw_error) / seen.period)
+    yaw_error = planar.wrap(planar.direction(-from_object) - touch.yaw)
+    rate = jnp.where(first, 0.0, planar.wrap(yaw_error - state.yaw_error) / touch.period)
     omega = params.K_p * yaw_error + params.K_d * rate
     speed = jnp.maximum(params.v_max / (1 + jnp.abs(state.gamma_mean)), params.v_min)
     speed = jnp.where(jnp.abs(yaw_error) > params.yaw_error_max, 0.0, speed)
@@ -176,7 +176,7 @@ def step(
         speed * jnp.sin(heading),
         jnp.clip(omega, -params.omega_max, params.omega_max),
     )
-    details = Details.of(seen)._replace(gamma=state.gamma)
+    details = Details.from_obs(touch)._replace(gamma=state.gamma)
     return state._replace(alpha=alpha, yaw_error=yaw_error), twist, details
 
 

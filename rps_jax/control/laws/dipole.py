@@ -18,12 +18,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax.control.base import Bound, Law, check_signs, documented
+from rps_jax.control.base import Bound, Law, check_signs, document_fields
 from rps_jax.control.observation import Details, PoseObservation, Twist
 from rps_jax.geometry import planar
 
 
-@documented
+@document_fields
 class DipoleParams(NamedTuple):
     """Parameters about the dipole field, which has none itself; the lookahead is H. and S.'s."""
 
@@ -54,35 +54,35 @@ check = partial(check_signs, "dipole", _POSITIVE)
 
 
 def init(params: DipoleParams) -> DipoleState:
-    """Before the object was seen there is no path."""
+    """Return a state without a path."""
     return DipoleState(jnp.zeros(2, jnp.result_type(float)), jnp.zeros((), bool))
 
 
 def step(
-    params: DipoleParams, state: DipoleState, observation: PoseObservation
+    params: DipoleParams, state: DipoleState, obs: PoseObservation
 ) -> tuple[DipoleState, Twist, Details]:
     """One control step: along the field line through the robot, facing the object."""
-    seen, thing = observation.touch, observation.p_world_object
+    touch, p_world_object = obs.touch, obs.p_world_object
 
     def along(start: jax.Array) -> jax.Array:
-        angle = planar.direction(seen.p_world_target - start)
+        angle = planar.direction(touch.p_world_target - start)
         return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
-    past = jnp.sum((thing - seen.p_world_target) * along(state.p_world_start))
-    anew = ~state.started | (past > params.beyond * observation.r_object)
-    start = jnp.where(anew, thing, state.p_world_start)
+    past = jnp.sum((p_world_object - touch.p_world_target) * along(state.p_world_start))
+    anew = ~state.started | (past > params.beyond * obs.r_object)
+    start = jnp.where(anew, p_world_object, state.p_world_start)
     way = along(start)
-    aim = start + (jnp.sum((thing - start) * way) + params.lookahead) * way
+    aim = start + (jnp.sum((p_world_object - start) * way) + params.lookahead) * way
 
-    to_aim = planar.direction(aim - thing)
-    from_object = seen.p_world_robot - thing
+    to_aim = planar.direction(aim - p_world_object)
+    from_object = touch.p_world_robot - p_world_object
     theta = planar.wrap(planar.direction(from_object) - to_aim)
-    heading = to_aim + 2 * theta - seen.yaw
-    error = planar.wrap(planar.direction(-from_object) - seen.yaw)
+    heading = to_aim + 2 * theta - touch.yaw
+    error = planar.wrap(planar.direction(-from_object) - touch.yaw)
     twist = Twist(
         params.v_max * jnp.cos(heading), params.v_max * jnp.sin(heading), params.K_h * error
-    ).within(params.v_max, params.omega_max)
-    return DipoleState(start, jnp.ones_like(state.started)), twist, Details.of(seen)
+    ).saturate(params.v_max, params.omega_max)
+    return DipoleState(start, jnp.ones_like(state.started)), twist, Details.from_obs(touch)
 
 
 LAW = Law(init, step, "pose", check=check, bounds=tuple(BOUNDS.items()))

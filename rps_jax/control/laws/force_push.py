@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax.control.base import Bound, Law, check_signs, documented
+from rps_jax.control.base import Bound, Law, check_signs, document_fields
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Scalar
@@ -31,7 +31,7 @@ from rps_jax.geometry.arrays import Scalar
 _POSITIVE = ("drift", "angle_max", "v_max", "omega_max", "d_success")
 
 
-@documented
+@document_fields
 class ForcePushParams(NamedTuple):
     """Parameters of Force Push; the gains are its authors', in their experiments."""
 
@@ -71,16 +71,16 @@ class Path(NamedTuple):
         two = jnp.zeros(2, dtype)
         return cls(two, jnp.zeros((), dtype), two, jnp.zeros((), bool))
 
-    def followed(self, seen: Observation) -> tuple[Path, Observation, jax.Array]:
-        """The path now, what is seen with the last contact, and its offset () [m] to the left.
+    def followed(self, obs: Observation) -> tuple[Path, Observation, jax.Array]:
+        """The path now, the observation with the last contact, and its offset () [m] to the left.
 
         A path is laid anew when the contact has passed the target.
         """
-        touching = jnp.asarray(seen.in_contact)
-        contact = jnp.where(touching, seen.p_robot_contact, self.p_robot_contact)
-        told = seen._replace(p_robot_contact=contact)
+        touching = jnp.asarray(obs.in_contact)
+        contact = jnp.where(touching, obs.p_robot_contact, self.p_robot_contact)
+        told = obs._replace(p_robot_contact=contact)
         d = displacement(told)
-        p_world_contact = seen.p_world_target - d
+        p_world_contact = obs.p_world_target - d
         along = jnp.stack([jnp.cos(self.theta_d), jnp.sin(self.theta_d)])
         passed = self.touched & touching & (jnp.sum(d * along) < 0)
         anew = (touching & ~self.touched) | passed
@@ -97,8 +97,8 @@ class Path(NamedTuple):
         """
         turn = params.k_omega * planar.wrap(self.theta_d - yaw)
         omega = jnp.clip(turn, -params.omega_max, params.omega_max)
-        push = Twist.moving(self.p_robot_contact, v_robot, omega)
-        push = push.within(params.v_max, params.omega_max)
+        push = Twist.from_point_velocity(self.p_robot_contact, v_robot, omega)
+        push = push.saturate(params.v_max, params.omega_max)
         ahead = Twist(params.v_approach, 0.0, 0.0)
         return jax.tree.map(lambda a, b: jnp.where(self.touched, a, b), push, ahead)
 
@@ -122,29 +122,29 @@ def init(params: ForcePushParams) -> ForcePushState:
 
 
 def step(
-    params: ForcePushParams, state: ForcePushState, seen: Observation
+    params: ForcePushParams, state: ForcePushState, obs: Observation
 ) -> tuple[ForcePushState, Twist, Details]:
     """One control step. Before the first contact it goes straight ahead."""
-    path, told, offset = state.path.followed(seen)
+    path, told, offset = state.path.followed(obs)
     contact, theta_d = told.p_robot_contact, path.theta_d
-    way = planar.norm(seen.p_world_robot - state.p_world_robot)
+    way = planar.norm(obs.p_world_robot - state.p_world_robot)
     kept = jnp.exp(-way / params.drift)
     l_mean = contact[1] + kept * (state.l_mean - contact[1])
     l_mean = jnp.where(state.path.touched, l_mean, contact[1])
     drifted = jnp.stack([jnp.asarray(params.drift, contact.dtype), contact[1] - l_mean])
-    theta_f = planar.wrap(seen.yaw - theta_d) + planar.direction(drifted)
+    theta_f = planar.wrap(obs.yaw - theta_d) + planar.direction(drifted)
     pushed = (1 + params.k_theta) * theta_f + params.k_y * offset
     back = planar.wrap(-params.k_y * offset - state.theta_p)
     recovered = state.theta_p + jnp.clip(back, -params.converge, params.converge)
-    theta_p = planar.wrap(jnp.where(seen.in_contact, pushed, recovered))
+    theta_p = planar.wrap(jnp.where(obs.in_contact, pushed, recovered))
 
-    angle = planar.wrap(theta_d + theta_p - seen.yaw)
+    angle = planar.wrap(theta_d + theta_p - obs.yaw)
     angle = jnp.clip(angle, -jnp.asarray(params.angle_max), params.angle_max)
     v_contact = params.v_max * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-    twist = path.twist(params, v_contact, seen.yaw)
+    twist = path.twist(params, v_contact, obs.yaw)
     theta_p = jnp.where(path.touched, theta_p, 0.0)
-    state = ForcePushState(path, theta_p, l_mean, seen.p_world_robot)
-    return state, twist, Details.of(told)._replace(gamma=theta_p)
+    state = ForcePushState(path, theta_p, l_mean, obs.p_world_robot)
+    return state, twist, Details.from_obs(told)._replace(gamma=theta_p)
 
 
 LAW = Law(init, step, check=check, bounds=tuple(BOUNDS.items()))

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax.control.base import Bound, Law, check_signs, documented
+from rps_jax.control.base import Bound, Law, check_signs, document_fields
 from rps_jax.control.laws.force_push import Path
 from rps_jax.control.observation import Details, ForceObservation, Twist
 from rps_jax.geometry import planar
@@ -33,7 +33,7 @@ from rps_jax.geometry import planar
 _POSITIVE = ("v_max", "omega_max", "d_success")
 
 
-@documented
+@document_fields
 class PublishedForcePushParams(NamedTuple):
     """Parameters of Force Push: its authors', of their experiments, f_min of their simulations."""
 
@@ -105,20 +105,24 @@ def yielding(params: PublishedForcePushParams, v_world: jax.Array, f_world: jax.
 def step(
     params: PublishedForcePushParams,
     state: PublishedForcePushState,
-    observation: ForceObservation,
+    obs: ForceObservation,
 ) -> tuple[PublishedForcePushState, Twist, Details]:
     """One control step. Before the first touch it goes straight ahead."""
-    seen = observation.touch
-    path, told, offset = state.path.followed(seen)
-    f_world = -planar.rotate(seen.yaw, observation.f_robot)  # on the object
+    touch = obs.touch
+    path, told, offset = state.path.followed(touch)
+    f_world = -planar.rotate(touch.yaw, obs.f_robot)  # on the object
     pushed = path.touched & (state.pushed | (planar.norm(f_world) >= params.f_min))
-    theta_p = steered(params, state.theta_p, f_world, path.theta_d, offset, seen.period)
+    theta_p = steered(params, state.theta_p, f_world, path.theta_d, offset, touch.period)
     theta_p = jnp.where(pushed, theta_p, 0.0)
     angle = path.theta_d + theta_p
     v_world = params.v_max * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-    v_robot = planar.rotate(-seen.yaw, yielding(params, v_world, f_world))
+    v_robot = planar.rotate(-touch.yaw, yielding(params, v_world, f_world))
     state = PublishedForcePushState(path, theta_p, pushed)
-    return state, path.twist(params, v_robot, seen.yaw), Details.of(told)._replace(gamma=theta_p)
+    return (
+        state,
+        path.twist(params, v_robot, touch.yaw),
+        Details.from_obs(told)._replace(gamma=theta_p),
+    )
 
 
 LAW = Law(init, step, "force", check=check, bounds=tuple(BOUNDS.items()))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rps_jax import errors
-from rps_jax.control.base import Law, documented
+from rps_jax.control.base import Law, document_fields
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams, RPSState
 from rps_jax.control.observation import Details, Observation, Twist
@@ -25,7 +25,7 @@ from rps_jax.control.observation import Details, Observation, Twist
 KNOTS = 60  # offsets of a plan, by default
 
 
-@documented
+@document_fields
 class GuidedParams(NamedTuple):
     """The parameters of the law, and the plan."""
 
@@ -66,10 +66,10 @@ def init(params: GuidedParams) -> GuidedState:
 
 
 def step(
-    params: GuidedParams, state: GuidedState, seen: Observation
+    params: GuidedParams, state: GuidedState, obs: Observation
 ) -> tuple[GuidedState, Twist, Details]:
     """One control step: the law's twist and G1."""
-    memory, twist, details = rps.step_with_details(params.law, state.law, seen)
+    memory, twist, details = rps.step_with_details(params.law, state.law, obs)
     offsets = jnp.asarray(params.offsets)
     which = jnp.floor(state.steps / params.hold).astype(jnp.int32)
     now = offsets[jnp.minimum(which, offsets.shape[0] - 1)]

@@ -12,12 +12,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax.control.base import Bound, Law, check_signs, documented
+from rps_jax.control.base import Bound, Law, check_signs, document_fields
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 
 
-@documented
+@document_fields
 class PursuitParams(NamedTuple):
     """Parameters of pursuit; the bounds are those of RPS."""
 
@@ -47,23 +47,25 @@ def init(params: PursuitParams) -> tuple[()]:
 
 
 def step(
-    params: PursuitParams, state: tuple[()], seen: Observation
+    params: PursuitParams, state: tuple[()], obs: Observation
 ) -> tuple[tuple[()], Twist, Details]:
     """One control step: C towards T at K_v ||d|| but at most v_max, the base towards facing T.
 
     In the robot frame C moves by (max(cos e, press), sin e) times that speed, so that the base
     keeps pressing on the object while it turns. Without contact it goes straight ahead.
     """
-    contact = jnp.where(seen.in_contact, seen.p_robot_contact, 0.0)
-    d = displacement(seen._replace(p_robot_contact=contact))
-    error = planar.wrap(planar.direction(d) - seen.yaw)
+    contact = jnp.where(obs.in_contact, obs.p_robot_contact, 0.0)
+    d = displacement(obs._replace(p_robot_contact=contact))
+    error = planar.wrap(planar.direction(d) - obs.yaw)
     speed = jnp.minimum(params.K_v * planar.norm(d), params.v_max)
     v_contact = speed * jnp.stack([jnp.maximum(jnp.cos(error), params.press), jnp.sin(error)])
     omega = jnp.clip(params.K_h * error, -params.omega_max, params.omega_max)
-    push = Twist.moving(contact, v_contact, omega).within(params.v_max, params.omega_max)
+    push = Twist.from_point_velocity(contact, v_contact, omega).saturate(
+        params.v_max, params.omega_max
+    )
     ahead = Twist(params.v_approach, 0.0, 0.0)
-    twist = jax.tree.map(lambda a, b: jnp.where(seen.in_contact, a, b), push, ahead)
-    details = Details.of(seen._replace(p_robot_contact=contact))
+    twist = jax.tree.map(lambda a, b: jnp.where(obs.in_contact, a, b), push, ahead)
+    details = Details.from_obs(obs._replace(p_robot_contact=contact))
     return state, twist, details._replace(gamma=error)
 
 

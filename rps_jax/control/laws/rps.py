@@ -18,14 +18,14 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax import errors
-from rps_jax.control import switches
-from rps_jax.control.base import Bound, Law, documented
+from rps_jax.control import soft
+from rps_jax.control.base import Bound, Law, document_fields
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Bool, Float
 
 
-@documented
+@document_fields
 class RPSParams(NamedTuple):
     """Parameters of the law, all floats, all leaves of a pytree (any may be batched).
 
@@ -184,11 +184,11 @@ def adaptive_rate(
     temperatures: Temperatures | None = None,
 ) -> Float[Array, "*B"]:
     """Eq. 5: a_r [1] from the lateral contact location l [m] and ||d|| [m]."""
-    soft = temperatures or HARD
+    temps = temperatures or HARD
     logistic = jax.nn.sigmoid((jnp.abs(l) - params.beta) * params.k)
-    a_r = (params.zeta + (params.eta - params.zeta) * logistic) * _sgn(params, l, soft.sgn)
-    far = switches.above(distance, params.d_th, soft.d_th)
-    return switches.choose(far, a_r, 0.0) * params.reactive
+    a_r = (params.zeta + (params.eta - params.zeta) * logistic) * _sgn(params, l, temps.sgn)
+    far = soft.greater(distance, params.d_th, temps.d_th)
+    return soft.where(far, a_r, 0.0) * params.reactive
 
 
 def linear_velocity(
@@ -222,7 +222,7 @@ def saturate(params: RPSParams, twist: Twist) -> Twist:
 
     With `clip_each`, v_x and v_y are clipped to +-v_max one by one, which turns the vector.
     """
-    scaled = twist.within(params.v_max, params.omega_max)
+    scaled = twist.saturate(params.v_max, params.omega_max)
     v_max, each = jnp.asarray(params.v_max), jnp.asarray(params.clip_each > 0)
     v_x, v_y = (
         jnp.where(each, jnp.clip(v, -v_max, v_max), other)
@@ -232,22 +232,22 @@ def saturate(params: RPSParams, twist: Twist) -> Twist:
 
 
 def _push(
-    params: RPSParams, l_th: jax.Array, observation: Observation, temperatures: Temperatures | None
+    params: RPSParams, l_th: jax.Array, obs: Observation, temperatures: Temperatures | None
 ) -> tuple[jax.Array, Twist, Details]:
     """One pass of Algorithm 1's control loop, in contact."""
-    l = observation.p_robot_contact[..., 1]  # noqa: E741
-    d = displacement(observation)
+    l = obs.p_robot_contact[..., 1]  # noqa: E741
+    d = displacement(obs)
     distance = planar.norm(d)
     v_star = params.K_v * distance  # Eq. 3
-    gamma = steering_angle(params, d, observation.yaw)
+    gamma = steering_angle(params, d, obs.yaw)
 
-    soft = temperatures or HARD
-    realigning = switches.both(
-        switches.above(jnp.abs(l), l_th, soft.realign), jnp.asarray(params.reactive) > 0
+    temps = temperatures or HARD
+    realigning = soft.logical_and(
+        soft.greater(jnp.abs(l), l_th, temps.realign), jnp.asarray(params.reactive) > 0
     )  # Algorithm 1's switch into, and out of, the Realignment State
-    a_r = switches.choose(
+    a_r = soft.where(
         realigning,
-        params.a_r_max * _sgn(params, l, soft.sgn),
+        params.a_r_max * _sgn(params, l, temps.sgn),
         adaptive_rate(params, l, distance, temperatures),
     )
     v_x, v_y = linear_velocity(v_star, a_r)  # Eqs. 1-2
@@ -255,54 +255,64 @@ def _push(
     first = jnp.asarray(params.saturate_first) > 0
     forward = jnp.where(first, bounded.v_x, v_x)
     speed = jnp.where(first, jnp.minimum(v_star, params.v_max), v_star)
-    turning_speed = switches.choose(realigning, realignment_gain(params, l) * speed, forward)
+    turning_speed = soft.where(realigning, realignment_gain(params, l) * speed, forward)
     omega = turning_speed / params.L * jnp.tan(gamma)  # Eq. 9 or 6
     twist = saturate(params, Twist(v_x, v_y, omega))
 
-    arrived = switches.below(distance, params.d_success, soft.arrive)
-    twist = jax.tree.map(lambda v: switches.choose(arrived, 0.0, v), twist)
-    new_l_th = switches.choose(realigning, params.l_mr, params.l_cr)
+    arrived = soft.less(distance, params.d_success, temps.arrive)
+    twist = jax.tree.map(lambda v: soft.where(arrived, 0.0, v), twist)
+    new_l_th = soft.where(realigning, params.l_mr, params.l_cr)
     return (
-        switches.choose(arrived, l_th, new_l_th),
+        soft.where(arrived, l_th, new_l_th),
         twist,
-        Details(l, distance, a_r, gamma, switches.both(realigning, switches.inverse(arrived))),
+        Details(
+            l,
+            distance,
+            a_r,
+            gamma,
+            soft.logical_and(realigning, soft.logical_not(arrived)),
+        ),
     )
 
 
 def step_with_details(
     params: RPSParams,
     state: RPSState,
-    observation: Observation,
+    obs: Observation,
     temperatures: Temperatures | None = None,
 ) -> tuple[RPSState, Twist, Details]:
     """`step`, and the quantities behind its twist (those of the last contact without one)."""
-    in_contact = jnp.asarray(observation.in_contact)
+    in_contact = jnp.asarray(obs.in_contact)
     if temperatures is not None:
         in_contact = in_contact.astype(state.l_th.dtype)
-    soft = temperatures or HARD
+    temps = temperatures or HARD
     # Without contact the location means nothing; the last one keeps every branch finite.
-    contact = switches.choose(in_contact, observation.p_robot_contact, state.p_robot_contact)
-    told = observation._replace(p_robot_contact=contact)
+    contact = soft.where(in_contact, obs.p_robot_contact, state.p_robot_contact)
+    told = obs._replace(p_robot_contact=contact)
     l_th, push, details = _push(params, state.l_th, told, temperatures)
-    kept = switches.both(state.touched, jnp.asarray(params.keep_contact) > 0)
+    kept = soft.logical_and(state.touched, jnp.asarray(params.keep_contact) > 0)
     # A remembered contact near the target must not stop the robot: only a felt one arrives.
-    away = switches.above(details.distance, params.d_success, soft.arrive, operator.ge)
-    pushing = switches.either(in_contact, switches.both(kept, away))
-    ahead = Twist(switches.choose(state.touched, params.v_lost, params.v_approach), 0.0, 0.0)
-    twist = switches.select(pushing, push, ahead)
+    away = soft.greater(details.distance, params.d_success, temps.arrive, operator.ge)
+    pushing = soft.logical_or(in_contact, soft.logical_and(kept, away))
+    ahead = Twist(soft.where(state.touched, params.v_lost, params.v_approach), 0.0, 0.0)
+    twist = soft.tree_where(pushing, push, ahead)
     state = RPSState(
-        l_th=switches.choose(pushing, l_th, state.l_th),
+        l_th=soft.where(pushing, l_th, state.l_th),
         p_robot_contact=contact,
-        touched=switches.either(state.touched, in_contact),
+        touched=soft.logical_or(state.touched, in_contact),
     )
-    return state, twist, details._replace(realigning=switches.both(details.realigning, pushing))
+    return (
+        state,
+        twist,
+        details._replace(realigning=soft.logical_and(details.realigning, pushing)),
+    )
 
 
 @jax.jit
 def step(
     params: RPSParams,
     state: RPSState,
-    observation: Observation,
+    obs: Observation,
     temperatures: Temperatures | None = None,
 ) -> tuple[RPSState, Twist]:
     """Algorithm 1: one control step of RPS (or NPS, by `params.reactive`).
@@ -324,18 +334,18 @@ def step(
       >>> import numpy as np
       >>> import rps_jax
       >>> params = rps_jax.RPSParams.paper()
-      >>> seen = rps_jax.Observation(
+      >>> obs = rps_jax.Observation(
       ...     p_world_robot=np.zeros(2),
       ...     yaw=0.0,
       ...     p_robot_contact=np.array([0.36, 0.0]),
       ...     in_contact=True,
       ...     p_world_target=np.array([2.0, 0.0]),
       ... )
-      >>> state, twist = rps_jax.step(params, rps_jax.RPSState.init(params), seen)
+      >>> state, twist = rps_jax.step(params, rps_jax.RPSState.init(params), obs)
       >>> f"{float(twist.v_x):.2f} m/s straight ahead"
       '0.05 m/s straight ahead'
     """
-    state, twist, _ = step_with_details(params, state, observation, temperatures)
+    state, twist, _ = step_with_details(params, state, obs, temperatures)
     return state, twist
 
 

@@ -35,8 +35,8 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax import errors
-from rps_jax.control import switches
-from rps_jax.control.base import Bound, Law, documented
+from rps_jax.control import soft
+from rps_jax.control.base import Bound, Law, document_fields
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams, RPSState, Temperatures
 from rps_jax.control.observation import Details, Observation, Twist, displacement
@@ -50,7 +50,7 @@ _WARM_FACING = 0.03  # [rad] P3's |angle of p| < facing
 _WARM_LOST = 5.0  # [1] control steps, n_lost
 
 
-@documented
+@document_fields
 class RPSPlusParams(NamedTuple):
     """Parameters of RPS+; those of the law are the tuned ones, but for a faster approach."""
 
@@ -126,50 +126,50 @@ def search(
 
     `l` () [m] is the place on the skin where it was felt.
     """
-    soft = temperatures or rps.HARD
+    temps = temperatures or rps.HARD
     angle, v_max = planar.direction(p_robot_felt), jnp.asarray(params.law.v_max)
-    faces = switches.below(jnp.abs(angle), FACING, temperatures and _WARM_FACING)
-    ahead = switches.choose(faces, params.ahead * v_max, 0.0)
-    far = switches.above(planar.norm(p_robot_felt), REACH, soft.d_th)
-    side = jnp.sign(l) if temperatures is None else jnp.tanh(l / soft.sgn)
-    turning = switches.choose(far, angle, 0.0)
+    faces = soft.less(jnp.abs(angle), FACING, temperatures and _WARM_FACING)
+    ahead = soft.where(faces, params.ahead * v_max, 0.0)
+    far = soft.greater(planar.norm(p_robot_felt), REACH, temps.d_th)
+    side = jnp.sign(l) if temperatures is None else jnp.tanh(l / temps.sgn)
+    turning = soft.where(far, angle, 0.0)
     return rps.saturate(params.law, Twist(ahead, params.aside * v_max * side, turning))
 
 
 def step(
     params: RPSPlusParams,
     state: RPSPlusState,
-    seen: Observation,
+    obs: Observation,
     temperatures: Temperatures | None = None,
 ) -> tuple[RPSPlusState, Twist, Details]:
     """One control step: the law's, or near the target P2, or after a loss P3.
 
     With `temperatures` all switches are smooth, as those of the law are, and the twists mix.
     """
-    soft = temperatures or rps.HARD
-    memory, twist, details = rps.step_with_details(params.law, state.law, seen, temperatures)
-    contact, touching = memory.p_robot_contact, jnp.asarray(seen.in_contact)
+    temps = temperatures or rps.HARD
+    memory, twist, details = rps.step_with_details(params.law, state.law, obs, temperatures)
+    contact, touching = memory.p_robot_contact, jnp.asarray(obs.in_contact)
     if temperatures is not None:
         touching = touching.astype(memory.l_th.dtype)
-    p_world_contact = seen.p_world_robot + planar.rotate(seen.yaw, contact)
-    p_world_felt = switches.choose(touching, p_world_contact, state.p_world_felt)
-    idle = switches.either(touching, switches.inverse(memory.touched))
-    lost = switches.choose(idle, 0, state.lost + 1)
-    d = displacement(seen._replace(p_robot_contact=contact))
+    p_world_contact = obs.p_world_robot + planar.rotate(obs.yaw, contact)
+    p_world_felt = soft.where(touching, p_world_contact, state.p_world_felt)
+    idle = soft.logical_or(touching, soft.logical_not(memory.touched))
+    lost = soft.where(idle, 0, state.lost + 1)
+    d = displacement(obs._replace(p_robot_contact=contact))
 
-    kept = switches.both(memory.touched, jnp.asarray(params.law.keep_contact) > 0)
-    pushing = switches.either(touching, kept)
-    near = switches.both(pushing, switches.below(details.distance, params.d_near, soft.d_th))  # P1
-    away = switches.above(details.distance, params.law.d_success, soft.arrive, operator.ge)
-    p_robot_felt = planar.rotate(-seen.yaw, p_world_felt - seen.p_world_robot)
+    kept = soft.logical_and(memory.touched, jnp.asarray(params.law.keep_contact) > 0)
+    pushing = soft.logical_or(touching, kept)
+    near = soft.logical_and(pushing, soft.less(details.distance, params.d_near, temps.d_th))  # P1
+    away = soft.greater(details.distance, params.law.d_success, temps.arrive, operator.ge)
+    p_robot_felt = planar.rotate(-obs.yaw, p_world_felt - obs.p_world_robot)
     for condition, other in (
-        (switches.both(near, away), translation(params, d, seen.yaw)),
+        (soft.logical_and(near, away), translation(params, d, obs.yaw)),
         (
-            switches.above(lost, params.n_lost, temperatures and _WARM_LOST),
+            soft.greater(lost, params.n_lost, temperatures and _WARM_LOST),
             search(params, p_robot_felt, contact[1], temperatures),
         ),
     ):
-        twist = switches.select(condition, other, twist)
+        twist = soft.tree_where(condition, other, twist)
     return RPSPlusState(memory, p_world_felt, lost), twist, details
 
 

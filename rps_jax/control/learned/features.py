@@ -28,7 +28,7 @@ _WHILE = 5.0  # [s] of the tanh scale of the time since contact
 _DRIFT = 0.01  # [m] of the tanh scale of a contact's way on the base between two decisions
 
 
-def observed(
+def taxel_observation(
     touch: Observation,
     reading: Reading | SmoothReading,
     skin: Skin,
@@ -46,42 +46,46 @@ def observed(
     )
 
 
-class Felt(NamedTuple):
+class TouchState(NamedTuple):
     """What is remembered of touch, with odometry."""
 
     p_world_contact: jax.Array  # (2,) [m] where the object was last touched
     touched: jax.Array  # () bool: it was at least once
-    since: jax.Array  # () [s] since then
+    time_since_contact: jax.Array  # () [s] since then
     in_contact: jax.Array  # () bool: it is touched now
-    p_robot_before: jax.Array  # (2,) [m] the contact at the last decision
-    before: jax.Array  # () bool: there was one
+    p_robot_decision: jax.Array  # (2,) [m] the contact at the last decision
+    has_decided: jax.Array  # () bool: there was one
 
     @classmethod
-    def nothing(cls, dtype: jax.typing.DTypeLike = float) -> Felt:
-        """Before anything was felt."""
+    def initial(cls, dtype: jax.typing.DTypeLike = float) -> TouchState:
+        """Return the state before the first contact."""
         zero, no = jnp.zeros((), dtype), jnp.zeros((), bool)
         return cls(jnp.zeros(2, dtype), no, zero, no, jnp.zeros(2, dtype), no)
 
-    def follow(self, seen: TaxelObservation) -> Felt:
+    def update(self, obs: TaxelObservation) -> TouchState:
         """The memory after one more control step."""
-        touch = seen.touch
+        touch = obs.touch
         there = touch.p_world_robot + planar.rotate(touch.yaw, touch.p_robot_contact)
         return self._replace(
             p_world_contact=jnp.where(touch.in_contact, there, self.p_world_contact),
             touched=self.touched | touch.in_contact,
-            since=jnp.where(touch.in_contact, 0.0, self.since + seen.touch.period),
+            time_since_contact=jnp.where(
+                touch.in_contact, 0.0, self.time_since_contact + obs.touch.period
+            ),
             in_contact=touch.in_contact,
         )
 
-    def decided(self, seen: TaxelObservation) -> Felt:
+    def mark_decision(self, obs: TaxelObservation) -> TouchState:
         """The memory after a decision."""
-        return self._replace(p_robot_before=self.p_robot_contact(seen), before=self.in_contact)
+        return self._replace(
+            p_robot_decision=self.p_robot_contact(obs), has_decided=self.in_contact
+        )
 
-    def p_robot_contact(self, seen: TaxelObservation) -> jax.Array:
+    def p_robot_contact(self, obs: TaxelObservation) -> jax.Array:
         """The last contact (2,) [m], in the robot frame as it is now; 0 before any."""
-        away = self.p_world_contact - seen.touch.p_world_robot
+        away = self.p_world_contact - obs.touch.p_world_robot
         there = jnp.where(
-            seen.touch.in_contact, seen.touch.p_robot_contact, planar.rotate(-seen.touch.yaw, away)
+            obs.touch.in_contact, obs.touch.p_robot_contact, planar.rotate(-obs.touch.yaw, away)
         )
         return jnp.where(self.touched, there, 0.0)
 
@@ -94,7 +98,7 @@ def _way(p_robot: jax.Array) -> list[jax.Array]:
     return [direction, scaled[None], jnp.tanh(length / _CLOSE)[None]]
 
 
-# Signs under the mirror of all that `features` gives after the taxels.
+# Signs under the mirror of all that `compute_features` gives after the taxels.
 _SIGNS = np.array(
     [1, 1, 1, 1]  # contact, line, touched, since
     + [1, -1]  # place of the contact
@@ -105,28 +109,30 @@ _SIGNS = np.array(
 )
 
 
-def size(taxels: int) -> int:
-    """How many numbers `features` gives for a skin of so many taxels."""
+def feature_count(taxels: int) -> int:
+    """How many numbers `compute_features` gives for a skin of so many taxels."""
     return taxels + _SIGNS.size
 
 
-def features(felt: Felt, action: jax.Array, seen: TaxelObservation) -> jax.Array:
+def compute_features(
+    touch_state: TouchState, action: jax.Array, obs: TaxelObservation
+) -> jax.Array:
     """The numbers (F,) that a network sees at a decision, after the last `action` (3,) [1].
 
-    What is remembered, `felt`, has followed `seen`.
+    What is remembered, `touch_state`, has followed `obs`.
     """
-    touch = seen.touch
-    contact = felt.p_robot_contact(seen)
+    touch = obs.touch
+    contact = touch_state.p_robot_contact(obs)
     d = displacement(touch._replace(p_robot_contact=contact))
     base = displacement(touch._replace(p_robot_contact=jnp.zeros_like(contact)))
-    drift = jnp.tanh((contact - felt.p_robot_before) / _DRIFT)
-    kept = touch.in_contact & felt.before
-    flags = jnp.stack([touch.in_contact, seen.line & touch.in_contact, felt.touched])
+    drift = jnp.tanh((contact - touch_state.p_robot_decision) / _DRIFT)
+    kept = touch.in_contact & touch_state.has_decided
+    flags = jnp.stack([touch.in_contact, obs.line & touch.in_contact, touch_state.touched])
     return jnp.concatenate(
         [
-            jnp.arcsinh(seen.signal),
+            jnp.arcsinh(obs.signal),
             flags.astype(contact.dtype),
-            jnp.tanh(felt.since / _WHILE)[None],
+            jnp.tanh(touch_state.time_since_contact / _WHILE)[None],
             jnp.clip(contact / _BASE, -3.0, 3.0),
             *_way(planar.rotate(-touch.yaw, d)),
             *_way(planar.rotate(-touch.yaw, base)),
@@ -136,13 +142,13 @@ def features(felt: Felt, action: jax.Array, seen: TaxelObservation) -> jax.Array
     )
 
 
-def mirrored(numbers: jax.Array) -> jax.Array:
+def mirror(numbers: jax.Array) -> jax.Array:
     """The numbers (..., F) of the mirrored world: the strip of taxels runs the other way."""
     count = numbers.shape[-1] - _SIGNS.size
     signs = jnp.asarray(_SIGNS, numbers.dtype)
     return jnp.concatenate([numbers[..., :count][..., ::-1], numbers[..., count:] * signs], -1)
 
 
-def executed(action: jax.Array) -> jax.Array:
+def clip_action(action: jax.Array) -> jax.Array:
     """An action (..., 3) [1] as it is carried out: a share of the greatest twist, within 1."""
-    return jnp.stack(Twist(*jnp.moveaxis(action, -1, 0)).within(1.0, 1.0), axis=-1)
+    return jnp.stack(Twist(*jnp.moveaxis(action, -1, 0)).saturate(1.0, 1.0), axis=-1)

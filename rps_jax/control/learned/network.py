@@ -18,10 +18,10 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.control.learned import features
-from rps_jax.control.learned.features import Felt
+from rps_jax.control.learned.features import TouchState
 from rps_jax.control.observation import Details, TaxelObservation, Twist
 
-Kind = Literal["mlp", "gru"]
+NetworkKind = Literal["mlp", "gru"]
 Weights = dict[str, Any]  # by name, float32
 _ACTION_SIGNS = np.array([1, -1, -1], np.float32)  # of (v_x, v_y, omega) under the mirror
 _REACH = 1.5  # [1] bound on the mean of each component of an action
@@ -30,14 +30,14 @@ _REACH = 1.5  # [1] bound on the mean of each component of an action
 class Network(NamedTuple):
     """What a network is, apart from its weights. Static."""
 
-    kind: Kind = "gru"  # mlp: two hidden layers; gru: one, and a recurrent one with a memory
+    kind: NetworkKind = "gru"  # mlp: two hidden layers; gru: one, and a recurrent one with a state
     width: int = 64  # pairs of units in a hidden layer
     taxels: int = 42  # of the skin
     hold: float = 0.2  # [s] for which an action is carried out
 
     def check(self) -> Network:
         """Itself; raises InputError if it means nothing."""
-        errors.check_name("network", self.kind, get_args(Kind))
+        errors.check_name("network", self.kind, get_args(NetworkKind))
         errors.check_count("network width", self.width, at_most=1024)
         errors.check_count("network taxels", self.taxels, at_most=10_000)
         errors.check_finite("network hold", self.hold, above=0, at_most=10, unit="s")
@@ -46,23 +46,25 @@ class Network(NamedTuple):
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shapes of the weights, by name."""
-        size, n = features.size(self.taxels), self.width
+        size, n = features.feature_count(self.taxels), self.width
         second = _dense("second", n, n) if self.kind == "mlp" else _gru("memory", n)
         return _dense("first", size, n) | second | _dense("action", n, 3)
 
     def init(self, key: jax.Array) -> Weights:
         """Weights by chance, with which the mean action is nearly to stand still."""
-        return start(self.shapes, key, small=("action",))
+        return init_weights(self.shapes, key, small=("action",))
 
-    def hidden(self, batch: tuple[int, ...] = (), dtype: jax.typing.DTypeLike = float) -> jax.Array:
-        """What a network remembers (..., 2, H) before it has seen anything; an MLP nothing."""
+    def initial_hidden(
+        self, batch: tuple[int, ...] = (), dtype: jax.typing.DTypeLike = float
+    ) -> jax.Array:
+        """What a network remembers (..., 2, H) before its first observation; an MLP nothing."""
         return jnp.zeros((*batch, 2, self.width if self.kind == "gru" else 0), dtype)
 
     def apply(
         self, weights: Weights, hidden: jax.Array, numbers: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """What it remembers (..., 2, H) and its mean action (..., 3) [1], from numbers (..., F)."""
-        x = jnp.tanh(dense(weights, "first", paired(numbers)))
+        x = jnp.tanh(dense(weights, "first", mirror_pairs(numbers)))
         if self.kind == "mlp":
             x = jnp.tanh(dense(weights, "second", x))
         else:
@@ -97,7 +99,7 @@ def critic(weights: Weights, pair: jax.Array) -> jax.Array:
     return jnp.mean(dense(weights, "value", x)[..., 0], axis=-1)
 
 
-def start(
+def init_weights(
     shapes: dict[str, tuple[int, ...]], key: jax.Array, small: tuple[str, ...] = ()
 ) -> Weights:
     """Weights of these shapes: normal, of variance one over the inputs; biases are zero.
@@ -112,9 +114,9 @@ def start(
     return found
 
 
-def paired(numbers: jax.Array) -> jax.Array:
+def mirror_pairs(numbers: jax.Array) -> jax.Array:
     """Numbers (..., F) and those of the mirrored world, (..., 2, F)."""
-    return jnp.stack([numbers, features.mirrored(numbers)], axis=-2)
+    return jnp.stack([numbers, features.mirror(numbers)], axis=-2)
 
 
 def dense(weights: Weights, name: str, pair: jax.Array) -> jax.Array:
@@ -134,73 +136,75 @@ def _remember(weights: Weights, name: str, hidden: jax.Array, x: jax.Array) -> j
 # --- the law -------------------------------------------------------------------------------
 
 
-class Memory(NamedTuple):
+class PolicyState(NamedTuple):
     """What a learned law remembers between two control steps."""
 
-    felt: Felt
+    touch_state: TouchState
     hidden: jax.Array  # (2, H) of the network
     action: jax.Array  # (3,) [1] the last one, which is carried out until the next
     waiting: jax.Array  # () [s] until then
 
     @classmethod
-    def init(cls, network: Network, dtype: jax.typing.DTypeLike = float) -> Memory:
-        """Before anything was seen."""
+    def init(cls, network: Network, dtype: jax.typing.DTypeLike = float) -> PolicyState:
+        """Return the state before the first observation."""
         zero = jnp.zeros((), dtype)
-        hidden = network.hidden(dtype=dtype)
-        return cls(Felt.nothing(dtype), hidden, jnp.zeros(3, dtype), zero)
+        hidden = network.initial_hidden(dtype=dtype)
+        return cls(TouchState.initial(dtype), hidden, jnp.zeros(3, dtype), zero)
 
-    def due(self, seen: TaxelObservation) -> jax.Array:
+    def due(self, obs: TaxelObservation) -> jax.Array:
         """Whether the next action is decided now."""
-        return self.waiting < 0.5 * seen.touch.period
+        return self.waiting < 0.5 * obs.touch.period
 
 
 def decide(
-    network: Network, weights: Weights, memory: Memory, seen: TaxelObservation
-) -> tuple[Memory, jax.Array]:
-    """The memory after a decision, and the mean action (3,) [1], which may exceed 1.
+    network: Network, weights: Weights, state: PolicyState, obs: TaxelObservation
+) -> tuple[PolicyState, jax.Array]:
+    """The state after a decision, and the mean action (3,) [1], which may exceed 1.
 
-    The memory has followed `seen`; its action is still the last one.
+    The state has followed `obs`; its action is still the last one.
     """
-    numbers = features.features(memory.felt, memory.action, seen)
-    hidden, mean = network.apply(weights, memory.hidden, numbers)
-    return memory._replace(felt=memory.felt.decided(seen), hidden=hidden), mean
+    numbers = features.compute_features(state.touch_state, state.action, obs)
+    hidden, mean = network.apply(weights, state.hidden, numbers)
+    return state._replace(touch_state=state.touch_state.mark_decision(obs), hidden=hidden), mean
 
 
-def heard(params: Any, memory: Memory, seen: TaxelObservation, sent: Twist) -> Memory:
-    """The memory to which the last action is what was sent to the base, if it decides now."""
-    action = features.executed(jnp.stack(sent) / _greatest(params))
-    return memory._replace(action=jnp.where(memory.due(seen), action, memory.action))
+def observe_sent(
+    params: Any, state: PolicyState, obs: TaxelObservation, sent: Twist
+) -> PolicyState:
+    """The state to which the last action is what was sent to the base, if it decides now."""
+    action = features.clip_action(jnp.stack(sent) / _greatest(params))
+    return state._replace(action=jnp.where(state.due(obs), action, state.action))
 
 
 def _greatest(params: Any) -> jax.Array:
     return jnp.stack([params.v_max, params.v_max, params.omega_max])
 
 
-def init(network: Network, params: Any) -> Memory:
+def init(network: Network, params: Any) -> PolicyState:
     """What a learned law remembers before its first step."""
-    return Memory.init(network)
+    return PolicyState.init(network)
 
 
 def step(
-    network: Network, weights: Weights, params: Any, memory: Memory, seen: TaxelObservation
-) -> tuple[Memory, Twist, Details]:
+    network: Network, weights: Weights, params: Any, state: PolicyState, obs: TaxelObservation
+) -> tuple[PolicyState, Twist, Details]:
     """One control step of a learned law, which acts as the mean of what was learned.
 
     Raises:
       InputError: the skin has another number of taxels than the network.
     """
-    if seen.signal.shape[-1] != network.taxels:
+    if obs.signal.shape[-1] != network.taxels:
         raise errors.InputError(
-            f"a law learned with {network.taxels} taxels cannot be told {seen.signal.shape[-1]}: "
+            f"a law learned with {network.taxels} taxels cannot be told {obs.signal.shape[-1]}: "
             "choose a robot with the boards that it was learned with."
         )
-    memory = memory._replace(felt=memory.felt.follow(seen))
-    due = memory.due(seen)
-    told, mean = decide(network, weights, memory, seen)
-    told = told._replace(action=features.executed(mean))
-    told = told._replace(waiting=jnp.full_like(memory.waiting, network.hold))
-    after = jax.tree.map(partial(jnp.where, due), told, memory)
+    state = state._replace(touch_state=state.touch_state.update(obs))
+    due = state.due(obs)
+    told, mean = decide(network, weights, state, obs)
+    told = told._replace(action=features.clip_action(mean))
+    told = told._replace(waiting=jnp.full_like(state.waiting, network.hold))
+    after = jax.tree.map(partial(jnp.where, due), told, state)
     twist = Twist(*(_greatest(params) * after.action))
-    contact = after.felt.p_robot_contact(seen)
-    details = Details.of(seen.touch._replace(p_robot_contact=contact))
-    return after._replace(waiting=after.waiting - seen.touch.period), twist, details
+    contact = after.touch_state.p_robot_contact(obs)
+    details = Details.from_obs(obs.touch._replace(p_robot_contact=contact))
+    return after._replace(waiting=after.waiting - obs.touch.period), twist, details

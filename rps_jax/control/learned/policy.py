@@ -46,7 +46,7 @@ class Policy(NamedTuple):
         }
 
 
-def encoded(policy: Policy) -> bytes:
+def encode(policy: Policy) -> bytes:
     """The content of a policy's file, which depends on the policy alone."""
     policy.network.check()
     arrays: dict[str, Any] = {"about": np.array(json.dumps(policy.about))}
@@ -55,7 +55,7 @@ def encoded(policy: Policy) -> bytes:
     return files.encode_arrays(digest=np.array(_digest(arrays)), **arrays)
 
 
-def decoded(content: bytes, source: Any) -> Policy:
+def decode(content: bytes, source: Any) -> Policy:
     """The policy of a file's content, which came from `source`; InputError if it is none."""
     try:
         arrays = files.decode_arrays(content)
@@ -132,7 +132,7 @@ def check(params: Any) -> Any:
     return params
 
 
-def law_of(policy: Policy) -> tuple[str, Law, Any]:
+def build_law(policy: Policy) -> tuple[str, Law, Any]:
     """The label of a policy, by its network and digest, its law and parameters.
 
     These are of a class of their own, which has no other numbers than the task's. The weights are
@@ -148,6 +148,6 @@ def law_of(policy: Policy) -> tuple[str, Law, Any]:
         step,
         "taxels",
         check=check,
-        heard=networks.heard,
+        observe_sent=networks.observe_sent,
     )
     return f"learned_{kind}_{digest}", law, own(**policy.task)

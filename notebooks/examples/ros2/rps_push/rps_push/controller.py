@@ -47,7 +47,7 @@ class Controller:
     ) -> None:
         """Compile skin and law, so that no step waits for a compiler; the law senses touch."""
         self.limits, self._skin = limits, skin
-        self._params = registry.read_law(law)[1]
+        self._params = registry.resolve_law(law)[1]
         self._law = registry.law_of(self._params)
         self._scan, self._step = jax.jit(skin.read), jax.jit(self._law.step)
         self.reset()

@@ -1,6 +1,6 @@
 """An object of one's own: an MJCF file, and the outline of what touches.
 
-    python notebooks/examples/own_object.py
+    python notebooks/examples/custom_object.py
 
 Once registered, its name works wherever `box` and `cylinder` do, in every engine: in pushes, in
 domains, in `PushEnv` and in films.

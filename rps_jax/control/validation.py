@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax.control.base import numbers
+from rps_jax.control.base import named_leaves
 from rps_jax.control.observation import (
     Details,
     ForceObservation,
@@ -45,7 +45,7 @@ _MENDS: dict[type[Exception], str] = {
 }
 
 
-def observation_of(senses: str) -> Any:
+def observation_shapes(senses: str) -> Any:
     """What a law observes that senses this, as shapes and types alone."""
     dtype = jnp.result_type(float)
 
@@ -72,7 +72,7 @@ def _tried(
     if odd := [leaf for leaf in jax.tree.leaves(memory) if _is_odd(leaf)]:
         told = f"returns {_described(odd[0])}"
         raise _refused("init", init, told, "a pytree of arrays, the law's memory")
-    found = _called("step", step, params, memory, observation_of(senses))
+    found = _called("step", step, params, memory, observation_shapes(senses))
     wanted = "(memory, Twist, Details)"
     if not (isinstance(found, tuple) and len(found) == 3):
         raise _refused("step", step, f"returns {_described(found)}", wanted)
@@ -84,7 +84,7 @@ def _tried(
             raise _refused("step", step, f"returns a twist whose {name} is {what}", "a number ()")
     if not isinstance(details, Details):
         told = f"returns {_described(details)} in the place of details"
-        raise _refused("step", step, told, "rps_jax.Details, as Details.of(observation)")
+        raise _refused("step", step, told, "rps_jax.Details, as Details.from_obs(obs)")
     for name, leaf in details._asdict().items():
         if (what := _not_number(leaf, flags=True)) is not None:
             raise _refused("step", step, f"returns details whose {name} is {what}", "a number ()")
@@ -100,7 +100,7 @@ def check_law(init: Callable[..., Any], step: Callable[..., Any], senses: str, p
     """
     if (getattr(_inner(step), "__module__", None) or "").startswith("rps_jax."):
         return
-    for name, value in numbers(params, is_leaf=lambda x: x is None).items():
+    for name, value in named_leaves(params, is_leaf=lambda x: x is None).items():
         if what := _no_leaf(value):
             raise InputError(f"params.{name} = {value!r} is not allowed: it is {what}.")
     leaves, tree = jax.tree.flatten(params)
@@ -190,7 +190,7 @@ def _difference(before: Any, after: Any) -> str:
     """How the memory after a step differs from the one before; empty if it does not."""
     if jax.tree.structure(before) != jax.tree.structure(after):
         return "of another structure"
-    for (name, a), b in zip(numbers(before).items(), jax.tree.leaves(after), strict=True):
+    for (name, a), b in zip(named_leaves(before).items(), jax.tree.leaves(after), strict=True):
         whose = f"whose {name}" if name else "that"
         if _is_odd(b):
             return f"{whose} is {_described(b)}"

@@ -1,7 +1,7 @@
-"""A law of one's own in random worlds: a pure function from memory and touch to a twist.
+"""Run a custom law in random worlds: a pure function from state and observation to a twist.
 
-python notebooks/examples/own_law.py
-rps sweep --laws rps notebooks/examples/own_law.py:PParams --worlds 1000
+python notebooks/examples/custom_law.py
+rps sweep --laws rps notebooks/examples/custom_law.py:PParams --worlds 1000
 """
 
 from typing import NamedTuple
@@ -23,17 +23,17 @@ class PParams(NamedTuple):
     d_success: float = 0.05  # [m]
 
 
-def step(params, memory, seen):
-    """The twist of one control step; memory is not needed here."""
-    details = Details.of(seen)  # with the contact's lateral place l
-    cos, sin = jnp.cos(seen.yaw), jnp.sin(seen.yaw)
+def step(params, state, obs):
+    """Return the state, the twist of one control step, and details; this law has no state."""
+    details = Details.from_obs(obs)  # with the contact's lateral place l
+    cos, sin = jnp.cos(obs.yaw), jnp.sin(obs.yaw)
     to_robot = jnp.array([[cos, sin], [-sin, cos]])
-    p_robot_target = to_robot @ (seen.p_world_target - seen.p_world_robot)
-    ahead, left = p_robot_target - seen.p_robot_contact
+    p_robot_target = to_robot @ (obs.p_world_target - obs.p_world_robot)
+    ahead, left = p_robot_target - obs.p_robot_contact
     error = jnp.arctan2(left, ahead)
     turn = jnp.clip(params.gains.heading * error, -0.15, 0.15)
-    omega = jnp.where(seen.in_contact, turn, 0.0)
-    return memory, Twist(params.v, params.gains.l * details.l, omega), details
+    omega = jnp.where(obs.in_contact, turn, 0.0)
+    return state, Twist(params.v, params.gains.l * details.l, omega), details
 
 
 rps_jax.register_law("p_control", rps_jax.Law(lambda params: (), step), PParams())

@@ -1,6 +1,6 @@
 """A domain of one's own: heavy, slippery, tall boxes, and what success depends on there.
 
-    python notebooks/examples/own_domain.py
+    python notebooks/examples/custom_domain.py
 
 Ranges that are not named keep those of the domain `wide`.
 """

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 
-def above(
+def greater(
     x: jax.Array,
     threshold: Any,
     temperature: Any,
@@ -20,35 +20,35 @@ def above(
     return jax.nn.sigmoid((x - threshold) / temperature)
 
 
-def below(x: jax.Array, threshold: Any, temperature: Any) -> jax.Array:
+def less(x: jax.Array, threshold: Any, temperature: Any) -> jax.Array:
     """The switch x < threshold; smooth if there is a temperature."""
     if temperature is None:
         return x < threshold
     return jax.nn.sigmoid((threshold - x) / temperature)
 
 
-def inverse(switch: jax.Array) -> jax.Array:
+def logical_not(switch: jax.Array) -> jax.Array:
     """The switch that is on where this one is off."""
     return ~switch if switch.dtype == bool else 1 - switch
 
 
-def both(a: jax.Array, b: jax.Array) -> jax.Array:
+def logical_and(a: jax.Array, b: jax.Array) -> jax.Array:
     """On where both are."""
     return a & b if a.dtype == b.dtype == bool else a * b
 
 
-def either(a: jax.Array, b: jax.Array) -> jax.Array:
+def logical_or(a: jax.Array, b: jax.Array) -> jax.Array:
     """On where one of them is."""
     return a | b if a.dtype == b.dtype == bool else jnp.maximum(a, b)
 
 
-def choose(switch: jax.Array, yes: Any, no: Any) -> jax.Array:
+def where(switch: jax.Array, yes: Any, no: Any) -> jax.Array:
     """`yes` or `no`; of a weight, the mixture."""
     if switch.dtype == bool:
         return jnp.where(switch, yes, no)
     return switch * yes + (1 - switch) * no
 
 
-def select(switch: jax.Array, yes: Any, no: Any) -> Any:
-    """`choose` between the leaves of two pytrees."""
-    return jax.tree.map(lambda a, b: choose(switch, a, b), yes, no)
+def tree_where(switch: jax.Array, yes: Any, no: Any) -> Any:
+    """`where` between the leaves of two pytrees."""
+    return jax.tree.map(lambda a, b: where(switch, a, b), yes, no)

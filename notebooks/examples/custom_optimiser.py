@@ -1,6 +1,6 @@
 """An optimiser of one's own: SciPy's differential evolution over two of the law's parameters.
 
-    python notebooks/examples/own_optimiser.py
+    python notebooks/examples/custom_optimiser.py
 
 `rps_jax.evaluate` takes all candidates of a generation at once and gives labelled outcomes.
 """
