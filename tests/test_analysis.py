@@ -102,10 +102,8 @@ def test_what_a_sweep_says_is_what_happened():
     bins = statistics.bins(np.arange(16.0), np.arange(16) < 4, count=4)
     assert bins.successes.tolist() == [4, 0, 0, 0]
     assert bins.trials.tolist() == [4] * 4
-    assert statistics.bins(np.array([1.0, 1, 2]), np.array([True, False, True])).of.tolist() == [
-        2,
-        1,
-    ]
+    few = statistics.bins(np.array([1.0, 1, 2]), np.array([True, False, True]))
+    assert few.trials.tolist() == [2, 1]
 
 
 def random_worlds(success, **drawn):
@@ -188,8 +186,8 @@ def test_of_what_was_drawn_the_figure_shows_what_matters(drawn):
     assert titles[0].startswith("spread 49.6 %, q = ")  # 1/4 (1 - 7/399), as a deviation
     assert not any("chance" in title for title in titles)
     told = " ".join(figure.get_suptitle().split())
-    assert "2 of 8 drawn quantities" in told
-    assert told.endswith("first: yaw of the object, mass of the object")
+    assert "the 2 most influential of 8 drawn quantities" in told
+    assert told.endswith(": yaw of the object, mass of the object")
     below = figure.get_supxlabel().replace("\N{NO-BREAK SPACE}", " ")
     for one in found:
         assert (WORDS[one.name] in told) == (one in found[:2])

@@ -184,7 +184,7 @@ def made_up(self, at):
 def made(monkeypatch):
     """No trial is run, nor kept to be replayed."""
     monkeypatch.setattr(Probe, "_try", made_up)
-    monkeypatch.setattr(attack.Attack, "_keep_worst", lambda *_: None)
+    monkeypatch.setattr(attack.Attack, "_store_worst", lambda *_: None)
 
 
 SMALL = {"generations": 12, "batch": 32, "drawn": 600, "cells": 8, "repeats": 1, "check_again": 0}

@@ -38,7 +38,7 @@ def test_laws_are_compared_with_one_of_them_world_by_world():
     found = results(base=[1] * 12 + [0] * 8, better=[1] * 20, worse=[0] * 12 + [1] + [0] * 7)
     header, *rows = tables.against_table(found, "base")
     assert [row[0] for row in rows] == ["better", "base", "worse"]  # best first
-    assert header[-1] == "wins of the 8 that base loses"
+    assert header[-1] == "successes in the 8 failures of base"
     better, base, worse = rows
     # Exact McNemar: 8 to 0 is 2 / 2^8; 1 to 12 is 2 (1 + 13) / 2^13, doubled as the smaller one.
     assert better[2:] == ["+40.00 % (+8 -0)", "0.0078", "8"]
@@ -136,7 +136,7 @@ def test_the_command_reports_information_against_success(tmp_path, capsys):
     assert "## Models" not in text
     for heading in ("Information against success", "Against rps_tuned, world by world"):
         assert f"## {heading}" in text
-    assert "by none" in text
+    assert "no law succeeds in" in text
     assert (out / "ladder.png").stat().st_size > 10_000
     assert load(out).success.sizes == {"law": 2, "world": 6}
 

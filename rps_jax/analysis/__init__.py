@@ -1,1 +1,1 @@
-"""What labelled results say: statistics, tables, figures and reports."""
+"""Statistics, tables, figures and reports of labelled results."""

@@ -1,4 +1,4 @@
-"""A run's report: sections of prose, tables and figures, as Markdown and as one HTML file."""
+"""Reports of runs: sections of prose, tables and figures, as Markdown and as one HTML file."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import html
 import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -28,13 +28,13 @@ code { background: #f5f5f5; }
 
 
 class Picture(NamedTuple):
-    """A figure of a report, drawn when it is asked for."""
+    """Figure of a report, drawn on demand."""
 
-    name: str  # of its PNG, without the ending
+    name: str  # file name of the PNG without its suffix
     draw: Callable[[], Figure | np.ndarray]  # or an image (height, width, 3) uint8
 
     def png(self) -> bytes:
-        """The picture as a PNG file, equal for equal figures."""
+        """Return the PNG file; equal figures have equal files."""
         drawn, file = self.draw(), io.BytesIO()
         if isinstance(drawn, np.ndarray):
             from PIL import Image
@@ -49,7 +49,7 @@ class Picture(NamedTuple):
 
 
 class Section(NamedTuple):
-    """One heading of a report."""
+    """Section of a report."""
 
     title: str
     text: str = ""  # Markdown
@@ -57,19 +57,19 @@ class Section(NamedTuple):
     picture: Picture | None = None
 
     def _repr_markdown_(self) -> str:
-        """What Jupyter shows: the words and the table."""
+        """Return the text and the table, for Jupyter."""
         return "\n\n".join(self.lines)
 
     @property
     def lines(self) -> list[str]:
-        """Heading, words and table as Markdown."""
+        """Heading, text and table as Markdown."""
         table = [tables.markdown(self.table)] if self.table else []
         return [f"## {self.title}", *([self.text] if self.text else []), *table]
 
 
 def write_report(folder: Path, title: str, intro: str, sections: Sequence[Section]) -> Path:
-    """Write `report.md` and `report.html`, which needs no other file; returns the first."""
-    import markdown  # while a run goes on: it takes as long as all of this module's others
+    """Write `report.md` and the self-contained `report.html`; return the path of the first."""
+    import markdown  # imported late: it takes as long as all other imports of this module
 
     texts, pictures = [f"# {title}", intro], {}
     for section in sections:
@@ -79,7 +79,7 @@ def write_report(folder: Path, title: str, intro: str, sections: Sequence[Sectio
             pictures[name] = section.picture.png()
             files.write_bytes(folder / name, pictures[name])
             texts.append(f"![{section.title}]({name})")
-    text = "\n\n".join(one for one in texts if one) + "\n"
+    text = "\n\n".join(text for text in texts if text) + "\n"
     files.write_text(folder / "report.md", text)
     body = markdown.markdown(text, extensions=["tables"])
     for name, content in pictures.items():
@@ -93,6 +93,6 @@ def write_report(folder: Path, title: str, intro: str, sections: Sequence[Sectio
     return folder / "report.md"
 
 
-def save(figure: Any, path: Path) -> Path:
-    """Write a figure as a PNG, whole or not at all."""
+def save(figure: Figure, path: Path) -> Path:
+    """Write a figure as a PNG file atomically."""
     return files.write_bytes(path, Picture(path.stem, lambda: figure).png())

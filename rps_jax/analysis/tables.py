@@ -1,4 +1,4 @@
-"""Tables of results: a header and rows of texts, and how they read in Markdown."""
+"""Tables of results: a header and rows of text cells, and their Markdown."""
 
 import shlex
 from collections.abc import Sequence
@@ -9,12 +9,13 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from rps_jax.analysis import statistics
+from rps_jax.analysis.statistics import Comparison
 from rps_jax.world import paper
 from rps_jax.world.domain import WORDS
 
 
 def markdown(rows: Sequence[Sequence[str]]) -> str:
-    """A header and rows as a Markdown table whose columns line up."""
+    """Format a header and rows as a Markdown table with aligned columns."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = [
         "| " + " | ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)) + " |"
@@ -25,205 +26,210 @@ def markdown(rows: Sequence[Sequence[str]]) -> str:
 
 
 def table_ii(results: xr.Dataset) -> list[list[str]]:
-    """Header and rows of Table II: successes with Wilson 95 % intervals in percent, and the
-    paper's beside them."""
+    """Return Table II: successes with Wilson 95 % intervals in percent, beside the paper's."""
     trials = results.sizes["target"]
     targets = np.stack([results.target_x, results.target_y], axis=-1)
-    whole = np.array_equal(targets, paper.TARGETS)
+    has_all_targets = np.array_equal(targets, paper.TARGETS)
     columns = [(str(o), str(f)) for o in results.object.values for f in results.friction.values]
     rows = [["", "", *(f"{o} {f}" for o, f in columns), "all"]]
     for law in map(str, results.law.values):
         success = results.success.sel(law=law)
         counts = [int(success.sel(object=o, friction=f).sum()) for o, f in columns]
-        sizes = [trials] * len(columns)
-        pairs = [*zip(counts, sizes, strict=True), (sum(counts), sum(sizes))]
-        cells = [f"{n}/{of} {_percent(n, of)}" for n, of in pairs]
+        cells = [f"{n}/{size} {_interval(n, size)}" for n, size in _with_sum(counts, trials)]
         rows.append([law.upper(), "ours", *cells])
-        theirs = [paper.TABLE_II.get((law, o, f)) for o, f in columns]
-        if whole and None not in theirs:
-            theirs = [n for n in theirs if n is not None]
-            pairs = [*zip(theirs, sizes, strict=True), (sum(theirs), sum(sizes))]
-            rows.append(["", "paper", *(f"{n}/{of}" for n, of in pairs)])
+        in_paper = [paper.TABLE_II.get((law, o, f)) for o, f in columns]
+        counts = [n for n in in_paper if n is not None]
+        if has_all_targets and len(counts) == len(columns):
+            rows.append(["", "paper", *(f"{n}/{size}" for n, size in _with_sum(counts, trials))])
     return rows
 
 
-def _percent(successes: int, trials: int) -> str:
+def _with_sum(counts: Sequence[int], trials: int) -> list[tuple[int, int]]:
+    """Return successes and trials of each cell, and their sums."""
+    return [*((n, trials) for n in counts), (sum(counts), trials * len(counts))]
+
+
+def _interval(successes: int, trials: int) -> str:
     low, high = statistics.wilson(successes, trials)
     return f"[{100 * low:.0f}, {100 * high:.0f}]"
 
 
 def summary(results: xr.Dataset) -> str:
-    """One line for each law: median time and D of the successes, losses, divergences."""
+    """Return a line for each law: successes, their median time and D, and divergences."""
     lines = []
     for law in map(str, results.law.values):
-        part = results.sel(law=law)
-        won = part.success.values.astype(bool)
-        line = f"{law.upper()}: {won.sum()} of {won.size} succeed"
-        if won.any():
-            time = part.time.values[won]
+        trials = results.sel(law=law)
+        success = trials.success.values.astype(bool)
+        line = f"{law.upper()}: {success.sum()} of {success.size} succeed"
+        if success.any():
+            time = trials.time.values[success]
             line += (
                 f", in a median of {np.median(time):.1f} s (longest {time.max():.1f} s), "
-                f"D = {np.mean(part.mean_abs_l.values[won]):.3f} m"
+                f"D = {np.mean(trials.mean_abs_l.values[success]):.3f} m"
             )
-        lines.append(f"{line}; {int(part.diverged.sum())} diverged")
+        lines.append(f"{line}; {int(trials.diverged.sum())} diverged")
     return "\n".join(lines)
 
 
 def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
-    """Header and one row for each law: success by object, distance left, time, path, failures.
+    """Return a row for each law: success by object, distance left, time, path and failures.
 
-    The bound of the failures is exact; with several laws it holds for whichever is picked here.
+    The bound of the failure rate is exact. With several laws it holds for any one of them.
     """
     groups = statistics.worlds_by_object(results)
-    ways = [way for way in statistics.FAILURES if way != "stalled" or "stalled" in results]
+    modes = [mode for mode in statistics.FAILURES if mode != "stalled" or "stalled" in results]
     laws = results.sizes["law"]
     bound = "fails at most" + f" (best of {laws})" * (laws > 1)
     header = ["", *groups, "all", bound, "CVaR 5 % of distance"]
-    header += ["median time", "median path", *ways]
+    header += ["median time", "median path", *modes]
     rows = [header]
     for law in map(str, results.law.values):
-        one = results.sel(law=law)
-        won = one.success.values > 0
-        kinds = statistics.failure_modes(one, max_lost)
+        trials = results.sel(law=law)
+        success = trials.success.values > 0
+        mode_index = statistics.failure_modes(trials, max_lost)
+        failures = int((~success).sum())
         rows.append(
             [
                 law,
-                *(_rate(won[mask]) for mask in groups.values()),
-                _rate(won),
-                _at_most(statistics.fails_at_most(int((~won).sum()), won.size, laws)),
-                _cvar(statistics.distance_left(one)),
-                f"{np.median(one.time.values[won]):.1f} s" if won.any() else "-",
-                f"{np.median(one.path_length.values[won]):.2f} m" if won.any() else "-",
-                *(str(int((kinds == i).sum())) for i in range(len(ways))),
+                *(_rate(success[mask]) for mask in groups.values()),
+                _rate(success),
+                _at_most(statistics.fails_at_most(failures, success.size, laws)),
+                _cvar(statistics.distance_left(trials)),
+                f"{np.median(trials.time.values[success]):.1f} s" if success.any() else "-",
+                f"{np.median(trials.path_length.values[success]):.2f} m" if success.any() else "-",
+                *(str(int((mode_index == i).sum())) for i in range(len(modes))),
             ]
         )
     return rows
 
 
-def _cvar(left: np.ndarray) -> str:
-    low, high = statistics.cvar_interval(left)
+def _cvar(distance: np.ndarray) -> str:
+    low, high = statistics.cvar_interval(distance)
     ends = f"[{low:.2f}, {high:.2f}]" if np.isfinite(high) else "(too few worlds for an interval)"
-    return f"{statistics.cvar(left):.2f} m {ends}"
+    return f"{statistics.cvar(distance):.2f} m {ends}"
 
 
 def _at_most(bound: float) -> str:
-    """An upper bound of a rate, with two digits where it is small."""
+    """Format an upper bound of a rate in percent, with more digits if it is small."""
     return f"{100 * bound:.{0 if bound > 0.1 else 2 if bound > 0.001 else 4}f} %"
 
 
 def models_table(results: xr.Dataset) -> list[list[str]]:
-    """Header and one row for each law: its rate on every model, and from the least to the most.
+    """Return a row for each law: its success rate on every model, and the range of the rates.
 
-    `model_success` is (model, law, world). The last column is the share of outcomes that are equal
-    to the first model's, at the least.
+    `model_success` is (model, law, world). The last column is the least share of outcomes that
+    equal those on the first model.
     """
     success = results.model_success
     names = list(map(str, success.model.values))
     rows = [["", *names, "over all models", "outcomes equal to the first"]]
     for law in map(str, success.law.values):
-        won = success.sel(law=law).values > 0
-        rates = won.mean(axis=1)
-        equal = 100 * (won == won[0]).mean(axis=1)[1:]
+        by_model = success.sel(law=law).values > 0
+        rates = by_model.mean(axis=1)
+        equal = 100 * (by_model == by_model[0]).mean(axis=1)[1:]
         least = f"{equal.min():.1f} % and more" if equal.size else "-"
-        rows.append([law, *map(_rate, won), rate_range(rates), least])
+        rows.append([law, *map(_rate, by_model), rate_range(rates), least])
     return rows
 
 
-def _rate(won: np.ndarray) -> str:
-    return share(int(won.sum()), won.size)
+def _rate(success: np.ndarray) -> str:
+    return share(int(success.sum()), success.size)
 
 
-def percent(won: float, of: int = 1) -> str:
-    """A rate in percent without its sign: all reports print rates by this, or by `share`."""
-    return f"{100 * won / of:.{_digits(won, of)}f}"
+def percent(successes: float, trials: int = 1) -> str:
+    """Format a rate in percent without its sign; all reports use this or `share`."""
+    return f"{100 * successes / trials:.{_digits(successes, trials)}f}"
 
 
-def _digits(won: float, of: int) -> int:
-    """Two above 99 %, and at both ends where a thousand trials and more can tell, else one."""
-    return 2 if 0.99 < won / of < 1 or (of >= 1000 and not 0.01 < won / of < 0.99) else 1
+def _digits(successes: float, trials: int) -> int:
+    """Return 2 above 99 %, and at both ends with a thousand trials and more, else 1."""
+    rate = successes / trials
+    return 2 if 0.99 < rate < 1 or (trials >= 1000 and not 0.01 < rate < 0.99) else 1
 
 
-def share(won: int, of: int) -> str:
-    """A success rate with its Wilson 95 % interval."""
-    if not of:
+def share(successes: int, trials: int) -> str:
+    """Format a success rate with its Wilson 95 % interval."""
+    if not trials:
         return "-"
-    ends = (f"{100 * end:.{_digits(won, of)}f}" for end in statistics.wilson(won, of))
-    return f"{percent(won, of)} % [{', '.join(ends)}]"
+    digits = _digits(successes, trials)
+    ends = (f"{100 * end:.{digits}f}" for end in statistics.wilson(successes, trials))
+    return f"{percent(successes, trials)} % [{', '.join(ends)}]"
 
 
 def rate_range(rates: ArrayLike) -> str:
-    """The least and the greatest of some rates, as models of the physics give them."""
-    least, most = float(np.min(rates)), float(np.max(rates))
-    digits = max(_digits(least, 1), _digits(most, 1))
-    return f"{100 * least:.{digits}f} to {100 * most:.{digits}f} %"
+    """Format the least and the greatest of several rates, as from models of the physics."""
+    least, greatest = float(np.min(rates)), float(np.max(rates))
+    digits = max(_digits(least, 1), _digits(greatest, 1))
+    return f"{100 * least:.{digits}f} to {100 * greatest:.{digits}f} %"
 
 
 def _p(value: float) -> str:
-    """A p-value; one below the smallest number is not zero."""
+    """Format a p-value; one that underflows is not zero."""
     return f"{value:.2g}" if value > 0 else "< 1e-300"
 
 
+def _difference(comparison: Comparison, trials: int) -> str:
+    return f"{100 * (comparison.gained - comparison.lost) / trials:+.2f} %"
+
+
 def difference_table(results: xr.Dataset) -> list[list[str]]:
-    """Header and one row for each pair of laws, world by world, with McNemar's exact test."""
+    """Return a row for each pair of laws, world by world, with McNemar's exact test."""
     rows = [["second against first", "gained", "lost", "difference", "McNemar p"]]
     for first, second in combinations(map(str, results.law.values), 2):
         a, b = results.success.sel(law=first), results.success.sel(law=second)
         c = statistics.compare(a, b)
-        share = f"{100 * (c.gained - c.lost) / a.size:+.2f} %"
         counts = str(c.gained), str(c.lost)
-        rows.append([f"{second} against {first}", *counts, share, _p(c.p)])
+        rows.append([f"{second} against {first}", *counts, _difference(c, a.size), _p(c.p)])
     return rows
 
 
 def against_table(results: xr.Dataset, reference: str) -> list[list[str]]:
-    """Header and one row for each law: world by world against one of them, best first.
+    """Return a row for each law, the best first: world by world against the reference law.
 
-    The p-values of McNemar's exact test are adjusted for as many tests as there are laws (Holm).
+    The p-values of McNemar's exact test are adjusted for the number of tests (Holm).
     """
     base = results.success.sel(law=reference)
     names = [str(law) for law in results.law.values]
     names.sort(key=lambda law: -float(results.success.sel(law=law).mean()))
     others = [law for law in names if law != reference]
-    found = {law: statistics.compare(base, results.success.sel(law=law)) for law in others}
-    adjusted = dict(zip(others, statistics.holm([found[a].p for a in others]), strict=True))
-    failed = int((base.values == 0).sum())
-    wins = f"wins of the {failed} that {reference} loses"
-    rows = [["", "success", f"against {reference}", "p (Holm)", wins]]
+    by_law = {law: statistics.compare(base, results.success.sel(law=law)) for law in others}
+    adjusted = dict(zip(others, statistics.holm([by_law[a].p for a in others]), strict=True))
+    failures = int((base.values == 0).sum())
+    gained = f"successes in the {failures} failures of {reference}"
+    rows = [["", "success", f"against {reference}", "p (Holm)", gained]]
     for law in names:
         cells = ["", "", ""]
         if law != reference:
-            c = found[law]
-            share = 100 * (c.gained - c.lost) / base.size
-            cells = [f"{share:+.2f} % (+{c.gained} -{c.lost})", _p(adjusted[law])]
-            cells.append(str(c.gained))
+            c = by_law[law]
+            difference = f"{_difference(c, base.size)} (+{c.gained} -{c.lost})"
+            cells = [difference, _p(adjusted[law]), str(c.gained)]
         rows.append([law, _rate(results.success.sel(law=law).values > 0), *cells])
     return rows
 
 
 def hardest_table(results: xr.Dataset, run: str, count: int = 10) -> list[list[str]]:
-    """Header and one row for each of the hardest worlds, with the command that replays it."""
+    """Return a row for each of the hardest worlds, with the command that replays it."""
     names = [str(name) for name in results.object.values]
     laws = [str(law) for law in results.law.values]
     rows = [["world", "object", *laws, "mass", "friction", "target", "replay"]]
-    for world in statistics.hardest(results, count):
-        one = results.isel(world=world)
-        x = float(one.distance), float(np.degrees(one.bearing))
-        fails = next(law for law in laws if not int(one.success.sel(law=law)))
+    for world in map(int, statistics.hardest(results, count)):
+        trials = results.isel(world=world)
+        fails = next(law for law in laws if not int(trials.success.sel(law=law)))
         rows.append(
             [
-                str(int(world)),
-                names[int(one.which_object)],
-                *(_told(one.sel(law=law)) for law in laws),
-                f"{float(one.mass):.1f} kg",
-                f"{float(one.friction_ground):.2f}, {float(one.friction_robot):.2f}",
-                f"{x[0]:.1f} m at {x[1]:.0f} deg",
-                f"`rps replay {shlex.quote(run)} {int(world)} --law {shlex.quote(fails)}`",
+                str(world),
+                names[int(trials.which_object)],
+                *(_outcome(trials.sel(law=law)) for law in laws),
+                f"{float(trials.mass):.1f} kg",
+                f"{float(trials.friction_ground):.2f}, {float(trials.friction_robot):.2f}",
+                f"{float(trials.distance):.1f} m at {np.degrees(float(trials.bearing)):.0f} deg",
+                f"`rps replay {shlex.quote(run)} {world} --law {shlex.quote(fails)}`",
             ]
         )
     return rows
 
 
-def _told(trial: xr.Dataset) -> str:
+def _outcome(trial: xr.Dataset) -> str:
     if int(trial.success):
         return f"{float(trial.time):.0f} s"
     distance = float(trial.min_distance)
@@ -231,27 +237,23 @@ def _told(trial: xr.Dataset) -> str:
 
 
 def influence_table(results: xr.Dataset, law: str) -> list[list[str]]:
-    """Header and one row for each quantity that was drawn: the law's worst and best bin.
+    """Return a row for each varied quantity: the worst and the best bin of a law.
 
-    Those whose bins differ most come first: by a chi-squared test that all bins have one rate,
-    false discoveries among the quantities held at 5 % (Benjamini-Hochberg) where q < 0.05.
+    Rows are in the order of q, from a chi-squared test that all bins have the same rate. With
+    q < 0.05, false discoveries among the quantities are held at 5 % (Benjamini-Hochberg).
     """
-    won = results.success.sel(law=law).values > 0
-    binned = {
-        name: statistics.bins(results[name].values, won)
-        for name in statistics.varied_quantities(results)
-    }
-    q = statistics.false_discovery([statistics.equal_rates_p(found) for found in binned.values()])
+    success = results.success.sel(law=law).values > 0
+    names = statistics.varied_quantities(results)
+    binned = [statistics.bins(results[name].values, success) for name in names]
+    q = statistics.false_discovery([statistics.equal_rates_p(b) for b in binned])
     rows = [["", "worst bin, about", "success", "best bin, about", "success", "q"]]
     for i in np.argsort(q, kind="stable"):
-        name, found = list(binned.items())[i]
-        order, unit = (
-            np.argsort(found.successes / found.trials, kind="stable"),
-            results[name].attrs["units"],
-        )
-        told = [f"{value:.3g} {unit}".removesuffix(" 1") for value in found.middle]
-        ends = []
+        name, (middle, successes, trials) = names[i], binned[i]
+        order = np.argsort(successes / trials, kind="stable")
+        unit = results[name].attrs["units"]
+        cells = []
         for n in (order[0], order[-1]):
-            ends += [told[n], share(int(found.successes[n]), int(found.trials[n]))]
-        rows.append([WORDS[name], *ends, f"{q[i]:.2g}"])
+            value = f"{middle[n]:.3g} {unit}".removesuffix(" 1")
+            cells += [value, share(int(successes[n]), int(trials[n]))]
+        rows.append([WORDS[name], *cells, f"{q[i]:.2g}"])
     return rows

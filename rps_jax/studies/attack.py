@@ -1,19 +1,18 @@
-"""A search for failures of many kinds, by quality and diversity (pyribs).
+"""Search for diverse failures with quality-diversity optimisation (pyribs).
 
-An archive has a cell for each small range of three quantities, and of each object of the domain;
-in a cell stands the severest trial that was met there. Emitters propose worlds: some follow
-CMA-ME or CMA-MAE (Fontaine and Nikolaidis, 2020 and 2023) towards where the archive improves, some
-mix elites along lines between them (Vassiliades and Mouret, 2018). Into their archives only near
-misses and failures are let, and failures alone when there are enough of these. They move in the
-normal quantiles of what the domain draws from ranges; of the others, noise and corners of prisms,
-every world has its own, by chance.
+An archive divides the ranges of three drawn quantities into cells, separately for each object of
+the domain, and keeps the severest trial of each cell. Emitters propose worlds: CMA-ME and CMA-MAE
+(Fontaine and Nikolaidis, 2020 and 2023) move towards improvements of the archive, and the line
+operator (Vassiliades and Mouret, 2018) mixes elites. The archives of the emitters accept near
+misses and failures, and failures alone as soon as there are enough. Emitters vary the normal
+quantiles of ranges and choices. Noise and corners of prisms are random in every world.
 """
 
 import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -48,65 +47,67 @@ from rps_jax.world import points
 from rps_jax.world.domain import Domain
 
 Algorithm = Literal["cma_me", "cma_mae", "line", "mixed"]
-_SEARCH, _CHECK = 0.6, 0.8  # [1] of the time, when the search ends, and the check of elites
-
+# [1] shares of the time after which the search ends, and the check of elites.
+_SEARCH_UNTIL, _CHECK_UNTIL = 0.6, 0.8
 _EDGE = 1e-6  # least distance of a coordinate to the ends of its range
-_RATE = 0.1  # [1] learning rate of the archive's thresholds, of CMA-MAE
-_ISO, _LINE, _SPREAD = 0.2, 0.1, 0.3  # [1] steps of the emitters, in normal quantiles
-_FAR = 4.0  # [1] how much farther than the others the archive's axes move
-_NEAR = 0.1  # [1] share of the first worlds whose severity lets a world into an archive
-_ENOUGH = 12  # failing cells of an object, from which on only failures are let in
+_LEARNING_RATE = 0.1  # [1] of the thresholds of CMA-MAE's archive
+_ISO_SIGMA, _LINE_SIGMA, _CMA_SIGMA = 0.2, 0.1, 0.3  # [1] step sizes in normal quantiles
+_AXIS_SCALE = 4.0  # [1] step size along the archive's axes over that along other quantities
+_NEAR_MISSES = 0.1  # [1] share of the first worlds that the emitters' archives accept
+_MIN_FAILURES = 12  # failing cells of an object from which on only failures are accepted
+_DRAWN_AT_ONCE = 4096
 
 
 @dataclass(frozen=True)
 class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
-    """Search for failures of many kinds: an archive over three quantities (needs pyribs).
+    """Search for diverse failures (quality-diversity archive; needs pyribs).
 
-    The answer holds the margin, severity less 1, by cell (object, and three axes), NaN where no
-    world was tried; elites that fail, worst first, `u` (elite, quantity) with `severity`, `time`
-    and `left`, and whether they fail again in converged C MuJoCo, `again` (elite), NaN of those not
-    tried; and (generation) `failing` cells, `trials` and `simulated` seconds so far. Attributes
-    say the same of drawn worlds.
+    The result has, by cell (object, and three axes), `margin`: severity less 1, NaN where no world
+    was tried. Elites that fail come worst first, with `u` (elite, quantity), `severity`, `time`,
+    `left` and `again`: whether they fail in converged C MuJoCo, NaN where this was not tried. By
+    generation it has `failing` cells, and the sums `trials` and `simulated` [s]. Attributes hold
+    the same sums of drawn worlds.
 
     Example:
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=1.0)
       >>> small = {"cells": 2, "algorithm": "line", "batch": 8, "generations": 1, "drawn": 8}
       >>> setting = rps_jax.Setting("quasistatic", rules=rules)
-      >>> found = rps_jax.attack("rps", drums, **small, check_again=0, setting=setting)
-      >>> found.margin.dims
+      >>> results = rps_jax.attack("rps", drums, **small, check_again=0, setting=setting)
+      >>> results.margin.dims
       ('object', 'size', 'com_offset', 'friction_robot')
     """
 
-    TITLE: ClassVar[str] = "A search for failures"
+    TITLE: ClassVar[str] = "Search for failures"
     LEFT_OUT: ClassVar[tuple[str, ...]] = ("minutes", "generations", "check_again", "worst")
     SMALL: ClassVar[Mapping[str, Any]] = {"minutes": 2.0, "drawn": 128, "check_again": 4}
 
     axes: tuple[str, ...] = ("size", "com_offset", "friction_robot")
-    """Three quantities of the domain, whose ranges the archive's cells divide."""
+    """Three drawn quantities whose ranges the cells of the archive divide."""
     cells: int = option(10, 2, 100)
     """Number of cells along each axis, for each object."""
     aim: Literal["distance", "time"] = "distance"
-    """What is worst: most distance left (failures), or most time (slow successes, too)."""
+    """What is maximised: distance (severity, which grows with the distance left) or time (slow
+    successes count, too)."""
     algorithm: Algorithm = "mixed"
-    """How worlds are proposed: cma_me, cma_mae, line (mixtures of elites), or half of each line
-    and cma_mae."""
+    """How worlds are proposed: cma_me, cma_mae, line (mixtures of elites), or mixed (half line,
+    half cma_mae)."""
     batch: int = option(96, 8, 1_000_000)
     """Number of worlds of a generation, for each object."""
     generations: int = option(1000, 1, 1_000_000)
-    """Number of generations, at most."""
+    """Maximum number of generations."""
     minutes: float = option(5.0, above=0, at_most=1e5, unit="min")
-    """Wall clock from the call to the report [min]. The first generation is made whatever it takes;
-    what is left of the time after the search goes into trying elites again."""
+    """Wall clock from the call to the report [min]. The first generation always runs. The time
+    after the search is for trying elites again."""
     repeats: int = option(2, 1, 100)
-    """Number of trials that differ in noise alone, in all of which a world must fail; the least
-    severe one counts. Only worlds that failed are tried again."""
+    """Number of trials that differ only in noise. A world that fails once is tried again, and its
+    least severe trial counts."""
     drawn: int = option(512, 1, 10_000_000)
-    """Number of drawn worlds beside it, with which it is compared."""
+    """Number of drawn worlds for comparison."""
     check_again: int = option(32, 0, 100_000)
-    """Number of elites, at most, that are tried again in converged C MuJoCo."""
+    """Maximum number of elites to try again in converged C MuJoCo."""
     worst: int = option(48, 1, 100_000)
-    """Number of elites, at most, that are kept as a sweep to be replayed and filmed."""
+    """Maximum number of elites to store as a sweep that can be replayed and filmed."""
     film: bool = field(default=False, kw_only=True)
     """Whether the command films the worst twelve."""
 
@@ -124,41 +125,44 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         return Bar(self.name, 60 * self.minutes, "clock", shown=self.shown)
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Search, then try what was found again, until the time is over."""
-        began = time.perf_counter()
+        """Search, then try elites again until the time is over."""
+        start_time = time.perf_counter()
 
-        def left(share: float) -> bool:
-            return time.perf_counter() - began < share * 60 * self.minutes
+        def has_time(share: float) -> bool:
+            return time.perf_counter() - start_time < share * 60 * self.minutes
 
         probe = Probe(self.ranges, self.params, self.setting, run.folder, **run.shape)
-        found = _Search(probe, self, seed_of(self.setting.seed, "tune")).run(partial(left, _SEARCH))
-        found = self._again(found, run, partial(left, _CHECK))
+        search = _Search(probe, self, seed_of(self.setting.seed, "tune"))
+        results = search.run(partial(has_time, _SEARCH_UNTIL))
+        results = self._check_elites(results, run, partial(has_time, _CHECK_UNTIL))
         if run.folder is not None:
-            self._keep_worst(found, run)
-        return found
+            self._store_worst(results, run)
+        return results
 
-    def _again(self, found: xr.Dataset, run: Run, left: Callable[[], bool]) -> xr.Dataset:
-        """Try elites once more in converged C MuJoCo, evenly from the worst to the least bad."""
-        total = found.sizes["elite"]
-        failed = np.full(total, np.nan)
-        order = _spread_out(total, min(self.check_again, total))
+    def _check_elites(
+        self, results: xr.Dataset, run: Run, has_time: Callable[[], bool]
+    ) -> xr.Dataset:
+        """Try elites again in converged C MuJoCo, evenly from the worst to the least severe."""
+        count = results.sizes["elite"]
+        failed = np.full(count, np.nan)
+        order = _coarse_to_fine(count, min(self.check_again, count))
         phase(run.report, "check in C MuJoCo")
-        fine = replace(self.setting, engine="mujoco", physics="default", fidelity="reference")
+        setting = replace(self.setting, engine="mujoco", physics="default", fidelity="reference")
         folder = None if run.folder is None else run.folder / "check"
-        probe = Probe(self.ranges, self.params, fine, folder, **run.shape)
-        some = max(1, run.workers or provenance.count_processors())
-        for first in range(0, len(order), some):
-            if not left():
+        probe = Probe(self.ranges, self.params, setting, folder, **run.shape)
+        batch = max(1, run.workers or provenance.count_processors())
+        for first in range(0, len(order), batch):
+            if not has_time():
                 break
-            rows = order[first : first + some]
-            failed[rows] = probe(found.u.values[rows]).success.values == 0
-        return found.assign(again=("elite", failed, {"units": "1"}))
+            rows = order[first : first + batch]
+            failed[rows] = probe(results.u.values[rows]).success.values == 0
+        return results.assign(again=("elite", failed, {"units": "1"}))
 
-    def _keep_worst(self, found: xr.Dataset, run: Run) -> None:
-        """Keep the worst elites as a sweep in the folder's `worlds`."""
-        if found.sizes["elite"]:
+    def _store_worst(self, results: xr.Dataset, run: Run) -> None:
+        """Store the worst elites as a sweep in the subfolder `worlds`."""
+        if results.sizes["elite"]:
             phase(run.report, "worst worlds")
-            at = points.checked(self.ranges, found.u.values[: self.worst])
+            at = points.checked(self.ranges, results.u.values[: self.worst])
             plan = Plan(self.ranges, len(at.u), {self.label: self.params}, self.setting, points=at)
             assert run.folder is not None
             sweeps.complete(run.folder / "worlds", plan, **run.shape)
@@ -170,35 +174,40 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         )
 
     def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        gain, cells = yields(found), found.margin.size
+        rates, cells = yields(found), found.margin.size
         text = (
-            f"{int(found.failing[-1])} of {cells} cells hold a failure, after "
-            f"{int(found.trials[-1]):,} trials and {float(found.simulated[-1]):,.0f} s of time: "
-            f"{gain['search']:.2f} an hour. {found.attrs['drawn_trials']:,} trials of drawn worlds "
-            f"found {found.attrs['drawn_failing']}: {gain['drawn']:.2f} an hour. "
+            f"{int(found.failing[-1])} of {cells} cells hold a failure after "
+            f"{int(found.trials[-1]):,} trials and {float(found.simulated[-1]):,.0f} s of "
+            f"simulated time: {rates['search']:.2f} cells per hour. "
+            f"{found.attrs['drawn_trials']:,} trials of drawn worlds fill "
+            f"{found.attrs['drawn_failing']}: {rates['drawn']:.2f} per hour. "
         )
-        times = f"{gain['times']:.1f} times as many, " if found.attrs["drawn_failing"] else ""
-        text += f"The search finds {times}at least {gain['times_low']:.1f} times (95 %)."
-        title = f"{self.label}, {name_of(self.domain)}: worst trial of each cell"
-        rise = Picture("search", partial(search_figure, found, gain["drawn"]))
+        ratio = f"{rates['times']:.1f} times as many, " if found.attrs["drawn_failing"] else ""
+        text += f"The search finds {ratio}at least {rates['times_low']:.1f} times (95 %)."
+        title = f"{self.label}, {name_of(self.domain)}: severest trial of each cell"
+        growth = Picture("search", partial(search_figure, found, rates["drawn"]))
         maps = Picture("archive", partial(archive_figure, found, self.axes, title))
-        margin = "Severity less 1: above 0 a failure, by so many metres; below 0 a success."
-        sections = [Section("Failing cells", text, (), rise), Section("Margins", margin, (), maps)]
-        tried = np.isfinite(found.again.values)
-        if tried.any():
-            bad, of = count_of(found.again.values == 1), count_of(tried)
-            low, high = statistics.clopper_pearson(bad, of)
+        margin = "Severity less 1: above 0 a failure, by this many metres; below 0 a success."
+        sections = [
+            Section("Failing cells", text, (), growth),
+            Section("Margins", margin, (), maps),
+        ]
+        checked = np.isfinite(found.again.values)
+        if checked.any():
+            failures, trials = count_of(found.again.values == 1), count_of(checked)
+            low, high = (100 * p for p in statistics.clopper_pearson(failures, trials))
             text = (
-                f"{bad} of {of} elites, evenly from the worst to the least bad, fail again in "
-                f"converged C MuJoCo: {100 * bad / of:.0f} % [{100 * low:.0f}, {100 * high:.0f}]."
+                f"{failures} of {trials} elites, evenly from the worst to the least severe, fail "
+                f"in converged C MuJoCo, too: {100 * failures / trials:.0f} % "
+                f"[{low:.0f}, {high:.0f}]."
             )
-            sections.append(Section("Do they fail elsewhere, too", text))
+            sections.append(Section("Failures in another engine", text))
         if run.folder is not None and found.sizes["elite"]:
-            sections.append(self._worst(run.folder / "worlds"))
+            sections.append(self._worst_section(run.folder / "worlds"))
         return sections
 
-    def _worst(self, folder: Path) -> Section:
-        """The worst worlds, with the commands that show them."""
+    def _worst_section(self, folder: Path) -> Section:
+        """Return the table of the worst worlds, with the commands that show them."""
         results = labelled(files.read_results(folder))
         failed = count_of(results.success.values == 0)
         text = (
@@ -211,8 +220,8 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
 attack = call_of(Attack)
 
 
-def _spread_out(total: int, count: int) -> np.ndarray:
-    """So many indices evenly from 0 to total - 1, coarse ones first."""
+def _coarse_to_fine(total: int, count: int) -> np.ndarray:
+    """Return `count` even indices from 0 to total - 1, in an order whose beginnings are even."""
     if not count:
         return np.zeros(0, int)
     even = np.unique(np.linspace(0, total - 1, count).round().astype(int))
@@ -221,254 +230,294 @@ def _spread_out(total: int, count: int) -> np.ndarray:
 
 
 class _Archive:
-    """The worst trial of every cell, and when it was met."""
+    """Severest trial of each cell: one pyribs archive for each object, over points `u`."""
 
-    def __init__(self, domain: Domain, hunt: Attack):
-        self.names = points.names(domain)
-        self.axes = [self.names.index(name) for name in hunt.axes]
-        self.shape = (len(domain.objects), *(hunt.cells,) * 3)
-        self.worst = np.full(self.shape, -np.inf)
-        self.u = np.zeros((*self.shape, len(self.names)))
-        self.told = {name: np.full(self.shape, np.nan) for name in ("success", "time", "left")}
-        self.cells = hunt.cells
+    FIELDS: ClassVar[tuple[str, ...]] = ("success", "time", "left")
 
-    def add(self, which: np.ndarray, found: xr.Dataset, worth: np.ndarray) -> None:
-        """Trials (n,) of objects `which`."""
-        u = found.u.values
-        at = np.minimum((u[:, self.axes] * self.cells).astype(int), self.cells - 1)
-        for i in np.argsort(worth, kind="stable"):
-            cell = (int(which[i]), *map(int, at[i]))
-            if worth[i] > self.worst[cell]:
-                self.worst[cell], self.u[cell] = worth[i], u[i]
-                for name, values in self.told.items():
-                    values[cell] = float(found[name][i])
+    def __init__(self, domain: Domain, options: Attack):
+        names = points.names(domain)
+        self.axes = [names.index(name) for name in options.axes]
+        self.shape = (len(domain.objects), *(options.cells,) * 3)
+        self.grids = [
+            errors.require("ribs.archives", "failures").GridArchive(
+                solution_dim=len(names),
+                dims=self.shape[1:],
+                ranges=[(0, 1)] * 3,
+                extra_fields=dict.fromkeys(self.FIELDS, ((), float)),
+            )
+            for _ in domain.objects
+        ]
+
+    def add(self, objects: np.ndarray, trials: xr.Dataset, objective: np.ndarray) -> None:
+        """Add trials (n,) whose worlds have these objects (n,), given by their index."""
+        for k, grid in enumerate(self.grids):
+            rows = objects == k
+            u = trials.u.values[rows]
+            fields = {name: trials[name].values[rows] for name in self.FIELDS}
+            grid.add(u, objective[rows], u[:, self.axes], **fields)
+
+    def elites(self, k: int) -> dict[str, np.ndarray]:
+        """Return the elites (n,) of one object, in the order of their cells."""
+        elites = self.grids[k].data()
+        order = np.argsort(elites["index"])
+        return {name: values[order] for name, values in elites.items()}
 
     @property
     def failing(self) -> np.ndarray:
-        """Which cells hold a failure."""
-        return self.told["success"] == 0
+        """Number (objects,) of the cells that hold a failure."""
+        return np.array([count_of(grid.data("success") == 0) for grid in self.grids])
 
 
 class _Search:
-    """The search of one law's failures."""
+    """Search for the failures of one law."""
 
-    def __init__(self, probe: Probe, hunt: Attack, seed: int):
-        self.probe, self.hunt, self.seed = probe, hunt, seed
+    def __init__(self, probe: Probe, options: Attack, seed: int):
+        self.probe, self.options, self.seed = probe, options, seed
         self.domain = probe.domain
-        every = points.quantities(self.domain)
-        self.q, self.objects = len(every), len(self.domain.objects)
-        # Moved are ranges and choices but the object, of which each has emitters of its own.
-        self.moved = [
-            i for i, one in enumerate(every)
-            if one.kind == "range" or (one.kind == "choice" and one.name != "object")
+        quantities = points.quantities(self.domain)
+        self.q, self.objects = len(quantities), len(self.domain.objects)
+        # Emitters vary ranges and choices, except the object: each object has its own emitters.
+        self.varied = [
+            i for i, x in enumerate(quantities)
+            if x.kind == "range" or (x.kind == "choice" and x.name != "object")
         ]  # fmt: skip
-        self.noise = np.array([i for i, one in enumerate(every) if one.kind == "noise"])
-        self.object_at = next((i for i, one in enumerate(every) if one.name == "object"), None)
+        self.noise = np.array([i for i, x in enumerate(quantities) if x.kind == "noise"])
+        self.object_column = next((i for i, x in enumerate(quantities) if x.name == "object"), None)
         self.rng = np.random.Generator(np.random.Philox(key=seed))
 
-    def run(self, left: Callable[[], bool]) -> xr.Dataset:
-        """Drawn worlds, a first generation of them, and then the emitters' while time is `left`."""
-        hunt = self.hunt
-        phase(self.probe.report, "drawn worlds")
-        by_chance = _Archive(self.domain, hunt)
-        for first in range(0, hunt.drawn, 4096):
-            count = -(-min(4096, hunt.drawn - first) // self.objects)
-            self._try(self.rng.random((self.objects, count, len(self.moved))), by_chance)
-        chance = {
-            "drawn_trials": self.probe.trials,
-            "drawn_failing": int(by_chance.failing.sum()),
-            "drawn_simulated": self.probe.simulated,
+    def run(self, has_time: Callable[[], bool]) -> xr.Dataset:
+        """Try drawn worlds, then generations of emitters while there is time."""
+        options, probe = self.options, self.probe
+        phase(probe.report, "drawn worlds")
+        drawn = _Archive(self.domain, options)
+        for first in range(0, options.drawn, _DRAWN_AT_ONCE):
+            count = -(-min(_DRAWN_AT_ONCE, options.drawn - first) // self.objects)
+            self._try(self.rng.random((self.objects, count, len(self.varied))), drawn)
+        attributes = {
+            "drawn_trials": probe.trials,
+            "drawn_failing": int(drawn.failing.sum()),
+            "drawn_simulated": probe.simulated,
         }
-        archive, history = _Archive(self.domain, hunt), []
+        archive, history = _Archive(self.domain, options), []
         schedulers: list[Any] = []
-        bars: list[float] = []  # severities from which on trials enter the emitters' archives
-        before = self.probe.trials, self.probe.simulated
-        phase(self.probe.report, "search")
-        for generation in range(hunt.generations):
-            if generation and not left():
+        thresholds: list[float] = []  # severities from which on the emitters accept a world
+        phase(probe.report, "search")
+        for generation in range(options.generations):
+            if generation and not has_time():
                 break
             if generation == 0:
-                v = self.rng.random((self.objects, hunt.batch, len(self.moved)))
+                v = self.rng.random((self.objects, options.batch, len(self.varied)))
             else:
-                v = stats.norm.cdf(self._reach * np.stack([one.ask() for one in schedulers]))
-            _, worth = self._try(v, archive)
-            rows = worth.reshape(self.objects, hunt.batch)
+                v = stats.norm.cdf(self._scale * np.stack([x.ask() for x in schedulers]))
+            objective = self._try(v, archive).reshape(self.objects, options.batch)
+            failing = archive.failing
             for k in range(self.objects):
                 if generation:
-                    schedulers[k].tell(rows[k], v[k][:, self._axes])
-                # From near misses, as soon as there are enough failures from these alone.
-                many = archive.failing[k].sum() >= _ENOUGH
-                bar = 1.0 if many else min(1.0, float(np.quantile(rows[k], 1 - _NEAR)))
+                    schedulers[k].tell(objective[k], v[k][:, self._axes])
+                enough = failing[k] >= _MIN_FAILURES
+                near = float(np.quantile(objective[k], 1 - _NEAR_MISSES))
+                threshold = 1.0 if enough else min(1.0, near)
                 if generation == 0:
-                    schedulers.append(self._scheduler(k, archive, bar))
-                    bars.append(bar)
-                elif many and bars[k] < 1:
-                    schedulers[k], bars[k] = self._scheduler(k, archive, bar), bar
-            spent = self.probe.trials - before[0], self.probe.simulated - before[1]
-            history.append((int(archive.failing.sum()), *spent))
-        return self._labelled(archive, history, chance)
+                    schedulers.append(self._scheduler(k, archive, threshold))
+                    thresholds.append(threshold)
+                elif enough and thresholds[k] < 1:
+                    schedulers[k] = self._scheduler(k, archive, threshold)
+                    thresholds[k] = threshold
+            trials = probe.trials - attributes["drawn_trials"]
+            simulated = probe.simulated - attributes["drawn_simulated"]
+            history.append((int(failing.sum()), trials, simulated))
+        return self._labelled(archive, history, attributes)
 
-    @property
+    @cached_property
     def _axes(self) -> list[int]:
-        """Where the archive's axes stand among what is moved."""
-        names = [points.names(self.domain)[i] for i in self.moved]
-        return [names.index(name) for name in self.hunt.axes]
+        """Indices of the archive's axes among the varied quantities."""
+        names = [points.names(self.domain)[i] for i in self.varied]
+        return [names.index(name) for name in self.options.axes]
 
-    @property
-    def _reach(self) -> np.ndarray:
-        """How far (moved,) the emitters' steps go, by what is moved."""
-        reach = np.ones(len(self.moved))
-        reach[self._axes] = _FAR
-        return reach
+    @cached_property
+    def _scale(self) -> np.ndarray:
+        """Scale (varied,) [1] of the emitters' steps, by quantity."""
+        scale = np.ones(len(self.varied))
+        scale[self._axes] = _AXIS_SCALE
+        return scale
 
-    def _try(self, v: np.ndarray, archive: _Archive) -> tuple[xr.Dataset, np.ndarray]:
-        """Worlds of all objects at what is moved, v (objects, n, moved), into an archive."""
+    def _try(self, v: np.ndarray, archive: _Archive) -> np.ndarray:
+        """Try worlds at varied quantities `v` (objects, n, varied), and add them to an archive.
+
+        Returns:
+          The objective (objects * n,) [1], which the search maximises.
+        """
         count = v.shape[0] * v.shape[1]
         u = self.rng.random((count, self.q))
-        u[:, self.moved] = np.clip(v.reshape(count, -1), _EDGE, 1 - _EDGE)
-        which = np.repeat(np.arange(self.objects), v.shape[1])
-        if self.object_at is not None:
-            u[:, self.object_at] = (which + 0.5) / self.objects
-        found = self.probe(u)
-        # One other noise sorts out most failures by chance; the rest are tried all at once.
-        for times in (min(1, self.hunt.repeats - 1), self.hunt.repeats - 2):
-            rows = np.flatnonzero(found.success.values == 0)
+        u[:, self.varied] = np.clip(v.reshape(count, -1), _EDGE, 1 - _EDGE)
+        objects = np.repeat(np.arange(self.objects), v.shape[1])
+        if self.object_column is not None:
+            u[:, self.object_column] = (objects + 0.5) / self.objects
+        trials = self.probe(u)
+        # The first repetition removes most accidental failures; the others run together.
+        for times in (min(1, self.options.repeats - 1), self.options.repeats - 2):
+            rows = np.flatnonzero(trials.success.values == 0)
             if rows.size and times > 0:
-                self._repeat(found, rows, times)
-        worth = found.severity.values
-        if self.hunt.aim == "time":
-            failed = found.success.values == 0
-            worth = found.time.values / float(self.probe.setting.rules.horizon) + failed
-        archive.add(which, found, worth)
-        return found, worth
+                self._repeat(trials, rows, times)
+        objective = trials.severity.values
+        if self.options.aim == "time":
+            failed = trials.success.values == 0
+            objective = trials.time.values / float(self.probe.setting.rules.horizon) + failed
+        archive.add(objects, trials, objective)
+        return objective
 
-    def _repeat(self, found: xr.Dataset, rows: np.ndarray, times: int) -> None:
-        """Try some worlds with other noises; the least severe trial is what was found of each."""
-        u = np.tile(found.u.values[rows], (times, 1))
+    def _repeat(self, trials: xr.Dataset, rows: np.ndarray, times: int) -> None:
+        """Try the worlds `rows` with other noise, and keep the least severe trial of each."""
+        u = np.tile(trials.u.values[rows], (times, 1))
         u[:, self.noise] = self.rng.random((len(u), self.noise.size))
-        other = self.probe(u)
+        repeated = self.probe(u)
         for i in range(times):
-            part = other.isel(world=slice(i * rows.size, (i + 1) * rows.size))
-            milder = part.severity.values < found.severity.values[rows]
-            for name, values in found.items():
-                values.values[rows[milder]] = part[name].values[milder]
+            trial = repeated.isel(world=slice(i * rows.size, (i + 1) * rows.size))
+            milder = trial.severity.values < trials.severity.values[rows]
+            for name, values in trials.items():
+                values.values[rows[milder]] = trial[name].values[milder]
 
-    def _scheduler(self, which: int, archive: _Archive, bar: float) -> Any:
-        """New emitters for one object, whose archive holds the elites from a severity on."""
+    def _scheduler(self, k: int, archive: _Archive, threshold: float) -> Any:
+        """Return pyribs' scheduler of new emitters for object `k`.
+
+        Their archive starts with the elites whose severity reaches the threshold.
+        """
         archives, emitters = (
-            errors.require("ribs.archives", "failures"),
-            errors.require("ribs.emitters", "failures"),
+            errors.require(f"ribs.{name}", "failures") for name in ("archives", "emitters")
         )
-        hunt, kept = self.hunt, archive.worst[which] >= bar
-        v, worth = archive.u[which][kept][:, self.moved], archive.worst[which][kept]
-        z = stats.norm.ppf(np.clip(v, _EDGE, 1 - _EDGE)) / self._reach
-        mae = hunt.algorithm != "cma_me"
-        rate: dict[str, Any] = {"learning_rate": _RATE, "threshold_min": bar} if mae else {}
-        own = archives.GridArchive(
-            solution_dim=len(self.moved), dims=[hunt.cells] * 3, ranges=[(0, 1)] * 3,
-            seed=self.seed + which, **rate,
+        options, elites = self.options, archive.elites(k)
+        accepted = elites["objective"] >= threshold
+        v, objective = elites["solution"][accepted][:, self.varied], elites["objective"][accepted]
+        z = stats.norm.ppf(np.clip(v, _EDGE, 1 - _EDGE)) / self._scale
+        if options.algorithm == "cma_me":
+            thresholds, rules = {}, ("2imp", "filter", "no_improvement")
+        else:
+            thresholds = {"learning_rate": _LEARNING_RATE, "threshold_min": threshold}
+            rules = ("imp", "mu", "basic")
+        cma = dict(zip(("ranker", "selection_rule", "restart_rule"), rules, strict=True))
+        grid = archives.GridArchive(
+            solution_dim=len(self.varied), dims=[options.cells] * 3, ranges=[(0, 1)] * 3,
+            seed=self.seed + k, **thresholds,
         )  # fmt: skip
-        own.add(z, worth, v[:, self._axes])
-        made: list[Any] = []
-        for i, (kind, size) in enumerate(_sizes(hunt.batch, hunt.algorithm)):
-            seed = int(self.rng.integers(2**31))
-            start = {"x0": z[np.argsort(-worth, kind="stable")[i % len(z)]], "seed": seed}
+        grid.add(z, objective, v[:, self._axes])
+        order = np.argsort(-objective, kind="stable")
+        sources = []
+        for i, (kind, size) in enumerate(_emitter_sizes(options.batch, options.algorithm)):
+            shared = {"x0": z[order[i % len(z)]], "seed": int(self.rng.integers(2**31))}
+            shared["batch_size"] = size
             if kind == "line":
-                line = {"iso_sigma": _ISO, "line_sigma": _LINE, "batch_size": size}
-                made.append(emitters.IsoLineEmitter(own, **line, **start))
-                continue
-            ranked = {"ranker": "imp" if mae else "2imp", "sigma0": _SPREAD, "batch_size": size}
-            rules = {"selection_rule": "mu" if mae else "filter"}
-            rules |= {"restart_rule": "basic" if mae else "no_improvement"}
-            made.append(emitters.EvolutionStrategyEmitter(own, **ranked, **rules, **start))
-        return errors.require("ribs.schedulers", "failures").Scheduler(own, made)
+                sigmas = {"iso_sigma": _ISO_SIGMA, "line_sigma": _LINE_SIGMA}
+                sources.append(emitters.IsoLineEmitter(grid, **sigmas, **shared))
+            else:
+                sources.append(
+                    emitters.EvolutionStrategyEmitter(grid, sigma0=_CMA_SIGMA, **cma, **shared)
+                )
+        return errors.require("ribs.schedulers", "failures").Scheduler(grid, sources)
 
     def _labelled(
-        self, archive: _Archive, history: Sequence[tuple[int, int, float]], chance: dict[str, Any]
+        self,
+        archive: _Archive,
+        history: Sequence[tuple[int, int, float]],
+        attributes: Mapping[str, Any],
     ) -> xr.Dataset:
-        hunt, every = self.hunt, points.quantities(self.domain)
-        margin = np.where(np.isfinite(archive.worst), archive.worst - 1, np.nan)
-        cells = np.argwhere(archive.failing)
-        cells = cells[np.argsort(-archive.worst[tuple(cells.T)], kind="stable")]
-        at = tuple(cells.T)
+        """Return the archive and the history of the search with names and units."""
+        axes, quantities = self.options.axes, {x.name: x for x in points.quantities(self.domain)}
+        margin = np.full((self.objects, np.prod(archive.shape[1:])), np.nan)
+        all_elites = [archive.elites(k) for k in range(self.objects)]
+        for k, elites in enumerate(all_elites):
+            margin[k, elites["index"]] = elites["objective"] - 1
+        elites = {
+            name: np.concatenate([x[name] for x in all_elites])
+            for name in ("solution", "objective", *archive.FIELDS)
+        }
+        objects = np.repeat(np.arange(self.objects), [len(x["index"]) for x in all_elites])
+        failed = np.flatnonzero(elites["success"] == 0)
+        worst_first = failed[np.argsort(-elites["objective"][failed], kind="stable")]
         failing, trials, simulated = (list(column) for column in zip(*history, strict=True))
-        middles = {}
-        for name in hunt.axes:
-            one = next(one for one in every if one.name == name)
-            middle = one.range.at((np.arange(hunt.cells) + 0.5) / hunt.cells)
-            middles[name] = (name, middle, {"units": one.unit})
+        middles = (np.arange(self.options.cells) + 0.5) / self.options.cells
         return xr.Dataset(
             {
-                "margin": (("object", *hunt.axes), margin),
-                "u": (("elite", "quantity"), archive.u[at]),
-                "severity": ("elite", archive.worst[at]),
-                "time": ("elite", archive.told["time"][at]),
-                "left": ("elite", archive.told["left"][at]),
-                "which_object": ("elite", cells[:, 0]),
+                "margin": (("object", *axes), margin.reshape(archive.shape)),
+                "u": (("elite", "quantity"), elites["solution"][worst_first]),
+                "severity": ("elite", elites["objective"][worst_first]),
+                "time": ("elite", elites["time"][worst_first]),
+                "left": ("elite", elites["left"][worst_first]),
+                "which_object": ("elite", objects[worst_first]),
                 "failing": ("generation", failing),
                 "trials": ("generation", trials),
                 "simulated": ("generation", simulated),
             },
-            {"object": list(self.domain.objects), "quantity": list(archive.names), **middles},
-            chance,
+            {
+                "object": list(self.domain.objects),
+                "quantity": list(quantities),
+                **{
+                    name: (
+                        name,
+                        quantities[name].range.at(middles),
+                        {"units": quantities[name].unit},
+                    )
+                    for name in axes
+                },
+            },
+            attributes,
         )
 
 
-def _sizes(batch: int, algorithm: Algorithm) -> list[tuple[str, int]]:
-    """Kinds and batch sizes of emitters that make up a batch; CMA's have about 24 worlds each."""
-    lines = {"line": batch, "mixed": batch // 2}.get(algorithm, 0)
-    rest = batch - lines
+def _emitter_sizes(batch: int, algorithm: Algorithm) -> list[tuple[str, int]]:
+    """Return kind and batch size of the emitters of a batch; a CMA emitter has about 24 worlds."""
+    line = {"line": batch, "mixed": batch // 2}.get(algorithm, 0)
+    rest = batch - line
     count = max(1, round(rest / 24)) if rest else 0
-    each = [rest // count + (i < rest % count) for i in range(count)]
-    return [("line", lines)] * bool(lines) + [("cma", size) for size in each]
+    sizes = [rest // count + (i < rest % count) for i in range(count)]
+    return [("line", line)] * bool(line) + [("cma", size) for size in sizes]
 
 
-def yields(found: xr.Dataset) -> dict[str, float]:
-    """Failing cells for each hour of simulated time, of the search and of drawn worlds.
+def yields(results: xr.Dataset) -> dict[str, float]:
+    """Compute the failing cells per hour of simulated time, of the search and of drawn worlds.
 
-    `times` is their ratio and `times_low` its lower end, with the exact upper end of the drawn
-    worlds' count (Poisson, 95 %). Drawn worlds are taken to hit no cell twice, in their favour.
+    `times` is their ratio. `times_low` is its lower end, from the exact upper end of the drawn
+    worlds' count (Poisson, 95 %). It assumes that drawn worlds fill no cell twice, in their favour.
     """
-    hours, drawn = float(found.simulated[-1]) / 3600, found.attrs["drawn_simulated"] / 3600
-    count = found.attrs["drawn_failing"]
-    own, chance = float(found.failing[-1]) / hours, count / drawn
-    most = float(stats.chi2.ppf(0.975, 2 * count + 2)) / 2 / drawn
+    hours, drawn = float(results.simulated[-1]) / 3600, results.attrs["drawn_simulated"] / 3600
+    count = results.attrs["drawn_failing"]
+    search_rate, drawn_rate = float(results.failing[-1]) / hours, count / drawn
+    highest = float(stats.chi2.ppf(0.975, 2 * count + 2)) / 2 / drawn
     return {
-        "search": own,
-        "drawn": chance,
-        "times": own / chance if chance else float("inf"),
-        "times_low": own / most,
+        "search": search_rate,
+        "drawn": drawn_rate,
+        "times": search_rate / drawn_rate if drawn_rate else float("inf"),
+        "times_low": search_rate / highest,
     }
 
 
 # --- figures -------------------------------------------------------------------------------
 
 
-def archive_figure(found: xr.Dataset, axes_: Sequence[str], title: str) -> Figure:
-    """The margin by which a law failed: a row for each object, a column for each pair of axes.
+def archive_figure(results: xr.Dataset, quantities: Sequence[str], title: str) -> Figure:
+    """Draw the margin of failures: a row for each object, a column for each pair of quantities.
 
-    A cell shows the worst trial over the third axis; a cell with a dot has a failure.
+    A cell shows the severest trial over the third quantity; a dot marks a failure.
     """
-    pairs = list(combinations(axes_, 2))
-    objects = [str(name) for name in found.object.values]
+    pairs = list(combinations(quantities, 2))
+    objects = [str(name) for name in results.object.values]
     size = 1.5 + 3.4 * len(pairs), 1.2 + 2.7 * len(objects)
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(len(objects), len(pairs), squeeze=False)
-    most = max(0.3, float(np.nanquantile(found.margin, 0.98)))
-    norm, image = TwoSlopeNorm(0, -1, most), None
+    norm = TwoSlopeNorm(0, -1, max(0.3, float(np.nanquantile(results.margin, 0.98))))
+    image = None
     for row, name in enumerate(objects):
         for ax, (x, y) in zip(axes[row], pairs, strict=True):
-            other = next(one for one in axes_ if one not in (x, y))
-            worst = found.margin.isel(object=row).max(other).transpose(y, x)
+            (third,) = set(quantities) - {x, y}
+            worst = results.margin.isel(object=row).max(third).transpose(y, x)
             image = ax.imshow(worst, origin="lower", norm=norm, cmap="RdBu_r", aspect="auto")
             ys, xs = np.nonzero(worst.values >= 0)
             ax.plot(xs, ys, "k.", ms=2)
-            for axis, of in ((ax.xaxis, x), (ax.yaxis, y)):
-                values = found[of].values
-                some = np.linspace(0, values.size - 1, 4).round().astype(int)
-                axis.set_ticks(some, [f"{values[i]:.2g}" for i in some], fontsize=7)
-                unit = f" [{found[of].attrs['units']}]".removesuffix(" [1]")
-                axis.set_label_text(f"{quantity(of)}{unit}", fontsize=8)
+            for axis, label in ((ax.xaxis, x), (ax.yaxis, y)):
+                values = results[label].values
+                ticks = np.linspace(0, values.size - 1, 4).round().astype(int)
+                axis.set_ticks(ticks, [f"{values[i]:.2g}" for i in ticks], fontsize=7)
+                unit = f" [{results[label].attrs['units']}]".removesuffix(" [1]")
+                axis.set_label_text(f"{quantity(label)}{unit}", fontsize=8)
             ax.set_facecolor("0.9")
             ax.set_title(words(name), fontsize=9)
     if image is not None:
@@ -477,12 +526,12 @@ def archive_figure(found: xr.Dataset, axes_: Sequence[str], title: str) -> Figur
     return figure
 
 
-def search_figure(found: xr.Dataset, drawn: float) -> Figure:
-    """Failing cells over simulated time: of a search, and of `drawn` cells each hour."""
+def search_figure(results: xr.Dataset, drawn: float) -> Figure:
+    """Draw failing cells over simulated time: of a search, and of `drawn` cells per hour."""
     figure = Figure(figsize=(5.5, 3.6), layout="constrained")
     ax = figure.subplots()
-    hours = found.simulated.values / 3600
-    ax.plot(hours, found.failing, "o-", ms=3, color="C3", label="search")
+    hours = results.simulated.values / 3600
+    ax.plot(hours, results.failing, "o-", ms=3, color="C3", label="search")
     ax.plot(hours, drawn * hours, "--", color="C0", label="drawn worlds, no cell twice")
     ax.set_xlabel("simulated time [h]")
     ax.set_ylabel("cells with a failure")

@@ -157,7 +157,7 @@ def parameters_figure(results: xr.Dataset, log: Collection[str]) -> Figure:
                 one.value.values,
                 won,
                 np.full(won.size, of),
-                beside=i,
+                curve=i,
                 color=f"C{i}",
                 label=which,
             )

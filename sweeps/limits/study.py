@@ -311,9 +311,7 @@ def figure_of(found: Mapping[str, xr.Dataset]) -> Figure:
     for ax, one in zip(axes, found.values(), strict=False):
         for i, law in enumerate(map(str, one.law.values)):
             seen = statistics.bins(one.value.values, one.success.sel(law=law).values > 0, 12)
-            success_rates(
-                ax, seen.middle, seen.successes, seen.trials, beside=i, color=f"C{i}", label=law
-            )
+            success_rates(ax, *seen, curve=i, color=f"C{i}", label=law)
             usual = 100 * float(one.usual.sel(law=law).mean())
             ax.axhline(usual, color=f"C{i}", lw=0.8, ls="--")
         ax.set_xlabel(one.value.attrs["long_name"], fontsize=9)

@@ -1,10 +1,10 @@
-"""Figures by theme. Every function returns a figure of matplotlib.
+"""Figures by theme: functions that return a figure of matplotlib.
 
-A function is loaded when it is first used: to import matplotlib takes half a second.
+A function is imported on first use, because importing matplotlib takes half a second.
 """
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rps_jax.analysis.figures.paper import min_distance, one_trial, profile, stills
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 __all__ = ["min_distance", "one_trial", "profile", "search", "stills", "success_curves"]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     for theme in ("paper", "sweeps", "tuning") if name in __all__ else ():
         module = importlib.import_module(f"{__name__}.{theme}")
         if hasattr(module, name):

@@ -1,7 +1,6 @@
-"""The paper's figures, from its grid of trials and from traces over time."""
+"""Figures of the paper, from its grid of trials and from traces over time."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +8,7 @@ import numpy as np
 import xarray as xr
 from matplotlib import patches
 from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
 
 from rps_jax.analysis.figures.style import SHADES, Figure, base_patch, shade, words
 from rps_jax.control.laws import rps
@@ -17,7 +17,7 @@ from rps_jax.robot import shell, skin
 
 
 def profile(params: RPSParams) -> Figure:
-    """The logistic profile of Eq. 5 (in the paper's Fig. 3): a_r over the contact location."""
+    """Draw the logistic profile of Eq. 5 (the paper's Fig. 3): a_r over the contact offset."""
     l = jnp.linspace(-shell.HALF_WIDTH, shell.HALF_WIDTH, 401)  # noqa: E741
     far = jnp.asarray(2 * params.d_th)
     a_r = jax.vmap(lambda l: rps.adaptive_rate(params, l, far))(l)  # noqa: E741
@@ -29,16 +29,17 @@ def profile(params: RPSParams) -> Figure:
             side * float(params.l_cr), side * shell.HALF_WIDTH, color=SHADES["realigning"], lw=0
         )
         ax.axvline(side * float(params.beta), color="0.6", lw=0.7, ls="--")
-    ax.set(xlabel="contact location $l$ [m]", ylabel="adaptive rate $a_r$ [1]")
+    ax.set(xlabel="contact offset $l$ [m]", ylabel="adaptive rate $a_r$ [1]")
     ax.set_title("Eq. 5; dashed: $\\pm\\beta$; shaded: critical region", fontsize=9)
     return figure
 
 
 def one_trial(trace: xr.Dataset, title: str) -> Figure:
-    """Fig. 6: the path with contact points; velocities; l and a_r; contact type.
+    """Draw Fig. 6: the path with contact points; velocities; l and a_r; contact type.
 
-    Blue shade: Realignment State. Yellow: no contact. The trace is of one trial over time, with
-    the contact `p_world_contact`, the target and the radius `d_success`; dashed: `l_cr`, if any.
+    Blue shade: Realignment State. Yellow shade: no contact. Dashed line: `l_cr`, if the law has it.
+    The trace is of one trial over time; it holds the contact point `p_world_contact`, the target
+    and the radius `d_success`.
     """
     time, touching = trace.time.values, trace.contact_type.values != skin.NONE
     figure = Figure(figsize=(11, 6), layout="constrained")
@@ -52,13 +53,13 @@ def one_trial(trace: xr.Dataset, title: str) -> Figure:
     velocity.legend(ncols=3, fontsize=8, loc="lower right")
     velocity.set_ylabel("a) twist")
 
-    place = figure.add_subplot(grid[1, 1], sharex=velocity)
-    place.plot(time, np.where(touching, trace.l, np.nan), color="C0")
-    place.set_ylabel("b) $l$ [m]", color="C0")
-    place.set_ylim(-trace.half_width, trace.half_width)
+    offset = figure.add_subplot(grid[1, 1], sharex=velocity)
+    offset.plot(time, np.where(touching, trace.l, np.nan), color="C0")
+    offset.set_ylabel("b) $l$ [m]", color="C0")
+    offset.set_ylim(-trace.half_width, trace.half_width)
     for sign in (-1, 1) if "l_cr" in trace else ():
-        place.axhline(sign * float(trace.l_cr), color="0.6", lw=0.7, ls="--")
-    rate = place.twinx()
+        offset.axhline(sign * float(trace.l_cr), color="0.6", lw=0.7, ls="--")
+    rate = offset.twinx()
     rate.plot(time, np.where(touching, trace.a_r, np.nan), color="C3", lw=0.9)
     rate.set_ylabel("$a_r$ [1]", color="C3")
 
@@ -67,7 +68,7 @@ def one_trial(trace: xr.Dataset, title: str) -> Figure:
     kind.set_yticks((0, 1, 2), ("none", "point", "line"))
     kind.set_ylim(-0.2, 2.2)
     kind.set(ylabel="c) contact", xlabel="time [s]")
-    for ax in (velocity, place, kind):
+    for ax in (velocity, offset, kind):
         shade(ax, time, trace.realigning.values > 0.5, SHADES["realigning"])
         shade(ax, time, ~touching, SHADES["lost"])
     bands = (("Realignment State", SHADES["realigning"]), ("no contact", SHADES["lost"]))
@@ -82,12 +83,12 @@ def one_trial(trace: xr.Dataset, title: str) -> Figure:
 
 
 def _half(trace: xr.Dataset) -> tuple[float, float]:
-    """Half length and half width of the base [m]."""
+    """Return the half length and half width of the base [m]."""
     return float(trace.half_length), float(trace.half_width)
 
 
 def _object(trace: xr.Dataset, index: int) -> np.ndarray:
-    """Outline (N, 2) [m] of the object in the world at one moment."""
+    """Return the outline (N, 2) [m] of the object in the world at one time step."""
     x, y, w, _, _, z = trace.qpos.values[index, [3, 4, 6, 7, 8, 9]]
     yaw = 2 * np.arctan2(z, w)
     turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
@@ -95,7 +96,7 @@ def _object(trace: xr.Dataset, index: int) -> np.ndarray:
 
 
 def _path(ax: Axes, trace: xr.Dataset) -> None:
-    """Left column of Fig. 6: the way of the base and of the contact point."""
+    """Draw the left column of Fig. 6: the paths of the base and of the contact point."""
     pose, target = trace.qpos.values[:, :3], trace.p_world_target.values
     ax.plot(*pose[:, :2].T, color="0.35", label="base")
     ax.plot(*trace.p_world_contact.values.T, ".", ms=1.5, color="C0", label="contact point")
@@ -113,7 +114,7 @@ def _path(ax: Axes, trace: xr.Dataset) -> None:
 
 
 def stills(images: Sequence[np.ndarray], titles: Sequence[str]) -> Figure:
-    """Figs. 1 and 4: pictures (height, width, 3), three in a row, with their titles."""
+    """Draw Figs. 1 and 4: images (height, width, 3) with their titles, three in a row."""
     rows = -(-len(images) // 3)
     figure = Figure(figsize=(12, 2.3 * rows), layout="constrained")
     axes = figure.subplots(rows, 3, squeeze=False).ravel()
@@ -126,10 +127,10 @@ def stills(images: Sequence[np.ndarray], titles: Sequence[str]) -> Figure:
 
 
 def min_distance(results: xr.Dataset) -> Figure:
-    """Draw Fig. 5: least distance of contact to target, over targets, mean of the friction sets.
+    """Draw Fig. 5: least distance of contact to target over targets, mean over friction sets.
 
-    Rows are laws, columns objects; the number at a target counts the successes of its
-    trials, and the last column sums them over objects.
+    Rows are laws, columns are objects. The number at a target counts the successes of its trials;
+    the last column sums them over objects.
     """
     laws, objects = (list(map(str, results[dim].values)) for dim in ("law", "object"))
     columns = [*objects, "all"] if len(objects) > 1 else objects
@@ -141,9 +142,9 @@ def min_distance(results: xr.Dataset) -> Figure:
             part = results.sel(law=law)
             part = part if column == "all" else part.sel(object=[column])
             image = _map(ax, part)
-            won, of = int(part.success.sum()), part.success.size
+            successes, trials = int(part.success.sum()), part.success.size
             name = "all objects" if column == "all" else words(column)
-            ax.set_title(f"{law.upper()}, {name}: {won}/{of}", fontsize=9)
+            ax.set_title(f"{law.upper()}, {name}: {successes}/{trials}", fontsize=9)
     for ax in axes[-1]:
         ax.set_xlabel("x [m]")
     for ax in axes[:, 0]:
@@ -154,9 +155,9 @@ def min_distance(results: xr.Dataset) -> Figure:
     return figure
 
 
-def _map(ax: Axes, part: xr.Dataset) -> Any:
-    """One panel: a coloured square and the count of successes at each target."""
-    # A trial that never touched has no least distance; it is drawn as the far end of the scale.
+def _map(ax: Axes, part: xr.Dataset) -> PathCollection:
+    """Draw a coloured square and the count of successes at each target."""
+    # A trial without contact has no least distance; it has the colour of the scale's far end.
     distance = part.min_distance.where(np.isfinite(part.min_distance), 3.0)
     distance = distance.mean(("object", "friction")).values
     count = part.success.sum(("object", "friction")).values
@@ -164,11 +165,9 @@ def _map(ax: Axes, part: xr.Dataset) -> Any:
     image = ax.scatter(
         x, y, c=distance, s=420, marker="s", cmap="viridis_r", vmin=0.0, vmax=2.0, linewidths=0
     )
-    for point in zip(x, y, distance, count, strict=True):
-        colour = "white" if point[2] > 1.0 else "black"
-        ax.annotate(
-            str(int(point[3])), point[:2], ha="center", va="center", fontsize=8, color=colour
-        )
+    for *xy, far, n in zip(x, y, distance, count, strict=True):
+        colour = "white" if far > 1.0 else "black"
+        ax.annotate(str(int(n)), xy, ha="center", va="center", fontsize=8, color=colour)
     ax.add_patch(base_patch(np.zeros(3), fill=True))
     margin = 0.6
     ax.set(

@@ -1,4 +1,4 @@
-"""What the figures have in common: colours, and parts of a panel."""
+"""Shared style of the figures: colours, panels and marks."""
 
 import io
 from typing import Any
@@ -17,7 +17,7 @@ SHADES = {"realigning": "#bcd7f2", "lost": "#f8e3a1"}
 
 
 class Figure(figure.Figure):
-    """A figure of matplotlib that Jupyter shows without `pyplot` and without its settings."""
+    """Figure of matplotlib that Jupyter shows without `pyplot` and its settings."""
 
     def _repr_png_(self) -> bytes:
         file = io.BytesIO()
@@ -26,19 +26,19 @@ class Figure(figure.Figure):
 
 
 def words(name: str) -> str:
-    """A name as words."""
+    """Return a name with spaces for underscores."""
     return name.replace("_", " ")
 
 
 def quantity(name: str) -> str:
-    """A drawn quantity in words."""
+    """Return the words for a drawn quantity."""
     return WORDS.get(name) or words(name)
 
 
 def tiles(
     count: int, columns: int, size: tuple[float, float], margin: tuple[float, float], **shared: Any
 ) -> tuple[Figure, np.ndarray]:
-    """A figure of panels (rows, columns) of one size [in], row by row; those left over are off."""
+    """Return a figure and its panels (rows, columns) of one size [in]; unused panels are hidden."""
     columns = min(columns, count)
     shape = np.array([columns, -(-count // columns)])
     sheet = Figure(figsize=tuple(np.array(margin) + size * shape), layout="constrained")
@@ -54,7 +54,7 @@ def base_patch(
     *,
     fill: bool,
 ) -> patches.Polygon:
-    """Outline of a base of half length and width (2,) [m] at a pose (3,) [m, m, rad]."""
+    """Return the outline of a base of half length and width (2,) [m] at a pose (3,) [m, m, rad]."""
     corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half
     c, s = np.cos(pose[2]), np.sin(pose[2])
     world = corners @ np.array([[c, s], [-s, c]]) + pose[:2]
@@ -62,26 +62,33 @@ def base_patch(
 
 
 def shade(ax: Axes, time: np.ndarray, active: np.ndarray, colour: str) -> None:
-    """Colour the times (T,) at which a mask (T,) holds, over the whole height of a panel."""
+    """Shade the times (T,) at which a mask (T,) is true, over the full height of a panel."""
     across = ax.get_xaxis_transform()
     ax.fill_between(time, 0, 1, where=active, transform=across, color=colour, lw=0, step="post")
 
 
 def success_rates(
-    ax: Axes, x: np.ndarray, won: np.ndarray, of: np.ndarray, *, beside: int = 0, **style
+    ax: Axes,
+    x: np.ndarray,
+    successes: np.ndarray,
+    trials: np.ndarray,
+    *,
+    curve: int = 0,
+    **style: Any,
 ) -> None:
     """Draw success rates in percent with their Wilson 95 % intervals.
 
-    The curve number `beside` has a mark of its own, 2.5 points beside the one before, so that
-    curves which coincide are all seen.
+    The index of the curve chooses its mark and shifts it by 2.5 points, so that coinciding curves
+    stay visible.
     """
-    rate = 100 * won / np.maximum(of, 1)
-    ends = 100 * np.array([statistics.wilson(int(n), int(m)) for n, m in zip(won, of, strict=True)])
+    rate = 100 * successes / np.maximum(trials, 1)
+    pairs = zip(successes, trials, strict=True)
+    ends = 100 * np.array([statistics.wilson(int(n), int(m)) for n, m in pairs])
     errors = np.abs(np.stack([rate - ends[:, 0], ends[:, 1] - rate]))
     sheet = ax.get_figure(root=True)
     assert sheet is not None
-    moved = transforms.ScaledTranslation(2.5 * beside / 72, 0, sheet.dpi_scale_trans)
-    mark = "osD^v"[beside % 5]
+    shift = transforms.ScaledTranslation(2.5 * curve / 72, 0, sheet.dpi_scale_trans)
+    mark = "osD^v"[curve % 5]
     bars = ax.errorbar(x, rate, errors, capsize=2, marker=mark, ms=4, lw=1.2, **style)
-    for drawn in bars.get_children():
-        drawn.set_transform(drawn.get_transform() + moved)
+    for artist in bars.get_children():
+        artist.set_transform(artist.get_transform() + shift)

@@ -1,4 +1,4 @@
-"""Random worlds: what success depends on, how the law fails, and one law against another."""
+"""Figures of sweeps over random worlds: dependence of success on the drawn quantities."""
 
 import textwrap
 from collections.abc import Sequence
@@ -7,47 +7,49 @@ import xarray as xr
 
 from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import Figure, success_rates, tiles
+from rps_jax.analysis.statistics import Influence
 from rps_jax.world.domain import WORDS
 
 
 def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
-    """Success against the drawn quantities that matter first, one line a law.
+    """Draw success against the most influential drawn quantities, with a curve for each law.
 
-    Of all quantities these have the greatest standard deviation of the success rate over their
-    bins beyond what binomial noise explains, in the law in which it is greatest; one that is flat
-    within the noise has no panel, unless all are. Below, the others are named: those whose bins
+    Quantities are in the order of the standard deviation of the success rate over their bins beyond
+    binomial noise, in the law in which it is greatest. A quantity that is flat within the noise has
+    no panel, unless all are flat. The text below names the other quantities: those whose bins
     differ nevertheless by a chi-squared test (q < 0.05, as of `statistics.influences`), and those
     that are flat. Intervals are Wilson's, of 95 %.
     """
-    found = statistics.influences(results)
-    shown = [one for one in found[:count] if one.variance > 0 and not _is_flat(one)] or found[:1]
-    others = [one for one in found if one not in shown]
+    influences = statistics.influences(results)
+    shown = [x for x in influences[:count] if x.variance > 0 and not _is_flat(x)]
+    shown = shown or influences[:1]
+    rest = [x for x in influences if x not in shown]
     figure, axes = tiles(len(shown), 3, (3.5, 2.5), (1, 1.6), sharey=True)
     columns = axes.shape[1]
-    for ax, one in zip(axes.ravel(), shown, strict=False):
+    for ax, influence in zip(axes.ravel(), shown, strict=False):
+        values = results[influence.name]
         for i, law in enumerate(map(str, results.law.values)):
-            won = results.success.sel(law=law).values > 0
-            bins = statistics.bins(results[one.name].values, won)
-            success_rates(
-                ax, bins.middle, bins.successes, bins.trials, color=f"C{i}", label=law, beside=i
-            )
-        unit = f" [{results[one.name].attrs['units']}]".removesuffix(" [1]")
-        ax.set_xlabel(f"{WORDS[one.name]}{unit}", fontsize=9)
-        chance = " (may be chance)" * _is_flat(one)
-        ax.set_title(f"spread {_spread(one)}, q = {one.q:.1g}{chance}", fontsize=8)
+            bins = statistics.bins(values.values, results.success.sel(law=law).values > 0)
+            success_rates(ax, *bins, color=f"C{i}", label=law, curve=i)
+        unit = f" [{values.attrs['units']}]".removesuffix(" [1]")
+        ax.set_xlabel(f"{WORDS[influence.name]}{unit}", fontsize=9)
+        chance = " (may be chance)" * _is_flat(influence)
+        ax.set_title(f"spread {_spread(influence)}, q = {influence.q:.1g}{chance}", fontsize=8)
         ax.grid(alpha=0.3)
     for ax in axes[:, 0]:
         ax.set_ylabel("success [%]")
     axes[0, 0].set_ylim(top=103)
     axes[0, 0].legend(fontsize=8)
-    which = f"{len(shown)} of {len(found)} drawn quantities, those that matter first"
-    title = f"Success against {which}: {_names(shown)}"
+    title = (
+        f"Success against the {len(shown)} most influential of {len(influences)} drawn quantities: "
+        f"{_names(shown)}"
+    )
     figure.suptitle(_filled(title, 42 * columns), fontsize=10)
     parts = {
-        "Chosen for their spread": "the greatest standard deviation of success over the bins "
-        "beyond binomial noise, in the law in which it is greatest",
-        "Weaker": _names([o for o in others if not _is_flat(o)], spread=True),
-        "Flat within the noise": _names([o for o in others if _is_flat(o)]),
+        "Order": "standard deviation of success over the bins beyond binomial noise, in the law in "
+        "which it is greatest",
+        "Less influential": _names([x for x in rest if not _is_flat(x)], spread=True),
+        "Flat within the noise": _names([x for x in rest if _is_flat(x)]),
     }
     lines = (_filled(f"{k}: {v}.", 60 * columns) for k, v in parts.items() if v)
     figure.supxlabel("\n".join(lines), fontsize=8, x=0.01, ha="left")
@@ -58,15 +60,15 @@ def _filled(text: str, width: int) -> str:
     return textwrap.fill(text, width, break_on_hyphens=False)
 
 
-def _is_flat(one: statistics.Influence) -> bool:
-    return one.q >= 0.05
+def _is_flat(influence: Influence) -> bool:
+    return influence.q >= 0.05
 
 
-def _spread(one: statistics.Influence) -> str:
-    return f"{100 * max(one.variance, 0) ** 0.5:.1f} %"
+def _spread(influence: Influence) -> str:
+    return f"{100 * max(influence.variance, 0) ** 0.5:.1f} %"
 
 
-def _names(found: Sequence[statistics.Influence], *, spread: bool = False) -> str:
-    """Quantities in words, which no line break separates."""
-    names = (WORDS[one.name] + f" ({_spread(one)})" * spread for one in found)
+def _names(influences: Sequence[Influence], *, spread: bool = False) -> str:
+    """Return the quantities in words without line breaks."""
+    names = (WORDS[x.name] + f" ({_spread(x)})" * spread for x in influences)
     return ", ".join(name.replace(" ", "\N{NO-BREAK SPACE}") for name in names)
