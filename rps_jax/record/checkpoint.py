@@ -29,18 +29,18 @@ class Checkpoints:
         """Where the files are."""
         return self.run / "parts"
 
-    def found(self) -> dict[str, Path]:
+    def paths(self) -> dict[str, Path]:
         """The files of all parts, in the order of their names."""
         return {name: path for name, path, _ in self._sound()}
 
-    def each(self, names: Container[str] | None = None) -> Iterator[tuple[str, bytes]]:
+    def items(self, names: Container[str] | None = None) -> Iterator[tuple[str, bytes]]:
         """Names and contents of all parts, or of these, in the order of their names."""
         for name, _, content in self._sound(names):
             yield name, content
 
     def get(self, name: str) -> bytes | None:
         """The content of one part, if it is finished."""
-        return next((content for _, content in self.each((name,))), None)
+        return next((content for _, content in self.items((name,))), None)
 
     def put(self, name: str, content: bytes, suffix: str = ".nc", *, new: bool = False) -> Path:
         """Write the file of a part, whole or not at all, and then remove what it had before.
@@ -57,7 +57,7 @@ class Checkpoints:
                 one.unlink(missing_ok=True)
         return path
 
-    def results(self, name: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
+    def load_or_compute(self, name: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
         """The labelled results of a part, which are made and put if it is not finished."""
         if (content := self.get(name)) is None:
             content = files.encode_results(make().assign_attrs(part=name))
