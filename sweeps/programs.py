@@ -45,8 +45,6 @@ _MUJOCOS_OWN = Physics(
 BATCHED = {
     "fused standard": Setting(engine="fused"),
     "fused fast": Setting(engine="fused", physics=preset(fidelity="fast")),
-    "warp standard": Setting(engine="warp"),
-    "warp fast": Setting(engine="warp", physics=preset(fidelity="fast")),
     "quasistatic": Setting(engine="quasistatic"),
     "mjx standard": Setting(engine="mjx"),
     "mjx fast": Setting(physics=preset(fidelity="fast"), engine="mjx"),

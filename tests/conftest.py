@@ -20,7 +20,6 @@ def pytest_configure(config):
     cache = config.rootpath / ".jax_cache"
     os.environ.setdefault("RPS_CACHE", str(cache))  # of commands, also in processes of their own
     jax.config.update("jax_compilation_cache_dir", os.environ["RPS_CACHE"])
-    os.environ.setdefault("WARP_CACHE_PATH", str(cache / "warp"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 

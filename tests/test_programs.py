@@ -123,7 +123,6 @@ def test_what_says_not_all_that_a_program_depends_on_keeps_none(cache, made):
 
 def test_a_cache_stays_where_it_was_when_its_process_goes_elsewhere(cache, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("WARP_CACHE_PATH", "warp")
     assert device.use_cache("programs") == tmp_path / "programs"
     assert jax.config.jax_compilation_cache_dir == str(tmp_path / "programs")
 

@@ -192,7 +192,7 @@ def test_the_hardware_targets_are_2_1_m_from_the_start():
 
 
 def test_every_condition_is_a_study_that_could_run():
-    ours = fidelity.CONDITIONS, fidelity.IN_WARP, readings.READINGS, readings.GAZEBO
+    ours = fidelity.CONDITIONS, readings.READINGS, readings.GAZEBO
     for studied in ours:
         for condition in studied.values():
             assert len(condition.cases(Grid(targets=NEAR))) == 12

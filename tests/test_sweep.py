@@ -326,10 +326,10 @@ def test_a_part_of_an_older_version_is_named(whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "run")
     victim = sorted(folder.glob("parts/*.npz"))[0]
     kept = files.decode_arrays(victim.read_bytes())
-    del kept["overflows"]
+    del kept["tipped"]
     older = files.encode_results(xr.Dataset({name: xr.Variable((), 0) for name in kept}))
     for content, lacks in (
-        (files.encode_arrays(**kept), "lacks overflows"),
+        (files.encode_arrays(**kept), "lacks tipped"),
         (older, "is a NetCDF file"),
     ):
         victim.unlink()
@@ -338,13 +338,23 @@ def test_a_part_of_an_older_version_is_named(whole, tmp_path):
             merge([folder], out=folder)
 
 
-def test_the_report_of_one_world_tells_what_was_lost_and_how_to_see_it(whole, tmp_path):
+def test_a_run_with_the_removed_column_overflows_is_read(whole, tmp_path):
+    folder = shutil.copytree(whole, tmp_path / "run")
+    expected = merge([folder], out=folder)
+    for number, chunk in enumerate(sorted(folder.glob("parts/*.npz"))):
+        columns = files.decode_arrays(chunk.read_bytes())
+        chunk.unlink()
+        older = columns | {"overflows": np.zeros(columns["trial"].size, np.int32)}
+        sweep.store(folder, number, files.encode_arrays(**older))
+    xr.testing.assert_identical(merge([folder], out=folder), expected)
+
+
+def test_the_report_of_one_world_says_how_to_replay_its_failure(whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "a run")
     results = merge([folder], out=folder)
     one = results.isel(world=[0])
-    one.success[:], one.overflows[:] = [[1], [0]], [[0], [3]]
+    one.success[:] = [[1], [0]]
     text = str(sweep.report_of(load_plan(folder), one, folder))
-    assert "1 trials lost contacts for want of room: they are not to be trusted" in text
     assert f"rps replay '{folder}' 0 --law nps" in text  # the law that fails
     assert tables.influence_table(one, "rps")[1:] == []
 

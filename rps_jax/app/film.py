@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import numpy as np
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.analysis import statistics
 from rps_jax.control import registry
 from rps_jax.control.base import Law
@@ -182,7 +182,6 @@ def shape_of(grid: str) -> tuple[int, int]:
 
 def of_cases(cases: Sequence[Case], setting: Setting) -> list[Take]:
     """The takes of cases of one kind, labelled by their targets."""
-    engines.get(setting.engine).check()
     stage, worlds = pushes.build(cases, setting)
     part = Part(np.arange(len(cases)), worlds, stage)
     one = pushes.scene_of(cases[0], setting.physics)
@@ -210,7 +209,6 @@ def of_sweep(
 
     Which worlds: the `first`; the `hardest`, as the report of the sweep has them; or indices.
     """
-    engines.get(plan.setting.engine).check()
     count = shape[0] * shape[1] if len(laws) == 1 else shape[1]
     if not isinstance(which, str):
         index = np.asarray(which[:count], int)

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 EngineName = Literal[
     "mjx",
     "fused",
-    "warp",
     "mujoco",
     "quasistatic",
 ]

@@ -8,7 +8,7 @@ program. One that is not (`traced = False`) steps worlds on the host, by `steppe
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -16,11 +16,10 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.control.observation import Twist
-from rps_jax.geometry.arrays import Bool, Float
+from rps_jax.geometry.arrays import Float
 from rps_jax.geometry.solid import Solid
 from rps_jax.record import provenance
 from rps_jax.robot.robot import Robot
-from rps_jax.world.objects import SHAPES
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import Friction, Scene
 
@@ -42,7 +41,6 @@ class Driven(NamedTuple):
     """A batch after one control period."""
 
     motion: Motion
-    overflowed: Bool[Any, "*B"] | None = None  # contacts were lost; None: this engine loses none
     # (B, 3) [N, N, N m] what the object does to the base, about the base's origin and in its frame,
     # the mean over the physics steps of the period; None: nobody asked.
     force: Any = None
@@ -95,7 +93,6 @@ class Engine(abc.ABC):
     """A way to step worlds; its subclasses say what it knows and what suits it."""
 
     name: ClassVar[str]
-    shapes: ClassVar[tuple[str, ...]] = SHAPES  # the shape families that it knows
     cones: ClassVar[tuple[str, ...]] = ("elliptic", "pyramidal")  # the friction that it knows
     traced: ClassVar[bool] = True  # JAX steps it: its trials can be viewed, and learned in
     side_by_side: ClassVar[bool] = False  # batches of several families fit one program of a GPU
@@ -103,23 +100,6 @@ class Engine(abc.ABC):
     newton: ClassVar[bool] = True  # it solves as `Physics` says: by so many iterations
     forces: ClassVar[bool] = True  # a contact can slow and stop the base
     tells_force: ClassVar[bool] = True  # it tells the force of a contact
-
-    def check(self, families: Iterable[str] = ()) -> None:
-        """Raises InputError unless this machine can step worlds of these shape families."""
-        for family in families:
-            if family not in self.shapes:
-                raise errors.InputError(
-                    f"engine = {self.name} is not allowed for objects of the shape {family}: it "
-                    f"knows {' and '.join(self.shapes)}."
-                )
-
-    def works(self, families: Iterable[str] = ()) -> bool:
-        """Whether `check` has nothing against it."""
-        try:
-            self.check(families)
-        except errors.InputError:
-            return False
-        return True
 
     def check_physics(self, physics: Physics) -> None:
         """Raises InputError unless the engine knows such physics."""
@@ -146,8 +126,7 @@ class Engine(abc.ABC):
             )
 
     def check_traced(self) -> None:
-        """Raises InputError unless it works on this machine and JAX traces its steps."""
-        self.check()
+        """Raises InputError unless JAX traces its steps."""
         if not self.traced:
             raise errors.InputError(
                 f"engine = {self.name} is not allowed: JAX must trace it, as fused, mjx or "
@@ -169,9 +148,6 @@ class Engine(abc.ABC):
         Args:
           scenes: the different scenes.
           which: (n,) of them each world has.
-
-        Raises:
-          InputError: the engine cannot step them on this machine.
         """
 
     @abc.abstractmethod
@@ -186,9 +162,6 @@ class Engine(abc.ABC):
         """Stage, and fields (n, ...) on the host, of solids (n, ...), friction and robots (n,).
 
         What MuJoCo would derive in compiling each of them is computed here, for all at once.
-
-        Raises:
-          InputError: the engine cannot step them on this machine.
         """
 
     def slots(self, backend: str) -> int:

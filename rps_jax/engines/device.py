@@ -73,7 +73,6 @@ def use_cache(folder: str | Path | None = None) -> Path | None:
     # Many programs of ours are small, and compile in less than JAX thinks worth keeping.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    os.environ.setdefault("WARP_CACHE_PATH", str(where / "warp"))
     return where
 
 

@@ -226,10 +226,8 @@ def put(model: mujoco.MjModel) -> mjx.Model:
     return there
 
 
-def stack(
-    models: Sequence[mujoco.MjModel], put: Callable[[mujoco.MjModel], mjx.Model] = put
-) -> tuple[mjx.Model, dict[str, jax.Array]]:
-    """One MJX model for all, `put` on the device, and the fields that vary: name -> (n, ...).
+def stack(models: Sequence[mujoco.MjModel]) -> tuple[mjx.Model, dict[str, jax.Array]]:
+    """One MJX model for all, on the device, and the fields that vary: name -> (n, ...).
 
     The fields are always the same ones, so that a world's numbers depend neither on what it is
     batched with nor on a program of its own. They are copied from compiled models, so nothing

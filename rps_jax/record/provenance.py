@@ -18,7 +18,7 @@ from rps_jax.record import folder as run_folder
 
 ENVIRONMENT = "environment.json"
 _PACKAGES = (
-    *("rps_jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "warp-lang"),
+    *("rps_jax", "jax", "jaxlib", "mujoco", "mujoco-mjx"),
     *("numpy", "scipy", "xarray"),
 )
 

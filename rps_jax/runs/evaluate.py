@@ -93,7 +93,7 @@ def evaluate(
     count = worlds if at is None else len(at.u)
     errors.check_count("worlds", count, at_most=10_000_000)
     errors.check_count("seed", setting.seed, at_least=0, at_most=2**30)
-    setting.check_here(ranges.families, ranges.weakest, [params])
+    setting.check_here(ranges.weakest, [params])
     ask = Ask(_checked(params), seed_of(setting.seed, split), np.arange(count), at)
     device.use_cache_if_asked()
     shown = watched() if progress is None else progress

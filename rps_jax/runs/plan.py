@@ -63,8 +63,7 @@ class Plan:
 
     def check_here(self) -> None:
         """Raises InputError unless the engine can step these worlds on this machine."""
-        domain = self.domain
-        self.setting.check_here(domain.families, domain.weakest, self.laws.values())
+        self.setting.check_here(self.domain.weakest, self.laws.values())
 
     @property
     def trials(self) -> int:

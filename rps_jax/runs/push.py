@@ -263,7 +263,7 @@ class Push(Case, FollowsOne, Pushes[Trace]):
 
     def check(self) -> None:
         super().check()
-        self.setting.check_here((), self.case.base, [self.case.params])
+        self.setting.check_here(self.case.base, [self.case.params])
 
     def answer(self, run: Run) -> Trace:
         case, setting = self.case, self.setting
@@ -354,7 +354,6 @@ def chosen(run: Path, world: int, law: str | None = None) -> tuple[Plan, str]:
     errors.check_count("world", world, at_least=0, at_most=plan.worlds - 1)
     if not engines.get(plan.setting.engine).traced:
         plan = dataclasses.replace(plan, setting=dataclasses.replace(plan.setting, engine="fused"))
-    engines.get(plan.setting.engine).check()
     return plan, name
 
 

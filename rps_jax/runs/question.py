@@ -339,7 +339,7 @@ class InDomain(Pushes[T]):
 
     def check_engine(self, laws: Sequence[LawParams] = ()) -> None:
         """Raises InputError unless the engine can step these worlds with these laws here."""
-        self.setting.check_here(self.ranges.families, self.ranges.weakest, laws)
+        self.setting.check_here(self.ranges.weakest, laws)
 
 
 def told(timing: Timing, device: str) -> str:

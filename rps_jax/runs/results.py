@@ -22,9 +22,8 @@ Part = Mapping[str, np.ndarray]  # columns of some trials, whose numbers are `tr
 Keep = Callable[[int, Part], Any]  # called with the number of a part
 Columns = Mapping[str, tuple[np.ndarray, str]]  # what was drawn: values (n,) and unit, by name
 # Of an outcome; the others are float32.
-_TYPES = dict.fromkeys(("success", "tipped", "diverged", "stalled"), np.int8) | {
-    "overflows": np.int32
-}
+_TYPES: dict[str, type] = dict.fromkeys(("success", "tipped", "diverged", "stalled"), np.int8)
+_REMOVED = "overflows"  # column of a version with the engine warp
 _HDF5 = b"\x89HDF"  # with which a NetCDF file begins
 
 
@@ -36,11 +35,12 @@ def encoded(part: Part) -> bytes:
 def decoded(number: int, content: bytes) -> Part:
     """A part from its file; InputError if it is damaged, or of another version."""
     try:
-        return files.decode_arrays(content)
+        columns = files.decode_arrays(content)
     except ValueError as error:
         if content.startswith(_HDF5):
             raise _of_another_version(number, "it is a NetCDF file") from error
         raise files.CorruptFileError(f"part {number}", error) from error
+    return {name: values for name, values in columns.items() if name != _REMOVED}
 
 
 def _of_another_version(number: int, why: str) -> InputError:

@@ -122,8 +122,6 @@ def rates(found: xr.Dataset, max_lost: float) -> Section:
         "and target; of an object that was never touched, the whole way. "
         f"{statistics.NOT_PROMISED}"
     )
-    if lost := int((found.overflows.values > 0).sum()):
-        text += f" {lost} trials lost contacts for want of room: they are not to be trusted."
     return Section("Success", text, tables.success_table(found, max_lost))
 
 

@@ -86,7 +86,7 @@ class Hardware(OfLaw[xr.Dataset]):
         return HARDWARE_LAYOUTS[self.layout]
 
     def check(self) -> None:
-        self.setting.check_here((), self.base.base, [self.params])
+        self.setting.check_here(self.base.base, [self.params])
 
     def trials(self) -> int | None:
         each = len(HARDWARE_OBJECTS) * len(self.targets)

@@ -69,7 +69,7 @@ class Table(Given, OfLaws[xr.Dataset]):
     def check(self) -> None:
         if not self.cases:
             raise errors.InputError("targets = () is not allowed: name at least one.")
-        self.setting.check_here((), self.cases[0].base, self.chosen.values())
+        self.setting.check_here(self.cases[0].base, self.chosen.values())
 
     def trials(self) -> int | None:
         return len(self.cases)

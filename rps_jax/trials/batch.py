@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import threading
 import time
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import partial
@@ -88,7 +87,6 @@ def run(
             tasks += [each.program for each in (*plan.own, *plan.last)]
         count = len(tasks)
     _side_by_side(tasks, count, shared)
-    warn_of_lost(shared.overflowed)
     total = time.perf_counter() - began
     return Timing(shared.compile, total - shared.compile, shared.simulated)
 
@@ -112,16 +110,6 @@ def gathered(
     return Outcome(**found), timing  # pyright: ignore[reportArgumentType]
 
 
-def warn_of_lost(count: int) -> None:
-    """Warns if in `count` trials, any at all, the engine lost contacts for want of room."""
-    if count:
-        warnings.warn(
-            f"the engine lost contacts for want of room in {count} trials, which are not to be "
-            "trusted",
-            stacklevel=3,
-        )
-
-
 def _side_by_side(tasks: Sequence[Callable[[], None]], count: int, shared: _Shared) -> None:
     """Run tasks on `count` threads; the first that fails stops the others."""
     with ThreadPoolExecutor(count) as pool:
@@ -143,7 +131,6 @@ class _Shared:
         self.drained = threading.Barrier(workers)  # no trial of any queue waits
         self.simulated = 0.0
         self.compile = 0.0
-        self.overflowed = 0  # trials
         self.stop = False  # set when one worker fails or the user interrupts
         self._finished = 0
         self._collect, self._report = collect, report
@@ -152,7 +139,6 @@ class _Shared:
     def add(self, numbers: np.ndarray, trials: Outcome, simulated: float) -> None:
         """Trials that ended in a segment, and the time [s] all of the worker's trials advanced."""
         with self._lock:
-            self.overflowed += int(np.count_nonzero(trials.overflows))
             if numbers.size:
                 self._collect(numbers, trials)
             self._finished += numbers.size

@@ -21,7 +21,7 @@ from rps_jax.record import provenance
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.shell import Shell
 from rps_jax.trials import batch, host, trial
-from rps_jax.trials.batch import SEGMENT, Job, Part, rows, warn_of_lost
+from rps_jax.trials.batch import SEGMENT, Job, Part, rows
 from rps_jax.trials.case import Case
 from rps_jax.trials.progress import Progress, Report, Timing, unheard
 from rps_jax.trials.setting import Setting
@@ -160,12 +160,7 @@ def follow(
     interval: float = 0.1,
     report: Report = unheard,
 ) -> list[Followed]:
-    """Run trials of one kind to their ends and keep what they looked like every `interval` [s].
-
-    Raises:
-      InputError: the engine's trials cannot be followed on this machine.
-    """
-    engines.get(setting.engine).check()
+    """Run trials of one kind to their ends and keep what they looked like every `interval` [s]."""
     stage, worlds = build(cases, setting)
     part = Part(np.arange(len(cases)), worlds, stage)
     law = registry.law_of(cases[0].params)
@@ -259,7 +254,6 @@ def _follow_on_host(
 
 def _followed(part: Part, whole: Snapshot, outcomes: Outcome, timing: Timing) -> list[Followed]:
     """What was seen (T, B, ...), trial by trial, each until its end."""
-    warn_of_lost(int(np.count_nonzero(outcomes.overflows)))
     return [
         Followed(
             rows(whole, (~whole.done[:, i], i)),

@@ -23,7 +23,6 @@ UNITS = {
     "tipped": ("1", "the object fell over"),
     "diverged": ("1", "physics became NaN or ran away"),
     "stalled": ("1", "it ended with the base standing still, for want of force"),
-    "overflows": ("1", "control steps in which the engine lost contacts for want of room"),
     "base_pose": ("m, m, rad", "x, y, yaw of the base in the world at the end"),
     "object_pose": ("m, m, rad", "x, y, yaw of the object in the world at the end"),
 }

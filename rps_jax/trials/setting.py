@@ -40,8 +40,8 @@ class Setting:
 
     engine: EngineName = "fused"
     """What steps the worlds: mjx (MuJoCo's equations in JAX), fused (the same equations,
-    specialised to these scenes: much faster), warp (MJX-Warp, on an NVIDIA GPU), mujoco (C MuJoCo,
-    on all cores) or quasistatic (planar, without inertia: fastest, and differentiable)."""
+    specialised to these scenes: much faster), mujoco (C MuJoCo, on all cores) or quasistatic
+    (planar, without inertia: fastest, and differentiable)."""
     physics: PhysicsField = PhysicsField()
     """How friction is modelled: default is isotropic Coulomb friction; paper_gazebo is a friction
     pyramid, as in the paper's simulator. Changes follow, as default,timestep=0.005 or
@@ -60,12 +60,9 @@ class Setting:
         if self.physics.cone != "elliptic":  # which all know: an engine is imported when needed
             engines.get(self.engine).check_physics(self.physics)
 
-    def check_here(
-        self, families: Iterable[str], robot: Robot, laws: Iterable[LawParams] = ()
-    ) -> None:
-        """Raises InputError unless the engine steps such worlds with these laws on this machine."""
+    def check_here(self, robot: Robot, laws: Iterable[LawParams] = ()) -> None:
+        """Raises InputError unless the engine steps such a robot with these laws."""
         engine = engines.get(self.engine)
-        engine.check(families)
         engine.check_robot(robot)
         for params in laws:
             engine.check_senses(registry.law_of(params).senses)

@@ -120,7 +120,6 @@ class Trial(NamedTuple):
     tilt: Float[Array, "*B"]  # [rad] greatest tilt of the object so far
     tipped: Bool[Array, "*B"]  # the object has fallen over
     diverged: Bool[Array, "*B"]
-    overflows: Int[Array, "*B"]  # control steps in which contacts were lost for want of room
     drive: Drive | None = None  # of a robot with limits
     load: Load | None = None  # of a law that senses the contact's force
 
@@ -149,7 +148,6 @@ class Outcome(NamedTuple):
     tipped: Bool[Array, "*B"]  # the object has fallen over
     diverged: Bool[Array, "*B"]
     stalled: Bool[Array, "*B"]  # it ended with the base standing still against the object
-    overflows: Int[Array, "*B"]  # control steps in which contacts were lost for want of room
     base_pose: Float[Array, "*B 3"]  # [m, m, rad] in the world, at the end
     object_pose: Float[Array, "*B 3"]  # [m, m, rad] likewise
 
@@ -189,7 +187,6 @@ def start(world: World, law: Law = rps.LAW) -> Trial:
         tilt=jnp.zeros_like(world.qpos[0]),
         tipped=false,
         diverged=false,
-        overflows=zero,
         drive=None if world.robot is None else drive.start(world.qpos),
         load=base.unloaded(world.qpos) if law.senses == "force" else None,
     )
@@ -329,14 +326,12 @@ def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
 
     A trial that had ended `before` comes back as it was.
     """
-    (qpos, qvel, warmstart, integral), overflowed, force = driven
+    (qpos, qvel, warmstart, integral), force = driven
     sane = (
         jnp.all(jnp.isfinite(qpos))
         & jnp.all(jnp.abs(qvel) < _MAX_SPEED)
         & jnp.all(jnp.abs(qpos.at[2].set(0.0)) < _MAX_DISTANCE)  # but for the turns of the base
     )
-    if overflowed is not None:
-        told = told._replace(overflows=told.overflows + (overflowed & ~told.done))
     now = told.drive
     if now is not None:
         now = drive.stalled(now if integral is None else now._replace(integral=integral), qvel)
@@ -394,7 +389,6 @@ def outcome(trial: Trial, period: float) -> Outcome:
         tipped=trial.tipped,
         diverged=trial.diverged,
         stalled=drive.has_stalled(trial.drive, period) & ~trial.success & ~trial.diverged,
-        overflows=trial.overflows,
         base_pose=trial.qpos[..., JOINTS.base],
         object_pose=pose.reshape(*trial.qpos.shape[:-1], 3),
     )

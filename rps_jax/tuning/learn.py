@@ -127,11 +127,9 @@ class Learn(PPO, Pushes[xr.Dataset]):
             raise errors.InputError("minutes = 0 is not allowed without updates: give one of them.")
         errors.check_each_once("domain", self.domains)
         errors.check_count("seed", self.setting.seed, at_least=0, at_most=2**30)
-        engine = engines.get(self.setting.engine)
         for one in self.domains:
             errors.check_name("skin of a domain to learn in", one.skin, ("capacitive",))
-            engine.check(one.families)
-        engine.check_traced()
+        engines.get(self.setting.engine).check_traced()
         count = self.num_envs * sum(len(one.objects) for one in self.domains)
         if self.num_minibatches > count:
             raise errors.InputError(

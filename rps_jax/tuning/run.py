@@ -166,7 +166,7 @@ class Tuning(OfLaw[xr.Dataset]):
                 f"{', '.join(known)} have."
             )
         for one in self.problem.domains:
-            self.setting.check_here(one.families, one.weakest, [self.space.base])
+            self.setting.check_here(one.weakest, [self.space.base])
         _ = self.tuner
 
     def described(self) -> dict[str, Any]:

@@ -2,9 +2,8 @@
 
     rps sweeps/engines --worlds 90
 
-runs the same worlds in every engine that can run them here (MJX-Warp: on an NVIDIA GPU, and without
-prisms, as with `--objects random_box random_cylinder`), and compares outcomes with those of
-converged C MuJoCo. `rps sweep` runs one engine.
+runs the same worlds in every engine and compares the outcomes with those of converged C MuJoCo.
+`rps sweep` runs one engine.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from typing import Any, ClassVar
 
 import xarray as xr
 
-from rps_jax import engines as engines_
 from rps_jax import errors
 from rps_jax.analysis import statistics
 from rps_jax.analysis.report import Section
@@ -58,7 +56,6 @@ ENGINES = {
     "fused, fast": Setting(physics=preset(fidelity="fast"), engine="fused"),
     "quasistatic": Setting(physics=preset(), engine="quasistatic"),
     "MJX, standard": Setting(physics=preset(), engine="mjx"),
-    "MJX-Warp, standard": Setting(physics=preset(), engine="warp"),
 }
 
 
@@ -87,7 +84,7 @@ class Engines(TrialStudy[xr.DataTree]):
     objects: tuple[str, ...] = ()
     """Objects to push, as random_box random_cylinder; by default the domain's."""
     engines: tuple[str, ...] = ()
-    """Engines and physics by name, the first to be compared with; by default all that run here."""
+    """Engines and physics by name, the first to be compared with; by default all."""
     part: int = option(256, 1, 1_000_000)
     """Number of trials in a part: what is lost when killed, at most. C waits for the slowest of
     each."""
@@ -98,7 +95,6 @@ class Engines(TrialStudy[xr.DataTree]):
         ranges = domains.named(self.domain)
         ranges = replace(ranges, objects=self.objects or ranges.objects)
         label, params = registry.resolve_law(self.law)
-        here = (n for n, s in ENGINES.items() if engines_.get(s.engine).works(ranges.families))
         low, high, log = ranges.gap
         moved = replace(ranges, gap=Range(low + _MOVED, high + _MOVED, log))
         return {
@@ -109,7 +105,7 @@ class Engines(TrialStudy[xr.DataTree]):
                 ENGINES[name],
                 self.part,
             )
-            for name in self.engines or here
+            for name in self.engines or ENGINES
         }
 
     def check(self) -> None:

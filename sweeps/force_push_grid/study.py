@@ -59,7 +59,6 @@ class ForcePushGrid(Study[xr.Dataset]):
             errors.check_name("slider", slider, grid.SLIDERS)
         force_push_published.check(grid.PARAMS)
         engine = engines.get(self.engine)
-        engine.check(self.sliders)
         engine.check_senses("force")
         engine.check_traced()
         engine.check_physics(grid.PHYSICS)

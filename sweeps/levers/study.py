@@ -138,9 +138,8 @@ class Levers(Study[xr.Dataset]):
     """Programs compiled side by side; what compiling takes is that of a program alone only if 1."""
 
     def check(self) -> None:
-        """Check the program, and that its engine has these objects here."""
+        """Check the name of the program."""
         errors.check_name("program", self.program, programs.BATCHED)
-        engines.get(programs.BATCHED[self.program].engine).check([self.family])
 
     def trials(self) -> int | None:
         """How many programs there are."""

@@ -60,7 +60,6 @@ FOR = {
 }
 EXTRAS = {
     "cuda": "NVIDIA GPUs: JAX's CUDA 13 plugin and NVIDIA's libraries",
-    "warp": "MJX-Warp as an engine (warp-lang)",
     "cluster": "`rps sweep --ray` (ray)",
     "viz": "`rps view` (viser)",
     "export": "`rps export onnx` (onnx, and onnxruntime to run what it writes)",

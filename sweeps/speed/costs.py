@@ -24,7 +24,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
@@ -80,12 +80,11 @@ class Costs(Study[list[Profile]]):
     """Functions of each program in the table."""
 
     def check(self) -> None:
-        """Check the programs, and that their engines have these objects here."""
+        """Check the names of the programs and of the families."""
         for family in self.families:
             errors.check_name("families", family, FAMILIES)
         for name in self.names:
             errors.check_name("names", name, programs.BATCHED)
-            engines.get(programs.BATCHED[name].engine).check(self.families)
 
     def trials(self) -> int | None:
         """How many programs there are."""

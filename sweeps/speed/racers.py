@@ -314,7 +314,6 @@ RACERS: dict[str, tuple[Callable[[Task], Racer], str]] = {
     "one process a trial": (single, "mujoco"),
     "C MuJoCo, rollout": (rollout, "mujoco"),
     "MJX": (functools.partial(jax_engine, name="mjx"), "mujoco-mjx"),
-    "MJX-Warp": (functools.partial(jax_engine, name="warp"), "mujoco-mjx"),
     "MuJoCo Warp": (mujoco_warp, "mujoco-warp"),
     "Newton, SolverMuJoCo": (newton, "newton"),
     "fused": (functools.partial(jax_engine, name="fused"), "rps_jax"),

@@ -45,7 +45,7 @@ from sweeps.programs import BATCHED, FAMILIES, Program
 from sweeps.study_base import Study
 
 _SPEED = 0.05  # [m/s] at which C MuJoCo alone pushes
-_SLOW = ("mjx", "warp")  # engines whose batches are bounded
+_SLOW = ("mjx",)  # engines whose batches are bounded
 # C MuJoCo on the processor, beside the programs of `BATCHED`.
 # The second steps by MuJoCo's `rollout`; the third is how trials are run one after the other.
 IN_C = {
@@ -54,11 +54,6 @@ IN_C = {
     "C, one trial at a time": "serial",
 }
 NAMES = (*BATCHED, *IN_C)
-
-
-def here() -> tuple[str, ...]:
-    """Those of `NAMES` that this machine can run."""
-    return tuple(n for n in NAMES if n in IN_C or engines.get(BATCHED[n].engine).works())
 
 
 @dataclass(frozen=True)
@@ -95,13 +90,13 @@ class Speed(Study[xr.Dataset]):
     GROWS: ClassVar[tuple[str, ...]] = ("names", "families", "worlds", "mujocos", "at_once")
 
     names: tuple[str, ...] = ()
-    """Engines and fidelities; by default all that this machine can run."""
+    """Engines and fidelities; by default all."""
     families: tuple[Literal["box", "cylinder", "prism"], ...] = FAMILIES
     """Families of the objects: box, cylinder, prism."""
     worlds: tuple[int, ...] = option((64, 512), 1, 10_000_000)
     """Numbers of worlds of a batch."""
     mujocos: int = option(16384, 1, 10_000_000)
-    """Largest batch of MJX and MJX-Warp."""
+    """Largest batch of MJX."""
     at_once: int = option(1, 1, 1024)
     """Programs compiled side by side; what compiling takes is that of a program alone only if 1."""
     refill: int = option(64, 0, 1_000_000)
@@ -114,8 +109,7 @@ class Speed(Study[xr.Dataset]):
     @cached_property
     def wanted(self) -> Sequence[tuple[str, str, int]]:
         """Names, families and worlds (0 in C, as suits it), those in C first."""
-        names = self.names or here()
-        named = [pair for pair in product(names, self.families) if can(*pair)]
+        named = list(product(self.names or NAMES, self.families))
         in_c = [(*pair, 0) for pair in named if pair[0] in IN_C]
         batched = [(*pair, n) for pair in named if pair[0] in BATCHED for n in self.worlds]
         slow = [name for name, one in BATCHED.items() if one.engine in _SLOW]
@@ -125,14 +119,12 @@ class Speed(Study[xr.Dataset]):
         """Check the names, and that there is something to time."""
         for name in self.names:
             errors.check_name("name", name, NAMES)
-            if name in BATCHED:
-                engines.get(BATCHED[name].engine).check()
         for family in self.families:
             errors.check_name("family", family, FAMILIES)
         if not self.wanted:
             raise errors.InputError(
-                f"names = {self.names} with worlds = {self.worlds} leave nothing to time: MJX and "
-                f"MJX-Warp are timed up to --mujocos {self.mujocos} worlds."
+                f"names = {self.names} with worlds = {self.worlds} leave nothing to time: MJX "
+                f"is timed up to --mujocos {self.mujocos} worlds."
             )
 
     def trials(self) -> int | None:
@@ -210,11 +202,6 @@ def _told(gain: xr.Dataset, slots: int, rounds: int) -> str:
     )
 
 
-def can(name: str, family: str) -> bool:
-    """Whether this machine can run one of `NAMES` with a family."""
-    return name in IN_C or engines.get(BATCHED[name].engine).works([family])
-
-
 def _best(action: Callable[[], Any], goes: int = 4, enough: float = 5.0) -> float:
     """Least wall clock [s] of some goes; of fewer, once `enough` seconds have been spent."""
     times = []
@@ -243,7 +230,7 @@ def batched(program: Program) -> Measurement:
     def once() -> None:
         state[0] = jax.block_until_ready(program.go(state[0]))
 
-    once()  # in which MJX-Warp builds its kernels
+    once()
     rate = program.worlds * program.simulated / _best(once)
     name, family, worlds, _, took, memory, contacts, physics, *_ = program
     solver = physics.timestep, physics.iterations, physics.ls_iterations
