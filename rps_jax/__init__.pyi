@@ -13,7 +13,6 @@ from rps_jax.runs.sweep import sweep as sweep
 from rps_jax.runs.results import load as load
 from rps_jax.runs.evaluate import evaluate as evaluate
 from rps_jax.runs.evaluate import stack as stack
-from rps_jax.runs.models import models as models
 from rps_jax.studies.ladder import ladder as ladder
 from rps_jax.studies.ladder import score as score
 from rps_jax.studies.ceiling import ceiling as ceiling

@@ -24,7 +24,7 @@ from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
-from rps_jax.trials.progress import Progress, Report, unheard
+from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
 from rps_jax.trials.results import outcome_dataset
 from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
@@ -95,7 +95,7 @@ def run_conditions(
     *,
     slots: int | None = None,
     workers: int | None = None,
-    report: Report = unheard,
+    callback: ProgressCallback = no_progress,
 ) -> xr.Dataset:
     """Outcomes (condition, law, object, friction, target), run or found in `folder`.
 
@@ -109,15 +109,15 @@ def run_conditions(
     found = {name: parts and _load(parts, name, c, grid) for name, c in conditions.items()}
     missing = [name for name, results in found.items() if results is None]
     finished, simulated = grid.size * (len(found) - len(missing)), 0.0
-    report(Progress(finished, simulated))
+    callback(Progress(finished, simulated))
     for chunk in _chunks(missing, conditions, grid):
         cases = [case for name in chunk for case in conditions[name].cases(grid)]
 
         def tell(progress: Progress, before=(finished, simulated)) -> None:
-            report(Progress(before[0] + progress.finished, before[1] + progress.simulated))
+            callback(Progress(before[0] + progress.finished, before[1] + progress.simulated))
 
         outcome, timing = pushes.run(
-            cases, conditions[chunk[0]].setting, slots=slots, workers=workers, report=tell
+            cases, conditions[chunk[0]].setting, slots=slots, workers=workers, callback=tell
         )
         finished, simulated = finished + len(cases), simulated + timing.simulated
         for i, name in enumerate(chunk):

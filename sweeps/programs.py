@@ -21,7 +21,7 @@ from rps_jax.record import provenance
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Loop, Trial, World
+from rps_jax.trials.trial import ControlLoop, Trial, World
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws, paper
 from rps_jax.world.domain import DOMAINS, Range
@@ -112,7 +112,7 @@ def traced(
 
     # A new one: what was jitted before gives back what it has traced for such arguments.
     def advance(stage: Any, worlds: World, trials: Trial) -> Trial:
-        return trial.advance((stage,), (worlds,), (trials,), Loop(physics), steps)[0]
+        return trial.advance((stage,), (worlds,), (trials,), ControlLoop(physics), steps)[0]
 
     lowered = jax.jit(advance, donate_argnums=2 if donated else ()).lower(shared, batch, start)
     tracing = time.perf_counter() - began

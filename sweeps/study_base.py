@@ -25,7 +25,7 @@ from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.record.options import option
 from rps_jax.runs.question import Question, Run
-from rps_jax.trials.progress import Report
+from rps_jax.trials.progress import ProgressCallback
 from rps_jax.world.domain import DOMAINS, QUANTITIES
 
 T = TypeVar("T", covariant=True)
@@ -80,9 +80,9 @@ class Study(Question[T]):
         """Folder of the study's source file."""
         return Path(inspect.getfile(type(self))).parent
 
-    def answered(self, report: Report) -> T:
+    def execute(self, callback: ProgressCallback) -> T:
         """Run the study, and publish its tables if a machine is named."""
-        results = super().answered(report)
+        results = super().execute(callback)
         if self.machine and self.out is not None:
             self.publish(results, Path(self.out))
         return results
@@ -99,9 +99,9 @@ class TrialStudy(Study[T]):
     quick: bool = False
     """Whether to make a small run of minutes on two cores; explicit options keep their values."""
 
-    def run_in(self, out: Path | None, report: Report) -> Run:
+    def create_run(self, out: Path | None, callback: ProgressCallback) -> Run:
         """Return the run folder and the resources of the run."""
-        return Run(out, report, self.slots, self.workers)
+        return Run(out, callback, self.slots, self.workers)
 
 
 def write_table(path: Path, runs: Sequence[Mapping[str, Any]], device: str, table: Table) -> Path:
@@ -155,7 +155,7 @@ def digest(commands: Sequence[Sequence[str]]) -> str:
             continue
         name, rest = names.split(words)
         question, _ = flags.parse(names.question_of(name), name, rest)
-        configurations.append(_expanded(question.asked().configuration()))
+        configurations.append(_expanded(question.with_quick_values().configuration()))
     text = json.dumps(configurations, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -21,12 +21,12 @@ from rps_jax.control.laws.rps import RPSParams
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.shell import HALF_LENGTH, HALF_WIDTH
-from rps_jax.runs import sweep
-from rps_jax.runs.plan import Plan
+from rps_jax.runs import execution
+from rps_jax.runs.plan import Plan, open_run
 from rps_jax.trials import trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Loop, Rules, Trial
+from rps_jax.trials.trial import ControlLoop, Rules, Trial
 from rps_jax.world import domain, objects
 from rps_jax.world.domain import DOMAINS, Range
 from rps_jax.world.physics import preset
@@ -69,7 +69,7 @@ FAST = preset(fidelity="fast")
 
 
 @partial(jax.jit, static_argnames="steps")
-def advance(stage: Any, worlds: Any, trials: Trial, loop: Loop, steps: int) -> Trial:
+def advance(stage: Any, worlds: Any, trials: Trial, loop: ControlLoop, steps: int) -> Trial:
     """Up to so many control steps of one batch of worlds."""
     return trial.advance((stage,), (worlds,), (trials,), loop, steps)[0]
 
@@ -108,8 +108,8 @@ def case(
 
 def swept(folder: Path, plan: Plan = PLAN, **options: Any) -> Path:
     """A run folder with all parts of a plan, or of one of its shards."""
-    sweep.open_run(folder, plan)
-    sweep.run_missing(folder, plan, slots=SLOTS, **options)
+    open_run(folder, plan)
+    execution.run_missing(folder, plan, slots=SLOTS, **options)
     return folder
 
 

@@ -12,7 +12,7 @@ from rps_jax.analysis.report import Picture, Section
 from rps_jax.analysis.statistics import Bins
 from rps_jax.runs.question import Run
 from rps_jax.studies import hardware
-from rps_jax.trials.progress import unheard
+from rps_jax.trials.progress import no_progress
 from rps_jax.tuning import learn
 from rps_jax.world.domain import WORDS
 from sweeps.ambiguities.study import tolerance_curve
@@ -134,7 +134,7 @@ def test_a_validated_law_has_two_decimals_above_99_percent():
         {"update": [7]},
         {"compile": 1.0, "run": 2.0},
     )
-    (told,) = learn.Learn().report(curve, Run(None, unheard))
+    (told,) = learn.Learn().report(curve, Run(None, no_progress))
     assert "of 99.37 % in validation" in told.text
     assert "99.37 %" in told.lines[-1]
 

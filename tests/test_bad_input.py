@@ -14,8 +14,7 @@ from rps_jax.engines import ENGINES
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.record.folder import claim
-from rps_jax.runs import sweep
-from rps_jax.runs.plan import Plan
+from rps_jax.runs.plan import Plan, open_run
 from rps_jax.studies.rare import Rare
 from rps_jax.studies.table import Table
 from rps_jax.trials.setting import Setting
@@ -366,7 +365,7 @@ def folder(tmp_path_factory):
         (root / f"{name}.json").write_text(json.dumps(values))
     laws = {"rps": RPSParams.paper()}
     for name, engine in (("run", "mjx"), ("in_c", "mujoco")):
-        sweep.open_run(root / name, Plan(DOMAINS["paper"], 3, laws, Setting(engine=engine)))
+        open_run(root / name, Plan(DOMAINS["paper"], 3, laws, Setting(engine=engine)))
     good = json.loads((root / "run" / "manifest.json").read_text())
     for name, changes in CHANGED_MANIFESTS.items():
         (root / name).mkdir()

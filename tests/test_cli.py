@@ -145,23 +145,23 @@ def test_the_papers_totals_and_targets():
 
 def test_a_quick_run_makes_small_only_what_was_not_asked_for():
     asked = TuneES(quick=True, worlds=7, tuned=("logistic",))
-    quick, small = asked.asked(), asked.small()
+    quick, small = asked.with_quick_values(), asked.quick_values()
     assert (quick.worlds, quick.tuned) == (7, ("logistic",))
     assert quick.population == small["population"] < TuneES().population
     assert quick.setting.engine == small["setting.engine"]
-    assert TuneES().asked() == TuneES()
+    assert TuneES().with_quick_values() == TuneES()
 
 
 def test_what_was_said_stays_in_a_quick_run_though_it_equals_its_default():
     words = ["--quick", "--engine", "fused", "--worlds=512", "--horizon", "300.0"]
     assert (TuneES().setting.engine, TuneES().worlds) == ("fused", 512)
-    quick = flags.parse(TuneES, "tune es", words)[0].asked()
+    quick = flags.parse(TuneES, "tune es", words)[0].with_quick_values()
     assert quick.setting == TuneES().setting
-    assert (quick.worlds, quick.validation) == (512, TuneES.SMALL["validation"])
+    assert (quick.worlds, quick.validation) == (512, TuneES.QUICK["validation"])
     robot = [*words[:3], "--domain", "real,robot=ridgeback"]
-    flags.parse(TuneES, "tune es", robot)[0].asked().checked()
+    flags.parse(TuneES, "tune es", robot)[0].with_quick_values().validate()
     with pytest.raises(InputError, match="engine = quasistatic"):
-        flags.parse(TuneES, "tune es", [robot[0], *robot[3:]])[0].asked().checked()
+        flags.parse(TuneES, "tune es", [robot[0], *robot[3:]])[0].with_quick_values().validate()
 
 
 def test_files_of_the_same_name_are_told_apart_by_their_folders(tmp_path):
@@ -178,13 +178,13 @@ def test_files_of_the_same_name_are_told_apart_by_their_folders(tmp_path):
 STUDY = """
 from dataclasses import dataclass
 import xarray as xr
-from rps_jax.runs.question import OfLaw, call_of
+from rps_jax.runs.question import LawQuestion, call_of
 from rps_jax.analysis.report import Section
 from rps_jax.record.options import option
 import rps_jax
 
 @dataclass(frozen=True)
-class Crowd(OfLaw[xr.Dataset]):
+class Crowd(LawQuestion[xr.Dataset]):
     'Count what a law wins among drums.'
 
     worlds: int = option(16, 1, 1000)
@@ -194,8 +194,8 @@ class Crowd(OfLaw[xr.Dataset]):
         drums = rps_jax.Domain(("random_cylinder",))
         return rps_jax.sweep(self.law, drums, self.worlds, setting=self.setting, progress=False)
 
-    def report(self, found, run):
-        return [Section("Drums", f"{int(found.success.sum())} of {self.worlds} were won.")]
+    def report(self, results, run):
+        return [Section("Drums", f"{int(results.success.sum())} of {self.worlds} were won.")]
 
 crowd = call_of(Crowd)
 """

@@ -14,7 +14,8 @@ from helpers import PLAN, SLOTS, one_sentence, parts_of, rps, swept
 from rps_jax.engines.device import use_cache
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
-from rps_jax.runs import cluster, sweep
+from rps_jax.runs import cluster
+from rps_jax.runs.plan import open_run
 from rps_jax.trials.progress import Bar
 from rps_jax.world.domain import from_json
 
@@ -96,7 +97,7 @@ def two_workers():
 
 def opened(folder):
     """A run folder with the plan of `SWEEP` in it, and the plan."""
-    return sweep.open_run(folder, OF_NEAR), OF_NEAR
+    return open_run(folder, OF_NEAR), OF_NEAR
 
 
 @pytest.mark.slow
@@ -108,10 +109,10 @@ def test_a_worker_killed_at_work_changes_nothing(domain, tmp_path, two_workers, 
     killed = []
 
     def killing(bar, progress):
-        assert bar._total == plan.trials
+        assert bar._total == plan.num_trials
         environment = json.loads((out / "environment.json").read_text())
         pids = [worker["pid"] for worker in environment.get("workers", ())]
-        if 0 < progress.finished < plan.trials and not killed:
+        if 0 < progress.finished < plan.num_trials and not killed:
             killed.append(pids[0])
             os.kill(pids[0], signal.SIGKILL)
 

@@ -12,7 +12,7 @@ import pytest
 from rps_jax.app import cli
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.errors import InputError
-from rps_jax.runs.evaluate import Answer
+from rps_jax.runs.evaluate import CandidateScores
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
@@ -72,7 +72,7 @@ class TestDescent:
         ):  # fmt: skip
             (name,) = bad
             with pytest.raises(InputError, match=name):
-                TuneGrad("rps", **bad).checked()
+                TuneGrad("rps", **bad).validate()
 
     def test_the_first_start_is_the_base(self):
         one = TuneGrad("rps", starts=3)
@@ -84,8 +84,8 @@ class TestDescent:
 
     def test_a_law_without_a_smooth_form_is_refused(self):
         with pytest.raises(InputError, match="no smooth form"):
-            TuneGrad("pursuit", tuned=("K_v",)).checked()
-        TuneGrad("pursuit", tuned=("K_v",), estimator="evolution").checked()
+            TuneGrad("pursuit", tuned=("K_v",)).validate()
+        TuneGrad("pursuit", tuned=("K_v",), estimator="evolution").validate()
 
     def test_steps_go_downhill_and_stay_within_the_clip(self):
         rule = TuneGrad("rps", optimiser="sgd", learning_rate=0.5, clip=1.0, steps=10).rule()
@@ -99,7 +99,7 @@ def test_antithetic_steps_find_the_slope_of_the_objective():
 
     def pretend(asks):
         z = one.space.vector(asks[0].params)
-        return [Answer(None, np.asarray(2 * z[:, 0] - z[:, 1])[:, None] + np.zeros(3))]
+        return [CandidateScores(None, np.asarray(2 * z[:, 0] - z[:, 1])[:, None] + np.zeros(3))]
 
     found = descent.smoothed(jnp.zeros((2, 2)), one, 0, pretend)
     np.testing.assert_allclose(found.gradient, [[2, -1], [2, -1]], atol=0.2)

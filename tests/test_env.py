@@ -189,7 +189,7 @@ def test_it_moves_as_a_trial_that_is_driven_by_the_same_twist(pushing):
     )
     worlds = state.info["world"]
     trials = trial.start_all(worlds, np.ones(mine.done.size, bool), law=dull)
-    loop = trial.Loop(FAST, push.setting.rules, dull)
+    loop = trial.ControlLoop(FAST, push.setting.rules, dull)
     alone = replace(NEAR, objects=(push.object,))
     drawn = draws.draw(alone, 0, np.arange(1))
     stage = drawn_worlds(alone, drawn, push.params, push.setting).stage

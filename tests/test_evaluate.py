@@ -14,7 +14,7 @@ from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.observation import Details, Twist
 from rps_jax.errors import InputError
 from rps_jax.runs import evaluate as room
-from rps_jax.runs.evaluate import Ask, Split, evaluate, seed_of
+from rps_jax.runs.evaluate import Candidates, Split, evaluate, seed_of
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
@@ -157,15 +157,15 @@ class TestSeveralAsks:
     def test_every_candidate_meets_the_same_worlds_whatever_shares_its_batch(self):
         faster, params = paper(2, v_approach=np.array([0.01, 0.05])), paper(2)
         hostile = replace(DOMAINS["hostile"], objects=("random_cylinder",))
-        asks = [Ask(faster, 3, np.arange(3)), Ask(params, 3, np.arange(3))]
+        asks = [Candidates(faster, 3, np.arange(3)), Candidates(params, 3, np.arange(3))]
         where = [CYLINDERS, hostile], BRIEF
-        (one, two), _ = room.try_out(asks, *where, Objective(), slots=6)
+        (one, two), _ = room.score_candidates(asks, *where, Objective(), slots=6)
         assert one.score.shape == (2, 6)
         np.testing.assert_array_equal(one.score[0], two.score[0])
         np.testing.assert_array_equal(two.score[0], two.score[1])
         assert (one.score[1] != one.score[0]).any()
-        (alone,), _ = room.try_out(
-            [Ask(paper(3), 3, np.arange(1, 2))], *where, Objective(), slots=6
+        (alone,), _ = room.score_candidates(
+            [Candidates(paper(3), 3, np.arange(1, 2))], *where, Objective(), slots=6
         )
         np.testing.assert_allclose(alone.score[0], two.score[0, [1, 4]], rtol=1e-4)
 
@@ -176,8 +176,8 @@ class TestSeveralAsks:
         params = space.params(away + np.asarray(space.vector(space.base)))
         near = replace(CYLINDERS, distance=Range(0.7, 0.9), gap=Range(0, 0))
         setting = Setting(rules=Rules(horizon=20.0), engine="fused")
-        ask = Ask(params, 1, np.arange(6))
-        (answer,), _ = room.try_out([ask], [near], setting, Objective())
+        ask = Candidates(params, 1, np.arange(6))
+        (answer,), _ = room.score_candidates([ask], [near], setting, Objective())
         expected = [
             [1.5613247156, 1.6000000238, 1.3565973043, 1.5677981377, 1.3648988008, 1.6000000238],
             [1.5611727238, 1.6000000238, 1.3189700842, 1.5676416159, 1.3648886681, 1.6000000238],

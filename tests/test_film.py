@@ -12,8 +12,7 @@ from rps_jax.app.film import Film
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.errors import InputError
 from rps_jax.record import folder as run_folder
-from rps_jax.runs import sweep
-from rps_jax.runs.plan import Plan
+from rps_jax.runs.plan import Plan, open_run
 from rps_jax.studies.table import Table
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
@@ -42,7 +41,7 @@ def plan_of(*names):
 
 def a_sweep(folder):
     """A run of `rps sweep`, as far as a film reads it."""
-    sweep.open_run(folder, plan_of("random_cylinder"))
+    open_run(folder, plan_of("random_cylinder"))
 
 
 def tiles(images, rows, columns):

@@ -198,7 +198,7 @@ def test_a_study_is_labelled_kept_and_refuses_what_was_run_otherwise(tmp_path, m
     monkeypatch.setattr(grounds, "HEIGHTS", (0.06, 0.34))
     some = {"objects": ("box",), "offsets": (0.05, 0.12), "steps": 50}
     told = []
-    results = grounds.run(("a", "b"), tmp_path, **some, report=told.append)
+    results = grounds.run(("a", "b"), tmp_path, **some, callback=told.append)
     friction = len(grounds.FRICTIONS)
     sizes = {
         "ground": 2,

@@ -6,7 +6,7 @@ import pytest
 
 from rps_jax.control.laws.rps import BOUNDS, RPSParams
 from rps_jax.runs import evaluate
-from rps_jax.runs.evaluate import Answer
+from rps_jax.runs.evaluate import CandidateScores
 from rps_jax.runs.question import seed_of
 from rps_jax.trials.trial import Outcome
 from rps_jax.tuning.run import Problem
@@ -83,17 +83,17 @@ def pretended(monkeypatch):
     """Trials that succeed by the seed of their worlds, and take 100 s times L."""
     asked = []
 
-    def try_out(asks, *_, **__):
+    def score_candidates(asks, *_, **__):
         answers = []
         for ask in asks:
             asked.append(ask)
             L = np.asarray(ask.params.L)[:, None]
             won = np.broadcast_to((ask.seed + ask.worlds) % 4 > 0, (L.size, ask.worlds.size))
             outcome = outcomes(success=won, time=100 * L + 0 * won, path_length=5 + 0 * won)
-            answers.append(Answer(outcome, 0 * won))
+            answers.append(CandidateScores(outcome, 0 * won))
         return answers, None
 
-    monkeypatch.setattr(evaluate, "try_out", try_out)
+    monkeypatch.setattr(evaluate, "score_candidates", score_candidates)
     return asked
 
 

@@ -143,7 +143,7 @@ def test_every_public_function_has_an_example():
 
 
 # Questions whose small runs take longest, which tests of their own ask, too.
-LONG = {"models", "hardware", "learn", "ladder", "regress", "ceiling", "score", "attack", "replay"}
+LONG = {"hardware", "learn", "ladder", "regress", "ceiling", "score", "attack", "replay"}
 
 
 @pytest.mark.parametrize(

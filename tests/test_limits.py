@@ -68,7 +68,7 @@ def test_every_robot_meets_the_worlds_of_the_ideal_one(monkeypatch):
         report_to=heard.append,
     )
     found = asked()
-    assert heard[-1].finished == asked.trials() == 9
+    assert heard[-1].finished == asked.num_trials() == 9
     one = found["half_width"]
     np.testing.assert_array_equal(one.success, one.usual)  # it is the ideal base itself
     np.testing.assert_array_equal(one.value, [usual] * 3)

@@ -12,7 +12,7 @@ from rps_jax.engines import native
 from rps_jax.lowering import nodes
 from rps_jax.trials import trial
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Loop
+from rps_jax.trials.trial import ControlLoop
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws
 from rps_jax.world.domain import DOMAINS
@@ -38,7 +38,7 @@ def batch(shape, skin="capacitive", count=21, law="rps_tuned", domain="wide", **
     domain = replace(DOMAINS[domain], objects=(f"random_{shape}",), skin=skin, **drawn)
     part = drawn_worlds(domain, draws.draw(domain, 3, np.arange(count)), params, SETTING)
     worlds = jax.tree.map(jnp.asarray, part.worlds)
-    return part.stage, worlds, Loop(SETTING.physics, SETTING.rules, registry.law_of(params))
+    return part.stage, worlds, ControlLoop(SETTING.physics, SETTING.rules, registry.law_of(params))
 
 
 def advanced(stage, worlds, trials, loop, steps):
@@ -265,7 +265,7 @@ def test_only_the_fused_engine_calls_compiled_functions(engine):
     domain = replace(DOMAINS["wide"], objects=("random_box",))
     setting = Setting(engine)
     part = drawn_worlds(domain, draws.draw(domain, 3, np.arange(2)), params, setting)
-    loop = Loop(setting.physics, setting.rules, registry.law_of(params))
+    loop = ControlLoop(setting.physics, setting.rules, registry.law_of(params))
     worlds = jax.tree.map(jnp.asarray, part.worlds)
     run = jax.make_jaxpr(lambda w, t: trial.advance((part.stage,), (w,), (t,), loop, 1))
     assert ("rps_native" in str(run(worlds, begun(worlds, loop)))) == (engine == "fused")

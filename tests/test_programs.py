@@ -65,7 +65,7 @@ def test_a_trial_that_is_followed_is_traced_once_for_all_processes(cache, monkey
     traced, record = [], trial.record
     monkeypatch.setattr(trial, "record", lambda *a, **k: traced.append(1) or record(*a, **k))
     setting = Setting("quasistatic", rules=Rules(horizon=0.2))
-    first, again = (pushes.follow([Case("box")], setting)[0] for _ in range(2))
+    first, again = (pushes.record_cases([Case("box")], setting)[0] for _ in range(2))
     assert len(traced) == 1
     assert jax.tree.structure(first.snapshots) == jax.tree.structure(again.snapshots)
     assert jax.tree.structure(first.outcome) == jax.tree.structure(again.outcome)

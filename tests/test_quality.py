@@ -55,7 +55,7 @@ def test_a_study_without_sense_is_refused():
         {"delta": 0.0},
     ):
         with pytest.raises(InputError):
-            Gradients(**bad).checked()
+            Gradients(**bad).validate()
 
 
 SMALL = Gradients(

@@ -483,7 +483,7 @@ def closed_loop():
         def run(params):
             pushed = worlds._replace(params=params)
             start = trial.start_all(pushed, jnp.ones(len(nudges), bool))
-            one = partial(trial.control_step, stage, pushed, loop=trial.Loop(preset()))
+            one = partial(trial.control_step, stage, pushed, loop=trial.ControlLoop(preset()))
             _, seen = jax.lax.scan(lambda trials, _: one(trials), start, length=150)
             distance = jnp.mean(seen.details.distance, axis=0)
             return jnp.sum(distance), distance

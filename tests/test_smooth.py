@@ -28,7 +28,7 @@ from rps_jax.robot.skin import NONE, CapacitiveSkin, IdealSkin, SmoothSkin
 from rps_jax.trials import host, pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Loop, Rules
+from rps_jax.trials.trial import ControlLoop, Rules
 from rps_jax.world.scene import FRICTION
 
 PAPER = RPSParams.paper()
@@ -566,8 +566,8 @@ def push(case: Case, law, horizon: float):
         seen.append(trials)
         return True
 
-    loop = Loop(setting.physics, setting.rules, law)
-    host.run(engines.get("mujoco"), models, worlds, loop, threads=1, report=report)
+    loop = ControlLoop(setting.physics, setting.rules, law)
+    host.run(engines.get("mujoco"), models, worlds, loop, threads=1, callback=report)
     return jax.tree.map(lambda x: np.asarray(x)[0], seen[-1])
 
 

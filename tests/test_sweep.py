@@ -41,7 +41,7 @@ from rps_jax.engines import device
 from rps_jax.errors import InputError
 from rps_jax.geometry import planar
 from rps_jax.record import files
-from rps_jax.runs import sweep
+from rps_jax.runs import execution, sweep
 from rps_jax.runs.plan import Shard, load_plan, open_run
 from rps_jax.runs.sweep import merge
 from rps_jax.trials import batch, trial
@@ -60,7 +60,7 @@ def outcomes(parts, setting=SHORT):
         for i, number in enumerate(numbers):
             found[int(number)] = row(ended, i)
 
-    job = Job(LAW, sum(p.numbers.size for p in parts), parts)
+    job = Job(LAW, sum(p.indices.size for p in parts), parts)
     batch.run([job], setting, slots=SLOTS, workers=1, collect=collect)
     return found
 
@@ -96,7 +96,7 @@ def test_late_poses_and_late_commands_are_late_by_as_much(error):
     part = drawn_worlds(late, draws.draw(late, 0, [0]), PAPER, SHORT)
     world = row(part.worlds, 0)
     now = jax.tree.map(jnp.asarray, trial.start(world))
-    decide = jax.jit(partial(trial.decide, loop=trial.Loop(SHORT.physics)))
+    decide = jax.jit(partial(trial.decide, loop=trial.ControlLoop(SHORT.physics)))
     told, done = [], []
     for step in range(8):
         now = now._replace(qpos=now.qpos.at[2].set(0.01 * step))  # turned by hand
@@ -256,7 +256,7 @@ def test_a_run_killed_six_times_ends_as_one_that_was_not(tmp_path, monkeypatch):
             process.join(dice.uniform(0.0, 0.5 if kill % 2 else 2.0))
             process.kill()
         process.join()
-        interrupted += 0 < done() < len(KILLED.parts)
+        interrupted += 0 < done() < len(KILLED.chunks)
     assert process.exitcode == 0
     assert interrupted > 1
     assert parts_of(folder) == parts_of(swept(tmp_path / "whole", KILLED))
@@ -269,11 +269,11 @@ def ends_in_one_sentence_and_is_continued(folder, whole, capsys, monkeypatch, *w
     assert all(word in error for word in words)
     monkeypatch.undo()
     kept = parts_of(folder)
-    assert 0 < len(kept) < len(PLAN.parts)
+    assert 0 < len(kept) < len(PLAN.chunks)
     assert kept.items() <= parts_of(whole).items()
     finished = []
-    swept(folder, report=lambda progress: finished.append(progress.finished))
-    assert finished[0] == sum(PLAN.parts[int(name[:7])].size for name in kept)
+    swept(folder, callback=lambda progress: finished.append(progress.finished))
+    assert finished[0] == sum(PLAN.chunks[int(name[:7])].size for name in kept)
     assert parts_of(folder) == parts_of(whole)
 
 
@@ -313,8 +313,8 @@ def test_a_corrupt_part_is_set_aside_and_done_again_alone(whole, tmp_path):
     content[len(content) // 2] ^= 1
     victim.write_bytes(content)
     finished = []
-    swept(folder, report=lambda progress: finished.append(progress.finished))
-    assert finished[0] == PLAN.trials - PLAN.parts[2].size
+    swept(folder, callback=lambda progress: finished.append(progress.finished))
+    assert finished[0] == PLAN.num_trials - PLAN.chunks[2].size
     assert {path: path.stat().st_mtime_ns for path in others} == others
     aside = victim.with_suffix(".npz.corrupt")
     assert aside.read_bytes() == bytes(content)
@@ -333,7 +333,7 @@ def test_a_part_of_an_older_version_is_named(whole, tmp_path):
         (older, "is a NetCDF file"),
     ):
         victim.unlink()
-        victim = sweep.store(folder, 0, content)
+        victim = execution.store_chunk(folder, 0, content)
         with pytest.raises(InputError, match=f"part 0 .* another version .it {lacks}"):
             merge([folder], out=folder)
 
@@ -345,7 +345,7 @@ def test_a_run_with_the_removed_column_overflows_is_read(whole, tmp_path):
         columns = files.decode_arrays(chunk.read_bytes())
         chunk.unlink()
         older = columns | {"overflows": np.zeros(columns["trial"].size, np.int32)}
-        sweep.store(folder, number, files.encode_arrays(**older))
+        execution.store_chunk(folder, number, files.encode_arrays(**older))
     xr.testing.assert_identical(merge([folder], out=folder), expected)
 
 

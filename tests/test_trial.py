@@ -18,7 +18,7 @@ from rps_jax.robot.skin import CapacitiveSkin
 from rps_jax.trials import batch, pushes, trial
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Loop, Rules, Shift
+from rps_jax.trials.trial import ControlLoop, Rules, Shift
 from rps_jax.world.physics import preset
 from rps_jax.world.scene import FRICTION
 
@@ -71,7 +71,7 @@ def test_a_gpu_that_seldom_asks_who_still_runs_finds_the_same(monkeypatch):
     def run(backend):
         monkeypatch.setattr(jax, "default_backend", lambda: backend)
         program = jax.jit(partial(advance.__wrapped__, steps=40))
-        loops = [Loop(setting.physics, Rules(horizon=t)) for t in (0.29, 300.0)]
+        loops = [ControlLoop(setting.physics, Rules(horizon=t)) for t in (0.29, 300.0)]
         return [program(stage, worlds, start, loop) for loop in loops]
 
     ended, running = seldom = run("gpu")
@@ -166,8 +166,8 @@ def advanced():
     stage, worlds = world_batch(SLOTS)
     broken = worlds._replace(qpos=worlds.qpos.at[1, 4].set(jnp.nan))
     live = jnp.ones(SLOTS, bool)
-    healthy = advance(stage, worlds, trial.start_all(worlds, live), Loop(preset()), 20)
-    mixed = advance(stage, broken, trial.start_all(broken, live), Loop(preset()), 20)
+    healthy = advance(stage, worlds, trial.start_all(worlds, live), ControlLoop(preset()), 20)
+    mixed = advance(stage, broken, trial.start_all(broken, live), ControlLoop(preset()), 20)
     return healthy, mixed
 
 
@@ -207,7 +207,7 @@ def test_the_way_of_the_base_is_its_speed_times_time(outcomes, advanced):
 def test_padding_never_moves_and_a_finished_batch_stops_at_once():
     stage, worlds = world_batch(SLOTS)
     trials = trial.start_all(worlds, jnp.zeros(SLOTS, bool))
-    after = advance(stage, worlds, trials, Loop(preset()), 20)
+    after = advance(stage, worlds, trials, ControlLoop(preset()), 20)
     np.testing.assert_array_equal(after.qpos, worlds.qpos)
     assert (np.asarray(after.steps) == 0).all()
 
@@ -222,7 +222,7 @@ def test_before_the_first_touch_the_base_creeps_and_nothing_counts_as_lost(advan
 @pytest.mark.parametrize("engine", ["fused", "mujoco"])
 def test_the_trace_of_a_trial_tells_the_same_story_as_its_outcome(engine):
     setting = replace(FUSED, engine=engine, rules=Rules(horizon=24.0))
-    (trace,) = pushes.follow([case(skin=CapacitiveSkin())], setting, interval=0.1)
+    (trace,) = pushes.record_cases([case(skin=CapacitiveSkin())], setting, interval=0.1)
     seen, outcome = trace.snapshots, trace.outcome
     assert outcome.success
     assert np.allclose(np.diff(seen.time), 0.1, atol=1e-4)

@@ -14,9 +14,9 @@ from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import BOUNDS, RPSParams
 from rps_jax.errors import InputError
 from rps_jax.runs import evaluate
-from rps_jax.runs.evaluate import Answer
+from rps_jax.runs.evaluate import CandidateScores
 from rps_jax.runs.question import Run
-from rps_jax.trials.progress import Timing, unheard
+from rps_jax.trials.progress import Timing, no_progress
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome, Rules
@@ -206,11 +206,11 @@ class TestEvolution:
 
     def test_bad_options_are_refused(self):
         with pytest.raises(InputError, match="choose from cma, lra_cma"):
-            TuneES("rps", algorithm="CMA_ES").checked()  # pyright: ignore[reportArgumentType]
+            TuneES("rps", algorithm="CMA_ES").validate()  # pyright: ignore[reportArgumentType]
         for bad in ({"population": 3}, {"spread": 0.0}, {"generations": 0}, {"prior": -1.0}):
             (name,) = bad
             with pytest.raises(InputError, match=name):
-                TuneES("rps", **bad).checked()
+                TuneES("rps", **bad).validate()
 
     def test_algorithms_of_several_parameters_are_refused_for_one(self):
         with pytest.raises(InputError, match="for one parameter"):
@@ -227,7 +227,7 @@ def pretend(asks, domains, setting, objective, **_):
     for ask in asks:
         value = (np.asarray(ask.params.L) - 0.4) ** 2 + (np.asarray(ask.params.K_h) - 0.6) ** 2
         scores = value[:, None] + 1e-3 * np.sin(ask.worlds + ask.seed)
-        answers.append(Answer(Outcome(scores < 0.05, *[scores] * 12), scores))
+        answers.append(CandidateScores(Outcome(scores < 0.05, *[scores] * 12), scores))
     return answers, Timing(0.0, 1.0, 1.0)
 
 
@@ -256,11 +256,11 @@ def pretended(monkeypatch):
     """How often worlds were asked for."""
     asked = []
 
-    def try_out(*args, **kwargs):
+    def score_candidates(*args, **kwargs):
         asked.append(args)
         return pretend(*args, **kwargs)
 
-    monkeypatch.setattr(evaluate, "try_out", try_out)
+    monkeypatch.setattr(evaluate, "score_candidates", score_candidates)
     return asked
 
 
@@ -349,7 +349,7 @@ class TestRuns:
 
     def test_the_report_of_a_descent_tells_its_times_and_parameters(self, pretended):
         asked = TuneGrad("rps", **SMALL, estimator="evolution", steps=2, starts=1, pairs=1)
-        (section,) = asked.report(asked(), Run(None, unheard))
+        (section,) = asked.report(asked(), Run(None, no_progress))
         assert "after" in section.text
         assert "gradients 0.0 s with their compilation" in section.text
         assert [name for name, *_ in section.table[1:]] == ["L", "K_h"]

@@ -92,7 +92,7 @@ def test_every_kind_of_law_is_shown_live(law, tmp_path, monkeypatch, registries)
     shutil.copy(Path(learned.__file__).parent / "learned_mlp.npz", tmp_path / "policy.npz")
     asked = viewer.Asked("cylinder", "S1", law, (0.6, 0.0))
     shown = viewer.View(law=law, setting=replace(SETTING, engine="quasistatic"))
-    shown.checked()
+    shown.validate()
     push = shown.push_of(asked)
     push.live.step(25)
     assert law in push.title

@@ -50,10 +50,10 @@ class Export(Question[Path]):
                 f"prefix = {self.prefix} is not allowed: it must be a name of C, as my_law."
             )
         _ = self.program
-        folder.ensure_writable(Path(self.out or self.place))
+        folder.ensure_writable(Path(self.out or self.default_folder))
 
     @contextlib.contextmanager
-    def opened(self) -> Iterator[None]:
+    def open_folder(self) -> Iterator[None]:
         yield None
 
     def texts(self) -> Mapping[str, str | bytes]:
@@ -61,7 +61,7 @@ class Export(Question[Path]):
         raise NotImplementedError
 
     def answer(self, run: Run) -> Path:
-        out, texts = Path(self.out or self.place), self.texts()
+        out, texts = Path(self.out or self.default_folder), self.texts()
         for name, text in texts.items():
             files.write_bytes(out / name, text if isinstance(text, bytes) else text.encode())
         return out / next(iter(texts))

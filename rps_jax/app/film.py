@@ -23,14 +23,14 @@ from rps_jax.control.base import Law
 from rps_jax.errors import InputError
 from rps_jax.record import files, folder
 from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan, scene_of, world_part
-from rps_jax.runs.push import another_engine, chosen
+from rps_jax.runs.plan import Plan, build_batch, scene_of
+from rps_jax.runs.push import another_engine, select_law
 from rps_jax.runs.question import Question, Run, call_of
 from rps_jax.studies.table import table_of
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.batch import Part, rows
+from rps_jax.trials.batch import WorldBatch, rows
 from rps_jax.trials.case import Case
-from rps_jax.trials.progress import Bar, Progress, Report
+from rps_jax.trials.progress import Bar, Progress, ProgressCallback
 from rps_jax.trials.setting import Setting
 from rps_jax.world import video
 from rps_jax.world.scene import Scene
@@ -74,7 +74,7 @@ class Film(Question[Path]):
     """The MP4 to write; by default RUN/film.mp4."""
 
     @property
-    def place(self) -> Path:
+    def default_folder(self) -> Path:
         """The MP4."""
         return Path(self.run) / "film.mp4"
 
@@ -94,7 +94,7 @@ class Film(Question[Path]):
 
     def check(self) -> None:
         """Check the grid, the file, and what is filmed."""
-        out = Path(self.out or self.place)
+        out = Path(self.out or self.default_folder)
         if out.is_dir():
             raise InputError(f"out = {out} is a folder: name a file, as {out / 'film.mp4'}.")
         _ = self.shape
@@ -105,26 +105,26 @@ class Film(Question[Path]):
                 raise InputError(what.mend)
         self.takes()
 
-    def bar(self) -> Bar:
+    def progress_bar(self) -> Bar:
         """A bar over simulated time."""
-        return Bar(self.name, self._length(self.takes()[1]), "simulated", shown=self.shown)
+        return Bar(self.name, self._length(self.takes()[1]), "simulated", shown=self.shows_progress)
 
     def _length(self, setting: Setting) -> float:
         """Simulated time that is filmed, at most [s]."""
         return min(float(setting.rules.horizon), self.seconds or math.inf)
 
     @contextlib.contextmanager
-    def opened(self) -> Iterator[None]:
+    def open_folder(self) -> Iterator[None]:
         """No run folder."""
         yield None
 
     def answer(self, run: Run) -> Path:
         """Run the trials again and film them."""
         takes, setting = self.takes()
-        seconds, out = self._length(setting), Path(self.out or self.place)
+        seconds, out = self._length(setting), Path(self.out or self.default_folder)
         speed = self.speed or float(max(1, math.ceil(seconds / _LENGTH)))
         of_takes = [list(map(Tile, take.scenes, take.part.worlds.p_world_target)) for take in takes]
-        frames = _frames(takes, setting, speed, seconds, run.report)
+        frames = _frames(takes, setting, speed, seconds, run.callback)
         size = _tile_size(self.shape)
         grid = {"shape": self.shape, "size": size, "fps": _FPS, "camera": self.camera}
         try:
@@ -137,7 +137,7 @@ class Film(Question[Path]):
         """The trials to film, at most as many as the grid has places, and what they share."""
         run, shape = Path(self.run), self.shape
         if not self._of_table:
-            plan, law = chosen(run, 0, self.law)
+            plan, law = select_law(run, 0, self.law)
             if self.laws:
                 rows_of(plan, self.laws, shape)
             which = worlds_of(plan, self.worlds) if self.worlds else self.which
@@ -163,7 +163,7 @@ class Take(NamedTuple):
     """Trials of one kind, of those that are filmed."""
 
     places: Sequence[int]  # in the grid, counted row by row
-    part: Part
+    part: WorldBatch
     law: Law
     scenes: Sequence[Scene]
     labels: Sequence[str]
@@ -183,7 +183,7 @@ def shape_of(grid: str) -> tuple[int, int]:
 def of_cases(cases: Sequence[Case], setting: Setting) -> list[Take]:
     """The takes of cases of one kind, labelled by their targets."""
     stage, worlds = pushes.build(cases, setting)
-    part = Part(np.arange(len(cases)), worlds, stage)
+    part = WorldBatch(np.arange(len(cases)), worlds, stage)
     one = pushes.scene_of(cases[0], setting.physics)
     labels = [f"({x:g}, {y:g}) m" for x, y in (case.target for case in cases)]
     law = registry.law_of(cases[0].params)
@@ -226,7 +226,7 @@ def of_sweep(
             columns = np.flatnonzero(of_object == one)
             worlds = index[columns].tolist()
             places = (row * shape[1] + columns).tolist()
-            part = world_part(plan, list(plan.laws).index(law), index[columns])
+            part = build_batch(plan, list(plan.laws).index(law), index[columns])
             scenes = [scene_of(plan, i) for i in worlds]
             labels = [f"{said}world {i}" for i in worlds]
             takes.append(Take(places, part, registry.law_of(plan.laws[law]), scenes, labels))
@@ -263,7 +263,7 @@ def _frames(
     setting: Setting,
     speed: float,
     seconds: float,
-    report: Report,
+    callback: ProgressCallback,
 ) -> Iterator[list[Shot]]:
     """What all tiles show in each frame."""
     period = setting.physics.control_period
@@ -276,7 +276,7 @@ def _frames(
         ended, of_takes = zip(*map(next, running), strict=True)
         shots = _placed(of_takes, takes)
         yield shots
-        report(Progress(0, count * every * period))
+        callback(Progress(0, count * every * period))
         if all(ended):
             break
     for _ in range(round(_HELD * _FPS)):

@@ -69,21 +69,21 @@ class Shadow(Question[xr.Dataset]):
             {"law": registry.resolve_law(self.law)[0]},
         )
 
-    def report(self, found: Any, run: Run) -> Sequence[Section]:
+    def report(self, results: Any, run: Run) -> Sequence[Section]:
         """How far the law is from what was commanded."""
         rows = [["", "root mean square", "greatest", "at time [s]"]]
         for name, unit in _UNITS.items():
-            apart = np.abs(found[name].sel(source="law") - found[name].sel(source="commanded"))
-            worst, when = float(apart.max()), float(found.time[int(np.argmax(apart.values))])
+            apart = np.abs(results[name].sel(source="law") - results[name].sel(source="commanded"))
+            worst, when = float(apart.max()), float(results.time[int(np.argmax(apart.values))])
             mean = f"{float(np.sqrt(np.mean(apart**2))):.2g}"
             rows.append([f"{name} [{unit}]", mean, f"{worst:.2g}", f"{when:.2f}"])
-        start, end = float(found.time[0]), float(found.time[-1])
+        start, end = float(results.time[0]), float(results.time[-1])
         text = (
-            f"{found.sizes['time']} commands in {end - start:.1f} s. The table has differences "
-            f"between what {found.attrs['law']} would have commanded and what was commanded, at "
+            f"{results.sizes['time']} commands in {end - start:.1f} s. The table has differences "
+            f"between what {results.attrs['law']} would have commanded and what was commanded, at "
             "the same observations."
         )
-        picture = Picture("shadow", lambda: figure(found))
+        picture = Picture("shadow", lambda: figure(results))
         return [Section("Beside what was commanded", text, rows, picture)]
 
 

@@ -28,9 +28,9 @@ from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
 from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan, scene_of, title_of, world_part
+from rps_jax.runs.plan import Plan, build_batch, scene_of, world_title
 from rps_jax.runs.push import Push as PushQuestion
-from rps_jax.runs.push import another_engine, chosen, sensed
+from rps_jax.runs.push import another_engine, case_options, select_law
 from rps_jax.runs.question import call_of
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case, label_of
@@ -90,7 +90,7 @@ class View(PushQuestion):
     def case(self) -> Case:
         """The options' push."""
         own = {one.name: getattr(self, one.name) for one in dataclasses.fields(Case)}
-        own |= sensed(self, self.setting)
+        own |= case_options(self, self.setting)
         own["law"] = self._own
         return Case(**own)
 
@@ -107,7 +107,9 @@ class View(PushQuestion):
 
     def _chosen(self) -> tuple[Plan, str]:
         """The plan and the law of a run that is shown."""
-        return chosen(Path(str(self.run)), self.world, None if self.law is None else str(self.law))
+        return select_law(
+            Path(str(self.run)), self.world, None if self.law is None else str(self.law)
+        )
 
     def in_shell(self) -> None:
         """Serve the page until it is ended."""
@@ -152,9 +154,9 @@ class Asked(NamedTuple):
 
 def _in_world(plan: Plan, law: str, index: int) -> Push:
     """A world of a sweep."""
-    part = world_part(plan, list(plan.laws).index(law), [index])
+    part = build_batch(plan, list(plan.laws).index(law), [index])
     live = Live(part, registry.law_of(plan.laws[law]), plan.setting)
-    title = title_of(plan, index).replace("$\\mu$", "friction")
+    title = world_title(plan, index).replace("$\\mu$", "friction")
     return Push(live, scene_of(plan, index), f"{title}, {law}")
 
 

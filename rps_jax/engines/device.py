@@ -129,7 +129,7 @@ def suits_processors(question: Any) -> bool:
     setting = getattr(question, "setting", None)
     if setting is None or jax.config.jax_platforms:
         return False
-    return engines.get(setting.engine).suits_processors(question.trials())
+    return engines.get(setting.engine).suits_processors(question.num_trials())
 
 
 def kept(path: Path, done: str, read: Callable[[bytes], Any]) -> Any:

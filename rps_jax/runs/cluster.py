@@ -29,9 +29,9 @@ from rps_jax.engines.device import Device
 from rps_jax.errors import InputError
 from rps_jax.record import folder as run_folder
 from rps_jax.record import provenance
-from rps_jax.runs import results, sweep
-from rps_jax.runs.sweep import Plan, Shard
-from rps_jax.trials.progress import Progress, Report, unheard
+from rps_jax.runs import execution, results
+from rps_jax.runs.plan import Plan, Shard
+from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
 
 PATIENCE = 10.0  # [s] to reach a cluster
 RETRIES = 16  # how often a task is begun again
@@ -62,11 +62,11 @@ def _work(
             "all hosts."
         )
     found, heard = dict[int, bytes](), [Progress(0, 0.0)]
-    sweep.work(
+    execution.run_chunks(
         plan,
-        {plan.kind(numbers[0]): numbers},
+        {plan.program_key(numbers[0]): numbers},
         lambda number, part: found.update({number: results.encoded(part)}),
-        report=heard.append,
+        callback=heard.append,
         slots=slots,
         workers=threads,
     )
@@ -129,11 +129,11 @@ def run_on_cluster(
     prepare: Callable[[], Any],
     gpus: bool = True,
     shard: Shard = Shard(),
-    report: Report = unheard,
+    callback: ProgressCallback = no_progress,
     slots: int | None = None,
     workers: int | None = None,
 ) -> None:
-    """Run what is missing of a plan, as `sweep.run_missing` does, on the workers of a cluster.
+    """Run what is missing of a plan, as `execution.run_missing` does, on the workers of a cluster.
 
     What came back is kept whatever error ends the run, and `environment.json` names the workers.
     Each task calls `prepare` first, to choose its device and its cache of programs. It has as many
@@ -141,11 +141,11 @@ def run_on_cluster(
     if the cluster has any and the engine can use one.
     """
     own, known = provenance.collect_environment(), dict[tuple[str, int], dict[str, Any]]()
-    missing, before = sweep.remaining(folder, plan, shard)
+    missing, before = execution.missing_chunks(folder, plan, shard)
     if missing:
         provenance.write_environment(folder, own)
     done = Progress(before, 0.0)
-    report(done)
+    callback(done)
     if not missing:
         return
     threads = workers or 1
@@ -164,12 +164,12 @@ def run_on_cluster(
                 (ended,), waiting[:] = ray.wait(waiting)
                 contents, progress, environment = ray.get(ended)
                 for number, content in contents.items():
-                    sweep.store(folder, number, content)
+                    execution.store_chunk(folder, number, content)
                 known[environment["host"], environment["pid"]] = environment
                 provenance.write_environment(folder, own | _environment(list(known.values())))
                 simulated = done.simulated + progress.simulated
                 done = Progress(done.finished + progress.finished, simulated)
-                report(done)
+                callback(done)
 
 
 def _divided(kinds: Iterable[Sequence[int]], workers: int) -> Iterator[Sequence[int]]:

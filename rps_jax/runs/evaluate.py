@@ -22,8 +22,8 @@ from rps_jax.errors import InputError
 from rps_jax.robot.robot import RobotLike
 from rps_jax.runs.question import Split, seed_of
 from rps_jax.trials import batch
-from rps_jax.trials.batch import Job, Part
-from rps_jax.trials.progress import Bar, Report, Timing, unheard, watched
+from rps_jax.trials.batch import Job, WorldBatch
+from rps_jax.trials.progress import Bar, ProgressCallback, Timing, is_interactive, no_progress
 from rps_jax.trials.results import variable
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
@@ -48,7 +48,7 @@ def evaluate(
     slots: int | None = None,
     workers: int | None = None,
     progress: bool | None = None,
-    report_to: Report | None = None,
+    report_to: ProgressCallback | None = None,
 ) -> xr.Dataset:
     """Score candidates, parameters of one law, in random worlds, all of them in the same ones.
 
@@ -94,12 +94,12 @@ def evaluate(
     errors.check_count("worlds", count, at_most=10_000_000)
     errors.check_count("seed", setting.seed, at_least=0, at_most=2**30)
     setting.check_here(ranges.weakest, [params])
-    ask = Ask(_checked(params), seed_of(setting.seed, split), np.arange(count), at)
+    ask = Candidates(_checked(params), seed_of(setting.seed, split), np.arange(count), at)
     device.use_cache_if_asked()
-    shown = watched() if progress is None else progress
+    shown = is_interactive() if progress is None else progress
     with Bar("evaluate", ask.candidates * count, shown=shown and report_to is None) as bar:
         shape = {"report": report_to or bar, "slots": slots, "workers": workers}
-        (answer,), _ = try_out([ask], [ranges], setting, objective, **shape)
+        (answer,), _ = score_candidates([ask], [ranges], setting, objective, **shape)
     variables: dict[str, Any] = {
         "score": (("candidate", "world"), answer.score, {"units": "1", "long_name": "objective"})
     }
@@ -183,7 +183,7 @@ def _checked(params: LawParams) -> LawParams:
 # --- several asks at once ------------------------------------------------------------------
 
 
-class Ask(NamedTuple):
+class Candidates(NamedTuple):
     """Candidates and the worlds that each of them meets."""
 
     params: LawParams  # leaves (P, ...)
@@ -205,22 +205,22 @@ class Ask(NamedTuple):
         return points_.draw(domain, self.seed, self.points, self.worlds[rows])
 
 
-class Answer(NamedTuple):
+class CandidateScores(NamedTuple):
     """How an `Ask` went."""
 
     outcome: Outcome  # leaves (P, D * W, ...), on the host
     score: np.ndarray  # (P, D * W) [1]
 
 
-def try_out(
-    asks: Sequence[Ask],
+def score_candidates(
+    asks: Sequence[Candidates],
     domains: Sequence[Domain],
     setting: Setting,
     objective: Objective,
     *,
-    report: Report = unheard,
+    callback: ProgressCallback = no_progress,
     **shape: Any,
-) -> tuple[list[Answer], Timing]:
+) -> tuple[list[CandidateScores], Timing]:
     """Every candidate in every world of its ask, all asks in one batch for each shape family."""
     widths = [len(domains) * ask.worlds.size for ask in asks]
     counts = [ask.candidates for ask in asks]
@@ -228,34 +228,34 @@ def try_out(
     narrow = partial(np.asarray, dtype=jnp.result_type(float))
     longest = max(remembered_steps(one, setting.physics.control_period) for one in domains)
     away = np.empty(ends[-1])  # [m] of the target from the start
-    jobs: dict[Any, list[Part]] = {}
+    jobs: dict[Any, list[WorldBatch]] = {}
     for ask, width, count, end in zip(asks, widths, counts, ends, strict=True):
         first = int(end) - count * width
         ask = ask._replace(params=jax.tree.map(narrow, jax.device_get(ask.params)))
-        for part, column, distance in parts(ask, domains, setting):
+        for part, column, distance in world_batches(ask, domains, setting):
             away[first:end].reshape(count, width)[:, column] = distance
             # As many steps of odometry in all domains let their worlds share a batch.
-            past = np.zeros((part.numbers.size, longest), part.worlds.odometry.past.dtype)
+            past = np.zeros((part.indices.size, longest), part.worlds.odometry.past.dtype)
             odometry = part.worlds.odometry._replace(past=past)
             worlds = part.worlds._replace(odometry=odometry, params=ask.params)
             leaves, tree = jax.tree.flatten(worlds)
             kind = (tree, *(leaf.shape[1:] for leaf in leaves))
             numbers = first + width * np.arange(count)[:, None] + column
-            jobs.setdefault(kind, []).append(Part(numbers, worlds, part.stage))
-    every, timing = batch.gathered(
-        list(map(_job, jobs.values())), setting, away.size, report=report, **shape
+            jobs.setdefault(kind, []).append(WorldBatch(numbers, worlds, part.stage))
+    every, timing = batch.run_all(
+        list(map(_job, jobs.values())), setting, away.size, callback=callback, **shape
     )
     score = objective.scores(every, away, setting.rules)
     answers = []
     for width, count, end in zip(widths, counts, ends, strict=True):
         own = np.arange(end - count * width, end).reshape(count, width)
-        answers.append(Answer(batch.rows(every, own), score[own]))
+        answers.append(CandidateScores(batch.rows(every, own), score[own]))
     return answers, timing
 
 
-def parts(
-    ask: Ask, domains: Sequence[Domain], setting: Setting
-) -> Iterator[tuple[Part, np.ndarray, np.ndarray]]:
+def world_batches(
+    ask: Candidates, domains: Sequence[Domain], setting: Setting
+) -> Iterator[tuple[WorldBatch, np.ndarray, np.ndarray]]:
     """Worlds of an ask by domain and object, their columns, and the targets' distances [m]."""
     for d, one in enumerate(domains):
         which = ask.object_of(one)
@@ -266,17 +266,17 @@ def parts(
             yield part, d * ask.worlds.size + rows, np.linalg.norm(drawn.p_world_target, axis=1)
 
 
-def _job(every: Sequence[Part]) -> Job:
+def _job(every: Sequence[WorldBatch]) -> Job:
     """The job of worlds (n, ...) of one shape family, candidate after candidate.
 
     A part has the numbers (P, n) of the trials of all candidates, and their parameters (P, ...).
     """
 
-    def filled() -> Iterator[Part]:
+    def filled() -> Iterator[WorldBatch]:
         for numbers, worlds, stage in every:
             for p, own in enumerate(numbers):
                 params = batch.rows(worlds.params, np.full(own.size, p))
-                yield Part(own, worlds._replace(params=params), stage)
+                yield WorldBatch(own, worlds._replace(params=params), stage)
 
-    trials = sum(part.numbers.size for part in every)
+    trials = sum(part.indices.size for part in every)
     return Job(registry.law_of(every[0].worlds.params), trials, filled())

@@ -26,7 +26,7 @@ from rps_jax.control.base import LawParams
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
-from rps_jax.trials.batch import Part
+from rps_jax.trials.batch import WorldBatch
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.trials.worlds import drawn_scene, drawn_worlds
@@ -37,7 +37,7 @@ from rps_jax.world.physics import Physics
 from rps_jax.world.points import Points
 from rps_jax.world.scene import Scene
 
-Kind = tuple[Any, ...]  # of a part: the object's number, and the form of the law's parameters
+ProgramKey = tuple[Any, ...]  # of a part: the object's number, and the form of the law's parameters
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Plan:
         self.setting.check_here(self.domain.weakest, self.laws.values())
 
     @property
-    def trials(self) -> int:
+    def num_trials(self) -> int:
         """How many: trial a * worlds + i is of law a in world i."""
         return len(self.laws) * self.worlds
 
@@ -81,7 +81,7 @@ class Plan:
         return math.ceil(of_objects.max() / self.part)
 
     @functools.cached_property
-    def parts(self) -> dict[int, np.ndarray]:
+    def chunks(self) -> dict[int, np.ndarray]:
         """Numbers of the trials of every part, by the part's number."""
         found, objects = {}, self.object_of(np.arange(self.worlds))
         for which in range(len(self.domain.objects)):
@@ -97,18 +97,18 @@ class Plan:
         """Which law a part is of, and which object."""
         return divmod(part // self.blocks, len(self.domain.objects))
 
-    def kind(self, part: int) -> Kind:
+    def program_key(self, part: int) -> ProgramKey:
         """Parts of a kind are run by one compiled program."""
         law, which = self.law_and_object(part)
         params = list(self.laws.values())[law]
         return which, type(params), *map(np.shape, jax.tree.leaves(params))
 
     @functools.cached_property
-    def sizes(self) -> Counter[Kind]:
+    def trials_by_key(self) -> Counter[ProgramKey]:
         """How many trials of each kind there are."""
-        counts: Counter[Kind] = Counter()
-        for number, trials in self.parts.items():
-            counts[self.kind(number)] += trials.size
+        counts: Counter[ProgramKey] = Counter()
+        for number, trials in self.chunks.items():
+            counts[self.program_key(number)] += trials.size
         return counts
 
     def configuration(self) -> dict[str, Any]:
@@ -196,9 +196,9 @@ def setting_of(found: Mapping[str, Any]) -> Setting:
     return Setting(found["engine"], Physics(**physics), rules=rules, seed=found["seed"])
 
 
-def share(plan: Plan, shard: Shard) -> dict[int, np.ndarray]:
+def shard_chunks(plan: Plan, shard: Shard) -> dict[int, np.ndarray]:
     """The parts of one shard: numbers of their trials, by the part's number."""
-    every = plan.parts.items()
+    every = plan.chunks.items()
     return {n: trials for i, (n, trials) in enumerate(every) if i % shard.of == shard.number - 1}
 
 
@@ -212,7 +212,7 @@ def scene_of(plan: Plan, index: int) -> Scene:
     return drawn_scene(plan.domain, draw(plan, [index]), plan.setting.physics, 0)
 
 
-def title_of(plan: Plan, index: int) -> str:
+def world_title(plan: Plan, index: int) -> str:
     """What one world is, in words."""
     drawn = draws.table(draw(plan, [index]))
     name = plan.domain.objects[int(plan.object_of(np.asarray(index)))].replace("_", " ")
@@ -223,11 +223,11 @@ def title_of(plan: Plan, index: int) -> str:
     )
 
 
-def world_part(plan: Plan, law: int, index: Any) -> Part:
+def build_batch(plan: Plan, law: int, index: Any) -> WorldBatch:
     """Worlds of one object, by their indices, with the parameters of a law."""
     return made(plan, law, draw(plan, index))
 
 
-def made(plan: Plan, law: int, drawn: Draw) -> Part:
+def made(plan: Plan, law: int, drawn: Draw) -> WorldBatch:
     """The worlds of a draw, with the parameters of a law."""
     return drawn_worlds(plan.domain, drawn, list(plan.laws.values())[law], plan.setting)

@@ -25,13 +25,13 @@ from rps_jax.record import bag as bags
 from rps_jax.record import folder
 from rps_jax.record.bag import Step
 from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan, load_plan, scene_of, title_of, world_part
-from rps_jax.runs.question import Pushes, Question, Run, call_of
+from rps_jax.runs.plan import Plan, build_batch, load_plan, scene_of, world_title
+from rps_jax.runs.question import Question, Run, SimulationQuestion, call_of
 from rps_jax.trials import pushes, results
-from rps_jax.trials.batch import Part
-from rps_jax.trials.case import Case, Given
+from rps_jax.trials.batch import WorldBatch
+from rps_jax.trials.case import Case, TrialOptions
 from rps_jax.trials.progress import Bar
-from rps_jax.trials.pushes import Followed
+from rps_jax.trials.pushes import Trajectory
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome, object_pose, p_world_contact
 from rps_jax.world import paper
@@ -49,17 +49,17 @@ FILM_LENGTH = 10.0  # [s] by default, whatever the trial's
 class Trace:
     """One trial that was followed."""
 
-    followed: Followed  # arrays over time, (T, ...)
+    followed: Trajectory  # arrays over time, (T, ...)
     scene: Scene
     title: str
     engine: str
 
     def __repr__(self) -> str:
         title = self.title.replace("$\\mu$", "friction")
-        return f"<Trace of {title}: {self.told}>"
+        return f"<Trace of {title}: {self.summary}>"
 
     @property
-    def told(self) -> str:
+    def summary(self) -> str:
         """How it ended, in words."""
         ended, (x, y) = self.outcome, self.followed.p_world_target
         return (
@@ -150,7 +150,7 @@ def check_length(seconds: float) -> None:
 
 
 @dataclass(frozen=True)
-class FollowsOne(Question[Trace]):
+class TraceQuestion(Question[Trace]):
     """A question whose answer is one trial, followed over time."""
 
     bag: str | Path | None = option(None, kw_only=True)
@@ -161,13 +161,13 @@ class FollowsOne(Question[Trace]):
             bags.check()
             folder.ensure_writable(Path(self.bag).parent)
 
-    def followed(self, part: Part, law: Law, setting: Setting, run: Run) -> Followed:
+    def followed(self, part: WorldBatch, law: Law, setting: Setting, run: Run) -> Trajectory:
         """Follow a world, and write its bag."""
         if self.bag is None:
-            return pushes.follow_part(part, law, setting, report=run.report)[0]
+            return pushes.record_batch(part, law, setting, callback=run.callback)[0]
         period = setting.physics.control_period
-        (whole,) = pushes.follow_part(
-            part, recorded_law(law), setting, interval=period, report=run.report
+        (whole,) = pushes.record_batch(
+            part, recorded_law(law), setting, interval=period, callback=run.callback
         )
         details, seen = tuple(whole.snapshots.details)  # of `recorded_law`
         whole = dataclasses.replace(whole, snapshots=whole.snapshots._replace(details=details))
@@ -182,15 +182,15 @@ class FollowsOne(Question[Trace]):
         """Time [s] after which the trial ends."""
         raise NotImplementedError
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         return 1
 
-    def bar(self) -> Bar:
-        return Bar(self.name, self.horizon, "simulated", shown=self.shown)
+    def progress_bar(self) -> Bar:
+        return Bar(self.name, self.horizon, "simulated", shown=self.shows_progress)
 
-    def report(self, found: Trace, run: Run) -> Sequence[Section]:
-        text = f"{found.told}. Stepped by the engine {found.engine}."
-        return [Section("The push", text, (), Picture("trial", found.plot))]
+    def report(self, results: Trace, run: Run) -> Sequence[Section]:
+        text = f"{results.summary}. Stepped by the engine {results.engine}."
+        return [Section("The push", text, (), Picture("trial", results.plot))]
 
 
 def recorded_law(law: Law) -> Law:
@@ -207,7 +207,7 @@ def recorded_law(law: Law) -> Law:
     return law._replace(step=step, senses="taxels" if touch else law.senses)
 
 
-def steps_of(followed: Followed, seen: Any, period: float) -> Iterator[Step]:
+def steps_of(followed: Trajectory, seen: Any, period: float) -> Iterator[Step]:
     """Steps of a bag of a trial that was followed, with its observations (T, ...) at each."""
     snapshots, touch = followed.snapshots, seen.touch
     beside = {"signal", "f_robot", "p_world_object", "r_object"} & set(seen._fields)
@@ -225,15 +225,15 @@ def steps_of(followed: Followed, seen: Any, period: float) -> Iterator[Step]:
         )
 
 
-def sensed(given: Given, setting: Setting) -> dict[str, Any]:
+def case_options(given: TrialOptions, setting: Setting) -> dict[str, Any]:
     """What is given beside object, friction, target and law, as fields of `Case`."""
-    named = {one.name: getattr(given, one.name) for one in dataclasses.fields(Given)}
+    named = {one.name: getattr(given, one.name) for one in dataclasses.fields(TrialOptions)}
     usual = paper.SKIN.get(setting.physics_name, "ideal")
     return named | {"skin": given.skin or usual}
 
 
 @dataclass(frozen=True)
-class Push(Case, FollowsOne, Pushes[Trace]):
+class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
     """Run one trial; draw the paper's Fig. 6 and film it.
 
     Example:
@@ -259,7 +259,7 @@ class Push(Case, FollowsOne, Pushes[Trace]):
     def case(self) -> Case:
         """The trial."""
         own = {one.name: getattr(self, one.name) for one in dataclasses.fields(Case)}
-        return Case(**own | sensed(self, self.setting))
+        return Case(**own | case_options(self, self.setting))
 
     def check(self) -> None:
         super().check()
@@ -268,7 +268,7 @@ class Push(Case, FollowsOne, Pushes[Trace]):
     def answer(self, run: Run) -> Trace:
         case, setting = self.case, self.setting
         stage, worlds = pushes.build([case], setting)
-        part = Part(np.arange(1), worlds, stage)
+        part = WorldBatch(np.arange(1), worlds, stage)
         followed = self.followed(part, registry.law_of(case.params), setting, run)
         scene = pushes.scene_of(case, setting.physics)
         return Trace(followed, scene, case.title, setting.engine)
@@ -278,7 +278,7 @@ push = call_of(Push)
 
 
 @dataclass(frozen=True)
-class Replay(FollowsOne):
+class Replay(TraceQuestion):
     """Run one world of a sweep again; draw it as in the paper's Fig. 6 and film it.
 
     Example:
@@ -301,7 +301,7 @@ class Replay(FollowsOne):
     """Which of the sweep's laws; by default the first."""
 
     @property
-    def place(self) -> Path:
+    def default_folder(self) -> Path:
         return Path(self.run) / f"replay-{self.world}"
 
     @property
@@ -310,7 +310,7 @@ class Replay(FollowsOne):
 
     @functools.cached_property
     def _chosen(self) -> tuple[Plan, str]:
-        return chosen(Path(self.run), self.world, self.law)
+        return select_law(Path(self.run), self.world, self.law)
 
     @property
     def title(self) -> str:
@@ -325,10 +325,10 @@ class Replay(FollowsOne):
 
     def answer(self, run: Run) -> Trace:
         plan, name = self._chosen
-        part = world_part(plan, list(plan.laws).index(name), [self.world])
+        part = build_batch(plan, list(plan.laws).index(name), [self.world])
         law = registry.law_of(plan.laws[name])
         followed = self.followed(part, law, plan.setting, run)
-        title = f"{title_of(plan, self.world)}, {name}"
+        title = f"{world_title(plan, self.world)}, {name}"
         return Trace(followed, scene_of(plan, self.world), title, plan.setting.engine)
 
 
@@ -341,7 +341,7 @@ def _evenly(length: int, count: int) -> list[int]:
     return [round(i * (length - 1) / (count - 1)) for i in range(count)]
 
 
-def chosen(run: Path, world: int, law: str | None = None) -> tuple[Plan, str]:
+def select_law(run: Path, world: int, law: str | None = None) -> tuple[Plan, str]:
     """The plan of a sweep, one of whose worlds can be followed, and the law that is meant.
 
     An engine whose trials cannot be followed is replaced by the fused one.
@@ -359,7 +359,7 @@ def chosen(run: Path, world: int, law: str | None = None) -> tuple[Plan, str]:
 
 def another_engine(run: Path) -> str:
     """Tell that worlds of a sweep are followed in another engine than the sweep's, if so."""
-    theirs, ours = load_plan(run).setting.engine, chosen(run, 0)[0].setting.engine
+    theirs, ours = load_plan(run).setting.engine, select_law(run, 0)[0].setting.engine
     if theirs == ours:
         return ""
     return f"Trials of the engine {theirs} cannot be followed: this is the engine {ours}."

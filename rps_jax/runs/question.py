@@ -4,7 +4,7 @@ A question is a frozen dataclass. Its fields are the options: their annotations 
 strings below them the help, and `option` holds their bounds. It has
 
     answer(run)           the run, part by part, so that it resumes; returns labelled data
-    report(found, run)    the prose, tables and figures about them
+    report(results, run)   the prose, tables and figures about them
     check()               what the fields' types and bounds do not say
 
     found = rps_jax.Rare("rps_tuned", "wide")()     # or rps_jax.rare("rps_tuned", "wide")
@@ -36,7 +36,7 @@ from rps_jax.record import files, folder, options, provenance
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
-from rps_jax.trials.progress import Bar, Report, Timing, watched
+from rps_jax.trials.progress import Bar, ProgressCallback, Timing, is_interactive
 from rps_jax.trials.setting import Setting
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import Domain, DomainLike
@@ -59,23 +59,24 @@ class Run(NamedTuple):
     """Where and how an answer is made."""
 
     folder: Path | None  # of the run; None keeps all in memory
-    report: Report  # hears how far the run is
+    callback: ProgressCallback  # called with the progress of the run
     slots: int | None = None  # worlds stepped at once by a worker
     workers: int | None = None  # host threads
 
     @property
-    def parts(self) -> Checkpoints | None:
-        """Finished parts of the run, if it has a folder."""
+    def checkpoints(self) -> Checkpoints | None:
+        """Finished steps of the run, if it has a folder."""
         return None if self.folder is None else Checkpoints(self.folder)
 
-    def part(self, name: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
-        """Labelled results of a part: those that are kept, or else made and kept."""
-        return make() if self.parts is None else self.parts.load_or_compute(name, make)
+    def checkpoint(self, name: str, compute: Callable[[], xr.Dataset]) -> xr.Dataset:
+        """Return the dataset that is stored under a name; compute and store it if there is none."""
+        stored = self.checkpoints
+        return compute() if stored is None else stored.load_or_compute(name, compute)
 
     @property
-    def shape(self) -> dict[str, Any]:
-        """Slots, workers and report, as what runs trials takes them."""
-        return {"slots": self.slots, "workers": self.workers, "report": self.report}
+    def batch_options(self) -> dict[str, Any]:
+        """Slots, workers and callback, as keyword arguments of functions that run trials."""
+        return {"slots": self.slots, "workers": self.workers, "callback": self.callback}
 
 
 def call_of(question: Callable[P, Question[T]]) -> Callable[P, T]:
@@ -85,13 +86,13 @@ def call_of(question: Callable[P, Question[T]]) -> Callable[P, T]:
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         return question(*args, **kwargs)()
 
-    name = snake(question.__name__)
+    name = snake_case(question.__name__)
     call.__name__ = call.__qualname__ = name
     call.__doc__ = f"{question.__doc__}\n\nFields of `{question.__name__}` are its arguments.\n"
     return call
 
 
-def snake(name: str) -> str:
+def snake_case(name: str) -> str:
     """`TuneGradients` as `tune_gradients`."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()
 
@@ -104,19 +105,19 @@ class Question(Generic[T]):
     """Run folder, in the shell by default runs/NAME; a run that was killed is continued there."""
     progress: bool | None = option(None, kw_only=True, hidden=True)
     """Whether a bar shows the progress; by default in a terminal and in a notebook."""
-    report_to: Report | None = option(None, kw_only=True, hidden=True)
+    report_to: ProgressCallback | None = option(None, kw_only=True, hidden=True)
     """What hears of the progress instead of a bar."""
-    said: tuple[str, ...] = option((), kw_only=True, hidden=True)
-    """Options that were asked for by name, which `quick` leaves alone even at their defaults."""
+    explicit_options: tuple[str, ...] = option((), kw_only=True, hidden=True)
+    """Options that the user gave, which `quick` leaves alone even at their defaults."""
 
-    SMALL: ClassVar[Mapping[str, Any]] = {}  # values of `quick`, by the field's name
+    QUICK: ClassVar[Mapping[str, Any]] = {}  # values of `quick`, by the field's name
     TITLE: ClassVar[str] = ""  # of the report
-    LEFT_OUT: ClassVar[tuple[str, ...]] = ()  # fields on which the answer does not depend
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ()  # fields on which the answer does not depend
 
     @property
     def name(self) -> str:
         """What it is called in the shell."""
-        return snake(type(self).__name__)
+        return snake_case(type(self).__name__)
 
     @property
     def title(self) -> str:
@@ -124,7 +125,7 @@ class Question(Generic[T]):
         return self.TITLE or self.name.replace("_", " ").capitalize()
 
     @property
-    def place(self) -> Path:
+    def default_folder(self) -> Path:
         """Run folder of the shell, if no other is named."""
         return Path("runs") / self.name
 
@@ -137,85 +138,85 @@ class Question(Generic[T]):
         """Run what is missing, and return labelled data."""
         raise NotImplementedError
 
-    def report(self, found: Any, run: Run) -> Sequence[Section]:
+    def report(self, results: Any, run: Run) -> Sequence[Section]:
         """Prose, tables and figures about the answer."""
         return ()
 
-    def intro(self, found: Any) -> str:
+    def intro(self, results: Any) -> str:
         """First paragraph of the report."""
         return ""
 
-    def small(self) -> Mapping[str, Any]:
+    def quick_values(self) -> Mapping[str, Any]:
         """Values of `quick`, by the field's name, or OWNER.FIELD."""
-        return self.SMALL
+        return self.QUICK
 
     def note(self) -> str:
         """What the shell says before the run, if anything."""
         return ""
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many trials there are, if that is known."""
         return None
 
     def configuration(self) -> dict[str, Any]:
         """All that the answer depends on, as JSON."""
-        return {"question": self.name} | self.described()
+        return {"question": self.name} | self.fields_as_json()
 
     # --- what is made of it ---
 
     def __call__(self) -> T:
         """Check, run what is missing, and return the answer; InputError for what is not allowed."""
-        asked = self.asked()
-        asked.checked()
+        asked = self.with_quick_values()
+        asked.validate()
         device.use_cache_if_asked()
         if asked.report_to is not None:
-            return asked.answered(asked.report_to)
-        with asked.bar() as bar:
-            return asked.answered(bar)
+            return asked.execute(asked.report_to)
+        with asked.progress_bar() as bar:
+            return asked.execute(bar)
 
-    def bar(self) -> Bar:
+    def progress_bar(self) -> Bar:
         """A bar over the trials."""
-        return Bar(self.name, self.trials(), shown=self.shown)
+        return Bar(self.name, self.num_trials(), shown=self.shows_progress)
 
     @property
-    def shown(self) -> bool:
+    def shows_progress(self) -> bool:
         """Whether a bar shows the progress."""
-        return watched() if self.progress is None else self.progress
+        return is_interactive() if self.progress is None else self.progress
 
-    def asked(self) -> Any:
+    def with_quick_values(self) -> Any:
         """What is asked in the end: with `quick`, small where nothing else was asked for."""
         if not getattr(self, "quick", False):
             return self
         small: dict[str, Any] = {}
-        for name, value in self.small().items():
+        for name, value in self.quick_values().items():
             owner, _, inner = name.partition(".")
             now, usual = getattr(self, owner), _default(type(self), owner)
             same = getattr(now, inner) == getattr(usual, inner) if inner else now == usual
-            if same and (inner or owner) not in self.said:
+            if same and (inner or owner) not in self.explicit_options:
                 part = {inner: value}
                 small[owner] = replace(small.get(owner, now), **part) if inner else value
         return replace(self, **small)
 
-    def checked(self) -> None:
+    def validate(self) -> None:
         """Raises InputError for what is not allowed, before anything is compiled or written."""
         options.check_fields(self)
         self.check()
 
-    def answered(self, report: Report) -> T:
+    def execute(self, callback: ProgressCallback) -> T:
         """The answer, kept in the run folder if there is one."""
-        with self.opened() as out:
-            found = self.answer(self.run_in(out, report))
+        with self.open_folder() as out:
+            found = self.answer(self.create_run(out, callback))
             data = found if isinstance(found, xr.Dataset) else getattr(found, "data", None)
             if out is not None and isinstance(data, xr.Dataset):
                 files.write_results(out / "results.nc", data)
             return found
 
-    def run_in(self, out: Path | None, report: Report) -> Run:
+    def create_run(self, out: Path | None, callback: ProgressCallback) -> Run:
         """Where and how the answer is made."""
-        return Run(out, report)
+        return Run(out, callback)
 
     @contextlib.contextmanager
-    def opened(self) -> Iterator[Path | None]:
+    def open_folder(self) -> Iterator[Path | None]:
         """The run folder, new or to be continued, in use."""
         if self.out is None:
             yield None
@@ -225,16 +226,16 @@ class Question(Generic[T]):
             provenance.write_environment(out)
             yield out
 
-    def described(self) -> dict[str, Any]:
+    def fields_as_json(self) -> dict[str, Any]:
         """Own fields as JSON, with laws by their parameters and a domain by its ranges."""
         found: dict[str, Any] = {}
         for one in fields(self):
-            if one.name in (*_NOT_ASKED, *self.LEFT_OUT):
+            if one.name in (*_NOT_ASKED, *self.IGNORED_FIELDS):
                 continue
             value = getattr(self, one.name)
             if one.name == "law" and (params := getattr(self, "params", None)) is not None:
                 value = registry.params_to_json(params)
-            elif one.name == "laws" and isinstance(self, OfLaws):
+            elif one.name == "laws" and isinstance(self, MultiLawQuestion):
                 value = {k: registry.params_to_json(v) for k, v in self.chosen.items()}
             elif one.name == "domain" and isinstance(value, str | Domain):
                 value = dataclasses.asdict(domains.named(value))
@@ -246,7 +247,16 @@ class Question(Generic[T]):
         return found
 
 
-_NOT_ASKED = ("out", "bag", "slots", "workers", "quick", "progress", "report_to", "said")
+_NOT_ASKED = (
+    "out",
+    "bag",
+    "slots",
+    "workers",
+    "quick",
+    "progress",
+    "report_to",
+    "explicit_options",
+)
 
 
 def _default(kind: type, name: str) -> Any:
@@ -267,7 +277,7 @@ def setting_as_json(setting: Setting) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pushes(Question[T]):
+class SimulationQuestion(Question[T]):
     """A question that is answered by pushing in simulation."""
 
     setting: Setting = Setting()
@@ -278,12 +288,12 @@ class Pushes(Question[T]):
     quick: bool = False
     """Whether to make a small run of minutes on two cores: what is not asked for becomes small."""
 
-    def run_in(self, out: Path | None, report: Report) -> Run:
-        return Run(out, report, self.slots, self.workers)
+    def create_run(self, out: Path | None, callback: ProgressCallback) -> Run:
+        return Run(out, callback, self.slots, self.workers)
 
 
 @dataclass(frozen=True)
-class OfLaw(Pushes[T]):
+class LawQuestion(SimulationQuestion[T]):
     """A question about one law."""
 
     law: LawLike = "rps_tuned"
@@ -302,7 +312,7 @@ class OfLaw(Pushes[T]):
 
 
 @dataclass(frozen=True)
-class OfLaws(Pushes[T]):
+class MultiLawQuestion(SimulationQuestion[T]):
     """A question about several laws, which all meet the same worlds."""
 
     laws: LawsLike = ("rps", "rps_tuned")
@@ -316,7 +326,7 @@ class OfLaws(Pushes[T]):
 
 
 @dataclass(frozen=True)
-class InDomain(Pushes[T]):
+class DomainQuestion(SimulationQuestion[T]):
     """A question about random worlds."""
 
     domain: DomainLike = "wide"
@@ -331,9 +341,9 @@ class InDomain(Pushes[T]):
         """The domain, with the robot."""
         return domains.named(self.domain, self.robot)
 
-    def described(self) -> dict[str, Any]:
+    def fields_as_json(self) -> dict[str, Any]:
         """Own fields as JSON; the robot stands in the domain."""
-        found = super().described() | {"domain": dataclasses.asdict(self.ranges)}
+        found = super().fields_as_json() | {"domain": dataclasses.asdict(self.ranges)}
         del found["robot"]
         return found
 
@@ -342,7 +352,7 @@ class InDomain(Pushes[T]):
         self.setting.check_here(self.ranges.weakest, laws)
 
 
-def told(timing: Timing, device: str) -> str:
+def timing_line(timing: Timing, device: str) -> str:
     """Where the time of a run went, in a line."""
     rate = timing.simulated / max(timing.run, 1e-9)
     return (
@@ -351,18 +361,18 @@ def told(timing: Timing, device: str) -> str:
     )
 
 
-def labelled(results: xr.Dataset) -> xr.Dataset:
+def with_coordinates(results: xr.Dataset) -> xr.Dataset:
     """Results with names for the numbers of a pose, and what was drawn as coordinates of worlds."""
     if "pose" in results.dims:
         results = results.assign_coords(pose=["x", "y", "yaw"])
     return results.set_coords([name for name in results if results[name].dims == ("world",)])
 
 
-def name_of(given: object) -> str:
+def name_or_custom(given: object) -> str:
     """What a domain or a skin is called."""
     return given if isinstance(given, str) else "of one's own"
 
 
-def count_of(mask: np.ndarray) -> int:
+def count_true(mask: np.ndarray) -> int:
     """How many are true."""
     return int(np.count_nonzero(mask))

@@ -13,13 +13,13 @@ from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import labelled
+from rps_jax.runs.question import with_coordinates
 from rps_jax.trials.results import UNITS, variable
 from rps_jax.trials.trial import Outcome
 from rps_jax.world.domain import WORDS, unit_of
 
-Part = Mapping[str, np.ndarray]  # columns of some trials, whose numbers are `trial`
-Keep = Callable[[int, Part], Any]  # called with the number of a part
+ResultChunk = Mapping[str, np.ndarray]  # columns of some trials, whose numbers are `trial`
+Keep = Callable[[int, ResultChunk], Any]  # called with the number of a part
 Columns = Mapping[str, tuple[np.ndarray, str]]  # what was drawn: values (n,) and unit, by name
 # Of an outcome; the others are float32.
 _TYPES: dict[str, type] = dict.fromkeys(("success", "tipped", "diverged", "stalled"), np.int8)
@@ -27,12 +27,12 @@ _REMOVED = "overflows"  # column of a version with the engine warp
 _HDF5 = b"\x89HDF"  # with which a NetCDF file begins
 
 
-def encoded(part: Part) -> bytes:
+def encoded(part: ResultChunk) -> bytes:
     """The file of a part: a NumPy archive, which is made much faster than NetCDF."""
     return files.encode_arrays(**part)
 
 
-def decoded(number: int, content: bytes) -> Part:
+def decoded(number: int, content: bytes) -> ResultChunk:
     """A part from its file; InputError if it is damaged, or of another version."""
     try:
         columns = files.decode_arrays(content)
@@ -60,12 +60,12 @@ class Collector:
     def __init__(self, plan: Plan, keep: Keep):
         """For the parts of a plan, each handed to `keep` when it is complete."""
         self._keep = keep
-        self._parts = plan.parts
-        self._part_of = np.empty(plan.trials, np.int32)
-        for number, trials in plan.parts.items():
+        self._parts = plan.chunks
+        self._part_of = np.empty(plan.num_trials, np.int32)
+        for number, trials in plan.chunks.items():
             self._part_of[trials] = number
         self._open: dict[int, dict[str, np.ndarray]] = {}
-        self._missing = {number: trials.size for number, trials in plan.parts.items()}
+        self._missing = {number: trials.size for number, trials in plan.chunks.items()}
         self.drawn: dict[int, Columns] = {}  # for the worlds of a part, to stand in its file
 
     def collect(self, numbers: np.ndarray, outcomes: Outcome) -> None:
@@ -89,16 +89,16 @@ class Collector:
 
 
 def gather(
-    plan: Plan, folders: Sequence[Path], out: Path, made: dict[int, Part] | None = None
+    plan: Plan, folders: Sequence[Path], out: Path, made: dict[int, ResultChunk] | None = None
 ) -> xr.Dataset:
     """All parts of a plan as one Dataset, and as `results.nc` in `out`; InputError if some lack.
 
     What was `made` in this process is not read again; it is taken out, to spare memory.
     """
     made = made or {}
-    lacking = {name_of(n): n for n in plan.parts if n not in made}
+    lacking = {name_of(n): n for n in plan.chunks if n not in made}
 
-    def contents() -> Iterator[tuple[int, Part]]:
+    def contents() -> Iterator[tuple[int, ResultChunk]]:
         for number in list(made):
             yield number, made.pop(number)
         for folder in folders:
@@ -109,14 +109,14 @@ def gather(
     results = dataset(plan, contents())
     if lacking:
         raise InputError(
-            f"run = {', '.join(map(str, folders))} lacks {len(lacking)} of {len(plan.parts)} parts:"
-            " run the same command again, or give the folders of all shards."
+            f"run = {', '.join(map(str, folders))} lacks {len(lacking)} of {len(plan.chunks)} "
+            "parts: run the same command again, or give the folders of all shards."
         )
     files.write_results(out / "results.nc", results)
     return results
 
 
-def dataset(plan: Plan, parts: Iterable[tuple[int, Part]]) -> xr.Dataset:
+def dataset(plan: Plan, parts: Iterable[tuple[int, ResultChunk]]) -> xr.Dataset:
     """All results of a plan, from its parts: (law, world), and (world) drawn."""
     every = np.arange(plan.worlds)
     which = {"units": "1", "long_name": "index of the object in the coordinate object"}
@@ -132,7 +132,7 @@ def dataset(plan: Plan, parts: Iterable[tuple[int, Part]]) -> xr.Dataset:
         lacking = {"trial", *UNITS} - set(part) | ({"drawn"} if not (law or drawn) else set())
         if lacking:
             raise _of_another_version(number, f"it lacks {', '.join(sorted(lacking))}")
-        trials = plan.parts[number]
+        trials = plan.chunks[number]
         for name, values in part.items():
             wanted = trials.size, *(columns[name].shape[2:] if name in UNITS else ())
             if values.shape != wanted or values.dtype.kind not in "biuf":
@@ -238,4 +238,4 @@ def load(run: str | Path) -> xr.Dataset:
       >>> found.equals(made)
       True
     """
-    return labelled(files.read_results(Path(run)))
+    return with_coordinates(files.read_results(Path(run)))

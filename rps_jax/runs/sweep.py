@@ -1,16 +1,12 @@
-"""Many random worlds, in memory or in a run folder that can be killed and continued, and split.
+"""The commands `sweep` and `merge`: all laws in the same random worlds, and the report about them.
 
-The design is paired: every law meets the same worlds. Trials are kept in parts: a part is one file,
-written whole as soon as its last trial has ended, named by the hash of its content. A part that is
-there is not run again.
+The design is paired: every law meets the same worlds. `execution` runs the plan of a sweep.
 """
 
 import functools
 import shlex
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,27 +15,29 @@ import xarray as xr
 
 from rps_jax.analysis import figures, statistics, tables
 from rps_jax.analysis.report import Picture, Section
-from rps_jax.control import registry
 from rps_jax.control.registry import LawsLike
 from rps_jax.engines.device import Device
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
-from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.options import option
-from rps_jax.runs import results
-from rps_jax.runs.plan import Kind, Plan, Shard, draw, load_plan, made, open_run, share
-from rps_jax.runs.question import InDomain, OfLaws, Pushes, Question, Run, call_of, labelled
-from rps_jax.trials import batch
-from rps_jax.trials.batch import Job, Part
-from rps_jax.trials.progress import Progress, Report, unheard
+from rps_jax.runs import cluster, model_panel, results
+from rps_jax.runs.execution import run_in_folder, run_missing, run_plan, shard_results
+from rps_jax.runs.plan import Plan, Shard, load_plan, open_run, shard_chunks
+from rps_jax.runs.question import (
+    DomainQuestion,
+    MultiLawQuestion,
+    Question,
+    Run,
+    SimulationQuestion,
+    call_of,
+    with_coordinates,
+)
+from rps_jax.trials.progress import ProgressCallback
 from rps_jax.world import points
-from rps_jax.world.draws import table
-
-_AHEAD = 16384  # worlds of a kind that are made before they are asked for, about
 
 
-class Planned(Pushes[xr.Dataset]):
+class PlanQuestion(SimulationQuestion[xr.Dataset]):
     """A question whose trials are those of a `plan`, which holds the run folder."""
 
     plan: Plan | functools.cached_property[Plan]  # what is run
@@ -47,22 +45,22 @@ class Planned(Pushes[xr.Dataset]):
     def check(self) -> None:
         self.plan.check_here()
 
-    def trials(self) -> int | None:
-        return self.plan.trials
+    def num_trials(self) -> int | None:
+        return self.plan.num_trials
 
     def configuration(self) -> dict[str, Any]:
         return self.plan.configuration()
 
-    def answered(self, report: Report) -> xr.Dataset:
+    def execute(self, callback: ProgressCallback) -> xr.Dataset:
         """Outcomes (law, world), and what was drawn (world) as coordinates."""
-        return self.answer(self.run_in(None if self.out is None else Path(self.out), report))
+        return self.answer(self.create_run(None if self.out is None else Path(self.out), callback))
 
     def answer(self, run: Run) -> xr.Dataset:
-        return whole(self.plan, run.folder, **run.shape)
+        return run_plan(self.plan, run.folder, **run.batch_options)
 
 
 @dataclass(frozen=True)
-class OfPlan(Planned, InDomain[xr.Dataset], OfLaws[xr.Dataset]):
+class SweepQuestion(PlanQuestion, DomainQuestion[xr.Dataset], MultiLawQuestion[xr.Dataset]):
     """A question that pushes with every law in the same worlds of a plan."""
 
     worlds: int | None = option(None, 1, 1_000_000_000)
@@ -79,11 +77,11 @@ class OfPlan(Planned, InDomain[xr.Dataset], OfLaws[xr.Dataset]):
         count = usual if self.worlds is None else self.worlds
         return Plan(self.ranges, count, self.chosen, self.setting, self.part or _part_of(count))
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         return intro_of(self.plan)
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        return report_of(self.plan, found, run.folder)
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
+        return report_of(self.plan, results, run.folder)
 
 
 def _part_of(worlds: int) -> int:
@@ -103,7 +101,7 @@ def intro_of(plan: Plan) -> str:
 
 def report_of(plan: Plan, found: xr.Dataset, folder: Path | None) -> list[Section]:
     """Rates, differences, what success depends on, and the hardest worlds of a plan."""
-    told = [rates(found, float(plan.setting.rules.max_lost))]
+    told = [success_section(found, float(plan.setting.rules.max_lost))]
     if found.sizes["law"] > 1:
         rows = tables.difference_table(found)
         told.append(Section("Differences, world by world", "", rows))
@@ -115,7 +113,7 @@ def report_of(plan: Plan, found: xr.Dataset, folder: Path | None) -> list[Sectio
     return [*told, Section("The hardest worlds", text, rows)]
 
 
-def rates(found: xr.Dataset, max_lost: float) -> Section:
+def success_section(found: xr.Dataset, max_lost: float) -> Section:
     """Success of each law."""
     text = (
         "CVaR: mean over the worst 5 % of worlds of the least distance between contact point "
@@ -148,7 +146,7 @@ class SweepOptions:
 
 
 @dataclass(frozen=True)
-class Sweep(SweepOptions, OfPlan):
+class Sweep(SweepOptions, SweepQuestion):
     """Push in many random worlds, every law in the same ones; the run can be continued.
 
     Example:
@@ -161,7 +159,7 @@ class Sweep(SweepOptions, OfPlan):
     """
 
     TITLE: ClassVar[str] = "Sweep over random worlds"
-    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 64}
+    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 64}
 
     laws: LawsLike = ("rps", "nps", "aps")
 
@@ -196,12 +194,12 @@ class Sweep(SweepOptions, OfPlan):
         if not self.ray:
             super().check()
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many trials its share has."""
-        return sum(numbers.size for numbers in share(self.plan, self.share).values())
+        return sum(numbers.size for numbers in shard_chunks(self.plan, self.share).values())
 
-    def answered(self, report: Report) -> xr.Dataset:
-        found = super().answered(report)
+    def execute(self, callback: ProgressCallback) -> xr.Dataset:
+        found = super().execute(callback)
         if self.table is not None:
             results.write_table(found, Path(self.table))
         return found
@@ -209,32 +207,28 @@ class Sweep(SweepOptions, OfPlan):
     def answer(self, run: Run) -> xr.Dataset:
         """Run what is missing; of a share alone, return its own trials (row)."""
         if run.folder is None or (not self.ray and self.share.of == 1):
-            found = whole(self.plan, run.folder, **run.shape)
+            found = run_plan(self.plan, run.folder, **run.batch_options)
         else:
             by = run_missing
             if self.ray:
-                from rps_jax.runs import cluster
-
                 by = cluster.on_cluster(self.ray, self.ray_device)
-            joined = complete(run.folder, self.plan, self.share, by=by, **run.shape)
+            joined = run_in_folder(run.folder, self.plan, self.share, by=by, **run.batch_options)
             if joined is None:
-                return own_trials(run.folder, self.plan, self.share)
-            found = labelled(joined)
+                return shard_results(run.folder, self.plan, self.share)
+            found = with_coordinates(joined)
         if self.models:
-            from rps_jax.runs import models
-
-            found = models.added(found, self.plan, run)
+            found = model_panel.add_models(found, self.plan, run)
         return found
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        if "row" in found.dims:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
+        if "row" in results.dims:
             text = f"When all shards are done: `rps merge {shlex.quote(str(self.out))} --out ...`."
             return [Section(f"Share {self.shard}", text)]
-        first, *others = super().report(found, run)
-        return [first, *spread(found), *others]
+        first, *others = super().report(results, run)
+        return [first, *models_section(results), *others]
 
 
-def spread(found: xr.Dataset) -> list[Section]:
+def models_section(found: xr.Dataset) -> list[Section]:
     """How much the rates hang on the model, if it was asked for."""
     if "model_success" not in found:
         return []
@@ -266,7 +260,7 @@ class Merge(Question[xr.Dataset]):
         if self.out is None:
             raise InputError("out = None is not allowed: name the run folder of the whole.")
 
-    def answered(self, report: Report) -> xr.Dataset:
+    def execute(self, callback: ProgressCallback) -> xr.Dataset:
         folders = [Path(one) for one in self.folders]
         out = run_folder.ensure_writable(Path(str(self.out)))
         manifest = run_folder.read_manifest(folders[0])
@@ -281,145 +275,13 @@ class Merge(Question[xr.Dataset]):
         found = results.gather(plan, folders, open_run(out, plan))
         for one in folders:
             provenance.write_environment(out, provenance.read_environment(one))
-        return labelled(found)
+        return with_coordinates(found)
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         return intro_of(load_plan(Path(str(self.out))))
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        return report_of(load_plan(Path(str(self.out))), found, run.folder)
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
+        return report_of(load_plan(Path(str(self.out))), results, run.folder)
 
 
 merge = call_of(Merge)
-
-
-def whole(plan: Plan, out: Path | None, *, report: Report = unheard, **shape: Any) -> xr.Dataset:
-    """All results of a plan, in a run folder, in which it can be continued, or in memory alone."""
-    if out is not None:
-        found = complete(out, plan, report=report, **shape)
-        assert found is not None
-        return labelled(found)
-    made: dict[int, results.Part] = {}
-    every: dict[Kind, list[int]] = {}
-    for number in plan.parts:
-        every.setdefault(plan.kind(number), []).append(number)
-    work(plan, every, made.__setitem__, report=report, **shape)
-    return labelled(results.dataset(plan, made.items()))
-
-
-def own_trials(folder: Path, plan: Plan, shard: Shard) -> xr.Dataset:
-    """Outcomes (row) of a shard's own trials, with the law and the world of each."""
-    own = share(plan, shard)
-    kept = Checkpoints(folder).items([results.name_of(number) for number in own])
-    parts = ((int(name), results.decoded(int(name), content)) for name, content in kept)
-    found = results.dataset(plan, parts)
-    law, world = np.divmod(np.concatenate(list(own.values())), plan.worlds)
-    at = {"law": xr.DataArray(law, dims="row"), "world": xr.DataArray(world, dims="row")}
-    return found[list(results.UNITS)].isel(at)
-
-
-def run_missing(
-    folder: Path,
-    plan: Plan,
-    *,
-    shard: Shard = Shard(),
-    report: Report = unheard,
-    **shape: Any,
-) -> dict[int, results.Part]:
-    """Run what is missing of a plan, or of one shard of it, in a folder that `open_run` opened.
-
-    Returns the parts that were made, of a whole plan.
-    """
-    made = {}
-    missing, before = remaining(folder, plan, shard)
-    report(Progress(before, 0.0))
-    if missing:
-        provenance.write_environment(folder)
-
-    def tell(progress: Progress) -> None:
-        report(replace(progress, finished=before + progress.finished))
-
-    def keep(number: int, part: results.Part) -> None:
-        store(folder, number, results.encoded(part))
-        if shard.of == 1:
-            made[number] = part
-
-    work(plan, missing, keep, report=tell, **shape)
-    return made
-
-
-def complete(
-    folder: Path,
-    plan: Plan,
-    shard: Shard = Shard(),
-    *,
-    by: Callable[..., Any] = run_missing,
-    **options: Any,
-) -> xr.Dataset | None:
-    """Run what a folder lacks of a plan, and gather the whole in `results.nc`; or run one shard.
-
-    `by` runs it with its `options`, as `run_missing` or `cluster.run_on_cluster`.
-    """
-    open_run(folder, plan)
-    with run_folder.lock(folder, shard.number, shard.of):
-        made = by(folder, plan, shard=shard, **options) or {}
-        return results.gather(plan, [folder], folder, made) if shard.of == 1 else None
-
-
-def work(
-    plan: Plan,
-    numbers: Mapping[Kind, Iterable[int]],
-    keep: results.Keep,
-    *,
-    report: Callable[[Progress], Any],
-    **shape: Any,
-) -> None:
-    """Run some parts of a plan: of each kind those with these numbers, asked for one by one.
-
-    There are as many slots as the whole plan has use for, whatever parts are run, so that a part
-    has the same bits whoever runs it, and with whatever other parts.
-    """
-    jobs, collector = [], results.Collector(plan, keep)
-    for kind, some in numbers.items():
-        parts = _made(plan, some, collector)
-        if isinstance(some, Sequence):  # what is asked for elsewhere is asked for when it is needed
-            parts = _ahead(parts, max(1, _AHEAD // plan.part))
-        jobs.append(Job(registry.law_of(kind[1]), plan.sizes[kind], parts))
-    batch.run(jobs, plan.setting, collect=collector.collect, report=report, **shape)
-
-
-def remaining(folder: Path, plan: Plan, shard: Shard) -> tuple[dict[Kind, list[int]], int]:
-    """Parts of a shard that a run folder lacks, by kind, and how many trials it has."""
-    done = Checkpoints(folder).paths()
-    missing: dict[Kind, list[int]] = {}
-    before = 0
-    for number, trials in share(plan, shard).items():
-        if results.name_of(number) in done:
-            before += trials.size
-        else:
-            missing.setdefault(plan.kind(number), []).append(number)
-    return missing, before
-
-
-def _made(plan: Plan, numbers: Iterable[int], collector: results.Collector) -> Iterator[Part]:
-    """The worlds of parts, made one part at a time; the first law's keep what was drawn."""
-    for number in numbers:
-        trials, (law, _) = plan.parts[number], plan.law_and_object(number)
-        drawn = draw(plan, trials % plan.worlds)
-        if law == 0:
-            collector.drawn[number] = table(drawn)
-        yield made(plan, law, drawn)._replace(numbers=trials)
-
-
-def _ahead(parts: Iterator[Part], count: int) -> Iterator[Part]:
-    """Prefetch worlds: make `count` parts ahead while the ones before them run."""
-    with ThreadPoolExecutor(1) as maker:
-        coming = deque(maker.submit(next, parts, None) for _ in range(count))
-        while (part := coming.popleft().result()) is not None:
-            coming.append(maker.submit(next, parts, None))
-            yield part
-
-
-def store(folder: Path, part: int, content: bytes) -> Path:
-    """Write the file of a part into a run folder, whole or not at all."""
-    return Checkpoints(folder).put(results.name_of(part), content, ".npz", new=True)

@@ -29,20 +29,20 @@ from rps_jax.analysis.report import Picture, Section
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.record.options import option
-from rps_jax.runs import sweep as sweeps
+from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import (
-    InDomain,
-    OfLaw,
+    DomainQuestion,
+    LawQuestion,
     Run,
     call_of,
-    count_of,
-    labelled,
-    name_of,
+    count_true,
+    name_or_custom,
     seed_of,
+    with_coordinates,
 )
 from rps_jax.studies.probe import Probe
-from rps_jax.trials.progress import Bar, phase
+from rps_jax.trials.progress import Bar, set_phase
 from rps_jax.world import points
 from rps_jax.world.domain import Domain
 
@@ -59,7 +59,7 @@ _DRAWN_AT_ONCE = 4096
 
 
 @dataclass(frozen=True)
-class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
+class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
     """Search for diverse failures (quality-diversity archive; needs pyribs).
 
     The result has, by cell (object, and three axes), `margin`: severity less 1, NaN where no world
@@ -79,8 +79,8 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Search for failures"
-    LEFT_OUT: ClassVar[tuple[str, ...]] = ("minutes", "generations", "check_again", "worst")
-    SMALL: ClassVar[Mapping[str, Any]] = {"minutes": 2.0, "drawn": 128, "check_again": 4}
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("minutes", "generations", "check_again", "worst")
+    QUICK: ClassVar[Mapping[str, Any]] = {"minutes": 2.0, "drawn": 128, "check_again": 4}
 
     axes: tuple[str, ...] = ("size", "com_offset", "friction_robot")
     """Three drawn quantities whose ranges the cells of the archive divide."""
@@ -121,8 +121,8 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         self.check_engine([self.params])
         errors.require("ribs", "failures")
 
-    def bar(self) -> Bar:
-        return Bar(self.name, 60 * self.minutes, "clock", shown=self.shown)
+    def progress_bar(self) -> Bar:
+        return Bar(self.name, 60 * self.minutes, "clock", shown=self.shows_progress)
 
     def answer(self, run: Run) -> xr.Dataset:
         """Search, then try elites again until the time is over."""
@@ -131,7 +131,7 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         def has_time(share: float) -> bool:
             return time.perf_counter() - start_time < share * 60 * self.minutes
 
-        probe = Probe(self.ranges, self.params, self.setting, run.folder, **run.shape)
+        probe = Probe(self.ranges, self.params, self.setting, run.folder, **run.batch_options)
         search = _Search(probe, self, seed_of(self.setting.seed, "tune"))
         results = search.run(partial(has_time, _SEARCH_UNTIL))
         results = self._check_elites(results, run, partial(has_time, _CHECK_UNTIL))
@@ -146,10 +146,10 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         count = results.sizes["elite"]
         failed = np.full(count, np.nan)
         order = _coarse_to_fine(count, min(self.check_again, count))
-        phase(run.report, "check in C MuJoCo")
+        set_phase(run.callback, "check in C MuJoCo")
         setting = replace(self.setting, engine="mujoco", physics="default", fidelity="reference")
         folder = None if run.folder is None else run.folder / "check"
-        probe = Probe(self.ranges, self.params, setting, folder, **run.shape)
+        probe = Probe(self.ranges, self.params, setting, folder, **run.batch_options)
         batch = max(1, run.workers or provenance.count_processors())
         for first in range(0, len(order), batch):
             if not has_time():
@@ -161,40 +161,40 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     def _store_worst(self, results: xr.Dataset, run: Run) -> None:
         """Store the worst elites as a sweep in the subfolder `worlds`."""
         if results.sizes["elite"]:
-            phase(run.report, "worst worlds")
+            set_phase(run.callback, "worst worlds")
             at = points.checked(self.ranges, results.u.values[: self.worst])
             plan = Plan(self.ranges, len(at.u), {self.label: self.params}, self.setting, points=at)
             assert run.folder is not None
-            sweeps.complete(run.folder / "worlds", plan, **run.shape)
+            execution.run_in_folder(run.folder / "worlds", plan, **run.batch_options)
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         return (
-            f"{self.label} in the domain {name_of(self.domain)}: axes {', '.join(self.axes)}, "
-            f"{self.repeats} noises each."
+            f"{self.label} in the domain {name_or_custom(self.domain)}: axes "
+            f"{', '.join(self.axes)}, {self.repeats} noises each."
         )
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        rates, cells = yields(found), found.margin.size
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
+        rates, cells = yields(results), results.margin.size
         text = (
-            f"{int(found.failing[-1])} of {cells} cells hold a failure after "
-            f"{int(found.trials[-1]):,} trials and {float(found.simulated[-1]):,.0f} s of "
+            f"{int(results.failing[-1])} of {cells} cells hold a failure after "
+            f"{int(results.trials[-1]):,} trials and {float(results.simulated[-1]):,.0f} s of "
             f"simulated time: {rates['search']:.2f} cells per hour. "
-            f"{found.attrs['drawn_trials']:,} trials of drawn worlds fill "
-            f"{found.attrs['drawn_failing']}: {rates['drawn']:.2f} per hour. "
+            f"{results.attrs['drawn_trials']:,} trials of drawn worlds fill "
+            f"{results.attrs['drawn_failing']}: {rates['drawn']:.2f} per hour. "
         )
-        ratio = f"{rates['times']:.1f} times as many, " if found.attrs["drawn_failing"] else ""
+        ratio = f"{rates['times']:.1f} times as many, " if results.attrs["drawn_failing"] else ""
         text += f"The search finds {ratio}at least {rates['times_low']:.1f} times (95 %)."
-        title = f"{self.label}, {name_of(self.domain)}: severest trial of each cell"
-        growth = Picture("search", partial(search_figure, found, rates["drawn"]))
-        maps = Picture("archive", partial(archive_figure, found, self.axes, title))
+        title = f"{self.label}, {name_or_custom(self.domain)}: severest trial of each cell"
+        growth = Picture("search", partial(search_figure, results, rates["drawn"]))
+        maps = Picture("archive", partial(archive_figure, results, self.axes, title))
         margin = "Severity less 1: above 0 a failure, by this many metres; below 0 a success."
         sections = [
             Section("Failing cells", text, (), growth),
             Section("Margins", margin, (), maps),
         ]
-        checked = np.isfinite(found.again.values)
+        checked = np.isfinite(results.again.values)
         if checked.any():
-            failures, trials = count_of(found.again.values == 1), count_of(checked)
+            failures, trials = count_true(results.again.values == 1), count_true(checked)
             low, high = (100 * p for p in statistics.clopper_pearson(failures, trials))
             text = (
                 f"{failures} of {trials} elites, evenly from the worst to the least severe, fail "
@@ -202,14 +202,14 @@ class Attack(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
                 f"[{low:.0f}, {high:.0f}]."
             )
             sections.append(Section("Failures in another engine", text))
-        if run.folder is not None and found.sizes["elite"]:
+        if run.folder is not None and results.sizes["elite"]:
             sections.append(self._worst_section(run.folder / "worlds"))
         return sections
 
     def _worst_section(self, folder: Path) -> Section:
         """Return the table of the worst worlds, with the commands that show them."""
-        results = labelled(files.read_results(folder))
-        failed = count_of(results.success.values == 0)
+        results = with_coordinates(files.read_results(folder))
+        failed = count_true(results.success.values == 0)
         text = (
             f"{failed} of {results.sizes['world']} fail again in the same engine. `rps film "
             f"{shlex.quote(str(folder))} --which hardest --grid 3x4` films the worst."
@@ -265,7 +265,7 @@ class _Archive:
     @property
     def failing(self) -> np.ndarray:
         """Number (objects,) of the cells that hold a failure."""
-        return np.array([count_of(grid.data("success") == 0) for grid in self.grids])
+        return np.array([count_true(grid.data("success") == 0) for grid in self.grids])
 
 
 class _Search:
@@ -288,7 +288,7 @@ class _Search:
     def run(self, has_time: Callable[[], bool]) -> xr.Dataset:
         """Try drawn worlds, then generations of emitters while there is time."""
         options, probe = self.options, self.probe
-        phase(probe.report, "drawn worlds")
+        set_phase(probe.callback, "drawn worlds")
         drawn = _Archive(self.domain, options)
         for first in range(0, options.drawn, _DRAWN_AT_ONCE):
             count = -(-min(_DRAWN_AT_ONCE, options.drawn - first) // self.objects)
@@ -301,7 +301,7 @@ class _Search:
         archive, history = _Archive(self.domain, options), []
         schedulers: list[Any] = []
         thresholds: list[float] = []  # severities from which on the emitters accept a world
-        phase(probe.report, "search")
+        set_phase(probe.callback, "search")
         for generation in range(options.generations):
             if generation and not has_time():
                 break

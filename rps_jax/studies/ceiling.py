@@ -33,16 +33,16 @@ from rps_jax.control.laws.rps import RPSParams
 from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, draw, load_plan
-from rps_jax.runs.question import InDomain, Run, call_of, count_of, seed_of
+from rps_jax.runs.question import DomainQuestion, Run, call_of, count_true, seed_of
 from rps_jax.trials import batch, score
-from rps_jax.trials.batch import Job, Part
-from rps_jax.trials.progress import InTurn
+from rps_jax.trials.batch import Job, WorldBatch
+from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.trial import Outcome
 from rps_jax.trials.worlds import drawn_worlds
 
 
 @dataclass(frozen=True)
-class Ceiling(InDomain[xr.Dataset]):
+class Ceiling(DomainQuestion[xr.Dataset]):
     """Tell how many worlds can be won: a planner that knows them tries.
 
     Worlds are those of a domain, kept for testing, or of a run. The answer holds, by world,
@@ -59,7 +59,7 @@ class Ceiling(InDomain[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Ceiling"
-    SMALL: ClassVar[Mapping[str, Any]] = {"sample": 2, "most": 2, "samples": 12, "rounds": 3}
+    QUICK: ClassVar[Mapping[str, Any]] = {"sample": 2, "most": 2, "samples": 12, "rounds": 3}
 
     run: str | Path | None = option(None, positional=True)
     """Run folder of a sweep or a ladder, whose domain, worlds and setting are taken."""
@@ -84,8 +84,8 @@ class Ceiling(InDomain[xr.Dataset]):
     """Time between two knots of a plan [s]."""
 
     @property
-    def place(self) -> Path:
-        return super().place if self.run is None else Path(self.run) / "ceiling"
+    def default_folder(self) -> Path:
+        return super().default_folder if self.run is None else Path(self.run) / "ceiling"
 
     @functools.cached_property
     def results(self) -> xr.Dataset | None:
@@ -119,7 +119,7 @@ class Ceiling(InDomain[xr.Dataset]):
             )
         replace(self, domain=self.plan.domain, setting=self.plan.setting, run=None).check_engine()
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many trials there are, at most."""
         return self.numbers.size * self.samples * self.rounds
 
@@ -130,16 +130,18 @@ class Ceiling(InDomain[xr.Dataset]):
     def answer(self, run: Run) -> xr.Dataset:
         """Search plans, round by round; finished rounds are not run again."""
         state = start = _start(self.numbers)
-        heard = InTurn(run.report)
-        run = run._replace(report=heard)
+        heard = SequentialProgress(run.callback)
+        run = run._replace(callback=heard)
         for r in range(self.rounds):
             open_ = np.flatnonzero(state.solved.values == 0)
             if not open_.size:
                 break
             name = f"round-{r:04d}"
-            state = run.part(name, functools.partial(self._round, state, open_, r, run))
-            files.check_like(state, start, name if run.parts is None else run.parts.folder / name)
-            heard.ended(open_.size * self.samples)
+            state = run.checkpoint(name, functools.partial(self._round, state, open_, r, run))
+            files.check_like(
+                state, start, name if run.checkpoints is None else run.checkpoints.folder / name
+            )
+            heard.finish(open_.size * self.samples)
         return state
 
     def _round(self, state: xr.Dataset, open_: np.ndarray, r: int, run: Run) -> xr.Dataset:
@@ -197,9 +199,11 @@ class Ceiling(InDomain[xr.Dataset]):
         of_objects = [np.flatnonzero(which == one) for one in np.unique(which)]
         slots = most * self.samples
         jobs = [Job(guided, slots, self._part(numbers, rows, flat)) for rows in of_objects]
-        return batch.gathered(jobs, self.plan.setting, len(flat), **run.shape)[0]
+        return batch.run_all(jobs, self.plan.setting, len(flat), **run.batch_options)[0]
 
-    def _part(self, numbers: np.ndarray, rows: np.ndarray, flat: np.ndarray) -> Iterator[Part]:
+    def _part(
+        self, numbers: np.ndarray, rows: np.ndarray, flat: np.ndarray
+    ) -> Iterator[WorldBatch]:
         """The trials of the worlds `rows`, which are of one object, made when they are needed."""
         plan = self.plan
         part = drawn_worlds(plan.domain, draw(plan, numbers[rows]), RPSParams.tuned(), plan.setting)
@@ -208,18 +212,18 @@ class Ceiling(InDomain[xr.Dataset]):
         steps = max(1, round(self.hold / plan.setting.physics.control_period))
         each: Any = np.full(trials.size, steps, flat.dtype)
         params = GuidedParams(worlds.params, flat[trials], each)
-        yield Part(trials, worlds._replace(params=params), part.stage)
+        yield WorldBatch(trials, worlds._replace(params=params), part.stage)
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         where = "the domain, kept for testing" if self.run is None else str(self.run)
-        return f"{found.sizes['world']} worlds of {where}, {int(found.trials.sum()):,} trials."
+        return f"{results.sizes['world']} worlds of {where}, {int(results.trials.sum()):,} trials."
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        text, table = _sampled_told(found), []
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
+        text, table = _sampled_told(results), []
         if self.results is not None:
             lost = " and ".join(self.lost_by)
             text = f"In the worlds that {lost} lose, and in the first {self.sample}. {text}"
-            table = won_table(found, self.results, self.lost_by)
+            table = won_table(results, self.results, self.lost_by)
         return [Section("A planner that knows the world", text, table)]
 
 
@@ -287,7 +291,7 @@ def _sampled_told(found: xr.Dataset) -> str:
     """How many of the first worlds were won, in sentences."""
     worlds = found.world.values
     sampled = np.flatnonzero(worlds == np.arange(worlds.size))  # those that follow one another
-    wins, alone = (count_of(found[name].values[sampled] > 0) for name in ("solved", "alone"))
+    wins, alone = (count_true(found[name].values[sampled] > 0) for name in ("solved", "alone"))
     return (
         f"MPPI around the tuned law, which knows each world, wins {wins} of the first "
         f"{sampled.size} worlds ({tables.share(wins, sampled.size)}); {alone} of them are won by "

@@ -18,11 +18,11 @@ from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.record import files
 from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan, world_part
-from rps_jax.runs.push import another_engine, chosen
+from rps_jax.runs.plan import Plan, build_batch
+from rps_jax.runs.push import another_engine, select_law
 from rps_jax.runs.question import Question, Run, call_of
 from rps_jax.trials import pushes, results
-from rps_jax.trials.progress import InTurn
+from rps_jax.trials.progress import SequentialProgress
 from rps_jax.world.domain import WORDS
 
 _COLUMNS = 6  # of maps
@@ -102,36 +102,36 @@ class Gallery(Question[xr.Dataset]):
 
     @property
     def title(self) -> str:
-        return f"Losses of {chosen(Path(self.run), 0, self.law)[1]}"
+        return f"Losses of {select_law(Path(self.run), 0, self.law)[1]}"
 
     @property
-    def place(self) -> Path:
+    def default_folder(self) -> Path:
         return Path(self.run) / "gallery"
 
     def check(self) -> None:
-        chosen(Path(self.run), 0, self.law)
+        select_law(Path(self.run), 0, self.law)
 
     def note(self) -> str:
         return another_engine(Path(self.run))
 
     def answer(self, run: Run) -> xr.Dataset:
-        plan, name = chosen(Path(self.run), 0, self.law)
+        plan, name = select_law(Path(self.run), 0, self.law)
         one = files.read_results(Path(self.run)).sel(law=name)
         found = kinds(one, float(plan.setting.rules.max_lost))
         return one.assign(kind=("world", found))
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         return f"Run {self.run}; kinds and maps."
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        plan, name = chosen(Path(self.run), 0, self.law)
-        kind_of = found.kind.values
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
+        plan, name = select_law(Path(self.run), 0, self.law)
+        kind_of = results.kind.values
         there = {k: np.flatnonzero(kind_of == k) for k in MECHANISMS if (kind_of == k).any()}
         some = np.array([i for worlds in there.values() for i in worlds[: self.each]], int)
-        seen, sections = _followed(plan, name, some, InTurn(run.report)), []
+        seen, sections = _followed(plan, name, some, SequentialProgress(run.callback)), []
         for kind, worlds in there.items():
             tracks = [seen[int(i)] for i in worlds[: self.each]]
-            left = found.min_distance.values[worlds[: self.each]]
+            left = results.min_distance.values[worlds[: self.each]]
             labels = [
                 f"world {i}, " + (f"{x:.2f} m left" if np.isfinite(x) else "untouched")
                 for i, x in zip(worlds, left, strict=False)
@@ -140,7 +140,7 @@ class Gallery(Question[xr.Dataset]):
             drawn = functools.partial(figure_of, tracks, labels, title)
             picture = Picture(kind.replace(" ", "_"), drawn)
             heading = f"{kind}: {worlds.size} of {kind_of.size}"
-            text = _told(self.run, name, found, kind_of == kind, kind)
+            text = _told(self.run, name, results, kind_of == kind, kind)
             sections.append(Section(heading, text, (), picture))
         return sections
 
@@ -161,16 +161,18 @@ def _told(run: str | Path, law: str, one: xr.Dataset, mask: np.ndarray, kind: st
     return MECHANISMS[kind] + common + again
 
 
-def _followed(plan: Plan, law: str, worlds: np.ndarray, heard: InTurn) -> Mapping[int, xr.Dataset]:
+def _followed(
+    plan: Plan, law: str, worlds: np.ndarray, heard: SequentialProgress
+) -> Mapping[int, xr.Dataset]:
     """Trials of a law over time, by world; those of one object are stepped together."""
     found: dict[int, Any] = {}
     of_object = plan.domain.object_of(worlds)
     for thing in np.unique(of_object):
         rows = worlds[of_object == thing]
-        part = world_part(plan, list(plan.laws).index(law), rows)
+        part = build_batch(plan, list(plan.laws).index(law), rows)
         decides = registry.law_of(plan.laws[law])
-        traces = pushes.follow_part(part, decides, plan.setting, interval=0.5, report=heard)
-        heard.ended(rows.size)
+        traces = pushes.record_batch(part, decides, plan.setting, interval=0.5, callback=heard)
+        heard.finish(rows.size)
         for world, trace in zip(rows.tolist(), traces, strict=True):
             found[world] = results.trace_dataset(trace)
     return found

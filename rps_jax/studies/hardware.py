@@ -17,10 +17,10 @@ from rps_jax.control.registry import LawLike
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.robot.skin import SkinLike
-from rps_jax.runs.question import OfLaw, Run, call_of, name_of
+from rps_jax.runs.question import LawQuestion, Run, call_of, name_or_custom
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
-from rps_jax.trials.progress import InTurn
+from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.results import outcome_dataset, trace_dataset
 from rps_jax.trials.trial import Shift
 from rps_jax.world.paper import (
@@ -41,7 +41,7 @@ def frictions() -> dict[str, Friction]:
 
 
 @dataclass(frozen=True)
-class Hardware(OfLaw[xr.Dataset]):
+class Hardware(LawQuestion[xr.Dataset]):
     """Run the paper's hardware experiments in simulation, over a range of friction.
 
     The answer holds outcomes (law, object, friction, target); of the shove, `recovered` and
@@ -57,7 +57,7 @@ class Hardware(OfLaw[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "The hardware experiments"
-    SMALL: ClassVar[Mapping[str, Any]] = {"shifts": (0.1, 0.2, 0.3)}
+    QUICK: ClassVar[Mapping[str, Any]] = {"shifts": (0.1, 0.2, 0.3)}
 
     law: LawLike = "rps"
     skin: SkinLike = "hardware"
@@ -88,17 +88,17 @@ class Hardware(OfLaw[xr.Dataset]):
     def check(self) -> None:
         self.setting.check_here(self.base.base, [self.params])
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         each = len(HARDWARE_OBJECTS) * len(self.targets)
         return each * (len(frictions()) + 2 * len(self.shifts) + 1)
 
     def answer(self, run: Run) -> xr.Dataset:
-        heard, found = InTurn(run.report), []
-        run = run._replace(report=heard)
+        heard, found = SequentialProgress(run.callback), []
+        run = run._replace(callback=heard)
         parts = {"hardware": self._pushed, "shifted": self._shifted, "paths": self._paths}
         for name, make in parts.items():
-            found.append(run.part(name, partial(make, run)))
-            heard.ended(found[-1].attrs.pop("trials"))
+            found.append(run.checkpoint(name, partial(make, run)))
+            heard.finish(found[-1].attrs.pop("trials"))
         whole = xr.merge(found, combine_attrs="drop")
         assert isinstance(whole, xr.Dataset)
         return whole
@@ -111,7 +111,7 @@ class Hardware(OfLaw[xr.Dataset]):
             for friction in frictions().values()
             for target in self.targets
         ]
-        outcome, _ = pushes.run(cases, self.setting, **run.shape)
+        outcome, _ = pushes.run(cases, self.setting, **run.batch_options)
         labels = [self.label], HARDWARE_OBJECTS, tuple(frictions()), self.targets
         return outcome_dataset(outcome, *labels).assign_attrs(trials=len(cases))
 
@@ -124,7 +124,7 @@ class Hardware(OfLaw[xr.Dataset]):
             for moved in [(0.0, side * size) for size in self.shifts for side in sides]
             for target in self.targets
         ]
-        outcome, _ = pushes.run(cases, self.setting, **run.shape)
+        outcome, _ = pushes.run(cases, self.setting, **run.batch_options)
         sizes = (len(HARDWARE_OBJECTS), len(self.shifts), len(sides), len(self.targets))
         dims = ("object", "shift", "side", "target")
         # A trial that had ended before the object was to be moved tells nothing.
@@ -146,7 +146,7 @@ class Hardware(OfLaw[xr.Dataset]):
         tracks, won = [], []
         for name in HARDWARE_OBJECTS:
             cases = [replace(self.base, object=name, target=target) for target in self.targets]
-            seen = pushes.follow(cases, self.setting, interval=0.5, report=run.report)
+            seen = pushes.record_cases(cases, self.setting, interval=0.5, callback=run.callback)
             tracks.append([trace_dataset(one) for one in seen])
             won.append([int(one.outcome.success) for one in seen])
         longest = max(one.sizes["time"] for row in tracks for one in row)
@@ -168,15 +168,15 @@ class Hardware(OfLaw[xr.Dataset]):
         coords = {"object": list(HARDWARE_OBJECTS), "path_time": seconds, "axis": ["x", "y"]}
         return xr.Dataset(variables, coords, {"trials": len(HARDWARE_OBJECTS) * len(self.targets)})
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         ground, robot = HARDWARE_GROUND, HARDWARE_ROBOT
         return (
-            f"{self.label}, skin {name_of(self.skin)}, engine {self.setting.engine}. "
+            f"{self.label}, skin {name_or_custom(self.skin)}, engine {self.setting.engine}. "
             f"Friction was not measured by the paper: here every pair of object-ground {ground} "
             f"and object-robot {robot} is run."
         )
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         ground, robot = MIDDLE
         text = (
             "D is the mean of |l| over the time in contact, where l is how far the contact point "
@@ -190,12 +190,12 @@ class Hardware(OfLaw[xr.Dataset]):
             "that had ended by then are not counted."
         )
         middle = f"Friction: ground {ground:g}, robot {robot:g}, the middle of the range."
-        ways = Picture("paths", partial(paths_figure, found))
-        curve = Picture("shifted", partial(shift_figure, found))
+        ways = Picture("paths", partial(paths_figure, results))
+        curve = Picture("shifted", partial(shift_figure, results))
         return [
-            Section("Hardware experiments", text, table(found)),
+            Section("Hardware experiments", text, table(results)),
             Section("Fig. 7: paths of the base", middle, (), ways),
-            Section("The object shoved aside", shove, shift_table(found), curve),
+            Section("The object shoved aside", shove, shift_table(results), curve),
         ]
 
 

@@ -27,9 +27,9 @@ from rps_jax.errors import InputError
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import OfLaws, Run, call_of, name_of, seed_of
+from rps_jax.runs.question import MultiLawQuestion, Run, call_of, name_or_custom, seed_of
 from rps_jax.runs.sweep import Sweep, SweepOptions
-from rps_jax.trials.progress import InTurn, Report
+from rps_jax.trials.progress import ProgressCallback, SequentialProgress
 from rps_jax.world.domain import Domain, DomainLike
 
 REFERENCE = "rps_tuned"  # the law that all others are compared with
@@ -63,13 +63,13 @@ class _TestSweep(Sweep):
         senses = [_senses(self.chosen[str(law)]) for law in results.law.values]
         return results.assign_coords(senses=("law", senses, {"long_name": "what the law senses"}))
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        first, *rest = super().report(found, run)
-        return [first, *rest] if "row" in found.dims else [first, *_comparison(found), *rest]
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
+        first, *rest = super().report(results, run)
+        return [first, *rest] if "row" in results.dims else [first, *_comparison(results), *rest]
 
 
 @dataclass(frozen=True)
-class Ladder(SweepOptions, OfLaws[xr.Dataset | xr.DataTree]):
+class Ladder(SweepOptions, MultiLawQuestion[xr.Dataset | xr.DataTree]):
     """Compare laws in the same test worlds, ordered by what each law senses.
 
     No tuner sees test worlds. The result for one domain has the outcomes (law, world), and as
@@ -86,7 +86,7 @@ class Ladder(SweepOptions, OfLaws[xr.Dataset | xr.DataTree]):
     """
 
     TITLE: ClassVar[str] = "Laws in the same worlds"
-    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 64, "domain": ("wide,objects=random_box",)}
+    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 64, "domain": ("wide,objects=random_box",)}
 
     laws: LawsLike = ()
     """The laws, by default all laws of the package: names, as rps, rps_tuned or rps_plus, or a
@@ -118,7 +118,7 @@ class Ladder(SweepOptions, OfLaws[xr.Dataset | xr.DataTree]):
             domain if isinstance(domain, str) else f"domain_{i}" for i, domain in enumerate(domains)
         ]
         errors.check_each_once("domain", domains, labels)
-        fields = [*dataclasses.fields(SweepOptions), *dataclasses.fields(OfLaws)]
+        fields = [*dataclasses.fields(SweepOptions), *dataclasses.fields(MultiLawQuestion)]
         shared = {f.name: getattr(self, f.name) for f in fields if f.name != "laws"}
         shared |= {"robot": self.robot, "part": self.part}
         sweeps = {}
@@ -144,42 +144,42 @@ class Ladder(SweepOptions, OfLaws[xr.Dataset | xr.DataTree]):
         for sweep in self.sweeps.values():
             sweep.check()
 
-    def trials(self) -> int | None:
-        return sum(sweep.trials() or 0 for sweep in self.sweeps.values())
+    def num_trials(self) -> int | None:
+        return sum(sweep.num_trials() or 0 for sweep in self.sweeps.values())
 
     def configuration(self) -> dict[str, Any]:
         if self.single:
             return self.single.configuration()
         return {"ladder": {name: sweep.configuration() for name, sweep in self.sweeps.items()}}
 
-    def answered(self, report: Report) -> xr.Dataset | xr.DataTree:
-        return self.single.answered(report) if self.single else super().answered(report)
+    def execute(self, callback: ProgressCallback) -> xr.Dataset | xr.DataTree:
+        return self.single.execute(callback) if self.single else super().execute(callback)
 
     def answer(self, run: Run) -> xr.DataTree:
-        progress = InTurn(run.report)
+        progress = SequentialProgress(run.callback)
         results = {}
         for name, sweep in self.sweeps.items():
             results[name] = sweep.answer(
-                run._replace(report=progress, folder=_subfolder(run, name))
+                run._replace(callback=progress, folder=_subfolder(run, name))
             )
-            progress.ended(sweep.plan.trials)
+            progress.finish(sweep.plan.num_trials)
         return xr.DataTree.from_dict(results)
 
-    def intro(self, found: xr.Dataset | xr.DataTree) -> str:
-        if self.single and isinstance(found, xr.Dataset):
-            return self.single.intro(found)
+    def intro(self, results: xr.Dataset | xr.DataTree) -> str:
+        if self.single and isinstance(results, xr.Dataset):
+            return self.single.intro(results)
         return (
             f"Seed {self.setting.seed} of the test worlds, engine {self.setting.engine}; all laws "
             "meet the same worlds. Intervals: Wilson 95 %."
         )
 
-    def report(self, found: xr.Dataset | xr.DataTree, run: Run) -> Sequence[Section]:
-        if self.single and isinstance(found, xr.Dataset):
-            return self.sections(self.single, found, run)
+    def report(self, results: xr.Dataset | xr.DataTree, run: Run) -> Sequence[Section]:
+        if self.single and isinstance(results, xr.Dataset):
+            return self.sections(self.single, results, run)
         sections = []
         for name, sweep in self.sweeps.items():
             run_in_domain = run._replace(folder=_subfolder(run, name))
-            for section in self.sections(sweep, found[name].to_dataset(), run_in_domain):
+            for section in self.sections(sweep, results[name].to_dataset(), run_in_domain):
                 picture = section.picture
                 if picture:  # pictures of all domains are in one folder
                     picture = picture._replace(name=f"{picture.name}_{_file_name(name)}")
@@ -262,7 +262,7 @@ def score_row(sweep: Sweep, results: xr.Dataset) -> list[list[str]]:
     times = results.time.values[0][successes[0]]
     median = f"{np.median(times):.1f} s" if times.size else "-"
     source = f"seed {sweep.setting.seed}" if sweep.points is None else "given points"
-    worlds = f"{successes.shape[1]:,} test worlds of {name_of(sweep.domain)}, {source}"
+    worlds = f"{successes.shape[1]:,} test worlds of {name_or_custom(sweep.domain)}, {source}"
     header = ["law", "success", "median time", *others, "worlds"]
     return [header, [law, rates[0], median, *rates[1:], f"{worlds}, {sweep.setting.engine}"]]
 

@@ -17,11 +17,11 @@ from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.record import files
 from rps_jax.runs.push import Push
-from rps_jax.runs.question import Pushes, Run, call_of
+from rps_jax.runs.question import Run, SimulationQuestion, call_of
 from rps_jax.studies import table
 from rps_jax.studies.hardware import Hardware
 from rps_jax.studies.table import Table
-from rps_jax.trials.progress import InTurn
+from rps_jax.trials.progress import SequentialProgress
 from rps_jax.world import paper as papers
 from rps_jax.world import scene, video
 from rps_jax.world.objects import PAPER_OBJECTS
@@ -29,7 +29,7 @@ from rps_jax.world.scene import FRICTION
 
 
 @dataclass(frozen=True)
-class Paper(Pushes[xr.DataTree]):
+class Paper(SimulationQuestion[xr.DataTree]):
     """Reproduce the paper: Tables I and II, Figs. 3 to 7, and the hardware experiments.
 
     The answer is a tree of `table` (law, object, friction, target), `trial` (time) and `hardware`,
@@ -49,35 +49,35 @@ class Paper(Pushes[xr.DataTree]):
         return (
             Table(setting=self.setting),
             Push(target=(-2.0, 0.0), setting=self.setting),
-            Hardware(setting=self.setting, quick=self.quick).asked(),
+            Hardware(setting=self.setting, quick=self.quick).with_quick_values(),
         )
 
     def check(self) -> None:
         for part in self.parts:
             part.check()
 
-    def trials(self) -> int | None:
-        return sum(part.trials() or 0 for part in self.parts)
+    def num_trials(self) -> int | None:
+        return sum(part.num_trials() or 0 for part in self.parts)
 
     def answer(self, run: Run) -> xr.DataTree:
-        heard = InTurn(run.report)
-        run = run._replace(report=heard)
+        heard = SequentialProgress(run.callback)
+        run = run._replace(callback=heard)
         tables, push, hardware = self.parts
         found = {"table": tables.answer(run)}
-        heard.ended(tables.trials() or 0)
-        found["trial"] = run.part("trial", lambda: push.answer(run).data)
-        heard.ended(1)
+        heard.finish(tables.num_trials() or 0)
+        found["trial"] = run.checkpoint("trial", lambda: push.answer(run).data)
+        heard.finish(1)
         found["hardware"] = hardware.answer(run)
         if run.folder is not None:
             for name, one in found.items():
                 files.write_results(run.folder / f"{name}.nc", one)
         return xr.DataTree.from_dict(found)
 
-    def intro(self, found: xr.DataTree) -> str:
+    def intro(self, results: xr.DataTree) -> str:
         return "The numbers of the paper *Pushing in the Dark* beside ours. Intervals: Wilson 95 %."
 
-    def report(self, found: xr.DataTree, run: Run) -> Sequence[Section]:
-        trial, (_, push, hardware) = found["trial"].to_dataset(), self.parts
+    def report(self, results: xr.DataTree, run: Run) -> Sequence[Section]:
+        trial, (_, push, hardware) = results["trial"].to_dataset(), self.parts
         reached = "reached" if int(trial.outcome_success) else "not reached"
         text = f"The target is {reached} at {float(trial.outcome_time):.1f} s."
         fig_6 = Picture("trial", partial(figures.one_trial, trial, push.case.title))
@@ -88,9 +88,9 @@ class Paper(Pushes[xr.DataTree]):
         )
         return [
             *_setup(),
-            *table.sections(found["table"].to_dataset()),
+            *table.sections(results["table"].to_dataset()),
             Section("Fig. 6: the box to (-2, 0) under S1", text, (), fig_6),
-            *hardware.report(found["hardware"].to_dataset(), run),
+            *hardware.report(results["hardware"].to_dataset(), run),
             Section("What the paper leaves open", left_open, rows),
         ]
 

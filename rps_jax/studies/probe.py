@@ -15,8 +15,8 @@ from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.trials import batch, score
-from rps_jax.trials.batch import Job, Part
-from rps_jax.trials.progress import InTurn, Report, unheard
+from rps_jax.trials.batch import Job, WorldBatch
+from rps_jax.trials.progress import ProgressCallback, SequentialProgress, no_progress
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import points
@@ -43,14 +43,14 @@ class Probe:
     folder: Path | None = None
     slots: int | None = None
     workers: int | None = None
-    report: Report = unheard
+    callback: ProgressCallback = no_progress
     calls: int = 0
     trials: int = 0  # of all calls, those answered from the folder too
     simulated: float = 0.0  # [s] of all these trials
-    _heard: InTurn = field(init=False)
+    _heard: SequentialProgress = field(init=False)
 
     def __post_init__(self) -> None:
-        self._heard = InTurn(self.report)
+        self._heard = SequentialProgress(self.callback)
 
     def __call__(self, u: np.ndarray) -> xr.Dataset:
         """Outcomes and `severity` (world) at points `u` (n, q)."""
@@ -70,7 +70,7 @@ class Probe:
         self.calls += 1
         self.trials += len(at.u)
         self.simulated += float(found.time.sum())
-        self._heard.ended(len(at.u))
+        self._heard.finish(len(at.u))
         return found
 
     def _try(self, at: Points) -> xr.Dataset:
@@ -79,7 +79,7 @@ class Probe:
         jobs = [self._job(at, np.flatnonzero(which == one), away) for one in np.unique(which)]
         shape = {"slots": self.slots, "workers": self.workers, "report": self._heard}
         began = time.perf_counter()
-        outcome, _ = batch.gathered(jobs, self.setting, len(at.u), **shape)
+        outcome, _ = batch.run_all(jobs, self.setting, len(at.u), **shape)
         found = {name: np.asarray(getattr(outcome, name), float) for name in _KEPT}
         found["left"] = statistics.miss_distance(outcome.min_distance, away)
         told = [found[name] for name in ("success", "time", "left", "contact_lost_time", "tilt")]
@@ -93,7 +93,7 @@ class Probe:
         drawn = at.draw(self.domain, rows)
         away[rows] = np.linalg.norm(drawn.p_world_target, axis=1)
 
-        def made() -> Iterator[Part]:
+        def made() -> Iterator[WorldBatch]:
             yield drawn_worlds(self.domain, drawn, self.params, self.setting)
 
         # Few different sizes, since each is a program of its own: powers of four.

@@ -28,7 +28,7 @@ from rps_jax import errors
 from rps_jax.analysis.figures.style import Figure
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.record.options import option
-from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, name_of, seed_of
+from rps_jax.runs.question import DomainQuestion, LawQuestion, Run, call_of, name_or_custom, seed_of
 from rps_jax.studies.probe import Probe
 from rps_jax.world import points
 from rps_jax.world.domain import Domain
@@ -165,7 +165,7 @@ def _moved(z: np.ndarray, step: float, noise: np.ndarray, rng: np.random.Generat
 
 
 @dataclass(frozen=True)
-class Rare(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
+class Rare(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
     """Estimate how often a law fails that rarely fails, by subset simulation.
 
     The answer holds `p` and its `low`, `high` and `variation`, and `trials` (repetition); `p_group`
@@ -181,7 +181,7 @@ class Rare(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Rare failures"
-    SMALL: ClassVar[Mapping[str, Any]] = {
+    QUICK: ClassVar[Mapping[str, Any]] = {
         "particles": 200,
         "groups": 4,
         "domain": "wide,objects=random_box",
@@ -213,26 +213,26 @@ class Rare(InDomain[xr.Dataset], OfLaw[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         domain, seed = self.ranges, self.setting.seed
-        probe = Probe(domain, self.params, self.setting, run.folder, **run.shape)
+        probe = Probe(domain, self.params, self.setting, run.folder, **run.batch_options)
         kinds = [one.kind for one in points.quantities(domain)]
         first = seed_of(seed, "tune") * 10_000
         every = [subset_simulation(kinds, self, first + i) for i in range(self.repetitions)]
         return _labelled(domain, run_together(lambda u: probe(u).severity.values, every))
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         what = "a failure is a trial that does not reach its target."
         if self.beyond:
             what = f"a failure misses the target by more than {self.beyond:g} m."
-        return f"{self.label} in the domain {name_of(self.domain)}: {what}"
+        return f"{self.label} in the domain {name_or_custom(self.domain)}: {what}"
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         text = (
             "Intervals of 95 %, from the spread of the groups. The last column is the number of "
             "worlds over that of drawn worlds with the same coefficient of variation. A kind of "
             "failure that no group has met is in no interval."
         )
-        picture = Picture("rare", partial(draw_estimates, found))
-        return [Section("How rare is a failure", text, estimate_table(found), picture)]
+        picture = Picture("rare", partial(draw_estimates, results))
+        return [Section("How rare is a failure", text, estimate_table(results), picture)]
 
 
 rare = call_of(Rare)

@@ -20,8 +20,8 @@ from rps_jax.control.registry import LawsLike
 from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import OfLaws, Run, call_of
-from rps_jax.runs.sweep import Planned
+from rps_jax.runs.question import MultiLawQuestion, Run, call_of
+from rps_jax.runs.sweep import PlanQuestion
 from rps_jax.trials.score import severity_of
 from rps_jax.trials.trial import Rules
 from rps_jax.world import points
@@ -38,7 +38,7 @@ def worlds() -> xr.Dataset:
 
 
 @dataclass(frozen=True)
-class Regress(Planned, OfLaws[xr.Dataset]):
+class Regress(PlanQuestion, MultiLawQuestion[xr.Dataset]):
     """Try laws in 200 worlds that were hard for those before them, and compare.
 
     The answer holds outcomes (law, world), and as `known_success` and `known_severity` (known,
@@ -74,16 +74,16 @@ class Regress(Planned, OfLaws[xr.Dataset]):
             known_severity=(("known", "world"), known.severity.values),
         ).assign_coords(known=known.known.values)
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         return (
-            f"The first {found.sizes['world']} of 200 worlds in which some law failed, or almost "
+            f"The first {results.sizes['world']} of 200 worlds in which some law failed, or almost "
             "did. A rate in them says nothing about rates elsewhere; only differences count."
         )
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        sections = [Section("Wins", "", table(found))]
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
+        sections = [Section("Wins", "", table(results))]
         for law in self.chosen:
-            rows = changes(found, law, self.against, self.setting.rules)
+            rows = changes(results, law, self.against, self.setting.rules)
             if len(rows) > 1:
                 sections.append(Section(f"{law} against {self.against}, world by world", "", rows))
         return sections

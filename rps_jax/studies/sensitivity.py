@@ -27,8 +27,16 @@ from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, count_of, name_of, seed_of
-from rps_jax.runs.sweep import Planned
+from rps_jax.runs.question import (
+    DomainQuestion,
+    LawQuestion,
+    Run,
+    call_of,
+    count_true,
+    name_or_custom,
+    seed_of,
+)
+from rps_jax.runs.sweep import PlanQuestion
 from rps_jax.world import points
 from rps_jax.world.domain import WORDS
 
@@ -48,7 +56,7 @@ MIN_FAILING_POINTS = 30  # base points at which a trial fails, for indices that 
 
 
 @dataclass(frozen=True)
-class Sensitivity(Planned, InDomain[xr.Dataset], OfLaw[xr.Dataset]):
+class Sensitivity(PlanQuestion, DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
     """Share the blame for failures among all quantities that are drawn, by Sobol indices.
 
     The answer holds `first`, `total` and the half widths `first_reach`, `total_reach` of their
@@ -64,7 +72,7 @@ class Sensitivity(Planned, InDomain[xr.Dataset], OfLaw[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Sensitivity of success"
-    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 256}
+    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 256}
 
     worlds: int = option(1024, 1, 100_000_000)
     """Number of worlds, at most: a power of two for each quantity and two more."""
@@ -125,32 +133,33 @@ class Sensitivity(Planned, InDomain[xr.Dataset], OfLaw[xr.Dataset]):
             files.write_results(run.folder / "sobol.nc", found)
         return found
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         each = f"{self.base} for each of {len(self.factors)} quantities and two more"
         return (
-            f"{self.label} in the domain {name_of(self.domain)}: {self.plan.worlds:,} worlds, "
-            f"{each}; {count_of(found.success.values == 0)} fail."
+            f"{self.label} in the domain {name_or_custom(self.domain)}: {self.plan.worlds:,} "
+            f"worlds, {each}; {count_true(results.success.values == 0)} fail."
         )
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        order = rank_factors(found)
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
+        order = rank_factors(results)
         said = {one: factor_words(one) for one in order}
-        drawn = [one for one in order if one in found.quantity.values][:5]
-        failed = found.success.values == 0
-        title = f"{self.label}, {name_of(self.domain)}: failures over pairs, {failed.size:,} worlds"
+        drawn = [one for one in order if one in results.quantity.values][:5]
+        failed = results.success.values == 0
+        where = f"{self.label}, {name_or_custom(self.domain)}"
+        title = f"{where}: failures over pairs, {failed.size:,} worlds"
         kinds = [one.removeprefix("random_") for one in self.ranges.objects]
-        u, names = found.u.sel(quantity=drawn).values, [said[one] for one in drawn]
+        u, names = results.u.sel(quantity=drawn).values, [said[one] for one in drawn]
         pairs = partial(interactions, u, failed, names, {factor_words("object"): kinds}, title)
         text = (
             "The first index is the share of the variance that a quantity explains alone, the "
             "total one what goes with it and all its interactions; noise and the corners of "
             "prisms are one quantity each. Intervals are bootstrapped, of 95 %. "
-            f"{reliability(found)}"
+            f"{reliability(results)}"
         )
-        indices = Picture("sobol", partial(indices_figure, found, said))
+        indices = Picture("sobol", partial(indices_figure, results, said))
         maps = Picture("interactions", pairs)
         return [
-            Section("Which quantity is to blame", text, index_table(found), indices),
+            Section("Which quantity is to blame", text, index_table(results), indices),
             Section("Interactions of the first five", "", (), maps),
         ]
 

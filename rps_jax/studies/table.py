@@ -17,16 +17,16 @@ from rps_jax.control.registry import LawsLike
 from rps_jax.record import files
 from rps_jax.record import folder as run_folder
 from rps_jax.runs.plan import setting_of
-from rps_jax.runs.push import sensed
-from rps_jax.runs.question import OfLaws, Run, call_of
+from rps_jax.runs.push import case_options
+from rps_jax.runs.question import MultiLawQuestion, Run, call_of
 from rps_jax.trials import pushes, results
-from rps_jax.trials.case import Case, FrictionLike, Given, label_of
+from rps_jax.trials.case import Case, FrictionLike, TrialOptions, label_of
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
 
 
 @dataclass(frozen=True)
-class Table(Given, OfLaws[xr.Dataset]):
+class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
     """Run the paper's trials: by default its 432, with Table II beside the paper's.
 
     The answer holds outcomes (law, object, friction, target).
@@ -41,7 +41,7 @@ class Table(Given, OfLaws[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Table II: successes"
-    SMALL: ClassVar[Mapping[str, Any]] = {"targets": paper.FEW_TARGETS}
+    QUICK: ClassVar[Mapping[str, Any]] = {"targets": paper.FEW_TARGETS}
 
     laws: LawsLike = paper.LAWS
     objects: Sequence[str] = PAPER_OBJECTS
@@ -57,7 +57,7 @@ class Table(Given, OfLaws[xr.Dataset]):
         """Every combination, in the nesting order of `results.outcome_dataset`."""
         for name in ("objects", "friction"):
             errors.check_each_once(name, getattr(self, name))
-        given = sensed(self, self.setting)
+        given = case_options(self, self.setting)
         return [
             Case(thing, contact, target, params, **given)
             for params in self.chosen.values()
@@ -71,14 +71,14 @@ class Table(Given, OfLaws[xr.Dataset]):
             raise errors.InputError("targets = () is not allowed: name at least one.")
         self.setting.check_here(self.cases[0].base, self.chosen.values())
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         return len(self.cases)
 
     def answer(self, run: Run) -> xr.Dataset:
-        return run.part("table", partial(self._run, run))
+        return run.checkpoint("table", partial(self._run, run))
 
     def _run(self, run: Run) -> xr.Dataset:
-        outcome, _ = pushes.run(self.cases, self.setting, **run.shape)
+        outcome, _ = pushes.run(self.cases, self.setting, **run.batch_options)
         labels = [label_of(one) for one in self.friction]
         names = (
             list(self.chosen),
@@ -86,14 +86,14 @@ class Table(Given, OfLaws[xr.Dataset]):
         )
         return results.outcome_dataset(outcome, *names, labels, self.targets)
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         return (
-            f"{found.success.size} trials, engine {self.setting.engine}, steps of "
+            f"{results.success.size} trials, engine {self.setting.engine}, steps of "
             f"{1000 * self.setting.physics.timestep:g} ms. Intervals: Wilson 95 %, in percent."
         )
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        return sections(found)
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
+        return sections(results)
 
 
 table = call_of(Table)
@@ -120,7 +120,7 @@ def table_of(folder: Path) -> Table:
         setting = setting_of(found["setting"])
         laws = {name: registry.params_from_json(law) for name, law in found["laws"].items()}
         pairs = {name: _tuples(found[name]) for name in ("objects", "friction", "targets")}
-        given = {one.name: found[one.name] for one in dataclasses.fields(Given)}
+        given = {one.name: found[one.name] for one in dataclasses.fields(TrialOptions)}
         if found["question"] != "table":
             raise KeyError("question")
     except (LookupError, TypeError, AttributeError, ValueError) as error:

@@ -24,9 +24,9 @@ from rps_jax import engines, errors
 from rps_jax.control.base import Law
 from rps_jax.engines import programs
 from rps_jax.trials import host, trial
-from rps_jax.trials.progress import Progress, Report, Timing, unheard
+from rps_jax.trials.progress import Progress, ProgressCallback, Timing, no_progress
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Loop, Outcome, Rules, Trial, World
+from rps_jax.trials.trial import ControlLoop, Outcome, Rules, Trial, World
 from rps_jax.world.physics import Physics
 
 SEGMENT = 10.0  # [s] simulated between two looks at which trials have ended
@@ -37,10 +37,10 @@ _ASIDE = 8192
 _SIDE_BY_SIDE = 4  # jobs, at most: a program of more would be long in compiling
 
 
-class Part(NamedTuple):
+class WorldBatch(NamedTuple):
     """Some trials of a job."""
 
-    numbers: np.ndarray  # (n,) of the trials
+    indices: np.ndarray  # (n,) indices of the trials in the run
     worlds: World  # leaves (n, ...), on the host
     stage: Any
 
@@ -50,7 +50,7 @@ class Job(NamedTuple):
 
     law: Law
     trials: int  # at most; there are no more slots than that
-    parts: Iterable[Part]  # of one stage, if JAX traces the engine
+    parts: Iterable[WorldBatch]  # of one stage, if JAX traces the engine
 
 
 Collect = Callable[[np.ndarray, Outcome], Any]  # numbers (m,) of trials and their outcomes
@@ -63,7 +63,7 @@ def run(
     slots: int | None = None,  # worlds stepped at once by a worker on each device of the host
     workers: int | None = None,
     collect: Collect,  # called with trials that ended, in any order, one call at a time
-    report: Report = unheard,  # called after every segment, likewise
+    callback: ProgressCallback = no_progress,  # called after every segment, likewise
 ) -> Timing:
     """Run every trial of every job to its end.
 
@@ -75,7 +75,7 @@ def run(
     workers = engine.workers(backend) if workers is None else workers
     errors.check_count("slots", slots, at_most=10_000_000)
     errors.check_count("workers", workers, at_most=1024)
-    shared = _Shared(collect, report, workers)
+    shared = _Shared(collect, callback, workers)
     began = time.perf_counter()
     if not engine.traced:
         count = max(1, min(workers, len(jobs)))
@@ -91,7 +91,7 @@ def run(
     return Timing(shared.compile, total - shared.compile, shared.simulated)
 
 
-def gathered(
+def run_all(
     jobs: Sequence[Job], setting: Setting, count: int, **shape: Any
 ) -> tuple[Outcome, Timing]:
     """Run every trial of every job, whose numbers are 0 to `count` - 1, by the `shape` of `run`.
@@ -127,13 +127,13 @@ def _side_by_side(tasks: Sequence[Callable[[], None]], count: int, shared: _Shar
 class _Shared:
     """What the workers report into."""
 
-    def __init__(self, collect: Collect, report: Callable[[Progress], Any], workers: int):
+    def __init__(self, collect: Collect, callback: Callable[[Progress], Any], workers: int):
         self.drained = threading.Barrier(workers)  # no trial of any queue waits
         self.simulated = 0.0
         self.compile = 0.0
         self.stop = False  # set when one worker fails or the user interrupts
         self._finished = 0
-        self._collect, self._report = collect, report
+        self._collect, self._report = collect, callback
         self._lock = threading.Lock()
 
     def add(self, numbers: np.ndarray, trials: Outcome, simulated: float) -> None:
@@ -158,16 +158,18 @@ class _Shared:
 def _run_on_host(job: Job, setting: Setting, threads: int, shared: _Shared) -> None:
     for part in job.parts:
 
-        def tell(ended: np.ndarray, trials: Trial, simulated: float, part: Part = part) -> bool:
+        def tell(
+            ended: np.ndarray, trials: Trial, simulated: float, part: WorldBatch = part
+        ) -> bool:
             outcomes = jax.device_get(trial.outcome(trials, setting.physics.control_period))
-            shared.add(part.numbers[ended], rows(outcomes, ended), simulated)
+            shared.add(part.indices[ended], rows(outcomes, ended), simulated)
             return not shared.stop
 
         if shared.stop:
             return
-        loop = Loop(setting.physics, setting.rules, job.law)
+        loop = ControlLoop(setting.physics, setting.rules, job.law)
         engine = engines.get(setting.engine)
-        host.run(engine, part.stage, part.worlds, loop, threads=max(1, threads), report=tell)
+        host.run(engine, part.stage, part.worlds, loop, threads=max(1, threads), callback=tell)
 
 
 # --- on a device -----------------------------------------------------------------------------
@@ -179,10 +181,10 @@ class _Queue:
     def __init__(self, job: Job):
         self.law, self.trials = job.law, job.trials
         self._parts = iter(job.parts)
-        self.like: Part = next(self._parts)
-        self._waiting: Part | None = self.like  # what is left of it
+        self.like: WorldBatch = next(self._parts)
+        self._waiting: WorldBatch | None = self.like  # what is left of it
         self._lock = threading.Lock()
-        self.aside: list[tuple[Part, Trial, np.ndarray]] = []  # with which are to be begun
+        self.aside: list[tuple[WorldBatch, Trial, np.ndarray]] = []  # with which are to be begun
 
     @property
     def waits(self) -> bool:
@@ -191,14 +193,14 @@ class _Queue:
             self._waiting = self._waiting or next(self._parts, None)
             return self._waiting is not None
 
-    def take(self, count: int) -> list[Part]:
+    def take(self, count: int) -> list[WorldBatch]:
         """Up to `count` waiting trials, as pieces of parts."""
         taken = []
         with self._lock:
             while count and (part := self._waiting or next(self._parts, None)):
                 piece, self._waiting = _cut(part, count)
                 taken.append(piece)
-                count -= piece.numbers.size
+                count -= piece.indices.size
         return taken
 
 
@@ -307,7 +309,7 @@ def _compiled(
         started = [trial.start_all(*each, law=law) for each in zip(worlds, live, strict=True)]
         begun = tuple(map(_pick, fresh, started, trials))
         steps = max(1, round(SEGMENT / physics.control_period))
-        after = trial.advance(stages, worlds, begun, Loop(physics, rules, law), steps)
+        after = trial.advance(stages, worlds, begun, ControlLoop(physics, rules, law), steps)
         # Of the same program: one of its own would wait for the other workers' segments.
         return after, tuple(
             (one.steps, one.done, trial.outcome(one, physics.control_period)) for one in after
@@ -333,13 +335,13 @@ def rows(tree: Any, which: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[which], tree)
 
 
-def _cut(part: Part, count: int) -> tuple[Part, Part | None]:
+def _cut(part: WorldBatch, count: int) -> tuple[WorldBatch, WorldBatch | None]:
     """The first `count` trials of a part, and the others if there are any."""
 
-    def piece(which: slice) -> Part:
-        return Part(part.numbers[which], rows(part.worlds, which), part.stage)
+    def piece(which: slice) -> WorldBatch:
+        return WorldBatch(part.indices[which], rows(part.worlds, which), part.stage)
 
-    over = part.numbers.size > count
+    over = part.indices.size > count
     return piece(slice(count)), piece(slice(count, None)) if over else None
 
 
@@ -375,12 +377,12 @@ class _Slots:
         self._before = running.steps.copy()
         self.trials = batch.put(running._replace(done=~self.live))
 
-    def _put(self, at: np.ndarray, taken: Sequence[Part]) -> World:
+    def _put(self, at: np.ndarray, taken: Sequence[WorldBatch]) -> World:
         """Put trials into the first of the slots `at`; returns all worlds."""
-        ends = np.cumsum([0, *(part.numbers.size for part in taken)])
+        ends = np.cumsum([0, *(part.indices.size for part in taken)])
         at = at[: ends[-1]]
         for part, slots in zip(taken, np.split(at, ends[1:-1]) if taken else (), strict=True):
-            self._numbers[slots] = part.numbers
+            self._numbers[slots] = part.indices
             for mine, theirs in zip(
                 jax.tree.leaves(self._host), jax.tree.leaves(part.worlds), strict=True
             ):
@@ -411,7 +413,7 @@ class _Slots:
     def set_aside(self) -> None:
         """Hand what runs over to the queue."""
         if (at := np.flatnonzero(self.live)).size:
-            part = Part(self._numbers[at], rows(self._host, at), self._queue.like.stage)
+            part = WorldBatch(self._numbers[at], rows(self._host, at), self._queue.like.stage)
             trials = rows(jax.device_get(self.trials), at)
             self._queue.aside.append((part, trials, self._fresh[at]))
 

@@ -20,7 +20,7 @@ FrictionLike = str | Friction | tuple[float, float]  # a friction set, or coeffi
 
 
 @dataclass(frozen=True, kw_only=True)
-class Given:
+class TrialOptions:
     """What is given beside object, friction, target and law, for one trial or for many."""
 
     mass: float | None = None
@@ -41,7 +41,7 @@ class Given:
 
 
 @dataclass(frozen=True)
-class Case(Given):
+class Case(TrialOptions):
     """One trial to run: all that may differ from world to world.
 
     Raises:

@@ -34,9 +34,9 @@ from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.robot.robot import Robot
 from rps_jax.trials import trial
-from rps_jax.trials.batch import Part, rows
+from rps_jax.trials.batch import WorldBatch, rows
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Seen, Trial, World
+from rps_jax.trials.trial import Measurement, Trial, World
 from rps_jax.trials.worlds import drawn_scene, drawn_worlds
 from rps_jax.world import domain, draws, objects, video
 from rps_jax.world.domain import DOMAINS, Domain
@@ -188,7 +188,7 @@ class PushEnv:
         (far, apart), (near, together) = of(before), of(now)
         return far - near, together - apart
 
-    def _observe(self, world: World, before: Trial) -> tuple[Trial, Seen]:
+    def _observe(self, world: World, before: Trial) -> tuple[Trial, Measurement]:
         """Sense and judge, unless the trial has ended."""
         physics, rules = self.setting.physics, self.setting.rules
         told, seen = trial.observe(world, before, physics=physics, rules=rules)
@@ -196,7 +196,7 @@ class PushEnv:
         told = told._replace(law_state=felt)
         return jax.tree.map(lambda a, b: jnp.where(before.done, a, b), before, told), seen
 
-    def _observation(self, world: World, now: Trial, seen: Seen) -> TaxelObservation:
+    def _observation(self, world: World, now: Trial, seen: Measurement) -> TaxelObservation:
         """What a law that senses taxels is told."""
         felt = world.skin, now.skin, trial.outline(world, now.qpos)
         touch = seen.observation._replace(period=jnp.asarray(self.dt))
@@ -259,7 +259,7 @@ class PushEnv:
         return draws.draw(self._alone, self.setting.seed, np.arange(self.worlds))
 
     @functools.cached_property
-    def _part(self) -> Part:
+    def _part(self) -> WorldBatch:
         """All worlds, on the device."""
         part = drawn_worlds(self._alone, self._drawn, self.params, self.setting)
         return part._replace(worlds=jax.tree.map(jnp.asarray, part.worlds))
@@ -301,14 +301,14 @@ class PushEnv:
         return images
 
 
-def _obs(now: Trial, seen: Seen) -> jax.Array:
+def _obs(now: Trial, seen: Measurement) -> jax.Array:
     taxels = jnp.where(now.skin.alive, now.skin.signal, 0.0)
     told = seen.observation
     p_robot_target = planar.rotate(-told.yaw, told.p_world_target - told.p_world_robot)
     return jnp.concatenate([taxels, p_robot_target])
 
 
-def _metrics(now: Trial, seen: Seen, progress: jax.Array) -> dict[str, jax.Array]:
+def _metrics(now: Trial, seen: Measurement, progress: jax.Array) -> dict[str, jax.Array]:
     flags = {
         "in_contact": seen.reading.in_contact,
         "success": now.success,

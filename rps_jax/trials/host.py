@@ -12,7 +12,7 @@ import numpy as np
 
 from rps_jax.engines.base import Driven, Engine, Motion
 from rps_jax.trials import trial
-from rps_jax.trials.trial import Loop, Snapshot, Trial, World
+from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
 
 _LOOK = 500  # control steps between two reports
 
@@ -25,10 +25,10 @@ def run(
     engine: Engine,
     stage: Any,
     worlds: World,
-    loop: Loop,
+    loop: ControlLoop,
     *,
     threads: int,
-    report: Callable[[np.ndarray, Trial, float], bool],
+    callback: Callable[[np.ndarray, Trial, float], bool],
     watch: Callable[[int, Snapshot], Any] = lambda step, seen: None,
 ) -> Trial:
     """Run a batch of worlds to their ends, and return the trials.
@@ -64,7 +64,7 @@ def run(
             if passes % _LOOK == 0 or not going.size:
                 done, steps = np.asarray(trials.done), int(np.asarray(trials.steps).sum())
                 simulated = (steps - before) * physics.control_period
-                if not report(np.flatnonzero(done & ~told_of), trials, simulated):
+                if not callback(np.flatnonzero(done & ~told_of), trials, simulated):
                     return trials
                 told_of, before = done, steps
         return trials

@@ -20,18 +20,18 @@ class Progress:
     rounds: int = 0  # generations or updates that are done
 
 
-Report = Callable[[Progress], object]  # called now and then by what runs
+ProgressCallback = Callable[[Progress], object]  # called now and then by what runs
 
 
-def unheard(progress: Progress) -> None:
+def no_progress(progress: Progress) -> None:
     """Ignore the progress of a run that nobody watches."""
 
 
-class InTurn:
-    """Report of runs that follow one another, as if they were one."""
+class SequentialProgress:
+    """ProgressCallback of runs that follow one another, as if they were one."""
 
-    def __init__(self, report: Report):
-        self._report = report
+    def __init__(self, callback: ProgressCallback):
+        self._report = callback
         self._before = self._now = Progress(0, 0.0)
 
     def __call__(self, progress: Progress) -> None:
@@ -43,7 +43,7 @@ class InTurn:
         )
         self._report(self._now)
 
-    def ended(self, trials: int) -> None:
+    def finish(self, trials: int) -> None:
         """Count a run of so many trials as ended, even if it had nothing left to run."""
         self._before = self._now = replace(self._now, finished=self._before.finished + trials)
 
@@ -87,7 +87,7 @@ class Bar:
         self._bar: Any = None
         self._began = time.perf_counter()
         self._last = Progress(0, 0.0)
-        self.when_compiled: Callable[[], object] | None = None  # called once, when trials run
+        self.on_compiled: Callable[[], object] | None = None  # called once, when trials run
 
     def __enter__(self) -> Bar:
         self._began = time.perf_counter()
@@ -124,8 +124,8 @@ class Bar:
 
     def __call__(self, progress: Progress) -> None:
         self._last = progress
-        if progress.compile and self.when_compiled is not None:
-            called, self.when_compiled = self.when_compiled, None
+        if progress.compile and self.on_compiled is not None:
+            called, self.on_compiled = self.on_compiled, None
             called()
         note = f"{progress.simulated:.0f} s simulated"
         if self.over == "trials":
@@ -151,13 +151,13 @@ class Bar:
         return Timing(self._last.compile, self.elapsed - self._last.compile, self._last.simulated)
 
 
-def phase(report: Report, what: str) -> None:
+def set_phase(callback: ProgressCallback, what: str) -> None:
     """Tell a bar what is done from now on; others do not hear of it."""
-    if isinstance(report, Bar):
-        report.phase(what)
+    if isinstance(callback, Bar):
+        callback.phase(what)
 
 
-def watched() -> bool:
+def is_interactive() -> bool:
     """Whether somebody looks: the error stream is a terminal, or this is a notebook."""
     if "ipykernel" in sys.modules:
         return True

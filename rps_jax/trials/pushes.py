@@ -21,11 +21,11 @@ from rps_jax.record import provenance
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.shell import Shell
 from rps_jax.trials import batch, host, trial
-from rps_jax.trials.batch import SEGMENT, Job, Part, rows
+from rps_jax.trials.batch import SEGMENT, Job, WorldBatch, rows
 from rps_jax.trials.case import Case
-from rps_jax.trials.progress import Progress, Report, Timing, unheard
+from rps_jax.trials.progress import Progress, ProgressCallback, Timing, no_progress
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Loop, Outcome, Shift, Snapshot, Trial, World
+from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, World
 from rps_jax.world import scene
 from rps_jax.world.objects import FAMILIES
 from rps_jax.world.physics import Physics
@@ -33,7 +33,7 @@ from rps_jax.world.scene import JOINTS, Scene
 
 
 @dataclass(frozen=True)
-class Followed:
+class Trajectory:
     """One trial, seen every `interval` [s]: arrays over time, (T, ...)."""
 
     snapshots: Snapshot
@@ -148,41 +148,41 @@ def run(
     for indices in kinds.values():
         mine = [cases[i] for i in indices]
         stage, worlds = build(mine, setting, indices)
-        part = Part(np.array(indices), worlds, stage)
+        part = WorldBatch(np.array(indices), worlds, stage)
         jobs.append(Job(registry.law_of(mine[0].params), len(mine), [part]))
-    return batch.gathered(jobs, setting, len(cases), **shape)
+    return batch.run_all(jobs, setting, len(cases), **shape)
 
 
-def follow(
+def record_cases(
     cases: Sequence[Case],
     setting: Setting = Setting(engine="mjx"),
     *,
     interval: float = 0.1,
-    report: Report = unheard,
-) -> list[Followed]:
+    callback: ProgressCallback = no_progress,
+) -> list[Trajectory]:
     """Run trials of one kind to their ends and keep what they looked like every `interval` [s]."""
     stage, worlds = build(cases, setting)
-    part = Part(np.arange(len(cases)), worlds, stage)
+    part = WorldBatch(np.arange(len(cases)), worlds, stage)
     law = registry.law_of(cases[0].params)
-    return follow_part(part, law, setting, interval=interval, report=report)
+    return record_batch(part, law, setting, interval=interval, callback=callback)
 
 
-def follow_part(
-    part: Part,
+def record_batch(
+    part: WorldBatch,
     law: Law,
     setting: Setting,
     *,
     interval: float = 0.1,
-    report: Report = unheard,
-) -> list[Followed]:
+    callback: ProgressCallback = no_progress,
+) -> list[Trajectory]:
     """`follow`, for worlds that are built."""
     period = setting.physics.control_period
     every = max(1, round(interval / period))
     if not engines.get(setting.engine).traced:
-        return _followed(part, *_follow_on_host(part, law, setting, every, report))
+        return _followed(part, *_follow_on_host(part, law, setting, every, callback))
     steps = every * max(1, round(SEGMENT / (every * period)))
     worlds = jax.device_put(part.worlds)
-    trials = trial.start_all(worlds, np.ones(part.numbers.size, bool), law=law)
+    trials = trial.start_all(worlds, np.ones(part.indices.size, bool), law=law)
     began = time.perf_counter()
     record = recorder(part.stage, worlds, trials, setting, law, steps=steps, every=every)
     compiled = time.perf_counter()
@@ -193,7 +193,7 @@ def follow_part(
             (trials.done, trials.steps, snapshots, outcomes)
         )
         parts.append(snapshots)
-        report(Progress(int(done.sum()), float(steps_done.sum()) * period, compiled - began))
+        callback(Progress(int(done.sum()), float(steps_done.sum()) * period, compiled - began))
         if done.all():
             break
     whole = jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
@@ -219,7 +219,7 @@ def recorder(
 
 
 def _follow_on_host(
-    part: Part, law: Law, setting: Setting, every: int, report: Report
+    part: WorldBatch, law: Law, setting: Setting, every: int, callback: ProgressCallback
 ) -> tuple[Snapshot, Outcome, Timing]:
     """What `host.run` sees every so many control steps: (T, B, ...), outcomes and timing."""
     seen: list[Snapshot] = []
@@ -234,16 +234,16 @@ def _follow_on_host(
     def tell(_: np.ndarray, trials: Trial, simulated: float) -> bool:
         nonlocal total
         total += simulated
-        report(Progress(int(np.asarray(trials.done).sum()), total, compiled))
+        callback(Progress(int(np.asarray(trials.done).sum()), total, compiled))
         return True
 
     trials = host.run(
         engines.get(setting.engine),
         part.stage,
         part.worlds,
-        Loop(setting.physics, setting.rules, law),
-        threads=1 if part.numbers.size == 1 else provenance.count_processors(),
-        report=tell,
+        ControlLoop(setting.physics, setting.rules, law),
+        threads=1 if part.indices.size == 1 else provenance.count_processors(),
+        callback=tell,
         watch=watch,
     )
     outcomes = jax.device_get(trial.outcome(trials, setting.physics.control_period))
@@ -252,10 +252,12 @@ def _follow_on_host(
     return jax.tree.map(lambda *each: np.stack(each), *seen), outcomes, timing
 
 
-def _followed(part: Part, whole: Snapshot, outcomes: Outcome, timing: Timing) -> list[Followed]:
+def _followed(
+    part: WorldBatch, whole: Snapshot, outcomes: Outcome, timing: Timing
+) -> list[Trajectory]:
     """What was seen (T, B, ...), trial by trial, each until its end."""
     return [
-        Followed(
+        Trajectory(
             rows(whole, (~whole.done[:, i], i)),
             rows(outcomes, i),
             timing,
@@ -264,7 +266,7 @@ def _followed(part: Part, whole: Snapshot, outcomes: Outcome, timing: Timing) ->
             _half(rows(part.worlds.skin.shell, i)),
             _outline(rows(part.worlds.footprint, i)),
         )
-        for i in range(part.numbers.size)
+        for i in range(part.indices.size)
     ]
 
 

@@ -8,7 +8,7 @@ import xarray as xr
 
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.trials import trial
-from rps_jax.trials.pushes import Followed
+from rps_jax.trials.pushes import Trajectory
 from rps_jax.trials.trial import Outcome
 
 DIMS = ("law", "object", "friction", "target")
@@ -68,7 +68,7 @@ def _plain(values: Any) -> np.ndarray:
     return values.astype(np.int8) if values.dtype == bool else values
 
 
-def trace_dataset(trace: Followed) -> xr.Dataset:
+def trace_dataset(trace: Trajectory) -> xr.Dataset:
     """One trial over time: variables (time, ...), and its outcome, target and thresholds alone."""
     seen = trace.snapshots
 

@@ -20,10 +20,10 @@ from rps_jax.control.base import Law
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.skin import CapacitiveSkin
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.batch import Part, rows
+from rps_jax.trials.batch import WorldBatch, rows
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Loop, Outcome, Shift, Snapshot, Trial, World
+from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, World
 
 CHUNK = 25  # steps, at most, that one call of the compiled program takes
 
@@ -48,9 +48,9 @@ class Live:
       InputError: an engine that cannot be followed.
     """
 
-    def __init__(self, part: Part, law: Law, setting: Setting) -> None:
+    def __init__(self, part: WorldBatch, law: Law, setting: Setting) -> None:
         engines.get(setting.engine).check_traced()
-        self._stage, self._loop = part.stage, Loop(setting.physics, setting.rules, law)
+        self._stage, self._loop = part.stage, ControlLoop(setting.physics, setting.rules, law)
         self._first: World = rows(part.worlds, slice(1))
         self.past: list[Moment] = []
         self.reset()
@@ -59,7 +59,7 @@ class Live:
     def of_case(cls, case: Case, setting: Setting) -> Live:
         """The trial of a case."""
         stage, worlds = pushes.build([case], setting)
-        return cls(Part(np.arange(1), worlds, stage), registry.law_of(case.params), setting)
+        return cls(WorldBatch(np.arange(1), worlds, stage), registry.law_of(case.params), setting)
 
     # --- what it is now ---
 
@@ -151,7 +151,7 @@ class Live:
 
 @jax.jit
 def _steps(
-    stage: Any, worlds: World, trials: Trial, count: int, loop: Loop
+    stage: Any, worlds: World, trials: Trial, count: int, loop: ControlLoop
 ) -> tuple[Trial, tuple[Trial, Snapshot, jax.Array, jax.Array]]:
     """Up to CHUNK control steps of a world (1, ...), and what each was: rows (CHUNK, ...)."""
 

@@ -66,7 +66,7 @@ class Rules(NamedTuple):
 
 @partial(jax.tree_util.register_dataclass, data_fields=["rules"], meta_fields=["physics", "law"])
 @dataclass(frozen=True)
-class Loop:
+class ControlLoop:
     """The loop of sensing, deciding and stepping; a pytree of the rules, the rest is static."""
 
     physics: Physics
@@ -230,7 +230,7 @@ def sense(
     return state, reading, observation
 
 
-class Seen(NamedTuple):
+class Measurement(NamedTuple):
     """What skin and odometry tell at one moment."""
 
     reading: Reading | SmoothReading
@@ -241,7 +241,7 @@ class Seen(NamedTuple):
 
 def observe(
     world: World, trial: Trial, *, physics: Physics, rules: Rules = Rules()
-) -> tuple[Trial, Seen]:
+) -> tuple[Trial, Measurement]:
     """The first half of `decide`: sense and judge.
 
     The rules judge by where the base is, the law by where it believes to be.
@@ -277,7 +277,7 @@ def observe(
         tipped=tipped,
         done=success | over,
     )
-    return told, Seen(reading, seen, distance)
+    return told, Measurement(reading, seen, distance)
 
 
 def execute(world: World, trial: Trial, twist: Twist, period: float) -> tuple[Trial, Twist]:
@@ -295,7 +295,7 @@ def execute(world: World, trial: Trial, twist: Twist, period: float) -> tuple[Tr
     return trial, Twist(*drive.carried_out(world.robot, aim))
 
 
-def decide(world: World, trial: Trial, loop: Loop) -> tuple[Trial, Twist, Snapshot]:
+def decide(world: World, trial: Trial, loop: ControlLoop) -> tuple[Trial, Twist, Snapshot]:
     """What happens between two control periods of one world: sense, judge, decide.
 
     Returns the trial as it is driven on, or ended; the twist carried out; and what was seen.
@@ -349,7 +349,11 @@ def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
 
 
 def control_step(
-    stage: Stage, worlds: World, trials: Trial, loop: Loop, mapped: Callable[..., Any] = jax.vmap
+    stage: Stage,
+    worlds: World,
+    trials: Trial,
+    loop: ControlLoop,
+    mapped: Callable[..., Any] = jax.vmap,
 ) -> tuple[Trial, Snapshot]:
     """One pass of the loop of a batch of worlds. One that has ended comes back as it is.
 
@@ -408,7 +412,7 @@ def advance(
     stages: tuple[Stage, ...],
     worlds: tuple[World, ...],
     trials: tuple[Trial, ...],
-    loop: Loop,
+    loop: ControlLoop,
     steps: int,
 ) -> tuple[Trial, ...]:
     """Up to `steps` control steps of batches side by side; fewer if all of them end before.
@@ -447,7 +451,7 @@ def _side_by_side(
     stages: tuple[Stage, ...],
     worlds: tuple[World, ...],
     trials: tuple[Trial, ...],
-    loop: Loop,
+    loop: ControlLoop,
     steps: int,
 ) -> tuple[Trial, ...]:
     """`advance` as XLA compiles it."""
@@ -484,7 +488,7 @@ def record(
     every: int = 1,
 ) -> tuple[Trial, Snapshot]:
     """`steps` control steps of a batch, and every `every`-th snapshot (steps // every, B, ...)."""
-    loop = Loop(physics, rules, law)
+    loop = ControlLoop(physics, rules, law)
 
     def body(trials, _):
         return control_step(stage, worlds, trials, loop)

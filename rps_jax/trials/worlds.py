@@ -13,7 +13,7 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.skin import CapacitiveSkin, IdealSkin, Skin
-from rps_jax.trials.batch import Part
+from rps_jax.trials.batch import WorldBatch
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Shift, World
 from rps_jax.world import scene
@@ -23,7 +23,7 @@ from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction, Scene
 
 
-def drawn_worlds(domain: Domain, drawn: Draw, params: LawParams, setting: Setting) -> Part:
+def drawn_worlds(domain: Domain, drawn: Draw, params: LawParams, setting: Setting) -> WorldBatch:
     """The worlds of a draw as a part of a job, all with the same parameters."""
     family = domain.family_of(drawn.case[0])
     count, dtype = drawn.number.size, jnp.result_type(float)
@@ -48,7 +48,7 @@ def drawn_worlds(domain: Domain, drawn: Draw, params: LawParams, setting: Settin
         "robot": None if robots.ideal else robots,
     }
     narrow = jax.tree.map(lambda x: x if x.dtype == np.uint32 else x.astype(dtype), world)
-    return Part(drawn.number, World(**narrow), stage)
+    return WorldBatch(drawn.number, World(**narrow), stage)
 
 
 def _skin(domain: Domain, drawn: Draw) -> Skin:

@@ -27,10 +27,10 @@ from rps_jax.runs import evaluate
 from rps_jax.runs.question import call_of
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Loop, Snapshot, Trial, World, control_step, start_all
+from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World, control_step, start_all
 from rps_jax.tuning import gradients
 from rps_jax.tuning.gradients import Estimate
-from rps_jax.tuning.run import Metrics, Problem, TryOut, Tuning, finite
+from rps_jax.tuning.run import Metrics, Problem, ScoreCandidates, Tuning, finite
 from rps_jax.tuning.space import Space
 from rps_jax.world.physics import preset
 
@@ -53,7 +53,7 @@ class TuneGrad(Tuning):
       {'generation': 2, 'parameter': 1}
     """
 
-    SMALL: ClassVar[dict[str, Any]] = Tuning.SMALL | {
+    QUICK: ClassVar[dict[str, Any]] = Tuning.QUICK | {
         "steps": 8, "starts": 1, "learning_rate": 0.3,
     }  # fmt: skip
 
@@ -174,7 +174,7 @@ def scores_of(how: Windows, stage: Any) -> gradients.Scores:
     """
     space, problem = how.space, how.problem
     law = registry.smooth_law(registry.law_of(space.base))
-    setting, loop = problem.setting, Loop(preset(fidelity="fast"), law=law)
+    setting, loop = problem.setting, ControlLoop(preset(fidelity="fast"), law=law)
 
     def cost(seen: Snapshot) -> jax.Array:
         return soft_score(seen, space.base, setting, problem.objective, how.arrive)
@@ -223,7 +223,7 @@ def differentiated(thetas: jax.Array, how: Windows, seed: int, step: int) -> tup
     setting = replace(problem.setting, engine="quasistatic")
     ask = problem.ask(jax.tree.map(lambda x: np.array([x]), RPSParams()), seed, step)
     random = np.random.default_rng((seed, step))
-    for part, column, _ in evaluate.parts(ask, problem.domains, setting):
+    for part, column, _ in evaluate.world_batches(ask, problem.domains, setting):
         worlds = soften(part.worlds), jnp.asarray(random.uniform(size=column.size))
         found.append((_differentiated(thetas, part.stage, worlds, how=how), column.size))
     total = sum(n for _, n in found)
@@ -234,7 +234,9 @@ def differentiated(thetas: jax.Array, how: Windows, seed: int, step: int) -> tup
     ), len(thetas) * total * (how.window + how.within / 2)
 
 
-def smoothed(thetas: jax.Array, descent: TuneGrad, step: int, try_out: TryOut) -> Estimate:
+def smoothed(
+    thetas: jax.Array, descent: TuneGrad, step: int, score_candidates: ScoreCandidates
+) -> Estimate:
     """Evolution gradients (S, p) of the hard law, of antithetic candidates in the same worlds."""
     problem = descent.problem
     key = jax.random.fold_in(jax.random.key(descent.setting.seed), step)
@@ -242,7 +244,7 @@ def smoothed(thetas: jax.Array, descent: TuneGrad, step: int, try_out: TryOut) -
     steps = jax.random.normal(key, (count, descent.pairs, p), thetas.dtype)
     both = jnp.concatenate([steps, -steps], axis=1) * descent.sigma
     params = descent.space.params((thetas[:, None] + both).reshape(-1, p))
-    (answer,) = try_out([problem.ask(params, descent.setting.seed, step)])
+    (answer,) = score_candidates([problem.ask(params, descent.setting.seed, step)])
     values = problem.objective.value(answer.score).reshape(count, 2, descent.pairs)
     slopes = (values[:, 0] - values[:, 1])[..., None] * steps / (2 * descent.sigma)
     return jax.vmap(gradients.estimate)(slopes)
@@ -284,10 +286,12 @@ class DescentState:
         shapes = {"validation": vectors.shape[:1]}
         return shapes | ({"gradient": vectors.shape} if generation < self.descent.steps else {})
 
-    def judge(self, vectors: np.ndarray, generation: int, try_out: TryOut) -> tuple[Metrics, Any]:
+    def judge(
+        self, vectors: np.ndarray, generation: int, score_candidates: ScoreCandidates
+    ) -> tuple[Metrics, Any]:
         """Values (S,) in the worlds for validation, and, except after the last step, gradients."""
         check = self.problem.validate(self.space.params(vectors), self.descent.setting.seed)
-        (tried,) = try_out([check])
+        (tried,) = score_candidates([check])
         values = self.problem.objective.value(tried.score)
         first = int(jnp.nanargmin(values))
         base = self._base_value if generation else float(values[0])
@@ -303,7 +307,7 @@ class DescentState:
         }
         if generation == self.descent.steps:
             return metrics, line
-        found, more = self._estimated(jnp.asarray(vectors), generation, try_out)
+        found, more = self._estimated(jnp.asarray(vectors), generation, score_candidates)
         metrics["gradient"] = np.asarray(found.gradient)
         return metrics, line | more | {
             "gradient": finite(jnp.linalg.norm(found.gradient, axis=1).mean()),
@@ -312,12 +316,12 @@ class DescentState:
         }
 
     def _estimated(
-        self, thetas: jax.Array, step: int, try_out: TryOut
+        self, thetas: jax.Array, step: int, score_candidates: ScoreCandidates
     ) -> tuple[Estimate, dict[str, float]]:
         """Estimates (S, p), and the times simulated and taken [s] by windows."""
         descent = self.descent
         if descent.estimator == "evolution":
-            return smoothed(thetas, descent, step, try_out), {
+            return smoothed(thetas, descent, step, score_candidates), {
                 "simulated": 0.0,
                 "differentiate": 0.0,
             }

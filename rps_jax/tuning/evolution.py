@@ -17,7 +17,7 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.record.options import option
 from rps_jax.runs.question import call_of
-from rps_jax.tuning.run import Metrics, TryOut, Tuning, finite
+from rps_jax.tuning.run import Metrics, ScoreCandidates, Tuning, finite
 
 Algorithm = Literal["cma", "lra_cma", "sep_cma", "xnes"]
 _KINDS: dict[str, Callable[..., Any]] = {
@@ -46,7 +46,7 @@ class TuneES(Tuning):
       {'generation': 1, 'parameter': 2}
     """
 
-    SMALL: ClassVar[dict[str, Any]] = Tuning.SMALL | {
+    QUICK: ClassVar[dict[str, Any]] = Tuning.QUICK | {
         "worlds": 32, "population": 12, "generations": 8, "spread": 1.0,
     }  # fmt: skip
 
@@ -119,12 +119,12 @@ class EvolutionState:
         return {"values": vectors.shape[:1], "mean": vectors.shape[1:], "validation": ()}
 
     def judge(
-        self, vectors: np.ndarray, generation: int, try_out: TryOut
+        self, vectors: np.ndarray, generation: int, score_candidates: ScoreCandidates
     ) -> tuple[Metrics, dict[str, Any]]:
         """The values of candidates, and that of the mean in the worlds for validation."""
         space, problem, seed = self.space, self.problem, self.seed
         mean = self.mean
-        tried, base, check = try_out(
+        tried, base, check = score_candidates(
             [
                 problem.ask(space.params(vectors), seed, generation),
                 problem.ask(space.params(self.base[None]), seed, generation),

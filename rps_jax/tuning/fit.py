@@ -33,12 +33,19 @@ from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.record import files
 from rps_jax.record.options import option
-from rps_jax.runs.question import InDomain, OfLaw, Pushes, Run, call_of, seed_of
+from rps_jax.runs.question import (
+    DomainQuestion,
+    LawQuestion,
+    Run,
+    SimulationQuestion,
+    call_of,
+    seed_of,
+)
 from rps_jax.trials import trial
 from rps_jax.trials.batch import rows
-from rps_jax.trials.progress import Progress, phase
+from rps_jax.trials.progress import Progress, set_phase
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Loop, object_pose
+from rps_jax.trials.trial import ControlLoop, object_pose
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.tuning import logs as logs_
 from rps_jax.tuning import posterior
@@ -75,7 +82,7 @@ class Fitted:
 
 
 @dataclass(frozen=True)
-class OfLogs(Pushes[Fitted]):
+class OfLogs(SimulationQuestion[Fitted]):
     """A question about logs."""
 
     logs: tuple[str | Any, ...] = option((), positional=True)
@@ -85,7 +92,7 @@ class OfLogs(Pushes[Fitted]):
 
 
 @dataclass(frozen=True)
-class Fit(OfLaw[Fitted], InDomain[Fitted], OfLogs):
+class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], OfLogs):
     """Fit a domain's ranges to logs of a robot: what of mass, friction, skin and drive they tell.
 
     The answer's `data` holds samples (sample, quantity) of the posterior, its 5, 50 and 95 %
@@ -102,7 +109,7 @@ class Fit(OfLaw[Fitted], InDomain[Fitted], OfLogs):
     """
 
     TITLE: ClassVar[str] = "A domain fitted to logs"
-    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 768, "window": 20.0}
+    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 768, "window": 20.0}
 
     law: LawLike = "rps"
     worlds: int = option(6144, 96, 1_000_000)
@@ -150,15 +157,15 @@ class Fit(OfLaw[Fitted], InDomain[Fitted], OfLogs):
                     f"distance={min(away, far.low):.1f}:{max(away, far.high):.1f}."
                 )
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         return self.worlds
 
-    def described(self) -> dict[str, Any]:
+    def fields_as_json(self) -> dict[str, Any]:
         """Own fields as JSON; logs by the digests of their numbers."""
         usual = dataclasses.replace(self, logs=())
         content = [b"".join(np.ascontiguousarray(v).tobytes() for v in g.columns.values())
                    for g in self.given]  # fmt: skip
-        return super(Fit, usual).described() | {"logs": [files.sha256(one) for one in content]}
+        return super(Fit, usual).fields_as_json() | {"logs": [files.sha256(one) for one in content]}
 
     def answer(self, run: Run) -> Fitted:
         """Simulate what is missing of the worlds, learn from them, and judge the logs."""
@@ -168,7 +175,7 @@ class Fit(OfLaw[Fitted], InDomain[Fitted], OfLogs):
         x = np.concatenate(
             [matrix(logs_.statistics(one, self.bank.interval), names) for one in observed]
         )
-        phase(run.report, "learn")
+        set_phase(run.callback, "learn")
         bank = simulated.sel(statistic=names).statistics.values
         learned = posterior.train(simulated.u.values, bank, self.setting.seed)
         found = posterior.sample(learned, x, SAMPLES, self.setting.seed)
@@ -181,7 +188,7 @@ class Fit(OfLaw[Fitted], InDomain[Fitted], OfLogs):
             files.write_json(run.folder / "fitted.json", dataclasses.asdict(fitted))
         return Fitted(data, fitted)
 
-    def intro(self, found: Fitted) -> str:
+    def intro(self, results: Fitted) -> str:
         has = self.observed[1]
         return (
             f"Logs: {len(self.given)}, the first {self.bank.window:g} s of each at "
@@ -189,8 +196,8 @@ class Fit(OfLaw[Fitted], InDomain[Fitted], OfLogs):
             f"{self.worlds} worlds of the domain {self.domain}, law {self.label}, in closed loop."
         )
 
-    def report(self, found: Fitted, run: Run) -> Sequence[Section]:
-        data = found.data
+    def report(self, results: Fitted, run: Run) -> Sequence[Section]:
+        data = results.data
         text = (
             "Median and 90 % interval. A quantity is undetermined if its interval is at least "
             f"{UNDETERMINED:.0%} of the prior's: the logs do not tell it, and its range stays as "
@@ -205,7 +212,7 @@ class Fit(OfLaw[Fitted], InDomain[Fitted], OfLogs):
         share = data.probability.to_series()
         pairs += [[str(name), f"{value:.2f}"] for name, value in share.items()]
         return [
-            Section("Quantities", text, table(data), Picture("marginals", found.plot)),
+            Section("Quantities", text, table(data), Picture("marginals", results.plot)),
             Section("Objects", "", pairs),
             Section("Told only together", "Correlations above 0.5.", together(data)),
         ]
@@ -237,9 +244,9 @@ class Bank:
         each, found = _TOGETHER * len(self.domain.objects), []
         for first in range(0, count, each):
             index = np.arange(first, min(first + each, count))
-            part = run.part(f"{split}-{first:07d}", partial(self._part, index, split, run))
+            part = run.checkpoint(f"{split}-{first:07d}", partial(self._part, index, split, run))
             found.append(part)
-            run.report(Progress(int(index[-1]) + 1, (index[-1] + 1) * self.window))
+            run.callback(Progress(int(index[-1]) + 1, (index[-1] + 1) * self.window))
         whole = xr.concat(found, "world")
         assert isinstance(whole, xr.Dataset)
         return whole
@@ -278,8 +285,9 @@ class Bank:
         full = rows(part.worlds, np.resize(np.arange(count), max(count, _TOGETHER)))
         period = self.setting.physics.control_period
         every = max(1, round(self.interval / period))
+        loop = ControlLoop(self.setting.physics, self.setting.rules, _telling(self.law))
         seen = _tracks(
-            part.stage, full, Loop(self.setting.physics, self.setting.rules, _telling(self.law)),
+            part.stage, full, loop,
             steps=round(self.window / self.interval), every=every,
         )  # fmt: skip
         seen = jax.tree.map(lambda x: np.swapaxes(np.asarray(x, float), 0, 1), seen)
@@ -313,7 +321,9 @@ def _tell(law: Law, params: Any, memory: Any, seen: Any) -> Any:
 
 
 @partial(jax.jit, static_argnames=("steps", "every"))
-def _tracks(stage: Any, worlds: Any, loop: Loop, *, steps: int, every: int) -> dict[str, jax.Array]:
+def _tracks(
+    stage: Any, worlds: Any, loop: ControlLoop, *, steps: int, every: int
+) -> dict[str, jax.Array]:
     """Logs of a batch, (steps, B, ...), one row every so many control steps."""
     jnp = jax.numpy
     one = partial(trial.control_step, stage, loop=loop)

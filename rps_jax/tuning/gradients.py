@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from rps_jax.control.base import LawParams
 from rps_jax.geometry import planar
 from rps_jax.trials import trial
-from rps_jax.trials.trial import Loop, Snapshot, Trial
+from rps_jax.trials.trial import ControlLoop, Snapshot, Trial
 
 Scores = Callable[[jax.Array, Any], jax.Array]
 
@@ -79,7 +79,7 @@ def window(
     stage: Any,  # of an engine with derivatives: see `Engine.check_derivatives`
     params_of: Callable[[jax.Array], LawParams],  # from theta (p,), differentiable
     cost: Callable[[Snapshot], jax.Array],  # () or (...) of snapshots (steps, ...) of one trial
-    loop: Loop,  # with the smooth law that the parameters belong to
+    loop: ControlLoop,  # with the smooth law that the parameters belong to
     steps: int,
 ) -> Scores:
     """Return scores of windows of trials, of `steps` control steps each.

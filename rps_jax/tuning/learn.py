@@ -27,9 +27,9 @@ from rps_jax.control.learned.policy import Policy
 from rps_jax.record import files, provenance
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.options import option
-from rps_jax.runs.question import Pushes, Run, Split, call_of, seed_of
+from rps_jax.runs.question import Run, SimulationQuestion, Split, call_of, seed_of
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv
-from rps_jax.trials.progress import Bar, Progress, Report
+from rps_jax.trials.progress import Bar, Progress, ProgressCallback
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import rollout
@@ -62,7 +62,7 @@ UNITS = {
 
 
 @dataclass(frozen=True)
-class Learn(PPO, Pushes[xr.Dataset]):
+class Learn(PPO, SimulationQuestion[xr.Dataset]):
     """Learn a law from touch by PPO, in random worlds for tuning; `policy.npz` then holds it.
 
     The answer is the curve: what was found after each update (update), in the units of its
@@ -79,8 +79,8 @@ class Learn(PPO, Pushes[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "A law, learned"
-    LEFT_OUT: ClassVar[tuple[str, ...]] = ("minutes", "updates", "every")
-    SMALL: ClassVar[Mapping[str, Any]] = {
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("minutes", "updates", "every")
+    QUICK: ClassVar[Mapping[str, Any]] = {
         "domain": ("wide,objects=random_box",),
         "network": "mlp",
         "width": 32,
@@ -143,9 +143,9 @@ class Learn(PPO, Pushes[xr.Dataset]):
                 f"least, {period:g} s."
             )
 
-    def described(self) -> dict[str, Any]:
+    def fields_as_json(self) -> dict[str, Any]:
         """Own fields as JSON, with domains by their ranges."""
-        return super().described() | {"domain": [asdict(one) for one in self.domains]}
+        return super().fields_as_json() | {"domain": [asdict(one) for one in self.domains]}
 
     def environments(self, split: Split = "tune") -> list[PushEnv]:
         """Those in which it is learned; or those for validation, by the rules of the paper."""
@@ -158,35 +158,35 @@ class Learn(PPO, Pushes[xr.Dataset]):
             for name in one.objects
         ]
 
-    def bar(self) -> Bar:
+    def progress_bar(self) -> Bar:
         if self.updates:
-            return Bar(self.name, self.updates, "updates", shown=self.shown)
-        return Bar(self.name, 60 * self.minutes, "clock", shown=self.shown)
+            return Bar(self.name, self.updates, "updates", shown=self.shows_progress)
+        return Bar(self.name, 60 * self.minutes, "clock", shown=self.shows_progress)
 
     def answer(self, run: Run) -> xr.Dataset:
         assert run.folder is not None
-        learning = _Learning(run.folder, self, run.report, time.perf_counter())
+        learning = _Learning(run.folder, self, run.callback, time.perf_counter())
         return learning.through(60 * self.minutes, self.updates, 60 * self.every)
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         return (
             f"{self.network.upper()} of {self.width} pairs of units, PPO in {self.num_envs} worlds "
             f"of each shape; judged in the domain itself, without noise, by the paper's rules."
         )
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        simulated = float(found.simulated[-1]) if found.sizes["update"] else 0.0
-        took = found.attrs["run"]
-        judged = found.validation.dropna("update")
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
+        simulated = float(results.simulated[-1]) if results.sizes["update"] else 0.0
+        took = results.attrs["run"]
+        judged = results.validation.dropna("update")
         text = (
-            f"Compile {found.attrs['compile']:.1f} s, run {took:.1f} s "
+            f"Compile {results.attrs['compile']:.1f} s, run {took:.1f} s "
             f"({simulated / max(took, 1e-9):.0f} simulated s per s). "
             f"`{run.folder}/policy.npz` is a law by that name, of "
             f"{tables.percent(float(np.max(judged.values, initial=0.0)))} % in validation."
         )
         rows = [["update", "wall clock", "success in validation", "mean time", "curriculum"]]
         for update, rate in zip(judged["update"].values, judged.values, strict=True):
-            at = found.sel(update=update)
+            at = results.sel(update=update)
             rows.append(
                 [
                     str(update),
@@ -197,7 +197,7 @@ class Learn(PPO, Pushes[xr.Dataset]):
                 ]
             )
         return [
-            Section("What was learned", text, rows, Picture("curve", partial(figure_of, found)))
+            Section("What was learned", text, rows, Picture("curve", partial(figure_of, results)))
         ]
 
 
@@ -218,8 +218,8 @@ def _checked_note(note: Any) -> dict[str, Any]:
 class _Learning:
     """A learning run under way, in its folder."""
 
-    def __init__(self, folder: Path, how: Learn, report: Report, began: float):
-        self.folder, self.how, self.report = folder, how, report
+    def __init__(self, folder: Path, how: Learn, callback: ProgressCallback, began: float):
+        self.folder, self.how, self.report = folder, how, callback
         self._began, self._before = began, 0.0  # [s]
         self._envs = how.environments()
         self._exams = how.environments("validate")

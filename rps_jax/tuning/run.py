@@ -24,8 +24,8 @@ from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.options import option
 from rps_jax.runs import evaluate
-from rps_jax.runs.evaluate import Answer, Ask
-from rps_jax.runs.question import OfLaw, Run, seed_of
+from rps_jax.runs.evaluate import Candidates, CandidateScores
+from rps_jax.runs.question import LawQuestion, Run, seed_of
 from rps_jax.trials.progress import Bar, Progress
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
@@ -36,7 +36,7 @@ from rps_jax.world.domain import DOMAINS, Domain, DomainLike
 
 Metrics = dict[str, np.ndarray]  # results of the trials of a generation, by name
 LogLine = dict[str, Any]  # a line of `log.jsonl`: numbers or None by name, and `params` by name
-TryOut = Callable[[list[Ask]], list[Answer]]  # in the worlds of a problem
+ScoreCandidates = Callable[[list[Candidates]], list[CandidateScores]]  # in the worlds of a problem
 
 
 @dataclass(frozen=True)
@@ -49,14 +49,14 @@ class Problem:
     setting: Setting = Setting()
     objective: Objective = Objective()
 
-    def ask(self, params: LawParams, seed: int, generation: int) -> Ask:
+    def ask(self, params: LawParams, seed: int, generation: int) -> Candidates:
         """Candidates with leaves (P,) in the worlds of a generation."""
         worlds = generation * self.worlds + np.arange(self.worlds)
-        return Ask(params, seed_of(seed, "tune"), worlds)
+        return Candidates(params, seed_of(seed, "tune"), worlds)
 
-    def validate(self, params: LawParams, seed: int) -> Ask:
+    def validate(self, params: LawParams, seed: int) -> Candidates:
         """Candidates with leaves (P,) in the worlds for validation."""
-        return Ask(params, seed_of(seed, "validate"), np.arange(self.validation))
+        return Candidates(params, seed_of(seed, "validate"), np.arange(self.validation))
 
 
 class Tuner(Protocol):
@@ -83,7 +83,7 @@ class Tuner(Protocol):
         ...
 
     def judge(
-        self, vectors: np.ndarray, generation: int, try_out: TryOut
+        self, vectors: np.ndarray, generation: int, score_candidates: ScoreCandidates
     ) -> tuple[Metrics, LogLine]:
         """Try the vectors of a generation; return its metrics and its line of the log."""
         ...
@@ -93,11 +93,11 @@ class Tuner(Protocol):
 
 
 @dataclass(frozen=True)
-class Tuning(OfLaw[xr.Dataset]):
+class Tuning(LawQuestion[xr.Dataset]):
     """A question for better parameters of a law."""
 
-    LEFT_OUT: ClassVar[tuple[str, ...]] = ("budget", "generations")
-    SMALL: ClassVar[dict[str, Any]] = {
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("budget", "generations")
+    QUICK: ClassVar[dict[str, Any]] = {
         # Few parameters, those that matter most, since few trials tell no more; and cylinders on
         # the quasi-static model, which compile and run fastest.
         "tuned": ("K_h", "K_v", "l_cr", "d_th"),
@@ -151,11 +151,11 @@ class Tuning(OfLaw[xr.Dataset]):
         """The search."""
         raise NotImplementedError
 
-    def small(self) -> Mapping[str, Any]:
+    def quick_values(self) -> Mapping[str, Any]:
         """Values of `quick`; which parameters matter is known of RPS alone."""
         own = registry.LAWS["rps"]
         alike = isinstance(self.params, type(own))
-        return {k: v for k, v in self.SMALL.items() if k != "tuned" or alike}
+        return {k: v for k, v in self.QUICK.items() if k != "tuned" or alike}
 
     def check(self) -> None:
         errors.check_count("seed", self.setting.seed, at_least=0, at_most=2**30)
@@ -169,47 +169,49 @@ class Tuning(OfLaw[xr.Dataset]):
             self.setting.check_here(one.weakest, [self.space.base])
         _ = self.tuner
 
-    def described(self) -> dict[str, Any]:
+    def fields_as_json(self) -> dict[str, Any]:
         """Own fields as JSON, with all that is tuned, and domains by their ranges."""
         ranges = [asdict(one) for one in self.problem.domains]
-        return super().described() | {"tuned": self.space.names, "domain": ranges}
+        return super().fields_as_json() | {"tuned": self.space.names, "domain": ranges}
 
-    def bar(self) -> Bar:
+    def progress_bar(self) -> Bar:
         name, count = self.name.replace("_", " "), self.tuner.generations
-        return Bar(name, count, "generations", shown=self.shown)
+        return Bar(name, count, "generations", shown=self.shows_progress)
 
     def answer(self, run: Run) -> xr.Dataset:
-        log = tune(run.folder, self.tuner, report=run.report, slots=run.slots, workers=run.workers)
+        log = tune(
+            run.folder, self.tuner, callback=run.callback, slots=run.slots, workers=run.workers
+        )
         return labelled(log, self.tuner)
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         names = ", ".join(self.space.names)
         return (
             f"{self.label}: {names}; {self.worlds} worlds of each generation and "
             f"{self.validation} for validation, engine {self.setting.engine}."
         )
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        best = int(found.validation.argmin("generation"))
-        rate = [tables.percent(float(won)) for won in found.validation_success.values]
-        total = {name: float(found[name].sum()) for name in ("compile", "run", "simulated")}
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
+        best = int(results.validation.argmin("generation"))
+        rate = [tables.percent(float(won)) for won in results.validation_success.values]
+        total = {name: float(results[name].sum()) for name in ("compile", "run", "simulated")}
         grad = ""
-        if "differentiate" in found:
-            took = float(found["differentiate"].sum())  # `found.differentiate` is a method
+        if "differentiate" in results:
+            took = float(results["differentiate"].sum())  # `found.differentiate` is a method
             grad = f", gradients {took:.1f} s with their compilation"
         text = (
-            f"Validation: objective {float(found.validation[0]):.4f} and success {rate[0]} % "
-            f"at the start, {float(found.validation[best]):.4f} and {rate[best]} % after "
-            f"{best} of {found.sizes['generation']}. Compile {total['compile']:.1f} s, run "
+            f"Validation: objective {float(results.validation[0]):.4f} and success {rate[0]} % "
+            f"at the start, {float(results.validation[best]):.4f} and {rate[best]} % after "
+            f"{best} of {results.sizes['generation']}. Compile {total['compile']:.1f} s, run "
             f"{total['run']:.1f} s{grad}, {total['simulated']:.3g} s simulated."
         )
         if run.folder is not None:
             text += f" The law with these parameters is `{self.label},{run.folder / TUNED}`."
         rows = [["parameter", "start", "tuned"]]
         start = registry.named_leaves(self.space.base)
-        for name, value in zip(found.parameter.values, found.tuned.values, strict=True):
+        for name, value in zip(results.parameter.values, results.tuned.values, strict=True):
             rows.append([str(name), f"{float(start[str(name)]):.4g}", f"{float(value):.4g}"])
-        picture = Picture("tuning", partial(figures.search, found))
+        picture = Picture("tuning", partial(figures.search, results))
         return [Section("What was found", text, rows, picture)]
 
 
@@ -238,7 +240,7 @@ def tune(
     folder: Path | None,
     tuner: Tuner,
     *,
-    report: Callable[[Progress], Any] = lambda progress: None,
+    callback: Callable[[Progress], Any] = lambda progress: None,
     **shape: Any,
 ) -> list[dict[str, Any]]:
     """Run a tuner to its end, in a folder in which it can be continued, or in memory.
@@ -261,7 +263,7 @@ def tune(
     simulated = 0.0
 
     def heard(progress: Progress) -> None:
-        report(replace(progress, simulated=simulated + progress.simulated, rounds=len(log)))
+        callback(replace(progress, simulated=simulated + progress.simulated, rounds=len(log)))
 
     while (name := f"{len(log):06d}") in kept or (
         len(log) < tuner.generations and not 0 < tuner.budget <= simulated
@@ -278,7 +280,7 @@ def tune(
         tuner.update(vectors, metrics)
         log.append(line)
         simulated += line["simulated"]
-        report(Progress(0, simulated, rounds=len(log)))
+        callback(Progress(0, simulated, rounds=len(log)))
         if folder is not None and name not in kept:
             _write(folder, tuner, log)
     if folder is not None:
@@ -290,7 +292,7 @@ def _tried(
     tuner: Tuner,
     vectors: np.ndarray,
     generation: int,
-    report: Callable[[Progress], Any],
+    callback: Callable[[Progress], Any],
     shape: dict[str, Any],
 ) -> tuple[Metrics, dict[str, Any]]:
     """The metrics of a generation, and its line of the log."""
@@ -298,13 +300,13 @@ def _tried(
     problem = tuner.problem
     where = problem.domains, problem.setting, problem.objective
 
-    def try_out(asks: list[Ask]) -> list[Answer]:
-        answers, timing = evaluate.try_out(asks, *where, report=report, **shape)
+    def score_candidates(asks: list[Candidates]) -> list[CandidateScores]:
+        answers, timing = evaluate.score_candidates(asks, *where, callback=callback, **shape)
         for name in took:
             took[name] += getattr(timing, name)
         return answers
 
-    metrics, line = tuner.judge(vectors, generation, try_out)
+    metrics, line = tuner.judge(vectors, generation, score_candidates)
     took["simulated"] += line.pop("simulated", 0.0)
     return metrics, {"generation": generation} | line | took
 

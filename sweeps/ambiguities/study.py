@@ -49,7 +49,7 @@ class Ambiguities(TrialStudy[xr.Dataset]):
     targets: tuple[tuple[float, float], ...] = paper.TARGETS
     """Targets X Y [m], one pair after the other; by default the paper's 24."""
 
-    def small(self) -> Mapping[str, Any]:
+    def quick_values(self) -> Mapping[str, Any]:
         """Few targets and readings."""
         few = readings.QUICK_GAZEBO if self.gazebo else readings.QUICK_READINGS
         if self.curve:
@@ -90,16 +90,16 @@ class Ambiguities(TrialStudy[xr.Dataset]):
         for name in self.grid.laws:
             errors.check_name("law", name, registry.LAWS)
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many trials there are."""
         return len(self.names) * self.grid.size
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run the readings that are missing."""
         conditions = {name: self.known[name] for name in self.names}
-        return run_conditions(conditions, self.grid, run.folder, **run.shape)
+        return run_conditions(conditions, self.grid, run.folder, **run.batch_options)
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         """What was asked."""
         without = [self.known[name].what for name in self.refused if name not in self.names]
         left_out = f" Left out, since the law refuses it: {', '.join(without)}." if without else ""
@@ -108,17 +108,17 @@ class Ambiguities(TrialStudy[xr.Dataset]):
             f"exact test, false discoveries held at 5 %.{left_out}"
         )
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Successes under each reading; the cells of Table II; the curve over tolerances."""
         names, laws = self.names, self.grid.laws
         sections = [
-            Section(f"Readings, {law.upper()}", "", condition_rows(found, names[0], law))
+            Section(f"Readings, {law.upper()}", "", condition_rows(results, names[0], law))
             for law in laws
         ]
         if self.gazebo and "paper_gazebo" in names and set(laws) <= set(paper.LAWS):
-            sections.append(Section("Cells of Table II", "", readings.cells(found)))
+            sections.append(Section("Cells of Table II", "", readings.cells(results)))
         if self.curve and not self.readings and "rps" in laws:
-            curve = readings.by_tolerance(found, readings.TOLERANCES)
+            curve = readings.by_tolerance(results, readings.TOLERANCES)
             trials = self.grid.size // len(PAPER_OBJECTS)
             picture = Picture("tolerance", partial(tolerance_curve, curve, trials))
             sections.append(Section("Success over the skin's tolerance", "", (), picture))

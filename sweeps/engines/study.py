@@ -21,10 +21,10 @@ from rps_jax.analysis.report import Section
 from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.record.options import option
-from rps_jax.runs import sweep as sweeps
+from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.progress import InTurn
+from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.setting import Setting
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import DomainLike, Range
@@ -67,7 +67,7 @@ class Engines(TrialStudy[xr.DataTree]):
     """
 
     TITLE: ClassVar[str] = "Do the engines agree in random worlds?"
-    SMALL: ClassVar[Mapping[str, Any]] = {
+    QUICK: ClassVar[Mapping[str, Any]] = {
         "worlds": 16,
         "objects": ("random_cylinder",),
         "engines": ("C, standard", "fused, standard"),
@@ -116,27 +116,27 @@ class Engines(TrialStudy[xr.DataTree]):
         for plan in self.plans.values():
             plan.check_here()
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many trials there are."""
-        return sum(plan.trials for plan in self.plans.values())
+        return sum(plan.num_trials for plan in self.plans.values())
 
     def answer(self, run: Run) -> xr.DataTree:
         """Run what is missing in each engine."""
-        heard, found = InTurn(run.report), {}
-        shape = run._replace(report=heard).shape
+        heard, found = SequentialProgress(run.callback), {}
+        shape = run._replace(callback=heard).batch_options
         for name, plan in self.plans.items():
             folder = None if run.folder is None else run.folder / name.replace(", ", "_")
-            found[name] = sweeps.whole(plan, folder, **shape).isel(law=0)
-            heard.ended(plan.trials)
+            found[name] = execution.run_plan(plan, folder, **shape).isel(law=0)
+            heard.finish(plan.num_trials)
         return xr.DataTree.from_dict(found)
 
-    def intro(self, found: xr.DataTree) -> str:
+    def intro(self, results: xr.DataTree) -> str:
         """What was asked."""
         return f"The same {self.worlds} worlds in every engine. Intervals: Wilson 95 %."
 
-    def report(self, found: xr.DataTree, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.DataTree, run: Run) -> Sequence[Section]:
         """Outcomes equal to those of the first engine."""
-        each = {name: found[name].to_dataset() for name in self.plans}
+        each = {name: results[name].to_dataset() for name in self.plans}
         return [Section("Equal outcomes", "", agreement_table(each))]
 
 

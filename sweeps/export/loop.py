@@ -18,7 +18,7 @@ from rps_jax.control.base import Law
 from rps_jax.control.observation import Details, Twist
 from rps_jax.runs.push import recorded_law
 from rps_jax.trials import pushes
-from rps_jax.trials.batch import Part
+from rps_jax.trials.batch import WorldBatch
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
@@ -33,9 +33,9 @@ def recorded(cases: Sequence[Case], setting: Setting) -> list[Any]:
     """What the law of each case observed in each control step: leaves (T, ...), by trial."""
     law = registry.law_of(cases[0].params)
     stage, worlds = pushes.build(cases, setting)
-    part = Part(np.arange(len(cases)), worlds, stage)
+    part = WorldBatch(np.arange(len(cases)), worlds, stage)
     period, found = setting.physics.control_period, []
-    for followed in pushes.follow_part(part, recorded_law(law), setting, interval=period):
+    for followed in pushes.record_batch(part, recorded_law(law), setting, interval=period):
         seen = followed.snapshots
         observed = tuple(seen.details)[1]  # of `recorded_law`, with taxels
         leaves = jax.tree.leaves(observed.touch if law.senses == "touch" else observed)

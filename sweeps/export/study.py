@@ -49,7 +49,7 @@ class Export(Study[xr.Dataset]):
 
     TITLE: ClassVar[str] = "Laws in C and ONNX beside those in JAX"
     GROWS: ClassVar[tuple[str, ...]] = ("laws", "tables", "in_worlds")
-    SMALL: ClassVar[Mapping[str, Any]] = {
+    QUICK: ClassVar[Mapping[str, Any]] = {
         "laws": ("rps_plus",),
         **{"inputs": 20_000, "states": 20_000, "worlds": 4, "bags": 1},
     }
@@ -89,8 +89,8 @@ class Export(Study[xr.Dataset]):
             rows = []
             laws = [x for x in self.laws if table != "worlds" or x in self.in_worlds]
             for law in laws:
-                rows.append(run.part(f"{table}-{law}", partial(self._kept, make, law)))
-                run.report(Progress(len(rows), 0.0))
+                rows.append(run.checkpoint(f"{table}-{law}", partial(self._kept, make, law)))
+                run.callback(Progress(len(rows), 0.0))
             if rows:
                 joined = xr.concat(rows, "law")
                 assert isinstance(joined, xr.Dataset)
@@ -177,9 +177,9 @@ class Export(Study[xr.Dataset]):
             for name, (_, note, rows) in tables(results, self).items()
         }
 
-    def report(self, found: Any, run: Run) -> Sequence[Section]:
+    def report(self, results: Any, run: Run) -> Sequence[Section]:
         """One section for each table."""
-        return [Section(title, note, rows) for title, note, rows in tables(found, self).values()]
+        return [Section(title, note, rows) for title, note, rows in tables(results, self).values()]
 
 
 export = call_of(Export)

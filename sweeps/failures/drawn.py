@@ -19,11 +19,11 @@ from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import Figure
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.record.options import option
-from rps_jax.runs import sweep as sweeps
+from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Run, call_of, count_of, seed_of
+from rps_jax.runs.question import Run, call_of, count_true, seed_of
 from rps_jax.studies.rare import Estimate, Rare, draw_estimates, estimate_row, estimate_table
-from rps_jax.trials.progress import phase
+from rps_jax.trials.progress import set_phase
 from rps_jax.trials.score import severity_of
 
 
@@ -50,32 +50,32 @@ class Drawn(Rare):
         found = super().answer(run)
         seeded = replace(self.setting, seed=seed_of(self.setting.seed, "tune"))
         plan = Plan(self.ranges, self.brute, {"law": self.params}, seeded, 4096)
-        phase(run.report, "drawn worlds")
+        set_phase(run.callback, "drawn worlds")
         folder = None if run.folder is None else run.folder / "drawn"
-        results = sweeps.whole(plan, folder, **run.shape)
+        results = execution.run_plan(plan, folder, **run.batch_options)
         failed = severity_of(results.sel(law="law"), self.setting.rules) >= self.level
-        told = of_drawn(count_of(failed), failed.size)._asdict()
+        told = of_drawn(count_true(failed), failed.size)._asdict()
         return found.assign({f"drawn_{name}": ((), value) for name, value in told.items()})
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """The estimates, beside drawn worlds."""
-        (usual,) = super().report(found, run)
+        (usual,) = super().report(results, run)
         p, low, high, variation, trials = (
-            float(found[f"drawn_{name}"]) for name in Estimate._fields
+            float(results[f"drawn_{name}"]) for name in Estimate._fields
         )
         against = Estimate(p, low, high, variation, int(trials))
         text = f"{usual.text} Those of drawn worlds are by Clopper and Pearson."
         if against.p:
-            off = 100 * (float(found.p.mean()) / against.p - 1)
-            held = count_of(((found.low <= against.p) & (against.p <= found.high)).values)
+            off = 100 * (float(results.p.mean()) / against.p - 1)
+            held = count_true(((results.low <= against.p) & (against.p <= results.high)).values)
             text += (
                 f" {held} of {self.repetitions} intervals hold the rate of the drawn worlds, and "
                 f"the mean of all is {off:+.1f} % off it."
             )
         else:
             text += " None of the drawn worlds fails."
-        rows = [*estimate_table(found), [*estimate_row("drawn worlds", against)[:-1], ""]]
-        picture = Picture("rare", partial(figure, found, against))
+        rows = [*estimate_table(results), [*estimate_row("drawn worlds", against)[:-1], ""]]
+        picture = Picture("rare", partial(figure, results, against))
         return [usual._replace(text=text, table=rows, picture=picture)]
 
 

@@ -31,10 +31,10 @@ class Cost(Sensitivity):
     quantity: str = "mass"
     """Drawn quantity that is asked about."""
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Whether the quantity costs anything, and the indices."""
-        section = Section(f"Does {self.quantity} cost anything", said(found, self.quantity))
-        return [section, *super().report(found, run)]
+        section = Section(f"Does {self.quantity} cost anything", said(results, self.quantity))
+        return [section, *super().report(results, run)]
 
 
 cost = call_of(Cost)

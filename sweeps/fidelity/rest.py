@@ -39,7 +39,7 @@ class Rest(Study[xr.Dataset]):
     """Leave random objects alone, and tell how far they have moved (domain, step, world) [m]."""
 
     TITLE: ClassVar[str] = "Does what is at rest stay?"
-    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 9, "seconds": 1.0}
+    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 9, "seconds": 1.0}
 
     worlds: int = option(150, 3, 100_000)
     """Number of worlds of each domain."""
@@ -50,7 +50,7 @@ class Rest(Study[xr.Dataset]):
     quick: bool = False
     """Whether to make a small run of seconds."""
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many worlds are stepped."""
         return len(DOMAINS) * len(STEPS) * self.worlds
 
@@ -60,10 +60,10 @@ class Rest(Study[xr.Dataset]):
         for i, name in enumerate(DOMAINS):
             for step in STEPS:
                 make = partial(self._moved, domains.named(name), STEPS[step])
-                part = run.part(f"{i}-{STEPS[step].timestep:g}", make)
+                part = run.checkpoint(f"{i}-{STEPS[step].timestep:g}", make)
                 found.append(part.expand_dims(domain=[name], step=[step]))
                 done += self.worlds
-                run.report(Progress(done, done * self.seconds))
+                run.callback(Progress(done, done * self.seconds))
         whole = xr.combine_by_coords(found, combine_attrs="drop")
         assert isinstance(whole, xr.Dataset)
         whole = whole.sel(domain=list(DOMAINS), step=list(STEPS))
@@ -92,16 +92,16 @@ class Rest(Study[xr.Dataset]):
             batch.close()
         return xr.Dataset({"moved": ("world", moved)}, {"family": ("world", family.astype(str))})
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         """What was asked."""
         return (
             f"How many of {self.worlds} random objects that nothing touches are more than "
             f"{100 * _FAR:g} cm away after {self.seconds:g} s, in C MuJoCo on the package's ground."
         )
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """How many moved, by domain, step and shape."""
-        return [Section("Objects that wander off", "", table(found))]
+        return [Section("Objects that wander off", "", table(results))]
 
 
 rest = call_of(Rest)

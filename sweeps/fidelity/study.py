@@ -93,7 +93,7 @@ class Fidelity(TrialStudy[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Is the physics converged?"
-    SMALL: ClassVar[Mapping[str, Any]] = {"conditions": QUICK, "targets": paper.FEW_TARGETS}
+    QUICK: ClassVar[Mapping[str, Any]] = {"conditions": QUICK, "targets": paper.FEW_TARGETS}
     GROWS: ClassVar[tuple[str, ...]] = ("conditions",)
 
     conditions: tuple[str, ...] = tuple(CONDITIONS)
@@ -117,14 +117,14 @@ class Fidelity(TrialStudy[xr.Dataset]):
         for name in self.conditions:
             errors.check_name("condition", name, CONDITIONS)
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many trials there are, but for the short ones."""
         return len(self.names) * self.grid.size
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run the settings that are missing."""
         chosen = {name: CONDITIONS[name] for name in self.names}
-        results = run_conditions(chosen, self.grid, run.folder, **run.shape)
+        results = run_conditions(chosen, self.grid, run.folder, **run.batch_options)
         short = {name: _early(condition) for name, condition in chosen.items()}
         of_rps = self.grid._replace(laws=("rps",))
         folder = None if run.folder is None else run.folder / "early"
@@ -136,18 +136,18 @@ class Fidelity(TrialStudy[xr.Dataset]):
         results["early_error"] = np.sqrt(apart).drop_vars("law")
         return results
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         """What was asked."""
         return (
             f"{self.grid.size} trials in every row, compared one by one with those of C MuJoCo in "
             "steps of 1 ms."
         )
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Successes, equal outcomes and costs of each setting."""
         return [
-            Section("Settings of the solver against C MuJoCo", "", table(found)),
-            Section("Equal outcomes by law", "", by_law(found)),
+            Section("Settings of the solver against C MuJoCo", "", table(results)),
+            Section("Equal outcomes by law", "", by_law(results)),
         ]
 
 

@@ -25,7 +25,7 @@ from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.record import bag
 from rps_jax.record.options import option
-from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, seed_of
+from rps_jax.runs.question import DomainQuestion, LawQuestion, Run, call_of, seed_of
 from rps_jax.tuning import fit, logs, posterior
 from rps_jax.world import domain as domains
 from sweeps.fit.study import judged, within
@@ -37,11 +37,11 @@ _NEAR = 0.02  # [1] of the interval's width, within which two of its ends are th
 
 
 @dataclass(frozen=True)
-class Bagged(Study[xr.Dataset], InDomain[xr.Dataset], OfLaw[xr.Dataset]):
+class Bagged(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
     """Count how often intervals fitted to bags hold the truth, beside those of the logs."""
 
     TITLE: ClassVar[str] = "Worlds fitted to bags"
-    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 192, "logs": 2, "window": 6.0}
+    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 192, "logs": 2, "window": 6.0}
 
     domain: domains.DomainLike = "real"
     """Ranges from which worlds are drawn, by name or as a JSON file; changes follow."""
@@ -67,7 +67,7 @@ class Bagged(Study[xr.Dataset], InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         learned = bank.worlds(self.worlds, run)
         names = fit.chosen(learned, _HAS)
         held = bank.worlds(self.logs, run, "test")
-        bags = run.part("bags", partial(self._bags, bank, names))
+        bags = run.checkpoint("bags", partial(self._bags, bank, names))
         seen = learned.sel(statistic=names)
         networks = posterior.train(seen.u.values, seen.statistics.values, self.setting.seed)
         own = held.sel(statistic=names).statistics.values[:, 0]
@@ -104,9 +104,9 @@ class Bagged(Study[xr.Dataset], InDomain[xr.Dataset], OfLaw[xr.Dataset]):
                 found.append(fit.matrix(logs.statistics(log, bank.interval), names)[0])
         return xr.Dataset({"statistics": (("log", "statistic"), np.stack(found))})
 
-    def report(self, found: Any, run: Run) -> Sequence[Section]:
+    def report(self, results: Any, run: Run) -> Sequence[Section]:
         """One row for bags, and one for the logs."""
-        return [Section("Coverage of bags", "", table(found))]
+        return [Section("Coverage of bags", "", table(results))]
 
 
 bagged = call_of(Bagged)

@@ -25,8 +25,8 @@ from rps_jax.analysis.report import Picture, Section, save
 from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.record.options import option
-from rps_jax.runs.question import InDomain, OfLaw, Run, call_of, seed_of
-from rps_jax.trials.progress import Progress, phase, unheard
+from rps_jax.runs.question import DomainQuestion, LawQuestion, Run, call_of, seed_of
+from rps_jax.trials.progress import Progress, no_progress, set_phase
 from rps_jax.tuning import fit, posterior
 from rps_jax.world import domain as domains
 from rps_jax.world import draws, points
@@ -45,11 +45,11 @@ _TASK = (*domains.of("task"), "key_0", "key_1")
 
 
 @dataclass(frozen=True)
-class Coverage(Study[xr.Dataset], InDomain[xr.Dataset], OfLaw[xr.Dataset]):
+class Coverage(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
     """Count how often the intervals of fitted worlds hold the truth, and what fitting is worth."""
 
     TITLE: ClassVar[str] = "Worlds fitted to logs"
-    SMALL: ClassVar[Mapping[str, Any]] = {
+    QUICK: ClassVar[Mapping[str, Any]] = {
         "worlds": 960, "logs": 48, "window": 20.0, "worth": 2, "tasks": 8,
     }  # fmt: skip
 
@@ -86,27 +86,27 @@ class Coverage(Study[xr.Dataset], InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         self.check_engine([self.params])
         fit.check_law(self.label, registry.law_of(self.params), self.setting)
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many logs are simulated."""
         return self.worlds + 5 * self.logs
 
     def answer(self, run: Run) -> xr.Dataset:
         """Learn once for each kind of log, and fit the logs."""
         learned = self.bank.worlds(self.worlds, run)
-        held = self.bank.worlds(self.logs, run._replace(report=unheard), "test")
+        held = self.bank.worlds(self.logs, run._replace(callback=no_progress), "test")
         found = [
-            run.part(f"fit-{i}", partial(self._fitted, kind, learned, held, run))
+            run.checkpoint(f"fit-{i}", partial(self._fitted, kind, learned, held, run))
             for i, kind in enumerate((*KINDS, FOUR))
         ]
         whole = xr.concat(found, "kind").assign_coords(kind=[*KINDS, FOUR])
-        worth = run.part("worth", partial(self._worth, learned, held, run))
+        worth = run.checkpoint("worth", partial(self._worth, learned, held, run))
         whole = xr.merge([whole, worth])
         return whole
 
     def _learned(self, kind: str, learned: xr.Dataset, run: Run) -> tuple[Any, list[str]]:
         names = fit.chosen(learned, KINDS.get(kind, ()))
         if tuple(names) not in self._networks:
-            phase(run.report, f"learn from {kind}")
+            set_phase(run.callback, f"learn from {kind}")
             one = learned.sel(statistic=names)
             made = posterior.train(one.u.values, one.statistics.values, self.setting.seed)
             self._networks[tuple(names)] = made
@@ -121,7 +121,7 @@ class Coverage(Study[xr.Dataset], InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         found = []
         for log in range(self.logs):
             found.append(judged(self.ranges, networks, x[log], held, log))
-            run.report(Progress(self.worlds, 0.0))
+            run.callback(Progress(self.worlds, 0.0))
         return xr.concat(found, "log").drop_vars("unit")
 
     def _again(self, names: list[str], run: Run) -> np.ndarray:
@@ -141,7 +141,7 @@ class Coverage(Study[xr.Dataset], InDomain[xr.Dataset], OfLaw[xr.Dataset]):
                     found[rows, more] = fit.matrix(seen, names)
             return xr.Dataset({"statistics": (("log", "more", "statistic"), found)})
 
-        return run.part("again", make).statistics.values
+        return run.checkpoint("again", make).statistics.values
 
     # --- what it is worth ---
 
@@ -157,7 +157,7 @@ class Coverage(Study[xr.Dataset], InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         at = points.points_of(self.ranges, index, seed)
         free = np.random.default_rng(self.setting.seed).random((self.tasks, len(task)))
         asked = {"setting": self.setting, "progress": False, "slots": 8}
-        phase(run.report, "predict")
+        set_phase(run.callback, "predict")
 
         def of(found: xr.Dataset) -> np.ndarray:
             """Success and mean time of the successes (law, 2) [1, s]."""
@@ -180,7 +180,7 @@ class Coverage(Study[xr.Dataset], InDomain[xr.Dataset], OfLaw[xr.Dataset]):
                     of(rps_jax.sweep(_LAWS, fitted, self.tasks, **asked)),
                 ]
             )
-            run.report(Progress(self.worlds + int(world), 0.0))
+            run.callback(Progress(self.worlds + int(world), 0.0))
         names_ = {"source": ["truth", "domain", "fit"], "law": list(_LAWS)}
         shape = ("world", "source", "law")
         values = np.array(found)
@@ -198,11 +198,13 @@ class Coverage(Study[xr.Dataset], InDomain[xr.Dataset], OfLaw[xr.Dataset]):
         super().publish(results, run_folder)
         save(figure(results), self.folder / "coverage.png")
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Coverage by kind of log, by quantity, and what fitting is worth."""
-        told = tables(found)
+        told = tables(results)
         return [
-            Section("Coverage", "", told["coverage"], Picture("coverage", partial(figure, found))),
+            Section(
+                "Coverage", "", told["coverage"], Picture("coverage", partial(figure, results))
+            ),
             Section("By quantity", "Coverage, and share of logs that tell it.", told["quantities"]),
             Section("Worth", "Mean error of the prediction.", told["worth"]),
         ]

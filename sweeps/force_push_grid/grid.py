@@ -41,7 +41,7 @@ from rps_jax.robot.robot import Robot
 from rps_jax.robot.shell import Boards
 from rps_jax.robot.skin import IdealSkin
 from rps_jax.trials import trial
-from rps_jax.trials.progress import Progress, Report, unheard
+from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
 from rps_jax.trials.trial import Rules, Shift, World
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction
@@ -216,7 +216,7 @@ def pushed(
     *,
     params: PublishedForcePushParams = PARAMS,
     physics: Physics = PHYSICS,
-    report: Report = unheard,
+    callback: ProgressCallback = no_progress,
 ) -> xr.Dataset:
     """Push a slider through the whole grid by one law.
 
@@ -227,7 +227,7 @@ def pushed(
       duration: [s] from the first contact.
       params: of the controller.
       physics: of the worlds; its control period is the controller's.
-      report: called after every 10 s that were simulated.
+      callback: called after every 10 s that were simulated.
 
     Returns:
       Over (inertia, friction, lateral, angle, contact): `success` by their criterion; `silent` [s],
@@ -251,7 +251,7 @@ def pushed(
         if steps == 0:
             waited += time.perf_counter() - began
         steps += _SEGMENT
-        report(Progress(0, steps * period * count, waited))
+        callback(Progress(0, steps * period * count, waited))
     memory: Following = jax.device_get(trials.memory)
     end = np.asarray(trials.qpos)[:, JOINTS.object][:, :2].astype(float)
     way = float(params.v_max) * duration

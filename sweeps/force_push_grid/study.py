@@ -21,7 +21,7 @@ from rps_jax.control.laws import force_push_published
 from rps_jax.engines import EngineName
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.progress import InTurn
+from rps_jax.trials.progress import SequentialProgress
 from sweeps.force_push_grid import grid
 from sweeps.study_base import Study
 
@@ -35,7 +35,7 @@ class ForcePushGrid(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Force Push on its authors' ground"
-    SMALL: ClassVar[Mapping[str, Any]] = {"duration": 60.0, "sliders": ("box",)}
+    QUICK: ClassVar[Mapping[str, Any]] = {"duration": 60.0, "sliders": ("box",)}
     GROWS: ClassVar[tuple[str, ...]] = ("laws", "sliders")
 
     laws: tuple[grid.LawName, ...] = grid.LAWS
@@ -63,33 +63,33 @@ class ForcePushGrid(Study[xr.Dataset]):
         engine.check_traced()
         engine.check_physics(grid.PHYSICS)
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many pushes there are."""
         return len(self.laws) * len(self.sliders) * grid.cells().angle.size
 
     def answer(self, run: Run) -> xr.Dataset:
         """Push by the laws, and with the sliders, that are missing."""
-        heard, found = InTurn(run.report), []
+        heard, found = SequentialProgress(run.callback), []
         for law in self.laws:
             of_law = []
             for slider in self.sliders:
-                push = partial(grid.pushed, law, slider, self.engine, self.duration, report=heard)
-                of_law.append(run.part(f"{law}_{slider}", push))
-                heard.ended(of_law[-1].success.size)
+                push = partial(grid.pushed, law, slider, self.engine, self.duration, callback=heard)
+                of_law.append(run.checkpoint(f"{law}_{slider}", push))
+                heard.finish(of_law[-1].success.size)
             found.append(xr.concat(of_law, xr.IndexVariable("slider", list(self.sliders))))
         every: Any = xr.concat(found, xr.IndexVariable("law", list(self.laws)))
         return every
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         """What was asked."""
         return (
             f"The grid of Heins and Schoellig (2024), {self.duration:g} s from the first contact "
             f"on, engine {self.engine}."
         )
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """How many pushes succeed by their criterion."""
-        return [Section("Pushes that succeed", "", grid.table(found))]
+        return [Section("Pushes that succeed", "", grid.table(results))]
 
 
 force_push_grid = call_of(ForcePushGrid)

@@ -15,7 +15,7 @@ from rps_jax.control.base import LawParams
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Loop, Snapshot
+from rps_jax.trials.trial import ControlLoop, Snapshot
 from rps_jax.tuning.gradients import Estimate, Scores, estimate, per_world, window
 
 
@@ -133,7 +133,7 @@ def distances(
     def left(seen: Snapshot) -> jax.Array:
         return seen.details.distance[at]
 
-    loop = Loop(setting.physics, law=law)
+    loop = ControlLoop(setting.physics, law=law)
     scores = jax.jit(window(stage, params_of, left, loop, int(at[-1]) + 1))
     return scores, (worlds, trial.start_all(worlds, np.ones(len(cases), bool), law=law))
 

@@ -30,7 +30,7 @@ from rps_jax.engines import EngineName
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, Split, call_of, seed_of
 from rps_jax.trials import trial
-from rps_jax.trials.progress import Progress, phase
+from rps_jax.trials.progress import Progress, set_phase
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Snapshot, World
 from rps_jax.trials.worlds import drawn_worlds
@@ -57,7 +57,7 @@ class Gradients(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Gradients against finite differences"
-    SMALL: ClassVar[Mapping[str, Any]] = {
+    QUICK: ClassVar[Mapping[str, Any]] = {
         "horizons": (0.5, 2.0, 8.0),
         "worlds": 8,
         "truth": 64,
@@ -124,7 +124,7 @@ class Gradients(Study[xr.Dataset]):
         of_both = ("reverse", "evolution") if "combined" in self.estimators else ()
         return tuple(dict.fromkeys((TRUTH, *of_both, *self.estimators)))
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many measurements there are."""
         return len(self.wanted)
 
@@ -132,12 +132,12 @@ class Gradients(Study[xr.Dataset]):
         """Measure the truth and every estimator that the run folder lacks."""
         found: dict[str, xr.Dataset] = {}
         for name in self.wanted:
-            phase(run.report, name)
-            found[name] = run.part(name, partial(_measured, self, name, found))
-            run.report(Progress(len(found), 0.0))
+            set_phase(run.callback, name)
+            found[name] = run.checkpoint(name, partial(_measured, self, name, found))
+            run.callback(Progress(len(found), 0.0))
         return judged(found, self.estimators)
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         """What was asked."""
         return (
             f"Of the distance that is left after a time, by {', '.join(self.space.names)}, in "
@@ -145,10 +145,10 @@ class Gradients(Study[xr.Dataset]):
             f"{self.truth:,} worlds."
         )
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Cosine, bias and error of each estimator."""
-        picture = Picture("gradients", partial(figure_of, found))
-        return [Section("Estimators against the truth", "", table(found), picture)]
+        picture = Picture("gradients", partial(figure_of, results))
+        return [Section("Estimators against the truth", "", table(results), picture)]
 
 
 gradients = call_of(Gradients)
@@ -172,7 +172,7 @@ def _distances(study: Gradients, stage: Any, physics: Any, smooth: bool) -> Scor
     def left(seen: Snapshot) -> jax.Array:
         return seen.details.distance[at]
 
-    loop = trial.Loop(physics, law=law)
+    loop = trial.ControlLoop(physics, law=law)
     score = window(stage, study.space.params, left, loop, int(at[-1]) + 1)
 
     def scores(thetas: jax.Array, worlds: World) -> jax.Array:

@@ -13,7 +13,7 @@ import xarray as xr
 
 from rps_jax.errors import InputError
 from rps_jax.record.checkpoint import Checkpoints
-from rps_jax.trials.progress import Progress, Report, unheard
+from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
 from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
 from rps_jax.world.scene import FRICTION
 from sweeps.ground import pushes
@@ -105,7 +105,7 @@ def run(
     offsets: Sequence[float] = OFFSETS,
     worlds: int | None = None,
     steps: int = STEPS,
-    report: Report = unheard,
+    callback: ProgressCallback = no_progress,
 ) -> xr.Dataset:
     """Pushes (ground, object, offset, speed) and the rigid limit's, run or found in `folder`.
 
@@ -126,7 +126,7 @@ def run(
     def told(pushed: int, seconds: float) -> None:
         nonlocal finished, simulated
         finished, simulated = finished + pushed, simulated + seconds
-        report(Progress(finished, simulated))
+        callback(Progress(finished, simulated))
 
     asked = f"{tuple(objects)} {tuple(offsets)}"
     limit = _part(

@@ -35,7 +35,7 @@ class Ground(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Which ground is dry friction?"
-    SMALL: ClassVar[Mapping[str, Any]] = {"grounds": grounds.QUICK}
+    QUICK: ClassVar[Mapping[str, Any]] = {"grounds": grounds.QUICK}
     GROWS: ClassVar[tuple[str, ...]] = ("grounds",)
 
     grounds: tuple[str, ...] = tuple(grounds.GROUNDS)
@@ -52,15 +52,15 @@ class Ground(Study[xr.Dataset]):
         for name in self.grounds:
             errors.check_name("ground", name, grounds.GROUNDS)
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many pushes there are."""
         return grounds.count(self.grounds, self.worlds)
 
     def answer(self, run: Run) -> xr.Dataset:
         """Push on the grounds that are missing."""
-        return grounds.run(self.grounds, run.folder, worlds=self.worlds, report=run.report)
+        return grounds.run(self.grounds, run.folder, worlds=self.worlds, callback=run.callback)
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         """What was asked."""
         return (
             "Two boxes (40 and 60 cm) and the paper's cylinder, pushed by 0.5 m in C MuJoCo, 5, 8 "
@@ -68,10 +68,10 @@ class Ground(Study[xr.Dataset]):
             "object ends from where a rigid one ends."
         )
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Errors, forces and hops of each ground."""
-        picture = Picture("ground", partial(figure_of, found, grounds.DRAWN))
-        return [Section("Grounds beside a rigid object", "", grounds.table(found), picture)]
+        picture = Picture("ground", partial(figure_of, results, grounds.DRAWN))
+        return [Section("Grounds beside a rigid object", "", grounds.table(results), picture)]
 
 
 ground = call_of(Ground)

@@ -22,7 +22,7 @@ from rps_jax.analysis.report import Section
 from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.record.options import option
-from rps_jax.runs import sweep as sweeps
+from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.setting import Setting
@@ -53,7 +53,7 @@ class Reproduce(TrialStudy[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Which worlds reproduce the paper's hardware runs?"
-    SMALL: ClassVar[Mapping[str, Any]] = {"setups": 8}
+    QUICK: ClassVar[Mapping[str, Any]] = {"setups": 8}
 
     law: LawLike = "rps"
     """The law: its name, as rps or aps, or a file's; changes follow, as rps,K_h=0.3."""
@@ -89,14 +89,14 @@ class Reproduce(TrialStudy[xr.Dataset]):
         """Check the domain and that the engine can step its worlds here."""
         self.plan.check_here()
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many pushes there are."""
         return self.plan.worlds
 
     def answer(self, run: Run) -> xr.Dataset:
         """Push, and take the means of each setup."""
         folder = None if run.folder is None else run.folder / "pushes"
-        pushed = sweeps.whole(self.plan, folder, **run.shape).isel(law=0)
+        pushed = execution.run_plan(self.plan, folder, **run.batch_options).isel(law=0)
         shape = (self.setups, 2, len(self.ranges.targets))
         won = pushed.success.values.reshape(shape) > 0
         D, time = (
@@ -134,7 +134,7 @@ class Reproduce(TrialStudy[xr.Dataset]):
         u = self.plan.points.u[:, points.names(self.ranges).index(name)]
         return getattr(self.ranges, name).at(u).reshape(self.setups, 2, -1)[..., 0]
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         """What was asked."""
         return (
             f"{self.setups} setups of {len(self.ranges.targets)} targets and two objects each. A "
@@ -143,9 +143,9 @@ class Reproduce(TrialStudy[xr.Dataset]):
             f"{TOLERANCE['time']:g} s; all sixteen pushes must succeed."
         )
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """The results, and what is drawn of the setups nearest to the paper."""
-        made = tables(found)
+        made = tables(results)
         return [
             Section("Results", "", made["results"]),
             Section("Quantities", "", made["quantities"]),

@@ -13,9 +13,9 @@ import xarray as xr
 from rps_jax.analysis import tables
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.runs import evaluate
-from rps_jax.runs.evaluate import Ask
+from rps_jax.runs.evaluate import Candidates
 from rps_jax.runs.question import Split, seed_of
-from rps_jax.trials.progress import Report, unheard
+from rps_jax.trials.progress import ProgressCallback, no_progress
 from rps_jax.trials.trial import Outcome
 from rps_jax.tuning.run import Problem
 from rps_jax.tuning.space import SUBSETS, Space
@@ -48,8 +48,10 @@ def _try(
     params: Any, problem: Problem, splits: Sequence[Split], seed: int, count: int, **run: Any
 ) -> list[Outcome]:
     """The outcomes (P, D * W) of candidates in the worlds of each split."""
-    asks = [Ask(params, seed_of(seed, split), np.arange(count)) for split in splits]
-    answers, _ = evaluate.try_out(asks, problem.domains, problem.setting, problem.objective, **run)
+    asks = [Candidates(params, seed_of(seed, split), np.arange(count)) for split in splits]
+    answers, _ = evaluate.score_candidates(
+        asks, problem.domains, problem.setting, problem.objective, **run
+    )
     return [answer.outcome for answer in answers]
 
 
@@ -71,7 +73,7 @@ def alone(
     count: int = 9,
     worlds: int = 1000,
     seed: int = 0,
-    report: Report = unheard,
+    callback: ProgressCallback = no_progress,
     **shape: Any,
 ) -> xr.Dataset:
     """Success, time and way against each parameter alone, in worlds for validation.
@@ -83,7 +85,7 @@ def alone(
         lambda *x: jnp.stack(x), *(lines(one, names, count) for one in sets.values())
     )
     params = jax.tree.map(lambda leaf: leaf.reshape(-1), grid)
-    (found,) = _try(params, problem, ("validate",), seed, worlds, report=report, **shape)
+    (found,) = _try(params, problem, ("validate",), seed, worlds, callback=callback, **shape)
     dims = ("set", "parameter", "step")
     columns: dict[str, Any] = {
         name: (dims, values.reshape(shape_of)) for name, values in aims(found)._asdict().items()
@@ -143,7 +145,7 @@ def front(
     spread: float = 0.5,
     worlds: int = 1000,
     seed: int = 0,
-    report: Report = unheard,
+    callback: ProgressCallback = no_progress,
     **shape: Any,
 ) -> xr.Dataset:
     """Candidates between and around sets of parameters, and which of them are undominated.
@@ -152,7 +154,9 @@ def front(
     measured in worlds for testing, so that luck in the choice does not count.
     """
     params = cloud(list(sets.values()), names, candidates, spread, seed)
-    found, again = _try(params, problem, ("validate", "test"), seed, worlds, report=report, **shape)
+    found, again = _try(
+        params, problem, ("validate", "test"), seed, worlds, callback=callback, **shape
+    )
     chosen = undominated(aims(found))
     labels = [*sets, *(f"{i}" for i in range(candidates))]
     columns: dict[str, Any] = {k: ("candidate", v) for k, v in aims(again)._asdict().items()}

@@ -21,8 +21,8 @@ from rps_jax.analysis.figures.style import Figure, success_rates
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.laws.rps import BOUNDS, RPSParams
 from rps_jax.record.options import option
-from rps_jax.runs.question import OfLaws, Run, call_of
-from rps_jax.trials.progress import InTurn
+from rps_jax.runs.question import MultiLawQuestion, Run, call_of
+from rps_jax.trials.progress import SequentialProgress
 from rps_jax.tuning.run import Problem
 from rps_jax.tuning.space import SUBSETS
 from rps_jax.world import domain as domains
@@ -31,7 +31,7 @@ from sweeps.landscape import candidates
 
 
 @dataclass(frozen=True)
-class Landscape(OfLaws[xr.DataTree]):
+class Landscape(MultiLawQuestion[xr.DataTree]):
     """Vary each parameter of RPS alone, and find what success costs in time and way.
 
     The answer is a tree: `alone` with success, time and way (set, parameter, step), and `front`
@@ -39,7 +39,7 @@ class Landscape(OfLaws[xr.DataTree]):
     """
 
     TITLE: ClassVar[str] = "What each parameter does"
-    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 32, "values": 3, "candidates": 16}
+    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 32, "values": 3, "candidates": 16}
 
     domain: Sequence[DomainLike] = ("wide",)
     """Domains: paper, hardware, wide, real, prisms or hostile, or JSON files of ranges; changes
@@ -73,31 +73,31 @@ class Landscape(OfLaws[xr.DataTree]):
         varied = len(self.chosen) * len(SUBSETS["full"]) * self.values
         return varied * each, 2 * (self.candidates + len(self.chosen)) * each
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many trials there are."""
         return sum(self._shares)
 
     def answer(self, run: Run) -> xr.DataTree:
         """Vary each parameter, then try the candidates."""
-        heard, seed = InTurn(run.report), self.setting.seed
-        common = {"worlds": self.worlds, "seed": seed, **run._replace(report=heard).shape}
+        heard, seed = SequentialProgress(run.callback), self.setting.seed
+        common = {"worlds": self.worlds, "seed": seed, **run._replace(callback=heard).batch_options}
         sets, problem = self.chosen, self.problem
         first, _ = self._shares
         alone = partial(candidates.alone, sets, problem, count=self.values, **common)
-        found = {"alone": run.part("alone", alone)}
-        heard.ended(first)
+        found = {"alone": run.checkpoint("alone", alone)}
+        heard.finish(first)
         several = {"candidates": self.candidates, "spread": self.spread}
         front = partial(candidates.front, sets, problem, **several, **common)
-        found["front"] = run.part("front", front)
+        found["front"] = run.checkpoint("front", front)
         return xr.DataTree.from_dict(found)
 
-    def intro(self, found: xr.DataTree) -> str:
+    def intro(self, results: xr.DataTree) -> str:
         """What was asked."""
         return f"Every candidate meets the same {self.worlds:,} worlds of each domain."
 
-    def report(self, found: xr.DataTree, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.DataTree, run: Run) -> Sequence[Section]:
         """Success against each parameter, and the front."""
-        alone, front = (found[name].to_dataset() for name in ("alone", "front"))
+        alone, front = (results[name].to_dataset() for name in ("alone", "front"))
         log = [name for name, bound in BOUNDS.items() if bound.log]
         lines = Picture("landscape", partial(parameters_figure, alone, log))
         trade = Picture("front", partial(front_figure, front))

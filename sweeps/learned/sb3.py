@@ -79,7 +79,7 @@ class SB3(Study[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Learn with each number of worlds."""
-        each = [run.part(f"curve_{n}", partial(self._learned, n)) for n in self.num_envs]
+        each = [run.checkpoint(f"curve_{n}", partial(self._learned, n)) for n in self.num_envs]
         found = xr.concat(each, xr.IndexVariable("envs", list(self.num_envs)))
         return found
 
@@ -133,9 +133,9 @@ class SB3(Study[xr.Dataset]):
             }
         )
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """The curves."""
-        return [Section("Curve", "", table(found), Picture("sb3", partial(figure_of, found)))]
+        return [Section("Curve", "", table(results), Picture("sb3", partial(figure_of, results)))]
 
 
 sb3 = call_of(SB3)

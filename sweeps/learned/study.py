@@ -51,7 +51,7 @@ class Learned(Study[list[list[Any]]]):
     """
 
     TITLE: ClassVar[str] = "A law learned from touch"
-    LEFT_OUT: ClassVar[tuple[str, ...]] = ("device",)
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("device",)
 
     runs: tuple[str, ...] = option((), positional=True)
     """Run folders of `rps learn`."""
@@ -90,11 +90,11 @@ class Learned(Study[list[list[Any]]]):
         )
         return rows
 
-    def intro(self, found: list[list[Any]]) -> str:
+    def intro(self, results: list[list[Any]]) -> str:
         """Where the rows are."""
-        return f"{len(found)} rows of `results/learned.json`; now render the tables."
+        return f"{len(results)} rows of `results/learned.json`; now render the tables."
 
-    def report(self, found: list[list[Any]], run: Run) -> Sequence[Section]:
+    def report(self, results: list[list[Any]], run: Run) -> Sequence[Section]:
         """The curve of each run."""
         return [
             Section(
@@ -103,7 +103,7 @@ class Learned(Study[list[list[Any]]]):
                     f"learned_{one[0].strip('`')}", partial(learn.figure_of, curve_of(Path(folder)))
                 ),
             )
-            for folder, one in zip(self.runs, found, strict=True)
+            for folder, one in zip(self.runs, results, strict=True)
         ]
 
 

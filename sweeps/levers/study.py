@@ -141,7 +141,7 @@ class Levers(Study[xr.Dataset]):
         """Check the name of the program."""
         errors.check_name("program", self.program, programs.BATCHED)
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many programs there are."""
         return 1 + len(levers_of(self.program, self.family))
 
@@ -151,21 +151,21 @@ class Levers(Study[xr.Dataset]):
         gains: list[Gain] = []
         for gain in measure(self.program, self.family, self.worlds, **how):
             gains.append(gain)
-            run.report(Progress(len(gains), 0.0))
+            run.callback(Progress(len(gains), 0.0))
         columns: dict[str, Any] = {
             name: ("lever", [getattr(gain, name) for gain in gains])
             for name in ("worlds", "compile", "memory", "rate", "times")
         }
         return xr.Dataset(columns, {"lever": [gain.lever for gain in gains]})
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         """Where it was measured."""
         return programs.machine()
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """How many times as fast each lever makes the program."""
         title = f"{self.program}, {self.family}"
-        times = dict(zip(map(str, found.lever.values), map(float, found.times), strict=True))
+        times = dict(zip(map(str, results.lever.values), map(float, results.times), strict=True))
         gains = [
             Gain(
                 self.program,
@@ -173,7 +173,7 @@ class Levers(Study[xr.Dataset]):
                 str(one.lever.item()),
                 *(one[name].item() for name in ("worlds", "compile", "memory", "rate", "times")),
             )
-            for one in (found.sel(lever=name) for name in found.lever.values)
+            for one in (results.sel(lever=name) for name in results.lever.values)
         ]
         picture = Picture("levers", partial(levers_figure, times, title))
         return [Section(title, "", table(gains), picture)]

@@ -28,12 +28,12 @@ from rps_jax.geometry.solid import GRAVITY
 from rps_jax.record.options import option
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.shell import BOARDS, HALF_WIDTH
-from rps_jax.runs import sweep as sweeps
-from rps_jax.runs.question import OfLaws, Run, call_of
+from rps_jax.runs import execution
+from rps_jax.runs.question import MultiLawQuestion, Run, call_of
 from rps_jax.runs.sweep import Sweep
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
-from rps_jax.trials.progress import InTurn
+from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import Domain, DomainLike, Range, named
@@ -99,7 +99,7 @@ LIMITS = {
 
 
 @dataclass(frozen=True)
-class Limits(OfLaws[xr.DataTree]):
+class Limits(MultiLawQuestion[xr.DataTree]):
     """Tell what each limit of a robot costs a law: force, lag, acceleration, size, skin.
 
     Every robot meets the worlds that the ideal base meets. The answer is a tree: for each limit its
@@ -107,7 +107,7 @@ class Limits(OfLaws[xr.DataTree]):
     """
 
     TITLE: ClassVar[str] = "What each limit costs"
-    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 64}
+    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 64}
 
     domain: DomainLike = "wide"
     """The worlds: paper, hardware, wide, prisms or hostile, or a JSON file of ranges; changes
@@ -125,7 +125,7 @@ class Limits(OfLaws[xr.DataTree]):
             errors.check_name("limit", name, LIMITS)
         self._sweep("ideal", named(self.domain)).check()
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many trials there are."""
         robots = 1 + sum(max(1, len(LIMITS[name].robots)) for name in self.limits)
         return len(self.chosen) * self.worlds * robots
@@ -149,13 +149,13 @@ class Limits(OfLaws[xr.DataTree]):
 
     def answer(self, run: Run) -> xr.DataTree:
         """Sweep with the ideal base and with every robot."""
-        base, heard = named(self.domain), InTurn(run.report)
-        shape = run._replace(report=heard).shape
+        base, heard = named(self.domain), SequentialProgress(run.callback)
+        shape = run._replace(callback=heard).batch_options
 
         def sweep(part: str, ranges: Domain, robot: Robot | None = None) -> xr.Dataset:
             folder = None if run.folder is None else run.folder / part
-            found = sweeps.whole(self._sweep(part, ranges, robot).plan, folder, **shape)
-            heard.ended(len(self.chosen) * self.worlds)
+            found = execution.run_plan(self._sweep(part, ranges, robot).plan, folder, **shape)
+            heard.finish(len(self.chosen) * self.worlds)
             return found
 
         ideal, found = sweep("ideal", base), {}
@@ -183,16 +183,16 @@ class Limits(OfLaws[xr.DataTree]):
             )
         return xr.DataTree.from_dict(found)
 
-    def intro(self, found: xr.DataTree) -> str:
+    def intro(self, results: xr.DataTree) -> str:
         """What was asked."""
         return (
             f"{self.worlds:,} worlds, seed {self.setting.seed}; every robot meets the same ones. "
             "Intervals: of rates Wilson 95 %, of limits bootstrap 95 %."
         )
 
-    def report(self, found: xr.DataTree, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.DataTree, run: Run) -> Sequence[Section]:
         """Where each law has lost so much, its success at each size, and what becomes of turns."""
-        each = {name: found[name].to_dataset() for name in self.limits}
+        each = {name: results[name].to_dataset() for name in self.limits}
         picture = Picture("limits", partial(figure_of, each))
         sections = [Section("Success over each limit", "", losses(each), picture)]
         if len(sizes := successes(each)) > 1:
@@ -289,7 +289,7 @@ def turning(
         case = Case(object, "S1", target, params, robot=robot)
         setting = Setting("fused", rules=Rules(horizon=seconds))
         period = setting.physics.control_period
-        (trace,) = pushes.follow([case], setting, interval=period)
+        (trace,) = pushes.record_cases([case], setting, interval=period)
         seen = trace.snapshots
         turns = np.diff(np.asarray(seen.qpos)[:, 2]) / period
         rows.append([np.asarray(seen.twist.omega)[:-1], turns, np.asarray(seen.time)[:-1]])

@@ -26,21 +26,21 @@ from rps_jax.record.options import option
 from rps_jax.runs import sweep as sweeps
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of, seed_of
-from rps_jax.runs.sweep import OfPlan
+from rps_jax.runs.sweep import SweepQuestion
 from rps_jax.trials.setting import Setting
 from rps_jax.world.domain import DomainLike
 from sweeps.mends.mended import FIRST, MENDS
 
 
 @dataclass(frozen=True)
-class Mends(OfPlan):
+class Mends(SweepQuestion):
     """Push with one mend of the tuned law at a time, in worlds for tuning, and compare them.
 
     The answer holds outcomes (law, world), as of `rps_jax.sweep`.
     """
 
     TITLE: ClassVar[str] = "Mends of the tuned law"
-    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 32}
+    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 32}
 
     laws: LawsLike = ()
     """The mends, by their names in the table; by default all. The one that the others are compared
@@ -67,11 +67,11 @@ class Mends(OfPlan):
         seed = seed_of(self.setting.seed, "tune")
         return dataclasses.replace(plan, setting=dataclasses.replace(plan.setting, seed=seed))
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Each mend against the first, world by world."""
-        rows = tables.against_table(found, FIRST)
+        rows = tables.against_table(results, FIRST)
         against = Section(f"Against: {FIRST}", "World by world; p by Holm.", rows)
-        return [against, sweeps.rates(found, float(self.plan.setting.rules.max_lost))]
+        return [against, sweeps.success_section(results, float(self.plan.setting.rules.max_lost))]
 
 
 mends = call_of(Mends)

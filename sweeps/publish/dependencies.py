@@ -94,7 +94,7 @@ class Dependencies(Study[xr.Dataset]):
         for name in self.extras:
             errors.check_name("extra", name, EXTRAS)
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many environments there are."""
         return 1 + len(self.extras)
 
@@ -102,11 +102,11 @@ class Dependencies(Study[xr.Dataset]):
         """Measure what was not measured before."""
         with tempfile.TemporaryDirectory() as folder:
             place = Path(folder) / "environment"
-            found = {"": run.part("core", partial(_core, place))}
+            found = {"": run.checkpoint("core", partial(_core, place))}
             for name in self.extras:
-                run.report(Progress(len(found), 0.0))
-                found[name] = run.part(name, partial(_extra, place, name))
-            run.report(Progress(len(found), 0.0))
+                run.callback(Progress(len(found), 0.0))
+                found[name] = run.checkpoint(name, partial(_extra, place, name))
+            run.callback(Progress(len(found), 0.0))
         index = xr.IndexVariable("installed", list(found))
         whole: Any = xr.concat(list(found.values()), index, join="outer", fill_value={"size": 0.0})
         return whole
@@ -115,9 +115,9 @@ class Dependencies(Study[xr.Dataset]):
         """Return both tables."""
         return {name: Table(rows, _NOTE) for name, rows in tables(results).items()}
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Both tables."""
-        return [Section(name.capitalize(), "", rows) for name, rows in tables(found).items()]
+        return [Section(name.capitalize(), "", rows) for name, rows in tables(results).items()]
 
 
 dependencies = call_of(Dependencies)

@@ -80,7 +80,7 @@ class Publish(Study[xr.Dataset]):
 
     def _anew(self, run: Run) -> None:
         """Make what is asked for, one file after the other; what fails is named at the end."""
-        failed, folder = [], run.folder or self.place
+        failed, folder = [], run.folder or self.default_folder
         for name, recipe in RECIPES.items():
             asked = any(_meet(name, pattern) for pattern in self.only)
             if not asked or self.needs not in ("any", recipe.device):
@@ -99,17 +99,17 @@ class Publish(Study[xr.Dataset]):
                 "is kept; the same command goes on."
             )
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """One row a data file, those that are not of today's code first."""
         shown = ("version", "date", "state", "made", "two cores", "one H100")
         rows = [["file", *shown]]
-        order = found.sortby("state", ascending=False)
+        order = results.sortby("state", ascending=False)
         for name in order.file.values:
             one = order.sel(file=name)
             rows.append([str(name), *(str(one[key].item()) for key in shown)])
-        current = int((found.state == CURRENT).sum())
+        current = int((results.state == CURRENT).sum())
         text = (
-            f"{current} of {found.sizes['file']} data files are of rps_jax {rps_jax.__version__} "
+            f"{current} of {results.sizes['file']} data files are of rps_jax {rps_jax.__version__} "
             "and hang on nothing that has changed since. A file without a digest was made before "
             "there were any: what it hangs on is known by its command and its commit alone."
         )
@@ -206,13 +206,15 @@ def _carried_out(words: list[str], runs: Path) -> tuple[Sequence[Section], Any, 
     here = [re.sub(r"\bruns/", f"{runs}/", word) for word in rest]
     name, options = names.split(here)
     out = runs / Path(place).name
-    asked = flags.parse(names.question_of(name), name, [*options, "--out", str(out)])[0].asked()
-    asked.checked()
+    asked = flags.parse(names.question_of(name), name, [*options, "--out", str(out)])[
+        0
+    ].with_quick_values()
+    asked.validate()
     before, sys.argv = sys.argv, list(words)
     try:  # so that the run folder says which command makes it
-        with asked.bar() as bar:
-            found = asked.answered(bar)
-            sections = asked.report(found, asked.run_in(out, bar))
+        with asked.progress_bar() as bar:
+            found = asked.execute(bar)
+            sections = asked.report(found, asked.create_run(out, bar))
     finally:
         sys.argv = before
     return sections, found, provenance.read_environment(out) | {"command": words}

@@ -24,7 +24,7 @@ from rps_jax.analysis.report import Section
 from rps_jax.control import registry
 from rps_jax.record import files
 from rps_jax.record.options import option
-from rps_jax.runs import sweep
+from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of, seed_of
 from rps_jax.trials.setting import Setting
@@ -49,7 +49,7 @@ class Million(TrialStudy[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "A million outcomes"
-    SMALL: ClassVar[dict[str, Any]] = {"worlds": 64}
+    QUICK: ClassVar[dict[str, Any]] = {"worlds": 64}
     GROWS: ClassVar[tuple[str, ...]] = ("laws",)
 
     laws: tuple[str, ...] = ("rps_tuned", "rps_plus", "learned_gru")
@@ -65,7 +65,7 @@ class Million(TrialStudy[xr.Dataset]):
         registry.resolve_laws(self.laws)
         domains.named(self.domain)
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many trials there are."""
         return self.worlds * len(self.laws)
 
@@ -76,7 +76,7 @@ class Million(TrialStudy[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Push with the laws that are missing."""
-        each = [run.part(law, partial(self._of, law, run)) for law in self.laws]
+        each = [run.checkpoint(law, partial(self._of, law, run)) for law in self.laws]
         found = xr.concat(each, xr.IndexVariable("law", list(self.laws)))
         for name, words in _WORDS.items():
             found[name].attrs["long_name"] = words
@@ -104,7 +104,7 @@ class Million(TrialStudy[xr.Dataset]):
         laws = registry.resolve_laws([law])
         plan = Plan(domains.named(self.domain), self.worlds, laws, self.seeded, 16_384)
         folder = None if run.folder is None else run.folder / f"sweep_{law}"
-        one = sweep.whole(plan, folder, **run.shape).isel(law=0)
+        one = execution.run_plan(plan, folder, **run.batch_options).isel(law=0)
         won, off = one.success.values > 0, one.min_distance.values
         how = 1 + statistics.failure_modes(one, float(self.setting.rules.max_lost))
         steps = np.rint(one.time.values / self.setting.physics.control_period)
@@ -118,9 +118,9 @@ class Million(TrialStudy[xr.Dataset]):
             }
         )
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """How the trials of each law ended."""
-        return [Section("Ends", "", [HEADER, *table(found)])]
+        return [Section("Ends", "", [HEADER, *table(results)])]
 
 
 million = call_of(Million)

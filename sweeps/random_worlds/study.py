@@ -20,7 +20,7 @@ from rps_jax.analysis import tables
 from rps_jax.analysis.report import Section
 from rps_jax.control import registry
 from rps_jax.record.options import option
-from rps_jax.runs import models, sweep
+from rps_jax.runs import execution, model_panel
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of, setting_as_json
 from rps_jax.trials.setting import Setting
@@ -35,7 +35,7 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
     """Push with four laws in worlds that nobody looked at, and in fewer on a panel of models."""
 
     TITLE: ClassVar[str] = "Four laws in random worlds"
-    SMALL: ClassVar[dict[str, Any]] = {"worlds": 24, "panel": 0, "in_c": 0}
+    QUICK: ClassVar[dict[str, Any]] = {"worlds": 24, "panel": 0, "in_c": 0}
     GROWS: ClassVar[tuple[str, ...]] = (*("domains", "panel", "in_c", "only", "run_missing"),)
 
     laws: tuple[str, ...] = ("rps", "rps_tuned", "rps_plus", "learned_gru")
@@ -72,9 +72,13 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
             for model, plan in self.plans(name).items():
                 safe = "".join(c if c.isalnum() else "_" for c in f"{name} {model}")
                 named = f"{safe}-{plan.worlds}"
-                if not self.run_missing and run.parts is not None and not run.parts.get(named):
+                if (
+                    not self.run_missing
+                    and run.checkpoints is not None
+                    and not run.checkpoints.get(named)
+                ):
                     continue
-                part = run.part(named, partial(_outcomes, plan, run))
+                part = run.checkpoint(named, partial(_outcomes, plan, run))
                 found.append(part.expand_dims(domain=[name], model=[model]))
         whole = xr.combine_by_coords(found, join="outer", combine_attrs="drop")
         assert isinstance(whole, xr.Dataset)
@@ -95,30 +99,35 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
         """What is run in a domain: on each model, the default's worlds first."""
         laws = registry.resolve_laws(self.laws)
         plan = Plan(domains.named(name), self.worlds, laws, self.setting, 4096)
-        found = {models.OWN: plan}
+        found = {model_panel.OWN: plan}
         if self.panel:
             small = replace(plan, worlds=min(self.panel, self.worlds))
-            found |= {k: v for k, v in models.plans(small).items() if k != models.OWN}
+            found |= {
+                k: v for k, v in model_panel.model_plans(small).items() if k != model_panel.OWN
+            }
         if self.in_c:
             in_c = replace(plan.setting, engine="mujoco")
             found[C] = replace(plan, worlds=min(self.in_c, self.worlds), setting=in_c)
         return {k: v for k, v in found.items() if not self.only or _meets(k, self.only)}
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Rates with their intervals, their range over the models, and times."""
         text = (
             f"{self.worlds:,} worlds of seed {self.setting.seed}; every law meets the same ones. "
             "Intervals: Wilson 95 %."
         )
-        if models.OWN not in found.model:
-            return [Section("Models", text, panel_table(found))]
-        if found.sizes["model"] == 1:
-            return [Section("Success", text, table(found))]
+        if model_panel.OWN not in results.model:
+            return [Section("Models", text, panel_table(results))]
+        if results.sizes["model"] == 1:
+            return [Section("Success", text, table(results))]
         text += (
             " Over the models: least and greatest rate of a panel of grounds, cones, steps and "
             "engines, each in the first of these worlds."
         )
-        return [Section("Success", text, table(found)), Section("Models", "", panel_table(found))]
+        return [
+            Section("Success", text, table(results)),
+            Section("Models", "", panel_table(results)),
+        ]
 
 
 random_worlds = call_of(RandomWorlds)
@@ -130,7 +139,9 @@ def _meets(name: str, patterns: Sequence[str]) -> bool:
 
 def _outcomes(plan: Plan, run: Run) -> xr.Dataset:
     """Success (law, world), and the time of each trial [s]."""
-    found = sweep.whole(plan, None, report=run.report, slots=run.slots, workers=run.workers)
+    found = execution.run_plan(
+        plan, None, callback=run.callback, slots=run.slots, workers=run.workers
+    )
     found = found[["success", "time"]].reset_coords(drop=True)
     return found.assign(success=found.success.astype(np.float32))
 
@@ -156,13 +167,13 @@ def table(found: xr.Dataset) -> list[list[Any]]:
 
 def _row(found: xr.Dataset, domain: str, law: str) -> dict[str, str]:
     by_model = rates(found, domain, law)
-    own = found.sel(domain=domain, law=law, model=models.OWN)
+    own = found.sel(domain=domain, law=law, model=model_panel.OWN)
     shares = [won / of for won, of in by_model.values()]
     median = float(own.time.where(own.success == 1).median())
     return {
         "domain": domain,
         "law": law,
-        "success": tables.share(*by_model[models.OWN]),
+        "success": tables.share(*by_model[model_panel.OWN]),
         "over the models": tables.rate_range(shares) if len(shares) > 1 else "",
         "in C MuJoCo": tables.share(*by_model[C]) if C in by_model else "",
         "median time of a success": f"{median:.1f} s" if np.isfinite(median) else "-",

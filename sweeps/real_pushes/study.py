@@ -169,7 +169,7 @@ class RealPushes(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Does the physics predict real pushes?"
-    SMALL: ClassVar[Mapping[str, Any]] = {"few": 60, "mujoco": 6}
+    QUICK: ClassVar[Mapping[str, Any]] = {"few": 60, "mujoco": 6}
 
     pushes: Path | None = None
     """A CSV file of pushes to predict, in the columns of data/pushes.csv; by default the project's
@@ -197,7 +197,7 @@ class RealPushes(Study[xr.Dataset]):
         rows = np.linspace(0, len(whole) - 1, self.few).round().astype(int)
         return whole.iloc[rows].reset_index(drop=True)
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many predictions there are, but for those of the fit."""
         return sum(int(self._rows(name).sum()) for name in self.models)
 
@@ -231,9 +231,9 @@ class RealPushes(Study[xr.Dataset]):
             for first in range(0, len(table), _TOGETHER):
                 rows = slice(first, first + _TOGETHER)
                 make = partial(self._one, model, friction, rows)
-                parts.append(run.part(f"{model}-{first}", make))
+                parts.append(run.checkpoint(f"{model}-{first}", make))
                 done += int(self._rows(model)[rows].sum())
-                run.report(Progress(done, 0.0))
+                run.callback(Progress(done, 0.0))
             found.append(xr.concat(parts, "push"))
         whole = xr.concat(found, "model", join="override", coords="minimal", compat="override")
         whole = whole.assign_coords(
@@ -281,7 +281,7 @@ class RealPushes(Study[xr.Dataset]):
         fitted = [name for name in FITTED if name in needed]
         found = [
             xr.concat(
-                [run.part(f"fit-{model}-{mu[0]:g}", partial(self._tried, table, model, mu))
+                [run.checkpoint(f"fit-{model}-{mu[0]:g}", partial(self._tried, table, model, mu))
                  for mu in (_TRIED[i : i + 4] for i in range(0, len(_TRIED), 4))],
                 "tried",
             )
@@ -325,22 +325,22 @@ class RealPushes(Study[xr.Dataset]):
             {"predicted": (("push", "pose"), pose), "force": (("push", "axis"), force)}
         )
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         """What was asked."""
         return (
-            f"{found.sizes['push']} pushes of a real robot (an aluminium triangle of 150 mm on "
+            f"{results.sizes['push']} pushes of a real robot (an aluminium triangle of 150 mm on "
             "three feet or flat), predicted. Errors are medians, with the 95 % interval of a "
             "bootstrap over pushes in brackets, and the 90 % quantile."
         )
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Errors by model, and the friction that was fitted."""
         sections = [
             Section(name.replace("_", " ").capitalize(), "", _texts(*made))
-            for name, made in tables(found).items()
+            for name, made in tables(results).items()
         ]
-        if sections and np.isfinite(found.both).any() and "rigid_feet" in self.models:
-            draw = partial(figure, found, self.table, WORDS)
+        if sections and np.isfinite(results.both).any() and "rigid_feet" in self.models:
+            draw = partial(figure, results, self.table, WORDS)
             sections[0] = sections[0]._replace(picture=Picture("real_pushes", draw))
         return sections
 

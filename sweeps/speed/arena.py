@@ -70,7 +70,7 @@ class Arena(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Engines on one scene"
-    SMALL: ClassVar[Mapping[str, Any]] = {
+    QUICK: ClassVar[Mapping[str, Any]] = {
         "names": ("C MuJoCo, rollout", "fused"),
         "worlds": (8,),
         "starts": 4,
@@ -107,7 +107,7 @@ class Arena(Study[xr.Dataset]):
         counts = {name: (max(self.worlds),) for name in ON_CORES}
         return [(name, n) for name in self.names for n in counts.get(name, self.worlds)]
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many rows there are."""
         return len(self.wanted)
 
@@ -117,22 +117,24 @@ class Arena(Study[xr.Dataset]):
             folder = Path(place)
             (folder / "scene.xml").write_text(mjcf())
             np.save(folder / "starts.npy", placed(self.starts))
-            truth = run.part("converged", partial(self._converged, folder)).pose.values
+            truth = run.checkpoint("converged", partial(self._converged, folder)).pose.values
             missing = [
-                one for one in self.wanted if run.parts is None or run.parts.get(_part(one)) is None
+                one
+                for one in self.wanted
+                if run.checkpoints is None or run.checkpoints.get(_part(one)) is None
             ]
             made = self._raced(missing, folder, truth)
             found: list[xr.Dataset] = []
             whole: Any = xr.Dataset()
             for number, one in enumerate(self.wanted):
-                row = next(made) if one in missing else run.part(_part(one), xr.Dataset)
+                row = next(made) if one in missing else run.checkpoint(_part(one), xr.Dataset)
                 if one in missing and not row.why.item():  # what failed is tried again
-                    run.part(_part(one), partial(xr.Dataset.copy, row))
+                    run.checkpoint(_part(one), partial(xr.Dataset.copy, row))
                 found.append(row)
                 whole = xr.concat(found, "row")
                 if self.machine and run.folder is not None:
                     self.publish(whole, run.folder)
-                run.report(Progress(number + 1, 0.0))
+                run.callback(Progress(number + 1, 0.0))
             made.close()
         return whole
 
@@ -162,14 +164,14 @@ class Arena(Study[xr.Dataset]):
         excluded = (f"Not in the arena: {name}, because {why}." for name, why in EXCLUDED.items())
         return {"arena": Table([_COLUMNS, *table(results)], " ".join(excluded))}
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         """Where it was measured."""
         return programs.machine()
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Speeds and errors."""
         told = " ".join(f"{name} is not in the arena: {why}." for name, why in EXCLUDED.items())
-        return [Section("Engines on one scene", told, [list(_COLUMNS), *table(found)])]
+        return [Section("Engines on one scene", told, [list(_COLUMNS), *table(results)])]
 
 
 arena = call_of(Arena)

@@ -72,7 +72,7 @@ class Commands(Study[xr.Dataset]):
     file: str = "commands"
     """Name of the data file."""
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many commands there are."""
         return len(self.wanted) + len(self.warm)
 
@@ -86,10 +86,12 @@ class Commands(Study[xr.Dataset]):
         found = []
         for number, (command, gpus) in enumerate(self.wanted):
             safe = re.sub(r"\W+", "_", command) + ("" if gpus is None else f"_{gpus}")
-            found.append(run.part(safe, partial(timed, command, self.limit, gpus)))
-            run.report(Progress(number + 1, 0.0))
+            found.append(run.checkpoint(safe, partial(timed, command, self.limit, gpus)))
+            run.callback(Progress(number + 1, 0.0))
         gpus = max(self.gpus, default=None)
-        found += [run.part(f"warm_{n}", partial(_warm, n, self.limit, gpus)) for n in self.warm]
+        found += [
+            run.checkpoint(f"warm_{n}", partial(_warm, n, self.limit, gpus)) for n in self.warm
+        ]
         told = [*_labels(self.wanted), *(f"`{_call(n)}`, in one process" for n in self.warm)]
         whole: Any = xr.concat(found, "command").assign_coords(command=told)
         return whole
@@ -98,13 +100,13 @@ class Commands(Study[xr.Dataset]):
         """Return the times of the commands."""
         return {self.file: Table([_COLUMNS, *table(results)])}
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         """Where it was measured."""
         return programs.machine()
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Wall clocks of both processes."""
-        return [Section("Whole commands", "", [list(_COLUMNS), *table(found)])]
+        return [Section("Whole commands", "", [list(_COLUMNS), *table(results)])]
 
 
 commands = call_of(Commands)

@@ -58,7 +58,7 @@ class Compilers(Study[xr.Dataset]):
     file: str = "compilers"
     """Name of the data file."""
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many skins there are."""
         return len(self.skins)
 
@@ -66,8 +66,8 @@ class Compilers(Study[xr.Dataset]):
         """Sweep what was not swept before."""
         found = []
         for number, skin in enumerate(self.skins):
-            found.append(run.part(skin, partial(self._compared, skin)))
-            run.report(Progress(number + 1, 0.0))
+            found.append(run.checkpoint(skin, partial(self._compared, skin)))
+            run.callback(Progress(number + 1, 0.0))
         whole: Any = xr.concat(found, "skin").assign_coords(skin=list(self.skins))
         return whole
 
@@ -75,13 +75,13 @@ class Compilers(Study[xr.Dataset]):
         """Return the comparison."""
         return {self.file: Table([self._columns, *self.table(results)])}
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         """Where it was compared."""
         return programs.machine()
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Outcomes and speeds of both."""
-        return [Section("Outcomes and speeds", "", [self._columns, *self.table(found)])]
+        return [Section("Outcomes and speeds", "", [self._columns, *self.table(results)])]
 
     @property
     def _columns(self) -> list[str]:

@@ -86,7 +86,7 @@ class Costs(Study[list[Profile]]):
         for name in self.names:
             errors.check_name("names", name, programs.BATCHED)
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many programs there are."""
         return len(self.names) * len(self.families)
 
@@ -98,24 +98,24 @@ class Costs(Study[list[Profile]]):
             for name in self.names:
                 for family in self.families:
                     found.append(measure(name, family, self.worlds, steps=self.steps))
-                    run.report(Progress(len(found), 0.0))
+                    run.callback(Progress(len(found), 0.0))
         finally:
             os.environ.pop("RPS_COMPILER")
             os.environ.update({} if compiler is None else {"RPS_COMPILER": compiler})
         return found
 
-    def intro(self, found: list[Profile]) -> str:
+    def intro(self, results: list[Profile]) -> str:
         """Where it was measured, and how long a control step takes."""
         whole = "\n".join(
             f"{p.name}, {p.family}: {1e6 * p.step:,.0f} us a control step of {p.worlds:,} worlds, "
             f"{1e6 * p.timed:,.0f} us in operations while the profiler ran."
-            for p in found
+            for p in results
         )
         return f"{programs.machine()}\n\n{whole}"
 
-    def report(self, found: list[Profile], run: Run) -> Sequence[Section]:
+    def report(self, results: list[Profile], run: Run) -> Sequence[Section]:
         """The most expensive functions of each program."""
-        return [Section("Functions", "", table(found, self.most))]
+        return [Section("Functions", "", table(results, self.most))]
 
 
 costs = call_of(Costs)

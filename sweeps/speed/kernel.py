@@ -77,7 +77,7 @@ class Kernel(Study[xr.Dataset]):
         if shutil.which("ncu") is None:
             raise InputError("ncu is not here: it is a part of NVIDIA's CUDA toolkit.")
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many families there are."""
         return len(self.families)
 
@@ -85,8 +85,8 @@ class Kernel(Study[xr.Dataset]):
         """Count what was not counted before."""
         found = []
         for number, family in enumerate(self.families):
-            found.append(run.part(family, partial(self._counted, family)))
-            run.report(Progress(number + 1, 0.0))
+            found.append(run.checkpoint(family, partial(self._counted, family)))
+            run.callback(Progress(number + 1, 0.0))
         whole: Any = xr.concat(found, "family").assign_coords(family=list(self.families))
         return whole
 
@@ -94,13 +94,13 @@ class Kernel(Study[xr.Dataset]):
         """Return the counts of each family."""
         return {"kernel": Table([_COLUMNS, *self.table(results)])}
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         """Where it was measured."""
         return programs.machine()
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """What the kernel of each family waits for."""
-        return [Section("Waits", "", [list(_COLUMNS), *self.table(found)])]
+        return [Section("Waits", "", [list(_COLUMNS), *self.table(results)])]
 
     def table(self, found: xr.Dataset) -> list[list[str]]:
         """A row for each family."""

@@ -54,7 +54,7 @@ class OnARobot(Study[xr.Dataset]):
     core: int = option(0, 0, 4095)
     """Core to stay on."""
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many runs there are."""
         return self.runs
 
@@ -62,8 +62,8 @@ class OnARobot(Study[xr.Dataset]):
         """Make the runs that are missing."""
         found = []
         for number in range(self.runs):
-            found.append(run.part(f"run_{number}", self._timed))
-            run.report(Progress(number + 1, 0.0))
+            found.append(run.checkpoint(f"run_{number}", self._timed))
+            run.callback(Progress(number + 1, 0.0))
         whole: Any = xr.concat(found, "run")
         return whole
 
@@ -93,9 +93,9 @@ class OnARobot(Study[xr.Dataset]):
             }
         )
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Times of each run."""
-        return [Section("Steps", "", [list(_COLUMNS), *table(found)])]
+        return [Section("Steps", "", [list(_COLUMNS), *table(results)])]
 
 
 on_a_robot = call_of(OnARobot)

@@ -34,7 +34,7 @@ from rps_jax.trials.batch import Job
 from rps_jax.trials.batch import run as run_batch
 from rps_jax.trials.progress import Progress
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Loop, Rules
+from rps_jax.trials.trial import ControlLoop, Rules
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws
 from rps_jax.world.domain import DOMAINS
@@ -81,7 +81,7 @@ class Speed(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Speed"
-    SMALL: ClassVar[Mapping[str, Any]] = {
+    QUICK: ClassVar[Mapping[str, Any]] = {
         "names": ("C in closed loop", "fused standard", "quasistatic"),
         "families": ("box",),
         "worlds": (64,),
@@ -127,41 +127,45 @@ class Speed(Study[xr.Dataset]):
                 f"is timed up to --mujocos {self.mujocos} worlds."
             )
 
-    def trials(self) -> int | None:
+    def num_trials(self) -> int | None:
         """How many measurements there are."""
         return len(self.wanted)
 
     def answer(self, run: Run) -> xr.Dataset:
         """Make the measurements that are missing."""
         if self.refill:
-            run.part("refilling", partial(_gain, self.refill, self.rounds))
-        missing = [w for w in self.wanted if run.parts is None or run.parts.get(_part(w)) is None]
+            run.checkpoint("refilling", partial(_gain, self.refill, self.rounds))
+        missing = [
+            w
+            for w in self.wanted
+            if run.checkpoints is None or run.checkpoints.get(_part(w)) is None
+        ]
         done = len(self.wanted) - len(missing)
         made = _measured(missing, self.at_once)
         found = []
         for one in self.wanted:
-            found.append(run.part(_part(one), lambda: _labelled(next(made))))
+            found.append(run.checkpoint(_part(one), lambda: _labelled(next(made))))
             done += one in missing
-            run.report(Progress(done, 0.0))
+            run.callback(Progress(done, 0.0))
         whole: Any = xr.concat(found, "measurement")
         return whole.drop_attrs()
 
-    def intro(self, found: xr.Dataset) -> str:
+    def intro(self, results: xr.Dataset) -> str:
         """Where it was measured."""
         return programs.machine()
 
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Speeds beside C MuJoCo's, and against the batch."""
         names = [one.name for one in dataclasses.fields(Measurement)]
         speeds = [
             Measurement(**{name: row[name].item() for name in names})
-            for row in (found.isel(measurement=i) for i in range(found.sizes["measurement"]))
+            for row in (results.isel(measurement=i) for i in range(results.sizes["measurement"]))
         ]
         points = [(s.family, s.name, s.worlds, s.rate) for s in speeds]
         picture = Picture("throughput", partial(throughput, points, tuple(IN_C)))
         sections = [Section("Simulated seconds in a second", "", table(speeds), picture)]
-        if self.refill and run.parts is not None:
-            gain = run.part("refilling", partial(_gain, self.refill, self.rounds))
+        if self.refill and run.checkpoints is not None:
+            gain = run.checkpoint("refilling", partial(_gain, self.refill, self.rounds))
             sections.append(Section("Refilled slots", _told(gain, self.refill, self.rounds)))
         return sections
 
@@ -246,10 +250,10 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
     setting, engine = Setting(engine="mujoco", physics=physics), engines.get("mujoco")
     stage, batch = programs.timed_worlds(family, worlds, setting)
     if how != "open":
-        loop = Loop(physics, Rules(horizon=simulated))
+        loop = ControlLoop(physics, Rules(horizon=simulated))
 
         def once() -> None:
-            host.run(engine, stage, batch, loop, threads=threads, report=lambda *_: True)
+            host.run(engine, stage, batch, loop, threads=threads, callback=lambda *_: True)
 
     else:
         stepper = engine.stepper(stage, np.asarray(batch.qpos, float), threads)

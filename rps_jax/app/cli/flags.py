@@ -22,8 +22,8 @@ import tyro
 from rps_jax.engines.device import Device
 from rps_jax.errors import InputError
 from rps_jax.record import options
-from rps_jax.runs.push import FILM_LENGTH, FollowsOne
-from rps_jax.runs.question import Pushes
+from rps_jax.runs.push import FILM_LENGTH, TraceQuestion
+from rps_jax.runs.question import SimulationQuestion
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 
@@ -55,7 +55,7 @@ def parse(kind: type[Any], name: str, words: Sequence[str]) -> tuple[Any, Beside
     extra = Beside(**{key: given.pop(key) for key in beside})
     said = [re.sub(r"\W", "_", word[2:].split("=")[0]) for word in words if word[:2] == "--"]
     said += ["rules"] if {*said} & {*Rules._fields} else []
-    return kind(**_gathered(kind, given), said=tuple(said)), extra
+    return kind(**_gathered(kind, given), explicit_options=tuple(said)), extra
 
 
 def _read(made: type[Any], program: str, words: Sequence[str], summary: str) -> Any:
@@ -131,7 +131,9 @@ def _unboxed(line: str) -> str:
 def _flat(kind: type[Any]) -> tuple[list[Any], list[str]]:
     """Fields of the flat dataclass, and which of them are the command line's alone."""
     types_, helps = options.field_types(kind), options.field_docs(kind)
-    shared = [one.name for one in dataclasses.fields(Pushes)]  # told last, but for the setting
+    shared = [
+        one.name for one in dataclasses.fields(SimulationQuestion)
+    ]  # told last, but for the setting
     own, last = [], []
     for one in dataclasses.fields(kind):
         if not one.init or options.is_hidden(one):
@@ -142,9 +144,9 @@ def _flat(kind: type[Any]) -> tuple[list[Any], list[str]]:
             kind_, help_ = cli_type(types_[one.name]), helps.get(one.name, "")
             made = _made(one.name, kind_, _default(one), help_, options.is_positional(one))
             (last if one.name in shared else own).append(made)
-    beside = ["device"] if issubclass(kind, Pushes | FollowsOne) else []
+    beside = ["device"] if issubclass(kind, SimulationQuestion | TraceQuestion) else []
     if beside and not hasattr(kind, "in_shell"):
-        filmed = issubclass(kind, FollowsOne)  # one trial over time
+        filmed = issubclass(kind, TraceQuestion)  # one trial over time
         beside += ["overwrite", "video", "film_length"] if filmed else ["overwrite"]
     texts, hints = options.field_docs(Beside), typing.get_type_hints(Beside)
     extra = [_made(n, hints[n], Beside._field_defaults[n], texts[n]) for n in beside]

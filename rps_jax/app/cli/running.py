@@ -119,14 +119,14 @@ def carry_out(question: Any, beside: Beside) -> None:
     from rps_jax.engines import device
     from rps_jax.record import folder
     from rps_jax.runs.push import check_length
-    from rps_jax.runs.question import told
+    from rps_jax.runs.question import timing_line
 
     if question.out is None and not hasattr(question, "in_shell"):
-        question = dataclasses.replace(question, out=question.place)
-    asked = question.asked()
+        question = dataclasses.replace(question, out=question.default_folder)
+    asked = question.with_quick_values()
     few = beside.device == "auto" and device.suits_processors(asked)
     device.choose("cpu" if few or getattr(asked, "ray", None) else beside.device)
-    asked.checked()
+    asked.validate()
     check_length(beside.film_length)
     _go_on()
     if note := asked.note():
@@ -139,13 +139,13 @@ def carry_out(question: Any, beside: Beside) -> None:
         folder.remove_run(Path(asked.out))
     tqdm.set_lock(threading.RLock())  # of this process alone: no semaphore is left if it is stopped
     film = None
-    with asked.bar() as bar:
+    with asked.progress_bar() as bar:
         _go_on()
         importlib.import_module("scipy.special")  # JAX does, too: in two threads they could meet
-        bar.when_compiled = _import_ahead
-        found = asked.answered(bar)
+        bar.on_compiled = _import_ahead
+        found = asked.execute(bar)
         timed = bar.timing.simulated > 0 and bar.over != "clock"
-        spent = told(bar.timing, device.kind()) if timed else ""
+        spent = timing_line(bar.timing, device.kind()) if timed else ""
         if isinstance(found, Path):
             print(f"{asked.name}: {found}")
             return
@@ -177,7 +177,7 @@ def _report(asked: Any, found: Any, bar: Bar) -> Path:
 
     out = Path(asked.out)
     bar.phase("report")
-    sections = asked.report(found, asked.run_in(out, bar))
+    sections = asked.report(found, asked.create_run(out, bar))
     parts = [asked.intro(found)]
     with contextlib.suppress(InputError):
         parts.append(provenance.describe(out))

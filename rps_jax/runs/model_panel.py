@@ -1,27 +1,24 @@
-"""How much does a success rate hang on the model? The same worlds on every physics that can be
-defended: grounds, cones and steps between which measurements have not decided.
+"""Runs of one plan on a panel of physics models, for the option `models` of a sweep.
 
-A rate has two errors. Its statistical interval says what other worlds would have given; the spread
-over models says what another simulation would have.
+The models are grounds, friction cones and time steps between which measurements do not decide. A
+success rate has two errors: its statistical interval is the effect of other worlds, and its range
+over the models is the effect of another simulation.
 """
 
 import contextlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import xarray as xr
 
-from rps_jax.analysis.report import Section
 from rps_jax.engines import EngineName
 from rps_jax.errors import InputError
 from rps_jax.record import files
-from rps_jax.runs import sweep as sweeps
+from rps_jax.runs.execution import run_plan
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Run, call_of
-from rps_jax.runs.sweep import OfPlan
-from rps_jax.trials.progress import InTurn, Report, unheard
+from rps_jax.runs.question import Run
+from rps_jax.trials.progress import ProgressCallback, SequentialProgress, no_progress
 from rps_jax.world.physics import MUJOCOS_GROUND, preset
 
 _HALVED = replace(preset(), timestep=0.005)
@@ -43,7 +40,7 @@ MODELS = {
 ENGINES: dict[str, EngineName] = {"quasi-static": "quasistatic"}  # of the others that of the sweep
 
 
-def plans(plan: Plan) -> dict[str, Plan]:
+def model_plans(plan: Plan) -> dict[str, Plan]:
     """A sweep on every model that can step its worlds, its own first; the worlds are the same."""
     found = {OWN: plan}
     for name, physics in MODELS.items():
@@ -57,55 +54,26 @@ def plans(plan: Plan) -> dict[str, Plan]:
     return found
 
 
-@dataclass(frozen=True)
-class Models(OfPlan):
-    """Push with every law in the same random worlds on every model of the physics.
-
-    Example:
-      >>> import rps_jax
-      >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=1.0)
-      >>> found = rps_jax.models("rps", drums, worlds=2, setting=rps_jax.Setting(rules=rules))
-      >>> found.sizes["model"]
-      7
-    """
-
-    TITLE: ClassVar[str] = "Random worlds on several models of the physics"
-    SMALL: ClassVar[Mapping[str, Any]] = {"worlds": 24}
-
-    def trials(self) -> int | None:
-        return self.plan.trials * len(plans(self.plan))
-
-    def answer(self, run: Run) -> xr.Dataset:
-        """Outcomes (model, law, world), and what was drawn (world) as coordinates."""
-        return complete(self.plan, run.folder, **run.shape)
-
-    def report(self, found: xr.Dataset, run: Run) -> Sequence[Section]:
-        return sweeps.spread(with_models(found.isel(model=0), found))
-
-
-models = call_of(Models)
-
-
 def with_models(found: xr.Dataset, every: xr.Dataset) -> xr.Dataset:
     """Outcomes (law, world) with the success of the same worlds on every model beside them."""
     success = every.success.assign_coords(model=every.model)
     return found.assign(model_success=success.transpose("model", "law", "world"))
 
 
-def added(found: xr.Dataset, plan: Plan, run: Run) -> xr.Dataset:
+def add_models(found: xr.Dataset, plan: Plan, run: Run) -> xr.Dataset:
     """Outcomes of a plan, and beside them the success of the same worlds on every other model."""
-    every = complete(plan, run.folder, found, **run.shape)
+    every = run_models(plan, run.folder, found, **run.batch_options)
     if run.folder is not None:
         files.write_results(run.folder / "models.nc", every)
     return with_models(found, every)
 
 
-def complete(
+def run_models(
     plan: Plan,
     out: Path | None,
     own: xr.Dataset | None = None,
     *,
-    report: Report = unheard,
+    callback: ProgressCallback = no_progress,
     **shape: Any,
 ) -> xr.Dataset:
     """What a run folder lacks of a sweep on every model, and the whole as (model, law, world).
@@ -113,13 +81,13 @@ def complete(
     The sweep as it was asked for stands in the folder itself, the others in folders of their own
     in it. Its `own` results are not run or read again, if they are at hand.
     """
-    found, heard = {} if own is None else {OWN: own}, InTurn(report)
-    for name, one in plans(plan).items():
+    found, heard = {} if own is None else {OWN: own}, SequentialProgress(callback)
+    for name, one in model_plans(plan).items():
         if name in found:
             continue
         plain = "".join(letter if letter.isalnum() else "_" for letter in name)
         folder = out if out is None or one is plan else out / "models" / plain
-        found[name] = sweeps.whole(one, folder, report=heard, **shape)
-        heard.ended(one.trials)
+        found[name] = run_plan(one, folder, callback=heard, **shape)
+        heard.finish(one.num_trials)
     joined = xr.concat(found.values(), "model", coords="minimal", compat="override")
     return joined.assign_coords(model=list(found))
