@@ -98,7 +98,7 @@ def evaluate(
     device.use_cache_if_asked()
     shown = is_interactive() if progress is None else progress
     with Bar("evaluate", ask.candidates * count, shown=shown and report_to is None) as bar:
-        shape = {"report": report_to or bar, "slots": slots, "workers": workers}
+        shape = {"callback": report_to or bar, "slots": slots, "workers": workers}
         (answer,), _ = score_candidates([ask], [ranges], setting, objective, **shape)
     variables: dict[str, Any] = {
         "score": (("candidate", "world"), answer.score, {"units": "1", "long_name": "objective"})

@@ -77,7 +77,7 @@ class Probe:
         which = self.domain.object_of(at.cases(self.domain, np.arange(len(at.u))))
         away = np.empty(len(at.u))
         jobs = [self._job(at, np.flatnonzero(which == one), away) for one in np.unique(which)]
-        shape = {"slots": self.slots, "workers": self.workers, "report": self._heard}
+        shape = {"slots": self.slots, "workers": self.workers, "callback": self._heard}
         began = time.perf_counter()
         outcome, _ = batch.run_all(jobs, self.setting, len(at.u), **shape)
         found = {name: np.asarray(getattr(outcome, name), float) for name in _KEPT}
