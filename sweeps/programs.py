@@ -16,9 +16,11 @@ import jax
 import numpy as np
 
 from rps_jax import engines
+from rps_jax.control.base import LawParams
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.record import provenance
 from rps_jax.trials import pushes, trial
+from rps_jax.trials.batch import WorldBatch, rows
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Trial, World
@@ -52,12 +54,11 @@ BATCHED = {
 }
 
 
-def timed_worlds(family: str, count: int, setting: Setting) -> tuple[Any, World]:
-    """Stage and worlds (count, ...): the paper's targets under S1, a box, a cylinder or prisms."""
+def timed_worlds(family: str, count: int, setting: Setting) -> WorldBatch:
+    """Return worlds with the paper's targets under S1: of a box, of a cylinder or of prisms."""
     if family == "prism":
         drawn = draws.draw(_PRISMS, 0, np.arange(count))
-        part = drawn_worlds(_PRISMS, drawn, RPSParams.paper(), setting)
-        return part.stage, part.worlds
+        return drawn_worlds(_PRISMS, drawn, setting).with_params(RPSParams.paper())
     targets = paper.TARGETS
     cases = [Case(family, FRICTION["S1"], targets[i % len(targets)], gap=0) for i in range(count)]
     return pushes.build(cases, setting)
@@ -103,18 +104,20 @@ def traced(
       flags: of XLA.
     """
     physics = setting.physics
-    usual, few = timed_worlds(family, len(paper.TARGETS), setting)
-    rows = np.arange(worlds) % len(paper.TARGETS)
-    batch = jax.device_put(jax.tree.map(lambda leaf: leaf[rows], few))
-    start = trial.start_all(batch, np.ones(worlds, bool))
+    few = timed_worlds(family, len(paper.TARGETS), setting)
+    usual, which = few.stage, np.arange(worlds) % len(paper.TARGETS)
+    batch, params = jax.device_put(rows((few.worlds, few.params), which))
+    start = trial.start_all(batch, params, np.ones(worlds, bool))
     shared, steps = stage(usual), round(simulated / physics.control_period)
     began = time.perf_counter()
 
     # A new one: what was jitted before gives back what it has traced for such arguments.
-    def advance(stage: Any, worlds: World, trials: Trial) -> Trial:
-        return trial.advance((stage,), (worlds,), (trials,), ControlLoop(physics), steps)[0]
+    def advance(stage: Any, worlds: World, params: LawParams, trials: Trial) -> Trial:
+        batches = (stage,), (worlds,), (params,), (trials,)
+        return trial.advance(*batches, ControlLoop(physics), steps)[0]
 
-    lowered = jax.jit(advance, donate_argnums=2 if donated else ()).lower(shared, batch, start)
+    given = shared, batch, params, start
+    lowered = jax.jit(advance, donate_argnums=3 if donated else ()).lower(*given)
     tracing = time.perf_counter() - began
 
     def compile_() -> Program:
@@ -124,9 +127,9 @@ def traced(
         needs: Any = program.memory_analysis()
         parts = ("argument", "output", "temp")
         memory = sum(getattr(needs, f"{part}_size_in_bytes") for part in parts)
-        corners = few.footprint.vertices.shape[-2]  # 1 of a cylinder
+        corners = few.worlds.footprint.vertices.shape[-2]  # 1 of a cylinder
         contacts = engines.get(setting.engine).contacts(usual, corners)
-        go = partial(program, shared, batch)
+        go = partial(program, shared, batch, params)
         return Program(
             name, family, worlds, simulated, took, memory, contacts, physics, go, start,
             program.as_text,

@@ -69,9 +69,11 @@ FAST = preset(fidelity="fast")
 
 
 @partial(jax.jit, static_argnames="steps")
-def advance(stage: Any, worlds: Any, trials: Trial, loop: ControlLoop, steps: int) -> Trial:
+def advance(
+    stage: Any, worlds: Any, params: Any, trials: Trial, loop: ControlLoop, steps: int
+) -> Trial:
     """Up to so many control steps of one batch of worlds."""
-    return trial.advance((stage,), (worlds,), (trials,), loop, steps)[0]
+    return trial.advance((stage,), (worlds,), (params,), (trials,), loop, steps)[0]
 
 
 # The fused engine, which compiles soonest of those that solve for contact.

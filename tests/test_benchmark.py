@@ -142,10 +142,10 @@ def test_an_engine_has_the_levers_that_it_knows():
 
 
 def test_without_physics_the_base_goes_and_the_object_stays():
-    _, worlds = pushes.build(
+    _, worlds, _, params = pushes.build(
         [Case("box", FRICTION["S1"], (2.0, 0.0), gap=0)], Setting(engine="mjx")
     )
-    start = trial.motion(trial.start_all(worlds, np.ones(1, bool)))
+    start = trial.motion(trial.start_all(worlds, params, np.ones(1, bool)))
     twists = Twist(*(np.full(1, x) for x in (0.05, 0.0, 0.0)))
     driven = levers.Unmoved().drive(worlds.fields, start, twists, preset())
     moved = np.asarray(driven.motion.qpos - start.qpos)[0]

@@ -2,7 +2,6 @@
 
 import json
 from types import SimpleNamespace
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -110,17 +109,14 @@ def test_antithetic_steps_find_the_slope_of_the_objective():
 def test_windows_begin_where_their_trials_are_by_then(monkeypatch):
     """With trials that only count their steps of 20 ms."""
 
-    class Blank(NamedTuple):
-        params: Any
-
-    monkeypatch.setattr(descent, "start_all", lambda worlds, live, law: jnp.zeros(live.size))
-    monkeypatch.setattr(descent, "control_step", lambda _, worlds, trials, loop: (trials + 1, None))
+    monkeypatch.setattr(descent, "start_all", lambda *given, law: jnp.zeros(given[-1].size))
+    monkeypatch.setattr(descent, "control_step", lambda *given: (given[3] + 1, None))
     monkeypatch.setattr(gradients, "window", lambda *_, **__: lambda thetas, starts: starts[1])
     late = jnp.array([0.0, 0.5, 1.0])
     for within, steps in ((10.0, [0, 250, 500]), (0.0, [0, 0, 0])):
         how = TuneGrad("rps", tuned=("L", "K_h"), within=within, setting=SETTING).how
         scores = descent.scores_of(how, None)
-        np.testing.assert_array_equal(scores(jnp.zeros((3, 2)), (Blank(None), late)), steps)
+        np.testing.assert_array_equal(scores(jnp.zeros((3, 2)), (None, late)), steps)
 
 
 class TestRuns:

@@ -12,7 +12,6 @@ import pytest
 from helpers import same
 
 from rps_jax import engines
-from rps_jax.control import registry
 from rps_jax.engines import mjx as mjx_engine
 from rps_jax.engines.fused import step as fused
 from rps_jax.engines.mjx_colliders import mjx
@@ -88,9 +87,9 @@ def test_the_paper_domain_is_the_papers_grid(engine):
     assert chosen.combinations == 144
     for which, name in enumerate(PAPER_OBJECTS):
         index = np.flatnonzero(chosen.object_of(np.arange(144)) == which)
-        part = drawn_worlds(chosen, draws.draw(chosen, 0, index), registry.LAWS["rps"], setting)
+        part = drawn_worlds(chosen, draws.draw(chosen, 0, index), setting)
         cases = [Case(name, f, t) for f in FRICTION.values() for t in paper.TARGETS]
-        _, worlds = pushes.build(cases, setting)
+        worlds = pushes.build(cases, setting).worlds
         mine, theirs = (w._replace(key=0, odometry=0) for w in (part.worlds, worlds))
         for world in (mine, theirs) if engine == "mjx" else ():
             for field in (".body_pos", ".qpos0", ".qpos_spring"):  # of a body that is free

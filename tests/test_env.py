@@ -188,11 +188,11 @@ def test_it_moves_as_a_trial_that_is_driven_by_the_same_twist(pushing):
         lambda params: (), lambda params, state, obs: (state, constant, Details.from_obs(obs))
     )
     worlds = state.info["world"]
-    trials = trial.start_all(worlds, np.ones(mine.done.size, bool), law=dull)
+    trials = trial.start_all(worlds, (), np.ones(mine.done.size, bool), law=dull)
     loop = trial.ControlLoop(FAST, push.setting.rules, dull)
     alone = replace(NEAR, objects=(push.object,))
     drawn = draws.draw(alone, 0, np.arange(1))
-    stage = drawn_worlds(alone, drawn, push.params, push.setting).stage
+    stage = drawn_worlds(alone, drawn, push.setting).stage
     theirs = advance(stage, worlds, trials, loop, STEPS)
     np.testing.assert_array_equal(mine.data.steps, STEPS)
     np.testing.assert_allclose(mine.data.qpos, theirs.qpos, atol=2e-5)

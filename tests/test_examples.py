@@ -104,7 +104,7 @@ def test_an_object_of_the_paper_that_is_registered_anew_is_the_same_world(name, 
     objects.register_object("mine", path)
     cases = [Case(n, FRICTION["S2"], (2.0, 1.0), mass=m) for n in (name, "mine") for m in (None, 9)]
     for engine in ("fused", "mjx"):
-        _, worlds = pushes.build(cases, Setting(engine=engine))
+        worlds = pushes.build(cases, Setting(engine=engine)).worlds
         for leaf in jax.tree.leaves(worlds._replace(key=None, shift=None)):
             leaf = np.asarray(leaf)
             np.testing.assert_allclose(leaf[:2], leaf[2:], rtol=1e-6, atol=1e-6)
@@ -116,7 +116,7 @@ def test_an_object_of_ones_own_may_be_of_a_domain(hexagon):
     own = Domain(objects=("hexagon",), friction_robot=Range(0.4, 0.5))
     drawn = draws.draw(own, 0, np.arange(5))
     assert (drawn.solid.mass == 12.0).all()
-    part = drawn_worlds(own, drawn, RPSParams.paper(), Setting(engine="fused"))
+    part = drawn_worlds(own, drawn, Setting(engine="fused"))
     assert part.worlds.footprint.vertices.shape == (5, 8, 2)
     plan = Plan(own, 5, {"rps": RPSParams.paper()})
     assert scene_of(plan, 3).model.ngeom == hexagon.model.ngeom

@@ -172,10 +172,11 @@ def test_a_law_is_told_the_force_of_the_push_it_makes(engine):
         outcome, _ = pushes.run([case], setting, workers=1)
         assert outcome.base_pose[0][0] == pytest.approx(0.2, rel=0.1)  # 0.05 m/s: it was felt
         return
-    stage, worlds = pushes.build([case], setting)
+    _, worlds, stage, own = pushes.build([case], setting)
     law = registry.law_of(params)
-    trials = trial.start_all(worlds, np.ones(1, bool), law=law)
-    trials, _ = trial.record(stage, worlds, trials, physics=setting.physics, law=law, steps=200)
+    trials = trial.start_all(worlds, own, np.ones(1, bool), law=law)
+    how = {"physics": setting.physics, "law": law, "steps": 200}
+    trials, _ = trial.record(stage, worlds, own, trials, **how)
     np.testing.assert_allclose(trials.load.wrench[0, 0], -0.3 * 10 * GRAVITY, rtol=0.1)
     np.testing.assert_allclose(trials.load.signal[0, 0], -0.3 * 10 * GRAVITY, rtol=0.1)
 

@@ -92,22 +92,22 @@ def test_operations_are_what_jax_says(each, tmp_path):
 @pytest.mark.parametrize("shape", ["box", "cylinder", "prism"])
 def test_a_control_step_is_the_processors(shape, skin, tmp_path):
     """Whichever worlds a warp has side by side."""
-    stage, worlds, loop, pushing = in_a_push(shape, skin)
+    stage, inputs, loop, pushing = in_a_push(shape, skin)
 
-    def one(world, now):
-        return trial.control_step(stage, world, now, loop, lambda f, *_: f)[0]
+    def one(world, params, now):
+        return trial.control_step(stage, world, params, now, loop, lambda f, *_: f)[0]
 
-    like = jax.tree.map(lambda x: jnp.asarray(x)[0], (worlds, pushing))
+    like = jax.tree.map(lambda x: jnp.asarray(x)[0], (*inputs, pushing))
     run = Emulated(one, like, tmp_path, 4)
-    found = run(worlds, pushing)
-    expected = advanced(stage, worlds, pushing, loop, 1)
+    found = run(*inputs, pushing)
+    expected = advanced(stage, inputs, pushing, loop, 1)
     close(found, expected, warm=4e-3, rest=1e-4)
-    same(found, run(worlds, pushing, order=np.roll(np.arange(21)[::-1], 5)))
+    same(found, run(*inputs, pushing, order=np.roll(np.arange(21)[::-1], 5)))
 
 
 def test_a_control_period_is_the_processors(tmp_path):
     """Of bases whose force is limited, before objects on feet; and what they feel."""
-    stage, worlds, loop, trials = in_a_push("prism", domain="real", feet=Range(0.3, 1.0))
+    stage, (worlds, _), loop, trials = in_a_push("prism", domain="real", feet=Range(0.3, 1.0))
     pushing = trial.motion(trials)
     twists = trial.Twist(*(np.full(21, x, np.float32) for x in (0.05, 0.01, 0.05)))
 

@@ -246,10 +246,11 @@ def test_the_derivative_of_a_window_of_fused_trials_is_its_finite_difference():
     targets = ((1.0, -1.5), (2.0, 0.5), (-1.5, 1.0))
     skin, setting = SmoothSkin(), Setting(engine="fused")
     cases = [Case("cylinder", "S1", t, skin=skin, gap=0.004) for t in targets]
-    stage, worlds = pushes.build(cases, setting)
+    _, worlds, stage, params = pushes.build(cases, setting)
     law = registry.smooth_law(rps.LAW)
-    starts = (worlds, trial.start_all(worlds, np.ones(3, bool), law=law))
-    scores = gradients.window(stage, params_of, final_distance, physics=setting.physics, steps=50)
+    starts = (worlds, trial.start_all(worlds, params, np.ones(3, bool), law=law))
+    loop = trial.ControlLoop(setting.physics, law=law)
+    scores = gradients.window(stage, params_of, final_distance, loop, 50)
     along = jax.jit(lambda thetas, way: jax.jvp(lambda x: scores(x, starts), (thetas,), (way,)))
     theta, h = np.array([0.2, 1.0, 0.12, 0.04], np.float32), 0.01
     slopes, differences = [], []

@@ -33,30 +33,38 @@ def cache(tmp_path):
 
 
 def batch(shape, skin="capacitive", count=21, law="rps_tuned", domain="wide", **drawn):
-    """Stage, worlds and loop of random objects, each at another place before the robot."""
+    """Stage, (worlds, params) and loop of random objects, each at another place."""
     _, params = registry.resolve_law(law)
     domain = replace(DOMAINS[domain], objects=(f"random_{shape}",), skin=skin, **drawn)
-    part = drawn_worlds(domain, draws.draw(domain, 3, np.arange(count)), params, SETTING)
-    worlds = jax.tree.map(jnp.asarray, part.worlds)
-    return part.stage, worlds, ControlLoop(SETTING.physics, SETTING.rules, registry.law_of(params))
+    part = drawn_worlds(domain, draws.draw(domain, 3, np.arange(count)), SETTING)
+    _, worlds, stage, params = jax.tree.map(jnp.asarray, part.with_params(params))
+    return (
+        stage,
+        (worlds, params),
+        ControlLoop(SETTING.physics, SETTING.rules, registry.law_of(params)),
+    )
 
 
-def advanced(stage, worlds, trials, loop, steps):
+def advance(stage, loop, steps):
+    """The function of (worlds, params) and trials that steps them."""
+    return lambda w, p, t: trial.advance((stage,), (w,), (p,), (t,), loop, steps)[0]
+
+
+def advanced(stage, inputs, trials, loop, steps):
     """Trials after some control steps."""
-    run = jax.jit(lambda w, t: trial.advance((stage,), (w,), (t,), loop, steps)[0])
-    return jax.device_get(run(worlds, trials))
+    return jax.device_get(jax.jit(advance(stage, loop, steps))(*inputs, trials))
 
 
-def begun(worlds, loop):
-    return trial.start_all(worlds, jnp.ones(len(worlds.qpos), bool), loop.law)
+def begun(inputs, loop):
+    return trial.start_all(*inputs, jnp.ones(len(inputs[0].qpos), bool), loop.law)
 
 
 def in_a_push(*asked, **drawn):
-    """Stage, worlds and loop as of `batch`, and trials in the middle of a push, after 8 s."""
-    stage, worlds, loop = batch(*asked, **drawn)
-    pushing = advanced(stage, worlds, begun(worlds, loop), loop, 400)
+    """Those of `batch`, and trials in the middle of a push, after 8 s."""
+    stage, inputs, loop = batch(*asked, **drawn)
+    pushing = advanced(stage, inputs, begun(inputs, loop), loop, 400)
     assert np.mean(pushing.contact_steps > 0) > 0.5
-    return stage, worlds, loop, pushing
+    return stage, inputs, loop, pushing
 
 
 def same(one, other):
@@ -75,31 +83,31 @@ def close(one, other, warm, rest):
 @pytest.mark.parametrize("skin", ["capacitive", "ideal"])
 @pytest.mark.parametrize("shape", ["box", "cylinder", "prism"])
 def test_a_control_step_ends_where_xla_ends_it(shape, skin, monkeypatch):
-    stage, worlds, loop, pushing = in_a_push(shape, skin)
-    found = advanced(stage, worlds, pushing, loop, 1)
+    stage, inputs, loop, pushing = in_a_push(shape, skin)
+    found = advanced(stage, inputs, pushing, loop, 1)
     monkeypatch.setenv("RPS_COMPILER", "none")
-    expected = advanced(stage, worlds, pushing, loop, 1)
+    expected = advanced(stage, inputs, pushing, loop, 1)
     close(found, expected, warm=2e-3, rest=2e-5)
 
 
 @pytest.mark.parametrize("shape", ["box", "cylinder", "prism"])
 def test_the_bits_of_a_world_depend_on_no_other_world(shape):
-    stage, worlds, loop = batch(shape)
-    together = advanced(stage, worlds, begun(worlds, loop), loop, 300)
+    stage, inputs, loop = batch(shape)
+    together = advanced(stage, inputs, begun(inputs, loop), loop, 300)
     for order in (np.arange(20, -1, -1), np.array([17]), np.array([5, 17, 5])):
-        some = jax.tree.map(lambda x, order=order: x[order], worlds)
+        some = jax.tree.map(lambda x, order=order: x[order], inputs)
         found = advanced(stage, some, begun(some, loop), loop, 300)
         same(found, jax.tree.map(lambda x, order=order: x[order], together))
 
 
 def test_a_drive_is_compiled_and_its_derivative_is_xlas(monkeypatch):
-    stage, worlds, loop = batch("box", count=3)
-    start = trial.motion(begun(worlds, loop))
+    stage, inputs, loop = batch("box", count=3)
+    start = trial.motion(begun(inputs, loop))
     still = jnp.zeros(3)
 
     def moved(speed):
         twist = trial.Twist(speed, still, still)
-        return stage.drive(worlds.fields, start, twist, loop.physics).motion.qpos[:, 0]
+        return stage.drive(inputs[0].fields, start, twist, loop.physics).motion.qpos[:, 0]
 
     def slope():
         return jax.jit(lambda x: jax.jvp(moved, (x,), (jnp.ones(3),)))(still + 0.05)
@@ -115,25 +123,26 @@ def test_a_drive_is_compiled_and_its_derivative_is_xlas(monkeypatch):
 
 
 def test_without_a_compiler_batches_run_side_by_side_in_one_loop(monkeypatch):
-    stages, worlds, loops = zip(*(batch(shape, count=2) for shape in ("box", "prism")), strict=True)
-    trials = tuple(begun(some, loops[0]) for some in worlds)
+    made = (batch(shape, count=2) for shape in ("box", "prism"))
+    stages, inputs, loops = zip(*made, strict=True)
+    trials = tuple(begun(some, loops[0]) for some in inputs)
     monkeypatch.setenv("RPS_COMPILER", "none")
-    run = jax.make_jaxpr(lambda w, t: trial.advance(stages, w, t, loops[0], 3))
-    primitives = [eqn.primitive.name for eqn in run(worlds, trials).eqns]
+    run = jax.make_jaxpr(lambda w, p, t: trial.advance(stages, w, p, t, loops[0], 3))
+    primitives = [eqn.primitive.name for eqn in run(*zip(*inputs, strict=True), trials).eqns]
     assert primitives.count("while") == 1
 
 
 def test_a_compiler_that_fails_is_told_once_and_xla_steps(monkeypatch, tmp_path, cache):
-    stage, worlds, loop = batch("box", count=2)
+    stage, inputs, loop = batch("box", count=2)
     monkeypatch.setenv("RPS_COMPILER", "none")
-    expected = advanced(stage, worlds, begun(worlds, loop), loop, 3)
+    expected = advanced(stage, inputs, begun(inputs, loop), loop, 3)
     broken = tmp_path / "broken"
     said = 'case "$*" in *-dM*) exit 0;; esac\necho it is broken >&2\nexit 1\n'
     broken.write_text(f"#!/bin/sh\n{said}")
     broken.chmod(0o755)
     monkeypatch.setenv("RPS_COMPILER", str(broken))
     with pytest.warns(UserWarning, match="fails, so XLA compiles: it is broken") as told:
-        found = advanced(stage, worlds, begun(worlds, loop), loop, 3)
+        found = advanced(stage, inputs, begun(inputs, loop), loop, 3)
     assert len({str(one.message) for one in told}) == 1
     same(found, expected)
 
@@ -233,9 +242,8 @@ def test_an_operation_is_what_jax_says(name):
 @pytest.mark.parametrize("skin", ["capacitive", "ideal"])
 @pytest.mark.parametrize("law", ["rps", "nps", "aps", "rps_plus", "pursuit", "dipole"])
 def test_the_loop_of_an_equation_is_compiled_as_a_whole(law, skin):
-    stage, worlds, loop = batch("box", skin, 2, law)
-    run = jax.make_jaxpr(lambda w, t: trial.advance((stage,), (w,), (t,), loop, 3))
-    primitives = str(run(worlds, begun(worlds, loop)))
+    stage, inputs, loop = batch("box", skin, 2, law)
+    primitives = str(jax.make_jaxpr(advance(stage, loop, 3))(*inputs, begun(inputs, loop)))
     assert "rps_native" in primitives
     assert "while" not in primitives
 
@@ -264,8 +272,8 @@ def test_only_the_fused_engine_calls_compiled_functions(engine):
     _, params = registry.resolve_law("rps")
     domain = replace(DOMAINS["wide"], objects=("random_box",))
     setting = Setting(engine)
-    part = drawn_worlds(domain, draws.draw(domain, 3, np.arange(2)), params, setting)
+    part = drawn_worlds(domain, draws.draw(domain, 3, np.arange(2)), setting).with_params(params)
     loop = ControlLoop(setting.physics, setting.rules, registry.law_of(params))
-    worlds = jax.tree.map(jnp.asarray, part.worlds)
-    run = jax.make_jaxpr(lambda w, t: trial.advance((part.stage,), (w,), (t,), loop, 1))
-    assert ("rps_native" in str(run(worlds, begun(worlds, loop)))) == (engine == "fused")
+    inputs = jax.tree.map(jnp.asarray, (part.worlds, part.params))
+    run = jax.make_jaxpr(advance(part.stage, loop, 1))
+    assert ("rps_native" in str(run(*inputs, begun(inputs, loop)))) == (engine == "fused")

@@ -144,7 +144,7 @@ def test_every_law_of_the_package_is_known_again_by_its_functions_and_weights():
 def test_a_model_of_mjx_is_known_again_by_its_numbers(cache):
     """Its static arrays, which JAX names by their addresses, too."""
     setting = Setting("mjx")
-    stages = [pushes.build([Case(name)], setting)[0] for name in ("box", "box", "cylinder")]
+    stages = [pushes.build([Case(name)], setting).stage for name in ("box", "box", "cylinder")]
     said = [repr(programs._said(jax.tree.structure(one))) for one in stages]
     assert said[0] == said[1] != said[2]
     assert programs._place(said[0]) is not None

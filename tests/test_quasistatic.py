@@ -475,20 +475,22 @@ def closed_loop():
             nudges += [RPSParams()._replace(**{name: getattr(RPSParams(), name) * (1 + e)})
                        for e in (1e-5, -1e-5)]  # fmt: skip
         cases = [Case("box", FRICTION["S1"], (1.0, 2.0), p, gap=0.0) for p in nudges]
-        stage, worlds = pushes.build(cases, Setting(engine="quasistatic"))
-        worlds = jax.device_put(worlds)
+        _, worlds, stage, nudged = jax.device_put(
+            pushes.build(cases, Setting(engine="quasistatic"))
+        )
 
         @jax.jit
         @partial(jax.value_and_grad, has_aux=True)
         def run(params):
-            pushed = worlds._replace(params=params)
-            start = trial.start_all(pushed, jnp.ones(len(nudges), bool))
-            one = partial(trial.control_step, stage, pushed, loop=trial.ControlLoop(preset()))
+            start = trial.start_all(worlds, params, jnp.ones(len(nudges), bool))
+            one = partial(
+                trial.control_step, stage, worlds, params, loop=trial.ControlLoop(preset())
+            )
             _, seen = jax.lax.scan(lambda trials, _: one(trials), start, length=150)
             distance = jnp.mean(seen.details.distance, axis=0)
             return jnp.sum(distance), distance
 
-        (_, distance), gradient = run(worlds.params)
+        (_, distance), gradient = run(nudged)
         return jax.device_get(distance), jax.device_get(gradient)
 
 

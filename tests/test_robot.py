@@ -272,5 +272,4 @@ def test_an_ideal_robot_is_the_base_as_it_was():
         [Case("box", FRICTION["S1"], (1.0, 0.5), PAPER, robot=ROBOTS["ideal"])], setting
     )[0]
     jax.tree.map(np.testing.assert_array_equal, plain, named)
-    _, world = pushes.build([Case("box", FRICTION["S1"], (1.0, 0.5))], setting)
-    assert world.robot is None
+    assert pushes.build([Case("box", FRICTION["S1"], (1.0, 0.5))], setting).worlds.robot is None

@@ -109,7 +109,7 @@ def test_a_corner_must_press_harder_on_coarser_taxels():
 
 def test_paper_case_starts_before_the_front_of_its_own_base():
     one = Case("box", FRICTION["S1"], (2.0, 0.0), PAPER, robot=Robot(half_length=0.5))
-    _, worlds = pushes.build([one], Setting(engine="fused"))
+    worlds = pushes.build([one], Setting(engine="fused")).worlds
     assert worlds.qpos[0][JOINTS.object][0] == pytest.approx(0.5 + 0.02 + 0.2, abs=1e-6)
     assert worlds.robot is None  # it has no limits
     assert worlds.skin.shell.half_length == pytest.approx(0.5)

@@ -559,7 +559,7 @@ def test_a_skin_that_is_not_warm_is_refused(value):
 def push(case: Case, law, horizon: float):
     """The trial of a case after `horizon` [s], or at its end."""
     setting = Setting(engine="mujoco", rules=Rules(horizon=horizon))
-    models, worlds = pushes.build([case], setting)
+    _, worlds, models, params = pushes.build([case], setting)
     seen = []
 
     def report(ended, trials, simulated):
@@ -567,7 +567,7 @@ def push(case: Case, law, horizon: float):
         return True
 
     loop = ControlLoop(setting.physics, setting.rules, law)
-    host.run(engines.get("mujoco"), models, worlds, loop, threads=1, callback=report)
+    host.run(engines.get("mujoco"), models, worlds, params, loop, threads=1, callback=report)
     return jax.tree.map(lambda x: np.asarray(x)[0], seen[-1])
 
 

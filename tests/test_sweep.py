@@ -67,7 +67,7 @@ def outcomes(parts, setting=SHORT):
 
 def made(index):
     """Worlds of the domain of boxes."""
-    return drawn_worlds(BOXES, draws.draw(BOXES, 0, index), PAPER, SHORT)
+    return drawn_worlds(BOXES, draws.draw(BOXES, 0, index), SHORT).with_params(PAPER)
 
 
 @pytest.fixture(scope="module")
@@ -93,14 +93,14 @@ def test_late_poses_and_late_commands_are_late_by_as_much(error):
     steps, period = 3, SHORT.physics.control_period
     still = replace(BOXES, **{name: Range(0, 0) for name in domain.of("base")})
     late = replace(still, **{error: Range(steps * period, steps * period)})
-    part = drawn_worlds(late, draws.draw(late, 0, [0]), PAPER, SHORT)
-    world = row(part.worlds, 0)
-    now = jax.tree.map(jnp.asarray, trial.start(world))
+    part = drawn_worlds(late, draws.draw(late, 0, [0]), SHORT).with_params(PAPER)
+    inputs = row((part.worlds, part.params), 0)
+    now = jax.tree.map(jnp.asarray, trial.start(*inputs))
     decide = jax.jit(partial(trial.decide, loop=trial.ControlLoop(SHORT.physics)))
     told, done = [], []
     for step in range(8):
         now = now._replace(qpos=now.qpos.at[2].set(0.01 * step))  # turned by hand
-        now, twist, seen = decide(world, now)
+        now, twist, seen = decide(*inputs, now)
         now = now._replace(steps=now.steps + 1)
         told.append([float(x) for x in seen.twist])
         done.append([float(x) for x in twist])
@@ -119,7 +119,7 @@ def test_a_base_that_errs_by_nothing_is_perfect():
     perfect = replace(CYLINDERS, **nothing)
     assert made(np.arange(2)).worlds.odometry.past.shape[1] > 1
     drawn = draws.draw(perfect, 0, np.arange(6))
-    part = drawn_worlds(perfect, drawn, PAPER, SHORT)
+    part = drawn_worlds(perfect, drawn, SHORT).with_params(PAPER)
     assert part.worlds.odometry.past.shape == (6, 0)
     remembered = part.worlds._replace(
         odometry=part.worlds.odometry._replace(past=np.zeros((6, 4), np.float32))
@@ -135,7 +135,7 @@ def test_flat_boxes_that_nothing_touches_stay_where_they_are():
     """Even in the long steps of `fast`, in which stiffer ground would shake them away."""
     flat = replace(BOXES, size=Range(0.25, 0.35), height=Range(0.3, 0.4), gap=Range(0.05, 0.05))
     still = PAPER._replace(v_approach=0.0)
-    part = drawn_worlds(flat, draws.draw(flat, 0, np.arange(SLOTS)), still, SHORT)
+    part = drawn_worlds(flat, draws.draw(flat, 0, np.arange(SLOTS)), SHORT).with_params(still)
     found = outcomes([part])
     pose = np.array([found[i].object_pose for i in range(SLOTS)])
     assert np.abs(pose[:, :2] - part.worlds.qpos[:, 3:5]).max() < 2e-3  # in 20 s
@@ -149,7 +149,7 @@ def test_a_faster_base_arrives_earlier():
     times = []
     for error in (-0.5, 0.0):
         chosen = replace(quick, velocity_error=Range(error, error))
-        part = drawn_worlds(chosen, draws.draw(chosen, 0, [1]), PAPER, SHORT)
+        part = drawn_worlds(chosen, draws.draw(chosen, 0, [1]), SHORT).with_params(PAPER)
         times.append(outcomes([part])[1].base_pose[0])  # x at the end
     assert times[0] < 0.7 * times[1]
 

@@ -65,14 +65,14 @@ def test_a_short_push_reaches_a_near_target(outcomes):
 def test_a_gpu_that_seldom_asks_who_still_runs_finds_the_same(monkeypatch):
     """As it would be traced there: 40 steps, in which trials end by their horizon, or do not."""
     setting = Setting(engine="quasistatic")
-    stage, worlds = pushes.build([case(), case(AHEAD)], setting)
-    start = trial.start_all(worlds, np.ones(2, bool))
+    _, worlds, stage, params = pushes.build([case(), case(AHEAD)], setting)
+    start = trial.start_all(worlds, params, np.ones(2, bool))
 
     def run(backend):
         monkeypatch.setattr(jax, "default_backend", lambda: backend)
         program = jax.jit(partial(advance.__wrapped__, steps=40))
         loops = [ControlLoop(setting.physics, Rules(horizon=t)) for t in (0.29, 300.0)]
-        return [program(stage, worlds, start, loop) for loop in loops]
+        return [program(stage, worlds, params, start, loop) for loop in loops]
 
     ended, running = seldom = run("gpu")
     assert ended.done.all()
@@ -103,17 +103,17 @@ def test_the_last_trials_of_jobs_end_alike_side_by_side(monkeypatch, most):
 
 
 def test_a_base_may_turn_as_often_as_it_likes_and_not_go_as_far():
-    _, worlds = pushes.build([case()], FUSED)
-    now = trial.start(jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], worlds))
+    part = pushes.build([case()], FUSED)
+    now = trial.start(*jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], part[1::2]))
     for i, value, diverges in ((2, 500.0, False), (2, np.nan, True), (0, 101.0, True)):
         driven = Driven(trial.motion(now)._replace(qpos=now.qpos.at[i].set(value)))
         assert bool(trial.settle(now, now, driven).diverged) == diverges
 
 
 def test_a_shove_happens_once_however_its_time_is_rounded():
-    _, worlds = pushes.build([case()], FUSED)
-    world = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], worlds)
-    start = trial.start(world)
+    part = pushes.build([case()], FUSED)
+    world, params = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], part[1::2])
+    start = trial.start(world, params)
     x = trial.JOINTS.object.start
 
     def moved(time, period, steps):
@@ -156,19 +156,22 @@ def test_contact_lost_for_too_long_ends_a_trial(outcomes):
 
 
 def world_batch(count):
-    stage, worlds = pushes.build([case()] * count, FUSED)
-    return stage, jax.device_put(worlds)
+    _, worlds, stage, params = pushes.build([case()] * count, FUSED)
+    return stage, *jax.device_put((worlds, params))
 
 
 @pytest.fixture(scope="module")
 def advanced():
     """Three healthy worlds beside one whose object starts as NaN, after 0.4 s."""
-    stage, worlds = world_batch(SLOTS)
+    stage, worlds, params = world_batch(SLOTS)
     broken = worlds._replace(qpos=worlds.qpos.at[1, 4].set(jnp.nan))
     live = jnp.ones(SLOTS, bool)
-    healthy = advance(stage, worlds, trial.start_all(worlds, live), ControlLoop(preset()), 20)
-    mixed = advance(stage, broken, trial.start_all(broken, live), ControlLoop(preset()), 20)
-    return healthy, mixed
+
+    def after(some):
+        trials = trial.start_all(some, params, live)
+        return advance(stage, some, params, trials, ControlLoop(preset()), 20)
+
+    return after(worlds), after(broken)
 
 
 def test_a_diverged_world_freezes_and_leaves_the_others_bit_unchanged(advanced):
@@ -183,17 +186,21 @@ def test_a_diverged_world_freezes_and_leaves_the_others_bit_unchanged(advanced):
 
 
 def test_an_object_that_leans_too_far_has_fallen_over_and_ends_its_trial():
-    _, worlds = world_batch(SLOTS)
+    _, worlds, params = world_batch(SLOTS)
     half = np.radians([0.0, 44.0, 46.0, -120.0]) / 2  # about the object's x axis
     qpos = worlds.qpos.at[:, 6].set(np.cos(half)).at[:, 7].set(np.sin(half))
     worlds = worlds._replace(qpos=qpos)
-    trials = trial.start_all(worlds, jnp.ones(SLOTS, bool))
-    seen = jax.vmap(lambda w, t: trial.observe(w, t, physics=preset())[0])(worlds, trials)
+    trials = trial.start_all(worlds, params, jnp.ones(SLOTS, bool))
+
+    def observed(**rules):
+        observe = partial(trial.observe, physics=preset(), **rules)
+        return jax.vmap(lambda *one: observe(*one)[0])(worlds, params, trials)
+
+    seen = observed()
     assert seen.tipped.tolist() == seen.done.tolist() == [False, False, True, True]
     np.testing.assert_array_equal(seen.tipped, seen.tilt > Rules().max_tilt)
     assert not seen.success.any()
-    late = jax.vmap(lambda w, t: trial.observe(w, t, physics=preset(), rules=Rules(max_tilt=3))[0])
-    assert not late(worlds, trials).tipped.any()
+    assert not observed(rules=Rules(max_tilt=3)).tipped.any()
 
 
 def test_the_way_of_the_base_is_its_speed_times_time(outcomes, advanced):
@@ -205,9 +212,9 @@ def test_the_way_of_the_base_is_its_speed_times_time(outcomes, advanced):
 
 
 def test_padding_never_moves_and_a_finished_batch_stops_at_once():
-    stage, worlds = world_batch(SLOTS)
-    trials = trial.start_all(worlds, jnp.zeros(SLOTS, bool))
-    after = advance(stage, worlds, trials, ControlLoop(preset()), 20)
+    stage, worlds, params = world_batch(SLOTS)
+    trials = trial.start_all(worlds, params, jnp.zeros(SLOTS, bool))
+    after = advance(stage, worlds, params, trials, ControlLoop(preset()), 20)
     np.testing.assert_array_equal(after.qpos, worlds.qpos)
     assert (np.asarray(after.steps) == 0).all()
 

@@ -107,16 +107,15 @@ def _shapes(tree: Any) -> Any:
 def world_of(family: str) -> tuple[Any, Any, Any]:
     """Stage, world and trial of a family, all of the paper's but the number of corners."""
     case = Case("cylinder" if family == "cylinder" else "box", "S1", (-2.0, 0.0))
-    stage, worlds = pushes.build([case], SETTING)
-    world = jax.tree.map(lambda x: jnp.asarray(x[0]), worlds)
+    part = pushes.build([case], SETTING)
+    world = jax.tree.map(lambda x: jnp.asarray(x[0]), part.worlds)
     corners = jnp.zeros((FAMILIES[family], 2))
     world = world._replace(
-        params=Arrival(),
         footprint=world.footprint._replace(vertices=corners),
         fields=world.fields._replace(vertices=corners),
     )
-    start = trial.start(world, law=registry.law_of(case.params)._replace(init=lambda _: ()))
-    return stage, world, start
+    law = registry.law_of(case.params)._replace(init=lambda _: ())
+    return part.stage, world, trial.start(world, Arrival(), law)
 
 
 def of_family(family: str) -> list[Routine]:
@@ -127,10 +126,10 @@ def of_family(family: str) -> list[Routine]:
     live = {**dict.fromkeys(own), "fields": None}
     blank = {name: getattr(start, name) for name in BY_HAND}
 
-    def sense(world: Any, told: Any) -> Any:
+    def sense(world: Any, params: Any, told: Any) -> Any:
         full = world._replace(**own)
         told, seen = trial.observe(
-            full, told._replace(**blank), physics=physics, rules=SETTING.rules
+            full, params, told._replace(**blank), physics=physics, rules=SETTING.rules
         )
         placed = trial.outline(full, told.qpos)
         touch = seen.observation._replace(in_contact=seen.reading.contact_type != NONE)
@@ -148,7 +147,7 @@ def of_family(family: str) -> list[Routine]:
     shape = _shapes(start._replace(**BY_HAND))
     twist = Twist(*(jnp.zeros(()),) * 3)
     outline = Outline(jnp.zeros((n, 2)), *(jnp.zeros(()),) * 3)
-    seen = {"world": _shapes(world._replace(**live)), "trial": shape}
+    seen = {"world": _shapes(world._replace(**live)), "params": _shapes(Arrival()), "trial": shape}
     driven = {"fields": _shapes(world.fields), "before": shape, "told": shape}
     return [
         routine(f"borne_{family}", lambda o: (borne(o),), {"outline": _shapes(outline)}, ["made"]),

@@ -182,8 +182,7 @@ def shape_of(grid: str) -> tuple[int, int]:
 
 def of_cases(cases: Sequence[Case], setting: Setting) -> list[Take]:
     """The takes of cases of one kind, labelled by their targets."""
-    stage, worlds = pushes.build(cases, setting)
-    part = WorldBatch(np.arange(len(cases)), worlds, stage)
+    part = pushes.build(cases, setting)
     one = pushes.scene_of(cases[0], setting.physics)
     labels = [f"({x:g}, {y:g}) m" for x, y in (case.target for case in cases)]
     law = registry.law_of(cases[0].params)
@@ -285,10 +284,11 @@ def _frames(
 
 def _shots(take: Take, setting: Setting, every: int) -> Iterator[tuple[bool, list[Shot]]]:
     """Whether all of a take's trials have ended, and what they show, each `every` steps."""
-    worlds = jax.device_put(take.part.worlds)
-    trials = trial.start_all(worlds, np.ones(len(take.labels), bool), law=take.law)
-    given = take.part.stage, worlds, trials, setting, take.law
-    advance = pushes.recorder(*given, steps=every, every=every)
+    part = jax.device_put(take.part)
+    trials = trial.start_all(
+        part.worlds, part.params, np.ones(len(take.labels), bool), law=take.law
+    )
+    advance = pushes.recorder(part, trials, setting, take.law, steps=every, every=every)
     shots: list[Shot] = []
     ended = np.zeros(len(take.labels), bool)
     while True:

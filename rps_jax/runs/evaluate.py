@@ -15,7 +15,6 @@ import xarray as xr
 from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams
-from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.registry import LawLike
 from rps_jax.engines import device
 from rps_jax.errors import InputError
@@ -237,11 +236,11 @@ def score_candidates(
             # As many steps of odometry in all domains let their worlds share a batch.
             past = np.zeros((part.indices.size, longest), part.worlds.odometry.past.dtype)
             odometry = part.worlds.odometry._replace(past=past)
-            worlds = part.worlds._replace(odometry=odometry, params=ask.params)
-            leaves, tree = jax.tree.flatten(worlds)
+            worlds = part.worlds._replace(odometry=odometry)
+            leaves, tree = jax.tree.flatten((worlds, ask.params))
             kind = (tree, *(leaf.shape[1:] for leaf in leaves))
             numbers = first + width * np.arange(count)[:, None] + column
-            jobs.setdefault(kind, []).append(WorldBatch(numbers, worlds, part.stage))
+            jobs.setdefault(kind, []).append(WorldBatch(numbers, worlds, part.stage, ask.params))
     every, timing = batch.run_all(
         list(map(_job, jobs.values())), setting, away.size, callback=callback, **shape
     )
@@ -262,7 +261,7 @@ def world_batches(
         for thing in np.unique(which):
             rows = np.flatnonzero(which == thing)
             drawn = ask.draw(one, rows)
-            part = drawn_worlds(one, drawn, RPSParams(), setting)
+            part = drawn_worlds(one, drawn, setting)
             yield part, d * ask.worlds.size + rows, np.linalg.norm(drawn.p_world_target, axis=1)
 
 
@@ -273,10 +272,10 @@ def _job(every: Sequence[WorldBatch]) -> Job:
     """
 
     def filled() -> Iterator[WorldBatch]:
-        for numbers, worlds, stage in every:
-            for p, own in enumerate(numbers):
-                params = batch.rows(worlds.params, np.full(own.size, p))
-                yield WorldBatch(own, worlds._replace(params=params), stage)
+        for part in every:
+            for p, own in enumerate(part.indices):
+                params = batch.rows(part.params, np.full(own.size, p))
+                yield WorldBatch(own, part.worlds, part.stage, params)
 
     trials = sum(part.indices.size for part in every)
-    return Job(registry.law_of(every[0].worlds.params), trials, filled())
+    return Job(registry.law_of(every[0].params), trials, filled())

@@ -230,4 +230,5 @@ def build_batch(plan: Plan, law: int, index: Any) -> WorldBatch:
 
 def made(plan: Plan, law: int, drawn: Draw) -> WorldBatch:
     """The worlds of a draw, with the parameters of a law."""
-    return drawn_worlds(plan.domain, drawn, list(plan.laws.values())[law], plan.setting)
+    params = list(plan.laws.values())[law]
+    return drawn_worlds(plan.domain, drawn, plan.setting).with_params(params)

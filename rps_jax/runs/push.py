@@ -267,8 +267,7 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
 
     def answer(self, run: Run) -> Trace:
         case, setting = self.case, self.setting
-        stage, worlds = pushes.build([case], setting)
-        part = WorldBatch(np.arange(1), worlds, stage)
+        part = pushes.build([case], setting)
         followed = self.followed(part, registry.law_of(case.params), setting, run)
         scene = pushes.scene_of(case, setting.physics)
         return Trace(followed, scene, case.title, setting.engine)

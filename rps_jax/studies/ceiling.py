@@ -206,13 +206,14 @@ class Ceiling(DomainQuestion[xr.Dataset]):
     ) -> Iterator[WorldBatch]:
         """The trials of the worlds `rows`, which are of one object, made when they are needed."""
         plan = self.plan
-        part = drawn_worlds(plan.domain, draw(plan, numbers[rows]), RPSParams.tuned(), plan.setting)
+        part = drawn_worlds(plan.domain, draw(plan, numbers[rows]), plan.setting)
+        part = part.with_params(RPSParams.tuned())
         trials = (rows[:, None] * self.samples + np.arange(self.samples)).ravel()
-        worlds = batch.rows(part.worlds, np.repeat(np.arange(rows.size), self.samples))
+        repeated = np.repeat(np.arange(rows.size), self.samples)
+        worlds, params = batch.rows((part.worlds, part.params), repeated)
         steps = max(1, round(self.hold / plan.setting.physics.control_period))
         each: Any = np.full(trials.size, steps, flat.dtype)
-        params = GuidedParams(worlds.params, flat[trials], each)
-        yield WorldBatch(trials, worlds._replace(params=params), part.stage)
+        yield WorldBatch(trials, worlds, part.stage, GuidedParams(params, flat[trials], each))
 
     def intro(self, results: xr.Dataset) -> str:
         where = "the domain, kept for testing" if self.run is None else str(self.run)

@@ -94,7 +94,7 @@ class Probe:
         away[rows] = np.linalg.norm(drawn.p_world_target, axis=1)
 
         def made() -> Iterator[WorldBatch]:
-            yield drawn_worlds(self.domain, drawn, self.params, self.setting)
+            yield drawn_worlds(self.domain, drawn, self.setting).with_params(self.params)
 
         # Few different sizes, since each is a program of its own: powers of four.
         size = _SLOTS

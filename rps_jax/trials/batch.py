@@ -21,7 +21,7 @@ from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from rps_jax import engines, errors
-from rps_jax.control.base import Law
+from rps_jax.control.base import Law, LawParams
 from rps_jax.engines import programs
 from rps_jax.trials import host, trial
 from rps_jax.trials.progress import Progress, ProgressCallback, Timing, no_progress
@@ -43,6 +43,13 @@ class WorldBatch(NamedTuple):
     indices: np.ndarray  # (n,) indices of the trials in the run
     worlds: World  # leaves (n, ...), on the host
     stage: Any
+    params: Any = ()  # `LawParams` with leaves (n, ...), on the host; () if not yet known
+
+    def with_params(self, params: LawParams) -> WorldBatch:
+        """Return the trials with the same law parameters in every world."""
+        count, dtype = self.indices.size, jnp.result_type(float)
+        same = jax.tree.map(lambda x: np.full((count, *np.shape(x)), x, dtype), params)
+        return self._replace(params=same)
 
 
 class Job(NamedTuple):
@@ -168,8 +175,8 @@ def _run_on_host(job: Job, setting: Setting, threads: int, shared: _Shared) -> N
         if shared.stop:
             return
         loop = ControlLoop(setting.physics, setting.rules, job.law)
-        engine = engines.get(setting.engine)
-        host.run(engine, part.stage, part.worlds, loop, threads=max(1, threads), callback=tell)
+        engine, threads = engines.get(setting.engine), max(1, threads)
+        host.run(engine, part.stage, part.worlds, part.params, loop, threads=threads, callback=tell)
 
 
 # --- on a device -----------------------------------------------------------------------------
@@ -261,13 +268,13 @@ class _Batch:
         return jax.device_put(tree, self.sharding)
 
     def _compile(self) -> Any:
-        worlds = [
-            jax.tree.map(partial(self._batched, slots), queue.like.worlds)
+        inputs = [
+            jax.tree.map(partial(self._batched, slots), _inputs(queue.like))
             for queue, slots in zip(self.queues, self.slots, strict=True)
         ]
         masks = tuple(jax.ShapeDtypeStruct((n,), bool, sharding=self.sharding) for n in self.slots)
         stages, rules = jax.eval_shape(lambda: (self.stages, self.setting.rules))
-        shapes = (stages, tuple(worlds), self.blank, masks, masks, rules)
+        shapes = (stages, tuple(inputs), self.blank, masks, masks, rules)
         leaves, tree = jax.tree.flatten(shapes)
         return _compiled(self.setting.physics, self.law, self.sharding, tree, tuple(leaves))
 
@@ -276,8 +283,8 @@ class _Batch:
         """Shapes of the trials of each queue."""
         start, found = partial(trial.start_all, law=self.law), []
         for queue, slots in zip(self.queues, self.slots, strict=True):
-            one = jax.tree.map(partial(self._batched, 1), queue.like.worlds)
-            like = jax.eval_shape(start, one, jax.ShapeDtypeStruct((1,), bool))
+            one = jax.tree.map(partial(self._batched, 1), _inputs(queue.like))
+            like = jax.eval_shape(start, *one, jax.ShapeDtypeStruct((1,), bool))
             found.append(jax.tree.map(partial(self._batched, slots), like))
         return tuple(found)
 
@@ -300,16 +307,20 @@ def _compiled(
 
     def advance(
         stages: tuple[Any, ...],
-        worlds: tuple[World, ...],
+        inputs: tuple[tuple[World, LawParams], ...],
         trials: tuple[Trial, ...],
         fresh: tuple[jax.Array, ...],
         live: tuple[jax.Array, ...],
         rules: Rules,
     ) -> tuple[tuple[Trial, ...], tuple[tuple[jax.Array, jax.Array, Outcome], ...]]:
-        started = [trial.start_all(*each, law=law) for each in zip(worlds, live, strict=True)]
+        worlds, params = zip(*inputs, strict=True)
+        every = zip(worlds, params, live, strict=True)
+        started = [trial.start_all(*each, law=law) for each in every]
         begun = tuple(map(_pick, fresh, started, trials))
         steps = max(1, round(SEGMENT / physics.control_period))
-        after = trial.advance(stages, worlds, begun, ControlLoop(physics, rules, law), steps)
+        after = trial.advance(
+            stages, worlds, params, begun, ControlLoop(physics, rules, law), steps
+        )
         # Of the same program: one of its own would wait for the other workers' segments.
         return after, tuple(
             (one.steps, one.done, trial.outcome(one, physics.control_period)) for one in after
@@ -335,11 +346,17 @@ def rows(tree: Any, which: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[which], tree)
 
 
+def _inputs(part: WorldBatch) -> tuple[World, LawParams]:
+    """Return what differs between the trials of a part."""
+    return part.worlds, part.params
+
+
 def _cut(part: WorldBatch, count: int) -> tuple[WorldBatch, WorldBatch | None]:
     """The first `count` trials of a part, and the others if there are any."""
 
     def piece(which: slice) -> WorldBatch:
-        return WorldBatch(part.indices[which], rows(part.worlds, which), part.stage)
+        worlds, params = rows(_inputs(part), which)
+        return WorldBatch(part.indices[which], worlds, part.stage, params)
 
     over = part.indices.size > count
     return piece(slice(count)), piece(slice(count, None)) if over else None
@@ -360,16 +377,16 @@ class _Slots:
         self._numbers = np.zeros(slots, np.int64)
         self.live = np.zeros(slots, bool)
         self._before = np.zeros(slots, int)  # steps at the last look
-        like = queue.like.worlds
+        like = _inputs(queue.like)
         self._host = jax.tree.map(lambda leaf: np.repeat(leaf[:1], slots, axis=0), like)
         self._fresh = np.ones(slots, bool)  # begin with the next segment
         blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), batch.blank[number])
         self.trials = batch.put(blank)
         if not (aside := queue.aside if resumed else ()):
-            self.worlds = self._put(np.arange(slots), queue.take(slots))
+            self.inputs = self._put(np.arange(slots), queue.take(slots))
             return
         parts, states, fresh = zip(*aside, strict=True)
-        self.worlds = self._put(np.arange(slots), parts)
+        self.inputs = self._put(np.arange(slots), parts)
         running = jax.tree.map(lambda *leaves: np.concatenate(leaves), *states)
         # What fills the other slots has ended.
         which = np.resize(np.arange(len(running.steps)), slots)
@@ -377,25 +394,25 @@ class _Slots:
         self._before = running.steps.copy()
         self.trials = batch.put(running._replace(done=~self.live))
 
-    def _put(self, at: np.ndarray, taken: Sequence[WorldBatch]) -> World:
-        """Put trials into the first of the slots `at`; returns all worlds."""
+    def _put(self, at: np.ndarray, taken: Sequence[WorldBatch]) -> tuple[World, LawParams]:
+        """Put trials into the first of the slots `at`; return the inputs of all slots."""
         ends = np.cumsum([0, *(part.indices.size for part in taken)])
         at = at[: ends[-1]]
         for part, slots in zip(taken, np.split(at, ends[1:-1]) if taken else (), strict=True):
             self._numbers[slots] = part.indices
             for mine, theirs in zip(
-                jax.tree.leaves(self._host), jax.tree.leaves(part.worlds), strict=True
+                jax.tree.leaves(self._host), jax.tree.leaves(_inputs(part)), strict=True
             ):
                 mine[slots] = theirs
         self.live[at], self._before[at] = True, 0
         # A copy: the device may otherwise share the host's memory, which the next call changes.
         return self._batch.put(jax.tree.map(np.copy, self._host))
 
-    def give(self) -> tuple[World, Trial, Any, Any]:
+    def give(self) -> tuple[tuple[World, LawParams], Trial, Any, Any]:
         """What the program takes; what is fresh then begins."""
         masks = self._batch.put((self._fresh.copy(), self.live.copy()))
         self._fresh[:] = False
-        return self.worlds, self.trials, *masks
+        return self.inputs, self.trials, *masks
 
     def look(self, steps: np.ndarray, done: np.ndarray, outcomes: Outcome) -> tuple[Any, ...]:
         """What `_Shared.add` takes of a segment; what ended in it makes room."""
@@ -406,14 +423,15 @@ class _Slots:
         self._before = steps.copy()
         self.live[at] = False
         if taken := self._queue.take(at.size):
-            self.worlds = self._put(at, taken)
+            self.inputs = self._put(at, taken)
             self._fresh[at] = self.live[at]
         return ended
 
     def set_aside(self) -> None:
         """Hand what runs over to the queue."""
         if (at := np.flatnonzero(self.live)).size:
-            part = WorldBatch(self._numbers[at], rows(self._host, at), self._queue.like.stage)
+            worlds, params = rows(self._host, at)
+            part = WorldBatch(self._numbers[at], worlds, self._queue.like.stage, params)
             trials = rows(jax.device_get(self.trials), at)
             self._queue.aside.append((part, trials, self._fresh[at]))
 

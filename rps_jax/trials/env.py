@@ -136,7 +136,7 @@ class PushEnv:
 
     def begin(self, world: World, index: jax.Array) -> State:
         """A world, of the index or one that was made of it, at its start."""
-        before = trial.start(world)
+        before = trial.start(world, self.params)
         never_felt = jnp.full_like(before.min_distance, jnp.inf)
         now, seen = self._observe(world, before._replace(law_state=never_felt))
         nothing = jnp.zeros_like(now.min_distance)
@@ -191,7 +191,7 @@ class PushEnv:
     def _observe(self, world: World, before: Trial) -> tuple[Trial, Measurement]:
         """Sense and judge, unless the trial has ended."""
         physics, rules = self.setting.physics, self.setting.rules
-        told, seen = trial.observe(world, before, physics=physics, rules=rules)
+        told, seen = trial.observe(world, self.params, before, physics=physics, rules=rules)
         felt = jnp.where(seen.reading.in_contact, seen.distance, before.law_state)
         told = told._replace(law_state=felt)
         return jax.tree.map(lambda a, b: jnp.where(before.done, a, b), before, told), seen
@@ -261,7 +261,7 @@ class PushEnv:
     @functools.cached_property
     def _part(self) -> WorldBatch:
         """All worlds, on the device."""
-        part = drawn_worlds(self._alone, self._drawn, self.params, self.setting)
+        part = drawn_worlds(self._alone, self._drawn, self.setting)
         return part._replace(worlds=jax.tree.map(jnp.asarray, part.worlds))
 
     @functools.cached_property

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from rps_jax.control.base import LawParams
 from rps_jax.engines.base import Driven, Engine, Motion
 from rps_jax.trials import trial
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
@@ -17,7 +18,7 @@ from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
 _LOOK = 500  # control steps between two reports
 
 
-_decide = jax.jit(jax.vmap(trial.decide, (0, 0, None)))
+_decide = jax.jit(jax.vmap(trial.decide, (0, 0, 0, None)))
 _settle = jax.jit(jax.vmap(trial.settle))
 
 
@@ -25,6 +26,7 @@ def run(
     engine: Engine,
     stage: Any,
     worlds: World,
+    params: LawParams,
     loop: ControlLoop,
     *,
     threads: int,
@@ -40,14 +42,14 @@ def run(
     physics, law = loop.physics, loop.law
     count = len(worlds.qpos)
     host = jax.devices("cpu")[0]  # where the engine is
-    worlds = jax.device_put(worlds, host)
-    trials = trial.start_all(worlds, np.ones(count, bool), law=law)
+    worlds, params = jax.device_put((worlds, params), host)
+    trials = trial.start_all(worlds, params, np.ones(count, bool), law=law)
     batch = engine.stepper(stage, np.asarray(trials.qpos, float), threads, trial.pushing(worlds))
     try:
         told_of = np.zeros(count, bool)
         before, passes, dtype = 0, 0, trials.qpos.dtype
         while not told_of.all():
-            told, twist, seen = _decide(worlds, trials, loop)
+            told, twist, seen = _decide(worlds, params, trials, loop)
             now = np.asarray(told.qpos)
             watch(passes, seen)
             going = np.flatnonzero(~np.asarray(told.done))

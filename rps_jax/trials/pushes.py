@@ -80,8 +80,8 @@ def _start_of(case: Case, at: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 def build(
     cases: Sequence[Case], setting: Setting, indices: Sequence[int] | None = None
-) -> tuple[Any, World]:
-    """Stage and worlds of cases of one kind (see `kind`), on the host: leaves (len(cases), ...).
+) -> WorldBatch:
+    """Return the worlds of cases of one kind (see `kind`), on the host: leaves (len(cases), ...).
 
     Each world draws its skin's imperfections from (setting.seed, its index); by default the
     indices count from 0.
@@ -99,7 +99,6 @@ def build(
         fields=jax.tree.map(lambda leaf: np.asarray(leaf, dtype), fields),
         footprint=_stack([s.footprint for s in scenes], dtype, which),
         skin=_stack([case.sensor for case in cases], dtype),
-        params=_stack([case.params for case in cases], dtype),
         p_world_target=_stack([target for _, target in starts], dtype),
         shift=Shift(
             _stack([case.shift.time for case in cases], dtype),
@@ -110,7 +109,7 @@ def build(
         odometry=_stack([Odometry()] * len(cases), dtype),
         robot=None if cases[0].base.ideal else _stack([case.base for case in cases], dtype),
     )
-    return stage, world
+    return WorldBatch(numbers, world, stage, _stack([case.params for case in cases], dtype))
 
 
 def kind(case: Case) -> Hashable:
@@ -147,8 +146,7 @@ def run(
         kinds.setdefault(kind(cases[i]), []).append(i)
     for indices in kinds.values():
         mine = [cases[i] for i in indices]
-        stage, worlds = build(mine, setting, indices)
-        part = WorldBatch(np.array(indices), worlds, stage)
+        part = build(mine, setting, indices)
         jobs.append(Job(registry.law_of(mine[0].params), len(mine), [part]))
     return batch.run_all(jobs, setting, len(cases), **shape)
 
@@ -161,8 +159,7 @@ def record_cases(
     callback: ProgressCallback = no_progress,
 ) -> list[Trajectory]:
     """Run trials of one kind to their ends and keep what they looked like every `interval` [s]."""
-    stage, worlds = build(cases, setting)
-    part = WorldBatch(np.arange(len(cases)), worlds, stage)
+    part = build(cases, setting)
     law = registry.law_of(cases[0].params)
     return record_batch(part, law, setting, interval=interval, callback=callback)
 
@@ -181,10 +178,10 @@ def record_batch(
     if not engines.get(setting.engine).traced:
         return _followed(part, *_follow_on_host(part, law, setting, every, callback))
     steps = every * max(1, round(SEGMENT / (every * period)))
-    worlds = jax.device_put(part.worlds)
-    trials = trial.start_all(worlds, np.ones(part.indices.size, bool), law=law)
+    part = jax.device_put(part)
+    trials = trial.start_all(part.worlds, part.params, np.ones(part.indices.size, bool), law=law)
     began = time.perf_counter()
-    record = recorder(part.stage, worlds, trials, setting, law, steps=steps, every=every)
+    record = recorder(part, trials, setting, law, steps=steps, every=every)
     compiled = time.perf_counter()
     parts = []
     while True:
@@ -202,7 +199,7 @@ def record_batch(
 
 
 def recorder(
-    stage: Any, worlds: World, trials: Trial, setting: Setting, law: Law, *, steps: int, every: int
+    part: WorldBatch, trials: Trial, setting: Setting, law: Law, *, steps: int, every: int
 ) -> Callable[[Trial], tuple[Trial, Snapshot, Outcome]]:
     """`trial.record` of a batch and how its trials stand then, compiled, or kept by a process."""
     own = {"physics": setting.physics, "law": law, "steps": steps, "every": every}
@@ -212,10 +209,11 @@ def recorder(
         after, snapshots = trial.record(*batch, rules=rules, **own)
         return after, snapshots, trial.outcome(after, setting.physics.control_period)
 
-    given = stage, worlds, trials, setting.rules
+    inputs = part.stage, part.worlds, part.params
+    given = *inputs, trials, setting.rules
     static = (setting.physics, steps, every)
-    program = programs.compiled(record, given, law=law, donate=2, static=static)
-    return lambda now: program(stage, worlds, now, setting.rules)
+    program = programs.compiled(record, given, law=law, donate=3, static=static)
+    return lambda now: program(*inputs, now, setting.rules)
 
 
 def _follow_on_host(
@@ -241,6 +239,7 @@ def _follow_on_host(
         engines.get(setting.engine),
         part.stage,
         part.worlds,
+        part.params,
         ControlLoop(setting.physics, setting.rules, law),
         threads=1 if part.indices.size == 1 else provenance.count_processors(),
         callback=tell,
@@ -262,7 +261,7 @@ def _followed(
             rows(outcomes, i),
             timing,
             (float(part.worlds.p_world_target[i][0]), float(part.worlds.p_world_target[i][1])),
-            rows(part.worlds.params, i),
+            rows(part.params, i),
             _half(rows(part.worlds.skin.shell, i)),
             _outline(rows(part.worlds.footprint, i)),
         )

@@ -16,7 +16,7 @@ import numpy as np
 
 from rps_jax import engines, errors
 from rps_jax.control import registry
-from rps_jax.control.base import Law
+from rps_jax.control.base import Law, LawParams
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.skin import CapacitiveSkin
 from rps_jax.trials import pushes, trial
@@ -52,14 +52,14 @@ class Live:
         engines.get(setting.engine).check_traced()
         self._stage, self._loop = part.stage, ControlLoop(setting.physics, setting.rules, law)
         self._first: World = rows(part.worlds, slice(1))
+        self._params = rows(part.params, slice(1))
         self.past: list[Moment] = []
         self.reset()
 
     @classmethod
     def of_case(cls, case: Case, setting: Setting) -> Live:
         """The trial of a case."""
-        stage, worlds = pushes.build([case], setting)
-        return cls(WorldBatch(np.arange(1), worlds, stage), registry.law_of(case.params), setting)
+        return cls(pushes.build([case], setting), registry.law_of(case.params), setting)
 
     # --- what it is now ---
 
@@ -88,7 +88,7 @@ class Live:
     def reset(self) -> None:
         """Back to the start, and the target with it."""
         self._worlds = self._first
-        started = trial.start_all(self._worlds, np.ones(1, bool), law=self._loop.law)
+        started = trial.start_all(self._worlds, self._params, np.ones(1, bool), law=self._loop.law)
         self._now: Trial = jax.device_get(started)
         self.past.clear()
 
@@ -96,7 +96,7 @@ class Live:
         """Some control periods, fewer if the trial ends before."""
         while count > 0 and not self.done:
             some = min(count, CHUNK)
-            made = _steps(self._stage, self._worlds, self._now, some, self._loop)
+            made = _steps(self._stage, self._worlds, self._params, self._now, some, self._loop)
             self._now, kept = jax.device_get(made)
             some -= int(kept[0].done[:some].sum())  # it ended before these
             self.past += [Moment(self._worlds, *rows(kept, i)) for i in range(some)]
@@ -151,12 +151,12 @@ class Live:
 
 @jax.jit
 def _steps(
-    stage: Any, worlds: World, trials: Trial, count: int, loop: ControlLoop
+    stage: Any, worlds: World, params: LawParams, trials: Trial, count: int, loop: ControlLoop
 ) -> tuple[Trial, tuple[Trial, Snapshot, jax.Array, jax.Array]]:
     """Up to CHUNK control steps of a world (1, ...), and what each was: rows (CHUNK, ...)."""
 
     def one(trials: Trial) -> tuple[Trial, Any]:
-        after, seen = trial.control_step(stage, worlds, trials, loop)
+        after, seen = trial.control_step(stage, worlds, params, trials, loop)
         placed = jax.vmap(trial.outline)(worlds, seen.qpos)
         compression = jax.vmap(_compression)(worlds.skin, placed)
         contact = trial.p_world_contact(seen)

@@ -83,12 +83,11 @@ class Shift(NamedTuple):
 
 
 class World(NamedTuple):
-    """What makes one world; every leaf is batched."""
+    """Object, robot, sensors and task of one world; every leaf is batched."""
 
     fields: Any  # for its engine's stage
     footprint: Footprint
     skin: Skin
-    params: LawParams
     p_world_target: Float[Array, "*B 2"]  # [m]
     shift: Shift
     qpos: Float[Array, "*B 10"]  # at the start, as in `Trial`
@@ -165,14 +164,14 @@ def p_world_contact(seen: Snapshot) -> Float[Array, "T 2"]:
     return jnp.where((seen.reading.contact_type != NONE)[:, None], point, jnp.nan)
 
 
-def start(world: World, law: Law = rps.LAW) -> Trial:
+def start(world: World, params: LawParams, law: Law = rps.LAW) -> Trial:
     """The trial of a world before its first control step."""
     zero, false = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
     return Trial(
         qpos=world.qpos,
         qvel=jnp.zeros_like(world.qpos[:9]),
         warmstart=jnp.zeros_like(world.qpos[:9]),
-        law_state=law.init(world.params),
+        law_state=law.init(params),
         skin=world.skin.init(world.key),
         poses=jnp.tile(world.qpos[JOINTS.base], (*world.odometry.past.shape, 1)),
         twists=jnp.zeros((*world.odometry.past.shape, 3), world.qpos.dtype),
@@ -240,7 +239,7 @@ class Measurement(NamedTuple):
 
 
 def observe(
-    world: World, trial: Trial, *, physics: Physics, rules: Rules = Rules()
+    world: World, params: LawParams, trial: Trial, *, physics: Physics, rules: Rules = Rules()
 ) -> tuple[Trial, Measurement]:
     """The first half of `decide`: sense and judge.
 
@@ -259,7 +258,7 @@ def observe(
 
     touch = reading.contact_type != NONE
     lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
-    success = touch & (distance < world.params.d_success)
+    success = touch & (distance < params.d_success)
     tilt = planar.tilt(trial.qpos[JOINTS.object][3:])
     tipped = tilt > rules.max_tilt
     over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost) | tipped
@@ -295,13 +294,15 @@ def execute(world: World, trial: Trial, twist: Twist, period: float) -> tuple[Tr
     return trial, Twist(*drive.carried_out(world.robot, aim))
 
 
-def decide(world: World, trial: Trial, loop: ControlLoop) -> tuple[Trial, Twist, Snapshot]:
+def decide(
+    world: World, params: LawParams, trial: Trial, loop: ControlLoop
+) -> tuple[Trial, Twist, Snapshot]:
     """What happens between two control periods of one world: sense, judge, decide.
 
     Returns the trial as it is driven on, or ended; the twist carried out; and what was seen.
     """
     period, law = loop.physics.control_period, loop.law
-    told, seen = observe(world, trial, physics=loop.physics, rules=loop.rules)
+    told, seen = observe(world, params, trial, physics=loop.physics, rules=loop.rules)
     observation: Any = seen.observation
     if not law.smooth:
         observation = observation._replace(in_contact=seen.reading.contact_type != NONE)
@@ -315,7 +316,7 @@ def decide(world: World, trial: Trial, loop: ControlLoop) -> tuple[Trial, Twist,
     if told.load is not None:
         felt, force = law.cell.read(told.load, world.key, told.steps, period)
         told, observation = told._replace(load=felt), ForceObservation(observation, force)
-    state, twist, details = law.step(world.params, trial.law_state, observation)
+    state, twist, details = law.step(params, trial.law_state, observation)
     snapshot = Snapshot(trial.steps * period, told.qpos, seen.reading, twist, details, trial.done)
     told, twist = execute(world, told._replace(law_state=state), twist, period)
     return told, twist, snapshot
@@ -351,6 +352,7 @@ def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
 def control_step(
     stage: Stage,
     worlds: World,
+    params: LawParams,
     trials: Trial,
     loop: ControlLoop,
     mapped: Callable[..., Any] = jax.vmap,
@@ -359,7 +361,7 @@ def control_step(
 
     Of one world alone, where a stage drives that, `mapped` gives back what it is given.
     """
-    told, twists, snapshots = mapped(decide, (0, 0, None))(worlds, trials, loop)
+    told, twists, snapshots = mapped(decide, (0, 0, 0, None))(worlds, params, trials, loop)
     asked = loop.law.senses == "force"
     driven = stage.drive(worlds.fields, motion(told), twists, loop.physics, pushing(worlds), asked)
     return mapped(settle)(trials, told, driven), snapshots
@@ -399,9 +401,11 @@ def outcome(trial: Trial, period: float) -> Outcome:
 
 
 @partial(jax.jit, static_argnames=("law",))
-def start_all(worlds: World, live: Bool[Array, " B"], law: Law = rps.LAW) -> Trial:
+def start_all(
+    worlds: World, params: LawParams, live: Bool[Array, " B"], law: Law = rps.LAW
+) -> Trial:
     """Trials of a batch of worlds; those not `live` are padding, ended from the start."""
-    trials = jax.vmap(partial(start, law=law))(worlds)
+    trials = jax.vmap(partial(start, law=law))(worlds, params)
     return trials._replace(done=~live)
 
 
@@ -411,6 +415,7 @@ _UNASKED = 20  # control steps of a GPU between two looks at whether any trial r
 def advance(
     stages: tuple[Stage, ...],
     worlds: tuple[World, ...],
+    params: tuple[LawParams, ...],
     trials: tuple[Trial, ...],
     loop: ControlLoop,
     steps: int,
@@ -420,26 +425,27 @@ def advance(
     Each batch is of a stage and a shape family of its own.
     """
     if not (all(getattr(stage, "native", False) for stage in stages) and native.is_available()):
-        return _side_by_side(stages, worlds, trials, loop, steps)
+        return _side_by_side(stages, worlds, params, trials, loop, steps)
 
-    def one(stage: Stage, world: World, now: Trial, rules: Any) -> Trial:
+    def one(stage: Stage, world: World, params: LawParams, now: Trial, rules: Any) -> Trial:
         def on(carry: tuple[Any, Trial]) -> tuple[Any, Trial]:
             own = dataclasses.replace(loop, rules=rules)
-            return carry[0] + 1, control_step(stage, world, carry[1], own, lambda f, *_: f)[0]
+            after, _ = control_step(stage, world, params, carry[1], own, lambda f, *_: f)
+            return carry[0] + 1, after
 
         return jax.lax.while_loop(lambda c: (c[0] < steps) & ~c[1].done, on, (0, now))[1]
 
     def whole(*given: Any) -> tuple[Trial, ...]:
-        some, now, rules = zip(*given, strict=True)
+        some, params, now, rules = zip(*given, strict=True)
         own = dataclasses.replace(loop, rules=jax.tree.map(lambda x: x[0], rules[0]))
-        return _side_by_side(stages, some, now, own, steps)
+        return _side_by_side(stages, some, params, now, own, steps)
 
     given = [
-        (some, now, jax.tree.map(lambda x, n=now.done.size: jnp.full(n, x, float), loop.rules))
-        for some, now in zip(worlds, trials, strict=True)
+        (some, own, now, jax.tree.map(lambda x, n=now.done.size: jnp.full(n, x, float), loop.rules))
+        for some, own, now in zip(worlds, params, trials, strict=True)
     ]
 
-    def phase(some: World, now: Trial, rules: Any) -> Any:
+    def phase(some: World, params: LawParams, now: Trial, rules: Any) -> Any:
         """Those that push, those that are still on their way, and those that have ended."""
         return 2 * now.done + (now.contact_steps == 0)
 
@@ -450,6 +456,7 @@ def advance(
 def _side_by_side(
     stages: tuple[Stage, ...],
     worlds: tuple[World, ...],
+    params: tuple[LawParams, ...],
     trials: tuple[Trial, ...],
     loop: ControlLoop,
     steps: int,
@@ -461,7 +468,7 @@ def _side_by_side(
         return (count < steps) & ~jnp.all(jnp.stack([jnp.all(each.done) for each in batches]))
 
     def on(_, batches):
-        every = zip(stages, worlds, batches, strict=True)
+        every = zip(stages, worlds, params, batches, strict=True)
         return tuple(control_step(*each, loop)[0] for each in every)
 
     # A GPU waits for the host whenever it is asked whether any still runs.
@@ -479,6 +486,7 @@ def _side_by_side(
 def record(
     stage: Stage,
     worlds: World,
+    params: LawParams,
     trials: Trial,
     *,
     physics: Physics,
@@ -491,7 +499,7 @@ def record(
     loop = ControlLoop(physics, rules, law)
 
     def body(trials, _):
-        return control_step(stage, worlds, trials, loop)
+        return control_step(stage, worlds, params, trials, loop)
 
     def interval(trials, _):
         trials, snapshots = jax.lax.scan(body, trials, length=every)

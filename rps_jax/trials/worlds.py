@@ -7,8 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import engines
-from rps_jax.control import registry
-from rps_jax.control.base import LawParams
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.base import Odometry
@@ -23,13 +21,12 @@ from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction, Scene
 
 
-def drawn_worlds(domain: Domain, drawn: Draw, params: LawParams, setting: Setting) -> WorldBatch:
-    """The worlds of a draw as a part of a job, all with the same parameters."""
+def drawn_worlds(domain: Domain, drawn: Draw, setting: Setting) -> WorldBatch:
+    """Return the worlds of a draw, on the host, without law parameters."""
     family = domain.family_of(drawn.case[0])
     count, dtype = drawn.number.size, jnp.result_type(float)
     engine, robots = engines.get(setting.engine), drawn.robot
     engine.check_robot(robots)
-    engine.check_senses(registry.law_of(params).senses)
     stage, own = engine.stage_of_solids(
         family, drawn.solid, drawn.friction, setting.physics, robots
     )
@@ -39,7 +36,6 @@ def drawn_worlds(domain: Domain, drawn: Draw, params: LawParams, setting: Settin
         "fields": own,
         "footprint": Footprint(*outline),
         "skin": _skin(domain, drawn),
-        "params": jax.tree.map(lambda x: np.full((count, *np.shape(x)), x), params),
         "p_world_target": drawn.p_world_target,
         "shift": Shift(*never),
         "qpos": starts(drawn),

@@ -20,7 +20,6 @@ import optax
 from rps_jax import errors
 from rps_jax.control import registry, soft
 from rps_jax.control.base import LawParams
-from rps_jax.control.laws.rps import RPSParams
 from rps_jax.record.options import option
 from rps_jax.robot.skin import CapacitiveSkin, SmoothSkin
 from rps_jax.runs import evaluate
@@ -185,13 +184,13 @@ def scores_of(how: Windows, stage: Any) -> gradients.Scores:
     score = gradients.window(stage, space.params, cost, loop, max(1, steps(how.window)))
 
     def begun(thetas: jax.Array, worlds: World, late: jax.Array) -> Trial:
-        worlds = worlds._replace(params=jax.vmap(space.params)(thetas))
-        first = start_all(worlds, jnp.ones(len(late), bool), law=law)
+        params = jax.vmap(space.params)(thetas)
+        first = start_all(worlds, params, jnp.ones(len(late), bool), law=law)
         if not how.within:
             return first
 
         def one(i: jax.Array, trials: Trial) -> Trial:
-            after, _ = control_step(stage, worlds, trials, loop)
+            after, _ = control_step(stage, worlds, params, trials, loop)
             return jax.vmap(soft.tree_where)(i < late * steps(how.within), after, trials)
 
         return jax.lax.fori_loop(0, steps(how.within), one, first)
@@ -221,7 +220,7 @@ def differentiated(thetas: jax.Array, how: Windows, seed: int, step: int) -> tup
     """
     problem, found = how.problem, []
     setting = replace(problem.setting, engine="quasistatic")
-    ask = problem.ask(jax.tree.map(lambda x: np.array([x]), RPSParams()), seed, step)
+    ask = problem.ask(how.space.base, seed, step)
     random = np.random.default_rng((seed, step))
     for part, column, _ in evaluate.world_batches(ask, problem.domains, setting):
         worlds = soften(part.worlds), jnp.asarray(random.uniform(size=column.size))

@@ -27,7 +27,7 @@ from rps_jax import engines
 from rps_jax.analysis.figures.style import Figure, quantity, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
-from rps_jax.control.base import Law
+from rps_jax.control.base import Law, LawParams
 from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
@@ -281,13 +281,14 @@ class Bank:
     def logs(self, drawn: Draw) -> Log:
         """The logs of worlds (n,) of one object; the program always steps as many."""
         count = drawn.number.size
-        part = drawn_worlds(self.domain, drawn, self.params, self.setting)
-        full = rows(part.worlds, np.resize(np.arange(count), max(count, _TOGETHER)))
+        part = drawn_worlds(self.domain, drawn, self.setting).with_params(self.params)
+        repeated = np.resize(np.arange(count), max(count, _TOGETHER))
+        worlds, params = rows((part.worlds, part.params), repeated)
         period = self.setting.physics.control_period
         every = max(1, round(self.interval / period))
         loop = ControlLoop(self.setting.physics, self.setting.rules, _telling(self.law))
         seen = _tracks(
-            part.stage, full, loop,
+            part.stage, worlds, params, loop,
             steps=round(self.window / self.interval), every=every,
         )  # fmt: skip
         seen = jax.tree.map(lambda x: np.swapaxes(np.asarray(x, float), 0, 1), seen)
@@ -322,15 +323,15 @@ def _tell(law: Law, params: Any, memory: Any, seen: Any) -> Any:
 
 @partial(jax.jit, static_argnames=("steps", "every"))
 def _tracks(
-    stage: Any, worlds: Any, loop: ControlLoop, *, steps: int, every: int
+    stage: Any, worlds: Any, params: LawParams, loop: ControlLoop, *, steps: int, every: int
 ) -> dict[str, jax.Array]:
     """Logs of a batch, (steps, B, ...), one row every so many control steps."""
     jnp = jax.numpy
-    one = partial(trial.control_step, stage, loop=loop)
+    one = partial(trial.control_step, stage, worlds, params, loop=loop)
 
     def row(trials: Any, _: Any) -> Any:
-        after, seen = one(worlds, trials)
-        after = jax.lax.fori_loop(1, every, lambda _, t: one(worlds, t)[0], after)
+        after, seen = one(trials)
+        after = jax.lax.fori_loop(1, every, lambda _, t: one(t)[0], after)
         touch = seen.details.touch
         place, yaw = jax.vmap(object_pose)(seen.qpos)
         found = {
@@ -347,7 +348,7 @@ def _tracks(
             found["signal"] = jnp.where(after.skin.alive, after.skin.signal, 0.0)
         return after, found
 
-    trials = trial.start_all(worlds, jnp.ones(len(worlds.qpos), bool), law=loop.law)
+    trials = trial.start_all(worlds, params, jnp.ones(len(worlds.qpos), bool), law=loop.law)
     return jax.lax.scan(row, trials, length=steps)[1]
 
 

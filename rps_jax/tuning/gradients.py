@@ -89,11 +89,11 @@ def window(
 
     def scores(thetas: jax.Array, starts: Any) -> jax.Array:
         worlds, trials = starts
-        worlds = worlds._replace(params=jax.vmap(params_of)(thetas))
+        params = jax.vmap(params_of)(thetas)
 
         @partial(jax.checkpoint, prevent_cse=False)  # in reverse, memory of one state a step
         def one(trials: Trial, _: None) -> tuple[Trial, Snapshot]:
-            return trial.control_step(stage, worlds, trials, loop)
+            return trial.control_step(stage, worlds, params, trials, loop)
 
         _, seen = jax.lax.scan(one, trials, length=steps)
         return jax.vmap(cost, in_axes=1)(seen)

@@ -18,7 +18,6 @@ from rps_jax.control.base import Law
 from rps_jax.control.observation import Details, Twist
 from rps_jax.runs.push import recorded_law
 from rps_jax.trials import pushes
-from rps_jax.trials.batch import WorldBatch
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
@@ -32,8 +31,7 @@ OFF = (1, -1, 2, -2, 4, -4, 8, -8)  # roundings of a twist, of 2^-23 each
 def recorded(cases: Sequence[Case], setting: Setting) -> list[Any]:
     """What the law of each case observed in each control step: leaves (T, ...), by trial."""
     law = registry.law_of(cases[0].params)
-    stage, worlds = pushes.build(cases, setting)
-    part = WorldBatch(np.arange(len(cases)), worlds, stage)
+    part = pushes.build(cases, setting)
     period, found = setting.physics.control_period, []
     for followed in pushes.record_batch(part, recorded_law(law), setting, interval=period):
         seen = followed.snapshots

@@ -173,8 +173,8 @@ def worlds(
     engine: EngineName,
     params: PublishedForcePushParams = PARAMS,
     physics: Physics = PHYSICS,
-) -> tuple[Any, World]:
-    """Stage and worlds of some cells of the grid, on the host."""
+) -> tuple[Any, World, PublishedForcePushParams]:
+    """Stage, worlds and law parameters of some cells of the grid, on the host."""
     count = grid.angle.size
     half = np.full(count, _HALF)
     box = slider == "box"
@@ -197,7 +197,6 @@ def worlds(
         "fields": fields,
         "footprint": Footprint(things.vertices, things.radius),  # type: ignore[arg-type]
         "skin": same(IdealSkin().on(_ROBOT.shell)),
-        "params": same(params),
         "p_world_target": np.tile([90.0, 0.0], (count, 1)),  # never reached
         "shift": same(Shift(p_robot=jnp.zeros(2))),
         "qpos": starts(slider, grid),
@@ -205,7 +204,8 @@ def worlds(
     }
     dtype = jnp.zeros(()).dtype
     narrow = jax.tree.map(lambda x: np.asarray(x, dtype), world)
-    return stage, World(**narrow, key=np.zeros((count, 2), np.uint32))  # type: ignore[arg-type]
+    made = World(**narrow, key=np.zeros((count, 2), np.uint32))  # type: ignore[arg-type]
+    return stage, made, jax.tree.map(lambda x: np.asarray(x, dtype), same(params))
 
 
 def pushed(
@@ -236,16 +236,16 @@ def pushed(
       along the path that was made good, of an ideal pusher's.
     """
     grid, law = cells(), follow(name, duration)
-    stage, batch = worlds(slider, grid, engine, params, physics)
+    stage, *inputs = worlds(slider, grid, engine, params, physics)
     period, count = physics.control_period, grid.angle.size
     horizon = duration + 2 * _BEHIND / float(params.v_max)
     rules = Rules(horizon=2 * horizon, max_lost=1e6)
-    trials = trial.start_all(batch, np.ones(count, bool), law=law)
+    trials = trial.start_all(*inputs, np.ones(count, bool), law=law)
     apart, steps, began = np.zeros(count), 0, time.perf_counter()
     waited = 0.0
     while steps * period < horizon:
         options = {"physics": physics, "rules": rules, "law": law}
-        trials, seen = trial.record(stage, batch, trials, **options, steps=_SEGMENT, every=_LOOK)
+        trials, seen = trial.record(stage, *inputs, trials, **options, steps=_SEGMENT, every=_LOOK)
         away = np.asarray(seen.qpos[..., 3:5] - seen.qpos[..., :2])
         apart = np.maximum(apart, np.hypot(*np.moveaxis(away, -1, 0)).max(axis=0))
         if steps == 0:

@@ -126,7 +126,7 @@ def distances(
       >>> found.gradient.shape
       (2, 2)
     """
-    stage, worlds = pushes.build(cases, setting)
+    part = pushes.build(cases, setting)
     law = registry.smooth_law(registry.law_of(cases[0].params))
     at = np.round(np.asarray(horizons) / setting.physics.control_period).astype(int)
 
@@ -134,8 +134,9 @@ def distances(
         return seen.details.distance[at]
 
     loop = ControlLoop(setting.physics, law=law)
-    scores = jax.jit(window(stage, params_of, left, loop, int(at[-1]) + 1))
-    return scores, (worlds, trial.start_all(worlds, np.ones(len(cases), bool), law=law))
+    scores = jax.jit(window(part.stage, params_of, left, loop, int(at[-1]) + 1))
+    start = trial.start_all(part.worlds, part.params, np.ones(len(cases), bool), law=law)
+    return scores, (part.worlds, start)
 
 
 def _repeated(worlds: Any, times: int) -> Any:

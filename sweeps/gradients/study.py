@@ -159,7 +159,7 @@ def _stage_and_worlds(study: Gradients, engine: EngineName, split: Split, count:
     alone = replace(domains.named(study.domain), objects=(study.object,))
     setting = Setting(engine=engine)
     drawn = draws.draw(alone, seed_of(study.seed, split), np.arange(count))
-    part = drawn_worlds(alone, drawn, RPSParams(), setting)
+    part = drawn_worlds(alone, drawn, setting)
     return part.stage, part.worlds, setting.physics
 
 
@@ -176,8 +176,9 @@ def _distances(study: Gradients, stage: Any, physics: Any, smooth: bool) -> Scor
     score = window(stage, study.space.params, left, loop, int(at[-1]) + 1)
 
     def scores(thetas: jax.Array, worlds: World) -> jax.Array:
-        live = jnp.ones(thetas.shape[0], bool)
-        return score(thetas, (worlds, trial.start_all(worlds, live, law=law)))
+        live, params = jnp.ones(thetas.shape[0], bool), jax.vmap(lambda _: RPSParams())(thetas)
+        start = jax.lax.stop_gradient(trial.start_all(worlds, params, live, law=law))
+        return score(thetas, (worlds, start))
 
     return scores
 

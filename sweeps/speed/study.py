@@ -248,12 +248,15 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
     threads = 1 if how == "serial" else provenance.count_processors()
     worlds = 1 if how == "serial" else 64 * threads
     setting, engine = Setting(engine="mujoco", physics=physics), engines.get("mujoco")
-    stage, batch = programs.timed_worlds(family, worlds, setting)
+    part = programs.timed_worlds(family, worlds, setting)
+    stage, batch = part.stage, part.worlds
     if how != "open":
         loop = ControlLoop(physics, Rules(horizon=simulated))
 
         def once() -> None:
-            host.run(engine, stage, batch, loop, threads=threads, callback=lambda *_: True)
+            host.run(
+                engine, stage, batch, part.params, loop, threads=threads, callback=lambda *_: True
+            )
 
     else:
         stepper = engine.stepper(stage, np.asarray(batch.qpos, float), threads)
@@ -291,7 +294,7 @@ def refilling(slots: int, rounds: int = 4) -> Refilling:
         timings = []
         for group in groups:
             drawn = draws.draw(boxes, 0, group)
-            part = drawn_worlds(boxes, drawn, RPSParams.paper(), setting)
+            part = drawn_worlds(boxes, drawn, setting).with_params(RPSParams.paper())
             job = Job(rps.LAW, group.size, [part])
             timings.append(run_batch([job], setting, slots=slots, collect=lambda *_: None))
         wall = sum(t.run for t in timings)
