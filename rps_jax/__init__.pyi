@@ -48,5 +48,5 @@ from rps_jax.world.objects import register_object as register_object
 from rps_jax.robot.robot import Robot as Robot
 from rps_jax.trials.setting import Setting as Setting
 from rps_jax.trials.trial import Rules as Rules
-from rps_jax.engines.device import use_cache as use_cache
+from rps_jax.record.cache import use_cache as use_cache
 from rps_jax.errors import InputError as InputError

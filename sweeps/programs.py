@@ -18,7 +18,7 @@ import numpy as np
 from rps_jax import engines
 from rps_jax.control.base import LawParams
 from rps_jax.control.laws.rps import RPSParams
-from rps_jax.record import provenance
+from rps_jax.engines import device
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.batch import WorldBatch, rows
 from rps_jax.trials.case import Case
@@ -156,4 +156,4 @@ def side_by_side(
 
 def machine() -> str:
     """Where speeds were measured, in a sentence."""
-    return f"On {jax.devices()[0].device_kind}, {provenance.count_processors()} processors."
+    return f"On {jax.devices()[0].device_kind}, {device.count_processors()} processors."

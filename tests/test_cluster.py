@@ -11,9 +11,10 @@ import jax
 import pytest
 from helpers import PLAN, SLOTS, one_sentence, parts_of, rps, swept
 
-from rps_jax.engines.device import use_cache
+from rps_jax.engines import device
 from rps_jax.errors import InputError
-from rps_jax.record import files, provenance
+from rps_jax.record import files
+from rps_jax.record.cache import use_cache
 from rps_jax.runs import cluster
 from rps_jax.runs.plan import open_run
 from rps_jax.trials.progress import Bar
@@ -135,8 +136,8 @@ def test_what_ends_a_worker_ends_the_run_as_itself(tmp_path, two_workers):
 
 
 def test_a_worker_with_other_software_is_refused(tmp_path, two_workers, monkeypatch):
-    here = provenance.collect_environment()
-    monkeypatch.setattr(provenance, "collect_environment", lambda: here | {"commit": "another"})
+    here = device.collect_environment()
+    monkeypatch.setattr(device, "collect_environment", lambda: here | {"commit": "another"})
     with pytest.raises(
         InputError, match=r"other software \(commit = .* there, .another. asked for"
     ):

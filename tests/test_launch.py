@@ -11,11 +11,10 @@ import jax
 import numpy as np
 import pytest
 
-from rps_jax.engines import native
+from rps_jax.engines import device, native
 from rps_jax.lowering import nvrtc
-from rps_jax.record import provenance
 
-COMPILER = provenance.find_compiler()
+COMPILER = device.find_compiler()
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler: apt install gcc")
 NAME = "rps_native_launched"
 # In a process of its own, which has no other driver: two worlds of one kind, twenty of another.

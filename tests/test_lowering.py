@@ -11,7 +11,7 @@ import pytest
 
 from rps_jax.app.export import c
 from rps_jax.app.export.program import routine
-from rps_jax.record import provenance
+from rps_jax.engines import device
 
 REALS = [0.0, -0.0, 0.5, -1.5, 2.5, 7.0, 1e30, -1e30, np.inf, -np.inf, np.nan]
 BOUNDS = [2147483520.0, -2147483520.0, 2147483648.0, -2147483648.0, -2147483904.0, 3e9]
@@ -21,7 +21,7 @@ CASES = {
     "argmax": lambda x, i: jnp.argmax(jnp.stack([x, jnp.roll(x, 1), x[::-1]]), axis=0),
     "argmin": lambda x, i: jnp.argmin(jnp.stack([x, jnp.roll(x, 1), x[::-1]]), axis=0),
 }
-COMPILER = provenance.find_compiler()
+COMPILER = device.find_compiler()
 
 
 def inputs(real):

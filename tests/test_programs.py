@@ -13,7 +13,7 @@ import pytest
 from rps_jax.control import registry
 from rps_jax.control.laws import rps
 from rps_jax.engines import device, programs
-from rps_jax.record import provenance
+from rps_jax.record import cache as program_cache
 from rps_jax.runs.push import Push
 from rps_jax.runs.sweep import Sweep
 from rps_jax.trials import pushes, trial
@@ -123,7 +123,7 @@ def test_what_says_not_all_that_a_program_depends_on_keeps_none(cache, made):
 
 def test_a_cache_stays_where_it_was_when_its_process_goes_elsewhere(cache, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert device.use_cache("programs") == tmp_path / "programs"
+    assert program_cache.use_cache("programs") == tmp_path / "programs"
     assert jax.config.jax_compilation_cache_dir == str(tmp_path / "programs")
 
 
@@ -157,7 +157,7 @@ def test_programs_that_were_not_used_for_longest_go_first(cache, made, monkeypat
     make, traced = made
     make(n=1)
     size = next(cache.iterdir()).stat().st_size
-    monkeypatch.setattr(device, "MOST", int(2.5 * size))
+    monkeypatch.setattr(program_cache, "MAX_BYTES", int(2.5 * size))
     for n in (2, 3, 4):
         make(n=n)
     assert len(list(cache.iterdir())) == 2
@@ -170,20 +170,20 @@ def test_programs_that_were_not_used_for_longest_go_first(cache, made, monkeypat
 
 def test_a_few_trials_stay_on_processors(monkeypatch):
     """Five hundred, where there is a C compiler; in C MuJoCo all."""
-    monkeypatch.setattr(provenance, "find_compiler", lambda: "cc")
+    monkeypatch.setattr(device, "find_compiler", lambda: "cc")
     before = jax.config.jax_platforms
     jax.config.update("jax_platforms", None)
     try:
         few = Sweep("rps", worlds=500)
-        assert device.suits_processors(few)
-        assert device.suits_processors(Push(setting=Setting("fused")))
-        assert not device.suits_processors(replace(few, worlds=501))
-        assert not device.suits_processors(replace(few, setting=Setting("mjx")))
-        assert device.suits_processors(replace(few, worlds=9000, setting=Setting("mujoco")))
-        monkeypatch.setattr(provenance, "find_compiler", lambda: None)
-        assert not device.suits_processors(few)
+        assert few.suits_processors()
+        assert Push(setting=Setting("fused")).suits_processors()
+        assert not replace(few, worlds=501).suits_processors()
+        assert not replace(few, setting=Setting("mjx")).suits_processors()
+        assert replace(few, worlds=9000, setting=Setting("mujoco")).suits_processors()
+        monkeypatch.setattr(device, "find_compiler", lambda: None)
+        assert not few.suits_processors()
         jax.config.update("jax_platforms", "cuda")  # asked for by name
-        assert not device.suits_processors(Push())
+        assert not Push().suits_processors()
     finally:
         jax.config.update("jax_platforms", before)
 

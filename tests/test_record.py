@@ -17,6 +17,7 @@ import xarray as xr
 from helpers import ROOT
 
 from rps_jax import engines
+from rps_jax.engines import device
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
@@ -357,7 +358,7 @@ def test_of_those_that_begin_a_run_at_once_all_agree_or_are_refused(tmp_path):
 
 
 def test_what_a_run_was_made_on_before_is_not_forgotten(tmp_path):
-    this = provenance.collect_environment()
+    this = device.collect_environment()
     there = this | {"commit": "abc", "device": this["device"] | {"kind": "H200"}, "time": "then"}
     provenance.write_environment(tmp_path, there)
     provenance.write_environment(tmp_path, this)
@@ -384,4 +385,4 @@ def test_only_processors_that_a_process_may_use_are_counted(monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 128)
     assert engines.get("fused").workers("cpu") == 3
     monkeypatch.delattr(os, "sched_getaffinity")
-    assert provenance.count_processors() == 128
+    assert device.count_processors() == 128

@@ -37,10 +37,9 @@ from helpers import (
 from rps_jax.analysis import tables
 from rps_jax.app.cli import running
 from rps_jax.control.laws.rps import LAW
-from rps_jax.engines import device
 from rps_jax.errors import InputError
 from rps_jax.geometry import planar
-from rps_jax.record import files
+from rps_jax.record import cache, files
 from rps_jax.runs import execution, sweep
 from rps_jax.runs.plan import Shard, load_plan, open_run
 from rps_jax.runs.sweep import merge
@@ -158,10 +157,10 @@ _ON_TWO_DEVICES = """
 import sys, jax
 from pathlib import Path
 from helpers import swept
-from rps_jax.engines import device
+from rps_jax.record import cache
 from rps_jax.control.laws.rps import LAW
 
-device.use_cache()
+cache.use_cache()
 assert jax.device_count() == 2
 programs, plain = [], jax.stages.Lowered.compile
 def noted(*given, **options):
@@ -231,7 +230,7 @@ KILLED = replace(
 
 
 def sweep_in_a_process(folder):
-    device.use_cache()
+    cache.use_cache()
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     swept(folder, KILLED)
 

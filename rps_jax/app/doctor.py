@@ -6,8 +6,8 @@ from pathlib import Path
 from rps_jax.engines import device, native
 from rps_jax.errors import InputError
 from rps_jax.lowering import nvrtc
+from rps_jax.record import cache
 from rps_jax.record import folder as run_folder
-from rps_jax.record import provenance
 from rps_jax.record.options import option
 from rps_jax.runs.question import Question, call_of
 from rps_jax.world import video
@@ -21,7 +21,7 @@ class Doctor(Question[str]):
 
     def in_shell(self) -> None:
         """Print the report."""
-        print(report(device.cache_folder()))
+        print(report(cache.default_folder()))
 
 
 doctor = call_of(Doctor)
@@ -30,7 +30,7 @@ doctor = call_of(Doctor)
 def report(cache: Path) -> str:
     """Versions, devices, folders and the state of rendering, one line each."""
     checks = [("cache", *_writable(cache)), *video.check()]
-    environment = provenance.collect_environment()
+    environment = device.collect_environment()
     found = environment["device"]
     rows = {
         "python": f"{environment['python']} on {environment['platform']}",

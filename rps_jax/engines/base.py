@@ -16,9 +16,9 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.control.observation import Twist
+from rps_jax.engines import device
 from rps_jax.geometry.arrays import Float
 from rps_jax.geometry.solid import Solid
-from rps_jax.record import provenance
 from rps_jax.robot.robot import Robot
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import Friction, Scene
@@ -173,7 +173,7 @@ class Engine(abc.ABC):
 
         A processor gets one for each core, since XLA steps a small batch on one core.
         """
-        return provenance.count_processors() if backend == "cpu" else 1
+        return device.count_processors() if backend == "cpu" else 1
 
     def suits_processors(self, trials: int | None) -> bool:
         """Whether processors end so many trials sooner than a GPU; None: nobody knows how many."""

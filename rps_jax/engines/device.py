@@ -1,23 +1,18 @@
-"""On which device worlds are stepped, and where its compiled programs are kept between runs."""
+"""The device that steps worlds: its choice, its processors and its C compiler."""
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 import platform
-import warnings
-from collections.abc import Callable
+import shutil
+import subprocess
 from importlib import metadata
-from pathlib import Path
 from typing import Any, Literal
 
-from rps_jax import engines
 from rps_jax.errors import InputError
-from rps_jax.record import files
+from rps_jax.record import provenance
 
-MOST = 512 * 2**20  # bytes of a kind that are kept
-_DIGEST = hashlib.sha256().digest_size
 Device = Literal["auto", "cpu", "gpu", "xla"]
 
 
@@ -36,52 +31,6 @@ def configure_xla() -> None:
     for flag, value in flags.items():
         if flag not in (before := os.environ.get("XLA_FLAGS", "")):
             os.environ["XLA_FLAGS"] = f"{before} {flag}={value}".strip()
-
-
-def cache_folder() -> Path:
-    """Where compiled programs are kept between runs: $RPS_CACHE, else the user's cache."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(os.environ.get("RPS_CACHE") or Path(base) / "rps_jax")
-
-
-def use_cache(folder: str | Path | None = None) -> Path | None:
-    """Keep compiled programs between processes, so that each compiles once on a machine.
-
-    The command line does this by itself. A library call does it if the environment variable
-    RPS_CACHE names a folder.
-
-    Args:
-      folder: where they are kept; by default $RPS_CACHE, else `rps_jax` in the user's cache.
-
-    Returns:
-      The folder, or None if it cannot be written: a run needs no cache.
-
-    Example:
-      >>> import rps_jax
-      >>> folder = rps_jax.use_cache("programs")
-      >>> folder.name
-      'programs'
-    """
-    import jax
-
-    where = (cache_folder() if folder is None else Path(folder)).absolute()
-    try:
-        where.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return None
-    jax.config.update("jax_compilation_cache_dir", str(where))
-    # Many programs of ours are small, and compile in less than JAX thinks worth keeping.
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    return where
-
-
-def use_cache_if_asked() -> None:
-    """Keep compiled programs if RPS_CACHE is set and no other cache is in use."""
-    import jax
-
-    if os.environ.get("RPS_CACHE") and not jax.config.jax_compilation_cache_dir:
-        use_cache()
 
 
 def kind() -> str:
@@ -122,47 +71,42 @@ def choose(name: Device) -> None:
     )
 
 
-def suits_processors(question: Any) -> bool:
-    """Whether processors answer a question sooner than a GPU, as its engine says."""
+def find_compiler() -> str | None:
+    """Return the path of the C compiler of native functions; None: XLA compiles them.
+
+    The environment variable RPS_COMPILER names another one, or `none`.
+    """
+    name = os.environ.get("RPS_COMPILER", "cc" if os.name == "posix" else "none")
+    return None if name == "none" else shutil.which(name)
+
+
+def _compiler_version() -> str | None:
+    """Return the first line that the C compiler prints about itself."""
+    if (name := find_compiler()) is None:
+        return None
+    done = subprocess.run([name, "--version"], capture_output=True, text=True, timeout=60)
+    return done.stdout.partition("\n")[0] or name
+
+
+def count_processors() -> int:
+    """Return the number of processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS and Windows
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def collect_environment() -> dict[str, Any]:
+    """Return the record of this process: command, versions, commit, device and compiler."""
     import jax
 
-    setting = getattr(question, "setting", None)
-    if setting is None or jax.config.jax_platforms:
-        return False
-    return engines.get(setting.engine).suits_processors(question.num_trials())
-
-
-def kept(path: Path, done: str, read: Callable[[bytes], Any]) -> Any:
-    """What `keep` kept, as it is read; None if it is not there, or damaged: then it is dropped."""
-    try:
-        content = path.read_bytes()
-    except OSError:
-        return None
-    body = content[:-_DIGEST]
-    try:
-        if hashlib.sha256(body).digest() != content[-_DIGEST:]:
-            raise ValueError("its checksum differs")
-        found = read(body)
-    except Exception as error:  # whatever a damaged file leads to
-        warnings.warn(f"{path} is dropped, and {done} again: {error}", stacklevel=2)
-        with contextlib.suppress(OSError):
-            path.unlink()
-        return None
-    with contextlib.suppress(OSError):
-        os.utime(path)
-    return found
-
-
-def keep(path: Path | None, body: bytes) -> None:
-    """Keep bytes and drop what was not used for longest; a run needs neither."""
-    if path is None:
-        return
-    with contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        files.write_bytes(path, body + hashlib.sha256(body).digest())
-        every = sorted(path.parent.iterdir(), key=lambda one: -one.stat().st_mtime)
-        total = 0
-        for one in every:
-            total += one.stat().st_size
-            if total > MOST:
-                one.unlink()
+    used = jax.devices()[0]
+    return provenance.collect_environment(
+        processors=count_processors(),
+        device={
+            "platform": used.platform,
+            "kind": used.device_kind,
+            "count": jax.device_count(),
+        },
+        x64=bool(jax.config.jax_enable_x64),
+        compiler=_compiler_version() if used.platform in ("cpu", "gpu") else None,
+    )

@@ -33,7 +33,7 @@ from rps_jax.engines import device
 from rps_jax.geometry import vectors
 from rps_jax.lowering import gpu_writer, nvrtc, writer
 from rps_jax.lowering.walk import TooLargeError, UnsupportedError
-from rps_jax.record import provenance
+from rps_jax.record import cache
 
 # A sum is fused with the product before it, as XLA does; nothing else is taken for something else.
 _FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-w")
@@ -72,7 +72,7 @@ def _macros(compiler: str) -> str | None:
 
 def target() -> str | None:
     """What tells compilers and devices apart that functions are compiled by and for, if any."""
-    if (compiler := provenance.find_compiler()) is None or (macros := _macros(compiler)) is None:
+    if (compiler := device.find_compiler()) is None or (macros := _macros(compiler)) is None:
         return None
     if jax.default_backend() == "cpu":
         return macros
@@ -181,7 +181,7 @@ def _made(functions: Sequence[_Function]) -> str | None:
             what, why = error.args
             warnings.warn(f"{what} fails, so XLA compiles: {why}", stacklevel=2)
             return None
-        device.keep(_place(name), body)
+        cache.write(_place(name), body)
         _register(name, body)
     return name
 
@@ -202,7 +202,7 @@ def _binary(text: str, name: str) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         source, binary = Path(folder) / f"{name}.c", Path(folder) / f"{name}.so"
         source.write_text(text)
-        words = [str(provenance.find_compiler()), *_FLAGS, "-shared", "-fPIC"]
+        words = [str(device.find_compiler()), *_FLAGS, "-shared", "-fPIC"]
         words += [f"-I{jax.ffi.include_dir()}", str(source), "-o", str(binary), "-lm", "-ldl"]
         done = subprocess.run(words, capture_output=True, text=True)
         if done.returncode:
@@ -244,7 +244,7 @@ def load(name: str) -> bool:
         place = _place(name)
         if name in _loaded or place is None:
             return name in _loaded
-        return bool(device.kept(place, "compiled", functools.partial(_register, name)))
+        return bool(cache.read(place, "compiled", functools.partial(_register, name)))
 
 
 def _place(name: str) -> Path | None:

@@ -25,7 +25,8 @@ import numpy as np
 from jax import export
 
 from rps_jax.control.base import Law
-from rps_jax.engines import device, native
+from rps_jax.engines import native
+from rps_jax.record import cache
 
 
 def compiled(
@@ -71,7 +72,7 @@ def compiled(
         exported = export.export(jitted, disabled_checks=safe)(*leaves)
         (structure,) = shapes
         with contextlib.suppress(ValueError, TypeError, AttributeError):  # what cannot be kept
-            device.keep(place, _head(structure) + b"\n" + bytes(exported.serialize()))
+            cache.write(place, _head(structure) + b"\n" + bytes(exported.serialize()))
     else:
         structure, exported = found
     program = built(jax.jit(exported.call, donate_argnums=donated).lower(*leaves))
@@ -198,4 +199,4 @@ def _read(path: Path, leaves: Sequence[Any]) -> tuple[Any, export.Exported] | No
             raise ValueError("it needs a compiled function that is not there")
         return jax.tree.structure(_tree(json.loads(head))), found
 
-    return device.kept(path, "traced", told)
+    return cache.read(path, "traced", told)

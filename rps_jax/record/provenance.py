@@ -1,10 +1,8 @@
 """What a run was made by: command, versions, device and commit, noted in its folder."""
 
 import importlib.metadata
-import os
 import platform
 import shlex
-import shutil
 import subprocess
 import sys
 import time
@@ -23,51 +21,17 @@ _PACKAGES = (
 )
 
 
-def collect_environment() -> dict[str, Any]:
-    """Versions, device, commit and command of this process."""
-    import jax
-
-    device = jax.devices()[0]
+def collect_environment(**device: object) -> dict[str, Any]:
+    """Return command, commit, time and versions of this process, and what `device` holds."""
     return {
         "command": _command(),
         "commit": git_commit(),
         "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "processors": count_processors(),
-        "device": {
-            "platform": device.platform,
-            "kind": device.device_kind,
-            "count": jax.device_count(),
-        },
-        "x64": bool(jax.config.jax_enable_x64),
-        "compiler": _compiled_by() if device.platform in ("cpu", "gpu") else None,
+        **device,
         "packages": {name: _version(name) for name in _PACKAGES},
     }
-
-
-def find_compiler() -> str | None:
-    """The C compiler by which functions are compiled, and launched on a GPU; None: XLA does it.
-
-    The environment variable RPS_COMPILER names another, or `none`.
-    """
-    named = os.environ.get("RPS_COMPILER", "cc" if os.name == "posix" else "none")
-    return None if named == "none" else shutil.which(named)
-
-
-def _compiled_by() -> str | None:
-    """The compiler as it calls itself."""
-    if (name := find_compiler()) is None:
-        return None
-    said = subprocess.run([name, "--version"], capture_output=True, text=True, timeout=60).stdout
-    return said.partition("\n")[0] or name
-
-
-def count_processors() -> int:
-    """Number of processors that this process may use, which a cluster may hold below the host's."""
-    if hasattr(os, "sched_getaffinity"):  # not on macOS and Windows
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _command() -> list[str]:
@@ -78,12 +42,12 @@ def _command() -> list[str]:
     return ["python", sys.argv[0], *sys.argv[1:]] if program.suffix == ".py" else list(sys.argv)
 
 
-def write_environment(folder: Path, signed: Mapping[str, Any] | None = None) -> None:
-    """Note in `environment.json` on what a run, or some of it, is made: by default by this process.
+def write_environment(folder: Path, environment: Mapping[str, Any]) -> None:
+    """Note the environment of a run, or of a piece of it, in `environment.json`.
 
-    What it was made on before stays there, under `before`, if anything but the time differs.
+    An earlier note stays there, under `before`, if anything but the time differs.
     """
-    new = dict(signed or collect_environment())
+    new = dict(environment)
     with run_folder.lock_briefly(folder):
         earlier = _history(folder) if (folder / ENVIRONMENT).exists() else []
         earlier = [*new.pop("before", []), *earlier]

@@ -27,8 +27,8 @@ from rps_jax import engines, errors
 from rps_jax.engines import device as devices
 from rps_jax.engines.device import Device
 from rps_jax.errors import InputError
+from rps_jax.record import cache, provenance
 from rps_jax.record import folder as run_folder
-from rps_jax.record import provenance
 from rps_jax.runs import execution, results
 from rps_jax.runs.plan import Plan, Shard
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
@@ -51,7 +51,7 @@ def _work(
 ) -> tuple[dict[int, bytes], Progress, dict[str, Any]]:
     """Run parts of one kind, as a task of Ray: their contents, progress, and the environment."""
     prepare()
-    environment = provenance.collect_environment() | {
+    environment = devices.collect_environment() | {
         "host": socket.gethostname(),
         "pid": os.getpid(),
     }
@@ -140,7 +140,7 @@ def run_on_cluster(
     threads as `workers` says, by default one, and claims as many processors, and with `gpus` a GPU
     if the cluster has any and the engine can use one.
     """
-    own, known = provenance.collect_environment(), dict[tuple[str, int], dict[str, Any]]()
+    own, known = devices.collect_environment(), dict[tuple[str, int], dict[str, Any]]()
     missing, before = execution.missing_chunks(folder, plan, shard)
     if missing:
         provenance.write_environment(folder, own)
@@ -215,7 +215,7 @@ def _prepare(device: Device, x64: bool) -> None:
     devices.configure_xla()
     jax.config.update("jax_enable_x64", x64)
     devices.choose(device)
-    devices.use_cache()
+    cache.use_cache()
 
 
 def _room(hosts: Sequence[Mapping[str, Any]], num_cpus: int, num_gpus: int) -> int:

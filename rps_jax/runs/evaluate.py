@@ -16,8 +16,8 @@ from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams
 from rps_jax.control.registry import LawLike
-from rps_jax.engines import device
 from rps_jax.errors import InputError
+from rps_jax.record import cache
 from rps_jax.robot.robot import RobotLike
 from rps_jax.runs.question import Split, seed_of
 from rps_jax.trials import batch
@@ -94,7 +94,7 @@ def evaluate(
     errors.check_count("seed", setting.seed, at_least=0, at_most=2**30)
     setting.check_here(ranges.weakest, [params])
     ask = Candidates(_checked(params), seed_of(setting.seed, split), np.arange(count), at)
-    device.use_cache_if_asked()
+    cache.use_cache_if_requested()
     shown = is_interactive() if progress is None else progress
     with Bar("evaluate", ask.candidates * count, shown=shown and report_to is None) as bar:
         shape = {"callback": report_to or bar, "slots": slots, "workers": workers}

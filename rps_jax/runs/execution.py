@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 
 from rps_jax.control import registry
+from rps_jax.engines import device
 from rps_jax.record import folder as run_folder
 from rps_jax.record import provenance
 from rps_jax.record.checkpoint import Checkpoints
@@ -72,7 +73,7 @@ def run_missing(
     missing, before = missing_chunks(folder, plan, shard)
     callback(Progress(before, 0.0))
     if missing:
-        provenance.write_environment(folder)
+        provenance.write_environment(folder, device.collect_environment())
 
     def tell(progress: Progress) -> None:
         callback(replace(progress, finished=before + progress.finished))

@@ -26,13 +26,13 @@ from typing import Any, ClassVar, Generic, Literal, NamedTuple, ParamSpec, TypeV
 import numpy as np
 import xarray as xr
 
-from rps_jax import errors
+from rps_jax import engines, errors
 from rps_jax.analysis.report import Section
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams
 from rps_jax.control.registry import LawLike, LawsLike
 from rps_jax.engines import device
-from rps_jax.record import files, folder, options, provenance
+from rps_jax.record import cache, files, folder, options, provenance
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
@@ -168,7 +168,7 @@ class Question(Generic[T]):
         """Check, run what is missing, and return the answer; InputError for what is not allowed."""
         asked = self.with_quick_values()
         asked.validate()
-        device.use_cache_if_asked()
+        cache.use_cache_if_requested()
         if asked.report_to is not None:
             return asked.execute(asked.report_to)
         with asked.progress_bar() as bar:
@@ -182,6 +182,15 @@ class Question(Generic[T]):
     def shows_progress(self) -> bool:
         """Whether a bar shows the progress."""
         return is_interactive() if self.progress is None else self.progress
+
+    def suits_processors(self) -> bool:
+        """Whether processors answer sooner than a GPU, by the engine and the number of trials."""
+        import jax
+
+        setting = getattr(self, "setting", None)
+        if setting is None or jax.config.jax_platforms:
+            return False
+        return engines.get(setting.engine).suits_processors(self.num_trials())
 
     def with_quick_values(self) -> Any:
         """What is asked in the end: with `quick`, small where nothing else was asked for."""
@@ -223,7 +232,7 @@ class Question(Generic[T]):
             return
         out = folder.claim(Path(self.out), self.configuration())
         with folder.lock(out):
-            provenance.write_environment(out)
+            provenance.write_environment(out, device.collect_environment())
             yield out
 
     def fields_as_json(self) -> dict[str, Any]:

@@ -26,8 +26,9 @@ from rps_jax import errors
 from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import Figure, quantity, words
 from rps_jax.analysis.report import Picture, Section
+from rps_jax.engines import device
 from rps_jax.errors import InputError
-from rps_jax.record import files, provenance
+from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
@@ -150,7 +151,7 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         setting = replace(self.setting, engine="mujoco", physics="default", fidelity="reference")
         folder = None if run.folder is None else run.folder / "check"
         probe = Probe(self.ranges, self.params, setting, folder, **run.batch_options)
-        batch = max(1, run.workers or provenance.count_processors())
+        batch = max(1, run.workers or device.count_processors())
         for first in range(0, len(order), batch):
             if not has_time():
                 break

@@ -15,9 +15,8 @@ from rps_jax import engines
 from rps_jax.control import registry
 from rps_jax.control.base import Law, LawParams
 from rps_jax.control.laws.rps import RPSParams
-from rps_jax.engines import programs
+from rps_jax.engines import device, programs
 from rps_jax.geometry.footprint import Footprint
-from rps_jax.record import provenance
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.shell import Shell
 from rps_jax.trials import batch, host, trial
@@ -241,7 +240,7 @@ def _follow_on_host(
         part.worlds,
         part.params,
         ControlLoop(setting.physics, setting.rules, law),
-        threads=1 if part.indices.size == 1 else provenance.count_processors(),
+        threads=1 if part.indices.size == 1 else device.count_processors(),
         callback=tell,
         watch=watch,
     )

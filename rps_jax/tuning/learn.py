@@ -24,7 +24,8 @@ from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.learned import policy as policies
 from rps_jax.control.learned.network import Weights
 from rps_jax.control.learned.policy import Policy
-from rps_jax.record import files, provenance
+from rps_jax.engines import device
+from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, SimulationQuestion, Split, call_of, seed_of
@@ -316,7 +317,7 @@ class _Learning:
 
     def policy(self) -> Policy:
         """The law that validated best, or the latest before any did."""
-        made = provenance.collect_environment()
+        made = device.collect_environment()
         how = {
             "success_in_validation": self.best_rate if self.best else None,
             "updates": len(self.curve),

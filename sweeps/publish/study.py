@@ -29,6 +29,7 @@ import xarray as xr
 import rps_jax
 from rps_jax.analysis.report import Section
 from rps_jax.app.cli import flags, names
+from rps_jax.engines import device
 from rps_jax.errors import InputError
 from rps_jax.record import provenance
 from rps_jax.runs.question import Run, call_of
@@ -252,9 +253,9 @@ def joined(tables: Sequence[tuple[str, Rows]], columns: Sequence[str]) -> tuple[
 
 def machine() -> str:
     """What this process runs on, in words."""
-    device, count = jax.devices()[0], provenance.count_processors()
-    if device.platform != "cpu":
-        return f"one {device.device_kind} and {count} processors"
+    used, count = jax.devices()[0], device.count_processors()
+    if used.platform != "cpu":
+        return f"one {used.device_kind} and {count} processors"
     model = platform.processor() or platform.machine()
     for line in _processors().splitlines():
         if line.startswith("model name"):

@@ -26,7 +26,7 @@ from rps_jax.analysis.figures.style import Figure, words
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
-from rps_jax.record import provenance
+from rps_jax.engines import device
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials import host
@@ -245,7 +245,7 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
     """Time C MuJoCo: on all cores in the closed loop of the law or stepping alone, or one trial."""
     physics = preset()
     how = IN_C[name]
-    threads = 1 if how == "serial" else provenance.count_processors()
+    threads = 1 if how == "serial" else device.count_processors()
     worlds = 1 if how == "serial" else 64 * threads
     setting, engine = Setting(engine="mujoco", physics=physics), engines.get("mujoco")
     part = programs.timed_worlds(family, worlds, setting)

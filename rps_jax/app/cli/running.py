@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rps_jax.errors import InputError
+from rps_jax.record import cache
 
 if TYPE_CHECKING:
     from rps_jax.app.cli.flags import Beside
@@ -124,14 +125,14 @@ def carry_out(question: Any, beside: Beside) -> None:
     if question.out is None and not hasattr(question, "in_shell"):
         question = dataclasses.replace(question, out=question.default_folder)
     asked = question.with_quick_values()
-    few = beside.device == "auto" and device.suits_processors(asked)
+    few = beside.device == "auto" and asked.suits_processors()
     device.choose("cpu" if few or getattr(asked, "ray", None) else beside.device)
     asked.validate()
     check_length(beside.film_length)
     _go_on()
     if note := asked.note():
         print(note)
-    device.use_cache()
+    cache.use_cache()
     if hasattr(asked, "in_shell"):
         asked.in_shell()
         return

@@ -13,12 +13,12 @@ import jax
 import numpy as np
 
 from rps_jax.control.observation import Twist
+from rps_jax.engines import device
 from rps_jax.engines.base import Driven, Engine, Motion, taken
 from rps_jax.engines.fused import step
 from rps_jax.engines.fused.contacts import Body
 from rps_jax.geometry import solid
 from rps_jax.geometry.solid import Solid
-from rps_jax.record import provenance
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics
@@ -83,7 +83,7 @@ class Fused(Engine):
 
     def suits_processors(self, trials: int | None) -> bool:
         """A few trials, by the function in C: a GPU takes some 5 s to begin."""
-        return trials is not None and trials <= _FEW and provenance.find_compiler() is not None
+        return trials is not None and trials <= _FEW and device.find_compiler() is not None
 
 
 @functools.cache
