@@ -101,9 +101,7 @@ def test_the_paper_domain_is_the_papers_grid(engine):
 @pytest.mark.parametrize("name", ["random_box", "random_cylinder"])
 def test_fused_bodies_equal_those_of_recompiled_models(name):
     worlds, family = drawn(name), RANDOM[name]
-    _, bodies = engines.get("fused").stage_of_solids(
-        family, worlds.solid, worlds.friction, preset()
-    )
+    _, bodies = engines.get("fused").stage(family, worlds.solid, worlds.friction, preset())
     for i in range(COUNT):
         one = scene.of_solid(family, worlds.solid, worlds.friction, preset(), i)
         compiled = fused.body(one.physics, np.asarray(one.footprint.vertices, float))
@@ -117,7 +115,7 @@ def test_fused_bodies_equal_those_of_recompiled_models(name):
 @pytest.mark.parametrize("name", list(RANDOM))
 def test_applied_domain_equals_the_recompiled_model_in_every_field(name):
     worlds, family = drawn(name), RANDOM[name]
-    _, fields = engines.get("mjx").stage_of_solids(family, worlds.solid, worlds.friction, preset())
+    _, fields = engines.get("mjx").stage(family, worlds.solid, worlds.friction, preset())
     assert set(fields) <= set(mjx_engine.FIELDS)
     for i in range(COUNT):
         one = scene.of_solid(family, worlds.solid, worlds.friction, preset(), i)

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from staging import recompiled
 
 from rps_jax import engines
 from rps_jax.app import cli
@@ -90,8 +91,8 @@ def test_every_engine_has_the_same_hexagon(hexagon):
     solids, friction = scene.solid_of(hexagon), Friction(np.array([0.3]), np.array([0.35]))
     physics = Setting(engine="mjx").physics
     for engine in ("fused", "mjx"):
-        _, alone = engines.get(engine).stage_of_scenes([hexagon], np.zeros(1, int))
-        _, drawn = engines.get(engine).stage_of_solids("prism", solids, friction, physics)
+        alone = recompiled(engine, [hexagon])
+        _, drawn = engines.get(engine).stage("prism", solids, friction, physics)
         if engine == "mjx":
             assert set(alone) == set(drawn)
         for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(drawn), strict=True):

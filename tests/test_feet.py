@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from staging import staged
 
 from rps_jax import engines
 from rps_jax.control.observation import Twist
@@ -73,7 +74,7 @@ def in_c(name, steps):
 def driven(engine, names, steps):
     """Positions (n, 10) after steps at TWIST in an engine."""
     scenes, qpos = zip(*map(start, names), strict=True)
-    stage, fields = engines.get(engine).stage_of_scenes(scenes, np.arange(len(names)))
+    stage, fields = staged(engine, scenes, FINE)
     twist = Twist(*(jnp.full(len(names), x) for x in TWIST))
     still = jnp.zeros((len(names), 9))
 
@@ -170,7 +171,7 @@ def drawn_on_feet(name, count=4):
 def stepped(engine, family, drawn, steps):
     """Positions (n, 10) of drawn worlds after steps at TWIST in a traced engine, or in C."""
     found = engines.get(engine)
-    stage, fields = found.stage_of_solids(family, drawn.solid, drawn.friction, FINE, Robot())
+    stage, fields = found.stage(family, drawn.solid, drawn.friction, FINE, Robot())
     qpos = starts(drawn)
     qpos[:, [3, 5]] -= 0.0005
     if engine == "mujoco":
@@ -238,7 +239,7 @@ def test_objects_on_drawn_feet_end_where_those_of_c_mujoco_do(engine, name):
 
 def test_quasistatic_slides_on_drawn_feet():
     plain, drawn, family = drawn_on_feet("random_prism")
-    _, sliders = engines.get("quasistatic").stage_of_solids(
+    _, sliders = engines.get("quasistatic").stage(
         family, drawn.solid, drawn.friction, FINE, Robot()
     )
     three = drawn.solid.feet[..., 2].sum(axis=1) == 3

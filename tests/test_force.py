@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import refusal
+from staging import staged
 
 from rps_jax import engines
 from rps_jax.control import registry
@@ -37,7 +38,7 @@ def pushed(engine, twist=AHEAD, seconds=2.0, friction=S1, robot=Robot(), yaw=0.0
     at = scene.load("box", STANDARD, friction, robot=robot)
     start = scene.initial_qpos(at, gap=0.0, yaw=yaw)[None]
     start[0, 4] += lateral
-    stage, fields = engines.get(engine).stage_of_scenes([at], np.zeros(1, int))
+    stage, fields = staged(engine, [at], STANDARD, robot)
     robots = jax.tree.map(lambda x: np.asarray(x, float)[None], robot) if robot.driven else None
     count = round(seconds / STANDARD.control_period)
     if engine == "mujoco":
@@ -108,7 +109,7 @@ def test_the_fused_engine_tells_the_force_of_c_mujoco():
 
 def test_who_does_not_ask_is_told_no_force():
     at = scene.load("box", STANDARD, S1)
-    stage, fields = engines.get("fused").stage_of_scenes([at], np.zeros(1, int))
+    stage, fields = staged("fused", [at], STANDARD)
     still = jnp.zeros((1, 9))
     motion = Motion(jnp.asarray(scene.initial_qpos(at)[None], float), still, still)
     fields = jax.tree.map(lambda x: jnp.asarray(x, float), fields)

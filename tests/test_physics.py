@@ -16,8 +16,8 @@ import mujoco
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
+from staging import staged
 
-from rps_jax import engines
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.observation import Twist
 from rps_jax.engines.base import Motion
@@ -108,7 +108,7 @@ def in_c(worlds, physics=REFERENCE, seconds=SECONDS):
 
 def in_jax(worlds, physics=STANDARD, engine="mjx", seconds=SECONDS):
     scenes, *start, twist = starts(worlds, physics)
-    stage, fields = engines.get(engine).stage_of_scenes(scenes, np.arange(len(scenes)))
+    stage, fields = staged(engine, scenes, physics)
     qpos, qvel, twist = (jnp.asarray(x, float) for x in (*start, twist))
     fields = jax.tree.map(jnp.asarray, fields)
 

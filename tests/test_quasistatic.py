@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import nnls
+from staging import staged
 
-from rps_jax import engines
 from rps_jax.control import registry
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.observation import Twist
@@ -527,8 +527,9 @@ def test_feet_bear_what_holds_the_centre_of_mass_and_none_pulls():
 
 @pytest.mark.parametrize("name", OBJECTS)
 def test_every_scene_has_a_slider(name):
-    loaded = scene.load(name, friction=scene.Friction(0.3, 0.4), robot=Robot(half_length=0.3))
-    stage, slider = engines.get("quasistatic").stage_of_scenes([loaded], np.zeros(1, int))
+    base = Robot(half_length=0.3)
+    loaded = scene.load(name, friction=scene.Friction(0.3, 0.4), robot=base)
+    stage, slider = staged("quasistatic", [loaded], preset(), base)
     assert isinstance(stage, Quasistatic)
     np.testing.assert_allclose(slider.friction_robot, [0.4])
     np.testing.assert_allclose(slider.base_half, [[0.3, SIDE]])

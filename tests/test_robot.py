@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import PAPER, SHORT, refusal
+from staging import recompiled, staged
 
 import rps_jax
 from rps_jax import engines
@@ -106,7 +107,7 @@ def pushed(engine, one, seconds=4.0, twist=AHEAD, name="box"):
     """Base velocity [m/s] and positions (10,) after a push, from contact, at a constant twist."""
     at = scene.load(name, STANDARD, FRICTION["S1"], robot=one)
     start = scene.initial_qpos(at, gap=0.0)[None]
-    stage, fields = engines.get(engine).stage_of_scenes([at], np.zeros(1, int))
+    stage, fields = staged(engine, [at], STANDARD, one)
     robots = jax.tree.map(lambda x: np.asarray(x, float)[None], one) if one.driven else None
     steps = round(seconds / STANDARD.control_period)
     if not engines.get(engine).traced:
@@ -168,9 +169,8 @@ def test_worlds_by_template_equal_recompiled_ones(engine):
     drawn = draws.draw(replace(DOMAINS["real"], objects=("random_box",)), 3, np.arange(3))
     args = ("box", drawn.solid, drawn.friction, STANDARD)
     heavy = replace(drawn.robot, mass=np.array([60.0, 130.0, 200.0]))
-    _, fields = engines.get(engine).stage_of_solids(*args, heavy)
-    scenes = [scene.of_solid(*args, i, heavy) for i in range(3)]
-    _, theirs = engines.get(engine).stage_of_scenes(scenes, np.arange(3))
+    _, fields = engines.get(engine).stage(*args, heavy)
+    theirs = recompiled(engine, [scene.of_solid(*args, i, heavy) for i in range(3)])
     for ours, compiled in zip(*map(jax.tree.leaves, (fields, theirs)), strict=True):
         np.testing.assert_allclose(ours, compiled, rtol=2e-5, atol=2e-6)
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import PAPER, refusal
+from staging import recompiled
 from test_robot import AHEAD, aims, pushed
 
 import rps_jax
@@ -138,9 +139,8 @@ def test_worlds_by_template_equal_recompiled_ones(engine):
         half_length=np.array([0.3, 0.4, 0.5]),
         half_width=np.array([0.2, 0.25, 0.4]),
     )
-    _, fields = engines.get(engine).stage_of_solids(*args, sizes)
-    scenes = [scene.of_solid(*args, i, sizes) for i in range(3)]
-    _, theirs = engines.get(engine).stage_of_scenes(scenes, np.arange(3))
+    _, fields = engines.get(engine).stage(*args, sizes)
+    theirs = recompiled(engine, [scene.of_solid(*args, i, sizes) for i in range(3)])
     for ours, compiled in zip(*map(jax.tree.leaves, (fields, theirs)), strict=True):
         np.testing.assert_allclose(ours, compiled, rtol=2e-5, atol=2e-6)
 

@@ -1,4 +1,4 @@
-"""What an engine is: how it checks, stages and drives worlds, and what it can do.
+"""What an engine is: how it checks, stages and drives worlds, and its abilities.
 
 An engine's stage is what all worlds of a batch share; its fields are what each world has of its
 own, rows of a pytree. Most engines are traced by JAX: their stage drives a batch inside a compiled
@@ -8,10 +8,9 @@ program. One that is not (`traced = False`) steps worlds on the host, by `steppe
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
-import jax
 import numpy as np
 
 from rps_jax import errors
@@ -21,7 +20,7 @@ from rps_jax.geometry.arrays import Float
 from rps_jax.geometry.solid import Solid
 from rps_jax.robot.robot import Robot
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import Friction, Scene
+from rps_jax.world.scene import Friction
 
 Mode = Literal["forward", "reverse"]  # of differentiation
 
@@ -142,16 +141,7 @@ class Engine(abc.ABC):
             )
 
     @abc.abstractmethod
-    def stage_of_scenes(self, scenes: Sequence[Scene], which: np.ndarray) -> tuple[Any, Any]:
-        """Stage, and fields (n, ...) on the host, of worlds in scenes of one shape family.
-
-        Args:
-          scenes: the different scenes.
-          which: (n,) of them each world has.
-        """
-
-    @abc.abstractmethod
-    def stage_of_solids(
+    def stage(
         self,
         family: str,
         solids: Solid,
@@ -159,9 +149,10 @@ class Engine(abc.ABC):
         physics: Physics,
         robots: Robot = Robot(),
     ) -> tuple[Any, Any]:
-        """Stage, and fields (n, ...) on the host, of solids (n, ...), friction and robots (n,).
+        """Return the stage, and fields (n, ...) on the host, of worlds of one shape family.
 
-        What MuJoCo would derive in compiling each of them is computed here, for all at once.
+        Their solids are (n, ...), their friction and robots (n,). What MuJoCo would derive in
+        compiling each of them is computed here, for all at once.
         """
 
     def slots(self, backend: str) -> int:
@@ -192,8 +183,3 @@ class Engine(abc.ABC):
     ) -> Stepper:
         """Worlds on the host, at rest at positions (n, 10), of an engine that is not traced."""
         raise NotImplementedError(f"{self.name} is traced")
-
-
-def taken(tree: Any, which: Any) -> Any:
-    """Rows `which` of every leaf of a pytree on the host."""
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[which], tree)

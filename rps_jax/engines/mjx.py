@@ -18,7 +18,7 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.control.observation import Twist
-from rps_jax.engines.base import Driven, Engine, Mode, Motion, taken
+from rps_jax.engines.base import Driven, Engine, Mode, Motion
 from rps_jax.engines.mjx_colliders import (
     BASE_PRISM,
     OWN,
@@ -156,24 +156,23 @@ class MJX(Engine):
                 "it must be pyramidal (or the engine fused)."
             )
 
-    def stage_of_scenes(self, scenes: Sequence[Scene], which: np.ndarray) -> tuple[Any, Any]:
-        """Stage and fields of worlds in scenes of one shape family."""
-        models, solids = [s.physics for s in scenes], scene.solids_of(scenes)
-        model, fields = stack(models)
-        if solids.feet is not None:
-            fields[OUTLINE] = jnp.asarray(solids.vertices)
-        return MJXStage(model, mjx.make_data(models[0])), taken(jax.device_get(fields), which)
-
-    def stage_of_solids(
+    def stage(
         self,
         family: str,
         solids: Solid,
         friction: Friction,
         physics: Physics,
         robots: Robot = Robot(),
-    ) -> tuple[Any, Any]:
-        """Stage and fields of solids (n, ...)."""
-        return solids_by_template(self, family, solids, friction, physics, robots)
+    ) -> tuple[MJXStage, dict[str, np.ndarray]]:
+        """Return the stage of the first of the worlds, and fields (n, ...) of all."""
+        robots = scene.each(robots, solids.mass.size)
+        template = scene.of_solid(family, solids, friction, physics, 0, robots)
+        model, fields = stack([template.physics])
+        fields = mjx_fields(family, solids, friction, template, jax.device_get(fields))
+        _size_bases(fields, template.physics, robots)
+        if robots.driven:
+            _weigh_bases(fields, template.physics, robots)
+        return MJXStage(model, mjx.make_data(template.physics)), fields
 
     def slots(self, backend: str) -> int:
         """Worlds that one worker steps at once: few on a processor, whose caches are small."""
@@ -197,25 +196,6 @@ def _sparse(stage: MJXStage) -> MJXStage:
     """The stage with a sparse inertia matrix."""
     model: Any = stage.model.tree_replace({"opt.jacobian": mjx.JacobianType.SPARSE})
     return stage._replace(model=model, data=mjx.make_data(model))
-
-
-def solids_by_template(
-    engine: Engine,
-    family: str,
-    solids: Solid,
-    friction: Friction,
-    physics: Physics,
-    robots: Robot = Robot(),
-) -> tuple[Any, Any]:
-    """Stage of the first of the solids, and fields (n, ...) of all."""
-    robots = scene.each(robots, solids.mass.size)
-    template = scene.of_solid(family, solids, friction, physics, 0, robots)
-    stage, fields = engine.stage_of_scenes([template], np.zeros(1, int))
-    fields = mjx_fields(family, solids, friction, template, fields)
-    _size_bases(fields, template.physics, robots)
-    if robots.driven:
-        _weigh_bases(fields, template.physics, robots)
-    return stage, fields
 
 
 def put(model: mujoco.MjModel) -> mjx.Model:

@@ -17,7 +17,7 @@ from rps_jax.robot import drive as drives
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS, Friction, Scene
+from rps_jax.world.scene import JOINTS, Friction
 
 _STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
@@ -151,23 +151,24 @@ class MuJoCo(Engine):
         """It steps worlds on the host."""
         return True
 
-    def stage_of_scenes(self, scenes: Sequence[Scene], which: np.ndarray) -> tuple[Any, Any]:
-        """The models of worlds in scenes of one shape family."""
-        return [scenes[i].physics for i in which], {}
-
-    def stage_of_solids(
+    def stage(
         self,
         family: str,
         solids: Solid,
         friction: Friction,
         physics: Physics,
         robots: Robot = Robot(),
-    ) -> tuple[Any, Any]:
-        """The models of solids (n, ...)."""
-        every = range(solids.mass.size)
-        robots = scene.each(robots, solids.mass.size)
-        scenes = (scene.of_solid(family, solids, friction, physics, i, robots) for i in every)
-        return [one.physics for one in scenes], {}
+    ) -> tuple[list[mujoco.MjModel], dict[str, np.ndarray]]:
+        """Return the models of the worlds; equal worlds share one."""
+        count, models = solids.mass.size, dict[bytes, mujoco.MjModel]()
+        robots = scene.each(robots, count)
+        leaves = [np.ascontiguousarray(x) for x in jax.tree.leaves((solids, friction, robots))]
+        keys = [b"".join(leaf[i].tobytes() for leaf in leaves) for i in range(count)]
+        for i, key in enumerate(keys):
+            if key not in models:
+                loaded = scene.of_solid(family, solids, friction, physics, i, robots)
+                models[key] = loaded.physics
+        return [models[key] for key in keys], {}
 
     def stepper(
         self, stage: Any, qpos: np.ndarray, threads: int, robots: Robot | None = None

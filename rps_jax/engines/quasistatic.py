@@ -29,7 +29,7 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.control.observation import Twist
-from rps_jax.engines.base import Driven, Engine, Motion, taken
+from rps_jax.engines.base import Driven, Engine, Motion
 from rps_jax.engines.fused.contacts import Point, circle_and_rectangle, polygon_and_rectangle
 from rps_jax.geometry import planar, solid
 from rps_jax.geometry import vectors as sp
@@ -38,7 +38,7 @@ from rps_jax.geometry.vectors import Vec
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS, Friction, Scene
+from rps_jax.world.scene import JOINTS, Friction
 
 _LEAST_SPEED = 1e-5  # [m/s] taken for that of a base at rest
 _SHARP = 3  # last steps of Newton's method, on the problem itself; those before widen its slip
@@ -274,22 +274,15 @@ class QuasistaticEngine(Engine):
     forces = False
     tells_force = False  # only its direction is known, and not the weight that it slides
 
-    def stage_of_scenes(self, scenes: Sequence[Scene], which: np.ndarray) -> tuple[Any, Any]:
-        """Stage and fields of worlds in scenes of one shape family."""
-        solids = scene.solids_of(scenes)
-        friction = np.array([s.physics.pair("base_object").friction[0] for s in scenes])
-        half = np.array([s.physics.geom("base").size[:2] for s in scenes])
-        return Quasistatic(), taken(sliders(solids, friction, half), which)
-
-    def stage_of_solids(
+    def stage(
         self,
         family: str,
         solids: Solid,
         friction: Friction,
         physics: Physics,
         robots: Robot = Robot(),
-    ) -> tuple[Any, Any]:
-        """Stage and fields of solids (n, ...); its bases follow every twist."""
+    ) -> tuple[Quasistatic, Slider]:
+        """Return the stage, and the sliders (n, ...) of the worlds; bases follow every twist."""
         assert not robots.driven, "checked by check_robot"
         half = scene.base_half(robots, solids.mass.size)
         return Quasistatic(), sliders(solids, friction.robot, half)

@@ -5,8 +5,10 @@ its origin in the middle of its height above the centroid of its outline; z is u
 NumPy in double precision and lead with the number of solids, n.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from rps_jax.geometry import vectors
@@ -196,6 +198,17 @@ def standing(solid: Solid) -> Solid:
         return solid
     at, share = _feet(solid)
     return solid._replace(feet=np.concatenate([at, share[..., None]], axis=-1))
+
+
+def stack(solids: Sequence[Solid]) -> Solid:
+    """Return single solids of one shape family as solids (n, ...).
+
+    If one has feet, the feet of a prism without any are its corners.
+    """
+    single = [jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], one) for one in solids]
+    if any(one.feet is not None for one in single):
+        single = [standing(one) for one in single]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *single)
 
 
 def _triangles(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

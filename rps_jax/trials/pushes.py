@@ -16,19 +16,20 @@ from rps_jax.control import registry
 from rps_jax.control.base import Law, LawParams
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.engines import device, programs
+from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.shell import Shell
-from rps_jax.trials import batch, host, trial
+from rps_jax.trials import batch, host, trial, worlds
 from rps_jax.trials.batch import SEGMENT, Job, WorldBatch, rows
 from rps_jax.trials.case import Case
 from rps_jax.trials.progress import Progress, ProgressCallback, Timing, no_progress
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, World
+from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial
 from rps_jax.world import scene
 from rps_jax.world.objects import FAMILIES
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS, Scene
+from rps_jax.world.scene import JOINTS, Friction, Scene
 
 
 @dataclass(frozen=True)
@@ -57,8 +58,8 @@ def scene_of(case: Case, physics: Physics) -> Scene:
 
 
 def _scenes(cases: Sequence[Case], physics: Physics) -> tuple[list[Scene], np.ndarray]:
-    """The different scenes of cases, and which of them each case has, (len(cases),)."""
-    keys = [(c.object_name, c.contact, c.mass, c.rear, c.base) for c in cases]
+    """Return the different scenes of cases, and the index (len(cases),) of each case's scene."""
+    keys = [(c.object_name, c.mass, c.rear, c.base) for c in cases]
     different = dict(zip(keys, cases, strict=True))
     order = {key: i for i, key in enumerate(different)}
     scenes = [scene_of(case, physics) for case in different.values()]
@@ -85,30 +86,35 @@ def build(
     Each world draws its skin's imperfections from (setting.seed, its index); by default the
     indices count from 0.
     """
+    engine = engines.get(setting.engine)
     for case in cases:
-        engines.get(setting.engine).check_robot(case.base)
-        engines.get(setting.engine).check_senses(registry.law_of(case.params).senses)
+        engine.check_robot(case.base)
+        engine.check_senses(registry.law_of(case.params).senses)
     scenes, which = _scenes(cases, setting.physics)
-    stage, fields = engines.get(setting.engine).stage_of_scenes(scenes, which)
+    solids = solid.stack([one.rounded_solid if engine.traced else one.solid for one in scenes])
     starts = [_start_of(case, scenes[i]) for case, i in zip(cases, which, strict=True)]
-    dtype = jnp.result_type(float)
+    qpos, targets = (np.array(column) for column in zip(*starts, strict=True))
     numbers = np.arange(len(cases)) if indices is None else np.asarray(indices)
     root = jax.random.PRNGKey(setting.seed)
-    world = World(
-        fields=jax.tree.map(lambda leaf: np.asarray(leaf, dtype), fields),
-        footprint=_stack([s.footprint for s in scenes], dtype, which),
-        skin=_stack([case.sensor for case in cases], dtype),
-        p_world_target=_stack([target for _, target in starts], dtype),
+    part = worlds.build(
+        numbers,
+        FAMILIES[cases[0].object_name],
+        rows(solids, which),
+        Friction(*np.array([case.contact for case in cases], float).T),
+        _stack([case.base for case in cases]),
+        setting,
+        skin=_stack([case.sensor for case in cases]),
+        p_world_target=targets,
         shift=Shift(
-            _stack([case.shift.time for case in cases], dtype),
-            _stack([np.array(case.shift.p_robot) for case in cases], dtype),
+            np.array([case.shift.time for case in cases], float),
+            np.array([case.shift.p_robot for case in cases], float),
         ),
-        qpos=_stack([qpos for qpos, _ in starts], dtype),
+        qpos=qpos,
         key=jax.device_get(jax.vmap(partial(jax.random.fold_in, root))(numbers)),
-        odometry=_stack([Odometry()] * len(cases), dtype),
-        robot=None if cases[0].base.ideal else _stack([case.base for case in cases], dtype),
+        odometry=_stack([Odometry()] * len(cases)),
     )
-    return WorldBatch(numbers, world, stage, _stack([case.params for case in cases], dtype))
+    params = _stack([case.params for case in cases], jnp.result_type(float))
+    return part._replace(params=params)
 
 
 def kind(case: Case) -> Hashable:
@@ -120,10 +126,9 @@ def kind(case: Case) -> Hashable:
     )
 
 
-def _stack(trees: Sequence[Any], dtype: np.dtype, which: np.ndarray | None = None) -> Any:
-    """Pytrees of floats stacked leaf by leaf, then rows taken in the order `which`."""
-    stacked = jax.tree.map(lambda *leaves: np.array([np.asarray(x) for x in leaves], dtype), *trees)
-    return stacked if which is None else rows(stacked, which)
+def _stack(trees: Sequence[Any], dtype: Any = float) -> Any:
+    """Return pytrees of numbers stacked leaf by leaf."""
+    return jax.tree.map(lambda *leaves: np.array([np.asarray(x) for x in leaves], dtype), *trees)
 
 
 def run(

@@ -9,7 +9,9 @@ import numpy as np
 from rps_jax import engines
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
+from rps_jax.geometry.solid import Solid
 from rps_jax.robot.base import Odometry
+from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import CapacitiveSkin, IdealSkin, Skin
 from rps_jax.trials.batch import WorldBatch
 from rps_jax.trials.setting import Setting
@@ -21,30 +23,56 @@ from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction, Scene
 
 
+def build(
+    numbers: np.ndarray,
+    family: str,
+    solids: Solid,
+    friction: Friction,
+    robots: Robot,
+    setting: Setting,
+    **fields: Any,
+) -> WorldBatch:
+    """Return worlds of one shape family, staged for the engine: on the host, without parameters.
+
+    Args:
+      numbers: (n,) of the trials.
+      family: shape family of all solids.
+      solids: (n, ...).
+      friction: (n,) each.
+      robots: (n,), or one.
+      setting: engine and physics.
+      fields: of `World`, (n, ...) each, beside those that follow from solids and robots.
+
+    Raises:
+      InputError: the engine cannot step such a robot.
+    """
+    engine, dtype = engines.get(setting.engine), jnp.result_type(float)
+    engine.check_robot(robots)
+    stage, staged = engine.stage(family, solids, friction, setting.physics, robots)
+    outline: Any = solids.vertices, solids.radius
+    robot = None if robots.ideal else robots
+    world = World(fields=staged, footprint=Footprint(*outline), robot=robot, **fields)
+    narrow = jax.tree.map(lambda x: x if x.dtype == np.uint32 else x.astype(dtype), world)
+    return WorldBatch(numbers, narrow, stage)
+
+
 def drawn_worlds(domain: Domain, drawn: Draw, setting: Setting) -> WorldBatch:
     """Return the worlds of a draw, on the host, without law parameters."""
-    family = domain.family_of(drawn.case[0])
-    count, dtype = drawn.number.size, jnp.result_type(float)
-    engine, robots = engines.get(setting.engine), drawn.robot
-    engine.check_robot(robots)
-    stage, own = engine.stage_of_solids(
-        family, drawn.solid, drawn.friction, setting.physics, robots
+    count = drawn.number.size
+    return build(
+        drawn.number,
+        domain.family_of(drawn.case[0]),
+        drawn.solid,
+        drawn.friction,
+        drawn.robot,
+        setting,
+        skin=_skin(domain, drawn),
+        p_world_target=drawn.p_world_target,
+        shift=Shift(np.full(count, np.inf), np.zeros((count, 2))),
+        qpos=starts(drawn),
+        key=drawn.key,
+        odometry=_odometry(domain, drawn, setting.physics.control_period),
     )
-    outline: Any = drawn.solid.vertices, drawn.solid.radius
-    never: Any = np.full(count, np.inf), np.zeros((count, 2))
-    world: Any = {
-        "fields": own,
-        "footprint": Footprint(*outline),
-        "skin": _skin(domain, drawn),
-        "p_world_target": drawn.p_world_target,
-        "shift": Shift(*never),
-        "qpos": starts(drawn),
-        "key": drawn.key,
-        "odometry": _odometry(domain, drawn, setting.physics.control_period),
-        "robot": None if robots.ideal else robots,
-    }
-    narrow = jax.tree.map(lambda x: x if x.dtype == np.uint32 else x.astype(dtype), world)
-    return WorldBatch(drawn.number, World(**narrow), stage)
 
 
 def _skin(domain: Domain, drawn: Draw) -> Skin:

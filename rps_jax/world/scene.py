@@ -5,7 +5,6 @@ both step.
 """
 
 import math
-from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -47,8 +46,20 @@ class Scene(NamedTuple):
     family: str
     model: mujoco.MjModel  # everything, for pictures
     physics: mujoco.MjModel  # the three geoms that touch, for stepping
-    footprint: Footprint
+    solid: Solid  # of the object; leaves without a leading axis
     shell: Shell  # of the robot
+
+    @property
+    def footprint(self) -> Footprint:
+        """Outline of the object, in JAX's precision."""
+        return Footprint(
+            jnp.asarray(self.solid.vertices, float), jnp.asarray(self.solid.radius, float)
+        )
+
+    @property
+    def rounded_solid(self) -> Solid:
+        """The solid with its outline in JAX's precision, that of the footprint."""
+        return self.solid._replace(vertices=np.asarray(self.footprint.vertices, float))
 
 
 class Joints(NamedTuple):
@@ -90,9 +101,23 @@ def load(
         for geom in geoms:
             geom.mass *= mass / total
     model, stripped = _compile(spec, physics, friction, robot)
-    outline = objects.outline_of(stripped.geom("object"))
-    assert outline is not None
-    return Scene(name, FAMILIES[name], model, stripped, outline, robot.shell)
+    one = _solid_of_model(model, FAMILIES[name])
+    return Scene(name, FAMILIES[name], model, stripped, one, robot.shell)
+
+
+def _solid_of_model(model: mujoco.MjModel, family: str) -> Solid:
+    """Return the solid of a compiled box or cylinder that stands on its corners or rim."""
+    body, size = model.body("object"), model.geom("object").size
+    box = family == "box"
+    return Solid(
+        vertices=solid.rectangles(size[:1], size[1:2])[0] if box else np.zeros((1, 2)),
+        radius=np.asarray(0.0 if box else size[0]),
+        height=2 * body.pos[2],
+        mass=body.mass[0],
+        p_object_com=body.ipos.copy(),
+        inertia=body.inertia.copy(),
+        q_object_body=body.iquat.copy(),
+    )
 
 
 def _load_registered(
@@ -141,9 +166,8 @@ def shaped(
     body.explicitinertial = True
     body.mass, body.ipos = one.mass, one.p_object_com
     body.iquat, body.inertia = one.q_object_body, one.inertia
-    outline = Footprint(jnp.asarray(one.vertices, float), jnp.asarray(one.radius, float))
     models = _compile(spec, physics, friction, robot)
-    return Scene(family, family, *models, outline, robot.shell)
+    return Scene(family, family, *models, one, robot.shell)
 
 
 def of_solid(
@@ -318,33 +342,10 @@ def _strip(spec: mujoco.MjSpec, full: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def solid_of(scene: Scene) -> Solid:
-    """The object of a scene as solids, one of them."""
-    thing, geom = scene.physics.body("object"), scene.physics.geom("object")
-    one = Solid(
-        vertices=np.asarray(scene.footprint.vertices, float)[None],
-        radius=geom.size[:1] * (scene.family == "cylinder"),
-        height=2 * thing.pos[2:],
-        mass=thing.mass.copy(),
-        p_object_com=thing.ipos[None] - OFF_CENTRE,
-        inertia=thing.inertia[None].copy(),
-        q_object_body=thing.iquat[None].copy(),
-    )
-    if "foot_0" not in [scene.physics.geom(i).name for i in range(scene.physics.ngeom)]:
-        return one
-    at = np.array([scene.physics.geom(f"foot_{i}").pos for i in range(solid.SIDES)])
-    stands = scene.family == "prism" and np.allclose(at, feet(one), atol=1e-6)
-    if stands:  # on its corners; outlines are in single precision
-        return one
-    own = np.column_stack([at[:, :2], at[:, 2] < 0])
-    return one._replace(feet=own[None])
-
-
-def solids_of(scenes: Sequence[Scene]) -> Solid:
-    """Objects of scenes of one shape family; if one has feet of its own, all say theirs."""
-    every = [solid_of(one) for one in scenes]
-    if any(one.feet is not None for one in every):
-        every = [solid.standing(one) for one in every]
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *every)
+    """Return the object of a scene as solids (1, ...), rounded as in published random worlds."""
+    one = scene.rounded_solid
+    one = one._replace(p_object_com=(one.p_object_com + OFF_CENTRE) - OFF_CENTRE)
+    return jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], one)
 
 
 def initial_qpos(scene: Scene, gap: float = 0.02, yaw: float = 0.0) -> np.ndarray:

@@ -80,7 +80,7 @@ class Rest(Study[xr.Dataset]):
             own = index[ranges.object_of(index) == thing]
             drawn = draws.draw(ranges, self.seed, own)
             family[own] = ranges.families[thing]
-            stage, _ = c.stage_of_solids(
+            stage, _ = c.stage(
                 ranges.families[thing], drawn.solid, drawn.friction, physics, Robot()
             )
             qpos = starts(drawn)

@@ -188,7 +188,7 @@ def worlds(
         q_object_body=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
     )
     friction = Friction(np.full(count, GROUND), np.maximum(grid.friction, _LEAST_FRICTION))
-    stage, fields = engines.get(engine).stage_of_solids(slider, things, friction, physics, _ROBOT)
+    stage, fields = engines.get(engine).stage(slider, things, friction, physics, _ROBOT)
 
     def same(tree: Any) -> Any:
         return jax.tree.map(lambda x: np.repeat(np.asarray(x, float)[None], count, axis=0), tree)

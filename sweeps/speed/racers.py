@@ -142,14 +142,16 @@ def jax_engine(task: Task, name: str) -> Racer:
     from rps_jax import engines
     from rps_jax.control.observation import Twist
     from rps_jax.engines.base import Motion
+    from rps_jax.geometry import solid
     from rps_jax.world import scene
     from rps_jax.world.physics import preset
 
     physics = preset()
     worlds, periods = len(task.qpos), round(task.seconds / physics.control_period)
-    stage, fields = engines.get(name).stage_of_scenes(
-        [scene.load("box", physics)], np.zeros(worlds, int)
-    )
+    box = solid.stack([scene.load("box", physics).solid])
+    boxes = jax.tree.map(lambda leaf: np.repeat(leaf, worlds, axis=0), box)
+    friction = scene.Friction(*(np.full(worlds, x) for x in scene.FRICTION["S1"]))
+    stage, fields = engines.get(name).stage("box", boxes, friction, physics)
     fields, qpos = jax.device_put((fields, task.qpos.astype(np.float32)))
     twists = Twist(*(jnp.full(worlds, v, jnp.float32) for v in (SPEED, 0.0, 0.0)))
 

@@ -6,15 +6,13 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from rps_jax.control.observation import Twist
 from rps_jax.engines import device
-from rps_jax.engines.base import Driven, Engine, Motion, taken
+from rps_jax.engines.base import Driven, Engine, Motion
 from rps_jax.engines.fused import step
 from rps_jax.engines.fused.contacts import Body
 from rps_jax.geometry import solid
@@ -22,7 +20,7 @@ from rps_jax.geometry.solid import Solid
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import OFF_CENTRE, Friction, Scene
+from rps_jax.world.scene import OFF_CENTRE, Friction
 
 _FEW = 500  # trials
 
@@ -52,21 +50,15 @@ class Fused(Engine):
     side_by_side = True
     modes = ("forward",)
 
-    def stage_of_scenes(self, scenes: Sequence[Scene], which: np.ndarray) -> tuple[Any, Any]:
-        """Stage and fields of worlds in scenes of one shape family."""
-        bodies = [step.body(s.physics, np.asarray(s.footprint.vertices)) for s in scenes]
-        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *bodies)
-        return FusedStage(), taken(_on_feet(stacked, scene.solids_of(scenes)), which)
-
-    def stage_of_solids(
+    def stage(
         self,
         family: str,
         solids: Solid,
         friction: Friction,
         physics: Physics,
         robots: Robot = Robot(),
-    ) -> tuple[Any, Any]:
-        """Stage and fields of solids (n, ...)."""
+    ) -> tuple[FusedStage, Body]:
+        """Return the stage, and the bodies (n, ...) of the worlds."""
         bodies = bodies_of(solids, friction, _template(physics))
         bodies = bodies._replace(base_half=scene.base_half(robots, solids.mass.size))
         if robots.driven:
@@ -90,7 +82,7 @@ class Fused(Engine):
 def _template(physics: Physics) -> Body:
     """A body of which only the base matters."""
     known = scene.load("box", physics)
-    return step.body(known.physics, np.asarray(known.footprint.vertices))
+    return step.body(known.physics, known.solid.vertices)
 
 
 def _on_feet(bodies: Body, solids: Solid) -> Body:
