@@ -13,6 +13,7 @@ import pytest
 
 from rps_jax.control.observation import Twist
 from rps_jax.engines import mjx_colliders
+from rps_jax.engines.base import ControlPeriod
 from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.engines.quasistatic import Quasistatic
 from rps_jax.errors import InputError
@@ -147,7 +148,7 @@ def test_without_physics_the_base_goes_and_the_object_stays():
     )
     start = trial.motion(trial.start_all(worlds, params, np.ones(1, bool)))
     twists = Twist(*(np.full(1, x) for x in (0.05, 0.0, 0.0)))
-    driven = levers.Unmoved().drive(worlds.fields, start, twists, preset())
+    driven = levers.Unmoved().drive(worlds.fields, start, ControlPeriod(twists, preset()))
     moved = np.asarray(driven.motion.qpos - start.qpos)[0]
     np.testing.assert_allclose(moved, [0.05 * 0.02, *[0] * 9], atol=1e-9)
 

@@ -207,9 +207,9 @@ def test_a_batch_is_driven_as_one_and_not_world_by_world():
     sizes = []
 
     class Stage:
-        def drive(self, fields, motion, twists, physics, robot=None):
+        def drive(self, fields, motion, period):
             sizes.append(jnp.shape(fields)[0])
-            return fields + 0 * twists, motion, twists
+            return fields + 0 * period.twists, motion, period.twists
 
     drive = env.one_of_many(Stage(), Setting(engine="mjx"))  # type: ignore[arg-type]
     batch = jnp.arange(5.0)

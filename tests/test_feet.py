@@ -9,7 +9,7 @@ from staging import staged
 
 from rps_jax import engines
 from rps_jax.control.observation import Twist
-from rps_jax.engines.base import Motion
+from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.errors import InputError
 from rps_jax.geometry import solid
 from rps_jax.geometry.solid import SIDES
@@ -81,7 +81,10 @@ def driven(engine, names, steps):
     @jax.jit
     def run(motion):
         return jax.lax.fori_loop(
-            0, steps, lambda _, now: stage.drive(fields, now, twist, FINE).motion, motion
+            0,
+            steps,
+            lambda _, now: stage.drive(fields, now, ControlPeriod(twist, FINE)).motion,
+            motion,
         )
 
     fields = jax.tree.map(lambda x: jnp.asarray(x, float), fields)
@@ -187,7 +190,10 @@ def stepped(engine, family, drawn, steps):
     @jax.jit
     def run(motion):
         return jax.lax.fori_loop(
-            0, steps, lambda _, now: stage.drive(fields, now, twist, FINE).motion, motion
+            0,
+            steps,
+            lambda _, now: stage.drive(fields, now, ControlPeriod(twist, FINE)).motion,
+            motion,
         )
 
     return np.asarray(run(Motion(jnp.asarray(qpos, float), still, still)).qpos, float)

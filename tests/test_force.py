@@ -13,7 +13,7 @@ from rps_jax import engines
 from rps_jax.control import registry
 from rps_jax.control.laws.force_push_published import PublishedForcePushParams
 from rps_jax.control.observation import Twist
-from rps_jax.engines.base import Motion
+from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.robot.base import LoadCell, unloaded
@@ -56,7 +56,7 @@ def pushed(engine, twist=AHEAD, seconds=2.0, friction=S1, robot=Robot(), yaw=0.0
     @jax.jit
     def run(now):
         def body(now, _):
-            driven = stage.drive(fields, now, twists, STANDARD, robots, True)
+            driven = stage.drive(fields, now, ControlPeriod(twists, STANDARD, robots, True))
             now = driven.motion
             return now, (driven.force[0], now.qpos[0], now.qvel[0])
 
@@ -116,9 +116,8 @@ def test_who_does_not_ask_is_told_no_force():
     twists = Twist(*(jnp.zeros(1),) * 3)
 
     def program(force):
-        return jax.make_jaxpr(lambda m: stage.drive(fields, m, twists, STANDARD, None, force))(
-            motion
-        )
+        period = ControlPeriod(twists, STANDARD, force=force)
+        return jax.make_jaxpr(lambda m: stage.drive(fields, m, period))(motion)
 
     assert len(program(False).out_avals) == 3
     assert len(program(True).out_avals) == 4

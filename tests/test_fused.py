@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from rps_jax.engines.base import Motion
+from rps_jax.control.observation import Twist
+from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.engines.fused import contacts, newton
 from rps_jax.engines.fused import step as fused
 from rps_jax.geometry import vectors
@@ -61,8 +62,9 @@ def program(family, physics):
 
     @jax.jit
     def run(body, state, steps):
-        twist = tuple(jnp.full(state[0].shape[0], x) for x in TWIST)
-        push = lambda _, now: fused.drive(body, now, twist, physics).motion  # noqa: E731
+        twist = Twist(*(jnp.full(state[0].shape[0], x) for x in TWIST))
+        period = ControlPeriod(twist, physics)
+        push = lambda _, now: fused.drive(body, now, period).motion  # noqa: E731
         return jax.lax.fori_loop(0, steps, push, Motion(*state))
 
     return run

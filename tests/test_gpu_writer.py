@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from test_native import OPERATIONS, advanced, close, in_a_push, same
 
+from rps_jax.engines.base import ControlPeriod
 from rps_jax.errors import InputError
 from rps_jax.geometry import vectors
 from rps_jax.lowering import gpu_writer
@@ -112,7 +113,7 @@ def test_a_control_period_is_the_processors(tmp_path):
     twists = trial.Twist(*(np.full(21, x, np.float32) for x in (0.05, 0.01, 0.05)))
 
     def one(fields, motion, twist, robot):
-        return stage.drive(fields, motion, twist, loop.physics, robot, True)
+        return stage.drive(fields, motion, ControlPeriod(twist, loop.physics, robot, True))
 
     given = worlds.fields, pushing, twists, trial.pushing(worlds)
     run = Emulated(one, jax.tree.map(lambda x: jnp.asarray(x)[0], given), tmp_path, 4)

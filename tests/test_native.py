@@ -9,6 +9,7 @@ import pytest
 
 from rps_jax.control import registry
 from rps_jax.engines import native
+from rps_jax.engines.base import ControlPeriod
 from rps_jax.lowering import nodes
 from rps_jax.trials import trial
 from rps_jax.trials.setting import Setting
@@ -107,7 +108,8 @@ def test_a_drive_is_compiled_and_its_derivative_is_xlas(monkeypatch):
 
     def moved(speed):
         twist = trial.Twist(speed, still, still)
-        return stage.drive(inputs[0].fields, start, twist, loop.physics).motion.qpos[:, 0]
+        period = ControlPeriod(twist, loop.physics)
+        return stage.drive(inputs[0].fields, start, period).motion.qpos[:, 0]
 
     def slope():
         return jax.jit(lambda x: jax.jvp(moved, (x,), (jnp.ones(3),)))(still + 0.05)

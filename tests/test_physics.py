@@ -20,7 +20,7 @@ from staging import staged
 
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.observation import Twist
-from rps_jax.engines.base import Motion
+from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.engines.mjx_colliders import collision, mjx
 from rps_jax.engines.mujoco import Batch
 from rps_jax.geometry import planar
@@ -117,7 +117,8 @@ def in_jax(worlds, physics=STANDARD, engine="mjx", seconds=SECONDS):
         state = Motion(*state)
 
         def body(state, _):
-            return stage.drive(fields, state, Twist(*twist.T), physics).motion, state[:2]
+            period = ControlPeriod(Twist(*twist.T), physics)
+            return stage.drive(fields, state, period).motion, state[:2]
 
         return jax.lax.scan(body, state, length=round(seconds / physics.control_period) + 1)[1]
 

@@ -20,7 +20,7 @@ from staging import staged
 from rps_jax.control import registry
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.observation import Twist
-from rps_jax.engines.base import Motion
+from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.engines.quasistatic import Contact, Problem, Quasistatic, Slider, solved
 from rps_jax.errors import InputError
 from rps_jax.geometry import footprint as fp
@@ -82,7 +82,8 @@ def drive(stage, fields, start, twists, physics):
 
     def step(qpos, twist):
         still = jnp.zeros_like(qpos[:, :9])
-        driven = stage.drive(fields, Motion(qpos, still, still), Twist(*twist.T), physics)
+        period = ControlPeriod(Twist(*twist.T), physics)
+        driven = stage.drive(fields, Motion(qpos, still, still), period)
         return driven.motion.qpos, driven.motion.qpos
 
     return jnp.concatenate([start[None], jax.lax.scan(step, start, twists)[1]])

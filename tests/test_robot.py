@@ -13,7 +13,7 @@ from staging import recompiled, staged
 import rps_jax
 from rps_jax import engines
 from rps_jax.control.observation import Twist
-from rps_jax.engines.base import Motion
+from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.robot import drive
@@ -123,7 +123,7 @@ def pushed(engine, one, seconds=4.0, twist=AHEAD, name="box"):
     @jax.jit
     def run(now):
         def body(now, _):
-            return stage.drive(fields, now, twists, STANDARD, robots).motion, None
+            return stage.drive(fields, now, ControlPeriod(twists, STANDARD, robots)).motion, None
 
         return jax.lax.scan(body, now, length=steps)[0]
 

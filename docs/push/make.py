@@ -24,6 +24,7 @@ from rps_jax.control import registry, validation
 from rps_jax.control.learned import features
 from rps_jax.control.observation import TaxelObservation, Twist
 from rps_jax.engines import quasistatic
+from rps_jax.engines.base import ControlPeriod
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import NONE
 from rps_jax.runs.push import push
@@ -140,8 +141,9 @@ def of_family(family: str) -> list[Routine]:
         # Noise is drawn by no one here, and its key is no number of JavaScript.
         unseen = blank | {"skin": start.skin._replace(key=jnp.zeros(2))}
         before, told = before._replace(**unseen), told._replace(**unseen)
-        batch = jax.tree.map(lambda x: jnp.asarray(x)[None], (fields, trial.motion(told), twist))
-        driven = jax.tree.map(lambda x: x[0], stage.drive(*batch, physics))
+        given = fields, trial.motion(told), ControlPeriod(twist, physics)
+        batch = jax.tree.map(lambda x: jnp.asarray(x)[None], given)
+        driven = jax.tree.map(lambda x: x[0], stage.drive(*batch))
         return (trial.settle(before, told, driven)._replace(**BY_HAND),)
 
     shape = _shapes(start._replace(**BY_HAND))

@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
+import jax
 import numpy as np
 
 from rps_jax import errors
@@ -36,6 +39,21 @@ class Motion(NamedTuple):
     integral: Any = None  # (B, 3) [N, N, N m] of the drive of a base whose force is limited
 
 
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["twists", "robot"],
+    meta_fields=["physics", "force"],
+)
+@dataclass(frozen=True)
+class ControlPeriod:
+    """Input of a stage for one control period; a pytree of twists and robots, the rest static."""
+
+    twists: Twist  # (B,) [m/s, m/s, rad/s] of the bases, in their own frames
+    physics: Physics
+    robot: Robot | None = None  # (B,) whose force is limited; None: bases follow every twist
+    force: bool = False  # whether `Driven.force` is computed
+
+
 class Driven(NamedTuple):
     """A batch after one control period."""
 
@@ -49,20 +67,11 @@ class Driven(NamedTuple):
 class Stage(Protocol):
     """What all worlds of a batch share, and how they are stepped together."""
 
-    def drive(
-        self,
-        fields: Any,
-        motion: Motion,
-        twists: Twist,
-        physics: Physics,
-        robot: Robot | None = None,
-        force: bool = False,
-    ) -> Driven:
+    def drive(self, fields: Any, motion: Motion, period: ControlPeriod) -> Driven:
         """Step a batch of worlds with these fields (B, ...) for one control period.
 
-        The base is a velocity source at `twists` (B,) [m/s, m/s, rad/s], in its own frame; with a
-        `robot` (B,) it is a body that its drive pushes towards these, as `robot.drive.push` says.
-        With `force`, which is static, it also tells `Driven.force`.
+        A base is a velocity source at its twist. If its force is limited, it is a body that its
+        drive pushes towards the twist: see `robot.drive.push`.
         """
         ...
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.control.observation import Twist
-from rps_jax.engines.base import Driven, Engine, Mode, Motion
+from rps_jax.engines.base import ControlPeriod, Driven, Engine, Mode, Motion
 from rps_jax.engines.mjx_colliders import (
     BASE_PRISM,
     OWN,
@@ -66,26 +66,19 @@ class MJXStage(NamedTuple):
     data: mjx.Data  # a blank to be filled with each world's state
     colliders: Colliders = Colliders()
 
-    def drive(
-        self,
-        fields: dict[str, jax.Array],
-        motion: Motion,
-        twists: Twist,
-        physics: Physics,
-        robot: Robot | None = None,
-        force: bool = False,
-    ) -> Driven:
+    def drive(self, fields: dict[str, jax.Array], motion: Motion, period: ControlPeriod) -> Driven:
         """Step a batch for one control period.
 
         Before each step the commanded twist is written into the base's joint velocities, turned
         into the world; or the force of its drive is applied to its joints.
         """
+        physics = period.physics
         step = jax.vmap(partial(self._step, timestep=physics.timestep))
 
         def one(state: Motion, _: None) -> tuple[Motion, jax.Array | None]:
             # Batched inside of the loop: a loop that is batched is traced anew.
-            after, felt = step(fields, state, twists, robot)
-            return after, felt if force else None
+            after, felt = step(fields, state, period.twists, period.robot)
+            return after, felt if period.force else None
 
         after, felt = jax.lax.scan(one, motion, length=physics.substeps)
         return Driven(after, force=None if felt is None else felt.mean(axis=0))

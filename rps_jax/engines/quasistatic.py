@@ -28,8 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.control.observation import Twist
-from rps_jax.engines.base import Driven, Engine, Motion
+from rps_jax.engines.base import ControlPeriod, Driven, Engine, Motion
 from rps_jax.engines.fused.contacts import Point, circle_and_rectangle, polygon_and_rectangle
 from rps_jax.geometry import planar, solid
 from rps_jax.geometry import vectors as sp
@@ -105,20 +104,12 @@ class Quasistatic:
         errors.check_finite("slip", self.slip, above=0, at_most=1)
         errors.check_finite("iterations", self.iterations, at_least=_SHARP + 1)
 
-    def drive(
-        self,
-        fields: Slider,
-        motion: Motion,
-        twists: Twist,
-        physics: Physics,
-        robot: Robot | None = None,
-        force: bool = False,
-    ) -> Driven:
+    def drive(self, fields: Slider, motion: Motion, period: ControlPeriod) -> Driven:
         """Step a batch for one control period; height and tilt of the object stay.
 
         The velocities that come back are means over the period.
         """
-        com, qpos, period = fields.p_object_com, motion.qpos, physics.control_period
+        com, qpos, physics = fields.p_object_com, motion.qpos, period.physics
         free = qpos[:, JOINTS.object]
         yaw = planar.yaw_of_quaternion(free[:, 3:])
         p = free[:, :2] + planar.rotate(yaw, com)
@@ -126,7 +117,7 @@ class Quasistatic:
         corners = jnp.moveaxis(fields.vertices - com[:, None], (0, 1), (2, 1))
         sliders = fields._replace(base_half=tuple(fields.base_half.T), vertices=tuple(corners))
         before = (tuple(qpos[:, JOINTS.base].T), (*p.T, yaw))
-        twist = (twists.v_x, twists.v_y, twists.omega)
+        twist = tuple(period.twists)
         step = partial(self._step, sliders, twist, physics.timestep)
         base, (x, y, angle) = jax.lax.fori_loop(0, physics.substeps, lambda _, s: step(s), before)
         half = 0.5 * (angle - yaw)
@@ -135,8 +126,9 @@ class Quasistatic:
         after = jnp.concatenate(
             [jnp.stack(base, axis=-1), origin, free[:, 2:3], jnp.stack(q, axis=-1)], axis=-1
         )
-        moved = (after - qpos)[:, :6] / period
-        spin = jnp.zeros_like(moved[:, :3]).at[:, 2].set((angle - yaw) / period)
+        seconds = physics.control_period
+        moved = (after - qpos)[:, :6] / seconds
+        spin = jnp.zeros_like(moved[:, :3]).at[:, 2].set((angle - yaw) / seconds)
         velocity = jnp.concatenate([moved, spin], axis=-1)
         return Driven(Motion(after, velocity, motion.warmstart))
 

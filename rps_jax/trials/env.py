@@ -28,7 +28,7 @@ from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.learned import features
 from rps_jax.control.observation import TaxelObservation, Twist
-from rps_jax.engines.base import Driven, Motion, Stage
+from rps_jax.engines.base import ControlPeriod, Driven, Motion, Stage
 from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
@@ -321,7 +321,7 @@ def one_of_many(stage: Stage, setting: Setting) -> Callable[..., Driven]:
     """Drives one world; under vmap the stage drives the whole batch, on a GPU as one kernel."""
 
     def together(fields: Any, motion: Motion, twist: Twist, robot: Robot | None = None) -> Driven:
-        return stage.drive(fields, motion, twist, setting.physics, robot)
+        return stage.drive(fields, motion, ControlPeriod(twist, setting.physics, robot))
 
     @jax.custom_batching.custom_vmap
     def drive(*one: Any) -> Driven:

@@ -29,7 +29,7 @@ from rps_jax.control.observation import (
     displacement,
 )
 from rps_jax.engines import native
-from rps_jax.engines.base import Driven, Motion, Stage
+from rps_jax.engines.base import ControlPeriod, Driven, Motion, Stage
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Bool, Float, Int, Scalar
@@ -362,8 +362,9 @@ def control_step(
     Of one world alone, where a stage drives that, `mapped` gives back what it is given.
     """
     told, twists, snapshots = mapped(decide, (0, 0, 0, None))(worlds, params, trials, loop)
-    asked = loop.law.senses == "force"
-    driven = stage.drive(worlds.fields, motion(told), twists, loop.physics, pushing(worlds), asked)
+    force = loop.law.senses == "force"
+    period = ControlPeriod(twists, loop.physics, pushing(worlds), force)
+    driven = stage.drive(worlds.fields, motion(told), period)
     return mapped(settle)(trials, told, driven), snapshots
 
 

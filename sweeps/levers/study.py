@@ -23,12 +23,10 @@ import xarray as xr
 from rps_jax import engines, errors
 from rps_jax.analysis.figures.style import Figure
 from rps_jax.analysis.report import Picture, Section
-from rps_jax.control.observation import Twist
-from rps_jax.engines.base import Driven, Motion
+from rps_jax.engines.base import ControlPeriod, Driven, Motion
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import Progress
-from rps_jax.world.physics import Physics
 from sweeps import programs
 from sweeps.programs import Program
 from sweeps.study_base import Study
@@ -47,18 +45,10 @@ class Lever(NamedTuple):
 class Unmoved(NamedTuple):
     """An engine without physics: the base goes, the object stays. What is left is the law's."""
 
-    def drive(
-        self,
-        fields: Any,
-        motion: Motion,
-        twists: Twist,
-        physics: Physics,
-        robot: Any = None,
-        force: bool = False,
-    ) -> Driven:
+    def drive(self, fields: Any, motion: Motion, period: ControlPeriod) -> Driven:
         """Step a batch for one control period."""
         turn = jax.vmap(lambda twist, yaw: twist.in_world(yaw))
-        ahead = physics.control_period * turn(twists, motion.qpos[:, 2])
+        ahead = period.physics.control_period * turn(period.twists, motion.qpos[:, 2])
         return Driven(motion._replace(qpos=motion.qpos.at[:, :3].add(ahead)))
 
 

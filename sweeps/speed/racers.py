@@ -141,7 +141,7 @@ def jax_engine(task: Task, name: str) -> Racer:
 
     from rps_jax import engines
     from rps_jax.control.observation import Twist
-    from rps_jax.engines.base import Motion
+    from rps_jax.engines.base import ControlPeriod, Motion
     from rps_jax.geometry import solid
     from rps_jax.world import scene
     from rps_jax.world.physics import preset
@@ -160,7 +160,7 @@ def jax_engine(task: Task, name: str) -> Racer:
         still = jnp.zeros((worlds, 9), qpos.dtype)
 
         def one(_: int, motion: Motion) -> Motion:
-            return stage.drive(fields, motion, twists, physics).motion
+            return stage.drive(fields, motion, ControlPeriod(twists, physics)).motion
 
         return jax.lax.fori_loop(0, periods, one, Motion(qpos, still, still)).qpos
 

@@ -10,9 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rps_jax.control.observation import Twist
 from rps_jax.engines import device
-from rps_jax.engines.base import Driven, Engine, Motion
+from rps_jax.engines.base import ControlPeriod, Driven, Engine, Motion
 from rps_jax.engines.fused import step
 from rps_jax.engines.fused.contacts import Body
 from rps_jax.geometry import solid
@@ -30,17 +29,9 @@ class FusedStage(NamedTuple):
 
     native = True
 
-    def drive(
-        self,
-        fields: Body,
-        motion: Motion,
-        twists: Twist,
-        physics: Physics,
-        robot: Robot | None = None,
-        force: bool = False,
-    ) -> Driven:
+    def drive(self, fields: Body, motion: Motion, period: ControlPeriod) -> Driven:
         """Step a batch for one control period."""
-        return step.drive(fields, motion, twists, physics, robot, force)
+        return step.drive(fields, motion, period)
 
 
 class Fused(Engine):

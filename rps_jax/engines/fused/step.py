@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 
 from rps_jax.engines import native
-from rps_jax.engines.base import Driven, Motion
+from rps_jax.engines.base import ControlPeriod, Driven, Motion
 from rps_jax.engines.fused.contacts import Body, Corners, Pushed, State, on_base, on_ground
 from rps_jax.engines.fused.newton import Base, accelerations, felt_by_base
 from rps_jax.geometry import vectors as sp
@@ -155,22 +155,15 @@ def step(
     return State(base, p, q, v, w, a, alpha, pushed, felt)  # type: ignore[arg-type]
 
 
-def drive(
-    body: Body,
-    motion: Motion,
-    twist: Vec,
-    physics: Physics,
-    robot: Robot | None = None,
-    force: bool = False,
-) -> Driven:
-    """One control period of a batch of worlds (B,) at `twist` (B,), with robots (B,) if limited.
+def drive(body: Body, motion: Motion, period: ControlPeriod) -> Driven:
+    """Step a batch of worlds (B,) for one control period.
 
     It is a function of C, or a kernel on an NVIDIA GPU, where they can be compiled; elsewhere, and
     where it is differentiated, XLA compiles it.
     """
-    driven = partial(_driven, physics=physics, force=force)
+    driven = partial(_driven, physics=period.physics, force=period.force)
     run = native.batched(driven, driven) if motion.qpos.ndim == 2 else driven
-    return run(body, motion, twist, robot)
+    return run(body, motion, period.twists, period.robot)
 
 
 def _driven(
