@@ -396,10 +396,10 @@ def test_gains_and_losses_by_hand():
         },
         {"law": ["mine"], "known": ["a", "b"], "object": ["random_box", "random_prism"]},
     )
-    assert regress.table(found)[-1] == ["mine", "2 of 4", "+1 -1", "+2 -1", "1"]
+    assert regress.success_table(found)[-1] == ["mine", "2 of 4", "+1 -1", "+2 -1", "1"]
     assert regress.changes(found, "mine", "a")[1:] == [
-        ["1", "random box", "wins", "fails, 25 cm off"],
-        ["2", "random prism", "fails, 10 cm off", "wins"],
+        ["1", "random box", "succeeds", "fails, 25 cm off"],
+        ["2", "random prism", "fails, 10 cm off", "succeeds"],
     ]
 
 

@@ -1,11 +1,13 @@
-"""The paper's hardware experiments (Sec. III-C), simulated: two objects, eight targets, and the
-shove of its video. Friction was never measured, so a plausible range is run.
+"""The paper's hardware experiments (Sec. III-C) in simulation: two objects and eight targets.
+
+The object is also shoved, as in the paper's video. The paper does not give the friction, so a
+plausible range is run.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import xarray as xr
@@ -32,11 +34,11 @@ from rps_jax.world.paper import (
 )
 from rps_jax.world.scene import Friction
 
-MIDDLE = Friction(0.35, 0.5)  # of which the paths are drawn, and at which the object is shoved
+MIDDLE = Friction(0.35, 0.5)  # friction of the paths and of the shove
 
 
 def frictions() -> dict[str, Friction]:
-    """The range of friction, labelled ground,robot."""
+    """Return the range of friction, labelled ground,robot."""
     return {f"{g:g},{r:g}": Friction(g, r) for g in HARDWARE_GROUND for r in HARDWARE_ROBOT}
 
 
@@ -44,20 +46,20 @@ def frictions() -> dict[str, Friction]:
 class Hardware(LawQuestion[xr.Dataset]):
     """Run the paper's hardware experiments in simulation, over a range of friction.
 
-    The answer holds outcomes (law, object, friction, target); of the shove, `recovered` and
-    `counted` (object, shift, side, target); and Fig. 7, `base_path` and `contact_path` (object,
-    target, time, axis) [m] at the middle of the friction range, NaN after the end.
+    The result has the outcomes (law, object, friction, target). Of the shove it has `recovered` and
+    `counted` (object, shift, side, target). For Fig. 7 it has `base_path` and `contact_path`
+    (object, target, path_time, axis) [m] at the middle of the friction range, NaN after the end.
 
     Example:
       >>> import rps_jax
       >>> brief = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
-      >>> found = rps_jax.hardware(shifts=(0.1,), setting=brief)
-      >>> dict(found.recovered.sizes)
+      >>> results = rps_jax.hardware(shifts=(0.1,), setting=brief)
+      >>> dict(results.recovered.sizes)
       {'object': 2, 'shift': 1, 'side': 2, 'target': 8}
     """
 
-    TITLE: ClassVar[str] = "The hardware experiments"
-    QUICK: ClassVar[Mapping[str, Any]] = {"shifts": (0.1, 0.2, 0.3)}
+    TITLE: ClassVar[str] = "Hardware experiments"
+    QUICK: ClassVar[Mapping[str, object]] = {"shifts": (0.1, 0.2, 0.3)}
 
     law: LawLike = "rps"
     skin: SkinLike = "hardware"
@@ -67,44 +69,47 @@ class Hardware(LawQuestion[xr.Dataset]):
     """The robot: ideal (it follows every twist at once, with any force), kairos (the paper's),
     ridgeback or mpo_500, or a JSON file of its size, boards and limits."""
     layout: Literal["circle", "grid"] = "circle"
-    """The eight targets: circle puts each 2.1 m from the start, grid 2.1 m apart in x and y."""
+    """Layout of the eight targets: circle (each 2.1 m from the start) or grid (2.1 m apart in x and
+    y)."""
     shifts: tuple[float, ...] = option((0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4), 0, 2, unit="m")
-    """Lengths by which the object is moved aside, to either side of the robot [m]."""
+    """Lengths of the shove, to either side of the robot [m]."""
     shift_time: float = option(30.0, 0, 300, unit="s")
-    """Time after the start at which it is moved [s]."""
+    """Time of the shove after the start [s]."""
 
     @cached_property
     def base(self) -> Case:
-        """What all trials have in common."""
+        """Case from which all trials differ in object, friction, target or shove."""
         target = HARDWARE_LAYOUTS[self.layout][0]
-        given = {"skin": self.skin, "robot": self.robot}
-        return Case(HARDWARE_OBJECTS[0], MIDDLE, target, self.params, **given)
+        return Case(
+            HARDWARE_OBJECTS[0], MIDDLE, target, self.params, skin=self.skin, robot=self.robot
+        )
 
     @property
     def targets(self) -> tuple[tuple[float, float], ...]:
-        """The eight targets [m]."""
+        """Eight targets [m]."""
         return HARDWARE_LAYOUTS[self.layout]
 
     def check(self) -> None:
         self.setting.check_here(self.base.base, [self.params])
 
     def num_trials(self) -> int | None:
-        each = len(HARDWARE_OBJECTS) * len(self.targets)
-        return each * (len(frictions()) + 2 * len(self.shifts) + 1)
+        trials = len(HARDWARE_OBJECTS) * len(self.targets)
+        return trials * (len(frictions()) + 2 * len(self.shifts) + 1)
 
     def answer(self, run: Run) -> xr.Dataset:
-        heard, found = SequentialProgress(run.callback), []
-        run = run._replace(callback=heard)
-        parts = {"hardware": self._pushed, "shifted": self._shifted, "paths": self._paths}
-        for name, make in parts.items():
-            found.append(run.checkpoint(name, partial(make, run)))
-            heard.finish(found[-1].attrs.pop("trials"))
-        whole = xr.merge(found, combine_attrs="drop")
-        assert isinstance(whole, xr.Dataset)
-        return whole
+        progress = SequentialProgress(run.callback)
+        run = run._replace(callback=progress)
+        parts = {"hardware": self._push, "shifted": self._shove, "paths": self._trace_paths}
+        results = []
+        for name, compute in parts.items():
+            results.append(run.checkpoint(name, partial(compute, run)))
+            progress.finish(results[-1].attrs.pop("trials"))
+        merged = xr.merge(results, combine_attrs="drop")
+        assert isinstance(merged, xr.Dataset)
+        return merged
 
-    def _pushed(self, run: Run) -> xr.Dataset:
-        """Outcomes over objects, friction and targets."""
+    def _push(self, run: Run) -> xr.Dataset:
+        """Return outcomes over objects, friction and targets."""
         cases = [
             replace(self.base, object=name, friction=friction, target=target)
             for name in HARDWARE_OBJECTS
@@ -115,86 +120,109 @@ class Hardware(LawQuestion[xr.Dataset]):
         labels = [self.label], HARDWARE_OBJECTS, tuple(frictions()), self.targets
         return outcome_dataset(outcome, *labels).assign_attrs(trials=len(cases))
 
-    def _shifted(self, run: Run) -> xr.Dataset:
-        """Success when the object is moved along the front of the robot, to either side."""
+    def _shove(self, run: Run) -> xr.Dataset:
+        """Return the success after the object is shoved along the front of the robot."""
         sides = (1.0, -1.0)
+        shoves = [(0.0, side * size) for size in self.shifts for side in sides]
         cases = [
-            replace(self.base, object=name, target=target, shift=Shift(self.shift_time, moved))
+            replace(self.base, object=name, target=target, shift=Shift(self.shift_time, shove))
             for name in HARDWARE_OBJECTS
-            for moved in [(0.0, side * size) for size in self.shifts for side in sides]
+            for shove in shoves
             for target in self.targets
         ]
         outcome, _ = pushes.run(cases, self.setting, **run.batch_options)
         sizes = (len(HARDWARE_OBJECTS), len(self.shifts), len(sides), len(self.targets))
         dims = ("object", "shift", "side", "target")
-        # A trial that had ended before the object was to be moved tells nothing.
+        # A trial that ends before the shove is not counted.
         counted = outcome.time > self.shift_time
-        telling = {
+        columns = {
             "recovered": (outcome.success, "the target is reached after the shove"),
             "counted": (counted, "the trial was under way when the object was shoved"),
         }
         variables = {
             name: (dims, values.astype(np.int8).reshape(sizes), _attrs("1", meaning))
-            for name, (values, meaning) in telling.items()
+            for name, (values, meaning) in columns.items()
         }
         shift = ("shift", list(self.shifts), _attrs("m", "length of the shove"))
         coords = {"object": list(HARDWARE_OBJECTS), "shift": shift, "side": ["left", "right"]}
         return xr.Dataset(variables, coords, {"trials": len(cases)})
 
-    def _paths(self, run: Run) -> xr.Dataset:
-        """Fig. 7: every object to every target, at the middle of the friction range."""
-        tracks, won = [], []
-        for name in HARDWARE_OBJECTS:
-            cases = [replace(self.base, object=name, target=target) for target in self.targets]
-            seen = pushes.record_cases(cases, self.setting, interval=0.5, callback=run.callback)
-            tracks.append([trace_dataset(one) for one in seen])
-            won.append([int(one.outcome.success) for one in seen])
-        longest = max(one.sizes["time"] for row in tracks for one in row)
-        sizes = (len(HARDWARE_OBJECTS), len(self.targets), longest, 2)
-        paths = {"base_path": np.full(sizes, np.nan), "contact_path": np.full(sizes, np.nan)}
-        for i, row in enumerate(tracks):
-            for j, one in enumerate(row):
-                steps = one.sizes["time"]
-                paths["base_path"][i, j, :steps] = one.qpos.values[:, :2]
-                paths["contact_path"][i, j, :steps] = one.p_world_contact.values
+    def _trace_paths(self, run: Run) -> xr.Dataset:
+        """Return the paths of Fig. 7: all objects and targets, at the middle friction."""
+        cases = [
+            replace(self.base, object=name, target=target)
+            for name in HARDWARE_OBJECTS
+            for target in self.targets
+        ]
+        traces, success = [], []
+        for first in range(0, len(cases), len(self.targets)):  # one object at a time
+            followed = pushes.record_cases(
+                cases[first : first + len(self.targets)],
+                self.setting,
+                interval=0.5,
+                callback=run.callback,
+            )
+            traces += [trace_dataset(trial) for trial in followed]
+            success += [int(trial.outcome.success) for trial in followed]
+        grid = len(HARDWARE_OBJECTS), len(self.targets)
+        steps = max(trace.sizes["time"] for trace in traces)
         dims = ("object", "target", "path_time", "axis")
-        told = {"base_path": "way of the base", "contact_path": "way of the contact point"}
+
+        def padded(meaning: str, paths: list[np.ndarray]) -> xr.Variable:
+            path = np.full((len(cases), steps, 2), np.nan)
+            for row, values in zip(path, paths, strict=True):
+                row[: len(values)] = values
+            return xr.Variable(dims, path.reshape(*grid, steps, 2), _attrs("m", meaning))
+
         half = np.asarray(self.base.base.shell.half, float)
-        variables: dict[str, Any] = {k: (dims, v, _attrs("m", told[k])) for k, v in paths.items()}
-        variables["path_success"] = (dims[:2], won, _attrs("1", "the target of Fig. 7 is reached"))
-        variables["half"] = ("axis", half, _attrs("m", "half length and half width of the base"))
-        after = 0.5 * np.arange(1, longest + 1)
-        seconds = ("path_time", after, _attrs("s", "time after the start"))
-        coords = {"object": list(HARDWARE_OBJECTS), "path_time": seconds, "axis": ["x", "y"]}
-        return xr.Dataset(variables, coords, {"trials": len(HARDWARE_OBJECTS) * len(self.targets)})
+        time = 0.5 * np.arange(1, steps + 1)
+        return xr.Dataset(
+            {
+                "base_path": padded("path of the base", [x.qpos.values[:, :2] for x in traces]),
+                "contact_path": padded(
+                    "path of the contact point", [x.p_world_contact.values for x in traces]
+                ),
+                "path_success": (
+                    dims[:2],
+                    np.reshape(success, grid),
+                    _attrs("1", "the target of Fig. 7 is reached"),
+                ),
+                "half": ("axis", half, _attrs("m", "half length and half width of the base")),
+            },
+            {
+                "object": list(HARDWARE_OBJECTS),
+                "path_time": ("path_time", time, _attrs("s", "time after the start")),
+                "axis": ["x", "y"],
+            },
+            {"trials": len(cases)},
+        )
 
     def intro(self, results: xr.Dataset) -> str:
         ground, robot = HARDWARE_GROUND, HARDWARE_ROBOT
         return (
             f"{self.label}, skin {name_or_custom(self.skin)}, engine {self.setting.engine}. "
-            f"Friction was not measured by the paper: here every pair of object-ground {ground} "
-            f"and object-robot {robot} is run."
+            f"The paper does not give the friction; all pairs of object-ground {ground} and "
+            f"object-robot {robot} are run."
         )
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         ground, robot = MIDDLE
         text = (
-            "D is the mean of |l| over the time in contact, where l is how far the contact point "
-            "lies from the centre of the robot's side that pushes (the paper's Sec. III-C). D and "
-            "time are means over successes; in brackets the least and greatest mean among the "
-            "frictions."
+            "D is the mean of |l| over the time in contact, where l is the contact offset from the "
+            "centre of the pushing side (the paper's Sec. III-C). D and time are means over "
+            "successes; brackets hold the least and the greatest mean among the frictions."
         )
         shove = (
-            f"{self.shift_time:g} s after the start the object is moved at once along the front "
-            f"of the robot, to either side (friction ground {ground:g}, robot {robot:g}). Trials "
-            "that had ended by then are not counted."
+            f"{self.shift_time:g} s after the start the object is moved at once along the front of "
+            f"the robot, to either side (friction ground {ground:g}, robot {robot:g}). Trials "
+            "that end earlier are not counted."
         )
         middle = f"Friction: ground {ground:g}, robot {robot:g}, the middle of the range."
-        ways = Picture("paths", partial(paths_figure, results))
+        paths = Picture("paths", partial(paths_figure, results))
         curve = Picture("shifted", partial(shift_figure, results))
         return [
             Section("Hardware experiments", text, table(results)),
-            Section("Fig. 7: paths of the base", middle, (), ways),
+            Section("Fig. 7: paths of the base", middle, (), paths),
             Section("The object shoved aside", shove, shift_table(results), curve),
         ]
 
@@ -207,67 +235,67 @@ def _attrs(unit: str, meaning: str) -> dict[str, str]:
 
 
 def table(results: xr.Dataset) -> list[list[str]]:
-    """Header and one row for each object: success, D and time beside the paper's."""
+    """Return a row for each object: success, D and time beside the paper's."""
     rows = [["object", "success", "95 %", "paper", "D", "paper", "time", "paper"]]
     for name in map(str, results.object.values):
-        one = results.isel(law=0).sel(object=name)
-        won = one.success.values.astype(bool)
-        low, high = statistics.wilson(int(won.sum()), won.size)
-        theirs = HARDWARE_RESULTS[name]
-        rate = [f"{won.sum()} of {won.size}", f"{100 * low:.0f}-{100 * high:.0f} %"]
-        off = [_spread(one.mean_abs_l.where(won), 3, "m"), f"{theirs.mean_abs_l:.3f} m"]
-        time = [_spread(one.time.where(won), 0, "s"), f"{theirs.time:.0f} s"]
-        rows.append([words(name), *rate, f"{theirs.success} of 8", *off, *time])
+        trials = results.isel(law=0).sel(object=name)
+        success = trials.success.values.astype(bool)
+        low, high = statistics.wilson(int(success.sum()), success.size)
+        in_paper = HARDWARE_RESULTS[name]
+        rate = [f"{success.sum()} of {success.size}", f"{100 * low:.0f}-{100 * high:.0f} %"]
+        offset = [_spread(trials.mean_abs_l.where(success), 3, "m"), f"{in_paper.mean_abs_l:.3f} m"]
+        time = [_spread(trials.time.where(success), 0, "s"), f"{in_paper.time:.0f} s"]
+        rows.append([words(name), *rate, f"{in_paper.success} of 8", *offset, *time])
     return rows
 
 
 def _spread(values: xr.DataArray, digits: int, unit: str) -> str:
-    """Mean over targets of the successes: over all friction, then its least and greatest."""
+    """Format the mean over successes, and its least and greatest value by friction."""
     if not values.notnull().any():
         return "-"
-    each = values.mean("target")
-    mean, low, high = (f"{float(v):.{digits}f}" for v in (values.mean(), each.min(), each.max()))
+    means = values.mean("target")
+    mean, low, high = (f"{float(v):.{digits}f}" for v in (values.mean(), means.min(), means.max()))
     return f"{mean} {unit} (by friction {low}-{high})"
 
 
 def shift_table(results: xr.Dataset) -> list[list[str]]:
-    """Header and one row for each size of shift: successes of those still under way."""
+    """Return a row for each shove length: successes of the trials still under way."""
     rows = [["shift", *(words(str(o)) for o in results.object.values)]]
-    won, of = counts(results)
+    successes, trials = counts(results)
     for i, size in enumerate(results["shift"].values):
         cells = []
-        for one, every in zip(won[:, i], of[:, i], strict=True):
-            low, high = statistics.wilson(int(one), int(every))
-            cells.append(f"{one} of {every} ({100 * low:.0f}-{100 * high:.0f} %)")
+        for n, total in zip(successes[:, i], trials[:, i], strict=True):
+            low, high = statistics.wilson(int(n), int(total))
+            cells.append(f"{n} of {total} ({100 * low:.0f}-{100 * high:.0f} %)")
         rows.append([f"{100 * float(size):g} cm", *cells])
     return rows
 
 
 def counts(results: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Trials (object, shift) that recovered, and those under way when the object was shifted."""
+    """Count trials (object, shift) that recover, and those under way at the shove."""
     counted = results.counted > 0
-    both = ("side", "target")
-    return (counted & (results.recovered > 0)).sum(both).values, counted.sum(both).values
+    dims = ("side", "target")
+    return (counted & (results.recovered > 0)).sum(dims).values, counted.sum(dims).values
 
 
-def paths_figure(found: xr.Dataset) -> Figure:
-    """Draw Fig. 7: the ways of the base to every target, and the contact points at the end."""
-    names = list(map(str, found.object.values))
+def paths_figure(results: xr.Dataset) -> Figure:
+    """Draw Fig. 7: the paths of the base to all targets, and the last contact points."""
+    names = list(map(str, results.object.values))
     figure = Figure(figsize=(5.2 * len(names), 5), layout="constrained")
     axes = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
     for ax, name in zip(axes, names, strict=True):
-        one = found.sel(object=name)
-        ax.add_patch(base_patch(np.zeros(3), tuple(found.half.values), fill=True))
-        for target in range(found.sizes["target"]):
-            (line,) = ax.plot(*one.base_path.values[target].T, lw=1.2)
-            at = float(found.target_x[target]), float(found.target_y[target])
-            ax.plot(*at, "*", ms=12, color=line.get_color())
-            touching = one.contact_path.isel(target=target).dropna("path_time").values
-            if len(touching):
-                ax.plot(*touching[-1], "o", ms=5, mfc="white", color=line.get_color())
-        won = int(one.path_success.sum())
+        trials = results.sel(object=name)
+        ax.add_patch(base_patch(np.zeros(3), tuple(results.half.values), fill=True))
+        for target in range(results.sizes["target"]):
+            (line,) = ax.plot(*trials.base_path.values[target].T, lw=1.2)
+            xy = float(results.target_x[target]), float(results.target_y[target])
+            ax.plot(*xy, "*", ms=12, color=line.get_color())
+            contacts = trials.contact_path.isel(target=target).dropna("path_time").values
+            if len(contacts):
+                ax.plot(*contacts[-1], "o", ms=5, mfc="white", color=line.get_color())
+        successes = int(trials.path_success.sum())
         ax.set(xlabel="x [m]", aspect="equal")
-        ax.set_title(f"{words(name)}: {won} of {found.sizes['target']}", fontsize=10)
+        ax.set_title(f"{words(name)}: {successes} of {results.sizes['target']}", fontsize=10)
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("y [m]")
     figure.suptitle(
@@ -278,15 +306,16 @@ def paths_figure(found: xr.Dataset) -> Figure:
     return figure
 
 
-def shift_figure(found: xr.Dataset) -> Figure:
-    """Draw success over the size of the shove, with Wilson 95 % intervals."""
+def shift_figure(results: xr.Dataset) -> Figure:
+    """Draw success over the length of the shove, with Wilson 95 % intervals."""
     figure = Figure(figsize=(5.5, 3.4), layout="constrained")
     ax = figure.subplots()
-    won, of = counts(found)
-    size = 100 * found["shift"].values
-    for i, name in enumerate(map(str, found.object.values)):
-        success_rates(ax, size, won[i], of[i], color=OBJECT_COLOURS[name], label=words(name))
-    ax.set(xlabel="the object is moved sideways by [cm]", ylabel="success [%]", ylim=(-3, 103))
+    successes, trials = counts(results)
+    size = 100 * results["shift"].values
+    for i, name in enumerate(map(str, results.object.values)):
+        style = {"color": OBJECT_COLOURS[name], "label": words(name)}
+        success_rates(ax, size, successes[i], trials[i], **style)
+    ax.set(xlabel="length of the shove [cm]", ylabel="success [%]", ylim=(-3, 103))
     ax.grid(alpha=0.3)
     ax.legend(fontsize=8)
     return figure

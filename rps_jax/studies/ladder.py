@@ -1,4 +1,4 @@
-"""The ladder of laws: all laws in the same test worlds, ordered by what each law senses.
+"""The ladder of laws: all laws in the same test worlds, ordered by senses.
 
 The order of the senses is `touch` (where the skin is touched), `taxels` (each taxel's signal),
 `force` (the contact force) and `pose` (where the object is). The worlds are test worlds: their
@@ -37,7 +37,7 @@ _OF_ONE_DOMAIN = ("points", "table", "ray")  # options that need a single domain
 
 
 def all_laws() -> tuple[str, ...]:
-    """Return the names of all registered laws, ordered by what they sense."""
+    """Return the names of all registered laws, ordered by their senses."""
     order, laws = get_args(Senses), registry.LAWS
     return tuple(sorted(laws, key=lambda name: order.index(_senses(laws[name]))))
 
@@ -70,7 +70,7 @@ class _TestSweep(Sweep):
 
 @dataclass(frozen=True)
 class Ladder(SweepOptions, MultiLawQuestion[xr.Dataset | xr.DataTree]):
-    """Compare laws in the same test worlds, ordered by what each law senses.
+    """Compare laws in the same test worlds, ordered by senses.
 
     No tuner sees test worlds. The result for one domain has the outcomes (law, world), and as
     coordinates the drawn quantities (world) and `senses` (law). The result for several domains is
@@ -258,19 +258,19 @@ def score_row(sweep: Sweep, results: xr.Dataset) -> list[list[str]]:
     """Return a header and the row of the first law: rates of all laws, median time and worlds."""
     successes = results.success.values > 0
     rates = [tables.share(int(success.sum()), success.size) for success in successes]
-    law, *others = map(str, results.law.values)
+    law, *rest = map(str, results.law.values)
     times = results.time.values[0][successes[0]]
     median = f"{np.median(times):.1f} s" if times.size else "-"
     source = f"seed {sweep.setting.seed}" if sweep.points is None else "given points"
     worlds = f"{successes.shape[1]:,} test worlds of {name_or_custom(sweep.domain)}, {source}"
-    header = ["law", "success", "median time", *others, "worlds"]
+    header = ["law", "success", "median time", *rest, "worlds"]
     return [header, [law, rates[0], median, *rates[1:], f"{worlds}, {sweep.setting.engine}"]]
 
 
 def _comparison(results: xr.Dataset) -> list[Section]:
     """Return the sections about success by senses, and about differences from the reference."""
     text = (
-        "Laws by what they sense: `touch` is where the skin is touched, `taxels` adds the signal "
+        "Senses of the laws: `touch` is where the skin is touched, `taxels` adds the signal "
         "of each taxel, `force` adds the contact force, and `pose` adds the object's position and "
         "size."
     )
@@ -293,9 +293,9 @@ def _solved_failures(results: xr.Dataset) -> str:
     senses = _senses_by_law(results)
     counts = []
     for kind in dict.fromkeys(senses.values()):
-        others = [name for name in senses if senses[name] == kind and name != REFERENCE]
-        if others:
-            solved = (results.success.sel(law=others).values > 0).any(axis=0)
+        laws = [name for name in senses if senses[name] == kind and name != REFERENCE]
+        if laws:
+            solved = (results.success.sel(law=laws).values > 0).any(axis=0)
             count = int((solved & failed).sum())
             counts.append(f"another law that senses {kind} succeeds in {count}")
     solved = (results.success.values > 0).any(axis=0)
@@ -305,7 +305,7 @@ def _solved_failures(results: xr.Dataset) -> str:
 
 
 def draw_ladder(results: xr.Dataset) -> Figure:
-    """Draw the success of each law, grouped by what it senses, with Wilson's 95 % intervals."""
+    """Draw the success of each law, grouped by senses, with Wilson's 95 % intervals."""
     senses = _senses_by_law(results)
     kinds = [kind for kind in get_args(Senses) if kind in senses.values()]
     colours = {kind: f"C{i}" for i, kind in enumerate(get_args(Senses))}

@@ -1,7 +1,7 @@
-"""All of the paper in one run folder: its tables, its figures, and its hardware experiments.
+"""Reproduction of the paper: its tables, figures and hardware experiments in one run folder.
 
-What the paper leaves open is named in `world.paper.CHOICES`; what each reading changes is measured
-in `sweeps/ambiguities`.
+`world.paper.CHOICES` lists the details that the paper leaves open. The study `sweeps/ambiguities`
+measures the effect of each reading.
 """
 
 from collections.abc import Sequence
@@ -32,20 +32,20 @@ from rps_jax.world.scene import FRICTION
 class Paper(SimulationQuestion[xr.DataTree]):
     """Reproduce the paper: Tables I and II, Figs. 3 to 7, and the hardware experiments.
 
-    The answer is a tree of `table` (law, object, friction, target), `trial` (time) and `hardware`,
-    as `rps_jax.table`, `rps_jax.push` and `rps_jax.hardware` return them. It takes some minutes.
+    The result is a tree of `table` (law, object, friction, target), `trial` (time) and `hardware`,
+    as returned by `rps_jax.table`, `rps_jax.push` and `rps_jax.hardware`. It takes some minutes.
 
     Example:
       >>> import rps_jax
-      >>> found = rps_jax.paper(quick=True)  # doctest: +SKIP
-      >>> found["table"].success.sum("target")  # doctest: +SKIP
+      >>> results = rps_jax.paper(quick=True)  # doctest: +SKIP
+      >>> results["table"].success.sum("target")  # doctest: +SKIP
     """
 
     TITLE: ClassVar[str] = "Pushing in the Dark, reproduced"
 
     @cached_property
     def parts(self) -> tuple[Table, Push, Hardware]:
-        """The questions that it consists of."""
+        """Questions whose results make up the paper."""
         return (
             Table(setting=self.setting),
             Push(target=(-2.0, 0.0), setting=self.setting),
@@ -60,18 +60,18 @@ class Paper(SimulationQuestion[xr.DataTree]):
         return sum(part.num_trials() or 0 for part in self.parts)
 
     def answer(self, run: Run) -> xr.DataTree:
-        heard = SequentialProgress(run.callback)
-        run = run._replace(callback=heard)
+        progress = SequentialProgress(run.callback)
+        run = run._replace(callback=progress)
         tables, push, hardware = self.parts
-        found = {"table": tables.answer(run)}
-        heard.finish(tables.num_trials() or 0)
-        found["trial"] = run.checkpoint("trial", lambda: push.answer(run).data)
-        heard.finish(1)
-        found["hardware"] = hardware.answer(run)
+        results = {"table": tables.answer(run)}
+        progress.finish(tables.num_trials() or 0)
+        results["trial"] = run.checkpoint("trial", lambda: push.answer(run).data)
+        progress.finish(1)
+        results["hardware"] = hardware.answer(run)
         if run.folder is not None:
-            for name, one in found.items():
-                files.write_results(run.folder / f"{name}.nc", one)
-        return xr.DataTree.from_dict(found)
+            for name, dataset in results.items():
+                files.write_results(run.folder / f"{name}.nc", dataset)
+        return xr.DataTree.from_dict(results)
 
     def intro(self, results: xr.DataTree) -> str:
         return "The numbers of the paper *Pushing in the Dark* beside ours. Intervals: Wilson 95 %."
@@ -82,10 +82,7 @@ class Paper(SimulationQuestion[xr.DataTree]):
         text = f"The target is {reached} at {float(trial.outcome_time):.1f} s."
         fig_6 = Picture("trial", partial(figures.one_trial, trial, push.case.title))
         rows = [["open", "our reading", "because"], *map(list, papers.CHOICES)]
-        left_open = (
-            "What another reading of each would change is measured in the project's study of "
-            "ambiguities, `sweeps/ambiguities`."
-        )
+        left_open = "The study `sweeps/ambiguities` measures the effect of other readings."
         return [
             *_setup(),
             *table.sections(results["table"].to_dataset()),
@@ -99,7 +96,7 @@ paper = call_of(Paper)
 
 
 def _setup() -> list[Section]:
-    """Table I, Fig. 3 and Fig. 4."""
+    """Return the sections with Table I, Fig. 3 and Fig. 4."""
     ground, robot = zip(*FRICTION.values(), strict=True)
     rows = [["", *FRICTION], ["object-ground", *map("{:g}".format, ground)]]
     rows.append(["object-robot", *map("{:g}".format, robot)])
@@ -115,9 +112,9 @@ def _objects() -> Section:
     try:
         images = []
         for name in PAPER_OBJECTS:
-            shown = scene.load(name)
-            at = scene.initial_qpos(shown)
-            images.append(video.snapshot(shown, at, p_world_target=np.array([2, 0])))
+            loaded = scene.load(name)
+            qpos = scene.initial_qpos(loaded)
+            images.append(video.snapshot(loaded, qpos, p_world_target=np.array([2, 0])))
     except video.VideoError as error:
         return Section("Fig. 4: the objects", f"Not drawn: {error}")
     picture = Picture("objects", partial(figures.stills, images, PAPER_OBJECTS))

@@ -1,15 +1,15 @@
-"""How often does a law fail that rarely fails? Subset simulation over the unit cube.
+"""Subset simulation: small failure probabilities as products of larger ones.
 
-The probability of a severity of at least 1 is a product of probabilities that are not small: of a
-level that a fifth of all worlds reach, of the next one given that, and so on (Au and Beck, 2001;
-Cerou and Guyader's multilevel splitting is its near relative). Worlds beyond a level are found by
-Markov chains that begin in those worlds and move in the normal quantiles z of u, a random half of
-the coordinates at a time, by the preconditioned Crank-Nicolson step z' = sqrt(1 - b^2) z + b e,
-under which the normal law does not change; a move to below the level is refused.
+The probability that the severity reaches 1 is a product of conditional probabilities: of a level
+that a fifth of the worlds reach, of the next level given the first, and so on (Au and Beck, 2001;
+multilevel splitting by Cerou and Guyader is closely related). Markov chains start in the worlds
+above a level and sample more of them. A step changes a random half of the normal quantiles z of the
+world's point u by the preconditioned Crank-Nicolson proposal z' = sqrt(1 - b^2) z + b e, which
+leaves the normal distribution invariant. Proposals below the level are rejected.
 
-All is done by several groups that share nothing but the levels. Their mean is the estimate, and
-their spread is its interval: no assumption about how far the chains mix is needed, but a kind of
-failure that no group has met is in no interval.
+Several groups of worlds share only the levels. The mean of their estimates is the estimate, and
+their spread gives the interval, without assumptions about how well the chains mix. The interval
+does not cover failures that no group has reached.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import zip_longest
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -35,130 +35,137 @@ from rps_jax.world.domain import Domain
 
 Severity = Callable[[np.ndarray], np.ndarray]  # of points (n, q), (n,)
 _EDGE = 1e-9  # least distance of a coordinate to the ends of its range
-_ACCEPTED = 0.35  # share of moves that the step is adapted to
+_ACCEPTANCE = 0.35  # acceptance rate of proposals to which the step is adapted
+_MIN_STEP, _MAX_STEP = 0.02, 1.0  # [1] b
 
 
 class Estimate(NamedTuple):
-    """A probability, with its interval of 95 %."""
+    """Probability with its interval of 95 %."""
 
     p: float  # [1]
     low: float
     high: float
-    variation: float  # [1] of the estimate: standard error over estimate
+    variation: float  # [1] coefficient of variation: standard error over estimate
     trials: int
 
 
-class Found(NamedTuple):
-    """What subset simulation came to."""
+class Result(NamedTuple):
+    """Result of a subset simulation."""
 
     estimate: Estimate
-    groups: np.ndarray  # (groups,) [1] what each came to
-    levels: list[float]  # severities that were the levels, the last one that of the event
-    u: np.ndarray  # (n, q) worlds of the last levels that fail
+    p_group: np.ndarray  # (groups,) [1] estimate of each group
+    levels: list[float]  # severities of the levels; the last is that of the event
+    u: np.ndarray  # (n, q) failing worlds of the last level
     severity: np.ndarray  # (n,)
 
 
-Steps = Generator[np.ndarray, np.ndarray, Found]
+# Yields points (n, q), receives their severities (n,), and returns the result.
+Simulation = Generator[np.ndarray, np.ndarray, Result]
 
 
-def combine(groups: np.ndarray, trials: int, least: float = 0.0) -> Estimate:
-    """The mean of groups' estimates, with Student's interval, even in the logarithm.
+def combine(p_group: np.ndarray, trials: int, min_variation: float = 0.0) -> Estimate:
+    """Return the mean of the groups' estimates, with Student's interval in the logarithm.
 
-    A few groups agree by luck now and then, so the coefficient of variation is at least `least`.
+    A few groups may agree by chance, so the coefficient of variation has a lower bound.
     """
-    p, count = float(groups.mean()), groups.size
+    p, count = float(p_group.mean()), p_group.size
     if p == 0:
         return Estimate(0.0, 0.0, 1.0, float("inf"), trials)
-    variation = max(least, float(groups.std(ddof=1)) / p / np.sqrt(count))
-    reach = variation * float(stats.t.ppf(0.975, count - 1))
-    return Estimate(p, p * np.exp(-reach), min(1.0, p * np.exp(reach)), variation, trials)
+    variation = max(min_variation, float(p_group.std(ddof=1)) / p / np.sqrt(count))
+    half_width = variation * float(stats.t.ppf(0.975, count - 1))
+    low, high = p * np.exp(-half_width), min(1.0, p * np.exp(half_width))
+    return Estimate(p, low, high, variation, trials)
 
 
-def run_together(score: Severity, every: Sequence[Steps]) -> list[Found]:
-    """Several of them side by side, which are asked for one batch of all of them at a time."""
-    found: dict[int, Found] = {}
-    asked = dict(enumerate(map(next, every)))
-    while asked:
-        told = score(np.concatenate(list(asked.values())))
-        ends = np.cumsum([len(u) for u in asked.values()])[:-1]
-        for i, s in zip(list(asked), np.split(told, ends), strict=True):
+def run_together(severity: Severity, simulations: Sequence[Simulation]) -> list[Result]:
+    """Run simulations side by side, with one batch of points of all of them at a time."""
+    results: dict[int, Result] = {}
+    requests = dict(enumerate(map(next, simulations)))
+    while requests:
+        answers = severity(np.concatenate(list(requests.values())))
+        ends = np.cumsum([len(u) for u in requests.values()])[:-1]
+        for i, s in zip(list(requests), np.split(answers, ends), strict=True):
             try:
-                asked[i] = every[i].send(s)
-            except StopIteration as end:
-                del asked[i]
-                found[i] = end.value
-    return [found[i] for i in sorted(found)]
+                requests[i] = simulations[i].send(s)
+            except StopIteration as stop:
+                del requests[i]
+                results[i] = stop.value
+    return [results[i] for i in sorted(results)]
 
 
-def subset_simulation(kinds: Sequence[str], how: Rare, seed: int) -> Steps:
-    """Subset simulation, which asks for the severities (n,) of points (n, q) as it goes on."""
+def subset_simulation(kinds: Sequence[str], options: Rare, seed: int) -> Simulation:
+    """Return a subset simulation over points whose coordinates have these kinds (q,)."""
     rng = np.random.Generator(np.random.Philox(key=seed))
     noise = np.array([kind == "noise" for kind in kinds])
-    shape = (how.groups, how.particles // how.groups)
+    shape = (options.groups, options.particles // options.groups)
     trials, step, levels = 0, 0.6, []
-    least = 0.0  # squared variation of independent worlds, which chains cannot have less of
+    variance = 0.0  # squared variation of independent worlds, a lower bound for chains
 
-    def ask(z: np.ndarray) -> Generator[np.ndarray, np.ndarray, np.ndarray]:
+    def request(z: np.ndarray) -> Generator[np.ndarray, np.ndarray, np.ndarray]:
         nonlocal trials
         trials += z[..., 0].size
-        told = yield _uniform(z.reshape(-1, z.shape[-1]))
-        return told.reshape(z.shape[:-1])
+        severity = yield _uniform(z.reshape(-1, z.shape[-1]))
+        return severity.reshape(z.shape[:-1])
 
     z = rng.standard_normal((*shape, len(kinds)))
-    s, p = (yield from ask(z)), np.ones(how.groups)
-    for _ in range(how.levels):
-        # One level for all groups, which is nearly independent of each; it must be passed.
-        level = float(np.sort(s, axis=None)[-max(2, round(how.share * s.size))])
-        if level >= how.level or (s >= level).all():
+    s, p_group = (yield from request(z)), np.ones(options.groups)
+    for _ in range(options.levels):
+        # All groups share the level, which is nearly independent of each.
+        level = float(np.sort(s, axis=None)[-max(2, round(options.share * s.size))])
+        if level >= options.level or (s >= level).all():
             break
         levels.append(level)
-        least += _variation(s >= level)
-        p *= (s >= level).mean(axis=1)
-        starts = [_chosen(one >= level, round(how.share * shape[1]), rng) for one in s]
-        z_now = np.stack([one[at] for one, at in zip(z, starts, strict=True)])
-        s_now = np.stack([one[at] for one, at in zip(s, starts, strict=True)])
-        zs, ss = [z_now], [s_now]
-        while sum(one.shape[1] for one in ss) < shape[1]:
-            moved = _moved(z_now, step, noise, rng)
-            s_moved = yield from ask(moved)
-            ok = s_moved >= level
-            z_now, s_now = np.where(ok[..., None], moved, z_now), np.where(ok, s_moved, s_now)
-            step = float(np.clip(step * np.exp(ok.mean() - _ACCEPTED), 0.02, 1.0))
-            zs.append(z_now)
-            ss.append(s_now)
-        z, s = (np.concatenate(some, axis=1)[:, : shape[1]] for some in (zs, ss))
-    p *= (s >= how.level).mean(axis=1)
-    failed = (s >= how.level) & (p > 0)[:, None]
-    least += _variation(s >= how.level)
-    return Found(
-        combine(p, trials, least**0.5), p, [*levels, how.level], _uniform(z[failed]), s[failed]
-    )
+        variance += _squared_variation(s >= level)
+        p_group *= (s >= level).mean(axis=1)
+        chains = round(options.share * shape[1])
+        starts = np.stack([_resample(above, chains, rng) for above in s >= level])
+        z_chain = np.take_along_axis(z, starts[..., None], axis=1)
+        s_chain = np.take_along_axis(s, starts, axis=1)
+        z_levels, s_levels = [z_chain], [s_chain]
+        while len(s_levels) * chains < shape[1]:
+            proposal = _propose(z_chain, step, noise, rng)
+            s_proposal = yield from request(proposal)
+            accepted = s_proposal >= level
+            z_chain = np.where(accepted[..., None], proposal, z_chain)
+            s_chain = np.where(accepted, s_proposal, s_chain)
+            step *= np.exp(accepted.mean() - _ACCEPTANCE)
+            step = float(np.clip(step, _MIN_STEP, _MAX_STEP))
+            z_levels.append(z_chain)
+            s_levels.append(s_chain)
+        z = np.concatenate(z_levels, axis=1)[:, : shape[1]]
+        s = np.concatenate(s_levels, axis=1)[:, : shape[1]]
+    failed = s >= options.level
+    p_group *= failed.mean(axis=1)
+    variance += _squared_variation(failed)
+    failed &= (p_group > 0)[:, None]
+    estimate = combine(p_group, trials, variance**0.5)
+    return Result(estimate, p_group, [*levels, options.level], _uniform(z[failed]), s[failed])
 
 
-def _variation(reached: np.ndarray) -> float:
-    """Squared coefficient of variation of a rate from so many independent worlds."""
+def _squared_variation(reached: np.ndarray) -> float:
+    """Return the squared coefficient of variation of a rate from independent worlds."""
     rate = max(float(reached.mean()), 1 / reached.size)
     return (1 - rate) / rate / reached.size
 
 
 def _uniform(z: np.ndarray) -> np.ndarray:
-    """Points (n, q) of the cube at these normal quantiles."""
+    """Return points (n, q) of the unit cube from normal quantiles."""
     return np.clip(stats.norm.cdf(z), _EDGE, 1 - _EDGE)
 
 
-def _chosen(beyond: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """As many of the worlds `beyond` (n,) as chains begin, each as often as another."""
-    some = rng.permutation(np.flatnonzero(beyond))
-    # A group that has none goes on with worlds that no longer count: its product is 0.
-    return np.resize(some if some.size else np.arange(beyond.size), count)
+def _resample(above: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Resample starts (count,) of chains uniformly from the worlds (n,) above the level."""
+    starts = rng.permutation(np.flatnonzero(above))
+    # A group without such worlds continues with any worlds: its estimate is already 0.
+    return np.resize(starts if starts.size else np.arange(above.size), count)
 
 
-def _moved(z: np.ndarray, step: float, noise: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Moves of a random half of the coordinates; of the noise, all of it anew or none."""
+def _propose(z: np.ndarray, step: float, noise: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Propose changes of a random half of the coordinates; noise changes as a whole or not."""
     fresh = rng.standard_normal(z.shape)
-    moved = np.where(rng.random(z.shape) < 0.5, np.sqrt(1 - step**2) * z + step * fresh, z)
-    again = rng.random((*z.shape[:-1], 1)) < 0.5 * step
-    return np.where(noise, np.where(again, fresh, z), moved)
+    proposal = np.where(rng.random(z.shape) < 0.5, np.sqrt(1 - step**2) * z + step * fresh, z)
+    new_noise = rng.random((*z.shape[:-1], 1)) < 0.5 * step
+    return np.where(noise, np.where(new_noise, fresh, z), proposal)
 
 
 # --- of a law ------------------------------------------------------------------------------
@@ -166,39 +173,39 @@ def _moved(z: np.ndarray, step: float, noise: np.ndarray, rng: np.random.Generat
 
 @dataclass(frozen=True)
 class Rare(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
-    """Estimate how often a law fails that rarely fails, by subset simulation.
+    """Estimate small failure probabilities by subset simulation.
 
-    The answer holds `p` and its `low`, `high` and `variation`, and `trials` (repetition); `p_group`
-    (repetition, group); and failures that were met, `u` (failure, quantity) with their `severity`.
+    The result has, by repetition, `p` with `low`, `high`, `variation` and `trials`; the estimates
+    `p_group` (repetition, group); and the failing worlds `u` (failure, quantity) with `severity`.
 
     Example:
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=1.0)
       >>> setting = rps_jax.Setting("quasistatic", rules=rules)
-      >>> found = rps_jax.rare("rps", drums, particles=40, groups=2, setting=setting)
-      >>> found.p.values.tolist()  # within a second no push is done
+      >>> results = rps_jax.rare("rps", drums, particles=40, groups=2, setting=setting)
+      >>> results.p.values.tolist()  # no push ends within a second
       [1.0]
     """
 
     TITLE: ClassVar[str] = "Rare failures"
-    QUICK: ClassVar[Mapping[str, Any]] = {
+    QUICK: ClassVar[Mapping[str, object]] = {
         "particles": 200,
         "groups": 4,
         "domain": "wide,objects=random_box",
     }
 
     particles: int = option(1000, 1, 10_000_000)
-    """Number of worlds of a level, over all groups; a group should have a hundred."""
+    """Number of worlds of a level, over all groups; use at least 100 for each group."""
     groups: int = option(10, 2, 10_000)
-    """Number of groups that share nothing but the levels; their spread is the interval."""
+    """Number of groups, which share only the levels; their spread gives the interval."""
     share: float = option(0.2, 0.05, 0.5)
-    """Share of the worlds that reach the next level, whose chains begin in them [1]."""
+    """Share of the worlds that reach the next level [1]; chains start in these worlds."""
     beyond: float = option(0.0, 0, 20, unit="m")
-    """A failure counts if it missed the target by more than this [m]; 0 counts all failures."""
+    """Distance from the target beyond which a failure counts [m]; 0 counts all failures."""
     levels: int = option(30, 1, 100)
-    """Number of levels after which it gives up, and says 0 if nothing has failed."""
+    """Maximum number of levels; without a failure by then the estimate is 0."""
     repetitions: int = option(1, 1, 10_000)
-    """How often all of it is done, side by side, each time with points of its own."""
+    """Number of independent repetitions, which run side by side."""
 
     def check(self) -> None:
         least = self.groups * 2 * round(1 / self.share)
@@ -208,87 +215,87 @@ class Rare(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
 
     @property
     def level(self) -> float:
-        """Severity from which on a trial is what is looked for."""
+        """Severity of the event whose probability is estimated."""
         return 1 + self.beyond
 
     def answer(self, run: Run) -> xr.Dataset:
         domain, seed = self.ranges, self.setting.seed
         probe = Probe(domain, self.params, self.setting, run.folder, **run.batch_options)
-        kinds = [one.kind for one in points.quantities(domain)]
-        first = seed_of(seed, "tune") * 10_000
-        every = [subset_simulation(kinds, self, first + i) for i in range(self.repetitions)]
-        return _labelled(domain, run_together(lambda u: probe(u).severity.values, every))
+        kinds = [quantity.kind for quantity in points.quantities(domain)]
+        seeds = seed_of(seed, "tune") * 10_000 + np.arange(self.repetitions)
+        simulations = [subset_simulation(kinds, self, int(i)) for i in seeds]
+        return _labelled(domain, run_together(lambda u: probe(u).severity.values, simulations))
 
     def intro(self, results: xr.Dataset) -> str:
-        what = "a failure is a trial that does not reach its target."
+        event = "a failure is a trial that does not reach its target."
         if self.beyond:
-            what = f"a failure misses the target by more than {self.beyond:g} m."
-        return f"{self.label} in the domain {name_or_custom(self.domain)}: {what}"
+            event = f"a failure misses the target by more than {self.beyond:g} m."
+        return f"{self.label} in the domain {name_or_custom(self.domain)}: {event}"
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         text = (
             "Intervals of 95 %, from the spread of the groups. The last column is the number of "
-            "worlds over that of drawn worlds with the same coefficient of variation. A kind of "
-            "failure that no group has met is in no interval."
+            "worlds over the number of drawn worlds with the same coefficient of variation. The "
+            "intervals do not cover failures that no group has reached."
         )
         picture = Picture("rare", partial(draw_estimates, results))
-        return [Section("How rare is a failure", text, estimate_table(results), picture)]
+        return [Section("Probability of failure", text, estimate_table(results), picture)]
 
 
 rare = call_of(Rare)
 
 
-def _labelled(domain: Domain, every: Sequence[Found]) -> xr.Dataset:
-    estimates = [found.estimate for found in every]
-    columns: dict[str, Any] = {
-        name: ("repetition", [getattr(one, name) for one in estimates]) for name in Estimate._fields
+def _labelled(domain: Domain, results: Sequence[Result]) -> xr.Dataset:
+    """Return the results of all repetitions with names."""
+    estimates = {
+        name: ("repetition", [getattr(result.estimate, name) for result in results])
+        for name in Estimate._fields
     }
-    levels = np.array(list(zip_longest(*(found.levels for found in every), fillvalue=np.nan))).T
-    columns["p_group"] = (("repetition", "group"), np.stack([found.groups for found in every]))
-    columns["level"] = (("repetition", "depth"), levels)
-    columns["u"] = (("failure", "quantity"), np.concatenate([found.u for found in every]))
-    columns["severity"] = ("failure", np.concatenate([found.severity for found in every]))
-    return xr.Dataset(columns, {"quantity": list(points.names(domain))})
+    levels = list(zip_longest(*(result.levels for result in results), fillvalue=np.nan))
+    return xr.Dataset(
+        {
+            **estimates,
+            "p_group": (("repetition", "group"), np.stack([x.p_group for x in results])),
+            "level": (("repetition", "depth"), np.array(levels).T),
+            "u": (("failure", "quantity"), np.concatenate([x.u for x in results])),
+            "severity": ("failure", np.concatenate([x.severity for x in results])),
+        },
+        {"quantity": list(points.names(domain))},
+    )
 
 
 def worlds_needed(p: float, variation: float) -> float:
-    """How many drawn worlds give the probability `p` with this coefficient of variation."""
+    """Return the number of drawn worlds with this coefficient of variation of `p`."""
     return (1 - p) / (p * variation**2) if p > 0 else float("inf")
 
 
-def estimate_table(found: xr.Dataset) -> list[list[str]]:
-    """Header and a row for each repetition, and one for all of them together."""
+def estimate_table(results: xr.Dataset) -> list[list[str]]:
+    """Return a row for each repetition, and one for all of them together."""
     rows = [["", "probability of failure", "95 %", "variation", "worlds", "share of drawn worlds"]]
-    for i in range(found.sizes["repetition"]):
-        one = found.isel(repetition=i)
-        p, low, high, variation, trials = (float(one[name]) for name in Estimate._fields)
-        rows.append(
-            estimate_row(f"splitting, {i + 1}", Estimate(p, low, high, variation, int(trials)))
-        )
-    if found.sizes["repetition"] > 1:
-        rows.append(
-            estimate_row("splitting, all", combine(found.p.values, int(found.trials.sum())))
-        )
+    for i in range(results.sizes["repetition"]):
+        *values, trials = (float(results[name][i]) for name in Estimate._fields)
+        rows.append(estimate_row(f"splitting, {i + 1}", Estimate(*values, trials=int(trials))))
+    if results.sizes["repetition"] > 1:
+        combined = combine(results.p.values, int(results.trials.sum()))
+        rows.append(estimate_row("splitting, all", combined))
     return rows
 
 
-def estimate_row(name: str, one: Estimate) -> list[str]:
-    """An estimate, and its number of worlds over that of drawn ones."""
-    said = ""
-    if 0 < one.p < 1:
-        said = f"{100 * one.trials / worlds_needed(one.p, one.variation):.2g} %"
-    ends = f"[{one.low:.2g}, {one.high:.2g}]"
-    return [name, f"{one.p:.3g}", ends, f"{one.variation:.2f}", f"{one.trials:,}", said]
+def estimate_row(name: str, estimate: Estimate) -> list[str]:
+    """Return a row with an estimate and its number of worlds over that of drawn worlds."""
+    p, low, high, variation, trials = estimate
+    ratio = f"{100 * trials / worlds_needed(p, variation):.2g} %" if 0 < p < 1 else ""
+    return [name, f"{p:.3g}", f"[{low:.2g}, {high:.2g}]", f"{variation:.2f}", f"{trials:,}", ratio]
 
 
-def draw_estimates(found: xr.Dataset) -> Figure:
-    """Estimates of every repetition with their intervals."""
+def draw_estimates(results: xr.Dataset) -> Figure:
+    """Draw the estimates of all repetitions with their intervals."""
     figure = Figure(figsize=(6.5, 3.4), layout="constrained")
     ax = figure.subplots()
-    place = np.arange(found.sizes["repetition"])
-    p = found.p.values
-    errors = np.abs(np.stack([p - found.low.values, found.high.values - p]))
-    ax.errorbar(place + 1, p, errors, fmt="o", ms=4, capsize=2, color="C3", label="splitting")
+    p = results.p.values
+    reach = np.abs(np.stack([p - results.low.values, results.high.values - p]))
+    repetition = 1 + np.arange(p.size)
+    ax.errorbar(repetition, p, reach, fmt="o", ms=4, capsize=2, color="C3", label="splitting")
     if (p > 0).all():
         ax.set_yscale("log")
     ax.set_xlabel("repetition")

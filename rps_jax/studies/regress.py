@@ -1,9 +1,9 @@
-"""Worlds that were hard: what a new law wins and loses of them, in seconds.
+"""Regression worlds: 200 hard worlds in which new laws are compared with earlier ones.
 
-`regression.nc` holds 200 points of the unit cube of the domain `wide`: worlds in which the paper's
-law, the tuned one, RPS+ or the learned GRU fails, or almost does, found by drawing and by `attack`;
-and how these laws did there. The worlds were picked because some law is bad in them. So a rate in
-them says nothing about rates elsewhere, and only differences between laws count.
+`regression.nc` holds points of the unit cube of the domain `wide`, and the outcomes of the paper's
+law, the tuned one, RPS+ and the learned GRU at these points. Each world was picked because one of
+these laws fails there, or nearly fails; drawing and `rps attack` supplied the candidates. A success
+rate in these worlds therefore says nothing about other worlds: only differences between laws count.
 """
 
 import functools
@@ -33,55 +33,55 @@ Known = Literal["rps", "rps_tuned", "rps_plus", "learned_gru"]
 
 
 def worlds() -> xr.Dataset:
-    """Read the points `u` (world, quantity), and `success` and `severity` (known, world)."""
+    """Load the points `u` (world, quantity), and `success` and `severity` (known, world)."""
     return files.read_dataset(FILE)
 
 
 @dataclass(frozen=True)
 class Regress(PlanQuestion, MultiLawQuestion[xr.Dataset]):
-    """Try laws in 200 worlds that were hard for those before them, and compare.
+    """Compare laws with earlier laws in 200 hard worlds.
 
-    The answer holds outcomes (law, world), and as `known_success` and `known_severity` (known,
-    world) those of the laws of the file.
+    The result has the outcomes (law, world), and those of the earlier laws, `known_success` and
+    `known_severity` (known, world).
 
     Example:
       >>> import rps_jax
       >>> brief = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=1.0))
-      >>> found = rps_jax.regress({"mine": "rps,K_h=0.3"}, worlds=3, setting=brief)
-      >>> dict(found.known_success.sizes)
+      >>> results = rps_jax.regress({"mine": "rps,K_h=0.3"}, worlds=3, setting=brief)
+      >>> dict(results.known_success.sizes)
       {'known': 4, 'world': 3}
     """
 
-    TITLE: ClassVar[str] = "Worlds that were hard"
+    TITLE: ClassVar[str] = "Hard worlds"
 
     laws: LawsLike = ("rps_tuned",)
     worlds: int | None = option(None, 1, 200)
-    """Number of the worlds, of the first ones; by default all."""
+    """Number of worlds, from the first on; by default all."""
     against: Known = "rps_tuned"
-    """Law of the file against which changes are listed."""
+    """Earlier law with which each world is compared."""
 
     @functools.cached_property
     def plan(self) -> Plan:
-        """What is run."""
+        """Sweep over the points of the file."""
         at = points.checked(DOMAINS[DOMAIN], worlds().u.values[: self.worlds])
         return Plan(DOMAINS[DOMAIN], len(at.u), self.chosen, self.setting, points=at)
 
     def answer(self, run: Run) -> xr.Dataset:
-        found = super().answer(run)
-        known = worlds().isel(world=slice(found.sizes["world"]))
-        return found.assign(
+        results = super().answer(run)
+        known = worlds().isel(world=slice(results.sizes["world"]))
+        return results.assign(
             known_success=(("known", "world"), known.success.values),
             known_severity=(("known", "world"), known.severity.values),
         ).assign_coords(known=known.known.values)
 
     def intro(self, results: xr.Dataset) -> str:
         return (
-            f"The first {results.sizes['world']} of 200 worlds in which some law failed, or almost "
-            "did. A rate in them says nothing about rates elsewhere; only differences count."
+            f"The first {results.sizes['world']} of 200 worlds in which some law fails, or nearly "
+            "fails. A rate in them says nothing about other worlds; only differences count."
         )
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        sections = [Section("Wins", "", table(results))]
+        sections = [Section("Successes", "", success_table(results))]
         for law in self.chosen:
             rows = changes(results, law, self.against, self.setting.rules)
             if len(rows) > 1:
@@ -92,36 +92,40 @@ class Regress(PlanQuestion, MultiLawQuestion[xr.Dataset]):
 regress = call_of(Regress)
 
 
-def table(found: xr.Dataset) -> list[list[str]]:
-    """Header and a row for each law: what it gains and loses against each of the file's."""
-    known = [str(law) for law in found.known.values]
-    rows = [["", "wins", *(f"against {law}" for law in known), "wins what none of them does"]]
-    for law in known:
-        won = int((found.known_success.sel(known=law) > 0).sum())
-        rows.append([f"{law} (file)", f"{won} of {found.sizes['world']}", *[""] * len(known), ""])
-    best = (found.known_success.values > 0).any(axis=0)
-    for law in map(str, found.law.values):
-        won = found.success.sel(law=law).values > 0
-        cells = []
-        for other in known:
-            before = found.known_success.sel(known=other).values > 0
-            cells.append(f"+{int((won & ~before).sum())} -{int((~won & before).sum())}")
-        rows.append([law, f"{int(won.sum())} of {won.size}", *cells, str(int((won & ~best).sum()))])
+def success_table(results: xr.Dataset) -> list[list[str]]:
+    """Return a row for each law: its gains and losses against each law of the file."""
+    known = {
+        str(law): results.known_success.sel(known=law).values > 0 for law in results.known.values
+    }
+    against = (f"against {law}" for law in known)
+    rows = [["", "successes", *against, "successes where all of them fail"]]
+    for law, success in known.items():
+        count = f"{int(success.sum())} of {success.size}"
+        rows.append([f"{law} (file)", count, *[""] * len(known), ""])
+    any_known = np.any(list(known.values()), axis=0)
+    for law in map(str, results.law.values):
+        success = results.success.sel(law=law).values > 0
+        cells = [
+            f"+{int((success & ~earlier).sum())} -{int((~success & earlier).sum())}"
+            for earlier in known.values()
+        ]
+        unique = str(int((success & ~any_known).sum()))
+        rows.append([law, f"{int(success.sum())} of {success.size}", *cells, unique])
     return rows
 
 
-def changes(found: xr.Dataset, law: str, against: str, rules: Rules = Rules()) -> list[list[str]]:
-    """Header and a row for each world whose outcome a law changes, the worst losses first."""
-    now = severity_of(found.sel(law=law), rules)
-    before = found.known_severity.sel(known=against).values
+def changes(results: xr.Dataset, law: str, against: str, rules: Rules = Rules()) -> list[list[str]]:
+    """Return a row for each world whose outcome changes with a law, the worst losses first."""
+    severity = severity_of(results.sel(law=law), rules)
+    earlier = results.known_severity.sel(known=against).values
+    names = [str(name).replace("_", " ") for name in results.object.values]
     rows = [["world", "object", against, law]]
-    names = [str(name) for name in found.object.values]
-    for world in np.argsort(before - now, kind="stable"):
-        if (now[world] < 1) != (before[world] < 1):
-            thing = names[int(found.which_object[world])].replace("_", " ")
-            rows.append([str(world), thing, _told(float(before[world])), _told(float(now[world]))])
+    for world in np.argsort(earlier - severity, kind="stable"):
+        if (severity[world] < 1) != (earlier[world] < 1):
+            cells = [_outcome(float(values[world])) for values in (earlier, severity)]
+            rows.append([str(world), names[int(results.which_object[world])], *cells])
     return rows
 
 
-def _told(severity: float) -> str:
-    return "wins" if severity < 1 else f"fails, {100 * (severity - 1):.0f} cm off"
+def _outcome(severity: float) -> str:
+    return "succeeds" if severity < 1 else f"fails, {100 * (severity - 1):.0f} cm off"

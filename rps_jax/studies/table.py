@@ -1,4 +1,4 @@
-"""The paper's Table II: every law pushes every object to every target, under each friction."""
+"""The paper's Table II: all laws push all objects to all targets, under each friction."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -27,42 +27,42 @@ from rps_jax.world.objects import PAPER_OBJECTS
 
 @dataclass(frozen=True)
 class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
-    """Run the paper's trials: by default its 432, with Table II beside the paper's.
+    """Run the paper's trials (by default all 432), and compare with its Table II.
 
-    The answer holds outcomes (law, object, friction, target).
+    The result has the outcomes (law, object, friction, target).
 
     Example:
       >>> import rps_jax
       >>> brief = rps_jax.Setting("mujoco", rules=rps_jax.Rules(horizon=2.0))
       >>> few = {"targets": [(1.0, 0.0), (1.0, 1.0)], "objects": ["cylinder"]}
-      >>> found = rps_jax.table("rps", **few, setting=brief)
-      >>> dict(found.success.sizes)
+      >>> results = rps_jax.table("rps", **few, setting=brief)
+      >>> dict(results.success.sizes)
       {'law': 1, 'object': 1, 'friction': 2, 'target': 2}
     """
 
     TITLE: ClassVar[str] = "Table II: successes"
-    QUICK: ClassVar[Mapping[str, Any]] = {"targets": paper.FEW_TARGETS}
+    QUICK: ClassVar[Mapping[str, object]] = {"targets": paper.FEW_TARGETS}
 
     laws: LawsLike = paper.LAWS
     objects: Sequence[str] = PAPER_OBJECTS
-    """Objects to push: their names, or MJCF files of one's own, FILE.xml."""
+    """Objects to push: their names, or custom MJCF files, FILE.xml."""
     friction: Sequence[FrictionLike] = ("S1", "S2")
     """Frictions: sets of the paper's Table I (S1, S2), or coefficients GROUND,ROBOT."""
     targets: Sequence[tuple[float, float]] = paper.TARGETS
-    """Targets X Y [m], one pair after the other, in the world, where the base starts at the
-    origin; by default the paper's 24."""
+    """Targets X Y [m] in the world, one pair after the other; the base starts at the origin. By
+    default the paper's 24."""
 
     @cached_property
     def cases(self) -> list[Case]:
-        """Every combination, in the nesting order of `results.outcome_dataset`."""
+        """Cases of all combinations, in the nesting order of `results.outcome_dataset`."""
         for name in ("objects", "friction"):
             errors.check_each_once(name, getattr(self, name))
-        given = case_options(self, self.setting)
+        sensing = case_options(self, self.setting)
         return [
-            Case(thing, contact, target, params, **given)
+            Case(name, friction, target, params, **sensing)
             for params in self.chosen.values()
-            for thing in self.objects
-            for contact in self.friction
+            for name in self.objects
+            for friction in self.friction
             for target in self.targets
         ]
 
@@ -79,12 +79,9 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
 
     def _run(self, run: Run) -> xr.Dataset:
         outcome, _ = pushes.run(self.cases, self.setting, **run.batch_options)
-        labels = [label_of(one) for one in self.friction]
-        names = (
-            list(self.chosen),
-            [Path(one).stem if one.endswith(".xml") else one for one in self.objects],
-        )
-        return results.outcome_dataset(outcome, *names, labels, self.targets)
+        objects = [Path(name).stem if name.endswith(".xml") else name for name in self.objects]
+        frictions = [label_of(friction) for friction in self.friction]
+        return results.outcome_dataset(outcome, list(self.chosen), objects, frictions, self.targets)
 
     def intro(self, results: xr.Dataset) -> str:
         return (
@@ -99,39 +96,37 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
 table = call_of(Table)
 
 
-def sections(found: xr.Dataset) -> list[Section]:
-    """Table II beside the paper's, and Fig. 5."""
-    text = "  \n".join(tables.summary(found).splitlines())
-    picture = Picture("min_distance", partial(figures.min_distance, found))
+def sections(outcomes: xr.Dataset) -> list[Section]:
+    """Return the sections with Table II beside the paper's, and Fig. 5."""
+    text = "  \n".join(tables.summary(outcomes).splitlines())
+    picture = Picture("min_distance", partial(figures.min_distance, outcomes))
     return [
-        Section("Table II: successes", text, tables.table_ii(found)),
+        Section("Table II: successes", text, tables.table_ii(outcomes)),
         Section("Fig. 5: least distance of contact to target", "", (), picture),
     ]
 
 
 def table_of(folder: Path) -> Table:
-    """Read the question of a run folder of `rps table`.
+    """Load the question of a run folder of `rps table`.
 
     Raises:
-      InputError: it holds none, or one with a robot or skin of one's own.
+      InputError: the folder holds no table, or one with a custom robot or skin.
     """
     try:
-        found = run_folder.read_manifest(folder)
-        setting = setting_of(found["setting"])
-        laws = {name: registry.params_from_json(law) for name, law in found["laws"].items()}
-        pairs = {name: _tuples(found[name]) for name in ("objects", "friction", "targets")}
-        given = {one.name: found[one.name] for one in dataclasses.fields(TrialOptions)}
-        if found["question"] != "table":
+        manifest = run_folder.read_manifest(folder)
+        setting = setting_of(manifest["setting"])
+        laws = {name: registry.restored(law) for name, law in manifest["laws"].items()}
+        pairs = {name: _tuples(manifest[name]) for name in ("objects", "friction", "targets")}
+        sensing = {field.name: manifest[field.name] for field in dataclasses.fields(TrialOptions)}
+        if manifest["question"] != "table":
             raise KeyError("question")
     except (LookupError, TypeError, AttributeError, ValueError) as error:
         raise files.CorruptFileError(folder / run_folder.MANIFEST, error) from error
-    if any(isinstance(given[name], dict) for name in ("robot", "skin")):
-        raise errors.InputError(
-            f"run = {folder} has a robot or skin of one's own: film it from Python."
-        )
-    return Table(laws, **pairs, **given, setting=setting)
+    if any(isinstance(sensing[name], dict) for name in ("robot", "skin")):
+        raise errors.InputError(f"run = {folder} has a custom robot or skin: film it from Python.")
+    return Table(laws, **pairs, **sensing, setting=setting)
 
 
 def _tuples(value: Any) -> Any:
-    """JSON's lists as tuples."""
+    """Convert lists of JSON to tuples."""
     return tuple(map(_tuples, value)) if isinstance(value, list) else value

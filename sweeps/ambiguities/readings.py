@@ -1,11 +1,12 @@
-"""What the paper leaves open, one reading at a time; and whether its simulator lost its trials.
+"""Readings of what the paper leaves open, and ingredients of the paper's simulator.
 
-All of it runs on the fused engine, the readings at 5 ms with the solver run to its end, so that no
-difference comes from the solver.
+All conditions run on the fused engine. The readings use steps of 5 ms with a converged solver, so
+that no difference comes from the solver.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from typing import Any
@@ -32,12 +33,12 @@ def _setting(physics: Physics = _CONVERGED, **changes: Any) -> Setting:
     return Setting(physics=replace(physics, **changes), engine="fused")
 
 
-def _params(what: str, **params: float) -> Condition:
-    return Condition(what, _setting(), params=params)
+def _params(words: str, **params: float) -> Condition:
+    return Condition(words, _setting(), params=params)
 
 
-def _case(what: str, **case: Any) -> Condition:
-    return Condition(what, _setting(), case=case)
+def _case(words: str, **case: Any) -> Condition:
+    return Condition(words, _setting(), case=case)
 
 
 READINGS = {
@@ -57,7 +58,7 @@ READINGS = {
     "period_50ms": Condition("control period 50 ms", _setting(control_period=0.05)),
     "period_100ms": Condition("control period 100 ms", _setting(control_period=0.1)),
     "drive_on_loss": _params("0.05 m/s instead of 0.01 after a loss", v_lost=0.05),
-    "keep_on_loss": _params("last contact acted upon after a loss", keep_contact=1.0),
+    "keep_on_loss": _params("last contact used after a loss", keep_contact=1.0),
     "base_98cm": _case("base 0.978 m long instead of 0.725", robot=Robot(half_length=0.489)),
     "base_58cm": _case("base 0.58 m long (square)", robot=Robot(half_length=0.29)),
     "capacitive": _case("capacitive skin of 42 taxels", skin=CapacitiveSkin()),
@@ -74,13 +75,14 @@ QUICK_READINGS = (DEFAULT, "tangent_as_printed", "drive_on_loss", "tolerance_1mm
 _THIN = {"skin": IdealSkin(0.001)}
 
 
-def _gazebo(what: str, tolerance: float = 0.001, bearing: float = 0.0, **changes: Any) -> Condition:
-    return Condition(
-        what, _setting(_GAZEBO, **changes), case={"skin": IdealSkin(tolerance), "bearing": bearing}
-    )
+def _gazebo(
+    words: str, tolerance: float = 0.001, bearing: float = 0.0, **changes: Any
+) -> Condition:
+    case = {"skin": IdealSkin(tolerance), "bearing": bearing}
+    return Condition(words, _setting(_GAZEBO, **changes), case=case)
 
 
-# What Gazebo may have done to the paper's trials: all together, then each ingredient alone.
+# Ingredients of Gazebo: all together, then one by one.
 GAZEBO = {
     DEFAULT: Condition("the defaults at 1 ms", _setting(_CONE)),
     "paper_gazebo": _gazebo("`paper_gazebo`: pyramid, skin 1 mm"),
@@ -108,73 +110,68 @@ ON_LOSS = {
 
 
 def curve(tolerances: tuple[float, ...] = TOLERANCES) -> dict[str, Condition]:
-    """Conditions over skin tolerance [mm] and behaviour on loss."""
+    """Return conditions over skin tolerance [mm] and behaviour on loss of contact."""
     return {
         f"{loss}_{mm:g}mm": Condition(
-            f"{mm:g} mm, {what}",
+            f"{mm:g} mm, {words}",
             Setting(engine="fused"),
             params=params,
             case={"skin": IdealSkin(mm / 1000)},
         )
-        for loss, (what, params) in ON_LOSS.items()
+        for loss, (words, params) in ON_LOSS.items()
         for mm in tolerances
     }
 
 
 def by_tolerance(results: xr.Dataset, tolerances: tuple[float, ...]) -> xr.Dataset:
-    """The RPS trials of `curve`, (loss, tolerance, object): how many were `won`, and the mean time
-    `lost` without contact [s].
+    """Return the RPS trials of `curve` by (loss, tolerance, object).
+
+    Variables are the number of successes, `won`, and the mean time without contact, `lost` [s].
     """
-    one = results.sel(law="rps")
+    trials = results.sel(law="rps")
     measures = {
-        "won": one.success.sum(("friction", "target")),
-        "lost": one.contact_lost_time.mean(("friction", "target")),
+        "won": trials.success.sum(("friction", "target")),
+        "lost": trials.contact_lost_time.mean(("friction", "target")),
     }
-    return xr.Dataset(
-        {
-            name: (
-                ("loss", "tolerance", "object"),
-                np.stack(
-                    [
-                        values.sel(condition=[f"{loss}_{mm:g}mm" for mm in tolerances]).values
-                        for loss in ON_LOSS
-                    ]
-                ),
-            )
-            for name, values in measures.items()
-        },
-        coords={
-            "loss": list(ON_LOSS),
-            "what": ("loss", [what for what, _ in ON_LOSS.values()]),
-            "tolerance": list(tolerances),
-            "object": one.object,
-        },
-    )
+    dims = ("loss", "tolerance", "object")
+    variables = {}
+    for name, values in measures.items():
+        by_loss = [
+            values.sel(condition=[f"{loss}_{mm:g}mm" for mm in tolerances]).values
+            for loss in ON_LOSS
+        ]
+        variables[name] = (dims, np.stack(by_loss))
+    coords = {
+        "loss": list(ON_LOSS),
+        "what": ("loss", [words for words, _ in ON_LOSS.values()]),
+        "tolerance": list(tolerances),
+        "object": trials.object,
+    }
+    return xr.Dataset(variables, coords)
 
 
 def cells(results: xr.Dataset, condition: str = "paper_gazebo") -> list[list[str]]:
-    """Header and the cells of Table II: ours, the paper's with its Wilson interval, in or out.
+    """Return a row for each cell of Table II: ours beside the paper's with its Wilson interval.
 
     The last column is the p of Fisher's exact test that both have the same rate.
     """
-    one = results.sel(condition=condition).success
-    trials = one.sizes["target"]
+    success = results.sel(condition=condition).success
+    trials, in_paper = success.sizes["target"], len(paper.TARGETS)
     rows = [["cell", "ours", "paper", "95 % of the paper's", "inside", "Fisher p"]]
-    for law in map(str, one.law.values):
-        for name in map(str, one.object.values):
-            for friction in map(str, one.friction.values):
-                won = int(one.sel(law=law, object=name, friction=friction).sum())
-                theirs, of = paper.TABLE_II[law, name, friction], len(paper.TARGETS)
-                low, high = statistics.wilson(theirs, of)
-                table = [[won, trials - won], [theirs, of - theirs]]
-                rows.append(
-                    [
-                        f"{law.upper()} {name} {friction}",
-                        f"{won} of {trials}",
-                        f"{theirs} of {of}",
-                        f"{of * low:.1f}-{of * high:.1f}",
-                        "yes" if low <= won / trials <= high else "no",
-                        f"{stats.fisher_exact(table).pvalue:.2g}",
-                    ]
-                )
+    coordinates = (success[dim].values for dim in ("law", "object", "friction"))
+    for law, name, friction in itertools.product(*coordinates):
+        ours = int(success.sel(law=law, object=name, friction=friction).sum())
+        theirs = paper.TABLE_II[str(law), str(name), str(friction)]
+        low, high = statistics.wilson(theirs, in_paper)
+        table = [[ours, trials - ours], [theirs, in_paper - theirs]]
+        rows.append(
+            [
+                f"{str(law).upper()} {name} {friction}",
+                f"{ours} of {trials}",
+                f"{theirs} of {in_paper}",
+                f"{in_paper * low:.1f}-{in_paper * high:.1f}",
+                "yes" if low <= ours / trials <= high else "no",
+                f"{stats.fisher_exact(table).pvalue:.2g}",
+            ]
+        )
     return rows

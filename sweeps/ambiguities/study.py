@@ -1,9 +1,9 @@
-"""What the paper leaves open: its 144 trials of RPS under one reading at a time.
+"""Study of ambiguities: the paper's 144 trials of RPS under one reading of the paper at a time.
 
     rps sweeps/ambiguities --quick
 
-`--gazebo` tests instead whether the paper's simulator lost its trials, and `--curve` runs skin
-tolerances. The readings stand in `readings`.
+`--gazebo` runs the ingredients of the paper's simulator instead, and `--curve` tolerances of the
+skin. The readings are in `readings`.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from sweeps.study_base import TrialStudy
 
 @dataclass(frozen=True)
 class Ambiguities(TrialStudy[xr.Dataset]):
-    """Run the paper's trials under each reading of what it leaves open, one at a time.
+    """Run the paper's trials under one reading of its open details at a time.
 
-    The answer holds outcomes (condition, law, object, friction, target).
+    The result has the outcomes (condition, law, object, friction, target).
     """
 
     TITLE: ClassVar[str] = "What the paper leaves open"
@@ -51,32 +51,32 @@ class Ambiguities(TrialStudy[xr.Dataset]):
 
     def quick_values(self) -> Mapping[str, Any]:
         """Few targets and readings."""
-        few = readings.QUICK_GAZEBO if self.gazebo else readings.QUICK_READINGS
+        names = readings.QUICK_GAZEBO if self.gazebo else readings.QUICK_READINGS
         if self.curve:
-            few = tuple(readings.curve(readings.QUICK_TOLERANCES))
-        return {"targets": paper.FEW_TARGETS, "readings": few}
+            names = tuple(readings.curve(readings.QUICK_TOLERANCES))
+        return {"targets": paper.FEW_TARGETS, "readings": names}
 
     @property
     def known(self) -> dict[str, Condition]:
-        """The readings that can be asked for."""
+        """Readings by name."""
         known = readings.GAZEBO if self.gazebo else readings.READINGS
         return readings.curve() if self.curve else known
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the readings, the defaults first."""
+        """Names of the selected readings, the defaults first."""
         names = self.readings or tuple(name for name in self.known if name not in self.refused)
         return names if self.curve else tuple(dict.fromkeys([readings.DEFAULT, *names]))
 
     @property
     def refused(self) -> tuple[str, ...]:
-        """The readings whose parameters a law refuses; they run only if they are asked for."""
+        """Readings whose parameters a law refuses; they run only on request."""
         laws = self.grid.laws
-        return tuple(name for name, one in self.known.items() if not one.allowed(laws))
+        return tuple(name for name, reading in self.known.items() if not reading.allowed(laws))
 
     @property
     def grid(self) -> Grid:
-        """Which trials."""
+        """Trials of each reading."""
         laws = self.laws or (paper.LAWS if self.gazebo else ("rps",))
         return Grid(laws=laws, targets=self.targets)
 
@@ -91,25 +91,27 @@ class Ambiguities(TrialStudy[xr.Dataset]):
             errors.check_name("law", name, registry.LAWS)
 
     def num_trials(self) -> int | None:
-        """How many trials there are."""
+        """Number of trials."""
         return len(self.names) * self.grid.size
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Run the readings that are missing."""
+        """Run the missing readings."""
         conditions = {name: self.known[name] for name in self.names}
         return run_conditions(conditions, self.grid, run.folder, **run.batch_options)
 
     def intro(self, results: xr.Dataset) -> str:
-        """What was asked."""
+        """Trials, tests and left-out readings."""
         without = [self.known[name].what for name in self.refused if name not in self.names]
-        left_out = f" Left out, since the law refuses it: {', '.join(without)}." if without else ""
+        left_out = (
+            f" Left out, because the law refuses it: {', '.join(without)}." if without else ""
+        )
         return (
             f"{self.grid.size} trials in every row, in the fused engine. Differences: McNemar's "
             f"exact test, false discoveries held at 5 %.{left_out}"
         )
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Successes under each reading; the cells of Table II; the curve over tolerances."""
+        """Successes under each reading, the cells of Table II, and the curve over tolerances."""
         names, laws = self.names, self.grid.laws
         sections = [
             Section(f"Readings, {law.upper()}", "", condition_rows(results, names[0], law))
@@ -129,26 +131,26 @@ ambiguities = call_of(Ambiguities)
 
 
 def tolerance_curve(curve: xr.Dataset, trials: int) -> Figure:
-    """Success of RPS, and time without contact, over skin tolerance.
+    """Draw the success of RPS, and the time without contact, over skin tolerance.
 
-    A column for each behaviour on loss of contact, which `what` puts into words; `curve` has, by
-    (loss, tolerance, object), the mean time `lost`, and how many of `trials` were `won`.
+    Each column is a behaviour on loss of contact, whose label is `what`. The variables (loss,
+    tolerance, object) are the mean time `lost`, and the number `won` of successful trials.
     """
     columns = curve.sizes["loss"]
     figure = Figure(figsize=(4 * columns, 5), layout="constrained")
     axes = figure.subplots(2, columns, squeeze=False, sharex=True, sharey="row")
     x = curve.tolerance.values
-    for (above, below), loss in zip(axes.T, map(str, curve.loss.values), strict=True):
+    for (top, bottom), loss in zip(axes.T, map(str, curve.loss.values), strict=True):
         for i, name in enumerate(map(str, curve.object.values)):
-            one = curve.sel(loss=loss, object=name)
+            measures = curve.sel(loss=loss, object=name)
             style: dict[str, Any] = {"color": OBJECT_COLOURS[name], "label": words(name)}
-            beside = x + 0.15 * (i - 1)  # where curves coincide
-            success_rates(above, beside, one.won.values, np.full(len(x), trials), **style)
-            below.plot(beside, one.lost.values, "o-", ms=4, lw=1.2, **style)
-        above.set_title(f"on loss: {curve.what.sel(loss=loss).item()}", fontsize=9)
-        above.set_ylim(-3, 103)
-        below.set_xlabel("skin tolerance [mm]")
-        for ax in (above, below):
+            shifted = x + 0.15 * (i - 1)  # so that coinciding curves stay visible
+            success_rates(top, shifted, measures.won.values, np.full(len(x), trials), **style)
+            bottom.plot(shifted, measures.lost.values, "o-", ms=4, lw=1.2, **style)
+        top.set_title(f"on loss: {curve.what.sel(loss=loss).item()}", fontsize=9)
+        top.set_ylim(-3, 103)
+        bottom.set_xlabel("skin tolerance [mm]")
+        for ax in (top, bottom):
             ax.grid(alpha=0.3)
     axes[0, 0].set_ylabel("success [%]")
     axes[1, 0].set_ylabel("mean time without contact [s]")
