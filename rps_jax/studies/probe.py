@@ -1,4 +1,4 @@
-"""One law at points of a domain's unit cube, again and again, through the same programs."""
+"""Probe: outcomes of one law at points of a domain's unit cube, call after call."""
 
 import time
 from collections.abc import Iterator
@@ -23,18 +23,18 @@ from rps_jax.world import points
 from rps_jax.world.domain import Domain
 from rps_jax.world.points import Points
 
-_SLOTS = 64  # of a program, at least
-_KEPT = ("success", "time", "contact_lost_time", "tilt")
-_ANSWERED = ("success", "time", "left", "severity")
+_SLOTS = 64  # least size of a program
+_STORED = ("success", "time", "contact_lost_time", "tilt")
+_RESULTS = ("success", "time", "left", "severity")
 
 
 @dataclass
 class Probe:
-    """Tries one law at points, and keeps what came of each call in a run folder, if it has one.
+    """Simulator of one law at given points, with a checkpoint for each call in a run folder.
 
     Each shape family has a program of 64 slots, one of 256 and so on, for any number of points.
-    Whoever asks for the same points in the same order after being killed is answered from the
-    folder: a search then goes on as if it had never been stopped.
+    After a kill, the same calls in the same order load their checkpoints, so a search resumes as
+    if it had never stopped.
     """
 
     domain: Domain
@@ -45,59 +45,74 @@ class Probe:
     workers: int | None = None
     callback: ProgressCallback = no_progress
     calls: int = 0
-    trials: int = 0  # of all calls, those answered from the folder too
+    trials: int = 0  # of all calls, loaded ones included
     simulated: float = 0.0  # [s] of all these trials
-    _heard: SequentialProgress = field(init=False)
+    _progress: SequentialProgress = field(init=False)
 
     def __post_init__(self) -> None:
-        self._heard = SequentialProgress(self.callback)
+        self._progress = SequentialProgress(self.callback)
 
     def __call__(self, u: np.ndarray) -> xr.Dataset:
-        """Outcomes and `severity` (world) at points `u` (n, q)."""
-        at, name = points.checked(self.domain, u), f"{self.calls:06d}"
-        if self.folder is not None:
-            found = Checkpoints(self.folder).load_or_compute(name, lambda: self._try(at))
-            sizes = {"world": len(at.u)}
-            kept = {"u": ("world", "quantity")} | dict.fromkeys(_ANSWERED, ("world",))
-            files.check_columns(found, self.folder, kept, sizes)
-            if not np.array_equal(found.u.values, at.u):
-                raise InputError(
-                    f"run = {self.folder} was searched otherwise from step {self.calls} on: use "
-                    "the version and the device that made it, or choose another folder."
-                )
-        else:
-            found = self._try(at)
+        """Return outcomes and `severity` (world) at points `u` (n, q)."""
+        at = points.checked(self.domain, u)
+        results = self._simulate(at) if self.folder is None else self._load_or_simulate(at)
         self.calls += 1
         self.trials += len(at.u)
-        self.simulated += float(found.time.sum())
-        self._heard.finish(len(at.u))
-        return found
+        self.simulated += float(results.time.sum())
+        self._progress.finish(len(at.u))
+        return results
 
-    def _try(self, at: Points) -> xr.Dataset:
-        which = self.domain.object_of(at.cases(self.domain, np.arange(len(at.u))))
-        away = np.empty(len(at.u))
-        jobs = [self._job(at, np.flatnonzero(which == one), away) for one in np.unique(which)]
-        shape = {"slots": self.slots, "workers": self.workers, "callback": self._heard}
-        began = time.perf_counter()
-        outcome, _ = batch.run_all(jobs, self.setting, len(at.u), **shape)
-        found = {name: np.asarray(getattr(outcome, name), float) for name in _KEPT}
-        found["left"] = statistics.miss_distance(outcome.min_distance, away)
-        told = [found[name] for name in ("success", "time", "left", "contact_lost_time", "tilt")]
-        found["severity"] = score.severity(*told, rules=self.setting.rules)
-        columns = {name: ("world", values) for name, values in found.items()}
-        wall = time.perf_counter() - began
-        return xr.Dataset({"u": (("world", "quantity"), at.u), **columns}, attrs={"wall": wall})
+    def _load_or_simulate(self, at: Points) -> xr.Dataset:
+        """Return the trials of the checkpoint of this call, or simulate and store them."""
+        assert self.folder is not None
+        checkpoints, name = Checkpoints(self.folder), f"{self.calls:06d}"
+        results = checkpoints.load_or_compute(name, lambda: self._simulate(at))
+        columns = {"u": ("world", "quantity")} | dict.fromkeys(_RESULTS, ("world",))
+        files.check_columns(results, self.folder, columns, {"world": len(at.u)})
+        if not np.array_equal(results.u.values, at.u):
+            raise InputError(
+                f"run = {self.folder} differs from this search from step {self.calls} on: use "
+                "the version and the device that created it, or choose another folder."
+            )
+        return results
 
-    def _job(self, at: Points, rows: np.ndarray, away: np.ndarray) -> Job:
-        """Points of one object; `away` takes the targets' distances from the start."""
+    def _simulate(self, at: Points) -> xr.Dataset:
+        start_time, count = time.perf_counter(), len(at.u)
+        objects = self.domain.object_of(at.cases(self.domain, np.arange(count)))
+        distance = np.empty(count)  # [m] of the target from the start
+        jobs = [self._job(at, np.flatnonzero(objects == k), distance) for k in np.unique(objects)]
+        outcome, _ = batch.run_all(
+            jobs,
+            self.setting,
+            count,
+            slots=self.slots,
+            workers=self.workers,
+            callback=self._progress,
+        )
+        columns = {name: np.asarray(getattr(outcome, name), float) for name in _STORED}
+        columns["left"] = statistics.miss_distance(outcome.min_distance, distance)
+        columns["severity"] = score.severity(
+            columns["success"],
+            columns["time"],
+            columns["left"],
+            columns["contact_lost_time"],
+            columns["tilt"],
+            self.setting.rules,
+        )
+        variables = {name: ("world", values) for name, values in columns.items()}
+        wall = time.perf_counter() - start_time
+        return xr.Dataset({"u": (("world", "quantity"), at.u), **variables}, attrs={"wall": wall})
+
+    def _job(self, at: Points, rows: np.ndarray, distance: np.ndarray) -> Job:
+        """Return the job of points of one object, and fill in the distances of their targets."""
         drawn = at.draw(self.domain, rows)
-        away[rows] = np.linalg.norm(drawn.p_world_target, axis=1)
+        distance[rows] = np.linalg.norm(drawn.p_world_target, axis=1)
 
-        def made() -> Iterator[WorldBatch]:
+        def worlds() -> Iterator[WorldBatch]:
             yield drawn_worlds(self.domain, drawn, self.setting).with_params(self.params)
 
-        # Few different sizes, since each is a program of its own: powers of four.
+        # Each size is a program of its own, so there are few: powers of four.
         size = _SLOTS
         while size < rows.size:
             size *= 4
-        return Job(registry.law_of(self.params), size, made())
+        return Job(registry.law_of(self.params), size, worlds())
