@@ -1,4 +1,4 @@
-"""Statistics, tables, figures and reports, from results made up by hand."""
+"""Statistics, tables, figures and reports, from synthetic results."""
 
 import itertools
 
@@ -23,10 +23,10 @@ from sweeps.speed.study import throughput
 
 @pytest.fixture
 def drawn(tmp_path):
-    """What draws a figure: gives the figure back, which has been saved as well."""
+    """Function that draws a figure, saves it, and returns it."""
 
-    def draw(what, *given):
-        figure, path = what(*given), tmp_path / f"{what.__name__}.png"
+    def draw(function, *arguments):
+        figure, path = function(*arguments), tmp_path / f"{function.__name__}.png"
         assert report.save(figure, path) == path
         assert path.read_bytes().startswith(b"\x89PNG")
         return figure
@@ -40,7 +40,7 @@ def test_wilsons_interval_by_hand():
     assert low == pytest.approx(1 / (1 + 1.959964**2 / 24), abs=1e-6)
     assert high == pytest.approx(1.0)
     assert statistics.wilson(0, 0) == (0.0, 1.0)
-    # p = 1/2 is symmetric about itself.
+    # The interval of p = 1/2 is symmetric.
     low, high = statistics.wilson(12, 24)
     assert low + high == pytest.approx(1.0)
 
@@ -49,36 +49,32 @@ def test_mcnemars_exact_test_by_hand():
     a = xr.DataArray([1, 1, 1, 1, 1, 1, 0, 0])
     b = xr.DataArray([0, 0, 0, 0, 0, 1, 0, 0])
     c = statistics.compare(a, b)
-    # Five of five differences go one way: 2 / 2^5.
+    # Five of five differences have one sign: 2 / 2^5.
     assert (c.gained, c.lost, c.p) == (0, 5, pytest.approx(0.0625))
     assert c.equal == pytest.approx(3 / 8)
     assert statistics.compare(a, a).p == 1.0
 
 
-def test_numbers_are_ranked_as_by_a_stable_sort():
+def test_ascending_order_equals_a_stable_sort():
     rng = np.random.default_rng(0)
-    many = rng.normal(size=5000) * 10.0 ** rng.integers(-40, 38, 5000)
-    for values in (many, rng.integers(-3, 4, 5000), np.array([0.0, -0.0, np.inf, -np.inf, -0.0])):
-        few = values.astype(np.float32)
-        found = statistics.ascending_order(few)
-        np.testing.assert_array_equal(found, np.argsort(few, kind="stable"))
-        np.testing.assert_array_equal(
-            statistics.ascending_order(values), np.argsort(values, kind="stable")
-        )
+    wide = rng.normal(size=5000) * 10.0 ** rng.integers(-40, 38, 5000)
+    for values in (wide, rng.integers(-3, 4, 5000), np.array([0.0, -0.0, np.inf, -np.inf, -0.0])):
+        for x in (values, values.astype(np.float32)):
+            expected = np.argsort(x, kind="stable")
+            np.testing.assert_array_equal(statistics.ascending_order(x), expected)
 
 
-def test_what_a_sweep_says_is_what_happened():
-    """Worked out by hand on four worlds."""
-    inf = np.inf
+def test_statistics_and_tables_of_a_sweep_by_hand():
+    dims, inf = ("law", "world"), np.inf
     results = xr.Dataset(
         {
-            "success": (("law", "world"), np.array([[1, 0, 0, 0], [1, 1, 0, 0]], np.int8)),
-            "diverged": (("law", "world"), np.array([[0, 0, 0, 1], [0, 0, 0, 0]], np.int8)),
-            "tipped": (("law", "world"), np.array([[0, 0, 0, 0], [0, 0, 0, 1]], np.int8)),
-            "time": (("law", "world"), np.array([[50.0, 300, 200, 9], [70, 80, 300, 300]])),
-            "min_distance": (("law", "world"), np.array([[0.04, 0.5, inf, 1], [0.04, 0.04, 1, 2]])),
-            "contact_lost_time": (("law", "world"), np.array([[0.0, 0, 0, 0], [0, 0, 151, 0]])),
-            "path_length": (("law", "world"), np.array([[2.0, 9, 9, 9], [3, 4, 9, 9]])),
+            "success": (dims, [[1, 0, 0, 0], [1, 1, 0, 0]]),
+            "diverged": (dims, [[0, 0, 0, 1], [0, 0, 0, 0]]),
+            "tipped": (dims, [[0, 0, 0, 0], [0, 0, 0, 1]]),
+            "time": (dims, [[50.0, 300, 200, 9], [70, 80, 300, 300]]),
+            "min_distance": (dims, [[0.04, 0.5, inf, 1], [0.04, 0.04, 1, 2]]),
+            "contact_lost_time": (dims, [[0.0, 0, 0, 0], [0, 0, 151, 0]]),
+            "path_length": (dims, [[2.0, 9, 9, 9], [3, 4, 9, 9]]),
             "which_object": ("world", [0, 0, 1, 1]),
             "distance": ("world", [1.0, 2.0, 3.0, 1.0]),
         },
@@ -102,12 +98,12 @@ def test_what_a_sweep_says_is_what_happened():
     bins = statistics.bins(np.arange(16.0), np.arange(16) < 4, count=4)
     assert bins.successes.tolist() == [4, 0, 0, 0]
     assert bins.trials.tolist() == [4] * 4
-    few = statistics.bins(np.array([1.0, 1, 2]), np.array([True, False, True]))
-    assert few.trials.tolist() == [2, 1]
+    by_value = statistics.bins(np.array([1.0, 1, 2]), np.array([True, False, True]))
+    assert by_value.trials.tolist() == [2, 1]
 
 
 def random_worlds(success, **drawn):
-    """Results of laws (laws, worlds), of which only what is given was drawn."""
+    """Results of laws (laws, worlds) in which only the given quantities differ between worlds."""
     count = success.shape[1]
     columns = {name: ("world", np.zeros(count), {"units": "1"}) for name in WORDS}
     columns |= {name: ("world", values, {"units": "kg"}) for name, values in drawn.items()}
@@ -120,7 +116,7 @@ def test_rates_of_more_than_99_percent_have_two_decimals():
     assert tables.share(142, 144) == "98.6 % [95.1, 99.6]"
     assert tables.share(99, 100) == "99.0 % [94.6, 99.8]"  # no more than 99 %
     assert tables.share(24, 24) == "100.0 % [86.2, 100.0]"
-    assert tables.share(10_000, 10_000) == "100.00 % [99.96, 100.00]"  # so many can tell
+    assert tables.share(10_000, 10_000) == "100.00 % [99.96, 100.00]"  # enough trials
     assert tables.share(3, 1000) == "0.30 % [0.10, 0.88]"
     assert tables.share(0, 0) == "-"
     assert (tables.percent(0.9937), tables.percent(0.5)) == ("99.37", "50.0")
@@ -134,16 +130,16 @@ def test_a_validated_law_has_two_decimals_above_99_percent():
         {"update": [7]},
         {"compile": 1.0, "run": 2.0},
     )
-    (told,) = learn.Learn().report(curve, Run(None, no_progress))
-    assert "of 99.37 % in validation" in told.text
-    assert "99.37 %" in told.lines[-1]
+    (section,) = learn.Learn().report(curve, Run(None, no_progress))
+    assert "of 99.37 % in validation" in section.text
+    assert "99.37 %" in section.lines[-1]
 
 
-def test_what_success_depends_on_stands_first():
-    """Heavy objects fail, of 400; friction has nothing to do with it; all else was not varied."""
-    number = np.arange(400)
-    drawn = {"mass": number * 1.0, "friction_ground": number % 7 * 1.0}
-    results = random_worlds((number < 350)[None], **drawn)
+def test_the_quantity_that_decides_comes_first():
+    """Heavy objects fail, whatever their friction; no other quantity varies."""
+    index = np.arange(400)
+    drawn = {"mass": index * 1.0, "friction_ground": index % 7 * 1.0}
+    results = random_worlds((index < 350)[None], **drawn)
     (_, mass, friction) = tables.influence_table(results, "a")
     assert mass[0] == "mass of the object"
     assert mass[1] == "374 kg"  # the last eighth: 350 to 399
@@ -157,49 +153,49 @@ def test_what_success_depends_on_stands_first():
     assert float(friction[5]) > 0.5
 
 
-def test_chance_alone_leaves_no_spread_unexplained_on_average():
-    """Over all ways in which 3 of 9 trials may succeed, in bins of 2, 3 and 4."""
-    found = []
-    for chosen in itertools.combinations(range(9), 3):
-        won = np.isin(np.arange(9), chosen)
-        counts = np.array([part.sum() for part in np.split(won, (2, 5))])
-        found.append(statistics.excess_variance(Bins(np.arange(3), counts, np.array([2, 3, 4]))))
-    assert np.mean(found) == pytest.approx(0, abs=1e-15)
+def test_chance_alone_has_no_excess_variance_on_average():
+    """The mean over all cases of 3 successes in 9 trials, in bins of 2, 3 and 4, is zero."""
+    variances = []
+    for successes in itertools.combinations(range(9), 3):
+        parts = np.split(np.isin(np.arange(9), successes), (2, 5))
+        binned = Bins(np.arange(3), np.array([part.sum() for part in parts]), np.array([2, 3, 4]))
+        variances.append(statistics.excess_variance(binned))
+    assert np.mean(variances) == pytest.approx(0, abs=1e-15)
     # Rates of 1 and 0 have a variance of 1/4, of which 1/28 is noise.
-    apart = Bins(np.arange(2), np.array([4, 0]), np.array([4, 4]))
-    assert statistics.excess_variance(apart) == pytest.approx(1 / 4 - 1 / 28)
+    extremes = Bins(np.arange(2), np.array([4, 0]), np.array([4, 4]))
+    assert statistics.excess_variance(extremes) == pytest.approx(1 / 4 - 1 / 28)
 
 
-def test_of_what_was_drawn_the_figure_shows_what_matters(drawn):
-    """Yaw decides for law b and mass for law a, the next six bring chance alone."""
-    number, random = np.arange(400), np.random.default_rng(0)
+def test_the_figure_shows_the_influential_quantities_and_names_the_rest(drawn):
+    """Yaw decides for law b and mass for law a; six other quantities have no influence."""
+    index, random = np.arange(400), np.random.default_rng(0)
     noise = ("size", "height", "gap", "noise", "distance", "lateral")
     columns = {name: random.permutation(400) * 1.0 for name in noise}
-    columns |= {"mass": number * 1.0, "yaw": number * 7 % 100 * 1.0}
-    results = random_worlds(np.stack([number < 370, columns["yaw"] < 50]), **columns)
-    found = statistics.influences(results)
-    assert [one.name for one in found[:2]] == ["yaw", "mass"]
-    assert [one.q < 0.05 for one in found] == [True] * 2 + [False] * 6
+    columns |= {"mass": index * 1.0, "yaw": index * 7 % 100 * 1.0}
+    results = random_worlds(np.stack([index < 370, columns["yaw"] < 50]), **columns)
+    influences = statistics.influences(results)
+    assert [x.name for x in influences[:2]] == ["yaw", "mass"]
+    assert [x.q < 0.05 for x in influences] == [True] * 2 + [False] * 6
     figure = drawn(figures.success_curves, results)
     titles = [ax.get_title() for ax in figure.axes]
     assert len(titles) == 2
     assert titles[0].startswith("spread 49.6 %, q = ")  # 1/4 (1 - 7/399), as a deviation
     assert not any("chance" in title for title in titles)
-    told = " ".join(figure.get_suptitle().split())
-    assert "the 2 most influential of 8 drawn quantities" in told
-    assert told.endswith(": yaw of the object, mass of the object")
-    below = figure.get_supxlabel().replace("\N{NO-BREAK SPACE}", " ")
-    for one in found:
-        assert (WORDS[one.name] in told) == (one in found[:2])
-        assert (WORDS[one.name] in below) == (one in found[2:])
+    title = " ".join(figure.get_suptitle().split())
+    assert "the 2 most influential of 8 drawn quantities" in title
+    assert title.endswith(": yaw of the object, mass of the object")
+    text = figure.get_supxlabel().replace("\N{NO-BREAK SPACE}", " ")
+    for x in influences:
+        assert (WORDS[x.name] in title) == (x in influences[:2])
+        assert (WORDS[x.name] in text) == (x in influences[2:])
 
 
-def test_curves_that_coincide_are_all_seen(drawn):
-    """The same rates of two laws have marks of their own, side by side on the page."""
-    won = np.arange(400) < 370
-    results = random_worlds(np.stack([won, won]), mass=np.arange(400) * 1.0)
+def test_coinciding_curves_are_all_visible(drawn):
+    """Equal rates of two laws have different marks, side by side on the page."""
+    success = np.arange(400) < 370
+    results = random_worlds(np.stack([success, success]), mass=np.arange(400) * 1.0)
     figure = drawn(figures.success_curves, results)
-    marks = [one.lines[0] for one in figure.axes[0].containers]
+    marks = [bars.lines[0] for bars in figure.axes[0].containers]
     low, high = figure.axes[0].get_xlim()
     assert low < 30 < 370 < high
     assert len({line.get_marker() for line in marks}) == 2
@@ -208,24 +204,24 @@ def test_curves_that_coincide_are_all_seen(drawn):
 
 
 def test_a_path_is_drawn_with_its_target_and_its_last_contact(drawn):
-    way, nowhere = np.linspace(0, 1, 6).reshape(3, 2), [np.nan, np.nan]
-    contact = [[0.3, 0.1], [0.4, 0.2], nowhere]
-    found = xr.Dataset(
+    path, none = np.linspace(0, 1, 6).reshape(3, 2), [np.nan, np.nan]
+    contact = [[0.3, 0.1], [0.4, 0.2], none]
+    dims = ("object", "target", "path_time", "axis")
+    results = xr.Dataset(
         {
-            "base_path": (("object", "target", "path_time", "axis"), [[way, way]]),
-            "contact_path": (("object", "target", "path_time", "axis"), [[contact, [nowhere] * 3]]),
+            "base_path": (dims, [[path, path]]),
+            "contact_path": (dims, [[contact, [none] * 3]]),
             "path_success": (("object", "target"), [[1, 0]]),
             "half": ("axis", [0.4, 0.2]),
         },
         {"object": ["hardware_box"], "target_x": ("target", [2.0] * 2)}
         | {"target_y": ("target", [1.0] * 2)},
     )
-    (ax,) = drawn(hardware.paths_figure, found).axes
+    (ax,) = drawn(hardware.paths_figure, results).axes
     assert ax.get_title() == "hardware box: 1 of 2"
     lines = [line.get_xydata().tolist() for line in ax.lines]
-    assert lines == [
-        way.tolist(), [[2.0, 1.0]], [[0.4, 0.2]], way.tolist(), [[2.0, 1.0]],
-    ]  # fmt: skip
+    target, line = [[2.0, 1.0]], path.tolist()
+    assert lines == [line, target, [[0.4, 0.2]], line, target]
 
 
 def test_rates_are_drawn_in_percent_by_object(drawn):
@@ -233,10 +229,10 @@ def test_rates_are_drawn_in_percent_by_object(drawn):
     coords = {"loss": ["creep"], "what": ("loss", ["ahead"]), "tolerance": [1.0, 6.0]}
     coords["object"] = ["box"]
     curve = xr.Dataset({"won": (dims, [[[1], [4]]]), "lost": (dims, [[[5.0], [2.0]]])}, coords)
-    above, below = drawn(tolerance_curve, curve, 4).axes
-    assert above.get_title() == "on loss: ahead"
-    assert above.lines[0].get_ydata().tolist() == [25.0, 100.0]
-    assert below.lines[0].get_ydata().tolist() == [5.0, 2.0]
+    top, bottom = drawn(tolerance_curve, curve, 4).axes
+    assert top.get_title() == "on loss: ahead"
+    assert top.lines[0].get_ydata().tolist() == [25.0, 100.0]
+    assert bottom.lines[0].get_ydata().tolist() == [5.0, 2.0]
     dims = ("object", "shift", "side", "target")
     shoved = xr.Dataset(
         {
@@ -250,31 +246,31 @@ def test_rates_are_drawn_in_percent_by_object(drawn):
     assert ax.lines[0].get_xydata().tolist() == [[10.0, 75.0], [40.0, 0.0]]
 
 
-def test_speeds_are_drawn_by_batch_and_gains_from_one(drawn):
+def test_speeds_are_drawn_by_batch_and_gains_from_1_on(drawn):
     rows = [("box", "fast", 64, 100.0), ("box", "fast", 512, 300.0), ("box", "C", 8, 50.0)]
     (ax,) = drawn(throughput, rows, {"C"}).axes
     fast, level = ax.lines
     assert fast.get_xydata().tolist() == [[64, 100.0], [512, 300.0]]
     assert list(level.get_ydata()) == [50.0, 50.0]
-    gains = {"as it is": 1.0, "long steps": 2.5, "short steps": 0.4}
+    gains = {"default": 1.0, "long steps": 2.5, "short steps": 0.4}
     (ax,) = drawn(levers_figure, gains, "MJX").axes
     assert [bar.get_x() + bar.get_width() for bar in ax.patches] == [1.0, 2.5, 0.4]
     assert [label.get_text() for label in ax.get_yticklabels()][1] == "long steps"
 
 
-def test_a_parameter_is_drawn_on_the_axis_of_its_bounds(drawn):
+def test_a_parameter_with_log_bounds_has_a_log_axis(drawn):
     dims = ("set", "parameter", "step")
-    found = xr.Dataset(
+    results = xr.Dataset(
         {"success": (dims, [[[0.5, 1.0]] * 2]), "value": (dims, [[[1.0, 10.0], [0.0, 1.0]]])},
         {"set": ["paper"], "parameter": ["k", "zeta"]},
         {"worlds": 10},
     )
-    k, zeta, *_ = drawn(parameters_figure, found, ["k"]).axes
+    k, zeta, *_ = drawn(parameters_figure, results, ["k"]).axes
     assert (k.get_xscale(), zeta.get_xscale()) == ("log", "linear")
     assert k.lines[0].get_xydata().tolist() == [[1.0, 50.0], [10.0, 100.0]]
 
 
-def test_a_report_is_one_html_file_that_needs_no_other(tmp_path):
+def test_a_report_is_one_self_contained_html_file(tmp_path):
     picture = Picture("dot", lambda: np.zeros((2, 3, 3), np.uint8))
     sections = [Section("Numbers", "in *words*", [["a", "b"], ["1", "2"]], picture)]
     path = report.write_report(tmp_path, "A <title>", "intro", sections)
@@ -288,7 +284,7 @@ def test_a_report_is_one_html_file_that_needs_no_other(tmp_path):
     assert (tmp_path / "dot.png").read_bytes() == picture.png()
 
 
-# --- bounds that hold ----------------------------------------------------------------------
+# --- bounds --------------------------------------------------------------------------------
 
 
 def test_exact_bounds_by_hand():
@@ -306,16 +302,15 @@ def test_exact_bounds_by_hand():
 def test_the_exact_interval_covers_rare_rates_where_wilsons_does_not():
     p, n = 0.003, 100
     chance = stats.binom.pmf(np.arange(n + 1), n, p)
-    covered = {
-        of: sum(c for k, c in enumerate(chance) if of(k, n)[0] <= p <= of(k, n)[1])
-        for of in (statistics.wilson, statistics.clopper_pearson)
-    }
-    assert covered[statistics.clopper_pearson] >= 0.95
+    intervals = (statistics.clopper_pearson(k, n) for k in range(n + 1))
+    assert (
+        sum(c for c, (low, high) in zip(chance, intervals, strict=True) if low <= p <= high) >= 0.95
+    )
     assert statistics.clopper_pearson(7, 100)[0] < statistics.wilson(7, 100)[0]
 
 
 def test_the_bound_of_the_best_of_many_holds_where_the_plain_one_fails():
-    """Twenty candidates that all fail in a tenth of the worlds; the luckiest is picked."""
+    """The best of twenty candidates, all of which fail in a tenth of the worlds."""
     rng = np.random.default_rng(0)
     least = rng.binomial(200, 0.1, (2000, 20)).min(axis=1)
     counts, times = np.unique(least, return_counts=True)
@@ -329,37 +324,34 @@ def test_the_bound_of_the_best_of_many_holds_where_the_plain_one_fails():
 
 
 def test_the_interval_of_cvar_covers():
-    """Of an exponential law the CVaR of the tail t is 1 - log t."""
+    """The CVaR of the tail t of an exponential distribution is 1 - log t."""
     rng = np.random.default_rng(0)
-    ends = np.array([statistics.cvar_interval(rng.exponential(size=400)) for _ in range(400)])
+    intervals = np.array([statistics.cvar_interval(rng.exponential(size=400)) for _ in range(400)])
     truth = 1 - np.log(0.05)
-    assert np.mean((ends[:, 0] <= truth) & (truth <= ends[:, 1])) > 0.9
-    one = statistics.cvar_interval(np.arange(10.0))
-    assert one == (0, np.inf)  # of a single value nothing is known
+    assert np.mean((intervals[:, 0] <= truth) & (truth <= intervals[:, 1])) > 0.9
+    assert statistics.cvar_interval(np.arange(10.0)) == (0, np.inf)  # one value in the tail
     assert statistics.cvar_interval(np.zeros(100)) == (0, 0)
 
 
-def test_statistics_are_those_of_scipy():
+def test_statistics_equal_those_of_scipy():
     rng = np.random.default_rng(0)
     for trials in (1, 2, 7, 60, 4096):
         for successes in {0, trials, *rng.integers(0, trials + 1, 5).tolist()}:
-            theirs = stats.binomtest(successes, trials)
-            for ours, method in (
-                (statistics.wilson, "wilson"),
-                (statistics.clopper_pearson, "exact"),
-            ):
-                interval = theirs.proportion_ci(0.9, method=method)
-                np.testing.assert_allclose(ours(successes, trials, 0.9), interval, atol=1e-12)
-    for bins in (2, 3, 12):
-        of = rng.integers(5, 50, bins)
-        found = statistics.Bins(np.zeros(bins), rng.binomial(of, 0.8), of)
-        table = np.stack([found.successes, of - found.successes])
+            test = stats.binomtest(successes, trials)
+            methods = {"wilson": statistics.wilson, "exact": statistics.clopper_pearson}
+            for method, function in methods.items():
+                interval = test.proportion_ci(0.9, method=method)
+                np.testing.assert_allclose(function(successes, trials, 0.9), interval, atol=1e-12)
+    for count in (2, 3, 12):
+        trials = rng.integers(5, 50, count)
+        binned = Bins(np.zeros(count), rng.binomial(trials, 0.8), trials)
+        table = np.stack([binned.successes, trials - binned.successes])
         expected = stats.chi2_contingency(table).pvalue
-        np.testing.assert_allclose(statistics.equal_rates_p(found), expected, rtol=1e-9)
+        np.testing.assert_allclose(statistics.equal_rates_p(binned), expected, rtol=1e-9)
     p = rng.uniform(size=20) ** 3
     expected = stats.false_discovery_control(p)
     np.testing.assert_allclose(statistics.false_discovery(p), expected, rtol=1e-12)
     assert statistics.false_discovery([]).size == 0
-    won = xr.DataArray([True] * 9 + [False] * 3)
-    other = xr.DataArray([False] * 7 + [True] * 5)
-    assert statistics.compare(won, other).p == pytest.approx(stats.binomtest(3, 10).pvalue)
+    first = xr.DataArray([True] * 9 + [False] * 3)
+    second = xr.DataArray([False] * 7 + [True] * 5)
+    assert statistics.compare(first, second).p == pytest.approx(stats.binomtest(3, 10).pvalue)

@@ -1,4 +1,4 @@
-"""APS: activations worked out by hand, symmetry, where it orbits, and what it can push."""
+"""APS: activations by hand, symmetry, orbits, and pushes of a box."""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ START = APSState.init(APS)
 aps_step = jax.jit(aps.step)
 
 
-def seen(robot, yaw=0.0, obj=(0.0, 0.0), target=(2.0, 0.0), r_object=0.2):
+def observe(robot, yaw=0.0, obj=(0.0, 0.0), target=(2.0, 0.0), r_object=0.2):
     touch = Observation(
         jnp.array(robot), jnp.array(yaw), jnp.zeros(2), jnp.array(False), jnp.array(target), 0.02
     )
@@ -29,8 +29,8 @@ def seen(robot, yaw=0.0, obj=(0.0, 0.0), target=(2.0, 0.0), r_object=0.2):
 
 def twist_at(angle, distance=0.6, params=PLAIN, state=START, **world):
     """Twist of a robot at this angle [rad] about the object, facing it; target along x."""
-    place = distance * np.array([np.cos(angle), np.sin(angle)])
-    return aps_step(params, state, seen(place, angle + np.pi, **world))[1]
+    position = distance * np.array([np.cos(angle), np.sin(angle)])
+    return aps_step(params, state, observe(position, angle + np.pi, **world))[1]
 
 
 def in_world(twist, yaw):
@@ -71,12 +71,12 @@ def test_behind_the_object_it_pushes_straight_at_the_target():
 
 
 @pytest.mark.parametrize("angle", [0.3, 1.2, 2.0, 2.9, -0.3, -1.2, -2.0, -2.9])
-def test_it_orbits_to_the_far_side_of_the_object_by_the_shorter_way(angle):
+def test_it_orbits_to_the_far_side_of_the_object_on_the_shorter_arc(angle):
     v = in_world(twist_at(angle), angle + np.pi)
     around = v @ [-np.sin(angle), np.cos(angle)]  # counter-clockwise about the object
     assert np.sign(around) == np.sign(angle)
     towards = -v @ [np.cos(angle), np.sin(angle)]
-    assert (towards > 0) == (np.cos(angle) < 0)  # on the target's side it backs off
+    assert (towards > 0) == (np.cos(angle) < 0)  # on the target's side it moves away
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.5, 2.0, 3.0, -1.0])
@@ -98,19 +98,19 @@ def mirrored(observation):
 
 def test_left_and_right_are_mirror_images_over_several_steps():
     rng = np.random.default_rng(0)
-    left, right = START, START
+    state, mirrored_state = START, START
     for _ in range(5):
         robot, obj = rng.normal(size=2), 0.3 * rng.normal(size=2)
         facing = np.arctan2(*(obj - robot)[::-1])
-        at = seen(robot, facing + 0.1 * rng.normal(), obj, (1.5, 0.7))
-        left, a, _ = aps_step(APS, left, at)
-        right, b, _ = aps_step(APS, right, mirrored(at))
+        at = observe(robot, facing + 0.1 * rng.normal(), obj, (1.5, 0.7))
+        state, a, _ = aps_step(APS, state, at)
+        mirrored_state, b, _ = aps_step(APS, mirrored_state, mirrored(at))
         assert np.hypot(a.v_x, a.v_y) > 0.005
         np.testing.assert_allclose(np.stack(a), np.stack(b) * [1, -1, -1], atol=1e-4)
 
 
-def test_the_whole_world_may_be_turned_and_moved():
-    at = seen((-0.5, 0.2), 0.1, (0.05, 0.0), (1.0, 1.0))
+def test_the_law_does_not_depend_on_the_world_frame():
+    at = observe((-0.5, 0.2), 0.1, (0.05, 0.0), (1.0, 1.0))
     turn, shift = 0.8, np.array([3.0, -2.0])
     c, s = np.cos(turn), np.sin(turn)
 
@@ -122,48 +122,48 @@ def test_the_whole_world_may_be_turned_and_moved():
         yaw=at.touch.yaw + turn,
         p_world_target=moved(at.touch.p_world_target),
     )
-    there = at._replace(touch=touch, p_world_object=moved(at.p_world_object))
-    here_twist, there_twist = aps_step(APS, START, at)[1], aps_step(APS, START, there)[1]
-    np.testing.assert_allclose(np.stack(here_twist), np.stack(there_twist), atol=1e-5)
+    elsewhere = at._replace(touch=touch, p_world_object=moved(at.p_world_object))
+    twists = [np.stack(aps_step(APS, START, x)[1]) for x in (at, elsewhere)]
+    np.testing.assert_allclose(*twists, atol=1e-5)
 
 
-def test_a_motion_error_is_learnt_and_steers_against_it():
-    first = seen((-0.6, 0.0))
+def test_a_motion_error_is_learned_and_compensated():
+    first = observe((-0.6, 0.0))
     state, _, _ = aps_step(PLAIN, START, first)
-    # The object went 2 cm at -0.3 rad from its way to the target: gamma = 0 - (-0.3) = 0.3.
+    # The object moved 2 cm at -0.3 rad from the line to the target: gamma = 0 - (-0.3) = 0.3.
     at = (0.02 * np.cos(0.3), -0.02 * np.sin(0.3))
-    state, _, _ = aps_step(PLAIN, state, seen((-0.58, 0.0), obj=at))
+    state, _, _ = aps_step(PLAIN, state, observe((-0.58, 0.0), obj=at))
     assert (state.gamma, state.gamma_mean) == pytest.approx((0.3, 0.3), abs=1e-5)
     # V = v_max / (1 + 0.3); heading turned right by K1 0.3 + K2 0.3 = 0.045.
     behind = np.array([-0.6, 0.0]) + at
-    still = seen(behind, obj=at, target=(10.0 + at[0], at[1]))
+    still = observe(behind, obj=at, target=(10.0 + at[0], at[1]))
     _, twist, _ = aps_step(PLAIN, state._replace(yaw_error=jnp.zeros(())), still)
     assert np.hypot(twist.v_x, twist.v_y) == pytest.approx(0.05 / 1.3, rel=1e-4)
     assert np.arctan2(twist.v_y, twist.v_x) == pytest.approx(-0.045, abs=1e-4)
 
 
-def test_only_a_fall_of_the_error_teaches_which_alpha_was_good():
+def test_alpha_is_learned_only_when_the_error_decreases():
     learnt = START._replace(
         started=jnp.array(True),
         alpha=jnp.array(3.0),
         gamma=jnp.array(0.4),
         gamma_count=jnp.array(5.0),
     )
-    better, _, _ = aps_step(PLAIN, learnt, seen((-0.6, 0.0), obj=(0.02, 0.0)))  # gamma = 0
+    better, _, _ = aps_step(PLAIN, learnt, observe((-0.6, 0.0), obj=(0.02, 0.0)))  # gamma = 0
     # m = pi + (3 - pi) / 101; the variance's update by hand.
     mean = np.pi + (3.0 - np.pi) / 101
     variance = np.pi / 4 + ((3.0 - np.pi) * (3.0 - mean) - np.pi / 4) / 101
     assert (better.weight, better.mean, better.variance) == pytest.approx(
         (101.0, mean, variance), rel=1e-5
     )
-    worse, _, _ = aps_step(PLAIN, learnt, seen((-0.6, 0.0), obj=(0.0, 0.02)))  # gamma = -pi / 2
+    worse, _, _ = aps_step(PLAIN, learnt, observe((-0.6, 0.0), obj=(0.0, 0.02)))  # gamma = -pi / 2
     assert worse.weight == 100.0
-    resting, _, _ = aps_step(PLAIN, learnt, seen((-0.6, 0.0), obj=(0.0005, 0.0)))
+    resting, _, _ = aps_step(PLAIN, learnt, observe((-0.6, 0.0), obj=(0.0005, 0.0)))
     assert (resting.weight, resting.gamma_count) == (100.0, 5.0)
 
 
 def test_it_turns_on_the_spot_until_it_faces_the_object():
-    _, twist, _ = aps_step(PLAIN, START, seen((-0.6, 0.0), yaw=0.5))
+    _, twist, _ = aps_step(PLAIN, START, observe((-0.6, 0.0), yaw=0.5))
     assert (twist.v_x, twist.v_y) == (0.0, 0.0)
     assert twist.omega == pytest.approx(-0.15)  # 0.6 * 0.5, clipped
 
@@ -175,12 +175,12 @@ def test_it_reaches_targets_ahead_only_if_it_aims_beyond_them():
     setting = Setting(engine="mujoco", rules=Rules(horizon=60.0))
     outcome, _ = pushes.run([case(APS), case(PLAIN)], setting)
     np.testing.assert_array_equal(outcome.success, [True, False])
-    # As published the object's centre, a half side of 0.2 m further, comes to the target.
+    # As published, the object's centre reaches the target, half a side (0.2 m) beyond the contact.
     assert outcome.min_distance[1] == pytest.approx(0.2, abs=0.01)
 
 
 @pytest.mark.parametrize("name", APSParams._fields)
 @pytest.mark.parametrize("value", [float("nan"), -0.1, float("inf")])
-def test_parameters_that_mean_nothing_are_refused_by_name(name, value):
+def test_invalid_parameters_are_refused_by_name(name, value):
     with pytest.raises(errors.InputError, match=rf"aps\.{name} = "):
         aps.check(APS._replace(**{name: value}))

@@ -1,4 +1,4 @@
-"""The ceiling: plans around the law, how they are searched, and what they prove."""
+"""The ceiling: plans around the law, their search, and their outcomes."""
 
 from dataclasses import replace
 
@@ -26,48 +26,46 @@ SIZES = {"samples": 6, "rounds": 3, "window": 10.0}
 SMALL = Ceiling(CYLINDERS, **SIZES)
 
 
-def seen(touched=True):
-    place = jnp.array([0.4, 0.1])
-    return Observation(
-        jnp.zeros(2), jnp.zeros(()), place, jnp.asarray(touched), jnp.array([2.0, 0.5])
-    )
+def observe(touched=True):
+    contact, target = jnp.array([0.4, 0.1]), jnp.array([2.0, 0.5])
+    return Observation(jnp.zeros(2), jnp.zeros(()), contact, jnp.asarray(touched), target)
 
 
-def test_without_offsets_a_guided_law_is_the_law():
+def test_without_offsets_a_guided_law_equals_the_law():
     params, state = GuidedParams(), guided.init(GuidedParams())
     alone = RPSState.init(params.law)
     for touched in (False, True, True, False):
-        state, twist, _ = guided.step(params, state, seen(touched))
-        alone, expected, _ = rps.step_with_details(params.law, alone, seen(touched))
+        state, twist, _ = guided.step(params, state, observe(touched))
+        alone, expected, _ = rps.step_with_details(params.law, alone, observe(touched))
         assert [float(x) for x in twist] == [float(x) for x in expected]
     assert int(state.steps) == 4
 
 
-def test_offsets_are_added_in_turn_and_bounded_and_end():
-    """G1 with bounds 0.05 m/s and 0.15 rad/s: the law drives on at 0.05 m/s untouched."""
+def test_offsets_are_added_in_turn_and_bounded():
+    """G1 with bounds 0.05 m/s and 0.15 rad/s; without contact the law drives at 0.05 m/s."""
     plan = np.array([[-0.5, 0.0, 0.0], [0.0, 0.0, 1.0]])
     params = GuidedParams(RPSParams.paper(), plan, hold=2)
     state, twists = guided.init(params), []
     for _ in range(5):
-        state, twist, _ = guided.step(params, state, seen(False))
+        state, twist, _ = guided.step(params, state, observe(False))
         twists.append([float(x) for x in twist])
-    _, usual, _ = rps.step_with_details(params.law, RPSState.init(params.law), seen(False))
-    usual = [float(x) for x in usual]
-    slower = [usual[0] - 0.5 * float(params.law.v_max), *usual[1:]]
+    _, unguided, _ = rps.step_with_details(params.law, RPSState.init(params.law), observe(False))
+    unguided = [float(x) for x in unguided]
+    slower = [unguided[0] - 0.5 * float(params.law.v_max), *unguided[1:]]
     np.testing.assert_allclose(twists[:2], [slower] * 2, rtol=1e-5, atol=1e-7)
-    turning = float(np.clip(usual[2] + params.law.omega_max, None, params.law.omega_max))
-    np.testing.assert_allclose(twists[2:4], [[*usual[:2], turning]] * 2, rtol=1e-5, atol=1e-7)
-    assert twists[4] == usual
+    turning = float(np.clip(unguided[2] + params.law.omega_max, None, params.law.omega_max))
+    np.testing.assert_allclose(twists[2:4], [[*unguided[:2], turning]] * 2, rtol=1e-5, atol=1e-7)
+    assert twists[4] == unguided
 
 
 @pytest.mark.parametrize("offsets", [np.zeros(3), np.zeros((0, 3)), np.full((2, 3), np.inf)])
-def test_plans_that_mean_nothing_are_refused(offsets):
+def test_invalid_plans_are_refused(offsets):
     with pytest.raises(InputError, match="offsets"):
         guided.check(GuidedParams(offsets=offsets))
 
 
 def test_costs_by_hand():
-    """A success costs its time; a failure 1, its miss, a tenth of the gap, and its early end."""
+    """A success costs its time; a failure 1, distance, a tenth of the gap, and its early end."""
     zero = np.zeros(4)
     pose = np.zeros((4, 3))
     away = pose.copy()
@@ -82,7 +80,7 @@ def test_costs_by_hand():
     np.testing.assert_allclose(score.plan_costs(outcome, Rules()), [0.1, 1.5, 6.2, 2.0])
 
 
-def test_weights_go_from_the_best_to_the_mean():
+def test_the_temperature_weights_from_the_best_to_all_samples():
     cost = np.array([[1.0, 2.0, 3.0]])
     np.testing.assert_allclose(ceiling._weights(cost, 1e-3)[0], [1, 0, 0], atol=1e-12)
     np.testing.assert_allclose(ceiling._weights(cost, 1e6)[0], [1, 1, 1], rtol=1e-5)
@@ -91,39 +89,38 @@ def test_weights_go_from_the_best_to_the_mean():
     np.testing.assert_allclose(ceiling._weights(np.ones((1, 3)), 0.2)[0], [1, 1, 1])
 
 
-def test_perturbations_belong_to_world_and_round_and_fill_one_window():
-    many = SMALL.perturbations(np.array([4, 9]), 1, np.array([300.0, 60.0]))
-    alone = SMALL.perturbations(np.array([9]), 1, np.array([60.0]))
-    np.testing.assert_array_equal(many[1], alone[0])
-    assert not many[:, :2].any()
+def test_perturbations_depend_on_world_and_round_and_fill_one_window():
+    both = SMALL.perturbations(np.array([4, 9]), 1, np.array([300.0, 60.0]))
+    single = SMALL.perturbations(np.array([9]), 1, np.array([60.0]))
+    np.testing.assert_array_equal(both[1], single[0])
+    assert not both[:, :2].any()
     # Window 10 s, knots of 5 s, in the second of three rounds: from 100 s and from 20 s on.
     for row, first in ((0, 20), (1, 4)):
-        used = np.flatnonzero(many[row, 2:].any(axis=(0, 2)))
+        used = np.flatnonzero(both[row, 2:].any(axis=(0, 2)))
         assert used.tolist() == [first, first + 1]
-    other = SMALL.perturbations(np.array([9]), 2, np.array([60.0]))
-    assert (other != alone).any()
+    assert (SMALL.perturbations(np.array([9]), 2, np.array([60.0])) != single).any()
 
 
 @pytest.mark.slow
-def test_a_search_goes_on_where_it_was_stopped_and_its_plans_win(tmp_path):
-    asked = SIZES | {"sample": 6, "setting": SHORT, "slots": 12, "out": tmp_path / "run"}
-    whole = rps_jax.ceiling(CYLINDERS, **asked)
+def test_a_search_resumes_and_its_plans_succeed_in_a_sweep(tmp_path):
+    options = SIZES | {"sample": 6, "setting": SHORT, "slots": 12, "out": tmp_path / "run"}
+    whole = rps_jax.ceiling(CYLINDERS, **options)
     rounds = list(Checkpoints(tmp_path / "run").paths().values())
     assert len(rounds) >= 2
     rounds[-1].unlink()
-    again = rps_jax.ceiling(CYLINDERS, **asked)
-    assert again.identical(whole)
-    assert not whole.solved.all()  # or nothing was searched
+    resumed = rps_jax.ceiling(CYLINDERS, **options)
+    assert resumed.identical(whole)
+    assert not whole.solved.all()  # else there was no search
     assert set(whole.trials.values) <= {6, 12, 18}
     assert (whole.cost.values[whole.solved.values == 0] > 1).all()
-    # Each best plan is a law like any other, and does in a sweep what it did in the search.
+    # Each best plan is a law whose outcome in a sweep equals that in the search.
     plans = {f"{i}": GuidedParams(offsets=whole.offsets.sel(world=i).values) for i in (0, 1)}
     test = replace(SHORT, seed=seed_of(0, "test"))
-    found = rps_jax.sweep(plans, CYLINDERS, worlds=6, setting=test, slots=6)
+    sweep = rps_jax.sweep(plans, CYLINDERS, worlds=6, setting=test, slots=6)
     for i in (0, 1):
-        one = found.sel(law=f"{i}").isel(world=i)
-        assert int(one.success) == int(whole.solved.sel(world=i))
-        np.testing.assert_allclose(float(one.time), float(whole.time.sel(world=i)), atol=0.021)
+        trial, search = sweep.sel(law=f"{i}").isel(world=i), whole.sel(world=i)
+        assert int(trial.success) == int(search.solved)
+        np.testing.assert_allclose(float(trial.time), float(search.time), atol=0.021)
 
 
 @pytest.mark.parametrize(
@@ -139,29 +136,29 @@ def test_searches_without_worlds_or_perturbations_are_refused(options, words):
         rps_jax.ceiling(CYLINDERS, **options)
 
 
-def test_the_first_worlds_and_what_all_named_laws_lose_are_chosen(monkeypatch):
-    won = np.array([[0, 0, 1, 0, 0], [1, 0, 1, 0, 1]])
-    found = xr.Dataset({"success": (("law", "world"), won)}, {"law": ["a", "b"]})
-    assert ceiling.failed_worlds(found, ["a", "b"]).tolist() == [1, 3]
-    monkeypatch.setattr(ceiling.files, "read_results", lambda path: found)
+def test_the_first_worlds_and_common_failures_are_tried(monkeypatch):
+    success = np.array([[0, 0, 1, 0, 0], [1, 0, 1, 0, 1]])
+    results = xr.Dataset({"success": (("law", "world"), success)}, {"law": ["a", "b"]})
+    assert ceiling.failed_worlds(results, ["a", "b"]).tolist() == [1, 3]
+    monkeypatch.setattr(ceiling.files, "read_results", lambda path: results)
 
-    def numbers(*lost_by, **options):
+    def worlds(*lost_by, **options):
         return Ceiling(run="run", lost_by=lost_by, **options).numbers.tolist()
 
-    assert numbers("a", "b", sample=1) == [0, 1, 3]
-    assert numbers("a", sample=0, most=2) == [0, 1]
+    assert worlds("a", "b", sample=1) == [0, 1, 3]
+    assert worlds("a", sample=0, most=2) == [0, 1]
     with pytest.raises(InputError, match="unknown law of the run 'c'"):
-        numbers("c", sample=0)
+        worlds("c", sample=0)
 
 
-def test_the_command_tries_what_a_law_loses(tmp_path, capsys):
+def test_the_command_tries_the_failures_of_a_law(tmp_path, capsys):
     run = tmp_path / "run"
-    asked = ["ladder", "--domain", "paper", "--worlds", 6, "--engine", "quasistatic"]
-    asked += ["--laws", "rps_tuned", "pursuit", "--slots", 6, "--workers", 1, "--out", run]
-    assert command(*asked) == 0
+    ladder = ["ladder", "--domain", "paper", "--worlds", 6, "--engine", "quasistatic"]
+    ladder += ["--laws", "rps_tuned", "pursuit", "--slots", 6, "--workers", 1, "--out", run]
+    assert command(*ladder) == 0
     capsys.readouterr()
-    few = ["--sample", 2, "--samples", 3, "--rounds", 1, "--slots", 6, "--workers", 1]
-    assert command("ceiling", run, "--lost-by", "pursuit", *few) == 0
+    small = ["--sample", 2, "--samples", 3, "--rounds", 1, "--slots", 6, "--workers", 1]
+    assert command("ceiling", run, "--lost-by", "pursuit", *small) == 0
     text = capsys.readouterr().out
     assert "A planner that knows the world" in text
     assert "of the first 2 worlds" in text

@@ -84,7 +84,7 @@ def normal_severity(p, ranges):
 
 
 def simulate(score, kinds, options, seed=0):
-    """One subset simulation."""
+    """Result of a subset simulation."""
     (result,) = rare.run_together(score, [rare.subset_simulation(kinds, options, seed)])
     return result
 
@@ -172,9 +172,9 @@ def synthetic_trials(self, at):
     depth = 1.5 * u["mass"] + u["friction_ground"] + 0.5 * u["lateral"] + 0.2 * u["key_0"] - 2.8
     success = depth < 0
     time = np.where(success, 80 * np.exp(np.minimum(depth, 0)), 300.0)
-    left = np.where(success, 0.05, 0.05 + np.maximum(depth, 0))
-    severe = severity(success, time, left, *np.zeros((2, len(time))), self.setting.rules)
-    columns = {"success": success * 1.0, "time": time, "left": left, "severity": severe}
+    distance = np.where(success, 0.05, 0.05 + np.maximum(depth, 0))
+    severe = severity(success, time, distance, *np.zeros((2, len(time))), self.setting.rules)
+    columns = {"success": success * 1.0, "time": time, "left": distance, "severity": severe}
     variables = {name: ("world", values) for name, values in columns.items()}
     return xr.Dataset({"u": (("world", "quantity"), at.u), **variables}, attrs={"wall": 0.1})
 
@@ -262,7 +262,7 @@ def test_a_missing_package_is_named(command, module, package, tmp_path, capsys, 
 
 
 def test_the_command_searches_checks_lists_and_draws(tmp_path, capsys):
-    """With a horizon that no push can keep, all tried cells fail, in C MuJoCo too."""
+    """All tried cells fail within a short horizon, in C MuJoCo too."""
     command = ["attack", "--engine", "quasistatic", "--cells", 2, "--batch", 8, "--generations", 2]
     command += ["--drawn", 3, "--horizon", 1, "--check-again", 2, "--worst", 2, "--slots", 8]
     command += ["--workers", 1, "--out", tmp_path / "run"]

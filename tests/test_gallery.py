@@ -1,4 +1,4 @@
-"""The gallery of failures: failure modes, what they have in common, and their maps."""
+"""The gallery of failures: failure modes, common quantities, and maps."""
 
 import numpy as np
 import xarray as xr

@@ -1,4 +1,4 @@
-"""The ladder of laws: equal worlds, what each senses, and how they compare."""
+"""The ladder of laws: the same worlds for all laws, their senses, and comparisons."""
 
 import numpy as np
 import pandas as pd
@@ -21,22 +21,21 @@ from rps_jax.world import draws
 
 
 def test_holms_adjustment_by_hand():
-    # Sorted 0.01, 0.03, 0.04 by 3, 2, 1: 0.03, 0.06, 0.04, which must not fall below 0.06.
+    # Sorted 0.01, 0.03, 0.04 times 3, 2, 1: 0.03, 0.06, 0.04, which is raised to 0.06.
     np.testing.assert_allclose(statistics.holm([0.01, 0.04, 0.03]), [0.03, 0.06, 0.06])
     np.testing.assert_allclose(statistics.holm([0.6, 0.9]), [1.0, 1.0])
     assert statistics.holm([]).size == 0
 
 
-def results(**won):
-    success = xr.DataArray(
-        np.array(list(won.values()), np.int8), dims=("law", "world"), coords={"law": list(won)}
-    )
-    return xr.Dataset({"success": success})
+def outcomes(**success):
+    """Results of laws: success by world."""
+    values = np.array(list(success.values()), np.int8)
+    return xr.Dataset({"success": (("law", "world"), values)}, {"law": list(success)})
 
 
-def test_laws_are_compared_with_one_of_them_world_by_world():
-    found = results(base=[1] * 12 + [0] * 8, better=[1] * 20, worse=[0] * 12 + [1] + [0] * 7)
-    header, *rows = tables.against_table(found, "base")
+def test_laws_are_compared_with_a_reference_world_by_world():
+    results = outcomes(base=[1] * 12 + [0] * 8, better=[1] * 20, worse=[0] * 12 + [1] + [0] * 7)
+    header, *rows = tables.against_table(results, "base")
     assert [row[0] for row in rows] == ["better", "base", "worse"]  # best first
     assert header[-1] == "successes in the 8 failures of base"
     better, base, worse = rows
@@ -47,11 +46,11 @@ def test_laws_are_compared_with_one_of_them_world_by_world():
     assert base[2:] == ["", "", ""]
 
 
-def test_every_rung_is_a_law_of_the_package_with_what_it_senses():
+def test_the_default_laws_are_all_laws_in_the_order_of_their_senses():
     senses = {name: registry.law_of(registry.LAWS[name]).senses for name in ladder.all_laws()}
     assert set(senses) == set(registry.LAWS) == set(ladder.Ladder().chosen)
     order = ["touch", "taxels", "force", "pose"]
-    assert list(dict.fromkeys(senses.values())) == order  # from what senses least
+    assert list(dict.fromkeys(senses.values())) == order  # from the fewest senses on
     assert {name for name in senses if senses[name] == "taxels"} == set(policy.SHIPPED)
     assert [name for name in senses if senses[name] == "force"] == ["force_push_published"]
     assert {name for name in senses if senses[name] == "pose"} == {"aps", "dipole"}
@@ -72,38 +71,37 @@ def test_every_rung_is_a_law_of_the_package_with_what_it_senses():
         (("persuit,none.json",), "unknown law 'persuit'"),
     ],
 )
-def test_laws_that_are_not_there_are_refused(laws, words):
+def test_unknown_laws_are_refused(laws, words):
     with pytest.raises(InputError, match=words):
         _ = ladder.Ladder(laws).chosen
 
 
 def test_a_law_may_have_the_values_of_a_file(tmp_path):
-    mine = tmp_path / "eager.json"
-    mine.write_text('{"press": 0.5}')
-    found = ladder.Ladder(("pursuit", f"pursuit,{mine}")).chosen
-    assert list(found) == ["pursuit", "pursuit,eager"]
-    assert found["pursuit,eager"] == registry.LAWS["pursuit"]._replace(press=0.5)
+    path = tmp_path / "eager.json"
+    path.write_text('{"press": 0.5}')
+    laws = ladder.Ladder(("pursuit", f"pursuit,{path}")).chosen
+    assert list(laws) == ["pursuit", "pursuit,eager"]
+    assert laws["pursuit,eager"] == registry.LAWS["pursuit"]._replace(press=0.5)
     with pytest.raises(InputError, match="eager"):
-        _ = ladder.Ladder((f"pursuit,{mine}",) * 2).chosen
-    mine.write_text('{"presses": 0.5}')
+        _ = ladder.Ladder((f"pursuit,{path}",) * 2).chosen
+    path.write_text('{"presses": 0.5}')
     with pytest.raises(InputError, match="presses"):
-        _ = ladder.Ladder(f"pursuit,{mine}").chosen
+        _ = ladder.Ladder(f"pursuit,{path}").chosen
 
 
-def test_every_law_meets_the_same_worlds_which_no_tuner_has_seen():
-    some = ("rps_tuned", "pursuit", "dipole")
-    asked = {"setting": Setting("quasistatic", rules=Rules(horizon=20.0)), "slots": 6}
-    found = climb(some, CYLINDERS, 6, **asked)
-    assert found.success.dims == ("law", "world")
-    assert found.law.values.tolist() == list(some)
-    assert found.senses.values.tolist() == ["touch", "touch", "pose"]
-    assert found.mass.dims == ("world",)
-    index = np.arange(6)
-    drawn = draws.table(draws.draw(CYLINDERS, seed_of(0, "test"), index))
-    np.testing.assert_allclose(found.mass, drawn["mass"][0], rtol=1e-6)
-    again = climb({"mine": RPSParams.tuned()}, CYLINDERS, 6, **asked)
-    np.testing.assert_array_equal(again.time.sel(law="mine"), found.time.sel(law="rps_tuned"))
-    np.testing.assert_array_equal(again.mass, found.mass)
+def test_all_laws_meet_the_same_test_worlds():
+    laws = ("rps_tuned", "pursuit", "dipole")
+    options = {"setting": Setting("quasistatic", rules=Rules(horizon=20.0)), "slots": 6}
+    results = climb(laws, CYLINDERS, 6, **options)
+    assert results.success.dims == ("law", "world")
+    assert results.law.values.tolist() == list(laws)
+    assert results.senses.values.tolist() == ["touch", "touch", "pose"]
+    assert results.mass.dims == ("world",)
+    drawn = draws.table(draws.draw(CYLINDERS, seed_of(0, "test"), np.arange(6)))
+    np.testing.assert_allclose(results.mass, drawn["mass"][0], rtol=1e-6)
+    renamed = climb({"mine": RPSParams.tuned()}, CYLINDERS, 6, **options)
+    np.testing.assert_array_equal(renamed.time.sel(law="mine"), results.time.sel(law="rps_tuned"))
+    np.testing.assert_array_equal(renamed.mass, results.mass)
 
 
 def test_several_domains_are_several_ladders(tmp_path, capsys):
@@ -115,9 +113,9 @@ def test_several_domains_are_several_ladders(tmp_path, capsys):
         alone = climb(("rps", "dipole"), domain, 3, setting=setting, slots=6)
         xr.testing.assert_identical(tree[domain].to_dataset(), alone)
         np.testing.assert_array_equal(load(tmp_path / "run" / domain).success, alone.success)
-    asked = ["ladder", "--laws", "rps", "dipole", "--domain", *domains, "--worlds", 3]
-    asked += ["--engine", "quasistatic", "--horizon", 2, "--slots", 6, "--out", tmp_path / "run"]
-    assert rps(*asked) == 0  # reads the finished sweeps
+    command = ["ladder", "--laws", "rps", "dipole", "--domain", *domains, "--worlds", 3]
+    command += ["--engine", "quasistatic", "--horizon", 2, "--slots", 6, "--out", tmp_path / "run"]
+    assert rps(*command) == 0  # reads the finished sweeps
     text = capsys.readouterr().out
     for domain in domains:
         assert f"## Success, {domain}" in text
@@ -129,9 +127,9 @@ def test_several_domains_are_several_ladders(tmp_path, capsys):
 
 def test_the_command_reports_information_against_success(tmp_path, capsys):
     out = tmp_path / "run"
-    asked = ["ladder", "--domain", "paper", "--worlds", 6, "--engine", "quasistatic"]
-    asked += ["--laws", "rps_tuned", "pursuit", "--slots", 6, "--workers", 1, "--out", out]
-    assert rps(*asked) == 0
+    command = ["ladder", "--domain", "paper", "--worlds", 6, "--engine", "quasistatic"]
+    command += ["--laws", "rps_tuned", "pursuit", "--slots", 6, "--workers", 1, "--out", out]
+    assert rps(*command) == 0
     text = capsys.readouterr().out
     assert "## Models" not in text
     for heading in ("Information against success", "Against rps_tuned, world by world"):
@@ -141,30 +139,30 @@ def test_the_command_reports_information_against_success(tmp_path, capsys):
     assert load(out).success.sizes == {"law": 2, "world": 6}
 
 
-def test_outcomes_are_a_long_table_for_others(tmp_path, monkeypatch):
+def test_outcomes_are_written_as_a_long_table(tmp_path, monkeypatch):
     setting = Setting("quasistatic", rules=Rules(horizon=2.0))
     path = tmp_path / "results.csv"
-    found = climb(("rps", "dipole"), CYLINDERS, 3, setting=setting, table=path)
+    results = climb(("rps", "dipole"), CYLINDERS, 3, setting=setting, table=path)
     table = pd.read_csv(path)
     assert table.law.tolist() == ["rps"] * 3 + ["dipole"] * 3
     assert table.world.tolist() == [0, 1, 2] * 2
     assert set(table.object) == {"random_cylinder"}
     for (law, world), row in table.set_index(["law", "world"]).iterrows():
-        one = found.sel(law=law, world=world)
+        trial = results.sel(law=law, world=world)
         for name in ("success", "time", "path_length", "mass", "friction_ground", "omega_error"):
-            assert row[name] == pytest.approx(float(one[name]), rel=1e-6), name
+            assert row[name] == pytest.approx(float(trial[name]), rel=1e-6), name
         poses = row[["base_x", "base_y", "base_yaw", "object_x", "object_y", "object_yaw"]]
-        wanted = np.concatenate([one.base_pose, one.object_pose])
-        np.testing.assert_allclose(poses.astype(float), wanted, rtol=1e-5)
-        assert row.senses == str(one.senses.values)
-    told = pd.read_csv(tmp_path / "results.columns.csv", keep_default_na=False)
-    assert told.column.tolist() == list(table)
-    units = dict(zip(told.column, told.unit, strict=True))
+        expected = np.concatenate([trial.base_pose, trial.object_pose])
+        np.testing.assert_allclose(poses.astype(float), expected, rtol=1e-5)
+        assert row.senses == str(trial.senses.values)
+    columns = pd.read_csv(tmp_path / "results.columns.csv", keep_default_na=False)
+    assert columns.column.tolist() == list(table)
+    units = dict(zip(columns.column, columns.unit, strict=True))
     assert (units["time"], units["mass"], units["base_yaw"], units["law"]) == ("s", "kg", "rad", "")
-    assert all(told.meaning)
-    # Without pyarrow, pandas is asked to write text in the place of Parquet.
+    assert all(columns.meaning)
+    # pyarrow is optional, so pandas writes text instead of Parquet here.
     monkeypatch.setattr(pd.DataFrame, "to_parquet", pd.DataFrame.to_csv)
-    write_table(found, tmp_path / "other.parquet")
+    write_table(results, tmp_path / "other.parquet")
     assert (tmp_path / "other.parquet").read_text() == path.read_text()
 
 
@@ -177,7 +175,7 @@ def test_outcomes_are_a_long_table_for_others(tmp_path, monkeypatch):
         ({"table": "results.parquet"}, "run pip install pyarrow, or name a .csv file"),
     ],
 )
-def test_tables_that_cannot_be_written_are_refused(options, words, monkeypatch):
+def test_invalid_tables_are_refused(options, words, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(InputError, match=words):
         climb("rps", **options)
@@ -199,27 +197,27 @@ rps_jax.register_law("{name}", rps_jax.Law(lambda params: (), step), {name}())
 """
 
 
-def test_a_law_of_ones_own_is_scored_in_the_ladders_worlds(tmp_path, capsys, registries):
+def test_a_custom_law_is_scored_in_the_worlds_of_the_ladder(tmp_path, capsys, registries):
     mine, out = tmp_path / "mine.py", tmp_path / "score"
     mine.write_text(MINE.format(name="Straight"))
-    asked = ["--domain", "wide,objects=random_cylinder", "--worlds", 6, "--engine", "quasistatic"]
-    asked += ["--slots", 6, "--workers", 1, "--horizon", 80]
-    assert rps("score", f"{mine},v=0.04", *asked, "--out", out) == 0
-    text, found = capsys.readouterr().out, load(out)
-    assert found.law.values.tolist() == ["Straight,v=0.04", "rps", "rps_plus"]
-    won = found.success.values > 0
-    rates = [tables.share(int(one.sum()), 6) for one in won]
-    median = f"{np.median(found.time.values[0][won[0]]):.1f} s" if won[0].any() else "-"
-    place = "6 test worlds of wide,objects=random_cylinder, seed 0, quasistatic"
-    cells = ["Straight,v=0.04", rates[0], median, *rates[1:], place]
+    options = ["--domain", "wide,objects=random_cylinder", "--worlds", 6]
+    options += ["--engine", "quasistatic", "--slots", 6, "--workers", 1, "--horizon", 80]
+    assert rps("score", f"{mine},v=0.04", *options, "--out", out) == 0
+    text, results = capsys.readouterr().out, load(out)
+    assert results.law.values.tolist() == ["Straight,v=0.04", "rps", "rps_plus"]
+    success = results.success.values > 0
+    rates = [tables.share(int(n), 6) for n in success.sum(axis=1)]
+    median = f"{np.median(results.time.values[0][success[0]]):.1f} s" if success[0].any() else "-"
+    worlds = "6 test worlds of wide,objects=random_cylinder, seed 0, quasistatic"
+    cells = ["Straight,v=0.04", rates[0], median, *rates[1:], worlds]
     (line,) = (line for line in text.splitlines() if line.startswith("    | Straight"))
     assert line.strip() == f"| {' | '.join(cells)} |"
     header = text.splitlines()[text.splitlines().index(line) - 2]
     assert header.strip() == "| law | success | median time | rps | rps_plus | worlds |"
-    assert rps("ladder", "--laws", "rps", "rps_plus", *asked, "--out", tmp_path / "ladder") == 0
+    assert rps("ladder", "--laws", "rps", "rps_plus", *options, "--out", tmp_path / "ladder") == 0
     same = load(tmp_path / "ladder")
-    np.testing.assert_array_equal(same.mass, found.mass)
-    np.testing.assert_array_equal(same.time, found.time.sel(law=same.law))
+    np.testing.assert_array_equal(same.mass, results.mass)
+    np.testing.assert_array_equal(same.time, results.time.sel(law=same.law))
 
 
 def test_a_file_of_one_law_is_named_without_its_class(tmp_path, registries):
@@ -237,5 +235,5 @@ def test_a_file_of_one_law_is_named_without_its_class(tmp_path, registries):
 
 def test_the_command_refuses_an_unknown_law(capsys):
     assert "unknown law 'rsp'" in refusal(capsys, "ladder", "--laws", "rsp")
-    said = refusal(capsys, "tune", "es", "--law", "aps")
-    assert "it has no bounds to tune within" in said
+    sentence = refusal(capsys, "tune", "es", "--law", "aps")
+    assert "it has no bounds to tune within" in sentence

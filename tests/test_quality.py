@@ -1,4 +1,4 @@
-"""The study of gradients: its measures by hand, and a small one that is continued."""
+"""The study of gradients: its measures by hand, and a small study that resumes."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from sweeps.gradients.study import Gradients
 
 
 def estimates(gradients, variance=0.0, finite=1.0):
-    """Of two parameters at one horizon: gradients (R, 2)."""
+    """Estimates of gradients (R, 2) of two parameters at one horizon."""
     gradient = np.array(gradients, float)[:, :, None]
     dims = ("repeat", "parameter", "horizon")
     return xr.Dataset(
@@ -26,27 +26,28 @@ def estimates(gradients, variance=0.0, finite=1.0):
 
 
 def test_the_measures_by_hand():
-    found = {
+    results = {
         "truth": estimates([[2.0, 0.0]], variance=0.02),
-        # Along the truth, and across it: cosines 1 and 0, mean (2, 1), off by 1 of 2.
+        # Along and across the truth: cosines 1 and 0, mean (2, 1), an error of 1 of 2.
         "reverse": estimates([[4.0, 0.0], [0.0, 2.0]], variance=0.5, finite=0.75),
         "forward": estimates([[-1.0, 0.0], [-3.0, 0.0]]),
     }
-    judged = gradients.judged(found, ("reverse", "forward")).isel(horizon=0)
-    one, other = (judged.sel(estimator=name) for name in ("reverse", "forward"))
-    assert (float(one.cosine), float(one.least_cosine), float(one.greatest_cosine)) == (0.5, 0, 1)
-    assert float(one.bias) == pytest.approx(0.5)
-    assert float(one.error) == pytest.approx(0.5)  # sqrt(0.5 + 0.5) / 2
-    assert float(one.finite) == pytest.approx(0.75)
-    assert float(other.cosine) == -1
-    assert float(other.bias) == pytest.approx(2.0)
+    judged = gradients.judged(results, ("reverse", "forward")).isel(horizon=0)
+    reverse, forward = (judged.sel(estimator=name) for name in ("reverse", "forward"))
+    cosines = [float(reverse[f"{kind}cosine"]) for kind in ("", "least_", "greatest_")]
+    assert cosines == [0.5, 0, 1]
+    assert float(reverse.bias) == pytest.approx(0.5)
+    assert float(reverse.error) == pytest.approx(0.5)  # sqrt(0.5 + 0.5) / 2
+    assert float(reverse.finite) == pytest.approx(0.75)
+    assert float(forward.cosine) == -1
+    assert float(forward.bias) == pytest.approx(2.0)
     assert float(judged.doubt) == pytest.approx(0.1)  # sqrt(0.02 + 0.02) / 2
-    rows = gradients.table(gradients.judged(found, ("reverse", "forward")))
+    rows = gradients.table(gradients.judged(results, ("reverse", "forward")))
     assert rows[1][:3] == ["reverse", "cosine", "0.50"]
     assert len(rows) == 1 + 2 * 4 + 1
 
 
-def test_a_study_without_sense_is_refused():
+def test_invalid_options_are_refused():
     for bad in (
         {"object": "box"},
         {"horizons": (2.0, 1.0)},
@@ -70,21 +71,19 @@ SMALL = Gradients(
 )
 
 
-def test_a_study_is_continued_and_is_of_one_kind(tmp_path, monkeypatch):
-    """On the quasi-static model, to compile little."""
-    asked = []
+def test_a_study_resumes_and_refuses_other_options(tmp_path, monkeypatch):
+    """The quasi-static model compiles fastest."""
+    names = []
     measured = gradients._measured
 
-    def noted(study, name, found):
-        asked.append(name)
-        return measured(study, name, found)
+    def recorded(study, name, results):
+        names.append(name)
+        return measured(study, name, results)
 
-    monkeypatch.setattr(gradients, "_measured", noted)
+    monkeypatch.setattr(gradients, "_measured", recorded)
     results = replace(SMALL, out=tmp_path)()
-    assert asked == ["truth", "evolution"]
-    again = replace(SMALL, out=tmp_path)()
-    assert asked == ["truth", "evolution"]
-    xr.testing.assert_identical(results, again)
+    xr.testing.assert_identical(results, replace(SMALL, out=tmp_path)())
+    assert names == ["truth", "evolution"]  # each ran once
     assert (results.finite == 1).all()
     assert (np.abs(results.cosine) <= 1 + 1e-6).all()
     assert (results.doubt > 0).all()
