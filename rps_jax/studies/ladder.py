@@ -327,7 +327,7 @@ def draw_ladder(results: xr.Dataset) -> Figure:
     ax.set_ylim(-0.6, len(order) - 0.3)
     ax.set_xlim(-3, 103)
     ax.set_xlabel("success [%]")
-    ax.set_title(f"{results.sizes['world']:,} equal worlds for every law", fontsize=10)
+    ax.set_title(f"{results.sizes['world']:,} worlds, the same for all laws", fontsize=10)
     ax.grid(axis="x", alpha=0.3)
     ax.legend(fontsize=8, loc="best")
     return figure

@@ -41,8 +41,8 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
     axes[0, 0].set_ylim(top=103)
     axes[0, 0].legend(fontsize=8)
     title = (
-        f"Success against the {len(shown)} most influential of {len(influences)} drawn quantities: "
-        f"{_names(shown)}"
+        f"Success against {len(shown)} of {len(influences)} drawn quantities, in the order of "
+        f"influence: {_names(shown)}"
     )
     figure.suptitle(_filled(title, 42 * columns), fontsize=10)
     parts = {
