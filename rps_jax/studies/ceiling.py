@@ -204,7 +204,7 @@ class Ceiling(DomainQuestion[xr.Dataset]):
         jobs = [Job(law, slots, self._worlds(worlds, rows, offsets)) for rows in rows_by_object]
         return batch.run_all(jobs, self.plan.setting, len(offsets), **run.batch_options)[0]
 
-    def _part(
+    def _worlds(
         self, numbers: np.ndarray, rows: np.ndarray, offsets: np.ndarray
     ) -> Iterator[WorldBatch]:
         """Yield the trials of the worlds `rows`, which share an object; built on demand."""
