@@ -3,12 +3,11 @@
 Worlds for tuning, validation and testing come from seeds that never meet.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
@@ -21,17 +20,15 @@ from rps_jax.record import cache
 from rps_jax.robot.robot import RobotLike
 from rps_jax.runs.question import Split, seed_of
 from rps_jax.trials import batch
-from rps_jax.trials.batch import Job, WorldBatch
-from rps_jax.trials.progress import Bar, ProgressCallback, Timing, is_interactive, no_progress
+from rps_jax.trials.batch import BatchOptions
+from rps_jax.trials.progress import Bar, ProgressCallback, Timing, is_interactive
 from rps_jax.trials.results import variable
+from rps_jax.trials.rollout import Candidates, rollout
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
-from rps_jax.trials.worlds import drawn_worlds, remembered_steps
 from rps_jax.world import points as points_
 from rps_jax.world.domain import Domain, DomainLike, named
-from rps_jax.world.draws import Draw
-from rps_jax.world.points import Points
 
 
 def evaluate(
@@ -96,9 +93,9 @@ def evaluate(
     ask = Candidates(_checked(params), seed_of(setting.seed, split), np.arange(count), at)
     cache.use_cache_if_requested()
     shown = is_interactive() if progress is None else progress
-    with Bar("evaluate", ask.candidates * count, shown=shown and report_to is None) as bar:
-        shape = {"callback": report_to or bar, "slots": slots, "workers": workers}
-        (answer,), _ = score_candidates([ask], [ranges], setting, objective, **shape)
+    with Bar("evaluate", ask.count * count, shown=shown and report_to is None) as bar:
+        options = BatchOptions(callback=report_to or bar, slots=slots, workers=workers)
+        (answer,), _ = score_candidates([ask], [ranges], setting, objective, **options)
     variables: dict[str, Any] = {
         "score": (("candidate", "world"), answer.score, {"units": "1", "long_name": "objective"})
     }
@@ -179,103 +176,26 @@ def _checked(params: LawParams) -> LawParams:
     return params
 
 
-# --- several asks at once ------------------------------------------------------------------
-
-
-class Candidates(NamedTuple):
-    """Candidates and the worlds that each of them meets."""
-
-    params: LawParams  # leaves (P, ...)
-    seed: int  # of the worlds
-    worlds: np.ndarray  # (W,) their indices, in each of the D domains
-    points: Points | None = None  # of the unit cube at which the worlds lie; None: drawn ones
-
-    @property
-    def candidates(self) -> int:
-        """How many candidates there are, P."""
-        return jax.tree.leaves(self.params)[0].shape[0]
-
-    def object_of(self, domain: Domain) -> np.ndarray:
-        """Which of a domain's objects each of the worlds (W,) has."""
-        return domain.object_of(points_.cases(domain, self.points, self.worlds))
-
-    def draw(self, domain: Domain, rows: np.ndarray) -> Draw:
-        """Some of the worlds (W,), all of one object."""
-        return points_.draw(domain, self.seed, self.points, self.worlds[rows])
+# --- several requests at once --------------------------------------------------------------
 
 
 class CandidateScores(NamedTuple):
-    """How an `Ask` went."""
+    """Outcomes and scores of all candidates of a request."""
 
     outcome: Outcome  # leaves (P, D * W, ...), on the host
     score: np.ndarray  # (P, D * W) [1]
 
 
 def score_candidates(
-    asks: Sequence[Candidates],
+    requests: Sequence[Candidates],
     domains: Sequence[Domain],
     setting: Setting,
     objective: Objective,
-    *,
-    callback: ProgressCallback = no_progress,
-    **shape: Any,
+    **options: Unpack[BatchOptions],
 ) -> tuple[list[CandidateScores], Timing]:
-    """Every candidate in every world of its ask, all asks in one batch for each shape family."""
-    widths = [len(domains) * ask.worlds.size for ask in asks]
-    counts = [ask.candidates for ask in asks]
-    ends = np.cumsum(np.multiply(widths, counts))
-    narrow = partial(np.asarray, dtype=jnp.result_type(float))
-    longest = max(remembered_steps(one, setting.physics.control_period) for one in domains)
-    away = np.empty(ends[-1])  # [m] of the target from the start
-    jobs: dict[Any, list[WorldBatch]] = {}
-    for ask, width, count, end in zip(asks, widths, counts, ends, strict=True):
-        first = int(end) - count * width
-        ask = ask._replace(params=jax.tree.map(narrow, jax.device_get(ask.params)))
-        for part, column, distance in world_batches(ask, domains, setting):
-            away[first:end].reshape(count, width)[:, column] = distance
-            # As many steps of odometry in all domains let their worlds share a batch.
-            past = np.zeros((part.indices.size, longest), part.worlds.odometry.past.dtype)
-            odometry = part.worlds.odometry._replace(past=past)
-            worlds = part.worlds._replace(odometry=odometry)
-            leaves, tree = jax.tree.flatten((worlds, ask.params))
-            kind = (tree, *(leaf.shape[1:] for leaf in leaves))
-            numbers = first + width * np.arange(count)[:, None] + column
-            jobs.setdefault(kind, []).append(WorldBatch(numbers, worlds, part.stage, ask.params))
-    every, timing = batch.run_all(
-        list(map(_job, jobs.values())), setting, away.size, callback=callback, **shape
-    )
-    score = objective.scores(every, away, setting.rules)
-    answers = []
-    for width, count, end in zip(widths, counts, ends, strict=True):
-        own = np.arange(end - count * width, end).reshape(count, width)
-        answers.append(CandidateScores(batch.rows(every, own), score[own]))
-    return answers, timing
-
-
-def world_batches(
-    ask: Candidates, domains: Sequence[Domain], setting: Setting
-) -> Iterator[tuple[WorldBatch, np.ndarray, np.ndarray]]:
-    """Worlds of an ask by domain and object, their columns, and the targets' distances [m]."""
-    for d, one in enumerate(domains):
-        which = ask.object_of(one)
-        for thing in np.unique(which):
-            rows = np.flatnonzero(which == thing)
-            drawn = ask.draw(one, rows)
-            part = drawn_worlds(one, drawn, setting)
-            yield part, d * ask.worlds.size + rows, np.linalg.norm(drawn.p_world_target, axis=1)
-
-
-def _job(every: Sequence[WorldBatch]) -> Job:
-    """The job of worlds (n, ...) of one shape family, candidate after candidate.
-
-    A part has the numbers (P, n) of the trials of all candidates, and their parameters (P, ...).
-    """
-
-    def filled() -> Iterator[WorldBatch]:
-        for part in every:
-            for p, own in enumerate(part.indices):
-                params = batch.rows(part.params, np.full(own.size, p))
-                yield WorldBatch(own, part.worlds, part.stage, params)
-
-    trials = sum(part.indices.size for part in every)
-    return Job(registry.law_of(every[0].params), trials, filled())
+    """Score every candidate in every world of its request, as `rollout` runs them."""
+    rollouts, timing = rollout(requests, domains, setting, **options)
+    return [
+        CandidateScores(outcome, objective.scores(outcome, distance, setting.rules))
+        for outcome, distance in rollouts
+    ], timing

@@ -17,6 +17,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import itertools
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -36,12 +37,14 @@ from rps_jax.record import cache, files, folder, options, provenance
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
+from rps_jax.trials.batch import BatchOptions
 from rps_jax.trials.progress import Bar, ProgressCallback, Timing, is_interactive
 from rps_jax.trials.setting import Setting
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import Domain, DomainLike
 
 P = ParamSpec("P")
+S = TypeVar("S")
 T = TypeVar("T", covariant=True)
 Split = Literal["tune", "validate", "test"]
 
@@ -55,12 +58,45 @@ def seed_of(seed: int, split: Split) -> int:
     return len(splits) * seed + splits.index(errors.check_name("split", split, splits))
 
 
-class Run(NamedTuple):
-    """Where and how an answer is made."""
+class StepFormat(NamedTuple, Generic[S]):
+    """File format of the results of a loop's steps."""
 
-    folder: Path | None  # of the run; None keeps all in memory
+    encode: Callable[[str, S], bytes]  # name of the step, result -> content
+    decode: Callable[[Path, bytes], S]  # path and content -> result; raises InputError
+    suffix: str
+
+
+def _encode_step(name: str, results: xr.Dataset) -> bytes:
+    return files.encode_results(results.assign_attrs(part=name))
+
+
+def _decode_step(path: Path, content: bytes) -> xr.Dataset:
+    results = files.decode_results(content, path, own=True)
+    if not path.name.startswith(f"{results.attrs.pop('part', None)}-"):
+        raise files.CorruptFileError(path, "it holds another part")
+    return results
+
+
+DATASETS = StepFormat(_encode_step, _decode_step, ".nc")
+
+
+class Run(NamedTuple):
+    """Run folder and resources of one execution of a question, and what the folder already holds.
+
+    A long run is a sequence of steps that are stored as checkpoints, so that it can be killed and
+    resumed. `checkpoint` runs one step; `steps` is the loop over numbered steps:
+
+        state = initial
+        for state in run.steps(lambda i: next_state(state, i), lambda i: i < 100):
+            ...
+
+    Steps in the folder are loaded and not computed again. The loop body must depend on nothing but
+    the results of earlier steps, so that a resumed loop continues as if it had never stopped.
+    """
+
+    folder: Path | None  # None keeps all results in memory
     callback: ProgressCallback  # called with the progress of the run
-    slots: int | None = None  # worlds stepped at once by a worker
+    slots: int | None = None  # worlds that one worker steps at once
     workers: int | None = None  # host threads
 
     @property
@@ -73,10 +109,41 @@ class Run(NamedTuple):
         stored = self.checkpoints
         return compute() if stored is None else stored.load_or_compute(name, compute)
 
+    def steps(
+        self,
+        compute: Callable[[int], S],
+        proceed: Callable[[int], bool],
+        *,
+        name: str = "{:06d}",
+        form: StepFormat[S] = DATASETS,
+    ) -> Iterator[S]:
+        """Yield the results of the steps 0, 1, ... of a loop, in this order.
+
+        Args:
+          compute: returns the result of a step by its index.
+          proceed: whether a step is computed if the folder lacks it; if not, the loop ends.
+          name: name of a step's checkpoint, with its index.
+          form: how a result is stored; by default as a labelled dataset.
+        """
+        stored = self.checkpoints
+        finished = {} if stored is None else stored.paths()
+        for index in itertools.count():
+            key = name.format(index)
+            content = None if stored is None or key not in finished else stored.get(key)
+            if content is not None:
+                yield form.decode(finished[key], content)
+            elif proceed(index):
+                result = compute(index)
+                if stored is not None:
+                    stored.put(key, form.encode(key, result), form.suffix)
+                yield result
+            else:
+                return
+
     @property
-    def batch_options(self) -> dict[str, Any]:
+    def batch_options(self) -> BatchOptions:
         """Slots, workers and callback, as keyword arguments of functions that run trials."""
-        return {"slots": self.slots, "workers": self.workers, "callback": self.callback}
+        return BatchOptions(slots=self.slots, workers=self.workers, callback=self.callback)
 
 
 def call_of(question: Callable[P, Question[T]]) -> Callable[P, T]:

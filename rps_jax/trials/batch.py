@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -63,6 +63,14 @@ class Job(NamedTuple):
 Collect = Callable[[np.ndarray, Outcome], Any]  # numbers (m,) of trials and their outcomes
 
 
+class BatchOptions(TypedDict, total=False):
+    """Keyword arguments of functions that run trials."""
+
+    slots: int | None  # worlds that one worker steps at once on each device of the host
+    workers: int | None  # host threads
+    callback: ProgressCallback
+
+
 def run(
     jobs: Sequence[Job],
     setting: Setting,
@@ -99,7 +107,7 @@ def run(
 
 
 def run_all(
-    jobs: Sequence[Job], setting: Setting, count: int, **shape: Any
+    jobs: Sequence[Job], setting: Setting, count: int, **options: Unpack[BatchOptions]
 ) -> tuple[Outcome, Timing]:
     """Run every trial of every job, whose numbers are 0 to `count` - 1, by the `shape` of `run`.
 
@@ -113,7 +121,7 @@ def run_all(
                 found[name] = np.empty((count, *leaf.shape[1:]), leaf.dtype)
             found[name][numbers] = leaf
 
-    timing = run(jobs, setting, collect=collect, **shape)
+    timing = run(jobs, setting, collect=collect, **options)
     return Outcome(**found), timing  # pyright: ignore[reportArgumentType]
 
 

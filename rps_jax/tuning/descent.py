@@ -22,8 +22,8 @@ from rps_jax.control import registry, soft
 from rps_jax.control.base import LawParams
 from rps_jax.record.options import option
 from rps_jax.robot.skin import CapacitiveSkin, SmoothSkin
-from rps_jax.runs import evaluate
 from rps_jax.runs.question import call_of
+from rps_jax.trials import rollout
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World, control_step, start_all
@@ -222,7 +222,7 @@ def differentiated(thetas: jax.Array, how: Windows, seed: int, step: int) -> tup
     setting = replace(problem.setting, engine="quasistatic")
     ask = problem.ask(how.space.base, seed, step)
     random = np.random.default_rng((seed, step))
-    for part, column, _ in evaluate.world_batches(ask, problem.domains, setting):
+    for part, column, _ in rollout.world_batches(ask, problem.domains, setting):
         worlds = soften(part.worlds), jnp.asarray(random.uniform(size=column.size))
         found.append((_differentiated(thetas, part.stage, worlds, how=how), column.size))
     total = sum(n for _, n in found)
