@@ -31,12 +31,12 @@ from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.scene import FRICTION, Friction
 
-# Trials run at once: more keep the device busier, fewer lose less when killed.
-_TOGETHER = {"cpu": 600, "gpu": 100_000}
+# Number of trials per call: more keep the device busier, fewer are lost when the run is killed.
+_TRIALS_AT_ONCE = {"cpu": 600, "gpu": 100_000}
 
 
 class Grid(NamedTuple):
-    """Which trials, in the nesting order of `outcome_dataset`."""
+    """Trials of a study, in the nesting order of `outcome_dataset`."""
 
     laws: tuple[str, ...] = ("rps",)
     objects: tuple[str, ...] = PAPER_OBJECTS
@@ -45,21 +45,21 @@ class Grid(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Trials."""
+        """Number of trials."""
         return len(self.laws) * len(self.objects) * len(self.friction) * len(self.targets)
 
 
 @dataclass(frozen=True)
 class Condition:
-    """What one row changes: of the setting, of the law's parameters, of every case."""
+    """Changes of one row to the setting, the law parameters and all cases."""
 
     what: str
     setting: Setting = Setting(engine="mjx")
-    params: Mapping[str, float] = field(default_factory=dict)  # of RPS, also within other laws
+    params: Mapping[str, float] = field(default_factory=dict)  # of RPS, or of RPS in another law
     case: Mapping[str, Any] = field(default_factory=dict)  # skin, gap, rear, bearing, ...
 
     def cases(self, grid: Grid) -> list[Case]:
-        """The trials of a grid under this condition."""
+        """Return the trials of a grid under this condition."""
         changed = {name: self._changed(registry.LAWS[name]) for name in grid.laws}
         return [
             Case(name, friction, target, changed[law], **self.case)
@@ -69,8 +69,8 @@ class Condition:
             for target in grid.targets
         ]
 
-    def allowed(self, laws: Sequence[str]) -> bool:
-        """Whether the changed parameters mean something to every law."""
+    def is_allowed(self, laws: Sequence[str]) -> bool:
+        """Return whether all laws accept the changed parameters."""
         try:
             for params in (self._changed(registry.LAWS[name]) for name in laws):
                 registry.law_of(params).check(params)
@@ -79,12 +79,12 @@ class Condition:
         return True
 
     def _changed(self, params: LawParams) -> LawParams:
-        """Parameters of RPS, or of a law that has RPS within, with the changes; others as is."""
+        """Return changed parameters of RPS or of a law that contains RPS; others unchanged."""
         if isinstance(params, RPSParams):
             return params._replace(**self.params)
-        within = getattr(params, "law", None)
-        if isinstance(within, RPSParams):
-            return params._replace(law=within._replace(**self.params))
+        inner = getattr(params, "law", None)
+        if isinstance(inner, RPSParams):
+            return params._replace(law=inner._replace(**self.params))
         return params
 
 
@@ -97,27 +97,31 @@ def run_conditions(
     workers: int | None = None,
     callback: ProgressCallback = no_progress,
 ) -> xr.Dataset:
-    """Outcomes (condition, law, object, friction, target), run or found in `folder`.
+    """Return outcomes (condition, law, object, friction, target).
 
-    Without a folder all is kept in memory. Each condition is a part of the folder as soon as it is
-    done; the same call computes only what is missing.
+    A finished condition is a part of `folder`; only missing conditions are run. Without a folder
+    all conditions are run and nothing is stored.
 
     Raises:
-      InputError: the folder holds a condition of the same name that was run otherwise.
+      InputError: the folder has a condition of the same name with other options.
     """
     parts = None if folder is None else Checkpoints(folder)
-    found = {name: parts and _load(parts, name, c, grid) for name, c in conditions.items()}
-    missing = [name for name, results in found.items() if results is None]
-    finished, simulated = grid.size * (len(found) - len(missing)), 0.0
+    parts_of = {name: parts and _load(parts, name, c, grid) for name, c in conditions.items()}
+    missing = [name for name, results in parts_of.items() if results is None]
+    finished, simulated = grid.size * (len(parts_of) - len(missing)), 0.0
     callback(Progress(finished, simulated))
     for chunk in _chunks(missing, conditions, grid):
         cases = [case for name in chunk for case in conditions[name].cases(grid)]
 
-        def tell(progress: Progress, before=(finished, simulated)) -> None:
-            callback(Progress(before[0] + progress.finished, before[1] + progress.simulated))
+        def report_progress(progress: Progress, previous=(finished, simulated)) -> None:
+            callback(Progress(previous[0] + progress.finished, previous[1] + progress.simulated))
 
         outcome, timing = pushes.run(
-            cases, conditions[chunk[0]].setting, slots=slots, workers=workers, callback=tell
+            cases,
+            conditions[chunk[0]].setting,
+            slots=slots,
+            workers=workers,
+            callback=report_progress,
         )
         finished, simulated = finished + len(cases), simulated + timing.simulated
         for i, name in enumerate(chunk):
@@ -126,8 +130,7 @@ def run_conditions(
             results = outcome_dataset(
                 part, grid.laws, grid.objects, tuple(grid.friction), grid.targets
             )
-            # Shared by all that ran together.
-            share = grid.size / len(cases)
+            share = grid.size / len(cases)  # of the time of the whole call
             results.attrs = {
                 "run_as": _fingerprint(conditions[name], grid),
                 "run_time": timing.run * share,
@@ -135,33 +138,33 @@ def run_conditions(
             }
             if parts is not None:
                 parts.put(name, files.encode_results(results))
-            found[name] = results
-    done = {name: results for name, results in found.items() if results is not None}
-    whole = xr.concat(
+            parts_of[name] = results
+    done = {name: results for name, results in parts_of.items() if results is not None}
+    joined = xr.concat(
         [results.drop_attrs(deep=False) for results in done.values()],
         xr.DataArray(list(done), dims="condition", name="condition"),
     )
     for attribute in ("run_time", "simulated"):
         values = [results.attrs[attribute] for results in done.values()]
-        whole = whole.assign_coords({attribute: ("condition", values)})
-    return whole.assign_coords(what=("condition", [conditions[name].what for name in done]))
+        joined = joined.assign_coords({attribute: ("condition", values)})
+    return joined.assign_coords(what=("condition", [conditions[name].what for name in done]))
 
 
 def _fingerprint(condition: Condition, grid: Grid) -> str:
-    """All that the outcomes depend on, as text."""
-    same = replace(condition, what="", params=dict(condition.params), case=dict(condition.case))
-    return f"{same!r} {grid._replace(friction=dict(grid.friction))!r}"
+    """Return everything that the outcomes depend on, as text."""
+    plain = replace(condition, what="", params=dict(condition.params), case=dict(condition.case))
+    return f"{plain!r} {grid._replace(friction=dict(grid.friction))!r}"
 
 
 def _load(parts: Checkpoints, name: str, condition: Condition, grid: Grid) -> xr.Dataset | None:
-    """A condition's results, if it is among the finished parts."""
+    """Return the results of a condition if it is finished."""
     if (content := parts.get(name)) is None:
         return None
     results = files.decode_results(content, parts.folder / name, own=True)
     if results.attrs.get("run_as") != _fingerprint(condition, grid):
         raise InputError(
             f"{parts.folder / name}-*.nc was run with other options: choose another folder, or "
-            "delete it to run again."
+            "delete the file to run the condition again."
         )
     return results
 
@@ -169,49 +172,49 @@ def _load(parts: Checkpoints, name: str, condition: Condition, grid: Grid) -> xr
 def _chunks(
     names: Sequence[str], conditions: Mapping[str, Condition], grid: Grid
 ) -> list[list[str]]:
-    """Names of conditions to run together: of one setting, and not too many."""
+    """Return groups of conditions that run in one call: one setting, bounded size."""
     groups: dict[Setting, list[str]] = {}
     for name in names:
         groups.setdefault(conditions[name].setting, []).append(name)
-    at_once = max(1, _TOGETHER.get(jax.default_backend(), 600) // grid.size)
+    at_once = max(1, _TRIALS_AT_ONCE.get(jax.default_backend(), 600) // grid.size)
     return [
         group[i : i + at_once] for group in groups.values() for i in range(0, len(group), at_once)
     ]
 
 
 def condition_rows(results: xr.Dataset, baseline: str, law: str = "rps") -> list[list[str]]:
-    """Header and one row for each condition: counts, interval, median time, and the difference.
+    """Return a header and one row per condition: counts, interval, median time, difference.
 
-    The last column says how outcomes differ from the baseline's, and whether significantly:
-    McNemar's exact test, false discoveries among all rows held at 5 % (Benjamini-Hochberg).
+    The last column compares with the baseline by McNemar's exact test. A star marks significant
+    differences at a false discovery rate of 5 % over all rows (Benjamini-Hochberg).
     """
     part = results.sel(law=law)
     base = part.success.sel(condition=baseline)
     names = [str(name) for name in part.condition.values]
-    against = [statistics.compare(base, part.success.sel(condition=name)) for name in names]
-    others = [i for i, name in enumerate(names) if name != baseline]
+    comparisons = [statistics.compare(base, part.success.sel(condition=name)) for name in names]
+    compared = [i for i, name in enumerate(names) if name != baseline]
     q = np.ones(len(names))
-    q[others] = statistics.false_discovery([against[i].p for i in others])
+    q[compared] = statistics.false_discovery([comparisons[i].p for i in compared])
     objects = [str(o) for o in part.object.values]
     header = ["reading", *objects, "all", "95 %", "median time", "against the first"]
     table = [header]
     for i, name in enumerate(names):
-        one = part.sel(condition=name)
-        won = one.success.values.astype(bool)
-        counts = one.success.sum("target").transpose("object", "friction").values.astype(int)
-        low, high = statistics.wilson(int(won.sum()), won.size)
-        time = one.time.values[won]
+        outcomes = part.sel(condition=name)
+        succeeded = outcomes.success.values.astype(bool)
+        counts = outcomes.success.sum("target").transpose("object", "friction").values.astype(int)
+        low, high = statistics.wilson(int(succeeded.sum()), succeeded.size)
+        time = outcomes.time.values[succeeded]
         difference = (
             ""
             if name == baseline
-            else f"+{against[i].gained} -{against[i].lost}, q = {q[i]:.2g}"
+            else f"+{comparisons[i].gained} -{comparisons[i].lost}, q = {q[i]:.2g}"
             + (" *" if q[i] < 0.05 else "")
         )
         table.append(
             [
-                str(one.what.values),
+                str(outcomes.what.values),
                 *(" ".join(map(str, row)) for row in counts),
-                f"{won.sum()} of {won.size}",
+                f"{succeeded.sum()} of {succeeded.size}",
                 f"{100 * low:.0f}-{100 * high:.0f} %",
                 f"{np.median(time):.1f} s" if time.size else "-",
                 difference,

@@ -34,7 +34,7 @@ FAMILIES = ("box", "cylinder", "prism")
 _PRISMS = replace(
     DOMAINS["paper"], objects=("random_prism",), frictions=(FRICTION["S1"],), gap=Range(0.0, 0.0)
 )
-_MUJOCOS_OWN = Physics(
+_MUJOCO_DEFAULTS = Physics(
     timestep=0.002,
     cone="pyramidal",
     impratio=1.0,
@@ -43,19 +43,19 @@ _MUJOCOS_OWN = Physics(
     tolerance=1e-8,
     **MUJOCOS_GROUND,
 )
-# What is timed, batched on JAX's device.
+# Timed programs, batched on JAX's device.
 BATCHED = {
     "fused standard": Setting(engine="fused"),
     "fused fast": Setting(engine="fused", physics=preset(fidelity="fast")),
     "quasistatic": Setting(engine="quasistatic"),
     "mjx standard": Setting(engine="mjx"),
     "mjx fast": Setting(physics=preset(fidelity="fast"), engine="mjx"),
-    "mjx, MuJoCo's defaults": Setting(physics=_MUJOCOS_OWN, engine="mjx"),
+    "mjx, MuJoCo's defaults": Setting(physics=_MUJOCO_DEFAULTS, engine="mjx"),
 }
 
 
 def timed_worlds(family: str, count: int, setting: Setting) -> WorldBatch:
-    """Return worlds with the paper's targets under S1: of a box, of a cylinder or of prisms."""
+    """Return worlds with boxes, cylinders or prisms at the paper's targets under S1."""
     if family == "prism":
         drawn = draws.draw(_PRISMS, 0, np.arange(count))
         return drawn_worlds(_PRISMS, drawn, setting).with_params(RPSParams.paper())
@@ -65,19 +65,19 @@ def timed_worlds(family: str, count: int, setting: Setting) -> WorldBatch:
 
 
 class Program(NamedTuple):
-    """What is timed on JAX's device: a full batch, `simulated` [s] of each world at a go."""
+    """Compiled program for a batch of worlds, which simulates `simulated` seconds per call."""
 
     name: str
     family: str
     worlds: int
     simulated: float
     compile: float  # [s]
-    memory: float  # [bytes] of its arguments, results and all in between
+    memory: float  # [bytes] of arguments, results and intermediate values
     contacts: int
     physics: Physics
     go: Callable[[Trial], Trial]
     start: Trial
-    text: Callable[[], str | None]  # of the compiled program, if it has one
+    text: Callable[[], str | None]  # HLO of the compiled program, if available
 
 
 def traced(
@@ -91,64 +91,63 @@ def traced(
     donated: bool = True,
     flags: dict[str, Any] | None = None,
 ) -> Callable[[], Program]:
-    """What compiles a program that has been traced.
+    """Trace a program and return the function that compiles it.
 
     Args:
-      name: of the program, for tables.
+      name: name of the program in tables.
       setting: physics and engine.
-      family: of the worlds.
-      worlds: how many.
-      simulated: [s] of each world at a go.
-      stage: changes the engine's stage.
-      donated: whether the state of the worlds is overwritten at each go.
-      flags: of XLA.
+      family: shape family of the objects.
+      worlds: number of worlds.
+      simulated: simulated time of each world per call [s].
+      stage: function that changes the engine's stage.
+      donated: whether a call overwrites the state of the worlds.
+      flags: flags of XLA.
     """
     physics = setting.physics
-    few = timed_worlds(family, len(paper.TARGETS), setting)
-    usual, which = few.stage, np.arange(worlds) % len(paper.TARGETS)
-    batch, params = jax.device_put(rows((few.worlds, few.params), which))
+    cases = timed_worlds(family, len(paper.TARGETS), setting)
+    indices = np.arange(worlds) % len(paper.TARGETS)
+    batch, params = jax.device_put(rows((cases.worlds, cases.params), indices))
     start = trial.start_all(batch, params, np.ones(worlds, bool))
-    shared, steps = stage(usual), round(simulated / physics.control_period)
-    began = time.perf_counter()
+    shared, steps = stage(cases.stage), round(simulated / physics.control_period)
+    start_time = time.perf_counter()
 
-    # A new one: what was jitted before gives back what it has traced for such arguments.
+    # A new function for each call: jax.jit caches the trace of a function by its arguments.
     def advance(stage: Any, worlds: World, params: LawParams, trials: Trial) -> Trial:
         batches = (stage,), (worlds,), (params,), (trials,)
         return trial.advance(*batches, ControlLoop(physics), steps)[0]
 
-    given = shared, batch, params, start
-    lowered = jax.jit(advance, donate_argnums=3 if donated else ()).lower(*given)
-    tracing = time.perf_counter() - began
+    arguments = shared, batch, params, start
+    lowered = jax.jit(advance, donate_argnums=3 if donated else ()).lower(*arguments)
+    tracing = time.perf_counter() - start_time
 
-    def compile_() -> Program:
-        began = time.perf_counter()
+    def compile_program() -> Program:
+        start_time = time.perf_counter()
         program = lowered.compile(compiler_options=flags)
-        took = tracing + time.perf_counter() - began
-        needs: Any = program.memory_analysis()
+        duration = tracing + time.perf_counter() - start_time
+        analysis: Any = program.memory_analysis()
         parts = ("argument", "output", "temp")
-        memory = sum(getattr(needs, f"{part}_size_in_bytes") for part in parts)
-        corners = few.worlds.footprint.vertices.shape[-2]  # 1 of a cylinder
-        contacts = engines.get(setting.engine).contacts(usual, corners)
+        memory = sum(getattr(analysis, f"{part}_size_in_bytes") for part in parts)
+        corners = cases.worlds.footprint.vertices.shape[-2]  # 1 for a cylinder
+        contacts = engines.get(setting.engine).contacts(cases.stage, corners)
         go = partial(program, shared, batch, params)
         return Program(
-            name, family, worlds, simulated, took, memory, contacts, physics, go, start,
+            name, family, worlds, simulated, duration, memory, contacts, physics, go, start,
             program.as_text,
         )  # fmt: skip
 
-    return compile_
+    return compile_program
 
 
 def side_by_side(
     programs: Sequence[Callable[[], Callable[[], Program]]], at_once: int
 ) -> Iterator[Program]:
-    """Programs in their order, `at_once` of them compiled side by side.
+    """Yield the programs of some calls of `traced`, compiling `at_once` of them in parallel.
 
-    Each call is of `traced`, and is made when its turn has come, one after the other. While the
-    caller holds a program nothing is compiled, so that it can be timed.
+    Nothing compiles while the caller has a program, so that the caller can time it.
     """
     with ThreadPoolExecutor(at_once) as pool:
-        for first in range(0, len(programs), at_once):
-            jobs = [pool.submit(trace()) for trace in programs[first : first + at_once]]
+        for i in range(0, len(programs), at_once):
+            jobs = [pool.submit(trace()) for trace in programs[i : i + at_once]]
             wait(jobs)
             for job in jobs:
                 yield job.result()

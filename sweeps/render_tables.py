@@ -1,20 +1,20 @@
-"""Write the published tables, which live as data, into the Markdown pages that show them.
+"""Write the published tables of the data files into the Markdown pages.
 
     python sweeps/render_tables.py [--check]
 
-`NAME.json` in `sweeps/results`, or in the `results` of a folder of `sweeps`, holds one table: the
-command, device, versions, commit and date that made it, its columns and its rows. A page shows it
-between `<!-- table: NAME -->` and `<!-- end -->`, and its commands between `<!-- command: NAME -->`
-and `<!-- end -->`. Within a sentence `<!-- cell: NAME | ROW | COLUMN -->...<!-- end -->` is a cell
-without its interval; ROW are the first cells of its row, also divided by bars, and a COLUMN whose
-name others have, too, follows one to its left, as `both / 90 %`. With `--check` nothing is written,
-and the exit code is 1 if a page differs from the data. Only the standard library is needed.
+`NAME.json` in `sweeps/results`, or in the `results` of a folder of `sweeps`, has one table: its
+commands, device, versions, commit, date, columns and rows. A page shows the table between
+`<!-- table: NAME -->` and `<!-- end -->`, and its commands between `<!-- command: NAME -->` and
+`<!-- end -->`. Within a sentence `<!-- cell: NAME | ROW | COLUMN -->...<!-- end -->` is a cell
+without its interval. ROW has the first cells of its row, separated by bars. A COLUMN whose name
+occurs twice follows a column to its left, as `both / 90 %`. With `--check` nothing is written, and
+the exit code is 1 if a page differs from the data. Only the standard library is needed.
 
-A cell is a text, a number, a list of numbers (a rate and the ends of its interval), or null. The
-`format` of a column is applied to a number and to the first of a list, its `rest` to those that
-follow. A column with `merge` shows no text twice below itself. A cell `{"from": NAME, "row": [...],
-"column": ...}` shows a cell of another table, in the row that begins with the values given. A table
-of such cells alone was made by no command, and has no more than columns and rows.
+A cell is a text, a number, a list of numbers (a rate and the limits of its interval), or null. The
+`format` of a column applies to a number and to the first of a list, its `rest` to the others. A
+column with `merge` leaves repeated texts out. A cell `{"from": NAME, "row": [...], "column": ...}`
+shows a cell of another table, in the row that starts with these values. A table of such cells has
+columns and rows only.
 """
 
 import json
@@ -33,17 +33,19 @@ _SKIPPED = {"runs", "build", "dist"}  # folders of the root that hold no pages o
 
 
 def data_files(root: Path = SWEEPS) -> dict[str, Path]:
-    """The data files of all tables by name; raises ValueError if two have the same name."""
-    found: dict[str, Path] = {}
+    """Return the data files of all tables by name; raises ValueError if a name occurs twice."""
+    paths: dict[str, Path] = {}
     for path in sorted(root.glob("**/results/*.json")):
-        if path.stem in found:
-            raise ValueError(f"{path} has the name of {found[path.stem]}: rename one of them.")
-        found[path.stem] = path
-    return found
+        if path.stem in paths:
+            raise ValueError(
+                f"{path} and {paths[path.stem]} have the same name: rename one of them."
+            )
+        paths[path.stem] = path
+    return paths
 
 
 def load(name: str, root: Path = SWEEPS) -> dict[str, Any]:
-    """The data of a table; raises ValueError, with one sentence, if there is no such file."""
+    """Return the data of a table; raises ValueError if the file is missing or invalid."""
     path = path_of(name, root)
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
@@ -58,12 +60,14 @@ def load(name: str, root: Path = SWEEPS) -> dict[str, Any]:
         raise ValueError(f"{path} lacks {', '.join(missing)}.")
     for row in data["rows"]:
         if len(row) != len(data["columns"]):
-            raise ValueError(f"{path}: the row {row[:2]} has not one cell for each column.")
+            raise ValueError(
+                f"{path}: the number of cells of row {row[:2]} is not the number of columns."
+            )
     return data
 
 
 def path_of(name: str, root: Path = SWEEPS) -> Path:
-    """The data file of a table; raises ValueError if there is none."""
+    """Return the data file of a table; raises ValueError if there is none."""
     files = data_files(root)
     if name not in files:
         raise ValueError(f"{name}.json is in no folder `results` of {root}.")
@@ -71,22 +75,22 @@ def path_of(name: str, root: Path = SWEEPS) -> Path:
 
 
 def table(data: dict[str, Any], root: Path = SWEEPS) -> str:
-    """The Markdown table of some data."""
+    """Return the Markdown table of some data."""
     lines = [[column["name"] for column in data["columns"]]]
-    before: list[Any] = [None] * len(data["columns"])
+    previous: list[Any] = [None] * len(data["columns"])
     for row in data["rows"]:
         texts = []
-        for cell, column, above in zip(row, data["columns"], before, strict=True):
+        for cell, column, above in zip(row, data["columns"], previous, strict=True):
             merged = column.get("merge") and cell == above
             texts.append("" if merged else _text(cell, column, root))
         lines.append(texts)
-        before = row
+        previous = row
     lines.insert(1, ["---"] * len(data["columns"]))
     return "".join(f"| {' | '.join(map(_escaped, texts))} |\n" for texts in lines)
 
 
 def _escaped(text: str) -> str:
-    """A cell whose bars, as of |l|, do not end it."""
+    """Return a cell with escaped bars, as in |l|."""
     return re.sub(r"(?<!\\)\|", r"\|", text)
 
 
@@ -103,66 +107,66 @@ def _text(cell: Any, column: dict[str, Any], root: Path) -> str:
 
 
 def _cited(cell: dict[str, Any], root: Path) -> str:
-    """The text of a cell of another table."""
+    """Return the text of a cell of another table."""
     data, first = load(cell["from"], root), cell["row"]
     names = [column["name"] for column in data["columns"]]
     rows = [row for row in data["rows"] if row[: len(first)] == first]
-    *left, column = cell["column"].split(" / ")
-    begin = names.index(left[0]) if left and left[0] in names else 0
-    if len(rows) != 1 or column not in names[begin:]:
+    *left_columns, column = cell["column"].split(" / ")
+    first_column = names.index(left_columns[0]) if left_columns and left_columns[0] in names else 0
+    if len(rows) != 1 or column not in names[first_column:]:
         raise ValueError(f"{cell} does not name one cell of {cell['from']}.json.")
-    i = names.index(column, begin)
+    i = names.index(column, first_column)
     return _text(rows[0][i], data["columns"][i], root)
 
 
 def caption(data: dict[str, Any], link: str) -> str:
-    """One line that says where the numbers were made and links to all that is known of them."""
+    """Return one line with device and date, and a link to the data file."""
     if data["command"] is None:
         return f"\n<sub>Every number is cited: [from which table]({link}).</sub>\n"
-    known = [f"Device: {data['device']}"] if data["device"] else []
-    known += [f"date: {data['date']}"] if data["date"] else []
-    return f"\n<sub>{'; '.join([*known, f'[command, versions and values]({link})'])}.</sub>\n"
+    parts = [f"Device: {data['device']}"] if data["device"] else []
+    parts += [f"date: {data['date']}"] if data["date"] else []
+    return f"\n<sub>{'; '.join([*parts, f'[command, versions and values]({link})'])}.</sub>\n"
 
 
 def commands(data: dict[str, Any]) -> str:
-    """The commands of some data, to be copied into a shell."""
+    """Return the commands of some data as a shell block."""
     lines = data["command"] if isinstance(data["command"], list) else [data["command"]]
     return "```bash\n" + "".join(f"{line}\n" for line in lines) + "```\n"
 
 
 def render(page: Path, root: Path = SWEEPS) -> str:
-    """The text of a page with all its blocks made anew from the data."""
+    """Return the text of a page with all blocks rendered from the data."""
 
-    def block(found: re.Match[str]) -> str:
-        begin, kind, name, end = found.groups()
+    def block(match: re.Match[str]) -> str:
+        start, kind, name, end = match.groups()
         data = load(name, root)
         if kind == "command":
-            return begin + commands(data) + end
+            return start + commands(data) + end
         link = Path(os.path.relpath(path_of(name, root), page.parent)).as_posix()
-        return begin + table(data, root) + caption(data, link) + end
+        return start + table(data, root) + caption(data, link) + end
 
-    def cell(found: re.Match[str]) -> str:
-        begin, words, end = found.groups()
+    def cell(match: re.Match[str]) -> str:
+        start, words, end = match.groups()
         name, *row, column = (word.strip() for word in words.split("|"))
         return (
-            begin + _cited({"from": name, "row": row, "column": column}, root).split(" [")[0] + end
+            start + _cited({"from": name, "row": row, "column": column}, root).split(" [")[0] + end
         )
 
     return _CELL.sub(cell, _BLOCK.sub(block, page.read_text(encoding="utf-8")))
 
 
 def pages(root: Path = ROOT) -> list[Path]:
-    """Every Markdown page of the repository."""
-    found = []
+    """Return the Markdown pages of the repository."""
+    paths = []
     for folder, folders, files in os.walk(root):
         skipped = _SKIPPED if Path(folder) == root else ()
         folders[:] = [name for name in folders if name[0] != "." and name not in skipped]
-        found += [Path(folder) / name for name in files if name.endswith(".md")]
-    return sorted(found)
+        paths += [Path(folder) / name for name in files if name.endswith(".md")]
+    return sorted(paths)
 
 
 def main(arguments: list[str]) -> int:
-    """Render every page, or check that each is as the data say; returns the exit code."""
+    """Render all pages, or check that they match the data; return the exit code."""
     if arguments not in ([], ["--check"]):
         print(__doc__, file=sys.stderr)
         return 2
@@ -180,8 +184,8 @@ def main(arguments: list[str]) -> int:
         print(f"render_tables: error: {error}", file=sys.stderr)
         return 1
     for page in stale:
-        what = "differs from its data; run this without --check" if arguments else "was rendered"
-        print(f"{page.relative_to(ROOT)} {what}.")
+        state = "differs from its data: run without --check" if arguments else "was rendered"
+        print(f"{page.relative_to(ROOT)} {state}.")
     return 1 if stale and arguments else 0
 
 

@@ -20,7 +20,7 @@ def test_the_file_of_the_scene_is_the_scene_that_the_engines_step():
 
 
 def test_starts_touch_the_base_and_no_more():
-    starts = arena.placed(20)
+    starts = arena.initial_poses(20)
     model = scene.load("box").physics
     data = mujoco.MjData(model)
     for qpos in starts:

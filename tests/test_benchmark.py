@@ -54,7 +54,7 @@ def test_a_profile_charges_the_functions_that_asked():
     assert len(set(wheres)) == len(wheres)
     for file in ("engines/quasistatic.py", "control/laws/rps.py", "trials/trial.py"):
         assert any(where.startswith(file) for where in wheres)
-    assert len(costs.table([found], most=3)) == 1 + 3
+    assert len(costs.table([found], count=3)) == 1 + 3
 
 
 def test_an_instruction_comes_from_the_innermost_function():
@@ -98,7 +98,7 @@ ENTRY %main (a: f32[]) -> f32[] {
 
 def test_what_nsight_counts_becomes_a_row():
     """Of the last launch that its table holds, after what the program itself printed."""
-    names = ["ID", *kernel._COUNTED]
+    names = ["ID", *kernel._COUNTERS]
     units = ["", "ns", *[""] * (len(names) - 2)]
     waits = ["5.0", "1.6", "1.1", "0.5", "0.4", "0.0"]
     launches = [
@@ -113,7 +113,7 @@ def test_what_nsight_counts_becomes_a_row():
         *("box", "16,384", "134 µs", "2,000", "251", "5.0"),
         *("1.6", "1.1", "0.5", "0.4", "0.0", "1.4"),
     ]
-    with pytest.raises(InputError, match="counted nothing: ==ERROR== No kernels"):
+    with pytest.raises(InputError, match="profiled no launch: ==ERROR== No kernels"):
         kernel.counts("==ERROR== No kernels")
 
 

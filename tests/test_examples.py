@@ -401,7 +401,7 @@ def test_the_law_runs_on_a_robot_and_compiles_nothing_on_the_way(compiled, capsy
     np.testing.assert_allclose(np.asarray(twist)[:2], [wanted.v_x, wanted.v_y], atol=2e-3)
     latency = made["main"](made["Options"](seconds=0.3))
     assert latency.shape == (300,)
-    assert on_a_robot.TOLD.search(capsys.readouterr().out)
+    assert on_a_robot.PRINTED.search(capsys.readouterr().out)
 
 
 def test_skin_and_law_on_a_robot_hear_the_time_since_the_last_step(monkeypatch):

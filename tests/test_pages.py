@@ -61,11 +61,11 @@ def test_a_table_follows_its_data_and_those_it_cites(tmp_path):
     assert "(one/results/one.json)" in text
     with pytest.raises(ValueError, match=r"does not name one cell of one\.json"):
         rendered([["a", 1.5]])
-    with pytest.raises(ValueError, match="has not one cell for each column"):
+    with pytest.raises(ValueError, match="is not the number of columns"):
         rendered([["a"]])
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "one.json").write_text("{}")
-    with pytest.raises(ValueError, match=r"one\.json has the name of .*one\.json"):
+    with pytest.raises(ValueError, match=r"one\.json and .*one\.json have the same name"):
         rendered([["a", 1.0]])
 
 

@@ -105,13 +105,13 @@ def test_a_law_is_beside_itself_as_it_was_tuned():
     laws = ["rps", "rps,tuned", "pursuit", "pursuit,tuned"]
     won = np.repeat([[1, 0], [1, 1], [0, 1], [0, 1]], [8, 8], axis=1)
     found = xr.Dataset({"success": (("law", "world"), won)}, {"law": laws})
-    head, *body = rows.tuned_beside(found)
+    head, *body = rows.default_beside_tuned(found)
     assert head[0] == "law"
     assert [row[0] for row in body] == ["rps", "pursuit"]
     assert body[0][1].startswith("50.0 %")
     assert body[0][2].startswith("100.0 %")
     assert [row[3] for row in body] == ["+8 -0", "+0 -0"]
-    assert rows.tuned_beside({"a": "tuner's"}) == []
+    assert rows.default_beside_tuned({"a": "tuner's"}) == []
 
 
 def test_a_comparison_names_laws_by_the_runs_that_tuned_them():
@@ -120,7 +120,7 @@ def test_a_comparison_names_laws_by_the_runs_that_tuned_them():
     setting = Setting("quasistatic", rules=Rules(horizon=20.0))
     laws = {"rps": "rps", "rps,a/runs/gradient/tuned.json": "rps_tuned"}
     found = xr.DataTree.from_dict({"near": sweep(laws, domain, 12, setting=setting)})
-    head, first, second = rows.compared(found)
+    head, first, second = rows.comparison(found)
     assert (first[0], first[1], second[1]) == ("`near`, 12", "rps", "gradient")
     by_object = first[head.index("by object [%]")].split(", ")
     assert len(by_object) == 2
@@ -178,13 +178,13 @@ def test_a_rare_failure_is_told_by_its_median_and_all_of_it():
     found = xr.Dataset({name: ("repetition", values) for name, values in each.items()})
     drawn = {"p": 0.25, "low": 0.2, "high": 0.3, "variation": 0.1, "trials": 400}
     beside = found.assign({f"drawn_{name}": value for name, value in drawn.items()})
-    head, middle, together, last = rows.rarely(beside)
+    head, middle, together, last = rows.rare_failures(beside)
     assert head[1:] == ["probability of failure", "95 %", "variation", "worlds"]
     assert middle == ["splitting, median of 3", "0.2", "[0.1, 0.3]", "0.40", "200"]
     assert together[1] == "0.3"
     assert together[-1] == "600"
     assert last == ["drawn worlds", "0.25", "[0.2, 0.3]", "0.10", "400"]
-    assert len(rows.rarely(found)) == 3
+    assert len(rows.rare_failures(found)) == 3
 
 
 def test_cosines_stand_under_the_time_simulated():
@@ -196,14 +196,14 @@ def test_cosines_stand_under_the_time_simulated():
 
 def test_what_only_a_dependency_brings_goes_with_it():
     needs = {"a": ["b", "c"], "b": ["d"], "c": [], "d": ["b"], "e": ["c", "not there"]}
-    assert dependencies.reached(needs, ["a", "e"]) == {*"abcde"}
-    assert dependencies.reached(needs, ["e"]) == {"c", "e"}
+    assert dependencies.with_dependencies(needs, ["a", "e"]) == {*"abcde"}
+    assert dependencies.with_dependencies(needs, ["e"]) == {"c", "e"}
 
 
 def test_every_dependency_and_extra_says_what_it_is_for():
     declared = dependencies.declared()
     needed = [re.match(r"[\w-]+", one).group() for one in declared["dependencies"]]
-    assert set(needed) == set(dependencies.FOR)
+    assert set(needed) == set(dependencies.PURPOSE)
     assert set(declared["optional-dependencies"]) == set(dependencies.EXTRAS)
 
 

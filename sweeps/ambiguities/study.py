@@ -72,7 +72,7 @@ class Ambiguities(TrialStudy[xr.Dataset]):
     def refused(self) -> tuple[str, ...]:
         """Readings whose parameters a law refuses; they run only on request."""
         laws = self.grid.laws
-        return tuple(name for name, reading in self.known.items() if not reading.allowed(laws))
+        return tuple(name for name, reading in self.known.items() if not reading.is_allowed(laws))
 
     @property
     def grid(self) -> Grid:

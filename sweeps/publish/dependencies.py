@@ -1,7 +1,7 @@
-"""What does each dependency bring, and how large is it?
+"""Purpose and installed size of each dependency and each extra.
 
-The package is installed into an empty environment, by pip and `constraints.txt`, and each extra
-beside it.
+pip installs the package into an empty environment, within `constraints.txt`, and the additional
+packages of each extra into a separate folder.
 
     rps sweeps/publish/dependencies.py --machine "Linux on x86-64, Python 3.11"
 """
@@ -35,13 +35,13 @@ from rps_jax.trials.progress import Progress
 from sweeps.study_base import Study, Table
 
 ROOT = Path(__file__).parents[2]
-OWN = "rps-jax"
-FOR = {
+PACKAGE = "rps-jax"
+PURPOSE = {
     "jax": "one program for thousands of worlds, on processors and GPUs, and its derivatives",
-    "flatbuffers": "programs of JAX that are kept between processes",
-    "mujoco": "scenes, C MuJoCo as an engine, pictures; pinned to the version of mujoco-mjx, which "
-    "has no 4.x",
-    "mujoco-mjx": "MuJoCo's own engine in JAX, to which the fused one is held",
+    "flatbuffers": "programs of JAX that are cached between processes",
+    "mujoco": "scenes, C MuJoCo as an engine, images; pinned to the version of mujoco-mjx (there "
+    "is no 4.x)",
+    "mujoco-mjx": "MuJoCo's engine in JAX, the reference of the fused engine",
     "numpy": "arrays on the host",
     "scipy": "Wilson intervals and exact tests; JAX needs it too",
     "xarray": "labelled results",
@@ -62,32 +62,32 @@ EXTRAS = {
     "cuda": "NVIDIA GPUs: JAX's CUDA 13 plugin and NVIDIA's libraries",
     "cluster": "`rps sweep --ray` (ray)",
     "viz": "`rps view` (viser)",
-    "export": "`rps export onnx` (onnx, and onnxruntime to run what it writes)",
+    "export": "`rps export onnx` (onnx, and onnxruntime to run the exported file)",
     "bags": "`rps push --bag` and `rps shadow` (mcap-ros2-support)",
     "failures": "`rps sensitivity` (SALib) and `rps attack` (ribs, which brings numba and "
     "scikit-learn)",
     "gym": "`rps_jax/Push-v0` of Gymnasium",
     "notebooks": "JupyterLab, and notebooks as text (jupytext)",
     "docs": "the site: MkDocs Material, docstrings (mkdocstrings) and equations (latex2mathml)",
-    "dev": "tests, linter, types, and what the tests of the other extras need",
+    "dev": "tests, linter, type checker, and the packages for tests of the other extras",
 }
 _MEGABYTES = "{:,.1f} MB"
 
 
 @dataclass(frozen=True)
 class Dependencies(Study[xr.Dataset]):
-    """Measure what pip installs of the package, and of each extra on top of it.
+    """Measure the packages that pip installs for the core and for each extra.
 
-    The answer holds `size` [B] and `needs`, names divided by blanks, by (installed, package): the
-    core, and what each extra adds to it; a package that is not installed has size 0.
+    The results hold `size` [B] and `needs` (names separated by blanks) by (installed, package):
+    the packages of the core, and those that each extra adds. Size 0: not installed.
     """
 
-    TITLE: ClassVar[str] = "What the dependencies bring"
+    TITLE: ClassVar[str] = "Packages of the dependencies"
     GROWS: ClassVar[tuple[str, ...]] = ("extras",)
     RESULTS: ClassVar[str] = "../results"
 
     extras: tuple[str, ...] = tuple(EXTRAS)
-    """Extras that are measured; by default all."""
+    """Extras to measure; by default all."""
 
     def check(self) -> None:
         """Check the names of the extras."""
@@ -95,134 +95,142 @@ class Dependencies(Study[xr.Dataset]):
             errors.check_name("extra", name, EXTRAS)
 
     def num_trials(self) -> int | None:
-        """How many environments there are."""
+        """Return the number of environments."""
         return 1 + len(self.extras)
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Measure what was not measured before."""
+        """Measure the environments that are missing."""
         with tempfile.TemporaryDirectory() as folder:
-            place = Path(folder) / "environment"
-            found = {"": run.checkpoint("core", partial(_core, place))}
+            environment = Path(folder) / "environment"
+            parts = {"": run.checkpoint("core", partial(_core, environment))}
             for name in self.extras:
-                run.callback(Progress(len(found), 0.0))
-                found[name] = run.checkpoint(name, partial(_extra, place, name))
-            run.callback(Progress(len(found), 0.0))
-        index = xr.IndexVariable("installed", list(found))
-        whole: Any = xr.concat(list(found.values()), index, join="outer", fill_value={"size": 0.0})
-        return whole
+                run.callback(Progress(len(parts), 0.0))
+                parts[name] = run.checkpoint(name, partial(_extra, environment, name))
+            run.callback(Progress(len(parts), 0.0))
+        index = xr.IndexVariable("installed", list(parts))
+        results: Any = xr.concat(
+            list(parts.values()), index, join="outer", fill_value={"size": 0.0}
+        )
+        return results
 
     def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
         """Return both tables."""
         return {name: Table(rows, _NOTE) for name, rows in tables(results).items()}
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Both tables."""
+        """Return both tables."""
         return [Section(name.capitalize(), "", rows) for name, rows in tables(results).items()]
 
 
 dependencies = call_of(Dependencies)
 
 _NOTE = (
-    "own: size of the installed files of the package itself, compiled bytecode included. packages "
-    "and their size: what else would go if the dependency went, so what only it needs."
+    "own: size of the installed files of the package, with compiled bytecode. Packages and their "
+    "size: packages that no other dependency needs."
 )
 
 
 def declared() -> dict[str, Any]:
-    """The table `project` of pyproject.toml."""
+    """Return the table `project` of pyproject.toml."""
     return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 
-def tables(found: xr.Dataset) -> dict[str, list[list[str]]]:
-    """Header and rows of both tables, by name."""
-    core = found.sel(installed="").isel(package=found["size"].sel(installed="").values > 0)
+def tables(results: xr.Dataset) -> dict[str, list[list[str]]]:
+    """Return header and rows of both tables, by name."""
+    core = results.sel(installed="").isel(package=results["size"].sel(installed="").values > 0)
     extras = [["extra", "what it is for", "packages", "size"]]
-    for name in map(str, found.installed.values[1:]):
-        sizes = found["size"].sel(installed=name).values
+    for name in map(str, results.installed.values[1:]):
+        sizes = results["size"].sel(installed=name).values
         size = f"{sizes.sum() / 1e6:,.0f} MB"
         extras.append([name, EXTRAS[name], str(int((sizes > 0).sum())), size])
-    return {"dependencies": _of_core(core), "extras": extras}
+    return {"dependencies": _core_table(core), "extras": extras}
 
 
-def _of_core(core: xr.Dataset) -> list[list[str]]:
-    """Header and a row for each dependency, and for all of them."""
-    names = [canonicalize_name(Requirement(one).name) for one in declared()["dependencies"]]
+def _core_table(core: xr.Dataset) -> list[list[str]]:
+    """Return a header, one row per dependency, and their sum."""
+    names = [canonicalize_name(Requirement(text).name) for text in declared()["dependencies"]]
     sizes = dict(zip(map(str, core.package.values), core["size"].values / 1e6, strict=True))
     needs = {str(name): str(core.needs.sel(package=name).item()).split() for name in sizes}
-    kept = reached(needs, names)
+    installed = with_dependencies(needs, names)
     rows = [["dependency", "what it is for", "own", "packages only it brings", "and their size"]]
     for name in names:
-        gone = kept - reached(needs, [one for one in names if one != name]) - {name}
-        words = FOR[name]
+        rest = with_dependencies(needs, [other for other in names if other != name])
+        exclusive = installed - rest - {name}
+        purpose = PURPOSE[name]
         if name == "jax":
-            words += f" (with jaxlib: {_MEGABYTES.format(sizes['jax'] + sizes['jaxlib'])})"
-        size = _MEGABYTES.format(sum(sizes[one] for one in gone))
-        rows.append([name, words, _MEGABYTES.format(sizes[name]), str(len(gone)), size])
-    whole = _MEGABYTES.format(sum(sizes[one] for one in kept))
-    return [*rows, ["all of the core", "", "", str(len(kept)), whole]]
+            purpose += f" (with jaxlib: {_MEGABYTES.format(sizes['jax'] + sizes['jaxlib'])})"
+        size = _MEGABYTES.format(sum(sizes[other] for other in exclusive))
+        rows.append([name, purpose, _MEGABYTES.format(sizes[name]), str(len(exclusive)), size])
+    whole = _MEGABYTES.format(sum(sizes[name] for name in installed))
+    return [*rows, ["all of the core", "", "", str(len(installed)), whole]]
 
 
-def reached(needs: Mapping[str, Sequence[str]], names: Sequence[str]) -> set[str]:
-    """What some packages bring: themselves, and all that these need."""
-    found, waiting = set(), list(names)
-    while waiting:
-        name = waiting.pop()
-        if name not in found and name in needs:
-            found.add(name)
-            waiting += needs[name]
-    return found
+def with_dependencies(needs: Mapping[str, Sequence[str]], names: Sequence[str]) -> set[str]:
+    """Return packages together with all packages that they need, directly or indirectly."""
+    packages, queue = set(), list(names)
+    while queue:
+        name = queue.pop()
+        if name not in packages and name in needs:
+            packages.add(name)
+            queue += needs[name]
+    return packages
 
 
 # --- environments --------------------------------------------------------------------------
 
 
-def _core(place: Path) -> xr.Dataset:
-    """The packages of the core, in an environment that is made if it is not there."""
-    if not place.exists():
-        venv.create(place, with_pip=True)
-        _pip(place, "install", "--quiet", str(ROOT))
-    return _packages(Path(sysconfig.get_path("purelib", "venv", {"base": str(place)})))
+def _core(environment: Path) -> xr.Dataset:
+    """Return the packages of the core, in an environment that is created once."""
+    if not environment.exists():
+        venv.create(environment, with_pip=True)
+        _pip(environment, "install", "--quiet", str(ROOT))
+    return _packages(Path(sysconfig.get_path("purelib", "venv", {"base": str(environment)})))
 
 
-def _extra(place: Path, name: str) -> xr.Dataset:
-    """The packages that an extra adds to the core, which are installed beside its environment."""
-    _core(place)
-    beside, report = place.with_name(name), str(place.with_name(f"{name}.json"))
-    _pip(place, "install", "--quiet", "--dry-run", "--report", report, f"{ROOT}[{name}]")
-    new = [one["metadata"] for one in json.loads(Path(report).read_text())["install"]]
-    names = [(canonicalize_name(one["name"]), one["version"]) for one in new]
-    pinned = [f"{name}=={version}" for name, version in names if name != OWN]
-    _pip(place, "install", "--quiet", "--no-deps", "--target", str(beside), *pinned)
-    found = _packages(beside)
-    shutil.rmtree(beside)
-    return found
+def _extra(environment: Path, name: str) -> xr.Dataset:
+    """Return the packages that an extra adds to the core, installed into a separate folder."""
+    _core(environment)
+    target, report = environment.with_name(name), str(environment.with_name(f"{name}.json"))
+    _pip(environment, "install", "--quiet", "--dry-run", "--report", report, f"{ROOT}[{name}]")
+    new = [item["metadata"] for item in json.loads(Path(report).read_text())["install"]]
+    names = [(canonicalize_name(item["name"]), item["version"]) for item in new]
+    pinned = [f"{name}=={version}" for name, version in names if name != PACKAGE]
+    _pip(environment, "install", "--quiet", "--no-deps", "--target", str(target), *pinned)
+    packages = _packages(target)
+    shutil.rmtree(target)
+    return packages
 
 
-def _pip(place: Path, *words: str) -> None:
-    """Run pip of an environment, within the versions of constraints.txt.
+def _pip(environment: Path, *words: str) -> None:
+    """Run pip in an environment, within the versions of constraints.txt.
 
     Raises:
-      InputError: it failed.
+      InputError: pip failed.
     """
-    command = [place / ("Scripts" if os.name == "nt" else "bin") / "python", "-m", "pip", *words]
-    ended = subprocess.run(
+    command = [
+        environment / ("Scripts" if os.name == "nt" else "bin") / "python",
+        "-m",
+        "pip",
+        *words,
+    ]
+    process = subprocess.run(
         [*command, "-c", str(ROOT / "constraints.txt")], capture_output=True, text=True, check=False
     )
-    if ended.returncode:
-        raise InputError(f"pip {words[0]} failed: {' '.join(ended.stderr.strip().split()[-40:])}")
+    if process.returncode:
+        raise InputError(f"pip {words[0]} failed: {' '.join(process.stderr.strip().split()[-40:])}")
 
 
 def _packages(site: Path) -> xr.Dataset:
-    """Sizes [B] and needs of the packages of a folder, but for this one and pip."""
+    """Return sizes [B] and needs of the packages in a folder, except this package and pip."""
     sizes, needs = {}, {}
-    for one in importlib.metadata.distributions(path=[str(site)]):
-        name = canonicalize_name(one.metadata["Name"])
-        if name in (OWN, "pip", "setuptools"):
+    for package in importlib.metadata.distributions(path=[str(site)]):
+        name = canonicalize_name(package.metadata["Name"])
+        if name in (PACKAGE, "pip", "setuptools"):
             continue
-        paths = [Path(str(file.locate())) for file in one.files or ()]
+        paths = [Path(str(file.locate())) for file in package.files or ()]
         sizes[name] = float(sum(path.stat().st_size for path in paths if path.is_file()))
-        asked = [Requirement(text) for text in one.requires or ()]
-        used = [r for r in asked if r.marker is None or r.marker.evaluate({"extra": ""})]
+        requirements = [Requirement(text) for text in package.requires or ()]
+        used = [r for r in requirements if r.marker is None or r.marker.evaluate({"extra": ""})]
         needs[name] = " ".join(sorted({canonicalize_name(r.name) for r in used}))
     size = ("package", list(sizes.values()), {"units": "B", "long_name": "of the installed files"})
     return xr.Dataset(

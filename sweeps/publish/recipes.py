@@ -1,8 +1,7 @@
-"""How every data file is made anew: its commands, what they need, and which table of the report.
+"""Recipes of all data files: commands, required device, and the table of the report.
 
-The commands of a recipe are those of its data file. Each has a run folder in `runs`, its own or
-the one that it names; one that stands in two recipes is run once. The table is that of a section of
-the report, so that a page shows what the run of a reader prints.
+Each command has a run folder in `runs`, which it may name; a command of two recipes is run once.
+The table is a section of the report, so that a page shows the same numbers as a reader's run.
 """
 
 from __future__ import annotations
@@ -15,22 +14,21 @@ from sweeps.publish.rows import Rows
 
 
 class Recipe(NamedTuple):
-    """How a data file is made."""
+    """Commands and table of a data file."""
 
     commands: tuple[str, ...]
     two_cores: float | None  # [min] on two cores; None: hours
-    one_gpu: float | None  # [min] on one H100 and 16 cores; None: no better there
-    # Pattern of the title of the report's section, or the table of the answer; "": the study writes
-    # its own file.
+    one_gpu: float | None  # [min] on one H100 and 16 cores; None: not faster there
+    # Pattern of a section's title, or function from results to rows; "": the study publishes.
     section: str | Callable[[Any], Rows] = ""
-    of: tuple[str, ...] = ()  # what stands before the rows of each command, if it has any
-    columns: tuple[str, ...] = ()  # those that are shown, by their names; by default all
+    labels: tuple[str, ...] = ()  # first cell of the rows of each command
+    columns: tuple[str, ...] = ()  # names of the columns to show; by default all
     note: str = ""
-    folder: str = ""  # of `sweeps`, where a file is that was not made before
+    folder: str = ""  # folder of `sweeps` for a new file
 
     @property
     def device(self) -> Literal["cpu", "gpu"]:
-        """Where it is made: on a GPU if two cores need more than an hour, or thrice as long."""
+        """Device: a GPU if two cores need more than an hour, or three times as long."""
         if self.one_gpu is None:
             return "cpu"
         cores = self.two_cores
@@ -46,7 +44,7 @@ _LADDERS = _each("rps ladder --domain {0} --worlds 10000 --seed 10 --out runs/la
 _AGAINST = ("", "success", "against rps_tuned", "p (Holm)")
 _OBJECTS = ("random_box", "random_cylinder", "random_prism")
 _RATES = ("", *_OBJECTS, "all", "median time", "timeout", "lost contact", "fell over")
-_MACHINE = "--machine MACHINE"  # in its place come the words for the machine
+_MACHINE = "--machine MACHINE"  # MACHINE is replaced by a description
 _IDEAL = (
     "wide,skin=ideal,pose_noise=0:0,yaw_noise=0:0,pose_latency=0:0,command_delay=0:0,"
     "velocity_error=0:0"
@@ -75,7 +73,7 @@ _RIVALS = ("rps", "pursuit", "dipole", "force_push", "force_push_published")
 _SWEPT = "sweep --laws rps_tuned --domain wide"
 _GRADIENTS = "rps sweeps/gradients --worlds 32 --estimators"
 
-# In the order of their weight, in which they are made.
+# In order of importance, which is the order of computation.
 RECIPES: dict[str, Recipe] = {
     "headline": Recipe((f"rps sweeps/random_worlds {_MACHINE}",), None, 30),
     "models": Recipe((f"rps sweeps/random_worlds {_MACHINE}",), None, 30),
@@ -114,12 +112,12 @@ RECIPES: dict[str, Recipe] = {
         "A planner that knows the world",
         ("", "", *_WIDE),
     ),
-    "plus": Recipe(tuple(_PLUS.values()), None, 12, rows.mended, tuple(_PLUS)),
+    "plus": Recipe(tuple(_PLUS.values()), None, 12, rows.plus_beside_tuned, tuple(_PLUS)),
     "tuned": Recipe(
         ("rps ladder --laws rps rps_tuned --domain wide hostile real --worlds 10000 --seed 4",),
         None,
         4,
-        rows.compared,
+        rows.comparison,
     ),
     "random_worlds": Recipe(
         ("rps sweep --domain wide --worlds 36000 --laws rps nps aps",),
@@ -164,7 +162,7 @@ RECIPES: dict[str, Recipe] = {
         ),
         None,
         4,
-        rows.blamed,
+        rows.largest_indices,
         ("rps_tuned, hostile", "rps_plus, hostile", "rps_tuned, real"),
     ),
     "rare": Recipe(
@@ -175,7 +173,7 @@ RECIPES: dict[str, Recipe] = {
         ),
         5,
         None,
-        rows.rarely,
+        rows.rare_failures,
     ),
     "rare_million": Recipe(
         (
@@ -184,7 +182,7 @@ RECIPES: dict[str, Recipe] = {
         ),
         None,
         3,
-        rows.rarely,
+        rows.rare_failures,
     ),
     "attack": Recipe(
         (
@@ -197,7 +195,7 @@ RECIPES: dict[str, Recipe] = {
         ),
         30,
         None,
-        rows.searched,
+        rows.attack_table,
         ("rps_tuned", "rps_plus", "rps_plus, three axes"),
     ),
     "regression": Recipe(("rps regress --laws rps rps_tuned rps_plus learned_gru",), 3, 1, "Wins"),
@@ -267,7 +265,7 @@ RECIPES: dict[str, Recipe] = {
         (),
         (
             "ground",
-            *(f"{what}, {speed} cm/s" for speed in (1, 5, 20) for what in _GROUNDS),
+            *(f"{column}, {speed} cm/s" for speed in (1, 5, 20) for column in _GROUNDS),
             "height of the push",
             "largest hop",
             "aloft",
@@ -294,7 +292,7 @@ RECIPES: dict[str, Recipe] = {
         ),
         None,
         10,
-        rows.tuned_beside,
+        rows.default_beside_tuned,
     ),
     "race": Recipe(
         (
@@ -307,7 +305,7 @@ RECIPES: dict[str, Recipe] = {
         ),
         None,
         15,
-        rows.compared,
+        rows.comparison,
     ),
     "gradients": Recipe(
         (
@@ -406,8 +404,8 @@ RECIPES: dict[str, Recipe] = {
     ),
 }
 
-# What is history, and is not made anew.
+# Files of old versions, which are not computed again.
 HISTORY = {
-    "tuning_runs": "the runs of 0.1.0 and 0.2.0 that made the tuned law",
-    "learned": "the runs of 0.2.0 that made the learned laws; `rps sweeps/learned` reads such runs",
+    "tuning_runs": "the runs of 0.1.0 and 0.2.0 that tuned the law",
+    "learned": "the runs of 0.2.0 that trained the laws; `rps sweeps/learned` reads such runs",
 }

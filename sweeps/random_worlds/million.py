@@ -1,10 +1,10 @@
-"""A million outcomes in one file, so that failures can be studied without a GPU.
+"""Outcomes of a million worlds in one file, so that failures can be studied without a GPU.
 
     rps sweeps/random_worlds/million.py --machine "one NVIDIA H100"
 
-pushes with three laws in the same 1,048,576 worlds of `wide`, and writes `million.nc`: how each
-trial ended, when, and how near it came. What was drawn follows from seed and index, by
-`rps_jax.world.draws`. A law is a part of the run folder, which may be asked for more laws later.
+runs three laws in the same 1,048,576 worlds of `wide` and writes `million.nc`: the end of each
+trial, its time and its smallest distance to the target. `rps_jax.world.draws` computes the drawn
+quantities again from the seed and the index of a world. More laws can be added to a run folder.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ from rps_jax.trials.setting import Setting
 from rps_jax.world import domain as domains
 from sweeps.study_base import Table, TrialStudy
 
-ENDS = ("success", *statistics.FAILURES)  # numbers of `how`
+ENDS = ("success", *statistics.FAILURES)  # `how` is an index into these
 UNTOUCHED = 65_535  # `missed` of an object that was never touched
-_WORDS = {
-    "success": "1 where the object arrived; eight worlds a byte, world 0 first (numpy.unpackbits)",
-    "how": f"how the trial ended: {', '.join(f'{i} {name}' for i, name in enumerate(ENDS))}",
-    "steps": "control steps until the trial ended; times `control_period` [s] they are its time",
-    "missed": f"least distance of contact and target [mm]; {UNTOUCHED}: never touched",
+_LONG_NAMES = {
+    "success": "1 for success; eight worlds per byte, world 0 first (numpy.unpackbits)",
+    "how": f"end of the trial: {', '.join(f'{i} {name}' for i, name in enumerate(ENDS))}",
+    "steps": "control steps until the trial ended; `control_period` is the length of a step [s]",
+    "missed": f"smallest distance of contact and target [mm]; {UNTOUCHED}: never touched",
 }
 
 
 @dataclass(frozen=True)
 class Million(TrialStudy[xr.Dataset]):
-    """Push in a million worlds, and keep of each trial how it ended, when and how near it came.
+    """Run laws in a million worlds, and store the end, time and smallest distance of each trial.
 
-    The answer holds `success` (law, byte), `how`, `steps` and `missed` (law, world).
+    The results hold `success` (law, byte), `how`, `steps` and `missed` (law, world).
     """
 
     TITLE: ClassVar[str] = "A million outcomes"
@@ -53,7 +53,7 @@ class Million(TrialStudy[xr.Dataset]):
     GROWS: ClassVar[tuple[str, ...]] = ("laws",)
 
     laws: tuple[str, ...] = ("rps_tuned", "rps_plus", "learned_gru")
-    """Laws, which all meet the same worlds."""
+    """Laws to run in the same worlds."""
     domain: str = "wide"
     """Ranges from which worlds are drawn."""
     worlds: int = option(2**20, 1, 2**30)
@@ -61,34 +61,34 @@ class Million(TrialStudy[xr.Dataset]):
     setting: Setting = field(default=Setting("fused", seed=37), kw_only=True)
 
     def check(self) -> None:
-        """Check that the laws and the domain are known."""
+        """Check that the laws and the domain exist."""
         registry.resolve_laws(self.laws)
         domains.named(self.domain)
 
     def num_trials(self) -> int | None:
-        """How many trials there are."""
+        """Return the number of trials."""
         return self.worlds * len(self.laws)
 
     @property
-    def seeded(self) -> Setting:
-        """The setting with the seed of the worlds for testing."""
+    def test_setting(self) -> Setting:
+        """Setting with the seed of the test worlds."""
         return dataclasses.replace(self.setting, seed=seed_of(self.setting.seed, "test"))
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Push with the laws that are missing."""
-        each = [run.checkpoint(law, partial(self._of, law, run)) for law in self.laws]
-        found = xr.concat(each, xr.IndexVariable("law", list(self.laws)))
-        for name, words in _WORDS.items():
-            found[name].attrs["long_name"] = words
-        ranges, seed = domains.named(self.domain), self.seeded.seed
-        found.attrs = {
+        """Run the laws that are missing."""
+        laws = [run.checkpoint(law, partial(self._outcomes, law, run)) for law in self.laws]
+        results = xr.concat(laws, xr.IndexVariable("law", list(self.laws)))
+        for name, long_name in _LONG_NAMES.items():
+            results[name].attrs["long_name"] = long_name
+        ranges, seed = domains.named(self.domain), self.test_setting.seed
+        results.attrs = {
             "domain": self.domain,
             "seed": seed,
             "objects": " ".join(ranges.objects),
             "control_period": self.setting.physics.control_period,
             "max_lost": float(self.setting.rules.max_lost),
         }
-        return found
+        return results
 
     def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
         """Return the rates of the laws."""
@@ -99,19 +99,20 @@ class Million(TrialStudy[xr.Dataset]):
         super().publish(results, run_folder)
         files.write_results(self.folder / "million.nc", packed(results))
 
-    def _of(self, law: str, run: Run) -> xr.Dataset:
-        """Outcomes of one law, small."""
+    def _outcomes(self, law: str, run: Run) -> xr.Dataset:
+        """Return the outcomes of one law in compact types."""
         laws = registry.resolve_laws([law])
-        plan = Plan(domains.named(self.domain), self.worlds, laws, self.seeded, 16_384)
+        plan = Plan(domains.named(self.domain), self.worlds, laws, self.test_setting, 16_384)
         folder = None if run.folder is None else run.folder / f"sweep_{law}"
-        one = execution.run_plan(plan, folder, **run.batch_options).isel(law=0)
-        won, off = one.success.values > 0, one.min_distance.values
-        how = 1 + statistics.failure_modes(one, float(self.setting.rules.max_lost))
-        steps = np.rint(one.time.values / self.setting.physics.control_period)
-        missed = np.where(np.isfinite(off), np.rint(1000 * np.nan_to_num(off, posinf=0)), UNTOUCHED)
+        outcomes = execution.run_plan(plan, folder, **run.batch_options).isel(law=0)
+        how = 1 + statistics.failure_modes(outcomes, float(self.setting.rules.max_lost))
+        steps = np.rint(outcomes.time.values / self.setting.physics.control_period)
+        distance = outcomes.min_distance.values
+        millimetres = np.rint(1000 * np.nan_to_num(distance, posinf=0))
+        missed = np.where(np.isfinite(distance), millimetres, UNTOUCHED)
         return xr.Dataset(
             {
-                "success": ("byte", np.packbits(won)),
+                "success": ("byte", np.packbits(outcomes.success.values > 0)),
                 "how": ("world", how.astype(np.uint8)),
                 "steps": ("world", steps.astype(np.uint16)),
                 "missed": ("world", np.minimum(missed, UNTOUCHED).astype(np.uint16)),
@@ -119,7 +120,7 @@ class Million(TrialStudy[xr.Dataset]):
         )
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """How the trials of each law ended."""
+        """Return a section with the ends of each law's trials."""
         return [Section("Ends", "", [HEADER, *table(results)])]
 
 
@@ -128,21 +129,23 @@ million = call_of(Million)
 HEADER = ["law", "success", *statistics.FAILURES, "median time of a success"]
 
 
-def packed(found: xr.Dataset) -> xr.Dataset:
-    """The data with the encoding by which they are small in a file."""
-    for name in found:
-        found[name].encoding = {"zlib": True, "complevel": 9, "shuffle": True}
-    return found
+def packed(results: xr.Dataset) -> xr.Dataset:
+    """Return the results with an encoding that compresses them."""
+    for name in results:
+        results[name].encoding = {"zlib": True, "complevel": 9, "shuffle": True}
+    return results
 
 
-def table(found: xr.Dataset) -> list[list[str]]:
-    """A row for each law: its rate, its failures by kind, its median time."""
+def table(results: xr.Dataset) -> list[list[str]]:
+    """Return one row per law: its rate, its failures by kind, its median time."""
     rows = []
-    for law in map(str, found.law.values):
-        how = found.how.sel(law=law).values
+    for law in map(str, results.law.values):
+        how = results.how.sel(law=law).values
         counts = np.bincount(how, minlength=len(ENDS))
-        steps = found.steps.sel(law=law).values[how == 0]
-        median = f"{np.median(steps) * found.attrs['control_period']:.1f} s" if steps.size else "-"
+        steps = results.steps.sel(law=law).values[how == 0]
+        median = (
+            f"{np.median(steps) * results.attrs['control_period']:.1f} s" if steps.size else "-"
+        )
         share = tables.share(int(counts[0]), how.size)
         rows.append([law, share, *(f"{int(n):,}" for n in counts[1:]), median])
     return rows

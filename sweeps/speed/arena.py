@@ -1,9 +1,8 @@
-"""How fast are the engines of others on the same scene, and how right?
+"""Speed and error of this project's and third-party engines on the same scene.
 
-A base pushes a box straight on at a constant speed, in one scene, on one device, in one run. Each
-engine is a process of its own. All make themselves ready side by side; then they are timed one
-after the other. Beside the speed stands how far the objects end from where C MuJoCo in fine steps
-leaves them.
+A base pushes a box straight ahead at a constant speed. Each engine runs in a separate process on
+the same device. All processes compile at the same time; then they are timed in turn. The error of
+an engine is the distance of its final poses from those of C MuJoCo with small steps.
 
     python sweeps/speed/peers.py peers
     rps sweeps/speed/arena.py --peers peers --machine "one NVIDIA H100"
@@ -42,7 +41,7 @@ from sweeps.speed import racers
 from sweeps.speed.racers import ON_CORES, RACERS
 from sweeps.study_base import Study, Table
 
-_HERE = Path(__file__).parent
+_FOLDER = Path(__file__).parent
 _COLUMNS = (
     *("engine", "version", "worlds", "simulated s/s", "fused over it"),
     *("error, median", "error, largest", "turned, median", "ready after", "why not"),
@@ -62,11 +61,11 @@ EXCLUDED = {
 
 @dataclass(frozen=True)
 class Arena(Study[xr.Dataset]):
-    """Race engines on one scene, each with its error against converged C MuJoCo.
+    """Compare speed and error of engines on one scene with converged C MuJoCo.
 
-    The answer holds simulated seconds in a second of wall clock, `rate` [1], and how far the
-    objects end from the converged poses, `error` [m] and `turned` [rad], for each engine and
-    number of worlds; and in words why an engine has no rate.
+    The results hold, by engine and number of worlds, simulated seconds per second of wall clock,
+    `rate` [1], the errors `error` [m] and `turned` [rad] of the final poses, and `why` an engine
+    has no rate.
     """
 
     TITLE: ClassVar[str] = "Engines on one scene"
@@ -80,63 +79,63 @@ class Arena(Study[xr.Dataset]):
     GROWS: ClassVar[tuple[str, ...]] = ("names", "worlds", "peers", "limit")
 
     names: tuple[str, ...] = tuple(RACERS)
-    """Engines; by default all."""
+    """Engines to run; by default all."""
     worlds: tuple[int, ...] = option((8192, 65536), 1, 10_000_000)
-    """Numbers of worlds; on the processor as many as suit it, but no more than the largest."""
+    """Numbers of worlds; engines on the processor run at most the largest number."""
     seconds: float = option(5.0, 0.1, 600, unit="s")
-    """How long each world is pushed [s]."""
+    """Duration of each push [s]."""
     starts: int = option(64, 1, 4096)
-    """Number of different places and headings of the box, which the worlds repeat."""
+    """Number of different positions and headings of the box, which the worlds repeat."""
     step: float = option(1e-4, 1e-6, 1e-2, unit="s")
-    """Of converged C MuJoCo [s]."""
+    """Time step of converged C MuJoCo [s]."""
     peers: Path | None = None
-    """Folder of the packages of others, as `peers.py` makes it."""
+    """Folder of the third-party packages, which `peers.py` installs."""
     limit: float = option(300.0, 1, 3600)
-    """Time in which an engine must be ready, and time in which it must then run [s]."""
+    """Time limit for an engine to compile, and time limit for it to run [s]."""
 
     def check(self) -> None:
         """Check the names."""
         if not self.names:
-            raise errors.InputError("names = () leave nothing to race.")
+            raise errors.InputError("names = () is not allowed: name at least one engine.")
         for name in self.names:
             errors.check_name("name", name, tuple(RACERS))
 
     @property
-    def wanted(self) -> list[tuple[str, int]]:
-        """Engines and numbers of worlds: a row each."""
+    def races(self) -> list[tuple[str, int]]:
+        """Engine and number of worlds of each row."""
         counts = {name: (max(self.worlds),) for name in ON_CORES}
         return [(name, n) for name in self.names for n in counts.get(name, self.worlds)]
 
     def num_trials(self) -> int | None:
-        """How many rows there are."""
-        return len(self.wanted)
+        """Return the number of rows."""
+        return len(self.races)
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Race the engines that were not raced before."""
-        with tempfile.TemporaryDirectory() as place:
-            folder = Path(place)
+        """Run the engines that are missing."""
+        with tempfile.TemporaryDirectory() as path:
+            folder = Path(path)
             (folder / "scene.xml").write_text(mjcf())
-            np.save(folder / "starts.npy", placed(self.starts))
+            np.save(folder / "starts.npy", initial_poses(self.starts))
             truth = run.checkpoint("converged", partial(self._converged, folder)).pose.values
             missing = [
-                one
-                for one in self.wanted
-                if run.checkpoints is None or run.checkpoints.get(_part(one)) is None
+                race
+                for race in self.races
+                if run.checkpoints is None or run.checkpoints.get(_part(race)) is None
             ]
-            made = self._raced(missing, folder, truth)
-            found: list[xr.Dataset] = []
-            whole: Any = xr.Dataset()
-            for number, one in enumerate(self.wanted):
-                row = next(made) if one in missing else run.checkpoint(_part(one), xr.Dataset)
-                if one in missing and not row.why.item():  # what failed is tried again
-                    run.checkpoint(_part(one), partial(xr.Dataset.copy, row))
-                found.append(row)
-                whole = xr.concat(found, "row")
+            new_rows = self._raced(missing, folder, truth)
+            rows: list[xr.Dataset] = []
+            results: Any = xr.Dataset()
+            for i, race in enumerate(self.races):
+                row = next(new_rows) if race in missing else run.checkpoint(_part(race), xr.Dataset)
+                if race in missing and not row.why.item():  # failures are tried again
+                    run.checkpoint(_part(race), partial(xr.Dataset.copy, row))
+                rows.append(row)
+                results = xr.concat(rows, "row")
                 if self.machine and run.folder is not None:
-                    self.publish(whole, run.folder)
-                run.callback(Progress(number + 1, 0.0))
-            made.close()
-        return whole
+                    self.publish(results, run.folder)
+                run.callback(Progress(i + 1, 0.0))
+            new_rows.close()
+        return results
 
     def _converged(self, folder: Path) -> xr.Dataset:
         starts = np.load(folder / "starts.npy")
@@ -144,48 +143,48 @@ class Arena(Study[xr.Dataset]):
         return xr.Dataset({"pose": (("start", "coordinate"), poses)})
 
     def _raced(
-        self, wanted: Sequence[tuple[str, int]], folder: Path, truth: np.ndarray
+        self, races: Sequence[tuple[str, int]], folder: Path, truth: np.ndarray
     ) -> Generator[xr.Dataset]:
-        """Rows: all are made ready first, and then timed one after the other."""
-        given = _environment(self.peers)
-        started = [_Process(*one, folder, self.seconds, given) for one in wanted]
+        """Yield the rows: all engines are prepared first, and then timed in turn."""
+        environment = _environment(self.peers)
+        processes = [_Process(*race, folder, self.seconds, environment) for race in races]
         try:
             until = time.perf_counter() + self.limit
-            for process in started:
+            for process in processes:
                 process.prepare(until)
-            for process in started:
+            for process in processes:
                 yield process.row(time.perf_counter() + self.limit, truth)
         finally:
-            for process in started:
+            for process in processes:
                 process.end()
 
     def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
-        """Return the race, and why other engines are not in it."""
+        """Return the rows, with the reasons for excluded engines."""
         excluded = (f"Not in the arena: {name}, because {why}." for name, why in EXCLUDED.items())
         return {"arena": Table([_COLUMNS, *table(results)], " ".join(excluded))}
 
     def intro(self, results: xr.Dataset) -> str:
-        """Where it was measured."""
+        """Return the device of the measurement."""
         return programs.machine()
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Speeds and errors."""
-        told = " ".join(f"{name} is not in the arena: {why}." for name, why in EXCLUDED.items())
-        return [Section("Engines on one scene", told, [list(_COLUMNS), *table(results)])]
+        """Return a section with speeds and errors."""
+        note = " ".join(f"{name} is not in the arena: {why}." for name, why in EXCLUDED.items())
+        return [Section("Engines on one scene", note, [list(_COLUMNS), *table(results)])]
 
 
 arena = call_of(Arena)
 
 
-def _part(wanted: tuple[str, int]) -> str:
-    return "_".join([re.sub(r"\W+", "_", wanted[0]), str(wanted[1])])
+def _part(race: tuple[str, int]) -> str:
+    return "_".join([re.sub(r"\W+", "_", race[0]), str(race[1])])
 
 
 # --- the scene -----------------------------------------------------------------------------
 
 
-def placed(count: int) -> np.ndarray:
-    """Where bases and boxes start (count, 10): the box turned and to a side, touching the base."""
+def initial_poses(count: int) -> np.ndarray:
+    """Return initial poses (count, 10): turned and shifted boxes that touch the base."""
     box, rng = scene.load("box"), np.random.default_rng(0)
     yaws, sides = rng.uniform(-0.3, 0.3, count), rng.uniform(-0.08, 0.08, count)
     qpos = np.array([scene.initial_qpos(box, 0.0, yaw) for yaw in yaws])
@@ -194,7 +193,7 @@ def placed(count: int) -> np.ndarray:
 
 
 def mjcf() -> str:
-    """The scene that the project's engines step, as a file that others read too."""
+    """Return the scene of the project's engines in a format that all engines read."""
     model = scene.load("box", preset()).physics
     base, box, o = model.body("base"), model.body("object"), model.opt
 
@@ -208,9 +207,9 @@ def mjcf() -> str:
         )
 
     def geom(name: str, kind: str) -> str:
-        one = model.geom(name)
+        g = model.geom(name)
         return (
-            f'<geom name="{name}" type="{kind}" size="{text(one.size)}" pos="{text(one.pos)}" '
+            f'<geom name="{name}" type="{kind}" size="{text(g.size)}" pos="{text(g.pos)}" '
             'contype="0" conaffinity="0"/>'
         )
 
@@ -251,10 +250,10 @@ def mjcf() -> str:
 
 
 def _environment(peers: Path | None) -> dict[str, str]:
-    """Of an engine's process: the packages of others come last, and JAX takes what it needs."""
-    places = [str(_HERE.parents[1]), os.environ.get("PYTHONPATH", ""), str(peers or "")]
+    """Return the environment of an engine's process, with the third-party packages last."""
+    paths = [str(_FOLDER.parents[1]), os.environ.get("PYTHONPATH", ""), str(peers or "")]
     return os.environ | {
-        "PYTHONPATH": os.pathsep.join(filter(None, places)),
+        "PYTHONPATH": os.pathsep.join(filter(None, paths)),
         "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
     }
 
@@ -265,26 +264,26 @@ class _Process:
     def __init__(
         self, name: str, count: int, folder: Path, seconds: float, environment: Mapping[str, str]
     ):
-        """Start it."""
+        """Start the process."""
         words = [name, str(folder), str(seconds), str(count)]
         self.name, self.count, self.failed, self.ready = name, count, "", np.nan
         self._errors = folder / f"{_part((name, count))}.txt"
         with self._errors.open("w") as file:
             self._child = subprocess.Popen(
-                [sys.executable, str(_HERE / "racers.py"), *words], env=environment, text=True,
+                [sys.executable, str(_FOLDER / "racers.py"), *words], env=environment, text=True,
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=file,
             )  # fmt: skip
         assert self._child.stdout is not None
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         threading.Thread(target=_read, args=(self._child.stdout, self._lines), daemon=True).start()
 
-    def _told(self, until: float) -> dict[str, Any] | None:
-        """What it says next; None if it says nothing more, which is a failure in words."""
+    def _next_message(self, until: float) -> dict[str, Any] | None:
+        """Return the next message of the process, or None and set `failed`."""
         while True:
             try:
                 line = self._lines.get(timeout=max(until - time.perf_counter(), 0.01))
             except queue.Empty:
-                self.failed = "took longer than the limit"
+                self.failed = "exceeded the time limit"
                 return None
             if line is None:
                 self._child.wait()
@@ -295,24 +294,24 @@ class _Process:
                 return json.loads(line)
 
     def prepare(self, until: float) -> None:
-        """Wait until it is ready."""
-        if (told := self._told(until)) is not None:
-            self.ready = told["ready"]
+        """Wait until the engine is ready."""
+        if (message := self._next_message(until)) is not None:
+            self.ready = message["ready"]
         else:
             self.end()
 
     def row(self, until: float, truth: np.ndarray) -> xr.Dataset:
-        """Let it run, and tell its row."""
-        told = None
+        """Run the engine and return its row."""
+        output = None
         if not self.failed:
             assert self._child.stdin is not None
             print("go", file=self._child.stdin, flush=True)
-            told = self._told(until)
+            output = self._next_message(until)
         self.end()
-        return _row(self, told or {"poses": []}, truth)
+        return _row(self, output or {"poses": []}, truth)
 
     def end(self) -> None:
-        """End it, if it has not ended."""
+        """Kill the process if it is running."""
         self._child.kill()
         self._child.wait()
 
@@ -323,9 +322,9 @@ def _read(stream: IO[str], lines: queue.SimpleQueue[str | None]) -> None:
     lines.put(None)
 
 
-def _row(process: _Process, told: Mapping[str, Any], truth: np.ndarray) -> xr.Dataset:
-    """A row: what was told, and how far it is from the converged poses (n, 7)."""
-    poses = np.array(told["poses"], float).reshape(-1, 7)
+def _row(process: _Process, output: Mapping[str, Any], truth: np.ndarray) -> xr.Dataset:
+    """Return a row: output of the process, and errors against the converged poses (n, 7)."""
+    poses = np.array(output["poses"], float).reshape(-1, 7)
     error, turned = np.array([np.nan]), np.array([np.nan])
     if len(poses):
         true = truth[np.arange(len(poses)) % len(truth)]
@@ -333,9 +332,9 @@ def _row(process: _Process, told: Mapping[str, Any], truth: np.ndarray) -> xr.Da
         turned = np.abs((_yaw(poses) - _yaw(true) + np.pi) % (2 * np.pi) - np.pi)
     values = {
         "engine": process.name,
-        "version": told.get("version", ""),
-        "worlds": told.get("worlds", process.count),
-        "rate": told.get("rate", np.nan),
+        "version": output.get("version", ""),
+        "worlds": output.get("worlds", process.count),
+        "rate": output.get("rate", np.nan),
         "error": np.median(error),
         "largest": np.max(error),
         "turned": np.median(turned),
@@ -346,24 +345,24 @@ def _row(process: _Process, told: Mapping[str, Any], truth: np.ndarray) -> xr.Da
 
 
 def _yaw(poses: np.ndarray) -> np.ndarray:
-    """Headings (n,) [rad] of poses (n, 7)."""
+    """Return headings (n,) [rad] of poses (n, 7)."""
     w, x, y, z = poses[:, 3:].T
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
-# --- what is shown -------------------------------------------------------------------------
+# --- the table -----------------------------------------------------------------------------
 
 
 def _times(ratio: float) -> str:
-    """How many times as fast, in three digits, or in whole numbers."""
+    """Format a ratio with three digits, or as a whole number."""
     return "" if np.isnan(ratio) else f"{ratio:,.0f}" if ratio >= 100 else f"{ratio:.3g}"
 
 
-def table(found: xr.Dataset) -> list[list[str]]:
-    """A row for each engine and number of worlds, the slowest first and failures last."""
-    rows = [found.isel(row=i) for i in range(found.sizes["row"])]
+def table(results: xr.Dataset) -> list[list[str]]:
+    """Return one row per engine and number of worlds, the slowest first and failures last."""
+    rows = [results.isel(row=i) for i in range(results.sizes["row"])]
     fused = {int(r.worlds): float(r.rate) for r in rows if r.engine.item() == "fused"}
-    most = max(fused.values(), default=np.nan)
+    largest_rate = max(fused.values(), default=np.nan)
 
     def cell(value: xr.DataArray, form: str, times: float = 1.0) -> str:
         return "" if np.isnan(value) else form.format(times * float(value))
@@ -374,7 +373,7 @@ def table(found: xr.Dataset) -> list[list[str]]:
             str(r.version.item()),
             f"{int(r.worlds):,}",
             cell(r.rate, "{:,.0f}"),
-            _times(fused.get(int(r.worlds), most) / float(r.rate)),
+            _times(fused.get(int(r.worlds), largest_rate) / float(r.rate)),
             cell(r.error, "{:.2g} mm", 1000),
             cell(r.largest, "{:.2g} mm", 1000),
             cell(r.turned, "{:.2g}°", 180 / np.pi),

@@ -1,8 +1,8 @@
-"""How long does a user wait for a whole command, from return to the report?
+"""Time that a user waits for a whole command, from the return key to the report.
 
-Each command is a process of its own, run with an empty cache and then once more with what the first
-left in it. With `--gpus` they see so many, and `JAX_PLATFORMS=cpu` is for the process that times
-them alone, so that it leaves the GPUs to them.
+Each command runs twice in a new process: first with an empty cache, then with the cache of the
+first run. With `--gpus` the processes see that number of GPUs; set `JAX_PLATFORMS=cpu` for the
+timing process, so that it leaves the GPUs to them.
 
     rps sweeps/speed/commands.py --machine "2 cores of an AMD EPYC"
 """
@@ -33,7 +33,7 @@ from rps_jax.trials.progress import Progress
 from sweeps import programs
 from sweeps.study_base import Study, Table
 
-TOLD = re.compile(r"compile ([\d.]+) s, run ([\d.]+) s \((\d+) simulated s per s\)")
+TIMING = re.compile(r"compile ([\d.]+) s, run ([\d.]+) s \((\d+) simulated s per s\)")
 _COLUMNS = (
     *("command", "empty cache", "once more", "of it compile", "run", "simulated s/s"),
     *("memory, empty cache", "memory, once more"),
@@ -42,13 +42,13 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class Commands(Study[xr.Dataset]):
-    """Time whole commands, with an empty cache and once more.
+    """Time whole commands, with an empty and with a filled cache.
 
-    The answer holds seconds from return to the end of the process, the most memory that it held,
-    and what the second told of itself, for each command.
+    The results hold, by command, the duration of both processes, their peak memory, and the times
+    that the second one prints.
     """
 
-    TITLE: ClassVar[str] = "How long a user waits for a whole command"
+    TITLE: ClassVar[str] = "Duration of whole commands"
     GROWS: ClassVar[tuple[str, ...]] = ("commands", "warm", "gpus")
 
     commands: tuple[str, ...] = (
@@ -61,89 +61,89 @@ class Commands(Study[xr.Dataset]):
         "table --engine mjx",
         "sweep --laws rps --domain wide --worlds 1048576 --horizon 0.02 --slots 2048",
     )
-    """What is asked of `rps`."""
+    """Arguments of `rps`."""
     gpus: tuple[int, ...] = option((), 1, 64)
-    """Numbers of GPUs with which each is timed; by default with what this process sees."""
+    """Numbers of GPUs with which each command is timed; by default those of this process."""
     warm: tuple[int, ...] = ()
-    """Numbers of worlds that are swept three times in one process: the first time with an empty
-    cache, and the last."""
+    """Numbers of worlds of sweeps that run three times in one process; the first, with an empty
+    cache, and the last are timed."""
     limit: float = option(1800.0, 1, 86400)
-    """Time after which a command is stopped [s]."""
+    """Time limit of a command [s]."""
     file: str = "commands"
     """Name of the data file."""
 
     def num_trials(self) -> int | None:
-        """How many commands there are."""
-        return len(self.wanted) + len(self.warm)
+        """Return the number of commands."""
+        return len(self.rows) + len(self.warm)
 
     @property
-    def wanted(self) -> list[tuple[str, int | None]]:
-        """Commands, each with the numbers of GPUs that it sees."""
+    def rows(self) -> list[tuple[str, int | None]]:
+        """Commands, each with its number of GPUs."""
         return [(command, count) for command in self.commands for count in self.gpus or (None,)]
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Time what was not timed before."""
-        found = []
-        for number, (command, gpus) in enumerate(self.wanted):
+        """Time the commands that are missing."""
+        parts = []
+        for i, (command, gpus) in enumerate(self.rows):
             safe = re.sub(r"\W+", "_", command) + ("" if gpus is None else f"_{gpus}")
-            found.append(run.checkpoint(safe, partial(timed, command, self.limit, gpus)))
-            run.callback(Progress(number + 1, 0.0))
+            parts.append(run.checkpoint(safe, partial(timed, command, self.limit, gpus)))
+            run.callback(Progress(i + 1, 0.0))
         gpus = max(self.gpus, default=None)
-        found += [
+        parts += [
             run.checkpoint(f"warm_{n}", partial(_warm, n, self.limit, gpus)) for n in self.warm
         ]
-        told = [*_labels(self.wanted), *(f"`{_call(n)}`, in one process" for n in self.warm)]
-        whole: Any = xr.concat(found, "command").assign_coords(command=told)
-        return whole
+        labels = [*_labels(self.rows), *(f"`{_call(n)}`, in one process" for n in self.warm)]
+        results: Any = xr.concat(parts, "command").assign_coords(command=labels)
+        return results
 
     def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
         """Return the times of the commands."""
         return {self.file: Table([_COLUMNS, *table(results)])}
 
     def intro(self, results: xr.Dataset) -> str:
-        """Where it was measured."""
+        """Return the device of the measurement."""
         return programs.machine()
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Wall clocks of both processes."""
+        """Return a section with the durations of both processes."""
         return [Section("Whole commands", "", [list(_COLUMNS), *table(results)])]
 
 
 commands = call_of(Commands)
 
 
-def _labels(wanted: Sequence[tuple[str, int | None]]) -> list[str]:
-    """What the rows are of: commands, and GPUs where these are said."""
-    said = {None: "", 1: ", one GPU"}
-    return [f"`rps {one}`{said.get(gpus, f', {gpus} GPUs')}" for one, gpus in wanted]
+def _labels(rows: Sequence[tuple[str, int | None]]) -> list[str]:
+    """Return the labels of the rows: command and number of GPUs."""
+    suffix = {None: "", 1: ", one GPU"}
+    return [f"`rps {command}`{suffix.get(gpus, f', {gpus} GPUs')}" for command, gpus in rows]
 
 
 def timed(command: str, limit: float, gpus: int | None = None) -> xr.Dataset:
-    """Seconds and memory [GB] of a command with an empty cache and once more, and what it told.
+    """Return duration [s] and peak memory [GB] of both runs of a command, and its printed times.
 
     Raises:
-      InputError: it failed, or took longer than the limit [s].
+      InputError: the command failed or exceeded the time limit [s].
     """
     seconds, memory, output = [], [], ""
     with tempfile.TemporaryDirectory() as folder:
-        for number in range(2):
-            words = ["-m", "rps_jax", *shlex.split(command), "--out", f"{folder}/run_{number}"]
-            begun = time.perf_counter()
-            output, held = printed(words, command, folder, limit, gpus)
-            seconds.append(time.perf_counter() - begun)
-            memory.append(held)
-    told = TOLD.search(output)
-    compile_, run, rate = map(float, told.groups()) if told else (float("nan"),) * 3
+        for i in range(2):
+            words = ["-m", "rps_jax", *shlex.split(command), "--out", f"{folder}/run_{i}"]
+            start = time.perf_counter()
+            output, peak = printed(words, command, folder, limit, gpus)
+            seconds.append(time.perf_counter() - start)
+            memory.append(peak)
+    match = TIMING.search(output)
+    compile_, run, rate = map(float, match.groups()) if match else (float("nan"),) * 3
     return _row(*seconds, compile_, run, rate, *memory)
 
 
 def _call(worlds: int) -> str:
-    """The call by which worlds are swept, as a row names it."""
+    """Return the call of a sweep, as its row names it."""
     return f'rps_jax.sweep("rps_tuned", "wide", worlds={worlds})'
 
 
 def _warm(worlds: int, limit: float, gpus: int | None = None) -> xr.Dataset:
-    """Seconds of a sweep with an empty cache, and the third time in that process."""
+    """Return the durations of the first and the third sweep of one process [s]."""
     code = (
         "import time, rps_jax\n"
         "for _ in range(3):\n"
@@ -152,58 +152,60 @@ def _warm(worlds: int, limit: float, gpus: int | None = None) -> xr.Dataset:
         "    print(time.perf_counter() - begun)\n"
     )
     with tempfile.TemporaryDirectory() as folder:
-        told, held = printed(["-c", code], _call(worlds), folder, limit, gpus)
-    first, *_, last = map(float, told.split())
-    return _row(first, last, *(float("nan"),) * 3, held)
+        output, peak = printed(["-c", code], _call(worlds), folder, limit, gpus)
+    first, *_, last = map(float, output.split())
+    return _row(first, last, *(float("nan"),) * 3, peak)
 
 
 def printed(
     words: Sequence[str],
-    asked: str,
+    label: str,
     folder: str,
     limit: float,
     gpus: int | None = None,
     environment: Mapping[str, str] | None = None,
 ) -> tuple[str, float]:
-    """What Python prints, with its cache in a folder, and the most memory that it held [GB].
+    """Run Python with a cache in a folder; return its output and its peak memory [GB].
 
     Raises:
-      InputError: it failed, or took longer than the limit [s].
+      InputError: the command failed or exceeded the time limit [s].
     """
-    kept = os.environ | {"RPS_CACHE": f"{folder}/cache"} | dict(environment or {})
+    variables = os.environ | {"RPS_CACHE": f"{folder}/cache"} | dict(environment or {})
     if gpus is not None:
-        kept["CUDA_VISIBLE_DEVICES"] = ",".join(map(str, range(gpus)))
-        kept.pop("JAX_PLATFORMS", None)
-    said, wrong = Path(folder, "said"), Path(folder, "wrong")
-    with open(said, "w") as out, open(wrong, "w") as errors:
-        process = subprocess.Popen([sys.executable, *words], env=kept, stdout=out, stderr=errors)
-        stop = threading.Timer(limit, process.kill)
-        stop.start()
-        _, process.returncode, used = os.wait4(process.pid, 0)
-    if not stop.is_alive():
-        raise InputError(f"commands = {asked} took more than {limit:g} s.")
-    stop.cancel()
+        variables["CUDA_VISIBLE_DEVICES"] = ",".join(map(str, range(gpus)))
+        variables.pop("JAX_PLATFORMS", None)
+    output, error_output = Path(folder, "output"), Path(folder, "errors")
+    with open(output, "w") as out, open(error_output, "w") as errors:
+        process = subprocess.Popen(
+            [sys.executable, *words], env=variables, stdout=out, stderr=errors
+        )
+        timer = threading.Timer(limit, process.kill)
+        timer.start()
+        _, process.returncode, usage = os.wait4(process.pid, 0)
+    if not timer.is_alive():
+        raise InputError(f"commands = {label} exceeded the limit of {limit:g} s: raise --limit.")
+    timer.cancel()
     if process.returncode:
-        last = wrong.read_text().strip().splitlines()[-1:]
-        raise InputError(f"commands = {asked} failed: {' '.join(last)}")
-    return said.read_text(), used.ru_maxrss * 1024 / 1e9  # Linux tells of KiB
+        last = error_output.read_text().strip().splitlines()[-1:]
+        raise InputError(f"commands = {label} failed: {' '.join(last)}")
+    return output.read_text(), usage.ru_maxrss * 1024 / 1e9  # Linux reports KiB
 
 
-def _row(*told: float) -> xr.Dataset:
-    """Seconds of both runs, what the second told (compile and run [s], rate [s/s]), and memory."""
+def _row(*values: float) -> xr.Dataset:
+    """Label durations of both runs, printed times (compile, run [s], rate) and peak memory."""
     names = ("empty", "again", "compile", "run", "rate", "memory_empty", "memory_again")
-    values = (*told, *(float("nan"),) * (len(names) - len(told)))
-    return xr.Dataset({name: ((), value) for name, value in zip(names, values, strict=True)})
+    padded = (*values, *(float("nan"),) * (len(names) - len(values)))
+    return xr.Dataset({name: ((), value) for name, value in zip(names, padded, strict=True)})
 
 
-def table(found: xr.Dataset) -> list[list[str]]:
-    """A row for each command."""
+def table(results: xr.Dataset) -> list[list[str]]:
+    """Return one row per command."""
     rows = []
-    for command in map(str, found.command.values):
-        one = found.sel(command=command)
-        cells = [f"{one[name].item():.1f} s" for name in ("empty", "again", "compile", "run")]
-        told = f"{one.rate.item():,.0f}"
-        held = [f"{one[f'memory_{name}'].item():.1f} GB" for name in ("empty", "again")]
-        shown = [cell.removeprefix("nan").removeprefix(" s") for cell in (*cells, told)]
-        rows.append([command, *shown, *(cell.replace("nan GB", "") for cell in held)])
+    for command in map(str, results.command.values):
+        timing = results.sel(command=command)
+        cells = [f"{timing[name].item():.1f} s" for name in ("empty", "again", "compile", "run")]
+        rate = f"{timing.rate.item():,.0f}"
+        peaks = [f"{timing[f'memory_{name}'].item():.1f} GB" for name in ("empty", "again")]
+        shown = [cell.removeprefix("nan").removeprefix(" s") for cell in (*cells, rate)]
+        rows.append([command, *shown, *(cell.replace("nan GB", "") for cell in peaks)])
     return rows

@@ -25,7 +25,7 @@ from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import Progress
 from sweeps import programs
-from sweeps.speed.commands import TOLD, printed
+from sweeps.speed.commands import TIMING, printed
 from sweeps.study_base import Study, Table
 
 _LIMIT = 3600.0  # [s] of a sweep
@@ -133,6 +133,6 @@ def _swept(
         out = folder / f"run_{name}_{number}"
         words = ["-m", "rps_jax", *asked.split(), "--out", str(out)]
         said, _ = printed(words, asked, str(folder), _LIMIT, environment=environment)
-    if (told := TOLD.search(said)) is None:
+    if (told := TIMING.search(said)) is None:
         raise InputError(f"{asked} does not tell how long it ran.")
     return rps_jax.load(out).success.values, float(told.group(3))

@@ -1,10 +1,9 @@
-"""Where does the time of a control step go? By the function of this package that asked for it.
+"""Time of a control step, by the function of this package that requests each operation.
 
-XLA's profiler times every operation that a device carries out; the compiled program says which
-line of source each operation comes from. An operation that XLA has fused from several is counted
-where its result is computed, so neighbours may be charged for one another.
-
-On a processor these are the operations of XLA, without a C compiler.
+XLA's profiler times every operation on the device, and the compiled program has the source line of
+each operation. A fused operation counts for the line that computes its result, so neighbouring
+functions may get the time of each other. On a processor the loop is compiled by XLA, not by the C
+compiler.
 
     rps sweeps/speed/costs.py --families box prism
 """
@@ -33,40 +32,40 @@ from sweeps import programs
 from sweeps.programs import FAMILIES
 from sweeps.study_base import Study
 
-_ABOVE = re.compile(r".*(?:rps_jax|site-packages)/")  # of a file, what says not which it is
+_ABOVE = re.compile(r".*(?:rps_jax|site-packages)/")  # prefix of a file name
 _INSTRUCTION = re.compile(r"^\s*(?:ROOT )?%([\w.\-]+) = .* ([\w\-]+)\(.*stack_frame_id=(\d+)", re.M)
-_HOLLOW = ("while", "call", "conditional")  # what is within them is timed by itself
+_HOLLOW = ("while", "call", "conditional")  # their operations are timed separately
 ELSEWHERE = "moved by XLA"
 
 
 class Cost(NamedTuple):
-    """What one function costs."""
+    """Cost of one function."""
 
     where: str  # file: function
-    time: float  # [s] of a control step of the whole batch
-    share: float  # [1] of all that was timed
-    operations: float  # carried out in a control step
+    time: float  # [s] per control step of the whole batch
+    share: float  # [1] of the timed operations
+    operations: float  # per control step
 
 
 class Profile(NamedTuple):
-    """Where the time of a program goes."""
+    """Profile of a program."""
 
-    name: str  # of `programs.BATCHED`
+    name: str  # in `programs.BATCHED`
     family: str
     worlds: int
-    step: float  # [s] of wall clock in a control step, without the profiler
-    timed: float  # [s] in operations, as the profiler timed them
+    step: float  # [s] wall clock of a control step, without the profiler
+    timed: float  # [s] in operations, with the profiler
     costs: tuple[Cost, ...]  # the most expensive first
 
 
 @dataclass(frozen=True)
 class Costs(Study[list[Profile]]):
-    """Tell where the time of a control step goes, by the function that asked for it.
+    """Profile a control step by the functions of this package.
 
-    The answer holds a profile of each program.
+    The results hold a profile of each program.
     """
 
-    TITLE: ClassVar[str] = "Where the time of a control step goes"
+    TITLE: ClassVar[str] = "Time of a control step by function"
 
     names: tuple[str, ...] = ("fused standard",)
     """Engines and fidelities, as those of `rps sweeps/speed`."""
@@ -75,9 +74,9 @@ class Costs(Study[list[Profile]]):
     worlds: int = option(64, 1, 10_000_000)
     """Number of worlds of the batch."""
     steps: int = option(20, 1, 1000)
-    """Control steps that are timed."""
+    """Number of timed control steps."""
     most: int = option(12, 1, 1000)
-    """Functions of each program in the table."""
+    """Number of functions of each program in the table."""
 
     def check(self) -> None:
         """Check the names of the programs and of the families."""
@@ -87,34 +86,34 @@ class Costs(Study[list[Profile]]):
             errors.check_name("names", name, programs.BATCHED)
 
     def num_trials(self) -> int | None:
-        """How many programs there are."""
+        """Return the number of programs."""
         return len(self.names) * len(self.families)
 
     def answer(self, run: Run) -> list[Profile]:
         """Profile each program."""
-        found, compiler = [], os.environ.get("RPS_COMPILER")
-        os.environ["RPS_COMPILER"] = "none"  # the profiler sees the operations of XLA alone
+        profiles, compiler = [], os.environ.get("RPS_COMPILER")
+        os.environ["RPS_COMPILER"] = "none"  # the profiler sees operations of XLA only
         try:
             for name in self.names:
                 for family in self.families:
-                    found.append(measure(name, family, self.worlds, steps=self.steps))
-                    run.callback(Progress(len(found), 0.0))
+                    profiles.append(measure(name, family, self.worlds, steps=self.steps))
+                    run.callback(Progress(len(profiles), 0.0))
         finally:
             os.environ.pop("RPS_COMPILER")
             os.environ.update({} if compiler is None else {"RPS_COMPILER": compiler})
-        return found
+        return profiles
 
     def intro(self, results: list[Profile]) -> str:
-        """Where it was measured, and how long a control step takes."""
-        whole = "\n".join(
+        """Return the device, and the time of a control step of each program."""
+        lines = "\n".join(
             f"{p.name}, {p.family}: {1e6 * p.step:,.0f} us a control step of {p.worlds:,} worlds, "
             f"{1e6 * p.timed:,.0f} us in operations while the profiler ran."
             for p in results
         )
-        return f"{programs.machine()}\n\n{whole}"
+        return f"{programs.machine()}\n\n{lines}"
 
     def report(self, results: list[Profile], run: Run) -> Sequence[Section]:
-        """The most expensive functions of each program."""
+        """Return a section with the most expensive functions of each program."""
         return [Section("Functions", "", table(results, self.most))]
 
 
@@ -122,29 +121,29 @@ costs = call_of(Costs)
 
 
 def measure(name: str, family: str, worlds: int, *, steps: int = 20) -> Profile:
-    """Profile one of `programs.BATCHED`, every world being pushed.
+    """Profile a program of `programs.BATCHED`, with a push in every world.
 
     Args:
-      name: of `programs.BATCHED`.
-      family: of its worlds.
-      worlds: how many.
-      steps: control steps that are timed.
+      name: name in `programs.BATCHED`.
+      family: shape family of the objects.
+      worlds: number of worlds.
+      steps: number of timed control steps.
     """
     setting = programs.BATCHED[name]
     simulated = steps * setting.physics.control_period
     program = programs.traced(name, setting, family, worlds, simulated=simulated)()
     state = jax.block_until_ready(program.go(jax.tree.map(jnp.copy, program.start)))
-    began = time.perf_counter()
+    start = time.perf_counter()
     state = jax.block_until_ready(program.go(state))
-    took = time.perf_counter() - began
+    duration = time.perf_counter() - start
     options = jax.profiler.ProfileOptions()
-    options.host_tracer_level = 3  # of a processor: every operation
+    options.host_tracer_level = 3  # every operation of a processor
     options.python_tracer_level = 0
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder, profiler_options=options):
             jax.block_until_ready(program.go(state))
-        (found,) = Path(folder).rglob("*.xplane.pb")
-        events = list(_events(jax.profiler.ProfileData.from_file(str(found))))
+        (trace_file,) = Path(folder).rglob("*.xplane.pb")
+        events = list(_events(jax.profiler.ProfileData.from_file(str(trace_file))))
     source = sources(program.text() or "")
     times: dict[str, float] = defaultdict(float)
     counts: Counter[str] = Counter()
@@ -152,16 +151,16 @@ def measure(name: str, family: str, worlds: int, *, steps: int = 20) -> Profile:
         if (where := source.get(operation)) is not None:
             times[where] += seconds
             counts[where] += 1
-    whole = sum(times.values())
+    total = sum(times.values())
     costs = [
-        Cost(where, seconds / steps, seconds / whole, counts[where] / steps)
+        Cost(where, seconds / steps, seconds / total, counts[where] / steps)
         for where, seconds in sorted(times.items(), key=lambda pair: -pair[1])
     ]
-    return Profile(name, family, worlds, took / steps, whole / steps, tuple(costs))
+    return Profile(name, family, worlds, duration / steps, total / steps, tuple(costs))
 
 
 def _events(data: Any) -> Iterator[tuple[str, float]]:
-    """Names of operations, and their durations [s]."""
+    """Yield the names of operations and their durations [s]."""
     for plane in data.planes:
         device = plane.name.startswith("/device:")
         for line in plane.lines:
@@ -175,32 +174,32 @@ def _events(data: Any) -> Iterator[tuple[str, float]]:
 
 
 def sources(text: str) -> dict[str, str]:
-    """The file and function of each instruction of a compiled program's text.
+    """Return file and function of each instruction in the text of a compiled program.
 
-    Of functions that call one another it is the innermost; an instruction without a place of its
-    own comes from `ELSEWHERE`.
+    Nested calls count for the innermost function, instructions without a source for `ELSEWHERE`.
     """
     files, functions = _names(text, "FileNames"), _names(text, "FunctionNames")
-    places = {
-        place: (int(file), int(function))
-        for place, file, function in _rows(
+    locations = {
+        location: (int(file), int(function))
+        for location, file, function in _rows(
             text, "FileLocations", r"file_name_id=(\d+) function_name_id=(\d+)"
         )
     }
     frames = {
-        frame: int(place) for frame, place in _rows(text, "StackFrames", r"file_location_id=(\d+)")
+        frame: int(location)
+        for frame, location in _rows(text, "StackFrames", r"file_location_id=(\d+)")
     }
-    found = {}
+    functions_of = {}
     for name, opcode, frame in _INSTRUCTION.findall(text):
         if opcode in _HOLLOW:
             continue
         where = ELSEWHERE
         if int(frame) in frames:
-            file, function = places[frames[int(frame)]]
+            file, function = locations[frames[int(frame)]]
             short = _ABOVE.sub("", files[file])
             where = f"{short}: {functions[function].replace('.<locals>', '')}"
-        found[name] = where
-    return found
+        functions_of[name] = where
+    return functions_of
 
 
 def _section(text: str, title: str) -> list[str]:
@@ -210,21 +209,21 @@ def _section(text: str, title: str) -> list[str]:
 
 def _names(text: str, title: str) -> dict[int, str]:
     rows = (line.partition(" ") for line in _section(text, title))
-    return {int(number): name.strip('"') for number, _, name in rows}
+    return {int(i): name.strip('"') for i, _, name in rows}
 
 
 def _rows(text: str, title: str, pattern: str) -> Iterator[tuple[int, ...]]:
     for line in _section(text, title):
-        number, _, rest = line.partition(" ")
-        if found := re.search(pattern, rest):
-            yield int(number), *(int(group) for group in found.groups())
+        i, _, rest = line.partition(" ")
+        if match := re.search(pattern, rest):
+            yield int(i), *(int(group) for group in match.groups())
 
 
-def table(profiles: Sequence[Profile], most: int = 12) -> list[list[str]]:
-    """Header, and the `most` expensive functions of each program."""
+def table(profiles: Sequence[Profile], count: int = 12) -> list[list[str]]:
+    """Return a header and the most expensive functions of each program."""
     rows = [["what", "family", "worlds", "where", "us a control step", "share", "operations"]]
     for p in profiles:
-        for c in p.costs[:most]:
+        for c in p.costs[:count]:
             rows.append(
                 [p.name, p.family, f"{p.worlds:,}", c.where, f"{1e6 * c.time:.1f}",
                  f"{100 * c.share:.0f} %", f"{c.operations:.1f}"]

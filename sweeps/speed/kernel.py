@@ -1,8 +1,7 @@
-"""What does the kernel of a GPU wait for, between two instructions of a warp?
+"""Stall reasons of the GPU kernel between two instructions of a warp.
 
-Nsight Compute (`ncu`, of the CUDA toolkit) counts what the second launch of a sweep does, which is
-in the middle of most pushes. The sweep is a process of its own, run once before so that nothing is
-compiled under the profiler.
+Nsight Compute (`ncu` of the CUDA toolkit) profiles the second launch of a sweep, in the middle of
+most pushes. The sweep runs in a separate process, once without the profiler to fill the cache.
 
     rps sweeps/speed/kernel.py --machine "one NVIDIA H200"
 """
@@ -34,8 +33,8 @@ from sweeps.programs import FAMILIES
 from sweeps.study_base import Study, Table
 
 _STALLED = "smsp__average_warps_issue_stalled_{}_per_issue_active.ratio"
-# Of what is counted: Nsight's name, ours, and what it is.
-_COUNTED = {
+# Counters: name of Nsight Compute, variable, description.
+_COUNTERS = {
     "gpu__time_duration.sum": ("time", "time of the launch [ns]"),
     "smsp__inst_executed.sum": ("instructions", "instructions of all warps"),
     "smsp__warps_launched.sum": ("warps", "warps"),
@@ -57,85 +56,88 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class Kernel(Study[xr.Dataset]):
-    """Count what the kernel of a GPU does, and what its warps wait for.
+    """Profile the kernel of a GPU: instructions, registers and stall reasons of its warps.
 
-    The answer holds what Nsight Compute counts of 10 simulated seconds, by the family of objects.
+    The results hold the counters of Nsight Compute for 10 simulated seconds, by shape family.
     """
 
-    TITLE: ClassVar[str] = "What the kernel waits for"
+    TITLE: ClassVar[str] = "Stall reasons of the kernel"
     GROWS: ClassVar[tuple[str, ...]] = ("families",)
 
     law: str = "rps_tuned"
-    """What decides."""
+    """Law to run."""
     families: tuple[Literal["box", "cylinder", "prism"], ...] = FAMILIES
     """Families of the objects: box, cylinder, prism."""
     worlds: int = option(16_384, 8193, 10_000_000)
-    """Number of worlds of `wide`; more than are set aside for the end."""
+    """Number of worlds of `wide`; it must exceed the number of suspended trials."""
 
     def check(self) -> None:
-        """Check that the profiler is there."""
+        """Check that the profiler is installed."""
         if shutil.which("ncu") is None:
-            raise InputError("ncu is not here: it is a part of NVIDIA's CUDA toolkit.")
+            raise InputError("ncu is not installed: install NVIDIA's CUDA toolkit, which has it.")
 
     def num_trials(self) -> int | None:
-        """How many families there are."""
+        """Return the number of families."""
         return len(self.families)
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Count what was not counted before."""
-        found = []
-        for number, family in enumerate(self.families):
-            found.append(run.checkpoint(family, partial(self._counted, family)))
-            run.callback(Progress(number + 1, 0.0))
-        whole: Any = xr.concat(found, "family").assign_coords(family=list(self.families))
-        return whole
+        """Profile the families that are missing."""
+        parts = []
+        for i, family in enumerate(self.families):
+            parts.append(run.checkpoint(family, partial(self._profiled, family)))
+            run.callback(Progress(i + 1, 0.0))
+        results: Any = xr.concat(parts, "family").assign_coords(family=list(self.families))
+        return results
 
     def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
         """Return the counts of each family."""
         return {"kernel": Table([_COLUMNS, *self.table(results)])}
 
     def intro(self, results: xr.Dataset) -> str:
-        """Where it was measured."""
+        """Return the device of the measurement."""
         return programs.machine()
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """What the kernel of each family waits for."""
+        """Return a section with the stall reasons of each family."""
         return [Section("Waits", "", [list(_COLUMNS), *self.table(results)])]
 
     def table(self, found: xr.Dataset) -> list[list[str]]:
-        """A row for each family."""
+        """Return one row per family."""
         steps, rows = SEGMENT / Setting().physics.control_period, []
         for family in map(str, found.family.values):
-            one = {name: leaf.item() for name, leaf in found.sel(family=family).items()}
-            waits = [one[name] for name in _WAITS]
+            counts = {name: leaf.item() for name, leaf in found.sel(family=family).items()}
+            waits = [counts[name] for name in _WAITS]
             rows.append([
-                family, f"{self.worlds:,}", f"{one['time'] / steps / 1e3:.0f} µs",
-                f"{one['instructions'] / one['warps'] / steps:,.0f}", f"{one['registers']:.0f}",
-                f"{one['between']:.1f}", *(f"{wait:.1f}" for wait in waits),
-                f"{one['between'] - sum(waits):.1f}",
+                family, f"{self.worlds:,}", f"{counts['time'] / steps / 1e3:.0f} µs",
+                f"{counts['instructions'] / counts['warps'] / steps:,.0f}",
+                f"{counts['registers']:.0f}",
+                f"{counts['between']:.1f}", *(f"{wait:.1f}" for wait in waits),
+                f"{counts['between'] - sum(waits):.1f}",
             ])  # fmt: skip
         return rows
 
-    def _counted(self, family: str) -> xr.Dataset:
-        """What is counted of a launch.
+    def _profiled(self, family: str) -> xr.Dataset:
+        """Profile one launch.
 
         Raises:
           InputError: the sweep or the profiler failed.
         """
-        asked = f"--laws {self.law} --domain wide,objects=random_{family} --worlds {self.worlds}"
-        asked = f"-m rps_jax sweep {asked} --horizon {3 * SEGMENT:g} --device gpu"
+        sweep = f"--laws {self.law} --domain wide,objects=random_{family} --worlds {self.worlds}"
+        sweep = f"-m rps_jax sweep {sweep} --horizon {3 * SEGMENT:g} --device gpu"
         with tempfile.TemporaryDirectory() as folder:
             log = Path(folder) / "counted.csv"
             ncu = (
                 "ncu --clock-control none --kernel-name step --launch-skip 1 --launch-count 1 "
                 f"--csv --page raw --print-units base --log-file {log} "
-                f"--metrics {','.join(_COUNTED)}"
+                f"--metrics {','.join(_COUNTERS)}"
             )
-            for number, before in enumerate(("", ncu)):
-                words = [sys.executable, *asked.split(), "--out", f"{folder}/run_{number}"]
-                done = subprocess.run([*before.split(), *words], capture_output=True, text=True)
-                if done.returncode:
-                    last = (done.stderr or done.stdout).strip().splitlines()[-1:]
+            for i, profiler in enumerate(("", ncu)):
+                words = [sys.executable, *sweep.split(), "--out", f"{folder}/run_{i}"]
+                process = subprocess.run(
+                    [*profiler.split(), *words], capture_output=True, text=True
+                )
+                if process.returncode:
+                    last = (process.stderr or process.stdout).strip().splitlines()[-1:]
                     raise InputError(f"families = {family} cannot be counted: {' '.join(last)}")
             return counts(log.read_text())
 
@@ -144,16 +146,16 @@ kernel = call_of(Kernel)
 
 
 def counts(text: str) -> xr.Dataset:
-    """What a table of Nsight Compute holds of its last launch.
+    """Return the counters of the last launch in a table of Nsight Compute.
 
     Raises:
-      InputError: it holds no launch.
+      InputError: the table has no launch.
     """
     rows = list(csv.reader(line for line in text.splitlines() if line.startswith('"')))
     if len(rows) < 3:  # names, units and one launch
-        raise InputError(f"Nsight Compute counted nothing: {' '.join(text.split()[-20:])}.")
+        raise InputError(f"Nsight Compute profiled no launch: {' '.join(text.split()[-20:])}.")
     values = dict(zip(rows[0], rows[-1], strict=True))
     return xr.Dataset({
         ours: ((), float(values[name].replace(",", "")), {"long_name": meaning})
-        for name, (ours, meaning) in _COUNTED.items()
+        for name, (ours, meaning) in _COUNTERS.items()
     })  # fmt: skip

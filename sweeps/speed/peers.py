@@ -1,9 +1,9 @@
-"""Set up the environment of the arena's engines that are not this project's.
+"""Install the third-party engines of the arena.
 
     python sweeps/speed/peers.py FOLDER
     rps sweeps/speed/arena.py --peers FOLDER
 
-They are installed into a folder of their own, beside JAX, NumPy and MuJoCo as they are here.
+The folder has these packages only; JAX, NumPy and MuJoCo are those of this environment.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
-# MuJoCo Warp and Newton on the Warp that MJX of the same version asks for, with what they import.
+# MuJoCo Warp and Newton, the Warp version that MJX requires, and their imports.
 PACKAGES = (
     "mujoco-warp==3.17.0",
     "newton==1.8.0",
@@ -22,7 +22,7 @@ PACKAGES = (
 
 
 def install(folder: str) -> int:
-    """Install the packages into a folder; the exit status of pip."""
+    """Install the packages into a folder and return the exit status of pip."""
     words = [sys.executable, "-m", "pip", "install", "--no-deps", "--upgrade", "--target", folder]
     return subprocess.run([*words, *PACKAGES], check=False).returncode
 

@@ -1,10 +1,10 @@
-"""What one process of the arena runs: one engine, from the starts to the end, as fast as it goes.
+"""Process of the arena for a single engine, which steps all worlds as fast as possible.
 
     python racers.py ENGINE FOLDER SECONDS WORLDS
 
-`FOLDER` holds `scene.xml` and `starts.npy`. The process makes everything ready, says so, waits for
-a line, and then says how fast it was and where the objects ended. It needs nothing of this project
-but for the project's own engines, so that others can live in an environment of their own.
+`FOLDER` holds `scene.xml` and `starts.npy`. The process compiles, prints `ready`, waits for
+a line, and then prints its speed and the final poses of the objects. It imports this project for
+the project's engines only, so that other engines can have a separate environment.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ BASE = slice(0, 3)  # of qpos and qvel: x, y, yaw
 OBJECT = slice(3, 10)  # of qpos: position and quaternion, scalar first
 # Room for a world's points of contact (four of each of two pairs), and for their rows.
 CONTACTS, ROWS = 8, 24
-_GRAPH = 50  # steps that are captured as one graph
-_ENOUGH = 6.0  # [s] after which no further go is made
+_GRAPH = 50  # steps in one CUDA graph
+_ENOUGH = 6.0  # [s] total time after which no further run starts
 _GOES = 4
 
 
 class Task(NamedTuple):
-    """What is asked of an engine."""
+    """Task of an engine."""
 
     scene: Path  # MJCF
-    qpos: np.ndarray  # (worlds, 10) where they start, at rest
-    seconds: float  # of each world
+    qpos: np.ndarray  # (worlds, 10) start, at rest
+    seconds: float  # [s] duration of each world
 
 
 class Racer(NamedTuple):
-    """An engine that is ready."""
+    """An engine that is ready to run."""
 
-    go: Callable[[], np.ndarray]  # poses (few, 7) of the first objects after a whole run
+    go: Callable[[], np.ndarray]  # runs all steps; poses (n, 7) of the first objects
     warm: Callable[[], Any]  # compiles what `go` needs
     worlds: int
 
@@ -59,7 +59,7 @@ def _model(task: Task) -> Any:
 
 
 def rollout(task: Task) -> Racer:
-    """MuJoCo's `rollout` on all cores, whose base is set on its way once in a control period."""
+    """MuJoCo's `rollout` on all cores, with the base velocity set once per control period."""
     import mujoco
     from mujoco.rollout import Rollout
 
@@ -75,20 +75,20 @@ def rollout(task: Task) -> Racer:
         warmstart = np.zeros((worlds, model.nv))
         for _ in range(periods):
             state[:, 1 + nq :][:, BASE] = [SPEED, 0.0, 0.0]
-            after = np.asarray(
+            states = np.asarray(
                 pool.rollout(
                     model, datas, state, nstep=substeps, initial_warmstart=warmstart
                 )[0]
             )  # fmt: skip
-            gained = after[:, -1, 1 + nq :] - after[:, -2, 1 + nq :]
-            state, warmstart = after[:, -1], gained / model.opt.timestep
+            velocity_change = states[:, -1, 1 + nq :] - states[:, -2, 1 + nq :]
+            state, warmstart = states[:, -1], velocity_change / model.opt.timestep
         return state[:, 1:][:, OBJECT]
 
     return Racer(go, functools.partial(go, 1), worlds)
 
 
 def in_c(model: Any, qpos: np.ndarray, seconds: float) -> np.ndarray:
-    """Pose (7,) of the object after one world was stepped by `mj_step`."""
+    """Return the pose (7,) of the object after `mj_step` has stepped one world."""
     import mujoco
 
     data = mujoco.MjData(model)
@@ -100,16 +100,16 @@ def in_c(model: Any, qpos: np.ndarray, seconds: float) -> np.ndarray:
 
 
 def single(task: Task) -> Racer:
-    """One process a trial, as many at a time as there are cores."""
+    """Start a process per trial, with one trial per core at a time."""
     cores = os.cpu_count() or 1
     worlds = min(len(task.qpos), 8 * cores)
     words = [sys.executable, __file__, "trial", str(task.scene.parent), str(task.seconds)]
 
-    def trial(number: int) -> list[float]:
-        done = subprocess.run(
-            [*words, str(number)], stdout=subprocess.PIPE, text=True, check=True
+    def trial(index: int) -> list[float]:
+        process = subprocess.run(
+            [*words, str(index)], stdout=subprocess.PIPE, text=True, check=True
         )  # fmt: skip
-        return json.loads(done.stdout)
+        return json.loads(process.stdout)
 
     def go() -> np.ndarray:
         from multiprocessing.pool import ThreadPool
@@ -121,7 +121,7 @@ def single(task: Task) -> Racer:
 
 
 def converged(scene: Path, starts: np.ndarray, seconds: float, step: float) -> np.ndarray:
-    """Poses (n, 7) of the objects by C MuJoCo in fine steps, solved to the end."""
+    """Return poses (n, 7) of the objects by C MuJoCo with small steps and a converged solver."""
     import mujoco
 
     model = mujoco.MjModel.from_xml_path(str(scene))
@@ -135,7 +135,7 @@ def converged(scene: Path, starts: np.ndarray, seconds: float, step: float) -> n
 
 
 def jax_engine(task: Task, name: str) -> Racer:
-    """An engine of this project: all of a run is one program."""
+    """An engine of this project, with a whole run as one program."""
     import jax
     import jax.numpy as jnp
 
@@ -159,10 +159,10 @@ def jax_engine(task: Task, name: str) -> Racer:
     def run(fields: Any, qpos: jax.Array, periods: int) -> jax.Array:
         still = jnp.zeros((worlds, 9), qpos.dtype)
 
-        def one(_: int, motion: Motion) -> Motion:
+        def drive(_: int, motion: Motion) -> Motion:
             return stage.drive(fields, motion, ControlPeriod(twists, physics)).motion
 
-        return jax.lax.fori_loop(0, periods, one, Motion(qpos, still, still)).qpos
+        return jax.lax.fori_loop(0, periods, drive, Motion(qpos, still, still)).qpos
 
     def go(periods: int = periods) -> np.ndarray:
         return np.asarray(jax.block_until_ready(run(fields, qpos, periods))[:, OBJECT])
@@ -176,23 +176,23 @@ def with_law(task: Task) -> Racer:
 
     from sweeps import programs
 
-    made = programs.traced(
+    program = programs.traced(
         "fused", programs.BATCHED["fused standard"], "box", len(task.qpos),
         simulated=task.seconds, donated=False,
     )()  # fmt: skip
 
     def go() -> np.ndarray:
-        jax.block_until_ready(made.go(made.start))
+        jax.block_until_ready(program.go(program.start))
         return np.full((1, 7), np.nan)  # the law pushes elsewhere
 
-    return Racer(go, go, made.worlds)
+    return Racer(go, go, program.worlds)
 
 
 # --- engines of others ---------------------------------------------------------------------
 
 
 def _captured(warp: Any, step: Callable[[], None], count: int) -> Callable[[], None]:
-    """Launches of a CUDA graph that make `count` steps; on a processor, the steps."""
+    """Return a function that makes `count` steps, by launches of a CUDA graph on a GPU."""
     if not warp.get_device().is_cuda:
 
         def steps() -> None:
@@ -215,7 +215,7 @@ def _captured(warp: Any, step: Callable[[], None], count: int) -> Callable[[], N
 
 @functools.cache
 def _commanded() -> Any:
-    """A kernel that sets the velocity of every base."""
+    """Return a kernel that sets the velocity of every base."""
     import warp  # pyright: ignore[reportMissingImports]
 
     @warp.kernel
@@ -229,7 +229,7 @@ def _commanded() -> Any:
 
 
 def mujoco_warp(task: Task) -> Racer:
-    """MuJoCo Warp as it is, its steps captured as a graph."""
+    """MuJoCo Warp, with its steps captured as a CUDA graph."""
     import mujoco
     import mujoco_warp as mjw  # pyright: ignore[reportMissingImports]
     import warp as wp  # pyright: ignore[reportMissingImports]
@@ -262,24 +262,24 @@ def mujoco_warp(task: Task) -> Racer:
 
 
 def newton(task: Task) -> Racer:
-    """Newton's solver that is made of MuJoCo Warp, as its examples run it."""
+    """Newton's solver based on MuJoCo Warp, set up like Newton's examples."""
     import newton  # pyright: ignore[reportMissingImports]
     import warp as wp  # pyright: ignore[reportMissingImports]
     from newton.solvers import SolverMuJoCo  # pyright: ignore[reportMissingImports]
 
     wp.config.log_level = wp.LOG_WARNING
     worlds, option = len(task.qpos), _model(task).opt
-    one = newton.ModelBuilder()
-    SolverMuJoCo.register_custom_attributes(one)
-    one.add_mjcf(str(task.scene))
-    every = newton.ModelBuilder()
-    every.replicate(one, worlds)
-    model = every.finalize()
+    single_world = newton.ModelBuilder()
+    SolverMuJoCo.register_custom_attributes(single_world)
+    single_world.add_mjcf(str(task.scene))
+    all_worlds = newton.ModelBuilder()
+    all_worlds.replicate(single_world, worlds)
+    model = all_worlds.finalize()
     solver = SolverMuJoCo(
         model, nconmax=CONTACTS, njmax=ROWS, iterations=option.iterations,
         ls_iterations=option.ls_iterations, cone="elliptic", impratio=option.impratio,
         tolerance=option.tolerance, integrator="euler", solver="newton",
-        kinematic_switchable_roots=False,  # else each body has a weld that is never switched on
+        kinematic_switchable_roots=False,  # otherwise each body has an unused weld
     )  # fmt: skip
     solver.mjw_model.opt.warn_overflow = False
     states, control = [model.state(), model.state()], model.control()
@@ -289,12 +289,12 @@ def newton(task: Task) -> Racer:
     command = _commanded()
     shape = (worlds, 9)
 
-    def step() -> None:  # two of them, so that the states are in their places again
+    def step() -> None:  # two steps, which swap the states twice
         for _ in range(2):
-            now, after = states
-            now.clear_forces()
-            wp.launch(command, dim=worlds, inputs=[now.joint_qd.reshape(shape), SPEED])
-            solver.step(now, after, control, None, option.timestep)
+            state, next_state = states
+            state.clear_forces()
+            wp.launch(command, dim=worlds, inputs=[state.joint_qd.reshape(shape), SPEED])
+            solver.step(state, next_state, control, None, option.timestep)
             states.reverse()
 
     launch = _captured(wp, step, round(task.seconds / option.timestep / 2))
@@ -305,13 +305,13 @@ def newton(task: Task) -> Racer:
         newton.eval_fk(model, states[0].joint_q, states[0].joint_qd, states[0])
         launch()
         wp.synchronize()
-        found = states[0].joint_q.numpy().reshape(worlds, -1)[:, OBJECT]
-        return found[:, [0, 1, 2, 6, 3, 4, 5]]
+        poses = states[0].joint_q.numpy().reshape(worlds, -1)[:, OBJECT]
+        return poses[:, [0, 1, 2, 6, 3, 4, 5]]
 
     return Racer(go, step, worlds)
 
 
-# Engines by name: what makes one ready, and the package whose version is told.
+# Engines by name: function that prepares the engine, and its package.
 RACERS: dict[str, tuple[Callable[[Task], Racer], str]] = {
     "one process a trial": (single, "mujoco"),
     "C MuJoCo, rollout": (rollout, "mujoco"),
@@ -321,15 +321,15 @@ RACERS: dict[str, tuple[Callable[[Task], Racer], str]] = {
     "fused": (functools.partial(jax_engine, name="fused"), "rps_jax"),
     "fused, law and skin": (with_law, "rps_jax"),
 }
-ON_CORES = ("one process a trial", "C MuJoCo, rollout")  # with as many worlds as suit them
+ON_CORES = ("one process a trial", "C MuJoCo, rollout")  # these choose the number of worlds
 
 
-def _say(**told: Any) -> None:
-    print(json.dumps(told), flush=True)
+def _say(**values: Any) -> None:
+    print(json.dumps(values), flush=True)
 
 
 def _version(package: str) -> str:
-    """Its version; none of this project where it runs from its sources."""
+    """Return the version of a package, or "" if it runs from its sources."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -337,24 +337,29 @@ def _version(package: str) -> str:
 
 
 def race(name: str, folder: Path, seconds: float, count: int) -> None:
-    """Make an engine ready for a number of worlds, wait for a line, and time it."""
+    """Prepare an engine for a number of worlds, wait for a line, and time it."""
     prepare, package = RACERS[name]
-    begun, starts = time.perf_counter(), np.load(folder / "starts.npy")
+    start, starts = time.perf_counter(), np.load(folder / "starts.npy")
     qpos = starts[np.arange(count) % len(starts)]
     try:
         racer = prepare(Task(folder / "scene.xml", qpos, seconds))
     except ModuleNotFoundError as error:
         sys.exit(f"{error.name} is not installed")
     racer.warm()
-    _say(ready=time.perf_counter() - begun)
+    _say(ready=time.perf_counter() - start)
     input()
     times, poses = [], np.empty(0)
     while len(times) < _GOES and sum(times) < _ENOUGH:
-        begun = time.perf_counter()
+        start = time.perf_counter()
         poses = racer.go()
-        times.append(time.perf_counter() - begun)
-    rate, few = racer.worlds * seconds / min(times), min(len(starts), racer.worlds)
-    _say(worlds=racer.worlds, rate=rate, version=_version(package), poses=poses[:few].tolist())
+        times.append(time.perf_counter() - start)
+    rate, count_poses = racer.worlds * seconds / min(times), min(len(starts), racer.worlds)
+    _say(
+        worlds=racer.worlds,
+        rate=rate,
+        version=_version(package),
+        poses=poses[:count_poses].tolist(),
+    )
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""How long does the law take on a robot, from 42 taxels to a twist, a thousand times a second?
+"""Time of a step of the law on a robot, from 42 taxels to a twist, a thousand times per second.
 
-`notebooks/examples/on_a_robot.py` is run as a process of its own, and says what it measured.
+A separate process runs `notebooks/examples/on_a_robot.py`, which prints its measurements.
 
     rps sweeps/speed/robot.py --core 1 --machine "one of 2 cores of an AMD EPYC"
 """
@@ -26,24 +26,24 @@ from sweeps.study_base import Study, Table
 
 _ROOT = Path(__file__).parents[2]
 _EXAMPLE = "notebooks/examples/on_a_robot.py"
-TOLD = re.compile(r"median (\d+) us, 99.9th percentile (\d+) us, worst (\d+) us; ([\d.]+)%")
-_FOUND = {
+PRINTED = re.compile(r"median (\d+) us, 99.9th percentile (\d+) us, worst (\d+) us; ([\d.]+)%")
+_VARIABLES = {
     "median": ("us", "median time of a step"),
     "slow": ("us", "99.9th percentile of the times"),
     "worst": ("us", "longest time of a step"),
-    "late": ("%", "share of the steps that took longer than their period"),
+    "late": ("%", "share of the steps that were longer than their period"),
 }
 _COLUMNS = ("run", "median", "99.9th percentile", "worst", "steps of more than 1 ms")
 
 
 @dataclass(frozen=True)
 class OnARobot(Study[xr.Dataset]):
-    """Time the steps of the law as a robot makes them, in several runs.
+    """Time the steps of the law at the rate of a robot, in several runs.
 
-    The answer holds `median`, `slow`, `worst` [us] and `late` [%] by run.
+    The results hold `median`, `slow`, `worst` [us] and `late` [%] by run.
     """
 
-    TITLE: ClassVar[str] = "How long a step takes on a robot"
+    TITLE: ClassVar[str] = "Time of a step on a robot"
     GROWS: ClassVar[tuple[str, ...]] = ("runs", "core")
     RESULTS: ClassVar[str] = "../results"
 
@@ -52,60 +52,60 @@ class OnARobot(Study[xr.Dataset]):
     seconds: float = option(12.0, above=0, at_most=3600, unit="s")
     """Length of a run [s]."""
     core: int = option(0, 0, 4095)
-    """Core to stay on."""
+    """Processor core of the process."""
 
     def num_trials(self) -> int | None:
-        """How many runs there are."""
+        """Return the number of runs."""
         return self.runs
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Make the runs that are missing."""
-        found = []
-        for number in range(self.runs):
-            found.append(run.checkpoint(f"run_{number}", self._timed))
-            run.callback(Progress(number + 1, 0.0))
-        whole: Any = xr.concat(found, "run")
-        return whole
+        """Time the runs that are missing."""
+        parts = []
+        for i in range(self.runs):
+            parts.append(run.checkpoint(f"run_{i}", self._timed))
+            run.callback(Progress(i + 1, 0.0))
+        results: Any = xr.concat(parts, "run")
+        return results
 
     def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
         """Return the times of each run."""
         return {"robot": Table([_COLUMNS, *table(results)])}
 
     def _timed(self) -> xr.Dataset:
-        """What one run told.
+        """Return the times that one run prints.
 
         Raises:
-          InputError: it failed.
+          InputError: the run failed.
         """
-        words = [_EXAMPLE, "--seconds", f"{self.seconds:g}", "--core", str(self.core)]
-        ended = subprocess.run(
-            [sys.executable, *words], cwd=_ROOT, capture_output=True, text=True, check=False
+        arguments = [_EXAMPLE, "--seconds", f"{self.seconds:g}", "--core", str(self.core)]
+        process = subprocess.run(
+            [sys.executable, *arguments], cwd=_ROOT, capture_output=True, text=True, check=False
         )
-        told = TOLD.search(ended.stdout)
-        if ended.returncode or not told:
-            last = ended.stderr.strip().splitlines()[-1:]
+        match = PRINTED.search(process.stdout)
+        if process.returncode or not match:
+            last = process.stderr.strip().splitlines()[-1:]
             raise InputError(f"core = {self.core} is not allowed here: {' '.join(last)}")
-        values = zip(_FOUND.items(), told.groups(), strict=True)
+        values = zip(_VARIABLES.items(), match.groups(), strict=True)
         return xr.Dataset(
             {
-                name: ((), float(value), {"units": unit, "long_name": words})
-                for (name, (unit, words)), value in values
+                name: ((), float(value), {"units": unit, "long_name": arguments})
+                for (name, (unit, arguments)), value in values
             }
         )
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Times of each run."""
+        """Return a section with the times of each run."""
         return [Section("Steps", "", [list(_COLUMNS), *table(results)])]
 
 
 on_a_robot = call_of(OnARobot)
 
 
-def table(found: xr.Dataset) -> list[list[str]]:
-    """A row for each run."""
+def table(results: xr.Dataset) -> list[list[str]]:
+    """Return one row per run."""
     rows = []
-    for number in range(found.sizes["run"]):
-        one = {name: float(found[name][number]) for name in _FOUND}
-        slow, worst = (f"{one[name] / 1000:.1f} ms" for name in ("slow", "worst"))
-        rows.append([str(number + 1), f"{one['median']:.0f} µs", slow, worst, f"{one['late']} %"])
+    for i in range(results.sizes["run"]):
+        times = {name: float(results[name][i]) for name in _VARIABLES}
+        slow, worst = (f"{times[name] / 1000:.1f} ms" for name in ("slow", "worst"))
+        rows.append([str(i + 1), f"{times['median']:.0f} µs", slow, worst, f"{times['late']} %"])
     return rows

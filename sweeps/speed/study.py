@@ -1,8 +1,8 @@
-"""How fast is it? Simulated seconds in a second of wall clock, by engine, shape family and batch.
+"""Simulated seconds per second of wall clock, by engine, shape family and batch size.
 
     rps sweeps/speed --worlds 64 512
 
-`rps sweeps/speed/costs.py` says where the time of a control step goes.
+`rps sweeps/speed/costs.py` profiles a control step.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ from sweeps import programs
 from sweeps.programs import BATCHED, FAMILIES, Program
 from sweeps.study_base import Study
 
-_SPEED = 0.05  # [m/s] at which C MuJoCo alone pushes
+_SPEED = 0.05  # [m/s] of a push in C MuJoCo without a law
 _SLOW = ("mjx",)  # engines whose batches are bounded
-# C MuJoCo on the processor, beside the programs of `BATCHED`.
-# The second steps by MuJoCo's `rollout`; the third is how trials are run one after the other.
+# C MuJoCo on the processor: in the closed loop of a law, by MuJoCo's `rollout`, and one trial at a
+# time.
 IN_C = {
     "C in closed loop": "closed",
     "C, mj_step alone": "open",
@@ -58,26 +58,25 @@ NAMES = (*BATCHED, *IN_C)
 
 @dataclass(frozen=True)
 class Measurement:
-    """How fast one program is."""
+    """Speed of one program."""
 
     name: str
     family: str
     worlds: int
-    compile: float  # [s] tracing too
+    compile: float  # [s] with tracing
     rate: float  # simulated s per s of wall clock
-    memory: float  # [bytes] of the program on its device; NaN for C
-    contacts: int  # points of one world: those a program looks into, those C has found
+    memory: float  # [bytes] on the device; NaN for C
+    contacts: int  # contact points of a world: capacity of a program, largest number in C
     timestep: float  # [s]
-    iterations: int  # of the solver, at most
-    ls_iterations: int  # of its line search, at most
+    iterations: int  # largest number of the solver
+    ls_iterations: int  # largest number of its line search
 
 
 @dataclass(frozen=True)
 class Speed(Study[xr.Dataset]):
-    """Tell how fast each engine is on this machine, by shape family and batch.
+    """Measure the speed of each engine on this machine, by shape family and batch size.
 
-    The answer holds simulated seconds in a second of wall clock, `rate` [1], of each measurement,
-    which is kept as soon as it is made.
+    The results hold simulated seconds per second of wall clock, `rate` [1], of each measurement.
     """
 
     TITLE: ClassVar[str] = "Speed"
@@ -98,38 +97,38 @@ class Speed(Study[xr.Dataset]):
     mujocos: int = option(16384, 1, 10_000_000)
     """Largest batch of MJX."""
     at_once: int = option(1, 1, 1024)
-    """Programs compiled side by side; what compiling takes is that of a program alone only if 1."""
+    """Number of programs compiled at the same time; compile times are valid for 1 only."""
     refill: int = option(64, 0, 1_000_000)
-    """Slots of each worker for the gain of refilling them; 0: not measured."""
+    """Slots per worker in the measurement of refilled slots; 0: no measurement."""
     rounds: int = option(4, 1, 1000)
-    """How many trials there are then for each slot."""
+    """Number of trials per slot in that measurement."""
     quick: bool = False
-    """Whether to make a small run of minutes: what is not asked for becomes small."""
+    """Whether to make a small run of minutes; explicit options keep their values."""
 
     @cached_property
-    def wanted(self) -> Sequence[tuple[str, str, int]]:
-        """Names, families and worlds (0 in C, as suits it), those in C first."""
+    def entries(self) -> Sequence[tuple[str, str, int]]:
+        """Name, family and number of worlds (0 in C, which chooses it) of all measurements."""
         named = list(product(self.names or NAMES, self.families))
         in_c = [(*pair, 0) for pair in named if pair[0] in IN_C]
         batched = [(*pair, n) for pair in named if pair[0] in BATCHED for n in self.worlds]
-        slow = [name for name, one in BATCHED.items() if one.engine in _SLOW]
+        slow = [name for name, setting in BATCHED.items() if setting.engine in _SLOW]
         return in_c + [b for b in batched if b[0] not in slow or b[2] <= self.mujocos]
 
     def check(self) -> None:
-        """Check the names, and that there is something to time."""
+        """Check the names, and that there is a measurement."""
         for name in self.names:
             errors.check_name("name", name, NAMES)
         for family in self.families:
             errors.check_name("family", family, FAMILIES)
-        if not self.wanted:
+        if not self.entries:
             raise errors.InputError(
                 f"names = {self.names} with worlds = {self.worlds} leave nothing to time: MJX "
                 f"is timed up to --mujocos {self.mujocos} worlds."
             )
 
     def num_trials(self) -> int | None:
-        """How many measurements there are."""
-        return len(self.wanted)
+        """Return the number of measurements."""
+        return len(self.entries)
 
     def answer(self, run: Run) -> xr.Dataset:
         """Make the measurements that are missing."""
@@ -137,26 +136,26 @@ class Speed(Study[xr.Dataset]):
             run.checkpoint("refilling", partial(_gain, self.refill, self.rounds))
         missing = [
             w
-            for w in self.wanted
+            for w in self.entries
             if run.checkpoints is None or run.checkpoints.get(_part(w)) is None
         ]
-        done = len(self.wanted) - len(missing)
-        made = _measured(missing, self.at_once)
-        found = []
-        for one in self.wanted:
-            found.append(run.checkpoint(_part(one), lambda: _labelled(next(made))))
-            done += one in missing
+        done = len(self.entries) - len(missing)
+        measurements = _measured(missing, self.at_once)
+        parts = []
+        for entry in self.entries:
+            parts.append(run.checkpoint(_part(entry), lambda: _labelled(next(measurements))))
+            done += entry in missing
             run.callback(Progress(done, 0.0))
-        whole: Any = xr.concat(found, "measurement")
-        return whole.drop_attrs()
+        results: Any = xr.concat(parts, "measurement")
+        return results.drop_attrs()
 
     def intro(self, results: xr.Dataset) -> str:
-        """Where it was measured."""
+        """Return the device of the measurement."""
         return programs.machine()
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Speeds beside C MuJoCo's, and against the batch."""
-        names = [one.name for one in dataclasses.fields(Measurement)]
+        """Return sections with speeds beside C MuJoCo, and with the gain of refilled slots."""
+        names = [field.name for field in dataclasses.fields(Measurement)]
         speeds = [
             Measurement(**{name: row[name].item() for name in names})
             for row in (results.isel(measurement=i) for i in range(results.sizes["measurement"]))
@@ -166,28 +165,32 @@ class Speed(Study[xr.Dataset]):
         sections = [Section("Simulated seconds in a second", "", table(speeds), picture)]
         if self.refill and run.checkpoints is not None:
             gain = run.checkpoint("refilling", partial(_gain, self.refill, self.rounds))
-            sections.append(Section("Refilled slots", _told(gain, self.refill, self.rounds)))
+            sections.append(
+                Section("Refilled slots", _gain_sentence(gain, self.refill, self.rounds))
+            )
         return sections
 
 
 speed = call_of(Speed)
 
 
-def _part(wanted: tuple[str, str, int]) -> str:
-    """Name of the part of a run folder that holds a measurement."""
-    name, family, worlds = wanted
+def _part(entry: tuple[str, str, int]) -> str:
+    """Return the name of a measurement's part of the run folder."""
+    name, family, worlds = entry
     return "_".join([re.sub(r"\W+", "_", name), family, str(worlds)])
 
 
-def _labelled(one: Measurement) -> xr.Dataset:
-    return xr.Dataset({name: ((), value) for name, value in dataclasses.asdict(one).items()})
+def _labelled(measurement: Measurement) -> xr.Dataset:
+    return xr.Dataset(
+        {name: ((), value) for name, value in dataclasses.asdict(measurement).items()}
+    )
 
 
-def _measured(wanted: Sequence[tuple[str, str, int]], at_once: int) -> Iterator[Measurement]:
-    """Measurements in their order, those in C first."""
-    for name, family, _ in (one for one in wanted if one[0] in IN_C):
+def _measured(entries: Sequence[tuple[str, str, int]], at_once: int) -> Iterator[Measurement]:
+    """Yield the measurements in order, C first."""
+    for name, family, _ in (entry for entry in entries if entry[0] in IN_C):
         yield in_c(name, family)
-    batched_ = [one for one in wanted if one[0] in BATCHED]
+    batched_ = [entry for entry in entries if entry[0] in BATCHED]
     calls = [partial(programs.traced, n, BATCHED[n], *rest) for n, *rest in batched_]
     for program in programs.side_by_side(calls, at_once):
         yield batched(program)
@@ -197,7 +200,7 @@ def _gain(slots: int, rounds: int) -> xr.Dataset:
     return xr.Dataset({k: ((), v) for k, v in refilling(slots, rounds)._asdict().items()})
 
 
-def _told(gain: xr.Dataset, slots: int, rounds: int) -> str:
+def _gain_sentence(gain: xr.Dataset, slots: int, rounds: int) -> str:
     refilled, waiting = float(gain.refilled), float(gain.waiting)
     return (
         f"{slots} slots a worker and {rounds} trials in each: {refilled:,.0f} simulated s/s, "
@@ -206,25 +209,25 @@ def _told(gain: xr.Dataset, slots: int, rounds: int) -> str:
     )
 
 
-def _best(action: Callable[[], Any], goes: int = 4, enough: float = 5.0) -> float:
-    """Least wall clock [s] of some goes; of fewer, once `enough` seconds have been spent."""
+def _best(action: Callable[[], Any], goes: int = 4, limit: float = 5.0) -> float:
+    """Return the shortest wall clock [s] of several runs; no run starts after `limit` seconds."""
     times = []
-    while len(times) < goes and sum(times) < enough:
-        began = time.perf_counter()
+    while len(times) < goes and sum(times) < limit:
+        start = time.perf_counter()
         action()
-        times.append(time.perf_counter() - began)
+        times.append(time.perf_counter() - start)
     return min(times)
 
 
 def _contacts_in_c(model: mujoco.MjModel, qpos: np.ndarray, seconds: float = 2.0) -> int:
-    """Most points that C MuJoCo finds while a base pushes straight on."""
-    data, most = mujoco.MjData(model), 0
+    """Return the largest number of contact points in C MuJoCo during a straight push."""
+    data, count = mujoco.MjData(model), 0
     data.qpos[:] = qpos
     for _ in range(round(seconds / model.opt.timestep)):
         data.qvel[JOINTS.base] = [_SPEED, 0.0, 0.0]
         mujoco.mj_step(model, data)
-        most = max(most, data.ncon)
-    return most
+        count = max(count, data.ncon)
+    return count
 
 
 def batched(program: Program) -> Measurement:
@@ -236,13 +239,13 @@ def batched(program: Program) -> Measurement:
 
     once()
     rate = program.worlds * program.simulated / _best(once)
-    name, family, worlds, _, took, memory, contacts, physics, *_ = program
+    name, family, worlds, _, compile_time, memory, contacts, physics, *_ = program
     solver = physics.timestep, physics.iterations, physics.ls_iterations
-    return Measurement(name, family, worlds, took, rate, memory, contacts, *solver)
+    return Measurement(name, family, worlds, compile_time, rate, memory, contacts, *solver)
 
 
 def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
-    """Time C MuJoCo: on all cores in the closed loop of the law or stepping alone, or one trial."""
+    """Time C MuJoCo on all cores with or without the law, or one trial on one core."""
     physics = preset()
     how = IN_C[name]
     threads = 1 if how == "serial" else device.count_processors()
@@ -270,17 +273,17 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
 
 
 class Refilling(NamedTuple):
-    """What refilling the slots of trials that ended is worth."""
+    """Gain of refilling the slots of finished trials."""
 
     refilled: float  # simulated s per s of wall clock
-    waiting: float  # the same, of batches that wait for their slowest
+    waiting: float  # simulated s per s of batches that wait for their slowest trial
     trials: float  # per s of wall clock, refilled
 
 
 def refilling(slots: int, rounds: int = 4) -> Refilling:
-    """Whole trials of RPS, with refilled slots and in batches that wait for their slowest.
+    """Time trials of RPS with refilled slots, and in batches that wait for their slowest trial.
 
-    Both run the same random boxes of the domain `wide`, `rounds` times as many as there are slots.
+    Both run the same random boxes of the domain `wide`, `rounds` per slot.
     """
     setting = BATCHED["fused standard"]
     boxes = replace(DOMAINS["wide"], objects=("random_box",))
@@ -300,14 +303,14 @@ def refilling(slots: int, rounds: int = 4) -> Refilling:
         wall = sum(t.run for t in timings)
         return sum(t.simulated for t in timings) / wall, groups.size / wall
 
-    numbers = np.arange(rounds * count)
-    timed(numbers[None, :count])  # compiles
-    refilled, trials = timed(numbers[None])
-    return Refilling(refilled, timed(numbers.reshape(rounds, count))[0], trials)
+    indices = np.arange(rounds * count)
+    timed(indices[None, :count])  # compiles
+    refilled, trials = timed(indices[None])
+    return Refilling(refilled, timed(indices.reshape(rounds, count))[0], trials)
 
 
 def table(speeds: list[Measurement]) -> list[list[str]]:
-    """Header and one row for each measurement, compared with C MuJoCo in closed loop."""
+    """Return a header and one row per measurement, compared with C MuJoCo in closed loop."""
     base = {s.family: s.rate for s in speeds if s.name == "C in closed loop"}
     rows = [["what", "family", "worlds", "dt", "iterations", "contacts", "compile", "simulated s/s",
              "against C in closed loop", "memory"]]  # fmt: skip
@@ -323,17 +326,17 @@ def table(speeds: list[Measurement]) -> list[list[str]]:
 
 
 def throughput(speeds: Iterable[tuple[str, str, int, float]], steady: Collection[str]) -> Figure:
-    """Simulated seconds per second over the batch, a panel for each family.
+    """Plot simulated seconds per second over the batch size, one panel per shape family.
 
-    `speeds` has rows of a family, a program, its worlds, and its speed; a program of `steady` has
-    one speed whatever the batch, and is drawn as a level line.
+    `speeds` has rows (family, program, worlds, speed). The speed of a program in `steady` does not
+    depend on the batch size and is drawn as a horizontal line.
     """
-    found: dict[str, dict[str, list[tuple[int, float]]]] = {}
+    speeds_of: dict[str, dict[str, list[tuple[int, float]]]] = {}
     for family, name, worlds, rate in speeds:
-        found.setdefault(family, {}).setdefault(name, []).append((worlds, rate))
-    figure = Figure(figsize=(4.5 * len(found), 4.0), layout="constrained")
-    axes = figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
-    for ax, (family, by_name) in zip(axes, found.items(), strict=True):
+        speeds_of.setdefault(family, {}).setdefault(name, []).append((worlds, rate))
+    figure = Figure(figsize=(4.5 * len(speeds_of), 4.0), layout="constrained")
+    axes = figure.subplots(1, len(speeds_of), squeeze=False, sharey=True)[0]
+    for ax, (family, by_name) in zip(axes, speeds_of.items(), strict=True):
         for i, (name, points) in enumerate(by_name.items()):
             if name in steady:
                 ax.axhline(points[0][1], color=f"C{i}", ls="--", label=name)
