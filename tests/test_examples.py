@@ -287,7 +287,7 @@ def test_a_run_made_with_a_file_knows_when_the_file_has_changed(tmp_path):
     kept = registry.params_to_json(params)
     assert registry.params_from_json(kept) == params
     law.write_text(LAW.read_text().replace("0.15, 0.15", "0.1, 0.1"))
-    with pytest.raises(InputError, match="is not what it was when the run was made"):
+    with pytest.raises(InputError, match="has changed since the run"):
         registry.params_from_json(kept)
 
 
@@ -355,7 +355,7 @@ def test_params_that_mean_nothing_are_refused():
         registry.register_law("p", own, Ahead(v=float("nan")))
     with pytest.raises(InputError, match=r"a field or property d_success"):
         registry.register_law("p", own, (1.0, 2.0))
-    with pytest.raises(InputError, match="their class RPSParams is that of 'rps'"):
+    with pytest.raises(InputError, match="the law .rps. has a class of the same name RPSParams"):
         registry.register_law("p", own, RPSParams())
     with pytest.raises(InputError, match="params of class Ahead belong to no law"):
         Case("box", FRICTION["S1"], (2.0, 0.0), Ahead())

@@ -179,7 +179,7 @@ def test_the_published_force_push_yields_to_a_large_force():
     for force, speed in ((50.0, 0.05), (70.0, 0.02), (90.0, -0.01), (1e4, -0.05)):
         _, twist, _ = step(params, state, with_force(observe(), (-force, 0.0)))
         np.testing.assert_allclose(twist, (speed, 0.0, 0.0), atol=1e-6)
-    v = force_push_published.yielding(params, jnp.array([0.03, 0.0]), jnp.array([0.0, 70.0]))
+    v = force_push_published.yield_to_force(params, jnp.array([0.03, 0.0]), jnp.array([0.0, 70.0]))
     np.testing.assert_allclose(v, (0.03, -0.03), atol=1e-6)
 
 

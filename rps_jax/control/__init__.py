@@ -1,1 +1,1 @@
-"""What decides: the paper's law, its rivals, laws learned from touch, and laws of one's own."""
+"""Control laws: the paper's law, its baselines and rivals, learned laws, and the registry."""

@@ -1,11 +1,11 @@
-"""What a law is: two pure functions, what it senses, and within which bounds it is tuned."""
+"""Types of a control law: its two functions, its parameters, and the bounds for tuning them."""
 
 import contextlib
 import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
 import numpy as np
@@ -14,7 +14,10 @@ from rps_jax import errors
 from rps_jax.control.observation import Details, Twist
 from rps_jax.robot.base import LoadCell
 
-T = TypeVar("T")
+# What a law observes in addition to odometry and the target: the contact point (`Observation`),
+# the signal of each taxel as well (`TaxelObservation`), the contact force as well
+# (`ForceObservation`), or the object's position and size (`PoseObservation`).
+Senses = Literal["touch", "taxels", "force", "pose"]
 
 
 @runtime_checkable
@@ -22,83 +25,93 @@ class LawParams(Protocol):
     """Parameters of a law: a pytree of numbers whose class selects the law."""
 
     @property
-    def d_success(self) -> Any:  # a number, or an array of a batch
-        """Distance to the target at which a trial has succeeded [m]."""
+    def d_success(self) -> Any:  # a number, or an array in a batch of parameters
+        """Distance to the target at which a trial succeeds [m]."""
         ...
 
 
-Params = TypeVar("Params", bound=LawParams)
+class Smoothing(Protocol):
+    """Widths of the smoothed switches of a law; hashable."""
 
-# What a law senses: where the skin is touched (`Observation`), what each taxel answers as well
-# (`TaxelObservation`), the contact's force as well (`ForceObservation`), or the object's place and
-# size (`PoseObservation`). All know odometry and the target.
-Senses = Literal["touch", "taxels", "force", "pose"]
+    def check(self) -> None:
+        """Raise InputError for a width that is not allowed."""
+
+
+T = TypeVar("T")
+Leaf = float | np.ndarray | jax.Array  # of a pytree of parameters
+Params = TypeVar("Params", bound=LawParams)
+State = TypeVar("State")  # a pytree of arrays
+Obs = TypeVar("Obs")
 
 
 class Bound(NamedTuple):
-    """The interval in which a parameter is tuned."""
+    """Interval in which a parameter is tuned."""
 
     low: float
     high: float
-    log: bool = False  # evenly in its logarithm
-    of: str = ""  # as a share of this other parameter
+    log: bool = False  # whether the scale is logarithmic
+    of: str = ""  # name of a parameter; the interval is then a fraction of its value
 
 
 def document_fields(kind: type[T]) -> type[T]:
-    """Give the fields of a NamedTuple the comments behind them as docstrings, for `help`."""
+    """Copy the comment after each field of a NamedTuple into its docstring, for `help`."""
     with contextlib.suppress(OSError):  # there is no source
-        text = Path(str(sys.modules[kind.__module__].__file__)).read_text("utf-8")
-        own = text.partition(f"\nclass {kind.__name__}(")[2].partition("\n\n\n")[0]
-        for name, comment in re.findall(r"^    (\w+): .*?  # (.+)$", own, re.MULTILINE):
+        source = Path(str(sys.modules[kind.__module__].__file__)).read_text("utf-8")
+        body = source.partition(f"\nclass {kind.__name__}(")[2].partition("\n\n\n")[0]
+        for name, comment in re.findall(r"^    (\w+): .*?  # (.+)$", body, re.MULTILINE):
             getattr(kind, name).__doc__ = comment
     return kind
 
 
-def named_leaves(params: Any, is_leaf: Callable[[Any], bool] | None = None) -> dict[str, Any]:
-    """Leaves of parameters by their place in the pytree, as `gains.k`."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(params, is_leaf=is_leaf)
-    return {jax.tree_util.keystr(at, simple=True, separator="."): leaf for at, leaf in leaves}
+def named_leaves(tree: object, is_leaf: Callable[[object], bool] | None = None) -> dict[str, Leaf]:
+    """Return the leaves of a pytree by their paths, such as `gains.k`."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree, is_leaf=is_leaf)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
-def check_finite_leaves(params: T) -> T:
-    """Return the parameters if all their leaves are finite numbers, or raise InputError."""
-    for name, leaf in named_leaves(params).items():
+def check_finite_leaves(tree: T) -> T:
+    """Return the pytree if all its leaves are finite numbers; otherwise raise InputError."""
+    for name, leaf in named_leaves(tree).items():
         for value in np.ravel(leaf):
             errors.check_finite(name, value)
-    return params
+    return tree
 
 
 def check_signs(
     law: str, positive: Sequence[str], params: Params, free: Sequence[str] = ()
 ) -> Params:
-    """Return parameters of one level if they are finite scalars of the right signs.
+    """Return flat parameters if all are finite scalars of the right sign.
 
-    Those named `positive` must be above 0, those `free` may have any sign, and all others must not
-    be negative; else InputError names the `law` and the parameter.
+    Parameters named in `positive` must be above 0, those in `free` may have any sign, and all
+    others must be at least 0.
+
+    Raises:
+      InputError: a parameter is out of range; the error names the `law` and the parameter.
     """
-    for name, value in params._asdict().items():
+    for name, value in named_leaves(params).items():
         bounds = {} if name in free else {"at_least": 0}
         bounds = {"above": 0} if name in positive else bounds
         errors.check_finite(f"{law}.{name}", value, **bounds)
     return params
 
 
-class Law(NamedTuple):
-    """A pushing law as two pure functions of one world.
+class Law(NamedTuple, Generic[Params, State, Obs]):
+    """Control law: two pure functions of one world.
 
-    It is static: a change compiles another program. The parameters of a law are a pytree of
-    numbers of a class of their own, which may be nested; the class selects the law. Their field or
-    property `d_success` [m] is the distance to the target at which a trial has succeeded.
+    A law is static: each law is compiled to its own program. Its parameters are a pytree of
+    numbers, which may be nested, and their class selects the law. The field or property
+    `d_success` [m] of the parameters is the distance to the target at which a trial succeeds.
     """
 
-    init: Callable[[Any], Any]  # params -> state
-    step: Callable[[Any, Any, Any], tuple[Any, Twist, Details]]  # params, state, obs
+    init: Callable[[Params], State]
+    step: Callable[[Params, State, Obs], tuple[State, Twist, Details]]
     senses: Senses = "touch"
-    check: Callable[[Any], Any] = check_finite_leaves  # raises InputError if params are invalid
+    check: Callable[[Params], Params] = check_finite_leaves  # raises InputError for bad params
     bounds: tuple[tuple[str, Bound], ...] = ()  # of the parameters that may be tuned
-    # Of the smooth form: `init` and `step` then take them as `temperatures`. None: it has none.
-    temperatures: Any = None
-    smooth: bool = False  # it is that form, and observes the weight of a contact
-    cell: LoadCell = LoadCell()  # by which it senses a force
-    # Of a law that observes its last twist: params, state, obs, twist sent -> state.
-    observe_sent: Callable[[Any, Any, Any, Twist], Any] | None = None
+    # Default widths of the smoothed law, which `init` and `step` accept as the keyword
+    # `temperatures`. None: the law has no smooth form.
+    temperatures: Smoothing | None = None
+    smooth: bool = False  # whether this is the smooth form; it observes `in_contact` as a weight
+    cell: LoadCell = LoadCell()  # the sensor of a law that senses force
+    # (params, state, obs, sent twist) -> state, for a law whose state holds its last command.
+    observe_sent: Callable[[Params, State, Obs, Twist], State] | None = None

@@ -1,54 +1,59 @@
-"""Switches of laws: a bool, or in a smooth law a weight from 0 to 1, which mixes."""
+"""Comparisons, logical operators and `where` for conditions that are bools or weights.
 
-import operator
-from collections.abc import Callable
-from typing import Any
+A condition of a law is a bool. In the smooth form of a law it is a weight from 0 to 1, and the
+operators here mix the alternatives by this weight, so that the law is differentiable.
+"""
+
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
+
+T = TypeVar("T")
 
 
-def greater(
-    x: jax.Array,
-    threshold: Any,
-    temperature: Any,
-    compare: Callable[[Any, Any], jax.Array] = operator.gt,
-) -> jax.Array:
-    """The switch `compare(x, threshold)`; smooth if there is a temperature."""
+def greater(x: jax.Array, threshold: ArrayLike, temperature: ArrayLike | None) -> jax.Array:
+    """Return `x > threshold`, or its sigmoid of width `temperature`."""
     if temperature is None:
-        return compare(x, threshold)
+        return x > threshold
     return jax.nn.sigmoid((x - threshold) / temperature)
 
 
-def less(x: jax.Array, threshold: Any, temperature: Any) -> jax.Array:
-    """The switch x < threshold; smooth if there is a temperature."""
+def greater_equal(x: jax.Array, threshold: ArrayLike, temperature: ArrayLike | None) -> jax.Array:
+    """Return `x >= threshold`, or its sigmoid of width `temperature`."""
+    return x >= threshold if temperature is None else greater(x, threshold, temperature)
+
+
+def less(x: jax.Array, threshold: ArrayLike, temperature: ArrayLike | None) -> jax.Array:
+    """Return `x < threshold`, or its sigmoid of width `temperature`."""
     if temperature is None:
         return x < threshold
     return jax.nn.sigmoid((threshold - x) / temperature)
 
 
-def logical_not(switch: jax.Array) -> jax.Array:
-    """The switch that is on where this one is off."""
-    return ~switch if switch.dtype == bool else 1 - switch
+def logical_not(condition: jax.Array) -> jax.Array:
+    """Return the negated condition."""
+    return ~condition if condition.dtype == bool else 1 - condition
 
 
 def logical_and(a: jax.Array, b: jax.Array) -> jax.Array:
-    """On where both are."""
+    """Return the conjunction; the product of weights."""
     return a & b if a.dtype == b.dtype == bool else a * b
 
 
 def logical_or(a: jax.Array, b: jax.Array) -> jax.Array:
-    """On where one of them is."""
+    """Return the disjunction; the maximum of weights."""
     return a | b if a.dtype == b.dtype == bool else jnp.maximum(a, b)
 
 
-def where(switch: jax.Array, yes: Any, no: Any) -> jax.Array:
-    """`yes` or `no`; of a weight, the mixture."""
-    if switch.dtype == bool:
-        return jnp.where(switch, yes, no)
-    return switch * yes + (1 - switch) * no
+def where(condition: jax.Array, x: ArrayLike, y: ArrayLike) -> jax.Array:
+    """Return `x` where the condition holds and `y` elsewhere; the mixture for a weight."""
+    if condition.dtype == bool:
+        return jnp.where(condition, x, y)
+    return condition * x + (1 - condition) * y
 
 
-def tree_where(switch: jax.Array, yes: Any, no: Any) -> Any:
-    """`where` between the leaves of two pytrees."""
-    return jax.tree.map(lambda a, b: where(switch, a, b), yes, no)
+def tree_where(condition: jax.Array, x: T, y: T) -> T:
+    """Apply `where` to the leaves of two pytrees."""
+    return jax.tree.map(lambda a, b: where(condition, a, b), x, y)

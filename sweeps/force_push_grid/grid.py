@@ -102,12 +102,12 @@ def follow(law: LawName = "force_push", duration: float = DURATION) -> Law:
         zero = jnp.zeros_like(seen.yaw)
         offset = seen.p_world_robot[1]
         if law == "force_push":
-            theta_p = force_push.steered(params, state.theta_p, f_world, zero, offset, period)
+            theta_p = force_push.steer(params, state.theta_p, f_world, zero, offset, period)
         else:
             theta_p = -params.k_y * offset
         theta_p = jnp.where(pushed, theta_p, 0.0)
         v_world = params.v_max * jnp.stack([jnp.cos(theta_p), jnp.sin(theta_p)])
-        v_robot = planar.rotate(-seen.yaw, force_push.yielding(params, v_world, f_world))
+        v_robot = planar.rotate(-seen.yaw, force_push.yield_to_force(params, v_world, f_world))
         going = state.clock < duration
         v_robot = jnp.where(going, v_robot, 0.0)
         silent = jnp.where(felt, 0.0, state.silent + period)

@@ -1,5 +1,5 @@
-"""One file a law: its parameters, its two functions, and a `LAW` that says what it is.
+"""Laws of the package, one file each: parameters, two functions, `LAW` and `PRESETS`.
 
-The registry finds every file here by itself. `PRESETS` names the parameters by which a law is
-known; a name that begins with an underscore is not offered.
+The registry imports every file here. `PRESETS` maps the names of a law to its parameters; a name
+that begins with an underscore is not listed.
 """

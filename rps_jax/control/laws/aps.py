@@ -1,15 +1,16 @@
-"""Baselines that the law is compared with. NPS is the law itself with `reactive=0`.
+"""APS, the adaptive pushing skill: the paper's baseline that knows the object's position.
 
-APS, the adaptive pushing skill of Krivic and Piater, "Pushing corridors for delivering unknown
-objects with a mobile robot" (Autonomous Robots 43, 2019), learns from which side to push while it
-orbits the object. It needs what RPS does not: the object's position.
+Krivic and Piater, "Pushing corridors for delivering unknown objects with a mobile robot"
+(Autonomous Robots 43, 2019). APS learns from which side to push while it orbits the object. It
+needs the object's position, which RPS does not. (The other baseline, NPS, is RPS with
+`reactive=0`.)
 
-As published it brings the object's centre O to the target, where the paper's rule asks it of the
-contact point, some radius behind O. So that it can pass at all, it aims as far beyond the target:
-`aim_beyond`, our choice, without which no trial succeeds by that rule.
+The published law brings the object's centre O to the target. The paper's criterion of success
+uses the contact point, about one radius behind O. We therefore aim the same distance beyond the
+target (`aim_beyond`); without this choice no trial succeeds by that criterion.
 
 Symbols: O object, R robot, T target. alpha is the angle at O from T to R, so that at alpha = pi
-the robot stands behind the object, seen from the target.
+the robot is behind the object, as seen from the target.
 """
 
 from __future__ import annotations
@@ -28,21 +29,21 @@ from rps_jax.robot.shell import HALF_LENGTH
 
 @document_fields
 class APSParams(NamedTuple):
-    """Parameters of APS; those marked * are ours, where the publication is silent."""
+    """Parameters of APS; those marked * are ours, since the publication does not give them."""
 
     K1: float | jax.Array = 0.05  # [1] gain of the mean motion error
     K2: float | jax.Array = 0.1  # [1] gain of the motion error
     K_p: float | jax.Array = 0.6  # [1/s] heading gain
     K_d: float | jax.Array = 0.4  # [1] heading rate gain
-    yaw_error_max: float | jax.Array = 0.3  # [rad] beyond it the robot turns on the spot
-    margin: float | jax.Array = 0.10  # [m] gap beyond which the robot approaches straight
-    r_robot: float | jax.Array = HALF_LENGTH  # [m] * radius of a base that is not round
-    gamma_drop: float | jax.Array = 0.01  # [rad] fall of |gamma| by which an alpha was a good one
+    yaw_error_max: float | jax.Array = 0.3  # [rad] above it the robot turns in place
+    margin: float | jax.Array = 0.10  # [m] gap above which the robot approaches straight
+    r_robot: float | jax.Array = HALF_LENGTH  # [m] * radius that stands for the rectangular base
+    gamma_drop: float | jax.Array = 0.01  # [rad] decrease of |gamma| after which alpha is good
     alpha_mean: float | jax.Array = jnp.pi  # [rad] prior mean of good alphas
     alpha_variance: float | jax.Array = jnp.pi / 4  # [rad^2] prior variance
     alpha_count: float | jax.Array = 100.0  # [1] weight of the prior
     aim_beyond: float | jax.Array = 1.0  # [1] * object radii beyond the target; 0: as published
-    min_motion: float | jax.Array = 0.001  # [m] * a shorter way of the object is no motion
+    min_motion: float | jax.Array = 0.001  # [m] * least motion of the object
     v_max: float | jax.Array = 0.05  # [m/s] bound on the speed
     v_min: float | jax.Array = 0.01  # [m/s] * least speed
     omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
@@ -50,23 +51,23 @@ class APSParams(NamedTuple):
 
 
 class APSState(NamedTuple):
-    """What APS remembers between two control steps."""
+    """State of APS between two control steps."""
 
-    p_world_object: jax.Array  # (2,) [m] O where it last moved
+    p_world_object: jax.Array  # (2,) [m] O at its last motion
     a_OT: jax.Array  # () [rad] direction from there to T
-    started: jax.Array  # () bool: the fields above hold something
+    started: jax.Array  # () bool: whether the fields above are set
     alpha: jax.Array  # () [rad] of the last step
     gamma: jax.Array  # () [rad] the last motion error
     gamma_mean: jax.Array  # () [rad] m_gamma
     gamma_count: jax.Array  # () [1]
     mean: jax.Array  # () [rad] m, running mean of good alphas
     variance: jax.Array  # () [rad^2] s2, running variance of good alphas
-    weight: jax.Array  # () [1] how many alphas these two sum up
+    weight: jax.Array  # () [1] number of alphas in mean and variance
     yaw_error: jax.Array  # () [rad] of the last step
 
     @classmethod
     def init(cls, params: APSParams) -> APSState:
-        """Before the first observation: the prior alone."""
+        """Return the state before the first observation, with the prior alone."""
         zero = jnp.zeros_like(jnp.asarray(params.K1, float))
         return cls(
             jnp.zeros(2, zero.dtype),
@@ -81,7 +82,7 @@ check = partial(check_signs, "aps", _POSITIVE)
 
 
 def predictive(params: APSParams, state: APSState) -> tuple[jax.Array, jax.Array]:
-    """Mean [rad] and variance [rad^2] of the next good alpha: Gaussian with unknown mean."""
+    """Return mean [rad] and variance [rad^2] of the next good alpha (Gaussian, unknown mean)."""
     precision = 1 / params.alpha_variance + state.weight / state.variance
     mean = params.alpha_mean / params.alpha_variance + state.weight * state.mean / state.variance
     return mean / precision, 1 / precision + state.variance
@@ -90,9 +91,9 @@ def predictive(params: APSParams, state: APSState) -> tuple[jax.Array, jax.Array
 def activations(
     params: APSParams, state: APSState, alpha: jax.Array, near: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """(psi_push, psi_relocate) [1] at alpha [rad]; `near` is false where the robot approaches.
+    """Return (psi_push, psi_relocate) [1] at alpha [rad]; the robot approaches unless `near`.
 
-    The released controller puts the predictive variance in the place of its root; so do we.
+    Like the released controller, we divide by the predictive variance, not by its square root.
     """
     mean, variance = predictive(params, state)
     peak = jnp.exp(-0.5 * ((alpha - mean) / variance) ** 2)
@@ -105,10 +106,10 @@ def activations(
 def _learn(
     params: APSParams, state: APSState, p_world_object: jax.Array, a_OT: jax.Array
 ) -> APSState:
-    """The state after the object moved, or did not, from where it last was."""
-    way = p_world_object - state.p_world_object
-    moved = state.started & (planar.norm(way) > params.min_motion)
-    gamma = planar.wrap(state.a_OT - planar.direction(way))
+    """Return the state after an observation of the object, which may have moved."""
+    motion = p_world_object - state.p_world_object
+    moved = state.started & (planar.norm(motion) > params.min_motion)
+    gamma = planar.wrap(state.a_OT - planar.direction(motion))
     gamma_count = state.gamma_count + 1
     good = moved & (jnp.abs(gamma) < jnp.abs(state.gamma) - params.gamma_drop)
     good &= state.gamma_count > 0
@@ -130,7 +131,7 @@ def _learn(
 
 
 def _aim(params: APSParams, obs: PoseObservation) -> jax.Array:
-    """T (2,) [m]: beyond the target, seen from the contact point, or else from the object."""
+    """Return the aim (2,) [m] beyond the target, on the line from the contact or the object."""
     touch = obs.touch
     angle = jnp.where(
         touch.in_contact,
@@ -144,10 +145,10 @@ def _aim(params: APSParams, obs: PoseObservation) -> jax.Array:
 def step(
     params: APSParams, state: APSState, obs: PoseObservation
 ) -> tuple[APSState, Twist, Details]:
-    """One control step of APS.
+    """Compute one control step of APS.
 
-    On the target's side of the object the robot backs off while it orbits, but not where it is
-    so far away that it approaches.
+    Between the object and the target the robot backs off while it orbits, unless it is so far
+    away that it approaches.
     """
     touch = obs.touch
     to_target = _aim(params, obs) - obs.p_world_object

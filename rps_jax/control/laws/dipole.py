@@ -1,15 +1,16 @@
 """Pushing in a dipole field: the law of Igarashi, Kamiyama and Inami.
 
 "A Dipole Field for Object Delivery by Pushing on a Flat Surface" (ICRA 2010) sends a robot along
-the field lines of a dipole that lies in the object and points at its target: seen from behind the
-object they lead straight on, beside it they lead back, so that the robot goes round without a
+the field lines of a dipole in the object that points at its target. Behind the object the field
+lines lead forward, and beside it they lead back, so that the robot circles the object without a
 plan. With theta the angle at the object from the target to the robot, the robot moves at 2 theta
-from the direction to the target (their Fig. 4). It needs what RPS does not: the object's place.
+from the direction to the target (their Fig. 4). The law needs the object's position, which RPS
+does not.
 
-As Heins and Schoellig (2024) use it, the robot aims at a point of a path that lies `lookahead`
-before the object. Our choices: the path is the straight line from where the object was first to the
-target and on, so that the contact point, too, passes the target; it is laid anew when the object
-has passed it by `beyond` radii; the base turns to face the object.
+As in Heins and Schoellig (2024), the robot aims at a point of a path, `lookahead` ahead of the
+object. Our choices: the path is the straight line from the object's first position through the
+target, so that the contact point also passes the target; it is replaced when the object has passed
+the target by `beyond` radii; the base turns to face the object.
 """
 
 from functools import partial
@@ -25,10 +26,10 @@ from rps_jax.geometry import planar
 
 @document_fields
 class DipoleParams(NamedTuple):
-    """Parameters about the dipole field, which has none itself; the lookahead is H. and S.'s."""
+    """Parameters of the dipole law; the lookahead is that of Heins and Schoellig."""
 
     K_h: float | jax.Array = 1.0  # [1/s] turning rate over heading error
-    lookahead: float | jax.Array = 1.0  # [m] of the path before the object, to be aimed at
+    lookahead: float | jax.Array = 1.0  # [m] distance along the path from object to aim
     beyond: float | jax.Array = 2.0  # [1] object radii after which a target is passed
     v_max: float | jax.Array = 0.05  # [m/s] speed, the bound of RPS
     omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
@@ -43,9 +44,9 @@ BOUNDS = {
 
 
 class DipoleState(NamedTuple):
-    """What the law remembers between two control steps."""
+    """State of the law between two control steps."""
 
-    p_world_start: jax.Array  # (2,) [m] where the path begins
+    p_world_start: jax.Array  # (2,) [m] start of the path
     started: jax.Array  # () bool
 
 
@@ -54,25 +55,25 @@ check = partial(check_signs, "dipole", _POSITIVE)
 
 
 def init(params: DipoleParams) -> DipoleState:
-    """Return a state without a path."""
+    """Return the state without a path."""
     return DipoleState(jnp.zeros(2, jnp.result_type(float)), jnp.zeros((), bool))
 
 
 def step(
     params: DipoleParams, state: DipoleState, obs: PoseObservation
 ) -> tuple[DipoleState, Twist, Details]:
-    """One control step: along the field line through the robot, facing the object."""
+    """Compute one control step: along the field line through the robot, facing the object."""
     touch, p_world_object = obs.touch, obs.p_world_object
 
-    def along(start: jax.Array) -> jax.Array:
+    def path_direction(start: jax.Array) -> jax.Array:
         angle = planar.direction(touch.p_world_target - start)
         return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
-    past = jnp.sum((p_world_object - touch.p_world_target) * along(state.p_world_start))
-    anew = ~state.started | (past > params.beyond * obs.r_object)
-    start = jnp.where(anew, p_world_object, state.p_world_start)
-    way = along(start)
-    aim = start + (jnp.sum((p_world_object - start) * way) + params.lookahead) * way
+    past = jnp.sum((p_world_object - touch.p_world_target) * path_direction(state.p_world_start))
+    is_new = ~state.started | (past > params.beyond * obs.r_object)
+    start = jnp.where(is_new, p_world_object, state.p_world_start)
+    along = path_direction(start)
+    aim = start + (jnp.sum((p_world_object - start) * along) + params.lookahead) * along
 
     to_aim = planar.direction(aim - p_world_object)
     from_object = touch.p_world_robot - p_world_object

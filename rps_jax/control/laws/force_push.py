@@ -1,18 +1,18 @@
-"""Force Push without a force: the law of Heins and Schoellig, told only where the skin touches.
+"""Force Push without a force sensor: the law of Heins and Schoellig, from the contact point alone.
 
 "Force Push: Robust Single-Point Pushing with Force Feedback" (IEEE RA-L 9, 2024) pushes with one
-point along a path, in the direction theta_p = (1 + k_theta) theta_f + k_y Delta from the path's,
-where theta_f is the angle of the contact force and Delta how far the contact has left the path: a
-point that goes farther out turns the object back in. Where the contact is lost, theta_p tends to
--k_y Delta, which leads back to the path, a little each step.
+point along a path. The point moves at the angle theta_p = (1 + k_theta) theta_f + k_y Delta from
+the path, where theta_f is the angle of the contact force and Delta the offset of the contact from
+the path. A larger offset turns the object back to the path. Without contact, theta_p tends to
+-k_y Delta, which leads back to the path, by a bounded amount each step.
 
-A flat skin feels the force along its normal, which the base carries with it, and by friction aside
-of it, to where the contact drifts. So here theta_f is the base's heading, and the angle at which
-the contact has drifted over the skin: that of (lambda, l - l_mean), with l_mean the mean of l over
-the last length lambda of the base's way. As in their experiments the base turns to face along the
-path, at k_omega. Our choices: the path is the straight line from the first contact to the target,
-and is laid anew when the contact has passed the target; since a skin cannot pull, the push is held
-within angle_max of the heading; the speed is the bound of RPS.
+On a flat skin the force is normal to the skin, plus friction towards the side to which the contact
+drifts. Here theta_f is therefore estimated as the base's heading plus the angle of the contact's
+drift over the skin: that of (lambda, l - l_mean), with l_mean the mean of l over the last length
+lambda of the base's path. As in their experiments, the base turns to face along the path, with gain
+k_omega. Our choices: the path is the straight line from the first contact to the target, and is
+replaced when the contact has passed the target; since a skin cannot pull, the push stays within
+angle_max of the heading; the speed bound is that of RPS.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ _POSITIVE = ("drift", "angle_max", "v_max", "omega_max", "d_success")
 
 @document_fields
 class ForcePushParams(NamedTuple):
-    """Parameters of Force Push; the gains are its authors', in their experiments."""
+    """Parameters of Force Push; the gains are those of its authors' experiments."""
 
     k_theta: float | jax.Array = 0.3  # [1] gain of the force's angle, beyond 1
     k_y: float | jax.Array = 0.5  # [rad/m] gain of the path
     k_omega: float | jax.Array = 1.0  # [1/s] gain of the heading
-    converge: float | jax.Array = 0.1  # [rad] of theta_p in a step without contact, at most
-    drift: float | jax.Array = 0.1  # [m] lambda, the length of way over which drift is told
-    angle_max: float | jax.Array = 1.2  # [rad] between push and heading, at most
-    v_max: float | jax.Array = 0.05  # [m/s] speed of the contact, and bound on the base's
+    converge: float | jax.Array = 0.1  # [rad] largest change of theta_p in a step without contact
+    drift: float | jax.Array = 0.1  # [m] lambda, length of motion over which drift is estimated
+    angle_max: float | jax.Array = 1.2  # [rad] largest angle between push and heading
+    v_max: float | jax.Array = 0.05  # [m/s] speed of the contact, and bound for the base
     omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
     v_approach: float | jax.Array = 0.01  # [m/s] forward speed before the first contact
     d_success: float | jax.Array = 0.05  # [m] target reached
@@ -58,42 +58,42 @@ BOUNDS = {
 
 
 class Path(NamedTuple):
-    """The path of a contact, straight from its first place to the target and on."""
+    """Path of the contact: the straight line from the first contact through the target."""
 
-    p_world_start: jax.Array  # (2,) [m] where it begins
-    theta_d: jax.Array  # () [rad] its direction in the world
+    p_world_start: jax.Array  # (2,) [m] start of the path
+    theta_d: jax.Array  # () [rad] direction of the path in the world
     p_robot_contact: jax.Array  # (2,) [m] the last contact
-    touched: jax.Array  # () bool: the skin has felt the object
+    touched: jax.Array  # () bool: whether there was a contact
 
     @classmethod
-    def none(cls, dtype: jax.typing.DTypeLike) -> Path:
-        """Before any contact there is no path."""
+    def initial(cls, dtype: jax.typing.DTypeLike) -> Path:
+        """Return the path before any contact."""
         two = jnp.zeros(2, dtype)
         return cls(two, jnp.zeros((), dtype), two, jnp.zeros((), bool))
 
-    def followed(self, obs: Observation) -> tuple[Path, Observation, jax.Array]:
-        """The path now, the observation with the last contact, and its offset () [m] to the left.
+    def update(self, obs: Observation) -> tuple[Path, Observation, jax.Array]:
+        """Return path, observation with the last contact, and its offset () [m] to the left.
 
-        A path is laid anew when the contact has passed the target.
+        A new path starts when the contact has passed the target.
         """
         touching = jnp.asarray(obs.in_contact)
         contact = jnp.where(touching, obs.p_robot_contact, self.p_robot_contact)
-        told = obs._replace(p_robot_contact=contact)
-        d = displacement(told)
+        filled = obs._replace(p_robot_contact=contact)
+        d = displacement(filled)
         p_world_contact = obs.p_world_target - d
         along = jnp.stack([jnp.cos(self.theta_d), jnp.sin(self.theta_d)])
         passed = self.touched & touching & (jnp.sum(d * along) < 0)
-        anew = (touching & ~self.touched) | passed
-        p_world_start = jnp.where(anew, p_world_contact, self.p_world_start)
-        theta_d = jnp.where(anew, planar.direction(d), self.theta_d)
+        is_new = (touching & ~self.touched) | passed
+        p_world_start = jnp.where(is_new, p_world_contact, self.p_world_start)
+        theta_d = jnp.where(is_new, planar.direction(d), self.theta_d)
         left = jnp.stack([-jnp.sin(theta_d), jnp.cos(theta_d)])
         offset = jnp.sum((p_world_contact - p_world_start) * left)
-        return Path(p_world_start, theta_d, contact, self.touched | touching), told, offset
+        return Path(p_world_start, theta_d, contact, self.touched | touching), filled, offset
 
     def twist(self, params: Any, v_robot: jax.Array, yaw: Scalar) -> Twist:
-        """The twist that moves the contact at `v_robot` (2,) [m/s] and turns along the path.
+        """Return the twist that moves the contact at `v_robot` (2,) [m/s] and faces along the path.
 
-        Before the first contact it goes straight ahead.
+        Before the first contact the base moves straight ahead.
         """
         turn = params.k_omega * planar.wrap(self.theta_d - yaw)
         omega = jnp.clip(turn, -params.omega_max, params.omega_max)
@@ -104,32 +104,32 @@ class Path(NamedTuple):
 
 
 class ForcePushState(NamedTuple):
-    """What the law remembers between two control steps."""
+    """State of the law between two control steps."""
 
     path: Path
-    theta_p: jax.Array  # () [rad] the last push's, from the path's
-    l_mean: jax.Array  # () [m] of l over the last of the way
-    p_world_robot: jax.Array  # (2,) [m] of the last step
+    theta_p: jax.Array  # () [rad] angle of the last push from the path
+    l_mean: jax.Array  # () [m] mean of l over the last motion
+    p_world_robot: jax.Array  # (2,) [m] at the last step
 
 
 check = partial(check_signs, "force_push", _POSITIVE, free=("k_theta", "k_y"))
 
 
 def init(params: ForcePushParams) -> ForcePushState:
-    """Before any contact there is no path."""
+    """Return the state before any contact."""
     zero = jnp.zeros_like(jnp.asarray(params.v_max, float))
-    return ForcePushState(Path.none(zero.dtype), zero, zero, jnp.zeros(2, zero.dtype))
+    return ForcePushState(Path.initial(zero.dtype), zero, zero, jnp.zeros(2, zero.dtype))
 
 
 def step(
     params: ForcePushParams, state: ForcePushState, obs: Observation
 ) -> tuple[ForcePushState, Twist, Details]:
-    """One control step. Before the first contact it goes straight ahead."""
-    path, told, offset = state.path.followed(obs)
-    contact, theta_d = told.p_robot_contact, path.theta_d
-    way = planar.norm(obs.p_world_robot - state.p_world_robot)
-    kept = jnp.exp(-way / params.drift)
-    l_mean = contact[1] + kept * (state.l_mean - contact[1])
+    """Compute one control step; before the first contact the base moves straight ahead."""
+    path, filled, offset = state.path.update(obs)
+    contact, theta_d = filled.p_robot_contact, path.theta_d
+    motion = planar.norm(obs.p_world_robot - state.p_world_robot)
+    weight = jnp.exp(-motion / params.drift)
+    l_mean = contact[1] + weight * (state.l_mean - contact[1])
     l_mean = jnp.where(state.path.touched, l_mean, contact[1])
     drifted = jnp.stack([jnp.asarray(params.drift, contact.dtype), contact[1] - l_mean])
     theta_f = planar.wrap(obs.yaw - theta_d) + planar.direction(drifted)
@@ -144,7 +144,7 @@ def step(
     twist = path.twist(params, v_contact, obs.yaw)
     theta_p = jnp.where(path.touched, theta_p, 0.0)
     state = ForcePushState(path, theta_p, l_mean, obs.p_world_robot)
-    return state, twist, Details.from_obs(told)._replace(gamma=theta_p)
+    return state, twist, Details.from_obs(filled)._replace(gamma=theta_p)
 
 
 LAW = Law(init, step, check=check, bounds=tuple(BOUNDS.items()))

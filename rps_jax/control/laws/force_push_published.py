@@ -1,22 +1,23 @@
-"""Force Push as published, by the contact's force: the law of Heins and Schoellig.
+"""Force Push as published, with a force sensor: the law of Heins and Schoellig.
 
 "Force Push: Robust Single-Point Pushing with Force Feedback" (IEEE RA-L 9, 2024) pushes an object
-with one point along a path. With theta_d the path's direction, theta_f the angle of the contact
-force on the object from it and Delta how far the contact is to the path's left, the point moves at
+with one point along a path. With theta_d the direction of the path, theta_f the angle of the
+contact force on the object from it and Delta the offset of the contact to the left of the path,
+the point moves at the angle
 
-    theta_p = (1 + k_theta) theta_f + k_y Delta        (`steered`)
+    theta_p = (1 + k_theta) theta_f + k_y Delta        (`steer`)
 
-from the path. A force below f_min is no contact; then theta_p tends to -k_y Delta, back to the
-path, at a bounded rate. An admittance takes k_f of what a force exceeds f_max by off the velocity
-(`yielding`). Written from the paper's equations and read beside its authors' code.
+from the path. A force below f_min counts as no contact; then theta_p tends to -k_y Delta, back to
+the path, at a bounded rate. An admittance reduces the velocity by k_f times the force above f_max
+(`yield_to_force`). We wrote this from the paper's equations and compared it with its authors' code.
 
-Our base is not a point, and our choices are these. The point that is moved is the contact as the
-skin tells it. The path is the straight line from the first touch to the target, and is laid anew
-when the contact has passed the target. Before the touch the base goes straight ahead; after it,
-until a force is felt, along the path, as theirs. As in their experiments the base turns to face
-along the path, at k_omega; theirs trades that against its speed in a quadratic program. The speed
-is the bound of RPS, half of theirs, and so k_f is half of theirs. A step of ours is two of theirs,
-so `converge` is a rate. Without their first second of acceleration.
+Our base is not a point, so we made these choices. The moving point is the contact reported by the
+skin. The path is the straight line from the first contact to the target, and is replaced when the
+contact has passed the target. Before the first contact the base moves straight ahead; after it,
+until it senses a force, along the path, as theirs. As in their experiments, the base turns to face
+along the path with gain k_omega; their controller trades this against speed in a quadratic program.
+The speed bound is that of RPS, half of theirs, and so is k_f. One step of ours is two of theirs, so
+`converge` is a rate. We omit their first second of acceleration.
 """
 
 from functools import partial
@@ -35,18 +36,18 @@ _POSITIVE = ("v_max", "omega_max", "d_success")
 
 @document_fields
 class PublishedForcePushParams(NamedTuple):
-    """Parameters of Force Push: its authors', of their experiments, f_min of their simulations."""
+    """Parameters of Force Push, as in its authors' experiments; f_min as in their simulations."""
 
     k_theta: float | jax.Array = 0.3  # [1] gain of the force's angle, beyond 1
     k_y: float | jax.Array = 0.5  # [rad/m] gain of the path; 0.1 in their simulations
     k_omega: float | jax.Array = 1.0  # [1/s] gain of the heading
-    converge: float | jax.Array = 10.0  # [rad/s] of theta_p without a force, at most
-    f_min: float | jax.Array = 1.0  # [N] a lesser force is none; 5 N in their experiments
-    f_max: float | jax.Array = 50.0  # [N] beyond which the base gives way
-    k_f: float | jax.Array = 0.0015  # [m/s/N] by so much; 0.003 at their speed of 0.1 m/s
-    v_max: float | jax.Array = 0.05  # [m/s] speed of the contact, and bound on the base's
+    converge: float | jax.Array = 10.0  # [rad/s] largest rate of theta_p without a force
+    f_min: float | jax.Array = 1.0  # [N] least force of a contact; 5 N in their experiments
+    f_max: float | jax.Array = 50.0  # [N] above which the base yields
+    k_f: float | jax.Array = 0.0015  # [m/s/N] admittance; 0.003 at their speed of 0.1 m/s
+    v_max: float | jax.Array = 0.05  # [m/s] speed of the contact, and bound for the base
     omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
-    v_approach: float | jax.Array = 0.01  # [m/s] forward speed before the first touch
+    v_approach: float | jax.Array = 0.01  # [m/s] forward speed before the first contact
     d_success: float | jax.Array = 0.05  # [m] target reached
 
 
@@ -62,40 +63,42 @@ BOUNDS = {
 
 
 class PublishedForcePushState(NamedTuple):
-    """What the law remembers between two control steps."""
+    """State of the law between two control steps."""
 
     path: Path
-    theta_p: jax.Array  # () [rad] the last push's, from the path's
-    pushed: jax.Array  # () bool: the skin has felt the object, and the force sensor has
+    theta_p: jax.Array  # () [rad] angle of the last push from the path
+    pushed: jax.Array  # () bool: whether a contact and a force were sensed
 
 
 check = partial(check_signs, "force_push_published", _POSITIVE, free=("k_theta", "k_y"))
 
 
 def init(params: PublishedForcePushParams) -> PublishedForcePushState:
-    """Before any contact there is no path."""
+    """Return the state before any contact."""
     zero = jnp.zeros_like(jnp.asarray(params.v_max, float))
-    return PublishedForcePushState(Path.none(zero.dtype), zero, jnp.zeros((), bool))
+    return PublishedForcePushState(Path.initial(zero.dtype), zero, jnp.zeros((), bool))
 
 
-def steered(
+def steer(
     params: PublishedForcePushParams,
-    theta_p: jax.Array,  # () [rad] of the last step
+    theta_p: jax.Array,  # () [rad] at the last step
     f_world: jax.Array,  # (2,) [N] of the base on the object
     theta_d: jax.Array,  # () [rad] the path's direction in the world
     offset: jax.Array,  # () [m] of the contact, to the path's left
     period: float | jax.Array,  # () [s] since the last step
 ) -> jax.Array:
-    """The push's angle () [rad] from the path's direction."""
+    """Return the angle () [rad] of the push from the path."""
     theta_f = planar.wrap(planar.direction(f_world) - theta_d)
     pushed = (1 + params.k_theta) * theta_f + params.k_y * offset
-    most = params.converge * period
-    back = theta_p + jnp.clip(planar.wrap(-params.k_y * offset - theta_p), -most, most)
+    limit = params.converge * period
+    back = theta_p + jnp.clip(planar.wrap(-params.k_y * offset - theta_p), -limit, limit)
     return planar.wrap(jnp.where(planar.norm(f_world) >= params.f_min, pushed, back))
 
 
-def yielding(params: PublishedForcePushParams, v_world: jax.Array, f_world: jax.Array) -> jax.Array:
-    """The contact's velocity (2,) [m/s] where a force (2,) [N] on the object is too large."""
+def yield_to_force(
+    params: PublishedForcePushParams, v_world: jax.Array, f_world: jax.Array
+) -> jax.Array:
+    """Return the contact's velocity (2,) [m/s], reduced where the force (2,) [N] is too large."""
     size = planar.norm(f_world)
     over = jnp.maximum(size - params.f_max, 0.0)
     v_world = v_world - params.k_f * over * f_world / jnp.maximum(size, 1e-9)
@@ -107,21 +110,21 @@ def step(
     state: PublishedForcePushState,
     obs: ForceObservation,
 ) -> tuple[PublishedForcePushState, Twist, Details]:
-    """One control step. Before the first touch it goes straight ahead."""
+    """Compute one control step; before the first contact the base moves straight ahead."""
     touch = obs.touch
-    path, told, offset = state.path.followed(touch)
+    path, filled, offset = state.path.update(touch)
     f_world = -planar.rotate(touch.yaw, obs.f_robot)  # on the object
     pushed = path.touched & (state.pushed | (planar.norm(f_world) >= params.f_min))
-    theta_p = steered(params, state.theta_p, f_world, path.theta_d, offset, touch.period)
+    theta_p = steer(params, state.theta_p, f_world, path.theta_d, offset, touch.period)
     theta_p = jnp.where(pushed, theta_p, 0.0)
     angle = path.theta_d + theta_p
     v_world = params.v_max * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-    v_robot = planar.rotate(-touch.yaw, yielding(params, v_world, f_world))
+    v_robot = planar.rotate(-touch.yaw, yield_to_force(params, v_world, f_world))
     state = PublishedForcePushState(path, theta_p, pushed)
     return (
         state,
         path.twist(params, v_robot, touch.yaw),
-        Details.from_obs(told)._replace(gamma=theta_p),
+        Details.from_obs(filled)._replace(gamma=theta_p),
     )
 
 

@@ -1,9 +1,9 @@
-"""Pursuit: the simplest law that could work with what RPS feels.
+"""Pursuit: the simplest law with the observations of RPS.
 
-It moves the contact point straight to the target, and turns to face it. It neither steers round
-the object nor realigns: what it loses is what RPS adds. The law and its numbers are ours.
+It moves the contact point straight to the target, and turns to face it. It neither steers nor
+realigns, so its failures show what RPS adds. The law and its parameters are ours.
 
-Symbols are those of `law`: C contact point, T target, d from C to T, e the heading error.
+Symbols are those of `rps`: C contact point, T target, d from C to T, e the heading error.
 """
 
 from functools import partial
@@ -23,7 +23,7 @@ class PursuitParams(NamedTuple):
 
     K_v: float | jax.Array = 0.5  # [1/s] speed over distance
     K_h: float | jax.Array = 1.0  # [1/s] turning rate over heading error
-    press: float | jax.Array = 0.2  # [1] least share of the speed that goes forward
+    press: float | jax.Array = 0.2  # [1] least share of the speed that is forward
     v_max: float | jax.Array = 0.05  # [m/s] bound on the speed
     omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
     v_approach: float | jax.Array = 0.01  # [m/s] forward speed without contact
@@ -42,17 +42,17 @@ check = partial(check_signs, "pursuit", _POSITIVE)
 
 
 def init(params: PursuitParams) -> tuple[()]:
-    """It remembers nothing."""
+    """Return the empty state."""
     return ()
 
 
 def step(
     params: PursuitParams, state: tuple[()], obs: Observation
 ) -> tuple[tuple[()], Twist, Details]:
-    """One control step: C towards T at K_v ||d|| but at most v_max, the base towards facing T.
+    """Compute one control step: C moves to T at min(K_v ||d||, v_max); the base turns to T.
 
     In the robot frame C moves by (max(cos e, press), sin e) times that speed, so that the base
-    keeps pressing on the object while it turns. Without contact it goes straight ahead.
+    keeps pressing on the object while it turns. Without contact the base moves straight ahead.
     """
     contact = jnp.where(obs.in_contact, obs.p_robot_contact, 0.0)
     d = displacement(obs._replace(p_robot_contact=contact))

@@ -1,21 +1,21 @@
 """The Reactive Pushing Strategy (RPS): Eqs. 1-10 and Algorithm 1 of Ozdamar, Sirintuna, Arbaud
-and Ajoudani, "Pushing in the Dark" (IEEE RA-L 2024). Nothing here knows of MuJoCo.
+and Ajoudani, "Pushing in the Dark" (IEEE RA-L 2024). This file does not use MuJoCo.
 
-Frames: W is the world, R the robot (origin at the middle of the base, x forward, y left).
-`p_robot_contact` is the paper's p^R_C; `l` is its y component. Every function takes single
-worlds; `jax.vmap` batches any argument, parameters included.
+Frames: W is the world, R the robot (origin at the centre of the base, x forward, y left).
+`p_robot_contact` is the paper's p^R_C; `l`, the contact offset, is its y component. Functions take
+single worlds; `jax.vmap` batches any argument, parameters included.
 
-The law switches. With `Temperatures` each of its switches is a weight from 0 to 1 instead, what it
-chose between is mixed by that weight, and the law is smooth; without them it is the paper's.
+The law has switches. With `Temperatures` each switch is a weight from 0 to 1 that mixes its two
+alternatives (see `soft`), so that the law is smooth. Without them it is the paper's law.
 """
 
 from __future__ import annotations
 
-import operator
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.control import soft
@@ -27,9 +27,9 @@ from rps_jax.geometry.arrays import Array, Bool, Float
 
 @document_fields
 class RPSParams(NamedTuple):
-    """Parameters of the law, all floats, all leaves of a pytree (any may be batched).
+    """Parameters of RPS: floats, the leaves of a pytree, any of which may be batched.
 
-    The paper gives the first block; it leaves the second open, and the defaults are ours.
+    The first block is given in the paper. The second is not; its defaults are ours.
     """
 
     eta: float | jax.Array = 10.0  # [1] upper asymptote of the adaptive rate, Eq. 5
@@ -39,14 +39,14 @@ class RPSParams(NamedTuple):
     K_h: float | jax.Array = 1.0  # [1] heading gain, Eq. 7
     K_v: float | jax.Array = 0.1  # [1/s] velocity gain, Eq. 3
     L: float | jax.Array = 0.2  # [m] turning length, Eqs. 6 and 9
-    l_cr: float | jax.Array = 0.24  # [m] the critical region starts here
+    l_cr: float | jax.Array = 0.24  # [m] start of the critical region
     d_th: float | jax.Array = 0.5  # [m] no lateral motion nearer than this, Eq. 5
     v_max: float | jax.Array = 0.05  # [m/s] bound on the norm of (v_x, v_y)
     omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
     d_success: float | jax.Array = 0.05  # [m] target reached, Algorithm 1
     v_approach: float | jax.Array = 0.01  # [m/s] forward speed without contact (Sec. III-B)
 
-    l_mr: float | jax.Array = 0.15  # [m] the middle region ends here; Realignment stops
+    l_mr: float | jax.Array = 0.15  # [m] end of the middle region, where Realignment stops
     a_r_max: float | jax.Array = 10.0  # [1] adaptive rate in Realignment; eta's value
     gamma_max: float | jax.Array = 1.56  # [rad] bound on |gamma|; inf is the tangent as printed
     v_lost: float | jax.Array = 0.01  # [m/s] forward speed after contact is lost
@@ -54,22 +54,23 @@ class RPSParams(NamedTuple):
 
     # Switches, each 0 or 1.
     reactive: float | jax.Array = 1.0  # 1: RPS; 0: NPS (a_r = 0 and no Realignment)
-    keep_contact: float | jax.Array = 0.0  # 1: a loss is ignored, the last contact acted upon
+    keep_contact: float | jax.Array = 0.0  # 1: after a loss the last contact is used
     saturate_first: float | jax.Array = 0.0  # 1: omega from the saturated linear velocity
     clip_each: float | jax.Array = 0.0  # 1: v_x and v_y clipped one by one, not as a vector
 
     @classmethod
     def paper(cls) -> RPSParams:
-        """The paper's values (Sec. III-A), with our defaults for what it leaves open."""
+        """Return the paper's values (Sec. III-A), with our defaults for those it does not give."""
         return cls()
 
     @classmethod
     def tuned(cls) -> RPSParams:
-        """Tuned by evolution in random worlds of boxes and cylinders (see `sweeps/random_worlds`).
+        """Return values tuned by evolution in random worlds of boxes and cylinders.
 
-        Full speed until the target. Nearer than d_th it drives straight on or, beyond l_cr, almost
-        purely sideways; Eq. 5 acts only farther away. A contact that is lost is acted upon as if it
-        were still felt. Some of the worlds had robots with limits.
+        See `sweeps/random_worlds`; some of the worlds had robots with limits. The base keeps full
+        speed until the target. Within d_th it moves straight ahead or, beyond l_cr, almost purely
+        sideways, and Eq. 5 acts only outside d_th. After a loss of contact the law acts as if the
+        last contact persisted.
         """
         return cls(
             eta=7.434028,
@@ -90,7 +91,7 @@ class RPSParams(NamedTuple):
 
     @classmethod
     def nps(cls) -> RPSParams:
-        """The non-reactive baseline: a_r = 0 throughout and no Realignment State (Sec. III-B)."""
+        """Return the non-reactive baseline: a_r = 0, and no Realignment State (Sec. III-B)."""
         return cls(reactive=0.0)
 
 
@@ -113,11 +114,11 @@ BOUNDS = {
 
 
 class Temperatures(NamedTuple):
-    """How far each switch of the smooth law reaches to either side, all [m].
+    """Widths of the switches of the smooth law, all [m].
 
-    As they go to zero the law tends to the paper's, but for l = 0 exactly, where a smooth sgn is
-    zero whatever `sgn_0`. They are small against what they soften: a Realignment State with a
-    memory needs realign < (l_cr - l_mr) / 4, beyond which l_th has one equilibrium for each l.
+    As the widths tend to zero, the law tends to the paper's, except at l = 0, where a smooth sgn
+    is zero for any `sgn_0`. The Realignment State is hysteretic only for realign below
+    (l_cr - l_mr) / 4; above this width l_th has one equilibrium for each l.
     """
 
     realign: float | jax.Array = 0.01  # Algorithm 1's |l| > l_th
@@ -126,33 +127,33 @@ class Temperatures(NamedTuple):
     arrive: float | jax.Array = 0.002  # ||d|| < d_success
 
     def check(self) -> None:
-        """Raises InputError for a temperature that is not a positive length."""
+        """Raise InputError for a temperature that is not a positive length."""
         for name, value in self._asdict().items():
             errors.check_finite(f"temperature {name}", value, above=0, at_most=1, unit="m")
 
 
 class RPSState(NamedTuple):
-    """What the law remembers between two control steps."""
+    """State of the law between two control steps."""
 
     l_th: Float[Array, "*B"]  # [m] dynamic threshold: l_cr normally, l_mr while realigning
     p_robot_contact: Float[Array, "*B 2"]  # [m] the last contact, in the robot frame
-    # The skin has felt the object at least once; smooth: a weight.
+    # Whether there was a contact; a weight in the smooth law.
     touched: Bool[Array, "*B"] | Float[Array, "*B"]
 
     @classmethod
     def init(cls, params: RPSParams, temperatures: Temperatures | None = None) -> RPSState:
-        """Algorithm 1's initialisation, l_th = l_cr, before any contact."""
+        """Return the initial state of Algorithm 1, l_th = l_cr."""
         l_th = jnp.asarray(params.l_cr, float)
         touched = jnp.zeros((), bool if temperatures is None else l_th.dtype)
         return cls(l_th, jnp.zeros(2, l_th.dtype), touched)
 
 
 def check(params: RPSParams) -> RPSParams:
-    """Return the parameters if they are scalars that mean something.
+    """Return the parameters if they are scalars in range.
 
     Raises:
-      InputError: a value is not a number, negative where it must not be, or infinite (only
-        gamma_max may be, for the tangent as printed).
+      InputError: a value is not a number, is out of range, or is infinite (only gamma_max may be,
+        for the tangent as printed).
     """
     errors.check_finite("zeta", params.zeta)
     for name in ("eta", "beta", "k", "d_th", "a_r_max", "l_mr", "v_approach", "v_lost"):
@@ -167,11 +168,11 @@ def check(params: RPSParams) -> RPSParams:
     return params
 
 
-HARD: Any = Temperatures._make([None] * len(Temperatures._fields))
+HARD: Any = Temperatures._make([None] * len(Temperatures._fields))  # the paper's switches
 
 
-def _sgn(params: RPSParams, x: jax.Array, temperature: Any = None) -> jax.Array:
-    """Sgn, with the parameter sgn(0): by default a centred contact asks for no lateral motion."""
+def _sgn(params: RPSParams, x: jax.Array, temperature: ArrayLike | None) -> jax.Array:
+    """Compute sgn(x) with the parameter sgn(0), by default 0: no lateral motion at l = 0."""
     if temperature is None:
         return jnp.where(x == 0, params.sgn_0, jnp.sign(x))
     return jnp.tanh(x / temperature)
@@ -183,7 +184,7 @@ def adaptive_rate(
     distance: Float[Array, "*B"],
     temperatures: Temperatures | None = None,
 ) -> Float[Array, "*B"]:
-    """Eq. 5: a_r [1] from the lateral contact location l [m] and ||d|| [m]."""
+    """Compute Eq. 5: the adaptive rate a_r [1] from contact offset l [m] and ||d|| [m]."""
     temps = temperatures or HARD
     logistic = jax.nn.sigmoid((jnp.abs(l) - params.beta) * params.k)
     a_r = (params.zeta + (params.eta - params.zeta) * logistic) * _sgn(params, l, temps.sgn)
@@ -194,8 +195,8 @@ def adaptive_rate(
 def linear_velocity(
     v_star: float | Float[Array, "*B"], a_r: float | Float[Array, "*B"]
 ) -> tuple[Float[Array, "*B"], Float[Array, "*B"]]:
-    """Eqs. 1-2: (v_x, v_y) [m/s] of norm v_star [m/s] and slope v_y / v_x = a_r [1]."""
-    a_r = jnp.asarray(a_r) * 1.0  # a float, of the width it came in
+    """Compute Eqs. 1-2: (v_x, v_y) [m/s] with norm v_star [m/s] and slope v_y / v_x = a_r [1]."""
+    a_r = jnp.asarray(a_r) * 1.0  # convert to float, and keep the width
     length = planar.norm(jnp.stack([jnp.ones_like(a_r), a_r], axis=-1))
     return v_star / length, v_star * (a_r / length)
 
@@ -203,30 +204,30 @@ def linear_velocity(
 def steering_angle(
     params: RPSParams, d: Float[Array, "*B 2"], yaw: float | Float[Array, "*B"]
 ) -> Float[Array, "*B"]:
-    """Eqs. 7-8: gamma = K_h (theta* - theta) [rad], theta* the direction of d [m].
+    """Compute Eqs. 7-8: gamma = K_h (theta* - theta) [rad], with theta* the direction of d [m].
 
     The heading error is wrapped to [-pi, pi). The paper's tangent changes sign beyond pi / 2,
-    where the robot would turn away from its target, so gamma is held within +-gamma_max.
+    where the robot would turn away from its target. Gamma is therefore clipped to +-gamma_max.
     """
     gamma = params.K_h * planar.wrap(planar.direction(d) - yaw)
     return jnp.clip(gamma, -jnp.asarray(params.gamma_max), params.gamma_max)
 
 
 def realignment_gain(params: RPSParams, l: Float[Array, "*B"]) -> Float[Array, "*B"]:  # noqa: E741
-    """Eq. 10: sigma = 1 - |l| / l_cr [1] of l [m], zero in the critical region."""
+    """Compute Eq. 10: sigma = 1 - |l| / l_cr [1], zero in the critical region."""
     return 1.0 - jnp.minimum(jnp.abs(l), params.l_cr) / params.l_cr
 
 
 def saturate(params: RPSParams, twist: Twist) -> Twist:
-    """Bound the commanded twist: (v_x, v_y) scaled as a vector to norm v_max, omega clipped.
+    """Scale (v_x, v_y) as a vector to norm v_max, and clip omega.
 
-    With `clip_each`, v_x and v_y are clipped to +-v_max one by one, which turns the vector.
+    With `clip_each`, v_x and v_y are clipped separately, which changes their direction.
     """
     scaled = twist.saturate(params.v_max, params.omega_max)
-    v_max, each = jnp.asarray(params.v_max), jnp.asarray(params.clip_each > 0)
+    v_max, clip_each = jnp.asarray(params.v_max), jnp.asarray(params.clip_each > 0)
     v_x, v_y = (
-        jnp.where(each, jnp.clip(v, -v_max, v_max), other)
-        for v, other in zip(twist[:2], scaled[:2], strict=True)
+        jnp.where(clip_each, jnp.clip(v, -v_max, v_max), v_scaled)
+        for v, v_scaled in zip(twist[:2], scaled[:2], strict=True)
     )
     return Twist(v_x, v_y, scaled.omega)
 
@@ -234,7 +235,7 @@ def saturate(params: RPSParams, twist: Twist) -> Twist:
 def _push(
     params: RPSParams, l_th: jax.Array, obs: Observation, temperatures: Temperatures | None
 ) -> tuple[jax.Array, Twist, Details]:
-    """One pass of Algorithm 1's control loop, in contact."""
+    """Compute one pass of Algorithm 1's control loop, in contact."""
     l = obs.p_robot_contact[..., 1]  # noqa: E741
     d = displacement(obs)
     distance = planar.norm(d)
@@ -244,7 +245,7 @@ def _push(
     temps = temperatures or HARD
     realigning = soft.logical_and(
         soft.greater(jnp.abs(l), l_th, temps.realign), jnp.asarray(params.reactive) > 0
-    )  # Algorithm 1's switch into, and out of, the Realignment State
+    )  # Algorithm 1: enter or leave the Realignment State
     a_r = soft.where(
         realigning,
         params.a_r_max * _sgn(params, l, temps.sgn),
@@ -281,19 +282,19 @@ def step_with_details(
     obs: Observation,
     temperatures: Temperatures | None = None,
 ) -> tuple[RPSState, Twist, Details]:
-    """`step`, and the quantities behind its twist (those of the last contact without one)."""
+    """Compute `step` and its details (without contact, those of the last contact)."""
     in_contact = jnp.asarray(obs.in_contact)
     if temperatures is not None:
         in_contact = in_contact.astype(state.l_th.dtype)
     temps = temperatures or HARD
-    # Without contact the location means nothing; the last one keeps every branch finite.
+    # Without contact the contact point is undefined; the last one keeps every branch finite.
     contact = soft.where(in_contact, obs.p_robot_contact, state.p_robot_contact)
-    told = obs._replace(p_robot_contact=contact)
-    l_th, push, details = _push(params, state.l_th, told, temperatures)
-    kept = soft.logical_and(state.touched, jnp.asarray(params.keep_contact) > 0)
-    # A remembered contact near the target must not stop the robot: only a felt one arrives.
-    away = soft.greater(details.distance, params.d_success, temps.arrive, operator.ge)
-    pushing = soft.logical_or(in_contact, soft.logical_and(kept, away))
+    filled = obs._replace(p_robot_contact=contact)
+    l_th, push, details = _push(params, state.l_th, filled, temperatures)
+    is_kept = soft.logical_and(state.touched, jnp.asarray(params.keep_contact) > 0)
+    # Only a current contact arrives: the last contact near the target must not stop the robot.
+    is_away = soft.greater_equal(details.distance, params.d_success, temps.arrive)
+    pushing = soft.logical_or(in_contact, soft.logical_and(is_kept, is_away))
     ahead = Twist(soft.where(state.touched, params.v_lost, params.v_approach), 0.0, 0.0)
     twist = soft.tree_where(pushing, push, ahead)
     state = RPSState(
@@ -315,20 +316,20 @@ def step(
     obs: Observation,
     temperatures: Temperatures | None = None,
 ) -> tuple[RPSState, Twist]:
-    """Algorithm 1: one control step of RPS (or NPS, by `params.reactive`).
+    """Compute one control step of Algorithm 1: RPS, or NPS with `params.reactive` 0.
 
-    In contact: the saturated twist of Eqs. 1-10, or zero once ||d|| < d_success. Without contact:
-    straight ahead, at v_approach before the first touch and at v_lost after a loss, l_th
-    unchanged; with `keep_contact`, a loss is ignored and the last contact acted upon.
-    Algorithm 1's last line prints v_x twice; (v_x, v_y, omega) is meant.
+    In contact, the twist is that of Eqs. 1-10, saturated, and zero once ||d|| < d_success. Without
+    contact the base moves straight ahead, at v_approach before the first contact and at v_lost
+    after a loss, and l_th is unchanged. With `keep_contact`, a loss is ignored and the last contact
+    is used. Algorithm 1's last line prints v_x twice; we read it as (v_x, v_y, omega).
 
-    With `temperatures` the smooth law: l_th moves continuously between l_mr and l_cr, a_r and the
-    turning speed between their values in and out of the Realignment State, and the contact's
-    weight mixes pushing with going straight ahead, and the contact felt with the last one (so
-    `p_robot_contact` must be finite, and the state from `RPSState.init(params, temperatures)`).
-    The speed stays v* split by the slope a_r. The 0-or-1 parameters switch as ever, and bounds
-    (saturation, gamma_max, sigma) stay as they are: they have kinks, but no jumps. One jump is
-    left: at a heading error of exactly pi the robot chooses a side.
+    With `temperatures` the law is smooth. l_th moves continuously between l_mr and l_cr; a_r and
+    the turning speed are mixed between their values in and out of the Realignment State. The
+    contact's weight mixes pushing with moving straight ahead, and the current contact with the
+    last one, so `p_robot_contact` must be finite. The state must be that of
+    `RPSState.init(params, temperatures)`. Parameters that are 0 or 1 still switch. Bounds
+    (saturation, gamma_max, sigma) are unchanged: they have kinks but no jumps. One jump remains: at
+    a heading error of exactly pi the robot turns to one side.
 
     Example:
       >>> import numpy as np

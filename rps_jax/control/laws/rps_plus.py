@@ -1,35 +1,34 @@
-"""RPS+: the law of `rps`, which translates near its target, and searches a contact that it lost.
+"""RPS+: RPS that translates near its target, and searches for the object after a lost contact.
 
-The tuned law loses worlds in two ways that touch alone can mend. Within arm's length of the target
-Eq. 6 turns the base to face the target while it drives on, and a wide object that touches off the
-middle, or a realignment, carries it round the target. And a contact that is lost it takes for felt:
-it drives on as if the object were there. A third mend is a number: RPS+ approaches at 0.03 m/s,
-where the paper creeps at 0.01 m/s after objects that may slide away.
+The tuned RPS fails in two ways that touch alone can prevent. Near the target Eq. 6 turns the base
+towards the target while it moves; a wide object with a large contact offset, or a realignment, then
+carries the base around the target. And after a loss the law acts as if the contact persisted: the
+base moves on without the object. Also, RPS+ approaches at 0.03 m/s, where the paper uses 0.01 m/s
+for objects that may slide away.
 
-A holonomic base need not turn: any velocity of the contact point can be had by translation. With C
-the contact point (while none is felt, where the skin was touched last), d from C to the target T,
-theta* its direction, e = theta* - theta the heading error, and v* of Eq. 3 within v_max:
+A holonomic base need not turn: translation can give the contact point any velocity. With C the
+contact point (without contact, the last one), d from C to the target T, theta* its direction,
+e = theta* - theta the heading error, and v* of Eq. 3 within v_max:
 
-  P1  near = ||d|| < d_near, touching or lately so, realigning or not
+  P1  near = ||d|| < d_near, with a current or kept contact, realigning or not
   P2  v_x = v* max(cos e, press),  v_y = v* sin e,  omega = 0      where near
 
-By P2 C moves straight to T while |e| < arccos(press), and as long as it sticks; farther round the
+By P2, C moves straight to T while |e| < arccos(press) and the contact sticks. For larger |e| the
 base keeps pressing with a share `press` of its speed, since a skin cannot pull.
 
-After n_lost control steps without contact, with p from the base to where C was felt last, in the
-robot frame, and l the place on the skin where it was felt:
+After n_lost control steps without contact, with p from the base to the last C, in the robot frame,
+and l the contact offset there:
 
   P3  omega = angle of p while |p| > reach, else 0
       v_x = v_max ahead while |angle of p| < facing, else 0,   v_y = v_max aside sgn(l)
 
-So the base faces the place where it lost the object, and goes there with a drift to the side to
-which the contact went, round and round until it touches. Everything else is the law of Eqs. 1-10
-with its own parameters. RPS+ senses what RPS senses; beyond what RPS remembers it remembers where
-in the world it felt the object last, and for how many steps it has not.
+The base faces the position of the last contact and moves there, with a sideways velocity towards
+the side of the contact, in circles until it touches. Everything else is Eqs. 1-10 with the tuned
+parameters. RPS+ has the observations of RPS. Its state adds the position of the last contact in the
+world, and the number of control steps since.
 """
 
-import operator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -44,40 +43,40 @@ from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Scalar
 
 FACING = 0.3  # [rad] P3's facing
-REACH = 0.45  # [m] P3's reach: the base's front is 0.36 m before its middle
-# How far switches of the smooth law reach that are not of lengths.
-_WARM_FACING = 0.03  # [rad] P3's |angle of p| < facing
-_WARM_LOST = 5.0  # [1] control steps, n_lost
+REACH = 0.45  # [m] P3's reach: the base's front is 0.36 m ahead of its centre
+# Widths of the switches of the smooth law that are not lengths.
+_FACING_WIDTH = 0.03  # [rad] P3's |angle of p| < facing
+_LOST_WIDTH = 5.0  # [1] control steps, n_lost
 
 
 @document_fields
 class RPSPlusParams(NamedTuple):
-    """Parameters of RPS+; those of the law are the tuned ones, but for a faster approach."""
+    """Parameters of RPS+: the tuned ones of RPS with a faster approach, and those of P1 to P3."""
 
     law: RPSParams = RPSParams.tuned()._replace(v_approach=0.03)  # of Eqs. 1-10
-    d_near: float | jax.Array = 0.25  # [m] nearer than this it translates, P1
-    press: float | jax.Array = 0.2  # [1] least share of the speed that goes forward, P2
+    d_near: float | jax.Array = 0.25  # [m] distance within which the base translates, P1
+    press: float | jax.Array = 0.2  # [1] least share of the speed that is forward, P2
     n_lost: float | jax.Array = 100  # [1] control steps without contact before P3: 2 s
-    ahead: float | jax.Array = 0.7  # [1] share of v_max with which it goes back, P3
-    aside: float | jax.Array = 0.5  # [1] share of v_max with which it searches to the side, P3
+    ahead: float | jax.Array = 0.7  # [1] share of v_max towards the last contact, P3
+    aside: float | jax.Array = 0.5  # [1] share of v_max to the side, P3
 
     @property
-    def d_success(self) -> Any:
-        """[m] Target reached."""
+    def d_success(self) -> float | jax.Array:
+        """Distance at which the target is reached [m]."""
         return self.law.d_success
 
     @property
-    def v_max(self) -> Any:
-        """[m/s] Bound on the speed."""
+    def v_max(self) -> float | jax.Array:
+        """Bound on the speed [m/s]."""
         return self.law.v_max
 
 
 class RPSPlusState(NamedTuple):
-    """What RPS+ remembers between two control steps."""
+    """State of RPS+ between two control steps."""
 
     law: RPSState
-    p_world_felt: jax.Array  # (2,) [m] where the object was felt last
-    lost: jax.Array  # () int32 control steps since then; of the smooth law a float
+    p_world_contact: jax.Array  # (2,) [m] the last contact
+    steps_lost: jax.Array  # () int32 control steps since then; a float in the smooth law
 
 
 BOUNDS = {f"law.{name}": bound for name, bound in rps.BOUNDS.items() if not bound.of} | {
@@ -91,7 +90,7 @@ BOUNDS = {f"law.{name}": bound for name, bound in rps.BOUNDS.items() if not boun
 
 
 def check(params: RPSPlusParams) -> RPSPlusParams:
-    """Return the parameters if they are scalars that mean something, or raise InputError."""
+    """Return the parameters if they are scalars in range; otherwise raise InputError."""
     rps.check(params.law)
     errors.check_finite("rps_plus.d_near", params.d_near, at_least=0)
     errors.check_finite("rps_plus.n_lost", params.n_lost, at_least=0)
@@ -101,36 +100,36 @@ def check(params: RPSPlusParams) -> RPSPlusParams:
 
 
 def init(params: RPSPlusParams, temperatures: Temperatures | None = None) -> RPSPlusState:
-    """Before the first touch."""
+    """Return the state before the first contact."""
     state = RPSState.init(params.law, temperatures)
-    lost = jnp.zeros((), jnp.int32 if temperatures is None else state.l_th.dtype)
-    return RPSPlusState(state, jnp.zeros_like(state.p_robot_contact), lost)
+    steps_lost = jnp.zeros((), jnp.int32 if temperatures is None else state.l_th.dtype)
+    return RPSPlusState(state, jnp.zeros_like(state.p_robot_contact), steps_lost)
 
 
 def translation(params: RPSPlusParams, d: jax.Array, yaw: Scalar) -> Twist:
-    """P2: the twist that takes the contact straight along d (2,) [m] of the world."""
+    """Compute P2: the twist that moves the contact straight along d (2,) [m] in the world."""
     error = planar.wrap(planar.direction(d) - yaw)
     speed = params.law.K_v * planar.norm(d)
     forward = jnp.maximum(jnp.cos(error), params.press)
-    still = jnp.zeros_like(error)
-    return rps.saturate(params.law, Twist(speed * forward, speed * jnp.sin(error), still))
+    omega = jnp.zeros_like(error)
+    return rps.saturate(params.law, Twist(speed * forward, speed * jnp.sin(error), omega))
 
 
 def search(
     params: RPSPlusParams,
-    p_robot_felt: jax.Array,
+    p_robot_last: jax.Array,
     l: jax.Array,  # noqa: E741
     temperatures: Temperatures | None = None,
 ) -> Twist:
-    """P3: the twist back to where the object was felt, (2,) [m] from the base in its frame.
+    """Compute P3: the twist back to the last contact, `p_robot_last` (2,) [m] in the robot frame.
 
-    `l` () [m] is the place on the skin where it was felt.
+    `l` () [m] is the contact offset there.
     """
     temps = temperatures or rps.HARD
-    angle, v_max = planar.direction(p_robot_felt), jnp.asarray(params.law.v_max)
-    faces = soft.less(jnp.abs(angle), FACING, temperatures and _WARM_FACING)
+    angle, v_max = planar.direction(p_robot_last), jnp.asarray(params.law.v_max)
+    faces = soft.less(jnp.abs(angle), FACING, temperatures and _FACING_WIDTH)
     ahead = soft.where(faces, params.ahead * v_max, 0.0)
-    far = soft.greater(planar.norm(p_robot_felt), REACH, temps.d_th)
+    far = soft.greater(planar.norm(p_robot_last), REACH, temps.d_th)
     side = jnp.sign(l) if temperatures is None else jnp.tanh(l / temps.sgn)
     turning = soft.where(far, angle, 0.0)
     return rps.saturate(params.law, Twist(ahead, params.aside * v_max * side, turning))
@@ -142,35 +141,35 @@ def step(
     obs: Observation,
     temperatures: Temperatures | None = None,
 ) -> tuple[RPSPlusState, Twist, Details]:
-    """One control step: the law's, or near the target P2, or after a loss P3.
+    """Compute one control step: RPS, or near the target P2, or after a loss P3.
 
-    With `temperatures` all switches are smooth, as those of the law are, and the twists mix.
+    With `temperatures` all switches are smooth and mix the twists.
     """
     temps = temperatures or rps.HARD
-    memory, twist, details = rps.step_with_details(params.law, state.law, obs, temperatures)
-    contact, touching = memory.p_robot_contact, jnp.asarray(obs.in_contact)
+    law_state, twist, details = rps.step_with_details(params.law, state.law, obs, temperatures)
+    contact, touching = law_state.p_robot_contact, jnp.asarray(obs.in_contact)
     if temperatures is not None:
-        touching = touching.astype(memory.l_th.dtype)
+        touching = touching.astype(law_state.l_th.dtype)
     p_world_contact = obs.p_world_robot + planar.rotate(obs.yaw, contact)
-    p_world_felt = soft.where(touching, p_world_contact, state.p_world_felt)
-    idle = soft.logical_or(touching, soft.logical_not(memory.touched))
-    lost = soft.where(idle, 0, state.lost + 1)
+    p_world_last = soft.where(touching, p_world_contact, state.p_world_contact)
+    idle = soft.logical_or(touching, soft.logical_not(law_state.touched))
+    steps_lost = soft.where(idle, 0, state.steps_lost + 1)
     d = displacement(obs._replace(p_robot_contact=contact))
 
-    kept = soft.logical_and(memory.touched, jnp.asarray(params.law.keep_contact) > 0)
-    pushing = soft.logical_or(touching, kept)
+    is_kept = soft.logical_and(law_state.touched, jnp.asarray(params.law.keep_contact) > 0)
+    pushing = soft.logical_or(touching, is_kept)
     near = soft.logical_and(pushing, soft.less(details.distance, params.d_near, temps.d_th))  # P1
-    away = soft.greater(details.distance, params.law.d_success, temps.arrive, operator.ge)
-    p_robot_felt = planar.rotate(-obs.yaw, p_world_felt - obs.p_world_robot)
-    for condition, other in (
-        (soft.logical_and(near, away), translation(params, d, obs.yaw)),
+    is_away = soft.greater_equal(details.distance, params.law.d_success, temps.arrive)
+    p_robot_last = planar.rotate(-obs.yaw, p_world_last - obs.p_world_robot)
+    for condition, action in (
+        (soft.logical_and(near, is_away), translation(params, d, obs.yaw)),
         (
-            soft.greater(lost, params.n_lost, temperatures and _WARM_LOST),
-            search(params, p_robot_felt, contact[1], temperatures),
+            soft.greater(steps_lost, params.n_lost, temperatures and _LOST_WIDTH),
+            search(params, p_robot_last, contact[1], temperatures),
         ),
     ):
-        twist = soft.tree_where(condition, other, twist)
-    return RPSPlusState(memory, p_world_felt, lost), twist, details
+        twist = soft.tree_where(condition, action, twist)
+    return RPSPlusState(law_state, p_world_last, steps_lost), twist, details
 
 
 LAW = Law(init, step, check=check, bounds=tuple(BOUNDS.items()), temperatures=Temperatures())

@@ -1,1 +1,1 @@
-"""Laws learned from touch: what they observe, their network, and the files that hold them."""
+"""Laws learned from touch: their observations, their network, and the files that hold them."""

@@ -1,9 +1,9 @@
-"""The network of a learned law, as pure functions of its weights, and the law that it makes.
+"""Network of a learned law, as pure functions of its weights, and the law built on it.
 
-Every layer keeps a pair of rows, one for the world and one for its mirror image (y to -y), and
-treats both alike, so the network has the mirror symmetry of the task exactly: in the mirrored
-world it does the mirrored thing, whatever its weights. A layer with a width of n works as a dense
-one of 2 n, with half the weights.
+The network is equivariant under mirroring (y to -y): in the mirrored world it commands the
+mirrored action, for any weights. Each layer has a pair of rows, one for the world and one for its
+mirror image, and treats both alike. A layer of width n acts as a dense one of 2 n, with half the
+weights.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from rps_jax.control.learned.features import TouchState
 from rps_jax.control.observation import Details, TaxelObservation, Twist
 
 NetworkKind = Literal["mlp", "gru"]
-Weights = dict[str, Any]  # by name, float32
+Weights = dict[str, Any]  # float32 arrays by name, of NumPy or JAX
 _ACTION_SIGNS = np.array([1, -1, -1], np.float32)  # of (v_x, v_y, omega) under the mirror
 _REACH = 1.5  # [1] bound on the mean of each component of an action
 
 
 class Network(NamedTuple):
-    """What a network is, apart from its weights. Static."""
+    """Architecture of a network, without its weights. Static."""
 
-    kind: NetworkKind = "gru"  # mlp: two hidden layers; gru: one, and a recurrent one with a state
+    kind: NetworkKind = "gru"  # mlp: two hidden layers; gru: one, and a recurrent layer
     width: int = 64  # pairs of units in a hidden layer
     taxels: int = 42  # of the skin
-    hold: float = 0.2  # [s] for which an action is carried out
+    hold: float = 0.2  # [s] duration of an action
 
     def check(self) -> Network:
-        """Itself; raises InputError if it means nothing."""
+        """Return the network; raise InputError for a field that is out of range."""
         errors.check_name("network", self.kind, get_args(NetworkKind))
         errors.check_count("network width", self.width, at_most=1024)
         errors.check_count("network taxels", self.taxels, at_most=10_000)
@@ -45,30 +45,30 @@ class Network(NamedTuple):
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shapes of the weights, by name."""
+        """Shapes of the weights by name."""
         size, n = features.feature_count(self.taxels), self.width
         second = _dense("second", n, n) if self.kind == "mlp" else _gru("memory", n)
         return _dense("first", size, n) | second | _dense("action", n, 3)
 
     def init(self, key: jax.Array) -> Weights:
-        """Weights by chance, with which the mean action is nearly to stand still."""
+        """Return random weights, with a mean action near zero."""
         return init_weights(self.shapes, key, small=("action",))
 
     def initial_hidden(
         self, batch: tuple[int, ...] = (), dtype: jax.typing.DTypeLike = float
     ) -> jax.Array:
-        """What a network remembers (..., 2, H) before its first observation; an MLP nothing."""
+        """Return the initial hidden state (..., 2, H); H = 0 for an MLP."""
         return jnp.zeros((*batch, 2, self.width if self.kind == "gru" else 0), dtype)
 
     def apply(
-        self, weights: Weights, hidden: jax.Array, numbers: jax.Array
+        self, weights: Weights, hidden: jax.Array, inputs: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """What it remembers (..., 2, H) and its mean action (..., 3) [1], from numbers (..., F)."""
-        x = jnp.tanh(dense(weights, "first", mirror_pairs(numbers)))
+        """Map features (..., F) to the hidden state (..., 2, H) and mean action (..., 3) [1]."""
+        x = jnp.tanh(dense(weights, "first", mirror_pairs(inputs)))
         if self.kind == "mlp":
             x = jnp.tanh(dense(weights, "second", x))
         else:
-            x = hidden = _remember(weights, "memory", hidden, x)
+            x = hidden = _apply_gru(weights, "memory", hidden, x)
         out = dense(weights, "action", x)
         mean = 0.5 * (out[..., 0, :] + jnp.asarray(_ACTION_SIGNS, out.dtype) * out[..., 1, :])
         return hidden, _REACH * jnp.tanh(mean / _REACH)
@@ -86,14 +86,14 @@ def _gru(name: str, n: int) -> dict[str, tuple[int, ...]]:
 
 
 def critic_shapes(inputs: int, width: int) -> dict[str, tuple[int, ...]]:
-    """Shapes of the weights of a value function of so many numbers."""
+    """Return the shapes of the weights of a value function with `inputs` pairs of inputs."""
     return (
         _dense("first", inputs, width) | _dense("second", width, width) | _dense("value", width, 1)
     )
 
 
 def critic(weights: Weights, pair: jax.Array) -> jax.Array:
-    """A value (...) of pairs (..., 2, n) of numbers: that of the mirrored world is the same."""
+    """Compute the value (...) of pairs (..., 2, n), which is invariant under mirroring."""
     x = jnp.tanh(dense(weights, "first", pair))
     x = jnp.tanh(dense(weights, "second", x))
     return jnp.mean(dense(weights, "value", x)[..., 0], axis=-1)
@@ -102,31 +102,34 @@ def critic(weights: Weights, pair: jax.Array) -> jax.Array:
 def init_weights(
     shapes: dict[str, tuple[int, ...]], key: jax.Array, small: tuple[str, ...] = ()
 ) -> Weights:
-    """Weights of these shapes: normal, of variance one over the inputs; biases are zero.
+    """Draw normal weights of variance 1 over the inputs, and zero biases.
 
-    Those of the layers `small` are a hundred times smaller.
+    Weights of the layers named in `small` are a hundred times smaller.
     """
-    found = {}
-    for one, (name, shape) in zip(jax.random.split(key, len(shapes)), shapes.items(), strict=True):
+    weights = {}
+    keys = jax.random.split(key, len(shapes))
+    for layer_key, (name, shape) in zip(keys, shapes.items(), strict=True):
         scale = (0.01 if name.split(".")[0] in small else 1.0) / math.sqrt(shape[0])
-        weight = name.endswith(".w")
-        found[name] = scale * jax.random.normal(one, shape) if weight else jnp.zeros(shape)
-    return found
+        is_weight = name.endswith(".w")
+        weights[name] = (
+            scale * jax.random.normal(layer_key, shape) if is_weight else jnp.zeros(shape)
+        )
+    return weights
 
 
-def mirror_pairs(numbers: jax.Array) -> jax.Array:
-    """Numbers (..., F) and those of the mirrored world, (..., 2, F)."""
-    return jnp.stack([numbers, features.mirror(numbers)], axis=-2)
+def mirror_pairs(inputs: jax.Array) -> jax.Array:
+    """Stack features (..., F) with those of the mirrored world, to (..., 2, F)."""
+    return jnp.stack([inputs, features.mirror(inputs)], axis=-2)
 
 
 def dense(weights: Weights, name: str, pair: jax.Array) -> jax.Array:
-    """A layer of pairs: each row of itself and of the other one."""
+    """Apply an equivariant dense layer to pairs (..., 2, n)."""
     both = jnp.concatenate([pair, pair[..., ::-1, :]], axis=-1)
     return both @ weights[f"{name}.w"] + weights[f"{name}.b"]
 
 
-def _remember(weights: Weights, name: str, hidden: jax.Array, x: jax.Array) -> jax.Array:
-    """A gated recurrent unit."""
+def _apply_gru(weights: Weights, name: str, hidden: jax.Array, x: jax.Array) -> jax.Array:
+    """Apply a gated recurrent unit to pairs (..., 2, n)."""
     both = jnp.concatenate([x, hidden], axis=-1)
     reset, update = jnp.split(jax.nn.sigmoid(dense(weights, f"{name}.gates", both)), 2, axis=-1)
     new = jnp.tanh(dense(weights, f"{name}.new", jnp.concatenate([x, reset * hidden], axis=-1)))
@@ -137,12 +140,12 @@ def _remember(weights: Weights, name: str, hidden: jax.Array, x: jax.Array) -> j
 
 
 class PolicyState(NamedTuple):
-    """What a learned law remembers between two control steps."""
+    """State of a learned law between two control steps."""
 
     touch_state: TouchState
     hidden: jax.Array  # (2, H) of the network
-    action: jax.Array  # (3,) [1] the last one, which is carried out until the next
-    waiting: jax.Array  # () [s] until then
+    action: jax.Array  # (3,) [1] the current one
+    waiting: jax.Array  # () [s] until the next decision
 
     @classmethod
     def init(cls, network: Network, dtype: jax.typing.DTypeLike = float) -> PolicyState:
@@ -152,59 +155,72 @@ class PolicyState(NamedTuple):
         return cls(TouchState.initial(dtype), hidden, jnp.zeros(3, dtype), zero)
 
     def due(self, obs: TaxelObservation) -> jax.Array:
-        """Whether the next action is decided now."""
+        """Whether the next decision is due in this control step."""
         return self.waiting < 0.5 * obs.touch.period
 
 
 def decide(
     network: Network, weights: Weights, state: PolicyState, obs: TaxelObservation
 ) -> tuple[PolicyState, jax.Array]:
-    """The state after a decision, and the mean action (3,) [1], which may exceed 1.
+    """Return the state after a decision, and the mean action (3,) [1], which may exceed 1.
 
-    The state has followed `obs`; its action is still the last one.
+    `state` is already updated with `obs`; its action is still the last one.
     """
-    numbers = features.compute_features(state.touch_state, state.action, obs)
-    hidden, mean = network.apply(weights, state.hidden, numbers)
+    inputs = features.compute_features(state.touch_state, state.action, obs)
+    hidden, mean = network.apply(weights, state.hidden, inputs)
     return state._replace(touch_state=state.touch_state.mark_decision(obs), hidden=hidden), mean
 
 
+class LearnedParams(NamedTuple):
+    """Parameters of a learned law. The weights are no parameters, but constants of the program."""
+
+    d_success: float | jax.Array = 0.05  # [m] target reached
+    v_max: float | jax.Array = 0.05  # [m/s] bound on the speed
+    omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
+
+
 def observe_sent(
-    params: Any, state: PolicyState, obs: TaxelObservation, sent: Twist
+    params: LearnedParams, state: PolicyState, obs: TaxelObservation, sent: Twist
 ) -> PolicyState:
-    """The state to which the last action is what was sent to the base, if it decides now."""
-    action = features.clip_action(jnp.stack(sent) / _greatest(params))
+    """Return the state whose last action is the twist sent to the base, if a decision is due."""
+    action = features.clip_action(jnp.stack(sent) / _twist_bounds(params))
     return state._replace(action=jnp.where(state.due(obs), action, state.action))
 
 
-def _greatest(params: Any) -> jax.Array:
+def _twist_bounds(params: LearnedParams) -> jax.Array:
     return jnp.stack([params.v_max, params.v_max, params.omega_max])
 
 
-def init(network: Network, params: Any) -> PolicyState:
-    """What a learned law remembers before its first step."""
+def init(network: Network, params: LearnedParams) -> PolicyState:
+    """Return the initial state of a learned law."""
     return PolicyState.init(network)
 
 
 def step(
-    network: Network, weights: Weights, params: Any, state: PolicyState, obs: TaxelObservation
+    network: Network,
+    weights: Weights,
+    params: LearnedParams,
+    state: PolicyState,
+    obs: TaxelObservation,
 ) -> tuple[PolicyState, Twist, Details]:
-    """One control step of a learned law, which acts as the mean of what was learned.
+    """Compute one control step of a learned law, which commands the mean action.
 
     Raises:
-      InputError: the skin has another number of taxels than the network.
+      InputError: the skin and the network have different numbers of taxels.
     """
     if obs.signal.shape[-1] != network.taxels:
         raise errors.InputError(
-            f"a law learned with {network.taxels} taxels cannot be told {obs.signal.shape[-1]}: "
-            "choose a robot with the boards that it was learned with."
+            f"the skin has {obs.signal.shape[-1]} taxels, and the law was learned with "
+            f"{network.taxels}: choose a robot with the same boards."
         )
     state = state._replace(touch_state=state.touch_state.update(obs))
     due = state.due(obs)
-    told, mean = decide(network, weights, state, obs)
-    told = told._replace(action=features.clip_action(mean))
-    told = told._replace(waiting=jnp.full_like(state.waiting, network.hold))
-    after = jax.tree.map(partial(jnp.where, due), told, state)
-    twist = Twist(*(_greatest(params) * after.action))
-    contact = after.touch_state.p_robot_contact(obs)
+    decided, mean = decide(network, weights, state, obs)
+    decided = decided._replace(
+        action=features.clip_action(mean), waiting=jnp.full_like(state.waiting, network.hold)
+    )
+    state = jax.tree.map(partial(jnp.where, due), decided, state)
+    twist = Twist(*(_twist_bounds(params) * state.action))
+    contact = state.touch_state.p_robot_contact(obs)
     details = Details.from_obs(obs.touch._replace(p_robot_contact=contact))
-    return after._replace(waiting=after.waiting - obs.touch.period), twist, details
+    return state._replace(waiting=state.waiting - obs.touch.period), twist, details

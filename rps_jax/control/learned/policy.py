@@ -1,8 +1,7 @@
-"""Files that hold a learned law: its network, its weights, and how it was learned.
+"""Files of learned laws: the network, its weights, and a record of how it was learned.
 
 A file is a NumPy archive (`.npz`) without pickled objects: `about`, a line of JSON, one array for
-each of the network's weights, and `digest`, the SHA-256 of all these. `SHIPPED` lists the files
-that come with the package.
+each weight, and `digest`, the SHA-256 of them all. `SHIPPED` lists the files of the package.
 """
 
 import hashlib
@@ -17,22 +16,21 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.control.base import Law
 from rps_jax.control.learned import network as networks
-from rps_jax.control.learned.network import Network, Weights
+from rps_jax.control.learned.network import LearnedParams, Network, Weights
 from rps_jax.errors import InputError
 from rps_jax.record import files
 
 FORMAT, VERSION = "rps_jax policy", 1
 SHIPPED = {path.stem: path for path in sorted(Path(__file__).parent.glob("learned_*.npz"))}
-_TASK = {"d_success": 0.05, "v_max": 0.05, "omega_max": 0.15}  # [m], [m/s], [rad/s]
 
 
 class Policy(NamedTuple):
-    """A learned law as its file holds it."""
+    """Content of a policy's file."""
 
     network: Network
     weights: Weights  # float32, on the host
-    task: Mapping[str, float] = _TASK  # values of its parameters: [m], [m/s], [rad/s]
-    learned: Mapping[str, Any] = {}
+    task: LearnedParams = LearnedParams()
+    learned: Mapping[str, Any] = {}  # JSON: how the law was learned
 
     @property
     def about(self) -> dict[str, Any]:
@@ -41,22 +39,22 @@ class Policy(NamedTuple):
             "format": FORMAT,
             "version": VERSION,
             "network": self.network._asdict(),
-            "task": dict(self.task),
+            "task": self.task._asdict(),
             "learned": dict(self.learned),
         }
 
 
 def encode(policy: Policy) -> bytes:
-    """The content of a policy's file, which depends on the policy alone."""
+    """Return the content of a policy's file, a function of the policy alone."""
     policy.network.check()
-    arrays: dict[str, Any] = {"about": np.array(json.dumps(policy.about))}
+    arrays = {"about": np.array(json.dumps(policy.about))}
     for name in policy.network.shapes:
         arrays[name] = np.asarray(policy.weights[name], np.float32)
     return files.encode_arrays(digest=np.array(_digest(arrays)), **arrays)
 
 
-def decode(content: bytes, source: Any) -> Policy:
-    """The policy of a file's content, which came from `source`; InputError if it is none."""
+def decode(content: bytes, source: Path | str) -> Policy:
+    """Return the policy of a file's content; InputError names the `source` of invalid content."""
     try:
         arrays = files.decode_arrays(content)
         digest = str(arrays.pop("digest"))
@@ -65,89 +63,81 @@ def decode(content: bytes, source: Any) -> Policy:
             raise ValueError(f"its format is {about['format']}")
     except (ValueError, KeyError, TypeError) as error:
         reason = " ".join(str(error).split()).strip("'\".")
-        why = f"it is no policy that can be read ({reason}); give a file that `rps learn` wrote"
-        raise _refused(source, why) from error
+        fault = f"it is no readable policy ({reason}); give a file that `rps learn` wrote"
+        raise _error(source, fault) from error
     if (version := about.get("version")) != VERSION:
-        why = f"it is of version {version}, and this package reads version {VERSION}"
-        raise _refused(source, why)
+        raise _error(source, f"its version is {version}, and this package reads {VERSION}")
     if digest != _digest(arrays):
-        raise InputError(
-            f"policy = {source} is corrupt: its content is not what its digest says; restore it."
-        )
+        raise InputError(f"policy = {source} is corrupt: its digest does not match; restore it.")
     del arrays["about"]
     learned = about.get("learned")
     if not isinstance(learned, dict):
-        why = f"its note on how it was learned is {learned!r}, and must be names with values"
-        raise _refused(source, why)
-    given = _named("task", tuple(_TASK), about, source)
+        raise _error(source, f"its record of learning is {learned!r}, and must be a JSON object")
     task = {
-        name: errors.check_finite(f"policy {name}", given[name], above=0, at_most=100)
-        for name in _TASK
+        name: errors.check_finite(f"policy {name}", value, above=0, at_most=100)
+        for name, value in _section("task", LearnedParams._fields, about, source).items()
     }
-    return Policy(_network(about, arrays, source), arrays, task, learned)
+    return Policy(_decode_network(about, arrays, source), arrays, LearnedParams(**task), learned)
 
 
-def _refused(source: Any, why: str) -> InputError:
-    return InputError(f"policy = {source} is not allowed: {why}.")
+def _error(source: Path | str, fault: str) -> InputError:
+    return InputError(f"policy = {source} is not allowed: {fault}.")
 
 
 def _digest(arrays: Mapping[str, np.ndarray]) -> str:
-    """SHA-256 of names, types, shapes and values."""
-    found = hashlib.sha256()
+    """Return the SHA-256 of names, types, shapes and values."""
+    sha256 = hashlib.sha256()
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
-        found.update(f"{name} {array.dtype.str} {array.shape} ".encode())
-        found.update(array.tobytes())
-    return found.hexdigest()
+        sha256.update(f"{name} {array.dtype.str} {array.shape} ".encode())
+        sha256.update(array.tobytes())
+    return sha256.hexdigest()
 
 
-def _network(about: Mapping[str, Any], weights: Weights, source: Any) -> Network:
-    """The network of a file, whose weights must be its own, and finite."""
-    network = Network(**_named("network", Network._fields, about, source)).check()
-    found, wanted = {name: array.shape for name, array in weights.items()}, network.shapes
-    for name in (*found, *wanted):
-        if found.get(name) != wanted.get(name):
-            why = f"its {name} has the shape {found.get(name)}, and its network asks for "
-            raise _refused(source, f"{why}{wanted.get(name)}")
+def _decode_network(about: Mapping[str, Any], weights: Weights, source: Path | str) -> Network:
+    """Return the network of a file, whose weights must have its shapes and be finite."""
+    network = Network(**_section("network", Network._fields, about, source)).check()
+    shapes = {name: array.shape for name, array in weights.items()}
+    for name in (*shapes, *network.shapes):
+        shape, expected = shapes.get(name), network.shapes.get(name)
+        if shape != expected:
+            raise _error(source, f"its {name} has the shape {shape}, and its network {expected}")
     for name, array in weights.items():
         if array.dtype != np.float32 or not np.isfinite(array).all():
-            raise _refused(source, f"its {name} must hold finite numbers of 32 bits")
+            raise _error(source, f"its {name} must hold finite numbers of 32 bits")
     return network
 
 
-def _named(
-    what: str, names: tuple[str, ...], about: Mapping[str, Any], source: Any
+def _section(
+    key: str, fields: tuple[str, ...], about: Mapping[str, Any], source: Path | str
 ) -> dict[str, Any]:
-    """What a file says of one thing, by these names."""
-    found = about.get(what)
-    if not isinstance(found, dict) or set(found) != set(names):
-        raise _refused(source, f"its {what} is {found}, and must have {', '.join(names)}")
-    return found
+    """Return a section of a file's JSON, which must have these fields."""
+    section = about.get(key)
+    if not isinstance(section, dict) or set(section) != set(fields):
+        raise _error(source, f"its {key} is {section}, and must have {', '.join(fields)}")
+    return {name: section[name] for name in fields}
 
 
-def check(params: Any) -> Any:
+def check(params: LearnedParams) -> LearnedParams:
     """Return the parameters if they are positive and finite; otherwise raise InputError."""
-    for name in params._fields:
-        errors.check_finite(f"learned.{name}", getattr(params, name), above=0)
+    for name, value in params._asdict().items():
+        errors.check_finite(f"learned.{name}", value, above=0)
     return params
 
 
-def build_law(policy: Policy) -> tuple[str, Law, Any]:
-    """The label of a policy, by its network and digest, its law and parameters.
+def build_law(policy: Policy) -> tuple[str, Law, LearnedParams]:
+    """Return the label of a policy, its law, and its parameters.
 
-    These are of a class of their own, which has no other numbers than the task's. The weights are
-    no parameters: they are constants of the program, and not copied to each world.
+    The label holds the kind of network and a digest of the weights. The parameters have a class of
+    the same name, so that each policy is a law of its own class.
     """
     kind, digest = policy.network.kind, _digest(policy.weights)[:8]
-    name = f"Learned{kind.upper()}_{digest}"
-    own = NamedTuple(name, [(field, Any) for field in _TASK])  # pyright: ignore
-    own.__doc__ = "Parameters of a learned law: what is asked of it."
-    step = partial(networks.step, policy.network, policy.weights)
+    params: type[LearnedParams] = type(f"Learned{kind.upper()}_{digest}", (LearnedParams,), {})
     law = Law(
         partial(networks.init, policy.network),
-        step,
+        partial(networks.step, policy.network, policy.weights),
         "taxels",
         check=check,
         observe_sent=networks.observe_sent,
     )
-    return f"learned_{kind}_{digest}", law, own(**policy.task)
+    return f"learned_{kind}_{digest}", law, params(*policy.task)
