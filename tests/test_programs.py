@@ -136,9 +136,9 @@ def test_every_law_of_the_package_is_known_again_by_its_functions_and_weights():
     gru = laws["learned_gru"]
     network, weights = gru.step.args
     other = weights | {"first.b": weights["first.b"] + 1}
-    changed = gru._replace(step=partial(gru.step.func, network, other))
+    changed = replace(gru, step=partial(gru.step.func, network, other))
     assert programs.identity(changed) != said["learned_gru"]
-    assert programs.identity(gru._replace(init=lambda params: None)) is None
+    assert programs.identity(replace(gru, init=lambda params: None)) is None
 
 
 def test_a_model_of_mjx_is_known_again_by_its_numbers(cache):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -115,7 +116,7 @@ def world_of(family: str) -> tuple[Any, Any, Any]:
         footprint=world.footprint._replace(vertices=corners),
         fields=world.fields._replace(vertices=corners),
     )
-    law = registry.law_of(case.params)._replace(init=lambda _: ())
+    law = replace(registry.law_of(case.params), init=lambda _: ())
     return part.stage, world, trial.start(world, Arrival(), law)
 
 

@@ -4,6 +4,7 @@ import contextlib
 import re
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
@@ -95,7 +96,8 @@ def check_signs(
     return params
 
 
-class Law(NamedTuple, Generic[Params, State, Obs]):
+@dataclass(frozen=True)
+class Law(Generic[Params, State, Obs]):
     """Control law: two pure functions of one world.
 
     A law is static: each law is compiled to its own program. Its parameters are a pytree of

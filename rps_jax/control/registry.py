@@ -12,6 +12,7 @@ import pkgutil
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar, get_args
@@ -118,7 +119,7 @@ def smooth_law(law: Law, temperatures: Smoothing | None = None) -> Law:
 def _smooth_law(law: Law, temperatures: Smoothing) -> Law:
     temperatures.check()
     init, step = (functools.partial(f, temperatures=temperatures) for f in (law.init, law.step))
-    return law._replace(init=init, step=step, smooth=True)
+    return replace(law, init=init, step=step, smooth=True)
 
 
 def register_law(name: str, law: Law, params: LawParams) -> None:

@@ -204,7 +204,7 @@ def recorded_law(law: Law) -> Law:
         memory, twist, details = law.step(params, memory, seen.touch if touch else seen)
         return memory, twist, (details, seen)
 
-    return law._replace(step=step, senses="taxels" if touch else law.senses)
+    return dataclasses.replace(law, step=step, senses="taxels" if touch else law.senses)
 
 
 def steps_of(followed: Trajectory, seen: Any, period: float) -> Iterator[Step]:

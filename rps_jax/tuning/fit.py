@@ -313,7 +313,7 @@ def check_law(label: str, law: Law, setting: Setting) -> None:
 @cache
 def _telling(law: Law) -> Law:
     """The law, with what it observed and the contact's force as its details."""
-    return law._replace(step=partial(_tell, law), senses="force")
+    return dataclasses.replace(law, step=partial(_tell, law), senses="force")
 
 
 def _tell(law: Law, params: Any, memory: Any, seen: Any) -> Any:
