@@ -355,7 +355,7 @@ def test_params_that_mean_nothing_are_refused():
         registry.register_law("p", own, Ahead(v=float("nan")))
     with pytest.raises(InputError, match=r"a field or property d_success"):
         registry.register_law("p", own, (1.0, 2.0))
-    with pytest.raises(InputError, match="the law .rps. has a class of the same name RPSParams"):
+    with pytest.raises(InputError, match="the law 'rps' has a class of the same name RPSParams"):
         registry.register_law("p", own, RPSParams())
     with pytest.raises(InputError, match="params of class Ahead belong to no law"):
         Case("box", FRICTION["S1"], (2.0, 0.0), Ahead())
