@@ -10,8 +10,8 @@
 # %% [markdown]
 # # One push
 #
-# This is the trial of the paper's Fig. 6: the box under the friction set S1, with its target 2 m
-# behind the robot. The fused engine steps it, as it does for `rps push`.
+# This is the trial of the paper's Fig. 6: the box with the friction set S1, and a target 2 m
+# behind the robot. The fused engine simulates it, as in `rps push`.
 
 # %%
 import tempfile
@@ -24,15 +24,15 @@ import rps_jax
 out = Path(tempfile.mkdtemp())
 
 # %% [markdown]
-# ## What the base did, and why
+# ## The motion of the base, and its reasons
 
 # %%
 setting = rps_jax.Setting("fused")
-seen = rps_jax.push("box", target=(-2.0, 0.0), friction="S1", setting=setting, progress=False)
-seen.plot()
+trace = rps_jax.push("box", target=(-2.0, 0.0), friction="S1", setting=setting, progress=False)
+trace.plot()
 
 # %%
-outcome, realigning = seen.outcome, seen.data.realigning
+outcome, realigning = trace.outcome, trace.data.realigning
 entries = int((realigning.diff("time") > 0).sum())
 print(
     f"reached at {outcome.time:.1f} s; mean |l| = {outcome.mean_abs_l:.3f} m; "
@@ -41,36 +41,37 @@ print(
 )
 
 # %% [markdown]
-# The trial has four acts.
+# The trial has four phases.
 #
-# 1. *Approach* (yellow). Nothing is felt; the base creeps forward at 1 cm/s until the skin
+# 1. *Approach* (yellow). Without contact, the base moves forward at 1 cm/s until the skin
 #    touches.
-# 2. *Turning on the edge* (blue, until 43 s). The target lies straight behind, so the base turns
-#    right at once, and the contact runs to the left edge of the front within seconds. There the
-#    law enters the Realignment State: $a_r$ = 10, and all speed goes sideways, after the contact.
-#    One point holds the box, near $l_{cr}$ (dashed), and base and box turn about each other. Since
-#    $\sigma$ is nearly zero so far out, the turn is slow: this act takes a third of the trial.
-# 3. *Pushing home* (43 to 98 s). The box has come round until its side lies flat on the front (the
-#    point becomes a line at 38 s). The contact slides back to 7 cm, below $\beta$; $a_r$ falls to
-#    0.4, and the base drives forward at nearly full speed with a little motion to the left.
-# 4. *Arriving* (from 98 s). Nearer than $d_{th}$ = 0.5 m Eq. 5 gives no more lateral motion: $a_r$
-#    is 0 at once, and the path bends visibly. Speed falls with the distance (Eq. 3), so the last
+# 2. *Turning at the edge* (blue, until 43 s). The target is straight behind, so the base turns
+#    right, and within seconds the contact moves to the left edge of the front. There the law
+#    enters the Realignment State: $a_r$ = 10, and the speed is almost all sideways, after the
+#    contact. The box touches at one point near $l_{cr}$ (dashed), and base and box rotate about
+#    each other. Since $\sigma$ is nearly zero at this offset, the rotation is slow: this phase
+#    takes a third of the trial.
+# 3. *Pushing* (43 to 98 s). The box has rotated until its side is flat on the front (the point
+#    becomes a line at 38 s). The contact offset decreases to 7 cm, below $\beta$; $a_r$ decreases
+#    to 0.4, and the base moves forward at nearly full speed with a little motion to the left.
+# 4. *Arrival* (from 98 s). Within $d_{th}$ = 0.5 m Eq. 5 gives no lateral motion: $a_r$ drops to
+#    0, and the path bends visibly. The speed decreases with the distance (Eq. 3), so the last
 #    half metre takes 23 s, nearly a fifth of the trial.
 #
-# Contact is never lost. The angular velocity changes fast around 4 s because $|l|$ is then at the
-# edge of the critical region, where $\sigma$ of Eq. 10 is zero on one side and turns the base on
-# the other.
+# The contact is never lost. The angular velocity changes fast around 4 s, since $|l|$ is then at
+# the edge of the critical region, where $\sigma$ of Eq. 10 is zero on one side and turns the base
+# on the other.
 #
 # ## The push in pictures
 
 # %%
-seen.stills()
+trace.stills()
 
 # %% [markdown]
-# In the second picture the base has gone round the corner of the box. In the third it stands
-# behind the box, as seen from the target, and from then on it pushes. The film shows the whole
-# trial twelve times as fast; the purple trail is that of the contact point.
+# In the second picture the base has moved around the corner of the box. In the third it is behind
+# the box, as seen from the target, and starts to push. The film shows the whole trial twelve
+# times as fast. The purple line is the path of the contact point.
 
 # %%
-film = seen.film(out / "push.mp4", seconds=10.0, fps=6, size=(480, 270))
+film = trace.film(out / "push.mp4", seconds=10.0, fps=6, size=(480, 270))
 Video(film, embed=True, width=480)

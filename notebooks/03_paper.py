@@ -10,9 +10,9 @@
 # %% [markdown]
 # # The paper's trials, from a run folder
 #
-# The paper simulates 432 trials: three objects, two sets of friction, 24 targets and three
-# laws. This notebook computes nothing; it reads what `rps table` left in `runs/table` (MJX,
-# two processors). Name another folder as `run` to read your own.
+# The paper simulates 432 trials: three objects, two sets of friction, 24 targets and three laws.
+# This notebook only reads the results of `rps table` in `runs/table` (MJX, two processors). Set
+# `run` to read another folder.
 
 # %%
 import drawing
@@ -27,17 +27,18 @@ results = rps_jax.load(run)
 # %% [markdown]
 # ## Table II
 #
-# Successes of 24, with Wilson 95 % intervals in percent, and the paper's counts below ours.
+# Successes of 24 trials, with Wilson 95 % intervals in percent; the paper's counts are below
+# ours.
 
 # %%
 Markdown(tables.markdown(tables.table_ii(results)))
 
 # %% [markdown]
-# RPS reaches every target here. The paper's 127 of 144 lies outside our interval, and so do three
-# of its six cells: the cylinder under both sets of friction, and the nonuniform box under S1. The
-# baselines agree in total, 23 and 8 on both sides, and NPS agrees in every cell too. So the task
-# is as hard without reaction here as there, and only the trials that RPS lost there differ.
-# `sweeps/ambiguities` asks whether the paper's simulator lost them.
+# Here RPS reaches every target. The paper's 127 of 144 is outside our interval, and so are three
+# of its six cells: the cylinder with both sets of friction, and the nonuniform box with S1. The
+# totals of the baselines agree (23 and 8 in the paper), and NPS agrees in every cell. Without
+# reaction the task is therefore as hard here as in the paper, and only the failures of RPS
+# differ. `sweeps/ambiguities` tests whether the paper's simulator caused them.
 
 # %%
 print(tables.summary(results))
@@ -45,59 +46,57 @@ print(tables.summary(results))
 # %% [markdown]
 # ## Maps over the targets: Fig. 5
 #
-# The robot starts in the middle, looking to the right, with the object before it. The colour shows
-# the least distance of the contact to the target, and the number counts successes.
+# The robot starts at the centre, faces right, and has the object in front of it. The colour shows
+# the smallest distance between contact and target, and the number counts successes.
 
 # %%
 figures.min_distance(results)
 
 # %% [markdown]
-# - NPS reaches targets ahead: all but two of its successes lie within 27 degrees of the first
-#   course. Targets beside the robot (x = 0) are missed by nearly as much as they lie to the side:
-#   it hardly turns the object before it loses it.
-# - APS fails near its targets: almost everywhere it comes to within half a metre, and hardly
-#   anywhere to the 5 cm that count.
-# - The maps of RPS have one colour. On this grid nothing but time is left to be improved.
+# - NPS reaches targets ahead: all but two of its successes are within 27 degrees of the initial
+#   heading. It misses targets at the side (x = 0) by nearly their distance, since it loses the
+#   object before the object has turned.
+# - APS fails near its targets: it comes within half a metre almost everywhere, but rarely within
+#   the 5 cm of a success.
+# - The maps of RPS have one colour. On this grid only the time can improve.
 #
-# ## How long a success takes
+# ## Time to success
 
 # %%
 drawing.time_to_success(results, "rps")
 
 # %% [markdown]
-# Straight ahead (dark), a metre takes 20 s: the base does its 0.05 m/s all the way. A target
-# straight behind (yellow) costs 75 to 80 s more than one ahead, whether it is 1 m or 2 m away:
-# that is the price of turning an object that may be lost. Between these, the angle counts for
-# more than the distance, and object and friction matter little.
+# Straight ahead (dark), a metre takes 20 s: the base moves at 0.05 m/s all the way. A target
+# straight behind (yellow) takes 75 to 80 s more than one ahead, at 1 m and at 2 m: the time to
+# turn the object without losing it. In between, the angle matters more than the distance, and
+# object and friction matter little.
 #
-# One trial stands apart: the nonuniform box under S1 with its target 2 m to the right takes 256
-# s, while its mirror image, 2 m to the left, takes 91 s. The box carries its load on the left,
-# and the trial ends 44 s before the horizon. So the 144 of 144 have at least one near miss in
-# them.
+# One trial is an outlier: the nonuniform box with S1 and its target 2 m to the right takes 256 s,
+# while the mirrored target, 2 m to the left, takes 91 s. The load of the box is on the left, and
+# the trial ends 44 s before the horizon. The 144 of 144 therefore have at least one near miss.
 #
-# ## Where the contact sits
+# ## Contact offset
 #
-# The paper sums this up as D, the mean of $|l|$ while pushing [m]. It is averaged here over the
-# successes.
+# The paper's measure is D, the mean of $|l|$ while pushing [m], averaged here over the successes.
 
 # %%
 distance = results.mean_abs_l.where(results.success == 1).mean("target")
 distance.to_series().unstack("law").round(3)
 
 # %% [markdown]
-# RPS lets the contact wander to about 10 cm with a box and 8 cm with a cylinder. That is where Eq.
-# 5 rises, as `01_the_law` shows: the law does not hold the contact in the middle, but where the
-# base begins to follow it. The few successes of the baselines are of easy targets, so their D says
-# little.
+# With RPS the contact moves to about 10 cm for a box and 8 cm for a cylinder. There Eq. 5 rises,
+# as `01_the_law` shows: the law keeps the contact where the base starts to follow it, and not at
+# the centre. The few successes of the baselines have easy targets, so their D is not informative.
 #
 # ## What the paper leaves open, and what we chose
 #
-# Each choice is a parameter, so that another reading is one option away. `rps sweeps/ambiguities`
-# runs the readings one by one: 24 of 27 give 144 of 144 (its page has the table).
+# Each choice is a parameter, so one option selects another interpretation. `rps
+# sweeps/ambiguities` runs the interpretations one by one: 24 of 27 give 144 of 144 (its page has
+# the table).
 #
 # The law:
 #
-# - $\tan\gamma$ beyond $\pm\pi/2$ changes sign and turns the robot away: $\gamma$ is held within
+# - $\tan\gamma$ beyond $\pm\pi/2$ changes sign and turns the robot away: $\gamma$ is clipped to
 #   $\pm 1.56$ rad, and `inf` gives the tangent as printed (`gamma_max`).
 # - The end of the middle region is 0.15 m (`l_mr`).
 # - The adaptive rate while realigning is 10, the value of $\eta$ (`a_r_max`).
@@ -106,25 +105,25 @@ distance.to_series().unstack("law").round(3)
 # - sgn(0) is 0 (`sgn_0`).
 # - A heading error of exactly $\pi$ is wrapped to $-\pi$, so the robot turns right
 #   (`planar.wrap`).
-# - Algorithm 1 prints $v_x$ twice; $(v_x, v_y, \omega)$ is meant (`rps_jax.step`).
-# - When contact is lost during a push, the base drives straight on at 0.01 m/s, as before the
-#   first contact, and $l_{th}$ stays (`v_lost`, `keep_contact`).
+# - Algorithm 1 prints $v_x$ twice; we read $(v_x, v_y, \omega)$ (`rps_jax.step`).
+# - After a loss of contact the base moves straight ahead at 0.01 m/s, as before the first
+#   contact, and $l_{th}$ is unchanged (`v_lost`, `keep_contact`).
 #
 # The rules of a trial:
 #
-# - The approach does not count as lost contact; only what follows the first touch does (`Rules`).
-# - 150 s without contact are meant in all, not at a stretch (`Rules.max_lost`).
+# - The approach does not count as lost contact; only the time after the first contact does
+#   (`Rules`).
+# - The 150 s without contact are a total, and need not be consecutive (`Rules.max_lost`).
 # - $D$ is the mean over the control steps in contact (`Outcome.mean_abs_l`).
-# - An object that falls over ends the trial, as failed, once it leans by 45 degrees
-#   (`Rules.max_tilt`).
+# - A trial fails when its object tilts by 45 degrees (`Rules.max_tilt`).
 # - The control period is 20 ms (`--physics default,control_period=0.02`).
 #
 # Base and skin:
 #
 # - The base is 0.725 m long, with 12 taxels in front, 15 on the left and 15 on the right, of 48.3
 #   mm each (`Robot.half_length`, `Robot.boards`).
-# - The simulated contact sensor has a tolerance of 6 mm (`--skin ideal,tolerance=0.006`), and what
-#   it feels is a point up to the length of one taxel (`point_length`).
+# - The simulated contact sensor has a tolerance of 6 mm (`--skin ideal,tolerance=0.006`), and a
+#   contact up to the length of one taxel is a point (`point_length`).
 # - The capacitive skin has 10 mm of foam, a filter of 50 ms and a threshold of +25 % capacitance
 #   (`CapacitiveSkin`).
 #
@@ -134,21 +133,22 @@ distance.to_series().unstack("law").round(3)
 # - The corner "rear left" of the nonuniform box: left is +y, and rear faces the robot (`--rear`).
 # - The "8 target points at 2.1 m intervals" of the hardware lie on a circle of radius 2.1 m
 #   (`--layout`).
-# - The friction of the hardware was not measured: every pair of ground 0.2, 0.35, 0.5, 0.65 and
-#   robot 0.3, 0.5, 0.7 is run.
+# - The friction of the hardware was not measured: all pairs of ground 0.2, 0.35, 0.5, 0.65 and
+#   robot 0.3, 0.5, 0.7 are run.
 # - The hardware box is pushed on its side of 26 cm (`mjcf/hardware_box.xml`).
 #
 # APS:
 #
-# - It brings the contact point to the target: it aims one object radius beyond, since it is built
-#   for the centre (`aim_beyond`, as in `--law aps,aim_beyond=0`).
+# - It is designed for the object's centre. To bring the contact point to the target, it aims one
+#   object radius beyond (`aim_beyond`, as in `--law aps,aim_beyond=0`).
 # - The radius of a rectangular robot is half its length (`r_robot`).
-# - Its least speed is 0.01 m/s, and an object that moved by less than 1 mm has not moved (`v_min`,
+# - Its smallest speed is 0.01 m/s, and motion of the object below 1 mm is ignored (`v_min`,
 #   `min_motion`).
 #
 # Physics (`Physics`; `mjcf/README.md` gives the reasons):
 #
-# - The solver is Newton's with 8 iterations of 10 line-search steps and a tolerance of 1e-13, the
-#   cone is elliptic, impratio is 10, and steps last 10 ms.
-# - Contacts at the base are as soft as MuJoCo's own; the ground is softer and less damped, since
-#   on MuJoCo's own ground pushed objects hop (`base_solref`, `ground_solref`, `ground_impedance`).
+# - The solver is Newton's, with 8 iterations of 10 line-search steps and a tolerance of 1e-13.
+#   The cone is elliptic, impratio is 10, and the time step is 10 ms.
+# - Contacts at the base are as soft as MuJoCo's default. The ground is softer and less damped,
+#   since pushed objects hop on MuJoCo's default ground (`base_solref`, `ground_solref`,
+#   `ground_impedance`).

@@ -10,12 +10,12 @@
 # %% [markdown]
 # # Tuning the law
 #
-# The paper's parameters were chosen by hand. `RPSParams.tuned()` was found by evolution in three
-# runs of CMA-ES, a coarse one, a fine one, and one with robots that have limits, whose commands
-# stand in `sweeps/random_worlds`; `runs/coarse`, `runs/fine` and `runs/robots` hold their logs.
-# `runs/compare/wide` has both sets of parameters in 1000 worlds that no tuner has seen. One switch
-# was added by hand to what the fine run found: when contact is lost, the tuned law acts upon the
-# last one (`keep_contact`). Only the section about gradients simulates anything.
+# The paper's parameters were chosen by hand. `RPSParams.tuned()` is the result of three runs of
+# CMA-ES: a coarse one, a fine one, and one with robots that have limits. `sweeps/random_worlds`
+# has their commands, and `runs/coarse`, `runs/fine` and `runs/robots` their logs.
+# `runs/compare/wide` has both sets of parameters in 1000 worlds that no tuner has used. After the
+# fine run we set one switch by hand: after a loss, the tuned law uses the last contact
+# (`keep_contact`). Only the section about gradients runs simulations.
 
 # %%
 import json
@@ -36,12 +36,12 @@ from sweeps.gradients import estimators
 
 
 def read_log(run):
-    """What a tuner wrote down of each generation."""
+    """Return a tuner's record of each generation."""
     return [json.loads(line) for line in Path("runs", run, "log.jsonl").read_text().splitlines()]
 
 
 def labelled(log):
-    """Make labelled data of it: variables (generation), and the parameters."""
+    """Return the record as labelled data: variables (generation), and the parameters."""
     names = [name for name in log[0] if name not in ("generation", "params")]
     columns = {name: ("generation", [line[name] for line in log]) for name in names}
     params = [list(line["params"].values()) for line in log]
@@ -53,9 +53,9 @@ def labelled(log):
 # %% [markdown]
 # ## The coarse search
 #
-# Every generation tries 64 candidates in 512 worlds, others in each generation. The mean of the
-# distribution of candidates is then tried in worlds that are kept for validation. Less is better:
-# a success scores its time, and a failure scores one more and how far it missed.
+# Each generation evaluates 64 candidates in 512 new worlds. The mean of the candidates'
+# distribution is then evaluated in separate worlds for validation. The objective is minimised: a
+# success scores its time, and a failure scores 1 plus its remaining distance.
 
 # %%
 log = read_log("coarse")
@@ -63,70 +63,69 @@ names = tuple(log[0]["params"])
 figures.search(labelled(log))
 
 # %% [markdown]
-# In seven generations the objective on the validation worlds halves, from 0.31 to 0.15, and
-# success rises from 86 to 95.5 %. Then the search gets worse again, while by its own measure it
-# gets better: the mean score of the candidates keeps falling, because they become alike (the blue
-# band narrows), far out where the bounded map is flat. $K_v$, $a_r^{max}$ and $d_{th}$ run into
-# the upper ends of what is allowed, 2, 100 and 2. Without worlds for validation this would have
-# gone unnoticed. The fine search begins at generation 6.
+# In seven generations the objective in the validation worlds halves, from 0.31 to 0.15, and
+# success rises from 86 to 95.5 %. Then validation gets worse, while the mean score of the
+# candidates keeps improving: the candidates converge (the blue band narrows) to a region where
+# the bounded map is flat. $K_v$, $a_r^{max}$ and $d_{th}$ reach their upper bounds, 2, 100 and 2.
+# Only the validation worlds reveal this. The fine search starts at generation 6.
 #
 # ## The fine search
 #
-# The fine search has a spread half as wide and a higher price for leaving the start. Time weighs
-# less in its objective, and its worlds are others, so its values cannot be compared with those
-# above.
+# The fine search has half the initial spread and a larger penalty for leaving the start. Time has
+# a smaller weight in its objective, and its worlds are different, so its values cannot be
+# compared with those above.
 
 # %%
 figures.search(labelled(read_log("fine")))
 
 # %% [markdown]
-# Validation falls from 0.164 to 0.117 at generation 7, whose mean was kept. The values jump from
-# one generation to the next, and those of the start (dashed) jump with them: the worlds make them
-# jump, and this is why candidates are compared within a generation only. The gain over the
-# generations before and after the seventh is smaller than such jumps, so another run would end at
-# somewhat other numbers.
+# Validation falls from 0.164 to 0.117 at generation 7, whose mean we chose. The values jump from
+# one generation to the next, and so do those of the start (dashed), since the worlds change.
+# Candidates are therefore compared only within a generation. The seventh generation differs from
+# its neighbours by less than these jumps, so another run would end at slightly different
+# parameters.
 #
 # ## With robots
 #
-# Until here every base followed its twist at once. The third search began with the result of the
-# second, and a third of its worlds had robots with a lag, a bounded acceleration and a bounded
+# Up to here every base followed its twist immediately. The third search started at the result of
+# the second. A third of its worlds had robots with a lag, a bounded acceleration and a bounded
 # force (the domain `real`).
 
 # %%
 figures.search(labelled(read_log("robots")))
 
 # %% [markdown]
-# Validation falls from 0.100 to 0.085 in one generation, success there from 94.3 to 95.8 %, and
-# then nothing is gained for twenty generations: every mean is better than the start, and none is
-# clearly better than another. The last one validated best by a hair and was kept. In test worlds
-# of `real` it wins 96.6 instead of 94.1 %, in `wide` and `hostile` as many as before: it steers a
-# little harder and realigns a little later, and both far less than between the paper's parameters
-# and these.
+# Validation falls from 0.100 to 0.085 in one generation, and success there rises from 94.3 to
+# 95.8 %. The next twenty generations gain nothing: every mean is better than the start, and none
+# is clearly better than another. We chose the last one, which validated best by a small margin.
+# In test worlds of `real` it succeeds in 96.6 instead of 94.1 %, in `wide` and `hostile` equally
+# often. It steers slightly more and realigns slightly later; both changes are much smaller than
+# those from the paper's parameters.
 #
-# ## What changed
+# ## Changed parameters
 
 # %%
 sets = {"paper": RPSParams.paper(), "tuned": RPSParams.tuned()}
-kept = json.loads(Path("runs/robots/tuned.json").read_text())
-assert kept == {name: getattr(sets["tuned"], name) for name in kept}
+tuned = json.loads(Path("runs/robots/tuned.json").read_text())
+assert tuned == {name: getattr(sets["tuned"], name) for name in tuned}
 space = Space(names)
-places = {label: jax.nn.sigmoid(space.vector(params)) for label, params in sets.items()}
-drawing.between_bounds(places, names)
+fractions = {label: jax.nn.sigmoid(space.vector(params)) for label, params in sets.items()}
+drawing.between_bounds(fractions, names)
 
 # %% [markdown]
-# $K_v$, $a_r^{max}$, $K_h$ and $l_{cr}$ moved most; $\beta$ and $\gamma_{max}$ hardly moved. What
-# this means is easier to see in the twist (compare `01_the_law`), here 1 m from the target:
+# $K_v$, $a_r^{max}$, $K_h$ and $l_{cr}$ changed most; $\beta$ and $\gamma_{max}$ changed little.
+# The effect is clearer in the twist (compare `01_the_law`), here 1 m from the target:
 
 # %%
 drawing.twist_field(sets, 1.0)
 
 # %% [markdown]
-# The tuned law has all but given up Eq. 5, which acts only beyond $d_{th}$ = 1.53 m. Nearer to the
-# target it does one of two things: it pushes straight ahead and turns as fast as it may, or,
-# beyond $l_{cr}$ = 18 cm, it slides sideways, without pushing, until the contact is back at 14 cm.
-# The paper's law mixes the two, and leaves the contact where mixing holds it.
+# The tuned law rarely uses Eq. 5, which acts only beyond $d_{th}$ = 1.53 m. Nearer to the target
+# it has two modes. It pushes straight ahead and turns at its maximum rate, or, beyond $l_{cr}$ =
+# 18 cm, it moves sideways without pushing until the contact is back at 14 cm. The paper's law
+# mixes the two, and keeps the contact where they balance.
 #
-# ## The same worlds, twice
+# ## Both laws in the same worlds
 
 # %%
 results = rps_jax.load("runs/compare/wide")
@@ -136,21 +135,21 @@ Markdown(tables.markdown(tables.difference_table(results)))
 drawing.paired(results)
 
 # %% [markdown]
-# The tuned law wins 71 worlds that the paper's parameters lose and loses 6 that they win, which is
-# no accident. Nor is this bought with time. Most worlds lie just below the diagonal: they end a
-# fifth sooner than before. In a second group of worlds the paper's parameters need 150 s and more;
-# the tuned law takes no longer for most of these than for the others, nor for most of the worlds
-# that only it wins. A few worlds became slower (above the diagonal). `04_robustness` shows which
-# objects gained.
+# The tuned law succeeds in 71 worlds where the paper's parameters fail, and fails in 6 where they
+# succeed; this difference is significant. It is not slower, either. Most worlds are just below
+# the diagonal: they end a fifth sooner. In a second group of worlds the paper's parameters need
+# 150 s and more; in most of these the tuned law is as fast as in the others, and so it is in most
+# of the worlds that it alone solves. A few worlds became slower (above the diagonal).
+# `04_robustness` shows which objects gained.
 #
-# ## What a gradient is worth
+# ## Usefulness of gradients
 #
-# Evolution needs no derivative. Does the simulator have useful ones? Here the distance to the
-# target at some time, in the quasi-static model with smooth law and skin, is differentiated with
-# respect to four parameters (in the coordinates of tuning), and averaged over the paper's 24
-# targets: by automatic differentiation (forward mode, which compiles fastest), by central
-# differences, and by antithetic random steps in all four parameters at once. The last two cost
-# equally many trials.
+# Evolution needs no derivatives. Are those of the simulator useful? Here the distance to the
+# target at three times, in the quasi-static model with smooth law and skin, is differentiated
+# with respect to four parameters (in the coordinates of tuning), and averaged over the paper's 24
+# targets. The estimators are automatic differentiation (forward mode, which compiles fastest),
+# central differences, and antithetic random steps in all four parameters at once. The last two
+# use equal numbers of trials.
 
 # %%
 names = ("L", "K_h", "K_v", "beta")
@@ -158,37 +157,36 @@ space = Space(names)
 targets = rps_jax.load("runs/table")[["target_x", "target_y"]].to_dataframe().to_numpy()
 cases = [Case("box", "S1", target, gap=0.004, skin=SmoothSkin()) for target in targets]
 horizons = (1.0, 3.0, 10.0)  # [s]
-distances, starts = estimators.distances(cases, space.params, horizons)  # of all three at once
+distances, starts = estimators.distances(cases, space.params, horizons)  # at all three times
 theta, key = space.vector(RPSParams.paper()), jax.random.key(0)
-found = {
+estimates = {
     "derivative": estimators.forward(distances, theta, starts),
     "differences": estimators.differences(distances, theta, starts, step=0.01),
     "evolution": estimators.evolution(distances, theta, starts, key, sigma=0.15, pairs=4),
 }
-bars = {name: (one.gradient.T, one.variance.T) for name, one in found.items()}
+bars = {name: (e.gradient.T, e.variance.T) for name, e in estimates.items()}
 drawing.estimates(horizons, bars, names)
 
 # %% [markdown]
-# Bars are two standard errors over the targets, so they show how much targets differ as well as
-# how noisy an estimate is. Until 3 s derivatives and differences are equal; evolution agrees,
-# with bars as wide or up to twice as wide. At 10 s this still holds for $K_h$, and nearly for $L$
-# and $K_v$. For $\beta$ the bars of the derivative are three times as wide as those of the
-# differences: in some worlds the derivative has grown far beyond what the parameter does. Rounding
-# decides in which worlds, and by how much: compiled in another way, the bars of $L$ and $K_v$
-# doubled, too. The bars of evolution grow as well, but for every parameter they remain within two
-# and a half times those of the differences.
+# Bars are two standard errors over the targets, so they contain the differences between targets
+# and the noise of an estimate. Up to 3 s derivatives and differences are equal; evolution agrees,
+# with bars up to twice as wide. At 10 s this still holds for $K_h$, and nearly for $L$ and $K_v$.
+# For $\beta$ the bars of the derivative are three times as wide as those of the differences: in
+# some worlds the derivative is much larger than the effect of the parameter. Rounding determines
+# the worlds and the size: another compilation also doubled the bars of $L$ and $K_v$. The bars of
+# evolution grow as well, but for every parameter they stay within two and a half times those of
+# the differences.
 #
-# A success takes some 80 s. So derivatives are good for a short look ahead, and over whole trials
-# the law was tuned by evolution. This is one box, 24 worlds and four parameters, so it is a look
-# and not a benchmark; `sweeps/gradients` has the study.
+# A success takes about 80 s. Derivatives are therefore useful over short horizons, and we tuned
+# the law over whole trials by evolution. With one box, 24 worlds and four parameters, this is an
+# example and not a benchmark; `sweeps/gradients` has the study.
 #
 # ## Gradients and evolution at equal cost
 #
-# So a gradient that is to tune the law looks at windows of 8 s, which begin anywhere in a trial;
-# what is left of the way after a window costs the time of driving it. `runs/race` holds the logs
-# of four runs from the paper's parameters, in the same worlds: evolution and gradients at 2.4
-# million simulated seconds each, half of the run by gradients, and evolution that continued this
-# half.
+# `rps tune grad` therefore uses windows of 8 s, which start at any time of a trial. The cost of
+# the remaining distance after a window is the time to drive it. `runs/race` has the logs of four
+# runs from the paper's parameters, in the same worlds: evolution and gradients with 2.4 million
+# simulated seconds each, half of the run by gradients, and evolution that continued this half.
 
 # %%
 logs = {name: read_log(f"race/{name}") for name in ("evolution", "gradient")}
@@ -196,8 +194,8 @@ logs["gradient, then evolution"] = read_log("race/half") + read_log("race/hybrid
 drawing.races(logs)
 
 # %% [markdown]
-# In one step, gradients come as far as evolution in its first generation, at equal cost; the best
-# parameters of both runs are about equally good in test worlds of `wide` (96.1 and 95.5 %;
-# `sweeps/gradients` has the table). Then gradients find nothing more and steer ever harder,
-# perhaps because 8 s do not show what that does to the contact later. Evolution that starts where
-# they stopped, with a small spread, takes long before it finds better.
+# One step by gradients gains as much as the first generation of evolution, at equal cost. The
+# best parameters of both runs are about equally good in test worlds of `wide` (96.1 and 95.5 %;
+# `sweeps/gradients` has the table). Further steps by gradients gain nothing and steer ever more,
+# perhaps because 8 s do not contain the later effect on the contact. Evolution that continues
+# from there, with a small spread, needs many generations to improve.

@@ -10,9 +10,9 @@
 # %% [markdown]
 # # From a log to a domain to a sweep
 #
-# A robot's log of one push says something of its floor, its box and its drive. Here a simulated
-# push stands for the log: a world of `wide`, whose truth is known. A table `FILE.csv` or a bag
-# takes its place for a robot of your own (`rps fit --help` lists the columns).
+# The log of one push has information about the floor, the object and the drive of the robot. Here
+# the log is simulated, in a world of `wide` whose quantities are known. For your robot, use a
+# table `FILE.csv` or a bag (`rps fit --help` lists the columns).
 
 # %%
 import tempfile
@@ -27,32 +27,33 @@ log = rps_jax.replay(run, 3, progress=False)
 log.plot()
 
 # %% [markdown]
-# ## What the log tells
+# ## Quantities that the log determines
 #
-# `fit` pushes in 384 worlds of the domain and learns to tell a world's quantities from the
-# statistics of its log. Blue is the posterior, grey the 90 % of the prior; a grey histogram is a
-# quantity that the log does not tell. More worlds tell more (6144 by default).
+# `fit` simulates 384 worlds of the domain and learns to estimate a world's quantities from the
+# statistics of its log. Blue is the posterior, grey the central 90 % of the prior; a grey
+# histogram is a quantity that the log does not determine. More worlds determine more (default
+# 6144).
 
 # %%
 fitted = rps_jax.fit(log, domain, worlds=384, window=15.0, setting=setting, progress=False)
 fitted.plot()
 
 # %%
-told = fitted.data.where(fitted.data.undetermined == 0, drop=True)
-for name in told["quantity"].values:
-    one, true = told.sel(quantity=name), truth.coords.get(name)
-    known = "" if true is None else f", in truth {float(true[3]):.3g}"
-    print(f"{name}: {float(one.low):.3g} to {float(one.high):.3g} {one.unit.item()}{known}")
+determined = fitted.data.where(fitted.data.undetermined == 0, drop=True)
+for name in determined["quantity"].values:
+    row, true = determined.sel(quantity=name), truth.coords.get(name)
+    value = "" if true is None else f", in truth {float(true[3]):.3g}"
+    print(f"{name}: {float(row.low):.3g} to {float(row.high):.3g} {row.unit.item()}{value}")
 
 # %% [markdown]
 # ## A sweep in the fitted domain
 #
-# The fitted domain has these intervals as its ranges, and those of `wide` for all else. In the
-# shell it is a file: `rps sweep --domain runs/fit/fitted.json`.
+# The fitted domain has these intervals as its ranges, and those of `wide` for other quantities.
+# The command `rps fit` writes it to a file: `rps sweep --domain runs/fit/fitted.json`.
 
 # %%
-before, after = (
-    rps_jax.sweep("rps", d, worlds=16, setting=setting, progress=False)
-    for d in (domain, fitted.domain)
-)
-print({name: float(found.success.mean()) for name, found in (("wide", before), ("fitted", after))})
+sweeps = {
+    name: rps_jax.sweep("rps", ranges, worlds=16, setting=setting, progress=False)
+    for name, ranges in (("wide", domain), ("fitted", fitted.domain))
+}
+print({name: float(sweep.success.mean()) for name, sweep in sweeps.items()})
