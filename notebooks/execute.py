@@ -1,9 +1,9 @@
-"""Execute the notebooks anew and write them, with their outputs, beside their texts.
+"""Execute the notebooks' texts, and write `.ipynb` files with their outputs.
 
     python notebooks/execute.py [01_the_law ...]
 
-The kernel is the interpreter that runs this, whatever kernels are installed. What is written names
-no machine and no time, so that only cells and results make a difference.
+The kernel is the running interpreter, independent of installed kernels. The files name no machine
+and no time, so that a difference is one of cells or results.
 """
 
 import sys
@@ -19,46 +19,46 @@ from nbformat import NotebookNode
 
 from rps_jax.world import rendering
 
-HERE = Path(__file__).resolve().parent
-TEXTS = tuple(sorted(HERE.glob("[0-9]*.py")))
+FOLDER = Path(__file__).resolve().parent
+TEXTS = tuple(sorted(FOLDER.glob("[0-9]*.py")))
 KERNEL = {"name": "python3", "display_name": "Python 3", "language": "python"}
 
 
 class ThisPython(AsyncKernelManager):
-    """Starts the running interpreter, whatever is asked for."""
+    """Kernel manager that starts the running interpreter for any kernel name."""
 
     @property
     def kernel_spec(self) -> KernelSpec:
-        """Of that interpreter."""
+        """Specification of a kernel of the running interpreter."""
         argv = [sys.executable, "-m", "ipykernel_launcher", "-f", "{connection_file}"]
         return KernelSpec(argv=argv, display_name=KERNEL["display_name"], language="python")
 
 
 def execute(texts: Sequence[Path]) -> list[NotebookNode]:
-    """The notebooks of texts, with their outputs; raises CellExecutionError if a cell fails.
+    """Execute texts and return notebooks with outputs; raise CellExecutionError if a cell fails.
 
-    One kernel executes them all, one after the other, and forgets its names in between: most of the
-    time would go into imports otherwise.
+    One kernel executes them all in sequence and deletes its names in between. Otherwise imports
+    would take most of the time.
     """
     notebooks = [jupytext.read(text) for text in texts]
-    whole = nbformat.v4.new_notebook()
+    joined = nbformat.v4.new_notebook()
     for notebook in notebooks:
-        whole.cells += [nbformat.v4.new_code_cell("%reset -f"), *notebook.cells]
+        joined.cells += [nbformat.v4.new_code_cell("%reset -f"), *notebook.cells]
     NotebookClient(
-        whole,
+        joined,
         kernel_manager_class=ThisPython,
         timeout=600,
         record_timing=False,
-        resources={"metadata": {"path": str(HERE)}},
+        resources={"metadata": {"path": str(FOLDER)}},
     ).execute()
     for notebook in notebooks:
         notebook.metadata = {"jupytext": {"formats": "ipynb,py:percent"}, "kernelspec": KERNEL}
-        _number(notebook)
+        _set_ids(notebook)
     return notebooks
 
 
-def _number(notebook: NotebookNode) -> None:
-    """Name its cells and count those of code, as if it had been executed alone."""
+def _set_ids(notebook: NotebookNode) -> None:
+    """Set the ids of cells and the counts of code cells, as if this notebook ran alone."""
     count = 0
     for i, cell in enumerate(notebook.cells):
         cell.id = f"cell-{i}"
@@ -71,7 +71,7 @@ def _number(notebook: NotebookNode) -> None:
 
 
 def main(names: list[str]) -> None:
-    """Execute the notebooks of these names, by default all."""
+    """Execute the named notebooks, by default all."""
     rendering.choose_gl()  # before the kernel imports MuJoCo for any of them
     texts = [text for text in TEXTS if not names or text.stem in names]
     for text, notebook in zip(texts, execute(texts), strict=True):

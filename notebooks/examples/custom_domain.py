@@ -1,8 +1,8 @@
-"""A domain of one's own: heavy, slippery, tall boxes, and what success depends on there.
+"""Run two laws in a custom domain: heavy, slippery, tall boxes.
 
     python notebooks/examples/custom_domain.py
 
-Ranges that are not named keep those of the domain `wide`.
+All other ranges are those of the domain `wide`.
 """
 
 import rps_jax
@@ -17,13 +17,13 @@ TALL = rps_jax.Domain(
 
 
 def main(worlds: int = 300, horizon: float = 300.0):
-    """Success of the paper's and the tuned parameters, and by the width of the object."""
+    """Print success of the paper's and the tuned parameters, and over the object's width."""
     laws = {"paper": rps_jax.RPSParams.paper(), "tuned": rps_jax.RPSParams.tuned()}
     setting = rps_jax.Setting(rules=rps_jax.Rules(horizon=horizon))
-    found = rps_jax.sweep(laws, TALL, worlds=worlds, setting=setting)
-    print(found.success.mean("world").to_series())
-    print(found.success.groupby_bins("size", 4).mean().to_pandas())
-    return found
+    results = rps_jax.sweep(laws, TALL, worlds=worlds, setting=setting)
+    print(results.success.mean("world").to_series())
+    print(results.success.groupby_bins("size", 4).mean().to_pandas())
+    return results
 
 
 if __name__ == "__main__":

@@ -29,8 +29,8 @@ def step(params, state, obs):
     cos, sin = jnp.cos(obs.yaw), jnp.sin(obs.yaw)
     to_robot = jnp.array([[cos, sin], [-sin, cos]])
     p_robot_target = to_robot @ (obs.p_world_target - obs.p_world_robot)
-    ahead, left = p_robot_target - obs.p_robot_contact
-    error = jnp.arctan2(left, ahead)
+    x, y = p_robot_target - obs.p_robot_contact
+    error = jnp.arctan2(y, x)
     turn = jnp.clip(params.gains.heading * error, -0.15, 0.15)
     omega = jnp.where(obs.in_contact, turn, 0.0)
     return state, Twist(params.v, params.gains.l * details.l, omega), details
@@ -40,12 +40,12 @@ rps_jax.register_law("p_control", rps_jax.Law(lambda params: (), step), PParams(
 
 
 def main(worlds: int = 300, horizon: float = 300.0):
-    """Success of RPS and of this law in the same random worlds."""
+    """Print success of RPS and of this law in the same random worlds."""
     laws = {"rps": rps_jax.RPSParams.paper(), "mine": PParams()}
     setting = rps_jax.Setting(rules=rps_jax.Rules(horizon=horizon))
-    found = rps_jax.sweep(laws, "wide", worlds=worlds, setting=setting)
-    print(found.success.mean("world").to_series())
-    return found
+    results = rps_jax.sweep(laws, "wide", worlds=worlds, setting=setting)
+    print(results.success.mean("world").to_series())
+    return results
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""An object of one's own: an MJCF file, and the outline of what touches.
+"""Push a custom object: an MJCF file, and the outline of its contact surface.
 
     python notebooks/examples/custom_object.py
 
-Once registered, its name works wherever `box` and `cylinder` do, in every engine: in pushes, in
+A registered name is valid wherever `box` and `cylinder` are, in every engine: in pushes, in
 domains, in `PushEnv` and in films.
 """
 
@@ -18,14 +18,14 @@ OUTLINE = 0.2 * np.stack([np.cos(CORNERS), np.sin(CORNERS)], axis=-1)  # (6, 2) 
 
 
 def main(horizon: float = 300.0, engine="fused"):
-    """Push it to targets ahead and to the left; returns the outcomes."""
+    """Push the object to targets ahead and to the left, and return the outcomes."""
     path = Path(__file__).with_name("hexagon.xml")
     rps_jax.register_object("hexagon", path, polygon(OUTLINE))
     targets = [(1.5, 0.5), (1.0, 1.0)]
     setting = rps_jax.Setting(engine, rules=rps_jax.Rules(horizon=horizon))
-    found = rps_jax.table("rps", ["hexagon"], ["S1"], targets, setting=setting)
-    print(found.success.values.ravel(), found.time.values.ravel())
-    return found
+    results = rps_jax.table("rps", ["hexagon"], ["S1"], targets, setting=setting)
+    print(results.success.values.ravel(), results.time.values.ravel())
+    return results
 
 
 if __name__ == "__main__":

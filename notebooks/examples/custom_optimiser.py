@@ -1,8 +1,8 @@
-"""An optimiser of one's own: SciPy's differential evolution over two of the law's parameters.
+"""Tune two parameters of RPS with a custom optimiser: SciPy's differential evolution.
 
     python notebooks/examples/custom_optimiser.py
 
-`rps_jax.evaluate` takes all candidates of a generation at once and gives labelled outcomes.
+`rps_jax.evaluate` runs all candidates of a generation at once and returns labelled outcomes.
 """
 
 from scipy.optimize import differential_evolution
@@ -10,33 +10,33 @@ from scipy.optimize import differential_evolution
 import rps_jax
 
 BOUNDS = {"K_h": (0.2, 2.0), "K_v": (0.05, 0.5)}  # [1], [1/s]
-LAW = rps_jax.RPSParams.paper()
+PARAMS = rps_jax.RPSParams.paper()
 
 
 def setting_of(horizon):
-    """The usual setting, with trials that end after `horizon` [s]."""
+    """Return the default setting, with trials that end after `horizon` [s]."""
     return rps_jax.Setting(rules=rps_jax.Rules(horizon=horizon))
 
 
 def scores(vectors, worlds, horizon):
-    """Score (P,) of vectors (2, P): failures, and the time of the others, less is better."""
-    candidates = rps_jax.stack([LAW] * vectors.shape[1])
+    """Return the cost (P,) of vectors (2, P): 1 for a failure, plus a term for the time."""
+    candidates = rps_jax.stack([PARAMS] * vectors.shape[1])
     candidates = candidates._replace(**dict(zip(BOUNDS, vectors, strict=True)))
-    found = rps_jax.evaluate(candidates, "wide", worlds, setting=setting_of(horizon))
-    return (1 - found.success + 0.1 * found.time / horizon).mean("world").values
+    results = rps_jax.evaluate(candidates, "wide", worlds, setting=setting_of(horizon))
+    return (1 - results.success + 0.1 * results.time / horizon).mean("world").values
 
 
 def main(worlds: int = 64, generations: int = 10, horizon: float = 300.0):
-    """Search, then compare with the paper's parameters in worlds kept for testing."""
-    found = differential_evolution(
+    """Search, and compare with the paper's parameters in test worlds."""
+    optimum = differential_evolution(
         scores, list(BOUNDS.values()), args=(worlds, horizon), maxiter=generations, popsize=8,
         seed=0, vectorized=True, updating="deferred", polish=False,
     )  # fmt: skip
-    best = LAW._replace(**dict(zip(BOUNDS, found.x, strict=True)))
+    best = PARAMS._replace(**dict(zip(BOUNDS, optimum.x, strict=True)))
     setting = setting_of(horizon)
-    tested = rps_jax.evaluate([LAW, best], "wide", 8 * worlds, split="test", setting=setting)
-    print(dict(zip(BOUNDS, found.x, strict=True)), tested.success.mean("world").values)
-    return found.x, tested
+    tested = rps_jax.evaluate([PARAMS, best], "wide", 8 * worlds, split="test", setting=setting)
+    print(dict(zip(BOUNDS, optimum.x, strict=True)), tested.success.mean("world").values)
+    return optimum.x, tested
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""A policy for `PushEnv`, found by evolution strategies: forward simulation and optax, no more.
+"""Train a policy for `PushEnv` by evolution strategies, with forward simulation and optax alone.
 
     python notebooks/examples/train_policy.py
 
-Each iteration tries random changes of the weights, each with its opposite in the same world, and
-moves the weights towards what earned more (Salimans et al., "Evolution strategies as a scalable
-alternative to reinforcement learning", 2017). Prints the mean return after each iteration.
+Each iteration evaluates random perturbations of the weights, each with its opposite in the same
+world, and moves the weights towards higher returns (Salimans et al., "Evolution strategies as a
+scalable alternative to reinforcement learning", 2017). It prints the mean return of each iteration.
 """
 
 from dataclasses import dataclass
@@ -20,60 +20,60 @@ import rps_jax
 
 @dataclass(frozen=True)
 class Options:
-    """What to try, and how often."""
+    """Options of the training."""
 
     iterations: int = 60
     pairs: int = 64
-    """Changes tried in an iteration, each with its opposite."""
+    """Perturbations per iteration, each with its opposite."""
     seconds: float = 10.0
-    """Length of a try [s]."""
+    """Length of an episode [s]."""
     sigma: float = 0.3
-    """Standard deviation of the changes."""
+    """Standard deviation of the perturbations."""
     learning_rate: float = 0.1
     seed: int = 0
 
 
 def policy(weights: dict, obs: jax.Array) -> jax.Array:
-    """The action (3,) for an observation (44,): linear in what is felt and where the target is."""
+    """Compute the action (3,) of an observation (44,), linear in taxels and target direction."""
     taxels, p_robot_target = jnp.tanh(obs[:42]), obs[42:]
     direction = p_robot_target / jnp.linalg.norm(p_robot_target)
     return jnp.tanh(weights["w"] @ jnp.concatenate([taxels, direction]) + weights["b"])
 
 
-def total(env: rps_jax.PushEnv, steps: int, weights: dict, key: jax.Array) -> jax.Array:
-    """Sum of the rewards () of one try."""
+def episode_return(env: rps_jax.PushEnv, steps: int, weights: dict, key: jax.Array) -> jax.Array:
+    """Compute the return () of one episode."""
 
-    def one(state, _):
+    def step(state, _):
         state = env.step(state, policy(weights, state.obs))
         return state, state.reward
 
-    return jax.lax.scan(one, env.reset(key), length=steps)[1].sum()
+    return jax.lax.scan(step, env.reset(key), length=steps)[1].sum()
 
 
 def main(options: Options) -> list[float]:
-    """Train; returns the mean return of each iteration."""
+    """Train, and return the mean return of each iteration."""
     env = rps_jax.PushEnv("random_box", setting=rps_jax.Setting("fused", fidelity="fast"))
     steps = round(options.seconds / env.dt)
     start = {"w": jnp.zeros((3, 44)), "b": jnp.zeros(3)}
     weights, unravel = ravel_pytree(start)
     optimizer = optax.adam(options.learning_rate)
-    attempt = jax.vmap(lambda flat, key: total(env, steps, unravel(flat), key))
+    returns_of = jax.vmap(lambda flat, key: episode_return(env, steps, unravel(flat), key))
 
     @jax.jit
-    def iterate(weights, memory, key):
-        key_change, key_world = jax.random.split(key)
-        change = jax.random.normal(key_change, (options.pairs, weights.size))
-        tries = weights + options.sigma * jnp.concatenate([change, -change])
+    def iterate(weights, state, key):
+        key_noise, key_world = jax.random.split(key)
+        noise = jax.random.normal(key_noise, (options.pairs, weights.size))
+        candidates = weights + options.sigma * jnp.concatenate([noise, -noise])
         worlds = jnp.tile(jax.random.split(key_world, options.pairs), 2)
-        earned = attempt(tries, worlds)
-        better = earned[: options.pairs] - earned[options.pairs :]
-        gradient = -(better / (earned.std() + 1e-6)) @ change / options.pairs
-        update, memory = optimizer.update(gradient, memory)
-        return optax.apply_updates(weights, update), memory, earned.mean()
+        returns = returns_of(candidates, worlds)
+        difference = returns[: options.pairs] - returns[options.pairs :]
+        gradient = -(difference / (returns.std() + 1e-6)) @ noise / options.pairs
+        update, state = optimizer.update(gradient, state)
+        return optax.apply_updates(weights, update), state, returns.mean()
 
-    memory, returns = optimizer.init(weights), []
+    state, returns = optimizer.init(weights), []
     for i, key in enumerate(jax.random.split(jax.random.key(options.seed), options.iterations)):
-        weights, memory, mean = iterate(weights, memory, key)
+        weights, state, mean = iterate(weights, state, key)
         returns.append(float(mean))
         print(f"iteration {i}: mean return {returns[-1]:.3f}")
     return returns

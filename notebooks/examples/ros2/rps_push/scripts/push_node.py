@@ -17,43 +17,45 @@ from std_msgs.msg import Float32MultiArray
 
 # Meaning with unit, and range, of each parameter.
 PARAMETERS = {
-    "v_max": ("greatest speed in any direction [m/s]", 0.0, 1.0),
-    "omega_max": ("greatest turning rate [rad/s]", 0.0, 3.0),
-    "a_max": ("greatest change of the velocity in a second [m/s^2]", 0.01, 10.0),
-    "alpha_max": ("greatest change of the turning rate [rad/s^2]", 0.01, 30.0),
-    "odometry_age": ("silence of odometry that stops the base [s]", 0.01, 0.08),
-    "taxels_age": ("silence of the skin that stops the base [s]", 0.01, 0.08),
-    "target_age": ("silence of the target that stops the base [s]", 0.01, 0.08),
+    "v_max": ("largest speed in any direction [m/s]", 0.0, 1.0),
+    "omega_max": ("largest turning rate [rad/s]", 0.0, 3.0),
+    "a_max": ("largest change of the velocity in a second [m/s^2]", 0.01, 10.0),
+    "alpha_max": ("largest change of the turning rate [rad/s^2]", 0.01, 30.0),
+    "odometry_age": ("time without odometry that stops the base [s]", 0.01, 0.08),
+    "taxels_age": ("time without taxels that stops the base [s]", 0.01, 0.08),
+    "target_age": ("time without target that stops the base [s]", 0.01, 0.08),
 }
 
 
 class PushNode(LifecycleNode):
     def __init__(self) -> None:
         super().__init__("push")
-        usual = Limits()
-        for name, (about, least, most) in PARAMETERS.items():
-            allowed = FloatingPointRange(from_value=least, to_value=most)
-            described = ParameterDescriptor(description=about, floating_point_range=[allowed])
-            self.declare_parameter(name, getattr(usual, name), described)
-        self._timer, self._status, self._heard = None, "", []
+        defaults = Limits()
+        for name, (description, low, high) in PARAMETERS.items():
+            allowed = FloatingPointRange(from_value=low, to_value=high)
+            descriptor = ParameterDescriptor(
+                description=description, floating_point_range=[allowed]
+            )
+            self.declare_parameter(name, getattr(defaults, name), descriptor)
+        self._timer, self._status, self._subscriptions = None, "", []
 
     def on_configure(self, state):
         names = [field.name for field in dataclasses.fields(Limits)]
         limits = Limits(**{name: self.get_parameter(name).value for name in names})
         self._controller = Controller(limits)
         self._twists = self.create_lifecycle_publisher(TwistStamped, "cmd_vel", 1)
-        for kind, topic, heard in (
+        for kind, topic, callback in (
             (Odometry, "odom", self._odometry),
             (Float32MultiArray, "taxels", self._taxels),
             (PointStamped, "target", self._target),
         ):
-            made = self.create_subscription(kind, topic, heard, qos_profile_sensor_data)
-            self._heard.append(made)
+            subscription = self.create_subscription(kind, topic, callback, qos_profile_sensor_data)
+            self._subscriptions.append(subscription)
         return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, state):
         self._controller.reset()
-        self._timer = self.create_timer(0.02, lambda: self._send(self._controller.tick(now())))
+        self._timer = self.create_timer(0.02, lambda: self._send(self._controller.tick(clock())))
         return super().on_activate(state)
 
     def on_deactivate(self, state):
@@ -62,26 +64,26 @@ class PushNode(LifecycleNode):
         return super().on_deactivate(state)
 
     def on_cleanup(self, state):
-        for made in self._heard:
-            self.destroy_subscription(made)
-        self._heard = []
+        for subscription in self._subscriptions:
+            self.destroy_subscription(subscription)
+        self._subscriptions = []
         self.destroy_publisher(self._twists)
         return TransitionCallbackReturn.SUCCESS
 
     def _odometry(self, message):
         pose, q = message.pose.pose, message.pose.pose.orientation
         yaw = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
-        self._controller.odometry(now(), pose.position.x, pose.position.y, yaw)
+        self._controller.odometry(clock(), pose.position.x, pose.position.y, yaw)
 
     def _taxels(self, message):
         expected = self._controller.taxels
         if len(message.data) != expected:
-            said = f"{len(message.data)} taxels instead of {expected}"
-            self.get_logger().error(said, throttle_duration_sec=1.0)
-        self._controller.skin(now(), message.data)
+            error = f"{len(message.data)} taxels instead of {expected}"
+            self.get_logger().error(error, throttle_duration_sec=1.0)
+        self._controller.skin(clock(), message.data)
 
     def _target(self, message):
-        self._controller.target(now(), message.point.x, message.point.y)
+        self._controller.target(clock(), message.point.x, message.point.y)
 
     def _send(self, command):
         message = TwistStamped()
@@ -95,7 +97,7 @@ class PushNode(LifecycleNode):
         self._status = command.status
 
 
-def now() -> float:
+def clock() -> float:
     return time.monotonic()
 
 
