@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from helpers import ROOT, refusal, rps
 
-from rps_jax.app.export import c, folder, graph, js, program
+from rps_jax.app.export import c, folder, js, onnx_model, program
 from rps_jax.control import registry
 from rps_jax.robot import robot as robots
 from rps_jax.robot.skin import SKINS
@@ -311,7 +311,7 @@ def test_javascript_does_what_c_does(name, tmp_path, own):
 def test_onnx_does_what_c_does(name, tmp_path):
     onnx, runtime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
     count, made = 200, program.program(name)
-    model = graph.models(made, "law", count)["law.onnx"]
+    model = onnx_model.models(made, "law", count)["law.onnx"]
     session = runtime.InferenceSession(model, providers=["CPUExecutionProvider"])
     about = {one.key: one.value for one in onnx.load_from_string(model).metadata_props}
     assert json.loads(about["units"])["yaw"] == "[rad] heading of the robot in the world"

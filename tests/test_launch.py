@@ -47,7 +47,7 @@ def folder(tmp_path_factory):
         codes.append(folder / f"{digit}.cubin")
         codes[-1].write_text(digit)
     text = nvrtc.launcher(NAME, codes, [(2, 1, 0, 1), (2, 1, 0, 1)], worlds=8)
-    (folder / "launcher.so").write_bytes(native._binary(text, NAME))
+    (folder / "launcher.so").write_bytes(native._library(text, NAME))
     words = [str(COMPILER), "-O1", "-w", "-shared", "-fPIC", "-Wl,-soname,libcuda.so.1"]
     words += [f"-I{jax.ffi.include_dir()}", str(Path(__file__).with_name("launch.c"))]
     subprocess.run([*words, "-o", str(folder / "libcuda.so.1")], check=True)
@@ -91,7 +91,7 @@ def test_kernels_run_beside_each_other_and_what_follows_waits_for_all(folder):
 
 @pytest.mark.parametrize(("fails", "error"), [
     ("load", "the GPU's driver cannot load a kernel"),
-    ("context", "no GPU is there"),
+    ("context", "no GPU is available"),
     ("stream", "a kernel could not be launched"),
     ("event", "a kernel could not be launched"),
     ("launch", "a kernel could not be launched"),

@@ -9,9 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+<<<<<<< HEAD
 from rps_jax.app.export import c
 from rps_jax.app.export.program import routine
 from rps_jax.engines import device
+=======
+from rps_jax.lowering import c
+from rps_jax.lowering.routine import routine
+from rps_jax.record import provenance
+>>>>>>> d42b8ea (Print scalar C and JavaScript from the graph of SIMD C)
 
 REALS = [0.0, -0.0, 0.5, -1.5, 2.5, 7.0, 1e30, -1e30, np.inf, -np.inf, np.nan]
 BOUNDS = [2147483520.0, -2147483520.0, 2147483648.0, -2147483648.0, -2147483904.0, 3e9]
@@ -44,9 +50,9 @@ def run_c(x, i, folder):
               (("x", x.astype(np.float64)), ("i", i))}  # fmt: skip
     traced = routine("run", lambda x, i: (results(x["x"], i["i"]),), shapes, ["out"])
     tables = {}
-    body = c._computed(traced, {"x": "x->", "i": "i->"}, {"out": "out->"}, tables, "law")
-    groups = {**traced.given, **traced.found}
-    structs = "\n".join(c._struct("law", name, group) for name, group in groups.items())
+    body = c.statements(traced, {"x": "x->", "i": "i->"}, {"out": "out->"}, tables, "law")
+    groups = {**traced.inputs, **traced.outputs}
+    structs = "\n".join(c.struct("law", name, group) for name, group in groups.items())
     real = "double" if x.dtype == np.float64 else "float"
     text = f"""
 #include <math.h>
@@ -64,7 +70,7 @@ void run(int n, const law_x *x, const law_i *i, law_out *out) {{
     flags = ["-std=c99", "-O2", "-w", "-shared", "-fPIC"]
     subprocess.run([COMPILER, *flags, str(source), "-lm", "-o", str(library)], check=True)
     kinds = {"f": x.dtype, "i": np.int32, "b": np.int32}
-    fields = [(one.name, kinds[one.kind], one.shape) for one in traced.found["out"]]
+    fields = [(one.name, kinds[one.kind], one.shape) for one in traced.outputs["out"]]
     out = np.zeros(len(x), np.dtype(fields, align=True))
     pointers = [v.ctypes.data_as(ctypes.c_void_p) for v in (np.ascontiguousarray(x), i, out)]
     ctypes.CDLL(str(library)).run(len(x), *pointers)

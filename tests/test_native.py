@@ -25,11 +25,11 @@ SETTING = Setting()
 @pytest.fixture
 def cache(tmp_path):
     """A cache of its own, and nothing that was compiled before."""
-    before, loaded = jax.config.jax_compilation_cache_dir, dict(native._loaded)
+    before, loaded = jax.config.jax_compilation_cache_dir, dict(native._libraries)
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    native._loaded.clear()
+    native._libraries.clear()
     yield tmp_path / "native"
-    native._loaded.update(loaded)
+    native._libraries.update(loaded)
     jax.config.update("jax_compilation_cache_dir", before)
 
 
@@ -152,7 +152,7 @@ def test_a_compiler_that_fails_is_told_once_and_xla_steps(monkeypatch, tmp_path,
 def test_operations_that_cannot_be_read_are_told_and_xla_steps(monkeypatch, cache):
     monkeypatch.setattr(nodes, "walk", lambda *_: {}["num_consts"])
     run = native.batched(lambda x: 2 * x, lambda x: 3 * x)
-    with pytest.warns(UserWarning, match="no C can be written, so XLA compiles: KeyError"):
+    with pytest.warns(UserWarning, match="the code cannot be printed, so XLA compiles: KeyError"):
         assert jax.jit(run)(jnp.ones(2)).tolist() == [3.0, 3.0]
 
 
@@ -160,7 +160,7 @@ def test_a_gpu_without_a_compiler_is_told(monkeypatch):
     monkeypatch.setattr(native, "target", lambda: None)
     assert not native.is_available()  # a processor without one is a usual thing
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    with pytest.warns(UserWarning, match="a C compiler .* is not here, so XLA compiles"):
+    with pytest.warns(UserWarning, match="a C compiler .* is not installed, so XLA compiles"):
         assert not native.is_available()
     monkeypatch.setenv("RPS_COMPILER", "none")
     assert not native.is_available()  # nor is one who asks for it told
@@ -180,11 +180,11 @@ def test_a_damaged_function_is_dropped_with_one_line(damage, cache, monkeypatch)
     content = kept.read_bytes()
     changed = {"cut": content[:100], "empty": b"", "turned": content[:-1] + b"?"}
     kept.write_bytes(changed[damage])
-    native._loaded.clear()
+    native._libraries.clear()
     with pytest.warns(UserWarning, match="is dropped, and compiled again: its checksum") as told:
         assert made() == expected
     assert len(told) == 1
-    native._loaded.clear()
+    native._libraries.clear()
     assert made() == expected
     assert kept.read_bytes() == content
 

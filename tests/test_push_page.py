@@ -12,9 +12,9 @@ from helpers import ROOT
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 
-from rps_jax.app.export.program import fields_of
 from rps_jax.engines.quasistatic import sliders
 from rps_jax.geometry import solid
+from rps_jax.lowering.routine import fields_of
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.stepper import Live

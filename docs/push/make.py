@@ -19,13 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import __version__
-from rps_jax.app.export import js
-from rps_jax.app.export.program import Group, Routine, fields_of, identifier, routine
 from rps_jax.control import registry, validation
 from rps_jax.control.learned import features
 from rps_jax.control.observation import TaxelObservation, Twist
 from rps_jax.engines import quasistatic
 from rps_jax.engines.base import ControlPeriod
+from rps_jax.lowering import js
+from rps_jax.lowering.routine import Group, Routine, fields_of, identifier, routine
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import NONE
 from rps_jax.runs.push import push
@@ -223,7 +223,7 @@ def scripts() -> str:
         "GAP": Case().gap,
         "RECORDED": json.loads(RECORDED.read_text("utf-8")),
     }
-    told = [f"const {name} = {js.text(value)};" for name, value in numbers.items()]
+    told = [f"const {name} = {js.text_of(value)};" for name, value in numbers.items()]
     return "\n".join([*told, js.HELPERS, *tables.values(), *functions])
 
 

@@ -10,6 +10,7 @@ from rps_jax.app.export import program as programs
 from rps_jax.app.export.program import Program
 from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
+from rps_jax.lowering.routine import identifier
 from rps_jax.record import files, folder
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
@@ -42,10 +43,10 @@ class Export(Question[Path]):
     @property
     def named(self) -> str:
         """What all names begin with."""
-        return self.prefix or programs.identifier(self.program.label)
+        return self.prefix or identifier(self.program.label)
 
     def check(self) -> None:
-        if self.prefix and programs.identifier(self.prefix) != self.prefix:
+        if self.prefix and identifier(self.prefix) != self.prefix:
             raise InputError(
                 f"prefix = {self.prefix} is not allowed: it must be a name of C, as my_law."
             )
@@ -97,9 +98,9 @@ class ExportOnnx(Export):
 
     def texts(self) -> Mapping[str, str | bytes]:
         """The models of the step and of the memory before it."""
-        from rps_jax.app.export import graph
+        from rps_jax.app.export import onnx_model
 
-        return graph.models(self.program, self.named, self.batch)
+        return onnx_model.models(self.program, self.named, self.batch)
 
 
 export_c = call_of(ExportC)

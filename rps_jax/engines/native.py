@@ -1,10 +1,10 @@
-"""Functions of one world, compiled for the lanes of a processor or the threads of a GPU.
+"""Functions of one world that are compiled with a C compiler or NVRTC instead of XLA.
 
-XLA begins every operation on a few worlds anew, which takes longer than the operation. Here the
-same source, as a jaxpr, is one function: see `nodes`; `writer` writes it in C, `threads` in CUDA,
-which `cuda` has compiled. It is kept in the program cache, under a key of its text, the compiler
-and the device, and verified before it is used. Where there is no compiler, in double precision, and
-where a function is differentiated, XLA compiles it, as it does with the device `xla`.
+XLA starts each operation on a few worlds separately, which takes longer than the operation itself.
+Here `lowering` prints a function of one world as one C function with a vector lane for each world,
+or as one CUDA kernel. The compiled library is stored in the program cache, under a key of its
+text, the compiler and the device, with a checksum. XLA compiles the function where there is no
+compiler, in double precision, and where it is differentiated.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import contextlib
 import ctypes
 import functools
 import hashlib
-import math
 import os
 import re
 import subprocess
@@ -21,10 +20,10 @@ import tempfile
 import threading
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -32,142 +31,153 @@ import jax.numpy as jnp
 from rps_jax.engines import device
 from rps_jax.geometry import vectors
 from rps_jax.lowering import gpu_writer, nvrtc, writer
-from rps_jax.lowering.walk import TooLargeError, UnsupportedError
+from rps_jax.lowering.target import TooLargeError, UnsupportedError, size_of
 from rps_jax.record import cache
 
-# A sum is fused with the product before it, as XLA does; nothing else is taken for something else.
+Pytree: TypeAlias = Any  # of arrays; functions of this module take any
+# XLA, too, fuses a sum with the product before it. No other optimisation may change results.
 _FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-w")
 _NAME = "rps_native_"
-_THREADS = 4  # of a GPU that hold a world
-_LACKING = "a C compiler (apt install gcc) or NVRTC (pip install nvidia-cuda-nvrtc) is not here"
+_THREADS = 4  # of a GPU that compute a world
+_NO_COMPILER = (
+    "a C compiler (apt install gcc) or NVRTC (pip install nvidia-cuda-nvrtc) is not installed"
+)
 _PLATFORMS = {"cpu": "cpu", "gpu": "CUDA"}
-_OF_ONE: ContextVar[bool] = ContextVar("rps_jax_of_one_world", default=False)
+_TRACING: ContextVar[bool] = ContextVar("rps_jax_traces_one_world", default=False)
 _warned: set[str] = set()
-_loaded: dict[str, Any] = {}
+_libraries: dict[str, ctypes.CDLL] = {}
 _locks: defaultdict[str, threading.RLock] = defaultdict(threading.RLock)
 
 
 def is_available() -> bool:
-    """Whether functions are compiled here, and not within one that is.
+    """Whether functions are compiled here: with a compiler, in float, and not within another.
 
-    Warns if a GPU does without, which nobody has asked for.
+    Warns if a GPU has no compiler, unless the user chose so by `RPS_COMPILER=none`.
     """
-    if jax.config.jax_enable_x64 or _OF_ONE.get():
+    if jax.config.jax_enable_x64 or _TRACING.get():
         return False
-    found, asked = target(), os.environ.get("RPS_COMPILER")
-    if found is None and asked != "none" and jax.default_backend() == "gpu":
-        warnings.warn(f"{_LACKING}, so XLA compiles, which is much slower", stacklevel=2)
-    return found is not None
+    compiler = target()
+    on_gpu = jax.default_backend() == "gpu"
+    if compiler is None and on_gpu and os.environ.get("RPS_COMPILER") != "none":
+        warnings.warn(f"{_NO_COMPILER}, so XLA compiles, which is much slower", stacklevel=2)
+    return compiler is not None
 
 
 @functools.cache
 def _macros(compiler: str) -> str | None:
-    """Digest of all that a compiler says of itself and of this processor; None: it does not."""
-    words = [compiler, *_FLAGS, "-dM", "-E", "-x", "c", os.devnull]
+    """Return a digest of the compiler's predefined macros for this processor; None: it fails."""
+    command = [compiler, *_FLAGS, "-dM", "-E", "-x", "c", os.devnull]
     with contextlib.suppress(OSError, subprocess.SubprocessError):
-        said = subprocess.run(words, capture_output=True, check=True, timeout=60).stdout
-        return hashlib.sha256(said).hexdigest()
+        macros = subprocess.run(command, capture_output=True, check=True, timeout=60).stdout
+        return hashlib.sha256(macros).hexdigest()
     return None
 
 
 def target() -> str | None:
-    """What tells compilers and devices apart that functions are compiled by and for, if any."""
+    """Return an identifier of the compiler and the device; None without a compiler."""
     if (compiler := device.find_compiler()) is None or (macros := _macros(compiler)) is None:
         return None
     if jax.default_backend() == "cpu":
         return macros
-    return (found := nvrtc.target()) and f"{macros} {found}"
+    return (gpu := nvrtc.target()) and f"{macros} {gpu}"
 
 
-def batched(one: Callable[..., Any], whole: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of a batch of worlds (B, ...), world by world.
+def batched(function: Callable[..., Pytree], whole: Callable[..., Pytree]) -> Callable[..., Pytree]:
+    """Return a function of a batch of worlds (B, ...) that runs world by world.
 
     Args:
-      one: the function of one world; pure.
-      whole: the same of a batch, which XLA compiles where `one` is not compiled here.
+      function: the function of one world; pure.
+      whole: the same function of a batch, which XLA compiles where `function` is not compiled.
     """
-    run = concurrent([one], lambda given: [whole(*given)])
+    run = concurrent([function], lambda arguments: [whole(*arguments)])
     return lambda *arguments: run(arguments)[0]
 
 
 def concurrent(
-    ones: Sequence[Callable[..., Any]],
-    whole: Callable[..., Any],
-    sort_by: Callable[..., Any] | None = None,
-) -> Any:
-    """Functions of batches of worlds, one of each, which a GPU runs at the same time.
+    functions: Sequence[Callable[..., Pytree]],
+    whole: Callable[..., Sequence[Pytree]],
+    sort_by: Callable[..., jax.Array] | None = None,
+) -> Callable[..., Any]:
+    """Return functions of batches of worlds as one function; a GPU runs them at the same time.
 
     Args:
-      ones: the functions of one world; pure.
-      whole: of a tuple of arguments for each of them, all their results; XLA compiles it where
-        `ones` are not compiled here.
-      sort_by: of a batch's arguments, numbers (B,) by which worlds are sorted, so that alike ones
-        are computed side by side. No result depends on it, only how long they take.
+      functions: of one world each; pure.
+      whole: all their results from a tuple of arguments for each; XLA compiles it where
+        `functions` are not compiled.
+      sort_by: returns keys (B,) of a batch's worlds. Worlds with similar keys are computed side by
+        side, which changes only how long it takes.
     """
     if not is_available():
         return whole
 
     @jax.custom_jvp
-    def run(*arguments: Any) -> list[Any]:
-        every = [_Function(*each, sort_by) for each in zip(ones, arguments, strict=True)]
-        calls = [every] if jax.default_backend() == "gpu" else [[each] for each in every]
-        names = [_made(call) for call in calls]
+    def run(*arguments: Pytree) -> list[Pytree]:
+        calls = [_Function(f, x, sort_by) for f, x in zip(functions, arguments, strict=True)]
+        groups = [calls] if jax.default_backend() == "gpu" else [[call] for call in calls]
+        names = [_compiled(group) for group in groups]
         if None in names:
             return list(whole(*arguments))
-        found: list[Any] = []
-        for call, name in zip(calls, names, strict=True):
-            shapes = [x for each in call for x in each.shapes]
-            given = [x for each in call for x in each.leaves]
-            called = jax.ffi.ffi_call(str(name), shapes, vmap_method="broadcast_all")
-            results = iter(called(*given))
-            found += [
-                jax.tree.unflatten(each.structure, [next(results) for _ in each.results])
-                for each in call
+        results: list[Pytree] = []
+        for group, name in zip(groups, names, strict=True):
+            shapes = [x for call in group for x in call.shapes]
+            leaves = [x for call in group for x in call.leaves]
+            call_library = jax.ffi.ffi_call(str(name), shapes, vmap_method="broadcast_all")
+            values = iter(call_library(*leaves))
+            results += [
+                jax.tree.unflatten(call.structure, [next(values) for _ in call.results])
+                for call in group
             ]
-        return found
+        return results
 
     run.defjvp(lambda primals, tangents: jax.jvp(lambda *x: list(whole(*x)), primals, tangents))
     return run
 
 
-class _Function:
-    """A function of one world as a jaxpr, and what a batch of worlds gives it."""
+@contextlib.contextmanager
+def _one_world() -> Iterator[None]:
+    """Trace a function of one world: its reductions are one operation, and nothing is nested."""
+    token = _TRACING.set(True)
+    try:
+        with vectors.reductions_in_one():
+            yield
+    finally:
+        _TRACING.reset(token)
 
-    def __init__(self, one: Callable[..., Any], arguments: Any, sort_by: Any) -> None:
+
+class _Function:
+    """The jaxpr of a function of one world, with the arguments and shapes of a batch."""
+
+    def __init__(
+        self, function: Callable[..., Pytree], arguments: Pytree,
+        sort_by: Callable[..., jax.Array] | None,
+    ) -> None:  # fmt: skip
         self.leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, arguments))
-        self.given = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in self.leaves]
-        token = _OF_ONE.set(True)
-        try:
-            with vectors.reductions_in_one():
-                self.jaxpr, out = jax.make_jaxpr(one, return_shape=True)(
-                    *jax.tree.unflatten(tree, self.given)
-                )
-        finally:
-            _OF_ONE.reset(token)
+        self.inputs = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in self.leaves]
+        with _one_world():
+            world = jax.tree.unflatten(tree, self.inputs)
+            self.jaxpr, out = jax.make_jaxpr(function, return_shape=True)(*world)
         self.results, self.structure = jax.tree.flatten(out)
-        count, self.ordered = len(self.leaves[0]), sort_by is not None
+        count, self.is_sorted = len(self.leaves[0]), sort_by is not None
         if sort_by is not None:
             self.leaves.append(jnp.argsort(sort_by(*arguments)).astype(jnp.int32))
         self.shapes = [jax.ShapeDtypeStruct((count, *x.shape), x.dtype) for x in self.results]
 
 
-def _made(functions: Sequence[_Function]) -> str | None:
-    """The name under which XLA knows functions; None if they cannot be compiled here."""
+def _compiled(functions: Sequence[_Function]) -> str | None:
+    """Compile functions, or load them from the cache; return their name in XLA, or None."""
     on_gpu = jax.default_backend() == "gpu"
-    write = functools.partial(gpu_writer.source, threads=_THREADS) if on_gpu else writer.source
+    source = functools.partial(gpu_writer.source, threads=_THREADS) if on_gpu else writer.source
     try:
         with jax.ensure_compile_time_eval():
-            texts = [write(x.jaxpr, x.given, x.results, x.ordered) for x in functions]
+            texts = [source(x.jaxpr, x.inputs, x.results, x.is_sorted) for x in functions]
     except UnsupportedError as error:
-        _warn_once(
-            f"{str(error).rstrip('.')}. XLA compiles this law, which is some ten times slower"
-        )
+        _warn_once(f"{error} XLA compiles this law, which is some ten times slower.")
         return None
     except (TooLargeError, jax.errors.TracerArrayConversionError):
         return None  # XLA is faster, or the law holds a value that is being traced
-    except Exception as error:  # of a version of JAX that writes its operations otherwise
-        said = f"{type(error).__name__}: {error}"
-        warnings.warn(f"no C can be written, so XLA compiles: {said}", stacklevel=2)
+    except Exception as error:  # a version of JAX with other jaxprs
+        message = f"{type(error).__name__}: {error}"
+        warnings.warn(f"the code cannot be printed, so XLA compiles: {message}", stacklevel=2)
         return None
     key = repr((texts, on_gpu and (nvrtc.LAUNCH, nvrtc.FLAGS), target(), jax.__version__))
     name = _NAME + hashlib.sha256(key.encode()).hexdigest()[:32]
@@ -175,13 +185,13 @@ def _made(functions: Sequence[_Function]) -> str | None:
         if load(name):
             return name
         try:
-            body = _launching(name, texts, functions) if on_gpu else _binary(
+            body = _kernels(name, texts, functions) if on_gpu else _library(
                 texts[0].replace(writer.HANDLER, name), name)  # fmt: skip
         except RuntimeError as error:
-            what, why = error.args
-            warnings.warn(f"{what} fails, so XLA compiles: {why}", stacklevel=2)
+            compiler, reason = error.args
+            warnings.warn(f"{compiler} fails, so XLA compiles: {reason}", stacklevel=2)
             return None
-        cache.write(_place(name), body)
+        cache.write(_cache_path(name), body)
         _register(name, body)
     return name
 
@@ -193,72 +203,72 @@ def _warn_once(message: str) -> None:
         warnings.warn(message, stacklevel=2)
 
 
-def _binary(text: str, name: str) -> bytes:
-    """A library of a text of C.
+def _library(text: str, name: str) -> bytes:
+    """Compile C to a shared library.
 
     Raises:
-      RuntimeError: the compiler, which fails, and why.
+      RuntimeError: the compiler that fails, and its first message.
     """
     with tempfile.TemporaryDirectory() as folder:
-        source, binary = Path(folder) / f"{name}.c", Path(folder) / f"{name}.so"
+        source, library = Path(folder) / f"{name}.c", Path(folder) / f"{name}.so"
         source.write_text(text)
-        words = [str(device.find_compiler()), *_FLAGS, "-shared", "-fPIC"]
-        words += [f"-I{jax.ffi.include_dir()}", str(source), "-o", str(binary), "-lm", "-ldl"]
-        done = subprocess.run(words, capture_output=True, text=True)
-        if done.returncode:
-            said = [*done.stderr.splitlines(), "it does not say why"]
-            raise RuntimeError(words[0], said[0])
-        return binary.read_bytes()
+        command = [str(device.find_compiler()), *_FLAGS, "-shared", "-fPIC"]
+        command += [f"-I{jax.ffi.include_dir()}", str(source), "-o", str(library), "-lm", "-ldl"]
+        process = subprocess.run(command, capture_output=True, text=True)
+        if process.returncode:
+            raise RuntimeError(command[0], [*process.stderr.splitlines(), "no message"][0])
+        return library.read_bytes()
 
 
-def _launching(name: str, texts: Sequence[str], functions: Sequence[_Function]) -> bytes:
-    """A library of kernels and of the function that launches them.
+def _kernels(name: str, texts: Sequence[str], functions: Sequence[_Function]) -> bytes:
+    """Compile kernels, and the library that launches them.
 
     Raises:
-      RuntimeError: the compiler that fails, and why.
+      RuntimeError: the compiler that fails, and its first message.
     """
     shapes = []
-    for each in functions:
-        one, size = next((i, n) for i, x in enumerate(each.given) if (n := math.prod(x.shape)))
-        shapes.append((len(each.leaves), len(each.results), one, size))
+    for function in functions:
+        sizes = [size_of(x.shape) for x in function.inputs]
+        sized = next(i for i, size in enumerate(sizes) if size)
+        shapes.append((len(function.leaves), len(function.results), sized, sizes[sized]))
     with tempfile.TemporaryDirectory() as folder:
-        codes = [Path(folder) / f"{k}.cubin" for k in range(len(texts))]
-        for code, image in zip(codes, nvrtc.images(texts), strict=True):
-            code.write_bytes(image)
-        return _binary(nvrtc.launcher(name, codes, shapes, gpu_writer.WARP // _THREADS), name)
+        paths = [Path(folder) / f"{k}.cubin" for k in range(len(texts))]
+        for path, image in zip(paths, nvrtc.images(texts), strict=True):
+            path.write_bytes(image)
+        return _library(nvrtc.launcher(name, paths, shapes, gpu_writer.WARP // _THREADS), name)
 
 
 def loaded_names() -> list[str]:
-    """Names of all functions that XLA knows by now."""
-    return list(_loaded)
+    """Return the names of all functions that XLA can call."""
+    return list(_libraries)
 
 
 def called_names(program: bytes) -> list[str]:
-    """Names of the functions that a program calls."""
+    """Return the names of the functions that a program calls."""
     return sorted({x.decode() for x in re.findall(rf"{_NAME}[0-9a-f]{{32}}".encode(), program)})
 
 
 def load(name: str) -> bool:
-    """Have XLA know a function that was kept, if it is whole."""
+    """Load a function from the cache and register it with XLA; return whether it is there."""
     with _locks[name]:
-        place = _place(name)
-        if name in _loaded or place is None:
-            return name in _loaded
-        return bool(cache.read(place, "compiled", functools.partial(_register, name)))
+        path = _cache_path(name)
+        if name in _libraries or path is None:
+            return name in _libraries
+        return bool(cache.read(path, "compiled", functools.partial(_register, name)))
 
 
-def _place(name: str) -> Path | None:
-    """Where a compiled function is kept; None if nowhere."""
+def _cache_path(name: str) -> Path | None:
+    """Return the path of a compiled function; None without a cache."""
     folder = jax.config.jax_compilation_cache_dir
     return Path(folder) / "native" / name if folder else None
 
 
 def _register(name: str, body: bytes) -> bool:
     with tempfile.TemporaryDirectory() as folder:
-        binary = Path(folder) / f"{name}.so"
-        binary.write_bytes(body)
-        library = ctypes.CDLL(str(binary))
+        path = Path(folder) / f"{name}.so"
+        path.write_bytes(body)
+        library = ctypes.CDLL(str(path))
     function = jax.ffi.pycapsule(getattr(library, name))
     jax.ffi.register_ffi_target(name, function, platform=_PLATFORMS[jax.default_backend()])
-    _loaded[name] = library
+    _libraries[name] = library
     return True

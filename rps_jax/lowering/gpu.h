@@ -1,7 +1,7 @@
-/* A number of each world of a warp, where THREADS threads hold a world: real numbers (f), whole
-   ones (i), those without a sign (u), and bools (b, 0 or 1). A single number is the same in all
-   threads of its world; of an array, thread t holds the numbers t, t + THREADS, ... All threads of
-   a warp take every turn together. `operations.h` follows. */
+/* A number of each world of a warp, where THREADS threads compute a world: reals (f), signed
+   integers (i), unsigned integers (u), and bools (b, 0 or 1). A single number is the same in all
+   threads of its world. Of an array, thread t stores the elements t, t + THREADS, ... All threads
+   of a warp run each iteration together. `operations.h` follows. */
 
 #ifndef INFINITY
 #define INFINITY __int_as_float(0x7f800000)
@@ -24,15 +24,15 @@ FUNCTION V choose_f(I m, V a, V b) { return m ? a : b; }
 FUNCTION I choose_i(I m, I a, I b) { return m ? a : b; }
 FUNCTION U choose_u(I m, U a, U b) { return m ? a : b; }
 
-/* What takes fewer instructions there, which are slower to fetch than to carry out. */
+/* Forms with fewer instructions: on a GPU, fetching them takes longer than executing them. */
 #if __CUDA_ARCH__ >= 800
 #define OF_A_GPU
 FUNCTION V div_f(V a, V b) { return __fdividef(a, b); }
 #define WITH_NAN(name) \
   FUNCTION V name##_f(V a, V b) { \
-    V found; \
-    asm(#name ".NaN.f32 %0, %1, %2;" : "=f"(found) : "f"(a), "f"(b)); \
-    return found; \
+    V result; \
+    asm(#name ".NaN.f32 %0, %1, %2;" : "=f"(result) : "f"(a), "f"(b)); \
+    return result; \
   }
 WITH_NAN(max)
 WITH_NAN(min)
@@ -47,12 +47,12 @@ FUNCTION V f_of_u(U x) { return (V)x; }
 FUNCTION V f_of_b(I x) { return x ? 1.0f : 0.0f; }
 FUNCTION I i_of_b(I x) { return x; }
 FUNCTION I not_b(I x) { return !x; }
-FUNCTION I whole(V x) { return (I)x; }
+FUNCTION I to_int(V x) { return (I)x; }
 FUNCTION U u_of_f(V x) { return !(x > 0) ? 0u : x < 4294967296.0f ? (U)x : 4294967295u; }
 FUNCTION V bits_f_of_i(I x) { return __int_as_float(x); }
 FUNCTION I bits_i_of_f(V x) { return __float_as_int(x); }
 
-/* What is reduced over the threads of a world, in all of which it is the same then. */
+/* Reductions over the threads of a world; all of them get the same result. */
 #define FOLD(name, kind, type) \
   FUNCTION type name##_over_threads_##kind(type x) { \
     for (int by = THREADS / 2; by; by /= 2) x = name##_##kind(x, __shfl_xor_sync(ALL, x, by)); \

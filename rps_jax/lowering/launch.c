@@ -1,14 +1,14 @@
-/* Launches kernels for XLA, each on a stream of its own, so that they run side by side. What stands
-   before this text and `xla_call.h` defines their number KERNELS, their IMAGES, how many arguments
-   of each are GIVEN and results FOUND, MOST of them and one more, which ONE of its arguments tells
-   the number of worlds, by its SIZE of each, how many WORLDS a block holds, and the NAME of this. */
+/* Launches kernels for XLA concurrently, each on its own stream. The text before defines the number
+   of KERNELS, their IMAGES, the number of INPUTS and OUTPUTS of each, MAX_POINTERS (the largest sum
+   of both, and one), the index of an argument that has numbers (SIZED) and its SIZE per world, the
+   WORLDS of a block, and the NAME of the function that XLA calls. */
 
 #include <dlfcn.h>
 #include <pthread.h>
 
 static const char *const images[KERNELS] = {IMAGES};
-static const int given[KERNELS] = {GIVEN}, found[KERNELS] = {FOUND};
-static const int one[KERNELS] = {ONE}, size[KERNELS] = {SIZE};
+static const int num_inputs[KERNELS] = {INPUTS}, num_outputs[KERNELS] = {OUTPUTS};
+static const int sized[KERNELS] = {SIZED}, size[KERNELS] = {SIZE};
 static void *kernels[KERNELS];
 static int failed;
 static pthread_once_t once = PTHREAD_ONCE_INIT;
@@ -19,18 +19,18 @@ static int (*get_kernel)(void **, void *, const char *);
 static int (*launch)(void *, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned,
                      void *, void **, void **);
 static int (*context_of)(void *, void **), (*push)(void *), (*pop)(void **);
-static int (*make_stream)(void **, unsigned), (*end_stream)(void *);
-static int (*make_event)(void **, unsigned), (*end_event)(void *);
+static int (*create_stream)(void **, unsigned), (*destroy_stream)(void *);
+static int (*create_event)(void **, unsigned), (*destroy_event)(void *);
 static int (*record)(void *, void *), (*await)(void *, void *, unsigned);
 
-static void begin(void) {
+static void load_kernels(void) {
   void *cuda = dlopen("libcuda.so.1", RTLD_NOW);
   struct { void *to; const char *name; } all[] = {
     {&load_library, "cuLibraryLoadData"}, {&get_kernel, "cuLibraryGetKernel"},
     {&launch, "cuLaunchKernel"}, {&context_of, "cuStreamGetCtx"},
     {&push, "cuCtxPushCurrent_v2"}, {&pop, "cuCtxPopCurrent_v2"},
-    {&make_stream, "cuStreamCreate"}, {&end_stream, "cuStreamDestroy_v2"},
-    {&make_event, "cuEventCreate"}, {&end_event, "cuEventDestroy_v2"},
+    {&create_stream, "cuStreamCreate"}, {&destroy_stream, "cuStreamDestroy_v2"},
+    {&create_event, "cuEventCreate"}, {&destroy_event, "cuEventDestroy_v2"},
     {&record, "cuEventRecord"}, {&await, "cuStreamWaitEvent"},
   };
   for (unsigned i = 0; i < sizeof all / sizeof *all; i++)
@@ -42,60 +42,60 @@ static void begin(void) {
   }
 }
 
-/* Launch kernels, the first on a stream and each other beside it; zero, or CUDA's code of an error.
-   What the stream does next waits for all of them. */
+/* Launch the first kernel on a stream and each other on a new stream; return 0, or CUDA's error code.
+   The next work of the stream waits for all of them. */
 static int launch_all(void **arguments, const int64_t *worlds, void *stream) {
-  void *before, *beside[KERNELS], *done[KERNELS];
-  int code = make_event(&before, 2), made = 1;
+  void *started, *streams[KERNELS], *done[KERNELS];
+  int code = create_event(&started, 2), created = 1;
   if (code) return code;
-  code = record(before, stream);
+  code = record(started, stream);
   for (int k = 0; k < KERNELS && !code; k++) {
     void *on = stream, *with[] = {arguments[k]};
     if (k) {
-      if ((code = make_stream(&beside[k], 1)) || (code = make_event(&done[k], 2))) break;
-      made = k + 1;
-      if ((code = await(beside[k], before, 0))) break;
-      on = beside[k];
+      if ((code = create_stream(&streams[k], 1)) || (code = create_event(&done[k], 2))) break;
+      created = k + 1;
+      if ((code = await(streams[k], started, 0))) break;
+      on = streams[k];
     }
     code = launch(kernels[k], (worlds[k] + WORLDS - 1) / WORLDS, 1, 1, 32, 1, 1, 0, on, with, 0);
   }
-  for (int k = 1; k < made; k++) {
-    if (!code) code = record(done[k], beside[k]);
+  for (int k = 1; k < created; k++) {
+    if (!code) code = record(done[k], streams[k]);
     if (!code) code = await(stream, done[k], 0);
-    end_event(done[k]);
-    end_stream(beside[k]);
+    destroy_event(done[k]);
+    destroy_stream(streams[k]);
   }
-  end_event(before);
+  destroy_event(started);
   return code;
 }
 
-static XLA_FFI_Error *say(XLA_FFI_CallFrame *frame, const char *what) {
-  XLA_FFI_Error_Create_Args args = {sizeof args, 0, what, XLA_FFI_Error_Code_INTERNAL};
+static XLA_FFI_Error *error_of(XLA_FFI_CallFrame *frame, const char *message) {
+  XLA_FFI_Error_Create_Args args = {sizeof args, 0, message, XLA_FFI_Error_Code_INTERNAL};
   return frame->api->XLA_FFI_Error_Create(&args);
 }
 
 XLA_FFI_Error *NAME(XLA_FFI_CallFrame *frame) {
-  if (is_told(frame)) return 0;
-  pthread_once(&once, begin);
-  if (failed) return say(frame, "the GPU's driver cannot load a kernel");
-  XLA_FFI_Stream_Get_Args asked = {sizeof asked, 0, frame->ctx, 0};
-  XLA_FFI_Error *error = frame->api->XLA_FFI_Stream_Get(&asked);
+  if (answers_version(frame)) return 0;
+  pthread_once(&once, load_kernels);
+  if (failed) return error_of(frame, "the GPU's driver cannot load a kernel");
+  XLA_FFI_Stream_Get_Args stream = {sizeof stream, 0, frame->ctx, 0};
+  XLA_FFI_Error *error = frame->api->XLA_FFI_Stream_Get(&stream);
   if (error) return error;
   void *context, *last;
-  if (context_of(asked.stream, &context) || push(context)) return say(frame, "no GPU is there");
-  int64_t room[KERNELS][MOST], worlds[KERNELS];
+  if (context_of(stream.stream, &context) || push(context)) return error_of(frame, "no GPU is available");
+  int64_t pointers[KERNELS][MAX_POINTERS], worlds[KERNELS];
   void *arguments[KERNELS], **args = frame->args.args, **rets = frame->rets.rets;
   for (int k = 0; k < KERNELS; k++) {
     int n = 0;
-    worlds[k] = worlds_of(args[one[k]], size[k]);
-    for (int i = 0; i < given[k]; i++)
-      room[k][n++] = (int64_t)((XLA_FFI_Buffer *)*args++)->data;
-    for (int i = 0; i < found[k]; i++)
-      room[k][n++] = (int64_t)((XLA_FFI_Buffer *)*rets++)->data;
-    room[k][n] = worlds[k];
-    arguments[k] = room[k];
+    worlds[k] = count_worlds(args[sized[k]], size[k]);
+    for (int i = 0; i < num_inputs[k]; i++)
+      pointers[k][n++] = (int64_t)((XLA_FFI_Buffer *)*args++)->data;
+    for (int i = 0; i < num_outputs[k]; i++)
+      pointers[k][n++] = (int64_t)((XLA_FFI_Buffer *)*rets++)->data;
+    pointers[k][n] = worlds[k];
+    arguments[k] = pointers[k];
   }
-  int code = launch_all(arguments, worlds, asked.stream);
+  int code = launch_all(arguments, worlds, stream.stream);
   pop(&last);
-  return code ? say(frame, "a kernel could not be launched") : 0;
+  return code ? error_of(frame, "a kernel could not be launched") : 0;
 }

@@ -1,9 +1,9 @@
-"""A pure function of one world as C, in which 8 or 16 worlds are computed at once, a lane each.
+"""Graph of arrays that C and CUDA are printed from, and the target that builds it.
 
-Values are arrays of vectors, a lane for each world. What works number by number on arrays of one
-size stands in one loop over their numbers; a loop that ends when a condition fails goes on until it
-has failed in every lane, and a lane in which it has is left as it is. So a world's numbers do not
-depend on the other lanes.
+`Node` is an array and the operation that computes it, `LoopNode` a loop, `Array` a view of a node.
+`SimdNodes` builds the graph of a pure function of one world. In C each number is a vector with a
+lane for each of 8 or 16 worlds. A `while` loop runs until its condition fails in all lanes, and
+masks the lanes that have finished, so the results of a world do not depend on other worlds.
 """
 
 from __future__ import annotations
@@ -11,92 +11,109 @@ from __future__ import annotations
 import functools
 import itertools
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jax.extend.core import ClosedJaxpr
 
-from rps_jax.lowering.walk import (
-    PAIRED,
+from rps_jax.lowering.target import (
+    REDUCTIONS,
+    Body,
+    Params,
     Target,
     TooLargeError,
+    Typed,
     UnsupportedError,
+    Value,
     is_constant,
     kind_of,
-    walk,
+    size_of,
 )
+from rps_jax.lowering.walk import walk
 
-_HERE = Path(__file__).parent
-OPERATIONS = (_HERE / "operations.h").read_text()
-PRELUDE = (_HERE / "xla_call.h").read_text()
-HEADER = PRELUDE + (_HERE / "simd.h").read_text() + OPERATIONS
-THREADS = (_HERE / "gpu.h").read_text() + OPERATIONS
-# Kinds of numbers for which each macro of the header writes an operation.
-_WRITTEN = {"INFIX": "fiu", "COMPARE": "fiub", "BITS": "iub", "EACH": "f", "EACH_OF_TWO": "f"}
-_KNOWN = set(re.findall(r"^FUNCTION \w+ (\w+)\(", HEADER, re.M)) | {
+_FOLDER = Path(__file__).parent
+_OPERATIONS = (_FOLDER / "operations.h").read_text()
+XLA_CALL = (_FOLDER / "xla_call.h").read_text()
+SIMD_HEADER = XLA_CALL + (_FOLDER / "simd.h").read_text() + _OPERATIONS
+GPU_HEADER = (_FOLDER / "gpu.h").read_text() + _OPERATIONS
+# Kinds of numbers for which each macro of the headers defines an operation.
+_MACROS = {"INFIX": "fiu", "COMPARE": "fiub", "BITS": "iub", "EACH": "f", "EACH_OF_TWO": "f"}
+OPERATIONS = frozenset(re.findall(r"^FUNCTION \w+ (\w+)\(", SIMD_HEADER, re.M)) | {
     f"{name}_{kind}"
-    for macro, kinds in _WRITTEN.items()
-    for name in re.findall(rf"^{macro}\((\w+)", HEADER, re.M)
+    for macro, kinds in _MACROS.items()
+    for name in re.findall(rf"^{macro}\((\w+)", SIMD_HEADER, re.M)
     for kind in kinds
 }
-# Where a reduction begins, by its operation and kind.
-STARTS = {
+# Initial value of a reduction, by its operation and kind.
+INITIAL = {
     **{("add", "f"): 0.0, ("add", "i"): 0, ("max", "f"): -np.inf, ("min", "f"): np.inf},
     **{("max", "i"): -(2**31), ("min", "i"): 2**31 - 1, ("and", "b"): True, ("or", "b"): False},
 }
-_MOST_PRODUCTS = 256  # of numbers, in one product of matrices
 _DTYPES = {"f": "float32", "i": "int32", "u": "uint32", "b": "bool"}
+# Operations that are not computed in a loop over their numbers.
+_SINGLE = ("move", "take", "while", "for", "if", "input", "part", "product")
 
 
 @dataclass(eq=False)
 class Node:
-    """An array of vectors, and how its numbers are made; or a loop, which makes several."""
+    """An array of numbers and the operation that computes it."""
 
     number: int
     op: str
-    args: tuple[Any, ...]  # of `Array` and constants
+    args: tuple[Value, ...]  # `Array` and constants
     kind: str
     size: int
-    extra: Any = None
-    inner: tuple[Node, ...] = ()  # of a loop: what it computes, in any order that suits
-    free: tuple[Node, ...] = ()  # of a loop: what it takes from outside
+    extra: Any = None  # static parameter of the operation
+    free: tuple[Node, ...] = ()  # nodes that it needs beside its operands
 
     @property
     def name(self) -> str:
-        """In C."""
+        """Variable in the printed code."""
         return f"v{self.number}"
 
     @property
-    def after(self) -> Iterable[Node]:
-        """What must be there before it is."""
+    def needed(self) -> Iterable[Node]:
+        """Nodes that must be computed before it."""
         return itertools.chain((a.node for a in self.args if isinstance(a, Array)), self.free)
 
     @property
     def width(self) -> int:
-        """How many numbers it holds."""
+        """Number of elements that it stores."""
         return 1 if self.op.startswith("fold") else self.size
 
     @property
-    def alone(self) -> bool:
-        """Whether it stands in no loop over its numbers."""
-        return self.size < 2 or self.op in ("move", "take", "while", "for", "given", "part")
+    def is_single(self) -> bool:
+        """Whether it is printed outside of the loops over elements."""
+        return self.size < 2 or self.op in _SINGLE
 
     @functools.cached_property
-    def entire(self) -> set[Node]:
-        """Of these what must be there with all its numbers, not only the one in turn."""
+    def whole(self) -> set[Node]:
+        """Nodes of which all elements must be computed before its first element."""
         arrays = [a for a in self.args if isinstance(a, Array)]
-        in_turn = set() if self.alone else {a.node for a in arrays if self.in_turn(a)}
-        return {a.node for a in arrays} - in_turn | set(self.free)
+        in_step = set() if self.is_single else {a.node for a in arrays if self.is_in_step(a)}
+        return {a.node for a in arrays} - in_step | set(self.free)
 
-    def in_turn(self, a: Array) -> bool:
-        """Whether it takes the numbers of an array one by one as it makes its own."""
+    def is_in_step(self, a: Array) -> bool:
+        """Whether element `i` of this node reads element `i` of a node."""
         return a.step == 1 and a.first == 0 and a.node.width == self.size
 
 
+@dataclass(eq=False)
+class LoopNode(Node):
+    """A loop, or a conditional block: its operands are the initial values of its carry."""
+
+    carried: tuple[Node, ...] = ()
+    results: tuple[Value, ...] = ()  # carry after one iteration
+    condition: Value = None  # of a `while` loop or an `if`
+    length: int | None = None  # iterations of a `for` loop
+    inner: tuple[Node, ...] = ()  # nodes that it computes, in any order that suits
+
+
 class Array(NamedTuple):
-    """Numbers of a node: from the `first` on, or that one again and again (`step` 0)."""
+    """View of a node: elements from `first` on (`step` 1), or one element repeated (`step` 0)."""
 
     node: Node
     first: int
@@ -104,89 +121,87 @@ class Array(NamedTuple):
     shape: tuple[int, ...]
 
     @property
-    def dtype(self) -> Any:
-        """As JAX has it."""
+    def dtype(self) -> np.dtype:
+        """Type of the numbers in JAX."""
         return np.dtype(_DTYPES[self.node.kind])
 
 
-class Loop(NamedTuple):
-    """What a loop carries."""
-
-    carried: tuple[Node, ...]
-    results: tuple[Any, ...]  # what they become in one turn
-    holds: Any  # whether it goes on
-    length: int | None  # how often, if that is known
-
-
-def size_of(shape: Sequence[int]) -> int:
-    """How many numbers."""
-    return int(np.prod(shape, dtype=int))
-
-
 class SimdNodes(Target):
-    """The target of a jaxpr of one world: nodes, of which equal ones are one."""
+    """Target that builds the graph of a function of one world; equal nodes are shared."""
 
     compiler = "the native compiler"
     kinds = "fibu"
+    operations = OPERATIONS
+    max_products = 256  # multiplications in one product of matrices
 
     def __init__(self) -> None:
-        """Begin without nodes."""
-        self._count = itertools.count()
-        self._known: list[dict[Any, Node]] = [{}]
+        self._numbers = itertools.count()
+        self._known: list[dict[Hashable, Node]] = [{}]  # of each loop that is being built
 
-    def node(self, op: str, args: Sequence[Any], kind: str, size: int, extra: Any = None) -> Node:
-        """The node of an operation, new or known."""
-        key = (op, tuple(map(_key, args)), kind, size, extra)
+    def node(self, op: str, args: Sequence[Value], kind: str, size: int, extra: Any = None) -> Node:
+        """Return the node of an operation, a new one or an equal one."""
+        key = (op, tuple(map(key_of, args)), kind, size, extra)
         for known in self._known:
             if key in known:
                 return known[key]
-        made = Node(next(self._count), op, tuple(args), kind, size, extra)
-        self._known[-1][key] = made
-        return made
+        node = Node(next(self._numbers), op, tuple(args), kind, size, extra)
+        self._known[-1][key] = node
+        return node
 
-    def given(self, place: int, shape: tuple[int, ...], dtype: Any) -> Array:
-        """An argument."""
-        kind, size = kind_in(dtype, "an argument"), size_of(shape)
-        return Array(self.node("given", (), kind, size, place), 0, 1, shape)
+    def kind(self, dtype: object, name: str) -> str:
+        """Return the kind of a dtype of 4 bytes.
 
-    def moved(self, values: Sequence[Any], places: np.ndarray, like: Any) -> Any:
-        """Numbers at other places: a view of a node where that is all."""
+        Raises:
+          UnsupportedError: the target has no such numbers.
+        """
+        kind = kind_of(dtype, name, self.kinds)
+        if np.dtype(_DTYPES[kind]).itemsize != getattr(dtype, "itemsize", 0):
+            raise UnsupportedError(f"{name} of {dtype}")
+        return kind
+
+    def input(self, index: int, shape: tuple[int, ...], dtype: object) -> Array:
+        """Return an argument of the function."""
+        kind, size = self.kind(dtype, "an argument"), size_of(shape)
+        return Array(self.node("input", (), kind, size, index), 0, 1, shape)
+
+    def source(self, value: Value, index: int) -> Value:
+        """Return one number of a value."""
+        return element(value, index)
+
+    def moved(self, values: Sequence[Value], indices: np.ndarray, like: Typed) -> Value:
+        """Gather numbers at constant indices: a view of a node where that suffices."""
         starts = np.cumsum([0, *(size_of(np.shape(v)) for v in values)])
-        flat = places.reshape(-1)
-        if not flat.size:
-            return np.zeros(places.shape, like.dtype)
-        which = np.searchsorted(starts, flat, "right") - 1
-        sources = [_pick(values[i], int(at - starts[i])) for i, at in zip(which, flat, strict=True)]
-        if all(not isinstance(one, Array) for one in sources):
-            return np.asarray(sources, like.dtype).reshape(places.shape)
-        one, two = sources[0], sources[min(1, len(sources) - 1)]
-        if all(isinstance(s, Array) and s.node is one.node for s in sources):
+        flat_indices = indices.reshape(-1)
+        if not flat_indices.size:
+            return np.zeros(indices.shape, like.dtype)
+        which = np.searchsorted(starts, flat_indices, "right") - 1
+        sources = [
+            self.source(values[i], int(at - starts[i]))
+            for i, at in zip(which, flat_indices, strict=True)
+        ]
+        if all(not isinstance(x, Array) for x in sources):
+            dtype = None if isinstance(like, Array) else like.dtype
+            return np.asarray(sources, dtype).reshape(indices.shape)
+        first, second = sources[0], sources[min(1, len(sources) - 1)]
+        if all(isinstance(s, Array) and s.node is first.node for s in sources):
             firsts = np.array([s.first for s in sources])
-            step = two.first - one.first
-            if step in (0, 1) and (firsts == one.first + step * np.arange(len(firsts))).all():
-                return Array(one.node, one.first, step if len(firsts) > 1 else 1, places.shape)
-        made = self.node("move", sources, kind_in(like.dtype, "move"), flat.size)
-        return Array(made, 0, 1, places.shape)
+            step = second.first - first.first
+            if step in (0, 1) and (firsts == first.first + step * np.arange(len(firsts))).all():
+                step = step if len(firsts) > 1 else 1
+                return Array(first.node, first.first, step, indices.shape)
+        node = self.node("move", sources, self.kind(like.dtype, "move"), flat_indices.size)
+        return Array(node, 0, 1, indices.shape)
 
-    def emit(self, name: str, values: Sequence[Any], params: Mapping[str, Any], out: Any) -> Any:
-        """Apply a primitive."""
-        kind, size = kind_in(out.dtype, name), size_of(out.shape)
-        first = kind_in(values[0].dtype, name)
-        if not size:
-            return np.zeros(out.shape, out.dtype)
-        if name in PAIRED and "axes" in params:
-            return self._folded(PAIRED[name], values[0], params["axes"], kind, out)
+    def apply(self, name: str, values: Sequence[Value], params: Params, out: Typed) -> Value:
+        """Apply a primitive element by element, or as a reduction, a product or a slice."""
+        kind, first = self.kind(out.dtype, name), self.kind(values[0].dtype, name)
+        if name in REDUCTIONS:
+            return self._reduced(REDUCTIONS[name], values[0], params["axes"], kind, out)
         if name == "dynamic_slice":
             return self._slice(values[0], values[1:], params["slice_sizes"], kind)
-        if name in ("argmax", "argmin"):
-            return self._furthest(name, values[0], params["axes"][0], out)
         if name == "dot_general":
             return self._product(values[0], values[1], params["dimension_numbers"], out)
-        if name == "clamp":
-            return self.emit("min", [self.emit("max", values[1::-1], {}, out), values[2]], {}, out)
-        if name == "integer_pow":
-            return self._power(values[0], params["y"], out)
-        if name == "select_n" and first == "b" and len(values) == 3:
+        if name == "select_n":
             op, values = f"choose_{kind}", [values[0], values[2], values[1]]
         elif name == "convert_element_type":
             if first == kind:
@@ -198,253 +213,214 @@ class SimdNodes(Target):
             op = "rint_f"
         else:
             op = f"{name}_{first}"
-        if op not in _KNOWN:
+        if op not in self.operations:
             raise UnsupportedError(name)
-        return self._made(op, values, kind, out.shape)
+        return self._elementwise(op, values, kind, out.shape)
 
-    def _made(self, op: str, values: Sequence[Any], kind: str, shape: tuple[int, ...]) -> Array:
+    def _elementwise(
+        self, op: str, values: Sequence[Value], kind: str, shape: tuple[int, ...]
+    ) -> Array:
         size, args = size_of(shape), []
         for value in values:
-            mine = np.shape(value)
-            if mine != shape and size_of(mine) > 1:
-                places = np.broadcast_to(np.arange(size_of(mine)).reshape(mine), shape)
-                value = self.moved([value], places, value)
+            own_shape = np.shape(value)
+            if own_shape != shape and size_of(own_shape) > 1:
+                indices = np.arange(size_of(own_shape)).reshape(own_shape)
+                value = self.moved([value], np.broadcast_to(indices, shape), value)
             args.append(flat(value, size))
         return Array(self.node(op, args, kind, size), 0, 1, shape)
 
-    def _power(self, x: Any, y: int, out: Any) -> Any:
-        """A whole power by repeated squaring, as XLA takes it."""
-        found, square, left = None, x, abs(y)
-        while left:
-            if left & 1:
-                found = square if found is None else self.emit("mul", [found, square], {}, out)
-            left >>= 1
-            square = self.emit("mul", [square, square], {}, out) if left else square
-        one = np.ones(out.shape, out.dtype)
-        found = one if found is None else found
-        return self.emit("div", [one, found], {}, out) if y < 0 else found
-
-    def _folded(self, pair: str, value: Any, axes: Sequence[int], kind: str, out: Any) -> Any:
-        """A reduction: of all numbers beside what else loops over them, else row by row."""
+    def _reduced(
+        self, binary: str, value: Value, axes: Sequence[int], kind: str, out: Typed
+    ) -> Value:
+        """Reduce all elements in one loop that other nodes share, or some axes row by row."""
         shape = np.shape(value)
-        if len(axes) == len(shape) and size_of(shape) > 1 and (pair, kind) in STARTS:
-            size, op = size_of(shape), f"fold {pair}_{kind}"
+        if len(axes) == len(shape) and size_of(shape) > 1 and (binary, kind) in INITIAL:
+            size, op = size_of(shape), f"fold {binary}_{kind}"
             return Array(self.node(op, [flat(value, size)], kind, size), 0, 0, ())
-        kept = [i for i in range(len(shape)) if i not in axes]
-        places = np.transpose(np.arange(size_of(shape)).reshape(shape), [*axes, *kept])
-        rows = places.reshape(-1, *out.shape)
-        found = self.moved([value], rows[0], out)
+        rest = [i for i in range(len(shape)) if i not in axes]
+        indices = np.transpose(np.arange(size_of(shape)).reshape(shape), [*axes, *rest])
+        rows = indices.reshape(-1, *out.shape)
+        result = self.moved([value], rows[0], out)
         for row in rows[1:]:
-            found = self.emit(pair, [found, self.moved([value], row, out)], {}, out)
-        return found
+            result = self.emit(binary, [result, self.moved([value], row, out)], {}, out)
+        return result
 
-    def _furthest(self, name: str, value: Any, axis: int, out: Any) -> Any:
-        """The first place of the greatest or least of an axis, or of the first that is none."""
-        shape = np.shape(value)
-        rows = np.moveaxis(np.arange(size_of(shape)).reshape(shape), axis, 0)
-        like, yes = np.empty(out.shape, value.dtype), np.empty(out.shape, bool)
-        best, found = self.moved([value], rows[0], like), np.zeros(out.shape, out.dtype)
-        for k, row in enumerate(rows[1:], 1):
-            one = self.moved([value], row, like)
-            better = self.emit("gt" if name == "argmax" else "lt", [one, best], {}, yes)
-            if value.node.kind == "f":
-                lost = self.emit("eq", [best, best], {}, yes)
-                none = self.emit("and", [self.emit("ne", [one, one], {}, yes), lost], {}, yes)
-                better = self.emit("or", [better, none], {}, yes)
-            best = self.emit("select_n", [better, best, one], {}, like)
-            at = np.full(out.shape, k, out.dtype)
-            found = self.emit("select_n", [better, found, at], {}, out)
-        return found
-
-    def _product(self, left: Any, right: Any, dimensions: Any, out: Any) -> Any:
-        """A product of matrices: of one, rows at a time, sums over the numbers of the other."""
-        (of_left, of_right), (with_left, with_right) = dimensions
+    def _product(self, left: Value, right: Value, dimensions: Any, out: Typed) -> Value:
+        """Multiply matrices: sums over the rows of one, elementwise over those of the other."""
+        (left_sum, right_sum), (left_batch, right_batch) = dimensions
         sides = [
-            (left, _rows(left, with_left, of_left)),
-            (right, _rows(right, with_right, of_right)),
+            (left, matrix_indices(left, left_batch, left_sum)),
+            (right, matrix_indices(right, right_batch, right_sum)),
         ]
-        sizes = [places.shape[1] for _, places in sides]
-        if size_of(out.shape) * sides[0][1].shape[2] > _MOST_PRODUCTS:
+        sizes = [indices.shape[1] for _, indices in sides]
+        if size_of(out.shape) * sides[0][1].shape[2] > self.max_products:
             raise TooLargeError("XLA compiles large products of matrices to faster code.")
-        # In one loop goes what is constant, else the longer.
-        known = [is_constant(value) for value, _ in sides]
-        long = known.index(True) if any(known) else int(sizes[1] > sizes[0])
-        (many, ways), (few, single) = sides[long], sides[1 - long]
+        # Elementwise over the constant matrix, else over the longer one.
+        constant = [is_constant(value) for value, _ in sides]
+        long = constant.index(True) if any(constant) else int(sizes[1] > sizes[0])
+        (many, many_indices), (few, few_indices) = sides[long], sides[1 - long]
         like = np.empty(sizes[long], out.dtype)
         parts = []
-        for batch, turn in np.ndindex(*single.shape[:2]):
-            found = None
-            for k in range(single.shape[2]):
+        for batch, row in np.ndindex(*few_indices.shape[:2]):
+            total = None
+            for k in range(few_indices.shape[2]):
                 pair = [
-                    self._at(many, ways[batch, :, k], like),
-                    self._at(few, np.full(like.shape, single[batch, turn, k]), like),
+                    self._at(many, many_indices[batch, :, k], like),
+                    self._at(few, np.full(like.shape, few_indices[batch, row, k]), like),
                 ]
                 term = self.emit("mul", pair, {}, like)
-                found = term if found is None else self.emit("add", [found, term], {}, like)
-            parts.append(np.zeros_like(like) if found is None else found)
-        places = np.arange(size_of(out.shape)).reshape(*single.shape[:2], sizes[long])
-        if long == 0:  # of left, whose rows come before those of right
-            places = places.swapaxes(1, 2)
-        return self.moved(parts, places.reshape(out.shape), out)
+                total = term if total is None else self.emit("add", [total, term], {}, like)
+            parts.append(np.zeros_like(like) if total is None else total)
+        indices = np.arange(size_of(out.shape)).reshape(*few_indices.shape[:2], sizes[long])
+        if long == 0:  # the rows of left come before those of right
+            indices = indices.swapaxes(1, 2)
+        return self.moved(parts, indices.reshape(out.shape), out)
 
-    def _at(self, value: Any, places: np.ndarray, like: Any) -> Any:
-        """Numbers of a value, at constant places."""
+    def _at(self, value: Value, indices: np.ndarray, like: Typed) -> Value:
+        """Return numbers of a value at constant indices."""
         if is_constant(value):
-            return np.reshape(value, -1)[places]
-        return self.moved([value], places, like)
+            return np.reshape(value, -1)[indices]
+        return self.moved([value], indices, like)
 
-    def _slice(self, value: Any, starts: Sequence[Any], sizes: Sequence[int], kind: str) -> Any:
-        """A slice from a place that differs between worlds, held within the array."""
+    def _slice(self, value: Value, starts: Sequence[Value], sizes: Sequence[int], kind: str) -> Any:
+        """Slice an array at an index that is known at run time, clamped to the array."""
         shape = np.shape(value)
         numbers = np.arange(size_of(shape)).reshape(shape)
         windows = np.lib.stride_tricks.sliding_window_view(numbers, tuple(sizes))
-        place: Any = np.zeros((), np.int32)
-        like = place
-        for start, room in zip(starts, windows.shape, strict=False):
-            held = like
-            if room > 1:
-                held = self.emit("max", [start, like], {}, like)
-                held = self.emit("min", [held, np.asarray(room - 1, np.int32)], {}, like)
-            place = self.emit("mul", [place, np.asarray(room, np.int32)], {}, like)
-            place = self.emit("add", [place, held], {}, like)
+        zero = np.zeros((), np.int32)
+        index: Value = zero
+        for start, count in zip(starts, windows.shape, strict=False):
+            clamped: Value = zero
+            if count > 1:
+                clamped = self.emit("max", [start, zero], {}, zero)
+                clamped = self.emit("min", [clamped, np.asarray(count - 1, np.int32)], {}, zero)
+            index = self.emit("mul", [index, np.asarray(count, np.int32)], {}, zero)
+            index = self.emit("add", [index, clamped], {}, zero)
         table = windows.reshape(-1, size_of(sizes))
         if is_constant(value):
-            made = self.node("move", list(np.reshape(value, -1)), kind, value.size)
-            value = Array(made, 0, 1, shape)
+            node = self.node("move", list(np.reshape(value, -1)), kind, value.size)
+            value = Array(node, 0, 1, shape)
         if value.step != 1 or value.node.size == 1:
-            return self.moved([value], windows[(0,) * len(shape)], like)
+            return self.moved([value], windows[(0,) * len(shape)], like=value)
         extra = tuple(map(tuple, (table + value.first).tolist()))
-        made = self.node("take", [flat(place, 1), value], kind, table.shape[1], extra)
-        return Array(made, 0, 1, tuple(sizes))
+        node = self.node("take", [flat(index, 1), value], kind, table.shape[1], extra)
+        return Array(node, 0, 1, tuple(sizes))
 
     # --- loops ---
 
-    def repeated(
-        self, once: Callable[[Sequence[Any]], list[Any]], carry: Sequence[Any], length: int
-    ) -> list[Any]:
-        """A loop of a known length."""
-        return self._loop(None, once, carry, length)
+    def for_loop(self, body: Body, carry: Sequence[Value], length: int) -> list[Value]:
+        """Emit a loop of `length` iterations."""
+        return self._loop(None, body, carry, length)
 
-    def repeated_while(
-        self,
-        holds: Callable[[Sequence[Any]], list[Any]],
-        once: Callable[[Sequence[Any]], list[Any]],
-        carry: Sequence[Any],
-    ) -> list[Any]:
-        """A loop that each lane leaves in its own turn."""
-        return self._loop(holds, once, carry, None)
+    def while_loop(self, condition: Body, body: Body, carry: Sequence[Value]) -> list[Value]:
+        """Emit a loop that each lane leaves when its own condition fails."""
+        return self._loop(condition, body, carry, None)
 
-    def _loop(self, holds: Any, once: Any, carry: Sequence[Any], length: int | None) -> list[Any]:
-        kinds = [kind_in(one.dtype, "a loop") for one in carry]
+    def _loop(
+        self, condition: Body | None, body: Body, carry: Sequence[Value], length: int | None
+    ) -> list[Value]:
         carried = [
-            Node(next(self._count), "carried", (), kind, size_of(np.shape(one)))
-            for kind, one in zip(kinds, carry, strict=True)
-        ]
-        now: list[Any] = [
-            Array(node, 0, 1, np.shape(one)) if node.size else one
-            for node, one in zip(carried, carry, strict=True)
+            Node(next(self._numbers), "carried", (), self.kind(x.dtype, "a loop"),
+                 size_of(np.shape(x)))
+            for x in carry
+        ]  # fmt: skip
+        current: list[Value] = [
+            Array(node, 0, 1, np.shape(x)) if node.size else x
+            for node, x in zip(carried, carry, strict=True)
         ]
         self._known.append({})
-        (goes,) = holds(now) if holds else (None,)
+        (holds,) = condition(current) if condition else (None,)
         results = []
-        for node, value in zip(carried, once(now), strict=True):
+        for node, value in zip(carried, body(current), strict=True):
             value = flat(value, node.size) if node.size else value
             if isinstance(value, Array) and value.node in carried and value.node is not node:
-                kept = [_pick(value, i) for i in range(node.size)]
-                value = Array(self.node("move", kept, node.kind, node.size), 0, 1, value.shape)
+                copies = [element(value, i) for i in range(node.size)]
+                copy = self.node("move", copies, node.kind, node.size)
+                value = Array(copy, 0, 1, value.shape)
             results.append(value)
         self._known.pop()
-        goes = None if goes is None else flat(goes, 1)
-        made = [a.node for a in (*results, goes) if isinstance(a, Array)]
-        inside, reach = set(carried), reached(made)
-        inner = []
-        for node in reach:  # in the order in which they were made
-            if node in inside or any(one in inside for one in node.after):
+        holds = None if holds is None else flat(holds, 1)
+        ends = [a.node for a in (*results, holds) if isinstance(a, Array)]
+        inside, inner = set(carried), []
+        for node in reached(ends):  # in the order of their creation
+            if node in inside or any(x in inside for x in node.needed):
                 inside.add(node)
                 inner += [node] if node.op != "carried" else []
-        free = {one for node in inner for one in node.after} | set(made)
-        starts = [flat(one, size_of(np.shape(one))) for one in carry]
-        loop = Node(
-            next(self._count), "for" if length else "while", tuple(starts), "f", 0,
-            Loop(tuple(carried), tuple(results), goes, length), tuple(inner), tuple(free - inside),
+        free = {x for node in inner for x in node.needed} | set(ends)
+        loop = LoopNode(
+            next(self._numbers), "for" if length else "while",
+            tuple(flat(x, size_of(np.shape(x))) for x in carry), "f", 0, None,
+            tuple(free - inside), tuple(carried), tuple(results), holds, length, tuple(inner),
         )  # fmt: skip
-        found = []
-        for node, one in zip(carried, carry, strict=True):
-            part = Node(next(self._count), "part", (), node.kind, node.size, node, free=(loop,))
-            found.append(Array(part, 0, 1, np.shape(one)) if node.size else one)
-        return found
+        parts = []
+        for node, x in zip(carried, carry, strict=True):
+            part = Node(next(self._numbers), "part", (), node.kind, node.size, node, (loop,))
+            parts.append(Array(part, 0, 1, np.shape(x)) if node.size else x)
+        return parts
 
 
 class Result(NamedTuple):
-    """A result that has numbers, and its place among all results."""
+    """A result with at least one number, and its index among all results."""
 
-    place: int
-    value: Any  # `Array`, or a constant
+    index: int
+    value: Value  # `Array` or a constant
     size: int
     kind: str
 
 
 def results(
-    closed: Any, shapes: Sequence[Any], outs: Sequence[Any], target: SimdNodes
+    closed: ClosedJaxpr, shapes: Sequence[Typed], outs: Sequence[Typed], target: SimdNodes
 ) -> tuple[list[Result], list[Node]]:
-    """Results of a closed jaxpr of arguments of these shapes and types, and the nodes of them."""
-    given = [
-        target.given(i, x.shape, x.dtype) if size_of(x.shape) else np.zeros(x.shape, x.dtype)
+    """Return the results of a closed jaxpr of arguments of these types, and their nodes."""
+    inputs = [
+        target.input(i, x.shape, x.dtype) if size_of(x.shape) else np.zeros(x.shape, x.dtype)
         for i, x in enumerate(shapes)
     ]
     found = []
-    for i, (one, like) in enumerate(zip(walk(closed, given, target), outs, strict=True)):
+    for i, (value, like) in enumerate(zip(walk(closed, inputs, target), outs, strict=True)):
         if size := size_of(like.shape):
-            found.append(Result(i, flat(one, size), size, kind_in(like.dtype, "a result")))
-    return found, [each.value.node for each in found if isinstance(each.value, Array)]
+            found.append(Result(i, flat(value, size), size, target.kind(like.dtype, "a result")))
+    return found, [result.value.node for result in found if isinstance(result.value, Array)]
 
 
-def kind_in(dtype: Any, name: str) -> str:
-    """The kind of a type that has a vector; InputError names what has none."""
-    kind = kind_of(np.dtype(dtype), name, SimdNodes.kinds)
-    if np.dtype(dtype).itemsize != (1 if kind == "b" else 4):
-        raise UnsupportedError(f"{name} of {dtype}")
-    return kind
-
-
-def _rows(value: Any, batch: Sequence[int], summed: Sequence[int]) -> np.ndarray:
-    """Places of an operand of a product of matrices: (batch, rows, what is summed over)."""
+def matrix_indices(value: Value, batch: Sequence[int], summed: Sequence[int]) -> np.ndarray:
+    """Return the flat indices of a factor of a product: (batch, rows, summed)."""
     shape = np.shape(value)
-    free = [i for i in range(len(shape)) if i not in (*batch, *summed)]
-    places = np.arange(size_of(shape)).reshape(shape).transpose([*batch, *free, *summed])
-    sizes = [size_of([shape[i] for i in some]) for some in (batch, free, summed)]
-    return places.reshape(sizes)
+    rows = [i for i in range(len(shape)) if i not in (*batch, *summed)]
+    indices = np.arange(size_of(shape)).reshape(shape).transpose([*batch, *rows, *summed])
+    return indices.reshape([size_of([shape[i] for i in axes]) for axes in (batch, rows, summed)])
 
 
-def _key(value: Any) -> Any:
+def key_of(value: Value) -> Hashable:
+    """Return what equal operands have in common."""
     if isinstance(value, Array):
         return (value.node.number, value.first, value.step)
     return np.asarray(value).tobytes(), np.asarray(value).dtype.str
 
 
-def _pick(value: Any, at: int) -> Any:
-    """One number of a value."""
+def element(value: Value, index: int) -> Value:
+    """Return one number of a value as an operand."""
     if isinstance(value, Array):
-        return Array(value.node, value.first + value.step * at, 1, ())
-    return np.asarray(value).reshape(-1)[at]
+        return Array(value.node, value.first + value.step * index, 1, ())
+    return np.asarray(value).reshape(-1)[index]
 
 
-def flat(value: Any, size: int) -> Any:
-    """A value as an operand of an operation on `size` numbers."""
+def flat(value: Value, size: int) -> Value:
+    """Return a value as an operand of an operation on `size` numbers."""
     if isinstance(value, Array):
-        many = size_of(value.shape)
-        return value._replace(shape=(size,), step=value.step if many == size else 0)
+        step = value.step if size_of(value.shape) == size else 0
+        return value._replace(shape=(size,), step=step)
     array = np.ascontiguousarray(value).reshape(-1)
     return array[:1] if len({x.tobytes() for x in array}) == 1 else array
 
 
 def reached(nodes: Iterable[Node]) -> list[Node]:
-    """Nodes and all that they need, as they were made."""
+    """Return nodes and all nodes that they need, in the order of their creation."""
     found: dict[int, Node] = {}
     waiting = list(nodes)
     while waiting:
         node = waiting.pop()
         if node.number not in found:
             found[node.number] = node
-            waiting += node.after
+            waiting += node.needed
     return [found[number] for number in sorted(found)]

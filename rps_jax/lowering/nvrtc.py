@@ -1,4 +1,4 @@
-"""Kernels for a GPU: compiled by NVIDIA's library, which JAX brings, and launched from C."""
+"""NVIDIA's run-time compiler of CUDA (NVRTC), and the C that launches its kernels from XLA."""
 
 from __future__ import annotations
 
@@ -8,26 +8,25 @@ import importlib.util
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import jax
 
-from rps_jax.lowering.nodes import PRELUDE
+from rps_jax.lowering.nodes import XLA_CALL
 
-# Quotients and roots to two roundings, and zero for what is less than 1e-38.
+# Quotients and square roots within two roundings, and zero for numbers below 1e-38.
 FLAGS = ("--prec-div=false", "--prec-sqrt=false", "--ftz=true")
-LAUNCH = PRELUDE + Path(__file__).with_name("launch.c").read_text()
+LAUNCH = XLA_CALL + Path(__file__).with_name("launch.c").read_text()
 
 
 @functools.cache
-def _library() -> Any:
-    """NVIDIA's compiler as a library, which comes with JAX for CUDA; None if it is not there."""
-    found = importlib.util.find_spec("nvidia")
-    folders = list(found.submodule_search_locations or ()) if found else []
-    places = [str(x) for one in folders for x in sorted(Path(one).glob("*/lib/libnvrtc.so.*"))]
-    for place in (*places, "libnvrtc.so.13", "libnvrtc.so.12"):
+def _library() -> ctypes.CDLL | None:
+    """Load NVRTC, which JAX for CUDA installs; None if it is missing."""
+    package = importlib.util.find_spec("nvidia")
+    folders = list(package.submodule_search_locations or ()) if package else []
+    paths = [str(x) for path in folders for x in sorted(Path(path).glob("*/lib/libnvrtc.so.*"))]
+    for path in (*paths, "libnvrtc.so.13", "libnvrtc.so.12"):
         try:
-            return ctypes.CDLL(place)
+            return ctypes.CDLL(path)
         except OSError:
             continue
     return None
@@ -35,21 +34,21 @@ def _library() -> Any:
 
 @functools.cache
 def target() -> str | None:
-    """The compiler's version and the GPU it compiles for; None if there is no such compiler."""
+    """Return NVRTC's version and the GPU's architecture; None without NVRTC or GPU."""
     device = jax.devices()[0]
     if (library := _library()) is None or not hasattr(device, "compute_capability"):
         return None
-    numbers = ctypes.c_int(), ctypes.c_int()
-    library.nvrtcVersion(*map(ctypes.byref, numbers))
-    major, minor = (x.value for x in numbers)
+    version = ctypes.c_int(), ctypes.c_int()
+    library.nvrtcVersion(*map(ctypes.byref, version))
+    major, minor = (x.value for x in version)
     return f"{major}.{minor} sm_{device.compute_capability.replace('.', '')}"
 
 
 def images(texts: Sequence[str]) -> list[bytes]:
-    """Machine code of kernels, each of its own text.
+    """Compile kernels in parallel, and return their machine code.
 
     Raises:
-      RuntimeError: the compiler, which fails, and why.
+      RuntimeError: the compiler that fails, and its first error.
     """
     with ThreadPoolExecutor(len(texts)) as pool:
         return list(pool.map(_image, texts))
@@ -57,49 +56,51 @@ def images(texts: Sequence[str]) -> list[bytes]:
 
 def _image(text: str) -> bytes:
     library, program = _library(), ctypes.c_void_p()
+    if library is None:
+        raise RuntimeError("NVRTC", "it is not installed")
     flags = [*FLAGS, f"--gpu-architecture={str(target()).split()[-1]}"]
-    given = (ctypes.c_char_p * len(flags))(*(x.encode() for x in flags))
+    options = (ctypes.c_char_p * len(flags))(*(x.encode() for x in flags))
 
-    def said(name: str) -> bytes:
+    def output(name: str) -> bytes:
         size = ctypes.c_size_t()
         getattr(library, f"nvrtcGet{name}Size")(program, ctypes.byref(size))
-        room = ctypes.create_string_buffer(size.value)
-        getattr(library, f"nvrtcGet{name}")(program, room)
-        return room.raw
+        buffer = ctypes.create_string_buffer(size.value)
+        getattr(library, f"nvrtcGet{name}")(program, buffer)
+        return buffer.raw
 
     library.nvrtcCreateProgram(ctypes.byref(program), text.encode(), b"step.cu", 0, None, None)
     try:
-        if library.nvrtcCompileProgram(program, len(flags), given):
-            lines = [x for x in said("ProgramLog").decode().splitlines() if "error" in x]
-            raise RuntimeError("NVRTC", (lines or ["it does not say why"])[0])
-        return said("CUBIN")
+        if library.nvrtcCompileProgram(program, len(flags), options):
+            lines = [x for x in output("ProgramLog").decode().splitlines() if "error" in x]
+            raise RuntimeError("NVRTC", (lines or ["no message"])[0])
+        return output("CUBIN")
     finally:
         library.nvrtcDestroyProgram(ctypes.byref(program))
 
 
 def launcher(
-    name: str, codes: Sequence[Path], shapes: Sequence[tuple[int, int, int, int]], worlds: int
+    name: str, images: Sequence[Path], shapes: Sequence[tuple[int, int, int, int]], worlds: int
 ) -> str:
-    """C of the function by which XLA launches kernels.
+    """Return the C of the function by which XLA launches kernels.
 
     Args:
       name: of the function.
-      codes: files of the kernels' machine code.
-      shapes: of each kernel the number of its arguments and results, and which argument tells the
-        number of worlds, by how many numbers it has of each.
-      worlds: that a block of threads holds.
+      images: files of the kernels' machine code.
+      shapes: for each kernel the number of its arguments and of its results, the index of an
+        argument that has numbers, and how many it has per world.
+      worlds: number of worlds of a block of threads.
     """
     counts = [", ".join(map(str, column)) for column in zip(*shapes, strict=True)]
-    told = {
+    macros = {
         "NAME": name,
-        "KERNELS": len(codes),
-        "IMAGES": ", ".join(f"image_{k}" for k in range(len(codes))),
-        **dict(zip(("GIVEN", "FOUND", "ONE", "SIZE"), counts, strict=True)),
-        "MOST": max(a + b for a, b, *_ in shapes) + 1,
+        "KERNELS": len(images),
+        "IMAGES": ", ".join(f"image_{k}" for k in range(len(images))),
+        **dict(zip(("INPUTS", "OUTPUTS", "SIZED", "SIZE"), counts, strict=True)),
+        "MAX_POINTERS": max(a + b for a, b, *_ in shapes) + 1,
         "WORLDS": worlds,
     }
-    lines = [f"#define {key} {value}" for key, value in told.items()]
-    for k, code in enumerate(codes):
-        place = f'.section .rodata\\n.balign 64\\nimage_{k}: .incbin \\"{code}\\"\\n.text'
-        lines += [f'__asm__("{place}");', f"extern const char image_{k}[];"]
+    lines = [f"#define {key} {value}" for key, value in macros.items()]
+    for k, image in enumerate(images):
+        section = f'.section .rodata\\n.balign 64\\nimage_{k}: .incbin \\"{image}\\"\\n.text'
+        lines += [f'__asm__("{section}");', f"extern const char image_{k}[];"]
     return "\n".join([*lines, LAUNCH])

@@ -1,5 +1,5 @@
-/* Operations on numbers of worlds, under JAX's names for them and the kind of their first operand;
-   what a number of worlds is stands in `simd.h` and in `gpu.h`. */
+/* Operations of JAX on numbers of several worlds, named by the primitive and the kind of its first
+   operand; `simd.h` and `gpu.h` define the types. */
 
 #define INFIX(name, sign) \
   FUNCTION V name##_f(V a, V b) { return a sign b; } \
@@ -26,6 +26,7 @@ COMPARE(ge, >=)
 BITS(and, &)
 BITS(or, |)
 BITS(xor, ^)
+FUNCTION I not_i(I x) { return ~x; }
 EACH(exp)
 EACH(log)
 EACH(sin)
@@ -46,6 +47,9 @@ EACH(floor)
 EACH(ceil)
 EACH(round)
 EACH(rint)
+EACH(exp2)
+EACH(cbrt)
+EACH(erf)
 EACH_OF_TWO(atan2, atan2f)
 EACH_OF_TWO(pow, powf)
 EACH_OF_TWO(rem, fmodf)
@@ -63,7 +67,7 @@ FUNCTION I neg_i(I x) { return (I)(0u - (U)x); }
 FUNCTION V abs_f(V x) { return bits_f_of_i(bits_i_of_f(x) & 0x7fffffff); }
 #ifndef OF_A_GPU
 FUNCTION V div_f(V a, V b) { return a / b; }
-/* As JAX has them: NaN goes on. */
+/* As in JAX, NaN propagates. */
 FUNCTION V max_f(V a, V b) { return choose_f((a >= b) | (a != a), a, b); }
 FUNCTION V min_f(V a, V b) { return choose_f((a <= b) | (a != a), a, b); }
 #endif
@@ -73,29 +77,29 @@ FUNCTION I is_finite_f(V x) { return abs_f(x) < INFINITY; }
 FUNCTION V sign_f(V x) {
   return choose_f(x > 0.0f, all_f(1.0f), choose_f(x < 0.0f, all_f(-1.0f), x));
 }
-/* As JAX has them: no whole number overflows. */
+/* As in JAX, integer arithmetic wraps around. */
 FUNCTION I max_i(I a, I b) { return choose_i(a > b, a, b); }
 FUNCTION I min_i(I a, I b) { return choose_i(a < b, a, b); }
 FUNCTION I abs_i(I x) { return max_i(x, neg_i(x)); }
 FUNCTION I sign_i(I x) { return i_of_b(x > 0) - i_of_b(x < 0); }
 FUNCTION I div_i(I a, I b) {
-  I odd = (b == 0) | (b == -1), found = a / choose_i(odd, all_i(1), b);
-  return choose_i(b == 0, all_i(-1), choose_i(odd, neg_i(a), found));
+  I special = (b == 0) | (b == -1), result = a / choose_i(special, all_i(1), b);
+  return choose_i(b == 0, all_i(-1), choose_i(special, neg_i(a), result));
 }
 FUNCTION I rem_i(I a, I b) {
   return choose_i(b == 0, a, a % choose_i((b == 0) | (b == -1), all_i(1), b));
 }
 FUNCTION I i_of_f(V x) {
-  V held = choose_f(x == x, x, all_f(0.0f));
-  held = min_f(max_f(held, all_f(-2147483648.0f)), all_f(2147483520.0f));
-  return choose_i(x >= 2147483648.0f, all_i(2147483647), whole(held));
+  V clamped = choose_f(x == x, x, all_f(0.0f));
+  clamped = min_f(max_f(clamped, all_f(-2147483648.0f)), all_f(2147483520.0f));
+  return choose_i(x >= 2147483648.0f, all_i(2147483647), to_int(clamped));
 }
 FUNCTION U shift_right_logical_u(U x, U by) {
   return choose_u(by < 32u, x >> (by & 31u), all_u(0u));
 }
 FUNCTION U shift_left_u(U x, U by) { return choose_u(by < 32u, x << (by & 31u), all_u(0u)); }
 
-/* One of the two words of the block cipher Threefry, by which JAX draws. */
+/* One of the two words of Threefry, the block cipher of JAX's random numbers. */
 FUNCTION U threefry(U key, U other, U x, U y, int which) {
   const U keys[3] = {key, other, key ^ other ^ 0x1BD11BDAu};
   x += keys[0];
@@ -116,7 +120,7 @@ FUNCTION U threefry(U key, U other, U x, U y, int which) {
 FUNCTION U threefry2x32_0_u(U a, U b, U x, U y) { return threefry(a, b, x, y, 0); }
 FUNCTION U threefry2x32_1_u(U a, U b, U x, U y) { return threefry(a, b, x, y, 1); }
 
-/* Giles's approximation, as XLA has it; by a logarithm to a few roundings of its largest value. */
+/* Giles's approximation, as in XLA, with a logarithm within a few roundings of its largest value. */
 FUNCTION V erf_inv_f(V x) {
   const float near[9] = {2.81022636e-08f, 3.43273939e-07f, -3.5233877e-06f, -4.39150654e-06f,
       0.00021858087f, -0.00125372503f, -0.00417768164f, 0.246640727f, 1.50140941f};
@@ -130,9 +134,9 @@ FUNCTION V erf_inv_f(V x) {
   V w = -(f_of_i(n) * 0.693147181f + 2.0f * (s + s * series));
   I inner = w < 5.0f;
   w = choose_f(inner, w - 2.5f, sqrt_f(w) - 3.0f);
-  V found = choose_f(inner, all_f(near[0]), all_f(far[0]));
+  V result = choose_f(inner, all_f(near[0]), all_f(far[0]));
   UNROLL
   for (int i = 1; i < 9; i++)
-    found = choose_f(inner, all_f(near[i]), all_f(far[i])) + found * w;
-  return choose_f(abs_f(x) == 1.0f, x * INFINITY, found * x);
+    result = choose_f(inner, all_f(near[i]), all_f(far[i])) + result * w;
+  return choose_f(abs_f(x) == 1.0f, x * INFINITY, result * x);
 }

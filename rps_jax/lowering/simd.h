@@ -1,5 +1,5 @@
-/* Vectors with a lane for each of some worlds: real numbers (f), whole ones (i), those without a
-   sign (u), and bools (b), whose lanes are 0 or -1. `operations.h` follows. */
+/* Vectors with a lane for each world: reals (f), signed integers (i), unsigned integers (u), and
+   bools (b), whose lanes are 0 or -1. `operations.h` follows. */
 
 #include <math.h>
 
@@ -19,9 +19,9 @@ FUNCTION I all_i(int32_t x) { return x - (I){0}; }
 FUNCTION U all_u(uint32_t x) { return x - (U){0}; }
 FUNCTION I all_b(int32_t x) { return all_i(x); }
 FUNCTION int32_t any(I m) {
-  int32_t found = 0;
-  for (int l = 0; l < LANES; l++) found |= m[l];
-  return found;
+  int32_t result = 0;
+  for (int l = 0; l < LANES; l++) result |= m[l];
+  return result;
 }
 FUNCTION V choose_f(I m, V a, V b) { return (V)((m & (I)a) | (~m & (I)b)); }
 FUNCTION I choose_i(I m, I a, I b) { return (m & a) | (~m & b); }
@@ -29,15 +29,15 @@ FUNCTION U choose_u(I m, U a, U b) { return ((U)m & a) | (~(U)m & b); }
 
 #define EACH(name) \
   FUNCTION V name##_f(V x) { \
-    V found; \
-    for (int l = 0; l < LANES; l++) found[l] = name##f(x[l]); \
-    return found; \
+    V result; \
+    for (int l = 0; l < LANES; l++) result[l] = name##f(x[l]); \
+    return result; \
   }
 #define EACH_OF_TWO(name, of) \
   FUNCTION V name##_f(V x, V y) { \
-    V found; \
-    for (int l = 0; l < LANES; l++) found[l] = of(x[l], y[l]); \
-    return found; \
+    V result; \
+    for (int l = 0; l < LANES; l++) result[l] = of(x[l], y[l]); \
+    return result; \
   }
 EACH(sqrt)
 FUNCTION V rsqrt_f(V x) { return 1.0f / sqrt_f(x); }
@@ -46,12 +46,12 @@ FUNCTION V f_of_u(U x) { return __builtin_convertvector(x, V); }
 FUNCTION V f_of_b(I x) { return (V)(x & (I)all_f(1.0f)); }
 FUNCTION I i_of_b(I x) { return -x; }
 FUNCTION I not_b(I x) { return ~x; }
-FUNCTION I whole(V x) { return __builtin_convertvector(x, I); }
+FUNCTION I to_int(V x) { return __builtin_convertvector(x, I); }
 FUNCTION U u_of_f(V x) {
-  U found;
+  U result;
   for (int l = 0; l < LANES; l++)
-    found[l] = !(x[l] > 0) ? 0u : x[l] < 4294967296.0f ? (uint32_t)x[l] : 4294967295u;
-  return found;
+    result[l] = !(x[l] > 0) ? 0u : x[l] < 4294967296.0f ? (uint32_t)x[l] : 4294967295u;
+  return result;
 }
 FUNCTION V bits_f_of_i(I x) { return (V)x; }
 FUNCTION I bits_i_of_f(V x) { return (I)x; }

@@ -1,322 +1,243 @@
-"""Walks a jaxpr: nested calls are entered, constants are computed, and the rest is handed on.
+"""Interpreter of jaxprs: enters nested calls, folds constants, and calls a target for the rest.
 
-Values are NumPy arrays where they are constants, and otherwise what a `Target` makes of them. All
-that only moves numbers (slices, reshapes, stacks, gathers at constant places) is one operation of a
-target, `moved`: JAX itself moves the places of the numbers, and tells so where each one comes from.
+Values are NumPy arrays where they are constant, and otherwise what a `Target` returns. Operations
+that only move numbers (slices, reshapes, stacks, gathers at constant indices) are one operation of
+a target, `moved`: they are applied to flat indices, which gives the source of each number.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
-from rps_jax.errors import InputError
+from rps_jax.lowering.target import (
+    Body,
+    Target,
+    UnsupportedError,
+    Value,
+    is_constant,
+    kind_of,
+    size_of,
+)
 
-_MOST_STEPS = 256  # of a scan, which is unrolled
-# What only moves numbers, with how many operands are moved; those behind them are places.
+_MAX_STEPS = 256  # of a scan that is unrolled
+# Primitives that only move numbers, with the number of operands that are moved; None: all. The
+# operands behind them are indices.
 _MOVES = {
-    "broadcast_in_dim": 1,
-    "reshape": 1,
-    "squeeze": 1,
-    "expand_dims": 1,
-    "slice": 1,
-    "rev": 1,
-    "transpose": 1,
-    "split": 1,
-    "unstack": 1,
-    "pad": 2,
-    "stack": None,
-    "concatenate": None,
-    "dynamic_slice": 1,
-    "dynamic_update_slice": 2,
-    "gather": 1,
-    "scatter": 1,  # its updates, the third operand, are moved as well
+    **dict.fromkeys(("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "slice", "rev"), 1),
+    **dict.fromkeys(("transpose", "split", "unstack", "dynamic_slice", "gather", "scatter"), 1),
+    **dict.fromkeys(("pad", "dynamic_update_slice"), 2),
+    **dict.fromkeys(("stack", "concatenate")),
 }
-# What draws by a key, and the function of its algorithm that does so.
-_OF_KEYS = {
+# Random primitives, with the method of the key's implementation that expresses them.
+_RANDOM = {
     **dict.fromkeys(("random_wrap", "random_unwrap")),
     **{"random_bits": "random_bits", "random_split": "split", "random_fold_in": "fold_in"},
 }
-_SAME = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "pvary", "reduce_precision")
+_IDENTITIES = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "pvary",
+               "reduce_precision")  # fmt: skip
 
 
-class Target(Protocol):
-    """What a jaxpr is written for; one that has no loops has them unrolled, or refused."""
+def traced(function: Callable[..., Any], *arguments: Any) -> tuple[ClosedJaxpr, Any]:
+    """Return the jaxpr of a function in float64, and the shapes of its results.
 
-    compiler = "the compiler"  # its name in errors
-    kinds = "fib"  # of numbers that it knows, as `kind_of` names them
-
-    def moved(self, values: Sequence[Any], places: np.ndarray, like: Any) -> Any:
-        """Take numbers of the values, laid end to end, at constant places."""
-        ...
-
-    def emit(self, name: str, values: Sequence[Any], params: Mapping[str, Any], out: Any) -> Any:
-        """Apply a primitive; `out` has the shape and the dtype of the result."""
-        ...
-
-    def repeated(
-        self, once: Callable[[Sequence[Any]], list[Any]], carry: Sequence[Any], length: int
-    ) -> list[Any] | None:
-        """What `carry` is after a function of it was applied so often; None: unroll it."""
-        return None
-
-    def repeated_while(
-        self,
-        holds: Callable[[Sequence[Any]], list[Any]],
-        once: Callable[[Sequence[Any]], list[Any]],
-        carry: Sequence[Any],
-    ) -> list[Any]:
-        """What `carry` is after a function of it was applied as long as a condition held."""
-        raise UnsupportedError("while")
-
-
-class UnsupportedError(InputError):
-    """A primitive that a target cannot express."""
-
-    def __init__(self, operation: str, compiler: str = "the compiler") -> None:
-        self.operation = operation
-        super().__init__(
-            f"operation `{operation}` is not supported by {compiler}; "
-            "use arithmetic, comparisons, jnp.where and elementary functions."
-        )
-
-
-class TooLargeError(InputError):
-    """A function that XLA compiles better than this package: its arrays are too large."""
-
-
-def traced(function: Callable[..., Any], *arguments: Any) -> tuple[Any, Any]:
-    """The jaxpr of a function in float64, and what it returns as shapes.
-
-    A target rounds to the numbers that it has; traced in float32, constants would be rounded twice.
+    A target rounds constants to its own precision; in float32 they would be rounded twice.
     """
     with jax.enable_x64(True):
         return jax.make_jaxpr(function, return_shape=True)(*arguments)
 
 
-def walk(closed: Any, arguments: Sequence[Any], target: Target) -> list[Any]:
-    """The results of a closed jaxpr of some arguments, as a target has them."""
+def walk(closed: ClosedJaxpr, arguments: Sequence[Value], target: Target) -> list[Value]:
+    """Return the results of a closed jaxpr as values of a target."""
     try:
         with jax.enable_x64(True):
-            return _walk(closed.jaxpr, closed.consts, arguments, target)
+            return _walk(closed, arguments, target)
     except UnsupportedError as error:
         raise UnsupportedError(error.operation, target.compiler) from None
 
 
-def is_constant(value: Any) -> bool:
-    """Whether a value is known already."""
-    return isinstance(value, jax.Array) or (isinstance(value, np.ndarray) and value.dtype != object)
+def _walk(closed: ClosedJaxpr | Jaxpr, arguments: Sequence[Value], target: Target) -> list[Value]:
+    jaxpr = closed.jaxpr if isinstance(closed, ClosedJaxpr) else closed
+    consts = closed.consts if isinstance(closed, ClosedJaxpr) else ()
+    values: dict[Any, Value] = dict(zip(jaxpr.constvars, map(np.asarray, consts), strict=True))
+    values |= dict(zip(jaxpr.invars, arguments, strict=True))
 
-
-def _is_key(value: Any) -> bool:
-    return isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
-
-
-def _walk(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any], target: Target) -> list[Any]:
-    known: dict[Any, Any] = dict(zip(jaxpr.constvars, map(np.asarray, consts), strict=True))
-    known |= dict(zip(jaxpr.invars, arguments, strict=True))
-
-    def read(atom: Any) -> Any:
-        return np.asarray(atom.val, atom.aval.dtype) if hasattr(atom, "val") else known[atom]
+    def read(atom: Any) -> Value:
+        return np.asarray(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]
 
     for eqn in jaxpr.eqns:
-        found = _results(eqn, [read(atom) for atom in eqn.invars], target)
-        known |= dict(zip(eqn.outvars, found, strict=True))
+        results = _results(eqn, [read(atom) for atom in eqn.invars], target)
+        values |= dict(zip(eqn.outvars, results, strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
 
-def _results(eqn: Any, values: list[Any], target: Target) -> Sequence[Any]:
-    """Results of one equation."""
-    name, params, outs = eqn.primitive.name, eqn.params, [one.aval for one in eqn.outvars]
-    if name in _SAME:
+def _results(eqn: JaxprEqn, values: list[Value], target: Target) -> Sequence[Value]:
+    """Return the results of one equation."""
+    name, params, outs = eqn.primitive.name, eqn.params, [var.aval for var in eqn.outvars]
+    if name in _IDENTITIES:
         return values
     if all(map(is_constant, values)):
-        if (several := _simply(eqn, values)) is not None:
-            return several
-        found = eqn.primitive.bind(*map(jnp.asarray, values), **params)
-        several = found if eqn.primitive.multiple_results else [found]
-        return [one if _is_key(one) else np.asarray(one) for one in several]
-    if name in _OF_KEYS and "u" in target.kinds:
-        return _drawn(eqn, values, target)
-    for one in outs:
-        kind_of(one.dtype, name, target.kinds)
+        if (moved := _moved_by_numpy(eqn, values)) is not None:
+            return moved
+        return [x if _is_key(x) else np.asarray(x) for x in _bind(eqn, values)]
+    if name in _RANDOM and "u" in target.kinds:
+        return _random(eqn, values, target)
+    for out in outs:
+        kind_of(out.dtype, name, target.kinds)
     if name == "cond":
-        return _chosen(values[0], params["branches"], values[1:], target)
+        branches = [_walk(branch, values[1:], target) for branch in params["branches"]]
+        return [
+            target.emit("select_n", [values[0], *cases], {}, out)
+            for *cases, out in zip(*branches, outs, strict=True)
+        ]
     if name == "scan":
-        return _unrolled(eqn, values, target)
+        return _scan(eqn, values, target)
     if name == "while":
-        first, second = params["cond_nconsts"], params["body_nconsts"]
-        ways = zip(("cond", "body"), (values[:first], values[first : first + second]), strict=True)
-        holds, once = (
-            functools.partial(_entered, params[f"{way}_jaxpr"], consts, target=target)
-            for way, consts in ways
-        )
-        return target.repeated_while(holds, once, values[first + second :])
+        first = params["cond_nconsts"]
+        second = first + params["body_nconsts"]
+        condition = _with_consts(params["cond_jaxpr"], values[:first], target)
+        body = _with_consts(params["body_jaxpr"], values[first:second], target)
+        return target.while_loop(condition, body, values[second:])
     inner = params.get("call_jaxpr", params.get("jaxpr"))
     if inner is not None:
-        closed = hasattr(inner, "consts")
-        consts = inner.consts if closed else ()
-        return _walk(inner.jaxpr if closed else inner, consts, values, target)
+        return _walk(inner, values, target)
     if name in _MOVES:
         count = len(values) if _MOVES[name] is None else _MOVES[name]
-        which = (0, 2) if name == "scatter" else range(count)
-        if all(is_constant(v) for i, v in enumerate(values) if i not in which):
-            return _moved(eqn, values, list(which), target)
+        # The updates of a scatter, its third operand, are moved as well.
+        sources = [0, 2] if name == "scatter" else list(range(count))
+        if all(is_constant(v) for i, v in enumerate(values) if i not in sources):
+            return _moved(eqn, values, sources, target)
     if name == "scatter-add" and is_constant(values[1]) and params["unique_indices"]:
-        return [_added(eqn, values, target)]
-    if name == "threefry2x32":  # of which the two results are told apart
+        return [_scatter_add(eqn, values, target)]
+    if name == "threefry2x32":  # one operation for each of its two results
         return [target.emit(f"{name}_{i}", values, params, out) for i, out in enumerate(outs)]
     if len(outs) != 1:
         raise UnsupportedError(name)
     return [target.emit(name, values, params, outs[0])]
 
 
-def _entered(closed: Any, consts: Sequence[Any], carry: Sequence[Any], target: Target) -> list[Any]:
-    return _walk(closed.jaxpr, closed.consts, [*consts, *carry], target)
+def _with_consts(closed: ClosedJaxpr, consts: Sequence[Value], target: Target) -> Body:
+    """Return a function from the carry of a loop to the results of a jaxpr."""
+    return lambda carry: _walk(closed, [*consts, *carry], target)
 
 
-def _drawn(eqn: Any, values: list[Any], target: Target) -> Sequence[Any]:
-    """What is drawn by a key, of which the whole numbers are known: as its algorithm does it."""
+def _is_key(value: Value) -> bool:
+    return isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
+
+
+def _bind(eqn: JaxprEqn, values: Sequence[Value]) -> Sequence[jax.Array]:
+    """Apply the primitive of an equation by JAX."""
+    result = eqn.primitive.bind(*map(jnp.asarray, values), **eqn.params)
+    return result if eqn.primitive.multiple_results else [result]
+
+
+def _random(eqn: JaxprEqn, values: list[Value], target: Target) -> Sequence[Value]:
+    """Return the results of a random primitive, by the algorithm of its key."""
     name, params = eqn.primitive.name, dict(eqn.params)
     if name in ("random_wrap", "random_unwrap"):
         return values
     values = [np.asarray(jax.random.key_data(x)) if _is_key(x) else x for x in values]
-    how = getattr(eqn.invars[0].aval.dtype._impl, _OF_KEYS[name])
+    key: Any = eqn.invars[0].aval
+    algorithm = getattr(key.dtype._impl, _RANDOM[name])
     shapes = [jax.ShapeDtypeStruct(np.shape(x), x.dtype) for x in values]
-    closed = jax.make_jaxpr(functools.partial(how, **params))(*shapes)
-    return _walk(closed.jaxpr, closed.consts, values, target)
+    return _walk(jax.make_jaxpr(functools.partial(algorithm, **params))(*shapes), values, target)
 
 
-def _moved(eqn: Any, values: list[Any], which: list[int], target: Target) -> list[Any]:
-    """What a primitive makes of places, taken from the values."""
-    start, places = 0, list(values)
-    for i in which:
-        size = int(np.prod(np.shape(values[i])))
-        places[i] = np.arange(start, start + size).reshape(np.shape(values[i]))
-        start += size
-    several = _simply(eqn, places)
-    if several is None:
-        found = eqn.primitive.bind(*map(jnp.asarray, places), **eqn.params)
-        several = found if eqn.primitive.multiple_results else [found]
-    sources = [values[i] for i in which]
+def _moved(eqn: JaxprEqn, values: list[Value], sources: list[int], target: Target) -> list[Value]:
+    """Apply a primitive to flat indices, and gather the numbers of the values there."""
+    start, indices = 0, list(values)
+    for i in sources:
+        shape = np.shape(values[i])
+        indices[i] = np.arange(start, start + size_of(shape)).reshape(shape)
+        start += size_of(shape)
+    moved = _moved_by_numpy(eqn, indices)
+    moved = _bind(eqn, indices) if moved is None else moved
     return [
-        target.moved(sources, np.asarray(one), out.aval)
-        for one, out in zip(several, eqn.outvars, strict=True)
+        target.moved([values[i] for i in sources], np.asarray(x), out.aval)
+        for x, out in zip(moved, eqn.outvars, strict=True)
     ]
 
 
-def _simply(eqn: Any, places: list[Any]) -> list[Any] | None:
-    """Move places or constants by NumPy, if it knows how: JAX would compile each move."""
-    name, params, out = eqn.primitive.name, eqn.params, eqn.outvars[0].aval.shape
+def _moved_by_numpy(eqn: JaxprEqn, arrays: list[Value]) -> list[np.ndarray] | None:
+    """Apply a primitive by NumPy, which is faster than a compilation by JAX; None: unknown."""
+    name, params, out = eqn.primitive.name, eqn.params, eqn.outvars[0].aval
+    shape: tuple[int, ...] = out.shape
     if name == "broadcast_in_dim":
-        sizes = iter(np.shape(places[0]))
-        kept = [next(sizes) if i in params["broadcast_dimensions"] else 1 for i in range(len(out))]
-        return [np.broadcast_to(np.reshape(places[0], kept), out)]
+        sizes, axes = iter(np.shape(arrays[0])), params["broadcast_dimensions"]
+        aligned = [next(sizes) if i in axes else 1 for i in range(len(shape))]
+        return [np.broadcast_to(np.reshape(arrays[0], aligned), shape)]
     if name in ("reshape", "squeeze", "expand_dims"):
-        return [np.reshape(places[0], out)]
-    if name == "convert_element_type":
-        return [np.asarray(places[0]).astype(params["new_dtype"])]
+        return [np.reshape(arrays[0], shape)]
+    if name == "convert_element_type" and (arrays[0].dtype.kind, out.dtype.kind) != ("f", "i"):
+        return [np.asarray(arrays[0]).astype(params["new_dtype"])]
     if name == "slice":
         limits = zip(params["start_indices"], params["limit_indices"], strict=True)
-        steps = params["strides"] or (1,) * len(out)
-        return [places[0][tuple(slice(*ab, c) for ab, c in zip(limits, steps, strict=True))]]
+        steps = params["strides"] or (1,) * len(shape)
+        return [arrays[0][tuple(slice(*ab, c) for ab, c in zip(limits, steps, strict=True))]]
     if name in ("concatenate", "stack"):
         axis = params.get("dimension", params.get("axis"))
-        return [getattr(np, name)(places, axis)]
+        return [getattr(np, name)(arrays, axis)]
     if name == "transpose":
-        return [np.transpose(places[0], params["permutation"])]
+        return [np.transpose(arrays[0], params["permutation"])]
     if name == "split":
-        return np.split(places[0], np.cumsum(params["sizes"])[:-1], params["axis"])
+        return np.split(arrays[0], np.cumsum(params["sizes"])[:-1], params["axis"])
     return None
 
 
-def _added(eqn: Any, values: list[Any], target: Target) -> Any:
-    """What `.at[].add` makes at constant places: the array, and updates or zeros."""
+def _scatter_add(eqn: JaxprEqn, values: list[Value], target: Target) -> Value:
+    """Add updates at constant indices: the sum of the array and of updates or zeros."""
     array, at, updates = values
-    out, size = eqn.outvars[0].aval, int(np.prod(np.shape(updates)))
-    numbers = jnp.asarray(1 + np.arange(size).reshape(np.shape(updates)), out.dtype)
-    nothing = jnp.zeros(np.shape(array), out.dtype)
-    places = eqn.primitive.bind(nothing, jnp.asarray(at), numbers, **eqn.params)
-    more = target.moved([np.zeros(1, out.dtype), updates], np.asarray(places, int), out)
+    out: Any = eqn.outvars[0].aval
+    shape = np.shape(updates)
+    numbers = jnp.asarray(1 + np.arange(size_of(shape)).reshape(shape), out.dtype)
+    zeros = jnp.zeros(np.shape(array), out.dtype)
+    (indices,) = _bind(eqn, [zeros, at, numbers])
+    more = target.moved([np.zeros(1, out.dtype), updates], np.asarray(indices, int), out)
     return target.emit("add", [array, more], {}, out)
 
 
-def _chosen(index: Any, branches: Sequence[Any], values: list[Any], target: Target) -> list[Any]:
-    """All branches of a `cond`, and of their results that of the index."""
-    every = [_walk(b.jaxpr, b.consts, values, target) for b in branches]
-    found = every[-1]
-    flag = jax.ShapeDtypeStruct((), np.dtype(bool))
-    for i in reversed(range(len(branches) - 1)):
-        low = target.emit("le", [index, np.asarray(i)], {}, flag)
-        outs = [branch.aval for branch in branches[i].jaxpr.outvars]
-        found = [
-            target.emit("select_n", [low, b, a], {}, out)
-            for a, b, out in zip(every[i], found, outs, strict=True)
-        ]
-    return found
-
-
-def _unrolled(eqn: Any, values: list[Any], target: Target) -> list[Any]:
-    """A `scan`, step by step."""
+def _scan(eqn: JaxprEqn, values: list[Value], target: Target) -> list[Value]:
+    """Emit a loop for a `fori_loop`, and unroll any other `scan`."""
     params = eqn.params
-    if params["length"] > _MOST_STEPS:
-        raise UnsupportedError(f"scan of more than {_MOST_STEPS} steps")
-    body = params["jaxpr"]
-    # What is carried has one shape inside and outside; what is scanned or stacked has not. Versions
-    # of JAX differ in the names under which they count it.
-    ends = zip(eqn.outvars, body.jaxpr.outvars, strict=True)
-    carried = sum(out.aval.shape == one.aval.shape for out, one in ends)
+    length, body = params["length"], params["jaxpr"]
+    if length > _MAX_STEPS:
+        raise UnsupportedError(f"scan of more than {_MAX_STEPS} steps")
+    # Versions of JAX differ in the names of these counts. Carried values have the same shape
+    # inside and outside of the body; scanned and stacked values have not.
+    results = zip(eqn.outvars, body.jaxpr.outvars, strict=True)
+    carried = sum(out.aval.shape == inner.aval.shape for out, inner in results)
     starts = zip(values, body.jaxpr.invars, strict=True)
-    fixed = sum(np.shape(value) == one.aval.shape for value, one in starts) - carried
+    fixed = sum(np.shape(value) == var.aval.shape for value, var in starts) - carried
     consts, carry = values[:fixed], values[fixed : fixed + carried]
-    if len(values) == fixed + carried == fixed + len(body.jaxpr.outvars):  # as of `fori_loop`
-        once = functools.partial(_walk, body.jaxpr, body.consts, target=target)
-        repeated = target.repeated(lambda now: once([*consts, *now]), carry, params["length"])
-        if repeated is not None:
-            return repeated
-    columns = body.jaxpr.invars[fixed + carried :]
-    rows: list[Any] = [None] * params["length"]
-    order = range(params["length"])
+    if len(values) == fixed + carried == fixed + len(body.jaxpr.outvars):
+        loop = target.for_loop(_with_consts(body, consts, target), carry, length)
+        if loop is not None:
+            return loop
+    scanned = list(zip(values[fixed + carried :], body.jaxpr.invars[fixed + carried :],
+                       strict=True))  # fmt: skip
+    rows: list[list[Value]] = [[]] * length
+    order = range(length)
     for step in reversed(order) if params["reverse"] else order:
-        now = []
-        for values_of, var in zip(values[fixed + carried :], columns, strict=True):
-            size = int(np.prod(var.aval.shape))
-            places = (step * size + np.arange(size)).reshape(var.aval.shape)
-            constant = is_constant(values_of)
-            now.append(values_of[step] if constant else target.moved([values_of], places, var.aval))
-        found = _walk(body.jaxpr, body.consts, [*consts, *carry, *map(_array, now)], target)
-        carry, rows[step] = found[:carried], found[carried:]
+        row = [_row(value, step, var.aval, target) for value, var in scanned]
+        results = _walk(body, [*consts, *carry, *row], target)
+        carry, rows[step] = results[:carried], results[carried:]
     stacked = []
     for i, var in enumerate(body.jaxpr.outvars[carried:]):
-        shape = (params["length"], *var.aval.shape)
-        out = jax.ShapeDtypeStruct(shape, var.aval.dtype)
-        places = np.arange(np.prod(shape, dtype=int)).reshape(shape)
-        stacked.append(target.moved([row[i] for row in rows], places, out))
+        out = jax.ShapeDtypeStruct((length, *var.aval.shape), var.aval.dtype)
+        indices = np.arange(size_of(out.shape)).reshape(out.shape)
+        stacked.append(target.moved([row[i] for row in rows], indices, out))
     return [*carry, *stacked]
 
 
-def _array(value: Any) -> Any:
-    return np.asarray(value) if isinstance(value, np.generic) else value
-
-
-def kind_of(dtype: Any, name: str = "", kinds: str = "fib") -> str:
-    """`f`, `i`, `b` or `u`: a real number, a whole one, a bool, or one without a sign.
-
-    Raises:
-      InputError: it is none of `kinds`.
-    """
-    kind = np.dtype(dtype).kind if isinstance(dtype, np.dtype) else "?"
-    if kind not in kinds:
-        raise UnsupportedError(f"{name} of {dtype}".strip())
-    return kind
-
-
-# Reductions and running ones, by the operation on two numbers that they repeat.
-_OF_PAIRS = {"sum": "add", "prod": "mul", "max": "max", "min": "min", "and": "and", "or": "or"}
-PAIRED = {f"{way}{name}": pair for name, pair in _OF_PAIRS.items() for way in ("reduce_", "cum")}
-COMPARISONS = ("lt", "le", "gt", "ge", "eq", "ne")
+def _row(value: Value, step: int, out: Any, target: Target) -> Value:
+    """Return the slice of a scanned value in one step."""
+    if is_constant(value):
+        return np.asarray(value[step])
+    size = size_of(out.shape)
+    return target.moved([value], (step * size + np.arange(size)).reshape(out.shape), out)

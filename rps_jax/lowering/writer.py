@@ -1,158 +1,294 @@
-"""Writes the nodes of a function of one world as C, which XLA calls with a batch of worlds."""
+"""Printer of a graph of arrays as C, and the SIMD function that XLA calls with a batch of worlds.
+
+`Writer` orders the nodes so that few loops are needed, and prints each as a statement. `SimdWriter`
+prints vectors with a lane for each world; `gpu_writer` and `scalar_writer` have the other printers.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
+from jax.extend.core import ClosedJaxpr
 
 from rps_jax.lowering.nodes import (
-    HEADER,
-    STARTS,
+    INITIAL,
+    SIMD_HEADER,
     Array,
-    Loop,
+    LoopNode,
     Node,
     SimdNodes,
     reached,
     results,
-    size_of,
 )
-from rps_jax.lowering.walk import kind_of
+from rps_jax.lowering.target import Typed, Value, kind_of, size_of
 
-HANDLER = "rps_native"  # what its name is replaced by is known to XLA
+HANDLER = "rps_native"  # placeholder of the name by which XLA calls the function
 TYPES = {"f": "V", "i": "I", "u": "U", "b": "I"}  # of a vector
-STORED = {"f": "float", "i": "int", "u": "unsigned", "b": "unsigned char"}  # of a world's number
-# Placeholders in capitals are lines that are written for a function.
-_BODY = """\
+STORED = {"f": "float", "i": "int", "u": "unsigned", "b": "unsigned char"}  # of a number of a world
+# Placeholders in capitals are lines that are printed for a function.
+_FUNCTION = """\
 
 {TABLES}
-static void some(void **given, void **found, int64_t first, int64_t worlds) {{
+static void run_lanes(void **inputs, void **outputs, int64_t first, int64_t worlds) {{
   int64_t at[LANES];
   for (int l = 0; l < LANES; l++) {{
-    const int64_t mine = first + l < worlds ? first + l : worlds - 1;
-    at[l] = {PLACE};
+    const int64_t own = first + l < worlds ? first + l : worlds - 1;
+    at[l] = {WORLD};
   }}
 {LINES}
 }}
 
 XLA_FFI_Error *{NAME}(XLA_FFI_CallFrame *frame) {{
-  if (is_told(frame)) return 0;
-  void *given[{COUNT}], *found[{FOUND}];
-  for (int i = 0; i < {COUNT}; i++) given[i] = ((XLA_FFI_Buffer *)frame->args.args[i])->data;
-  for (int i = 0; i < {FOUND}; i++) found[i] = ((XLA_FFI_Buffer *)frame->rets.rets[i])->data;
-  const int64_t worlds = worlds_of(frame->args.args[{ONE}], {SIZE});
-  for (int64_t first = 0; first < worlds; first += LANES) some(given, found, first, worlds);
+  if (answers_version(frame)) return 0;
+  void *inputs[{INPUTS}], *outputs[{OUTPUTS}];
+  for (int i = 0; i < {INPUTS}; i++) inputs[i] = ((XLA_FFI_Buffer *)frame->args.args[i])->data;
+  for (int i = 0; i < {OUTPUTS}; i++) outputs[i] = ((XLA_FFI_Buffer *)frame->rets.rets[i])->data;
+  const int64_t worlds = count_worlds(frame->args.args[{SIZED}], {SIZE});
+  for (int64_t first = 0; first < worlds; first += LANES) run_lanes(inputs, outputs, first, worlds);
   return 0;
 }}
 """
 
 
-class SimdWriter:
-    """Statements of nodes, in an order in which few loops are needed."""
+class Writer:
+    """Printer of nodes as statements, in an order in which few loops are needed."""
 
-    table_of = "static const"
+    index = "int"  # type of a loop's index
 
     def __init__(self) -> None:
-        """Begin without statements."""
-        self.tables: dict[bytes, str] = {}  # of constants, which stand before the function
+        self.tables: dict[str, str] = {}  # declarations of constants before the function
 
-    def lines(self, nodes: Iterable[Node], wanted: Iterable[Node], there: set[Node]) -> list[str]:
-        """Statements that make nodes, where some are there; `wanted` are used afterwards."""
-        waiting, there, groups = list(nodes), set(there), []
+    # --- what a language defines ---
+
+    def declaration(self, kind: str, name: str, size: int = 1, constant: bool = True) -> str:
+        """Return the left side of a declaration."""
+        raise NotImplementedError
+
+    def empty(self, kind: str, name: str, size: int) -> str:
+        """Return the declaration of an array without values."""
+        return f"{self.declaration(kind, name, size, constant=False)};"
+
+    def constant(self, value: Value) -> str:
+        """Return a constant, or element `i` of a table of constants."""
+        raise NotImplementedError
+
+    def initial(self, node: Node) -> str:
+        """Return the initial value of a reduction."""
+        return self.constant(np.asarray(INITIAL[node.op[5:-2], node.kind]))
+
+    def call(self, op: str, operands: Sequence[str]) -> str:
+        """Return the expression of an operation."""
+        return f"{op}({', '.join(operands)})"
+
+    def single(self, node: Node) -> list[str]:
+        """Return the statements of a node that is not computed in a loop over its elements."""
+        raise NotImplementedError
+
+    # --- order ---
+
+    def lines(
+        self, nodes: Iterable[Node], used_after: Iterable[Node], computed: set[Node]
+    ) -> list[str]:
+        """Return the statements of nodes; `used_after` are read by later statements."""
+        waiting, computed, groups = list(nodes), set(computed), []
         while waiting:
-            group = self._next(waiting, there)
-            there |= set(group)
-            waiting = [node for node in waiting if node not in there]
+            group = self._next(waiting, computed)
+            computed |= set(group)
+            waiting = [node for node in waiting if node not in computed]
             groups.append(group)
-        lines, wanted = [], set(wanted)
+        lines, used_after = [], set(used_after)
         users: dict[Node, set[int]] = {}
         for i, group in enumerate(groups):
             for node in group:
-                for one in node.after:
-                    users.setdefault(one, set()).add(i)
+                for operand in node.needed:
+                    users.setdefault(operand, set()).add(i)
         last: dict[int, list[Node]] = {}
         for i, group in enumerate(groups):
             for node in group:
-                if node not in wanted:
+                if node not in used_after:
                     last.setdefault(max(users.get(node, {i})), []).append(node)
         for i, group in enumerate(groups):
-            if self.apart(group[0]):
+            if self.is_single(group[0]):
                 for node in group:
-                    lines += self._alone(node)
+                    lines += self.loop(node) if isinstance(node, LoopNode) else self.single(node)
             else:
-                whole = set().union(*(node.entire for node in group))
-                kept = {n for n in group if n in wanted or n in whole or users.get(n, set()) - {i}}
-                lines += self._together(group, kept)
-            self.done(last.get(i, ()))
+                whole = set().union(*(node.whole for node in group))
+                stored = {
+                    node
+                    for node in group
+                    if node in used_after or node in whole or users.get(node, set()) - {i}
+                }
+                lines += self.together(group, stored)
+            self.release(last.get(i, ()))
         return lines
 
-    def apart(self, node: Node) -> bool:
-        """Whether a node stands in no loop over its numbers."""
-        return node.alone
+    def is_single(self, node: Node) -> bool:
+        """Whether a node is printed outside of the loops over elements."""
+        return node.is_single
 
-    def first_of(self, sizes: Iterable[int]) -> int:
-        """Of which size the first of several loops over numbers is."""
+    def first_size(self, sizes: Collection[int]) -> int:
+        """Return the size of the first of several loops over elements."""
         return next(iter(sizes))
 
-    def done(self, nodes: Iterable[Node]) -> None:
-        """Hear of nodes that no statement to come reads."""
+    def release(self, nodes: Iterable[Node]) -> None:
+        """Note that no later statement reads these nodes."""
 
     def statement(self, lines: Sequence[str]) -> list[str]:
-        """Statements, after those that they need."""
+        """Return statements, after those that their operands need."""
         return list(lines)
 
-    def _next(self, waiting: Sequence[Node], there: set[Node]) -> list[Node]:
-        """What can be made next: all that stands alone, else one loop, else one of JAX's loops."""
-        for wanted in ("alone", "together", "loop"):
+    def _next(self, waiting: Sequence[Node], computed: set[Node]) -> list[Node]:
+        """Return the next nodes: all single ones, else one loop over elements, else a loop node."""
+        for wanted in ("single", "together", "loop"):
             groups: dict[int, list[Node]] = {}
-            have = set(there)
+            ready = set(computed)
             for node in waiting:
-                kind = "alone" if self.apart(node) else "together"
-                kind = "loop" if isinstance(node.extra, Loop) else kind
-                if kind != wanted:
+                group = "single" if self.is_single(node) else "together"
+                group = "loop" if isinstance(node, LoopNode) else group
+                if group != wanted:
                     continue
-                whole = there if kind == "together" else have
-                if node.entire <= whole and set(node.after) <= have:
-                    groups.setdefault(node.size if kind == "together" else 0, []).append(node)
-                    have.add(node)
-                    if kind == "loop":
+                whole = computed if group == "together" else ready
+                if node.whole <= whole and set(node.needed) <= ready:
+                    groups.setdefault(node.size if group == "together" else 0, []).append(node)
+                    ready.add(node)
+                    if group == "loop":
                         break
             if groups:
-                return groups[self.first_of(groups)]
+                return groups[self.first_size(groups)]
         raise AssertionError("nodes wait for one another")
 
-    def _together(self, group: Sequence[Node], kept: set[Node]) -> list[str]:
-        """One loop over the numbers of nodes."""
-        before, lines, mine = [], [], set(group)
-        for node in group:
-            kind, name = TYPES[node.kind], node.name
-            text = self._expression(node, mine)
-            if node.op.startswith("fold"):
-                op = node.op[5:]
-                start = STARTS[op[:-2], node.kind]
-                before.append(f"{kind} {name} = {_all(node.kind, start)};")
-                lines.append(f"  {name} = {op}({name}, {text});")
-                continue
-            lines.append(f"  const {kind} e{node.number} = {text};")
-            if node in kept:
-                before.append(f"{kind} {name}[{node.size}];")
-                lines.append(f"  {name}[i] = e{node.number};")
-        return [*before, f"for (int i = 0; i < {group[0].size}; i++) {{", *lines, "}"]
+    # --- statements ---
 
-    def _alone(self, node: Node) -> list[str]:
+    def together(self, group: Sequence[Node], stored: set[Node]) -> list[str]:
+        """Return one loop over the elements of nodes."""
+        head, lines, own = [], [], set(group)
+        for node in group:
+            text = self._expression(node, own)
+            if node.op.startswith("fold"):
+                declared = self.declaration(node.kind, node.name, constant=False)
+                head.append(f"{declared} = {self.initial(node)};")
+                lines.append(f"  {node.name} = {self.call(node.op[5:], [node.name, text])};")
+                continue
+            lines.append(f"  {self.declaration(node.kind, f'e{node.number}')} = {text};")
+            if node in stored:
+                head.append(self.empty(node.kind, node.name, node.size))
+                lines.append(f"  {node.name}[i] = e{node.number};")
+        return [*head, self.loop_head(group[0].size), *lines, "}"]
+
+    def loop_head(self, size: int) -> str:
+        """Return the first line of a loop over elements."""
+        return f"for ({self.index} i = 0; i < {size}; i++) {{"
+
+    def loop(self, loop: LoopNode) -> list[str]:
+        """Return the statements of a loop, or of a block that runs under a condition."""
+        lines, body = [], []
+        for node, start in zip(loop.carried, loop.args, strict=True):
+            if node.size:
+                lines += self.assign(node, start, declare=True)
+        results = [a.node for a in (*loop.results, loop.condition) if isinstance(a, Array)]
+        computed = {*loop.free, *loop.carried, *(n for n in results if n not in loop.inner)}
+        if loop.op == "while":
+            condition = [n for n in reached([loop.condition.node]) if n in loop.inner]
+            body += self.lines(condition, loop.inner, computed)
+            body += self.leave(loop)
+            computed |= set(condition)
+            rest = [n for n in loop.inner if n not in set(condition)]
+        else:
+            rest = list(loop.inner)
+        body += self.lines(rest, results, computed)
+        for node, result in zip(loop.carried, loop.results, strict=True):
+            if node.size and not (isinstance(result, Array) and result.node is node):
+                body += self.assign(node, result, masked=loop.op == "while")
+        return [*lines, self.head(loop), *(f"  {line}" for line in body), "}"]
+
+    def head(self, loop: LoopNode) -> str:
+        """Return the first line of a loop node."""
+        if not loop.length:
+            return "for (;;) {"
+        return f"for ({self.index} turn = 0; turn < {loop.length}; turn++) {{"
+
+    def leave(self, loop: LoopNode) -> list[str]:
+        """Return the statements that leave a `while` loop."""
+        raise NotImplementedError
+
+    def assign(
+        self, node: Node, value: Value, declare: bool = False, masked: bool = False
+    ) -> list[str]:
+        """Return the statements that assign a carried node, in the lanes that go on if masked."""
+        text = self.read(value, Node(0, "set", (value,), node.kind, node.size), set())
+        at = "" if node.size == 1 else "[i]"
+        text = f"choose_{node.kind}(goes, {text}, {node.name}{at})" if masked else text
+        if node.size == 1:
+            declared = self.declaration(node.kind, node.name, constant=False)
+            return [f"{declared if declare else node.name} = {text};"]
+        head = [self.empty(node.kind, node.name, node.size)] if declare else []
+        return [*head, f"{self.loop_head(node.size)[:-2]} {node.name}[i] = {text};"]
+
+    # --- expressions ---
+
+    def item(self, node: Node, index: int | str) -> str:
+        """Return an element of a node."""
+        return node.name if node.width == 1 else f"{node.name}[{index}]"
+
+    def read(self, a: Value, node: Node, own: set[Node]) -> str:
+        """Return an operand of a node; nodes in `own` are computed in the same loop."""
+        if not isinstance(a, Array):
+            return self.constant(a)
+        if a.node.width == 1:
+            return self.item(a.node, 0)
+        if a.node in own and node.is_in_step(a):
+            return f"e{a.node.number}"
+        if not a.step or node.size == 1 or node.op in ("move", "take"):
+            return self.item(a.node, a.first)
+        return self.item(a.node, f"i + {a.first}" if a.first else "i")
+
+    def _expression(self, node: Node, own: set[Node]) -> str:
+        operands = [self.read(a, node, own) for a in node.args]
+        return operands[0] if node.op.startswith("fold") else self.call(node.op, operands)
+
+
+class SimdWriter(Writer):
+    """Printer of nodes as C with a vector lane for each world."""
+
+    table_type = "static const"
+
+    def declaration(self, kind: str, name: str, size: int = 1, constant: bool = True) -> str:
+        return f"{'const ' * constant}{TYPES[kind]} {name}{'' if size == 1 else f'[{size}]'}"
+
+    def constant(self, value: Value) -> str:
+        array = np.asarray(value).reshape(-1)
+        kind = kind_of(array.dtype)
+        if array.size == 1:
+            return f"all_{kind}({literal(array[0], kind)})"
+        return f"all_{kind}({self.table(array)}[i])"
+
+    def table(self, array: np.ndarray) -> str:
+        """Return the name of a table of constants."""
+        key = f"{array.dtype.str}{array.tobytes()}"
+        kind = kind_of(array.dtype)
+        if key not in self.tables:
+            texts = ", ".join(literal(x, kind) for x in array.reshape(-1))
+            stored = "int" if kind == "b" else STORED[kind]
+            name = f"t{len(self.tables)}"
+            self.tables[key] = f"{self.table_type} {stored} {name}[{array.size}] = {{{texts}}};"
+        return self.tables[key].split("[")[0].split()[-1]
+
+    def leave(self, loop: LoopNode) -> list[str]:
+        holds = self.read(loop.condition, Node(0, "goes", (), "b", 1), set())
+        return self.statement([f"const I goes = {holds};", "if (!any(goes)) break;"])
+
+    def single(self, node: Node) -> list[str]:
         kind, name, size = TYPES[node.kind], node.name, node.size
-        if isinstance(node.extra, Loop):
-            return self._loop(node, node.extra)
         if node.op == "part":
             if size == 1:
                 return [f"const {kind} {name} = {node.extra.name};"]
             return [f"const {kind} *const {name} = {node.extra.name};"]
-        declared = f"{kind} {name}" + ("" if size == 1 else f"[{size}]")
+        declared = self.declaration(node.kind, name, size, constant=False)
         at = "" if size == 1 else "[i]"
-        if node.op == "given":
-            stored = f"((const {STORED[node.kind]} *)given[{node.extra}])[at[l] * {size} + i]"
+        if node.op == "input":
+            stored = f"((const {STORED[node.kind]} *)inputs[{node.extra}])[at[l] * {size} + i]"
             stored = f"-(int){stored}" if node.kind == "b" else stored
             return [
                 f"{declared};",
@@ -160,8 +296,8 @@ class SimdWriter:
                 f"  for (int l = 0; l < LANES; l++) {name}{at}[l] = {stored};",
             ]
         if node.op == "take":
-            place, source = node.args
-            row, table = self.read(place, node, set()), self.table(np.array(node.extra))
+            index, source = node.args
+            row, table = self.read(index, node, set()), self.table(np.array(node.extra))
             return [
                 f"{declared};",
                 f"for (int i = 0; i < {size}; i++)",
@@ -175,122 +311,56 @@ class SimdWriter:
             return [f"{declared};", *(f"{name}[{i}] = {x};" for i, x in enumerate(reads))]
         return [f"const {declared} = {self._expression(node, set())};"]
 
-    def _loop(self, node: Node, loop: Loop) -> list[str]:
-        lines, body = [], []
-        for own, start in zip(loop.carried, node.args, strict=True):
-            if own.size:
-                lines += self._set(own, start, f"{TYPES[own.kind]} ", node)
-        results = [a.node for a in (*loop.results, loop.holds) if isinstance(a, Array)]
-        there = {*node.free, *loop.carried, *(n for n in results if n not in node.inner)}
-        if loop.holds is not None:
-            before = [n for n in reached([loop.holds.node]) if n in node.inner]
-            body += self.lines(before, node.inner, there)
-            goes = self.read(loop.holds, Node(0, "goes", (), "b", 1), set())
-            body += self.statement([f"const I goes = {goes};", "if (!any(goes)) break;"])
-            there |= set(before)
-            rest = [n for n in node.inner if n not in set(before)]
-        else:
-            rest = list(node.inner)
-        body += self.lines(rest, results, there)
-        for own, result in zip(loop.carried, loop.results, strict=True):
-            if own.size and not (isinstance(result, Array) and result.node is own):
-                body += self._set(own, result, "", node, masked=loop.holds is not None)
-        often = f"int turn = 0; turn < {loop.length}; turn++" if loop.length else ";;"
-        return [*lines, f"for ({often}) {{", *(f"  {line}" for line in body), "}"]
 
-    def _set(self, own: Node, to: Any, head: str, node: Node, masked: bool = False) -> list[str]:
-        """Statements that give a carried node its numbers, in the lanes that go on."""
-        each = Node(0, "set", (to,), own.kind, own.size)
-        text, at = self.read(to, each, set()), "" if own.size == 1 else "[i]"
-        text = f"choose_{own.kind}(goes, {text}, {own.name}{at})" if masked else text
-        if own.size == 1:
-            return [f"{head}{own.name} = {text};"]
-        declared = [f"{head}{own.name}[{own.size}];"] if head else []
-        return [*declared, f"for (int i = 0; i < {own.size}; i++) {own.name}[i] = {text};"]
-
-    def read(self, a: Any, node: Node, mine: set[Node]) -> str:
-        """How a node reads an operand."""
-        if not isinstance(a, Array):
-            return constant(a, self)
-        if a.node.width == 1:
-            return a.node.name
-        if a.node in mine and node.in_turn(a):
-            return f"e{a.node.number}"
-        if not a.step or node.size == 1 or node.op in ("move", "take"):
-            return f"{a.node.name}[{a.first}]"
-        return f"{a.node.name}[i + {a.first}]" if a.first else f"{a.node.name}[i]"
-
-    def _expression(self, node: Node, mine: set[Node]) -> str:
-        reads = [self.read(a, node, mine) for a in node.args]
-        return reads[0] if node.op.startswith("fold") else f"{node.op}({', '.join(reads)})"
-
-    def table(self, array: np.ndarray) -> str:
-        """The name of constants that stand before the function."""
-        key = array.tobytes() + array.dtype.str.encode()
-        kind = kind_of(array.dtype, "", SimdNodes.kinds)
-        if key not in self.tables:
-            texts = ", ".join(literal(x, kind) for x in array.reshape(-1))
-            stored = "int" if kind == "b" else STORED[kind]
-            name = f"t{len(self.tables)}"
-            self.tables[key] = f"{self.table_of} {stored} {name}[{array.size}] = {{{texts}}};"
-        return self.tables[key].split("[")[0].split()[-1]
-
-
-def constant(a: Any, writer: SimdWriter) -> str:
-    """A constant, or the one in turn of several."""
-    array = np.asarray(a).reshape(-1)
-    kind = kind_of(array.dtype, "", SimdNodes.kinds)
-    if array.size == 1:
-        return _all(kind, array[0])
-    return f"all_{kind}({writer.table(array)}[i])"
-
-
-def _all(kind: str, value: Any) -> str:
-    """A constant in every lane."""
-    return f"all_{kind}({literal(value, kind)})"
-
-
-def literal(value: Any, kind: str) -> str:
-    """A number in C."""
+def literal(value: object, kind: str, suffix: str = "f") -> str:
+    """Return a number in C."""
     if kind == "f":
-        number = float(value)
-        text = f"{number!r}f" if math.isfinite(number) else repr(number).replace("inf", "INFINITY")
-        return "NAN" if math.isnan(number) else text
+        number = float(value)  # pyright: ignore[reportArgumentType]
+        if math.isnan(number):
+            return "NAN"
+        finite = math.isfinite(number)
+        return f"{number!r}{suffix}" if finite else repr(number).replace("inf", "INFINITY")
+    number = int(value)  # pyright: ignore[reportArgumentType]
     if kind == "b":
-        return str(-int(value))
-    whole = int(value)
-    return f"{whole}u" if kind == "u" else str(whole) if whole > -(2**31) else "-2147483647 - 1"
+        return str(-number)
+    return f"{number}u" if kind == "u" else str(number) if number > -(2**31) else "-2147483647 - 1"
 
 
-def source(closed: Any, shapes: Sequence[Any], outs: Sequence[Any], ordered: bool = False) -> str:
-    """C of a closed jaxpr of arguments of these shapes and types: the handler `HANDLER` of XLA's.
+def source(
+    closed: ClosedJaxpr, shapes: Sequence[Typed], outs: Sequence[Typed], sorted_worlds: bool = False
+) -> str:
+    """Return the C of a closed jaxpr: the function `HANDLER` that XLA calls.
 
-    Of `ordered` worlds one more argument tells which come first.
+    Args:
+      closed: the function of one world.
+      shapes: types of its arguments.
+      outs: types of its results.
+      sorted_worlds: whether one more argument has the order of the worlds.
 
     Raises:
-      InputError: it has an operation that is not known here.
+      UnsupportedError: it has an operation that is not in the headers.
     """
     (found, ends), writer = results(closed, shapes, outs, SimdNodes()), SimdWriter()
     lines = writer.lines(reached(ends), ends, set())
-    for place, a, size, kind in found:
-        read = writer.read(a, Node(0, "end", (a,), kind, size), set())
+    for index, a, size, kind in found:
+        text = writer.read(a, Node(0, "end", (a,), kind, size), set())
         stored, truth = STORED[kind], " != 0" * (kind == "b")
         lines += [
             f"for (int i = 0; i < {size}; i++) {{",
-            f"  const {TYPES[kind]} e = {read};",
+            f"  const {TYPES[kind]} e = {text};",
             "  for (int l = 0; l < LANES && first + l < worlds; l++)",
-            f"    (({stored} *)found[{place}])[at[l] * {size} + i] = e[l]{truth};",
+            f"    (({stored} *)outputs[{index}])[at[l] * {size} + i] = e[l]{truth};",
             "}",
         ]
-    one = next(i for i, x in enumerate(shapes) if size_of(x.shape))
+    sized = next(i for i, x in enumerate(shapes) if size_of(x.shape))
     fill = {
         "TABLES": "\n".join(writer.tables.values()),
         "LINES": "\n".join(f"  {line}" for line in lines),
         "NAME": HANDLER,
-        "COUNT": len(shapes) + ordered,
-        "FOUND": len(outs),
-        "PLACE": f"((const int *)given[{len(shapes)}])[mine]" if ordered else "mine",
-        "ONE": one,
-        "SIZE": size_of(shapes[one].shape),
+        "INPUTS": len(shapes) + sorted_worlds,
+        "OUTPUTS": len(outs),
+        "WORLD": f"((const int *)inputs[{len(shapes)}])[own]" if sorted_worlds else "own",
+        "SIZED": sized,
+        "SIZE": size_of(shapes[sized].shape),
     }
-    return HEADER + _BODY.format(**fill)
+    return SIMD_HEADER + _FUNCTION.format(**fill)

@@ -1,19 +1,19 @@
-/* What every function does that XLA calls by its foreign function interface. */
+/* Functions shared by all functions that XLA calls through its foreign function interface. */
 
 #include <stdint.h>
 #include "xla/ffi/api/c_api.h"
 
-/* Whether XLA only asks for the version of the interface, which it is told then. */
-static int is_told(XLA_FFI_CallFrame *frame) {
-  XLA_FFI_Metadata_Extension *asks = (void *)frame->extension_start;
-  if (!asks || asks->extension_base.type != XLA_FFI_Extension_Metadata) return 0;
-  asks->metadata->api_version.major_version = XLA_FFI_API_MAJOR;
-  asks->metadata->api_version.minor_version = XLA_FFI_API_MINOR;
+/* Whether XLA only asks for the version of the interface; if so, answer it. */
+static int answers_version(XLA_FFI_CallFrame *frame) {
+  XLA_FFI_Metadata_Extension *query = (void *)frame->extension_start;
+  if (!query || query->extension_base.type != XLA_FFI_Extension_Metadata) return 0;
+  query->metadata->api_version.major_version = XLA_FFI_API_MAJOR;
+  query->metadata->api_version.minor_version = XLA_FFI_API_MINOR;
   return 1;
 }
 
-/* How many worlds an argument is of that has so many numbers of each. */
-static int64_t worlds_of(const XLA_FFI_Buffer *argument, int64_t each) {
+/* Number of worlds of an argument with `each` numbers per world. */
+static int64_t count_worlds(const XLA_FFI_Buffer *argument, int64_t each) {
   int64_t numbers = 1;
   for (int64_t i = 0; i < argument->rank; i++) numbers *= argument->dims[i];
   return numbers / each;

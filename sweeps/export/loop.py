@@ -16,6 +16,7 @@ from rps_jax.app.shadow import shadow
 from rps_jax.control import registry
 from rps_jax.control.base import Law
 from rps_jax.control.observation import Details, Twist
+from rps_jax.lowering.routine import identifier
 from rps_jax.runs.push import recorded_law
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
@@ -75,7 +76,7 @@ def in_the_loop(name: str, where: Path) -> Any:
             Details.from_obs(getattr(seen, "touch", seen)),
         )
 
-    return _registered(f"{program.identifier(label)}_in_c", law, step, params)
+    return _registered(f"{identifier(label)}_in_c", law, step, params)
 
 
 def nudged(name: str, roundings: int) -> Any:
@@ -89,7 +90,7 @@ def nudged(name: str, roundings: int) -> Any:
         return memory, Twist(*more), details
 
     off = f"{abs(roundings)}_{'down' if roundings < 0 else 'up'}"
-    return _registered(f"{program.identifier(label)}_{off}", law, step, params)
+    return _registered(f"{identifier(label)}_{off}", law, step, params)
 
 
 def _registered(name: str, law: Law, step: Any, params: Any) -> Any:

@@ -25,10 +25,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+<<<<<<< HEAD
 from rps_jax.app.export import c, folder, graph, program
 from rps_jax.app.export.program import Group, Program
 from rps_jax.control import registry, validation
+=======
+from rps_jax.app.export import c, folder, onnx_model, program
+from rps_jax.app.export.program import Program
+from rps_jax.control import registry, trying
+>>>>>>> d42b8ea (Print scalar C and JavaScript from the graph of SIMD C)
 from rps_jax.control.base import Law
+from rps_jax.lowering.routine import Group
 
 Precision = Literal["float", "double"]
 Form = Literal["float", "double", "onnx"]  # C of either precision, or ONNX, which is of float
@@ -141,7 +148,7 @@ class Onnx(Structs):
         import onnxruntime
 
         super().__init__(made, "onnx")
-        model = graph.models(made, "law", count)["law.onnx"]
+        model = onnx_model.models(made, "law", count)["law.onnx"]
         assert isinstance(model, bytes)
         self.session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
         self.about = {one.key: one.value for one in onnx.load_from_string(model).metadata_props}

@@ -1,78 +1,27 @@
-"""What is exported of a law: its three routines, with the names of all that goes in and out."""
+"""The exported program of a law: its three routines, with the names of their fields."""
 
 from __future__ import annotations
 
-import inspect
-import re
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import errors
-from rps_jax.app.export.scalars import Node, Scalars
 from rps_jax.control import registry, validation
 from rps_jax.control.observation import TaxelObservation, Twist
 from rps_jax.errors import InputError
-from rps_jax.lowering import walk
+from rps_jax.lowering.routine import Group, Pytree, Routine, fields_of, routine
 from rps_jax.robot import robot as robots
 from rps_jax.robot import skin as skins
 from rps_jax.robot.skin import LINE, CapacitiveSkin
 
-_REAL: Any = jax.ShapeDtypeStruct((), np.float64)
-
-
-class Field(NamedTuple):
-    """A number or an array of numbers of a group."""
-
-    name: str
-    shape: tuple[int, ...]
-    kind: str  # f, i or b
-    about: str = ""  # unit and meaning
-    value: Any = None  # at the start
-
-    @property
-    def size(self) -> int:
-        """How many numbers."""
-        return int(np.prod(self.shape, dtype=int))
-
-
-Group = tuple[Field, ...]
-
-
-class Routine(NamedTuple):
-    """A pure function of groups of fields, as a jaxpr over all their fields."""
-
-    name: str
-    jaxpr: Any
-    given: Mapping[str, Group]
-    found: Mapping[str, Group]
-
-    def results(self, target: walk.Target, arguments: Sequence[Any]) -> dict[str, list[Any]]:
-        """The results of a target, by group."""
-        flat = iter(walk.walk(self.jaxpr, arguments, target))
-        return {name: [next(flat) for _ in group] for name, group in self.found.items()}
-
-    def scalars(self, compiler: str) -> tuple[Scalars, dict[str, list[list[Node]]]]:
-        """The routine as single numbers: of each group the nodes of each field."""
-        target = Scalars(compiler)
-        given = [
-            target.inputs(group, one.name, one.shape, one.kind)
-            for group, fields in self.given.items()
-            for one in fields
-        ]
-        found = self.results(target, given)
-        nodes = {
-            group: [list(target.array(value).reshape(-1)) for value in values]
-            for group, values in found.items()
-        }
-        return target, nodes
+Number: TypeAlias = Any  # an array of JAX or NumPy, or its type
+_REAL = jax.ShapeDtypeStruct((), np.float64)
 
 
 class Program(NamedTuple):
-    """A law with chosen parameters on a robot with a skin."""
+    """A law with its parameters, and the skin of a robot."""
 
     label: str  # of the law
     robot: str
@@ -84,45 +33,45 @@ class Program(NamedTuple):
 
     @property
     def taxels(self) -> int:
-        """How many taxels the skin has."""
+        """Number of taxels of the skin."""
         return self.groups["skin"][0].size
 
 
 class SkinParams(NamedTuple):
-    """Numbers of a skin."""
+    """Parameters of a skin."""
 
-    time_constant: Any  # [s] of the low-pass filter
-    threshold: Any  # [1] relative change of capacitance that counts as touch
+    time_constant: Number  # [s] of the low-pass filter
+    threshold: Number  # [1] relative change of capacitance that counts as touch
 
 
 class Skin(NamedTuple):
-    """What a skin remembers."""
+    """State of a skin."""
 
-    signal: Any  # (T,) [1] filtered, of each taxel
-    alive: Any  # (T,) 0 of a taxel that is to be ignored
+    signal: Number  # (T,) [1] filtered, of each taxel
+    alive: Number  # (T,) 0 of a taxel that is to be ignored
 
 
 class Scan(NamedTuple):
-    """What a skin answers."""
+    """One reading of all taxels."""
 
-    taxels: Any  # (T,) [1] relative change of capacitance of each taxel, along the strip
-    period: Any  # [s] since the last step
+    taxels: Number  # (T,) [1] relative change of capacitance of each taxel, along the strip
+    period: Number  # [s] since the last step
 
 
 class Filtered(NamedTuple):
-    """What a scan changes of what a skin remembers."""
+    """Part of the state of a skin that a scan changes."""
 
-    signal: Any  # (T,) [1] filtered, of each taxel
+    signal: Number  # (T,) [1] filtered, of each taxel
 
 
 class Contact(NamedTuple):
-    """What a skin feels."""
+    """Contact that a skin detects."""
 
-    contact_type: Any  # 0 none, 1 a point, 2 a line
-    p_robot_contact: Any  # [m] in the robot frame; 0 without contact
-    in_contact: Any  # whether anything is felt
-    line: Any  # whether the contact is a line
-    signal: Any  # (T,) [1] filtered, 0 of a dead taxel
+    contact_type: Number  # 0 none, 1 a point, 2 a line
+    p_robot_contact: Number  # [m] in the robot frame; 0 without contact
+    in_contact: Number  # whether there is a contact
+    line: Number  # whether the contact is a line
+    signal: Number  # (T,) [1] filtered, 0 of a dead taxel
 
 
 def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive") -> Program:
@@ -133,7 +82,7 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
     """
     label, params = registry.resolve_law(law)
     params = registry.check_params(params)
-    of, base = registry.law_of(params), robots.named(robot)
+    functions, base = registry.law_of(params), robots.named(robot)
     sensor = skins.named(skin).on(base.shell)
     if not isinstance(sensor, CapacitiveSkin) or not sensor.shell.count:
         raise InputError(
@@ -142,93 +91,43 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
         )
     taxels = jax.ShapeDtypeStruct((sensor.shell.count,), np.float64)
     with jax.enable_x64(True):
-        seen = validation.observation_shapes(of.senses)
-        if isinstance(seen, TaxelObservation):
-            seen = seen._replace(signal=taxels)
-        # Parameters are real numbers, whatever they were written as, as in a trial.
+        observation = validation.observation_shapes(functions.senses)
+        if isinstance(observation, TaxelObservation):
+            observation = observation._replace(signal=taxels)
+        # Parameters are reals, as in a trial, even if the user wrote integers.
         shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x), np.float64), params)
-        made = jax.eval_shape(of.init, shapes)
-        start = of.init(jax.tree.map(lambda x: np.asarray(x, float), params))
+        memory = jax.eval_shape(functions.init, shapes)
+        start = functions.init(jax.tree.map(lambda x: np.asarray(x, float), params))
 
-    def step(params: Any, memory: Any, seen: Any) -> Any:
-        memory, twist, _ = of.step(params, memory, seen)
+    def step(params: Pytree, memory: Pytree, observation: Pytree) -> tuple[Pytree, Twist]:
+        memory, twist, _ = functions.step(params, memory, observation)
         return memory, Twist(*twist)
 
-    def skin_step(numbers: Any, before: Any, scan: Any) -> Any:
-        own = sensor._replace(**numbers._asdict())
-        key: Any = jax.ShapeDtypeStruct((2,), np.uint32)  # of noise, which a real skin has itself
-        state = skins.SkinState(key, before.signal, before.signal, before.alive)
-        state, reading = own.read(state, scan.taxels, scan.period)
-        line = reading.contact_type == LINE
-        told = jnp.where(before.alive, state.signal, 0.0)
+    def skin_step(numbers: SkinParams, skin: Skin, scan: Scan) -> tuple[Filtered, Contact]:
+        scaled = sensor._replace(**numbers._asdict())
+        key: Any = jax.ShapeDtypeStruct((2,), np.uint32)  # of simulated noise
+        state = skins.SkinState(key, skin.signal, skin.signal, skin.alive)
+        state, reading = scaled.read(state, scan.taxels, scan.period)
+        signal = jnp.where(skin.alive, state.signal, 0.0)
         touch = (reading.contact_type, reading.p_robot_contact, reading.in_contact)
-        return Filtered(state.signal), Contact(*touch, line, told)
+        return Filtered(state.signal), Contact(*touch, reading.contact_type == LINE, signal)
 
     numbers = SkinParams(*(np.asarray(float(getattr(sensor, x))) for x in SkinParams._fields))
-    own = {
+    skin_inputs = {
         "skin_params": SkinParams(_REAL, _REAL),
         "skin": Skin(taxels, jax.ShapeDtypeStruct(taxels.shape, bool)),
         "scan": Scan(taxels, _REAL),
     }
-    given = {"params": shapes, "memory": made, "observation": seen}
-    init = routine("init", lambda params: (of.init(params),), {"params": shapes}, ("memory",))
-    stepped = routine("step", step, given, ("memory", "twist"))
-    felt = routine("skin_step", skin_step, own, ("filtered", "contact"))
-    groups = {**stepped.given, **stepped.found, **felt.given, **felt.found}
+    inputs = {"params": shapes, "memory": memory, "observation": observation}
+    init = routine("init", lambda params: (functions.init(params),), {"params": shapes},
+                   ("memory",))  # fmt: skip
+    law_step = routine("step", step, inputs, ("memory", "twist"))
+    touch = routine("skin_step", skin_step, skin_inputs, ("filtered", "contact"))
+    groups = {**law_step.inputs, **law_step.outputs, **touch.inputs, **touch.outputs}
     for name, tree, values in (
-        *(("params", shapes, params), ("memory", made, start)),
-        ("skin_params", own["skin_params"], numbers),
+        *(("params", shapes, params), ("memory", memory, start)),
+        ("skin_params", skin_inputs["skin_params"], numbers),
     ):
         groups[name] = fields_of(tree, values)
-    name = robot if isinstance(robot, str) else "of one's own"
-    return Program(label, name, of.senses, groups, init, stepped, felt)
-
-
-def routine(
-    name: str, function: Callable[..., Any], given: Mapping[str, Any], found: Sequence[str]
-) -> Routine:
-    """A traced function of named pytrees, which returns as many as are named."""
-    jaxpr, out = walk.traced(function, *given.values())
-    return Routine(
-        name,
-        jaxpr,
-        {key: fields_of(tree) for key, tree in given.items()},
-        {key: fields_of(tree) for key, tree in zip(found, out, strict=True)},
-    )
-
-
-def fields_of(tree: Any, values: Any = None) -> Group:
-    """The leaves of a pytree as fields, named by their places."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    starts = jax.tree.leaves(values) if values is not None else [None] * len(leaves)
-    found = []
-    for (at, leaf), value in zip(leaves, starts, strict=True):
-        path = jax.tree_util.keystr(at, simple=True, separator=".")
-        name = identifier(path.removeprefix("touch.")) or "value"
-        dtype = np.dtype(getattr(leaf, "dtype", np.asarray(leaf).dtype))
-        value = None if value is None else np.asarray(value)
-        found.append(
-            Field(name, tuple(np.shape(leaf)), walk.kind_of(dtype), _about(tree, path), value)
-        )
-    names = [one.name for one in found]
-    errors.check_each_once("names of the law's numbers", names) if names else None
-    return tuple(found)
-
-
-def _about(tree: Any, path: str) -> str:
-    """What the comment behind a field in its class says of it."""
-    *way, last = path.split(".")
-    for step in way:
-        tree = getattr(tree, step, None)
-    try:
-        source = inspect.getsource(type(tree))
-    except (OSError, TypeError):
-        return ""
-    said = re.search(rf"^    {re.escape(last)}:[^#\n]*(?:# noqa\S* \S*)?# *(.*)$", source, re.M)
-    return re.sub(r"^(\(\d*T?,?\) |noqa: \S+ +)", "", said[1]).replace("*/", "") if said else ""
-
-
-def identifier(text: str) -> str:
-    """A text as a name of C and JavaScript."""
-    name = re.sub(r"\W+", "_", text, flags=re.ASCII).strip("_")
-    return f"law_{name}" if name[:1].isdigit() else name
+    name = robot if isinstance(robot, str) else "custom"
+    return Program(label, name, functions.senses, groups, init, law_step, touch)

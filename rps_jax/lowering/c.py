@@ -1,0 +1,133 @@
+"""Printer of scalar C99: the statements of a routine, its structs and its helper functions."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from rps_jax.lowering import spelling
+from rps_jax.lowering.nodes import Node
+from rps_jax.lowering.routine import Group, Routine
+from rps_jax.lowering.scalar_writer import ScalarWriter
+from rps_jax.lowering.target import kind_of
+from rps_jax.lowering.writer import literal as literal_of
+
+_TYPES = {"f": "{p}_real", "i": "int", "b": "int"}
+# `{p}` is the prefix of all names, `{P}` the same in capitals.
+HELPERS = """\
+/* As in JAX, NaN propagates and integer arithmetic wraps around. */
+static inline {p}_real {p}_max({p}_real a, {p}_real b) {{ return a >= b || a != a ? a : b; }}
+static inline {p}_real {p}_min({p}_real a, {p}_real b) {{ return a <= b || a != a ? a : b; }}
+static inline {p}_real {p}_sign({p}_real x) {{
+  return x > 0 ? ({p}_real)1 : x < 0 ? ({p}_real)-1 : x;
+}}
+static inline {p}_real {p}_logistic({p}_real x) {{ return 1 / (1 + {P}_F(exp)(-x)); }}
+/* Lambert's fraction near zero, which is exact to a rounding and avoids a call of tanh. */
+static inline {p}_real {p}_tanh({p}_real x) {{
+  const {p}_real a = {P}_F(fabs)(x), s = x * x;
+  if (a < ({p}_real)0.5)
+    return x * (135135 + s * (17325 + s * (378 + s)))
+         / (135135 + s * (62370 + s * (3150 + s * 28)));
+  return {P}_F(copysign)(1 - 2 / (1 + {P}_F(exp)(2 * a)), x);
+}}
+static inline int {p}_int({p}_real x) {{
+  return x != x ? 0 : x >= ({p}_real)2147483648.0 ? 2147483647
+       : x <= ({p}_real)-2147483648.0 ? -2147483647 - 1 : (int)x;
+}}
+static inline int {p}_idiv(int a, int b) {{
+  return b == 0 ? -1 : b == -1 ? (int)(0u - (unsigned)a) : a / b;
+}}
+static inline int {p}_irem(int a, int b) {{ return b == 0 ? a : b == -1 ? 0 : a % b; }}
+"""
+
+
+class CWriter(ScalarWriter):
+    """Printer of one routine as statements of C99."""
+
+    compiler = "the C exporter"
+    spelling = spelling.C
+    flag = "({} != 0)"  # C takes any number but 0 for true
+    alias = "{head} = &{corner};"
+    pointer = "*"
+
+    def declaration(self, kind: str, name: str, size: int = 1, constant: bool = True) -> str:
+        kind = _TYPES[kind].format(p=self.prefix)
+        return f"{'const ' * constant}{kind} {name}{'' if size == 1 else f'[{size}]'}"
+
+    def literal(self, value: object, kind: str) -> str:
+        return literal(self.prefix, value, kind)
+
+    def listed(self, texts: Iterable[str]) -> str:
+        text = " ".join(", ".join(texts).split())
+        lines = textwrap.wrap(text, 92, break_long_words=False, break_on_hyphens=False)
+        return "{" + (text if len(lines) < 2 else "\n    " + "\n    ".join(lines)) + "}"
+
+    def zeros(self, size: int) -> str:
+        return "{0}"
+
+    def packed(self, name: str, array: np.ndarray) -> str:
+        kind = kind_of(array.dtype)
+
+        def text(value: np.ndarray) -> str:
+            return self.listed(map(text, value)) if value.ndim else literal_of(value, kind, "")
+
+        sized = sized_name(name, array.shape)
+        return f"static {self.declaration(kind, sized)} = {text(array)};"
+
+
+def literal(prefix: str, value: object, kind: str) -> str:
+    """Return a constant of C."""
+    if kind == "b":
+        return str(int(bool(value)))
+    text = literal_of(value, kind, suffix="")
+    return f"({prefix}_real){text}" if kind == "f" else text
+
+
+def sized_name(name: str, sizes: Iterable[int]) -> str:
+    """Return the declarator of an array, or one of its elements."""
+    return name + "".join(f"[{size}]" for size in sizes)
+
+
+def struct(prefix: str, name: str, group: Group) -> str:
+    """Return the type of a group."""
+    lines = [
+        f"  {_TYPES[field.kind].format(p=prefix)} {sized_name(field.name, field.shape)};"
+        + (f" /* {field.about} */" if field.about else "")
+        for field in group
+        if field.size
+    ]
+    empty = "  char nothing; /* it has no fields */"
+    return "\n".join(["typedef struct {", *(lines or [empty]), f"}} {prefix}_{name};", ""])
+
+
+def statements(
+    routine: Routine, inputs: Mapping[str, str], outputs: Mapping[str, str],
+    tables: dict[str, str], prefix: str,
+) -> str:  # fmt: skip
+    """Return the statements that compute and store the results of a routine.
+
+    Args:
+      routine: the function.
+      inputs: text before the names of the fields of each input group, as `params->`.
+      outputs: the same of each output group.
+      tables: declarations of constants, to which those of the routine are added.
+      prefix: of all names.
+    """
+    writer = CWriter(routine, inputs, tables, prefix)
+    lines = list(writer.body)
+    for group, field, value in writer.outputs:
+        name = f"{outputs[group]}{field.name}"
+        if len(field.shape) == 1 and field.size > 1:
+            text = writer.read(value, Node(0, "end", (value,), field.kind, field.size), set())
+            lines.append(f"for (int i = 0; i < {field.size}; i++) {name}[i] = {text};")
+        else:
+            lines += [
+                f"{sized_name(name, index)} = {writer.at(value, i)};"
+                for i, index in enumerate(np.ndindex(field.shape))
+            ]
+    for group, fields in routine.outputs.items():
+        if not any(field.size for field in fields):
+            lines.append(f"{outputs[group]}nothing = 0;")
+    return "\n".join(f"  {line}" for line in lines)

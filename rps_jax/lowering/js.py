@@ -1,0 +1,110 @@
+"""Printer of JavaScript: the statements of a routine, literals and helper functions."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from rps_jax.lowering import spelling
+from rps_jax.lowering.routine import Group, Routine
+from rps_jax.lowering.scalar_writer import ScalarWriter
+
+HELPERS = """\
+const finite = (x) => (Array.isArray(x) ? x.every(finite) : Number.isFinite(Number(x)));
+const nan = (x) => (Array.isArray(x) ? x.some(nan) : Number.isNaN(Number(x)));
+const rint = (x) => (Math.abs(x % 1) === 0.5 ? 2 * Math.round(x / 2) : Math.round(x));
+const clamped = (x) => Math.min(2147483647, Math.max(-2147483648, x));
+const int = (x) => (Number.isNaN(x) ? 0 : Math.trunc(clamped(x)));
+const unpacked = (text, Kind, rows) => {
+  const all = new Kind(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
+  const columns = all.length / rows;
+  return Array.from({ length: rows }, (_, i) => all.subarray(i * columns, (i + 1) * columns));
+};
+"""
+
+
+class JsWriter(ScalarWriter):
+    """Printer of one routine as statements of JavaScript."""
+
+    compiler = "the JavaScript exporter"
+    spelling = spelling.JAVASCRIPT
+    index = "let"
+    flag = "Boolean({})"
+    alias = "{head} = {name}.flat(Infinity);"
+
+    def declaration(self, kind: str, name: str, size: int = 1, constant: bool = True) -> str:
+        return f"{'const' if constant or size > 1 else 'let'} {name}"
+
+    def empty(self, kind: str, name: str, size: int) -> str:
+        return f"const {name} = Array({size});"
+
+    def literal(self, value: object, kind: str) -> str:
+        return text_of(np.asarray(value).item())
+
+    def listed(self, texts: Iterable[str]) -> str:
+        return f"[{', '.join(texts)}]"
+
+    def zeros(self, size: int) -> str:
+        return f"Array({size}).fill(0)"
+
+    def packed(self, name: str, array: np.ndarray) -> str:
+        """Return a table; a matrix is packed in as few bytes as are exact."""
+        if array.ndim < 2:
+            return f"const {name} = {text_of(array.tolist())};"
+        exact = bool(np.all(array.astype("<f4") == array))
+        kind, dtype = ("Float32Array", "<f4") if exact else ("Float64Array", "<f8")
+        packed = base64.b64encode(array.astype(dtype).tobytes()).decode()
+        return f'const {name} = unpacked("{packed}", {kind}, {len(array)});'
+
+
+def statements(routine: Routine, groups: Mapping[str, str], tables: dict[str, str]) -> str:
+    """Return the statements that compute the results of a routine, as named constants.
+
+    Args:
+      routine: the function.
+      groups: text before the names of the fields of each input group, as `params.`.
+      tables: declarations of constants, to which those of the routine are added.
+    """
+    writer = JsWriter(routine, groups, tables)
+    lines = list(writer.body)
+    for group, field, value in writer.outputs:
+        names = [writer.at(value, i) for i in range(field.size)]
+        array = np.array(names, object).reshape(field.shape).tolist()
+        lines.append(f"const result_{group}_{field.name} = {_nested(array)};")
+    return "\n".join(f"  {line}" for line in lines)
+
+
+def function(name: str, routine: Routine, tables: dict[str, str]) -> str:
+    """Return a routine as a function of its groups of fields."""
+    lines = statements(routine, {group: f"{group}." for group in routine.inputs}, tables)
+    results = ", ".join(f"{group}: {object_of(group, routine.outputs)}"
+                        for group in routine.outputs)  # fmt: skip
+    head = f"function {name}({', '.join(routine.inputs)}) {{"
+    return f"{head}\n{lines}\n  return {{ {results} }};\n}}\n"
+
+
+def object_of(group: str, groups: Mapping[str, Group]) -> str:
+    """Return the results of a routine as an object."""
+    fields = ", ".join(f"{field.name}: result_{group}_{field.name}" for field in groups[group])
+    return f"{{ {fields} }}"
+
+
+def text_of(value: object) -> str:
+    """Return numbers, texts, lists and mappings as a literal of JavaScript."""
+    if isinstance(value, Mapping):
+        items = (f"{json.dumps(k)}: {text_of(v)}" for k, v in value.items())
+        return "{" + ", ".join(items) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(text_of, value)) + "]"
+    if isinstance(value, float) and not math.isfinite(value):
+        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    return json.dumps(value)
+
+
+def _nested(names: object) -> str:
+    """Return names in nested lists as text."""
+    return "[" + ", ".join(map(_nested, names)) + "]" if isinstance(names, list) else str(names)

@@ -1,0 +1,247 @@
+"""Target that builds a graph of ONNX in float32: each value is a tensor of the graph."""
+
+from __future__ import annotations
+
+import string
+from collections.abc import Hashable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rps_jax import errors
+from rps_jax.lowering.target import (
+    REDUCTIONS,
+    Params,
+    Target,
+    Typed,
+    UnsupportedError,
+    Value,
+    kind_of,
+    size_of,
+)
+
+_OPSET, _FORMAT = 18, 9  # versions of the operators and of the file
+_DTYPES = {"f": np.float32, "i": np.int32, "b": np.bool_}
+_NAMES = {
+    **{name: name.capitalize() for name in ("add", "sub", "mul", "div", "max", "min", "neg")},
+    **{name: name.capitalize() for name in ("abs", "sqrt", "exp", "log", "sin", "cos", "tan")},
+    **{name: name.capitalize() for name in ("asin", "acos", "atan", "sinh", "cosh", "tanh")},
+    **{name: name.capitalize() for name in ("asinh", "acosh", "atanh", "sign", "floor", "ceil")},
+    **{name: name.capitalize() for name in ("erf", "pow", "and", "or", "xor", "not")},
+    "logistic": "Sigmoid",
+    "lt": "Less",
+    "le": "LessOrEqual",
+    "gt": "Greater",
+    "ge": "GreaterOrEqual",
+    "eq": "Equal",
+}
+_REDUCED = {"add": "ReduceSum", "mul": "ReduceProd", "max": "ReduceMax", "min": "ReduceMin"}
+
+
+class Tensor(NamedTuple):
+    """A value of the graph."""
+
+    name: str
+    shape: tuple[int, ...]
+    kind: str
+    about: str = ""
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Type of the numbers."""
+        return np.dtype(_DTYPES[self.kind])
+
+
+class Graph(Target):
+    """Target that builds a graph of ONNX."""
+
+    compiler = "the ONNX exporter"
+
+    def __init__(self) -> None:
+        """Build a graph without nodes.
+
+        Raises:
+          InputError: ONNX is not installed.
+        """
+        self.onnx: Any = errors.require("onnx", "export")
+        self.nodes: list[Any] = []
+        self.constants: dict[Hashable, Any] = {}
+
+    def tensor(self, value: Value) -> Tensor:
+        """Return a value as a tensor."""
+        if isinstance(value, Tensor):
+            return value
+        array = np.asarray(value)
+        kind = kind_of(array.dtype)
+        return self.constant(array.astype(_DTYPES[kind]), kind)
+
+    def constant(self, array: np.ndarray, kind: str = "") -> Tensor:
+        """Return a constant as a tensor."""
+        array = np.ascontiguousarray(array).reshape(array.shape)
+        key = (array.tobytes(), array.shape, array.dtype.str)
+        if key not in self.constants:
+            name = f"constant_{len(self.constants)}"
+            self.constants[key] = self.onnx.numpy_helper.from_array(array, name)
+        return Tensor(self.constants[key].name, array.shape, kind)
+
+    def node(
+        self, op: str, inputs: Sequence[Tensor], shape: Sequence[int], kind: str,
+        **attributes: object,
+    ) -> Tensor:  # fmt: skip
+        """Return the result of an operator."""
+        out = Tensor(f"value_{len(self.nodes)}", tuple(shape), kind)
+        names = [tensor.name for tensor in inputs]
+        self.nodes.append(self.onnx.helper.make_node(op, names, [out.name], **attributes))
+        return out
+
+    def reshaped(self, value: Value, shape: Sequence[int]) -> Tensor:
+        """Return a value in another shape."""
+        tensor = self.tensor(value)
+        if tensor.shape == tuple(shape):
+            return tensor
+        to = self.constant(np.array(shape, np.int64))
+        return self.node("Reshape", [tensor, to], shape, tensor.kind)
+
+    def moved(self, values: Sequence[Value], indices: np.ndarray, like: Typed) -> Value:
+        """Gather numbers at constant indices: a reshape or an expansion where that suffices."""
+        if not indices.size:
+            return np.zeros(indices.shape, like.dtype)
+        flat = [self.reshaped(value, (size_of(value.shape),)) for value in values]
+        kind, size = kind_of(like.dtype), sum(tensor.shape[0] for tensor in flat)
+        whole = flat[0] if len(flat) == 1 else self.node("Concat", flat, (size,), kind, axis=0)
+        if size == 1 and indices.size > 1:
+            to = self.constant(np.array(indices.shape, np.int64))
+            return self.node("Expand", [whole, to], indices.shape, kind)
+        if indices.size != size or (indices.reshape(-1) != np.arange(size)).any():
+            at = self.constant(indices.reshape(-1).astype(np.int64))
+            whole = self.node("Gather", [whole, at], (indices.size,), kind, axis=0)
+        return self.reshaped(whole, indices.shape)
+
+    def apply(self, name: str, values: Sequence[Value], params: Params, out: Typed) -> Tensor:
+        """Apply a primitive."""
+        x, shape, kind = [self.tensor(value) for value in values], out.shape, kind_of(out.dtype)
+
+        def make(op: str, *inputs: Tensor, to: str = kind, **attributes: object) -> Tensor:
+            return self.node(op, inputs, shape, to, **attributes)
+
+        def number(value: float) -> Tensor:
+            return self.constant(np.asarray(value, _DTYPES[x[0].kind]), x[0].kind)
+
+        if name in ("div", "rem") and kind == "i":
+            return self._divided(name, x[0], x[1], out)
+        if name in _NAMES:
+            return make(_NAMES[name], *x)
+        if name == "ne":
+            return make("Not", make("Equal", *x))
+        if name == "select_n":
+            if kind != "b":
+                return make("Where", x[0], x[2], x[1])
+            yes, no = make("And", x[0], x[2]), make("And", make("Not", x[0]), x[1])
+            return make("Or", yes, no)
+        if name == "convert_element_type":
+            return (
+                self._integer(x[0]) if (x[0].kind, kind) == ("f", "i") else self._cast(x[0], kind)
+            )
+        if name == "rem":
+            return make("Mod", *x, fmod=1)
+        if name == "rsqrt":
+            return make("Reciprocal", make("Sqrt", x[0]))
+        if name == "square":
+            return make("Mul", x[0], x[0])
+        if name == "round" and int(params["rounding_method"]) == 1:
+            return make("Round", x[0])
+        if name == "is_finite":
+            special = make("Or", make("IsInf", x[0], to="b"), make("IsNaN", x[0], to="b"), to="b")
+            return make("Not", special)
+        if name == "atan2":
+            y, at = x
+            zero, pi = number(0), number(np.pi)
+            upright = make("Mul", make("Sign", y), number(np.pi / 2))
+            behind = make("Where", make("Less", y, zero, to="b"), make("Neg", pi), pi)
+            turn = make("Where", make("Less", at, zero, to="b"), behind, zero)
+            angle = make("Add", make("Atan", make("Div", y, at)), turn)
+            return make("Where", make("Equal", at, zero, to="b"), upright, angle)
+        if name in REDUCTIONS:
+            return self._reduced(REDUCTIONS[name], x[0], params["axes"], shape, kind)
+        if name == "dot_general":
+            return make("Einsum", *x, equation=_equation(x, params["dimension_numbers"]))
+        raise UnsupportedError(name)
+
+    def _divided(self, name: str, x: Tensor, y: Tensor, out: Typed) -> Value:
+        """Divide integers as JAX does: by 0 the quotient is -1 and the remainder the dividend."""
+        zero, one = np.zeros((), np.int32), np.ones((), np.int32)
+        flag = np.empty(out.shape, bool)
+        by_zero = self.apply("eq", [y, zero], {}, flag)
+        by_minus_one = self.apply("eq", [y, -one], {}, flag)
+        divisor = self.apply("select_n", [by_zero, y, one], {}, out)
+        divisor = self.apply("select_n", [by_minus_one, divisor, one], {}, out)
+        quotient = self.node("Div", [x, divisor], out.shape, "i")
+        if name == "div":
+            negative = self.apply("neg", [x], {}, out)
+            quotient = self.apply("select_n", [by_minus_one, quotient, negative], {}, out)
+            return self.apply("select_n", [by_zero, quotient, -one], {}, out)
+        whole = self.apply("mul", [quotient, divisor], {}, out)
+        return self.apply("select_n", [by_zero, self.apply("sub", [x, whole], {}, out), x], {}, out)
+
+    def _integer(self, x: Tensor) -> Tensor:
+        """Convert reals to integers as JAX does: NaN to 0, and saturating."""
+        flag, integer = np.empty(x.shape, bool), np.empty(x.shape, np.int32)
+        low, high = np.float32(-(2**31)), np.float32(2**31 - 128)
+        number = self.apply("eq", [x, x], {}, flag)
+        y = self.apply("select_n", [number, np.float32(0), x], {}, x)
+        y = self.apply("max", [y, low], {}, x)
+        y = self._cast(self.apply("min", [y, high], {}, x), "i")
+        above = self.apply("gt", [x, high], {}, flag)
+        return self.apply("select_n", [above, y, np.int32(2**31 - 1)], {}, integer)
+
+    def _cast(self, x: Tensor, kind: str) -> Tensor:
+        return self.node("Cast", [x], x.shape, kind, to=self._type(kind))
+
+    def _type(self, kind: str) -> int:
+        return self.onnx.helper.np_dtype_to_tensor_dtype(np.dtype(_DTYPES[kind]))
+
+    def _reduced(
+        self, binary: str, x: Tensor, axes: Sequence[int], shape: Sequence[int], kind: str
+    ) -> Tensor:
+        over = self.constant(np.array(axes, np.int64))
+        if binary in ("and", "or"):
+            whole = self._cast(x, "i")
+            op = "ReduceMin" if binary == "and" else "ReduceMax"
+            return self._cast(self.node(op, [whole, over], shape, "i", keepdims=0), "b")
+        return self.node(_REDUCED[binary], [x, over], shape, kind, keepdims=0)
+
+    def model(
+        self, name: str, inputs: Sequence[Tensor], outputs: Sequence[tuple[Tensor, Value]],
+        **names: str,
+    ) -> Any:  # fmt: skip
+        """Return the graph as a model of ONNX; `names` are its text fields."""
+        make = self.onnx.helper
+        for out, value in outputs:
+            self.nodes.append(make.make_node("Identity", [self.tensor(value).name], [out.name]))
+
+        def infos(tensors: Sequence[Tensor]) -> list[Any]:
+            return [
+                make.make_tensor_value_info(x.name, self._type(x.kind), x.shape, x.about)
+                for x in tensors
+            ]
+
+        graph = make.make_graph(
+            self.nodes, name, infos(inputs), infos([out for out, _ in outputs]),
+            list(self.constants.values()), doc_string=names.pop("doc_string", ""),
+        )  # fmt: skip
+        opset = make.make_opsetid("", _OPSET)
+        return make.make_model(graph, opset_imports=[opset], ir_version=_FORMAT, **names)
+
+
+def _equation(x: Sequence[Tensor], numbers: Any) -> str:
+    """Return a product as an equation of `Einsum`."""
+    (left, right), (left_batch, right_batch) = numbers
+    letters = iter(string.ascii_lowercase)
+    a = [next(letters) for _ in x[0].shape]
+    b = [next(letters) for _ in x[1].shape]
+    for i, j in zip((*left, *left_batch), (*right, *right_batch), strict=True):
+        b[j] = a[i]
+    out = [a[i] for i in left_batch]
+    out += [c for i, c in enumerate(a) if i not in (*left, *left_batch)]
+    out += [c for j, c in enumerate(b) if j not in (*right, *right_batch)]
+    return f"{''.join(a)},{''.join(b)}->{''.join(out)}"

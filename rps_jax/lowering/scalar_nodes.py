@@ -1,0 +1,187 @@
+"""Graph of arrays that scalar C and JavaScript are printed from.
+
+`ScalarNodes` builds the graph. Unlike `SimdNodes` it leaves the precision to the printed code, and
+a product with a large constant matrix is one node (`product`). `conditional` moves such products
+into a block that runs only when its result is used.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import numpy as np
+
+from rps_jax.lowering.nodes import (
+    Array,
+    LoopNode,
+    Node,
+    SimdNodes,
+    element,
+    flat,
+    key_of,
+    matrix_indices,
+    reached,
+)
+from rps_jax.lowering.target import (
+    Body,
+    Typed,
+    UnsupportedError,
+    Value,
+    is_constant,
+    kind_of,
+    size_of,
+)
+
+_LARGE = 256  # weights of a matrix from which on a product is a loop over its rows
+
+
+class ScalarNodes(SimdNodes):
+    """Target that builds the graph of a function for one thread, in float or double."""
+
+    kinds = "fib"
+    max_products = 100_000
+
+    def __init__(self, compiler: str, operations: Collection[str]) -> None:
+        """Errors name the compiler; `operations` are those that the language spells."""
+        super().__init__()
+        self.compiler, self.operations = compiler, frozenset(operations)
+        self.matrices: dict[bytes, np.ndarray] = {}
+
+    def kind(self, dtype: object, name: str) -> str:
+        return kind_of(dtype, name, self.kinds)
+
+    def source(self, value: Value, index: int) -> Value:
+        """Return one number of a value, from where it was gathered."""
+        number = element(value, index)
+        while isinstance(number, Array) and number.node.op == "move":
+            number = number.node.args[number.first]
+        return number
+
+    def while_loop(self, condition: Body, body: Body, carry: Sequence[Value]) -> list[Value]:
+        """Refuse a loop whose length is unknown: a control step has a deadline."""
+        raise UnsupportedError("while")
+
+    def _product(self, left: Value, right: Value, dimensions: Any, out: Typed) -> Value:
+        (left_sum, right_sum), (left_batch, right_batch) = dimensions
+        rows = matrix_indices(left, left_batch, left_sum)
+        columns = matrix_indices(right, right_batch, right_sum)
+        shape = (rows.shape[1], columns.shape[1])
+        if left_batch or kind_of(out.dtype) != "f":
+            return super()._product(left, right, dimensions, out)
+        if is_constant(right) and columns.size >= _LARGE:
+            matrix = np.reshape(right, -1)[columns[0]].T
+            product = self._times_matrix(self._rows(left, rows[0]), matrix)
+            indices = np.arange(size_of(shape))
+        elif is_constant(left) and rows.size >= _LARGE:
+            matrix = np.reshape(left, -1)[rows[0]].T
+            product = self._times_matrix(self._rows(right, columns[0]), matrix)
+            indices = np.arange(size_of(shape)).reshape(shape[::-1]).T
+        else:
+            return super()._product(left, right, dimensions, out)
+        return self.moved([product], indices.reshape(out.shape), out)
+
+    def _rows(self, value: Value, indices: np.ndarray) -> list[list[Value]]:
+        return [[self.source(value, int(i)) for i in row] for row in indices]
+
+    def _times_matrix(self, rows: list[list[Value]], matrix: np.ndarray) -> Value:
+        """Multiply rows with a constant matrix, in one loop over the matrix.
+
+        The learned laws have pairs of rows (a, b), (b, a). Sum and difference halve their
+        arithmetic: (a + b) (P + Q) / 2 plus or minus (a - b) (P - Q) / 2 of the halves P and Q.
+        """
+        matrix = np.ascontiguousarray(matrix, float)
+        columns, (half, odd) = matrix.shape[1], divmod(matrix.shape[0], 2)
+        keys = [list(map(key_of, row)) for row in rows]
+        if len(rows) == 2 and not odd and keys[0] == keys[1][half:] + keys[1][:half]:
+            like, outs = np.empty(half), np.empty(columns)
+            a, b = (self._stacked(part) for part in (rows[0][:half], rows[0][half:]))
+            p, q = matrix.reshape(2, half, columns) / 2
+            even, odd = (
+                self._times_matrix(self._rows(self.emit(name, [a, b], {}, like), _row(half)), m)
+                for name, m in (("add", p + q), ("sub", p - q))
+            )
+            halves = [self.emit(name, [even, odd], {}, outs) for name in ("add", "sub")]
+            return self.moved(halves, np.arange(2 * columns), outs)
+        key = matrix.tobytes()
+        self.matrices.setdefault(key, matrix)
+        size = len(rows) * columns
+        node = self.node("product", list(itertools.chain(*rows)), "f", size, key)
+        return Array(node, 0, 1, (size,))
+
+    def _stacked(self, numbers: Sequence[Value]) -> Value:
+        return self.moved(numbers, np.arange(len(numbers)), np.empty(0))
+
+
+def _row(size: int) -> np.ndarray:
+    return np.arange(size)[None]
+
+
+def conditional(ends: Sequence[Node]) -> list[Node]:
+    """Return all nodes that some nodes need, with a block for products that are not always used.
+
+    A learned law decides five times a second. Its network is evaluated only in these steps.
+    """
+    nodes = reached(ends)
+    if not any(node.op == "product" for node in nodes):
+        return nodes
+    conditions = {
+        (a.node, a.first): a
+        for node in nodes
+        if node.op.startswith("choose") and isinstance(a := node.args[0], Array)
+        if a.step == 0 or node.size == 1
+    }
+    for (condition, first), side in itertools.product(conditions, (1, 2)):
+        if _move_into_block(nodes, ends, conditions[condition, first], side):
+            return reached(ends)
+    return nodes
+
+
+def _move_into_block(
+    nodes: Sequence[Node], ends: Sequence[Node], condition: Array, side: int
+) -> bool:
+    """Move nodes that matter on one side of a condition into a block, if a product is there."""
+
+    def is_choice(node: Node) -> bool:
+        a = node.args[0] if node.op.startswith("choose") else None
+        return (
+            isinstance(a, Array)
+            and (a.node, a.first) == (condition.node, condition.first)
+            and (a.step == 0 or node.size == 1)
+        )
+
+    always: set[Node] = set()
+    waiting = list(ends)
+    while waiting:
+        node = waiting.pop()
+        if node not in always:
+            always.add(node)
+            args = (node.args[0], node.args[3 - side]) if is_choice(node) else node.args
+            waiting += [a.node for a in args if isinstance(a, Array)] + list(node.free)
+    block = [node for node in nodes if node not in always and node.op != "input"]
+    inside = set(block)
+    if not any(node.op == "product" for node in block):
+        return False
+    choices = [
+        node for node in nodes
+        if node in always and is_choice(node)
+        if isinstance(a := node.args[side], Array) and a.node in inside
+    ]  # fmt: skip
+    needed = {x for node in block for x in node.needed} - inside
+    starts = tuple(node.args[3 - side] for node in choices)
+    needed |= {a.node for a in (*starts, condition) if isinstance(a, Array)}
+    if set(reached(needed)) & set(choices):
+        return False
+    number = itertools.count(max(node.number for node in nodes) + 1)
+    carried = tuple(Node(next(number), "carried", (), n.kind, n.size) for n in choices)
+    results = tuple(flat(node.args[side], node.size) for node in choices)
+    holds = condition._replace(shape=(1,))
+    loop = LoopNode(
+        next(number), "if", starts, "f", 0, side == 1, tuple(needed), carried, results, holds,
+        inner=tuple(block),
+    )  # fmt: skip
+    for node, carry in zip(choices, carried, strict=True):
+        node.op, node.args, node.extra, node.free = "part", (), carry, (loop,)
+        node.__dict__.pop("whole", None)
+    return True

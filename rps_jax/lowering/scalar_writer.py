@@ -1,0 +1,202 @@
+"""Printer of a graph of arrays as scalar code, the base of the printers of C and JavaScript."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from rps_jax.lowering.nodes import Array, LoopNode, Node, results
+from rps_jax.lowering.routine import Field, Routine
+from rps_jax.lowering.scalar_nodes import ScalarNodes, conditional
+from rps_jax.lowering.target import Value, kind_of
+from rps_jax.lowering.writer import Writer
+
+_UNROLLED = 4  # elements of an array that is printed without a loop, at most
+# Rows of a matrix that one iteration multiplies. Compilers vectorise the loop over the columns, and
+# load and store a sum once for all rows.
+_ROWS = 8
+
+
+class Output(NamedTuple):
+    """A field that a routine returns, and its value."""
+
+    group: str
+    field: Field
+    value: Value
+
+
+class ScalarWriter(Writer):
+    """Printer of one routine; subclasses define the spelling of a language."""
+
+    compiler: ClassVar[str]  # name in errors
+    spelling: ClassVar[Mapping[str, str]]  # of operations
+    flag: ClassVar[str]  # of an input that is a bool
+    alias: ClassVar[str]  # declaration of a flattened input array
+    pointer: ClassVar[str] = ""  # mark of a pointer in a declaration
+
+    def __init__(
+        self, routine: Routine, groups: Mapping[str, str], tables: dict[str, str], prefix: str = ""
+    ) -> None:
+        """Print the statements `body`; constants are added to the tables.
+
+        Args:
+          routine: the function.
+          groups: text before the names of the fields of each input group, as `params->`.
+          tables: declarations of constants, by name.
+          prefix: of all names.
+        """
+        super().__init__()
+        self.tables, self.prefix = tables, prefix
+        fields = [(groups[group], x) for group, fields in routine.inputs.items() for x in fields]
+        self._inputs = [(f"{text}{field.name}", field) for text, field in fields]
+        outputs = [(group, x) for group, fields in routine.outputs.items() for x in fields]
+        target = ScalarNodes(self.compiler, self.spelling)
+        values, ends = results(
+            routine.jaxpr, [x.type for _, x in fields], [x.type for _, x in outputs], target
+        )
+        self._matrices = target.matrices
+        self.body = self.lines(conditional(ends), ends, set())
+        known = {result.index: result.value for result in values}
+        self.outputs = [Output(*x, known.get(i, ())) for i, x in enumerate(outputs)]
+
+    # --- what a language defines ---
+
+    def literal(self, value: object, kind: str) -> str:
+        """Return a constant."""
+        raise NotImplementedError
+
+    def listed(self, texts: Iterable[str]) -> str:
+        """Return an array of these elements."""
+        raise NotImplementedError
+
+    def zeros(self, size: int) -> str:
+        """Return an array of zeros."""
+        raise NotImplementedError
+
+    def packed(self, name: str, array: np.ndarray) -> str:
+        """Return the declaration of a table of constants."""
+        raise NotImplementedError
+
+    # --- expressions ---
+
+    def constant(self, value: Value) -> str:
+        array = np.asarray(value).reshape(-1)
+        return self.at(array, 0) if array.size == 1 else f"{self.table(array)}[i]"
+
+    def table(self, array: np.ndarray) -> str:
+        """Return the name of a table of constants."""
+        digest = hashlib.sha256(array.dtype.str.encode() + array.tobytes()).hexdigest()[:8]
+        name = f"{self.prefix}_w_{digest}"
+        if name not in self.tables:
+            self.tables[name] = self.packed(name, array)
+        return name
+
+    def call(self, op: str, operands: Sequence[str]) -> str:
+        return self.spelling[op].format(*operands, p=self.prefix, P=self.prefix.upper())
+
+    def at(self, a: Value, index: int) -> str:
+        """Return an element of an operand."""
+        if isinstance(a, Array):
+            return self.item(a.node, a.first + a.step * index)
+        array = np.asarray(a).reshape(-1)
+        text = self.literal(array[index if array.size > 1 else 0], kind_of(array.dtype))
+        return f"({text})" if "-" in text.split("e")[0] else text
+
+    def item(self, node: Node, index: int | str) -> str:
+        if node.op == "part":
+            return self.item(node.extra, index)
+        if node.op != "input":
+            return super().item(node, index)
+        name, field = self._inputs[node.extra]
+        if node.size == 1:
+            text = name + "[0]" * len(field.shape)
+        else:
+            text = f"{name if len(field.shape) == 1 else node.name}[{index}]"
+        return self.flag.format(text) if node.kind == "b" else text
+
+    # --- statements ---
+
+    def together(self, group: Sequence[Node], stored: set[Node]) -> list[str]:
+        size = group[0].size
+        if size > _UNROLLED:
+            return super().together(group, stored)
+        lines = []
+        for node in group:
+            if node.op.startswith("fold"):
+                pair = functools.partial(self._pair, node.op[5:])
+                text = functools.reduce(pair, (self.at(node.args[0], k) for k in range(size)))
+                lines.append(f"{self.declaration(node.kind, node.name)} = {text};")
+            else:
+                rows = [[self.at(a, k) for a in node.args] for k in range(size)]
+                lines.append(self._array(node, [self.call(node.op, row) for row in rows]))
+        return lines
+
+    def _pair(self, op: str, left: str, right: str) -> str:
+        return f"({self.call(op, [left, right])})"
+
+    def _array(self, node: Node, elements: Sequence[str]) -> str:
+        """Return the declaration of a node with its elements."""
+        text = elements[0] if node.size == 1 else self.listed(elements)
+        return f"{self.declaration(node.kind, node.name, node.size)} = {text};"
+
+    def single(self, node: Node) -> list[str]:
+        if node.op == "part":
+            return []
+        if node.op == "input":
+            name, field = self._inputs[node.extra]
+            if node.size == 1 or len(field.shape) == 1:
+                return []
+            corner = name + "[0]" * len(field.shape)
+            head = self.declaration(node.kind, f"{self.pointer}{node.name}")
+            return [self.alias.format(head=head, name=name, corner=corner)]
+        if node.op == "product":
+            return self._product(node)
+        if node.op == "move":
+            return [self._array(node, [self.at(a, 0) for a in node.args])]
+        if node.op == "take":
+            index, source = node.args
+            row, table = self.at(index, 0), np.array(node.extra)
+            return [self._array(node, [
+                self.item(source.node, self._entry(table[:, k], row)) for k in range(node.size)
+            ])]  # fmt: skip
+        return [self._array(node, [self.call(node.op, [self.at(a, 0) for a in node.args])])]
+
+    def _entry(self, column: np.ndarray, row: str) -> str:
+        """Return the entry of a column of indices in a row."""
+        first, step = column[0], column[1] - column[0] if len(column) > 1 else 0
+        if (column == first + step * np.arange(len(column))).all():
+            text = row if step == 1 else f"{step} * {row}"
+            return f"{first} + {text}" if first else text
+        return f"{self.table(column)}[{row}]"
+
+    def head(self, loop: LoopNode) -> str:
+        if loop.op != "if":
+            return super().head(loop)
+        return f"if ({'' if loop.extra else '!'}{self.at(loop.condition, 0)}) {{"
+
+    def _product(self, node: Node) -> list[str]:
+        """Return a product of rows with a matrix, which is padded with zeros."""
+        n, matrix = node.number, self._matrices[node.extra]
+        inputs, columns = matrix.shape
+        padded = inputs + -inputs % _ROWS
+        table = self.table(np.pad(matrix, ((0, padded - inputs), (0, 0))))
+        items = [self.at(a, 0) for a in node.args]
+        zeros = [self.literal(0.0, "f")] * (padded - inputs)
+        rows = [[*items[i : i + inputs], *zeros] for i in range(0, len(items), inputs)]
+        flat = [text for row in rows for text in row]
+        lines = [
+            f"{self.declaration('f', f'x{n}', len(flat))} = {self.listed(flat)};",
+            f"{self.declaration('f', node.name, node.size, constant=False)} = "
+            f"{self.zeros(node.size)};",
+            f"for ({self.index} i = 0; i < {padded}; i += {_ROWS}) {{",
+            f"  for ({self.index} j = 0; j < {columns}; j++) {{",
+        ]
+        for r in range(len(rows)):
+            total = f"{node.name}[{r * columns} + j]" if r else f"{node.name}[j]"
+            terms = [f"x{n}[i + {r * padded + k}] * {table}[i + {k}][j]" for k in range(_ROWS)]
+            lines.append(f"    {total} = {' + '.join([total, *terms])};")
+        return [*lines, "  }", "}"]
