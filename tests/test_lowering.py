@@ -9,15 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-<<<<<<< HEAD
-from rps_jax.app.export import c
-from rps_jax.app.export.program import routine
 from rps_jax.engines import device
-=======
 from rps_jax.lowering import c
 from rps_jax.lowering.routine import routine
-from rps_jax.record import provenance
->>>>>>> d42b8ea (Print scalar C and JavaScript from the graph of SIMD C)
 
 REALS = [0.0, -0.0, 0.5, -1.5, 2.5, 7.0, 1e30, -1e30, np.inf, -np.inf, np.nan]
 BOUNDS = [2147483520.0, -2147483520.0, 2147483648.0, -2147483648.0, -2147483904.0, 3e9]

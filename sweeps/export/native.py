@@ -25,15 +25,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-<<<<<<< HEAD
-from rps_jax.app.export import c, folder, graph, program
-from rps_jax.app.export.program import Group, Program
-from rps_jax.control import registry, validation
-=======
 from rps_jax.app.export import c, folder, onnx_model, program
 from rps_jax.app.export.program import Program
-from rps_jax.control import registry, trying
->>>>>>> d42b8ea (Print scalar C and JavaScript from the graph of SIMD C)
+from rps_jax.control import registry, validation
 from rps_jax.control.base import Law
 from rps_jax.lowering.routine import Group
 
