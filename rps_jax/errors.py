@@ -1,4 +1,4 @@
-"""The one exception for input that cannot be used, and the checks that raise it."""
+"""The exception for invalid input, and the checks that raise it."""
 
 from __future__ import annotations
 
@@ -13,24 +13,22 @@ from typing import Any
 
 
 class InputError(ValueError):
-    """Bad input: one sentence that names the field, its value and what is allowed.
+    """Invalid input: one sentence with the field, its value, the allowed values and the fix.
 
-    Of a word of more than `_LONGEST` characters, as a value may be one, only its beginning stands
-    there; what cannot be printed is escaped.
+    A word of more than `_MAX_WORD` characters is shortened; unprintable characters are escaped.
     """
 
     def __init__(self, sentence: object) -> None:
-        """Say it."""
         super().__init__(_readable(str(sentence)))
 
 
-_LONGEST = 200  # characters of a word; most paths are shorter
-_ENDLESS = re.compile(rf"(\S{{60}})\S{{{_LONGEST - 60},}}?([^\w\s]{{0,3}})(?!\S)")
+_MAX_WORD = 200  # characters; most paths are shorter
+_LONG_WORD = re.compile(rf"(\S{{60}})\S{{{_MAX_WORD - 60},}}?([^\w\s]{{0,3}})(?!\S)")
 
 
 def _readable(sentence: str) -> str:
-    """A sentence without endless words, and without characters that a terminal would obey."""
-    short = _ENDLESS.sub(r"\1…\2", sentence)
+    """Return a sentence with long words shortened and control characters escaped."""
+    short = _LONG_WORD.sub(r"\1…\2", sentence)
     plain = (c if c.isprintable() else ascii(c)[1:-1] for c in short)
     return "".join(plain)
 
@@ -45,12 +43,19 @@ def check_number(
     unit: str = "",
     text: bool = False,
 ) -> float:
-    """`value` as a float if it is a number within bounds; infinite only where `at_most` says so.
+    """Return a value as a float if it is a number within bounds; it may be infinite.
 
-    A text is no number, unless one that says a number is allowed by `text`.
+    Args:
+      name: of the field, for the error.
+      value: any input.
+      above: exclusive lower bound.
+      at_least: lower bound.
+      at_most: upper bound.
+      unit: of the value, for the error.
+      text: whether a text with a number is allowed.
 
     Raises:
-      InputError: it is NaN, not a number, or out of bounds.
+      InputError: the value is NaN, not a number, or out of bounds.
     """
     bounds = []
     if above > -math.inf:
@@ -61,29 +66,25 @@ def check_number(
         bounds.append(f"at most {at_most:g}")
     allowed = " and ".join(["a number", *bounds]) + (f" [{unit}]" if unit else "")
     try:
-        odd = (isinstance(value, str) and not text) or "complex" in type(value).__name__
-        number = math.nan if odd else float(value)
+        refused = (isinstance(value, str) and not text) or "complex" in type(value).__name__
+        scalar = math.nan if refused else float(value)
     except (TypeError, ValueError, OverflowError):
-        number = math.nan
-    if math.isnan(number) or not (above < number and at_least <= number <= at_most):
+        scalar = math.nan
+    if math.isnan(scalar) or not (above < scalar and at_least <= scalar <= at_most):
         raise InputError(f"{name} = {value} is not allowed: it must be {allowed}.")
-    return number
+    return scalar
 
 
 def check_finite(name: str, value: Any, **bounds: Any) -> float:
-    """`check_number`, and finite."""
-    number = check_number(name, value, **bounds)
-    if math.isinf(number):
+    """Return a value as a float if it is a finite number within bounds: see `check_number`."""
+    scalar = check_number(name, value, **bounds)
+    if math.isinf(scalar):
         raise InputError(f"{name} = {value} is not allowed: it must be finite.")
-    return number
+    return scalar
 
 
-def check_count(name: str, value: Any, *, at_least: int = 1, at_most: int) -> int:
-    """`value` if it is a whole number within bounds.
-
-    Raises:
-      InputError: it is not.
-    """
+def check_count(name: str, value: object, *, at_least: int = 1, at_most: int) -> int:
+    """Return a value if it is a whole number within bounds, or raise InputError."""
     if not (isinstance(value, numbers.Integral) and at_least <= int(value) <= at_most):
         raise InputError(
             f"{name} = {value} is not allowed: it must be a whole number from {at_least} to "
@@ -93,7 +94,7 @@ def check_count(name: str, value: Any, *, at_least: int = 1, at_most: int) -> in
 
 
 def check_name(kind: str, name: str, known: Iterable[str]) -> str:
-    """`name` if it is one of `known`; otherwise an InputError lists them and the nearest."""
+    """Return a name if it is known, or raise an InputError with the known and the nearest names."""
     known = list(known)
     if name in known:
         return name
@@ -102,10 +103,12 @@ def check_name(kind: str, name: str, known: Iterable[str]) -> str:
     raise InputError(f"unknown {kind} '{name}': choose from {', '.join(known)}{hint}.")
 
 
-def check_each_once(field: str, given: Sequence[Any], labels: Sequence[Any] | None = None) -> None:
-    """Raises InputError if nothing is given, or one twice, by its label if it has one."""
-    if not given or len(set(given if labels is None else labels)) < len(given):
-        raise InputError(f"{field} = {given} is not allowed: name each once, at least one.")
+def check_each_once(
+    field: str, values: Sequence[object], labels: Sequence[object] | None = None
+) -> None:
+    """Raise InputError if there is no value, or if a value (or its label) is repeated."""
+    if not values or len(set(values if labels is None else labels)) < len(values):
+        raise InputError(f"{field} = {values} is not allowed: name each once, at least one.")
 
 
 def require(module: str, extra: str) -> ModuleType:

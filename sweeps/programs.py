@@ -27,7 +27,7 @@ from rps_jax.trials.trial import ControlLoop, Trial, World
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws, paper
 from rps_jax.world.domain import DOMAINS, Range
-from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
+from rps_jax.world.physics import MUJOCO_GROUND, Physics, preset
 from rps_jax.world.scene import FRICTION
 
 FAMILIES = ("box", "cylinder", "prism")
@@ -41,7 +41,7 @@ _MUJOCO_DEFAULTS = Physics(
     iterations=100,
     ls_iterations=50,
     tolerance=1e-8,
-    **MUJOCOS_GROUND,
+    **MUJOCO_GROUND,
 )
 # Timed programs, batched on JAX's device.
 BATCHED = {

@@ -86,7 +86,7 @@ NEAR = replace(
     lateral=Range(-0.03, 0.03),
     com_offset=Range(0, 0),
     gap=Range(0.02, 0.02),
-    **{name: Range(0, 0) for name in domain.of("base")},
+    **{name: Range(0, 0) for name in domain.quantities_of("base")},
 )
 SLOTS = 8  # of all sweeps of this setting, so that they share their programs
 BOXES = replace(

@@ -14,7 +14,7 @@ from rps_jax.runs.question import Run
 from rps_jax.studies import hardware
 from rps_jax.trials.progress import no_progress
 from rps_jax.tuning import learn
-from rps_jax.world.domain import WORDS
+from rps_jax.world.domain import LABELS
 from sweeps.ambiguities.study import tolerance_curve
 from sweeps.landscape.study import parameters_figure
 from sweeps.levers.study import levers_figure
@@ -105,7 +105,7 @@ def test_statistics_and_tables_of_a_sweep_by_hand():
 def random_worlds(success, **drawn):
     """Results of laws (laws, worlds) in which only the given quantities differ between worlds."""
     count = success.shape[1]
-    columns = {name: ("world", np.zeros(count), {"units": "1"}) for name in WORDS}
+    columns = {name: ("world", np.zeros(count), {"units": "1"}) for name in LABELS}
     columns |= {name: ("world", values, {"units": "kg"}) for name, values in drawn.items()}
     columns["success"] = (("law", "world"), success.astype(np.int8))
     return xr.Dataset(columns, coords={"law": list("ab")[: len(success)]})
@@ -186,8 +186,8 @@ def test_the_figure_shows_the_influential_quantities_and_names_the_rest(drawn):
     assert title.endswith(": yaw of the object, mass of the object")
     text = figure.get_supxlabel().replace("\N{NO-BREAK SPACE}", " ")
     for x in influences:
-        assert (WORDS[x.name] in title) == (x in influences[:2])
-        assert (WORDS[x.name] in text) == (x in influences[2:])
+        assert (LABELS[x.name] in title) == (x in influences[:2])
+        assert (LABELS[x.name] in text) == (x in influences[2:])
 
 
 def test_coinciding_curves_are_all_visible(drawn):

@@ -103,7 +103,7 @@ def test_fused_bodies_equal_those_of_recompiled_models(name):
     worlds, family = drawn(name), RANDOM[name]
     _, bodies = engines.get("fused").stage(family, worlds.solid, worlds.friction, preset())
     for i in range(COUNT):
-        one = scene.of_solid(family, worlds.solid, worlds.friction, preset(), i)
+        one = scene.compile_row(family, worlds.solid, worlds.friction, preset(), i)
         compiled = fused.body(one.physics, np.asarray(one.footprint.vertices, float))
         for field, a, b in zip(compiled._fields, bodies, compiled, strict=True):
             if b is None:  # these solids have no feet of their own
@@ -118,7 +118,7 @@ def test_applied_domain_equals_the_recompiled_model_in_every_field(name):
     _, fields = engines.get("mjx").stage(family, worlds.solid, worlds.friction, preset())
     assert set(fields) <= set(mjx_engine.FIELDS)
     for i in range(COUNT):
-        one = scene.of_solid(family, worlds.solid, worlds.friction, preset(), i)
+        one = scene.compile_row(family, worlds.solid, worlds.friction, preset(), i)
         compiled = mjx.put_model(one.physics)
         # The mesh of a prism stands for it in C MuJoCo alone: MJX reads its corners off its feet.
         real = one.physics.geom_type != mujoco.mjtGeom.mjGEOM_MESH
@@ -136,7 +136,7 @@ def test_models_of_a_family_differ_in_nothing_but_these_fields():
     for name, family in RANDOM.items():
         worlds = drawn(name, 2)
         models = [
-            scene.of_solid(family, worlds.solid, worlds.friction, preset(), i).physics
+            scene.compile_row(family, worlds.solid, worlds.friction, preset(), i).physics
             for i in range(2)
         ]
         if family != "prism":  # whose meshes differ, and are not read

@@ -109,7 +109,7 @@ def test_worlds_are_those_of_the_domain(pushing):
     drawn = draws.draw(replace(NEAR, objects=("random_cylinder",)), 0, index)
     np.testing.assert_allclose(state.info["world"].footprint.radius, drawn.solid.radius, rtol=1e-6)
     np.testing.assert_allclose(state.obs[:, 42:], drawn.p_world_target, rtol=1e-6)
-    np.testing.assert_allclose(state.data.qpos[:, 4], drawn.at["lateral"], rtol=1e-6)
+    np.testing.assert_allclose(state.data.qpos[:, 4], drawn.values["lateral"], rtol=1e-6)
 
 
 def test_an_action_is_a_share_of_the_greatest_twist():

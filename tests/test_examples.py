@@ -162,7 +162,7 @@ BAD_FILES = {
         root.remove(root.find("contact")),
         _body(root).find("geom").attrib.pop("name"),
     ),
-    "joints of .* nothing else a joint": _with_a_hinge,
+    "joints of .* no other body a joint": _with_a_hinge,
     "bodies within the body object": _with_a_lid,
     "from 0 to 0.8 m .* in the middle of its height": lambda root: (
         _body(root).find("geom").set("pos", "0 0 0.4")

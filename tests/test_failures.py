@@ -361,7 +361,7 @@ def test_the_regression_set_is_small_hard_and_diverse():
     assert known.u.shape == (200, len(points.names(DOMAINS["wide"])))
     assert regress.FILE.stat().st_size < 200_000
     assert known.known.values.tolist() == ["rps", "rps_tuned", "rps_plus", "learned_gru"]
-    points.checked(DOMAINS["wide"], known)
+    points.check_points(DOMAINS["wide"], known)
     assert len(np.unique(known.u, axis=0)) == 200
     failed = known.success.values == 0
     assert (failed.sum(axis=1) >= 10).all()  # of each law

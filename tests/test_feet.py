@@ -166,7 +166,7 @@ def test_feet_without_sense_are_refused(stands, feet, message):
 def drawn_on_feet(name, count=4):
     """Worlds with drawn feet, and with those of the same worlds without."""
     changes = f"wide,objects={name},gap=0,lateral=-0.05:0.05,height=0.3:0.4,friction_ground=0.1:0.4"
-    ranges = [domains.named(changes), domains.named(f"{changes},feet=0.5:0.9")]
+    ranges = [domains.parse_domain(changes), domains.parse_domain(f"{changes},feet=0.5:0.9")]
     plain, on_feet = (draws.draw(one, 3, np.arange(count)) for one in ranges)
     return plain, on_feet, ranges[1].families[0]
 
@@ -203,15 +203,15 @@ def stepped(engine, family, drawn, steps):
 def test_drawn_feet_change_nothing_else_and_bear_the_object(name):
     plain, drawn, _ = drawn_on_feet(name, 64)
     assert plain.solid.feet is None
-    for a, b in zip(jax.tree.leaves(plain._replace(solid=None, at=None)),
-                    jax.tree.leaves(drawn._replace(solid=None, at=None)), strict=True):  # fmt: skip
+    rest = [jax.tree.leaves(x._replace(solid=None, values=None)) for x in (plain, drawn)]
+    for a, b in zip(*rest, strict=True):
         np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(plain.solid.mass, drawn.solid.mass)
-    assert set(drawn.at) - set(plain.at) == {"feet"}
+    assert set(drawn.values) - set(plain.values) == {"feet"}
     feet, com = drawn.solid.feet, drawn.solid.p_object_com[:, :2]
     assert set(feet[..., 2].sum(axis=1)) == {3.0, 4.0}
     for share, one, middle, outline, radius in zip(
-        drawn.at["feet"], feet, com, drawn.solid.vertices, drawn.solid.radius, strict=True
+        drawn.values["feet"], feet, com, drawn.solid.vertices, drawn.solid.radius, strict=True
     ):
         for foot in one[one[:, 2] > 0, :2]:
             # Stretched by the share, a foot lies on the outline.
@@ -259,12 +259,12 @@ def test_quasistatic_slides_on_drawn_feet():
 
 def test_feet_are_drawn_for_random_objects_alone():
     with pytest.raises(InputError, match="random ones alone stand on drawn feet"):
-        domains.named("wide,objects=box,feet=0.5:0.9")
-    ranges = domains.named("wide,feet=0.5:0.9")
+        domains.parse_domain("wide,objects=box,feet=0.5:0.9")
+    ranges = domains.parse_domain("wide,feet=0.5:0.9")
     assert {"feet", "feet_number", "feet_turn"} == set(points.names(ranges)) - set(
-        points.names(domains.named("wide"))
+        points.names(domains.parse_domain("wide"))
     )
     u = points.points_of(ranges, np.arange(6), 1)
-    again = points.checked(ranges, u).draw(ranges, np.array([0, 3]))
+    again = points.check_points(ranges, u).draw(ranges, np.array([0, 3]))
     drawn = draws.draw(ranges, 1, np.array([0, 3]))
     np.testing.assert_array_equal(again.solid.feet, drawn.solid.feet)

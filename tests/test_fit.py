@@ -228,7 +228,7 @@ def test_four_observations_halve_the_width(toy):
 
 
 def test_a_fitted_domain_keeps_what_is_undetermined_and_is_read_by_every_command(tmp_path):
-    wide = domains.named("wide")
+    wide = domains.parse_domain("wide")
     u = np.random.default_rng(1).random((4000, len(fit.coordinates(wide))))
     at = {name: i for i, name in enumerate(fit.coordinates(wide))}
     u[:, at["mass"]] *= 0.5
@@ -252,7 +252,7 @@ def test_a_log_is_fitted_from_the_shell(tmp_path, capsys):
     told = capsys.readouterr().out
     assert "undetermined" in told
     assert "nothing here holds" in told  # no world gives such a log: its object never slides
-    found = domains.named(str(tmp_path / "run" / "fitted.json"))
+    found = domains.parse_domain(str(tmp_path / "run" / "fitted.json"))
     assert found.objects == ("random_box",)
     assert (tmp_path / "run" / "marginals.png").stat().st_size > 10_000
     assert rps(*ask, "--physics", "default,timestep=0.01", "--out", tmp_path / "run") == 0

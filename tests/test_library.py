@@ -12,7 +12,7 @@ from helpers import PAPER, SLOTS, addresses, decode, rps
 import rps_jax
 from rps_jax.errors import InputError
 from rps_jax.record import files
-from rps_jax.world.domain import DOMAINS, QUANTITIES, WORDS
+from rps_jax.world.domain import DOMAINS, LABELS, QUANTITIES
 
 LAWS = {"paper": PAPER, "slow": PAPER._replace(v_max=0.02)}
 # As the examples of the docstrings, so that all share one program.
@@ -51,7 +51,7 @@ def test_what_was_drawn_is_a_coordinate_of_the_worlds(tmp_path):
     found = rps_jax.sweep(LAWS, DRUMS, worlds=4, **BRIEF)
     drawn = {name for name in found.coords if found[name].dims == ("world",)}
     undrawn = {name for name in QUANTITIES if getattr(DOMAINS["wide"], name) is None}
-    assert drawn == {"world", "which_object", *WORDS} - undrawn
+    assert drawn == {"world", "which_object", *LABELS} - undrawn
     assert all(found[name].dims[:2] == ("law", "world") for name in found)
     heavy = found.where(found.mass > found.mass.median(), drop=True)
     assert heavy.world.size == 2

@@ -14,28 +14,28 @@ from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.runs.plan import load_plan
 from rps_jax.world import draws, points
-from rps_jax.world.domain import DOMAINS, Range, of
+from rps_jax.world.domain import DOMAINS, Range, quantities_of
 
 SWEPT = {"setting": SHORT, "slots": SLOTS}
 # Quantities that a world has in its solid, friction, target and robot, unless these are given.
-SHOWN = (*of("object", "robot"), "distance", "bearing")
+SHOWN = (*quantities_of("object", "robot"), "distance", "bearing")
 
 
 def used(drawn):
     """What a world has of a draw."""
-    return drawn._replace(at={k: v for k, v in drawn.at.items() if k not in SHOWN})
+    return drawn._replace(values={k: v for k, v in drawn.values.items() if k not in SHOWN})
 
 
 @pytest.mark.parametrize("name", DOMAINS)
 def test_a_drawn_world_is_the_same_world_at_its_point_bit_for_bit(name):
     domain, index = DOMAINS[name], np.arange(7, 300)
-    at = points.checked(domain, points.points_of(name, index, seed=5))
+    at = points.check_points(domain, points.points_of(name, index, seed=5))
     which = domain.object_of(index)
     np.testing.assert_array_equal(domain.object_of(at.cases(domain, np.arange(293))), which)
     for thing in np.unique(which):
         rows = np.flatnonzero(which == thing)
         drawn, again = used(draws.draw(domain, 5, index[rows])), used(at.draw(domain, rows))
-        for a, b in zip(drawn, again._replace(number=index[rows], case=drawn.case), strict=True):
+        for a, b in zip(drawn, again._replace(number=index[rows], case=drawn.cases), strict=True):
             assert jax.tree.all(jax.tree.map(np.array_equal, a, b))
 
 
@@ -43,7 +43,7 @@ def test_a_drawn_world_is_the_same_world_at_its_point_bit_for_bit(name):
 def test_every_coordinate_of_a_domain_changes_some_world(name):
     domain = DOMAINS[name]
     u = points.points_of(domain, np.arange(144))
-    for column, quantity in enumerate(points.quantities(domain)):
+    for column, quantity in enumerate(points.coordinates(domain)):
         other = u.copy()
         other[:, column] = (other[:, column] + 0.5) % 1
         a, b = (_leaves(domain, some) for some in (u, other))
@@ -51,7 +51,7 @@ def test_every_coordinate_of_a_domain_changes_some_world(name):
 
 
 def _leaves(domain, u):
-    at = points.checked(domain, u)
+    at = points.check_points(domain, u)
     which = domain.object_of(at.cases(domain, np.arange(len(u))))
     drawn = [used(at.draw(domain, np.flatnonzero(which == thing))) for thing in np.unique(which)]
     return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(drawn)])

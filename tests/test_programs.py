@@ -44,7 +44,7 @@ def made():
         shape = jax.ShapeDtypeStruct((n,), jnp.float32)
         known = [factor] if static is None else [static]
         given = (shape, shape)
-        program = programs.compiled(function, given, law=rps.LAW, donate=0, static=known)
+        program = programs.compile_function(function, given, law=rps.LAW, donate=0, static=known)
         return np.asarray(program(jnp.ones(n), jnp.ones(n))["sum"]).tolist()
 
     return make, traced
@@ -83,7 +83,7 @@ def test_a_program_whose_results_cannot_be_named_is_not_kept(result, cache):
         return result(x)
 
     for _ in range(2):
-        program = programs.compiled(function, [shape], law=rps.LAW, donate=0, static=[])
+        program = programs.compile_function(function, [shape], law=rps.LAW, donate=0, static=[])
         assert jax.tree.leaves(program(jnp.ones(3)))[0].tolist() == [1.0] * 3
     assert len(traced) == 2
     assert not cache.exists()

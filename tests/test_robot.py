@@ -17,7 +17,7 @@ from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.robot import drive
-from rps_jax.robot.robot import ROBOTS, Robot, named
+from rps_jax.robot.robot import ROBOTS, Robot, parse_robot
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
@@ -64,7 +64,7 @@ def test_speed_is_scaled_as_a_vector_and_the_turn_is_clipped():
 
 
 def test_wheels_that_slip_lose_their_share():
-    np.testing.assert_allclose(drive.carried_out(Robot(slip=0.1), jnp.ones(3)), 0.9, rtol=1e-6)
+    np.testing.assert_allclose(drive.apply_slip(Robot(slip=0.1), jnp.ones(3)), 0.9, rtol=1e-6)
 
 
 # --- the drive -----------------------------------------------------------------------------
@@ -170,7 +170,7 @@ def test_worlds_by_template_equal_recompiled_ones(engine):
     args = ("box", drawn.solid, drawn.friction, STANDARD)
     heavy = replace(drawn.robot, mass=np.array([60.0, 130.0, 200.0]))
     _, fields = engines.get(engine).stage(*args, heavy)
-    theirs = recompiled(engine, [scene.of_solid(*args, i, heavy) for i in range(3)])
+    theirs = recompiled(engine, [scene.compile_row(*args, i, heavy) for i in range(3)])
     for ours, compiled in zip(*map(jax.tree.leaves, (fields, theirs)), strict=True):
         np.testing.assert_allclose(ours, compiled, rtol=2e-5, atol=2e-6)
 
@@ -193,10 +193,12 @@ def test_a_trial_whose_base_stalls_says_so():
 def test_random_robots_are_drawn_last_and_change_no_other_number():
     index = np.arange(0, 30, 3)
     wide, real = (draws.draw(DOMAINS[name], 5, index) for name in ("wide", "real"))
-    limits = {name for name in domain.of("robot") if getattr(DOMAINS["real"], name) is not None}
+    limits = {
+        name for name in domain.quantities_of("robot") if getattr(DOMAINS["real"], name) is not None
+    }
     assert len(limits) == 4
-    assert set(real.at) - set(wide.at) == limits
-    same = real._replace(at={k: v for k, v in real.at.items() if k not in limits}, robot=None)
+    assert set(real.values) - set(wide.values) == limits
+    same = real._replace(at={k: v for k, v in real.values.items() if k not in limits}, robot=None)
     jax.tree.map(np.testing.assert_array_equal, wide._replace(robot=None), same)
     assert wide.robot.ideal
     assert real.robot.driven
@@ -219,10 +221,10 @@ def test_a_domain_with_robots_goes_through_json():
 
 
 def test_robots_are_named_in_the_library_and_in_files(tmp_path):
-    assert named("kairos") == ROBOTS["kairos"]
+    assert parse_robot("kairos") == ROBOTS["kairos"]
     path = tmp_path / "mine.json"
     path.write_text('{"mass": 50, "force_max": 120, "acceleration_max": [0.5, 1]}')
-    mine = named(str(path))
+    mine = parse_robot(str(path))
     assert mine == Robot(mass=50, force_max=120, acceleration_max=(0.5, 1))
     found = rps_jax.sweep(
         "rps",
@@ -243,13 +245,13 @@ def test_robots_are_named_in_the_library_and_in_files(tmp_path):
         ({"mass": 0}, "robot mass = 0"),
         ({"acceleration_max": [0.5]}, "give two numbers"),
         ({"slip": 0.7}, "robot slip = 0.7"),
-        ({"force_max": 20, "resistance": 0.05}, "rolling takes 64 N"),
+        ({"force_max": 20, "resistance": 0.05}, "rolling resistance takes 64 N"),
         ({"speed": 1}, "unknown robot quantity 'speed'"),
     ],
 )
 def test_numbers_that_no_robot_has_are_one_sentence(numbers, said):
     with pytest.raises(InputError, match=said.replace("(", r"\(")):
-        named(numbers)
+        parse_robot(numbers)
 
 
 def test_commands_refuse_robots_that_they_cannot_step(capsys, tmp_path):

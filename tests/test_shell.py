@@ -59,7 +59,7 @@ def test_rows_lie_on_the_strip(boards):
     shell = Robot(0.48, 0.3965, boards).shell
     for row in shell.rows():
         for s in (0.0, 0.3, 1.0):
-            place = shell.on_strip(jnp.asarray(row.begins + s * row.length))
+            place = shell.on_strip(jnp.asarray(row.offset + s * row.length))
             np.testing.assert_allclose(place, row.start + s * row.length * row.along, atol=1e-6)
 
 
@@ -140,7 +140,7 @@ def test_worlds_by_template_equal_recompiled_ones(engine):
         half_width=np.array([0.2, 0.25, 0.4]),
     )
     _, fields = engines.get(engine).stage(*args, sizes)
-    theirs = recompiled(engine, [scene.of_solid(*args, i, sizes) for i in range(3)])
+    theirs = recompiled(engine, [scene.compile_row(*args, i, sizes) for i in range(3)])
     for ours, compiled in zip(*map(jax.tree.leaves, (fields, theirs)), strict=True):
         np.testing.assert_allclose(ours, compiled, rtol=2e-5, atol=2e-6)
 
@@ -168,11 +168,11 @@ def test_presets_wear_as_many_boards_as_they_have_room_for():
 def test_boards_go_through_json(given, tmp_path):
     rows = [{"side": "front", "count": 2, "pitch": 0.05}, {"side": "right", "count": 1}]
     values = {"half_width": 0.3, "boards": rows}
-    one = robot.named(values)
+    one = robot.parse_robot(values)
     assert one.boards == (Boards("front", 2, 0.05), Boards("right", 1))
     if given == "file":
         (tmp_path / "mine.json").write_text(json.dumps(values))
-        assert robot.named(str(tmp_path / "mine.json")) == one
+        assert robot.parse_robot(str(tmp_path / "mine.json")) == one
 
 
 FRONT = Boards("front", 2, 0.05)

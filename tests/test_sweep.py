@@ -48,7 +48,7 @@ from rps_jax.trials.batch import Job
 from rps_jax.trials.trial import Rules
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import domain, draws
-from rps_jax.world.domain import QUANTITIES, WORDS, Range
+from rps_jax.world.domain import LABELS, QUANTITIES, Range
 
 
 def outcomes(parts, setting=SHORT):
@@ -90,7 +90,7 @@ def test_a_world_in_a_refilled_slot_ends_as_it_does_alone():
 def test_late_poses_and_late_commands_are_late_by_as_much(error):
     """Of a base that is told to turn: what is believed, and done, is what was n steps before."""
     steps, period = 3, SHORT.physics.control_period
-    still = replace(BOXES, **{name: Range(0, 0) for name in domain.of("base")})
+    still = replace(BOXES, **{name: Range(0, 0) for name in domain.quantities_of("base")})
     late = replace(still, **{error: Range(steps * period, steps * period)})
     part = drawn_worlds(late, draws.draw(late, 0, [0]), SHORT).with_params(PAPER)
     inputs = row((part.worlds, part.params), 0)
@@ -114,7 +114,7 @@ def test_late_poses_and_late_commands_are_late_by_as_much(error):
 
 @pytest.mark.slow
 def test_a_base_that_errs_by_nothing_is_perfect():
-    nothing = {name: Range(0, 0) for name in domain.of("base")}
+    nothing = {name: Range(0, 0) for name in domain.quantities_of("base")}
     perfect = replace(CYLINDERS, **nothing)
     assert made(np.arange(2)).worlds.odometry.past.shape[1] > 1
     drawn = draws.draw(perfect, 0, np.arange(6))
@@ -143,7 +143,7 @@ def test_flat_boxes_that_nothing_touches_stay_where_they_are():
 
 @pytest.mark.slow
 def test_a_faster_base_arrives_earlier():
-    perfect = {name: Range(0, 0) for name in domain.of("base")}
+    perfect = {name: Range(0, 0) for name in domain.quantities_of("base")}
     quick = replace(CYLINDERS, **perfect, gap=Range(0.05, 0.05))
     times = []
     for error in (-0.5, 0.0):
@@ -209,8 +209,8 @@ def test_results_hold_every_world_with_what_was_drawn(whole, tmp_path):
         np.testing.assert_allclose(results[name], values, rtol=1e-6)
         assert results[name].attrs["units"] == unit
     undrawn = {name for name in QUANTITIES if getattr(BOXES, name) is None}
-    assert undrawn == {*domain.of("robot"), "foam", "time_constant", "feet"}
-    assert set(WORDS) == {*columns, *undrawn}
+    assert undrawn == {*domain.quantities_of("robot"), "foam", "time_constant", "feet"}
+    assert set(LABELS) == {*columns, *undrawn}
     again = outcomes([made(np.arange(20))])
     for i, one in again.items():
         assert float(results.time.sel(law="rps")[i]) == one.time

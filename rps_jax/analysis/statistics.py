@@ -13,7 +13,7 @@ import scipy
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from rps_jax.world.domain import WORDS
+from rps_jax.world.domain import LABELS
 
 FAILURES = ("never touched", "lost contact", "timeout", "fell over", "diverged", "stalled")
 # Failure modes in order of precedence.
@@ -47,7 +47,7 @@ class Bins(NamedTuple):
 class Influence(NamedTuple):
     """Dependence of success on one quantity."""
 
-    name: str  # of `WORDS`
+    name: str  # of `LABELS`
     variance: float  # [1] of the success rate over its bins, as of `excess_variance`
     q: float  # [1] false discovery rate of the test that all bins have the same rate
 
@@ -100,12 +100,12 @@ def worlds_by_object(results: xr.Dataset) -> dict[str, np.ndarray]:
 
 
 def varied_quantities(results: xr.Dataset) -> list[str]:
-    """Return the names of the quantities of `WORDS` that differ between worlds."""
+    """Return the names of the quantities of `LABELS` that differ between worlds."""
 
     def differs(values: np.ndarray) -> bool:
         return np.unique(values[np.isfinite(values)]).size > 1
 
-    return [name for name in WORDS if name in results and differs(results[name].values)]
+    return [name for name in LABELS if name in results and differs(results[name].values)]
 
 
 def cvar(values: np.ndarray) -> float:

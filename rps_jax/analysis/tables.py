@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from rps_jax.analysis import statistics
 from rps_jax.analysis.statistics import Comparison
 from rps_jax.world import paper
-from rps_jax.world.domain import WORDS
+from rps_jax.world.domain import LABELS
 
 
 def markdown(rows: Sequence[Sequence[str]]) -> str:
@@ -255,5 +255,5 @@ def influence_table(results: xr.Dataset, law: str) -> list[list[str]]:
         for n in (order[0], order[-1]):
             value = f"{middle[n]:.3g} {unit}".removesuffix(" 1")
             cells += [value, share(int(successes[n]), int(trials[n]))]
-        rows.append([WORDS[name], *cells, f"{q[i]:.2g}"])
+        rows.append([LABELS[name], *cells, f"{q[i]:.2g}"])
     return rows

@@ -49,14 +49,14 @@ class Shadow(Question[xr.Dataset]):
 
     def check(self) -> None:
         """Check the law and the robot, and that the file is there."""
-        _ = self.params, robots.named(self.robot)
+        _ = self.params, robots.parse_robot(self.robot)
         bags.check()
         if not Path(self.file).is_file():
             raise InputError(f"bag = {self.file} is not allowed: give an MCAP file.")
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run the law over the bag."""
-        shell = robots.named(self.robot).shell
+        shell = robots.parse_robot(self.robot).shell
         recorded = with_contacts(bags.read(Path(self.file)), shell, f"bag = {self.file}")
         twists = shadowed(registry.law_of(self.params), self.params, recorded)
         both = np.stack([recorded["twist"], twists])

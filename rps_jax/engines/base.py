@@ -107,7 +107,7 @@ class Engine(abc.ABC):
     modes: ClassVar[tuple[Mode, ...]] = ()  # in which it can be differentiated
     newton: ClassVar[bool] = True  # it solves as `Physics` says: by so many iterations
     forces: ClassVar[bool] = True  # a contact can slow and stop the base
-    tells_force: ClassVar[bool] = True  # it tells the force of a contact
+    computes_force: ClassVar[bool] = True  # it tells the force of a contact
 
     def check_physics(self, physics: Physics) -> None:
         """Raises InputError unless the engine knows such physics."""
@@ -127,7 +127,7 @@ class Engine(abc.ABC):
 
     def check_senses(self, senses: str) -> None:
         """Raises InputError unless the engine tells what a law senses."""
-        if senses == "force" and not self.tells_force:
+        if senses == "force" and not self.computes_force:
             raise errors.InputError(
                 f"engine = {self.name} is not allowed for a law that senses the contact's "
                 "force, which it does not compute: choose fused, mjx or mujoco."

@@ -33,7 +33,7 @@ def configure_xla() -> None:
             os.environ["XLA_FLAGS"] = f"{before} {flag}={value}".strip()
 
 
-def kind() -> str:
+def device_name() -> str:
     """What JAX computes on, in words."""
     import jax
 

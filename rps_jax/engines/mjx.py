@@ -158,8 +158,8 @@ class MJX(Engine):
         robots: Robot = Robot(),
     ) -> tuple[MJXStage, dict[str, np.ndarray]]:
         """Return the stage of the first of the worlds, and fields (n, ...) of all."""
-        robots = scene.each(robots, solids.mass.size)
-        template = scene.of_solid(family, solids, friction, physics, 0, robots)
+        robots = scene.repeat_robot(robots, solids.mass.size)
+        template = scene.compile_row(family, solids, friction, physics, 0, robots)
         model, fields = stack([template.physics])
         fields = mjx_fields(family, solids, friction, template, jax.device_get(fields))
         _size_bases(fields, template.physics, robots)
@@ -310,7 +310,7 @@ def _size_geoms(family: str, solids: Solid, template: Scene, new: dict[str, np.n
         )
         new[".geom_rbound"][:, geom] = bound
     if family == "prism" or solids.feet is not None:
-        for i, at in enumerate(scene.feet(solids).swapaxes(0, 1)):
+        for i, at in enumerate(scene.foot_positions(solids).swapaxes(0, 1)):
             new[".geom_pos"][:, model.geom(f"foot_{i}").id] = at
 
 

@@ -161,12 +161,12 @@ class MuJoCo(Engine):
     ) -> tuple[list[mujoco.MjModel], dict[str, np.ndarray]]:
         """Return the models of the worlds; equal worlds share one."""
         count, models = solids.mass.size, dict[bytes, mujoco.MjModel]()
-        robots = scene.each(robots, count)
+        robots = scene.repeat_robot(robots, count)
         leaves = [np.ascontiguousarray(x) for x in jax.tree.leaves((solids, friction, robots))]
         keys = [b"".join(leaf[i].tobytes() for leaf in leaves) for i in range(count)]
         for i, key in enumerate(keys):
             if key not in models:
-                loaded = scene.of_solid(family, solids, friction, physics, i, robots)
+                loaded = scene.compile_row(family, solids, friction, physics, i, robots)
                 models[key] = loaded.physics
         return [models[key] for key in keys], {}
 

@@ -29,7 +29,7 @@ from rps_jax.engines import native
 from rps_jax.record import cache
 
 
-def compiled(
+def compile_function(
     function: Callable[..., Any],
     arguments: Sequence[Any],
     *,
@@ -50,7 +50,7 @@ def compiled(
       The compiled function. It is the same program whether it was kept or not.
     """
     if (who := identity(law)) is None:
-        return built(jax.jit(function, donate_argnums=donate).lower(*arguments))
+        return compile_lowered(jax.jit(function, donate_argnums=donate).lower(*arguments))
     leaves, tree = jax.tree.flatten(jax.eval_shape(lambda *given: given, *arguments))
     sizes = [jax.tree.structure(one).num_leaves for one in arguments]
     first = sum(sizes[:donate])
@@ -75,7 +75,7 @@ def compiled(
             cache.write(place, _head(structure) + b"\n" + bytes(exported.serialize()))
     else:
         structure, exported = found
-    program = built(jax.jit(exported.call, donate_argnums=donated).lower(*leaves))
+    program = compile_lowered(jax.jit(exported.call, donate_argnums=donated).lower(*leaves))
     return lambda *given: jax.tree.unflatten(structure, program(*jax.tree.leaves(given)))
 
 
@@ -129,7 +129,7 @@ def _tree(words: Any) -> Any:
     return words
 
 
-def built(lowered: Any) -> Any:
+def compile_lowered(lowered: Any) -> Any:
     """Compile a program; on a GPU so that what does not wait for one another runs side by side."""
     if jax.default_backend() == "gpu":
         with contextlib.suppress(Exception):  # an XLA that does not know of it

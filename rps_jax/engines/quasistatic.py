@@ -264,7 +264,7 @@ class QuasistaticEngine(Engine):
     modes = ("forward", "reverse")
     newton = False  # but by its own rule
     forces = False
-    tells_force = False  # only its direction is known, and not the weight that it slides
+    computes_force = False  # only its direction is known, and not the weight that it slides
 
     def stage(
         self,

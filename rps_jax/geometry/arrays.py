@@ -1,8 +1,8 @@
 """Types of arrays by kind and shape: `Float[Array, "B 2"]` is an array (B, 2) of floats.
 
-A name is one length throughout a call and its records, and `*B` any number of axes of one shape;
-with `#` an axis may also be 1, and `...` is any axes at all. Nothing is checked while the package
-runs: the tests look into the calls of some modules, as `tests/shapes.py` says.
+A name has one length in a call and its records; `*B` is any number of axes of one shape. With `#`
+an axis may also be 1; `...` is any axes. Nothing is checked while the package runs: the tests check
+the calls of some modules, see `tests/shapes.py`.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -16,7 +16,7 @@ from rps_jax.geometry.arrays import Array, Float, Scalar
 
 
 class Footprint(NamedTuple):
-    """All points within `radius` of the convex hull of `vertices`, in the object's frame."""
+    """Set of points within `radius` of the convex hull of `vertices`, in the object's frame."""
 
     vertices: Float[Array, "*B N 2"]  # [m] counter-clockwise; N is static
     radius: Float[Array, "*B"]  # [m]
@@ -24,21 +24,21 @@ class Footprint(NamedTuple):
 
 @jax.jit
 def rectangle(half_x: Scalar, half_y: Scalar) -> Footprint:
-    """Rectangle of sides 2 half_x by 2 half_y [m] about the origin."""
+    """Return a rectangle of sides 2 half_x by 2 half_y [m] about the origin."""
     signs = jnp.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
     return Footprint(signs * jnp.stack([jnp.asarray(half_x), jnp.asarray(half_y)]), jnp.zeros(()))
 
 
 def circle(radius: Scalar) -> Footprint:
-    """Circle of the given radius [m] about the origin."""
+    """Return a circle of a radius [m] about the origin."""
     return Footprint(jnp.zeros((1, 2)), jnp.asarray(radius, float))
 
 
 def polygon(vertices: np.ndarray | list) -> Footprint:
-    """Convex polygon of vertices (N >= 3, 2) [m], counter-clockwise.
+    """Return a convex polygon of vertices (N >= 3, 2) [m], counter-clockwise.
 
     Raises:
-      InputError: they are not finite, not convex or not counter-clockwise.
+      InputError: the vertices are not finite, not convex or not counter-clockwise.
 
     Example:
       >>> from rps_jax.geometry.footprint import polygon
@@ -60,24 +60,24 @@ def polygon(vertices: np.ndarray | list) -> Footprint:
 
 
 def place(footprint: Footprint, position: Float[Array, "2"], yaw: Scalar) -> Footprint:
-    """The footprint of an object at `position` [m] and `yaw` [rad] in another frame."""
+    """Return the footprint of an object at `position` [m] and `yaw` [rad] in another frame."""
     return footprint._replace(vertices=planar.rotate(yaw, footprint.vertices) + position)
 
 
 def extent(footprint: Footprint, along: Float[Array, "2"]) -> Float[Array, ""]:
-    """Support function: the furthest reach [m] in the unit direction `along`."""
+    """Return the support function: the furthest reach [m] in the unit direction `along`."""
     return jnp.max(footprint.vertices @ along) + footprint.radius
 
 
 def circumradius(footprint: Footprint) -> Float[Array, ""]:
-    """Greatest distance [m] of the outline from the object's origin."""
+    """Return the greatest distance [m] of the outline from the object's origin."""
     return jnp.max(planar.norm(footprint.vertices)) + footprint.radius
 
 
 def _edges(
     footprint: Footprint,
 ) -> tuple[Float[Array, "N 2"], Float[Array, "N 2"], Float[Array, " N"]]:
-    """Start points, vectors and squared lengths, never zero, of the edges."""
+    """Return start points, vectors and squared lengths of the edges; no length is zero."""
     start = footprint.vertices
     along = jnp.roll(start, -1, axis=0) - start
     length2 = jnp.sum(along * along, axis=-1)
@@ -85,11 +85,11 @@ def _edges(
 
 
 def signed_distance(footprint: Footprint, point: Float[Array, "*P 2"]) -> Float[Array, "*P"]:
-    """Distance [m] of `point` [m] to the outline, negative inside."""
+    """Return the distance [m] of `point` [m] to the outline, negative inside."""
     start, along, length2 = _edges(footprint)
     nearest, inside = jnp.asarray(jnp.inf), ~jnp.all(along == 0)
-    # Edge by edge and coordinate by coordinate: GPUs are slow at reducing axes this short. Squares,
-    # of which one root is taken: that is most of the work.
+    # A loop over edges and coordinates: GPUs are slow at reducing such short axes. The root is most
+    # of the work: it is taken once, of the smallest square.
     for i in range(footprint.vertices.shape[0]):
         x, y = point[..., 0] - start[i, 0], point[..., 1] - start[i, 1]
         ahead = along[i] / length2[i]
@@ -107,13 +107,13 @@ def signed_distance(footprint: Footprint, point: Float[Array, "*P 2"]) -> Float[
 def crossing(
     footprint: Footprint, origin: Float[Array, "2"], along: Float[Array, "2"], tolerance: Scalar
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The interval of a line that lies within `tolerance` [m] of the footprint.
+    """Return the interval of a line that lies within `tolerance` [m] of the footprint.
 
-    The line is origin [m] + s * along, `along` of unit length. Returns its ends
-    (s_low, s_high) [m]; s_low > s_high (+inf, -inf) if the line stays clear.
+    The line is origin [m] + s * along, with `along` of unit length. The interval is (s_low, s_high)
+    [m], or (+inf, -inf) if the line stays clear.
 
-    The neighbourhood of a convex polygon is convex, and bounded by arcs about the vertices and
-    by shifted edges; the ends are the extreme meetings of the line with these, in closed form.
+    The neighbourhood of a convex polygon is convex. Arcs about the vertices and shifted edges bound
+    it; the line meets these at the two ends, in closed form.
     """
     reach = footprint.radius + tolerance
     normal = jnp.stack([-along[1], along[0]])
@@ -121,7 +121,7 @@ def crossing(
     s_vertex, n_vertex = (start - origin) @ along, (start - origin) @ normal
     meets_arc = jnp.abs(n_vertex) <= reach
     half = planar.safe_sqrt(reach * reach - n_vertex * n_vertex)
-    ends = [(meets_arc, s_vertex - half), (meets_arc, s_vertex + half)]
+    meetings = [(meets_arc, s_vertex - half), (meets_arc, s_vertex + half)]
     if footprint.vertices.shape[0] > 1:
         outward = jnp.stack([edge[:, 1], -edge[:, 0]], axis=-1) / jnp.sqrt(length2)[:, None]
         shifted = start + reach * outward
@@ -129,8 +129,8 @@ def crossing(
         parallel = n_edge == 0
         t = -n_start / jnp.where(parallel, 1.0, n_edge)
         meets_edge = ~parallel & (t >= 0) & (t <= 1)
-        ends.append((meets_edge, (shifted - origin) @ along + t * (edge @ along)))
-    meets = jnp.concatenate([hit for hit, _ in ends])
-    s = jnp.concatenate([value for _, value in ends])
+        meetings.append((meets_edge, (shifted - origin) @ along + t * (edge @ along)))
+    meets = jnp.concatenate([hit for hit, _ in meetings])
+    s = jnp.concatenate([value for _, value in meetings])
     low, high = jnp.where(meets, -s, -jnp.inf), jnp.where(meets, s, -jnp.inf)
     return -planar.greatest(low), planar.greatest(high)

@@ -1,7 +1,7 @@
 """Planar geometry whose values and derivatives are finite everywhere.
 
-Every singularity of the project is guarded here and nowhere else: the norm at zero, the
-direction of a zero vector, the wrap at pi, the greatest of several.
+This module alone guards the singularities: the norm at zero, the direction of a zero vector, the
+wrap at pi, and the maximum of several numbers.
 """
 
 import functools
@@ -22,24 +22,24 @@ def rotate(
 
 
 def _components(vector: jax.Array) -> list[jax.Array]:
-    """The components (...) of vectors (..., n), n small, one by one: see `footprint`."""
+    """Return the components (...) of vectors (..., n) for a small n: see `footprint`."""
     return [vector[..., i] for i in range(vector.shape[-1])]
 
 
 def _scale(vector: jax.Array) -> jax.Array:
-    """Largest component (...) of vectors (..., n), to divide by; zero only for a zero vector.
+    """Return the largest component (...) of vectors (..., n); zero only for a zero vector.
 
-    Bounded, since the reciprocal of a larger float32 is subnormal, which XLA takes for zero.
+    It is bounded, since the reciprocal of a larger float32 is subnormal, which XLA takes for zero.
     """
     largest = functools.reduce(jnp.maximum, (jnp.abs(x) for x in _components(vector)))
     return jax.lax.stop_gradient(jnp.minimum(largest, 1e37))
 
 
 def norm(vector: Float[Array, "*B n"]) -> Float[Array, "*B"]:
-    """Euclidean norm over the last axis: (..., n) -> (...).
+    """Return the Euclidean norm over the last axis: (..., n) -> (...).
 
-    Scaled by the largest component, so squares neither overflow nor vanish in float32; the
-    derivative at zero is zero, where `jnp.linalg.norm` gives NaN.
+    The vector is scaled by the largest component, so squares neither overflow nor vanish in
+    float32. The derivative at zero is zero, where `jnp.linalg.norm` gives NaN.
     """
     scale = _scale(vector)
     is_zero = scale == 0
@@ -49,7 +49,7 @@ def norm(vector: Float[Array, "*B n"]) -> Float[Array, "*B"]:
 
 
 def direction(vector: Float[Array, "*B 2"]) -> Float[Array, "*B"]:
-    """Angle [rad] of planar vectors (..., 2) in [-pi, pi]; 0 with zero derivative at zero."""
+    """Return the angle [rad] of planar vectors (..., 2) in [-pi, pi]; 0 with zero slope at zero."""
     scale = _scale(vector)
     is_zero = scale == 0
     # Scaling changes no angle and keeps x*x + y*y, which the derivative divides by, in range.
@@ -67,27 +67,27 @@ def wrap(angle: Float[Array, "*B"]) -> Float[Array, "*B"]:
 
 
 def safe_sqrt(x: Float[Array, "*B"]) -> Float[Array, "*B"]:
-    """Square root of max(x, 0), with zero derivative where x <= 0."""
+    """Return the square root of max(x, 0), with zero derivative where x <= 0."""
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
 def greatest(x: Float[Array, " n"]) -> Float[Array, ""]:
-    """The greatest () of x (n,), with the derivative of one entry.
+    """Return the greatest () of x (n,), with the derivative of one entry.
 
-    That of `jnp.max` is shared by the entries that equal it, and NaN where a compiler computes
-    the entries twice, rounds otherwise, and finds none.
+    `jnp.max` divides its derivative among equal entries. It is NaN if the compiler computes the
+    entries twice with different rounding, so that none equals the maximum.
     """
     return x[jnp.argmax(x)]
 
 
 def yaw_of_quaternion(quaternion: Float[Array, "*B 4"]) -> Float[Array, "*B"]:
-    """Heading (...) [rad] of unit quaternions (..., 4), scalar first."""
+    """Return the heading (...) [rad] of unit quaternions (..., 4), scalar first."""
     w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
     return direction(jnp.stack([1 - 2 * (y * y + z * z), 2 * (w * z + x * y)], axis=-1))
 
 
 def tilt(quaternion: Float[Array, "*B 4"]) -> Float[Array, "*B"]:
-    """Angle (...) [rad] between the vertical and its image under unit quaternions (..., 4)."""
+    """Return the tilt (...) [rad] of the vertical under unit quaternions (..., 4)."""
     _, x, y, _ = jnp.moveaxis(quaternion, -1, 0)
     return 2 * jnp.arcsin(jnp.minimum(norm(jnp.stack([x, y], axis=-1)), 1.0))

@@ -1,8 +1,8 @@
-"""Solids of any size, many at once: their mass properties, and what each engine makes of them.
+"""Batches of solids: outlines, mass properties and feet, in NumPy.
 
-A solid is an upright prism or cylinder of even density with a compact load inside. Its frame has
-its origin in the middle of its height above the centroid of its outline; z is up. All arrays are
-NumPy in double precision and lead with the number of solids, n.
+A solid is an upright prism or cylinder of uniform density with a compact load inside. The origin
+of its frame is at half its height above the centroid of its outline; z is up. Arrays are in double
+precision, and their leading axis is n, the number of solids.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from rps_jax.geometry import vectors
 
 GRAVITY = 9.81  # [m/s^2]
 SIDES = 8  # vertices of a prism at most; those of fewer sides repeat some
-_LOAD_AT = 0.8  # of the way from the middle to the outline stands the load
+_LOAD_AT = 0.8  # [1] place of the load, as a share of the way from the middle to the outline
 
 
 class Solid(NamedTuple):
@@ -29,8 +29,8 @@ class Solid(NamedTuple):
     p_object_com: np.ndarray  # (n, 3) [m]
     inertia: np.ndarray  # (n, 3) [kg m^2] principal moments about the centre of mass
     q_object_body: np.ndarray  # (n, 4) principal axes in the object's frame, scalar first
-    # (n, SIDES, 3) [m, m, 1] places of feet and their weights, as of springs; a weight of 0 is no
-    # foot. None: prisms stand on their corners, cylinders on their rims.
+    # (n, SIDES, 3) [m, m, 1] positions of feet and their weights, as of springs; an entry of weight
+    # 0 is unused. None: prisms stand on their corners, cylinders on their rims.
     feet: np.ndarray | None = None
 
 
@@ -42,12 +42,11 @@ def build(
     com_offset: np.ndarray,
     com_bearing: np.ndarray,
 ) -> Solid:
-    """Solids whose centre of mass a load moves off the middle.
+    """Return solids whose centre of mass a load moves off the middle.
 
-    The load is a share of the mass, at `_LOAD_AT` of the way to the outline and at half height,
-    such that the centre of mass moves by `com_offset` (n,) [1] of that way, in the direction
-    `com_bearing` (n,) [rad]. What is left of the mass fills the solid evenly, so an offset of 0 is
-    a solid of even density.
+    The load is a share of the mass, at `_LOAD_AT` of the way to the outline and at half height. It
+    moves the centre of mass by `com_offset` (n,) [1] of that way, in the direction `com_bearing`
+    (n,) [rad]. The rest of the mass fills the solid uniformly.
     """
     direction = np.stack([np.cos(com_bearing), np.sin(com_bearing)], axis=-1)
     at = _LOAD_AT * reach(vertices, radius, direction)[:, None] * direction
@@ -59,7 +58,7 @@ def build(
     xy = rest * xy + pair * at[:, 0] * at[:, 1]
     zz = rest * height**2 / 12
     middle, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
-    turn = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the axis along which the mass is spread most
+    turn = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the axis with the largest second moment of area
     inertia = mass[:, None] * np.stack([middle - half + zz, middle + half + zz, xx + yy], axis=-1)
     zero = np.zeros_like(mass)
     return Solid(
@@ -74,10 +73,10 @@ def build(
 
 
 def on_feet(solid: Solid, share: np.ndarray, count: np.ndarray, turn: np.ndarray) -> Solid:
-    """Solids on `count` (n,) feet, at most 4, evenly about the centre of mass.
+    """Return solids on `count` (n,) feet, at most 4, evenly about the centre of mass.
 
-    Each is `share` (n,) [1] of the way from there to the outline, the first in the direction
-    `turn` (n,) [turns].
+    Each foot is `share` (n,) [1] of the way from there to the outline, the first one in the
+    direction `turn` (n,) [turns].
     """
     com, at = solid.p_object_com[:, :2], []
     for i in range(SIDES):
@@ -93,7 +92,7 @@ def on_feet(solid: Solid, share: np.ndarray, count: np.ndarray, turn: np.ndarray
 
 
 def padded(vertices: np.ndarray) -> np.ndarray:
-    """Outlines (..., N, 2) [m] with SIDES corners, the last repeated; circles as they are."""
+    """Return outlines (..., N, 2) [m] with SIDES corners, the last repeated; circles unchanged."""
     if vertices.shape[-2] == 1:
         return vertices
     missing = SIDES - vertices.shape[-2]
@@ -101,13 +100,13 @@ def padded(vertices: np.ndarray) -> np.ndarray:
 
 
 def rectangles(half_x: np.ndarray, half_y: np.ndarray) -> np.ndarray:
-    """Outlines (n, 4, 2) [m] of boxes, as `footprint.rectangle` has them."""
+    """Return outlines (n, 4, 2) [m] of boxes, in the order of `footprint.rectangle`."""
     signs = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
     return signs * np.stack([half_x, half_y], axis=-1)[:, None, :]
 
 
 def centred(vertices: np.ndarray) -> np.ndarray:
-    """Polygons (n, N, 2) [m] moved so that the centroids of their areas are the origin."""
+    """Return polygons (n, N, 2) [m] moved so that their centroids are at the origin."""
     cross, ahead = _triangles(vertices)
     area = cross.sum(axis=1) / 2
     third = (vertices + ahead) * cross[..., None] / 6
@@ -115,7 +114,7 @@ def centred(vertices: np.ndarray) -> np.ndarray:
 
 
 def reach(vertices: np.ndarray, radius: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Distance (n,) [m] from the origin to the outline in the directions (n, 2)."""
+    """Return the distance (n,) [m] from the origin to the outline in the directions (n, 2)."""
     if vertices.shape[1] == 1:
         return radius
     edge = np.roll(vertices, -1, axis=1) - vertices
@@ -128,40 +127,40 @@ def reach(vertices: np.ndarray, radius: np.ndarray, direction: np.ndarray) -> np
 
 
 def area(solid: Solid) -> np.ndarray:
-    """Areas (n,) [m^2] of the outlines."""
+    """Return the areas (n,) [m^2] of the outlines."""
     if solid.vertices.shape[1] == 1:
         return np.pi * solid.radius**2
     return _triangles(solid.vertices)[0].sum(axis=1) / 2
 
 
 def corners(solid: Solid) -> np.ndarray:
-    """Numbers (n,) of corners of the outlines, those repeated counted once; 0 of a cylinder."""
+    """Count the corners (n,) of the outlines, repeated ones once; 0 for a cylinder."""
     if solid.vertices.shape[1] == 1:
         return np.zeros(solid.mass.size)
-    new = np.any(solid.vertices != np.roll(solid.vertices, 1, axis=1), axis=2)
-    return new.sum(axis=1).astype(float)
+    distinct = np.any(solid.vertices != np.roll(solid.vertices, 1, axis=1), axis=2)
+    return distinct.sum(axis=1).astype(float)
 
 
 def extent(solid: Solid, yaw: np.ndarray) -> np.ndarray:
-    """How far (n,) [m] the solids, turned by `yaw` (n,) [rad], reach towards -x."""
+    """Return the reach (n,) [m] towards -x of solids turned by `yaw` (n,) [rad]."""
     c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
     x = c * solid.vertices[..., 0] - s * solid.vertices[..., 1]
     return solid.radius - x.min(axis=1)
 
 
 def axes(solid: Solid) -> np.ndarray:
-    """Rotation matrices (n, 3, 3) from principal axes to the object's frame."""
+    """Return rotation matrices (n, 3, 3) from principal axes to the object's frame."""
     w, x, y, z = solid.q_object_body.T
     rows = vectors.matrix((w, x, y, z))
     return np.stack([entry for row in rows for entry in row], axis=-1).reshape(-1, 3, 3)
 
 
 def friction_arm(solid: Solid) -> np.ndarray:
-    """Arms m_max / f_max (n,) [m] of the ground's friction about the centres of mass.
+    """Return arms m_max / f_max (n,) [m] of the ground's friction about the centres of mass.
 
-    That is the mean distance of the load from its centre. The load is what springs bear that give
-    way alike and only push, under the points on which engines stand solids: the corners of a prism,
-    three points of a cylinder's rim, one where it leans to.
+    The arm is the mean distance of the load from its centre. Equal springs that only push bear the
+    load, under the points on which engines stand solids: the corners of a prism, or three points
+    of a cylinder's rim, the first in the direction of the centre of mass.
     """
     at, share = _feet(solid)
     com = solid.p_object_com[:, :2]
@@ -169,10 +168,10 @@ def friction_arm(solid: Solid) -> np.ndarray:
     bears = np.ones(share.shape, bool)
     load = share
     for _ in range(at.shape[1]):
-        some = rows * (bears * share)[..., None]
-        # Pressure is linear in place; its sum is 1, its centre the centre of mass.
-        pressure = np.linalg.pinv(some.swapaxes(1, 2) @ rows)[..., :1]
-        load = (some @ pressure)[..., 0]
+        weighted = rows * (bears * share)[..., None]
+        # Pressure is linear in position; its sum is 1, its centre the centre of mass.
+        pressure = np.linalg.pinv(weighted.swapaxes(1, 2) @ rows)[..., :1]
+        load = (weighted @ pressure)[..., 0]
         if not np.any(load < 0):
             break
         bears &= load >= 0
@@ -180,7 +179,7 @@ def friction_arm(solid: Solid) -> np.ndarray:
 
 
 def _feet(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, N, 2) [m] on which engines stand solids, and whether (n, N) each counts."""
+    """Return the support points (n, N, 2) [m] of solids, and the weight (n, N) of each."""
     if solid.feet is not None:
         return solid.feet[..., :2], solid.feet[..., 2]
     at = solid.vertices
@@ -193,7 +192,7 @@ def _feet(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
 
 
 def standing(solid: Solid) -> Solid:
-    """Prisms whose feet, if they have none of their own, are said to be their corners."""
+    """Return prisms with explicit feet: their corners, if they have no feet yet."""
     if solid.feet is not None:
         return solid
     at, share = _feet(solid)
@@ -205,14 +204,14 @@ def stack(solids: Sequence[Solid]) -> Solid:
 
     If one has feet, the feet of a prism without any are its corners.
     """
-    single = [jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], one) for one in solids]
-    if any(one.feet is not None for one in single):
-        single = [standing(one) for one in single]
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *single)
+    rows = [jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], row) for row in solids]
+    if any(row.feet is not None for row in rows):
+        rows = [standing(row) for row in rows]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *rows)
 
 
 def _triangles(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cross products (n, N) [m^2] of consecutive vertices, and the following vertices."""
+    """Return cross products (n, N) [m^2] of consecutive vertices, and the next vertices."""
     ahead = np.roll(vertices, -1, axis=1)
     return vertices[..., 0] * ahead[..., 1] - vertices[..., 1] * ahead[..., 0], ahead
 
@@ -220,7 +219,7 @@ def _triangles(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _second_moments(
     vertices: np.ndarray, radius: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean of x^2, y^2 and x y [m^2] over outlines centred at the origin."""
+    """Return the mean of x^2, y^2 and x y [m^2] over outlines centred at the origin."""
     if vertices.shape[1] == 1:
         quarter = radius**2 / 4
         return quarter, quarter, np.zeros_like(quarter)

@@ -1,7 +1,7 @@
-"""Vectors of three and rotations as tuples of scalars, for programs written out entry by entry.
+"""Vectors and rotations in 3D as tuples of scalars, for programs written out entry by entry.
 
-An entry is a number or an array; all arrays have one shape. Literal zeros and ones are folded away,
-which halves a program that has axis-aligned directions in it.
+An entry is a number or an array; all arrays have one shape. Literal zeros and ones are folded,
+which halves programs with axis-aligned directions.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -17,7 +17,7 @@ X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 
 def mul(a: Any, b: Any) -> Any:
-    """A b."""
+    """Return a b."""
     for x, y in ((a, b), (b, a)):
         if isinstance(x, float) and x in (0.0, 1.0):
             return y if x else 0.0
@@ -25,7 +25,7 @@ def mul(a: Any, b: Any) -> Any:
 
 
 def plus(a: Any, b: Any) -> Any:
-    """A + b."""
+    """Return a + b."""
     for x, y in ((a, b), (b, a)):
         if isinstance(x, float) and x == 0.0:
             return y
@@ -33,32 +33,32 @@ def plus(a: Any, b: Any) -> Any:
 
 
 def minus(a: Any, b: Any) -> Any:
-    """A - b."""
+    """Return a - b."""
     return a if isinstance(b, float) and b == 0.0 else a - b
 
 
 def add(a: Vec, b: Vec) -> Vec:
-    """Sum of vectors."""
+    """Return the sum of two vectors."""
     return plus(a[0], b[0]), plus(a[1], b[1]), plus(a[2], b[2])
 
 
 def sub(a: Vec, b: Vec) -> Vec:
-    """Difference of vectors."""
+    """Return the difference of two vectors."""
     return minus(a[0], b[0]), minus(a[1], b[1]), minus(a[2], b[2])
 
 
 def scale(s: Any, a: Vec) -> Vec:
-    """Multiple of a vector."""
+    """Return a multiple of a vector."""
     return mul(s, a[0]), mul(s, a[1]), mul(s, a[2])
 
 
 def dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
-    """Inner product of any number of entries."""
+    """Return the inner product of sequences of entries."""
     return reduce(plus, map(mul, a, b))
 
 
 def cross(a: Vec, b: Vec) -> Vec:
-    """Cross product."""
+    """Return the cross product."""
     return (
         minus(mul(a[1], b[2]), mul(a[2], b[1])),
         minus(mul(a[2], b[0]), mul(a[0], b[2])),
@@ -67,28 +67,28 @@ def cross(a: Vec, b: Vec) -> Vec:
 
 
 def combine(weights: Sequence[Any], vectors: Sequence[Vec]) -> Vec:
-    """Weighted sum of vectors."""
+    """Return the weighted sum of vectors."""
     return reduce(add, map(scale, weights, vectors))
 
 
 def norm(a: Sequence[Any], least: float = 1e-12) -> Any:
-    """Length, at least `least`."""
+    """Return the length, at least `least`."""
     return jnp.sqrt(jnp.maximum(dot(a, a), least * least))
 
 
 def to_world(m: Sequence[Vec], a: Vec) -> Vec:
-    """Rotate by the matrix of rows m."""
+    """Rotate a vector by the matrix with rows m."""
     return dot(m[0], a), dot(m[1], a), dot(m[2], a)
 
 
 def to_body(m: Sequence[Vec], a: Vec) -> Vec:
-    """Rotate by its transpose."""
+    """Rotate a vector by the transpose of the matrix with rows m."""
     x, y, z = (dot([row[j] for row in m], a) for j in range(3))
     return x, y, z
 
 
 def matrix(q: Sequence[Any]) -> tuple[Vec, Vec, Vec]:
-    """Rows of the rotation matrix of a unit quaternion."""
+    """Return the rows of the rotation matrix of a unit quaternion."""
     w, x, y, z = q
     return (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -98,24 +98,24 @@ def matrix(q: Sequence[Any]) -> tuple[Vec, Vec, Vec]:
 
 
 def times(p: Sequence[Any], q: Sequence[Any]) -> tuple[Any, Any, Any, Any]:
-    """Product of quaternions, scalar first."""
+    """Return the product of quaternions, scalar first."""
     a, u = p[0], (p[1], p[2], p[3])
     b, v = q[0], (q[1], q[2], q[3])
     x, y, z = add(cross(u, v), add(scale(a, v), scale(b, u)))
     return a * b - dot(u, v), x, y, z
 
 
-# --- over the leading axis, which numbers corners or contacts ---------------------------------
+# --- reductions over the leading axis, of corners or contacts ----------------------------------
 
 _IN_ONE = ContextVar("rps_jax_reductions_in_one", default=False)
 
 
 @contextmanager
 def reductions_in_one() -> Iterator[None]:
-    """While this is traced, reduce as one operation, of which `lowering` makes one loop.
+    """Trace reductions as one operation, of which `engines.native` makes one loop.
 
-    XLA makes on a processor a loop over the leading axis of it, one world at a time; of slices
-    that are added it makes vectors of worlds.
+    On a processor XLA turns such an operation into a loop over the leading axis for one world at a
+    time, and sums of slices into vectors of worlds.
     """
     token = _IN_ONE.set(True)
     try:
@@ -130,22 +130,22 @@ def _over(x: Any, in_one: Callable[..., Any], two: Callable[[Any, Any], Any]) ->
     if _IN_ONE.get():
         return in_one(x, axis=0)
     rows = [x[i] for i in range(x.shape[0])]
-    while len(rows) > 1:  # in pairs: fewer steps that wait for one another
+    while len(rows) > 1:  # in pairs, for a short chain of dependent operations
         over = rows[-1:] if len(rows) % 2 else []
         rows = [two(a, b) for a, b in zip(rows[::2], rows[1::2], strict=False)] + over
     return rows[0]
 
 
 def total(x: Any) -> Any:
-    """Sum over the leading axis; a literal number is what all together have."""
+    """Return the sum over the leading axis; a literal number is returned unchanged."""
     return _over(x, jnp.sum, jnp.add)
 
 
 def greatest(x: Any) -> Any:
-    """Greatest along the leading axis."""
+    """Return the maximum along the leading axis."""
     return _over(x, jnp.max, jnp.maximum)
 
 
 def least(x: Any) -> Any:
-    """Least along the leading axis."""
+    """Return the minimum along the leading axis."""
     return _over(x, jnp.min, jnp.minimum)

@@ -1,9 +1,9 @@
-"""What a base with limits makes of a commanded twist: first where it aims, then how it pushes.
+"""The drive of a base with limits: the twist it aims at, and the force with which it pushes.
 
-The aim is the twist within the base's speed, followed with its lag and its acceleration. A base
-whose force is limited is a body: its drive is a velocity servo with integral action, in the base's
-own frame, that pushes with a force and a torque up to their limits. Without a load or with one
-below the limit it loses no speed for long; beyond the limit it stalls.
+The aim is the commanded twist within the speed limits, followed with lag and limited acceleration.
+A base with a force limit is a body. Its drive is a velocity servo with integral action in the
+base's frame, with a bounded force and torque. Below the limit a load slows the base only briefly;
+above the limit the base stalls.
 """
 
 import math
@@ -14,70 +14,72 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax.geometry import planar
+from rps_jax.geometry.vectors import Vec
 from rps_jax.robot.robot import Robot
 
-STALLED = 0.1  # [1] of the speed aimed at, below which a base stands still
-_STALL = 1.0  # [s] for which a base has stood still that is said to have stalled
-_MOVING = 1e-3  # [m/s] below which nothing is aimed at
-Triple = tuple[Any, Any, Any]
+STALLED = 0.1  # [1] share of the aimed speed below which a base stands still
+_STALL = 1.0  # [s] of standing still after which a base has stalled
+_MOVING = 1e-3  # [m/s] aimed speed above which a base can stall
 
 
 class Drive(NamedTuple):
-    """What a base with limits remembers."""
+    """State of the drive of a base with limits."""
 
-    aim: jax.Array  # (3,) [m/s, m/s, rad/s] the twist it is to have, in its own frame
-    integral: jax.Array  # (3,) [N, N, N m] of the servo, likewise
-    stalled: jax.Array  # () int32 control steps in a row in which it stood still, pushing
+    aim: jax.Array  # (3,) [m/s, m/s, rad/s] the aimed twist, in the base's frame
+    integral: jax.Array  # (3,) [N, N, N m] of the servo, in the base's frame
+    stalled: jax.Array  # () int32 consecutive control steps in which it stood still, pushing
 
 
-def start(like: jax.Array) -> Drive:
-    """A base at rest; numbers are of the type of `like`."""
-    still = jnp.zeros(3, like.dtype)
+def init_drive(template: jax.Array) -> Drive:
+    """Return the drive of a base at rest, in the precision of `template`."""
+    still = jnp.zeros(3, template.dtype)
     return Drive(still, still, jnp.zeros((), jnp.int32))
 
 
-def aim(robot: Robot, before: jax.Array, twist: jax.Array, period: float) -> jax.Array:
-    """The twist (3,) that the base is to have, after `before` (3,) and commanded `twist` (3,).
+def aim(robot: Robot, previous: jax.Array, twist: jax.Array, period: float) -> jax.Array:
+    """Return the aimed twist (3,), after the `previous` aim (3,) and a commanded `twist` (3,).
 
-    All in the base's frame [m/s, m/s, rad/s]; `period` [s] is that of the control loop.
+    Twists are in the base's frame [m/s, m/s, rad/s]; `period` [s] is the control period.
     """
     if robot.v_max is not None:
-        most = jnp.asarray(robot.v_max)
-        speed = planar.norm(twist[:2]) if most.ndim == 0 else jnp.abs(twist[:2])
-        shares = most / jnp.maximum(speed, 1e-9)  # the direction is kept
+        v_max = jnp.asarray(robot.v_max)
+        speed = planar.norm(twist[:2]) if v_max.ndim == 0 else jnp.abs(twist[:2])
+        shares = v_max / jnp.maximum(speed, 1e-9)  # the direction is kept
         twist = twist.at[:2].multiply(jnp.minimum(1.0, jnp.min(shares)))
     if robot.omega_max is not None:
         twist = twist.at[2].set(jnp.clip(twist[2], -robot.omega_max, robot.omega_max))
     if robot.lag is not None:
         share = 1 - jnp.exp(-period / jnp.maximum(robot.lag, 1e-9))
-        twist = before + share * (twist - before)
+        twist = previous + share * (twist - previous)
     if robot.acceleration_max is not None:
         linear, turning = jnp.asarray(robot.acceleration_max) * period
-        change = twist - before
+        change = twist - previous
         size = planar.norm(change[:2])
         limited = change[:2] * jnp.minimum(1.0, linear / jnp.maximum(size, 1e-12))
         turn = jnp.clip(change[2], -turning, turning)
-        twist = before + jnp.concatenate([limited, turn[None]])
+        twist = previous + jnp.concatenate([limited, turn[None]])
     return twist
 
 
-def carried_out(robot: Robot, aim: jax.Array) -> jax.Array:
-    """The twist (3,) of wheels that slip, which the base's own sensors do not see."""
+def apply_slip(robot: Robot, aim: jax.Array) -> jax.Array:
+    """Return the twist (3,) of wheels that slip, which the base's own sensors do not measure."""
     return aim if robot.slip is None else aim * (1 - robot.slip)
 
 
 def push(
-    robot: Robot,  # whose force is limited
-    integral: Triple,  # [N, N, N m] of the servo, in the base's frame
-    twist: Triple,  # [m/s, m/s, rad/s] wanted, in the base's frame
-    velocity: Triple,  # [m/s, m/s, rad/s] of the base in the world
+    robot: Robot,  # with a force limit
+    integral: Vec,  # [N, N, N m] of the servo, in the base's frame
+    twist: Vec,  # [m/s, m/s, rad/s] aimed, in the base's frame
+    velocity: Vec,  # [m/s, m/s, rad/s] of the base, in the world's frame
     turn: tuple[Any, Any],  # cosine and sine of the base's heading
     timestep: float,  # [s] of the physics
-    xp: ModuleType = jnp,  # or numpy, whichever the numbers are of
-) -> tuple[Triple, Triple]:
-    """Force and torque of the drive [N, N, N m] on the base in one physics step, in the world.
+    xp: ModuleType = jnp,  # or numpy, for numbers on the host
+) -> tuple[Vec, Vec]:
+    """Compute one physics step of the servo.
 
-    Returns them, and the servo's integral after the step.
+    Returns:
+      Force and torque [N, N, N m] of the drive on the base, in the world's frame; and the integral
+      after the step.
     """
     c, s = turn
     errors = (
@@ -87,32 +89,32 @@ def push(
     )
     inertia = (robot.mass, robot.mass, robot.inertia)
     rate = 2 * math.pi * robot.bandwidth  # [rad/s], critically damped
-    wanted = [m * 2 * rate * e + i for m, e, i in zip(inertia, errors, integral, strict=True)]
-    given = list(wanted)
-    if (most := robot.push_max) is not None:
-        size = xp.sqrt(wanted[0] * wanted[0] + wanted[1] * wanted[1])
-        share = xp.minimum(1.0, most / xp.maximum(size, 1e-9))
-        given[:2] = wanted[0] * share, wanted[1] * share
-    if (most := robot.turn_max) is not None:
-        given[2] = xp.minimum(xp.maximum(wanted[2], -most), most)
-    after = tuple(
-        i + timestep * (m * rate**2 * e + rate * (g - w))  # the integral forgets what is cut off
-        for i, m, e, g, w in zip(integral, inertia, errors, given, wanted, strict=True)
+    demand = [m * 2 * rate * e + i for m, e, i in zip(inertia, errors, integral, strict=True)]
+    output = list(demand)
+    if (limit := robot.push_max) is not None:
+        size = xp.sqrt(demand[0] * demand[0] + demand[1] * demand[1])
+        share = xp.minimum(1.0, limit / xp.maximum(size, 1e-9))
+        output[:2] = demand[0] * share, demand[1] * share
+    if (limit := robot.turn_max) is not None:
+        output[2] = xp.minimum(xp.maximum(demand[2], -limit), limit)
+    x, y, z = (
+        i + timestep * (m * rate**2 * e + rate * (u - d))  # anti-windup: u - d is the cut-off part
+        for i, m, e, u, d in zip(integral, inertia, errors, output, demand, strict=True)
     )
-    force = (c * given[0] - s * given[1], s * given[0] + c * given[1], given[2])
-    return force, after  # type: ignore[return-value]
+    force = (c * output[0] - s * output[1], s * output[0] + c * output[1], output[2])
+    return force, (x, y, z)
 
 
-def stalled(drive: Drive, qvel: jax.Array) -> Drive:
-    """The drive with the control steps counted in which the base stands still, pushing.
+def count_stalled_steps(drive: Drive, qvel: jax.Array) -> Drive:
+    """Return the drive with the count of control steps in which the base stands still, pushing.
 
-    `qvel` (9,) is as of a trial: of the base [m/s, m/s, rad/s] in the world first.
+    `qvel` (9,) is that of a trial: the base's velocity [m/s, m/s, rad/s] in the world comes first.
     """
-    wanted = planar.norm(drive.aim[:2])
-    stands = (planar.norm(qvel[:2]) < STALLED * wanted) & (wanted > _MOVING)
+    speed = planar.norm(drive.aim[:2])
+    stands = (planar.norm(qvel[:2]) < STALLED * speed) & (speed > _MOVING)
     return drive._replace(stalled=jnp.where(stands, drive.stalled + 1, 0))
 
 
-def has_stalled(drive: Drive | None, period: float) -> Any:
-    """Whether () a base has stood still for a while by now; `period` [s] is of the control loop."""
+def has_stalled(drive: Drive | None, period: float) -> jax.Array | bool:
+    """Whether () a base has stood still for `_STALL`; `period` [s] is the control period."""
     return False if drive is None else drive.stalled * period >= _STALL

@@ -1,7 +1,6 @@
-"""The robot: its size, its skin's boards, what keeps it from following a twist, and presets.
+"""The robot: its size, the boards of its skin, its limits, and presets.
 
-A limit that is None does not exist, and costs nothing: `Robot()` follows every twist at once, with
-any force.
+A limit of None is absent and costs nothing: `Robot()` follows every twist at once, with any force.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -23,86 +22,89 @@ from rps_jax.record import files
 from rps_jax.record.options import parse_changes
 from rps_jax.robot.shell import BOARDS, HALF_LENGTH, HALF_WIDTH, Boards, Shell
 
+# A number or an array of a batch, on the host or traced. `Any`: NumPy's, JAX's and Python's numbers
+# have no common type with arithmetic.
+Number: TypeAlias = Any
+
 
 @dataclass(frozen=True)
 class Robot:
-    """A base that moves in all directions, and its limits. A pytree whose numbers may be batched.
+    """An omnidirectional base and its limits. A pytree whose numbers may be batched.
 
     Twists and limits are in the robot frame, x forward and y left.
     """
 
-    half_length: Any = HALF_LENGTH  # () [m]
-    half_width: Any = HALF_WIDTH  # () [m]
+    half_length: Number = HALF_LENGTH  # () [m]
+    half_width: Number = HALF_WIDTH  # () [m]
     boards: tuple[Boards, ...] = BOARDS  # of the skin
-    mass: Any = 130.0  # () [kg] of the whole robot; it matters to a base with a limited force
-    # () [m/s] greatest speed in any direction, or (2,) forward and sideways
-    v_max: Any = None
-    omega_max: Any = None  # () [rad/s] greatest turning rate
-    lag: Any = None  # () [s] time constant with which the base follows a twist
-    # (2,) [m/s^2, rad/s^2] greatest change of the velocity in a second
-    acceleration_max: Any = None
-    force_max: Any = None  # () [N] of the drive, in any direction
-    torque_max: Any = None  # () [N m] of the drive about the vertical
-    bandwidth: Any = 5.0  # () [Hz] of the drive's velocity servo; of a limited force alone
-    traction: Any = None  # () [1] friction coefficient of the wheels, which bounds force and torque
-    resistance: Any = None  # () [1] of rolling, over the weight: a force that the drive spends
-    slip: Any = None  # () [1] share of the velocity that the wheels lose
+    mass: Number = 130.0  # () [kg] of the whole robot; used if the force is limited
+    # () [m/s] maximum speed in any direction, or (2,) forward and sideways
+    v_max: Number = None
+    omega_max: Number = None  # () [rad/s] maximum turning rate
+    lag: Number = None  # () [s] time constant with which the base follows a twist
+    acceleration_max: Number = None  # (2,) [m/s^2, rad/s^2] maximum acceleration
+    force_max: Number = None  # () [N] of the drive, in any direction
+    torque_max: Number = None  # () [N m] of the drive about the vertical
+    bandwidth: Number = 5.0  # () [Hz] of the drive's velocity servo; used if the force is limited
+    traction: Number = None  # () [1] friction coefficient of the wheels; bounds force and torque
+    resistance: Number = None  # () [1] rolling resistance over the weight
+    slip: Number = None  # () [1] share of the velocity that the wheels lose
 
     @property
     def driven(self) -> bool:
-        """Whether the base is a body that contact can slow and stop."""
+        """Whether the force is limited, so that contact can slow and stop the base."""
         return any(x is not None for x in (self.force_max, self.torque_max, self.traction))
 
     @property
     def ideal(self) -> bool:
-        """Whether every twist is followed at once, with any force."""
+        """Whether the base has no limits: it follows every twist at once, with any force."""
         return all(getattr(self, name) is None for name in LIMITS)
 
     @property
-    def inertia(self) -> Any:
-        """Moment of inertia () [kg m^2] about the vertical, as of a plate of the base's outline."""
+    def inertia(self) -> Number:
+        """Moment of inertia () [kg m^2] about the vertical, of a plate with the base's outline."""
         return self.mass * (self.half_length**2 + self.half_width**2) / 3
 
     @property
-    def arm(self) -> Any:
-        """From the middle to the wheels () [m], which stand at the corners of the outline."""
+    def arm(self) -> Number:
+        """Distance () [m] from the middle to the wheels, at the corners of the outline."""
         size = self.half_length**2 + self.half_width**2
         return jnp.sqrt(size) if isinstance(size, jax.Array) else np.sqrt(size)
 
     @property
     def shell(self) -> Shell:
-        """The outline and the boards, of robots on the host."""
+        """Outline and boards, of robots on the host."""
         return Shell.of(self.half_length, self.half_width, self.boards)
 
     @property
-    def push_max(self) -> Any:
-        """The greatest force () [N] on an object; None without a limit.
+    def push_max(self) -> Number:
+        """Maximum force () [N] on an object; None without a limit.
 
-        The wheels give at most the drive's force and what their traction holds, and rolling takes
-        its part of it.
+        The drive's force and the traction bound the force of the wheels; rolling resistance reduces
+        it.
         """
         weight = self.mass * GRAVITY
-        most = _least(self.force_max, None if self.traction is None else self.traction * weight)
-        if most is None or self.resistance is None:
-            return most
-        return most - self.resistance * weight
+        limit = _minimum(self.force_max, None if self.traction is None else self.traction * weight)
+        if limit is None or self.resistance is None:
+            return limit
+        return limit - self.resistance * weight
 
     @property
-    def turn_max(self) -> Any:
-        """The greatest torque () [N m] about the vertical; None without a limit.
+    def turn_max(self) -> Number:
+        """Maximum torque () [N m] about the vertical; None without a limit.
 
         The wheels share the force.
         """
         force = self.push_max
-        return _least(self.torque_max, None if force is None else force * self.arm)
+        return _minimum(self.torque_max, None if force is None else force * self.arm)
 
     @property
     def body(self) -> Robot:
-        """What a physics step needs of it: without its skin and the limits of where it aims."""
-        return dataclasses.replace(self, boards=(), **dict.fromkeys(_OF_THE_AIM))
+        """The fields that a physics step needs: without the skin and the limits of the aim."""
+        return dataclasses.replace(self, boards=(), **dict.fromkeys(_AIM_LIMITS))
 
     def check(self) -> None:
-        """Raises InputError for numbers that no robot has; each is one number, or None."""
+        """Raise InputError for numbers that no robot has; each is one number, or None."""
         Shell(self.half_length, self.half_width, self.boards).check()
         errors.check_finite("robot mass", self.mass, above=0, at_most=1e4, unit="kg")
         if np.size(self.v_max) > 2:
@@ -115,12 +117,12 @@ class Robot:
                 f"robot v_max = {self.v_max} is not allowed: a base that cannot move sideways "
                 "cannot follow the law, which needs v_y."
             )
-        for name, (least, most, unit) in _ALLOWED.items():
+        for name, (low, high, unit) in _BOUNDS.items():
             value = getattr(self, name)
             if value is not None:
-                for one in np.atleast_1d(np.asarray(value, object)):
+                for scalar in np.atleast_1d(np.asarray(value, object)):
                     errors.check_finite(
-                        f"robot {name}", one, at_least=least, at_most=most, unit=unit
+                        f"robot {name}", scalar, at_least=low, at_most=high, unit=unit
                     )
         if self.acceleration_max is not None and np.size(self.acceleration_max) != 2:
             raise InputError(
@@ -130,14 +132,14 @@ class Robot:
         if self.push_max is not None and self.push_max <= 0:
             raise InputError(
                 f"robot force_max = {self.force_max} N and traction = {self.traction} are not "
-                "allowed: rolling takes "
-                f"{(self.resistance or 0) * self.mass * GRAVITY:.0f} N, which leaves nothing to "
-                "push with."
+                "allowed: rolling resistance takes "
+                f"{(self.resistance or 0) * self.mass * GRAVITY:.0f} N, so that no force is left "
+                "to push with."
             )
 
 
-def _least(a: Any, b: Any) -> Any:
-    """The lesser of two numbers, on the host or traced; None is none."""
+def _minimum(a: Number, b: Number) -> Number:
+    """Return the minimum of two numbers, on the host or traced, of which each may be None."""
     if a is None or b is None:
         return b if a is None else a
     xp = jnp if isinstance(a, jax.Array) or isinstance(b, jax.Array) else np
@@ -145,36 +147,36 @@ def _least(a: Any, b: Any) -> Any:
 
 
 _FIELDS = [field.name for field in dataclasses.fields(Robot)]
-_OF_THE_AIM = ("v_max", "omega_max", "lag", "acceleration_max", "slip")
-_NO_LIMITS = ("half_length", "half_width", "boards", "mass", "bandwidth", "resistance")
-LIMITS = tuple(name for name in _FIELDS if name not in _NO_LIMITS)
+_AIM_LIMITS = ("v_max", "omega_max", "lag", "acceleration_max", "slip")
+_NOT_LIMITS = ("half_length", "half_width", "boards", "mass", "bandwidth", "resistance")
+LIMITS = tuple(name for name in _FIELDS if name not in _NOT_LIMITS)
 jax.tree_util.register_dataclass(Robot, data_fields=_FIELDS, meta_fields=[])
-_LEAST = 1e-3  # of what would else bring the base to a stop
-_ALLOWED = {
-    "v_max": (_LEAST, 10, "m/s"),
-    "omega_max": (_LEAST, 20, "rad/s"),
+_POSITIVE = 1e-3  # lower bound of limits that would stop the base
+_BOUNDS = {
+    "v_max": (_POSITIVE, 10, "m/s"),
+    "omega_max": (_POSITIVE, 20, "rad/s"),
     "lag": (0, 5, "s"),
-    "acceleration_max": (_LEAST, 100, "1"),
+    "acceleration_max": (_POSITIVE, 100, "1"),
     "bandwidth": (0.1, 100, "Hz"),
     "force_max": (0, 1e5, "N"),
-    "torque_max": (_LEAST, 1e5, "N m"),
-    "traction": (_LEAST, 5, "1"),
+    "torque_max": (_POSITIVE, 1e5, "N m"),
+    "traction": (_POSITIVE, 5, "1"),
     "resistance": (0, 1, "1"),
     "slip": (0, 0.5, "1"),
 }
 
 
 def _covered(length: float, width: float) -> tuple[Boards, ...]:
-    """As many of the paper's boards as a base of these [m] has room for, in the middle of sides."""
+    """Return the paper's boards that fit on a base of this length and width [m], centred."""
     pitch = 2 * HALF_WIDTH / 12  # of the paper's taxels
     side, front = (int(size / (3 * pitch) + 1e-6) for size in (length, width))
     return Boards("left", side, pitch), Boards("front", front, pitch), Boards("right", side, pitch)
 
 
-# From data sheets and the makers' robot descriptions, as far as these say. None of these has a
-# skin of its own: they wear the paper's boards.
+# From data sheets and the makers' robot descriptions, where these give a number. None of these has
+# a skin: they get the paper's boards.
 ROBOTS: dict[str, Robot] = {
-    # Every twist is followed at once: as the paper's simulation has it.
+    # Follows every twist at once, as in the paper's simulation.
     "ideal": Robot(),
     # The paper's: a Robotnik SUMMIT-XL STEEL with a UR16e arm. Robotnik's `summit_xl_common` gives
     # 125 kg (summit_xls_base.urdf.xacro), 2.5 m/s^2 and 3.2 rad/s^2 (base_local_planner_params);
@@ -214,11 +216,11 @@ ROBOTS: dict[str, Robot] = {
 }
 
 
-RobotLike = Robot | str | Mapping[str, Any]  # or its text, see `named`
+RobotLike = Robot | str | Mapping[str, Any]  # or its text: see `parse_robot`
 
 
-def named(robot: RobotLike) -> Robot:
-    """Read a robot: itself, its name, as kairos, a JSON file, or names with numbers.
+def parse_robot(robot: RobotLike) -> Robot:
+    """Return a robot from a name, as kairos, a JSON file, or a mapping of names to numbers.
 
     Changes may follow a name or a file, as `kairos,force_max=300`.
     """
@@ -227,15 +229,15 @@ def named(robot: RobotLike) -> Robot:
         if head.endswith(".json"):
             robot = files.read_json(Path(head)) | changes
         else:
-            usual = ROBOTS[errors.check_name("robot", head, ROBOTS)]
-            robot = {f.name: getattr(usual, f.name) for f in dataclasses.fields(Robot)} | changes
+            preset = ROBOTS[errors.check_name("robot", head, ROBOTS)]
+            robot = {name: getattr(preset, name) for name in _FIELDS} | changes
     if isinstance(robot, Mapping):
         for name in robot:
             errors.check_name("robot quantity", name, _FIELDS)
-        read = {k: tuple(v) if isinstance(v, list | tuple) else v for k, v in robot.items()}
-        if "boards" in read:
-            read["boards"] = _boards(read["boards"])
-        robot = Robot(**read)
+        values = {k: tuple(v) if isinstance(v, list | tuple) else v for k, v in robot.items()}
+        if "boards" in values:
+            values["boards"] = _parse_boards(values["boards"])
+        robot = Robot(**values)
     if not isinstance(robot, Robot):
         raise InputError(
             f'robot = {robot!r} is not allowed: write names with numbers, as {{"force_max": 300}}.'
@@ -244,13 +246,13 @@ def named(robot: RobotLike) -> Robot:
     return robot
 
 
-def _boards(rows: Any) -> tuple[Boards, ...]:
-    """Rows of boards from names with numbers."""
+def _parse_boards(rows: object) -> tuple[Boards, ...]:
+    """Return rows of boards from mappings of names to numbers."""
     known = [field.name for field in dataclasses.fields(Boards)]
-    found = []
+    boards = []
     for row in rows if isinstance(rows, tuple) else (rows,):
         if isinstance(row, Boards):
-            found.append(row)
+            boards.append(row)
             continue
         if not isinstance(row, Mapping) or not {"side", "count"} <= set(row):
             raise InputError(
@@ -259,5 +261,5 @@ def _boards(rows: Any) -> tuple[Boards, ...]:
             )
         for name in row:
             errors.check_name("robot boards' quantity", name, known)
-        found.append(Boards(**row))
-    return tuple(found)
+        boards.append(Boards(**row))
+    return tuple(boards)

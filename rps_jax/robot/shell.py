@@ -1,8 +1,8 @@
-"""The shell: the outline of a base, and where along it the boards of its skin are.
+"""The shell: the outline of a base, and the positions of the boards of its skin.
 
 The skin covers the front, left and right sides. Positions along the rim form one strip that starts
 at the rear of the left side, runs forward, across the front from left to right, and back along the
-right side. What is None is as the paper has it.
+right side. A field of None has the paper's value.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ Side = Literal["left", "front", "right"]
 SIDES: tuple[Side, ...] = ("left", "front", "right")  # in the order of the strip
 _ALONG = {"left": (1.0, 0.0), "front": (0.0, -1.0), "right": (-1.0, 0.0)}
 _ROUNDING = 1e-9  # [m]
-_APART = 0.01  # [m] between two points of a taxel, at most
-_STATIC = {"static": True}  # of a pytree's field: no leaf
+_SPACING = 0.01  # [m] maximum, between two sample points of a taxel
+_STATIC = {"static": True}  # metadata of a field that is no leaf of the pytree
 
 
 @jax.tree_util.register_dataclass
@@ -36,13 +36,13 @@ class Boards:
 
     side: Side = field(metadata=_STATIC)
     count: int = field(metadata=_STATIC)  # boards
-    pitch: Any = None  # () [m] of the taxels; None: so that the row covers the whole side
+    pitch: Any = None  # () [m] of the taxels; None: the row covers the whole side
     middle: Any = None  # () [m] of the row along the strip, from the middle of the side; None: 0
     electrodes: int = field(default=3, metadata=_STATIC)  # on each board
 
     @property
     def taxels(self) -> int:
-        """How many."""
+        """Number of taxels."""
         return self.count * self.electrodes
 
 
@@ -50,37 +50,37 @@ BOARDS = (Boards("left", 5), Boards("front", 4), Boards("right", 5))  # 14 board
 
 
 class Row(NamedTuple):
-    """The part of a side that a row of boards covers."""
+    """Part of a side that a row of boards covers."""
 
     start: jax.Array  # (2,) [m] in the robot frame
     along: np.ndarray  # (2,) unit vector
     length: Any  # () [m]
-    begins: Any  # () [m] where on the strip
+    offset: Any  # () [m] of its start along the strip
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Shell:
-    """A base's outline, a rectangle about its origin, and its boards, in the strip's order."""
+    """Outline of a base, a rectangle about its origin, and its boards in the strip's order."""
 
     half_length: Any = HALF_LENGTH  # () [m]
-    half_width: Any = None  # () [m]; None: the paper's, which a compiled program then knows
+    half_width: Any = None  # () [m]; None: the paper's, a constant of the compiled program
     boards: tuple[Boards, ...] = BOARDS
-    # Points of each taxel at which it feels foam; 1 cm apart they feel a corner.
+    # Sample points of each taxel for the compression of foam; 1 cm apart they resolve a corner.
     samples: int = field(default=5, metadata=_STATIC)
 
     @classmethod
     def of(cls, half_length: Any, half_width: Any, boards: tuple[Boards, ...]) -> Shell:
-        """The shell of a base or, if these are (n,), of many."""
+        """Return the shell of a base, or of many bases if the sizes are (n,)."""
         x, y = (float(np.max(half)) for half in (half_length, half_width))
         sides = _lengths(x, y)
         pitches = [
-            sides[one.side] / one.taxels if one.pitch is None else np.max(one.pitch)
-            for one in boards
+            sides[row.side] / row.taxels if row.pitch is None else np.max(row.pitch)
+            for row in boards
         ]
-        usual = np.all(np.asarray(half_width) == HALF_WIDTH)
-        samples = math.ceil(float(max(pitches)) / _APART)
-        return cls(half_length, None if usual else half_width, boards, samples)
+        is_default = np.all(np.asarray(half_width) == HALF_WIDTH)
+        samples = math.ceil(float(max(pitches)) / _SPACING)
+        return cls(half_length, None if is_default else half_width, boards, samples)
 
     @property
     def half(self) -> tuple[Any, Any]:
@@ -89,37 +89,37 @@ class Shell:
 
     @property
     def count(self) -> int:
-        """How many taxels."""
+        """Number of taxels."""
         return sum(row.taxels for row in self.boards)
 
     def rows(self) -> list[Row]:
-        """Where the rows of boards are."""
+        """Return the positions of the rows of boards."""
         x, y = self.half
         corners = {"left": (-x, y), "front": (x, y), "right": (x, -y)}
-        begins = {"left": 0.0, "front": 2 * x, "right": 2 * x + 2 * y}
-        found, sides = [], _lengths(x, y)
-        for one in self.boards:
-            along, side = np.array(_ALONG[one.side]), sides[one.side]
-            start, begin = jnp.stack(corners[one.side]), begins[one.side]
-            if one.pitch is None:
-                found.append(Row(start, along, side, begin))
+        offsets = {"left": 0.0, "front": 2 * x, "right": 2 * x + 2 * y}
+        rows, sides = [], _lengths(x, y)
+        for boards in self.boards:
+            along, side = np.array(_ALONG[boards.side]), sides[boards.side]
+            start, offset = jnp.stack(corners[boards.side]), offsets[boards.side]
+            if boards.pitch is None:
+                rows.append(Row(start, along, side, offset))
                 continue
-            length = one.taxels * one.pitch
-            ahead = (side - length) / 2 + (0.0 if one.middle is None else one.middle)
-            found.append(Row(start + ahead * along, along, length, begin + ahead))
-        return found
+            length = boards.taxels * boards.pitch
+            gap = (side - length) / 2 + (0.0 if boards.middle is None else boards.middle)
+            rows.append(Row(start + gap * along, along, length, offset + gap))
+        return rows
 
     def taxels(self, samples: int = 1) -> jax.Array:
-        """Sample points (T, samples, 2) [m] of the taxels in the robot frame."""
-        found = []
-        for one, row in zip(self.boards, self.rows(), strict=True):
-            count = one.taxels * samples
+        """Return sample points (T, samples, 2) [m] of the taxels in the robot frame."""
+        points = []
+        for boards, row in zip(self.boards, self.rows(), strict=True):
+            count = boards.taxels * samples
             s = (np.arange(count) + 0.5) / count * row.length
-            found.append((row.start + s[:, None] * row.along).reshape(-1, samples, 2))
-        return jnp.concatenate(found)
+            points.append((row.start + s[:, None] * row.along).reshape(-1, samples, 2))
+        return jnp.concatenate(points)
 
     def on_strip(self, s: jax.Array) -> jax.Array:
-        """Points (..., 2) [m] of the strip in the robot frame, `s` (...) [m] from its start."""
+        """Return points (..., 2) [m] in the robot frame at positions `s` (...) [m] of the strip."""
         x, y = self.half
         x = jnp.asarray(x, s.dtype)
         corners = jnp.cumsum(jnp.stack([0 * x, 2 * x, jnp.full_like(x, 2 * y), 2 * x]))
@@ -128,62 +128,62 @@ class Shell:
         return jnp.stack([at_x, jnp.interp(s, corners, jnp.asarray(y, s.dtype))], axis=-1)
 
     def check(self) -> None:
-        """Raises InputError for a base of no size, and boards that overlap or leave it."""
+        """Raise InputError for a base without size, or boards that overlap or leave it."""
         x, y = self.half
         for name, value in (("half_length", x), ("half_width", y)):
             errors.check_finite(f"robot {name}", value, at_least=0.1, at_most=2, unit="m")
         if not self.boards:
             raise InputError("robot boards = () is not allowed: name at least one row.")
-        for one in self.boards:
-            _check(one)
-        if [one.side for one in self.boards] != sorted(
-            (one.side for one in self.boards), key=SIDES.index
-        ):
+        for row in self.boards:
+            _check(row)
+        used = [row.side for row in self.boards]
+        if used != sorted(used, key=SIDES.index):
             raise InputError(
-                f"robot boards on {', '.join(one.side for one in self.boards)} are not allowed: "
-                "name the rows in the order left, front, right."
+                f"robot boards on {', '.join(used)} are not allowed: name the rows in the order "
+                "left, front, right."
             )
         sides = _lengths(x, y)
-        for one in self.boards:
-            first, last = _ends(one, sides[one.side])
-            if first < -_ROUNDING or last > sides[one.side] + _ROUNDING:
+        for row in self.boards:
+            first, last = _interval(row, sides[row.side])
+            if first < -_ROUNDING or last > sides[row.side] + _ROUNDING:
                 raise InputError(
-                    f"robot boards from {first:g} to {last:g} m of the {one.side} side are not "
-                    f"allowed: they leave the base, whose side ends at {sides[one.side]:g} m."
+                    f"robot boards from {first:g} to {last:g} m of the {row.side} side are not "
+                    f"allowed: they leave the base, whose side ends at {sides[row.side]:g} m."
                 )
-        for one, after in itertools.pairwise(self.boards):
-            if one.side == after.side:
-                last, first = _ends(one, sides[one.side])[1], _ends(after, sides[one.side])[0]
+        for row, follower in itertools.pairwise(self.boards):
+            if row.side == follower.side:
+                side = sides[row.side]
+                last, first = _interval(row, side)[1], _interval(follower, side)[0]
                 if first < last - _ROUNDING:
                     raise InputError(
-                        f"robot boards on the {one.side} side are not allowed: a row ends at "
+                        f"robot boards on the {row.side} side are not allowed: a row ends at "
                         f"{last:g} m and the following begins at {first:g} m, so they overlap."
                     )
 
 
 def _lengths(x: Any, y: Any) -> dict[Side, Any]:
-    """Lengths [m] of the sides of a base of half length x and half width y [m]."""
+    """Return the lengths [m] of the sides of a base of half length x and half width y [m]."""
     return {"left": 2 * x, "front": 2 * y, "right": 2 * x}
 
 
-def _ends(one: Boards, side: float) -> tuple[float, float]:
-    """Where on its side, of length `side` [m], a row begins and ends [m]."""
-    if one.pitch is None:
+def _interval(row: Boards, side: float) -> tuple[float, float]:
+    """Return the start and end [m] of a row on its side of length `side` [m]."""
+    if row.pitch is None:
         return 0.0, side
-    length, middle = one.taxels * one.pitch, side / 2 + (one.middle or 0.0)
+    length, middle = row.taxels * row.pitch, side / 2 + (row.middle or 0.0)
     return middle - length / 2, middle + length / 2
 
 
-def _check(one: Boards) -> None:
-    errors.check_name("robot boards' side", one.side, SIDES)
+def _check(row: Boards) -> None:
+    errors.check_name("robot boards' side", row.side, SIDES)
     for name in ("count", "electrodes"):
-        errors.check_count(f"robot boards' {name}", getattr(one, name), at_most=100)
-    if one.pitch is not None:
-        errors.check_finite("robot boards' pitch", one.pitch, at_least=0.002, at_most=1, unit="m")
-    if one.middle is not None:
-        errors.check_finite("robot boards' middle", one.middle, unit="m")
-        if one.pitch is None and one.middle != 0:
+        errors.check_count(f"robot boards' {name}", getattr(row, name), at_most=100)
+    if row.pitch is not None:
+        errors.check_finite("robot boards' pitch", row.pitch, at_least=0.002, at_most=1, unit="m")
+    if row.middle is not None:
+        errors.check_finite("robot boards' middle", row.middle, unit="m")
+        if row.pitch is None and row.middle != 0:
             raise InputError(
-                f"robot boards' middle = {one.middle:g} m is not allowed without a pitch: such a "
+                f"robot boards' middle = {row.middle:g} m is not allowed without a pitch: such a "
                 "row covers the whole side."
             )

@@ -1,13 +1,13 @@
-"""The tactile skin: where does the object touch the base?
+"""The tactile skin: sensors of the contact between object and base.
 
-Two sensors behind one interface, both purely geometric: they read the object's footprint, placed
-in the robot frame, and never the engine's contacts. They feel where the boards of a base's shell
-are; the two extreme positions of a contact are its first and last along the shell's strip.
+Both sensors are purely geometric: they read the object's footprint, placed in the robot frame, and
+never the engine's contacts. They sense along the boards of a base's shell. The two extreme
+positions of a contact are the first and the last along the shell's strip.
 
     sensor.init(key) -> state
     sensor.sense(state, footprint, period) -> (state, Reading)
 
-`SmoothSkin` makes either sensor smooth: a reading tells how much contact there is, from 0 to 1.
+`SmoothSkin` makes either sensor smooth: its reading has a contact weight from 0 to 1.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from rps_jax.record.options import parse_changes
 from rps_jax.robot.shell import HALF_WIDTH, Shell
 
 _NODES = 16  # points on each row of boards of the smooth ideal sensor
-_REACH = 8.0  # [1] temperatures beyond its tolerance at which they end, with 3e-4 of the weight
-_NEVER = -1e9  # of a dead taxel: its excess over the threshold, in temperatures
+_REACH = 8.0  # [1] temperatures beyond the tolerance at which the points end: weight 3e-4
+_NEVER = -1e9  # excess of a dead taxel over the threshold, in temperatures
 
 NONE, POINT, LINE = 0, 1, 2  # contact types, Fig. 6c
 
 
 class Reading(NamedTuple):
-    """What the skin tells the law."""
+    """Contact type and location that a skin measures."""
 
     contact_type: Int[Array, "*B"]  # NONE, POINT or LINE
     p_robot_contact: Float[Array, "*B 2"]  # [m] contact location in the robot frame; 0 if NONE
@@ -46,36 +46,36 @@ class Reading(NamedTuple):
 
 
 class SmoothReading(NamedTuple):
-    """What a smooth skin tells: a `Reading` whose contact is a weight."""
+    """Reading of a smooth skin, whose contact is a weight."""
 
-    contact_type: Int[Array, "*B"]  # NONE up to a weight of 1/2, beyond it POINT or LINE
+    contact_type: Int[Array, "*B"]  # NONE up to a weight of 1/2, else POINT or LINE
     p_robot_contact: Float[Array, "*B 2"]  # [m] contact location in the robot frame, at any weight
     in_contact: Float[Array, "*B"]  # [1] weight of the contact, from 0 to 1
 
 
 class SkinState(NamedTuple):
-    """What a sensor carries from one reading to the next (empty for the ideal one)."""
+    """State of a sensor between two readings; empty for the ideal one."""
 
-    key: jax.Array  # noise of the readings to come
+    key: jax.Array  # of the noise of later readings
     signal: Float[Array, "*B T"]  # [1] filtered relative change of capacitance
     gain: Float[Array, "*B T"]  # [1] of each taxel
-    alive: Bool[Array, "*B T"] | Float[Array, "*B 0"]  # of the ideal sensor empty
+    alive: Bool[Array, "*B T"] | Float[Array, "*B 0"]  # empty for the ideal sensor
 
 
 class IdealSkin(NamedTuple):
-    """The exact contact interval, as the position of the paper's Gazebo contact sensor.
+    """Sensor of the exact contact interval, as the paper's Gazebo contact sensor.
 
-    A point of a face is in contact if it lies within `tolerance` of the object: foam gives a real
-    skin several millimetres of it, and without any, the corners of a box alternate and the law
+    A point of a face is in contact if it lies within `tolerance` of the object. Foam gives a real
+    skin a tolerance of several millimetres. Without it the corners of a box alternate, and the law
     chatters.
     """
 
     tolerance: float | jax.Array = 0.006  # [m]
-    point_length: float | jax.Array = 2 * HALF_WIDTH / 12  # [m] up to one taxel long: a point
-    shell: Shell = Shell()  # what it covers; in a trial, that of the robot
+    point_length: float | jax.Array = 2 * HALF_WIDTH / 12  # [m] one taxel: longest POINT contact
+    shell: Shell = Shell()  # outline and boards; in a trial, the robot's
 
     def check(self) -> None:
-        """Raises InputError unless all are lengths."""
+        """Raise InputError for fields that are no lengths."""
         for name in ("tolerance", "point_length"):
             errors.check_finite(
                 f"skin {name}", getattr(self, name), at_least=0, at_most=0.1, unit="m"
@@ -87,45 +87,45 @@ class IdealSkin(NamedTuple):
         return self._replace(shell=shell)
 
     def init(self, key: Array) -> SkinState:
-        """No memory, no imperfections."""
+        """Return the empty state."""
         return SkinState(key, *(jnp.zeros(0),) * 3)
 
     def sense(
         self, state: SkinState, footprint: Footprint, period: Scalar
     ) -> tuple[SkinState, Reading]:
-        """The middle between the two ends of the contact interval; the period is unused."""
+        """Return the middle between the two ends of the contact interval; the period is unused."""
         del period
         dtype = footprint.vertices.dtype
-        hits, ends = [], []  # of both ends of each row's interval, in strip order
+        hits, positions = [], []  # of both ends of each row's interval, in strip order
         for row in self.shell.rows():
             start, along = jnp.asarray(row.start, dtype), jnp.asarray(row.along, dtype)
             low, high = fp.crossing(footprint, start, along, self.tolerance)
             hit = (low <= high) & (high >= 0) & (low <= row.length)
             for s in (low, high):
                 s = jnp.clip(s, 0.0, row.length)
-                ends.append(jnp.concatenate([start + s * along, row.begins + s[None]]))
+                positions.append(jnp.concatenate([start + s * along, row.offset + s[None]]))
                 hits.append(hit)
-        ends, hits = jnp.stack(ends), jnp.stack(hits)
-        first, last = _extremes(hits, ends)
+        positions, hits = jnp.stack(positions), jnp.stack(hits)
+        first, last = _extremes(hits, positions)
         kind = jnp.where(last[2] - first[2] > self.point_length, LINE, POINT)
         return state, _reading(jnp.where(jnp.any(hits), kind, NONE), first[:2], last[:2])
 
     def sense_smoothly(
         self, state: SkinState, footprint: Footprint, period: Scalar, temperature: Any
     ) -> tuple[SkinState, SmoothReading]:
-        """The reading if a point at signed distance x is active by its excess, tolerance - x.
+        """Return the reading of points whose activity is a sigmoid.
 
-        Active is sigmoid(excess / temperature [m]). The contact is one run along the strip, so
-        its mean is the middle of its two ends and its total activity their distance, also around
-        a corner. The points lie where `footprint.crossing` finds a face near enough, and so move
-        with the object: a few suffice, and as the temperature falls their reading tends to that
-        of `sense`.
+        The activity of a point at signed distance x is sigmoid((tolerance - x) / temperature), with
+        a temperature in [m]. The contact is one run along the strip, also around a corner: its mean
+        is the middle of its two ends, its total activity their distance. The points lie where
+        `footprint.crossing` finds a face near enough and move with the object, so that a few
+        suffice. As the temperature falls, the reading tends to that of `sense`.
         """
         del period
         s, share = self._nodes(footprint, self.tolerance + _REACH * temperature)
         distance = fp.signed_distance(footprint, self.shell.on_strip(s))
         excess = (self.tolerance - distance) / temperature
-        # A softmax: defined where nothing is near too, by whatever is nearest.
+        # A softmax: also defined without contact, by the nearest point.
         middle = jnp.sum(s * jax.nn.softmax(jax.nn.log_sigmoid(excess) + jnp.log(share)))
         length = jnp.sum(share * jax.nn.sigmoid(excess))
         first, last = self.shell.on_strip(middle + length * jnp.array([-0.5, 0.5], s.dtype))
@@ -133,9 +133,9 @@ class IdealSkin(NamedTuple):
         return state, _smooth_reading(planar.greatest(excess), kind, first, last)
 
     def _nodes(self, footprint: Footprint, tolerance: Any) -> tuple[jax.Array, jax.Array]:
-        """Points (N,) [m] of the strip within `tolerance` of a footprint, the length of each.
+        """Return points (N,) [m] of the strip within `tolerance` of a footprint, and their lengths.
 
-        Of a row of boards that lies beyond it, points all along.
+        A row of boards outside of the tolerance has points along its whole length.
         """
         middles = (np.arange(_NODES) + 0.5) / _NODES
         nodes, shares = [], []
@@ -146,8 +146,8 @@ class IdealSkin(NamedTuple):
             near = (low <= high) & (high >= 0) & (low <= row.length)
             low = jnp.where(near, jnp.clip(low, 0.0, row.length), 0.0)
             high = jnp.where(near, jnp.clip(high, 0.0, row.length), row.length)
-            nodes.append(row.begins + low + (high - low) * middles)
-            share = jnp.maximum(high - low, 1e-6) / _NODES  # not zero: its logarithm is taken
+            nodes.append(row.offset + low + (high - low) * middles)
+            share = jnp.maximum(high - low, 1e-6) / _NODES  # positive, for its logarithm
             shares.append(jnp.broadcast_to(share, _NODES))
         return jnp.concatenate(nodes), jnp.concatenate(shares)
 
@@ -155,21 +155,21 @@ class IdealSkin(NamedTuple):
 class CapacitiveSkin(NamedTuple):
     """Taxels under foam: compression -> capacitance -> low-pass -> threshold (Sec. II-B).
 
-    The foam stands proud of the rigid base by `foam`. An electrode's capacitance is the mean of
-    eps / gap over its length, the gap being what the object leaves of the foam.
+    The foam is `foam` thick on the rigid base. The capacitance of an electrode is the mean of
+    eps / gap over its length, where the gap is the thickness of the compressed foam.
     """
 
-    foam: float | jax.Array = 0.010  # [m] thickness, uncompressed
-    max_compression: float | jax.Array = 0.9  # [1] share of the thickness that can give way
+    foam: float | jax.Array = 0.010  # [m] uncompressed thickness
+    max_compression: float | jax.Array = 0.9  # [1] share of the thickness that can be compressed
     time_constant: float | jax.Array = 0.05  # [s] of the low-pass filter
-    threshold: float | jax.Array = 0.25  # [1] relative change of capacitance that counts as touch
+    threshold: float | jax.Array = 0.25  # [1] relative change of capacitance at contact
     noise: float | jax.Array = 0.0  # [1] standard deviation of each raw reading
     gain_spread: float | jax.Array = 0.0  # [1] standard deviation of the taxels' gains about 1
-    dead_share: float | jax.Array = 0.0  # [1] probability that a taxel never answers
-    shell: Shell = Shell()  # what it covers; in a trial, that of the robot
+    dead_share: float | jax.Array = 0.0  # [1] probability that a taxel is dead
+    shell: Shell = Shell()  # outline and boards; in a trial, the robot's
 
     def check(self) -> None:
-        """Raises InputError for foam, filter or imperfections that no skin can have."""
+        """Raise InputError for foam, filter or imperfections that no skin can have."""
         errors.check_finite("skin foam", self.foam, above=0, at_most=0.1, unit="m")
         errors.check_finite("skin max_compression", self.max_compression, above=0, at_most=0.99)
         errors.check_finite("skin time_constant", self.time_constant, above=0, unit="s")
@@ -183,7 +183,7 @@ class CapacitiveSkin(NamedTuple):
         return self._replace(shell=shell)
 
     def init(self, key: Array) -> SkinState:
-        """Draws each taxel's gain and whether it is dead."""
+        """Draw the gain of each taxel, and whether it is dead."""
         key, key_gain, key_dead = jax.random.split(key, 3)
         n = self.shell.count
         gain = 1 + self.gain_spread * jax.random.normal(key_gain, (n,))
@@ -191,17 +191,17 @@ class CapacitiveSkin(NamedTuple):
         return SkinState(key, jnp.zeros(n), gain, alive)
 
     def compression(self, footprint: Footprint) -> Float[Array, "T S"]:
-        """How far the object presses into the foam [m] at each sample of each taxel."""
+        """Return the compression of the foam [m] at each sample of each taxel."""
         samples = jnp.asarray(self.shell.taxels(self.shell.samples), footprint.vertices.dtype)
-        # One long axis: a processor's vectors are filled along the last.
+        # One long axis: a processor fills its vectors along the last axis.
         line = jnp.swapaxes(samples, 0, 1).reshape(-1, 2)
         depth = (self.foam - fp.signed_distance(footprint, line)).reshape(samples.shape[1::-1]).T
         return jnp.clip(depth, 0.0, self.max_compression * self.foam)
 
     def _scan(self, state: SkinState, footprint: Footprint) -> tuple[SkinState, jax.Array]:
-        """What all taxels answer (T,) [1], as foam, gains and noise have it."""
+        """Return the raw signals (T,) [1] of all taxels, with gains and noise."""
         share = self.foam / (self.foam - self.compression(footprint))
-        # Sample by sample: a reduction of so short an axis is slow on every device.
+        # A loop over samples: reductions of such short axes are slow on every device.
         change = sum(share[:, i] for i in range(self.shell.samples)) / self.shell.samples - 1.0
         key, key_noise = jax.random.split(state.key)
         noise = self.noise * jax.random.normal(key_noise, change.shape, change.dtype)
@@ -214,10 +214,10 @@ class CapacitiveSkin(NamedTuple):
     def read(
         self, state: SkinState, raw: Float[Array, " T"], period: Scalar
     ) -> tuple[SkinState, Reading]:
-        """One scan of a real skin, or of a simulated one, filtered and compared to the threshold.
+        """Return the reading of one scan of a real or simulated skin: filtered, with a threshold.
 
-        `raw` [1] is each taxel's relative change of capacitance, in the order of
-        `Shell.taxels`, `period` [s] after the last scan.
+        `raw` [1] is the relative change of capacitance of each taxel, in the order of
+        `Shell.taxels`, `period` [s] after the previous scan.
         """
         state = self._filtered(state, raw, period)
         active = (state.signal > self.threshold) & state.alive
@@ -229,17 +229,18 @@ class CapacitiveSkin(NamedTuple):
     def sense(
         self, state: SkinState, footprint: Footprint, period: Scalar
     ) -> tuple[SkinState, Reading]:
-        """One scan of all taxels, read."""
+        """Return the reading of one scan of all taxels."""
         return self.read(*self._scan(state, footprint), period)
 
     def sense_smoothly(
         self, state: SkinState, footprint: Footprint, period: Scalar, temperature: Any
     ) -> tuple[SkinState, SmoothReading]:
-        """The reading if a taxel is active by its excess, signal - threshold.
+        """Return the reading of taxels whose activity is a sigmoid.
 
-        Active is sigmoid(excess / temperature [1]). As if each were so with that probability, the
-        two ends are the means of the first and of the last active taxel. As the temperature falls
-        they tend to those of `sense`, also where dead taxels interrupt a contact.
+        The activity of a taxel is sigmoid((signal - threshold) / temperature), with a temperature
+        in [1]. It serves as the probability of being active: the two ends of the contact are the
+        expected first and last active taxels. As the temperature falls they tend to those of
+        `sense`, also if dead taxels interrupt a contact.
         """
         state = self._filtered(*self._scan(state, footprint), period)
         excess = jnp.where(state.alive, (state.signal - self.threshold) / temperature, _NEVER)
@@ -250,11 +251,11 @@ class CapacitiveSkin(NamedTuple):
 
 
 class SmoothSkin(NamedTuple):
-    """A sensor whose threshold is soft. As the temperature goes to zero it tends to the sensor.
+    """A sensor with a soft threshold. As the temperature goes to zero it tends to the sensor.
 
-    The temperature is of the threshold's unit: [m] of an ideal sensor; [1], a relative change of
-    capacitance, of a capacitive one, where 0.03 is a good value. It must be well below the
-    threshold itself, or the skin feels what is not there.
+    The temperature has the threshold's unit: [m] for an ideal sensor; [1], a relative change of
+    capacitance, for a capacitive one, for which 0.03 is a good value. It must be well below the
+    threshold, or the skin senses contact without an object.
     """
 
     sensor: IdealSkin | CapacitiveSkin = IdealSkin()
@@ -262,7 +263,7 @@ class SmoothSkin(NamedTuple):
 
     @property
     def shell(self) -> Shell:
-        """What it covers."""
+        """Shell of the sensor."""
         return self.sensor.shell
 
     def on(self, shell: Shell) -> SmoothSkin:
@@ -270,18 +271,18 @@ class SmoothSkin(NamedTuple):
         return self._replace(sensor=self.sensor.on(shell))
 
     def check(self) -> None:
-        """Raises InputError for a sensor or a temperature that means nothing."""
+        """Raise InputError for an invalid sensor or temperature."""
         self.sensor.check()
         errors.check_finite("skin temperature", self.temperature, above=0, at_most=1)
 
     def init(self, key: Array) -> SkinState:
-        """As of the sensor."""
+        """Return the state of the sensor before its first reading."""
         return self.sensor.init(key)
 
     def sense(
         self, state: SkinState, footprint: Footprint, period: Scalar
     ) -> tuple[SkinState, SmoothReading]:
-        """A smooth reading, by the rule of the sensor."""
+        """Return a smooth reading, by the rule of the sensor."""
         return self.sensor.sense_smoothly(state, footprint, period, self.temperature)
 
 
@@ -289,10 +290,10 @@ Skin = IdealSkin | CapacitiveSkin | SmoothSkin  # a pytree of parameters with tw
 
 
 def signals(skin: Skin, state: SkinState, footprint: Footprint) -> Float[Array, " T"]:
-    """What the taxels of a skin tell [1], filtered; 0 of one that is dead.
+    """Return the filtered signals of the taxels of a skin [1]; 0 for a dead one.
 
-    For a skin without taxels: what perfect ones on its boards would answer at once to a footprint
-    placed in the robot frame.
+    For a skin without taxels, they are the unfiltered signals of perfect taxels on its boards, for
+    a footprint placed in the robot frame.
     """
     if state.signal.size:
         return jnp.where(state.alive, state.signal, 0.0)
@@ -336,7 +337,7 @@ def with_contacts(steps: dict[str, np.ndarray], shell: Shell, source: str) -> di
 
 
 SkinName = Literal["ideal", "thin", "capacitive", "hardware"]
-# "thin" chatters between the corners of a box, as a rigid contact sensor does.
+# "thin" chatters between the corners of a box, as a rigid contact sensor.
 SKINS: dict[SkinName, Skin] = {
     "ideal": IdealSkin(),
     "thin": IdealSkin(tolerance=0.001),
@@ -345,29 +346,29 @@ SKINS: dict[SkinName, Skin] = {
 }
 
 
-SkinLike = str | Skin  # a sensor, or its text, see `named`
+SkinLike = str | Skin  # a sensor, or its text: see `parse_skin`
 
 
-def named(skin: SkinLike) -> Any:
-    """Read a skin: itself, or a name with changes, as `capacitive,foam=0.01`; or InputError."""
+def parse_skin(skin: SkinLike) -> Any:
+    """Return a skin from a name with changes, as `capacitive,foam=0.01`; or raise InputError."""
     if not isinstance(skin, str):
         skin.check()
         return skin
     name, changes = parse_changes("skin", skin)
-    usual: Any = SKINS[errors.check_name("skin", name, SKINS)]  # pyright: ignore
-    own = [field for field in usual._fields if field != "shell"]  # which is the robot's
+    preset: Any = SKINS[errors.check_name("skin", name, SKINS)]  # pyright: ignore
+    known = [field for field in preset._fields if field != "shell"]  # the robot has the shell
     for field, value in changes.items():
-        errors.check_name(f"number of the skin {name}", field, own)
+        errors.check_name(f"number of the skin {name}", field, known)
         errors.check_number(f"skin {field}", value)
-    found = usual._replace(**changes)
-    found.check()
-    return found
+    changed = preset._replace(**changes)
+    changed.check()
+    return changed
 
 
 def _first(excess: jax.Array) -> jax.Array:
-    """Probability (n,) of each to be the first active one, given that there is one.
+    """Return the probability (n,) of each entry to be the first active one, if any is active.
 
-    Each is active with the probability sigmoid(excess), independently.
+    Each is active with the probability sigmoid(excess), independently of the others.
     """
     none_before = -jnp.cumsum(jax.nn.softplus(excess))[:-1]
     return jax.nn.softmax(
@@ -376,17 +377,17 @@ def _first(excess: jax.Array) -> jax.Array:
 
 
 def _extremes(active: jax.Array, values: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The rows of `values` (n, m) at the first and the last True of `active` (n,)."""
+    """Return the rows of `values` (n, m) at the first and the last True of `active` (n,)."""
     count = active.shape[0]
-    # Least and greatest numbers: a processor is slow at `argmax`, twenty times.
-    number = jnp.arange(count)
-    first = jnp.min(jnp.where(active, number, count - 1))
-    last = jnp.max(jnp.where(active, number, 0))
+    # Minimum and maximum of indices: on a processor `argmax` is twenty times slower.
+    index = jnp.arange(count)
+    first = jnp.min(jnp.where(active, index, count - 1))
+    last = jnp.max(jnp.where(active, index, 0))
     return values[first], values[last]
 
 
 def _reading(kind: jax.Array, first: jax.Array, last: jax.Array) -> Reading:
-    """Sec. II-B: one position is the location itself, several give the mean of the extremes."""
+    """Return the reading of Sec. II-B: the location is the mean of the extreme positions."""
     location = jnp.where(kind == NONE, 0.0, 0.5 * (first + last))
     return Reading(kind.astype(jnp.int32), location)
 
@@ -394,7 +395,7 @@ def _reading(kind: jax.Array, first: jax.Array, last: jax.Array) -> Reading:
 def _smooth_reading(
     excess: jax.Array, kind: jax.Array, first: jax.Array, last: jax.Array
 ) -> SmoothReading:
-    """As much contact as where there is most: so it is 1/2 at the threshold at any temperature."""
+    """Return a reading whose weight is the maximum activity: 1/2 at the threshold."""
     in_contact = jax.nn.sigmoid(excess)
     kind = jnp.where(excess > 0, kind, NONE)
     return SmoothReading(kind.astype(jnp.int32), 0.5 * (first + last), in_contact)

@@ -28,7 +28,7 @@ from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
 from rps_jax.world import points as points_
-from rps_jax.world.domain import Domain, DomainLike, named
+from rps_jax.world.domain import Domain, DomainLike, parse_domain
 
 
 def evaluate(
@@ -84,8 +84,8 @@ def evaluate(
       >>> found.score.mean("world").shape
       (4,)
     """
-    ranges, params = named(domain, robot), candidates(law)
-    at = None if points is None else points_.checked(ranges, points)
+    ranges, params = parse_domain(domain, robot), candidates(law)
+    at = None if points is None else points_.check_points(ranges, points)
     count = worlds if at is None else len(at.u)
     errors.check_count("worlds", count, at_most=10_000_000)
     errors.check_count("seed", setting.seed, at_least=0, at_most=2**30)
@@ -101,7 +101,7 @@ def evaluate(
     }
     for name, values in answer.outcome._asdict().items():
         variables[name] = variable(name, ("candidate", "world"), values)
-    drawn = points_.coordinates(ranges, ask.object_of(ranges), partial(ask.draw, ranges))
+    drawn = points_.drawn_columns(ranges, ask.object_of(ranges), partial(ask.draw, ranges))
     return xr.Dataset(variables, {"pose": ["x", "y", "yaw"], "world": ask.worlds} | drawn)
 
 

@@ -19,11 +19,11 @@ from rps_jax.runs.execution import run_plan
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run
 from rps_jax.trials.progress import ProgressCallback, SequentialProgress, no_progress
-from rps_jax.world.physics import MUJOCOS_GROUND, preset
+from rps_jax.world.physics import MUJOCO_GROUND, preset
 
 _HALVED = replace(preset(), timestep=0.005)
 # Fine enough for MuJoCo's own ground, on which sliding objects hop.
-_FINE = replace(preset(), timestep=0.002, **MUJOCOS_GROUND)
+_FINE = replace(preset(), timestep=0.002, **MUJOCO_GROUND)
 OWN = "as asked"  # the model of the sweep itself
 
 
@@ -31,7 +31,7 @@ OWN = "as asked"  # the model of the sweep itself
 MODELS = {
     "this ground, 10 ms": preset(),
     "this ground, 5 ms": _HALVED,
-    "MuJoCo's ground, 5 ms": replace(_HALVED, **MUJOCOS_GROUND),
+    "MuJoCo's ground, 5 ms": replace(_HALVED, **MUJOCO_GROUND),
     "MuJoCo's ground, 2 ms": _FINE,
     "MuJoCo's ground, impratio 1, 2 ms": replace(_FINE, impratio=1.0),
     "quasi-static": preset(),

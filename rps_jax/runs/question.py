@@ -314,7 +314,7 @@ class Question(Generic[T]):
             elif one.name == "laws" and isinstance(self, MultiLawQuestion):
                 value = {k: registry.params_to_json(v) for k, v in self.chosen.items()}
             elif one.name == "domain" and isinstance(value, str | Domain):
-                value = dataclasses.asdict(domains.named(value))
+                value = dataclasses.asdict(domains.parse_domain(value))
             elif one.name == "setting":
                 value = setting_as_json(value)
             else:
@@ -415,7 +415,7 @@ class DomainQuestion(SimulationQuestion[T]):
     @functools.cached_property
     def ranges(self) -> Domain:
         """The domain, with the robot."""
-        return domains.named(self.domain, self.robot)
+        return domains.parse_domain(self.domain, self.robot)
 
     def fields_as_json(self) -> dict[str, Any]:
         """Own fields as JSON; the robot stands in the domain."""

@@ -16,7 +16,7 @@ from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import with_coordinates
 from rps_jax.trials.results import UNITS, variable
 from rps_jax.trials.trial import Outcome
-from rps_jax.world.domain import WORDS, unit_of
+from rps_jax.world.domain import LABELS, unit_of
 
 ResultChunk = Mapping[str, np.ndarray]  # columns of some trials, whose numbers are `trial`
 Keep = Callable[[int, ResultChunk], Any]  # called with the number of a part
@@ -147,7 +147,7 @@ def dataset(plan: Plan, parts: Iterable[tuple[int, ResultChunk]]) -> xr.Dataset:
                 empty = np.zeros(plan.worlds, np.float32)
                 attrs = {
                     "units": unit_of(name),
-                    "long_name": WORDS.get(name, name.replace("_", " ")),
+                    "long_name": LABELS.get(name, name.replace("_", " ")),
                 }
                 columns[name] = xr.Variable("world", empty, attrs)
             columns[name].values[world] = part[name]

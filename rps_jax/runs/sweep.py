@@ -171,7 +171,7 @@ class Sweep(SweepOptions, SweepQuestion):
         given = self.points
         if isinstance(given, str | Path):
             given = files.read_dataset(Path(given))
-        at = points.checked(self.ranges, given)
+        at = points.check_points(self.ranges, given)
         part = self.part or _part_of(len(at.u))
         return Plan(self.ranges, len(at.u), self.chosen, self.setting, part, at)
 

@@ -163,7 +163,7 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         """Store the worst elites as a sweep in the subfolder `worlds`."""
         if results.sizes["elite"]:
             set_phase(run.callback, "worst worlds")
-            at = points.checked(self.ranges, results.u.values[: self.worst])
+            at = points.check_points(self.ranges, results.u.values[: self.worst])
             plan = Plan(self.ranges, len(at.u), {self.label: self.params}, self.setting, points=at)
             assert run.folder is not None
             execution.run_in_folder(run.folder / "worlds", plan, **run.batch_options)
@@ -275,7 +275,7 @@ class _Search:
     def __init__(self, probe: Probe, options: Attack, seed: int):
         self.probe, self.options, self.seed = probe, options, seed
         self.domain = probe.domain
-        quantities = points.quantities(self.domain)
+        quantities = points.coordinates(self.domain)
         self.q, self.objects = len(quantities), len(self.domain.objects)
         # Emitters vary ranges and choices, except the object: each object has its own emitters.
         self.varied = [
@@ -422,7 +422,7 @@ class _Search:
         attributes: Mapping[str, Any],
     ) -> xr.Dataset:
         """Return the archive and the history of the search with names and units."""
-        axes, quantities = self.options.axes, {x.name: x for x in points.quantities(self.domain)}
+        axes, quantities = self.options.axes, {x.name: x for x in points.coordinates(self.domain)}
         margin = np.full((self.objects, np.prod(archive.shape[1:])), np.nan)
         all_elites = [archive.elites(k) for k in range(self.objects)]
         for k, elites in enumerate(all_elites):

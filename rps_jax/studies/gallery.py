@@ -22,7 +22,7 @@ from rps_jax.runs.push import another_engine, select_law
 from rps_jax.runs.question import Question, Run, call_of
 from rps_jax.trials import pushes, results
 from rps_jax.trials.progress import SequentialProgress
-from rps_jax.world.domain import WORDS
+from rps_jax.world.domain import LABELS
 
 _COLUMNS = 6  # of maps
 NEAR = 0.2  # [m] least distance below which a timeout is near the target
@@ -164,7 +164,7 @@ def _text(run: str | Path, law: str, trials: xr.Dataset, mask: np.ndarray, mode:
     parts = []
     for name, masked, overall in common_quantities(trials, mask):
         unit = trials[name].attrs.get("units", "1").replace("1", "")
-        parts.append(f"{WORDS[name]} {masked:.2g} {unit}".rstrip() + f" (all: {overall:.2g})")
+        parts.append(f"{LABELS[name]} {masked:.2g} {unit}".rstrip() + f" (all: {overall:.2g})")
     common = f" Medians: {', '.join(parts)}." if parts else ""
     world = int(np.flatnonzero(mask)[0])
     command = f"rps replay {shlex.quote(str(run))} {world} --law {shlex.quote(law)}"

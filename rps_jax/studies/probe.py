@@ -54,7 +54,7 @@ class Probe:
 
     def __call__(self, u: np.ndarray) -> xr.Dataset:
         """Return outcomes and `severity` (world) at points `u` (n, q)."""
-        at = points.checked(self.domain, u)
+        at = points.check_points(self.domain, u)
         results = self._simulate(at) if self.folder is None else self._load_or_simulate(at)
         self.calls += 1
         self.trials += len(at.u)

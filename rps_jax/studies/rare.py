@@ -221,7 +221,7 @@ class Rare(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
     def answer(self, run: Run) -> xr.Dataset:
         domain, seed = self.ranges, self.setting.seed
         probe = Probe(domain, self.params, self.setting, run.folder, **run.batch_options)
-        kinds = [quantity.kind for quantity in points.quantities(domain)]
+        kinds = [quantity.kind for quantity in points.coordinates(domain)]
         seeds = seed_of(seed, "tune") * 10_000 + np.arange(self.repetitions)
         simulations = [subset_simulation(kinds, self, int(i)) for i in seeds]
         return _labelled(domain, run_together(lambda u: probe(u).severity.values, simulations))

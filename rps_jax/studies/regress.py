@@ -63,7 +63,7 @@ class Regress(PlanQuestion, MultiLawQuestion[xr.Dataset]):
     @functools.cached_property
     def plan(self) -> Plan:
         """Sweep over the points of the file."""
-        at = points.checked(DOMAINS[DOMAIN], worlds().u.values[: self.worlds])
+        at = points.check_points(DOMAINS[DOMAIN], worlds().u.values[: self.worlds])
         return Plan(DOMAINS[DOMAIN], len(at.u), self.chosen, self.setting, points=at)
 
     def answer(self, run: Run) -> xr.Dataset:

@@ -38,7 +38,7 @@ from rps_jax.runs.question import (
 )
 from rps_jax.runs.sweep import PlanQuestion
 from rps_jax.world import points
-from rps_jax.world.domain import WORDS
+from rps_jax.world.domain import LABELS
 
 OUTPUTS = {
     "success": "success",
@@ -87,7 +87,7 @@ class Sensitivity(PlanQuestion, DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
         """Factor of each quantity (q,)."""
         return tuple(
             x.name if self.apart else _JOINT_FACTORS.get(x.kind, x.name)
-            for x in points.quantities(self.ranges)
+            for x in points.coordinates(self.ranges)
         )
 
     @property
@@ -129,7 +129,7 @@ class Sensitivity(PlanQuestion, DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
     @functools.cached_property
     def plan(self) -> Plan:
         """Sweep over the points of the design."""
-        at = points.checked(self.ranges, self.u())
+        at = points.check_points(self.ranges, self.u())
         return Plan(self.ranges, len(at.u), {"law": self.params}, self.setting, points=at)
 
     def answer(self, run: Run) -> xr.Dataset:
@@ -227,7 +227,7 @@ def index_table(results: xr.Dataset) -> list[list[str]]:
 
 def factor_words(name: str) -> str:
     """Return the words for a factor."""
-    return WORDS.get(name) or _FACTOR_WORDS.get(name, name.replace("_", " "))
+    return LABELS.get(name) or _FACTOR_WORDS.get(name, name.replace("_", " "))
 
 
 def count_failing_points(results: xr.Dataset) -> int:

@@ -345,8 +345,8 @@ def _compiled(
     arguments = jax.tree.unflatten(tree, leaves)
     if sharding is None:
         static = (physics, SEGMENT)
-        return programs.compiled(advance, arguments, law=law, donate=2, static=static)
-    return programs.built(jax.jit(advance, donate_argnums=2).lower(*arguments))
+        return programs.compile_function(advance, arguments, law=law, donate=2, static=static)
+    return programs.compile_lowered(jax.jit(advance, donate_argnums=2).lower(*arguments))
 
 
 def rows(tree: Any, which: Any) -> Any:

@@ -63,10 +63,10 @@ class Case(TrialOptions):
     """How the object is moved by a hand during the push."""
 
     def __post_init__(self) -> None:
-        errors.check_name("object", objects.named(self.object), objects.OBJECTS)
+        errors.check_name("object", objects.parse_object(self.object), objects.OBJECTS)
         registry.check_params(self.params)
-        scene.check(self.contact, self.mass)
-        skins.named(self.skin or "ideal")
+        scene.check_contact(self.contact, self.mass)
+        skins.parse_skin(self.skin or "ideal")
         errors.check_finite("gap", self.gap, at_least=0, at_most=1, unit="m")
         errors.check_name("rear", self.rear, scene.SIDES)
         errors.check_finite("bearing", self.bearing, at_least=-10, at_most=10, unit="rad")
@@ -78,7 +78,7 @@ class Case(TrialOptions):
     @cached_property
     def object_name(self) -> str:
         """Name of the object."""
-        return objects.named(self.object)
+        return objects.parse_object(self.object)
 
     @cached_property
     def params(self) -> LawParams:
@@ -93,14 +93,14 @@ class Case(TrialOptions):
     @cached_property
     def base(self) -> Robot:
         """The robot."""
-        robot = robots.named(self.robot)
+        robot = robots.parse_robot(self.robot)
         robot.check()
         return robot
 
     @cached_property
     def sensor(self) -> Skin:
         """The skin on the robot."""
-        return skins.named(self.skin or "ideal").on(self.base.shell)
+        return skins.parse_skin(self.skin or "ideal").on(self.base.shell)
 
     @property
     def title(self) -> str:

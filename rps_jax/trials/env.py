@@ -252,7 +252,9 @@ class PushEnv:
 
     @functools.cached_property
     def _alone(self) -> Domain:
-        return dataclasses.replace(domain.named(self.domain, self.robot), objects=(self.object,))
+        return dataclasses.replace(
+            domain.parse_domain(self.domain, self.robot), objects=(self.object,)
+        )
 
     @functools.cached_property
     def _drawn(self) -> Draw:

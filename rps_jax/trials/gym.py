@@ -138,7 +138,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         errors.check_name("autoreset_mode", mode, [one.value for one in modes])
         given: dict[str, Any] = {"weights": SHAPED_REWARD} | options
         self.render_mode = render_mode
-        self.push_env = PushEnv(domain=domains.named(domain), **given)
+        self.push_env = PushEnv(domain=domains.parse_domain(domain), **given)
         dt = self.push_env.dt
         hold = errors.check_finite("hold", hold, at_least=0.999 * dt, at_most=1000, unit="s")
         steps = max(1, round(hold / dt))

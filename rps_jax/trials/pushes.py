@@ -216,7 +216,7 @@ def recorder(
     inputs = part.stage, part.worlds, part.params
     given = *inputs, trials, setting.rules
     static = (setting.physics, steps, every)
-    program = programs.compiled(record, given, law=law, donate=3, static=static)
+    program = programs.compile_function(record, given, law=law, donate=3, static=static)
     return lambda now: program(*inputs, now, setting.rules)
 
 

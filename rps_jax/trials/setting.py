@@ -17,14 +17,14 @@ from rps_jax.world.physics import Fidelity, Physics
 class PhysicsField:
     """A field that takes a physics or its text, and gives the physics.
 
-    Texts are those of `world.physics.named`, of the fidelity of the same object.
+    Texts are those of `world.physics.parse_physics`, of the fidelity of the same object.
     """
 
     def __get__(self, instance: Any, owner: type | None = None) -> Physics:
         if instance is None:
             return "default"  # pyright: ignore[reportReturnType]  # of the dataclass's field
         given = instance.__dict__["physics"]
-        return physics_.named(given, instance.fidelity)
+        return physics_.parse_physics(given, instance.fidelity)
 
     def __set__(self, instance: Any, value: str | Physics) -> None:
         instance.__dict__["physics"] = value

@@ -186,8 +186,8 @@ def start(world: World, params: LawParams, law: Law = rps.LAW) -> Trial:
         tilt=jnp.zeros_like(world.qpos[0]),
         tipped=false,
         diverged=false,
-        drive=None if world.robot is None else drive.start(world.qpos),
-        load=base.unloaded(world.qpos) if law.senses == "force" else None,
+        drive=None if world.robot is None else drive.init_drive(world.qpos),
+        load=base.init_load(world.qpos) if law.senses == "force" else None,
     )
 
 
@@ -251,7 +251,7 @@ def observe(
     skin, reading, observation = sense(world, trial, period)
     distance = planar.norm(displacement(observation))
     now = trial.qpos[JOINTS.base]
-    poses, believed = base.believed(
+    poses, believed = base.observe_pose(
         world.odometry, trial.poses, now, world.key, trial.steps, period
     )
     seen = observation._replace(p_world_robot=believed[:2], yaw=believed[2])
@@ -285,13 +285,13 @@ def execute(world: World, trial: Trial, twist: Twist, period: float) -> tuple[Tr
     Both are in the robot frame; `period` [s] is that of the control loop.
     """
     if trial.twists.shape[0]:
-        twists, done = base.executed(world.odometry, trial.twists, jnp.stack(twist), period)
+        twists, done = base.delay_twist(world.odometry, trial.twists, jnp.stack(twist), period)
         trial, twist = trial._replace(twists=twists), Twist(*done)
     if world.robot is None or trial.drive is None:
         return trial, twist
     aim = drive.aim(world.robot, trial.drive.aim, jnp.stack(twist), period)
     trial = trial._replace(drive=trial.drive._replace(aim=aim))
-    return trial, Twist(*drive.carried_out(world.robot, aim))
+    return trial, Twist(*drive.apply_slip(world.robot, aim))
 
 
 def decide(
@@ -335,7 +335,9 @@ def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
     )
     now = told.drive
     if now is not None:
-        now = drive.stalled(now if integral is None else now._replace(integral=integral), qvel)
+        now = drive.count_stalled_steps(
+            now if integral is None else now._replace(integral=integral), qvel
+        )
     moved = told._replace(
         qpos=qpos,
         qvel=qvel,

@@ -17,7 +17,7 @@ from rps_jax.trials.batch import WorldBatch
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Shift, World
 from rps_jax.world import scene
-from rps_jax.world.domain import RANDOM, Domain, Range, of
+from rps_jax.world.domain import RANDOM, Domain, Range, quantities_of
 from rps_jax.world.draws import Draw
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction, Scene
@@ -58,10 +58,10 @@ def build(
 
 def drawn_worlds(domain: Domain, drawn: Draw, setting: Setting) -> WorldBatch:
     """Return the worlds of a draw, on the host, without law parameters."""
-    count = drawn.number.size
+    count = drawn.indices.size
     return build(
-        drawn.number,
-        domain.family_of(drawn.case[0]),
+        drawn.indices,
+        domain.family_of(drawn.cases[0]),
         drawn.solid,
         drawn.friction,
         drawn.robot,
@@ -76,22 +76,28 @@ def drawn_worlds(domain: Domain, drawn: Draw, setting: Setting) -> WorldBatch:
 
 
 def _skin(domain: Domain, drawn: Draw) -> Skin:
-    count = drawn.number.size
+    count = drawn.indices.size
     plain = IdealSkin() if domain.skin == "ideal" else CapacitiveSkin()
     full: Any = jax.tree.map(lambda value: np.full(count, value, float), plain)
     if isinstance(full, IdealSkin):
         return full.on(drawn.robot.shell)
-    own: dict[str, Any] = {name: drawn.at[name] for name in of("skin") if name in drawn.at}
+    own: dict[str, Any] = {
+        name: drawn.values[name] for name in quantities_of("skin") if name in drawn.values
+    }
     return full.on(drawn.robot.shell)._replace(**own)
 
 
 def starts(drawn: Draw) -> np.ndarray:
     """Positions (n, 10) at the start: the base at the origin, the object before it."""
-    qpos = np.zeros((drawn.number.size, 10))
-    front = drawn.robot.half_length + drawn.at["gap"] + solid.extent(drawn.solid, drawn.at["yaw"])
-    half = drawn.at["yaw"] / 2
+    qpos = np.zeros((drawn.indices.size, 10))
+    front = (
+        drawn.robot.half_length
+        + drawn.values["gap"]
+        + solid.extent(drawn.solid, drawn.values["yaw"])
+    )
+    half = drawn.values["yaw"] / 2
     zero = np.zeros_like(half)
-    place = [front, drawn.at["lateral"], drawn.solid.height / 2]
+    place = [front, drawn.values["lateral"], drawn.solid.height / 2]
     turn = [np.cos(half), zero, zero, np.sin(half)]
     qpos[:, JOINTS.object] = np.stack(place + turn, axis=-1)
     return qpos
@@ -99,25 +105,27 @@ def starts(drawn: Draw) -> np.ndarray:
 
 def remembered_steps(domain: Domain, period: float) -> int:
     """How many control steps of `period` [s] the odometry of the domain's worlds looks back."""
-    if all(getattr(domain, name) == Range(0, 0) for name in of("base")):
+    if all(getattr(domain, name) == Range(0, 0) for name in quantities_of("base")):
         return 0
     return 1 + round(max(domain.pose_latency.high, domain.command_delay.high) / period)
 
 
 def _odometry(domain: Domain, drawn: Draw, period: float) -> Odometry:
-    past: Any = np.zeros((drawn.number.size, remembered_steps(domain, period)))
-    own: dict[str, Any] = {name: drawn.at[name] for name in of("base") if name in drawn.at}
+    past: Any = np.zeros((drawn.indices.size, remembered_steps(domain, period)))
+    own: dict[str, Any] = {
+        name: drawn.values[name] for name in quantities_of("base") if name in drawn.values
+    }
     error: Any = drawn.velocity_error
     return Odometry(**own, velocity_error=error, past=past)
 
 
 def drawn_scene(domain: Domain, drawn: Draw, physics: Physics, i: int) -> Scene:
     """The compiled scene of the i-th world of a draw, for pictures: with its looks, if it has."""
-    case = int(drawn.case[i])
-    name = domain.objects[int(domain.object_of(drawn.case[i]))]
+    case = int(drawn.cases[i])
+    name = domain.objects[int(domain.object_of(drawn.cases[i]))]
     if name in RANDOM:
         robots = drawn.robot
-        return scene.of_solid(
+        return scene.compile_row(
             domain.family_of(case), drawn.solid, drawn.friction, physics, i, robots
         )
     ground, robot = (float(leaf[i]) for leaf in drawn.friction)

@@ -52,7 +52,7 @@ from rps_jax.tuning import posterior
 from rps_jax.tuning.logs import Given, Log
 from rps_jax.world import domain as domains
 from rps_jax.world import draws, points
-from rps_jax.world.domain import ERRORS, QUANTITIES, Domain, Range
+from rps_jax.world.domain import QUANTITIES, VELOCITY_ERRORS, Domain, Range
 from rps_jax.world.draws import Draw
 
 _TOGETHER = 64  # worlds of one object that are stepped at once
@@ -280,7 +280,7 @@ class Bank:
 
     def logs(self, drawn: Draw) -> Log:
         """The logs of worlds (n,) of one object; the program always steps as many."""
-        count = drawn.number.size
+        count = drawn.indices.size
         part = drawn_worlds(self.domain, drawn, self.setting).with_params(self.params)
         repeated = np.resize(np.arange(count), max(count, _TOGETHER))
         worlds, params = rows((part.worlds, part.params), repeated)
@@ -357,9 +357,9 @@ def _tracks(
 
 def coordinates(domain: Domain) -> tuple[str, ...]:
     """The coordinates of a domain's cube that are fitted: all but the task's and shapes."""
-    task = {*domains.of("task"), "com_bearing", "friction", "target"}
+    task = {*domains.quantities_of("task"), "com_bearing", "friction", "target"}
     return tuple(
-        one.name for one in points.quantities(domain)
+        one.name for one in points.coordinates(domain)
         if one.kind in ("range", "choice") and one.name not in task
     )  # fmt: skip
 
@@ -379,7 +379,9 @@ def values_of(domain: Domain, u: np.ndarray) -> dict[str, np.ndarray]:
     found = {}
     for name, column in zip(coordinates(domain), u.T, strict=True):
         if name != "object":
-            found[name] = getattr(domain, "velocity_error" if name in ERRORS else name).at(column)
+            found[name] = getattr(domain, "velocity_error" if name in VELOCITY_ERRORS else name).at(
+                column
+            )
     for name, (_, of, make) in DERIVED.items():
         if all(one in found for one in of):
             found[name] = make(*(found[one] for one in of))
@@ -427,8 +429,8 @@ def fitted_domain(domain: Domain, data: xr.Dataset) -> Domain:
     changes: dict[str, Any] = {
         name: Range(*ends[name], getattr(domain, name).log) for name in ends if name in QUANTITIES
     }
-    if all(name in ends for name in ERRORS):
-        low, high = zip(*(ends[name] for name in ERRORS), strict=True)
+    if all(name in ends for name in VELOCITY_ERRORS):
+        low, high = zip(*(ends[name] for name in VELOCITY_ERRORS), strict=True)
         changes["velocity_error"] = Range(min(low), max(high))
     likely = data.probability.values >= 0.05
     objects = tuple(o for o, is_ in zip(domain.objects, likely, strict=True) if is_)

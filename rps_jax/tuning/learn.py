@@ -119,7 +119,7 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
         """The domains."""
         one = isinstance(self.domain, str | Domain)
         several: list[Any] = [self.domain] if one else list(self.domain)
-        return tuple(domains.named(text) for text in several)
+        return tuple(domains.parse_domain(text) for text in several)
 
     def check(self) -> None:
         if self.out is None:

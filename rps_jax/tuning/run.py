@@ -142,7 +142,7 @@ class Tuning(LawQuestion[xr.Dataset]):
         """The worlds in which candidates are tried, and what is minimised there."""
         one = isinstance(self.domain, str | Domain)
         several: list[Any] = [self.domain] if one else list(self.domain)
-        domains = tuple(replace(worlds_.named(x), objects=self.objects) for x in several)
+        domains = tuple(replace(worlds_.parse_domain(x), objects=self.objects) for x in several)
         errors.check_each_once("domain", domains)
         return Problem(domains, self.worlds, self.validation, self.setting, self.objective)
 

@@ -1,4 +1,4 @@
-"""Domains: from which ranges random worlds are drawn (see `draws`), by name and as JSON."""
+"""Domains: the ranges from which random worlds are drawn (see `draws`), by name and as JSON."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -13,46 +13,45 @@ from rps_jax import errors
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.options import parse_changes
-from rps_jax.robot.robot import Robot, RobotLike
-from rps_jax.robot.robot import named as named_robot
+from rps_jax.robot.robot import Robot, RobotLike, parse_robot
 from rps_jax.world import paper, scene
 from rps_jax.world.objects import FAMILIES, OBJECTS, PAPER_OBJECTS
 from rps_jax.world.scene import FRICTION, Friction
 
 
 class Range(NamedTuple):
-    """From where to where a quantity is drawn, evenly, or evenly in its logarithm."""
+    """Interval of a drawn quantity, uniform in the quantity or in its logarithm."""
 
     low: float
     high: float
     log: bool = False
 
     def at(self, u: np.ndarray) -> np.ndarray:
-        """The quantity at u in [0, 1)."""
+        """Return the quantity at u in [0, 1)."""
         if self.log:
             return self.low * (self.high / self.low) ** u
         return self.low + u * (self.high - self.low)
 
 
-Part = Literal["object", "task", "skin", "base", "robot"]  # what a quantity is of
+Owner = Literal["object", "task", "skin", "base", "robot"]  # of a quantity
 _KEY = "quantity"
 
 
 class Quantity(NamedTuple):
-    """What a drawn quantity is: all that there is to say of it, beside its range."""
+    """Declaration of a drawn quantity, without its range."""
 
-    column: int  # of a world's random numbers; a new quantity takes the next one that is free
+    column: int  # of a world's random numbers; a new quantity takes the next free one
     unit: str
-    least: float  # which its range must not leave
-    most: float
-    words: str  # what it is called in reports; empty: it is in none
-    of: Part = "object"
-    sets: str = ""  # number of the robot that is drawn; of skin and odometry it is called alike
+    low: float  # bounds of its range
+    high: float
+    label: str  # in reports; empty: not reported
+    owner: Owner = "object"
+    sets: str = ""  # field of the robot; fields of skin and odometry have the quantity's name
 
 
-def drawn(usual: Range | None, *about: Any) -> Any:
-    """Declare a drawn quantity by its usual range, and the values of a `Quantity`."""
-    return field(default=usual, metadata={_KEY: Quantity(*about)})
+def drawn(default: Range | None, *declaration: Any) -> Any:
+    """Declare a drawn quantity by its default range, and the values of a `Quantity`."""
+    return field(default=default, metadata={_KEY: Quantity(*declaration)})
 
 
 _POSITIVE = 1e-3
@@ -60,31 +59,31 @@ _POSITIVE = 1e-3
 
 @dataclass(frozen=True)
 class Domain:
-    """Ranges of all that differs between worlds.
+    """Ranges of all quantities that differ between worlds.
 
-    Worlds take the `objects` in turn. A domain with `frictions` or `targets` takes these in turn
-    too, targets fastest, then friction, then objects, instead of drawing them.
+    Worlds cycle through the `objects`. A domain with `frictions` or `targets` cycles through these,
+    too, instead of drawing them: targets fastest, then frictions, then objects.
 
-    A quantity is one field here. One that sets a number of the skin (`sets`, of taxels), of
-    odometry or of the robot needs nothing else anywhere.
+    A quantity is one field of this class. A quantity of the skin, of odometry or of the robot needs
+    no other declaration.
     """
 
-    # The object: a scene of `mjcf/` as it is, or a random one of a shape family.
+    # The object: a scene of `mjcf/`, or a random one of a shape family.
     objects: tuple[str, ...] = ("random_box", "random_cylinder", "random_prism")
     mass: Range = drawn(Range(3, 60, log=True), 0, "kg", 0.1, 1e3, "mass of the object")
     # Half width: the square root of half depth times half breadth.
     size: Range = drawn(Range(0.1, 0.35), 1, "m", 0.03, 1.0, "half width of the object")
     aspect: Range = drawn(Range(0.5, 2.0, log=True), 2, "1", 0.1, 10, "")  # breadth over depth
     height: Range = drawn(Range(0.3, 0.8), 3, "m", 0.1, 2.0, "height of the object")
-    # Of the way from the middle to the outline.
+    # As a share of the way from the middle to the outline.
     com_offset: Range = drawn(Range(0, 0.4), 4, "1", 0, 0.75, "centre of mass off the middle")
-    # Of the way from the centre of mass to the outline are three or four feet; None: it stands on
-    # its corners or its rim.
+    # Three or four feet, at this share of the way from the centre of mass to the outline; None: it
+    # stands on its corners or its rim.
     feet: Range | None = drawn(None, 43, "1", 0.1, 1, "feet, of the way to the outline")
     friction_ground: Range = drawn(Range(0.1, 0.7), 6, "1", _POSITIVE, 10, "friction object-ground")
     friction_robot: Range = drawn(Range(0.1, 0.8), 7, "1", _POSITIVE, 10, "friction object-robot")
     frictions: tuple[Friction, ...] = ()
-    # The task: where object and target are at the start, seen from the base.
+    # The task: object and target at the start, in the frame of the base.
     lateral: Range = drawn(Range(-0.12, 0.12), 8, "m", -0.5, 0.5, "lateral offset", "task")
     yaw: Range = drawn(Range(-0.6, 0.6), 9, "rad", -math.pi, math.pi, "yaw of the object", "task")
     gap: Range = drawn(Range(0, 0.05), 10, "m", 0, 1, "gap at the start", "task")
@@ -99,19 +98,19 @@ class Domain:
     noise: Range = drawn(Range(0, 0.05), 13, "1", 0, 1, "noise of the skin", "skin")
     gain_spread: Range = drawn(Range(0, 0.1), 14, "1", 0, 1, "spread of the taxels' gains", "skin")
     dead_share: Range = drawn(Range(0, 0.05), 15, "1", 0, 1, "dead taxels", "skin")
-    # None: as the skin has it.
+    # None: the skin's default.
     foam: Range | None = drawn(None, 40, "m", 0.002, 0.05, "foam of the skin", "skin")
     time_constant: Range | None = drawn(
         None, 41, "s", _POSITIVE, 1, "time constant of the skin", "skin"
     )
-    # The base: where it believes it is, and how it does what it is told.
+    # The base: errors of its odometry and of the executed twist.
     pose_noise: Range = drawn(Range(0, 0.005), 16, "m", 0, 1, "noise of the position", "base")
     yaw_noise: Range = drawn(Range(0, 0.01), 17, "rad", 0, 1, "noise of the heading", "base")
     pose_latency: Range = drawn(Range(0, 0.1), 18, "s", 0, 1, "latency of the pose", "base")
     command_delay: Range = drawn(Range(0, 0.1), 19, "s", 0, 1, "delay of the command", "base")
-    # Of each component of the twist, all trial long: columns 20, 21 and 22.
+    # Of each component of the twist, constant in a trial: columns 20, 21 and 22.
     velocity_error: Range = drawn(Range(-0.03, 0.03), 20, "1", -0.9, 0.9, "", "base")
-    # The robot, and what of it differs between worlds; None: as the robot has it.
+    # The robot and its drawn limits; None: the robot's own value.
     robot: Robot = Robot()
     robot_force: Range | None = drawn(
         None, 35, "N", 1, 1e5, "greatest force of the robot", "robot", "force_max"
@@ -120,7 +119,7 @@ class Domain:
         None, 36, "1", _POSITIVE, 5, "traction of the robot's wheels", "robot", "traction"
     )
     robot_lag: Range | None = drawn(None, 37, "s", 0, 5, "lag of the robot", "robot", "lag")
-    # Of the wheels when turning, too.
+    # Also of the wheels when turning.
     robot_acceleration: Range | None = drawn(
         None, 38, "m/s^2", _POSITIVE, 100, "greatest acceleration of the robot", "robot",
         "acceleration_max",
@@ -132,31 +131,31 @@ class Domain:
             errors.check_name("domain object", name, (*RANDOM, *OBJECTS))
         errors.check_each_once("domain objects", self.objects)
         for friction in self.frictions:
-            scene.check(friction, None)
+            scene.check_contact(friction, None)
         errors.check_name("domain skin", self.skin, ("ideal", "capacitive"))
         if self.feet is not None and not set(self.objects) <= set(RANDOM):
             raise InputError(
-                f"domain feet are not allowed with objects = {self.objects}: random ones alone "
+                f"domain feet are not allowed with objects = {self.objects}: only random objects "
                 "stand on drawn feet."
             )
         self.robot.check()
         for target in self.targets:
             scene.check_target(target, self.robot.shell)
-        for name, about in QUANTITIES.items():
-            if (given := getattr(self, name)) is None:
+        for name, quantity in QUANTITIES.items():
+            if (interval := getattr(self, name)) is None:
                 continue
-            if not isinstance(given, Range):
+            if not isinstance(interval, Range):
                 raise InputError(
-                    f"domain {name} = {given!r} is not allowed: give a Range, as Range(3, 10)."
+                    f"domain {name} = {interval!r} is not allowed: give a Range, as Range(3, 10)."
                 )
-            low, high, log = given
+            low, high, log = interval
             for side, value in (("low", low), ("high", high)):
                 errors.check_finite(
                     f"domain {name} ({side})",
                     value,
-                    at_least=about.least,
-                    at_most=about.most,
-                    unit=about.unit,
+                    at_least=quantity.low,
+                    at_most=quantity.high,
+                    unit=quantity.unit,
                 )
             if low > high or (log and low <= 0):
                 raise InputError(
@@ -172,87 +171,92 @@ class Domain:
 
     @property
     def weakest(self) -> Robot:
-        """The robot with the least force and traction of what is drawn of it."""
+        """Robot with the lowest drawn force and traction."""
         ranges = {"force_max": self.robot_force, "traction": self.robot_traction}
-        return replace(self.robot, **{of: r.low for of, r in ranges.items() if r is not None})
+        return replace(self.robot, **{name: r.low for name, r in ranges.items() if r is not None})
 
     @property
     def combinations(self) -> int:
-        """How many indices see every combination of objects, frictions and targets once."""
+        """Number of combinations of objects, frictions and targets."""
         return len(self.objects) * max(1, len(self.frictions)) * max(1, len(self.targets))
 
     def object_of(self, index: np.ndarray) -> np.ndarray:
-        """Which of `objects` the worlds `index` have."""
+        """Return the position in `objects` of the objects of the worlds `index`."""
         return index // (self.combinations // len(self.objects)) % len(self.objects)
 
     @property
     def idle(self) -> frozenset[str]:
-        """Ranges of which nothing is drawn, since something else says what they would."""
-        found = set()
+        """Names of unused ranges, whose quantities other fields of the domain determine."""
+        unused = set()
         if not set(self.objects) & set(RANDOM):
-            found |= set(of("object")) - {"friction_ground", "friction_robot"}
+            unused |= set(quantities_of("object")) - {"friction_ground", "friction_robot"}
         if self.frictions:
-            found |= {"friction_ground", "friction_robot"}
+            unused |= {"friction_ground", "friction_robot"}
         if self.targets:
-            found |= {"distance", "bearing"}
+            unused |= {"distance", "bearing"}
         if self.skin == "ideal":
-            found |= set(of("skin"))
-        return frozenset(name for name in found if getattr(self, name) is not None)
+            unused |= set(quantities_of("skin"))
+        return frozenset(name for name in unused if getattr(self, name) is not None)
 
     @property
     def families(self) -> tuple[str, ...]:
-        """The shape family of each of `objects`."""
+        """Shape family of each of `objects`."""
         known = FAMILIES | RANDOM | ({} if self.feet is None else {"random_box": "prism"})
         return tuple(known[name] for name in self.objects)
 
     def family_of(self, index: int) -> str:
-        """The shape family of one world's object."""
+        """Return the shape family of the object of one world."""
         return self.families[int(self.object_of(np.asarray(index)))]
 
 
 RANDOM = {"random_box": "box", "random_cylinder": "cylinder", "random_prism": "prism"}
 QUANTITIES: dict[str, Quantity] = {
-    one.name: one.metadata[_KEY] for one in fields(Domain) if _KEY in one.metadata
+    item.name: item.metadata[_KEY] for item in fields(Domain) if _KEY in item.metadata
 }
 
 
-def of(*parts: Part) -> tuple[str, ...]:
-    """Names of the quantities of some parts of a world."""
-    return tuple(name for name, about in QUANTITIES.items() if about.of in parts)
+def quantities_of(*owners: Owner) -> tuple[str, ...]:
+    """Return the names of the quantities of some owners."""
+    return tuple(name for name, quantity in QUANTITIES.items() if quantity.owner in owners)
 
 
-# The velocity error is drawn three times.
-ERRORS = {"v_x_error": "error of v_x", "v_y_error": "error of v_y", "omega_error": "error of omega"}
-# What a table of worlds has, and its name in words.
-WORDS: dict[str, str] = {
-    **{name: about.words for name, about in QUANTITIES.items() if about.words},
+# Labels of the three draws of the velocity error.
+VELOCITY_ERRORS = {
+    "v_x_error": "error of v_x",
+    "v_y_error": "error of v_y",
+    "omega_error": "error of omega",
+}
+# Columns of a table of worlds, with their labels.
+LABELS: dict[str, str] = {
+    **{name: quantity.label for name, quantity in QUANTITIES.items() if quantity.label},
     "corners": "corners of the object",
-    **ERRORS,
+    **VELOCITY_ERRORS,
 }
 
 
 def unit_of(name: str) -> str:
-    """The unit of a column of a table of worlds."""
+    """Return the unit of a column of a table of worlds."""
     return QUANTITIES[name].unit if name in QUANTITIES else "1"
 
 
-def _only(value: float) -> Range:
+def _constant(value: float) -> Range:
     return Range(value, value)
 
 
 PERFECT: dict[str, Any] = {
     **dict.fromkeys(
-        ("noise", "gain_spread", "dead_share", "pose_noise", "yaw_noise", "pose_latency"), _only(0)
+        ("noise", "gain_spread", "dead_share", "pose_noise", "yaw_noise", "pose_latency"),
+        _constant(0),
     ),
-    **dict.fromkeys(("command_delay", "velocity_error", "lateral", "yaw"), _only(0)),
+    **dict.fromkeys(("command_delay", "velocity_error", "lateral", "yaw"), _constant(0)),
 }
-_HARDWARE: dict[str, Any] = PERFECT | {"noise": _only(0.05), "gain_spread": _only(0.1)}
+_HARDWARE: dict[str, Any] = PERFECT | {"noise": _constant(0.05), "gain_spread": _constant(0.1)}
 DOMAINS = {
     "paper": Domain(
         objects=PAPER_OBJECTS,
         frictions=tuple(FRICTION.values()),
         targets=paper.TARGETS,
-        gap=_only(0.02),
+        gap=_constant(0.02),
         skin="ideal",
         **PERFECT,
     ),
@@ -260,8 +264,8 @@ DOMAINS = {
         objects=paper.HARDWARE_OBJECTS,
         friction_ground=Range(paper.HARDWARE_GROUND[0], paper.HARDWARE_GROUND[-1]),
         friction_robot=Range(paper.HARDWARE_ROBOT[0], paper.HARDWARE_ROBOT[-1]),
-        gap=_only(0.02),
-        distance=_only(2.1),
+        gap=_constant(0.02),
+        distance=_constant(2.1),
         **_HARDWARE,
     ),
     "wide": Domain(),
@@ -297,56 +301,56 @@ DOMAINS = {
 }
 
 
-DomainLike = Domain | str  # or its text, see `named`
+DomainLike = Domain | str  # or its text: see `parse_domain`
 
 
-def named(domain: DomainLike, robot: RobotLike | None = None) -> Domain:
-    """Read a domain: itself, its name, as wide, or a JSON file of ranges.
+def parse_domain(domain: DomainLike, robot: RobotLike | None = None) -> Domain:
+    """Return a domain from its name, as wide, or from a JSON file of ranges.
 
-    Changes may follow a name or a file, as `wide,mass=3:10,objects=random_box`. With a robot, its
-    worlds have that one, but for what the domain draws of it.
+    Changes may follow a name or a file, as `wide,mass=3:10,objects=random_box`. A `robot` replaces
+    the domain's, except for its drawn limits.
     """
     if robot is not None:
-        return replace(named(domain), robot=named_robot(robot))
+        return replace(parse_domain(domain), robot=parse_robot(robot))
     if isinstance(domain, Domain):
         return domain
     if not isinstance(domain, str):
         raise InputError(f"domain = {domain!r} is not allowed: give a name or a Domain.")
     head, changes = parse_changes("domain", domain)
     if head.endswith(".json"):
-        found = from_json(files.read_json(Path(head)))
+        base = from_json(files.read_json(Path(head)))
     else:
-        found = DOMAINS[errors.check_name("domain", head, DOMAINS)]
+        base = DOMAINS[errors.check_name("domain", head, DOMAINS)]
     for name in changes:
-        errors.check_name("domain quantity", name, [one.name for one in fields(Domain)])
-        if name in found.idle:
+        errors.check_name("domain quantity", name, [item.name for item in fields(Domain)])
+        if name in base.idle:
             raise InputError(
                 f"domain = {domain} is not allowed: its objects, frictions, targets or skin leave "
                 f"no {name} to draw."
             )
-    return replace(found, **_from_json(changes, found))
+    return replace(base, **_from_json(changes, base))
 
 
-def _names(values: Any) -> tuple[str, ...]:
-    if not isinstance(values, list | tuple) or not all(isinstance(one, str) for one in values):
+def _names(values: object) -> tuple[str, ...]:
+    if not isinstance(values, list | tuple) or not all(isinstance(name, str) for name in values):
         raise TypeError("one name, not a list")
     return tuple(values)
 
 
-def _range(usual: Range | None, values: Any) -> Range:
+def _range(default: Range | None, values: object) -> Range:
     if isinstance(values, float | int) and not isinstance(values, bool):
         values = [values, values]
     if not isinstance(values, list | tuple):
         raise TypeError("no list")
     low, high, *log = values
-    if len(log) > 1 or not all(isinstance(one, bool) for one in log):
-        raise ValueError("more than low, high, and whether evenly in the logarithm")
+    if len(log) > 1 or not all(isinstance(flag, bool) for flag in log):
+        raise ValueError("more than low, high, and whether uniform in the logarithm")
     if isinstance(low, str) or isinstance(high, str):
         raise TypeError("texts")
-    return Range(float(low), float(high), *(log or [usual is not None and usual.log]))
+    return Range(float(low), float(high), *(log or [default is not None and default.log]))
 
 
-# How JSON has what is not a range.
+# Readers of the JSON of fields that are no ranges, and their formats for the error.
 _FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
     "objects": (_names, 'names, as ["random_box"]'),
     "frictions": (
@@ -358,29 +362,29 @@ _FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
         "pairs of x and y [m], as [[2, 0]]",
     ),
     "skin": (str, "its name"),
-    "robot": (named_robot, 'a robot\'s name or numbers, as {"force_max": 300}'),
+    "robot": (parse_robot, 'a robot\'s name or numbers, as {"force_max": 300}'),
 }
 
 
 def from_json(values: dict[str, Any]) -> Domain:
-    """Read the domain that `dataclasses.asdict` wrote as JSON; InputError if it is none."""
+    """Return the domain of the JSON of `dataclasses.asdict`, or raise InputError."""
     return Domain(**_from_json(values, DOMAINS["wide"]))
 
 
-def _from_json(values: Mapping[str, Any], usual: Domain) -> dict[str, Any]:
-    """Fields of a domain; a range whose scale is not told has that of the usual domain."""
-    given = {}
+def _from_json(values: Mapping[str, Any], base: Domain) -> dict[str, Any]:
+    """Return fields of a domain; a range without a scale has that of the `base` domain."""
+    parsed = {}
     known = {f.name: f for f in fields(Domain)}
     for name, value in values.items():
         errors.check_name("domain quantity", name, known)
         if value is None and name in QUANTITIES and known[name].default is None:
             continue
         if name == "objects" and isinstance(value, str):
-            value = [value]  # the only one of a text
-        ranged = partial(_range, getattr(usual, name))
+            value = [value]  # of a text with one name
+        ranged = partial(_range, getattr(base, name))
         read, form = _FORMS.get(name, (ranged, "low and high, as [0.1, 0.5]"))
         try:
-            given[name] = read(value)
+            parsed[name] = read(value)
         except (TypeError, ValueError, OverflowError) as error:
             raise InputError(f"domain {name} = {value} is not allowed: write {form}.") from error
-    return given
+    return parsed

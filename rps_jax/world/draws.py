@@ -1,7 +1,7 @@
-"""What random worlds are: a draw from the ranges of a domain, addressed by (domain, seed, index).
+"""Random worlds: draws from the ranges of a domain, addressed by (domain, seed, index).
 
-Whatever the batch, whatever the device, the same address gives the same world: the bits come from
-a counter-based generator, and everything after them is computed on the host in double precision.
+An address gives the same world in any batch and on any device: the bits come from a counter-based
+generator, and the quantities are computed from them on the host in double precision.
 """
 
 from dataclasses import fields, replace
@@ -15,64 +15,68 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.solid import SIDES, Solid
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
-from rps_jax.world.domain import ERRORS, QUANTITIES, RANDOM, Domain, of, unit_of
+from rps_jax.world.domain import QUANTITIES, RANDOM, VELOCITY_ERRORS, Domain, quantities_of, unit_of
 from rps_jax.world.scene import Friction
 
-COLUMNS = 64  # random numbers of a world, more than are used, so that new ones change no old ones
+COLUMNS = 64  # random numbers of a world; unused ones are for new quantities
 
 
 class Draw(NamedTuple):
-    """Worlds of one object or shape family, as drawn; leaves lead with their number, n."""
+    """Drawn worlds of one object or shape family; the leading axis of leaves is n."""
 
-    number: np.ndarray  # (n,) their indices
-    case: np.ndarray  # (n,) indices that have their object, and their friction and target of a list
+    indices: np.ndarray  # (n,) of the worlds
+    cases: np.ndarray  # (n,) indices with the same object, friction and target of the lists
     solid: Solid
     friction: Friction  # (n,) each
-    at: dict[str, np.ndarray]  # (n,) of each quantity of the domain, in its unit
+    values: dict[str, np.ndarray]  # (n,) of each quantity of the domain, in its unit
     p_world_target: np.ndarray  # (n, 2) [m]
     velocity_error: np.ndarray  # (n, 3) [1]
     robot: Robot  # (n,) each
-    key: np.ndarray  # (n, 2) uint32, of all that is drawn while the world runs
+    key: np.ndarray  # (n, 2) uint32, of the noise of sensors and odometry
 
 
-# Random numbers of a world that are drawn from no range of their own.
-_OTHERS = {
+# Columns of random numbers that belong to no range.
+_UNRANGED = {
     "com_bearing": 5,
-    **{name: 20 + i for i, name in enumerate(ERRORS)},
+    **{name: 20 + i for i, name in enumerate(VELOCITY_ERRORS)},
     **{"key_0": 23, "key_1": 24, "sides": 25, "turn": 26},
     **{f"corner_{i}": 27 + i for i in range(SIDES)},
     **{"feet_number": 44, "feet_turn": 45},
 }
-_OWN = {name: one.column for name, one in QUANTITIES.items() if name != "velocity_error"}
-# Which random number of a world is what, in the order of the columns.
-USES: dict[str, int] = dict(sorted((_OWN | _OTHERS).items(), key=lambda item: item[1]))
+_RANGED = {name: item.column for name, item in QUANTITIES.items() if name != "velocity_error"}
+# Columns of the random numbers of a world by name, in their order.
+USES: dict[str, int] = dict(sorted((_RANGED | _UNRANGED).items(), key=lambda item: item[1]))
 
 
 def draw(domain: Domain, seed: int, index: ArrayLike) -> Draw:
-    """The worlds `index` (n,), all of one object of the domain."""
+    """Return the worlds `index` (n,), all of one object of the domain."""
     index = np.asarray(index, np.int64)
-    return drawn_at(domain, index, numbers_of(seed, index))
+    return draw_at(domain, index, random_numbers(seed, index))
 
 
-def drawn_at(domain: Domain, index: np.ndarray, numbers: np.ndarray) -> Draw:
-    """Worlds from their random numbers (n, columns); ValueError if they are of several objects."""
-    which = domain.object_of(index)
-    if (which != which[0]).any():
+def draw_at(domain: Domain, index: np.ndarray, uniform: np.ndarray) -> Draw:
+    """Return worlds of one object from their random numbers (n, columns) in [0, 1).
+
+    Raises:
+      ValueError: the worlds are of several objects.
+    """
+    objects = domain.object_of(index)
+    if (objects != objects[0]).any():
         raise ValueError("worlds of several objects cannot be batched")
-    u = {name: numbers[:, column] for name, column in USES.items()}
-    name = domain.objects[int(which[0])]
+    u = {name: uniform[:, column] for name, column in USES.items()}
+    name = domain.objects[int(objects[0])]
     ranges = {name: getattr(domain, name) for name in QUANTITIES if name in u}
-    at = {name: one.at(u[name]) for name, one in ranges.items() if one is not None}
+    at = {name: item.at(u[name]) for name, item in ranges.items() if item is not None}
     if domain.skin == "ideal":
-        at |= {name: np.zeros(index.size) for name in of("skin") if name in at}
-    error = [domain.velocity_error.at(u[name]) for name in ERRORS]
+        at |= {name: np.zeros(index.size) for name in quantities_of("skin") if name in at}
+    error = [domain.velocity_error.at(u[name]) for name in VELOCITY_ERRORS]
     key = [np.floor(u[name] * 2**32).astype(np.uint32) for name in ("key_0", "key_1")]
     return Draw(
-        number=index,
-        case=index,
+        indices=index,
+        cases=index,
         solid=_solid(name, at, u),
         friction=_friction(domain, index, at),
-        at=at,
+        values=at,
         p_world_target=_targets(domain, index, at),
         velocity_error=np.stack(error, axis=-1),
         robot=_robots(domain.robot, at, index.size),
@@ -80,8 +84,8 @@ def drawn_at(domain: Domain, index: np.ndarray, numbers: np.ndarray) -> Draw:
     )
 
 
-def numbers_of(seed: int, index: np.ndarray) -> np.ndarray:
-    """Random numbers (n, COLUMNS) in [0, 1): those of each index, however it is asked for."""
+def random_numbers(seed: int, index: np.ndarray) -> np.ndarray:
+    """Return the random numbers (n, COLUMNS) in [0, 1) of the worlds `index` (n,)."""
     rows = np.empty((index.size, COLUMNS))
     order = np.argsort(index)
     far = np.flatnonzero(np.diff(index[order]) > 100) + 1
@@ -95,11 +99,11 @@ def numbers_of(seed: int, index: np.ndarray) -> np.ndarray:
 
 
 def _solid(name: str, at: dict[str, np.ndarray], u: dict[str, np.ndarray]) -> Solid:
-    """The objects called `name`: a scene's, or random ones."""
+    """Return the solids of an object of a scene, or random ones of a shape family."""
     count = u["mass"].size
     if name not in RANDOM:
-        one = scene.solid_of(scene.load(name))
-        return jax.tree.map(lambda leaf: np.repeat(leaf, count, axis=0), one)
+        single = scene.solid_of(scene.load(name))
+        return jax.tree.map(lambda leaf: np.repeat(leaf, count, axis=0), single)
     depth, breadth = at["size"] / np.sqrt(at["aspect"]), at["size"] * np.sqrt(at["aspect"])
     radius = np.zeros(count)
     if name == "random_cylinder":
@@ -108,16 +112,16 @@ def _solid(name: str, at: dict[str, np.ndarray], u: dict[str, np.ndarray]) -> So
         vertices = solid.rectangles(depth, breadth)
     else:
         vertices = _polygons(depth, breadth, u)
-    found = solid.build(
+    solids = solid.build(
         vertices, radius, at["height"], at["mass"], at["com_offset"], 2 * np.pi * u["com_bearing"]
     )
     if "feet" not in at:
-        return found
-    return solid.on_feet(found, at["feet"], 3 + np.floor(2 * u["feet_number"]), u["feet_turn"])
+        return solids
+    return solid.on_feet(solids, at["feet"], 3 + np.floor(2 * u["feet_number"]), u["feet_turn"])
 
 
 def _polygons(depth: np.ndarray, breadth: np.ndarray, u: dict[str, np.ndarray]) -> np.ndarray:
-    """Convex polygons (n, SIDES, 2) of 3 to SIDES corners on ellipses of these half axes."""
+    """Return convex polygons (n, SIDES, 2) of 3 to SIDES corners on ellipses of these half axes."""
     sides = 3 + np.floor((SIDES - 2) * u["sides"]).astype(int)[:, None]
     corner = np.minimum(np.arange(SIDES), sides - 1)  # the last one repeated
     jitter = np.stack([u[f"corner_{i}"] for i in range(SIDES)], axis=-1) - 0.5
@@ -128,27 +132,27 @@ def _polygons(depth: np.ndarray, breadth: np.ndarray, u: dict[str, np.ndarray]) 
 
 
 def _robots(robot: Robot, at: dict[str, np.ndarray], count: int) -> Robot:
-    """The robots (count,) of worlds, with what was drawn of them."""
-    own = {QUANTITIES[name].sets: at[name] for name in of("robot") if name in at}
-    if (linear := own.get("acceleration_max")) is not None:
-        own["acceleration_max"] = np.stack([linear, linear / robot.arm], axis=-1)
+    """Return the robots (count,) of worlds, with their drawn limits."""
+    limits = {QUANTITIES[name].sets: at[name] for name in quantities_of("robot") if name in at}
+    if (linear := limits.get("acceleration_max")) is not None:
+        limits["acceleration_max"] = np.stack([linear, linear / robot.arm], axis=-1)
 
-    def spread(value: Any) -> np.ndarray:
+    def repeat(value: Any) -> np.ndarray:
         return np.repeat(np.asarray(value, float)[None], count, axis=0)
 
-    full = {
-        f.name: spread(value)
+    fixed = {
+        f.name: repeat(value)
         for f in fields(robot)
-        if f.name not in (*own, "boards") and (value := getattr(robot, f.name)) is not None
+        if f.name not in (*limits, "boards") and (value := getattr(robot, f.name)) is not None
     }
-    return replace(robot, boards=jax.tree.map(spread, robot.boards), **full, **own)
+    return replace(robot, boards=jax.tree.map(repeat, robot.boards), **fixed, **limits)
 
 
 def _friction(domain: Domain, index: np.ndarray, at: dict[str, np.ndarray]) -> Friction:
     if not domain.frictions:
         return Friction(at["friction_ground"], at["friction_robot"])
-    which = index // max(1, len(domain.targets)) % len(domain.frictions)
-    return Friction(*np.array(domain.frictions)[which].T)
+    rows = index // max(1, len(domain.targets)) % len(domain.frictions)
+    return Friction(*np.array(domain.frictions)[rows].T)
 
 
 def _targets(domain: Domain, index: np.ndarray, at: dict[str, np.ndarray]) -> np.ndarray:
@@ -159,7 +163,7 @@ def _targets(domain: Domain, index: np.ndarray, at: dict[str, np.ndarray]) -> np
 
 
 def table(drawn: Draw) -> dict[str, tuple[np.ndarray, str]]:
-    """What was drawn, one column (n,) and its unit a quantity."""
+    """Return the drawn quantities: a column (n,) and its unit for each."""
     shape = drawn.solid
     away = np.linalg.norm(shape.p_object_com, axis=1)
     toward = shape.p_object_com[:, :2] / np.maximum(away, 1e-12)[:, None]
@@ -174,21 +178,21 @@ def table(drawn: Draw) -> dict[str, tuple[np.ndarray, str]]:
         "distance": np.hypot(x, y),
         "bearing": np.arctan2(y, x),
     }
-    found = {}
-    for name, about in QUANTITIES.items():
-        if about.of == "robot":
-            values = _limit(drawn.robot, about.sets)
+    columns = {}
+    for name, quantity in QUANTITIES.items():
+        if quantity.owner == "robot":
+            values = _limit(drawn.robot, quantity.sets)
         else:
-            values = derived.get(name, drawn.at.get(name))
-        if about.words and values is not None:
-            found[name] = values
-    found["corners"] = solid.corners(shape)
-    for name, values in zip(ERRORS, drawn.velocity_error.T, strict=True):
-        found[name] = values
-    return {name: (values, unit_of(name)) for name, values in found.items()}
+            values = derived.get(name, drawn.values.get(name))
+        if quantity.label and values is not None:
+            columns[name] = values
+    columns["corners"] = solid.corners(shape)
+    for name, values in zip(VELOCITY_ERRORS, drawn.velocity_error.T, strict=True):
+        columns[name] = values
+    return {name: (values, unit_of(name)) for name, values in columns.items()}
 
 
 def _limit(robots: Robot, name: str) -> np.ndarray | None:
-    """A limit of robots (n,), of one that has it; of several numbers the first."""
+    """Return a limit of robots (n,), or None; the first number of a limit with several."""
     values = getattr(robots, name)
     return None if values is None else values.reshape(len(values), -1)[:, 0]

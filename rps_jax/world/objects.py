@@ -1,7 +1,7 @@
-"""The objects that can be pushed, by name: the paper's, and one's own.
+"""Objects by name: the paper's, and custom ones.
 
-An object of one's own is an MJCF file, which gives its looks and its mass, and a footprint: what
-touches is the upright solid over it, in every engine and for the skin alike.
+A custom object has an MJCF file with its visual geoms and mass, and a footprint. Contacts and skin
+use the upright solid over the footprint, in all engines.
 """
 
 import math
@@ -28,10 +28,10 @@ FAMILIES = {
     "hardware_cylinder": "cylinder",
 }  # object -> shape family
 SHAPES = ("box", "cylinder", "prism")  # the families
-OBJECTS = FAMILIES.keys()  # also those that are registered later
+OBJECTS = FAMILIES.keys()  # grows with registered objects
 PAPER_OBJECTS = ("box", "cylinder", "nonuniform_box")  # Fig. 4, in the order of Table II
 _BUILT_IN = tuple({**FAMILIES, **dict.fromkeys(SHAPES)})
-_NEEDED = {
+_REQUIRED = {
     mujoco.mjtObj.mjOBJ_BODY: ("base", "object", "target"),
     mujoco.mjtObj.mjOBJ_JOINT: ("base_x", "base_y", "base_yaw", "object"),
     mujoco.mjtObj.mjOBJ_GEOM: ("ground", "base", "object", "skin_front", "skin_left", "skin_right"),
@@ -40,29 +40,29 @@ _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
 class Registered(NamedTuple):
-    """An object of one's own."""
+    """Custom object: its file and its solid."""
 
-    path: Path  # of its looks
-    solid: Solid  # what touches; leaves without a leading axis
+    path: Path  # of the MJCF file
+    solid: Solid  # for contacts; leaves without a leading axis
 
 
 REGISTERED: dict[str, Registered] = {}
 
 
 def mjcf_folder() -> Path:
-    """The folder of the scenes: inside an installed package, or beside it in a checkout."""
+    """Return the folder of the scenes: in an installed package, or beside it in a checkout."""
     package = Path(__file__).resolve().parent.parent
     installed = package / "mjcf"
     return installed if installed.is_dir() else package.parent / "mjcf"
 
 
 def path_of(name: str) -> Path:
-    """The MJCF file of an object, or of the template of a shape family."""
+    """Return the MJCF file of an object, or of the template of a shape family."""
     return REGISTERED[name].path if name in REGISTERED else mjcf_folder() / f"{name}.xml"
 
 
-def named(text: str) -> str:
-    """Read an object's text: its name, or the path of an MJCF file, which is then registered."""
+def parse_object(text: str) -> str:
+    """Return the name of an object from its name or its MJCF file, which is then registered."""
     if not isinstance(text, str) or not text.endswith(".xml"):
         return text
     path = Path(text).absolute()
@@ -79,7 +79,7 @@ def named(text: str) -> str:
 
 
 def read(path: Path) -> mujoco.MjSpec:
-    """An MJCF file, wherever it is; `base.xml` is that of `mjcf_folder`."""
+    """Read an MJCF file in any folder; `base.xml` is that of `mjcf_folder`."""
     base = (mjcf_folder() / "base.xml").read_bytes()
     return mujoco.MjSpec.from_file(str(path), include={"base.xml": base})
 
@@ -90,25 +90,25 @@ def register_object(
     footprint: Footprint | None = None,
     feet: ArrayLike | None = None,
 ) -> None:
-    """Make an object of one's own known, to be used as those of the paper are.
+    """Register a custom object, to be used like the paper's objects.
 
-    Its file includes `base.xml`, which need not lie beside it, and has a body `object` with a free
-    joint `object` and geoms that stand upright, one of them called `object`. The body's origin is
-    in the middle of that geom's height.
+    The file includes `base.xml`, which need not be in the same folder. It has a body `object` with
+    a free joint `object` and upright geoms, one of them named `object`. The body's origin is at
+    half the height of that geom.
 
     Args:
-      name: what it is called; registered again, it replaces what was called so.
-      path: of the MJCF file. Mass, centre of mass and inertia are those of all the body's geoms.
-      footprint: outline of the solid that touches, in the body's frame: a circle about the origin,
+      name: of the object; it replaces an object registered under the same name.
+      path: MJCF file. Mass, centre of mass and inertia are those of all geoms of the body.
+      footprint: outline of the solid for contacts, in the body's frame: a circle about the origin,
         or a convex polygon of up to 8 corners around it. By default that of the geom `object`, if
-        it is a box or a cylinder. The solid is as high as this geom.
-      feet: places (S, 2) [m] of 3 to 8 points on which it stands, in the body's frame, or with
-        weights (S, 3) [m, m, 1], as of springs; by default its corners or its rim. Weights are of
-        the engine quasistatic alone: the others find the load of each foot from how the object
-        leans, on ground that gives way alike under all.
+        it is a box or a cylinder. The height of the solid is that of this geom.
+      feet: positions (S, 2) [m] of 3 to 8 points on which it stands, in the body's frame, or with
+        weights (S, 3) [m, m, 1], as of springs; by default its corners or its rim. Only the engine
+        quasistatic uses weights: the others compute the load of each foot from the tilt of the
+        object, on ground of uniform stiffness.
 
     Raises:
-      InputError: the name is one of the paper's, or file, footprint or feet are not such.
+      InputError: the name is one of the paper's, or file, footprint or feet are invalid.
 
     Example:
       >>> from pathlib import Path
@@ -131,96 +131,96 @@ def register_object(
     """
     if name in _BUILT_IN:
         raise InputError(
-            f"object name '{name}' is not allowed: {', '.join(_BUILT_IN)} are there already."
+            f"object name '{name}' is not allowed: {', '.join(_BUILT_IN)} exist already."
         )
     path = Path(path).absolute()
-    what = f"object '{name}'"
-    model = _compiled(what, path)
-    family, vertices, radius = _outline(what, footprint or _own_outline(what, model))
-    thing = model.body("object")
+    label = f"object '{name}'"
+    model = _compiled(label, path)
+    family, vertices, radius = _outline(label, footprint or _geom_outline(label, model))
+    body = model.body("object")
     if feet is not None:
         family, vertices = "cylinder" if radius else "prism", solid.padded(vertices)
-        feet = _feet(what, np.asarray(feet, float), thing.ipos[:2])
-    one = Solid(
+        feet = _feet(label, np.asarray(feet, float), body.ipos[:2])
+    single = Solid(
         vertices=vertices,
         radius=np.asarray(radius),
-        height=np.asarray(_height(what, model)),
-        mass=thing.mass[0],
-        p_object_com=thing.ipos.copy(),
-        inertia=thing.inertia.copy(),
-        q_object_body=thing.iquat.copy(),
+        height=np.asarray(_height(label, model)),
+        mass=body.mass[0],
+        p_object_com=body.ipos.copy(),
+        inertia=body.inertia.copy(),
+        q_object_body=body.iquat.copy(),
         feet=feet,
     )
-    REGISTERED[name] = Registered(path, one)
+    REGISTERED[name] = Registered(path, single)
     FAMILIES[name] = family
 
 
-def _compiled(what: str, path: Path) -> mujoco.MjModel:
-    """The model of a file that keeps to the convention."""
+def _compiled(label: str, path: Path) -> mujoco.MjModel:
+    """Compile the model of a file, or raise InputError if it lacks a required element."""
     try:
         model = read(path).compile()
     except ValueError as error:
         reason = " ".join(str(error).split())
-        raise InputError(f"{what}: MuJoCo cannot compile {path} ({reason}).") from error
-    for kind, names in _NEEDED.items():
-        for needed in names:
-            if mujoco.mj_name2id(model, kind, needed) < 0:
+        raise InputError(f"{label}: MuJoCo cannot compile {path} ({reason}).") from error
+    for kind, names in _REQUIRED.items():
+        for required in names:
+            if mujoco.mj_name2id(model, kind, required) < 0:
                 kind_name = kind.name.removeprefix("mjOBJ_").lower()
                 raise InputError(
-                    f"{what}: {path} lacks the {kind_name} '{needed}': include base.xml, and give "
-                    "the body, its free joint and one geom the name object."
+                    f"{label}: {path} lacks the {kind_name} '{required}': include base.xml, and "
+                    "give the body, its free joint and one geom the name object."
                 )
     joint, body = model.joint("object"), model.body("object")
     free = joint.type[0] == mujoco.mjtJoint.mjJNT_FREE and joint.bodyid[0] == body.id
     if not free or joint.qposadr[0] != 3 or model.nq != 10:
         raise InputError(
-            f"{what}: the joints of {path} are not allowed: give the body object a free joint, and "
-            "nothing else a joint."
+            f"{label}: the joints of {path} are not allowed: give the body object a free joint, "
+            "and no other body a joint."
         )
     if not math.isclose(model.body_subtreemass[body.id], body.mass[0]):
         raise InputError(
-            f"{what}: bodies within the body object of {path} are not allowed: give it all geoms."
+            f"{label}: bodies within the body object of {path} are not allowed: give it all geoms."
         )
     return model
 
 
 def outline_of(geom: Any) -> Footprint | None:
-    """The outline of a geom that is a box or a cylinder."""
+    """Return the outline of a box or a cylinder; None for another geom."""
     if geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX:
         return fp.rectangle(geom.size[0], geom.size[1])
     return fp.circle(geom.size[0]) if geom.type[0] == mujoco.mjtGeom.mjGEOM_CYLINDER else None
 
 
-def _own_outline(what: str, model: mujoco.MjModel) -> Footprint:
-    """The outline of the geom `object`."""
+def _geom_outline(label: str, model: mujoco.MjModel) -> Footprint:
+    """Return the outline of the geom `object`, or raise InputError."""
     geom = model.geom("object")
     centred = np.allclose(geom.pos[:2], 0) and np.allclose(geom.quat, _UPRIGHT)
     if centred and (outline := outline_of(geom)) is not None:
         return outline
     raise InputError(
-        f"{what}: footprint = None is not allowed: the geom object is not an upright box or "
+        f"{label}: footprint = None is not allowed: the geom object is not an upright box or "
         "cylinder about the body's origin, so give the outline."
     )
 
 
-def _outline(what: str, footprint: Footprint) -> tuple[str, np.ndarray, float]:
-    """Shape family, vertices (N, 2) [m] as its solids have them, and radius [m]."""
+def _outline(label: str, footprint: Footprint) -> tuple[str, np.ndarray, float]:
+    """Return shape family, vertices (N, 2) [m] of its solids, and radius [m]."""
     vertices, radius = np.asarray(footprint.vertices, float), float(footprint.radius)
     if vertices.shape == (1, 2) and not vertices.any():
-        errors.check_finite(f"{what}: radius of the footprint", radius, at_least=0.02, at_most=2)
+        errors.check_finite(f"{label}: radius of the footprint", radius, at_least=0.02, at_most=2)
         return "cylinder", vertices, radius
     if radius or not 3 <= len(vertices) <= SIDES:
         raise InputError(
-            f"{what}: footprint = {vertices.tolist()} with radius {radius:g} m is not allowed: "
+            f"{label}: footprint = {vertices.tolist()} with radius {radius:g} m is not allowed: "
             f"give a circle about the origin, or a polygon of 3 to {SIDES} corners with radius 0."
         )
     fp.polygon(vertices)  # raises unless it is convex
     reach = np.linalg.norm(vertices, axis=1).max()
-    errors.check_finite(f"{what}: reach of the footprint", reach, at_least=0.02, at_most=2)
+    errors.check_finite(f"{label}: reach of the footprint", reach, at_least=0.02, at_most=2)
     ahead = np.roll(vertices, -1, axis=0)
     if (vertices[:, 0] * ahead[:, 1] <= vertices[:, 1] * ahead[:, 0]).any():
         raise InputError(
-            f"{what}: footprint = {vertices.tolist()} is not allowed: the origin must be inside."
+            f"{label}: footprint = {vertices.tolist()} is not allowed: the origin must be inside."
         )
     half = np.abs(vertices[0])
     if len(vertices) == 4 and np.allclose(np.abs(vertices), half):
@@ -228,25 +228,25 @@ def _outline(what: str, footprint: Footprint) -> tuple[str, np.ndarray, float]:
     return "prism", solid.padded(vertices), 0.0
 
 
-def _feet(what: str, feet: np.ndarray, com: np.ndarray) -> np.ndarray:
-    """Feet (SIDES, 3) [m, m, 1], those that are missing with a weight of 0."""
+def _feet(label: str, feet: np.ndarray, com: np.ndarray) -> np.ndarray:
+    """Return feet (SIDES, 3) [m, m, 1]; missing ones have a weight of 0."""
     if feet.ndim == 2 and feet.shape[1] == 2:
         feet = np.column_stack([feet, np.ones(len(feet))])
-    said = f"{what}: feet = {feet.tolist()} is not allowed:"
+    prefix = f"{label}: feet = {feet.tolist()} is not allowed:"
     if feet.ndim != 2 or feet.shape[1] != 3 or not 3 <= len(feet) <= SIDES:
-        raise InputError(f"{said} give 3 to {SIDES} rows of x, y [m] and, if you like, a weight.")
+        raise InputError(f"{prefix} give 3 to {SIDES} rows of x, y [m] and, if you like, a weight.")
     if not np.isfinite(feet).all() or (feet[:, 2] <= 0).any():
-        raise InputError(f"{said} all numbers must be finite, and weights positive.")
+        raise InputError(f"{prefix} all numbers must be finite, and weights positive.")
     bearing = np.linspace(0, 2 * np.pi, 360)
     reach = (feet[:, :2] - com) @ np.stack([np.cos(bearing), np.sin(bearing)])
     if reach.max(axis=0).min() <= 0:
-        raise InputError(f"{said} the centre of mass must be between them, or it tips over.")
+        raise InputError(f"{prefix} the centre of mass must be between them, or it tips over.")
     missing = np.repeat(feet[-1:] * [1, 1, 0], SIDES - len(feet), axis=0)
     return np.concatenate([feet, missing])
 
 
-def _height(what: str, model: mujoco.MjModel) -> float:
-    """Of the geom `object` [m]."""
+def _height(label: str, model: mujoco.MjModel) -> float:
+    """Return the height of the geom `object` [m]."""
     geom = model.geom("object")
     if geom.type[0] == mujoco.mjtGeom.mjGEOM_MESH:
         mesh = model.mesh(geom.dataid[0])
@@ -260,7 +260,7 @@ def _height(what: str, model: mujoco.MjModel) -> float:
     low, high = float(z.min()), float(z.max())
     if abs(low + high) > 1e-3:
         raise InputError(
-            f"{what}: its geom object reaches from {low:g} to {high:g} m above the body's origin, "
+            f"{label}: its geom object reaches from {low:g} to {high:g} m above the body's origin, "
             "which is not allowed: the origin must be in the middle of its height."
         )
-    return errors.check_finite(f"{what}: height", high - low, at_least=0.1, at_most=3, unit="m")
+    return errors.check_finite(f"{label}: height", high - low, at_least=0.1, at_most=3, unit="m")

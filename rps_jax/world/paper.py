@@ -1,4 +1,4 @@
-"""What the paper ran and what it reports, as data."""
+"""The paper's experiments and results, as data."""
 
 import math
 from itertools import product
@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 TARGETS = tuple(
     (float(x), float(y)) for x in (2, 1, 0, -1, -2) for y in (2, 1, 0, -1, -2) if (x, y) != (0, 0)
-)  # [m] Sec. III-B: a grid of 1 m, without the robot's place
+)  # [m] Sec. III-B: a grid of 1 m, without the robot's position
 
-FEW_TARGETS = ((2.0, 0.0), (1.0, 1.0), (0.0, -2.0), (-2.0, 1.0))  # of them, for a first look
+FEW_TARGETS = ((2.0, 0.0), (1.0, 1.0), (0.0, -2.0), (-2.0, 1.0))  # a subset, for quick runs
 
 LAWS = ("rps", "nps", "aps")
-SKIN = {"default": "ideal", "paper_gazebo": "thin"}  # that goes with each physics
+SKIN = {"default": "ideal", "paper_gazebo": "thin"}  # by physics
 
 _SUCCESSES = {  # of 24, with box, cylinder and nonuniform_box, each under S1 and S2
     "rps": (23, 24, 19, 19, 19, 23),
@@ -21,9 +21,9 @@ _SUCCESSES = {  # of 24, with box, cylinder and nonuniform_box, each under S1 an
 _COLUMNS = tuple(product(("box", "cylinder", "nonuniform_box"), ("S1", "S2")))
 # Table II, keyed by law, object and friction set.
 TABLE_II: dict[tuple[str, str, str], int] = {
-    (law, *column): won
+    (law, *column): successes
     for law, row in _SUCCESSES.items()
-    for column, won in zip(_COLUMNS, row, strict=True)
+    for column, successes in zip(_COLUMNS, row, strict=True)
 }
 
 # Sec. III-C, on the robot itself.
@@ -36,13 +36,13 @@ HARDWARE_LAYOUTS = {
     "grid": tuple(
         (x, y) for x in (_REACH, 0, -_REACH) for y in (_REACH, 0, -_REACH) if (x, y) != (0, 0)
     ),
-}  # the paper's "8 different target points at 2.1 m intervals apart" may be read either way
+}  # both are readings of the paper's "8 different target points at 2.1 m intervals apart"
 HARDWARE_GROUND = (0.2, 0.35, 0.5, 0.65)  # [1] object-ground
 HARDWARE_ROBOT = (0.3, 0.5, 0.7)  # [1] object-robot: polyurethane foam coated with ink
 
 
 class HardwareResult(NamedTuple):
-    """What the paper reports of one object, over eight targets."""
+    """Results that the paper reports for one object, over eight targets."""
 
     success: int
     mean_abs_l: float  # [m] D
@@ -54,7 +54,7 @@ HARDWARE_RESULTS = {
     "hardware_cylinder": HardwareResult(8, 0.059, 88.0),
 }
 
-# What is open, our reading, and why: physics or the text, not the score.
+# Open points of the paper: the point, our reading, and the reason (physics or text, not the score).
 CHOICES = (
     (
         "tangent beyond a quarter turn",

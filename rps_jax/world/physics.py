@@ -1,4 +1,4 @@
-"""How worlds are stepped: the timestep, the cone, the solver, the softness of contacts; by name."""
+"""Physics of the simulation: timestep, friction cone, solver and contact softness; presets."""
 
 import math
 from dataclasses import dataclass, fields, replace
@@ -10,24 +10,24 @@ from rps_jax.record.options import check_fields, option, parse_changes
 
 @dataclass(frozen=True)
 class Physics:
-    """How the world is stepped. Static: a change compiles another program."""
+    """Options of the simulation. Static: a change compiles another program."""
 
     timestep: float = option(0.01, 1e-5, 0.1, unit="s")
-    # Between two decisions of the law; left open by the paper.
+    # Between two steps of the law; the paper leaves it open.
     control_period: float = option(0.02, above=0, at_most=1, unit="s")
     cone: Literal["elliptic", "pyramidal"] = "elliptic"
     impratio: float = option(10.0, above=0)  # [1] friction stiffness over normal stiffness
-    # Of the Newton solver, at most; with 4 the object is lost.
+    # Maximum, of the Newton solver; with 4 the base loses the object.
     iterations: int = option(8, 1, 10_000)
-    ls_iterations: int = option(10, 1, 10_000)  # of its line search, at most
-    # Of the solver, relative to the trace of the mass matrix: that is 3e6 by the base's armature,
-    # so MuJoCo's own 1e-8 would end the solver far from an object's solution.
+    ls_iterations: int = option(10, 1, 10_000)  # maximum, of its line search
+    # Of the solver, relative to the trace of the mass matrix. The base's armature makes that 3e6:
+    # MuJoCo's default of 1e-8 would end the solver far from the object's solution.
     tolerance: float = option(1e-13, 0)  # [1]
     # Time constant and damping ratio [s, 1] of the two contacts (MuJoCo's solref) and the ground's
-    # impedance [1] (its solimp). MuJoCo's cone lifts what slides; on its own ground, (0.02, 1) and
-    # 0.9, objects hop at 5 cm/s and the push force chatters by three quarters of its mean. This
-    # softer and less damped ground carries them steadily, 0.5 mm deep.
-    base_solref: tuple[float, float] = option((0.02, 1.0), above=0)  # MuJoCo's own
+    # impedance [1] (its solimp). MuJoCo's cone lifts sliding objects. On its default ground, with
+    # (0.02, 1) and 0.9, objects hop at 5 cm/s and the push force chatters by three quarters of its
+    # mean. On this softer and less damped ground they slide steadily, 0.5 mm deep.
+    base_solref: tuple[float, float] = option((0.02, 1.0), above=0)  # MuJoCo's default
     ground_solref: tuple[float, float] = option((0.1, 0.3), above=0)
     ground_impedance: float = option(0.7, above=0, at_most=0.9999)
 
@@ -46,18 +46,18 @@ class Physics:
         return round(self.control_period / self.timestep)
 
 
-# The ground contact that MuJoCo has if none is chosen.
-MUJOCOS_GROUND = {"ground_solref": (0.02, 1.0), "ground_impedance": 0.9}
+# MuJoCo's default ground contact.
+MUJOCO_GROUND = {"ground_solref": (0.02, 1.0), "ground_impedance": 0.9}
 _EXACT = Physics(timestep=0.001, iterations=100, ls_iterations=50, tolerance=1e-15)
 # The pyramid needs Gazebo's own step of 1 ms: in steps of 5 ms it loses most boxes.
 _PYRAMID = Physics(timestep=0.001, cone="pyramidal", iterations=20, ls_iterations=20)
-# How the friction is modelled, and how finely that is solved: see `preset`.
+# By friction model and fidelity: see `preset`.
 PHYSICS = {
     "default": {
         "reference": _EXACT,
         # Share of the 432 outcomes equal to the reference's in C (`rps paper`):
         "standard": Physics(),  # MJX 99.5 %, fused 100 %
-        # MJX 95.6 %, fused 100 %. On `standard`'s ground flat boxes at rest wander off at 20 ms.
+        # MJX 95.6 %, fused 100 %. On the ground of `standard`, flat boxes at rest drift at 20 ms.
         "fast": Physics(timestep=0.02, iterations=6, ls_iterations=8, ground_impedance=0.5),
     },
     "paper_gazebo": {
@@ -69,36 +69,39 @@ PHYSICS = {
 
 
 PhysicsName = Literal["default", "paper_gazebo"]
-PhysicsLike = str | Physics  # or its text, see `named`
+PhysicsLike = str | Physics  # or its text: see `parse_physics`
 Fidelity = Literal["reference", "standard", "fast"]
 
 
 def preset(name: PhysicsName = "default", fidelity: Fidelity = "standard") -> Physics:
-    """Physics by name: `default`, isotropic Coulomb friction; or `paper_gazebo`, as in the paper.
+    """Return physics by name and fidelity.
 
-    There friction is a pyramid along the world's axes. The fidelity is `reference`, converged, for
-    the engine `mujoco`; `standard`, for tables; or `fast`.
+    Args:
+      name: `default`, isotropic Coulomb friction; or `paper_gazebo`, the paper's friction pyramid
+        along the world's axes.
+      fidelity: `reference`, converged, for the engine `mujoco`; `standard`, for tables; or `fast`.
     """
     errors.check_name("physics", name, PHYSICS)
     return PHYSICS[name][errors.check_name("fidelity", fidelity, PHYSICS[name])]
 
 
-def named(physics: PhysicsLike, fidelity: Fidelity = "standard") -> Physics:
-    """Read a physics: itself, or a name with changes, as `default,timestep=0.005`."""
+def parse_physics(physics: PhysicsLike, fidelity: Fidelity = "standard") -> Physics:
+    """Return physics from a name with changes, as `default,timestep=0.005`."""
     if isinstance(physics, Physics):
         return physics
     if not isinstance(physics, str):
         raise errors.InputError(f"physics = {physics!r} is not allowed: give a name or a Physics.")
     name, changes = parse_changes("physics", physics)
     errors.check_name("physics", name, PHYSICS)
-    usual = preset(name, fidelity)  # pyright: ignore[reportArgumentType]
+    base = preset(name, fidelity)  # pyright: ignore[reportArgumentType]
+    known = [field.name for field in fields(Physics)]
     for field, value in changes.items():
-        errors.check_name("field of physics", field, [one.name for one in fields(Physics)])
-        if isinstance(getattr(usual, field), int) and isinstance(value, float):
+        errors.check_name("field of physics", field, known)
+        if isinstance(getattr(base, field), int) and isinstance(value, float):
             changes[field] = int(value) if value == int(value) else value
         elif isinstance(value, list):
             changes[field] = tuple(value)
     try:
-        return replace(usual, **changes)
+        return replace(base, **changes)
     except TypeError as error:
         raise errors.InputError(f"physics = {physics} is not allowed ({error}).") from error

@@ -1,8 +1,7 @@
-"""Worlds as points of the unit cube: every number that a domain draws is one coordinate.
+"""Worlds as points of the unit cube: each drawn quantity of a domain is one coordinate.
 
 A drawn world is addressed by (domain, seed, index). The same world is the point `u` of its random
-numbers, each in [0, 1), of which a domain reads only some. Whoever looks for worlds, instead of
-drawing them, moves such points.
+numbers in [0, 1), of which a domain reads only some. A search for worlds moves such points.
 """
 
 from __future__ import annotations
@@ -24,68 +23,76 @@ from rps_jax.geometry.solid import SIDES
 from rps_jax.record import files
 from rps_jax.robot.robot import Robot
 from rps_jax.world import draws
-from rps_jax.world.domain import ERRORS, QUANTITIES, RANDOM, Domain, Range, from_json, named
+from rps_jax.world.domain import (
+    QUANTITIES,
+    RANDOM,
+    VELOCITY_ERRORS,
+    Domain,
+    Range,
+    from_json,
+    parse_domain,
+    unit_of,
+)
 from rps_jax.world.draws import Draw
 
-Kind = Literal["range", "choice", "shape", "noise"]
-FILE = "points.nc"  # of a run folder whose worlds are points
+CoordinateKind = Literal["range", "choice", "shape", "noise"]
+FILE = "points.nc"  # in a run folder whose worlds are points
 _OF_PRISMS = ("sides", "turn", *(f"corner_{i}" for i in range(SIDES)))
 _OF_FEET = ("feet_number", "feet_turn")
 _TURN = Range(0, 2 * np.pi)
-_MOST = 100_000_000
+_MAX_POINTS = 100_000_000
 
 
-class Quantity(NamedTuple):
-    """One coordinate of the cube, and what it stands for."""
+class Coordinate(NamedTuple):
+    """Coordinate of the cube."""
 
     name: str
-    kind: Kind  # a range; a choice from a list; corners or feet; the key of all noise
-    range: Range  # of the quantity, or from 0 to how many there are to choose from
+    kind: CoordinateKind  # a range; a choice from a list; corners or feet; the key of all noise
+    range: Range  # of the quantity, or from 0 to the length of the list
     unit: str
 
 
-def quantities(domain: Domain) -> tuple[Quantity, ...]:
-    """The q coordinates of a domain: lists first, then what it draws, shapes and noise with it.
+def coordinates(domain: Domain) -> tuple[Coordinate, ...]:
+    """Return the q coordinates of a domain: lists first, then drawn quantities, shapes and noise.
 
-    A range of a single value is no coordinate, nor is one of which the domain draws nothing.
+    Unused ranges and ranges of a single value are no coordinates.
     """
-    return tuple(_quantities(domain))
+    return tuple(_coordinates(domain))
 
 
-def _quantities(domain: Domain) -> Iterator[Quantity]:
+def _coordinates(domain: Domain) -> Iterator[Coordinate]:
     for name, count in zip(("object", "friction", "target"), _counts(domain), strict=True):
         if count > 1:
-            yield Quantity(name, "choice", Range(0, count), "1")
+            yield Coordinate(name, "choice", Range(0, count), "1")
     random = set(domain.objects) & set(RANDOM)
     idle = set(domain.idle) | ({"aspect"} if random == {"random_cylinder"} else set())
     for name in draws.USES:
         if name in (*_OF_PRISMS, *_OF_FEET):
             if domain.feet is not None if name in _OF_FEET else "random_prism" in random:
-                yield Quantity(name, "shape", Range(0, 1), "1")
+                yield Coordinate(name, "shape", Range(0, 1), "1")
         elif name == "com_bearing":
             if random and domain.com_offset.high > 0:
-                yield Quantity(name, "range", _TURN, "rad")
+                yield Coordinate(name, "range", _TURN, "rad")
         elif name.startswith("key_"):
-            yield Quantity(name, "noise", Range(0, 1), "1")
+            yield Coordinate(name, "noise", Range(0, 1), "1")
         else:
-            of = getattr(domain, "velocity_error" if name in ERRORS else name)
-            if name not in idle and of is not None and of.low < of.high:
-                unit = QUANTITIES[name].unit if name in QUANTITIES else "1"
-                yield Quantity(name, "range", of, unit)
+            interval = getattr(domain, "velocity_error" if name in VELOCITY_ERRORS else name)
+            if name not in idle and interval is not None and interval.low < interval.high:
+                yield Coordinate(name, "range", interval, unit_of(name))
 
 
-def names(domain: Domain, *kinds: Kind) -> tuple[str, ...]:
-    """The names of a domain's coordinates, of these kinds or of all, in their order."""
-    return tuple(one.name for one in quantities(domain) if not kinds or one.kind in kinds)
+def names(domain: Domain, *kinds: CoordinateKind) -> tuple[str, ...]:
+    """Return the names of a domain's coordinates, of some kinds or of all, in their order."""
+    return tuple(item.name for item in coordinates(domain) if not kinds or item.kind in kinds)
 
 
 def check_drawn(field: str, name: str, domain: Domain) -> str:
-    """`name` if the domain draws a quantity of this name from a range, or InputError."""
+    """Return a name if the domain draws this quantity from a range, or raise InputError."""
     drawn = names(domain, "range")
-    known = (*QUANTITIES, *ERRORS, "com_bearing")
+    known = (*QUANTITIES, *VELOCITY_ERRORS, "com_bearing")
     if name in known and name not in drawn:
         raise InputError(
-            f"{field} = {name} is not allowed: this domain does not draw it, but "
+            f"{field} = {name} is not allowed: this domain does not draw it; it draws "
             f"{', '.join(drawn)}."
         )
     return errors.check_name(field, name, drawn)
@@ -93,7 +100,7 @@ def check_drawn(field: str, name: str, domain: Domain) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points (n, q) of the cube of a domain, all in [0, 1)."""
+    """Points (n, q) of the cube of a domain, in [0, 1)."""
 
     u: np.ndarray  # (n, q)
 
@@ -102,133 +109,137 @@ class Points:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the numbers and of how many each point has."""
+        """SHA-256 of the coordinates and their shape."""
         return files.sha256(repr(self.u.shape).encode() + np.ascontiguousarray(self.u).tobytes())
 
     def cases(self, domain: Domain, index: Any) -> np.ndarray:
-        """Which object, friction and target the worlds `index` have, as indices of the domain."""
+        """Return indices of the domain with the object, friction and target of the worlds."""
         rows = dict(zip(names(domain), self.u[np.asarray(index)].T, strict=True))
-        found = np.zeros(np.shape(index), np.int64)
+        indices = np.zeros(np.shape(index), np.int64)
         for name, count in zip(("object", "friction", "target"), _counts(domain), strict=True):
-            which = np.floor(rows[name] * count).astype(np.int64) if name in rows else 0
-            found = found * count + which
-        return found
+            choice = np.floor(rows[name] * count).astype(np.int64) if name in rows else 0
+            indices = indices * count + choice
+        return indices
 
     def draw(self, domain: Domain, index: Any) -> Draw:
-        """The worlds `index` (n,), all of one object of the domain."""
+        """Return the worlds `index` (n,), all of one object of the domain."""
         index = np.asarray(index, np.int64)
         cases = self.cases(domain, index)
-        numbers = np.full((index.size, draws.COLUMNS), 0.5)
-        own = [i for i, name in enumerate(names(domain)) if name in draws.USES]
-        at = [draws.USES[name] for name in names(domain) if name in draws.USES]
-        numbers[:, at] = self.u[index][:, own]
-        return draws.drawn_at(domain, cases, numbers)._replace(number=index)
+        uniform = np.full((index.size, draws.COLUMNS), 0.5)
+        pairs = [(i, draws.USES[x]) for i, x in enumerate(names(domain)) if x in draws.USES]
+        ours, theirs = (list(column) for column in zip(*pairs, strict=True))
+        uniform[:, theirs] = self.u[index][:, ours]
+        return draws.draw_at(domain, cases, uniform)._replace(indices=index)
 
     def write(self, folder: Path, domain: Domain) -> Path:
-        """Keep the points in a run folder."""
+        """Write the points into a run folder."""
         return files.write_results(folder / FILE, _labelled(domain, self.u))
 
     @staticmethod
     def read(folder: Path, digest: str) -> Points:
-        """The points of this digest that a run folder holds; InputError if it does not."""
+        """Return the points of a run folder if they have this digest, or raise InputError."""
         if not (folder / FILE).exists():
             raise InputError(f"run = {folder} lacks its {FILE}: run the same command again.")
-        kept = files.check_columns(
+        stored = files.check_columns(
             files.read_dataset(folder / FILE), folder / FILE, {"u": ("world", "quantity")}, {}
         )
-        found = Points(kept.u.values)
-        if found.digest != digest:
+        points = Points(stored.u.values)
+        if points.digest != digest:
             raise files.CorruptFileError(folder / FILE, "its points are not those of the run")
-        return found
+        return points
 
 
 def _counts(domain: Domain) -> tuple[int, int, int]:
-    """How many objects, frictions and targets the domain lists; 1 where it lists none."""
+    """Return the number of objects, frictions and targets of the lists; 1 for an empty list."""
     return len(domain.objects), max(1, len(domain.frictions)), max(1, len(domain.targets))
 
 
-def checked(domain: Domain, u: Any) -> Points:
-    """Points of a domain: an array (n, q) in [0, 1), or of `worlds_at`; or InputError."""
-    every = names(domain)
+def check_points(domain: Domain, u: Any) -> Points:
+    """Return the points of an array (n, q) or of a dataset of `worlds_at`; or InputError."""
+    expected = names(domain)
     if isinstance(u, xr.Dataset):
         if "u" not in u or "quantity" not in u.coords:
             raise InputError("points are not allowed: the dataset has no u (world, quantity).")
         theirs = tuple(map(str, u.quantity.values))
-        if theirs != every or ("domain" in u.attrs and not _tells(u.attrs["domain"], domain)):
+        if theirs != expected or (
+            "domain" in u.attrs and not _is_json_of(u.attrs["domain"], domain)
+        ):
             raise InputError(
                 "points are not allowed: they are of another domain; give that domain."
             )
         u = u.u.values
     try:
-        found = np.array(u, float)
+        values = np.array(u, float)
     except (TypeError, ValueError) as error:
-        raise InputError(f"u = {u!r} is not allowed: give an array (n, {len(every)}).") from error
-    if found.ndim != 2 or found.shape[1] != len(every) or not len(found):
         raise InputError(
-            f"u of shape {found.shape} is not allowed: it must be (n, {len(every)}), a row a world "
-            f"and a column for each of {', '.join(every)}."
-        )
-    wrong = np.argwhere(~((found >= 0) & (found < 1)))
-    if len(wrong):
-        row, column = wrong[0]
+            f"u = {u!r} is not allowed: give an array (n, {len(expected)})."
+        ) from error
+    if values.ndim != 2 or values.shape[1] != len(expected) or not len(values):
         raise InputError(
-            f"u[{row}, {column}] = {found[row, column]} ({every[column]}) is not allowed: it must "
-            "be at least 0 and below 1."
+            f"u of shape {values.shape} is not allowed: it must be (n, {len(expected)}), a row for "
+            f"each world and a column for each of {', '.join(expected)}."
         )
-    errors.check_count("points", len(found), at_most=_MOST)
-    return Points(found)
+    outside = np.argwhere(~((values >= 0) & (values < 1)))
+    if len(outside):
+        row, column = outside[0]
+        raise InputError(
+            f"u[{row}, {column}] = {values[row, column]} ({expected[column]}) is not allowed: it "
+            "must be at least 0 and below 1."
+        )
+    errors.check_count("points", len(values), at_most=_MAX_POINTS)
+    return Points(values)
 
 
 def cases(domain: Domain, points: Points | None, index: Any) -> np.ndarray:
-    """Which object, friction and target worlds have, drawn ones or points."""
+    """Return indices with the object, friction and target of worlds, drawn ones or points."""
     return np.asarray(index) if points is None else points.cases(domain, index)
 
 
 def draw(domain: Domain, seed: int, points: Points | None, index: Any) -> Draw:
-    """The worlds `index` of one object, drawn ones or points."""
+    """Return the worlds `index` of one object, drawn ones or points."""
     return draws.draw(domain, seed, index) if points is None else points.draw(domain, index)
 
 
 def points_of(domain: Domain | str, index: ArrayLike, seed: int = 0) -> np.ndarray:
-    """The points (n, q) of the unit cube at which the drawn worlds `index` (n,) lie.
+    """Return the points (n, q) of the unit cube of the drawn worlds `index` (n,).
 
-    `worlds_at` makes the same worlds of them, bit for bit.
+    `worlds_at` returns the same worlds for them, bit for bit.
     """
-    domain = named(domain)
+    domain = parse_domain(domain)
     errors.check_count("seed", seed, at_least=0, at_most=2**32 - 1)
     index = np.atleast_1d(np.asarray(index, np.int64))
-    every = draws.numbers_of(seed, index)
-    numbers = {name: every[:, column] for name, column in draws.USES.items()}
+    uniform = draws.random_numbers(seed, index)
+    by_name = {name: uniform[:, column] for name, column in draws.USES.items()}
     objects, frictions, targets = _counts(domain)
     of_lists = {
         "object": (domain.object_of(index) + 0.5) / objects,
         "friction": (index // targets % frictions + 0.5) / frictions,
         "target": (index % targets + 0.5) / targets,
     }
-    return np.stack([(numbers | of_lists)[name] for name in names(domain)], axis=-1)
+    return np.stack([(by_name | of_lists)[name] for name in names(domain)], axis=-1)
 
 
 def worlds_at(
     domain: Domain | str, u: ArrayLike | xr.Dataset, *, robot: Robot | str | None = None
 ) -> xr.Dataset:
-    """The worlds at points of the unit cube, which `sweep` and `evaluate` take as `points`.
+    """Return the worlds at points of the unit cube, as `sweep` and `evaluate` take them.
 
-    A quantity is at `low + u (high - low)`, or at `low (high / low)^u` where its range is even in
-    the logarithm. Kinds of quantities are `range`; `choice`, of the object, friction or target from
-    the domain's lists; `shape`, of a prism's corners or of feet; and `noise`, the key of all that
-    is drawn while a world runs, so that neighbours in it have nothing in common.
+    A quantity is `low + u (high - low)`, or `low (high / low)^u` if its range is uniform in the
+    logarithm. Kinds of coordinates are `range`; `choice`, of the object, friction or target from
+    the domain's lists; `shape`, of a prism's corners or of feet; and `noise`, the key of the noise
+    of a trial: worlds close to each other in it have unrelated noise.
 
     Args:
-      domain: ranges of what differs between worlds, or their name, as wide.
-      u: (n, q) in [0, 1), a row a world, a column for each quantity of the domain, in order.
-      robot: by its name, as kairos, or a JSON file's; None: the domain's.
+      domain: ranges of the quantities that differ between worlds, or their name, as wide.
+      u: (n, q) in [0, 1), a row for each world, a column for each coordinate, in order.
+      robot: its name, as kairos, or a JSON file; None: the domain's.
 
     Returns:
       `u` (world, quantity); for each quantity its `low`, `high`, `log`, `unit` and `kind`; and
-      what the worlds have (world), as coordinates.
+      the drawn quantities (world), as coordinates.
 
     Raises:
-      InputError: `u` is not of this domain, or not in [0, 1).
+      InputError: `u` is of another domain, or outside of [0, 1).
 
     Example:
       >>> import numpy as np
@@ -245,50 +256,49 @@ def worlds_at(
       >>> bool((found.mass == drawn.mass).all())
       True
     """
-    domain = named(domain, robot)
-    points = checked(domain, u)
-    every = np.arange(len(points.u))
-    which = domain.object_of(points.cases(domain, every))
-    columns = coordinates(domain, which, partial(points.draw, domain))
+    domain = parse_domain(domain, robot)
+    points = check_points(domain, u)
+    objects = domain.object_of(points.cases(domain, np.arange(len(points.u))))
+    columns = drawn_columns(domain, objects, partial(points.draw, domain))
     return _labelled(domain, points.u).assign_coords(columns)
 
 
-def coordinates(
-    domain: Domain, which: np.ndarray, draw: Callable[[np.ndarray], Draw]
+def drawn_columns(
+    domain: Domain, objects: np.ndarray, draw: Callable[[np.ndarray], Draw]
 ) -> dict[str, Any]:
-    """Objects of worlds, and what was drawn for them, as coordinates.
+    """Return objects and drawn quantities of worlds as coordinates of a dataset.
 
-    `which` (n,) of the domain's objects they have, and `draw` makes some of them, by their rows.
+    `objects` (n,) are positions in the domain's objects; `draw` returns some worlds by their rows.
     """
-    columns: dict[str, Any] = {"object": ("world", np.array(domain.objects)[which])}
-    for thing in np.unique(which):
-        rows = np.flatnonzero(which == thing)
+    columns: dict[str, Any] = {"object": ("world", np.array(domain.objects)[objects])}
+    for chosen in np.unique(objects):
+        rows = np.flatnonzero(objects == chosen)
         for name, (values, unit) in draws.table(draw(rows)).items():
-            empty = ("world", np.empty(which.size), {"units": unit})
+            empty = ("world", np.empty(objects.size), {"units": unit})
             columns.setdefault(name, empty)[1][rows] = values
     return columns
 
 
 def _labelled(domain: Domain, u: np.ndarray) -> xr.Dataset:
-    """Points with the names, ranges, units and kinds of their quantities."""
-    every = quantities(domain)
+    """Return points with the names, ranges, units and kinds of their coordinates."""
+    labels = coordinates(domain)
     columns: dict[str, Any] = {
-        "low": [one.range.low for one in every],
-        "high": [one.range.high for one in every],
-        "log": np.array([one.range.log for one in every], np.int8),
-        "unit": [one.unit for one in every],
-        "kind": [one.kind for one in every],
+        "low": [item.range.low for item in labels],
+        "high": [item.range.high for item in labels],
+        "log": np.array([item.range.log for item in labels], np.int8),
+        "unit": [item.unit for item in labels],
+        "kind": [item.kind for item in labels],
     }
-    coordinates = {name: ("quantity", values) for name, values in columns.items()}
-    coordinates |= {"quantity": [one.name for one in every], "world": np.arange(len(u))}
+    coords = {name: ("quantity", values) for name, values in columns.items()}
+    coords |= {"quantity": [item.name for item in labels], "world": np.arange(len(u))}
     text = {"units": "1", "long_name": "point of the unit cube"}
     return xr.Dataset(
-        {"u": (("world", "quantity"), u, text)}, coordinates, {"domain": json.dumps(asdict(domain))}
+        {"u": (("world", "quantity"), u, text)}, coords, {"domain": json.dumps(asdict(domain))}
     )
 
 
-def _tells(text: Any, domain: Domain) -> bool:
-    """Whether a text is of this domain, maybe written before some quantity could be drawn."""
+def _is_json_of(text: Any, domain: Domain) -> bool:
+    """Whether a text is this domain's JSON, also of a version without some quantities."""
     try:
         return from_json(json.loads(text)) == domain
     except (TypeError, ValueError, AttributeError, RecursionError):

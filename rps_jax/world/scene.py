@@ -1,7 +1,6 @@
-"""Scenes: `mjcf/` -> a MuJoCo model for looking at, and one stripped to the physics for stepping.
+"""Scenes of `mjcf/`: a full MuJoCo model for pictures, and a stripped one for stepping.
 
-The physics model holds the three geoms that touch and nothing else; it is what C MuJoCo and MJX
-both step.
+The stripped model holds only the three geoms that touch. C MuJoCo and MJX both step it.
 """
 
 import math
@@ -24,15 +23,15 @@ from rps_jax.world.physics import PHYSICS, Physics
 
 Side = Literal["near", "far"]
 SIDES = ("near", "far")
-# An inertial frame off by this [m] keeps MuJoCo from compiling centred bodies to a structure of
-# their own, which could not be batched with the others.
+# Offset [m] of inertial frames: without it MuJoCo compiles centred bodies to another structure,
+# which cannot be batched with the rest.
 OFF_CENTRE = 1e-6
 
 
 class Friction(NamedTuple):
     """Coulomb coefficients of the two contacts."""
 
-    ground: Any  # [1] object-ground; a number, or (n,) of many worlds
+    ground: Any  # [1] object-ground; a number, or (n,) of n worlds
     robot: Any  # [1] object-robot
 
 
@@ -40,12 +39,12 @@ FRICTION = {"S1": Friction(0.3, 0.35), "S2": Friction(0.2, 0.5)}  # Table I
 
 
 class Scene(NamedTuple):
-    """One object before the robot."""
+    """Object in front of the robot: models, solid and shell."""
 
     name: str
     family: str
-    model: mujoco.MjModel  # everything, for pictures
-    physics: mujoco.MjModel  # the three geoms that touch, for stepping
+    model: mujoco.MjModel  # full, for pictures
+    physics: mujoco.MjModel  # stripped to the three geoms that touch, for stepping
     solid: Solid  # of the object; leaves without a leading axis
     shell: Shell  # of the robot
 
@@ -63,7 +62,7 @@ class Scene(NamedTuple):
 
 
 class Joints(NamedTuple):
-    """Where the joints are in qpos and qvel; the same in every scene and in both models."""
+    """Slices of the joints in qpos and qvel, equal in all scenes and in both models."""
 
     base: slice = slice(0, 3)  # x, y [m], yaw [rad] in the world
     object: slice = slice(3, 10)  # position [m] and quaternion, scalar first
@@ -73,13 +72,13 @@ JOINTS = Joints()
 
 
 def load(
-    name: str,  # of an object, as `objects.OBJECTS` has them
+    name: str,  # of an object in `objects.OBJECTS`
     physics: Physics = PHYSICS["default"]["standard"],
     friction: Friction = FRICTION["S1"],
     *,
-    rear: Side = "near",  # where the nonuniform box's load stands: "rear left corner", the paper
-    mass: float | None = None,  # [kg], its inertia scaled along; None: the object's own
-    robot: Robot = Robot(),  # contact can slow and stop it, if its force is limited
+    rear: Side = "near",  # side of the nonuniform box's load, the paper's "rear left corner"
+    mass: float | None = None,  # [kg], scales the inertia too; None: the object's own mass
+    robot: Robot = Robot(),  # a body if its force is limited
 ) -> Scene:
     """Compile a scene of an object.
 
@@ -88,7 +87,7 @@ def load(
     """
     errors.check_name("object", name, OBJECTS)
     errors.check_name("rear", rear, SIDES)
-    check(friction, mass)
+    check_contact(friction, mass)
     if name in objects.REGISTERED:
         return _load_registered(name, physics, friction, mass, robot)
     spec = objects.read(path_of(name))
@@ -101,8 +100,8 @@ def load(
         for geom in geoms:
             geom.mass *= mass / total
     model, stripped = _compile(spec, physics, friction, robot)
-    one = _solid_of_model(model, FAMILIES[name])
-    return Scene(name, FAMILIES[name], model, stripped, one, robot.shell)
+    single = _solid_of_model(model, FAMILIES[name])
+    return Scene(name, FAMILIES[name], model, stripped, single, robot.shell)
 
 
 def _solid_of_model(model: mujoco.MjModel, family: str) -> Solid:
@@ -127,50 +126,51 @@ def _load_registered(
     mass: float | None,
     robot: Robot,
 ) -> Scene:
-    """The looks of a registered object, and the solid that stands for it in the physics."""
-    one = objects.REGISTERED[name].solid
+    """Compile the full model of a registered object, and the physics of its solid."""
+    single = objects.REGISTERED[name].solid
     if mass is not None:
-        one = one._replace(mass=np.asarray(mass), inertia=one.inertia * mass / one.mass)
+        inertia = single.inertia * mass / single.mass
+        single = single._replace(mass=np.asarray(mass), inertia=inertia)
     spec = objects.read(path_of(name))
     _set_robot(spec, robot)
-    upright = shaped(FAMILIES[name], one, physics, friction, robot=robot)
+    upright = compile_solid(FAMILIES[name], single, physics, friction, robot=robot)
     return upright._replace(name=name, model=spec.compile())
 
 
-def shaped(
+def compile_solid(
     family: str,
-    one: Solid,
+    single: Solid,
     physics: Physics = PHYSICS["default"]["standard"],
     friction: Friction = FRICTION["S1"],
     *,
     robot: Robot = Robot(),
 ) -> Scene:
-    """Compile a scene with one solid (its leaves without a leading axis) of a shape family."""
+    """Compile a scene with a single solid (leaves without a leading axis) of a shape family."""
     errors.check_name("family", family, SHAPES)
-    check(friction, float(one.mass))
+    check_contact(friction, float(single.mass))
     spec = objects.read(path_of(family))
     body = spec.body("object")
-    body.pos[2] = one.height / 2
+    body.pos[2] = single.height / 2
     for geom in list(body.geoms):
         if not geom.name:
-            spec.delete(geom)  # the looks of the object that gave the family its file
-    for name, size in geom_sizes(family, one).items():
+            spec.delete(geom)  # visual geoms of the object that gave the family its file
+    for name, size in geom_sizes(family, single).items():
         spec.geom(name).size[: size.size] = size
     if family == "prism":
-        _set_corners(spec, one)
-    if one.feet is not None and family == "cylinder":
+        _set_corners(spec, single)
+    if single.feet is not None and family == "cylinder":
         _add_feet(spec)
-    if one.feet is not None or family == "prism":
-        for i, foot in enumerate(feet(one)):
+    if single.feet is not None or family == "prism":
+        for i, foot in enumerate(foot_positions(single)):
             spec.geom(f"foot_{i}").pos = foot
     body.explicitinertial = True
-    body.mass, body.ipos = one.mass, one.p_object_com
-    body.iquat, body.inertia = one.q_object_body, one.inertia
+    body.mass, body.ipos = single.mass, single.p_object_com
+    body.iquat, body.inertia = single.q_object_body, single.inertia
     models = _compile(spec, physics, friction, robot)
-    return Scene(family, family, *models, one, robot.shell)
+    return Scene(family, family, *models, single, robot.shell)
 
 
-def of_solid(
+def compile_row(
     family: str,
     solids: Solid,
     friction: Friction,
@@ -178,38 +178,38 @@ def of_solid(
     i: int,
     robots: Robot | None = None,
 ) -> Scene:
-    """Compile a scene with the i-th of solids (n, ...), friction and robots (n,) each.
+    """Compile a scene with row i of solids (n, ...), friction (n,) and robots (n,).
 
-    Without robots, before an ideal one.
+    Without robots, the robot is ideal.
     """
-    one, pair, robot = jax.tree.map(lambda leaf: leaf[i], (solids, friction, robots))
+    single, pair, robot = jax.tree.map(lambda leaf: leaf[i], (solids, friction, robots))
     friction = Friction(float(pair.ground), float(pair.robot))
-    return shaped(family, one, physics, friction, robot=robot or Robot())
+    return compile_solid(family, single, physics, friction, robot=robot or Robot())
 
 
-def each(robots: Robot, count: int) -> Robot:
-    """One robot, or robots (n,), as robots (count,)."""
+def repeat_robot(robots: Robot, count: int) -> Robot:
+    """Return one robot as robots (count,); robots (n,) are returned unchanged."""
     if np.ndim(robots.mass):
         return robots
     return jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf, float)[None], count, 0), robots)
 
 
 def base_half(robots: Robot, count: int) -> np.ndarray:
-    """Half length and half width (count, 2) [m] of the bases of robots."""
+    """Return half length and half width (count, 2) [m] of the bases of robots."""
     half = np.stack([robots.half_length, robots.half_width], axis=-1)
     return np.broadcast_to(np.asarray(half, float), (count, 2))
 
 
 def base_invweight(robots: Robot) -> np.ndarray:
-    """MuJoCo's weight [1/kg] in a contact of bases that can be slowed.
+    """Return MuJoCo's inverse weight [1/kg] in a contact of bases with a limited force.
 
-    It is the mean over x, y and z of what a force of 1 N changes; along z the base does not move.
+    It is the mean over x, y and z of the acceleration by a force of 1 N; along z the base is fixed.
     """
     return 2 / (3 * np.asarray(robots.mass, float))
 
 
 def geom_sizes(family: str, solids: Solid) -> dict[str, np.ndarray]:
-    """Sizes (..., 3) [m], as MuJoCo means them, of the geoms of solids (...)."""
+    """Return MuJoCo's sizes (..., 3) [m] of the geoms of solids (...), by name."""
     half = solids.height / 2
     if family == "box":
         corner = solids.vertices[..., 0, :]
@@ -217,34 +217,34 @@ def geom_sizes(family: str, solids: Solid) -> dict[str, np.ndarray]:
     if family == "cylinder":
         size = np.stack([solids.radius, half, np.zeros_like(half)], axis=-1)
         return {"object": size, "object_side": size}
-    return {}  # of a mesh and points
+    return {}  # a prism is a mesh and points
 
 
-def _set_corners(spec: mujoco.MjSpec, one: Solid) -> None:
-    """Give the mesh of a prism its corners."""
-    real = np.any(one.vertices != np.roll(one.vertices, 1, axis=0), axis=1)
-    half = one.height / 2
+def _set_corners(spec: mujoco.MjSpec, single: Solid) -> None:
+    """Set the corners of the mesh of a prism."""
+    distinct = np.any(single.vertices != np.roll(single.vertices, 1, axis=0), axis=1)
+    corners, half = single.vertices[distinct], single.height / 2
     spec.mesh("prism").uservert = np.concatenate(
-        [np.column_stack([one.vertices[real], np.full(real.sum(), z)]) for z in (-half, half)]
+        [np.column_stack([corners, np.full(len(corners), z)]) for z in (-half, half)]
     ).ravel()
 
 
 def _add_feet(spec: mujoco.MjSpec) -> None:
-    """Give a cylinder feet as a prism has them, and let these alone touch the ground."""
-    usual = spec.find_default("ground_object")
+    """Add the feet of a prism to a cylinder; only these touch the ground."""
+    default = spec.find_default("ground_object")
     spec.delete(spec.pair("ground_object"))
     for i in range(solid.SIDES):
         spec.body("object").add_geom(
             name=f"foot_{i}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-6, 0, 0], mass=0, group=3
         )
         pair = {"geomname1": "ground", "geomname2": f"foot_{i}"}
-        spec.add_pair(usual, name=f"ground_object_{i}", **pair)
+        spec.add_pair(default, name=f"ground_object_{i}", **pair)
 
 
-def feet(solids: Solid) -> np.ndarray:
-    """Where solids (...) on corners or feet stand, (..., N, 3) [m]; what is no foot is at the top.
+def foot_positions(solids: Solid) -> np.ndarray:
+    """Return the support points (..., N, 3) [m] of solids (...); unused points are at the top.
 
-    Feet of their own count alike here, whatever their weight.
+    The weights of feet are ignored.
     """
     at = solids.vertices
     unused = np.all(at == np.roll(at, 1, axis=-2), axis=-1)
@@ -260,7 +260,7 @@ def _compile(
     friction: Friction,
     robot: Robot,
 ) -> tuple[mujoco.MjModel, mujoco.MjModel]:
-    """The model for looking at, and the one stripped to the physics."""
+    """Compile the full model and the stripped one."""
     _set_robot(spec, robot)
     for pair in spec.pairs:
         if pair.name == "base_object":
@@ -276,8 +276,8 @@ def _compile(
     return model, _strip(spec, model)
 
 
-def check(friction: Friction, mass: float | None) -> None:
-    """Raises InputError unless friction and mass are positive and finite, as MuJoCo does not."""
+def check_contact(friction: Friction, mass: float | None) -> None:
+    """Raise InputError unless friction and mass are positive and finite."""
     for side, value in friction._asdict().items():
         errors.check_finite(f"friction {side}", value, above=0, at_most=10)
     if mass is not None:
@@ -285,7 +285,7 @@ def check(friction: Friction, mass: float | None) -> None:
 
 
 def check_target(p_world_target: tuple[float, float], shell: Shell = Shell()) -> None:
-    """Raises InputError for a target [m] that is under the robot, or out of the world."""
+    """Raise InputError for a target [m] under the robot or more than 50 m away."""
     x, y = (
         errors.check_finite(f"target {axis}", value, at_least=-50, at_most=50, unit="m")
         for axis, value in zip("xy", p_world_target, strict=True)
@@ -299,7 +299,7 @@ def check_target(p_world_target: tuple[float, float], shell: Shell = Shell()) ->
 
 
 def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
-    """Give the base its size and, if its force is limited, a mass that contact can move."""
+    """Set the size of the base and, if its force is limited, its mass."""
     x, y = (float(half) for half in robot.shell.half)
     spec.geom("base").size[:2] = x, y
     spec.geom("skin_front").pos[0] = x
@@ -317,13 +317,13 @@ def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
 
 
 def _strip(spec: mujoco.MjSpec, full: mujoco.MjModel) -> mujoco.MjModel:
-    """Only what touches: the geoms of the contact pairs, with each body's whole inertia."""
+    """Compile a model of the geoms that touch, with the full inertia of each body."""
     spec = spec.copy()
     spec.modelname = "physics"
-    spec.stat.meanmass, spec.stat.meansize = 1.0, 1.0  # unused, and so the same for all
+    spec.stat.meanmass, spec.stat.meansize = 1.0, 1.0  # unused, but must be equal in a batch
     spec.delete(spec.body("target"))
     touching = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
-    touching.add("object")  # of which the solid is read, though it stand on feet
+    touching.add("object")  # also if the object stands on feet: engines read its size
     for geom in list(spec.geoms):
         if geom.name not in touching:
             spec.delete(geom)
@@ -337,21 +337,21 @@ def _strip(spec: mujoco.MjSpec, full: mujoco.MjModel) -> mujoco.MjModel:
         body.iquat = compiled.iquat
         body.inertia = compiled.inertia
     model = spec.compile()
-    model.body_sameframe[:] = 0  # likewise: always the general formula for the inertial frame
+    model.body_sameframe[:] = 0  # the general formula for the inertial frame, for all bodies
     return model
 
 
 def solid_of(scene: Scene) -> Solid:
     """Return the object of a scene as solids (1, ...), rounded as in published random worlds."""
-    one = scene.rounded_solid
-    one = one._replace(p_object_com=(one.p_object_com + OFF_CENTRE) - OFF_CENTRE)
-    return jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], one)
+    single = scene.rounded_solid
+    single = single._replace(p_object_com=(single.p_object_com + OFF_CENTRE) - OFF_CENTRE)
+    return jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], single)
 
 
 def initial_qpos(scene: Scene, gap: float = 0.02, yaw: float = 0.0) -> np.ndarray:
-    """Base at the origin, object `gap` [m] in front of the middle of its front face: (10,).
+    """Return positions (10,): base at the origin, object `gap` [m] before its front face.
 
-    `yaw` [rad] turns the object.
+    `yaw` [rad] is the heading of the object.
     """
     x, y = np.asarray(scene.footprint.vertices).T
     reach = np.max(math.sin(yaw) * y - math.cos(yaw) * x) + float(scene.footprint.radius)

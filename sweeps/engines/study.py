@@ -92,7 +92,7 @@ class Engines(TrialStudy[xr.DataTree]):
     @cached_property
     def plans(self) -> dict[str, Plan]:
         """What is run, by the engine's name."""
-        ranges = domains.named(self.domain)
+        ranges = domains.parse_domain(self.domain)
         ranges = replace(ranges, objects=self.objects or ranges.objects)
         label, params = registry.resolve_law(self.law)
         low, high, log = ranges.gap

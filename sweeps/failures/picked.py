@@ -26,7 +26,7 @@ def chosen(
       count: how many.
       first: indices that come in anyway.
     """
-    kinds = np.array([one.kind for one in points.quantities(domain)])
+    kinds = np.array([one.kind for one in points.coordinates(domain)])
     features = np.concatenate(
         [u[:, (kinds == "range") | (kinds == "choice")], 2 * np.minimum(severity, 2).T], axis=1
     )

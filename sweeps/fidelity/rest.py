@@ -59,7 +59,7 @@ class Rest(Study[xr.Dataset]):
         found, done = [], 0
         for i, name in enumerate(DOMAINS):
             for step in STEPS:
-                make = partial(self._moved, domains.named(name), STEPS[step])
+                make = partial(self._moved, domains.parse_domain(name), STEPS[step])
                 part = run.checkpoint(f"{i}-{STEPS[step].timestep:g}", make)
                 found.append(part.expand_dims(domain=[name], step=[step]))
                 done += self.worlds

@@ -24,7 +24,7 @@ from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import paper
-from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
+from rps_jax.world.physics import MUJOCO_GROUND, Physics, preset
 from sweeps.conditions import Condition, Grid, run_conditions
 from sweeps.study_base import TrialStudy
 
@@ -64,7 +64,7 @@ IN_FUSED = {
     "fused_5ms": _fused("fused, 5 ms", timestep=0.005),
     "impratio_1": _fused("fused, impratio 1", impratio=1.0),
     "impratio_100": _fused("fused, impratio 100", impratio=100.0),
-    "mujocos_ground": _fused("fused, MuJoCo's own ground contact", **MUJOCOS_GROUND),
+    "mujocos_ground": _fused("fused, MuJoCo's own ground contact", **MUJOCO_GROUND),
     "soft": _fused("fused, skin contact 60 ms (solref)", base_solref=(0.06, 1.0)),
     "pyramid": _condition("fused", preset("paper_gazebo"), "fused, friction pyramid, 1 ms"),
     "period_5ms": _fused("fused, control period 5 ms", control_period=0.005, timestep=0.005),

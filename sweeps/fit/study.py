@@ -41,7 +41,7 @@ KINDS: dict[str, tuple[str, ...]] = {  # of logs: what they have beside touch, o
 }
 FOUR = "touch, four logs"  # of one world, to four targets
 _LAWS = ("rps", "rps_plus")
-_TASK = (*domains.of("task"), "key_0", "key_1")
+_TASK = (*domains.quantities_of("task"), "key_0", "key_1")
 
 
 @dataclass(frozen=True)
@@ -134,10 +134,10 @@ class Coverage(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dat
             for more in range(3):
                 for thing in np.unique(which):
                     rows = index[which == thing]
-                    numbers = draws.numbers_of(seed, rows)
-                    other = draws.numbers_of(seed, rows + (more + 1) * 1_000_000)
+                    numbers = draws.random_numbers(seed, rows)
+                    other = draws.random_numbers(seed, rows + (more + 1) * 1_000_000)
                     numbers[:, fresh] = other[:, fresh]
-                    seen, _ = self.bank.statistics(draws.drawn_at(self.ranges, rows, numbers))
+                    seen, _ = self.bank.statistics(draws.draw_at(self.ranges, rows, numbers))
                     found[rows, more] = fit.matrix(seen, names)
             return xr.Dataset({"statistics": (("log", "more", "statistic"), found)})
 

@@ -156,7 +156,7 @@ gradients = call_of(Gradients)
 
 def _stage_and_worlds(study: Gradients, engine: EngineName, split: Split, count: int) -> Any:
     """What worlds share in their engine, the first worlds (count, ...) of a split, and physics."""
-    alone = replace(domains.named(study.domain), objects=(study.object,))
+    alone = replace(domains.parse_domain(study.domain), objects=(study.object,))
     setting = Setting(engine=engine)
     drawn = draws.draw(alone, seed_of(study.seed, split), np.arange(count))
     part = drawn_worlds(alone, drawn, setting)

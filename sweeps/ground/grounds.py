@@ -14,7 +14,7 @@ import xarray as xr
 from rps_jax.errors import InputError
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
-from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
+from rps_jax.world.physics import MUJOCO_GROUND, Physics, preset
 from rps_jax.world.scene import FRICTION
 from sweeps.ground import pushes
 from sweeps.ground.pushes import DISTANCE, OFFSETS, SPEEDS, STEPS, Pushes
@@ -42,7 +42,7 @@ def _on(base: Physics, what: str, speeds: tuple[float, ...] = SPEEDS, **changes:
 
 
 _C = preset(fidelity="reference")
-_OWN = replace(_C, **MUJOCOS_GROUND)
+_OWN = replace(_C, **MUJOCO_GROUND)
 # In C MuJoCo, converged, in steps of 1 ms.
 CONVERGED = {
     "ours": _on(_C, "ours, 1 ms", (0.002, *SPEEDS)),

@@ -88,7 +88,7 @@ def things() -> dict[str, Thing]:
 def scene_of(thing: Thing, physics: Physics, friction: Friction = FRICTION["S1"]) -> Scene:
     """The scene that pushes of an object are stepped in."""
     one = jax.tree.map(lambda leaf: leaf[0], thing.solid)
-    return scene.shaped(thing.family, one, physics, friction)
+    return scene.compile_solid(thing.family, one, physics, friction)
 
 
 def start_of(thing: Thing, offset: float) -> np.ndarray:

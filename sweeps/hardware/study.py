@@ -68,7 +68,7 @@ class Reproduce(TrialStudy[xr.Dataset]):
     @cached_property
     def ranges(self) -> Domain:
         """Domain with the paper's targets."""
-        return replace(domains.named(self.domain), targets=paper.HARDWARE_LAYOUTS["circle"])
+        return replace(domains.parse_domain(self.domain), targets=paper.HARDWARE_LAYOUTS["circle"])
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -90,7 +90,7 @@ class Reproduce(TrialStudy[xr.Dataset]):
                 rows = slice(None) if name in _BY_OBJECT else slice(1)
                 u[..., i] = u[:, rows, :1, i]
         label, params = registry.resolve_law(self.law)
-        at = points.checked(self.ranges, u.reshape(-1, len(names)))
+        at = points.check_points(self.ranges, u.reshape(-1, len(names)))
         return Plan(self.ranges, len(at.u), {label: params}, self.setting, 256, at)
 
     def check(self) -> None:

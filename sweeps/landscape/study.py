@@ -58,7 +58,7 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
         """The worlds."""
         one = isinstance(self.domain, str | Domain)
         several: list[Any] = [self.domain] if one else list(self.domain)
-        return Problem(tuple(domains.named(x) for x in several), setting=self.setting)
+        return Problem(tuple(domains.parse_domain(x) for x in several), setting=self.setting)
 
     def check(self) -> None:
         """Check that the laws are RPS with parameters."""

@@ -70,7 +70,7 @@ class SB3(Study[xr.Dataset]):
 
     def check(self) -> None:
         """Check the domain, and that the libraries are there."""
-        domains.named(self.domain)
+        domains.parse_domain(self.domain)
         for name in ("gymnasium", "stable_baselines3"):
             if not importlib.util.find_spec(name):
                 raise errors.InputError(

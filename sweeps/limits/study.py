@@ -36,7 +36,7 @@ from rps_jax.trials.case import Case
 from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
-from rps_jax.world.domain import Domain, DomainLike, Range, named
+from rps_jax.world.domain import Domain, DomainLike, Range, parse_domain
 
 LOSSES = (0.01, 0.10)  # [1] of success, whose limits are looked for
 _RESAMPLES = 200  # of a bootstrap
@@ -123,7 +123,7 @@ class Limits(MultiLawQuestion[xr.DataTree]):
         errors.check_each_once("limits", self.limits)
         for name in self.limits:
             errors.check_name("limit", name, LIMITS)
-        self._sweep("ideal", named(self.domain)).check()
+        self._sweep("ideal", parse_domain(self.domain)).check()
 
     def num_trials(self) -> int | None:
         """How many trials there are."""
@@ -149,7 +149,7 @@ class Limits(MultiLawQuestion[xr.DataTree]):
 
     def answer(self, run: Run) -> xr.DataTree:
         """Sweep with the ideal base and with every robot."""
-        base, heard = named(self.domain), SequentialProgress(run.callback)
+        base, heard = parse_domain(self.domain), SequentialProgress(run.callback)
         shape = run._replace(callback=heard).batch_options
 
         def sweep(part: str, ranges: Domain, robot: Robot | None = None) -> xr.Dataset:

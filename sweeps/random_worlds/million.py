@@ -63,7 +63,7 @@ class Million(TrialStudy[xr.Dataset]):
     def check(self) -> None:
         """Check that the laws and the domain exist."""
         registry.resolve_laws(self.laws)
-        domains.named(self.domain)
+        domains.parse_domain(self.domain)
 
     def num_trials(self) -> int | None:
         """Return the number of trials."""
@@ -80,7 +80,7 @@ class Million(TrialStudy[xr.Dataset]):
         results = xr.concat(laws, xr.IndexVariable("law", list(self.laws)))
         for name, long_name in _LONG_NAMES.items():
             results[name].attrs["long_name"] = long_name
-        ranges, seed = domains.named(self.domain), self.test_setting.seed
+        ranges, seed = domains.parse_domain(self.domain), self.test_setting.seed
         results.attrs = {
             "domain": self.domain,
             "seed": seed,
@@ -102,7 +102,7 @@ class Million(TrialStudy[xr.Dataset]):
     def _outcomes(self, law: str, run: Run) -> xr.Dataset:
         """Return the outcomes of one law in compact types."""
         laws = registry.resolve_laws([law])
-        plan = Plan(domains.named(self.domain), self.worlds, laws, self.test_setting, 16_384)
+        plan = Plan(domains.parse_domain(self.domain), self.worlds, laws, self.test_setting, 16_384)
         folder = None if run.folder is None else run.folder / f"sweep_{law}"
         outcomes = execution.run_plan(plan, folder, **run.batch_options).isel(law=0)
         how = 1 + statistics.failure_modes(outcomes, float(self.setting.rules.max_lost))

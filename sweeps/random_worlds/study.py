@@ -63,7 +63,7 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
         """Check that the laws and the domains exist."""
         registry.resolve_laws(self.laws)
         for name in self.domains:
-            domains.named(name)
+            domains.parse_domain(name)
 
     def configuration(self) -> dict[str, Any]:
         """Return the options as JSON; the names of the parts have domain, model and size."""
@@ -101,7 +101,7 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
     def plans(self, name: str) -> dict[str, Plan]:
         """Return the plan of each model in a domain, the default model first."""
         laws = registry.resolve_laws(self.laws)
-        plan = Plan(domains.named(name), self.worlds, laws, self.setting, 4096)
+        plan = Plan(domains.parse_domain(name), self.worlds, laws, self.setting, 4096)
         plans = {model_panel.OWN: plan}
         if self.panel:
             small = replace(plan, worlds=min(self.panel, self.worlds))

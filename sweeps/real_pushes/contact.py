@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 import pandas as pd
 
-from rps_jax.world.physics import MUJOCOS_GROUND, Physics, preset
+from rps_jax.world.physics import MUJOCO_GROUND, Physics, preset
 from sweeps.real_pushes import pushes
 from sweeps.real_pushes.sliding import turned
 
@@ -36,7 +36,7 @@ class Kind:
 
 
 _OURS = preset("default", "reference")  # converged, in steps of 1 ms
-_MUJOCOS = replace(_OURS, **MUJOCOS_GROUND)
+_MUJOCOS = replace(_OURS, **MUJOCO_GROUND)
 _LIGHT = replace(_OURS, ground_solref=(0.1, 0.2), ground_impedance=0.3)
 _DEFAULT = replace(_MUJOCOS, cone="pyramidal", impratio=1.0, base_solref=(0.02, 1.0))
 KINDS = {

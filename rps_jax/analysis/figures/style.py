@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from rps_jax.analysis import statistics
 from rps_jax.robot import shell
-from rps_jax.world.domain import WORDS
+from rps_jax.world.domain import LABELS
 
 OBJECT_COLOURS = {"box": "C0", "cylinder": "C1", "nonuniform_box": "C2"}
 OBJECT_COLOURS |= {"hardware_box": "C0", "hardware_cylinder": "C1"}
@@ -32,7 +32,7 @@ def words(name: str) -> str:
 
 def quantity(name: str) -> str:
     """Return the words for a drawn quantity."""
-    return WORDS.get(name) or words(name)
+    return LABELS.get(name) or words(name)
 
 
 def tiles(

@@ -8,7 +8,7 @@ import xarray as xr
 from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import Figure, success_rates, tiles
 from rps_jax.analysis.statistics import Influence
-from rps_jax.world.domain import WORDS
+from rps_jax.world.domain import LABELS
 
 
 def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
@@ -32,7 +32,7 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
             bins = statistics.bins(values.values, results.success.sel(law=law).values > 0)
             success_rates(ax, *bins, color=f"C{i}", label=law, curve=i)
         unit = f" [{values.attrs['units']}]".removesuffix(" [1]")
-        ax.set_xlabel(f"{WORDS[influence.name]}{unit}", fontsize=9)
+        ax.set_xlabel(f"{LABELS[influence.name]}{unit}", fontsize=9)
         chance = " (may be chance)" * _is_flat(influence)
         ax.set_title(f"spread {_spread(influence)}, q = {influence.q:.1g}{chance}", fontsize=8)
         ax.grid(alpha=0.3)
@@ -70,5 +70,5 @@ def _spread(influence: Influence) -> str:
 
 def _names(influences: Sequence[Influence], *, spread: bool = False) -> str:
     """Return the quantities in words without line breaks."""
-    names = (WORDS[x.name] + f" ({_spread(x)})" * spread for x in influences)
+    names = (LABELS[x.name] + f" ({_spread(x)})" * spread for x in influences)
     return ", ".join(name.replace(" ", "\N{NO-BREAK SPACE}") for name in names)

@@ -146,7 +146,7 @@ def carry_out(question: Any, beside: Beside) -> None:
         bar.on_compiled = _import_ahead
         found = asked.execute(bar)
         timed = bar.timing.simulated > 0 and bar.over != "clock"
-        spent = timing_line(bar.timing, device.kind()) if timed else ""
+        spent = timing_line(bar.timing, device.device_name()) if timed else ""
         if isinstance(found, Path):
             print(f"{asked.name}: {found}")
             return
