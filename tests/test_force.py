@@ -16,7 +16,7 @@ from rps_jax.control.observation import Twist
 from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
-from rps_jax.robot.base import LoadCell, unloaded
+from rps_jax.robot.base import LoadCell, init_load
 from rps_jax.robot.robot import Robot
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.pushes import Case
@@ -124,7 +124,7 @@ def test_who_does_not_ask_is_told_no_force():
 
 
 def told(cell, forces, period=0.02):
-    key, load = jnp.array([1, 2], jnp.uint32), unloaded(jnp.zeros(1))
+    key, load = jnp.array([1, 2], jnp.uint32), init_load(jnp.zeros(1))
     seen = []
     for i, force in enumerate(forces):
         load = load._replace(wrench=jnp.array([*force, 0.0]))

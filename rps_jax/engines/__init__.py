@@ -1,6 +1,6 @@
-"""How worlds are stepped. Each engine is one object, `ENGINE` of the module of its name.
+"""Engines, which step worlds. Each is one object, `ENGINE` of the module of its name.
 
-A new engine is one file beside these and one line below.
+A new engine is one file in this folder and one line below.
 """
 
 from __future__ import annotations
@@ -23,10 +23,6 @@ ENGINES: tuple[EngineName, ...] = get_args(EngineName)
 
 
 def get(name: str) -> Engine:
-    """The engine of a name.
-
-    Raises:
-      InputError: no engine has this name.
-    """
+    """Return the engine of a name, or raise InputError."""
     errors.check_name("engine", name, ENGINES)
     return importlib.import_module(f"{__name__}.{name}").ENGINE

@@ -1,8 +1,8 @@
-"""What an engine is: how it checks, stages and drives worlds, and its abilities.
+"""Base class of engines: checks, staging and driving of worlds, and abilities.
 
-An engine's stage is what all worlds of a batch share; its fields are what each world has of its
-own, rows of a pytree. Most engines are traced by JAX: their stage drives a batch inside a compiled
-program. One that is not (`traced = False`) steps worlds on the host, by `stepper`.
+All worlds of a batch share the engine's stage; each world has a row of its fields, a pytree. JAX
+traces most engines: their stage drives a batch in a compiled program. An engine that JAX does not
+trace (`traced = False`) steps worlds on the host, by its `stepper`.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ Mode = Literal["forward", "reverse"]  # of differentiation
 
 
 class Motion(NamedTuple):
-    """Where the bodies of a batch of worlds are, and how they move."""
+    """Positions and velocities of the bodies of a batch of worlds."""
 
     # In the world: base x, y [m], yaw [rad]; object position [m] and quaternion, scalar first.
     qpos: Float[Any, "*B 10"]
     # Of these [m/s, rad/s]; the object's angular velocity is in its own frame.
     qvel: Float[Any, "*B 9"]
     warmstart: Float[Any, "*B 9"]  # [m/s^2, rad/s^2] last accelerations, for a solver
-    integral: Any = None  # (B, 3) [N, N, N m] of the drive of a base whose force is limited
+    integral: Float[Any, "*B 3"] | None = None  # [N, N, N m] of the drive, if its force is limited
 
 
 @partial(
@@ -58,14 +58,14 @@ class Driven(NamedTuple):
     """A batch after one control period."""
 
     motion: Motion
-    # (B, 3) [N, N, N m] what the object does to the base, about the base's origin and in its frame,
-    # the mean over the physics steps of the period; None: nobody asked.
-    force: Any = None
+    # [N, N, N m] wrench of the object on the base, about the base's origin and in its frame; mean
+    # over the physics steps of the period; None: not requested.
+    force: Float[Any, "*B 3"] | None = None
 
 
 @runtime_checkable
 class Stage(Protocol):
-    """What all worlds of a batch share, and how they are stepped together."""
+    """Shared part of all worlds of a batch, with the function that steps them."""
 
     def drive(self, fields: Any, motion: Motion, period: ControlPeriod) -> Driven:
         """Step a batch of worlds with these fields (B, ...) for one control period.
@@ -77,40 +77,40 @@ class Stage(Protocol):
 
 
 class Stepper(Protocol):
-    """Worlds that are stepped on the host; its arrays can be written to."""
+    """Worlds that are stepped on the host; its arrays are writable."""
 
-    qpos: Float[np.ndarray, "n 10"]  # as in `Motion`
+    qpos: Float[np.ndarray, "n 10"]  # see `Motion`
     qvel: Float[np.ndarray, "n 9"]
     warmstart: Float[np.ndarray, "n 9"]
     integral: Float[np.ndarray, "n 3"] | None
-    force: Float[np.ndarray, "n 3"]  # of the last period, as in `Driven`
+    force: Float[np.ndarray, "n 3"]  # of the last period, see `Driven`
 
-    def drive(self, which: np.ndarray, twist: np.ndarray, substeps: int) -> None:
-        """Step the worlds `which` (m,) with the base held at `twist` (m, 3) in its own frame.
+    def drive(self, rows: np.ndarray, twist: np.ndarray, substeps: int) -> None:
+        """Step the worlds `rows` (m,) with their bases at `twist` (m, 3), in the base's frame.
 
-        Or pushed towards it, if there is a robot whose force is limited.
+        A base with a limited force is pushed towards its twist.
         """
         ...
 
     def close(self) -> None:
-        """End the threads of the stepper."""
+        """Stop the threads of the stepper."""
         ...
 
 
 class Engine(abc.ABC):
-    """A way to step worlds; its subclasses say what it knows and what suits it."""
+    """Base class of engines; class variables declare their abilities."""
 
     name: ClassVar[str]
-    cones: ClassVar[tuple[str, ...]] = ("elliptic", "pyramidal")  # the friction that it knows
-    traced: ClassVar[bool] = True  # JAX steps it: its trials can be viewed, and learned in
+    cones: ClassVar[tuple[str, ...]] = ("elliptic", "pyramidal")  # supported friction cones
+    traced: ClassVar[bool] = True  # JAX traces its steps: trials can be viewed and learned in
     side_by_side: ClassVar[bool] = False  # batches of several families fit one program of a GPU
-    modes: ClassVar[tuple[Mode, ...]] = ()  # in which it can be differentiated
-    newton: ClassVar[bool] = True  # it solves as `Physics` says: by so many iterations
-    forces: ClassVar[bool] = True  # a contact can slow and stop the base
-    computes_force: ClassVar[bool] = True  # it tells the force of a contact
+    modes: ClassVar[tuple[Mode, ...]] = ()  # supported modes of differentiation
+    newton: ClassVar[bool] = True  # its solver uses the iterations of `Physics`
+    forces: ClassVar[bool] = True  # contact can slow and stop a base with a limited force
+    computes_force: ClassVar[bool] = True  # it computes the force of a contact
 
     def check_physics(self, physics: Physics) -> None:
-        """Raises InputError unless the engine knows such physics."""
+        """Raise InputError unless the engine supports the physics."""
         if physics.cone not in self.cones:
             raise errors.InputError(
                 f"cone = {physics.cone} is not allowed with the engine {self.name}: it must be "
@@ -118,7 +118,7 @@ class Engine(abc.ABC):
             )
 
     def check_robot(self, robot: Robot) -> None:
-        """Raises InputError unless the engine can step such a base."""
+        """Raise InputError unless the engine can step the base of the robot."""
         if robot.driven and not self.forces:
             raise errors.InputError(
                 f"engine = {self.name} is not allowed for a robot with a limited force: its base "
@@ -126,7 +126,7 @@ class Engine(abc.ABC):
             )
 
     def check_senses(self, senses: str) -> None:
-        """Raises InputError unless the engine tells what a law senses."""
+        """Raise InputError unless the engine computes the quantities that a law senses."""
         if senses == "force" and not self.computes_force:
             raise errors.InputError(
                 f"engine = {self.name} is not allowed for a law that senses the contact's "
@@ -134,19 +134,20 @@ class Engine(abc.ABC):
             )
 
     def check_traced(self) -> None:
-        """Raises InputError unless JAX traces its steps."""
+        """Raise InputError unless JAX traces the steps."""
         if not self.traced:
             raise errors.InputError(
-                f"engine = {self.name} is not allowed: JAX must trace it, as fused, mjx or "
+                f"engine = {self.name} is not allowed: JAX must trace it; choose fused, mjx or "
                 "quasistatic."
             )
 
     def check_derivatives(self, mode: Mode, physics: Physics) -> None:
-        """Raises InputError unless a trial can be differentiated in this mode."""
+        """Raise InputError unless a trial can be differentiated in this mode."""
         if mode not in self.modes:
-            known = f"it knows {' and '.join(self.modes)} mode" if self.modes else "it knows none"
+            known = " and ".join(self.modes) or "no"
             raise errors.InputError(
-                f"engine = {self.name} is not allowed in {mode}-mode differentiation: {known}."
+                f"engine = {self.name} is not allowed in {mode}-mode differentiation: it supports "
+                f"{known} mode."
             )
 
     @abc.abstractmethod
@@ -160,35 +161,35 @@ class Engine(abc.ABC):
     ) -> tuple[Any, Any]:
         """Return the stage, and fields (n, ...) on the host, of worlds of one shape family.
 
-        Their solids are (n, ...), their friction and robots (n,). What MuJoCo would derive in
-        compiling each of them is computed here, for all at once.
+        Solids are (n, ...), friction and robots (n,). The constants that MuJoCo derives when it
+        compiles a model are computed for all worlds at once.
         """
 
     def slots(self, backend: str) -> int:
-        """Worlds that one worker steps at once on a device of this kind."""
+        """Return the number of worlds that one worker steps at once on a backend."""
         return 64 if backend == "cpu" else 65536
 
     def workers(self, backend: str) -> int:
-        """Host threads that each drive a batch of their own.
+        """Return the number of host threads, each of which drives one batch.
 
-        A processor gets one for each core, since XLA steps a small batch on one core.
+        There is one for each processor, since XLA steps a small batch on one processor.
         """
         return device.count_processors() if backend == "cpu" else 1
 
     def suits_processors(self, trials: int | None) -> bool:
-        """Whether processors end so many trials sooner than a GPU; None: nobody knows how many."""
+        """Whether processors finish this number of trials sooner than a GPU; None: unknown."""
         return False
 
     def levers(self, family: str) -> dict[str, Callable[[Any], Any]]:
-        """Changes of the stage that are worth timing, by name: see `sweeps/levers`."""
+        """Return changes of the stage to be timed, by name: see `sweeps/levers`."""
         return {}
 
     def contacts(self, stage: Any, corners: int) -> int:
-        """Points of contact that a program looks into, in a world of an object with `corners`."""
+        """Return the number of candidate contacts in a world of an object with `corners`."""
         return 3 + 2 if corners == 1 else corners + 4
 
     def stepper(
         self, stage: Any, qpos: np.ndarray, threads: int, robots: Robot | None = None
     ) -> Stepper:
-        """Worlds on the host, at rest at positions (n, 10), of an engine that is not traced."""
+        """Return worlds on the host at rest at positions (n, 10), if the engine is not traced."""
         raise NotImplementedError(f"{self.name} is traced")

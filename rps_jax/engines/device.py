@@ -17,11 +17,11 @@ Device = Literal["auto", "cpu", "gpu", "xla"]
 
 
 def configure_xla() -> None:
-    """Ask XLA for sums in a fixed order, and to take a GPU's memory as it is needed.
+    """Set flags of XLA: deterministic sums, no preallocation of GPU memory, no fused multiply-add.
 
-    The same command must give the same results. To take most of the memory at once takes a second.
-    From JAX 0.12 on it multiplies and adds in one step in the body of a vectorised loop, but not in
-    its remainder, so that bits would depend on a trial's slot: AVX has no such instruction.
+    Deterministic sums make commands repeatable. Preallocation takes a second. From JAX 0.12 on, XLA
+    fuses multiply-add in the body of a vectorised loop but not in its remainder, so that bits would
+    depend on a trial's slot; AVX has no such instruction.
     """
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     flags = {"--xla_gpu_deterministic_ops": "true"}
@@ -29,45 +29,45 @@ def configure_xla() -> None:
     if release >= (0, 12) and platform.machine().lower() in ("x86_64", "amd64"):
         flags["--xla_cpu_max_isa"] = "AVX"
     for flag, value in flags.items():
-        if flag not in (before := os.environ.get("XLA_FLAGS", "")):
-            os.environ["XLA_FLAGS"] = f"{before} {flag}={value}".strip()
+        if flag not in (flags_before := os.environ.get("XLA_FLAGS", "")):
+            os.environ["XLA_FLAGS"] = f"{flags_before} {flag}={value}".strip()
 
 
 def device_name() -> str:
-    """What JAX computes on, in words."""
+    """Return the name of the device on which JAX computes."""
     import jax
 
     return jax.devices()[0].device_kind
 
 
 def choose(name: Device) -> None:
-    """Have JAX use this kind of device; `xla` is the processor without the C compiler.
+    """Make JAX use a kind of device; `xla` is the processor without the C compiler.
 
     Raises:
-      InputError: there is no such device.
+      InputError: the device is not available.
     """
     import jax
 
     if name == "auto":
         try:
             jax.devices()
-        except (RuntimeError, AssertionError) as error:  # whichever JAX raises
-            asked = jax.config.jax_platforms
+        except (RuntimeError, AssertionError) as error:  # JAX raises either
             raise InputError(
-                f"JAX_PLATFORMS = {asked} is not there: name a device that is, or none."
+                f"JAX_PLATFORMS = {jax.config.jax_platforms} is not available: name an available "
+                "device, or none."
             ) from error
         return
-    before = jax.config.jax_platforms
+    platforms = jax.config.jax_platforms
     jax.config.update("jax_platforms", "cuda" if name == "gpu" else "cpu")
-    with contextlib.suppress(RuntimeError, AssertionError):  # whichever JAX raises
+    with contextlib.suppress(RuntimeError, AssertionError):  # JAX raises either
         if jax.default_backend() == ("cpu" if name == "xla" else name):
             if name == "xla":
                 os.environ["RPS_COMPILER"] = "none"
             return
-    jax.config.update("jax_platforms", before)
+    jax.config.update("jax_platforms", platforms)
     raise InputError(
-        f"device = {name} is not there: install rps_jax[cuda] on a machine with an NVIDIA GPU, or "
-        "choose cpu."
+        f"device = {name} is not available: install rps_jax[cuda] on a machine with an NVIDIA GPU, "
+        "or choose cpu."
     )
 
 

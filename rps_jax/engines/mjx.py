@@ -1,7 +1,7 @@
-"""MuJoCo MJX: MuJoCo's own equations, written in JAX, for any scene.
+"""The engine MJX: MuJoCo's equations in JAX, for any scene.
 
-All objects of one shape family compile to the same MJX structure, so that they can be batched in
-one program: `stack` collects the fields in which they differ, `apply` puts one world's in place.
+All objects of one shape family compile to the same MJX structure, so that one program steps a
+batch of them: `stack` collects the fields that differ, `apply` sets those of one world.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rps_jax.control.observation import Twist
 from rps_jax.engines.base import ControlPeriod, Driven, Engine, Mode, Motion
 from rps_jax.engines.mjx_colliders import (
     BASE_PRISM,
-    OWN,
+    COLLIDERS,
     GeomType,
     Pair,
     collision,
@@ -39,7 +39,7 @@ from rps_jax.world import scene
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, OFF_CENTRE, Friction, Scene
 
-# All that differs between objects of one shape family, as paths into an MJX model.
+# Fields that differ between objects of one shape family, as paths into an MJX model.
 FIELDS = (
     ".stat.meaninertia",
     *(f".body_{name}" for name in ("pos", "ipos", "iquat", "mass", "subtreemass", "inertia")),
@@ -47,41 +47,41 @@ FIELDS = (
     *(".geom_pos", ".geom_size", ".geom_aabb", ".geom_rbound", ".pair_friction"),
 )
 
-# Beside these, of prisms on feet of their own: (N, 2) [m], which else are their feet.
+# Field of prisms on explicit feet: (N, 2) [m]; other prisms stand on their outline.
 OUTLINE = "outline"
 
 
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Colliders:
-    """Which colliders are ours; of the others MJX's own are taken."""
+    """Pairs of geoms with our colliders; other pairs have MJX's."""
 
-    pairs: frozenset[Pair] = frozenset(OWN)
+    pairs: frozenset[Pair] = frozenset(COLLIDERS)
 
 
 class MJXStage(NamedTuple):
-    """What all worlds of a batch that MJX steps share."""
+    """Stage of MJX: the parts that all worlds of a batch share."""
 
     model: mjx.Model
-    data: mjx.Data  # a blank to be filled with each world's state
+    data: mjx.Data  # a template for the state of each world
     colliders: Colliders = Colliders()
 
     def drive(self, fields: dict[str, jax.Array], motion: Motion, period: ControlPeriod) -> Driven:
         """Step a batch for one control period.
 
-        Before each step the commanded twist is written into the base's joint velocities, turned
-        into the world; or the force of its drive is applied to its joints.
+        Before each step, the twist is written into the base's joint velocities, in the world's
+        frame. If the force is limited, the force of the drive is applied to its joints instead.
         """
         physics = period.physics
         step = jax.vmap(partial(self._step, timestep=physics.timestep))
 
-        def one(state: Motion, _: None) -> tuple[Motion, jax.Array | None]:
-            # Batched inside of the loop: a loop that is batched is traced anew.
-            after, felt = step(fields, state, period.twists, period.robot)
-            return after, felt if period.force else None
+        def body(state: Motion, _: None) -> tuple[Motion, jax.Array | None]:
+            # vmap inside of the loop: JAX would trace a batched loop again.
+            state, wrench = step(fields, state, period.twists, period.robot)
+            return state, wrench if period.force else None
 
-        after, felt = jax.lax.scan(one, motion, length=physics.substeps)
-        return Driven(after, force=None if felt is None else felt.mean(axis=0))
+        motion, wrenches = jax.lax.scan(body, motion, length=physics.substeps)
+        return Driven(motion, force=None if wrenches is None else wrenches.mean(axis=0))
 
     def _step(
         self,
@@ -91,40 +91,41 @@ class MJXStage(NamedTuple):
         robot: Robot | None,
         timestep: float,
     ) -> tuple[Motion, jax.Array]:
-        """A world after one step, and the wrench (3,) of its object on its base, in its frame."""
+        """Return a world after one step, and the wrench (3,) on its base, in the base's frame."""
         model, (qpos, qvel, warmstart, integral) = apply(self.model, fields), state
         data = self.data
         if robot is None:
             qvel = qvel.at[JOINTS.base].set(twist.in_world(qpos[2]))
         else:
             turn, base = (jnp.cos(qpos[2]), jnp.sin(qpos[2])), qvel[JOINTS.base]
-            force, after = drives.push(robot, tuple(integral), twist, tuple(base), turn, timestep)
+            servo: Any = tuple(integral)
+            force, servo = drives.push(robot, servo, twist, tuple(base), turn, timestep)
             applied = data.qfrc_applied.at[JOINTS.base].set(jnp.stack(force))
-            data, integral = data.replace(qfrc_applied=applied), jnp.stack(after)
+            data, integral = data.replace(qfrc_applied=applied), jnp.stack(servo)
         data = data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
         with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
             data = step(model, data, self.colliders, fields.get(OUTLINE))
-        felt = data.qfrc_constraint[JOINTS.base]  # of the contacts alone: the drive is applied
-        felt = felt.at[:2].set(planar.rotate(-qpos[2], felt[:2]))
-        return Motion(data.qpos, data.qvel, data.qacc_warmstart, integral), felt
+        wrench = data.qfrc_constraint[JOINTS.base]  # of the contacts, without the drive
+        wrench = wrench.at[:2].set(planar.rotate(-qpos[2], wrench[:2]))
+        return Motion(data.qpos, data.qvel, data.qacc_warmstart, integral), wrench
 
 
 def step(
     model: mjx.Model, data: mjx.Data, colliders: Colliders = Colliders(), outline: Any = None
 ) -> mjx.Data:
-    """One step of MJX by MJX's own stages, and our colliders, of a prism of this outline (N, 2).
+    """Compute one step by functions of MJX and our colliders, with a prism's outline (N, 2).
 
-    Left out is what these scenes have not: tendons, actuators, sensors, springs, dampers, cameras
-    and lights. As in C MuJoCo, without dampers nothing is integrated implicitly.
+    Unused features are left out: tendons, actuators, sensors, springs, dampers, cameras and lights.
+    As in C MuJoCo, without dampers no velocity is integrated implicitly.
     """
     data = smooth.kinematics(model, data)
     data = smooth.com_pos(model, data)
     data = smooth.crb(model, data)
     data = smooth.factor_m(model, data)
-    own = {pair: OWN[pair] for pair in colliders.pairs}
+    ours = {pair: COLLIDERS[pair] for pair in colliders.pairs}
     if outline is not None:
-        own[BASE_PRISM] = partial(own[BASE_PRISM], outline=outline)
-    data = collision(model, data, own)
+        ours[BASE_PRISM] = partial(ours[BASE_PRISM], outline=outline)
+    data = collision(model, data, ours)
     data = constraint.make_constraint(model, data)
     data = smooth.com_vel(model, data)
     data = smooth.rne(model, data)
@@ -135,13 +136,13 @@ def step(
 
 
 class MJX(Engine):
-    """The engine of the paper's tables."""
+    """Engine of the paper's tables."""
 
     name = "mjx"
     modes = ("forward",)
 
     def check_derivatives(self, mode: Mode, physics: Physics) -> None:
-        """Raises InputError unless a trial can be differentiated in this mode."""
+        """Raise InputError unless a trial can be differentiated in this mode."""
         super().check_derivatives(mode, physics)
         if physics.cone == "elliptic":
             raise errors.InputError(
@@ -168,43 +169,43 @@ class MJX(Engine):
         return MJXStage(model, mjx.make_data(template.physics)), fields
 
     def slots(self, backend: str) -> int:
-        """Worlds that one worker steps at once: few on a processor, whose caches are small."""
+        """Return the number of worlds that one worker steps at once: few for small CPU caches."""
         return 24 if backend == "cpu" else 16384
 
     def levers(self, family: str) -> dict[str, Callable[[MJXStage], MJXStage]]:
-        """Other options of the model, and MJX's own box collider."""
-        found = {"sparse inertia matrix": _sparse}
+        """Return other options of the model, and MJX's box collider."""
+        levers = {"sparse inertia matrix": _sparse}
         boxes = GeomType.BOX, GeomType.BOX
         if family == "box":
-            usual = Colliders(frozenset(OWN) - {boxes})
-            found["MJX's own box collider"] = lambda stage: stage._replace(colliders=usual)
-        return found
+            default = Colliders(frozenset(COLLIDERS) - {boxes})
+            levers["MJX's own box collider"] = lambda stage: stage._replace(colliders=default)
+        return levers
 
     def contacts(self, stage: MJXStage, corners: int) -> int:
-        """Points of contact that the program looks into."""
+        """Return the number of candidate contacts."""
         return stage.data._impl.contact.dist.size  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _sparse(stage: MJXStage) -> MJXStage:
-    """The stage with a sparse inertia matrix."""
+    """Return the stage with a sparse inertia matrix."""
     model: Any = stage.model.tree_replace({"opt.jacobian": mjx.JacobianType.SPARSE})
     return stage._replace(model=model, data=mjx.make_data(model))
 
 
 def put(model: mujoco.MjModel) -> mjx.Model:
-    """The model as MJX's own engine has it."""
-    # A static copy of the bounding radii, which only height fields use, would bar stacking.
+    """Return a model on the device."""
+    # MJX holds a static copy of the bounding radii for height fields, which would prevent stacking.
     unused: dict[str, Any] = {"_impl.geom_rbound_hfield": np.zeros(model.ngeom)}
-    there: Any = mjx.put_model(model).tree_replace(unused)
-    return there
+    on_device: Any = mjx.put_model(model).tree_replace(unused)
+    return on_device
 
 
 def stack(models: Sequence[mujoco.MjModel]) -> tuple[mjx.Model, dict[str, jax.Array]]:
-    """One MJX model for all, on the device, and the fields that vary: name -> (n, ...).
+    """Return one MJX model for all, on the device, and the varying fields: name -> (n, ...).
 
-    The fields are always the same ones, so that a world's numbers depend neither on what it is
-    batched with nor on a program of its own. They are copied from compiled models, so nothing
-    that MuJoCo derives from a mass, a size or a friction is forgotten.
+    The fields are always `FIELDS`, so that the numbers of a world do not depend on the batch. They
+    are copied from compiled models, so that they include all constants that MuJoCo derives from a
+    mass, a size or a friction.
 
     Raises:
       ValueError: the models differ in anything but `FIELDS`.
@@ -225,7 +226,7 @@ def stack(models: Sequence[mujoco.MjModel]) -> tuple[mjx.Model, dict[str, jax.Ar
 
 
 def apply(model: mjx.Model, fields: dict[str, jax.Array]) -> mjx.Model:
-    """The model with one world's fields, as named by `stack`, put in place."""
+    """Return the model with the fields of one world, named as by `stack`."""
     return jax.tree_util.tree_map_with_path(
         lambda path, leaf: fields.get(jax.tree_util.keystr(path), leaf), model
     )
@@ -234,25 +235,25 @@ def apply(model: mjx.Model, fields: dict[str, jax.Array]) -> mjx.Model:
 def mjx_fields(
     family: str, solids: Solid, friction: Friction, template: Scene, fields: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """Fields of an MJX model for solids, from those (1, ...) of a scene with another solid."""
+    """Return fields (n, ...) for solids, from those (1, ...) of a scene with another solid."""
     count = solids.mass.size
     new = {name: np.repeat(np.asarray(row, float), count, axis=0) for name, row in fields.items()}
     model = template.physics
-    thing, mass = model.body("object").id, solids.mass
+    body, mass = model.body("object").id, solids.mass
     com = solids.p_object_com + OFF_CENTRE
     turn = solid.axes(solids)
     moments = np.einsum("nij,nj,nkj->nik", turn, solids.inertia, turn)
     inverse = np.einsum("nij,nj,nkj->nik", turn, 1 / solids.inertia, turn)
     z = JOINTS.object.start + 2
-    new[".body_pos"][:, thing, 2] = solids.height / 2
+    new[".body_pos"][:, body, 2] = solids.height / 2
     new[".qpos0"][:, z] = new[".qpos_spring"][:, z] = solids.height / 2
-    new[".body_ipos"][:, thing], new[".body_iquat"][:, thing] = com, solids.q_object_body
-    new[".body_mass"][:, thing] = new[".body_subtreemass"][:, thing] = mass
+    new[".body_ipos"][:, body], new[".body_iquat"][:, body] = com, solids.q_object_body
+    new[".body_mass"][:, body] = new[".body_subtreemass"][:, body] = mass
     new[".body_subtreemass"][:, 0] = new[".body_mass"].sum(axis=1)
-    new[".body_inertia"][:, thing] = solids.inertia
+    new[".body_inertia"][:, body] = solids.inertia
     spin = np.mean(1 / solids.inertia, axis=1)
-    new[".body_invweight0"][:, thing] = np.stack([1 / mass, spin], axis=-1)
-    # The free joint moves the object's origin, which feels the spin through the arm of the centre.
+    new[".body_invweight0"][:, body] = np.stack([1 / mass, spin], axis=-1)
+    # The free joint moves the object's origin; the spin moves it by the arm of the centre of mass.
     arm = _skew(com)
     shift = 1 / mass + np.trace(arm @ inverse @ arm.swapaxes(1, 2), axis1=1, axis2=2) / 3
     new[".dof_invweight0"][:, 3:6], new[".dof_invweight0"][:, 6:9] = shift[:, None], spin[:, None]
@@ -271,7 +272,7 @@ def mjx_fields(
 
 
 def _size_bases(fields: dict[str, np.ndarray], model: mujoco.MjModel, robots: Robot) -> None:
-    """Size, bounding box and radius of the bases of robots (n,)."""
+    """Set size, bounding box and radius of the bases of robots (n,)."""
     geom = model.geom("base").id
     size = fields[".geom_size"][:, geom]
     size[:, :2] = scene.base_half(robots, len(size))
@@ -281,7 +282,7 @@ def _size_bases(fields: dict[str, np.ndarray], model: mujoco.MjModel, robots: Ro
 
 
 def _weigh_bases(fields: dict[str, np.ndarray], model: mujoco.MjModel, robots: Robot) -> None:
-    """The masses of bases (n,) that can be slowed, and what MuJoCo derives from them."""
+    """Set the masses of bases (n,) with a limited force, and the derived constants."""
     base = model.body("base").id
     mass, inertia = np.asarray(robots.mass, float), np.asarray(robots.inertia, float)
     fields[".body_mass"][:, base] = fields[".body_subtreemass"][:, base] = mass
@@ -296,7 +297,7 @@ def _weigh_bases(fields: dict[str, np.ndarray], model: mujoco.MjModel, robots: R
 
 
 def _size_geoms(family: str, solids: Solid, template: Scene, new: dict[str, np.ndarray]) -> None:
-    """Sizes, bounding boxes and radii of the object's geoms."""
+    """Set sizes, bounding boxes and radii of the object's geoms."""
     model, half = template.physics, solids.height / 2
     for name, size in scene.geom_sizes(family, solids).items():
         geom = model.geom(name).id
@@ -315,7 +316,7 @@ def _size_geoms(family: str, solids: Solid, template: Scene, new: dict[str, np.n
 
 
 def _skew(v: np.ndarray) -> np.ndarray:
-    """Matrices (n, 3, 3) of the cross products with v (n, 3)."""
+    """Return matrices (n, 3, 3) of the cross products with v (n, 3)."""
     x, y, z = v.T
     zero = np.zeros_like(x)
     rows = [zero, -z, y, z, zero, -x, -y, x, zero]

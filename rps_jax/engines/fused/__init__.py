@@ -1,6 +1,6 @@
-"""MuJoCo's equations for these scenes alone, written out in scalars: thousands of worlds at once.
+"""The fused engine: MuJoCo's equations, specialised to these scenes and written out in scalars.
 
-`contacts` finds where the object touches, `newton` solves for its accelerations, `step` integrates.
+`contacts` finds the contacts, `newton` solves for the accelerations, `step` integrates.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from rps_jax.world import scene
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import OFF_CENTRE, Friction
 
-_FEW = 500  # trials
+_MAX_ON_PROCESSORS = 500  # trials that processors finish sooner than a GPU
 
 
 class FusedStage(NamedTuple):
-    """Worlds of the fused engine share nothing."""
+    """Stage of the fused engine, whose worlds share nothing."""
 
     native = True
 
@@ -57,37 +57,38 @@ class Fused(Engine):
         return FusedStage(), bodies
 
     def slots(self, backend: str) -> int:
-        """Worlds that one worker steps at once."""
+        """Return the number of worlds that one worker steps at once."""
         return 64 if backend == "cpu" else 16384
 
     def workers(self, backend: str) -> int:
-        """Two for a GPU, which steps one's worlds while the host sees to the other's."""
+        """Return 2 for a GPU, which steps the worlds of one while the host serves the other."""
         return super().workers(backend) if backend == "cpu" else 2
 
     def suits_processors(self, trials: int | None) -> bool:
-        """A few trials, by the function in C: a GPU takes some 5 s to begin."""
-        return trials is not None and trials <= _FEW and device.find_compiler() is not None
+        """Whether there are few trials and a C compiler: a GPU takes some 5 s to start."""
+        few = trials is not None and trials <= _MAX_ON_PROCESSORS
+        return few and device.find_compiler() is not None
 
 
 @functools.cache
 def _template(physics: Physics) -> Body:
-    """A body of which only the base matters."""
-    known = scene.load("box", physics)
-    return step.body(known.physics, known.solid.vertices)
+    """Return a body whose constants of the base are used."""
+    box = scene.load("box", physics)
+    return step.body(box.physics, box.solid.vertices)
 
 
 def _on_feet(bodies: Body, solids: Solid) -> Body:
-    """Bodies (n, ...) that stand on the feet of solids, if these have feet of their own."""
+    """Return bodies (n, ...) that stand on the feet of solids, if these have feet."""
     if solids.feet is None:
         return bodies
     low = np.broadcast_to(-solids.height[:, None, None] / 2, (*solids.feet.shape[:2], 1))
-    at = np.concatenate([solids.feet[..., :2], low], axis=-1)
-    at = (at - bodies.p_object_com[:, None, :]) @ solid.axes(solids)
-    return bodies._replace(feet=at, bears=np.sign(solids.feet[..., 2:]))
+    feet = np.concatenate([solids.feet[..., :2], low], axis=-1)
+    feet = (feet - bodies.p_object_com[:, None, :]) @ solid.axes(solids)
+    return bodies._replace(feet=feet, bears=np.sign(solids.feet[..., 2:]))
 
 
 def bodies_of(solids: Solid, friction: Friction, template: Body) -> Body:
-    """Solids as the fused engine has them, before the base of `template`."""
+    """Return the bodies of solids, with the base of `template`."""
     com = solids.p_object_com + OFF_CENTRE
     corners = np.concatenate(
         [
@@ -97,7 +98,7 @@ def bodies_of(solids: Solid, friction: Friction, template: Body) -> Body:
         axis=-1,
     )
     count, axes = solids.mass.size, solid.axes(solids)
-    own = Body(
+    derived = Body(
         mass=solids.mass,
         inertia=solids.inertia,
         p_object_com=com,
@@ -115,8 +116,8 @@ def bodies_of(solids: Solid, friction: Friction, template: Body) -> Body:
     )
     shared = [None if x is None else np.broadcast_to(np.asarray(x), (count, *np.shape(x)))
               for x in template]  # fmt: skip
-    found = [theirs if mine is None else mine for mine, theirs in zip(own, shared, strict=True)]
-    return _on_feet(Body(*found), solids)
+    pairs = zip(derived, shared, strict=True)
+    return _on_feet(Body(*(base if value is None else value for value, base in pairs)), solids)
 
 
 ENGINE = Fused()

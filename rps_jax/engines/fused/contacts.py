@@ -1,8 +1,8 @@
-"""Where the object of a scene touches: the ground with the corners of its lower face, the base
-along two upright lines; and MuJoCo's soft constraint at each point. For `step`.
+"""Contacts of the object with the ground and the base, and MuJoCo's soft constraint at each.
 
-Vectors are in the world's axes, points about the object's centre of mass unless said otherwise.
-The leading axis of an array numbers corners or contacts, the others are of the batch.
+The corners of the lower face touch the ground; the side touches the base along two upright lines.
+Vectors are in the world's axes; points are relative to the object's centre of mass unless stated
+otherwise. The leading axis of an array is that of corners or contacts, the rest is the batch.
 Reference: MuJoCo documentation, "Computation: Constraint model".
 """
 
@@ -18,67 +18,66 @@ from rps_jax.geometry import vectors as sp
 from rps_jax.geometry.vectors import Vec
 from rps_jax.world.physics import Physics
 
-_FAR = 1e9  # [m] of what can never touch
+_FAR = 1e9  # [m] distance of points that never touch
 _PARALLEL = 1e-4  # [m] by which a face of the base is preferred to one of the object
-_UPRIGHT = 1e-6  # [rad] tilt below which every point of a cylinder's rim is the lowest
-# MuJoCo's own impedance of the skin contact: least, greatest, and the depth [m] between them.
+_UPRIGHT = 1e-6  # [rad] tilt below which all points of a cylinder's rim are equally low
+# MuJoCo's default impedance of the skin contact: minimum, maximum, and the depth [m] between.
 _D_MIN, _D_MAX, _WIDTH = 0.9, 0.95, 0.001
 
 
 class Body(NamedTuple):
-    """What one world is made of, as MuJoCo compiled it. Frame: principal axes at the centre of
-    mass."""
+    """Constants of one world, from MuJoCo. Frame: principal axes at the centre of mass."""
 
     mass: Any  # () [kg]
     inertia: Any  # (3,) [kg m^2] principal moments
     p_object_com: Any  # (3,) [m] centre of mass in the object's frame
     q_object_body: Any  # (4,) principal axes in the object's frame
-    vertices: Any  # (N, 3) [m] of the lower face, of a cylinder its centre; spread: `Corners`
+    vertices: Any  # (N, 3) [m] of the lower face; a cylinder's centre; after `spread`: `Corners`
     radius: Any  # () [m] of a cylinder; 0 of a prism
     height: Any  # () [m]
     up: Any  # (3,) unit vector along the height
     friction_ground: Any  # () [1]
     friction_robot: Any  # () [1]
-    invweight: Any  # () [1/kg] MuJoCo's weight of the object in a contact
-    base_invweight: Any  # () [1/kg] and of the base
+    invweight: Any  # () [1/kg] MuJoCo's inverse weight of the object in a contact
+    base_invweight: Any  # () [1/kg] inverse weight of the base
     base_half: Any  # (2,) [m] half length and width of the base
-    base_z: Any  # (2,) [m] its lower and upper edge
-    feet: Any = None  # (N, 3) [m] on which a prism stands if not on its vertices; spread: a `Vec`
-    bears: Any = None  # (N, 1) [1] whether each is one; spread: of one entry
+    base_z: Any  # (2,) [m] heights of the base's lower and upper edge
+    feet: Any = None  # (N, 3) [m] of a prism that does not stand on its vertices; later a `Vec`
+    bears: Any = None  # (N, 1) [1] 1 for a foot, 0 for an unused entry
 
 
 class Corners(NamedTuple):
     """The lower face of a prism."""
 
     at: Vec  # (N, ...) [m]
-    ahead: Vec  # (N, ...) [m] the following corner
-    real: Any  # (N, ...) bool, not of a corner that repeats the one before
+    ahead: Vec  # (N, ...) [m] the next corner
+    real: Any  # (N, ...) bool, False for a corner that repeats the previous one
 
     @classmethod
     def of(cls, at: Vec) -> Corners:
-        """Corners (N, ...), counter-clockwise seen from above."""
+        """Return the corners of points (N, ...), counter-clockwise seen from above."""
         back = tuple(x - jnp.roll(x, 1, axis=0) for x in at)
         ahead = tuple(jnp.roll(x, -1, axis=0) for x in at)
         return cls(at, ahead, sp.dot(back, back) > 1e-12)  # type: ignore[arg-type]
 
 
 class State(NamedTuple):
-    """A world in motion."""
+    """State of a world."""
 
     base: Vec  # x, y [m], yaw [rad]
     p: Vec  # [m] centre of mass
     q: tuple[Any, Any, Any, Any]  # principal axes in the world, scalar first
     v: Vec  # [m/s] of the centre of mass
     w: Vec  # [rad/s] in principal axes
-    a: Vec  # [m/s^2] last acceleration, from which the solver starts
+    a: Vec  # [m/s^2] last acceleration, the solver's first guess
     alpha: Vec  # [rad/s^2]
-    pushed: Pushed | None = None  # a base whose force is limited
-    # [N, N, N m] of the object on the base, in the base's frame, summed over steps, if asked for
+    driven: DrivenBase | None = None  # of a base with a limited force
+    # [N, N, N m] of the object on the base, in the base's frame, summed over steps, if requested
     felt: Vec | None = None
 
 
-class Pushed(NamedTuple):
-    """A base in motion that its drive pushes; axes of the world, x, y and about the vertical."""
+class DrivenBase(NamedTuple):
+    """State of a base that its drive pushes, in the world's axes: x, y and about the vertical."""
 
     v: Vec  # [m/s, m/s, rad/s]
     a: Vec  # [m/s^2, m/s^2, rad/s^2] last acceleration
@@ -86,64 +85,64 @@ class Pushed(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """Points of contact (C, ...). The rows of each are J a - a_ref along n, t and s."""
+    """Contacts (C, ...). The rows of each are J a - a_ref along n, t and s."""
 
     r: Vec  # [m] from the centre of mass
     n: Vec  # unit normal, towards the object
     t: Vec  # unit tangents
     s: Vec
     bias: Vec  # [m/s^2] -a_ref
-    d: Any  # [kg] stiffness of the normal row, 0 without contact
+    d: Any  # [kg] stiffness of the normal row; 0 without contact
     friction: Any  # [1]
     arm: tuple[Any, Any] | None = None  # [m] from the origin of a base that can be slowed
 
 
-def _stiff(distance: Any, there: Any, impedance: Any, invweight: Any) -> Any:
-    """Stiffness [kg] of a contact's normal row; 0 if nothing touches."""
-    return jnp.where(there & (distance < 0), impedance / (invweight * (1 - impedance)), 0.0)
+def _stiff(distance: Any, exists: Any, impedance: Any, invweight: Any) -> Any:
+    """Return the stiffness [kg] of a contact's normal row; 0 without contact."""
+    return jnp.where(exists & (distance < 0), impedance / (invweight * (1 - impedance)), 0.0)
 
 
 def _bias(k: Any, b: Any, impedance: Any, distance: Any, u: Vec) -> Vec:
-    """Minus the reference acceleration of a point of velocity u, along (n, t, s)."""
+    """Return minus the reference acceleration of a point of velocity u, along (n, t, s)."""
     return b * u[0] + k * impedance * distance, b * u[1], b * u[2]
 
 
 def _stiffness(solref: tuple[float, float], d_max: float, timestep: float) -> tuple[float, float]:
-    """MuJoCo's stiffness [1/s^2] and damping [1/s] of a contact."""
+    """Return MuJoCo's stiffness [1/s^2] and damping [1/s] of a contact."""
     time, ratio = max(solref[0], 2 * timestep), solref[1]
     return 1 / (d_max * time * ratio) ** 2, 2 / (d_max * time)
 
 
-def _index(count: int, like: Any) -> Any:
-    """0, 1, ... along a new leading axis of the batch."""
-    return jax.lax.broadcasted_iota(jnp.int32, (count, *like.shape), 0)
+def _index(count: int, template: jax.Array) -> jax.Array:
+    """Return 0, 1, ... along a new leading axis of the batch of `template`."""
+    return jax.lax.broadcasted_iota(jnp.int32, (count, *template.shape), 0)
 
 
 def on_ground(body: Body, state: State, m: Sequence[Vec], physics: Physics) -> Contact:
-    """Contacts of the lower face with the ground."""
+    """Return the contacts of the lower face with the ground."""
     k, b = _stiffness(physics.ground_solref, physics.ground_impedance, physics.timestep)
-    r, there = _lower_face(body, m)
+    r, exists = _lower_face(body, m)
     distance = state.p[2] + r[2]
     at = (r[0], r[1], r[2] - 0.5 * distance)
     u = sp.add(state.v, sp.cross(sp.to_world(m, state.w), at))
-    d = _stiff(distance, there, physics.ground_impedance, body.invweight)
+    d = _stiff(distance, exists, physics.ground_impedance, body.invweight)
     bias = _bias(k, b, physics.ground_impedance, distance, (u[2], u[0], u[1]))
     return Contact(at, sp.Z, sp.X, sp.Y, bias, d, body.friction_ground)
 
 
 def _lower_face(body: Body, m: Sequence[Vec]) -> tuple[Vec, Any]:
-    """Points that may touch the ground, from the centre of mass, and whether they exist."""
+    """Return points that may touch the ground, from the centre of mass, and whether they exist."""
     if body.feet is not None:
         return sp.to_world(m, body.feet), body.bears[0] > 0
     if isinstance(body.vertices, Corners):
         return sp.to_world(m, body.vertices.at), body.vertices.real
-    # Of a cylinder three points of the rim, the first the lowest; the fourth only fills up.
+    # Three points of a cylinder's rim, the lowest first; the fourth is padding.
     up = sp.to_world(m, body.up)
     tilt = jnp.sqrt(up[0] * up[0] + up[1] * up[1])
     standing = tilt < _UPRIGHT
-    least = jnp.maximum(tilt, _UPRIGHT)
-    # Horizontal direction in which it leans; of a standing one, fixed to the object.
-    lean = [jnp.where(standing, m[i][0], up[i] / least) for i in range(2)]
+    divisor = jnp.maximum(tilt, _UPRIGHT)
+    # Horizontal direction in which it leans; of an upright one, fixed to the object.
+    lean = [jnp.where(standing, m[i][0], up[i] / divisor) for i in range(2)]
     across = (-lean[1], lean[0], 0.0)
     low = sp.cross(across, up)
     low = sp.scale(body.radius / sp.norm(low), low)
@@ -157,7 +156,7 @@ def _lower_face(body: Body, m: Sequence[Vec]) -> tuple[Vec, Any]:
 
 
 def on_base(body: Body, state: State, m: Sequence[Vec], twist: Vec, physics: Physics) -> Contact:
-    """Contacts of the object's side with the base, at the upper and lower edge of both."""
+    """Return the contacts of the object's side with the base, at the lower and upper edge."""
     k, b = _stiffness(physics.base_solref, _D_MAX, physics.timestep)
     c, s = jnp.cos(state.base[2]), jnp.sin(state.base[2])
     z, normal, q, distance = meetings(body, state, m, (c, s))
@@ -166,10 +165,10 @@ def on_base(body: Body, state: State, m: Sequence[Vec], twist: Vec, physics: Phy
     arm = (c * q[0] - s * q[1], s * q[0] + c * q[1])  # from the base's origin
     lever = (state.base[0] + arm[0] - state.p[0], state.base[1] + arm[1] - state.p[1])
     r = (*lever, z - state.p[2])
-    if state.pushed is None:
+    if state.driven is None:
         v, w = (c * twist[0] - s * twist[1], s * twist[0] + c * twist[1]), twist[2]
     else:
-        *v, w = state.pushed.v
+        *v, w = state.driven.v
     of_base = (v[0] - w * arm[1], v[1] + w * arm[0], 0.0)
     u = sp.sub(sp.add(state.v, sp.cross(sp.to_world(m, state.w), r)), of_base)
     x = jnp.minimum(jnp.abs(distance) / _WIDTH, 1.0)
@@ -177,7 +176,7 @@ def on_base(body: Body, state: State, m: Sequence[Vec], twist: Vec, physics: Phy
     impedance = _D_MIN + x * (_D_MAX - _D_MIN)
     d = _stiff(distance, True, impedance, body.invweight + body.base_invweight)
     bias = _bias(k, b, impedance, distance, (sp.dot(n, u), sp.dot(t, u), u[2]))
-    held = state.pushed is None
+    held = state.driven is None
     return Contact(r, n, t, sp.Z, bias, d, body.friction_robot, None if held else arm)
 
 
@@ -187,9 +186,9 @@ Point = tuple[Any, Any]
 def meetings(
     body: Body, state: State, m: Sequence[Vec], turn: Point
 ) -> tuple[Any, Point, Point, Any]:
-    """Heights, normals, points and distances [m] of the contacts (C, ...), in the base's frame.
+    """Return heights, normals, points and distances [m] of contacts (C, ...), in the base's frame.
 
-    At the upper and lower edge of the base; where the object leans away, at its own lower edge.
+    They are at the lower and upper edge of the base; if the object leans away, at its lower edge.
     """
     c, s = turn
     up = sp.to_world(m, body.up)
@@ -198,20 +197,20 @@ def meetings(
     low, high = body.base_z[0], jnp.minimum(body.base_z[1], 0.98 * body.height)
     feet = body.vertices.at if isinstance(body.vertices, Corners) else body.vertices
 
-    def seen(point: Vec) -> Vec:
-        """A point of the object in the base's frame, its height as in the world."""
+    def in_base(point: Vec) -> Vec:
+        """Return a point of the object in the base's frame, with its height in the world."""
         x, y, h = sp.sub(sp.add(sp.to_world(m, point), state.p), (*state.base[:2], 0.0))
         return c * x + s * y, -s * x + c * y, h
 
     def outline(foot: Vec, z: Any) -> Point:
-        """Points of the lower face, moved up along the edges to the height z."""
-        x, y, h = seen(foot)
+        """Return points of the lower face, moved along the upright edges to the height z."""
+        x, y, h = in_base(foot)
         rise = z - h
         return x + slope[0] * rise, y + slope[1] * rise
 
     def on_object(z: Any, normal: Point, surface: Point, distance: Any) -> tuple[Any, Any]:
-        """Heights and distances, those below the object's lower face moved up its side to there."""
-        middle, face = seen((0.0, 0.0, 0.0)), sp.dot(body.up, feet)
+        """Return heights and distances, with points below the lower face moved up to it."""
+        middle, face = in_base((0.0, 0.0, 0.0)), sp.dot(body.up, feet)
         face = sp.greatest(face) if isinstance(body.vertices, Corners) else face
         away = (surface[0] - middle[0], surface[1] - middle[1])
         above = up[2] * (sp.dot(slope, away) + z - middle[2]) - face
@@ -222,7 +221,7 @@ def meetings(
         z = jnp.where(_index(2, body.radius) == 0, low, high)
         centre = outline(body.vertices, z)
         normal, point, distance = circle_and_rectangle(centre, body.radius, body.base_half)
-        # Level with the ground a leaning cylinder is an ellipse: so much wider along the normal.
+        # A horizontal section of a leaning cylinder is an ellipse, wider along the normal.
         lean = sp.dot(slope, normal)
         wider = body.radius * (jnp.sqrt(1 + lean * lean) - 1)
         point = (point[0] - 0.5 * wider * normal[0], point[1] - 0.5 * wider * normal[1])
@@ -231,15 +230,15 @@ def meetings(
         z, distance = on_object(z, normal, surface, distance)
         return z, normal, point, distance
     middle = 0.5 * (low + high)
-    here, ahead = (outline(foot, middle) for foot in (body.vertices.at, body.vertices.ahead))
-    normal, points, distances = polygon_and_rectangle(here, ahead, body.base_half)
+    corners, ahead = (outline(foot, middle) for foot in (body.vertices.at, body.vertices.ahead))
+    normal, points, distances = polygon_and_rectangle(corners, ahead, body.base_half)
     i = _index(4, middle + 0 * normal[0])
     first = i % 2 == 0
     z = jnp.where(i < 2, low, high)
     point = tuple(jnp.where(first, a, b) for a, b in zip(*points, strict=True))
-    apart = jnp.where(first, *distances)
-    distance = apart + sp.dot(slope, normal) * (z - middle)
-    half = distance - 0.5 * apart  # from the point, which is midway at the middle height
+    gap = jnp.where(first, *distances)
+    distance = gap + sp.dot(slope, normal) * (z - middle)
+    half = distance - 0.5 * gap  # from the point, which is midway at the middle height
     surface = (point[0] + half * normal[0], point[1] + half * normal[1])
     z, distance = on_object(z, normal, surface, distance)
     return z, normal, point, distance  # type: ignore[return-value]
@@ -248,44 +247,44 @@ def meetings(
 def circle_and_rectangle(
     centre: Point, radius: Any, half: Sequence[Any]
 ) -> tuple[Point, Point, Any]:
-    """Normal, point and distance [m] of a circle outside a centred rectangle."""
+    """Return normal, point and distance [m] of a circle outside a centred rectangle."""
     nearest = tuple(jnp.clip(x, -h, h) for x, h in zip(centre, half, strict=True))
-    apart = (centre[0] - nearest[0], centre[1] - nearest[1])
-    gap = sp.norm(apart)
+    offset = (centre[0] - nearest[0], centre[1] - nearest[1])
+    gap = sp.norm(offset)
     outside = gap > 1e-6
-    normal = (jnp.where(outside, apart[0] / gap, 1.0), jnp.where(outside, apart[1] / gap, 0.0))
+    normal = (jnp.where(outside, offset[0] / gap, 1.0), jnp.where(outside, offset[1] / gap, 0.0))
     distance = jnp.where(outside, gap, centre[0] - half[0]) - radius
     point = (nearest[0] + 0.5 * distance * normal[0], nearest[1] + 0.5 * distance * normal[1])
     return normal, point, distance
 
 
 def polygon_and_rectangle(
-    here: Point, ahead: Point, half: Sequence[Any]
+    corners: Point, ahead: Point, half: Sequence[Any]
 ) -> tuple[Point, list[Point], list[Any]]:
-    """Normal from a centred rectangle to a convex polygon, and two points with distances [m].
+    """Return the normal from a centred rectangle to a convex polygon, two points and distances [m].
 
-    The polygon is given by its corners (N, ...) and the corners that follow them. The face that
-    separates the two best is the reference; the face of the other that looks most against it is
-    clipped to its width (as in MuJoCo's box-box collider).
+    The polygon has corners (N, ...), each with its next corner `ahead`. The face of maximum
+    separation is the reference face. The most opposed face of the other outline is the incident
+    face; it is clipped to the width of the reference face, as in MuJoCo's box-box collider.
     """
     a, b = half
-    x, y = here
+    x, y = corners
     along = (ahead[0] - x, ahead[1] - y)
     length = sp.norm(along)
     along = (along[0] / length, along[1] / length)
     n = (along[1], -along[0])
     real = length > 1e-6
-    apart = -(x * n[0] + y * n[1]) - (a * jnp.abs(n[0]) + b * jnp.abs(n[1]))
-    faces = (n, here, along, length)
-    separation, chosen = _best(jnp.where(real, apart, -_FAR), faces)
+    gaps = -(x * n[0] + y * n[1]) - (a * jnp.abs(n[0]) + b * jnp.abs(n[1]))
+    faces = (n, corners, along, length)
+    separation, chosen = _best(jnp.where(real, gaps, -_FAR), faces)
 
-    one, nil = jnp.ones_like(separation), jnp.zeros_like(separation)
+    unit, nil = jnp.ones_like(separation), jnp.zeros_like(separation)
     # Reference faces: separation, normal out of its owner, a point on it, along it, its length.
     sides = [
-        (sp.least(x) - a, (one, nil), (a, -b), (nil, one), 2 * b),
-        (-sp.greatest(x) - a, (-one, nil), (-a, b), (nil, -one), 2 * b),
-        (sp.least(y) - b, (nil, one), (a, b), (-one, nil), 2 * a),
-        (-sp.greatest(y) - b, (nil, -one), (-a, -b), (one, nil), 2 * a),
+        (sp.least(x) - a, (unit, nil), (a, -b), (nil, unit), 2 * b),
+        (-sp.greatest(x) - a, (-unit, nil), (-a, b), (nil, -unit), 2 * b),
+        (sp.least(y) - b, (nil, unit), (a, b), (-unit, nil), 2 * a),
+        (-sp.greatest(y) - b, (nil, -unit), (-a, -b), (unit, nil), 2 * a),
     ]
 
     def side(score: list[Any]) -> Any:
@@ -310,9 +309,9 @@ def polygon_and_rectangle(
     offset = (p[0] - start[0]) * direction[0] + (p[1] - start[1]) * direction[1]
     pace = sp.dot(edge, direction)  # near -1
     pace = jnp.where(jnp.abs(pace) < 1e-3, -1e-3, pace)
-    ends = [-offset / pace, (width - offset) / pace]
-    low = jnp.clip(jnp.minimum(*ends), 0.0, extent)
-    high = jnp.clip(jnp.maximum(*ends), 0.0, extent)
+    limits = [-offset / pace, (width - offset) / pace]
+    low = jnp.clip(jnp.minimum(*limits), 0.0, extent)
+    high = jnp.clip(jnp.maximum(*limits), 0.0, extent)
     normal = (jnp.where(by_base, ref[0], -ref[0]), jnp.where(by_base, ref[1], -ref[1]))
     points, distances = [], []
     for t in (low, high):
@@ -324,9 +323,9 @@ def polygon_and_rectangle(
 
 
 def _best(score: Any, values: Any) -> tuple[Any, Any]:
-    """The greatest score along the leading axis, and what stands there; the first of equals."""
+    """Return the maximum score along the leading axis and its values; the first of equal ones."""
     top = sp.greatest(score)
     i = jax.lax.broadcasted_iota(jnp.int32, score.shape, 0)
     first = sp.least(jnp.where(score == top, i, score.shape[0]))
-    there = i == first
-    return top, jax.tree.map(lambda x: sp.total(jnp.where(there, x, 0.0)), values)
+    is_first = i == first
+    return top, jax.tree.map(lambda x: sp.total(jnp.where(is_first, x, 0.0)), values)

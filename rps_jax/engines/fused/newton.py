@@ -1,12 +1,11 @@
 """MuJoCo's convex problem for one free object, by Newton's method with an exact line search.
 
-A base that contact can slow and stop adds its three accelerations to the object's six.
-
-Its accelerations minimise
+The unknowns are the object's six accelerations, and three more of a base with a limited force.
+They minimise
 
     (a - a_free)' M (a - a_free) / 2 + sum over contacts of s(J a - a_ref),
 
-as MuJoCo's and MJX's do. For `rps_jax.engines.fused.step`.
+as in MuJoCo and MJX.
 
 Reference: MuJoCo documentation, "Computation: Constraint model" and "Solver".
 """
@@ -26,15 +25,15 @@ from rps_jax.geometry.solid import GRAVITY
 from rps_jax.geometry.vectors import Vec
 from rps_jax.world.physics import Physics
 
-_ENOUGH = 1e-4  # [m/s^2] error of the acceleration with which the solver ends
-_FLAT = 1e-3  # [1] of the slope at its start, with which a line search ends
-_FAR = 1e9  # no upper bound of the line search
+_TOLERANCE = 1e-4  # [m/s^2] error of the acceleration at which the solver ends
+_FLAT = 1e-3  # [1] share of the initial slope at which a line search ends
+_FAR = 1e9  # upper bound of a line search without a bracket
 
 
 def contact_force(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tuple[Any, ...]]:
-    """Force [N] along (n, t, s) at J a - aref = x, and the stiffness against x.
+    """Return the force [N] along (n, t, s) at J a - aref = x, and the stiffness.
 
-    The stiffness is (nn, nt, ns, tt, ts, ss), minus the force's derivative.
+    The stiffness (nn, nt, ns, tt, ts, ss) is minus the derivative of the force.
     """
     if physics.cone == "pyramidal":
         return _pyramid(contact, x, physics)
@@ -69,7 +68,7 @@ def contact_force(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tupl
 
 
 def _pyramid(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tuple[Any, ...]]:
-    """Compute these of four frictionless edges n +- friction t, n +- friction s."""
+    """Return force and stiffness of four frictionless edges n +- friction t, n +- friction s."""
     f = contact.friction
     d = contact.d * physics.impratio / (2 * f * f * (1 + f * f))
     up_t, down_t = x[0] + f * x[1], x[0] - f * x[1]
@@ -89,17 +88,17 @@ def _pyramid(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tuple[Any
 
 
 class Base(NamedTuple):
-    """A base that its drive pushes; axes of the world, x, y and about the vertical."""
+    """Base that its drive pushes, in the world's axes: x, y and about the vertical."""
 
     inertia: Vec  # [kg, kg, kg m^2]
     force: Vec  # [N, N, N m] of the drive
-    a: Vec  # [m/s^2, m/s^2, rad/s^2] last acceleration, from which the solver starts
+    a: Vec  # [m/s^2, m/s^2, rad/s^2] last acceleration, the first guess
 
 
 def _rows(contact: Contact, a: Vec, alpha: Vec, b: Vec | None) -> Vec:
-    """J of an acceleration: of the contact's point along n, t, s, against a base's if it has one.
+    """Return J times accelerations: those of a contact's point along n, t, s.
 
-    `b` is that of the base's origin and about it.
+    The acceleration `b` of a base, at and about its origin, is subtracted.
     """
     u = sp.add(a, sp.cross(alpha, contact.r))
     if b is not None and contact.arm is not None:
@@ -135,12 +134,15 @@ def accelerations(
     physics: Physics,
     base: Base | None = None,
 ) -> tuple[Vec, Vec, Vec | None]:
-    """Linear and angular acceleration of the object: the minimum of MuJoCo's convex cost.
+    """Return the minimum of MuJoCo's convex cost.
 
-    And those of the base, x, y and about the vertical, if it is not held.
+    Newton's method with an exact line search finds it from the last accelerations. The solver ends
+    at an error of `_TOLERANCE`; the tolerance of `physics`, which also depends on the mass of the
+    base, is not used.
 
-    Newton's method with an exact line search, from the last accelerations. It ends at an error of
-    `_ENOUGH`; the tolerance of `physics`, relative to the mass of the base too, is not used.
+    Returns:
+      Linear and angular acceleration of the object; and of a base with a limited force along x, y
+      and about the vertical.
     """
     i_w = _spin(body, m)
     i, w = body.inertia, state.w
@@ -148,7 +150,7 @@ def accelerations(
     free = sp.to_world(m, (torque[0] / i[0], torque[1] / i[1], torque[2] / i[2]))
 
     def gauss(a: Vec, alpha: Vec) -> tuple[Vec, Vec]:
-        """M (a - free accelerations)."""
+        """Return M (a - free accelerations)."""
         linear = sp.scale(body.mass, (a[0], a[1], a[2] + GRAVITY))
         return linear, sp.to_world(i_w, sp.sub(alpha, free))
 
@@ -156,9 +158,9 @@ def accelerations(
         linear, angular = gauss(a, alpha)
         size = 6 if base is None else 9
         h: list[list[Any]] = [[0.0] * size for _ in range(size)]
-        pushing: Any = ()
+        on_base: Any = ()
         if base is not None:
-            pushing = _lacking(base, b)
+            on_base = _imbalance(base, b)
             for row in range(3):
                 h[6 + row][6 + row] = base.inertia[row]
         for row in range(3):
@@ -172,9 +174,9 @@ def accelerations(
             linear = sp.sub(linear, _sums(f))
             angular = sp.sub(angular, _sums(sp.cross(c.r, f)))
             if base is not None and c.arm is not None:
-                pushing = sp.add(pushing, _sums(_on_base(c.arm, f)))
+                on_base = sp.add(on_base, _sums(_on_base(c.arm, f)))
             _stiffen(h, c, k)
-        return (*linear, *angular, *pushing), h
+        return (*linear, *angular, *on_base), h
 
     def improve(carry):
         count, a, alpha, b, active, _ = carry
@@ -186,41 +188,41 @@ def accelerations(
         slope = sp.dot(linear, d) + sp.dot(angular, delta)
         bend = body.mass * sp.dot(d, d) + sp.dot(delta, sp.to_world(i_w, delta))
         if base is not None:
-            slope = slope + sp.dot(_lacking(base, b), e)
+            slope = slope + sp.dot(_imbalance(base, b), e)
             bend = bend + sp.dot(base.inertia, tuple(x * x for x in e))
         lines = [
             (c, sp.add(_rows(c, a, alpha, b), c.bias), _rows(c, d, delta, e)) for c in contacts
         ]
-        # An inner product of step and gradient: twice what a quadratic cost would gain.
+        # Inner product of step and gradient: twice the decrease of a quadratic cost.
         gain = -sp.dot(step, g)
         x = _line_search(lines, slope, bend, active * gain, physics)
-        going = gain > 2 * body.mass * _ENOUGH**2
-        # A world that is done stays as it is while others go on: its numbers are its own.
-        move = jnp.where(active > 0, jnp.where(going, x, jnp.minimum(x, 1.0)), 0.0)
+        continues = gain > 2 * body.mass * _TOLERANCE**2
+        # A converged world stays while others continue, so that its result does not depend on them.
+        move = jnp.where(active > 0, jnp.where(continues, x, jnp.minimum(x, 1.0)), 0.0)
         a, alpha = sp.add(a, sp.scale(move, d)), sp.add(alpha, sp.scale(move, delta))
         b = None if base is None else sp.add(b, sp.scale(move, e))
-        active = jnp.where(going, active, 0.0)
-        return count + 1, a, alpha, b, active, _some(active)
+        active = jnp.where(continues, active, 0.0)
+        return count + 1, a, alpha, b, active, _any(active)
 
     active = jnp.ones_like(body.mass)
-    start = (0, state.a, state.alpha, base and base.a, active, _some(active))
+    start = (0, state.a, state.alpha, base and base.a, active, _any(active))
     _, a, alpha, b, _, _ = jax.lax.while_loop(
         lambda carry: (carry[0] < physics.iterations) & carry[5], improve, start
     )
     return a, alpha, b
 
 
-def _lacking(base: Base, b: Any) -> Vec:
-    """M (b - free accelerations) of a base."""
+def _imbalance(base: Base, b: Any) -> Vec:
+    """Return M (b - free accelerations) of a base."""
     return sp.sub(tuple(m * x for m, x in zip(base.inertia, b, strict=True)), base.force)
 
 
 def _on_base(arm: tuple[Any, Any], f: Vec) -> Vec:
-    """A force at an arm from the base's origin: along x and y, and its torque about the origin."""
+    """Return a force at an arm from the base's origin as x, y and torque about the origin."""
     return f[0], f[1], sp.minus(sp.mul(arm[0], f[1]), sp.mul(arm[1], f[0]))
 
 
-def felt_by_base(
+def wrench_on_base(
     contact: Contact,
     arm: tuple[Any, Any],
     a: Vec,
@@ -229,34 +231,38 @@ def felt_by_base(
     turn: tuple[Any, Any],
     physics: Physics,
 ) -> Vec:
-    """What the object does to the base [N, N, N m], about the base's origin and in its frame.
+    """Return the wrench of the object on the base [N, N, N m], about its origin, in its frame.
 
     Args:
-      contact: points of the object with the base.
-      arm: (C, ...) [m] to them from the base's origin, in the world's axes.
-      a: [m/s^2] solution: the acceleration of the object's centre of mass.
-      alpha: [rad/s^2] and its angular acceleration.
-      b: of a base that is not held; None of one that is.
+      contact: contacts of the object with the base.
+      arm: (C, ...) [m] to the contacts from the base's origin, in the world's axes.
+      a: [m/s^2] solution for the acceleration of the object's centre of mass.
+      alpha: [rad/s^2] solution for its angular acceleration.
+      b: solution for a base with a limited force; else None.
       turn: cosine and sine of the base's heading.
-      physics: whose cone it is.
+      physics: with the friction cone.
     """
     force, _ = contact_force(contact, sp.add(_rows(contact, a, alpha, b), contact.bias), physics)
     x, y, torque = _sums(_on_base(arm, sp.combine(force, (contact.n, contact.t, contact.s))))
     c, s = turn
-    return -(c * x + s * y), -(c * y - s * x), -torque  # on the object, and so against the base
+    return (
+        -(c * x + s * y),
+        -(c * y - s * x),
+        -torque,
+    )  # minus: the contacts' force is on the object
 
 
 def _sums(vector: Vec) -> Vec:
     return sp.total(vector[0]), sp.total(vector[1]), sp.total(vector[2])
 
 
-def _some(active: jax.Array) -> jax.Array:
-    """Whether any is above zero."""
+def _any(active: jax.Array) -> jax.Array:
+    """Whether any entry is above zero."""
     return jnp.sum(active) > 0
 
 
 def _spin(body: Body, m: Sequence[Vec]) -> list[Vec]:
-    """The inertia tensor in the world's axes."""
+    """Return the inertia tensor in the world's axes."""
     i = body.inertia
     return [
         tuple(sum(m[r][k] * m[c][k] * i[k] for k in range(3)) for c in range(3)) for r in range(3)
@@ -281,7 +287,7 @@ def _stiffen(h: list[list[Any]], c: Contact, k: tuple[Any, ...]) -> None:
             h[3 + i][3 + j] = sp.plus(h[3 + i][3 + j], sp.total(row[j]))
     if c.arm is None:
         return
-    # The base's rows: with B the way its origin's motion moves the point, -B^T K (1, [r]^T, -B).
+    # The base's rows: -B^T K (1, [r]^T, -B), where B maps the motion of its origin to the point's.
     onto = [_on_base(c.arm, column) for column in columns]
     for j in range(3):
         twisted = _on_base(c.arm, (turned[0][j], turned[1][j], turned[2][j]))
@@ -295,9 +301,9 @@ def _stiffen(h: list[list[Any]], c: Contact, k: tuple[Any, ...]) -> None:
 
 
 class _Line(NamedTuple):
-    """Contacts (C, ...) along the line a + x step: their rows, in the axes of the cone.
+    """Rows of contacts (C, ...) along the line a + x step, in the axes of the cone.
 
-    Of each n(x) = n + x pace and slip(x)^2 = square + 2 x half + x^2 bend.
+    For each, n(x) = n + x pace and slip(x)^2 = square + 2 x half + x^2 bend.
     """
 
     n: Any
@@ -305,12 +311,12 @@ class _Line(NamedTuple):
     square: Any
     half: Any
     bend: Any
-    weight: Any  # [kg] stiffness of what sticks
+    weight: Any  # [kg] stiffness of a sticking contact
     mu: Any
 
 
 def _line(c: Contact, start: Vec, pace: Vec, physics: Physics) -> _Line:
-    """Contacts whose rows are `start` and change by `pace`, in the elliptic cone."""
+    """Return the line of contacts in the elliptic cone whose rows start at `start`."""
     f = c.friction
     mu = f * physics.impratio**-0.5
     (n, t, s), (p, q, r) = start, pace
@@ -320,7 +326,7 @@ def _line(c: Contact, start: Vec, pace: Vec, physics: Physics) -> _Line:
 
 
 def _slope_of_ellipse(line: _Line, x: Any) -> tuple[Any, Any]:
-    """First and second derivative of the contacts' cost along the line: see `contact_force`."""
+    """Return first and second derivative of the contacts' cost along the line."""
     n, mu = line.n + x * line.pace, line.mu
     turn = line.half + x * line.bend
     slip = jnp.sqrt(jnp.maximum(line.square + x * (line.half + turn), 1e-30))
@@ -338,7 +344,7 @@ def _slope_of_ellipse(line: _Line, x: Any) -> tuple[Any, Any]:
 
 
 def _slope_of_pyramid(lines: tuple[Contact, Vec, Vec], x: Any, physics: Physics) -> tuple[Any, Any]:
-    """Compute these of the friction pyramid."""
+    """Return first and second derivative of the contacts' cost for the friction pyramid."""
     c, start, pace = lines
     force, k = _pyramid(c, sp.add(start, sp.scale(x, pace)), physics)
     nn, nt, ns, tt, _, ss = k
@@ -350,11 +356,13 @@ def _slope_of_pyramid(lines: tuple[Contact, Vec, Vec], x: Any, physics: Physics)
 def _line_search(
     lines: list[tuple[Contact, Vec, Vec]], slope: Any, bend: Any, steepness: Any, physics: Physics
 ) -> Any:
-    """How far the cost is least: Newton's method, bracketed, until the slope is `_FLAT`.
+    """Return the step length of minimum cost, by Newton's method with a bracket.
 
-    `slope` and `bend` are the first and second derivative of what is not of contacts; `lines` are
-    the contacts, with their rows at the start and how these change; `steepness` is minus the
-    slope at the start, 0 of worlds that need no search.
+    The search ends at a slope of `_FLAT` times the initial one.
+
+    `slope` and `bend` are the first and second derivative of the cost without contacts; `lines` are
+    the contacts with their rows at the start and the change of these; `steepness` is minus the
+    initial slope, or 0 for worlds that need no search.
     """
     slopes: list[Callable[[Any], tuple[Any, Any]]]
     if physics.cone == "pyramidal":
@@ -366,19 +374,19 @@ def _line_search(
         count, x, low, high, searching, _ = carry
         first, second = slope + x * bend, bend
         for of_contacts in slopes:
-            one, two = of_contacts(x)
-            first, second = first + sp.total(one), second + sp.total(two)
+            rise, curve = of_contacts(x)
+            first, second = first + sp.total(rise), second + sp.total(curve)
         searching = jnp.where(jnp.abs(first) > _FLAT * steepness, searching, 0.0)
         low, high = jnp.where(first < 0, x, low), jnp.where(first < 0, high, x)
         new = x - first / second
         halved = jnp.where(high < _FAR, 0.5 * (low + high), 2 * x)
         new = jnp.where((new > low) & (new < high), new, halved)
         x = jnp.where(searching > 0, new, x)
-        return count + 1, x, low, high, searching, _some(searching)
+        return count + 1, x, low, high, searching, _any(searching)
 
-    one = jnp.ones_like(slope)
-    searching = jnp.where(steepness > 0, one, 0.0)
-    start = (0, one, 0.0 * one, _FAR * one, searching, _some(searching))
+    unit = jnp.ones_like(slope)
+    searching = jnp.where(steepness > 0, unit, 0.0)
+    start = (0, unit, 0.0 * unit, _FAR * unit, searching, _any(searching))
     return jax.lax.while_loop(
         lambda carry: (carry[0] < physics.ls_iterations) & carry[5], refine, start
     )[1]

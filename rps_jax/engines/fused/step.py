@@ -1,11 +1,10 @@
-"""MuJoCo's equations for these scenes alone: one free object, on the ground, before the base.
+"""MuJoCo's equations for one free object on the ground before the base.
 
-MJX solves any scene. Here the scene is known: the base is a velocity source, so only the object's
-six accelerations are unknown, and three more of a base whose force is limited; the object touches
-the ground with the corners of its lower face and the base along two lines. What MuJoCo computes
-(its soft contacts, its two cones, its Newton solver and Euler's rule) is written out for that in
-scalars, so that a compiler can keep a whole world in registers: `contacts.py` finds the points,
-`newton.py` solves.
+MJX solves any scene. Here the scene is fixed. The base is a velocity source, so that only the six
+accelerations of the object are unknown, and three more of a base with a limited force. The object
+touches the ground with the corners of its lower face, and the base along two lines. MuJoCo's soft
+contacts, two cones, Newton solver and Euler rule are written out in scalars for this case, so that
+a compiler can keep a whole world in registers.
 """
 
 from __future__ import annotations
@@ -20,8 +19,8 @@ import numpy as np
 
 from rps_jax.engines import native
 from rps_jax.engines.base import ControlPeriod, Driven, Motion
-from rps_jax.engines.fused.contacts import Body, Corners, Pushed, State, on_base, on_ground
-from rps_jax.engines.fused.newton import Base, accelerations, felt_by_base
+from rps_jax.engines.fused.contacts import Body, Corners, DrivenBase, State, on_base, on_ground
+from rps_jax.engines.fused.newton import Base, accelerations, wrench_on_base
 from rps_jax.geometry import vectors as sp
 from rps_jax.geometry.vectors import Vec
 from rps_jax.robot import drive as drives
@@ -31,27 +30,27 @@ from rps_jax.world.scene import JOINTS
 
 
 def body(model: mujoco.MjModel, vertices: np.ndarray) -> Body:
-    """The constants of a physics model and the vertices (N, 2) [m] of its footprint."""
-    thing, base = model.body("object"), model.body("base")
+    """Return the body of a physics model and the vertices (N, 2) [m] of its footprint."""
+    object_body, base = model.body("object"), model.body("base")
     geom, front = model.geom("object"), model.geom("base")
-    frame = sp.matrix(thing.iquat)
+    frame = sp.matrix(object_body.iquat)
     round_ = len(vertices) == 1
-    half = thing.pos[2]  # a scene starts with its object on the ground
+    half = object_body.pos[2]  # a scene starts with its object on the ground
     bottom = np.column_stack([vertices, np.full(len(vertices), -half)])
     pairs = [model.pair(i) for i in range(model.npair)]
     friction = {pair.name.partition("_")[0]: pair.friction[0] for pair in pairs}
     return Body(
-        mass=thing.mass[0],
-        inertia=thing.inertia.copy(),
-        p_object_com=thing.ipos.copy(),
-        q_object_body=thing.iquat.copy(),
-        vertices=np.array([sp.to_body(frame, v) for v in bottom - thing.ipos]),
+        mass=object_body.mass[0],
+        inertia=object_body.inertia.copy(),
+        p_object_com=object_body.ipos.copy(),
+        q_object_body=object_body.iquat.copy(),
+        vertices=np.array([sp.to_body(frame, v) for v in bottom - object_body.ipos]),
         radius=geom.size[0] if round_ else 0.0,
         height=2 * half,
         up=np.array(sp.to_body(frame, (0.0, 0.0, 1.0))),
         friction_ground=friction["ground"],
         friction_robot=friction["base"],
-        invweight=model.body_invweight0[thing.id, 0],
+        invweight=model.body_invweight0[object_body.id, 0],
         base_invweight=model.body_invweight0[base.id, 0],
         base_half=front.size[:2].copy(),
         base_z=front.pos[2] + front.size[2] * np.array([-1.0, 1.0]),
@@ -63,7 +62,7 @@ def _split(array: jax.Array, at: slice = slice(None)) -> Any:
 
 
 def enter(body: Body, motion: Motion, robot: Robot | None = None, force: bool = False) -> State:
-    """The state of worlds as MuJoCo holds them; with `force`, that on the base is summed up."""
+    """Return the state of worlds from MuJoCo's; with `force`, the wrench on the base is summed."""
     qpos, qvel, warmstart, integral = motion
     free, spin = _split(qpos, JOINTS.object), _split(qvel, slice(6, 9))
     com, axes = _split(body.p_object_com), _split(body.q_object_body)
@@ -77,27 +76,29 @@ def enter(body: Body, motion: Motion, robot: Robot | None = None, force: bool = 
         w=sp.to_body(sp.matrix(axes), spin),
         a=_split(warmstart, slice(3, 6)),
         alpha=_split(warmstart, slice(6, 9)),
-        pushed=None
+        driven=None
         if robot is None
-        else Pushed(_split(qvel, JOINTS.base), _split(warmstart, JOINTS.base), _split(integral)),
+        else DrivenBase(
+            _split(qvel, JOINTS.base), _split(warmstart, JOINTS.base), _split(integral)
+        ),
         felt=_split(jnp.zeros_like(qpos[..., JOINTS.base])) if force else None,
     )
 
 
 def leave(body: Body, state: State, twist: Vec) -> Motion:
-    """The opposite of `enter`, after a period at `twist`."""
+    """Return MuJoCo's state of worlds after a period at `twist`: the inverse of `enter`."""
     com, axes = _split(body.p_object_com), _split(body.q_object_body)
     q = sp.times(state.q, (axes[0], -axes[1], -axes[2], -axes[3]))
     m = sp.matrix(q)
     spin = sp.to_world(sp.matrix(axes), state.w)
     v = sp.sub(state.v, sp.to_world(m, sp.cross(spin, com)))
     p = sp.sub(state.p, sp.to_world(m, com))
-    if state.pushed is None:
+    if state.driven is None:
         c, s = jnp.cos(state.base[2]), jnp.sin(state.base[2])
         base = (c * twist[0] - s * twist[1], s * twist[0] + c * twist[1], twist[2])
         last, integral = tuple(jnp.zeros_like(x) for x in state.base), None
     else:
-        base, last, integral = state.pushed
+        base, last, integral = state.driven
     return Motion(
         jnp.stack([*state.base, *p, *q], axis=-1),
         jnp.stack([*base, *v, *spin], axis=-1),
@@ -109,39 +110,39 @@ def leave(body: Body, state: State, twist: Vec) -> Motion:
 def step(
     body: Body, state: State, twist: Vec, physics: Physics, robot: Robot | None = None
 ) -> State:
-    """One step of MuJoCo's semi-implicit Euler rule with the base held at `twist`.
+    """Compute one step of MuJoCo's semi-implicit Euler rule with the base at `twist`.
 
-    Or, if the force of the `robot` is limited, pushed towards it. `twist` [m/s, m/s, rad/s] is in
-    the base's frame.
+    A `robot` with a limited force is pushed towards it. `twist` [m/s, m/s, rad/s] is in the base's
+    frame.
     """
-    m, dt, pushed = sp.matrix(state.q), physics.timestep, state.pushed
+    m, dt, driven = sp.matrix(state.q), physics.timestep, state.driven
     contacts = [on_ground(body, state, m, physics), on_base(body, state, m, twist, physics)]
-    if robot is None or pushed is None:
+    if robot is None or driven is None:
         a, alpha, _ = accelerations(body, state, m, contacts, physics)
     else:
         turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
-        force, integral = drives.push(robot, pushed.integral, twist, pushed.v, turn, dt)
-        base = Base((robot.mass, robot.mass, robot.inertia), force, pushed.a)
+        force, integral = drives.push(robot, driven.integral, twist, driven.v, turn, dt)
+        base = Base((robot.mass, robot.mass, robot.inertia), force, driven.a)
         b: Any
         a, alpha, b = accelerations(body, state, m, contacts, physics, base)
-        pushed = Pushed(sp.add(pushed.v, sp.scale(dt, b)), b, integral)
+        driven = DrivenBase(sp.add(driven.v, sp.scale(dt, b)), b, integral)
     felt = state.felt
     if felt is not None:
-        apart = (state.p[0] - state.base[0], state.p[1] - state.base[1])
-        arm = (contacts[1].r[0] + apart[0], contacts[1].r[1] + apart[1])
+        offset = (state.p[0] - state.base[0], state.p[1] - state.base[1])
+        arm = (contacts[1].r[0] + offset[0], contacts[1].r[1] + offset[1])
         turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
-        b = None if pushed is None else pushed.a
-        felt = sp.add(felt, felt_by_base(contacts[1], arm, a, alpha, b, turn, physics))
+        b = None if driven is None else driven.a
+        felt = sp.add(felt, wrench_on_base(contacts[1], arm, a, alpha, b, turn, physics))
     v = sp.add(state.v, sp.scale(dt, a))
     w = sp.add(state.w, sp.scale(dt, sp.to_body(m, alpha)))
     angle = sp.scale(dt, w)
     half = 0.5 * sp.norm(angle)
-    # By their series: the angles of one step are small.
+    # Taylor series: the angles of one step are small.
     sinc = 0.5 * (1 - half * half / 6)
     turn = (1 - half * half / 2 + half**4 / 24, *sp.scale(sinc, angle))
     q = sp.times(state.q, turn)
     length = jax.lax.rsqrt(sp.dot(q, q))
-    if pushed is None:
+    if driven is None:
         c, s = jnp.cos(state.base[2]), jnp.sin(state.base[2])
         base = (
             state.base[0] + dt * (c * twist[0] - s * twist[1]),
@@ -149,10 +150,10 @@ def step(
             state.base[2] + dt * twist[2],
         )
     else:
-        base = sp.add(state.base, sp.scale(dt, pushed.v))
+        base = sp.add(state.base, sp.scale(dt, driven.v))
     p = sp.add(state.p, sp.scale(dt, v))
     q = tuple(x * length for x in q)
-    return State(base, p, q, v, w, a, alpha, pushed, felt)  # type: ignore[arg-type]
+    return State(base, p, q, v, w, a, alpha, driven, felt)  # type: ignore[arg-type]
 
 
 def drive(body: Body, motion: Motion, period: ControlPeriod) -> Driven:
@@ -161,20 +162,20 @@ def drive(body: Body, motion: Motion, period: ControlPeriod) -> Driven:
     It is a function of C, or a kernel on an NVIDIA GPU, where they can be compiled; elsewhere, and
     where it is differentiated, XLA compiles it.
     """
-    driven = partial(_driven, physics=period.physics, force=period.force)
-    run = native.batched(driven, driven) if motion.qpos.ndim == 2 else driven
+    steps = partial(_drive, physics=period.physics, force=period.force)
+    run = native.batched(steps, steps) if motion.qpos.ndim == 2 else steps
     return run(body, motion, period.twists, period.robot)
 
 
-def _driven(
+def _drive(
     body: Body, motion: Motion, twist: Vec, robot: Robot | None, *, physics: Physics, force: bool
 ) -> Driven:
-    """`drive` of a batch, or of one world."""
+    """Step a batch of worlds, or one world, for one control period."""
     scalars = spread(body)
     state = jax.lax.fori_loop(
         0,
         physics.substeps,
-        lambda _, now: step(scalars, now, twist, physics, robot),
+        lambda _, state: step(scalars, state, twist, physics, robot),
         enter(body, motion, robot, force),
     )
     felt = state.felt and jnp.stack(state.felt, axis=-1) / physics.substeps
@@ -182,7 +183,7 @@ def _driven(
 
 
 def spread(body: Body) -> Body:
-    """Bodies (...) with every entry an array of its own, as `step` has them."""
+    """Return bodies (...) with each entry as a separate array, the input of `step`."""
     leaves = body._replace(vertices=None, feet=None, bears=None)
     entries = {
         name: _split(leaf) if jnp.ndim(leaf) > jnp.ndim(body.mass) else leaf
