@@ -154,8 +154,8 @@ def digest(commands: Sequence[Sequence[str]]) -> str:
             configurations.append(words)
             continue
         name, rest = names.split(words)
-        question, _ = flags.parse(names.question_of(name), name, rest)
-        configurations.append(_expanded(question.with_quick_values().configuration()))
+        question, _ = flags.parse(names.question_type(name), name, rest)
+        configurations.append(_expanded(question.configuration()))
     text = json.dumps(configurations, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -40,7 +40,7 @@ def flags_of(command: str) -> Flags:
     """Return metavar, default and help of each flag and argument of a command, by name."""
     entries: list[list[str]] = []
     for line in help_of(command).splitlines():
-        if re.match(r"  [-\w]", line):
+        if re.match(r"  (--?\w|[A-Z_]+(  |$))", line):
             entries.append(re.split(r" {2,}", line.strip(), maxsplit=1))
         elif line.startswith("   ") and line.strip():
             entries[-1].append(line.strip())

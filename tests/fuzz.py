@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import atexit
 import contextlib
-import dataclasses
 import functools
 import io
 import itertools
@@ -225,14 +224,10 @@ def commands() -> list[tuple[str, ...]]:
 
 
 def options(command: Sequence[str]) -> list[str]:
-    """Options of a command, without those that are no flags."""
-    from rps_jax.app.cli import flags, names
-    from rps_jax.record import options
+    """Return the flags of a command."""
+    from command_line import flags_of
 
-    kind = names.question_of(" ".join(command))
-    places = [one.name for one in dataclasses.fields(kind) if options.is_positional(one)]
-    every = [name for name, *_ in flags._flat(kind)[0]]
-    return [f"--{name.replace('_', '-')}" for name in every if name not in places]
+    return [name for name in flags_of(" ".join(command)) if name.startswith("--")]
 
 
 def values(seed: int = 0) -> Iterator[Case]:

@@ -22,9 +22,8 @@ from rps_jax.world.domain import DOMAINS
 
 
 def unlike(option, value, *choices):
-    """What tyro says of a value that is none of the choices of an option, in any order."""
-    listed = "".join(f"(?=.*'{choice}')" for choice in choices)
-    return f"invalid choice '{value}' for argument '{option}'. Expected one of{listed}"
+    """Return the pattern of the error for a value that is none of an option's choices."""
+    return f"unknown {option.strip('-')} '{value}': choose from {', '.join(choices)}"
 
 
 ESTIMATORS = ("reverse", "evolution")
@@ -115,8 +114,8 @@ PUSH = {
 }
 HARDWARE = {
     "--layout ring": unlike("--layout", "ring", "circle", "grid"),
-    "--mass 3": "Unrecognized .*--mass",  # each object of the hardware has the paper's
-    "--rear far": "Unrecognized .*--rear",
+    "--mass 3": "unknown option '--mass'",  # each object of the hardware has the paper's
+    "--rear far": "unknown option '--rear'",
     "--skin fur": "unknown skin 'fur': choose from ideal, thin, capacitive, hardware",
     "--slots -1": "slots = -1 is not allowed",
     "--out file": "out = file cannot be written",
@@ -236,7 +235,7 @@ VIEW = {
     "cut": "cut/manifest.json is corrupt",
 }
 FILM = {
-    "": "RUN Run folder of",
+    "": "run is missing: `rps film --help` lists the options",
     "run --grid 4x": "grid = 4x is not allowed: write ROWSxCOLUMNS, as 4x6, each from 1 to 12",
     "run --grid 0x3": "grid = 0x3 is not allowed: write ROWSxCOLUMNS",
     "run --grid 4x99": "grid = 4x99 is not allowed",
@@ -264,7 +263,7 @@ TUNE = {
     "es --tuned L L": "tuned = .* is not allowed: name each once",
     "es --law rps,lost.json": "lost.json cannot be read",
     "es --law rps,L.json": "L = -1.0 is not allowed: it must be a number and above 0",
-    "es --algorithm CMA_ES": "invalid choice 'CMA_ES'",
+    "es --algorithm CMA_ES": "unknown algorithm 'CMA_ES': choose from cma, lra_cma",
     "es --algorithm xnes --tuned L": "algorithm = xnes is not allowed for one parameter",
     "es --population 2": "population = 2 is not allowed: .* from 4 to",
     "es --generations 0": "generations = 0 is not allowed",

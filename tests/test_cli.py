@@ -155,13 +155,13 @@ def test_a_quick_run_makes_small_only_what_was_not_asked_for():
 def test_what_was_said_stays_in_a_quick_run_though_it_equals_its_default():
     words = ["--quick", "--engine", "fused", "--worlds=512", "--horizon", "300.0"]
     assert (TuneES().setting.engine, TuneES().worlds) == ("fused", 512)
-    quick = flags.parse(TuneES, "tune es", words)[0].with_quick_values()
+    quick = flags.parse(TuneES, "tune es", words)[0]
     assert quick.setting == TuneES().setting
     assert (quick.worlds, quick.validation) == (512, TuneES.QUICK["validation"])
     robot = [*words[:3], "--domain", "real,robot=ridgeback"]
-    flags.parse(TuneES, "tune es", robot)[0].with_quick_values().validate()
+    flags.parse(TuneES, "tune es", robot)[0].validate()
     with pytest.raises(InputError, match="engine = quasistatic"):
-        flags.parse(TuneES, "tune es", [robot[0], *robot[3:]])[0].with_quick_values().validate()
+        flags.parse(TuneES, "tune es", [robot[0], *robot[3:]])[0].validate()
 
 
 def test_files_of_the_same_name_are_told_apart_by_their_folders(tmp_path):
@@ -253,6 +253,6 @@ def test_an_interrupt_that_the_garbage_collector_swallows_comes_again(capsys):
             time.sleep(0.01)
 
     began = time.monotonic()
-    assert running.guarded(action) == 130
+    assert running.exit_code(action) == 130
     assert time.monotonic() - began < 4
     assert capsys.readouterr().err.endswith("rps: interrupted.\n")

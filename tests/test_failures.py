@@ -416,5 +416,5 @@ def test_the_command_of_regress_reports_known_laws(tmp_path, capsys):
     assert "rps_plus (file)" in text
     assert "simulated s per s" in text
     sentence = refusal(capsys, *command, "--against", "best")
-    assert "invalid choice 'best' for argument '--against'. Expected one of ('rps'," in sentence
+    assert "unknown against 'best': choose from rps, " in sentence
     assert "worlds = 201 is not allowed" in refusal(capsys, "regress", "--worlds", 201)

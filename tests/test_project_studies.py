@@ -56,7 +56,7 @@ REFUSED = [
     ("random_worlds", "--laws none", "unknown law 'none'"),
     ("publish", "--only nothing", "no data file has such a name"),
     ("real_pushes", "--pushes none.csv", r"pushes = none\.csv cannot be read"),
-    ("real_pushes", "--models rigid", r"invalid choice 'rigid'"),
+    ("real_pushes", "--models rigid", "unknown models 'rigid'"),
     ("real_pushes", "--mujoco -1", "mujoco = -1 is not allowed"),
     ("fit", "--logs 1", "logs = 1 is not allowed"),
     ("fit", "--law aps", "fit knows laws that sense touch"),
@@ -80,10 +80,10 @@ def test_a_study_refuses_before_it_compiles(
 
 @pytest.mark.parametrize("folder", STUDIES, ids=lambda folder: folder.name)
 def test_a_folder_asks_one_question_of_a_report(folder):
-    question = names.question_of(str(folder))
+    question = names.question_type(str(folder))
     assert question.__doc__
     assert question.TITLE
-    assert names.question_of(str(folder / "study.py")) is question
+    assert names.question_type(str(folder / "study.py")) is question
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
@@ -110,7 +110,7 @@ def test_a_published_command_can_still_be_asked(line, monkeypatch):
     monkeypatch.chdir(ROOT)
     _, *words = shlex.split(line.replace("\\\n", " "), comments=True)
     name, rest = names.split(words)
-    asked, _ = flags.parse(names.question_of(name), name, rest)
+    asked, _ = flags.parse(names.question_type(name), name, rest)
     assert asked.name
 
 

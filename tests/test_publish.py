@@ -39,7 +39,7 @@ def test_a_data_file_is_made_by_one_recipe_or_cites_others_or_is_history(path):
 @pytest.mark.parametrize("command", sorted(set(COMMANDS)))
 def test_the_command_of_a_recipe_can_be_asked(command):
     name, rest = names.split(shlex.split(command)[1:])
-    assert flags.parse(names.question_of(name), name, rest)[0].name
+    assert flags.parse(names.question_type(name), name, rest)[0].name
 
 
 def test_a_recipe_says_on_what_it_is_made():

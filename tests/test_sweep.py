@@ -263,7 +263,7 @@ def test_a_run_killed_six_times_ends_as_one_that_was_not(tmp_path, monkeypatch):
 
 def ends_in_one_sentence_and_is_continued(folder, whole, capsys, monkeypatch, *words):
     """What was done stays, alone, and is not run again; then all is as if nothing had happened."""
-    assert running.guarded(lambda: swept(folder)) == 2
+    assert running.exit_code(lambda: swept(folder)) == 2
     error = one_sentence(capsys.readouterr().err)
     assert all(word in error for word in words)
     monkeypatch.undo()

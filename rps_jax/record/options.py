@@ -4,10 +4,8 @@ A field's annotation is its type, the string below it is its help, and `option` 
 The command line, the checks and the manifests of runs are made from these declarations.
 """
 
-import ast
 import dataclasses
 import functools
-import inspect
 import numbers
 import types
 import typing
@@ -89,35 +87,6 @@ def _check(name: str, value: Any, kind: Any, bounds: dict[str, Any] | None) -> N
     elif get_origin(kind) is tuple and bounds is not None:
         for one in value if isinstance(value, tuple | list) else (value,):
             _check(name, one, get_args(kind)[0], bounds)
-
-
-@functools.cache
-def field_docs(kind: type) -> dict[str, str]:
-    """Strings below the fields of a dataclass (or named tuple) and of its bases, by field."""
-    found: dict[str, str] = {}
-    for base in reversed(kind.__mro__):
-        if not (dataclasses.is_dataclass(base) or "_fields" in vars(base)):
-            continue
-        try:
-            tree = ast.parse(inspect.cleandoc("\n" + inspect.getsource(base)))
-        except (OSError, TypeError, SyntaxError):
-            continue
-        found |= _below_fields(tree.body[0])
-    return found
-
-
-def _below_fields(tree: Any) -> dict[str, str]:
-    found, name = {}, None
-    for node in tree.body:
-        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            name = node.target.id
-        elif name and isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-            if isinstance(node.value.value, str):
-                found[name] = inspect.cleandoc(node.value.value)
-            name = None
-        else:
-            name = None
-    return found
 
 
 def to_json(value: Any) -> Any:

@@ -20,9 +20,10 @@ import functools
 import itertools
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Literal, NamedTuple, ParamSpec, TypeVar
+from typing import Any, ClassVar, Generic, Literal, NamedTuple, ParamSpec, Self, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -174,8 +175,6 @@ class Question(Generic[T]):
     """Whether a bar shows the progress; by default in a terminal and in a notebook."""
     report_to: ProgressCallback | None = option(None, kw_only=True, hidden=True)
     """What hears of the progress instead of a bar."""
-    explicit_options: tuple[str, ...] = option((), kw_only=True, hidden=True)
-    """Options that the user gave, which `quick` leaves alone even at their defaults."""
 
     QUICK: ClassVar[Mapping[str, Any]] = {}  # values of `quick`, by the field's name
     TITLE: ClassVar[str] = ""  # of the report
@@ -259,19 +258,22 @@ class Question(Generic[T]):
             return False
         return engines.get(setting.engine).suits_processors(self.num_trials())
 
-    def with_quick_values(self) -> Any:
-        """What is asked in the end: with `quick`, small where nothing else was asked for."""
-        if not getattr(self, "quick", False):
-            return self
-        small: dict[str, Any] = {}
-        for name, value in self.quick_values().items():
-            owner, _, inner = name.partition(".")
-            now, usual = getattr(self, owner), _default(type(self), owner)
-            same = getattr(now, inner) == getattr(usual, inner) if inner else now == usual
-            if same and (inner or owner) not in self.explicit_options:
-                part = {inner: value}
-                small[owner] = replace(small.get(owner, now), **part) if inner else value
-        return replace(self, **small)
+    def with_quick_values(self) -> Self:
+        """Return the question with the values of `quick`, if asked, for fields at their default."""
+        question, default = self, type(self)()
+        if getattr(self, "quick", False):
+            for name, value in self.quick_values().items():
+                if attrgetter(name)(self) == attrgetter(name)(default):
+                    question = _replace_field(question, name, value)
+        return question
+
+    def quick_defaults(self) -> Self:
+        """Return the question with all options at their defaults, but for the values of `quick`."""
+        return functools.reduce(
+            lambda question, change: _replace_field(question, *change),
+            self.quick_values().items(),
+            type(self)(),
+        )
 
     def validate(self) -> None:
         """Raises InputError for what is not allowed, before anything is compiled or written."""
@@ -331,12 +333,15 @@ _NOT_ASKED = (
     "quick",
     "progress",
     "report_to",
-    "explicit_options",
 )
 
 
-def _default(kind: type, name: str) -> Any:
-    return next(one.default for one in fields(kind) if one.name == name)
+def _replace_field(record: Any, name: str, value: object) -> Any:
+    """Return a dataclass with another value of a field, or of a field of a field, OWNER.FIELD."""
+    owner, _, inner = name.partition(".")
+    new = _replace_field(getattr(record, owner), inner, value) if inner else value
+    values = {one.name: vars(record)[one.name] for one in fields(record)}  # as they were given
+    return type(record)(**values | {owner: new})
 
 
 def setting_as_json(setting: Setting) -> dict[str, Any]:

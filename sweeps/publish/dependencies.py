@@ -55,6 +55,7 @@ PURPOSE = {
     "cmaes": "the evolution of `rps tune es`, in NumPy",
     "filelock": "one process at a time in a run folder",
     "tyro": "the command line, from typed options",
+    "docstring-parser": "the help of options, from docstrings of fields; tyro needs it too",
     "markdown": "`report.html` from `report.md`",
     "jaxtyping": "shapes in the types of functions and records",
 }

@@ -210,7 +210,7 @@ def _run_command(words: list[str], runs: Path) -> tuple[Sequence[Section], Any, 
     name, options = names.split([re.sub(r"\bruns/", f"{runs}/", word) for word in options])
     out = runs / Path(folder).name
     options += ["--out", str(out)]
-    question = flags.parse(names.question_of(name), name, options)[0].with_quick_values()
+    question, _ = flags.parse(names.question_type(name), name, options)
     question.validate()
     arguments, sys.argv = sys.argv, list(words)  # the run folder stores the command
     try:

@@ -1,7 +1,7 @@
-"""The command line: `rps NAME` and `rps PATH` ask a question, and write its report.
+"""The command line: `rps NAME` and `rps PATH` run a question and write its report.
 
-A question's fields are the options (`flags`), found by its file's text (`names`), so that
-`rps --help` imports neither JAX nor MuJoCo. Input is checked before anything compiles (`running`).
+`names` finds the class of a command in the text of its file, so that `rps --help` imports neither
+JAX nor MuJoCo. `flags` parses the options, and `running` checks them before anything compiles.
 """
 
 import os
@@ -13,7 +13,7 @@ from rps_jax.app.cli import names, running
 
 
 def run() -> NoReturn:
-    """Run `rps` as a process, which ends at once if it was stopped.
+    """Run `rps` as a process, which ends at once if it was interrupted.
 
     Threads of XLA may still be compiling then, and can crash while Python is taken down.
     """
@@ -26,23 +26,22 @@ def run() -> NoReturn:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Ask what the words ask; exit code 0, 2 for bad input, 130 if stopped."""
+    """Run a command, and return its exit code: 0, 2 for bad input, or 130 if interrupted."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help"):
-        return running.guarded(lambda: print(names.overview()))
+        return running.exit_code(lambda: print(names.overview()))
     if words[0] == "--version":
         from rps_jax import __version__
 
-        return running.guarded(lambda: print(f"rps_jax {__version__}"))
-    return running.guarded(lambda: _ask(words))
+        return running.exit_code(lambda: print(f"rps_jax {__version__}"))
+    return running.exit_code(lambda: _run(words))
 
 
-def _ask(words: list[str]) -> None:
-    """Find the question, read its options, and answer it."""
+def _run(words: list[str]) -> None:
+    """Find the question of a command, parse its options, and execute it."""
     from rps_jax.app.cli import flags
     from rps_jax.engines import device
 
     name, rest = names.split(words)
     device.configure_xla()
-    question = names.question_of(name)
-    running.carry_out(*flags.parse(question, name, rest))
+    running.execute(*flags.parse(names.question_type(name), name, rest))

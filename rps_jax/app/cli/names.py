@@ -1,116 +1,134 @@
-"""Which questions there are, found in the text of their files: nothing is imported for `--help`.
+"""Names of the commands, found in the text of their files: `rps --help` imports none of them.
 
-A module of the package is a command if it says `name = call_of(Class)`; a file or folder of a
-user's own is one if it does.
+A module of the package defines a command by `name = call_of(Class)`. So does the file of a custom
+question, or `study.py` of a folder.
 """
 
+import ast
 import functools
 import importlib
-import re
 import sys
 import textwrap
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import TYPE_CHECKING, NamedTuple
 
 from rps_jax.errors import InputError, check_name
 
-_ROOMS = {  # where questions live, and under which heading of the help
+if TYPE_CHECKING:
+    from rps_jax.runs.question import Question
+
+_HEADINGS = {  # of the help, by the rooms that define commands
     "runs": "sweep and replay",
     "studies": "ask of a law",
     "tuning": "tune and learn",
     "app": "look",
 }
-_MAKES = re.compile(r"^(\w+) = call_of\((\w+)\)$", re.MULTILINE)
 _REPLACED = {"compare": "rps ladder --domain DOMAIN ..."}  # removed commands
 _PACKAGE = Path(__file__).parents[2]
 
 
-class Name(NamedTuple):
+class Command(NamedTuple):
     """A command of the package."""
 
     room: str
     module: str
-    question: str  # the name of the class
-    summary: str
+    class_name: str
+    summary: str  # first line of the class's docstring
 
 
 @functools.cache
-def known() -> dict[str, Name]:
-    """All commands by the words that call them."""
-    found = {}
-    for room in _ROOMS:
+def known() -> dict[str, Command]:
+    """Return all commands of the package by their names."""
+    commands = {}
+    for room in _HEADINGS:
         for path in sorted((_PACKAGE / room).glob("*.py")):
-            text = path.read_text(encoding="utf-8")
-            for name, kind in _MAKES.findall(text):
-                module = f"rps_jax.{room}.{path.stem}"
-                found[name.replace("_", " ")] = Name(room, module, kind, _summary(text, kind))
-    return found
+            if "call_of(" in (text := path.read_text(encoding="utf-8")):
+                for name, (class_name, summary) in _definitions(text).items():
+                    module = f"rps_jax.{room}.{path.stem}"
+                    commands[name.replace("_", " ")] = Command(room, module, class_name, summary)
+    return commands
 
 
-def _summary(text: str, kind: str) -> str:
-    """First line of a class's docstring."""
-    found = re.search(rf'^class {kind}\b.*?"""(.*?)(?:\n|""")', text, re.MULTILINE | re.DOTALL)
-    return found[1].strip() if found else ""
+def _definitions(text: str) -> dict[str, tuple[str, str]]:
+    """Return the class of each `name = call_of(Class)` in a file, and its summary, by name."""
+    classes, summaries = {}, {}
+    for node in ast.parse(text).body:
+        match node:
+            case ast.ClassDef(name=class_name):
+                summaries[class_name] = (ast.get_docstring(node) or "").partition("\n")[0]
+            case ast.Assign(
+                targets=[ast.Name(id=name)],
+                value=ast.Call(func=ast.Name(id="call_of"), args=[ast.Name(id=class_name)]),
+            ):
+                classes[name] = class_name
+    return {
+        name: (class_name, summaries.get(class_name, "")) for name, class_name in classes.items()
+    }
 
 
 def overview() -> str:
-    """What `rps --help` says."""
+    """Return the text of `rps --help`."""
     lines = [
-        "usage: rps NAME [OPTIONS]      ask one of the questions below",
-        "       rps PATH [OPTIONS]      ask that of a file, or of study.py of a folder",
-        "       rps NAME --help         its options",
+        "usage: rps NAME [OPTIONS]      run one of the commands below",
+        "       rps PATH [OPTIONS]      run that of a file, or of study.py of a folder",
+        "       rps NAME --help         list its options",
         "       rps --version",
         "",
         "Pushing unknown objects by touch: the Reactive Pushing Strategy in MuJoCo.",
     ]
     width = max(map(len, known())) + 2
-    for room, heading in _ROOMS.items():
+    indent = " " * (width + 2)
+    for room, heading in _HEADINGS.items():
         lines += ["", f"{heading}:"]
-        for words, name in known().items():
-            if name.room == room:
-                hang = " " * (width + 2)
-                text = textwrap.fill(name.summary, 100, initial_indent=hang, subsequent_indent=hang)
-                lines.append(f"  {words.ljust(width)}{text.lstrip()}")
+        for name, command in known().items():
+            if command.room == room:
+                text = textwrap.fill(
+                    command.summary, 100, initial_indent=indent, subsequent_indent=indent
+                )
+                lines.append(f"  {name.ljust(width)}{text.lstrip()}")
     return "\n".join(lines)
 
 
 def split(words: list[str]) -> tuple[str, list[str]]:
-    """The words that name a question, and the others."""
+    """Return the name or path of a command, and the words after it."""
     for count in (2, 1):
         name = " ".join(words[:count])
         if name in known():
             return name, words[count:]
     first = words[0]
-    if first in _REPLACED:
-        raise InputError(f"unknown command '{first}': use `{_REPLACED[first]}`.")
     if first.endswith(".py") or "/" in first or Path(first).is_dir():
         return first, words[1:]
-    check_name("command", " ".join(words[:2]) if first in ("tune", "export") else first, known())
-    raise AssertionError
+    if first in _REPLACED:
+        raise InputError(f"unknown command '{first}': use `{_REPLACED[first]}`.")
+    name = " ".join(words[:2]) if first in ("tune", "export") else first
+    return check_name("command", name, known()), []  # which raises
 
 
-def question_of(name: str) -> type[Any]:
-    """The class of a question, by its words or its path."""
+def question_type(name: str) -> "type[Question[object]]":
+    """Return the class of a command, by its name or its path."""
     if name in known():
-        return getattr(importlib.import_module(known()[name].module), known()[name].question)
+        return getattr(importlib.import_module(known()[name].module), known()[name].class_name)
     path = Path(name)
     path = path / "study.py" if path.is_dir() else path
     try:
-        made = _MAKES.findall(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is no text"
+        definitions = _definitions(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, SyntaxError) as error:
+        reason = getattr(error, "strerror", None) or "it is no Python text"
         raise InputError(
             f"study = {path} cannot be read ({reason}): give a file, or a folder with study.py."
         ) from error
-    if len(made) != 1:
+    if len(definitions) != 1:
         raise InputError(
-            f"study = {path} makes {len(made)} questions: it must say `name = call_of(Class)` once."
+            f"study = {path} defines {len(definitions)} commands: write `name = call_of(Class)` "
+            "once."
         )
-    return getattr(_module_of(path.resolve()), made[0][1])
+    ((class_name, _),) = definitions.values()
+    return getattr(_import_file(path.resolve()), class_name)
 
 
-def _module_of(path: Path) -> Any:
-    """The module of a file: one of its package, if it is in one, else one of its own."""
+def _import_file(path: Path) -> ModuleType:
+    """Import a file, as a module of its package if it is in one."""
     from rps_jax.control import registry
 
     root = path.parent
@@ -123,7 +141,7 @@ def _module_of(path: Path) -> Any:
         return importlib.import_module(".".join(path.relative_to(root).with_suffix("").parts))
     except InputError:
         raise
-    except Exception as error:  # whatever a user's file raises
+    except Exception as error:  # of any kind, in the user's code
         raise InputError(
-            f"{path} cannot be run ({type(error).__name__}: {error}): mend the file."
+            f"{path} cannot be run ({type(error).__name__}: {error}): correct the file."
         ) from error

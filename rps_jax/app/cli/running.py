@@ -1,4 +1,4 @@
-"""How a command runs: the question, its report, its exit code, and what it prints."""
+"""How a command runs: exit codes, errors and interrupts, and what it prints and writes."""
 
 from __future__ import annotations
 
@@ -13,51 +13,55 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rps_jax.errors import InputError
-from rps_jax.record import cache
 
 if TYPE_CHECKING:
-    from rps_jax.app.cli.flags import Beside
+    from numpy.typing import ArrayLike
+
+    from rps_jax.app.cli.flags import Session
     from rps_jax.runs.push import Trace
+    from rps_jax.runs.question import Question
     from rps_jax.trials.progress import Bar
 
-_MEND = "make room, then run the same command again; what is done is kept"
-# Of results and report.
-_AFTER = ("rps_jax.analysis.figures.sweeps", "h5netcdf", "markdown.extensions.tables")
-_stopped: list[bool] = []  # interrupts of this command
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+# Modules that the results and the report need.
+_IMPORTED_EARLY = ("rps_jax.analysis.figures.sweeps", "h5netcdf", "markdown.extensions.tables")
+_interrupts: list[bool] = []  # of this command
 
 
-def guarded(action: Callable[[], object]) -> int:
-    """Run a command: exit code 0, or one sentence on the error stream and 2 (130: interrupted)."""
+def exit_code(command: Callable[[], object]) -> int:
+    """Run a command, and return its exit code: 0, 2 after one sentence, or 130 if interrupted."""
     for stream in (sys.stdout, sys.stderr):  # a terminal without UTF-8 shows `?`
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     try:
         with _interruptible():
-            action()
+            command()
         sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing more to say
-        return 0
+    except BrokenPipeError:  # nobody reads the output
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except InputError as error:
-        return _told(error)
+        return _print_error(error)
     except OSError as error:
-        hint = f": {_MEND}" if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) else ""
-        return _told(InputError(f"{error.filename or 'output'}: {error.strerror or error}{hint}."))
+        full = ": make room, then run the same command again; finished parts are stored"
+        hint = full if error.errno in _DISK_FULL else ""
+        return _print_error(f"{error.filename or 'output'}: {error.strerror or error}{hint}.")
     except RuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
-        return _told(
-            "the device is out of memory: ask for fewer worlds at once with --slots; what is done "
-            "is kept."
+        return _print_error(
+            "the device is out of memory: step fewer worlds at once with --slots; finished parts "
+            "are stored."
         )
     except MemoryError:
-        return _told("this machine is out of memory: ask for fewer worlds; what is done is kept.")
+        return _print_error(
+            "this machine is out of memory: run fewer worlds; finished parts are stored."
+        )
     except KeyboardInterrupt:
         print("rps: interrupted.", file=sys.stderr)
         return 130
@@ -66,123 +70,124 @@ def guarded(action: Callable[[], object]) -> int:
     return 0
 
 
-@contextlib.contextmanager
-def _interruptible() -> Iterator[None]:
-    """Remember an interrupt that comes while a module is imported, where it may be swallowed.
-
-    Where Python can raise nothing, as in a callback of its garbage collector, it comes again.
-    """
-
-    def stop(*_: object) -> None:
-        _stopped.append(True)
-        raise KeyboardInterrupt
-
-    def again(unraisable: Any) -> None:
-        if isinstance(unraisable.exc_value, KeyboardInterrupt):
-            threading.Timer(0.05, repeated).start()
-        else:
-            told(unraisable)
-
-    def repeated() -> None:
-        if sys.unraisablehook is again:  # and not when the command has ended
-            _thread.interrupt_main()
-
-    _stopped.clear()
-    usual = threading.current_thread() is threading.main_thread() and (
-        signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    )
-    told = sys.unraisablehook
-    if usual:
-        signal.signal(signal.SIGINT, stop)
-        sys.unraisablehook = again
-    try:
-        yield
-    finally:
-        if usual:
-            sys.unraisablehook = told
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def _go_on() -> None:
-    if _stopped:
-        raise KeyboardInterrupt
-
-
-def _told(sentence: str | InputError) -> int:
-    print(f"rps: error: {sentence}", file=sys.stderr)
+def _print_error(sentence: object) -> int:
+    """Print one sentence on the error stream; return the exit code for bad input."""
+    print(f"rps: error: {InputError(sentence)}", file=sys.stderr)
     return 2
 
 
-def carry_out(question: Any, beside: Beside) -> None:
-    """Check a question, answer it, and write and print its report."""
+@contextlib.contextmanager
+def _interruptible() -> Iterator[None]:
+    """Note interrupts, since a module that is being imported may swallow them.
+
+    Python cannot raise in some callbacks, such as those of its garbage collector. An interrupt in
+    one of these is sent again.
+    """
+    default_hook = sys.unraisablehook
+
+    def interrupt(*_: object) -> None:
+        _interrupts.append(True)
+        raise KeyboardInterrupt
+
+    def hook(unraisable: sys.UnraisableHookArgs) -> None:
+        if isinstance(unraisable.exc_value, KeyboardInterrupt):
+            threading.Timer(0.05, interrupt_again).start()
+        else:
+            default_hook(unraisable)
+
+    def interrupt_again() -> None:
+        if sys.unraisablehook is hook:  # and not when the command has ended
+            _thread.interrupt_main()
+
+    _interrupts.clear()
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if not in_main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    signal.signal(signal.SIGINT, interrupt)
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = default_hook
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _raise_interrupts() -> None:
+    if _interrupts:
+        raise KeyboardInterrupt
+
+
+def execute(question: Question[object], session: Session) -> None:
+    """Check a question, compute its results, and write and print its report."""
     from tqdm import tqdm
 
     from rps_jax.engines import device
-    from rps_jax.record import folder
-    from rps_jax.runs.push import check_length
+    from rps_jax.record import cache, folder
+    from rps_jax.runs.push import Trace
     from rps_jax.runs.question import timing_line
 
-    if question.out is None and not hasattr(question, "in_shell"):
+    in_shell = hasattr(question, "in_shell")
+    if question.out is None and not in_shell:
         question = dataclasses.replace(question, out=question.default_folder)
-    asked = question.with_quick_values()
-    few = beside.device == "auto" and asked.suits_processors()
-    device.choose("cpu" if few or getattr(asked, "ray", None) else beside.device)
-    asked.validate()
-    check_length(beside.film_length)
-    _go_on()
-    if note := asked.note():
+    few = session.device == "auto" and question.suits_processors()
+    device.choose("cpu" if few or getattr(question, "ray", None) else session.device)
+    question.validate()
+    _raise_interrupts()
+    if note := question.note():
         print(note)
     cache.use_cache()
-    if hasattr(asked, "in_shell"):
-        asked.in_shell()
+    if in_shell:
+        question.in_shell()
         return
-    if beside.overwrite:
-        folder.remove_run(Path(asked.out))
+    out = Path(str(question.out))
+    if session.overwrite:
+        folder.remove_run(out)
     tqdm.set_lock(threading.RLock())  # of this process alone: no semaphore is left if it is stopped
     film = None
-    with asked.progress_bar() as bar:
-        _go_on()
+    with question.progress_bar() as bar:
+        _raise_interrupts()
         importlib.import_module("scipy.special")  # JAX does, too: in two threads they could meet
-        bar.on_compiled = _import_ahead
-        found = asked.execute(bar)
+        bar.on_compiled = _import_early
+        results = question.execute(bar)
         timed = bar.timing.simulated > 0 and bar.over != "clock"
-        spent = timing_line(bar.timing, device.device_name()) if timed else ""
-        if isinstance(found, Path):
-            print(f"{asked.name}: {found}")
+        timing = timing_line(bar.timing, device.device_name()) if timed else ""
+        if isinstance(results, Path):
+            print(f"{question.name}: {results}")
             return
-        if beside.video and hasattr(found, "film"):
-            film = _Film(found, Path(asked.out), beside.film_length)
-        path = _report(asked, found, bar)
-    print(path.read_text(encoding="utf-8"))
-    if spent:
-        print(spent)
+        if session.video and isinstance(results, Trace):
+            film = _Film(results, out, session.film_length)
+        report = _write_report(question, results, bar)
+    print(report.read_text(encoding="utf-8"))
+    if timing:
+        print(timing)
     if film is not None:
-        film.end()
-    if getattr(asked, "film", False) and (Path(asked.out) / "worlds").is_dir():
+        film.finish()
+    if getattr(question, "film", False) and (out / "worlds").is_dir():
         from rps_jax.app.film import Film
 
-        print(f"film: {Film(Path(asked.out) / 'worlds', grid='3x4', which='hardest')()}")
-    print(f"run folder: {asked.out}")
+        print(f"film: {Film(out / 'worlds', grid='3x4', which='hardest')()}")
+    print(f"run folder: {out}")
 
 
-def _import_ahead() -> None:
-    """Import what the report needs while trials run, which leaves Python to others."""
-    later = map(importlib.import_module, _AFTER)
-    threading.Thread(target=list, args=(later,), daemon=True).start()
+def _import_early() -> None:
+    """Import what the report needs while trials run, which leaves Python to other threads."""
+    imports = map(importlib.import_module, _IMPORTED_EARLY)
+    threading.Thread(target=list, args=(imports,), daemon=True).start()
 
 
-def _report(asked: Any, found: Any, bar: Bar) -> Path:
-    """Write the report of an answer; returns its path."""
+def _write_report(question: Question[object], results: object, bar: Bar) -> Path:
+    """Write the report of the results, and return its path."""
     from rps_jax.analysis.report import write_report
     from rps_jax.record import provenance
 
-    out = Path(asked.out)
+    out = Path(str(question.out))
     bar.phase("report")
-    sections = asked.report(found, asked.create_run(out, bar))
-    parts = [asked.intro(found)]
+    sections = question.report(results, question.create_run(out, bar))
+    intro = [question.intro(results)]
     with contextlib.suppress(InputError):
-        parts.append(provenance.describe(out))
-    return write_report(out, asked.title, "\n\n".join(filter(None, parts)), sections)
+        intro.append(provenance.describe(out))
+    return write_report(out, question.title, "\n\n".join(filter(None, intro)), sections)
 
 
 class _Film:
@@ -192,18 +197,18 @@ class _Film:
         self._trace, self._out = trace, out
         self._total, self._drawn = 0, 0
         pool = ThreadPoolExecutor(1)
-        self._film = pool.submit(trace.film, out / "push.mp4", seconds, watch=self._watched)
+        self._path = pool.submit(trace.film, out / "push.mp4", seconds, watch=self._watch)
         pool.shutdown(wait=False)
 
-    def _watched(self, frames: Any) -> Iterator[Any]:
+    def _watch(self, frames: Iterable[ArrayLike]) -> Iterator[ArrayLike]:
+        frames = list(frames)
         self._total = len(frames)
         for self._drawn, frame in enumerate(frames):
-            if _stopped:
-                raise KeyboardInterrupt
+            _raise_interrupts()
             yield frame
 
-    def end(self) -> None:
-        """Wait for the film, with a bar, and draw the stills."""
+    def finish(self) -> None:
+        """Draw the stills, and wait for the film with a bar."""
         from tqdm import tqdm
 
         from rps_jax.analysis.report import save
@@ -212,10 +217,10 @@ class _Film:
         try:
             save(self._trace.stills(), self._out / "stills.png")
             with tqdm(unit="frame", desc="film") as bar:
-                while not self._film.done():
+                while not self._path.done():
                     bar.total, bar.n = self._total, self._drawn
                     bar.refresh()
                     time.sleep(0.1)
-            print(f"film: {self._film.result()}")
+            print(f"film: {self._path.result()}")
         except video.VideoError as error:
             print(f"no film: {error}")
