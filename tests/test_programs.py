@@ -145,12 +145,12 @@ def test_a_model_of_mjx_is_known_again_by_its_numbers(cache):
     """Its static arrays, which JAX names by their addresses, too."""
     setting = Setting("mjx")
     stages = [pushes.build([Case(name)], setting).stage for name in ("box", "box", "cylinder")]
-    said = [repr(programs._said(jax.tree.structure(one))) for one in stages]
+    said = [repr(programs._describe(jax.tree.structure(one))) for one in stages]
     assert said[0] == said[1] != said[2]
-    assert programs._place(said[0]) is not None
+    assert programs._path_of(said[0]) is not None
     model = stages[0].model
     changed = stages[0]._replace(model=model.replace(geom_bodyid=model.geom_bodyid + 1))
-    assert repr(programs._said(jax.tree.structure(changed))) != said[0]
+    assert repr(programs._describe(jax.tree.structure(changed))) != said[0]
 
 
 def test_programs_that_were_not_used_for_longest_go_first(cache, made, monkeypatch):

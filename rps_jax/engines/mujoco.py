@@ -1,4 +1,4 @@
-"""C MuJoCo, the engine that MJX is measured against: it steps worlds on the host, in double."""
+"""The engine C MuJoCo, the reference of the others: it steps worlds on the host, in double."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from rps_jax.world.scene import JOINTS, Friction
 _STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 
-def _as_it_goes(model: mujoco.MjModel) -> mujoco.MjModel:
-    """The model without MuJoCo's habit to put a world that runs away back to its start, unasked."""
+def _without_reset(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Return a model without MuJoCo's automatic reset of diverged worlds."""
     model = copy.copy(model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     return model
 
 
 def _in_base(wrench: np.ndarray, turn: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Wrenches (n, 3) along the world's axes in the base's frame, of headings' (cos, sin) (n,)."""
+    """Return wrenches (n, 3) of the world's axes in the base's frame, from (cos, sin) (n,)."""
     (x, y, torque), (c, s) = wrench.T, turn
     return np.stack([c * x + s * y, c * y - s * x, torque], axis=1)
 
 
 class Batch:
-    """Worlds stepped by C MuJoCo on a pool of threads: (time, qpos, qvel) of each, in double."""
+    """Worlds stepped by C MuJoCo on a pool of threads; the state is (time, qpos, qvel)."""
 
     def __init__(
         self,
@@ -45,11 +45,15 @@ class Batch:
         threads: int,
         robots: Robot | None = None,
     ):
-        """Start from positions (n, 10) at rest; the models are of one shape family.
+        """Start from positions (n, 10) at rest.
 
-        `robots` (n,) are of bases whose force is limited.
+        Args:
+          models: of one shape family.
+          qpos: positions (n, 10).
+          threads: of the pool.
+          robots: (n,) with a limited force, if any.
         """
-        self.models = [_as_it_goes(model) for model in models]
+        self.models = [_without_reset(model) for model in models]
         nq, nv = models[0].nq, models[0].nv
         size = mujoco.mj_stateSize(models[0], _STATE)
         assert size == 1 + nq + nv, "the scenes have neither actuators nor plugins"
@@ -67,21 +71,20 @@ class Batch:
         self._data = [mujoco.MjData(models[0]) for _ in range(threads)]
         self._pool = rollout.Rollout(nthread=threads)
         self._warning = mujoco.get_mju_user_warning()
-        # What runs away is an outcome, not a file of lines.
+        # A diverged world is an outcome; MuJoCo would write its warnings to a file.
         mujoco.set_mju_user_warning(lambda _: None)
 
-    def drive(self, which: np.ndarray, twist: np.ndarray, substeps: int) -> None:
-        """Step the worlds `which` (n,) with the base held at `twist` (n, 3) in its own frame.
+    def drive(self, rows: np.ndarray, twist: np.ndarray, substeps: int) -> None:
+        """Step the worlds `rows` (n,) with their bases at `twist` (n, 3), in the base's frame.
 
-        The velocity is written once, along the heading of mid-period. The other engines turn it at
-        every step, along the heading of the step's beginning, half a step behind: less than
-        0.001 rad.
+        The velocity is written once, for the heading at half of the period. The other engines use
+        the heading at the start of each step, half a step earlier: less than 0.001 rad.
         """
         if self._robots is not None:
-            self._push(which, twist, substeps)
+            self._push(rows, twist, substeps)
             return
-        models = [self.models[i] for i in which]
-        state = self.state[which]
+        models = [self.models[i] for i in rows]
+        state = self.state[rows]
         nq = self.qpos.shape[1]
         v_x, v_y, omega = twist.T
         yaw = state[:, 1 + JOINTS.base.start + 2] + omega * (substeps * self._timestep / 2)
@@ -89,35 +92,35 @@ class Batch:
         state[:, 1 + nq :][:, JOINTS.base] = np.stack(
             [c * v_x - s * v_y, s * v_x + c * v_y, omega], axis=1
         )
-        warmstart = self.warmstart[which]
-        after, _ = self._pool.rollout(
+        warmstart = self.warmstart[rows]
+        states, _ = self._pool.rollout(
             models, self._data, state, nstep=substeps, initial_warmstart=warmstart
         )
-        after = np.asarray(after)
-        before_last = after[:, -2] if substeps > 1 else state
-        # Euler's rule gives back the acceleration, with which the next step starts.
-        difference = after[:, -1, 1 + nq :] - before_last[:, 1 + nq :]
-        # Nothing but contact changes the velocity of the base, if by little: that is its force.
-        gained = after[:, -1, 1 + nq :][:, JOINTS.base] - state[:, 1 + nq :][:, JOINTS.base]
-        felt = self._inertia[which] * gained / (substeps * self._timestep)
-        self.force[which] = _in_base(felt, (c, s))
-        self.state[which], self.warmstart[which] = after[:, -1], difference / self._timestep
+        states = np.asarray(states)
+        previous = states[:, -2] if substeps > 1 else state
+        # By Euler's rule, the last change of velocity is the acceleration: the next first guess.
+        change = states[:, -1, 1 + nq :] - previous[:, 1 + nq :]
+        # Only contact changes the velocity of the base, by a small amount: that gives its force.
+        gained = states[:, -1, 1 + nq :][:, JOINTS.base] - state[:, 1 + nq :][:, JOINTS.base]
+        wrench = self._inertia[rows] * gained / (substeps * self._timestep)
+        self.force[rows] = _in_base(wrench, (c, s))
+        self.state[rows], self.warmstart[rows] = states[:, -1], change / self._timestep
 
-    def _push(self, which: np.ndarray, twist: np.ndarray, substeps: int) -> None:
-        """Step the worlds `which` with their bases pushed by their drives towards `twist`."""
-        models, dt = [self.models[i] for i in which], self._timestep
-        robots = jax.tree.map(lambda leaf: np.asarray(leaf, float)[which], self._robots)
+    def _push(self, rows: np.ndarray, twist: np.ndarray, substeps: int) -> None:
+        """Step the worlds `rows` with their bases pushed by their drives towards `twist`."""
+        models, dt = [self.models[i] for i in rows], self._timestep
+        robots = jax.tree.map(lambda leaf: np.asarray(leaf, float)[rows], self._robots)
         assert self.integral is not None
-        state, warmstart = self.state[which], self.warmstart[which]
-        integral, nq = tuple(self.integral[which].T), self.qpos.shape[1]
-        applied = np.zeros((len(which), 1, self.qvel.shape[1]))
-        felt = np.zeros((len(which), 3))
+        state, warmstart = self.state[rows], self.warmstart[rows]
+        integral, nq = tuple(self.integral[rows].T), self.qpos.shape[1]
+        applied = np.zeros((len(rows), 1, self.qvel.shape[1]))
+        wrench = np.zeros((len(rows), 3))
         for _ in range(substeps):
             yaw, qvel = state[:, 1 + JOINTS.base.start + 2], state[:, 1 + nq :]
             turn, base = (np.cos(yaw), np.sin(yaw)), tuple(qvel[:, JOINTS.base].T)
             force, integral = drives.push(robots, integral, tuple(twist.T), base, turn, dt, np)
             applied[:, 0, JOINTS.base] = np.stack(force, axis=1)
-            after, _ = self._pool.rollout(
+            states, _ = self._pool.rollout(
                 models,
                 self._data,
                 state,
@@ -126,29 +129,29 @@ class Batch:
                 nstep=1,
                 initial_warmstart=warmstart,
             )
-            after = np.asarray(after)[:, -1]
-            warmstart = (after[:, 1 + nq :] - qvel) / dt
-            of_contact = self._inertia[which] * warmstart[:, JOINTS.base] - np.stack(force, axis=1)
-            felt += _in_base(of_contact, turn) / substeps
-            state = after
-        self.state[which], self.warmstart[which] = state, warmstart
-        self.integral[which] = np.stack(integral, axis=1)
-        self.force[which] = felt
+            following = np.asarray(states)[:, -1]
+            warmstart = (following[:, 1 + nq :] - qvel) / dt
+            contact = self._inertia[rows] * warmstart[:, JOINTS.base] - np.stack(force, axis=1)
+            wrench += _in_base(contact, turn) / substeps
+            state = following
+        self.state[rows], self.warmstart[rows] = state, warmstart
+        self.integral[rows] = np.stack(integral, axis=1)
+        self.force[rows] = wrench
 
     def close(self) -> None:
-        """End the threads, and let MuJoCo warn again."""
+        """Stop the threads, and restore MuJoCo's warnings."""
         mujoco.set_mju_user_warning(self._warning)
         self._pool.close()
 
 
 class MuJoCo(Engine):
-    """C MuJoCo on all cores; worlds share nothing, and their stage is a list of models."""
+    """C MuJoCo on all processors; the stage is a list of models."""
 
     name = "mujoco"
     traced = False
 
     def suits_processors(self, trials: int | None) -> bool:
-        """It steps worlds on the host."""
+        """Return True: it steps worlds on the host."""
         return True
 
     def stage(
@@ -173,7 +176,7 @@ class MuJoCo(Engine):
     def stepper(
         self, stage: Any, qpos: np.ndarray, threads: int, robots: Robot | None = None
     ) -> Batch:
-        """Worlds on a pool of threads."""
+        """Return worlds on a pool of threads."""
         return Batch(stage, qpos, threads, robots)
 
 

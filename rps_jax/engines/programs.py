@@ -1,9 +1,9 @@
-"""Traced programs, kept between processes beside XLA's compiled ones, so that none is traced twice.
+"""A cache of traced programs between processes, beside XLA's cache of compiled ones.
 
-XLA's cache spares a process the compilation; tracing and lowering, which are Python, it does not
-spare. So a program is also kept as StableHLO, as `jax.export` writes it, under a key of all that it
-depends on: versions, this package's source, the device, shapes and static settings. An entry is
-verified before it is used; one that is damaged is dropped with one line, and traced again.
+XLA's cache saves compilation, but not tracing and lowering in Python. This cache stores a program as
+StableHLO, written by `jax.export`, under a key of all its inputs: versions, source of this package,
+device, shapes and static settings. An entry is verified before use; a damaged one is deleted with a
+warning, and the program is traced again.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from typing import Any
 import jax
 import numpy as np
 from jax import export
+from jax.tree_util import PyTreeDef
 
 from rps_jax.control.base import Law
 from rps_jax.engines import native
@@ -35,168 +36,175 @@ def compile_function(
     *,
     law: Law,
     donate: int,
-    static: Sequence[Any],
+    static: Sequence[object],
 ) -> Callable[..., Any]:
-    """Compile a function for arguments of these shapes, from what was kept of it if there is.
+    """Compile a function for arguments of some shapes, from the cache if it holds the program.
 
     Args:
-      function: pure; it may depend on nothing but its arguments, the law and `static`.
+      function: pure; it depends only on its arguments, the law and `static`.
       arguments: pytrees of arrays or `jax.ShapeDtypeStruct`.
-      law: which it calls; of one that no name says (see `identity`), nothing is kept.
-      donate: position of the argument whose memory may be used again.
-      static: what else it depends on; each with a `repr` that says all of it.
+      law: called by the function; without an `identity`, the program is not cached.
+      donate: index of the argument whose memory may be reused.
+      static: further inputs of the function; the `repr` of each identifies it.
 
     Returns:
-      The compiled function. It is the same program whether it was kept or not.
+      The compiled function: the same program with and without the cache.
     """
-    if (who := identity(law)) is None:
+    if (law_name := identity(law)) is None:
         return compile_lowered(jax.jit(function, donate_argnums=donate).lower(*arguments))
-    leaves, tree = jax.tree.flatten(jax.eval_shape(lambda *given: given, *arguments))
-    sizes = [jax.tree.structure(one).num_leaves for one in arguments]
+    leaves, tree = jax.tree.flatten(jax.eval_shape(lambda *inputs: inputs, *arguments))
+    sizes = [jax.tree.structure(argument).num_leaves for argument in arguments]
     first = sum(sizes[:donate])
     donated = tuple(range(first, first + sizes[donate]))
-    shapes: list[Any] = []  # of what it returns
+    structures: list[PyTreeDef] = []  # of the results, once traced
 
-    def flat(*given: Any) -> list[Any]:
-        found, structure = jax.tree.flatten(function(*jax.tree.unflatten(tree, given)))
-        shapes[:] = [structure]
-        return found
+    def flat(*inputs: Any) -> list[Any]:
+        results, structure = jax.tree.flatten(function(*jax.tree.unflatten(tree, inputs)))
+        structures[:] = [structure]
+        return results
 
-    shown = [(x.shape, str(x.dtype)) for x in leaves]
-    place = _place(repr((function.__qualname__, _said(tree), shown, donated, who, static)))
-    found = None if place is None else _read(place, leaves)
-    if found is None:
+    shapes = [(x.shape, str(x.dtype)) for x in leaves]
+    inputs = function.__qualname__, _describe(tree), shapes, donated, law_name, static
+    path = _path_of(repr(inputs))
+    stored = None if path is None else _read(path, leaves)
+    if stored is None:
         jitted = jax.jit(flat, donate_argnums=donated)
-        jitted.trace(*leaves)  # in which functions are compiled that it calls
+        jitted.trace(*leaves)  # compiles the native functions that it calls
         safe = list(map(export.DisabledSafetyCheck.custom_call, native.loaded_names()))
         exported = export.export(jitted, disabled_checks=safe)(*leaves)
-        (structure,) = shapes
-        with contextlib.suppress(ValueError, TypeError, AttributeError):  # what cannot be kept
-            cache.write(place, _head(structure) + b"\n" + bytes(exported.serialize()))
+        (structure,) = structures
+        with contextlib.suppress(ValueError, TypeError, AttributeError):  # cannot be serialised
+            cache.write(path, _encode(structure) + b"\n" + bytes(exported.serialize()))
     else:
-        structure, exported = found
+        structure, exported = stored
     program = compile_lowered(jax.jit(exported.call, donate_argnums=donated).lower(*leaves))
-    return lambda *given: jax.tree.unflatten(structure, program(*jax.tree.leaves(given)))
+    return lambda *inputs: jax.tree.unflatten(structure, program(*jax.tree.leaves(inputs)))
 
 
-def _said(structure: Any) -> Any:
-    """All that the structure of a pytree holds, with a digest of every static array."""
+def _describe(structure: PyTreeDef) -> object:
+    """Return the content of the structure of a pytree, with a digest of each static array."""
     data = structure.node_data()
-    held = data and (data[0], _digests(data[1]))
-    return held, structure.num_leaves, [_said(child) for child in structure.children()]
+    node = data and (data[0], _digests(data[1]))
+    return node, structure.num_leaves, [_describe(child) for child in structure.children()]
 
 
-def _digests(data: Any) -> Any:
-    """Static data with a digest in the place of every array."""
+def _digests(data: object) -> object:
+    """Return static data with a digest in place of each array."""
     if isinstance(data, tuple):
         return tuple(map(_digests, data))
     if isinstance(data, Mapping):
-        return {name: _digests(one) for name, one in data.items()}
-    array = getattr(data, "array", data)  # so MJX wraps what a model has of fixed numbers
+        return {name: _digests(value) for name, value in data.items()}
+    array = getattr(data, "array", data)  # MJX wraps static arrays of a model
     if isinstance(array, np.ndarray):
         return array.shape, str(array.dtype), hashlib.sha256(array.tobytes()).hexdigest()
     return data
 
 
-def _head(structure: Any) -> bytes:
-    """The structure of a pytree as JSON has it, from which `_tree` makes it again.
+def _encode(structure: PyTreeDef) -> bytes:
+    """Return the structure of a pytree as JSON, which `_decode` reads.
 
     Raises:
-      ValueError, TypeError, AttributeError: it has nodes that are made otherwise.
+      ValueError, TypeError, AttributeError: it has nodes that JSON cannot hold.
     """
-    head = json.dumps(_words(structure.unflatten([0] * structure.num_leaves)))
-    if jax.tree.structure(_tree(json.loads(head))) != structure:
-        raise ValueError(f"{structure} is not kept")
-    return head.encode()
+    text = json.dumps(_to_json(structure.unflatten([0] * structure.num_leaves)))
+    if _decode(text) != structure:
+        raise ValueError(f"{structure} cannot be cached")
+    return text.encode()
 
 
-def _words(tree: Any) -> Any:
+def _decode(text: str | bytes) -> PyTreeDef:
+    return jax.tree.structure(_from_json(json.loads(text)))
+
+
+def _to_json(tree: Any) -> Any:
     if isinstance(tree, dict):
-        return {key: _words(one) for key, one in tree.items()}
+        return {key: _to_json(child) for key, child in tree.items()}
     if isinstance(tree, tuple):
-        return [f"{type(tree).__module__}:{type(tree).__name__}", *map(_words, tree)]
+        return [f"{type(tree).__module__}:{type(tree).__name__}", *map(_to_json, tree)]
     return tree
 
 
-def _tree(words: Any) -> Any:
-    """The pytree of which these are the words."""
-    if isinstance(words, dict):
-        return {key: _tree(one) for key, one in words.items()}
-    if isinstance(words, list):
-        module, _, name = words[0].partition(":")
-        kind, leaves = getattr(importlib.import_module(module), name), map(_tree, words[1:])
-        return tuple(leaves) if kind is tuple else kind(*leaves)
-    return words
+def _from_json(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {key: _from_json(child) for key, child in content.items()}
+    if isinstance(content, list):
+        module, _, name = content[0].partition(":")
+        kind, children = (
+            getattr(importlib.import_module(module), name),
+            map(_from_json, content[1:]),
+        )
+        return tuple(children) if kind is tuple else kind(*children)
+    return content
 
 
-def compile_lowered(lowered: Any) -> Any:
-    """Compile a program; on a GPU so that what does not wait for one another runs side by side."""
+def compile_lowered(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
+    """Compile a lowered program; on a GPU, independent operations run concurrently."""
     if jax.default_backend() == "gpu":
-        with contextlib.suppress(Exception):  # an XLA that does not know of it
+        with contextlib.suppress(Exception):  # an XLA without this option
             return lowered.compile({"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"})
     program = lowered.compile()
     with contextlib.suppress(AttributeError, OSError, TypeError):  # a system without glibc
-        ctypes.CDLL(None).malloc_trim(0)  # gives back the compiler's memory, 0.8 GB
+        ctypes.CDLL(None).malloc_trim(0)  # frees memory of the compiler, 0.8 GB
     return program
 
 
 def identity(law: Law) -> str | None:
-    """What says in any process which law this is; None if nothing does.
+    """Return a text that identifies a law in all processes; None if there is none.
 
-    A law of this package whose functions stand at the top of their modules is said by their names,
-    and by what is bound to them, as the weights of a network; its source is a part of every key.
+    It holds the names of the law's functions, at the top of modules of this package, and digests of
+    bound arguments, as the weights of a network. The source of the package is a part of every key.
     """
-    names = list(map(_named, (law.init, law.step)))
+    names = list(map(_name_of, (law.init, law.step)))
     if None in names:
         return None
     return repr((names, law.senses, law.temperatures, law.smooth, law.cell))
 
 
-def _named(function: Any) -> Any:
+def _name_of(function: object) -> object:
     if isinstance(function, functools.partial):
-        own = _named(function.func)
-        return own and (own, _digests(function.args), _digests(function.keywords))
+        name = _name_of(function.func)
+        return name and (name, _digests(function.args), _digests(function.keywords))
     module, name = getattr(function, "__module__", ""), getattr(function, "__qualname__", "<")
     return f"{module}.{name}" if module.startswith("rps_jax.") and "<" not in name else None
 
 
 @functools.cache
-def _source() -> str:
-    """Digest of this package's source and of the versions that make a program of it."""
+def _source_digest() -> str:
+    """Return a digest of the source of this package and of the versions it depends on."""
     names = ("jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx")
     versions = [metadata.version(name) for name in names]
-    told = hashlib.sha256(repr(versions).encode())
+    digest = hashlib.sha256(repr(versions).encode())
     root = Path(__file__).parents[1]
     for path in sorted([*root.rglob("*.py"), *root.rglob("*.[ch]")]):
-        told.update(path.read_bytes())
-    return told.hexdigest()
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
-def _place(told: str) -> Path | None:
-    """Where a program is kept of which this says all; None if nowhere.
+def _path_of(inputs: str) -> Path | None:
+    """Return the file of a program by the text of its inputs; None if it cannot be cached.
 
-    An address in memory, or what was left out of a long array, says nothing.
+    A text with an address in memory, or with a shortened array, does not identify its inputs.
     """
     folder = jax.config.jax_compilation_cache_dir
-    if not folder or " at 0x" in told or "..." in told:
+    if not folder or " at 0x" in inputs or "..." in inputs:
         return None
-    found = jax.devices()[0]
+    device = jax.devices()[0]
     flags = [jax.config.jax_enable_x64, jax.config.jax_default_matmul_precision, native.target()]
-    where = [found.platform, found.device_kind, os.environ.get("XLA_FLAGS", ""), flags]
-    key = hashlib.sha256(repr((_source(), where, told)).encode()).hexdigest()
+    platform = [device.platform, device.device_kind, os.environ.get("XLA_FLAGS", ""), flags]
+    key = hashlib.sha256(repr((_source_digest(), platform, inputs)).encode()).hexdigest()
     return Path(folder) / "traced" / key
 
 
-def _read(path: Path, leaves: Sequence[Any]) -> tuple[Any, export.Exported] | None:
-    """A program that was kept and the structure of its results, if it is of these arguments."""
+def _read(path: Path, leaves: Sequence[Any]) -> tuple[PyTreeDef, export.Exported] | None:
+    """Return a cached program and the structure of its results, if it fits these arguments."""
 
-    def told(body: bytes) -> tuple[Any, export.Exported]:
+    def parse(body: bytes) -> tuple[PyTreeDef, export.Exported]:
         head, _, program = body.partition(b"\n")
-        found = export.deserialize(bytearray(program))
-        if [(x.shape, x.dtype) for x in found.in_avals] != [(x.shape, x.dtype) for x in leaves]:
-            raise ValueError("it is of other shapes")
-        if not all(map(native.load, native.called_names(found.mlir_module_serialized))):
-            raise ValueError("it needs a compiled function that is not there")
-        return jax.tree.structure(_tree(json.loads(head))), found
+        exported = export.deserialize(bytearray(program))
+        if [(x.shape, x.dtype) for x in exported.in_avals] != [(x.shape, x.dtype) for x in leaves]:
+            raise ValueError("it has other shapes")
+        if not all(map(native.load, native.called_names(exported.mlir_module_serialized))):
+            raise ValueError("it needs a compiled function that is missing")
+        return _decode(head), exported
 
-    return cache.read(path, "traced", told)
+    return cache.read(path, "traced", parse)

@@ -1,19 +1,20 @@
-"""Quasi-static planar pushing: no inertia, no height, and derivatives that are finite and right.
+"""The quasi-static engine: planar, without inertia, with finite and correct derivatives.
 
-An object that a force f through its centre of friction and a torque m about it make slide has a
-twist V = (v_x, v_y, omega) normal to the limit surface of its friction with the ground, here the
-ellipsoid f^2 / f_max^2 + m^2 / m_max^2 = 1: V goes as L^-1 (f, m), with L = diag(1, 1, c^2) and
-c = m_max / f_max (Goyal, Ruina and Papadopoulos 1991; Howe and Cutkosky 1996; Lynch and Mason
-1996). The base, a velocity source, sets how fast the object moves, and so the size of the force
-does not matter, nor do the mass and the friction with the ground. In each step V minimises
+A force f through the centre of friction and a torque m about it slide an object with a twist
+V = (v_x, v_y, omega) normal to the limit surface of its friction with the ground. Here that is the
+ellipsoid f^2 / f_max^2 + m^2 / m_max^2 = 1, so that V is proportional to L^-1 (f, m), with
+L = diag(1, 1, c^2) and c = m_max / f_max (Goyal, Ruina and Papadopoulos 1991; Howe and Cutkosky
+1996; Lynch and Mason 1996). The base, a velocity source, determines the speed of the object, so
+that the results depend neither on the size of the force, nor on the mass, nor on the friction with
+the ground. In each step V minimises
 
     V L V / (2 S) + sum over contacts of P(gap + dt (v_n - mu |v_t|)),
 
-S the speed of the base, v the velocity of the object's point relative to the base's, P the
-potential of a stiff spring that only pushes. Where its derivative is zero, the ground's friction
-balances contact forces within Coulomb's cones (Anitescu 2006, whose cones keep a contact that
-slides mu |v_t| dt apart: below 0.4 mm here). All of it is smooth and strictly convex in V, solved
-by Newton's method, and has the derivatives that the implicit function theorem gives.
+with S the speed of the base, v the velocity of the object's point relative to the base's, and P the
+potential of a stiff spring that only pushes. At the minimum the ground's friction balances contact
+forces within Coulomb's cones. (The cones of Anitescu 2006 keep a sliding contact mu |v_t| dt apart:
+below 0.4 mm here.) The problem is smooth and strictly convex in V. Newton's method solves it, and
+the implicit function theorem gives its derivatives.
 """
 
 from __future__ import annotations
@@ -39,15 +40,15 @@ from rps_jax.world import scene
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction
 
-_LEAST_SPEED = 1e-5  # [m/s] taken for that of a base at rest
-_SHARP = 3  # last steps of Newton's method, on the problem itself; those before widen its slip
+_MIN_SPEED = 1e-5  # [m/s] speed of a base at rest
+_SHARP = 3  # final steps of Newton's method with the final slip; earlier ones have a wider slip
 _ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric matrix
 
 
 class Slider(NamedTuple):
-    """What one world is made of."""
+    """Constants of one world."""
 
-    p_object_com: Any  # (2,) [m] centre of mass, and so of friction, in the object's frame
+    p_object_com: Any  # (2,) [m] centre of mass and of friction, in the object's frame
     arm: Any  # () [m] c = m_max / f_max of the friction with the ground
     friction_robot: Any  # () [1]
     base_half: Any  # (2,) [m] half length and width of the base
@@ -56,9 +57,9 @@ class Slider(NamedTuple):
 
 
 def sliders(solids: Solid, friction_robot: np.ndarray, base_half: np.ndarray) -> Slider:
-    """Solids (n,) on the points on which the other engines stand them.
+    """Return the sliders of solids (n,), on the support points of the other engines.
 
-    Their friction (n,) is that with a base of half length and width (2,) [m].
+    The friction (n,) is that with the base, whose half length and width are (2,) or (n, 2) [m].
     """
     count = solids.mass.size
     return Slider(
@@ -72,16 +73,16 @@ def sliders(solids: Solid, friction_robot: np.ndarray, base_half: np.ndarray) ->
 
 
 class Contact(NamedTuple):
-    """A point where the base may push the object; in the base's frame."""
+    """Candidate contact of base and object, in the base's frame."""
 
     normal: Point  # unit, towards the object
     r: Point  # [m] from the object's centre of mass
     v: Point  # [m/s] of the base there
-    gap: Any  # [m] below zero inside
+    gap: Any  # [m] negative for penetration
 
 
 class Problem(NamedTuple):
-    """What decides the object's twist in one step."""
+    """Optimisation problem for the object's twist in one step."""
 
     contacts: Sequence[Contact]
     speed: Any  # [m/s] of the base
@@ -92,62 +93,62 @@ class Problem(NamedTuple):
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Quasistatic:
-    """Stage of quasi-static worlds: how contact is smoothed and the problem solved."""
+    """Stage of quasi-static worlds: smoothing of contacts and options of the solver."""
 
-    depth: float = 1e-4  # [m] how far, about, a push sinks the object into the base
-    slip: float = 0.01  # [1] share of the base's speed at which friction is 0.7 of its most
+    depth: float = 1e-4  # [m] approximate penetration of a push
+    slip: float = 0.01  # [1] share of the base's speed at which friction is 0.7 of its maximum
     iterations: int = 10  # of Newton's method
 
     def __post_init__(self) -> None:
-        """Raises InputError for values with which there is nothing to solve."""
+        """Raise InputError for invalid options."""
         errors.check_finite("depth", self.depth, above=0, at_most=0.01, unit="m")
         errors.check_finite("slip", self.slip, above=0, at_most=1)
         errors.check_finite("iterations", self.iterations, at_least=_SHARP + 1)
 
     def drive(self, fields: Slider, motion: Motion, period: ControlPeriod) -> Driven:
-        """Step a batch for one control period; height and tilt of the object stay.
+        """Step a batch for one control period, with constant height and tilt of the object.
 
-        The velocities that come back are means over the period.
+        The resulting velocities are means over the period.
         """
         com, qpos, physics = fields.p_object_com, motion.qpos, period.physics
         free = qpos[:, JOINTS.object]
         yaw = planar.yaw_of_quaternion(free[:, 3:])
         p = free[:, :2] + planar.rotate(yaw, com)
-        # The batch comes last, as `contacts` has it.
+        # The batch axis comes last, as in `contacts`.
         corners = jnp.moveaxis(fields.vertices - com[:, None], (0, 1), (2, 1))
         sliders = fields._replace(base_half=tuple(fields.base_half.T), vertices=tuple(corners))
-        before = (tuple(qpos[:, JOINTS.base].T), (*p.T, yaw))
+        poses = (tuple(qpos[:, JOINTS.base].T), (*p.T, yaw))
         twist = tuple(period.twists)
         step = partial(self._step, sliders, twist, physics.timestep)
-        base, (x, y, angle) = jax.lax.fori_loop(0, physics.substeps, lambda _, s: step(s), before)
+        base, (x, y, angle) = jax.lax.fori_loop(0, physics.substeps, lambda _, s: step(s), poses)
         half = 0.5 * (angle - yaw)
         q = sp.times((jnp.cos(half), 0.0, 0.0, jnp.sin(half)), tuple(free[:, 3:].T))
         origin = jnp.stack([x, y], axis=-1) - planar.rotate(angle, com)
-        after = jnp.concatenate(
+        end = jnp.concatenate(
             [jnp.stack(base, axis=-1), origin, free[:, 2:3], jnp.stack(q, axis=-1)], axis=-1
         )
         seconds = physics.control_period
-        moved = (after - qpos)[:, :6] / seconds
+        moved = (end - qpos)[:, :6] / seconds
         spin = jnp.zeros_like(moved[:, :3]).at[:, 2].set((angle - yaw) / seconds)
         velocity = jnp.concatenate([moved, spin], axis=-1)
-        return Driven(Motion(after, velocity, motion.warmstart))
+        return Driven(Motion(end, velocity, motion.warmstart))
 
     def _step(
         self, slider: Slider, twist: Vec, dt: float, poses: tuple[Vec, Vec]
     ) -> tuple[Vec, Vec]:
-        """Poses of the base and of the object, about its centre of mass, after dt [s] at `twist`.
+        """Return the poses of base and object after dt [s] at `twist`.
 
-        Each is x, y [m], yaw [rad] in the world.
+        A pose is x, y [m], yaw [rad] in the world, for the object of its centre of mass.
         """
-        base, thing = poses
+        base, pushed = poses
         c, s = jnp.cos(base[2]), jnp.sin(base[2])
-        apart = (thing[0] - base[0], thing[1] - base[1])
-        p = (c * apart[0] + s * apart[1], c * apart[1] - s * apart[0])
+        offset = (pushed[0] - base[0], pushed[1] - base[1])
+        p = (c * offset[0] + s * offset[1], c * offset[1] - s * offset[0])
         v_x, v_y, omega = twist
         reach = sp.dot(slider.base_half, slider.base_half)
         problem = Problem(
-            _contacts(slider, (*p, thing[2] - base[2]), twist),
-            jnp.sqrt(v_x * v_x + v_y * v_y + reach * omega * omega + _LEAST_SPEED**2),
+            _contacts(slider, (*p, pushed[2] - base[2]), twist),
+            jnp.sqrt(v_x * v_x + v_y * v_y + reach * omega * omega + _MIN_SPEED**2),
             slider.arm,
             slider.friction_robot,
         )
@@ -156,21 +157,21 @@ class Quasistatic:
         def turned(u: Vec) -> Vec:
             return c * u[0] - s * u[1], s * u[0] + c * u[1], u[2]
 
-        return sp.add(base, sp.scale(dt, turned(twist))), sp.add(thing, sp.scale(dt, turned(v)))
+        return sp.add(base, sp.scale(dt, turned(twist))), sp.add(pushed, sp.scale(dt, turned(v)))
 
     def solve(self, problem: Problem, v: Vec, dt: float) -> Vec:
-        """The object's twist, from a first guess v, both in the base's frame.
+        """Return the object's twist, from a first guess v, both in the base's frame.
 
-        Newton's method starts with friction that sets in slowly, so that no step overshoots. Its
-        last step alone is differentiated, with its matrix held: at the solution that gives the
+        Newton's method starts with a wide slip of friction, so that no step overshoots. Only its
+        last step is differentiated, with a constant matrix: at the solution that gives the
         derivatives of the implicit function.
         """
-        held, v = jax.lax.stop_gradient((problem, v))
+        fixed, v = jax.lax.stop_gradient((problem, v))
         widening = self.iterations - _SHARP
 
         def newton(i: jax.Array, v: Vec) -> Vec:
             slip = self.slip ** jnp.minimum(i / widening, 1.0).astype(v[0].dtype)
-            gradient, hessian = self.derivatives(held, v, slip, dt)
+            gradient, hessian = self.derivatives(fixed, v, slip, dt)
             return sp.sub(v, solved(gradient, hessian))
 
         v = jax.lax.stop_gradient(jax.lax.fori_loop(0, self.iterations, newton, v))
@@ -178,7 +179,7 @@ class Quasistatic:
         return sp.sub(v, solved(gradient, jax.lax.stop_gradient(hessian)))
 
     def derivatives(self, problem: Problem, v: Vec, slip: Any, dt: float) -> tuple[Vec, list[Any]]:
-        """Gradient, and the upper entries of the Hessian, of what the object's twist minimises."""
+        """Return the gradient and the upper entries of the Hessian of the cost."""
         tiny, friction = slip * problem.speed, problem.friction
         stiff = 1 / problem.speed
         inertia = (stiff, stiff, stiff * problem.arm * problem.arm)
@@ -204,18 +205,18 @@ class Quasistatic:
 
 
 def _contacts(slider: Slider, pose: Vec, twist: Vec) -> list[Contact]:
-    """Where a base at `twist` may push the object, at `pose`; all in the base's frame."""
+    """Return the candidate contacts of a base at `twist` with an object at `pose`."""
     p_x, p_y, yaw = pose
     c, s = jnp.cos(yaw), jnp.sin(yaw)
     x, y = slider.vertices  # (N, ...) each, from the centre of mass
-    here = (p_x + c * x - s * y, p_y + s * x + c * y)
+    corners = (p_x + c * x - s * y, p_y + s * x + c * y)
     radius, half = slider.radius, slider.base_half
     if x.shape[0] == 1:
-        normal, point, gap = circle_and_rectangle((here[0][0], here[1][0]), radius, half)
+        normal, point, gap = circle_and_rectangle((corners[0][0], corners[1][0]), radius, half)
         points, gaps = [point], [gap]
     else:
-        ahead = (jnp.roll(here[0], -1, axis=0), jnp.roll(here[1], -1, axis=0))
-        normal, middles, gaps = polygon_and_rectangle(here, ahead, half)
+        ahead = (jnp.roll(corners[0], -1, axis=0), jnp.roll(corners[1], -1, axis=0))
+        normal, middles, gaps = polygon_and_rectangle(corners, ahead, half)
         gaps = [gap - radius for gap in gaps]
         off = 0.5 * radius
         points = [(q[0] - off * normal[0], q[1] - off * normal[1]) for q in middles]
@@ -231,14 +232,14 @@ def _contacts(slider: Slider, pose: Vec, twist: Vec) -> list[Contact]:
 
 
 def _with_moment(direction: Point, r: Point) -> Vec:
-    """A unit force at r and its moment."""
+    """Return a unit force at r with its moment."""
     return (*direction, r[0] * direction[1] - r[1] * direction[0])
 
 
 def _spring(inside: Any, depth: float) -> tuple[Any, Any]:
-    """Force [1] and stiffness [1/m] of a contact `inside` [m] the base.
+    """Return force [1] and stiffness [1/m] of a contact `inside` [m] the base.
 
-    Zero up to -depth, of slope 1 / depth from depth on, a parabola between.
+    The force is zero up to -depth, a parabola up to depth, and has the slope 1 / depth beyond.
     """
     bent = jnp.clip(inside + depth, 0.0, 2 * depth)
     force = bent * bent / (4 * depth) + jnp.maximum(inside - depth, 0.0)
@@ -246,7 +247,7 @@ def _spring(inside: Any, depth: float) -> tuple[Any, Any]:
 
 
 def solved(g: Vec, h: Sequence[Any]) -> Vec:
-    """The vector that the symmetric matrix of upper entries h maps to g."""
+    """Solve h x = g for a symmetric 3 x 3 matrix with the upper entries h."""
     a, b, c, d, e, f = h
     l_1, l_2 = b / a, c / a
     d, e = d - l_1 * b, e - l_1 * c
@@ -257,14 +258,14 @@ def solved(g: Vec, h: Sequence[Any]) -> Vec:
 
 
 class QuasistaticEngine(Engine):
-    """Planar, without inertia: the fastest, and differentiable in both modes."""
+    """Planar engine without inertia: the fastest, and differentiable in both modes."""
 
     name = "quasistatic"
     cones = ("elliptic",)  # its friction is the same in all directions
     modes = ("forward", "reverse")
-    newton = False  # but by its own rule
+    newton = False  # its solver has its own iterations
     forces = False
-    computes_force = False  # only its direction is known, and not the weight that it slides
+    computes_force = False  # only the direction of the force is known, not its size
 
     def stage(
         self,
@@ -280,7 +281,7 @@ class QuasistaticEngine(Engine):
         return Quasistatic(), sliders(solids, friction.robot, half)
 
     def contacts(self, stage: Any, corners: int) -> int:
-        """Points of contact that the program looks into."""
+        """Return the number of candidate contacts."""
         return min(corners, 2)
 
 
