@@ -1,8 +1,8 @@
 """A cache of traced programs between processes, beside XLA's cache of compiled ones.
 
-XLA's cache saves compilation, but not tracing and lowering in Python. This cache stores a program as
-StableHLO, written by `jax.export`, under a key of all its inputs: versions, source of this package,
-device, shapes and static settings. An entry is verified before use; a damaged one is deleted with a
+XLA's cache saves compilation, but not tracing and lowering in Python. This cache stores programs as
+StableHLO, written by `jax.export`, under a key of all inputs: versions, source of this package,
+device, shapes and static settings. An entry is verified before use. A damaged one is deleted with a
 warning, and the program is traced again.
 """
 

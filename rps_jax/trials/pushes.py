@@ -46,7 +46,7 @@ class Trajectory:
 
 
 def scene_of(case: Case, physics: Physics) -> Scene:
-    """The scene that a case is run in."""
+    """Compile the scene of a case."""
     return scene.load(
         case.object_name,
         physics,
@@ -67,7 +67,7 @@ def _scenes(cases: Sequence[Case], physics: Physics) -> tuple[list[Scene], np.nd
 
 
 def _start_of(case: Case, at: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """The start (10,) and the target (2,) of a case, the whole turned by its bearing."""
+    """Return start (10,) and target (2,) of a case, both turned by its bearing."""
     qpos = scene.initial_qpos(at, case.gap)
     c, s = math.cos(case.bearing), math.sin(case.bearing)
     turn = np.array([[c, -s], [s, c]])
@@ -81,25 +81,25 @@ def _start_of(case: Case, at: Scene) -> tuple[np.ndarray, np.ndarray]:
 def build(
     cases: Sequence[Case], setting: Setting, indices: Sequence[int] | None = None
 ) -> WorldBatch:
-    """Return the worlds of cases of one kind (see `kind`), on the host: leaves (len(cases), ...).
+    """Return the worlds of n cases of one kind (see `kind`), on the host.
 
-    Each world draws its skin's imperfections from (setting.seed, its index); by default the
+    (setting.seed, index) is the key of the imperfections of the skin of a world; by default the
     indices count from 0.
     """
     engine = engines.get(setting.engine)
     for case in cases:
         engine.check_robot(case.base)
         engine.check_senses(registry.law_of(case.params).senses)
-    scenes, which = _scenes(cases, setting.physics)
-    solids = solid.stack([one.rounded_solid if engine.traced else one.solid for one in scenes])
-    starts = [_start_of(case, scenes[i]) for case, i in zip(cases, which, strict=True)]
+    scenes, scene_indices = _scenes(cases, setting.physics)
+    solids = solid.stack([x.rounded_solid if engine.traced else x.solid for x in scenes])
+    starts = [_start_of(case, scenes[i]) for case, i in zip(cases, scene_indices, strict=True)]
     qpos, targets = (np.array(column) for column in zip(*starts, strict=True))
-    numbers = np.arange(len(cases)) if indices is None else np.asarray(indices)
+    trials = np.arange(len(cases)) if indices is None else np.asarray(indices)
     root = jax.random.PRNGKey(setting.seed)
-    part = worlds.build(
-        numbers,
+    batch = worlds.build(
+        trials,
         FAMILIES[cases[0].object_name],
-        rows(solids, which),
+        rows(solids, scene_indices),
         Friction(*np.array([case.contact for case in cases], float).T),
         _stack([case.base for case in cases]),
         setting,
@@ -110,11 +110,11 @@ def build(
             np.array([case.shift.p_robot for case in cases], float),
         ),
         qpos=qpos,
-        key=jax.device_get(jax.vmap(partial(jax.random.fold_in, root))(numbers)),
+        key=jax.device_get(jax.vmap(partial(jax.random.fold_in, root))(trials)),
         odometry=_stack([Odometry()] * len(cases)),
     )
     params = _stack([case.params for case in cases], jnp.result_type(float))
-    return part._replace(params=params)
+    return batch._replace(params=params)
 
 
 def kind(case: Case) -> Hashable:

@@ -1,4 +1,4 @@
-"""A draw becomes worlds, for every engine and for pictures."""
+"""Builders of worlds: of any solids, of draws, and their scenes for pictures."""
 
 from typing import Any
 
@@ -17,14 +17,14 @@ from rps_jax.trials.batch import WorldBatch
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Shift, World
 from rps_jax.world import scene
-from rps_jax.world.domain import RANDOM, Domain, Range, quantities_of
+from rps_jax.world.domain import RANDOM, Domain, Owner, Range, quantities_of
 from rps_jax.world.draws import Draw
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction, Scene
 
 
 def build(
-    numbers: np.ndarray,
+    indices: np.ndarray,
     family: str,
     solids: Solid,
     friction: Friction,
@@ -35,7 +35,7 @@ def build(
     """Return worlds of one shape family, staged for the engine: on the host, without parameters.
 
     Args:
-      numbers: (n,) of the trials.
+      indices: (n,) of the trials.
       family: shape family of all solids.
       solids: (n, ...).
       friction: (n,) each.
@@ -53,7 +53,7 @@ def build(
     robot = None if robots.ideal else robots
     world = World(fields=staged, footprint=Footprint(*outline), robot=robot, **fields)
     narrow = jax.tree.map(lambda x: x if x.dtype == np.uint32 else x.astype(dtype), world)
-    return WorldBatch(numbers, narrow, stage)
+    return WorldBatch(indices, narrow, stage)
 
 
 def drawn_worlds(domain: Domain, drawn: Draw, setting: Setting) -> WorldBatch:
@@ -75,52 +75,44 @@ def drawn_worlds(domain: Domain, drawn: Draw, setting: Setting) -> WorldBatch:
     )
 
 
+def _drawn(drawn: Draw, owner: Owner) -> dict[str, Any]:
+    """Return the drawn quantities of an owner by name."""
+    return {name: drawn.values[name] for name in quantities_of(owner) if name in drawn.values}
+
+
 def _skin(domain: Domain, drawn: Draw) -> Skin:
-    count = drawn.indices.size
-    plain = IdealSkin() if domain.skin == "ideal" else CapacitiveSkin()
-    full: Any = jax.tree.map(lambda value: np.full(count, value, float), plain)
-    if isinstance(full, IdealSkin):
-        return full.on(drawn.robot.shell)
-    own: dict[str, Any] = {
-        name: drawn.values[name] for name in quantities_of("skin") if name in drawn.values
-    }
-    return full.on(drawn.robot.shell)._replace(**own)
+    sensor = IdealSkin() if domain.skin == "ideal" else CapacitiveSkin()
+    repeated: Any = jax.tree.map(lambda x: np.full(drawn.indices.size, x, float), sensor)
+    quantities = {} if domain.skin == "ideal" else _drawn(drawn, "skin")
+    return repeated.on(drawn.robot.shell)._replace(**quantities)
 
 
 def starts(drawn: Draw) -> np.ndarray:
-    """Positions (n, 10) at the start: the base at the origin, the object before it."""
-    qpos = np.zeros((drawn.indices.size, 10))
-    front = (
-        drawn.robot.half_length
-        + drawn.values["gap"]
-        + solid.extent(drawn.solid, drawn.values["yaw"])
-    )
-    half = drawn.values["yaw"] / 2
-    zero = np.zeros_like(half)
-    place = [front, drawn.values["lateral"], drawn.solid.height / 2]
-    turn = [np.cos(half), zero, zero, np.sin(half)]
-    qpos[:, JOINTS.object] = np.stack(place + turn, axis=-1)
+    """Return start positions (n, 10): the base at the origin, the object in front of it."""
+    qpos, yaw = np.zeros((drawn.indices.size, 10)), drawn.values["yaw"]
+    front = drawn.robot.half_length + drawn.values["gap"] + solid.extent(drawn.solid, yaw)
+    half, zero = yaw / 2, np.zeros_like(yaw)
+    position = [front, drawn.values["lateral"], drawn.solid.height / 2]
+    quaternion = [np.cos(half), zero, zero, np.sin(half)]
+    qpos[:, JOINTS.object] = np.stack(position + quaternion, axis=-1)
     return qpos
 
 
 def remembered_steps(domain: Domain, period: float) -> int:
-    """How many control steps of `period` [s] the odometry of the domain's worlds looks back."""
+    """Return the number of control steps of `period` [s] that the odometry remembers."""
     if all(getattr(domain, name) == Range(0, 0) for name in quantities_of("base")):
         return 0
     return 1 + round(max(domain.pose_latency.high, domain.command_delay.high) / period)
 
 
 def _odometry(domain: Domain, drawn: Draw, period: float) -> Odometry:
-    past: Any = np.zeros((drawn.indices.size, remembered_steps(domain, period)))
-    own: dict[str, Any] = {
-        name: drawn.values[name] for name in quantities_of("base") if name in drawn.values
-    }
-    error: Any = drawn.velocity_error
-    return Odometry(**own, velocity_error=error, past=past)
+    past = np.zeros((drawn.indices.size, remembered_steps(domain, period)))
+    quantities = _drawn(drawn, "base") | {"velocity_error": drawn.velocity_error}
+    return Odometry(**quantities, past=past)
 
 
 def drawn_scene(domain: Domain, drawn: Draw, physics: Physics, i: int) -> Scene:
-    """The compiled scene of the i-th world of a draw, for pictures: with its looks, if it has."""
+    """Compile the scene of row i of a draw, for pictures; named objects keep their visual geoms."""
     case = int(drawn.cases[i])
     name = domain.objects[int(domain.object_of(drawn.cases[i]))]
     if name in RANDOM:
