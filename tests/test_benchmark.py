@@ -127,7 +127,7 @@ def test_levers_are_timed_beside_the_program_as_it_is(monkeypatch):
     every = levers.levers_of("quasistatic", "cylinder")
     monkeypatch.setattr(levers, "levers_of", lambda *_: {name: every[name] for name in some})
     gains = list(levers.measure("quasistatic", "cylinder", 2, simulated=0.1, goes=1))
-    assert [gain.lever for gain in gains] == [levers.AS_IT_IS, *some]
+    assert [gain.lever for gain in gains] == [levers.BASELINE, *some]
     assert [gain.worlds for gain in gains] == [2, 2, 8, 2]
     assert all(0 < gain.times < np.inf for gain in gains)
     assert len(levers.table(gains)) == 1 + len(gains)

@@ -156,7 +156,7 @@ def test_pushes_mirror_balance_and_converge():
 def test_a_steady_lift_of_what_slides_hardly_moves_the_end():
     """Of four points it moves load between two diagonals alone, and of three none at all."""
     for name, apart in (("box", 1e-3), ("cylinder", 1e-9)):
-        thing = pushes.things()[name]
+        thing = pushes.targets()[name]
         ends = [
             pushes.in_the_limit(thing, [0.08], 0.06, steps=60, rounding=Rounding(lift=lift)).lateral
             for lift in (0.0, 1.2)
@@ -179,7 +179,7 @@ def test_a_box_touches_with_its_corners_and_at_the_ends_of_the_front():
 
 def test_a_push_in_mujoco_ends_where_a_rigid_object_does():
     """On this project's ground, at 5 cm/s, pushed at the lower edge of the base."""
-    box = pushes.things()["box"]
+    box = pushes.targets()["box"]
     found = pushes.in_mujoco(box, 0.08, 0.05, grounds.GROUNDS["standard"].physics)
     rigid_one = pushes.in_the_limit(box, [0.08], float(found.height), steps=100)
     assert 0.059 < found.height < 0.075

@@ -28,8 +28,8 @@ def difference(cone: str, island: str, count: int) -> float:
         for k in range(count)
     )
     texts = [
-        SCENE.format(cone=cone, island=island, boxes=boxes, jacobian=one)
-        for one in ("dense", "sparse")
+        SCENE.format(cone=cone, island=island, boxes=boxes, jacobian=jacobian)
+        for jacobian in ("dense", "sparse")
     ]
     models = [mujoco.MjModel.from_xml_string(text) for text in texts]
     dense, sparse = (mujoco.MjData(model) for model in models)
@@ -40,8 +40,8 @@ def difference(cone: str, island: str, count: int) -> float:
         sparse.qacc_warmstart[:] = dense.qacc_warmstart
         mujoco.mj_step(models[0], dense)
         mujoco.mj_step(models[1], sparse)
-        apart = np.abs(dense.qacc - sparse.qacc).max() / (1 + np.abs(dense.qacc).max())
-        worst = max(worst, float(apart))
+        error = np.abs(dense.qacc - sparse.qacc).max() / (1 + np.abs(dense.qacc).max())
+        worst = max(worst, float(error))
     return worst
 
 

@@ -41,8 +41,8 @@ def _steps(timestep: float, setting: Setting = Setting()) -> Setting:
     return replace(setting, physics=replace(setting.physics, timestep=timestep))
 
 
-# The first is what the others are compared with. Those whose objects start a micrometre farther
-# away tell what no step can: how many outcomes hang on nothing.
+# The first is the reference of the others. In those named "moved", objects start a micrometre
+# farther away: they show how many outcomes are chaotic.
 ENGINES = {
     "C, reference": _CONVERGED,
     "C, reference, moved": _CONVERGED,
@@ -61,7 +61,7 @@ ENGINES = {
 
 @dataclass(frozen=True)
 class Engines(TrialStudy[xr.DataTree]):
-    """Tell whether the engines agree in random worlds, outcome by outcome.
+    """Compare the outcomes of engines in random worlds.
 
     The answer is a tree with the outcomes (world) of each engine.
     """
@@ -86,12 +86,12 @@ class Engines(TrialStudy[xr.DataTree]):
     engines: tuple[str, ...] = ()
     """Engines and physics by name, the first to be compared with; by default all."""
     part: int = option(256, 1, 1_000_000)
-    """Number of trials in a part: what is lost when killed, at most. C waits for the slowest of
-    each."""
+    """Number of trials in a part, the maximum that a kill loses. C waits for the slowest trial of
+    each part."""
 
     @cached_property
     def plans(self) -> dict[str, Plan]:
-        """What is run, by the engine's name."""
+        """Plans by name of the engine."""
         ranges = domains.parse_domain(self.domain)
         ranges = replace(ranges, objects=self.objects or ranges.objects)
         label, params = registry.resolve_law(self.law)
@@ -117,49 +117,49 @@ class Engines(TrialStudy[xr.DataTree]):
             plan.check_here()
 
     def num_trials(self) -> int | None:
-        """How many trials there are."""
+        """Return the number of trials."""
         return sum(plan.num_trials for plan in self.plans.values())
 
     def answer(self, run: Run) -> xr.DataTree:
-        """Run what is missing in each engine."""
-        heard, found = SequentialProgress(run.callback), {}
-        shape = run._replace(callback=heard).batch_options
+        """Run the missing trials of each engine."""
+        progress, results = SequentialProgress(run.callback), {}
+        shape = run._replace(callback=progress).batch_options
         for name, plan in self.plans.items():
             folder = None if run.folder is None else run.folder / name.replace(", ", "_")
-            found[name] = execution.run_plan(plan, folder, **shape).isel(law=0)
-            heard.finish(plan.num_trials)
-        return xr.DataTree.from_dict(found)
+            results[name] = execution.run_plan(plan, folder, **shape).isel(law=0)
+            progress.finish(plan.num_trials)
+        return xr.DataTree.from_dict(results)
 
     def intro(self, results: xr.DataTree) -> str:
-        """What was asked."""
-        return f"The same {self.worlds} worlds in every engine. Intervals: Wilson 95 %."
+        """Describe the worlds."""
+        return f"{self.worlds} worlds, equal in all engines. Intervals: Wilson 95 %."
 
     def report(self, results: xr.DataTree, run: Run) -> Sequence[Section]:
         """Outcomes equal to those of the first engine."""
-        each = {name: results[name].to_dataset() for name in self.plans}
-        return [Section("Equal outcomes", "", agreement_table(each))]
+        by_engine = {name: results[name].to_dataset() for name in self.plans}
+        return [Section("Equal outcomes", "", agreement_table(by_engine))]
 
 
 engines = call_of(Engines)
 
 
-def agreement_table(found: Mapping[str, xr.Dataset]) -> list[list[str]]:
+def agreement_table(results: Mapping[str, xr.Dataset]) -> list[list[str]]:
     """Header and one row for each engine: success, and outcomes equal to the first's, by object.
 
     The results are those of one law in the same worlds.
     """
-    base = next(iter(found.values()))
+    base = next(iter(results.values()))
     groups = statistics.worlds_by_object(base)
     rows = [["engine", *groups, "equal outcomes", "95 %", *(f"equal, {g}" for g in groups), "+/-"]]
-    for name, one in found.items():
-        won = one.success.values > 0
-        same = won == (base.success.values > 0)
-        c = statistics.compare(base.success, one.success)
+    for name, dataset in results.items():
+        succeeded = dataset.success.values > 0
+        same = succeeded == (base.success.values > 0)
+        c = statistics.compare(base.success, dataset.success)
         low, high = c.equal_interval
         rows.append(
             [
                 name,
-                *(f"{won[mask].sum()} of {mask.sum()}" for mask in groups.values()),
+                *(f"{succeeded[mask].sum()} of {mask.sum()}" for mask in groups.values()),
                 f"{100 * c.equal:.1f} %",
                 f"{100 * low:.0f}-{100 * high:.0f} %",
                 *(f"{same[mask].sum()} of {mask.sum()}" for mask in groups.values()),

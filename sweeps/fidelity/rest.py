@@ -27,7 +27,7 @@ from sweeps.study_base import Study, Table
 
 DOMAINS = ("wide", "hostile", "hostile,friction_ground=0.05:0.1,com_offset=0.5:0.7")
 _AWAY = 5.0  # [m] stands the base
-_FAR = 0.01  # [m] that what is at rest does not move, but for settling
+_FAR = 0.01  # [m] that objects at rest do not move, except while settling
 STEPS: Mapping[str, Physics] = {
     **{f"{ms} ms": replace(preset(), timestep=ms / 1000) for ms in (2, 5, 10)},
     "20 ms (`fast`)": preset(fidelity="fast"),
@@ -38,7 +38,7 @@ STEPS: Mapping[str, Physics] = {
 class Rest(Study[xr.Dataset]):
     """Leave random objects alone, and tell how far they have moved (domain, step, world) [m]."""
 
-    TITLE: ClassVar[str] = "Does what is at rest stay?"
+    TITLE: ClassVar[str] = "Do objects at rest stay?"
     QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 9, "seconds": 1.0}
 
     worlds: int = option(150, 3, 100_000)
@@ -51,20 +51,20 @@ class Rest(Study[xr.Dataset]):
     """Whether to make a small run of seconds."""
 
     def num_trials(self) -> int | None:
-        """How many worlds are stepped."""
+        """Return the number of worlds."""
         return len(DOMAINS) * len(STEPS) * self.worlds
 
     def answer(self, run: Run) -> xr.Dataset:
         """Step the worlds that are missing."""
-        found, done = [], 0
+        parts, done = [], 0
         for i, name in enumerate(DOMAINS):
             for step in STEPS:
                 make = partial(self._moved, domains.parse_domain(name), STEPS[step])
                 part = run.checkpoint(f"{i}-{STEPS[step].timestep:g}", make)
-                found.append(part.expand_dims(domain=[name], step=[step]))
+                parts.append(part.expand_dims(domain=[name], step=[step]))
                 done += self.worlds
                 run.callback(Progress(done, done * self.seconds))
-        whole = xr.combine_by_coords(found, combine_attrs="drop")
+        whole = xr.combine_by_coords(parts, combine_attrs="drop")
         assert isinstance(whole, xr.Dataset)
         whole = whole.sel(domain=list(DOMAINS), step=list(STEPS))
         return whole
@@ -76,45 +76,45 @@ class Rest(Study[xr.Dataset]):
     def _moved(self, ranges: domains.Domain, physics: Physics) -> xr.Dataset:
         index, c = np.arange(self.worlds), engines.get("mujoco")
         moved, family = np.zeros(self.worlds), np.empty(self.worlds, object)
-        for thing in range(len(ranges.objects)):
-            own = index[ranges.object_of(index) == thing]
-            drawn = draws.draw(ranges, self.seed, own)
-            family[own] = ranges.families[thing]
-            stage, _ = c.stage(
-                ranges.families[thing], drawn.solid, drawn.friction, physics, Robot()
-            )
+        for i in range(len(ranges.objects)):
+            rows = index[ranges.object_of(index) == i]
+            drawn = draws.draw(ranges, self.seed, rows)
+            family[rows] = ranges.families[i]
+            stage, _ = c.stage(ranges.families[i], drawn.solid, drawn.friction, physics, Robot())
             qpos = starts(drawn)
             qpos[:, 0] -= _AWAY
             batch = c.stepper(stage, qpos, 1)
-            still = np.zeros((own.size, 3))
-            batch.drive(np.arange(own.size), still, round(self.seconds / physics.timestep))
-            moved[own] = np.linalg.norm(batch.qpos[:, 3:5] - qpos[:, 3:5], axis=1)
+            still = np.zeros((rows.size, 3))
+            batch.drive(np.arange(rows.size), still, round(self.seconds / physics.timestep))
+            moved[rows] = np.linalg.norm(batch.qpos[:, 3:5] - qpos[:, 3:5], axis=1)
             batch.close()
         return xr.Dataset({"moved": ("world", moved)}, {"family": ("world", family.astype(str))})
 
     def intro(self, results: xr.Dataset) -> str:
-        """What was asked."""
+        """Describe the worlds."""
         return (
             f"How many of {self.worlds} random objects that nothing touches are more than "
             f"{100 * _FAR:g} cm away after {self.seconds:g} s, in C MuJoCo on the package's ground."
         )
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """How many moved, by domain, step and shape."""
+        """Return the counts of moved objects, by domain, step and shape."""
         return [Section("Objects that wander off", "", table(results))]
 
 
 rest = call_of(Rest)
 
 
-def table(found: xr.Dataset) -> list[list[str]]:
+def table(results: xr.Dataset) -> list[list[str]]:
     """Header and one row for each domain and step."""
-    families = list(dict.fromkeys(map(str, found.family.values)))
+    families = list(dict.fromkeys(map(str, results.family.values)))
     rows = [["domain", "step", *(f"moved, {name}" for name in families), "the farthest"]]
-    for name in map(str, found.domain.values):
-        for step in map(str, found.step.values):
-            moved = found.moved.sel(domain=name, step=step)
-            each = [moved.values[found.family.values == one] for one in families]
-            counts = [f"{int((one > _FAR).sum())} of {one.size}" for one in each]
+    for name in map(str, results.domain.values):
+        for step in map(str, results.step.values):
+            moved = results.moved.sel(domain=name, step=step)
+            by_family = [moved.values[results.family.values == name] for name in families]
+            counts = [
+                f"{int((distances > _FAR).sum())} of {distances.size}" for distances in by_family
+            ]
             rows.append([f"`{name}`", step, *counts, f"{100 * float(moved.max()):.1f} cm"])
     return rows

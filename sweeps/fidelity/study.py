@@ -1,7 +1,7 @@
 """Is the physics right? The paper's trials at many settings of the solver, against C MuJoCo.
 
-The reference is C MuJoCo run to convergence. Every row runs the same trials; what is compared is
-the outcome, trial by trial, and the object's place after the first 5 s.
+The reference is converged C MuJoCo. All rows run the same trials. Outcomes are compared trial by
+trial, and positions of the object after the first 5 s.
 
     rps sweeps/fidelity --quick
 """
@@ -32,8 +32,8 @@ REFERENCE = "reference"
 _EARLY = 5.0  # [s] after which the object's place is compared
 
 
-def _condition(engine: EngineName, base: Physics, what: str, **changes: Any) -> Condition:
-    return Condition(what, Setting(physics=replace(base, **changes), engine=engine))
+def _condition(engine: EngineName, base: Physics, label: str, **changes: Any) -> Condition:
+    return Condition(label, Setting(physics=replace(base, **changes), engine=engine))
 
 
 _c = partial(_condition, "mujoco", preset(fidelity="reference"))
@@ -54,7 +54,7 @@ IN_MJX = {
     "fast": Condition("MJX `fast`", Setting(physics=preset(fidelity="fast"), engine="mjx")),
     "mjx_20ms_4_6": _mjx("MJX, 20 ms, 4/6", timestep=0.02, iterations=4, ls_iterations=6),
 }
-# The same equations in the fused engine, float32: first as they are, then what the physics does.
+# The fused engine, in float32: first the defaults, then changes of the physics.
 IN_FUSED = {
     "fused_standard": _fused("fused, `standard`"),
     "fused_fast": Condition(
@@ -108,7 +108,7 @@ class Fidelity(TrialStudy[xr.Dataset]):
 
     @property
     def grid(self) -> Grid:
-        """Which trials."""
+        """Grid of the trials."""
         return Grid(laws=paper.LAWS, targets=self.targets)
 
     def check(self) -> None:
@@ -118,7 +118,7 @@ class Fidelity(TrialStudy[xr.Dataset]):
             errors.check_name("condition", name, CONDITIONS)
 
     def num_trials(self) -> int | None:
-        """How many trials there are, but for the short ones."""
+        """Return the number of trials, without the short ones."""
         return len(self.names) * self.grid.size
 
     def answer(self, run: Run) -> xr.Dataset:
@@ -131,13 +131,13 @@ class Fidelity(TrialStudy[xr.Dataset]):
         if folder is not None:
             folder.mkdir(exist_ok=True)
         early = run_conditions(short, of_rps, folder, slots=run.slots, workers=run.workers)
-        place = early.object_pose.sel(law="rps", pose=["x", "y"])
-        apart = ((place - place.sel(condition=REFERENCE)) ** 2).sum("pose")
-        results["early_error"] = np.sqrt(apart).drop_vars("law")
+        position = early.object_pose.sel(law="rps", pose=["x", "y"])
+        squares = ((position - position.sel(condition=REFERENCE)) ** 2).sum("pose")
+        results["early_error"] = np.sqrt(squares).drop_vars("law")
         return results
 
     def intro(self, results: xr.Dataset) -> str:
-        """What was asked."""
+        """Describe the comparison."""
         return (
             f"{self.grid.size} trials in every row, compared one by one with those of C MuJoCo in "
             "steps of 1 ms."
@@ -171,15 +171,15 @@ def table(results: xr.Dataset) -> list[list[str]]:
     header += ["equal outcomes", "95 %", "+/-", "McNemar p", "5 s error: median, 95 %", "cost"]
     rows = [header]
     for name in map(str, results.condition.values):
-        one = results.sel(condition=name)
-        counts = one.success.sum(("friction", "target"))
-        c = statistics.compare(base, one.success)
+        condition = results.sel(condition=name)
+        counts = condition.success.sum(("friction", "target"))
+        c = statistics.compare(base, condition.success)
         low, high = c.equal_interval
-        median, worst = np.quantile(one.early_error.values, (0.5, 0.95))
-        cost = float(one.run_time) / float(one.simulated)
+        median, worst = np.quantile(condition.early_error.values, (0.5, 0.95))
+        cost = float(condition.run_time) / float(condition.simulated)
         rows.append(
             [
-                str(one.what.values),
+                str(condition.what.values),
                 *(str(int(counts.sel(law=s, object=o))) for s in laws for o in objects),
                 f"{100 * c.equal:.1f} %",
                 f"{100 * low:.0f}-{100 * high:.0f} %",
@@ -198,10 +198,10 @@ def by_law(results: xr.Dataset) -> list[list[str]]:
     laws = [str(s) for s in results.law.values]
     rows = [["setting", *(s.upper() for s in laws)]]
     for name in map(str, results.condition.values):
-        one = results.success.sel(condition=name)
+        success = results.success.sel(condition=name)
         shares = []
         for s in laws:
-            c = statistics.compare(base.sel(law=s), one.sel(law=s))
+            c = statistics.compare(base.sel(law=s), success.sel(law=s))
             low, high = c.equal_interval
             shares.append(f"{100 * c.equal:.1f} % ({100 * low:.0f}-{100 * high:.0f})")
         rows.append([str(results.what.sel(condition=name).values), *shares])

@@ -25,56 +25,56 @@ FRICTIONS = (FRICTION["S1"].robot, 0.28, 0.2, 0.1, 0.001)
 OBJECTS = ("box", "box_60", "cylinder")
 LIMIT = "limit"  # name of the part that holds the rigid limit
 _DIMS = ("object", "offset", "speed")
-_KEPT = ("lateral", "force", "spread")  # of the rigid limit, beside what is measured
+_LIMIT_FIELDS = ("lateral", "force", "spread")  # results of the rigid limit beside measured ones
 
 
 @dataclass(frozen=True)
 class Kind:
     """A kind of ground: how the pushes are stepped, and at which speeds [m/s] of the base."""
 
-    what: str
+    what: str  # label
     physics: Physics
     speeds: tuple[float, ...] = SPEEDS
 
 
-def _on(base: Physics, what: str, speeds: tuple[float, ...] = SPEEDS, **changes: Any) -> Kind:
-    return Kind(what, replace(base, **changes), speeds)
+def _on(base: Physics, label: str, speeds: tuple[float, ...] = SPEEDS, **changes: Any) -> Kind:
+    return Kind(label, replace(base, **changes), speeds)
 
 
 _C = preset(fidelity="reference")
-_OWN = replace(_C, **MUJOCO_GROUND)
+_DEFAULT = replace(_C, **MUJOCO_GROUND)
 # In C MuJoCo, converged, in steps of 1 ms.
 CONVERGED = {
     "ours": _on(_C, "ours, 1 ms", (0.002, *SPEEDS)),
-    "mujocos": _on(_OWN, "MuJoCo's own, 1 ms", (0.002, *SPEEDS)),
+    "mujocos": _on(_DEFAULT, "MuJoCo's own, 1 ms", (0.002, *SPEEDS)),
     "stiff": _on(
         _C, "time constant 4 ms, impedance 0.95", ground_solref=(0.004, 1.0), ground_impedance=0.95
     ),
     "impratio_1": _on(_C, "ours, impratio 1", impratio=1.0),
     "impratio_100": _on(_C, "ours, impratio 100", impratio=100.0),
     "impratio_1000": _on(_C, "ours, impratio 1000", impratio=1000.0),
-    "mujocos_100": _on(_OWN, "MuJoCo's own, impratio 100", impratio=100.0),
+    "mujocos_100": _on(_DEFAULT, "MuJoCo's own, impratio 100", impratio=100.0),
     "pyramid": _on(_C, "ours, friction pyramid", cone="pyramidal"),
-    "mujocos_pyramid": _on(_OWN, "MuJoCo's own, friction pyramid", cone="pyramidal"),
+    "mujocos_pyramid": _on(_DEFAULT, "MuJoCo's own, friction pyramid", cone="pyramidal"),
 }
 # As others step it: ever larger steps.
 STEPPED = {
     "ours_5ms": _on(_C, "ours, 5 ms", timestep=0.005),
     "standard": _on(preset(), "ours, standard: 10 ms"),
     "fast": _on(preset(fidelity="fast"), "ours, fast: 20 ms, impedance 0.5"),
-    "mujocos_5ms": _on(_OWN, "MuJoCo's own, 5 ms", timestep=0.005),
-    "mujocos_10ms": _on(_OWN, "MuJoCo's own, 10 ms", timestep=0.01),
+    "mujocos_5ms": _on(_DEFAULT, "MuJoCo's own, 5 ms", timestep=0.005),
+    "mujocos_10ms": _on(_DEFAULT, "MuJoCo's own, 10 ms", timestep=0.01),
 }
 # Ever stiffer: first with damping that grows along, then with hops that last as long as ours.
 STIFFER = {
     "critical_10": _on(
-        _OWN, "MuJoCo's own, time constant 10 ms", timestep=5e-4, ground_solref=(0.01, 1.0)
+        _DEFAULT, "MuJoCo's own, time constant 10 ms", timestep=5e-4, ground_solref=(0.01, 1.0)
     ),
     "critical_5": _on(
-        _OWN, "MuJoCo's own, time constant 5 ms", timestep=2.5e-4, ground_solref=(0.005, 1.0)
+        _DEFAULT, "MuJoCo's own, time constant 5 ms", timestep=2.5e-4, ground_solref=(0.005, 1.0)
     ),
     "critical_2": _on(
-        _OWN, "MuJoCo's own, time constant 2 ms", timestep=1e-4, ground_solref=(0.002, 1.0)
+        _DEFAULT, "MuJoCo's own, time constant 2 ms", timestep=1e-4, ground_solref=(0.002, 1.0)
     ),
     "damping_01": _on(
         _C, "ours, damping ratio 0.1: 9 times as stiff", timestep=5e-4, ground_solref=(0.1, 0.1)
@@ -123,33 +123,35 @@ def run(
     parts = None if folder is None else Checkpoints(folder)
     finished, simulated = 0, 0.0
 
-    def told(pushed: int, seconds: float) -> None:
+    def on_push(pushed: int, seconds: float) -> None:
         nonlocal finished, simulated
         finished, simulated = finished + pushed, simulated + seconds
         callback(Progress(finished, simulated))
 
-    asked = f"{tuple(objects)} {tuple(offsets)}"
+    options = f"{tuple(objects)} {tuple(offsets)}"
     limit = _part(
         parts,
         LIMIT,
-        f"{asked} {HEIGHTS} {FRICTIONS} {steps}",
+        f"{options} {HEIGHTS} {FRICTIONS} {steps}",
         lambda: _limit(objects, offsets, steps),
     )
-    found = []
+    datasets = []
     for name in names:
         ground = GROUNDS[name]
-        before = finished
-        one = _part(
+        previous = finished
+        dataset = _part(
             parts,
             name,
-            f"{asked} {replace(ground, what='')!r}{'' if worlds is None else f' {worlds}'}",
-            lambda ground=ground: _pushes(ground, objects, offsets, worlds, told),
+            f"{options} {replace(ground, what='')!r}{'' if worlds is None else f' {worlds}'}",
+            lambda ground=ground: _pushes(ground, objects, offsets, worlds, on_push),
         )
-        told(before + _count(ground, objects, offsets, worlds) - finished, 0.0)
-        found.append(one.drop_attrs(deep=False))
-    whole = xr.concat(found, xr.DataArray(list(names), dims="ground", name="ground"), join="outer")
+        on_push(previous + _count(ground, objects, offsets, worlds) - finished, 0.0)
+        datasets.append(dataset.drop_attrs(deep=False))
+    whole = xr.concat(
+        datasets, xr.DataArray(list(names), dims="ground", name="ground"), join="outer"
+    )
     whole = whole.assign_coords(what=("ground", [GROUNDS[name].what for name in names]))
-    whole = whole.assign({f"limit_{name}": limit[name] for name in _KEPT})
+    whole = whole.assign({f"limit_{name}": limit[name] for name in _LIMIT_FIELDS})
     at = whole.height.clip(min(HEIGHTS), max(HEIGHTS)).fillna(HEIGHTS[0])
     expected = whole.limit_lateral.interp(at_height=at).drop_vars("at_height")
     whole["apart"] = (whole.lateral - expected).transpose(*whole.lateral.dims, "friction")
@@ -163,8 +165,8 @@ def as_if(results: xr.Dataset) -> xr.DataArray:
     Between two of `FRICTIONS` the place of the end is taken for linear.
     """
     fine = np.linspace(min(FRICTIONS), max(FRICTIONS), 100)
-    apart = results.apart.sortby("friction").interp(friction=fine)
-    return (apart**2).mean(("object", "offset")).fillna(np.inf).idxmin("friction")
+    distances = results.apart.sortby("friction").interp(friction=fine)
+    return (distances**2).mean(("object", "offset")).fillna(np.inf).idxmin("friction")
 
 
 def count(names: Sequence[str], worlds: int | None = None) -> int:
@@ -175,8 +177,8 @@ def count(names: Sequence[str], worlds: int | None = None) -> int:
 def _count(
     ground: Kind, objects: Sequence[str], offsets: Sequence[float], worlds: int | None
 ) -> int:
-    every = len(objects) * len(offsets) * len(ground.speeds)
-    return every if worlds is None else min(worlds, every)
+    total = len(objects) * len(offsets) * len(ground.speeds)
+    return total if worlds is None else min(worlds, total)
 
 
 def _part(
@@ -199,19 +201,19 @@ def _pushes(
     objects: Sequence[str],
     offsets: Sequence[float],
     worlds: int | None,
-    told: Callable[[int, float], None],
+    on_push: Callable[[int, float], None],
 ) -> xr.Dataset:
-    every, found = pushes.things(), []
+    targets, results = pushes.targets(), []
     for name, offset, speed in itertools.product(objects, offsets, ground.speeds):
-        if len(found) == worlds:
+        if len(results) == worlds:
             break
-        found.append(pushes.in_mujoco(every[name], offset, speed, ground.physics))
-        told(1, DISTANCE / speed)
-    missing = len(objects) * len(offsets) * len(ground.speeds) - len(found)
-    found += [pushes.NOTHING] * missing
+        results.append(pushes.in_mujoco(targets[name], offset, speed, ground.physics))
+        on_push(1, DISTANCE / speed)
+    missing = len(objects) * len(offsets) * len(ground.speeds) - len(results)
+    results += [pushes.NOTHING] * missing
     shape = (len(objects), len(offsets), len(ground.speeds))
     columns = {
-        name: (_DIMS, np.reshape([getattr(one, name) for one in found], shape))
+        name: (_DIMS, np.reshape([getattr(result, name) for result in results], shape))
         for name in Pushes._fields
     }
     coords = {"object": list(objects), "offset": list(offsets), "speed": list(ground.speeds)}
@@ -219,16 +221,18 @@ def _pushes(
 
 
 def _limit(objects: Sequence[str], offsets: Sequence[float], steps: int) -> xr.Dataset:
-    every = pushes.things()
+    targets = pushes.targets()
     grid = np.meshgrid(offsets, HEIGHTS, FRICTIONS, indexing="ij")
-    asked = [axis.ravel() for axis in grid]
-    found = [pushes.in_the_limit(every[name], *asked, steps=steps) for name in objects]
+    values = [axis.ravel() for axis in grid]
+    results = [pushes.in_the_limit(targets[name], *values, steps=steps) for name in objects]
     columns = {
         name: (
             ("object", "offset", "at_height", "friction"),
-            np.reshape([getattr(one, name) for one in found], (len(found), *grid[0].shape)),
+            np.reshape(
+                [getattr(result, name) for result in results], (len(results), *grid[0].shape)
+            ),
         )
-        for name in _KEPT
+        for name in _LIMIT_FIELDS
     }
     coords = {"object": list(objects), "offset": list(offsets)}
     return xr.Dataset(columns, coords | {"at_height": list(HEIGHTS), "friction": list(FRICTIONS)})
@@ -246,26 +250,26 @@ def table(results: xr.Dataset, speeds: Sequence[float] = SPEEDS) -> list[list[st
         header += [f"error, {at}", f"push over mu m g, {at}", f"spread, {at}"]
         header += [f"as if of friction, {at}"]
     header += ["height of the push", "largest hop", "largest tilt", "aloft"]
-    own = results.sel(friction=FRICTIONS[0])
-    force, spread = (float(own[f"limit_{name}"].mean()) for name in ("force", "spread"))
+    dry = results.sel(friction=FRICTIONS[0])
+    force, spread = (float(dry[f"limit_{name}"].mean()) for name in ("force", "spread"))
     rigid = ["0", f"{force:.3f}", f"{100 * spread:.1f} %", f"{FRICTIONS[0]:g}"] * len(speeds)
     rows = [header, ["rigid object", *rigid, "all", "0", "0", "0"]]
     friction = as_if(results)
     for name in map(str, results.ground.values):
-        one = results.sel(ground=name)
-        row = [str(one.what.values)]
+        ground = results.sel(ground=name)
+        row = [str(ground.what.values)]
         for speed in speeds:
-            at = one.sel(speed=speed)
+            at = ground.sel(speed=speed)
             error = float(np.sqrt((at.error**2).mean()))
             row += [f"{1000 * error:.1f} mm", f"{float(at.force.mean()):.3f}"]
             row += [f"{100 * float(at.spread.mean()):.1f} %"]
             row += [f"{float(friction.sel(ground=name, speed=speed)):.2f}"]
-        some = one.sel(speed=list(speeds))
+        chosen = ground.sel(speed=list(speeds))
         row += [
-            f"{100 * float(some.height.min()):.0f} to {100 * float(some.height.max()):.0f} cm",
-            f"{1000 * float(some.hop.max()):.2f} mm",
-            f"{1000 * float(some.tilt.max()):.1f} mrad",
-            f"{100 * float(some.aloft.max()):.0f} %",
+            f"{100 * float(chosen.height.min()):.0f} to {100 * float(chosen.height.max()):.0f} cm",
+            f"{1000 * float(chosen.hop.max()):.2f} mm",
+            f"{1000 * float(chosen.tilt.max()):.1f} mrad",
+            f"{100 * float(chosen.aloft.max()):.0f} %",
         ]
         rows.append(row)
     return rows

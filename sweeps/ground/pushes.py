@@ -39,22 +39,22 @@ _SETTLE = 1.0  # [s] that the object stands before the push
 _SAMPLE = 0.01  # [s] between two looks at the contacts
 
 
-class Thing(NamedTuple):
-    """An object to push."""
+class Target(NamedTuple):
+    """Object to push."""
 
     family: str
-    solid: Solid  # one, its leaves (1, ...)
+    solid: Solid  # leaves (1, ...)
     yaw: float = 0.0  # [rad] at the start
     bearing: float = 0.0  # [rad] of the base's way, to its left
 
     @property
     def direction(self) -> tuple[float, float]:
-        """Of the base's way, a unit vector in its axes."""
+        """Direction of the base, a unit vector in its axes."""
         return math.cos(self.bearing), math.sin(self.bearing)
 
 
 class Pushes(NamedTuple):
-    """What came of pushes (...); what a rigid object has not is NaN."""
+    """Results of pushes (...); NaN for quantities that a rigid object lacks."""
 
     lateral: np.ndarray  # [m] of the object's middle to the left of the base's, at the end
     yaw: np.ndarray  # [rad] of the object, at the end
@@ -69,32 +69,32 @@ class Pushes(NamedTuple):
     sink: np.ndarray  # [m] depth in the ground on which it stood
 
 
-NOTHING = Pushes(*np.full(len(Pushes._fields), np.nan))  # of a push that ran away, or never ran
+NOTHING = Pushes(*np.full(len(Pushes._fields), np.nan))  # of a push that diverged, or did not run
 
 
-def things() -> dict[str, Thing]:
-    """The paper's box (40 cm) and cylinder, and a box of 60 cm as high and heavy as the former."""
+def targets() -> dict[str, Target]:
+    """Return the paper's box (40 cm) and cylinder, and a box of 60 cm of equal height and mass."""
     box, cylinder = (scene.solid_of(scene.load(name)) for name in ("box", "cylinder"))
     half = np.array([0.3])
     mass = (half * 0 + 20.0, np.zeros(1), np.zeros(1))
     wide = solid.build(solid.rectangles(half, half), 0 * half, box.height, *mass)
     return {
-        "box": Thing("box", box, yaw=ASKEW),
-        "box_60": Thing("box", wide, yaw=ASKEW),
-        "cylinder": Thing("cylinder", cylinder, bearing=ASKEW),
+        "box": Target("box", box, yaw=ASKEW),
+        "box_60": Target("box", wide, yaw=ASKEW),
+        "cylinder": Target("cylinder", cylinder, bearing=ASKEW),
     }
 
 
-def scene_of(thing: Thing, physics: Physics, friction: Friction = FRICTION["S1"]) -> Scene:
-    """The scene that pushes of an object are stepped in."""
-    one = jax.tree.map(lambda leaf: leaf[0], thing.solid)
-    return scene.compile_solid(thing.family, one, physics, friction)
+def scene_of(target: Target, physics: Physics, friction: Friction = FRICTION["S1"]) -> Scene:
+    """Compile the scene of pushes of an object."""
+    single = jax.tree.map(lambda leaf: leaf[0], target.solid)
+    return scene.compile_solid(target.family, single, physics, friction)
 
 
-def start_of(thing: Thing, offset: float) -> np.ndarray:
-    """Pose (3,) [m, m, rad] of the object's origin before the middle of the base's front."""
-    reach = float(solid.extent(thing.solid, np.array([thing.yaw]))[0])
-    return np.array([GAP + reach, offset, thing.yaw])
+def start_of(target: Target, offset: float) -> np.ndarray:
+    """Return the pose (3,) [m, m, rad] of the object's origin before the base's front."""
+    reach = float(solid.extent(target.solid, np.array([target.yaw]))[0])
+    return np.array([GAP + reach, offset, target.yaw])
 
 
 # --- in C MuJoCo ----------------------------------------------------------------------------
@@ -102,27 +102,27 @@ def start_of(thing: Thing, offset: float) -> np.ndarray:
 
 @contextlib.contextmanager
 def _unwarned() -> Iterator[None]:
-    """What runs away is an outcome, not a page of lines."""
-    before = mujoco.get_mju_user_warning()
+    """Suppress MuJoCo's warnings: a diverged push is an outcome."""
+    handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _: None)
     try:
         yield
     finally:
-        mujoco.set_mju_user_warning(before)
+        mujoco.set_mju_user_warning(handler)
 
 
 @_unwarned()
-def in_mujoco(thing: Thing, offset: float, speed: float, physics: Physics) -> Pushes:
-    """One push in C MuJoCo at a speed [m/s], from where the object has settled; NaN if it ran away.
+def in_mujoco(target: Target, offset: float, speed: float, physics: Physics) -> Pushes:
+    """Run one push in C MuJoCo at a speed [m/s] of a settled object; NaN if it diverges.
 
-    The base reaches its speed evenly, at 0.5 m/s^2, and holds it whatever the force.
+    The base accelerates at 0.5 m/s^2 and keeps its speed at any force.
     """
-    chosen = scene_of(thing, physics)
+    chosen = scene_of(target, physics)
     model, dt = chosen.physics, physics.timestep
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # it may run away
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # it may diverge
     data = mujoco.MjData(model)
-    height, friction = float(thing.solid.height[0]), FRICTION["S1"].ground
-    x, y, yaw = start_of(thing, offset)
+    height, friction = float(target.solid.height[0]), FRICTION["S1"].ground
+    x, y, yaw = start_of(target, offset)
     free = JOINTS.object
     data.qpos[:] = scene.initial_qpos(chosen)
     data.qpos[free] = [x + shell.HALF_LENGTH, y, height / 2, *_upright(yaw)]
@@ -134,10 +134,10 @@ def in_mujoco(thing: Thing, offset: float, speed: float, physics: Physics) -> Pu
     steps = round((DISTANCE / speed + rising / 2) / dt)
     force, way = np.zeros(steps), np.zeros(steps)
     rise, upright = np.zeros(steps), np.zeros(steps)
-    every = max(1, round(_SAMPLE / dt))
-    seen = []
+    interval = max(1, round(_SAMPLE / dt))
+    samples = []
     qpos, qvel, constraint = data.qpos, data.qvel, data.qfrc_constraint
-    c, s = thing.direction
+    c, s = target.direction
     for i in range(steps):
         pace = speed * min(1.0, (i + 0.5) * dt / rising)
         qvel[0], qvel[1], qvel[2] = c * pace, s * pace, 0.0
@@ -145,16 +145,16 @@ def in_mujoco(thing: Thing, offset: float, speed: float, physics: Physics) -> Pu
         force[i] = -c * constraint[0] - s * constraint[1]
         way[i] = c * qpos[0] + s * qpos[1]
         rise[i], upright[i] = qpos[5], 1 - 2 * (qpos[7] ** 2 + qpos[8] ** 2)
-        if i % every == 0:
-            seen.append((*_contact_forces(model, data), _yaw(qpos)))
+        if i % interval == 0:
+            samples.append((*_contact_forces(model, data), _yaw(qpos)))
             if not abs(qpos[5]) < height:
-                return NOTHING  # it ran away
-    weight = float(thing.solid.mass[0]) * GRAVITY
+                return NOTHING  # it diverged
+    weight = float(target.solid.mass[0]) * GRAVITY
     unit = friction * weight
     late = force[way > DISTANCE / 2] / unit
-    ground, pushing, moment, carried, turned = np.array(seen).T
+    ground, pushing, moment, carried, turned = np.array(samples).T
     turning = np.abs(np.diff(turned, append=turned[-1]))
-    found = Pushes(
+    result = Pushes(
         lateral=qpos[4] - qpos[1],
         yaw=turned[-1],
         force=late.mean(),
@@ -167,23 +167,23 @@ def in_mujoco(thing: Thing, offset: float, speed: float, physics: Physics) -> Pu
         tilt=np.arccos(np.clip(upright.min(), -1, 1)),
         sink=height / 2 - stood,
     )
-    return Pushes(*(np.asarray(value, float) for value in found))
+    return Pushes(*(np.asarray(value, float) for value in result))
 
 
 def _upright(yaw: float) -> tuple[float, float, float, float]:
-    """Quaternion of a turn about the vertical by `yaw` [rad]."""
+    """Return the quaternion of a turn about the vertical by `yaw` [rad]."""
     return math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)
 
 
 def _yaw(qpos: np.ndarray) -> float:
-    """Of the object [rad]."""
+    """Return the yaw of the object [rad]."""
     return 2 * math.atan2(qpos[9], qpos[6])
 
 
 def _contact_forces(
     model: mujoco.MjModel, data: mujoco.MjData
 ) -> tuple[float, float, float, float]:
-    """Load on the ground and push [N], the push's moment [N m], and what the base lifts [N]."""
+    """Return load on the ground and push [N], moment of the push [N m], lift of the base [N]."""
     plane = model.geom("ground").id
     ground = pushing = moment = carried = 0.0
     out = np.zeros(6)
@@ -208,7 +208,7 @@ def _contact_forces(
 
 
 def in_the_limit(
-    thing: Thing,
+    target: Target,
     offset: npt.ArrayLike = OFFSETS,
     height: npt.ArrayLike = CONTACT_HEIGHT,
     friction_robot: npt.ArrayLike = FRICTION["S1"].robot,
@@ -219,12 +219,12 @@ def in_the_limit(
     """Push a rigid object in the same ways (B,), at offsets [m], heights [m] and frictions [1]."""
     offset, height, robot = np.broadcast_arrays(offset, height, friction_robot)
     count = offset.size
-    many = jax.tree.map(lambda leaf: np.repeat(leaf, count, axis=0), thing.solid)
+    solids = jax.tree.map(lambda leaf: np.repeat(leaf, count, axis=0), target.solid)
     ground = np.full(count, FRICTION["S1"].ground)
-    pushed = Pushed(many, ground, robot, height)
-    pose = np.array([start_of(thing, float(one)) for one in offset])
-    way = rigid.push(pushed, pose, DISTANCE, steps, direction=thing.direction, rounding=rounding)
-    push = way.force @ np.array(thing.direction) / ground
+    pushed = Pushed(solids, ground, robot, height)
+    pose = np.array([start_of(target, float(x)) for x in offset])
+    way = rigid.push(pushed, pose, DISTANCE, steps, direction=target.direction, rounding=rounding)
+    push = way.force @ np.array(target.direction) / ground
     late = push[steps // 2 :]
     return Pushes(
         lateral=way.pose[-1, :, 1],

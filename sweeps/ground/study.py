@@ -1,4 +1,4 @@
-"""Which ground is nearest to dry friction: single pushes, beside those of a rigid object.
+"""Comparison of grounds with dry friction: single pushes beside those of a rigid object.
 
 `rigid` solves for the motion of the rigid object, `pushes` runs one push in C MuJoCo or in the
 rigid limit, and `grounds` runs them on many grounds and compares.
@@ -28,10 +28,10 @@ from sweeps.study_base import Study
 
 @dataclass(frozen=True)
 class Ground(Study[xr.Dataset]):
-    """Tell which ground is nearest to dry friction, by pushes beside a rigid object's.
+    """Compare grounds with dry friction, by pushes beside those of a rigid object.
 
-    The answer holds pushes (ground, object, offset, speed) in C MuJoCo, where a rigid object ends
-    (object, offset, at_height, friction), and how far from there each push ended, `error` [m].
+    The answer holds pushes (ground, object, offset, speed) in C MuJoCo, the end positions of rigid
+    objects (object, offset, at_height, friction), and their distance from each push, `error` [m].
     """
 
     TITLE: ClassVar[str] = "Which ground is dry friction?"
@@ -53,7 +53,7 @@ class Ground(Study[xr.Dataset]):
             errors.check_name("ground", name, grounds.GROUNDS)
 
     def num_trials(self) -> int | None:
-        """How many pushes there are."""
+        """Return the number of pushes."""
         return grounds.count(self.grounds, self.worlds)
 
     def answer(self, run: Run) -> xr.Dataset:
@@ -61,7 +61,7 @@ class Ground(Study[xr.Dataset]):
         return grounds.run(self.grounds, run.folder, worlds=self.worlds, callback=run.callback)
 
     def intro(self, results: xr.Dataset) -> str:
-        """What was asked."""
+        """Describe the pushes."""
         return (
             "Two boxes (40 and 60 cm) and the paper's cylinder, pushed by 0.5 m in C MuJoCo, 5, 8 "
             "and 12 cm off the middle of the base. The error is how far along the base's front an "
@@ -84,21 +84,21 @@ def figure_of(results: xr.Dataset, names: Collection[str]) -> Figure:
     `limit_lateral` [m], by (object, offset, at_height, friction), of which the first is the own.
     """
     chosen = [name for name in map(str, results.ground.values) if name in names]
-    things = list(map(str, results.object.values))
+    objects = list(map(str, results.object.values))
     figure = Figure(figsize=(11, 7), layout="constrained")
     above, below = figure.subplots(2, 3)
     speeds = results.speed.values
-    for ax, thing in zip(above, things, strict=False):
-        one = results.sel(object=thing)
+    for ax, target in zip(above, objects, strict=False):
+        dataset = results.sel(object=target)
         for offset in results.offset.values:
-            line = 1000 * one.limit_lateral.sel(offset=offset).isel(friction=0)
+            line = 1000 * dataset.limit_lateral.sel(offset=offset).isel(friction=0)
             ax.plot(100 * results.at_height, line, "k-", lw=1)
         for i, name in enumerate(chosen):
             for speed, marker in zip(speeds, "vos^D", strict=False):
-                at = one.sel(ground=name, speed=speed)
+                at = dataset.sel(ground=name, speed=speed)
                 style = {"color": f"C{i}", "marker": marker, "ls": "none", "ms": 5}
                 ax.plot(100 * at.height, 1000 * at.lateral, mfc="none", **style)
-        ax.set(title=words(thing), xlabel="height of the push [cm]")
+        ax.set(title=words(target), xlabel="height of the push [cm]")
         ax.grid(alpha=0.3)
     above[0].set_ylabel("end, along the base's front [mm]")
     panels = {
@@ -108,13 +108,13 @@ def figure_of(results: xr.Dataset, names: Collection[str]) -> Figure:
     }
     for ax, (field, label) in zip(below, panels.items(), strict=True):
         for i, name in enumerate(chosen):
-            one, over = results[field].sel(ground=name), ("object", "offset")
-            value = one.max(over) if field == "hop" else one.mean(over)
+            dataset, over = results[field].sel(ground=name), ("object", "offset")
+            value = dataset.max(over) if field == "hop" else dataset.mean(over)
             if field == "error":
-                value = np.sqrt((one**2).mean(over))
+                value = np.sqrt((dataset**2).mean(over))
             factor = 100 if field == "spread" else 1000
-            what = str(results.what.sel(ground=name).values)
-            ax.plot(100 * speeds, factor * value, "o-", ms=4, color=f"C{i}", label=what)
+            label = str(results.what.sel(ground=name).values)
+            ax.plot(100 * speeds, factor * value, "o-", ms=4, color=f"C{i}", label=label)
         ax.set(xscale="log", yscale="log", xlabel="speed of the base [cm/s]", ylabel=label)
         ax.set_xticks(100 * speeds, [f"{100 * speed:g}" for speed in speeds])
         ax.minorticks_off()

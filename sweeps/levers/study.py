@@ -1,4 +1,4 @@
-"""What is each choice for speed worth? One change at a time, timed beside the program as it is.
+"""The effect of single changes on the speed of a program.
 
 A lever is a change of the physics, of what a step does, or of how the program is compiled. Some
 change outcomes: which of them may be had is for the study of fidelity to say, not for a clock.
@@ -33,7 +33,7 @@ from sweeps.study_base import Study
 
 
 class Lever(NamedTuple):
-    """One change to a program of `programs.BATCHED`."""
+    """Change to a program of `programs.BATCHED`."""
 
     physics: Mapping[str, Any] = {}  # fields of `Physics` to change
     stage: Callable[[Any], Any] = lambda stage: stage
@@ -84,16 +84,16 @@ _FLAGS = {
 
 
 def levers_of(name: str, family: str) -> dict[str, Lever]:
-    """All that can be changed about one of `programs.BATCHED` on this machine."""
+    """Return the levers of a program of `programs.BATCHED` on this machine."""
     engine = engines.get(programs.BATCHED[name].engine)
-    found = _OF_ALL | (_OF_SOLVERS if engine.newton else {})
-    found |= {what: Lever(stage=change) for what, change in engine.levers(family).items()}
+    levers = _OF_ALL | (_OF_SOLVERS if engine.newton else {})
+    levers |= {label: Lever(stage=change) for label, change in engine.levers(family).items()}
     flags = _FLAGS.get(jax.default_backend(), {})
-    return found | {what: Lever(flags=values) for what, values in flags.items()}
+    return levers | {label: Lever(flags=values) for label, values in flags.items()}
 
 
 class Gain(NamedTuple):
-    """What a lever does to a program."""
+    """Effect of a lever on a program."""
 
     name: str
     family: str
@@ -132,7 +132,7 @@ class Levers(Study[xr.Dataset]):
         errors.check_name("program", self.program, programs.BATCHED)
 
     def num_trials(self) -> int | None:
-        """How many programs there are."""
+        """Return the number of programs."""
         return 1 + len(levers_of(self.program, self.family))
 
     def answer(self, run: Run) -> xr.Dataset:
@@ -149,21 +149,21 @@ class Levers(Study[xr.Dataset]):
         return xr.Dataset(columns, {"lever": [gain.lever for gain in gains]})
 
     def intro(self, results: xr.Dataset) -> str:
-        """Where it was measured."""
+        """Describe the machine."""
         return programs.machine()
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """How many times as fast each lever makes the program."""
+        """Return the gain of each lever."""
         title = f"{self.program}, {self.family}"
         times = dict(zip(map(str, results.lever.values), map(float, results.times), strict=True))
         gains = [
             Gain(
                 self.program,
                 self.family,
-                str(one.lever.item()),
-                *(one[name].item() for name in ("worlds", "compile", "memory", "rate", "times")),
+                str(row.lever.item()),
+                *(row[name].item() for name in ("worlds", "compile", "memory", "rate", "times")),
             )
-            for one in (results.sel(lever=name) for name in results.lever.values)
+            for row in (results.sel(lever=name) for name in results.lever.values)
         ]
         picture = Picture("levers", partial(levers_figure, times, title))
         return [Section(title, "", table(gains), picture)]
@@ -172,7 +172,7 @@ class Levers(Study[xr.Dataset]):
 levers = call_of(Levers)
 
 
-AS_IT_IS = "as it is"
+BASELINE = "as it is"
 
 
 def measure(
@@ -184,25 +184,25 @@ def measure(
     goes: int = 5,
     at_once: int = 1,
 ) -> Iterator[Gain]:
-    """Pull every lever of one of `programs.BATCHED` in turn, first none.
+    """Time a program of `programs.BATCHED` without a lever, then with each lever.
 
-    Program and program with a lever are timed in turns, `goes` times each, since a machine that
-    others use is now faster, now slower; the gain is the median of the ratios.
+    The baseline and the changed program alternate, `goes` times each, since the speed of a shared
+    machine varies; the gain is the median of the ratios.
 
     Args:
       name: of `programs.BATCHED`.
       family: of its worlds.
-      worlds: how many, but for the levers that change that.
-      simulated: [s] at a go.
-      goes: of each.
-      at_once: programs compiled side by side; what one takes is its own only if 1.
+      worlds: their number, unless a lever changes it.
+      simulated: [s] of each run.
+      goes: runs of each program.
+      at_once: concurrent compilations; compile times are exact only if 1.
     """
-    wanted = {AS_IT_IS: Lever()} | levers_of(name, family)
-    calls = [partial(_traced, name, family, worlds, lever, simulated) for lever in wanted.values()]
-    usual = None
-    for what, program in zip(wanted, programs.side_by_side(calls, at_once), strict=True):
-        usual = usual or program
-        yield _gain(what, usual, program, goes)
+    levers = {BASELINE: Lever()} | levers_of(name, family)
+    calls = [partial(_traced, name, family, worlds, lever, simulated) for lever in levers.values()]
+    baseline = None
+    for label, program in zip(levers, programs.side_by_side(calls, at_once), strict=True):
+        baseline = baseline or program
+        yield _gain(label, baseline, program, goes)
 
 
 def _traced(
@@ -216,19 +216,19 @@ def _traced(
 
 
 def _rate(program: Program) -> float:
-    """Simulated s per s of wall clock of one go from the start."""
+    """Return the simulated time per wall-clock time of one run from the start."""
     start = jax.block_until_ready(jax.tree.map(jnp.copy, program.start))
-    began = time.perf_counter()
+    start_time = time.perf_counter()
     jax.block_until_ready(program.go(start))
-    return program.worlds * program.simulated / (time.perf_counter() - began)
+    return program.worlds * program.simulated / (time.perf_counter() - start_time)
 
 
-def _gain(what: str, usual: Program, p: Program, goes: int) -> Gain:
-    """The first go of each is not counted."""
-    rates = [(_rate(usual), _rate(p)) for _ in range(goes + 1)][1:]
-    rate = statistics.median(after for _, after in rates)
-    times = statistics.median(after / before for before, after in rates)
-    return Gain(p.name, p.family, what, p.worlds, p.compile, p.memory, rate, times)
+def _gain(label: str, baseline: Program, p: Program, goes: int) -> Gain:
+    """Return the gain of a program over the baseline, without the first run of each."""
+    rates = [(_rate(baseline), _rate(p)) for _ in range(goes + 1)][1:]
+    rate = statistics.median(new_rate for _, new_rate in rates)
+    times = statistics.median(new_rate / base_rate for base_rate, new_rate in rates)
+    return Gain(p.name, p.family, label, p.worlds, p.compile, p.memory, rate, times)
 
 
 def table(gains: Sequence[Gain]) -> list[list[str]]:
@@ -243,7 +243,7 @@ def table(gains: Sequence[Gain]) -> list[list[str]]:
 
 
 def levers_figure(gains: Mapping[str, float], title: str) -> Figure:
-    """How many times as fast each lever makes a program, as bars from 1."""
+    """Draw the gain of each lever as bars from 1."""
     figure = Figure(figsize=(7.0, 1.2 + 0.28 * len(gains)), layout="constrained")
     ax = figure.subplots()
     times = np.array(list(gains.values()))

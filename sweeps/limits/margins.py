@@ -1,4 +1,4 @@
-"""What can be proved of the law: a contact in the critical region of the skin moves back.
+"""A bound that can be proved: a contact in the critical region of the skin moves back.
 
 Assume quasi-static pushing with Coulomb friction, a vertex (or any material point) of the object at
 p = (x, l) on the base's flat front, and an ellipsoidal limit surface (Lynch, Maekawa and Tanie
@@ -23,10 +23,10 @@ v_y = a_r,max sgn(l) v_x. So **|l| shrinks wherever |l| >= l_cr if**
 
   T4  a_r,max > tan(phi + delta)
 
-and a contact that has not left the skin stays within the larger of l_cr and where it began, but for
-what it moves in one control period. For a disc l is the place of its centre, which moves along f
-itself: delta = 0. It is sufficient and not necessary, says nothing of a corner of the base on a
-face of the object, and nothing of whether the target is reached.
+and a contact on the skin stays within the larger of l_cr and its start, up to its motion in one
+control period. For a disc l is the position of its centre, which moves along f itself: delta = 0.
+The condition is sufficient and not necessary. It does not cover a corner of the base on a face of
+the object, and does not imply that the target is reached.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def drift(twist: np.ndarray, touch: Touch) -> np.ndarray:
 
     Args:
       twist: (..., 3) [m/s, m/s, rad/s] of the base in its own frame.
-      touch: where and what it pushes; T4's phi + delta must be below a right angle.
+      touch: contact and object; T4's phi + delta must be below a right angle.
 
     Returns:
       NaN where the base moves away from the object.
@@ -112,5 +112,5 @@ def drift(twist: np.ndarray, touch: Touch) -> np.ndarray:
         w_x, w_y = a_xx + sign * touch.mu * a_xy, a_xy + sign * touch.mu * a_yy
         speed = w_y * u_x / w_x - u_y
         slips.append(np.where((w_x > 0) & (sign * speed <= 0), speed, np.nan))
-    found = np.where(sticks, 0.0, np.where(np.isnan(slips[0]), slips[1], slips[0]))
-    return np.where(u_x > 0, found, np.nan)
+    rate = np.where(sticks, 0.0, np.where(np.isnan(slips[0]), slips[1], slips[0]))
+    return np.where(u_x > 0, rate, np.nan)

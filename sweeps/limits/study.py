@@ -1,4 +1,4 @@
-"""What a robot's limits cost a law: force, lag, acceleration, the base's size, the skin's pitch.
+"""The effect of a robot's limits on a law: force, lag, acceleration, size, pitch of the skin.
 
 Every robot meets the same worlds as the ideal base, so that a loss is a paired difference. Force,
 lag and acceleration are drawn, a different one for each world; sizes and pitches are taken in turn.
@@ -51,18 +51,18 @@ TURNING = {
 
 @dataclass(frozen=True)
 class Limit:
-    """One quantity that is varied."""
+    """Varied quantity."""
 
-    what: str  # with its unit
+    label: str  # with its unit
     drawn: Mapping[str, Range] = field(default_factory=dict)  # ranges of a domain
     robots: Mapping[float, Robot] = field(default_factory=dict)  # or each value's robot
-    value: Callable[[xr.Dataset], np.ndarray] = lambda found: np.zeros(0)  # (n,) of drawn worlds
+    value: Callable[[xr.Dataset], np.ndarray] = lambda results: np.zeros(0)  # (n,) of drawn worlds
     harms: int = 0  # 1: the more the worse, -1: the less the worse, 0: neither
     log: bool = False
 
 
 def _with_front(count: int) -> Robot:
-    """The paper's base with so many boards across its front, and as many for its sides."""
+    """Return the paper's base with `count` boards across its front, and sides in proportion."""
     return Robot(
         boards=tuple(replace(row, count=math.ceil(row.count * count / 4)) for row in BOARDS)
     )
@@ -126,18 +126,18 @@ class Limits(MultiLawQuestion[xr.DataTree]):
         self._sweep("ideal", parse_domain(self.domain)).check()
 
     def num_trials(self) -> int | None:
-        """How many trials there are."""
+        """Return the number of trials."""
         robots = 1 + sum(max(1, len(LIMITS[name].robots)) for name in self.limits)
         return len(self.chosen) * self.worlds * robots
 
     def configuration(self) -> dict[str, Any]:
-        """All that the parts of the answer depend on; more limits may be asked for later."""
-        found = super().configuration()
-        del found["limits"]
-        return found
+        """Return the inputs of the parts of the answer; later calls may add limits."""
+        configuration = super().configuration()
+        del configuration["limits"]
+        return configuration
 
     def _sweep(self, part: str, ranges: Domain, robot: Robot | None = None) -> Sweep:
-        """A sweep in a folder of its own."""
+        """Return a sweep in its own folder."""
         return Sweep(
             self.chosen,
             ranges,
@@ -149,16 +149,16 @@ class Limits(MultiLawQuestion[xr.DataTree]):
 
     def answer(self, run: Run) -> xr.DataTree:
         """Sweep with the ideal base and with every robot."""
-        base, heard = parse_domain(self.domain), SequentialProgress(run.callback)
-        shape = run._replace(callback=heard).batch_options
+        base, progress = parse_domain(self.domain), SequentialProgress(run.callback)
+        shape = run._replace(callback=progress).batch_options
 
         def sweep(part: str, ranges: Domain, robot: Robot | None = None) -> xr.Dataset:
             folder = None if run.folder is None else run.folder / part
-            found = execution.run_plan(self._sweep(part, ranges, robot).plan, folder, **shape)
-            heard.finish(len(self.chosen) * self.worlds)
-            return found
+            dataset = execution.run_plan(self._sweep(part, ranges, robot).plan, folder, **shape)
+            progress.finish(len(self.chosen) * self.worlds)
+            return dataset
 
-        ideal, found = sweep("ideal", base), {}
+        ideal, results = sweep("ideal", base), {}
         for name in self.limits:
             limit = LIMITS[name]
             if limit.drawn:
@@ -169,33 +169,33 @@ class Limits(MultiLawQuestion[xr.DataTree]):
                 parts = [sweep(f"{name}_{i}", base, robot) for i, robot in enumerate(robots)]
                 values = np.repeat([float(value) for value in limit.robots], self.worlds)
             success = np.concatenate([part.success.values for part in parts], axis=1)
-            found[name] = xr.Dataset(
+            results[name] = xr.Dataset(
                 {
                     "success": (("law", "case"), success),
                     "usual": (("law", "case"), np.tile(ideal.success.values, (1, len(parts)))),
                 },
                 {
                     "law": list(self.chosen),
-                    "value": ("case", values, {"long_name": limit.what}),
+                    "value": ("case", values, {"long_name": limit.label}),
                     "world": ("case", np.tile(np.arange(self.worlds), len(parts))),
                 },
                 {"harms": limit.harms, "log": int(limit.log)},
             )
-        return xr.DataTree.from_dict(found)
+        return xr.DataTree.from_dict(results)
 
     def intro(self, results: xr.DataTree) -> str:
-        """What was asked."""
+        """Describe the worlds."""
         return (
-            f"{self.worlds:,} worlds, seed {self.setting.seed}; every robot meets the same ones. "
+            f"{self.worlds:,} worlds, seed {self.setting.seed}, equal for all robots. "
             "Intervals: of rates Wilson 95 %, of limits bootstrap 95 %."
         )
 
     def report(self, results: xr.DataTree, run: Run) -> Sequence[Section]:
-        """Where each law has lost so much, its success at each size, and what becomes of turns."""
-        each = {name: results[name].to_dataset() for name in self.limits}
-        picture = Picture("limits", partial(figure_of, each))
-        sections = [Section("Success over each limit", "", losses(each), picture)]
-        if len(sizes := successes(each)) > 1:
+        """Return losses of each law, its success at each size, and the executed turns."""
+        by_limit = {name: results[name].to_dataset() for name in self.limits}
+        picture = Picture("limits", partial(figure_of, by_limit))
+        sections = [Section("Success over each limit", "", losses(by_limit), picture)]
+        if len(sizes := successes(by_limit)) > 1:
             sections.append(Section("Success at each size", "", sizes))
         params = next(iter(self.chosen.values()))
         turns = Picture("turning", lambda: turning_figure(turning(TURNING, params)))
@@ -207,11 +207,11 @@ limits = call_of(Limits)
 
 
 def crossing(value: np.ndarray, lost: np.ndarray, level: float, harms: int) -> float:
-    """The value at which a law has lost `level` [1] of its success; NaN if it never has.
+    """Return the value at which a law has lost `level` [1] of its success, or NaN.
 
     The losses (n,) of cases, each -1, 0 or 1, at values (n,) are made monotone by least squares:
-    rising with the value if `harms` is 1, falling if it is -1. At the harmless end, where the base
-    is ideal, nothing is lost: this is put in with the weight of a twentieth of the cases.
+    rising with the value if `harms` is 1, falling if it is -1. At the harmless end, the base is
+    ideal and the loss is zero, with the weight of a twentieth of the cases.
     """
     order = np.argsort(harms * value, kind="stable")
     ideal = np.zeros(value.size // 20)
@@ -220,47 +220,49 @@ def crossing(value: np.ndarray, lost: np.ndarray, level: float, harms: int) -> f
     return float(value[order][over[0]]) if over.size else math.nan
 
 
-def crossings(found: xr.Dataset, level: float, seed: int = 0) -> dict[str, tuple[float, ...]]:
-    """For each law `crossing` and its bootstrap 95 % interval; cases are drawn again."""
-    random, value = np.random.default_rng(seed), found.value.values
-    told = {}
-    for law in map(str, found.law.values):
-        lost = found.usual.sel(law=law).values - found.success.sel(law=law).values
+def crossings(results: xr.Dataset, level: float, seed: int = 0) -> dict[str, tuple[float, ...]]:
+    """Return `crossing` of each law, and its bootstrap 95 % interval over cases."""
+    random, value = np.random.default_rng(seed), results.value.values
+    intervals = {}
+    for law in map(str, results.law.values):
+        lost = results.usual.sel(law=law).values - results.success.sel(law=law).values
         again = []
         for _ in range(_RESAMPLES):
-            some = random.integers(0, value.size, value.size)
-            again.append(crossing(value[some], lost[some], level, found.harms))
-        # A resample that never loses so much says that the limit may lie beyond what was tried.
-        beyond = float(value.max() if found.harms > 0 else value.min())
-        ends = np.percentile(np.nan_to_num(again, nan=beyond), [2.5, 97.5])
-        told[law] = (crossing(value, lost, level, found.harms), *map(float, ends))
-    return told
+            rows = random.integers(0, value.size, value.size)
+            again.append(crossing(value[rows], lost[rows], level, results.harms))
+        # In a resample without such a loss, the limit may be beyond the tried values.
+        beyond = float(value.max() if results.harms > 0 else value.min())
+        interval = np.percentile(np.nan_to_num(again, nan=beyond), [2.5, 97.5])
+        intervals[law] = (crossing(value, lost, level, results.harms), *map(float, interval))
+    return intervals
 
 
-def losses(found: Mapping[str, xr.Dataset]) -> list[list[str]]:
-    """Header and a row for each drawn limit and law: where it has lost each of `LOSSES`."""
+def losses(results: Mapping[str, xr.Dataset]) -> list[list[str]]:
+    """Return a header and a row for each drawn limit and law: its limits for `LOSSES`."""
     rows = [["limit", "law", "ideal base", *(f"{100 * x:g} points lost at" for x in LOSSES)]]
-    for name in (name for name in found if LIMITS[name].drawn):
-        one, at = found[name], [crossings(found[name], level) for level in LOSSES]
-        for law in map(str, one.law.values):
-            usual = f"{tables.percent(float(one.usual.sel(law=law).mean()))} %"
-            rows.append([LIMITS[name].what, law, usual, *(_place(*each[law]) for each in at)])
+    for name in (name for name in results if LIMITS[name].drawn):
+        dataset, at = results[name], [crossings(results[name], level) for level in LOSSES]
+        for law in map(str, dataset.law.values):
+            ideal = f"{tables.percent(float(dataset.usual.sel(law=law).mean()))} %"
+            rows.append(
+                [LIMITS[name].label, law, ideal, *(_interval_text(*by_law[law]) for by_law in at)]
+            )
     return rows
 
 
-def _place(at: float, low: float, high: float) -> str:
+def _interval_text(at: float, low: float, high: float) -> str:
     return "nowhere" if math.isnan(at) else f"{at:.2g} [{low:.2g}, {high:.2g}]"
 
 
-def successes(found: Mapping[str, xr.Dataset]) -> list[list[str]]:
-    """Header and a row for each value of the sizes and pitches: every law's success there."""
-    laws = [str(law) for one in list(found.values())[:1] for law in one.law.values]
+def successes(results: Mapping[str, xr.Dataset]) -> list[list[str]]:
+    """Return a header and a row for each size and pitch, with the success of each law."""
+    laws = [str(law) for dataset in list(results.values())[:1] for law in dataset.law.values]
     rows = [["quantity", "value", *laws]]
-    for name in (name for name in found if LIMITS[name].robots):
-        for value in np.unique(found[name].value.values):
-            here = found[name].success.values[:, found[name].value.values == value] > 0
-            rates = [tables.share(int(won.sum()), won.size) for won in here]
-            rows.append([LIMITS[name].what, f"{value:.3g}", *rates])
+    for name in (name for name in results if LIMITS[name].robots):
+        for value in np.unique(results[name].value.values):
+            success = results[name].success.values[:, results[name].value.values == value] > 0
+            rates = [tables.share(int(succeeded.sum()), succeeded.size) for succeeded in success]
+            rows.append([LIMITS[name].label, f"{value:.3g}", *rates])
     return rows
 
 
@@ -272,14 +274,14 @@ def turning(
     object: str = "box",
     target: tuple[float, float] = (-2.0, 0.0),
 ) -> xr.Dataset:
-    """What robots make of the turns that a law asks for in the first seconds of one push.
+    """Return commanded and executed turning rates of robots in the first seconds of one push.
 
     Args:
       robots: by name.
       params: of the law.
       seconds: from the start.
-      object: what is pushed, by name.
-      target: where to [m].
+      object: name of the pushed object.
+      target: of the push [m].
 
     Returns:
       `asked` and `done` (robot, time) [rad/s]: the law's twist, and the base's own.
@@ -290,32 +292,36 @@ def turning(
         setting = Setting("fused", rules=Rules(horizon=seconds))
         period = setting.physics.control_period
         (trace,) = pushes.record_cases([case], setting, interval=period)
-        seen = trace.snapshots
-        turns = np.diff(np.asarray(seen.qpos)[:, 2]) / period
-        rows.append([np.asarray(seen.twist.omega)[:-1], turns, np.asarray(seen.time)[:-1]])
-    asked, done, time = (np.stack(columns) for columns in zip(*rows, strict=True))
+        snapshots = trace.snapshots
+        turns = np.diff(np.asarray(snapshots.qpos)[:, 2]) / period
+        rows.append(
+            [np.asarray(snapshots.twist.omega)[:-1], turns, np.asarray(snapshots.time)[:-1]]
+        )
+    commanded, done, time = (np.stack(columns) for columns in zip(*rows, strict=True))
     return xr.Dataset(
-        {"asked": (("robot", "time"), asked), "done": (("robot", "time"), done)},
+        {"asked": (("robot", "time"), commanded), "done": (("robot", "time"), done)},
         {"robot": list(robots), "time": time[0]},
     )
 
 
-def figure_of(found: Mapping[str, xr.Dataset]) -> Figure:
+def figure_of(results: Mapping[str, xr.Dataset]) -> Figure:
     """Draw success over each limit of a robot, with 95 % intervals; dashed: the ideal base."""
-    columns = min(3, len(found))
-    rows = -(-len(found) // columns)
+    columns = min(3, len(results))
+    rows = -(-len(results) // columns)
     figure = Figure(figsize=(4 * columns, 3.2 * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
-    for ax in axes[len(found) :]:
+    for ax in axes[len(results) :]:
         ax.axis("off")
-    for ax, one in zip(axes, found.values(), strict=False):
-        for i, law in enumerate(map(str, one.law.values)):
-            seen = statistics.bins(one.value.values, one.success.sel(law=law).values > 0, 12)
-            success_rates(ax, *seen, curve=i, color=f"C{i}", label=law)
-            usual = 100 * float(one.usual.sel(law=law).mean())
-            ax.axhline(usual, color=f"C{i}", lw=0.8, ls="--")
-        ax.set_xlabel(one.value.attrs["long_name"], fontsize=9)
-        ax.set_xscale("log" if one.attrs["log"] else "linear")
+    for ax, dataset in zip(axes, results.values(), strict=False):
+        for i, law in enumerate(map(str, dataset.law.values)):
+            binned = statistics.bins(
+                dataset.value.values, dataset.success.sel(law=law).values > 0, 12
+            )
+            success_rates(ax, *binned, curve=i, color=f"C{i}", label=law)
+            ideal = 100 * float(dataset.usual.sel(law=law).mean())
+            ax.axhline(ideal, color=f"C{i}", lw=0.8, ls="--")
+        ax.set_xlabel(dataset.value.attrs["long_name"], fontsize=9)
+        ax.set_xscale("log" if dataset.attrs["log"] else "linear")
         ax.grid(alpha=0.3)
     for ax in axes[::columns]:
         ax.set_ylabel("success [%]")
@@ -323,15 +329,17 @@ def figure_of(found: Mapping[str, xr.Dataset]) -> Figure:
     return figure
 
 
-def turning_figure(found: xr.Dataset) -> Figure:
+def turning_figure(results: xr.Dataset) -> Figure:
     """Draw the turning rate that a law asks for, and what each robot makes of it, over time."""
-    names = list(map(str, found.robot.values))
+    names = list(map(str, results.robot.values))
     figure = Figure(figsize=(8, 1.7 * len(names)), layout="constrained")
     axes = figure.subplots(len(names), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
     for ax, name in zip(axes, names, strict=True):
-        one = found.sel(robot=name)
-        ax.step(one.time, one.asked, color="0.7", lw=1, where="post", label="asked by the law")
-        ax.plot(one.time, one.done, color="C0", lw=1.2, label="of the base")
+        dataset = results.sel(robot=name)
+        ax.step(
+            dataset.time, dataset.asked, color="0.7", lw=1, where="post", label="asked by the law"
+        )
+        ax.plot(dataset.time, dataset.done, color="C0", lw=1.2, label="of the base")
         ax.set_title(name, fontsize=9, loc="left")
         ax.set_ylabel(r"$\omega$ [rad/s]")
         ax.grid(alpha=0.3)
