@@ -1,4 +1,4 @@
-"""The questions that are asked of this project: one a folder of `sweeps`, each with its page."""
+"""The studies of this project: options, pages, published commands and digests."""
 
 import json
 import re
@@ -69,7 +69,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("study", "options", "message"), REFUSED)
-def test_a_study_refuses_before_it_compiles(
+def test_a_study_refuses_invalid_options_before_it_compiles(
     study, options, message, tmp_path, compiled, capsys, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
@@ -79,7 +79,7 @@ def test_a_study_refuses_before_it_compiles(
 
 
 @pytest.mark.parametrize("folder", STUDIES, ids=lambda folder: folder.name)
-def test_a_folder_asks_one_question_of_a_report(folder):
+def test_a_folder_has_one_study(folder):
     question = names.question_type(str(folder))
     assert question.__doc__
     assert question.TITLE
@@ -87,7 +87,7 @@ def test_a_folder_asks_one_question_of_a_report(folder):
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
-def test_a_folder_has_a_page_that_says_first_what_was_found(folder):
+def test_a_folder_has_a_page_that_starts_with_the_result(folder):
     lines = (folder / "README.md").read_text().splitlines()
     assert lines[0].startswith("# ")
     assert lines[2]
@@ -96,67 +96,69 @@ def test_a_folder_has_a_page_that_says_first_what_was_found(folder):
 
 
 def published():
-    """Commands of `rps` in the data of all tables, but for those with a place to be filled."""
+    """Yield the commands of `rps` in all data files, except those with placeholders."""
     for path in sorted(SWEEPS.glob("**/results/*.json")):
-        commands = json.loads(path.read_text()).get("command", [])  # one that cites has none
+        commands = json.loads(path.read_text()).get(
+            "command", []
+        )  # a table that cites others has none
         for line in [commands] if isinstance(commands, str) else commands:
             if line.startswith("rps ") and not re.search(r"\$C|[A-Z]{3,}|\.\.\.", line):
                 yield pytest.param(line, id=f"{path.stem}: {line[:60]}")
 
 
 @pytest.mark.parametrize("line", list(published()))
-def test_a_published_command_can_still_be_asked(line, monkeypatch):
-    """Its options are known; what it names, as files, may have to be made first."""
+def test_a_published_command_exists(line, monkeypatch):
+    """Only its options are checked; files that it names may not exist."""
     monkeypatch.chdir(ROOT)
     _, *words = shlex.split(line.replace("\\\n", " "), comments=True)
     name, rest = names.split(words)
-    asked, _ = flags.parse(names.question_type(name), name, rest)
-    assert asked.name
+    question, _ = flags.parse(names.question_type(name), name, rest)
+    assert question.name
 
 
 def test_commands_are_published():
     assert len(list(published())) > 50
 
 
-def test_a_published_command_names_no_place_of_a_machine(tmp_path):
-    made = {
+def test_a_published_command_has_no_local_path(tmp_path):
+    run = {
         "command": ["rps", "sweep", "--out", "/somewhere/of mine", "--worlds", "3"],
         "packages": dict.fromkeys(("rps_jax", "jax", "mujoco", "mujoco-mjx")),
         "commit": None,
         "time": "2026-01-01T00:00:00",
     }
-    path = write_table(tmp_path / "results" / "x.json", [made], "", Table([["what"]]))
-    told = json.loads(path.read_text())
-    assert told["command"] == ["rps sweep --worlds 3"]
-    assert told["digest"] == digest([["rps", "sweep", "--worlds", "3"]])
-    script = [made | {"command": ["python", "mine.py"]}]  # has none, and is published
+    path = write_table(tmp_path / "results" / "x.json", [run], "", Table([["what"]]))
+    data = json.loads(path.read_text())
+    assert data["command"] == ["rps sweep --worlds 3"]
+    assert data["digest"] == digest([["rps", "sweep", "--worlds", "3"]])
+    script = [run | {"command": ["python", "mine.py"]}]  # has no digest
     assert "digest" not in json.loads(write_table(path, script, "", Table([["what"]])).read_text())
     for path in SWEEPS.rglob("results/*.json"):
         assert "--out /" not in path.read_text(), path
 
 
-def test_a_number_that_hangs_on_what_has_changed_is_stale():
-    """A tuned law, a domain and a default count; the folder of a run does not."""
-    asked = ["rps", "sweep", "--domain", "wide", "--laws", "rps_tuned", "--worlds", "8"]
-    assert digest([asked]) == digest([[*asked, "--engine", "fused"]])
+def test_a_digest_changes_with_laws_domains_and_options():
+    """The default engine may be named; laws, domains, seeds and sizes matter."""
+    command = ["rps", "sweep", "--domain", "wide", "--laws", "rps_tuned", "--worlds", "8"]
+    assert digest([command]) == digest([[*command, "--engine", "fused"]])
     for changes in (["--laws", "rps"], ["--domain", "real"], ["--seed", "3"], ["--worlds", "9"]):
-        assert digest([asked]) != digest([[*asked, *changes]])
+        assert digest([command]) != digest([[*command, *changes]])
 
 
 def test_no_published_number_is_stale(monkeypatch):
-    """With the package's laws alone: a ladder takes in all that other tests have registered."""
+    """A ladder runs all registered laws, so the laws of other tests are removed first."""
     monkeypatch.setattr(
         registry, "LAWS", {name: registry.LAWS[name] for name in registry.PACKAGE_LAWS}
     )
     for path in data_files():
         data = json.loads(path.read_text())
         if "digest" in data:
-            commands = [shlex.split(one) for one in data["command"]]
+            commands = [shlex.split(text) for text in data["command"]]
             assert digest(commands) == data["digest"], f"{path.name} is stale: make it anew"
 
 
-def test_a_copy_of_a_shipped_policy_leaves_the_law_what_it_is(tmp_path):
+def test_a_copy_of_a_shipped_policy_does_not_change_its_law(tmp_path):
     shutil.copy(policy.SHIPPED["learned_mlp"], tmp_path / "copy.npz")
-    before = registry.params_to_json(registry.LAWS["learned_mlp"])
+    params = registry.params_to_json(registry.LAWS["learned_mlp"])
     assert registry.parse_law(str(tmp_path / "copy.npz"))[0] == "learned_mlp"
-    assert registry.params_to_json(registry.LAWS["learned_mlp"]) == before
+    assert registry.params_to_json(registry.LAWS["learned_mlp"]) == params

@@ -1,4 +1,4 @@
-"""Published numbers are made anew by one command, which says what each takes and goes on."""
+"""The studies that compute published numbers again, and the tables that they derive."""
 
 import json
 import re
@@ -26,51 +26,52 @@ from sweeps.random_worlds import million
 
 SWEEPS = ROOT / "sweeps"
 PUSH = "rps sweep --domain wide,objects=random_cylinder --worlds 3 --engine quasistatic --horizon 1"
-COMMANDS = [one for recipe in RECIPES.values() for one in recipe.commands if one[:4] == "rps "]
+COMMANDS = [c for recipe in RECIPES.values() for c in recipe.commands if c[:4] == "rps "]
 
 
 @pytest.mark.parametrize("path", study.published(), ids=lambda path: path.stem)
-def test_a_data_file_is_made_by_one_recipe_or_cites_others_or_is_history(path):
+def test_a_data_file_has_one_recipe_or_cites_others_or_is_history(path):
     ways = [name for name in RECIPES if fnmatch(path.stem, name)]
     cites = "command" not in json.loads(path.read_text())
     assert len(ways) + cites + (path.stem in HISTORY) == 1
 
 
 @pytest.mark.parametrize("command", sorted(set(COMMANDS)))
-def test_the_command_of_a_recipe_can_be_asked(command):
+def test_the_command_of_a_recipe_exists(command):
     name, rest = names.split(shlex.split(command)[1:])
     assert flags.parse(names.question_type(name), name, rest)[0].name
 
 
-def test_a_recipe_says_on_what_it_is_made():
+def test_a_recipe_chooses_its_device():
     assert Recipe((), 5, None).device == "cpu"
-    assert Recipe((), 5, 4).device == "cpu"  # no GPU for so little
+    assert Recipe((), 5, 4).device == "cpu"  # short runs need no GPU
     assert Recipe((), 90, 4).device == Recipe((), None, 30).device == "gpu"
 
 
 @pytest.fixture
-def few(tmp_path, monkeypatch):
-    """Three recipes, of which the second fails, in a folder of data files of their own."""
+def recipe_folder(tmp_path, monkeypatch):
+    """Folder with the data files of three recipes; the second recipe fails."""
     shutil.copytree(SWEEPS / "table" / "results", tmp_path / "study" / "results")
     recipes = {
         "first": Recipe((f"{PUSH} --laws rps --out runs/one",), 1, None, "Success", ("drums",),
                         ("", "all"), folder="study"),
         "broken": Recipe((f"{PUSH} --laws none",), 1, None, "Success"),
         "second": Recipe((f"{PUSH} --laws rps --out runs/one",), 1, None,
-                         lambda found: [["worlds"], [str(found.sizes["world"])]], folder="study"),
+                         lambda results: [["worlds"], [str(results.sizes["world"])]],
+                         folder="study"),
     }  # fmt: skip
     monkeypatch.setattr(study, "RECIPES", recipes)
     monkeypatch.setattr(study, "_SWEEPS", tmp_path)
     return tmp_path
 
 
-def test_what_fails_is_named_and_the_others_are_made(few, capsys):
+def test_failed_recipes_are_named_and_the_others_are_run(recipe_folder, capsys):
     words = (SWEEPS / "publish", "--only", "*", "--needs", "cpu", "--machine", "a core")
-    assert rps(*words, "--out", few / "run") == 2
-    said = capsys.readouterr()
-    assert "1 of the files could not be made: broken." in said.err
-    assert "unknown law 'none'" in said.out
-    first, second = (json.loads((few / f"study/results/{n}.json").read_text())
+    assert rps(*words, "--out", recipe_folder / "run") == 2
+    output = capsys.readouterr()
+    assert "1 of the files could not be made: broken." in output.err
+    assert "unknown law 'none'" in output.out
+    first, second = (json.loads((recipe_folder / f"study/results/{n}.json").read_text())
                      for n in ("first", "second"))  # fmt: skip
     assert [column["name"] for column in first["columns"]] == ["", "law", "all"]
     assert first["rows"][0][:2] == ["drums", "rps"]
@@ -78,34 +79,36 @@ def test_what_fails_is_named_and_the_others_are_made(few, capsys):
     assert first["command"] == second["command"] == [f"{PUSH} --laws rps"]
     assert first["device"] == "a core"
     assert len(first["digest"]) == 16
-    assert [path.name for path in (few / "run" / "runs").iterdir()] == ["one"]  # run once
+    assert [path.name for path in (recipe_folder / "run" / "runs").iterdir()] == [
+        "one"
+    ]  # one run for both recipes
 
 
-def test_a_run_that_another_command_reads_keeps_its_name_and_is_hung_upon(tmp_path):
+def test_a_data_file_keeps_run_folders_that_other_commands_read(tmp_path):
     tuned = "rps tune es --worlds 16 --law pursuit --out runs/tuned"
     ladder = "rps ladder --worlds 9 --laws pursuit pursuit,runs/tuned/tuned.json --out runs/other"
-    commands = [shlex.split(one) for one in (tuned, ladder)]
+    commands = [shlex.split(text) for text in (tuned, ladder)]
     signed = {
         "packages": dict.fromkeys(study_base._PACKAGES, "1"),
         "commit": "",
         "time": "2026-01-01",
     }
-    made = [signed | {"command": words} for words in commands]
+    runs = [signed | {"command": words} for words in commands]
     path = study_base.write_table(
-        tmp_path / "results" / "one.json", made, "a core", study_base.Table([["x"]])
+        tmp_path / "results" / "one.json", runs, "a core", study_base.Table([["x"]])
     )
     data = json.loads(path.read_text())
     assert data["command"] == [tuned, ladder.removesuffix(" --out runs/other")]
-    assert data["digest"] == study_base.digest([shlex.split(one) for one in data["command"]])
-    other = tuned.replace("16", "17"), ladder
-    assert data["digest"] != study_base.digest([shlex.split(one) for one in other])
+    assert data["digest"] == study_base.digest([shlex.split(text) for text in data["command"]])
+    changed = tuned.replace("16", "17"), ladder
+    assert data["digest"] != study_base.digest([shlex.split(text) for text in changed])
 
 
-def test_a_law_is_beside_itself_as_it_was_tuned():
+def test_laws_with_default_and_tuned_parameters_are_compared():
     laws = ["rps", "rps,tuned", "pursuit", "pursuit,tuned"]
-    won = np.repeat([[1, 0], [1, 1], [0, 1], [0, 1]], [8, 8], axis=1)
-    found = xr.Dataset({"success": (("law", "world"), won)}, {"law": laws})
-    head, *body = rows.default_beside_tuned(found)
+    success = np.repeat([[1, 0], [1, 1], [0, 1], [0, 1]], [8, 8], axis=1)
+    results = xr.Dataset({"success": (("law", "world"), success)}, {"law": laws})
+    head, *body = rows.default_beside_tuned(results)
     assert head[0] == "law"
     assert [row[0] for row in body] == ["rps", "pursuit"]
     assert body[0][1].startswith("50.0 %")
@@ -119,8 +122,8 @@ def test_a_comparison_names_laws_by_the_runs_that_tuned_them():
     domain = replace(near, objects=("random_cylinder", "random_box"), distance=Range(0.7, 0.8))
     setting = Setting("quasistatic", rules=Rules(horizon=20.0))
     laws = {"rps": "rps", "rps,a/runs/gradient/tuned.json": "rps_tuned"}
-    found = xr.DataTree.from_dict({"near": sweep(laws, domain, 12, setting=setting)})
-    head, first, second = rows.comparison(found)
+    results = xr.DataTree.from_dict({"near": sweep(laws, domain, 12, setting=setting)})
+    head, first, second = rows.comparison(results)
     assert (first[0], first[1], second[1]) == ("`near`, 12", "rps", "gradient")
     by_object = first[head.index("by object [%]")].split(", ")
     assert len(by_object) == 2
@@ -130,9 +133,9 @@ def test_a_comparison_names_laws_by_the_runs_that_tuned_them():
     assert first[2].startswith(f"{100 * lost / 12:.1f} %")
 
 
-def test_worlds_of_robots_are_told_by_force_lag_and_acceleration():
+def test_success_is_grouped_by_force_lag_and_acceleration():
     rng = np.random.default_rng(3)
-    many = {
+    limits = {
         "robot_force": (150, 800),
         "robot_traction": (0.3, 0.8),
         "robot_lag": (0, 0.5),
@@ -140,31 +143,31 @@ def test_worlds_of_robots_are_told_by_force_lag_and_acceleration():
         "friction_ground": (0.1, 0.7),
         "mass": (3, 60),
     }
-    drawn = {name: ("world", rng.uniform(*ends, 4000)) for name, ends in many.items()}
-    found = xr.Dataset(drawn, {"law": ["rps"]})
-    force = np.minimum(found.robot_force, found.robot_traction * 130 * 9.81)
-    margin = force / (found.friction_ground * found.mass * 9.81)
-    found["success"] = ("law", "world"), (margin.values[None] >= 1).astype(np.int8)
-    _, *body = rows.by_robot(found)
-    count = {what: int(of.replace(",", "")) for what, of, _ in body}
-    told = {what: rate.split(" [")[0] for what, _, rate in body}
-    assert told["0.8 to 1"] == "0.0 %"
-    assert told["1 to 1.25"] == "100.0 %"
-    margins = [what for what in count if "enough" not in what]
-    assert sum(count[what] for what in margins) == int((margin >= 0.5).sum())
-    for what in ("lag", "acceleration"):
-        parts = [n for name, n in count.items() if name.startswith(what)]
+    drawn = {name: ("world", rng.uniform(*interval, 4000)) for name, interval in limits.items()}
+    results = xr.Dataset(drawn, {"law": ["rps"]})
+    force = np.minimum(results.robot_force, results.robot_traction * 130 * 9.81)
+    margin = force / (results.friction_ground * results.mass * 9.81)
+    results["success"] = ("law", "world"), (margin.values[None] >= 1).astype(np.int8)
+    _, *body = rows.by_robot(results)
+    count = {label: int(worlds.replace(",", "")) for label, worlds, _ in body}
+    rate_of = {label: rate.split(" [")[0] for label, _, rate in body}
+    assert rate_of["0.8 to 1"] == "0.0 %"
+    assert rate_of["1 to 1.25"] == "100.0 %"
+    margins = [label for label in count if "enough" not in label]
+    assert sum(count[label] for label in margins) == int((margin >= 0.5).sum())
+    for label in ("lag", "acceleration"):
+        parts = [n for name, n in count.items() if name.startswith(label)]
         assert len(parts) == 5
         assert sum(parts) == int((margin >= 1.5).sum())
 
 
-def test_speeds_stand_by_engine_and_batch_beside_c():
+def test_speeds_are_grouped_by_engine_and_batch():
     measured = [("C in closed loop", 64, "box", 100.0), ("C in closed loop", 64, "prism", 50.0),
                 ("fused", 4096, "box", 200_000.0), ("fused", 8, "box", 50.0),
                 ("fused", 8, "prism", 25.0)]  # fmt: skip
     fields = zip(("name", "worlds", "family", "rate"), zip(*measured, strict=True), strict=True)
-    found = xr.Dataset({name: ("measurement", list(values)) for name, values in fields})
-    assert rows.speeds(found) == [
+    results = xr.Dataset({name: ("measurement", list(values)) for name, values in fields})
+    assert rows.speeds(results) == [
         ["engine", "worlds", "box", "prism", "against C in closed loop"],
         ["C in closed loop", "64", "100", "50", "1, 1"],
         ["fused", "4,096", "200,000", "", "2,000"],
@@ -172,65 +175,69 @@ def test_speeds_stand_by_engine_and_batch_beside_c():
     ]
 
 
-def test_a_rare_failure_is_told_by_its_median_and_all_of_it():
-    each = {"p": [0.1, 0.2, 0.6], "low": [0.0, 0.1, 0.3], "high": [0.2, 0.3, 0.9],
+def test_rare_failures_have_rows_of_the_median_and_of_all_repetitions():
+    repetitions = {"p": [0.1, 0.2, 0.6], "low": [0.0, 0.1, 0.3], "high": [0.2, 0.3, 0.9],
             "variation": [0.5, 0.4, 0.3], "trials": [100, 200, 300]}  # fmt: skip
-    found = xr.Dataset({name: ("repetition", values) for name, values in each.items()})
+    results = xr.Dataset({name: ("repetition", values) for name, values in repetitions.items()})
     drawn = {"p": 0.25, "low": 0.2, "high": 0.3, "variation": 0.1, "trials": 400}
-    beside = found.assign({f"drawn_{name}": value for name, value in drawn.items()})
-    head, middle, together, last = rows.rare_failures(beside)
+    with_drawn = results.assign({f"drawn_{name}": value for name, value in drawn.items()})
+    head, middle, together, last = rows.rare_failures(with_drawn)
     assert head[1:] == ["probability of failure", "95 %", "variation", "worlds"]
     assert middle == ["splitting, median of 3", "0.2", "[0.1, 0.3]", "0.40", "200"]
     assert together[1] == "0.3"
     assert together[-1] == "600"
     assert last == ["drawn worlds", "0.25", "[0.2, 0.3]", "0.10", "400"]
-    assert len(rows.rare_failures(found)) == 3
+    assert len(rows.rare_failures(results)) == 3
 
 
-def test_cosines_stand_under_the_time_simulated():
+def test_cosines_have_a_column_per_horizon():
     cosine = xr.DataArray([[0.5, -0.25]], dims=("estimator", "horizon"))
-    found = xr.Dataset({"cosine": cosine, "doubt": ("horizon", [0.1, 0.2])},
+    results = xr.Dataset({"cosine": cosine, "doubt": ("horizon", [0.1, 0.2])},
                        {"estimator": ["forward"], "horizon": [2.0, 30.0]})  # fmt: skip
-    assert rows.cosines(found)[1:] == [["forward", "", "0.50", "", "-0.25", "", ""]]
+    assert rows.cosines(results)[1:] == [["forward", "", "0.50", "", "-0.25", "", ""]]
 
 
-def test_what_only_a_dependency_brings_goes_with_it():
+def test_dependencies_include_indirect_ones():
     needs = {"a": ["b", "c"], "b": ["d"], "c": [], "d": ["b"], "e": ["c", "not there"]}
     assert dependencies.with_dependencies(needs, ["a", "e"]) == {*"abcde"}
     assert dependencies.with_dependencies(needs, ["e"]) == {"c", "e"}
 
 
-def test_every_dependency_and_extra_says_what_it_is_for():
+def test_every_dependency_and_extra_has_a_purpose():
     declared = dependencies.declared()
-    needed = [re.match(r"[\w-]+", one).group() for one in declared["dependencies"]]
+    needed = [re.match(r"[\w-]+", requirement).group() for requirement in declared["dependencies"]]
     assert set(needed) == set(dependencies.PURPOSE)
     assert set(declared["optional-dependencies"]) == set(dependencies.EXTRAS)
 
 
-def test_only_what_needs_such_a_device_is_made(few, capsys):
-    assert rps(SWEEPS / "publish", "--only", "first", "--needs", "gpu", "--out", few / "run") == 0
+def test_recipes_are_selected_by_device(recipe_folder, capsys):
+    assert (
+        rps(SWEEPS / "publish", "--only", "first", "--needs", "gpu", "--out", recipe_folder / "run")
+        == 0
+    )
     assert "Published numbers" in capsys.readouterr().out
-    assert not (few / "study" / "results" / "first.json").exists()
+    assert not (recipe_folder / "study" / "results" / "first.json").exists()
 
 
-def test_a_million_outcomes_are_kept_small_and_read_as_the_page_says(tmp_path, monkeypatch, capsys):
+def test_the_code_of_the_page_reads_a_million_outcomes(tmp_path, monkeypatch, capsys):
     setting = Setting("quasistatic", rules=Rules(horizon=16.0), seed=37)
     near = "wide,objects=random_cylinder,distance=0.7:0.8,bearing=0:0.1"
-    asked = million.Million(("rps", "nps"), near, 19, setting=setting, out=tmp_path / "run")
-    found = asked()
-    files.write_results(tmp_path / "million.nc", million.packed(found))
+    laws, out = ("rps", "nps"), tmp_path / "run"
+    study = million.Million(laws, near, 19, setting=setting, slots=32, out=out)
+    results = study()
+    files.write_results(tmp_path / "million.nc", million.packed(results))
     seeded = replace(setting, seed=seed_of(37, "test"))
-    usual = sweep(("rps", "nps"), near, 19, setting=seeded)
-    bits = np.unpackbits(found.success.values, axis=1, count=19)
-    np.testing.assert_array_equal(bits, usual.success)
-    np.testing.assert_array_equal(found.how == 0, usual.success)
+    swept = sweep(laws, near, 19, setting=seeded, slots=32)
+    bits = np.unpackbits(results.success.values, axis=1, count=19)
+    np.testing.assert_array_equal(bits, swept.success)
+    np.testing.assert_array_equal(results.how == 0, swept.success)
     assert 0 < bits.sum() < bits.size
-    period = found.attrs["control_period"]
-    np.testing.assert_allclose(found.steps * period, usual.time, atol=1e-4)
-    touched = np.isfinite(usual.min_distance.values)
-    np.testing.assert_array_equal(found.missed.values < million.UNTOUCHED, touched)
-    off = 1000 * usual.min_distance.values
-    np.testing.assert_allclose(found.missed.values[touched], off[touched], atol=0.51)
+    period = results.attrs["control_period"]
+    np.testing.assert_allclose(results.steps * period, swept.time, atol=1e-4)
+    touched = np.isfinite(swept.min_distance.values)
+    np.testing.assert_array_equal(results.missed.values < million.UNTOUCHED, touched)
+    distance = 1000 * swept.min_distance.values
+    np.testing.assert_allclose(results.missed.values[touched], distance[touched], atol=0.51)
     page = (SWEEPS / "random_worlds" / "README.md").read_text()
     (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     monkeypatch.chdir(tmp_path)
