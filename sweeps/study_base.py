@@ -23,8 +23,7 @@ from rps_jax.app.cli import flags, names
 from rps_jax.control import registry
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
-from rps_jax.record.options import option
-from rps_jax.runs.question import Question, Run
+from rps_jax.runs.question import Question, TrialQuestion
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.world.domain import DOMAINS, QUANTITIES
 
@@ -89,19 +88,8 @@ class Study(Question[T]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrialStudy(Study[T]):
+class TrialStudy(Study[T], TrialQuestion[T]):
     """Base class of studies that run trials with several settings."""
-
-    slots: int | None = option(None, 1, 10_000_000, kw_only=True)
-    """Number of worlds that one worker steps at once; the default suits engine and device."""
-    workers: int | None = option(None, 1, 1024, kw_only=True)
-    """Number of host threads that step worlds; the default suits engine and device."""
-    quick: bool = False
-    """Whether to make a small run of minutes on two cores; explicit options keep their values."""
-
-    def create_run(self, out: Path | None, callback: ProgressCallback) -> Run:
-        """Return the run folder and the resources of the run."""
-        return Run(out, callback, self.slots, self.workers)
 
 
 def write_table(path: Path, runs: Sequence[Mapping[str, Any]], device: str, table: Table) -> Path:

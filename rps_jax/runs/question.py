@@ -358,10 +358,9 @@ def setting_as_json(setting: Setting) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SimulationQuestion(Question[T]):
-    """A question that is answered by pushing in simulation."""
+class TrialQuestion(Question[T]):
+    """Base class of questions that run trials."""
 
-    setting: Setting = Setting()
     slots: int | None = option(None, 1, 10_000_000, kw_only=True)
     """Number of worlds that one worker steps at once; by default as suits engine and device."""
     workers: int | None = option(None, 1, 1024, kw_only=True)
@@ -371,6 +370,13 @@ class SimulationQuestion(Question[T]):
 
     def create_run(self, out: Path | None, callback: ProgressCallback) -> Run:
         return Run(out, callback, self.slots, self.workers)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationQuestion(TrialQuestion[T]):
+    """Base class of questions that run trials with one setting."""
+
+    setting: Setting = Setting()
 
 
 @dataclass(frozen=True)
