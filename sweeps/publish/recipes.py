@@ -94,11 +94,7 @@ RECIPES: dict[str, Recipe] = {
     "table": Recipe(("rps table",), 1, None, "Table II*"),
     "table_mjx": Recipe(("rps table --engine mjx",), 4, None, "Table II*", folder="table"),
     "grid": Recipe(
-        ("rps table --laws rps rps_tuned rps_plus learned_gru",),
-        3,
-        1,
-        "Table II*",
-        folder="table",
+        ("rps table --laws rps rps_tuned rps_plus learned_gru",), 3, 1, "Table II*", folder="table"
     ),
     "hardware": Recipe(("rps hardware --engine fused",), 4, 2, "Hardware experiments"),
     "shoves": Recipe(("rps hardware --engine fused",), 4, 2, "The object shoved aside"),
@@ -210,10 +206,7 @@ RECIPES: dict[str, Recipe] = {
         "Readings, *",
     ),
     "gazebo": Recipe(
-        ("rps sweeps/ambiguities --gazebo --readings paper_gazebo",),
-        12,
-        2,
-        "Cells of Table II",
+        ("rps sweeps/ambiguities --gazebo --readings paper_gazebo",), 12, 2, "Cells of Table II"
     ),
     "gazebo_parts": Recipe(
         ("rps sweeps/ambiguities --gazebo --laws rps --readings paper_gazebo pyramid thin",),

@@ -12,13 +12,7 @@ import subprocess
 import sys
 
 # MuJoCo Warp and Newton, the Warp version that MJX requires, and their imports.
-PACKAGES = (
-    "mujoco-warp==3.17.0",
-    "newton==1.8.0",
-    "warp-lang==1.18.0",
-    "absl-py",
-    "etils",
-)
+PACKAGES = ("mujoco-warp==3.17.0", "newton==1.8.0", "warp-lang==1.18.0", "absl-py", "etils")
 
 
 def install(folder: str) -> int:
