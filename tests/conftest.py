@@ -1,11 +1,16 @@
-"""Shared by all tests: the processor, offscreen drawing, shapes that are checked, and a cache."""
+"""Set-up of all tests: processor, fast compilation, offscreen rendering, checked shapes, cache."""
 
 import os
+from pathlib import Path
 
 import pytest
 import shapes
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# Most of the time of the tests is compilation, which takes a third without optimisations.
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")
+if os.name == "posix":
+    os.environ.setdefault("RPS_COMPILER", str(Path(__file__).with_name("cc")))
 
 
 def pytest_configure(config):
@@ -20,7 +25,7 @@ def pytest_configure(config):
     cache = config.rootpath / ".jax_cache"
     os.environ.setdefault("RPS_CACHE", str(cache))  # of commands, also in processes of their own
     jax.config.update("jax_compilation_cache_dir", os.environ["RPS_CACHE"])
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 # The files that take longest, to be begun first: what is begun last leaves a processor idle.
