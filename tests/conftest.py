@@ -28,11 +28,12 @@ def pytest_configure(config):
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
-# The files that take longest, to be begun first: what is begun last leaves a processor idle.
+# Files with the most work, which start first: the last file to start leaves a processor idle.
 LONGEST = (
-    *("learning", "ladder", "push_page", "failures", "gym", "house", "examples", "sweep"),
-    *("quasistatic", "library", "fit", "cli", "view", "isolation", "physics", "real_pushes"),
-    *("export", "notebooks", "limits", "cluster", "scene"),
+    *("failures", "learning", "native", "export", "ladder", "rivals", "gpu_writer", "smooth"),
+    *("bags", "examples", "sweep", "shell", "trial", "robot", "video", "points", "faults"),
+    *("force_push_grid", "film", "evaluate", "feet", "ground", "force", "library", "cli", "study"),
+    *("quasistatic", "fit", "physics", "notebooks", "publish", "quality", "limits", "isolation"),
 )
 
 
