@@ -59,6 +59,17 @@ def compiled():
 
 
 @pytest.fixture
+def optimised():
+    """Compile the programs of a test with optimisations, if it runs longer than it compiles."""
+    import jax
+
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    is_disabled = os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] == "true"
+    jax.config.update("jax_disable_most_optimizations", is_disabled)
+
+
+@pytest.fixture
 def registries():
     """What a test registers is forgotten after it."""
     from helpers import temporary_names

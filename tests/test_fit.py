@@ -244,7 +244,7 @@ def test_a_fitted_domain_keeps_what_is_undetermined_and_is_read_by_every_command
     assert fitted.mass[:2] == pytest.approx((3.23, 12.4), rel=0.03)
 
 
-def test_a_log_is_fitted_from_the_shell(tmp_path, capsys):
+def test_a_log_is_fitted_from_the_shell(tmp_path, capsys, optimised):
     """And the fitted domain is one that a sweep takes."""
     log = written(tmp_path / "log.csv", rows_of())
     ask = ["fit", log, "--domain", "wide,objects=random_box", "--worlds", 96, "--window", 5]

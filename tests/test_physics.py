@@ -159,7 +159,7 @@ def films(engine):
 
 
 @pytest.fixture
-def seen(request):
+def seen(request, optimised):
     """Films of all worlds in one engine."""
     return films(request.param)
 

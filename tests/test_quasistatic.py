@@ -538,7 +538,7 @@ def test_every_scene_has_a_slider(name):
     np.testing.assert_allclose(slider.p_object_com[0], com, atol=1e-5)
 
 
-def test_the_papers_grid_ends_as_in_the_other_engines():
+def test_the_papers_grid_ends_as_in_the_other_engines(optimised):
     """RPS 144 of 144; NPS 25, as on converged C MuJoCo and on the fused engine."""
     cases = [
         Case(name, FRICTION[friction], target, registry.LAWS[law])
