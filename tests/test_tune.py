@@ -36,8 +36,8 @@ class TestSpace:
         params = FULL.params(jnp.asarray(self.vectors))
         for name, bound in BOUNDS.items():
             value = np.asarray(getattr(params, name))
-            if bound.of:
-                value = value / np.asarray(getattr(params, bound.of))
+            if bound.relative_to:
+                value = value / np.asarray(getattr(params, bound.relative_to))
             assert (value >= bound.low - 1e-5 * abs(bound.low)).all()
             assert (value <= bound.high * (1 + 1e-5)).all()
 

@@ -51,7 +51,7 @@ class Bound(NamedTuple):
     low: float
     high: float
     log: bool = False  # whether the scale is logarithmic
-    of: str = ""  # name of a parameter; the interval is then a fraction of its value
+    relative_to: str = ""  # name of a parameter; the interval is then a fraction of its value
 
 
 def document_fields(kind: type[T]) -> type[T]:

@@ -196,8 +196,8 @@ def parse_law(text: str) -> tuple[str, LawParams]:
             values = {name: errors.check_number(f"{head} {name}", value, text=True)}
         elif change.endswith(".json"):
             values = {
-                key: errors.check_number(f"{change} {key}", number)
-                for key, number in files.read_json(Path(change)).items()
+                key: errors.check_number(f"{change} {key}", x)
+                for key, x in files.read_json(Path(change)).items()
             }
         else:
             raise InputError(
@@ -276,9 +276,9 @@ def resolve_law(law: LawLike, index: int = 0) -> tuple[str, LawParams]:
     return f"{next(iter(presets), type(law).__name__)}_{index + 1}", law
 
 
-def _is_equal(params: LawParams, others: LawParams) -> bool:
+def _is_equal(params: LawParams, preset: LawParams) -> bool:
     """Whether parameters of one class are equal."""
-    a, b = named_leaves(params), named_leaves(others)
+    a, b = named_leaves(params), named_leaves(preset)
     return list(a) == list(b) and all(np.array_equal(a[name], b[name]) for name in a)
 
 

@@ -32,17 +32,17 @@ def less(x: jax.Array, threshold: ArrayLike, temperature: ArrayLike | None) -> j
     return jax.nn.sigmoid((threshold - x) / temperature)
 
 
-def logical_not(condition: jax.Array) -> jax.Array:
+def not_(condition: jax.Array) -> jax.Array:
     """Return the negated condition."""
     return ~condition if condition.dtype == bool else 1 - condition
 
 
-def logical_and(a: jax.Array, b: jax.Array) -> jax.Array:
+def and_(a: jax.Array, b: jax.Array) -> jax.Array:
     """Return the conjunction; the product of weights."""
     return a & b if a.dtype == b.dtype == bool else a * b
 
 
-def logical_or(a: jax.Array, b: jax.Array) -> jax.Array:
+def or_(a: jax.Array, b: jax.Array) -> jax.Array:
     """Return the disjunction; the maximum of weights."""
     return a | b if a.dtype == b.dtype == bool else jnp.maximum(a, b)
 

@@ -1,7 +1,8 @@
 """Checks of a custom law before anything compiles, with errors of one sentence.
 
 `check_law` traces `init` and `step` with `jax.eval_shape`, which computes nothing, and compares
-what they return with what a trial needs. Without it, a mistake in a law is a traceback through JAX.
+the results with the types that a trial needs. Without it, a mistake in a law ends in a traceback
+through JAX.
 """
 
 import functools
@@ -101,27 +102,22 @@ def _check_traced(
     if invalid := [leaf for leaf in jax.tree.leaves(state) if not _is_array(leaf)]:
         raise traced_init.error(_describe(invalid[0]), "a pytree of arrays, the law's state")
     results = traced_step(params, state, observation_shapes(senses))
-    expected = "(state, Twist, Details)"
-    if not (isinstance(results, tuple) and len(results) == 3):
-        raise traced_step.error(_describe(results), expected)
-    next_state, twist, details = results
-    if not (isinstance(twist, tuple) and len(twist) == 3):
-        raise traced_step.error(f"{_describe(twist)} instead of a Twist", expected)
-    if not isinstance(details, Details):
-        fault = f"{_describe(details)} instead of Details"
-        raise traced_step.error(fault, "rps_jax.Details, such as Details.from_obs(obs)")
-    for name, leaf in Twist(*twist)._asdict().items():
-        if fault := _scalar_fault(leaf, "iuf"):
-            raise traced_step.error(f"a Twist whose {name} is {fault}", "a real scalar")
-    for name, leaf in details._asdict().items():
-        if fault := _scalar_fault(leaf, "biuf"):
-            raise traced_step.error(f"Details whose {name} is {fault}", "a scalar")
-    if difference := _difference(state, next_state):
+    parts = results if isinstance(results, tuple) else ()
+    is_twist = len(parts) == 3 and isinstance(parts[1], tuple) and len(parts[1]) == 3
+    if not (is_twist and isinstance(parts[2], Details)):
+        actual = ", ".join(map(_describe, parts)) or _describe(results)
+        raise traced_step.error(actual, "state, Twist, Details, such as Details.from_obs(obs)")
+    scalars = [("Twist", "iuf", item) for item in Twist(*parts[1])._asdict().items()]
+    scalars += [("Details", "biuf", item) for item in parts[2]._asdict().items()]
+    for group, kinds, (name, leaf) in scalars:
+        if fault := _scalar_fault(leaf, kinds):
+            raise traced_step.error(f"{group} whose {name} is {fault}", "a real scalar")
+    if difference := _difference(state, parts[0]):
         raise traced_step.error(f"a state {difference}", "the shapes and types that init returned")
 
 
 class _Traced(NamedTuple):
-    """One function of a law, called on abstract values."""
+    """Function of a law, called on abstract values."""
 
     name: str
     function: Function
@@ -152,8 +148,8 @@ class _Traced(NamedTuple):
 
     def error(self, actual: str, expected: str) -> InputError:
         """Return the error of a wrong result."""
-        place = _definition(self.function)
-        return InputError(f"{self.name} of the law in {place} returns {actual}: return {expected}.")
+        line = _definition(self.function)
+        return InputError(f"{self.name} of the law in {line} returns {actual}: return {expected}.")
 
 
 def _is_array(leaf: object) -> bool:
@@ -167,21 +163,16 @@ def _is_array(leaf: object) -> bool:
         return dtype is not None and jnp.issubdtype(dtype, jax.dtypes.extended)
 
 
-def _describe(value: object) -> str:
+def _describe(value: Any) -> str:
     """Describe a value in a few words."""
     if value is None:
         return "None"
     if type(value) is tuple:
         return f"{len(value)} values"
-    if _is_shaped(value):
+    if hasattr(value, "shape") and _is_array(value):
         return f"an array {tuple(value.shape)}"
     name = type(value).__name__
     return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name}"
-
-
-def _is_shaped(value: Any) -> bool:
-    """Whether a value has a shape and a numeric type."""
-    return hasattr(value, "shape") and _is_array(value)
 
 
 def _scalar_fault(leaf: Any, kinds: str) -> str:

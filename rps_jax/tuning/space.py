@@ -69,14 +69,14 @@ class Space:
             name: jnp.broadcast_to(jnp.asarray(value, vector.dtype), vector.shape[:-1])
             for name, value in registry.named_leaves(self.base).items()
         }
-        for name in sorted(self.names, key=lambda name: bool(bounds[name].of)):
+        for name in sorted(self.names, key=lambda name: bool(bounds[name].relative_to)):
             low, high, log, of = bounds[name]
             u = jax.nn.sigmoid(vector[..., self.names.index(name)])
             value = low * (high / low) ** u if log else low + (high - low) * u
             filled[name] = value * filled[of] if of else value
         for name, bound in bounds.items():
-            if bound.of:  # a share of a tuned parameter that is itself fixed must not pass it
-                filled[name] = jnp.minimum(filled[name], filled[bound.of])
+            if bound.relative_to:  # must not exceed the other parameter, which may be fixed
+                filled[name] = jnp.minimum(filled[name], filled[bound.relative_to])
         return registry.replace_leaves(self.base, filled)
 
     def named(self, vector: Any) -> dict[str, float]:
@@ -91,4 +91,4 @@ class Space:
 
 
 def _share(bound: Bound, numbers: Mapping[str, Any], name: str) -> Any:
-    return numbers[name] / numbers[bound.of] if bound.of else numbers[name]
+    return numbers[name] / numbers[bound.relative_to] if bound.relative_to else numbers[name]

@@ -37,7 +37,7 @@ class APSParams(NamedTuple):
     K_d: float | jax.Array = 0.4  # [1] heading rate gain
     yaw_error_max: float | jax.Array = 0.3  # [rad] above it the robot turns in place
     margin: float | jax.Array = 0.10  # [m] gap above which the robot approaches straight
-    r_robot: float | jax.Array = HALF_LENGTH  # [m] * radius that stands for the rectangular base
+    r_robot: float | jax.Array = HALF_LENGTH  # [m] * equivalent radius of the rectangular base
     gamma_drop: float | jax.Array = 0.01  # [rad] decrease of |gamma| after which alpha is good
     alpha_mean: float | jax.Array = jnp.pi  # [rad] prior mean of good alphas
     alpha_variance: float | jax.Array = jnp.pi / 4  # [rad^2] prior variance

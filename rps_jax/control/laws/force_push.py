@@ -86,8 +86,8 @@ class Path(NamedTuple):
         is_new = (touching & ~self.touched) | passed
         p_world_start = jnp.where(is_new, p_world_contact, self.p_world_start)
         theta_d = jnp.where(is_new, planar.direction(d), self.theta_d)
-        left = jnp.stack([-jnp.sin(theta_d), jnp.cos(theta_d)])
-        offset = jnp.sum((p_world_contact - p_world_start) * left)
+        normal = jnp.stack([-jnp.sin(theta_d), jnp.cos(theta_d)])
+        offset = jnp.sum((p_world_contact - p_world_start) * normal)
         return Path(p_world_start, theta_d, contact, self.touched | touching), filled, offset
 
     def twist(self, params: Any, v_robot: jax.Array, yaw: Scalar) -> Twist:

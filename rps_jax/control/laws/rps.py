@@ -19,7 +19,7 @@ from jax.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.control import soft
-from rps_jax.control.base import Bound, Law, document_fields
+from rps_jax.control.base import Bound, Law, check_signs, document_fields
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Bool, Float
@@ -105,7 +105,7 @@ BOUNDS = {
     "K_v": Bound(0.02, 2, log=True),  # [1/s]
     "L": Bound(0.03, 1.5, log=True),  # [m]
     "l_cr": Bound(0.1, 0.289),  # [m] the half width of the base is 0.29
-    "l_mr": Bound(0.02, 0.98, of="l_cr"),  # [1]
+    "l_mr": Bound(0.02, 0.98, relative_to="l_cr"),  # [1]
     "a_r_max": Bound(1, 100, log=True),  # [1]
     "d_th": Bound(0.02, 2, log=True),  # [m]
     "gamma_max": Bound(0.5, 1.57),  # [rad]
@@ -155,16 +155,12 @@ def check(params: RPSParams) -> RPSParams:
       InputError: a value is not a number, is out of range, or is infinite (only gamma_max may be,
         for the tangent as printed).
     """
-    errors.check_finite("zeta", params.zeta)
-    for name in ("eta", "beta", "k", "d_th", "a_r_max", "l_mr", "v_approach", "v_lost"):
-        errors.check_finite(name, getattr(params, name), at_least=0)
-    for name in ("K_h", "K_v", "L", "l_cr", "v_max", "omega_max", "d_success"):
-        errors.check_finite(name, getattr(params, name), above=0)
-    errors.check_finite("l_mr", params.l_mr, at_most=params.l_cr)
-    errors.check_number("gamma_max", params.gamma_max, above=0)
-    errors.check_finite("sgn_0", params.sgn_0, at_least=0, at_most=1)
-    for name in ("reactive", "keep_contact", "saturate_first", "clip_each"):
-        errors.check_finite(name, getattr(params, name), at_least=0, at_most=1)
+    positive = ("K_h", "K_v", "L", "l_cr", "v_max", "omega_max", "d_success")
+    check_signs("rps", positive, params._replace(gamma_max=0.0), free=("zeta",))
+    errors.check_number("rps.gamma_max", params.gamma_max, above=0)
+    errors.check_finite("rps.l_mr", params.l_mr, at_most=params.l_cr)
+    for name in ("sgn_0", "reactive", "keep_contact", "saturate_first", "clip_each"):
+        errors.check_finite(f"rps.{name}", getattr(params, name), at_most=1)
     return params
 
 
@@ -243,7 +239,7 @@ def _push(
     gamma = steering_angle(params, d, obs.yaw)
 
     temps = temperatures or HARD
-    realigning = soft.logical_and(
+    realigning = soft.and_(
         soft.greater(jnp.abs(l), l_th, temps.realign), jnp.asarray(params.reactive) > 0
     )  # Algorithm 1: enter or leave the Realignment State
     a_r = soft.where(
@@ -271,7 +267,7 @@ def _push(
             distance,
             a_r,
             gamma,
-            soft.logical_and(realigning, soft.logical_not(arrived)),
+            soft.and_(realigning, soft.not_(arrived)),
         ),
     )
 
@@ -291,21 +287,21 @@ def step_with_details(
     contact = soft.where(in_contact, obs.p_robot_contact, state.p_robot_contact)
     filled = obs._replace(p_robot_contact=contact)
     l_th, push, details = _push(params, state.l_th, filled, temperatures)
-    is_kept = soft.logical_and(state.touched, jnp.asarray(params.keep_contact) > 0)
+    is_kept = soft.and_(state.touched, jnp.asarray(params.keep_contact) > 0)
     # Only a current contact arrives: the last contact near the target must not stop the robot.
     is_away = soft.greater_equal(details.distance, params.d_success, temps.arrive)
-    pushing = soft.logical_or(in_contact, soft.logical_and(is_kept, is_away))
+    pushing = soft.or_(in_contact, soft.and_(is_kept, is_away))
     ahead = Twist(soft.where(state.touched, params.v_lost, params.v_approach), 0.0, 0.0)
     twist = soft.tree_where(pushing, push, ahead)
     state = RPSState(
         l_th=soft.where(pushing, l_th, state.l_th),
         p_robot_contact=contact,
-        touched=soft.logical_or(state.touched, in_contact),
+        touched=soft.or_(state.touched, in_contact),
     )
     return (
         state,
         twist,
-        details._replace(realigning=soft.logical_and(details.realigning, pushing)),
+        details._replace(realigning=soft.and_(details.realigning, pushing)),
     )
 
 

@@ -79,8 +79,8 @@ class RPSPlusState(NamedTuple):
     steps_lost: jax.Array  # () int32 control steps since then; a float in the smooth law
 
 
-BOUNDS = {f"law.{name}": bound for name, bound in rps.BOUNDS.items() if not bound.of} | {
-    "law.l_mr": rps.BOUNDS["l_mr"]._replace(of="law.l_cr"),
+BOUNDS = {f"law.{name}": bound for name, bound in rps.BOUNDS.items() if not bound.relative_to} | {
+    "law.l_mr": rps.BOUNDS["l_mr"]._replace(relative_to="law.l_cr"),
     "d_near": Bound(0.05, 1, log=True),  # [m]
     "press": Bound(0, 1),  # [1]
     "n_lost": Bound(10, 2000, log=True),  # [1]
@@ -152,17 +152,17 @@ def step(
         touching = touching.astype(law_state.l_th.dtype)
     p_world_contact = obs.p_world_robot + planar.rotate(obs.yaw, contact)
     p_world_last = soft.where(touching, p_world_contact, state.p_world_contact)
-    idle = soft.logical_or(touching, soft.logical_not(law_state.touched))
+    idle = soft.or_(touching, soft.not_(law_state.touched))
     steps_lost = soft.where(idle, 0, state.steps_lost + 1)
     d = displacement(obs._replace(p_robot_contact=contact))
 
-    is_kept = soft.logical_and(law_state.touched, jnp.asarray(params.law.keep_contact) > 0)
-    pushing = soft.logical_or(touching, is_kept)
-    near = soft.logical_and(pushing, soft.less(details.distance, params.d_near, temps.d_th))  # P1
+    is_kept = soft.and_(law_state.touched, jnp.asarray(params.law.keep_contact) > 0)
+    pushing = soft.or_(touching, is_kept)
+    near = soft.and_(pushing, soft.less(details.distance, params.d_near, temps.d_th))  # P1
     is_away = soft.greater_equal(details.distance, params.law.d_success, temps.arrive)
     p_robot_last = planar.rotate(-obs.yaw, p_world_last - obs.p_world_robot)
     for condition, action in (
-        (soft.logical_and(near, is_away), translation(params, d, obs.yaw)),
+        (soft.and_(near, is_away), translation(params, d, obs.yaw)),
         (
             soft.greater(steps_lost, params.n_lost, temperatures and _LOST_WIDTH),
             search(params, p_robot_last, contact[1], temperatures),

@@ -155,7 +155,7 @@ class PolicyState(NamedTuple):
         return cls(TouchState.initial(dtype), hidden, jnp.zeros(3, dtype), zero)
 
     def due(self, obs: TaxelObservation) -> jax.Array:
-        """Whether the next decision is due in this control step."""
+        """Whether this control step needs a decision."""
         return self.waiting < 0.5 * obs.touch.period
 
 
@@ -182,7 +182,7 @@ class LearnedParams(NamedTuple):
 def observe_sent(
     params: LearnedParams, state: PolicyState, obs: TaxelObservation, sent: Twist
 ) -> PolicyState:
-    """Return the state whose last action is the twist sent to the base, if a decision is due."""
+    """Return the state whose last action is the twist sent to the base, if the law decides now."""
     action = features.clip_action(jnp.stack(sent) / _twist_bounds(params))
     return state._replace(action=jnp.where(state.due(obs), action, state.action))
 

@@ -34,7 +34,7 @@ class Policy(NamedTuple):
 
     @property
     def about(self) -> dict[str, Any]:
-        """All but the weights, as JSON."""
+        """JSON header of the file, with everything except the weights."""
         return {
             "format": FORMAT,
             "version": VERSION,
@@ -129,7 +129,7 @@ def build_law(policy: Policy) -> tuple[str, Law, LearnedParams]:
     """Return the label of a policy, its law, and its parameters.
 
     The label holds the kind of network and a digest of the weights. The parameters have a class of
-    the same name, so that each policy is a law of its own class.
+    the same name, so that the class selects the policy.
     """
     kind, digest = policy.network.kind, _digest(policy.weights)[:8]
     params: type[LearnedParams] = type(f"Learned{kind.upper()}_{digest}", (LearnedParams,), {})
