@@ -249,12 +249,12 @@ def test_rps_plus_searches_at_its_last_contact():
     """P3 with v_max = 0.05 m/s: ahead 0.035, sideways 0.025, and at most 0.15 rad/s."""
     params = RPSPlusParams(n_lost=3)
     state, _, _ = step_once(rps_plus, params, observe((0.36, -0.2), (3.0, 0.0)))
-    np.testing.assert_allclose(state.p_world_felt, (0.36, -0.2), atol=1e-6)
+    np.testing.assert_allclose(state.p_world_contact, (0.36, -0.2), atol=1e-6)
     lost = observe(target=(3.0, 0.0), touching=False)
     for n in (1, 2, 3):
         _, expected, _ = rps.step_with_details(params.law, state.law, lost)
         state, twist, _ = rps_plus.step(params, state, lost)
-        assert int(state.lost) == n
+        assert int(state.steps_lost) == n
         same(twist, expected)
     # The bearing atan2(-0.2, 0.36), 0.41 m away, is off the front: it moves only to the right.
     state, twist, _ = rps_plus.step(params, state, lost)
@@ -265,7 +265,7 @@ def test_rps_plus_searches_at_its_last_contact():
     np.testing.assert_allclose(twist, (0.035, -0.025, -0.15), atol=1e-6)
     # A new contact ends the search.
     state, _, _ = rps_plus.step(params, state, observe((0.36, 0.0), (3.0, 0.0)))
-    assert int(state.lost) == 0
+    assert int(state.steps_lost) == 0
 
 
 def test_rps_plus_does_not_search_before_its_first_contact():
@@ -273,7 +273,7 @@ def test_rps_plus_does_not_search_before_its_first_contact():
     state = rps_plus.init(params)
     for _ in range(3):
         state, twist, _ = rps_plus.step(params, state, observe(touching=False))
-    assert int(state.lost) == 0
+    assert int(state.steps_lost) == 0
     np.testing.assert_allclose(twist, (params.law.v_approach, 0.0, 0.0), atol=1e-7)
 
 

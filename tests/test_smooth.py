@@ -634,7 +634,7 @@ def test_without_heat_smooth_rps_plus_is_the_hard_one(monkeypatch):
         (states[0], twist, _) = hard.step(params, states[0], told)
         (states[1], mixed, _) = cold.step(params, states[1], weight)
         np.testing.assert_allclose(jnp.stack(mixed), jnp.stack(twist), atol=1e-5)
-        assert float(states[1].lost) == pytest.approx(float(states[0].lost))
+        assert float(states[1].steps_lost) == pytest.approx(float(states[0].steps_lost))
 
 
 def test_a_smooth_rps_plus_can_be_differentiated_by_its_own_parameters():
