@@ -1,4 +1,4 @@
-"""The examples run, and what they register is known everywhere."""
+"""Tests of the examples, and of the laws and objects that they register."""
 
 import runpy
 import time
@@ -38,7 +38,7 @@ BOX, CYLINDER = (objects.mjcf_folder() / f"{name}.xml" for name in ("box", "cyli
 
 
 def example(name):
-    """What one example defines."""
+    """Return the names that an example defines."""
     return runpy.run_path(str(EXAMPLES / f"{name}.py"))
 
 
@@ -54,11 +54,11 @@ def test_the_short_examples_are_short(name):
     assert len([line for line in code.splitlines() if line.strip()]) <= 40
 
 
-# --- objects of one's own ------------------------------------------------------------------
+# --- custom objects ----------------------------------------------------------------------
 
 
 def test_a_hexagon_of_ones_own_is_pushed(capsys):
-    # C MuJoCo, which compiles least; what the other engines step is compared below.
+    # C MuJoCo compiles least; the other engines are compared below.
     outcome = example("custom_object")["main"](horizon=8.0, engine="mujoco").squeeze()
     assert "[0 0]" in capsys.readouterr().out
     # The base touches within 2 s, at 1 cm/s, and then pushes at 5 cm/s.
@@ -74,17 +74,17 @@ def hexagon():
     return scene.load("hexagon")
 
 
-def test_a_hexagon_has_the_mass_of_its_geoms_and_the_outline_it_was_given(hexagon):
-    thing = hexagon.physics.body("object")
-    assert thing.mass[0] == pytest.approx(12.0)
+def test_a_hexagon_has_the_mass_of_its_geoms_and_its_registered_outline(hexagon):
+    body = hexagon.physics.body("object")
+    assert body.mass[0] == pytest.approx(12.0)
     # Three boxes of 4 kg about one axis.
-    assert thing.inertia[2] == pytest.approx(12 * (0.3464**2 + 0.2**2) / 12, rel=1e-4)
+    assert body.inertia[2] == pytest.approx(12 * (0.3464**2 + 0.2**2) / 12, rel=1e-4)
     assert hexagon.family == "prism"
     assert float(jnp.linalg.norm(hexagon.footprint.vertices, axis=1).max()) == pytest.approx(0.2)
-    assert 2 * thing.pos[2] == pytest.approx(0.5)
-    assert hexagon.model.ngeom > hexagon.physics.ngeom  # its looks are its own
+    assert 2 * body.pos[2] == pytest.approx(0.5)
+    assert hexagon.model.ngeom > hexagon.physics.ngeom  # with visual geoms
     heavy = scene.load("hexagon", mass=24.0).physics.body("object")
-    np.testing.assert_allclose(heavy.inertia, 2 * thing.inertia, rtol=1e-6)
+    np.testing.assert_allclose(heavy.inertia, 2 * body.inertia, rtol=1e-6)
 
 
 def test_every_engine_has_the_same_hexagon(hexagon):
@@ -100,8 +100,8 @@ def test_every_engine_has_the_same_hexagon(hexagon):
 
 
 @pytest.mark.parametrize(("name", "path"), [("box", BOX), ("cylinder", CYLINDER)])
-def test_an_object_of_the_paper_that_is_registered_anew_is_the_same_world(name, path):
-    """And so may share its batch."""
+def test_a_registered_object_of_the_paper_gives_an_equal_world(name, path):
+    """Both can share a batch."""
     objects.register_object("mine", path)
     cases = [Case(n, FRICTION["S2"], (2.0, 1.0), mass=m) for n in (name, "mine") for m in (None, 9)]
     for engine in ("fused", "mjx"):
@@ -111,20 +111,20 @@ def test_an_object_of_the_paper_that_is_registered_anew_is_the_same_world(name, 
             np.testing.assert_allclose(leaf[:2], leaf[2:], rtol=1e-6, atol=1e-6)
 
 
-def test_an_object_of_ones_own_may_be_of_a_domain(hexagon):
-    """Its mass and outline are those of all worlds, and a replay has its looks."""
+def test_a_custom_object_can_be_in_a_domain(hexagon):
+    """Its mass and outline are those of all worlds, and a replay shows its visual geoms."""
     assert Case("hexagon", FRICTION["S1"], (2.0, 0.0)).title.startswith("hexagon, ")
-    own = Domain(objects=("hexagon",), friction_robot=Range(0.4, 0.5))
-    drawn = draws.draw(own, 0, np.arange(5))
+    domain = Domain(objects=("hexagon",), friction_robot=Range(0.4, 0.5))
+    drawn = draws.draw(domain, 0, np.arange(5))
     assert (drawn.solid.mass == 12.0).all()
-    part = drawn_worlds(own, drawn, Setting(engine="fused"))
+    part = drawn_worlds(domain, drawn, Setting(engine="fused"))
     assert part.worlds.footprint.vertices.shape == (5, 8, 2)
-    plan = Plan(own, 5, {"rps": RPSParams.paper()})
+    plan = Plan(domain, 5, {"rps": RPSParams.paper()})
     assert scene_of(plan, 3).model.ngeom == hexagon.model.ngeom
 
 
 def changed(tmp_path, change):
-    """The box's file with a change made to its tree."""
+    """Write the box's file with a change of its tree, and return the path."""
     tree = ET.parse(BOX)
     change(tree.getroot())
     path = tmp_path / "mine.xml"
@@ -173,7 +173,7 @@ BAD_FILES = {
 
 
 @pytest.mark.parametrize("message", BAD_FILES)
-def test_a_file_that_lacks_something_is_refused_with_what_it_lacks(message, tmp_path):
+def test_an_invalid_object_file_is_rejected_with_the_reason(message, tmp_path):
     path = changed(tmp_path, BAD_FILES[message])
     with pytest.raises(InputError, match=f"object 'mine': .*{message}"):
         objects.register_object("mine", path)
@@ -195,12 +195,12 @@ SQUARE = [[0.1, 0.1], [-0.1, 0.1], [-0.1, -0.1], [0.1, -0.1]]
         (rectangle(5.0, 5.0), "reach of the footprint"),
     ],
 )
-def test_a_footprint_that_cannot_be_pushed_is_refused(footprint, message):
+def test_an_invalid_footprint_is_rejected(footprint, message):
     with pytest.raises(InputError, match=message):
         objects.register_object("mine", BOX, footprint)
 
 
-def test_the_papers_names_are_taken():
+def test_names_of_the_package_cannot_be_registered():
     for name in ("box", "prism"):
         with pytest.raises(InputError, match=f"object name '{name}' is not allowed"):
             objects.register_object(name, BOX)
@@ -210,35 +210,35 @@ def test_the_papers_names_are_taken():
         objects.register_object("mine", "nowhere.xml")
 
 
-# --- laws of one's own ---------------------------------------------------------------------
+# --- custom laws ---------------------------------------------------------------------------
 
 
-def test_a_law_of_ones_own_runs_beside_the_law(capsys):
-    found = example("custom_law")["main"](worlds=1, horizon=3.0)
+def test_a_custom_law_runs_in_the_same_worlds_as_rps(capsys):
+    results = example("custom_law")["main"](worlds=1, horizon=3.0)
     assert "mine" in capsys.readouterr().out
-    # Both have touched and pushed by then, each in its way.
-    moved = found.base_pose.sel(pose="x").values
+    # Both have pushed by then, with different motions.
+    moved = results.base_pose.sel(pose="x").values
     assert (moved > 0.01).all()
     assert not np.array_equal(moved[0], moved[1])
 
 
-def test_a_domain_of_ones_own_draws_what_it_says(capsys):
-    found = example("custom_domain")["main"](worlds=8, horizon=1.0)
+def test_a_custom_domain_draws_within_its_ranges(capsys):
+    results = example("custom_domain")["main"](worlds=8, horizon=1.0)
     assert "tuned" in capsys.readouterr().out
-    assert ((found.mass >= 30) & (found.mass <= 80)).all()
-    assert set(found.object.values) == {"random_box"}
+    assert ((results.mass >= 30) & (results.mass <= 80)).all()
+    assert set(results.object.values) == {"random_box"}
 
 
-def test_an_optimiser_of_ones_own_needs_evaluate_alone(capsys):
-    made = example("custom_optimiser")
-    best, tested = made["main"](worlds=3, generations=1, horizon=1.0)
+def test_a_custom_optimiser_needs_only_evaluate(capsys):
+    names = example("custom_optimiser")
+    best, tested = names["main"](worlds=3, generations=1, horizon=1.0)
     assert "K_h" in capsys.readouterr().out
-    for value, (low, high) in zip(best, made["BOUNDS"].values(), strict=True):
+    for value, (low, high) in zip(best, names["BOUNDS"].values(), strict=True):
         assert low <= value <= high
     assert dict(tested.success.sizes) == {"candidate": 2, "world": 24}
 
 
-def test_registered_names_work_on_the_command_line(tmp_path, capsys, hexagon):
+def test_the_command_line_accepts_registered_names(tmp_path, capsys, hexagon):
     example("custom_law")  # registers p_control
     out = tmp_path / "table"
     command = ["table", "--objects", "hexagon", "--laws", "p_control", "--friction", "S1"]
@@ -254,7 +254,7 @@ def test_registered_names_work_on_the_command_line(tmp_path, capsys, hexagon):
     assert "choose from v, gains.l" in capsys.readouterr().err
 
 
-def test_a_sweep_finds_a_registered_law_again(tmp_path):
+def test_a_plan_is_loaded_with_its_registered_law(tmp_path):
     kind = example("custom_law")["PParams"]
     plan = Plan(Domain(), 3, {"p": kind(v=0.03)})
     open_run(tmp_path, plan)
@@ -267,7 +267,7 @@ def test_a_sweep_finds_a_registered_law_again(tmp_path):
 LAW = EXAMPLES / "custom_law.py"
 
 
-def test_a_law_of_a_file_runs_in_every_command_that_asks_for_laws(tmp_path, capsys):
+def test_commands_accept_a_law_of_a_file(tmp_path, capsys):
     name = f"{LAW}:PParams"
     short = ["--horizon", "0.5", "--engine", "mujoco"]
     table = ["table", "--objects", "box", "--friction", "S1", "--targets", "2", "0", *short]
@@ -280,19 +280,19 @@ def test_a_law_of_a_file_runs_in_every_command_that_asks_for_laws(tmp_path, caps
     capsys.readouterr()
 
 
-def test_a_run_made_with_a_file_knows_when_the_file_has_changed(tmp_path):
+def test_a_run_detects_that_the_file_of_its_law_has_changed(tmp_path):
     law = tmp_path / "mine.py"
     law.write_text(LAW.read_text())
     _, params = registry.parse_law(f"{law}:PParams")
-    kept = registry.params_to_json(params)
-    assert registry.params_from_json(kept) == params
+    stored = registry.params_to_json(params)
+    assert registry.params_from_json(stored) == params
     law.write_text(LAW.read_text().replace("0.15, 0.15", "0.1, 0.1"))
     with pytest.raises(InputError, match="has changed since the run"):
-        registry.params_from_json(kept)
+        registry.params_from_json(stored)
 
 
-def test_a_file_is_run_again_if_another_law_took_its_name_since():
-    """And a law that no file holds is not kept as if one did."""
+def test_a_file_is_run_again_if_another_law_has_taken_its_name():
+    """The law without a file is stored without a file."""
     kinds = []
     for _ in range(2):
         _, params = registry.parse_law(f"{LAW}:PParams")
@@ -311,7 +311,7 @@ def test_a_file_is_run_again_if_another_law_took_its_name_since():
         ("class PParams: pass", "call rps_jax.register_law"),
     ],
 )
-def test_a_file_without_a_law_is_one_sentence(content, message, tmp_path):
+def test_a_file_without_a_law_is_rejected_in_one_sentence(content, message, tmp_path):
     law = tmp_path / "mine.py"
     if content is not None:
         law.write_text(content)
@@ -319,9 +319,9 @@ def test_a_file_without_a_law_is_one_sentence(content, message, tmp_path):
         registry.parse_law(f"{law}:PParams")
 
 
-def test_parameters_that_are_arrays_and_nested_are_kept_and_found_again(tmp_path):
-    made = example("custom_law")
-    weights = made["PParams"](gains=made["Gains"](np.ones((2, 3)), np.arange(2.0)))
+def test_nested_array_parameters_are_stored_and_loaded(tmp_path):
+    names = example("custom_law")
+    weights = names["PParams"](gains=names["Gains"](np.ones((2, 3)), np.arange(2.0)))
 
     def step(params, state, obs):
         turn = jnp.sum(params.gains.l) + jnp.max(params.gains.heading)
@@ -330,13 +330,13 @@ def test_parameters_that_are_arrays_and_nested_are_kept_and_found_again(tmp_path
     registry.register_law("p_control", Law(lambda params: (), step), weights)
     plan = Plan(Domain(), 3, {"p": weights._replace(v=0.03)})
     open_run(tmp_path, plan)
-    found = load_plan(tmp_path).laws["p"]
-    assert jax.tree.map(np.shape, found) == jax.tree.map(np.shape, weights)
-    np.testing.assert_array_equal(found.gains.l, weights.gains.l)
+    params = load_plan(tmp_path).laws["p"]
+    assert jax.tree.map(np.shape, params) == jax.tree.map(np.shape, weights)
+    np.testing.assert_array_equal(params.gains.l, weights.gains.l)
 
 
 def test_a_law_registered_again_replaces_the_old_one():
-    """As when a cell of a notebook is run twice, and its class of parameters is made anew."""
+    """For example, if a notebook cell runs twice and defines its class of parameters again."""
     kinds = [example("custom_law")["PParams"] for _ in range(2)]
     assert kinds[0] not in registry._LAWS_BY_CLASS
     assert type(registry.LAWS["p_control"]) is kinds[1]
@@ -349,14 +349,14 @@ class Ahead(NamedTuple):
     d_success: float = 0.05  # [m]
 
 
-def test_params_that_mean_nothing_are_refused():
-    own = Law(lambda params: (), lambda *_: None)
+def test_invalid_params_of_a_custom_law_are_rejected():
+    law = Law(lambda params: (), lambda *_: None)
     with pytest.raises(InputError, match="v = nan is not allowed"):
-        registry.register_law("p", own, Ahead(v=float("nan")))
+        registry.register_law("p", law, Ahead(v=float("nan")))
     with pytest.raises(InputError, match=r"a field or property d_success"):
-        registry.register_law("p", own, (1.0, 2.0))
+        registry.register_law("p", law, (1.0, 2.0))
     with pytest.raises(InputError, match="the law 'rps' has a class of the same name RPSParams"):
-        registry.register_law("p", own, RPSParams())
+        registry.register_law("p", law, RPSParams())
     with pytest.raises(InputError, match="params of class Ahead belong to no law"):
         Case("box", FRICTION["S1"], (2.0, 0.0), Ahead())
     details = Details.from_obs(
@@ -366,76 +366,76 @@ def test_params_that_mean_nothing_are_refused():
     assert float(details.distance) == pytest.approx(np.hypot(0.7, 0.9))
 
 
-# --- a policy, and a robot -----------------------------------------------------------------
+# --- a policy and a robot ------------------------------------------------------------------
 
 
 def test_a_policy_is_trained():
-    made = example("train_policy")
-    few = made["Options"](iterations=3, pairs=2, seconds=0.2)
-    returns = made["main"](few)
+    names = example("train_policy")
+    options = names["Options"](iterations=3, pairs=2, seconds=0.2)
+    returns = names["main"](options)
     assert len(returns) == 3
     assert np.isfinite(returns).all()
     assert len(set(returns)) > 1
 
 
-def test_the_law_runs_on_a_robot_and_compiles_nothing_on_the_way(compiled, capsys):
-    made = example("on_a_robot")
-    tick, memory = made["controller"](RPSParams.paper(), CapacitiveSkin())
-    robot, target = made["Robot"](), np.array([-2.0, 0.0], np.float32)
-    given = target, np.float32(0.001)
-    memory, twist = tick(memory, *robot.read(), *given)
+def test_the_law_runs_on_a_robot_without_compilation_in_the_loop(compiled, capsys):
+    names = example("on_a_robot")
+    tick, states = names["controller"](RPSParams.paper(), CapacitiveSkin())
+    robot, target = names["Robot"](), np.array([-2.0, 0.0], np.float32)
+    inputs = target, np.float32(0.001)
+    states, twist = tick(states, *robot.read(), *inputs)
     assert compiled
-    before = len(compiled)
+    count = len(compiled)
     for _ in range(200):
-        memory, twist = tick(memory, *robot.read(), *given)
+        states, twist = tick(states, *robot.read(), *inputs)
         robot.command(np.asarray(twist))
-    assert len(compiled) == before
-    # Four taxels left of the middle, the 17th to 20th, are felt after the filter's delay.
-    place = 0.29 - 0.58 * (1.5 + 4.5) / 2 / 12
-    seen = Observation(
-        jnp.zeros(2), jnp.zeros(()), jnp.array([0.3625, place]), jnp.array(True), jnp.array(target)
+    assert len(compiled) == count
+    # Taxels 17 to 20, left of the centre, are in contact after the filter's delay.
+    offset = 0.29 - 0.58 * (1.5 + 4.5) / 2 / 12
+    obs = Observation(
+        jnp.zeros(2), jnp.zeros(()), jnp.array([0.3625, offset]), jnp.array(True), jnp.array(target)
     )
-    _, wanted = step(RPSParams.paper(), RPSState.init(RPSParams.paper()), seen)
-    np.testing.assert_allclose(memory[1].p_robot_contact, [0.3625, place], atol=1e-6)
-    assert float(wanted.v_y) > 0.01
-    np.testing.assert_allclose(np.asarray(twist)[:2], [wanted.v_x, wanted.v_y], atol=2e-3)
-    latency = made["main"](made["Options"](seconds=0.3))
+    _, expected = step(RPSParams.paper(), RPSState.init(RPSParams.paper()), obs)
+    np.testing.assert_allclose(states[1].p_robot_contact, [0.3625, offset], atol=1e-6)
+    assert float(expected.v_y) > 0.01
+    np.testing.assert_allclose(np.asarray(twist)[:2], [expected.v_x, expected.v_y], atol=2e-3)
+    latency = names["main"](names["Options"](seconds=0.3))
     assert latency.shape == (300,)
     assert on_a_robot.PRINTED.search(capsys.readouterr().out)
 
 
-def test_skin_and_law_on_a_robot_hear_the_time_since_the_last_step(monkeypatch):
-    made, heard = example("on_a_robot"), []
-    inside = made["controller"].__globals__
+def test_skin_and_law_on_a_robot_observe_the_time_since_the_last_step(monkeypatch):
+    names, commands = example("on_a_robot"), []
+    module = names["controller"].__globals__
 
-    def law(params, state, seen):
-        return state, Twist(seen.period, 0.0, 0.0)
+    def law(params, state, obs):
+        return state, Twist(obs.period, 0.0, 0.0)
 
-    monkeypatch.setitem(inside, "step", law)
-    tick, memory = made["controller"](RPSParams.paper(), CapacitiveSkin())
-    taxels, pose = made["Robot"]().read()
+    monkeypatch.setitem(module, "step", law)
+    tick, states = names["controller"](RPSParams.paper(), CapacitiveSkin())
+    taxels, pose = names["Robot"]().read()
     for period in (0.001, 0.02):
-        (skin, _), twist = tick(memory, taxels, pose, np.zeros(2, np.float32), np.float32(period))
+        (skin, _), twist = tick(states, taxels, pose, np.zeros(2, np.float32), np.float32(period))
         assert float(twist[0]) == pytest.approx(period)
         share = 1 - np.exp(-period / CapacitiveSkin().time_constant)
         assert float(skin.signal[17]) == pytest.approx(0.6 * share, rel=1e-4)
 
-    class Noting(made["Robot"]):
+    class SlowRobot(names["Robot"]):
         def command(self, twist):
-            heard.append(float(twist[0]))
+            commands.append(float(twist[0]))
             time.sleep(0.01)  # late
 
-    made["run"](Noting(), np.zeros(2, np.float32), 0.02)
-    assert heard[0] < 0.01
-    assert min(heard[1:]) > 0.01
+    names["run"](SlowRobot(), np.zeros(2, np.float32), 0.02)
+    assert commands[0] < 0.01
+    assert min(commands[1:]) > 0.01
 
 
-def test_a_skin_reads_real_taxels_as_it_reads_its_own():
+def test_a_skin_reads_taxels_of_a_robot():
     skin = CapacitiveSkin(time_constant=1e-6)
     state = skin.init(jax.random.PRNGKey(0))
     for taxel, point in ((0, (-0.3625 + 0.725 / 30, 0.29)), (41, (-0.3625 + 0.725 / 30, -0.29))):
         _, reading = skin.read(state, jnp.zeros(42).at[taxel].set(0.3), 0.01)
         assert int(reading.contact_type) == POINT
         np.testing.assert_allclose(reading.p_robot_contact, point, atol=1e-6)
-    _, nothing = skin.read(state, jnp.full(42, 0.2), 0.01)
-    assert not bool(nothing.in_contact)
+    _, reading = skin.read(state, jnp.full(42, 0.2), 0.01)
+    assert not bool(reading.in_contact)

@@ -1,4 +1,4 @@
-"""The notebooks run, and what is kept of them is what their texts say."""
+"""Tests of the notebooks: they run, and the stored notebooks match their texts."""
 
 import re
 import runpy
@@ -12,10 +12,10 @@ from helpers import addresses, imported
 FOLDER = Path(__file__).parents[1] / "notebooks"
 RUNNER = runpy.run_path(str(FOLDER / "execute.py"))
 TEXTS = {text.stem: text for text in RUNNER["TEXTS"]}
-every_notebook = pytest.mark.parametrize("name", TEXTS)
+all_notebooks = pytest.mark.parametrize("name", TEXTS)
 
 
-def kept(name):
+def stored(name):
     return nbformat.read(TEXTS[name].with_suffix(".ipynb"), as_version=4)
 
 
@@ -24,7 +24,7 @@ def cells(notebook):
 
 
 def outputs(notebook):
-    """Kind of output, type of its content, and the content; without what is encoded in it."""
+    """Yield type of output, media type and content of each output, without base64 data."""
     for cell in notebook.cells:
         for output in cell.get("outputs", ()):
             content = output.get("data") or {"text/plain": output.get("text", "")}
@@ -32,52 +32,52 @@ def outputs(notebook):
                 yield output.output_type, kind, re.sub(r"base64,[\w+/=\s]+", "", value)
 
 
-def told(notebook):
-    """The tables and lines that a notebook prints."""
+def printed(notebook):
+    """Return the tables and lines that a notebook prints."""
     return [
         value for _, kind, value in outputs(notebook) if kind in ("text/markdown", "text/plain")
     ]
 
 
-def test_there_are_six_of_them():
+def test_there_are_six_notebooks():
     assert [name[:2] for name in TEXTS] == ["01", "02", "03", "04", "05", "06"]
 
 
 @pytest.mark.parametrize("path", TEXTS.values(), ids=lambda path: path.stem)
-def test_notebooks_import_what_the_table_of_public_names_has(path):
+def test_notebooks_import_only_public_names(path):
     assert "rps_jax" in imported(path)
     assert set(imported(path)) <= {"rps_jax", *dict(addresses())}
 
 
-@every_notebook
+@all_notebooks
 def test_text_and_notebook_have_the_same_cells(name):
-    assert cells(kept(name)) == cells(jupytext.read(TEXTS[name]))
+    assert cells(stored(name)) == cells(jupytext.read(TEXTS[name]))
 
 
-@every_notebook
-def test_what_is_kept_has_figures_and_no_error_and_names_no_machine(name):
+@all_notebooks
+def test_stored_notebooks_have_figures_and_no_errors_or_local_paths(name):
     assert TEXTS[name].with_suffix(".ipynb").stat().st_size < 2_000_000
-    found = list(outputs(kept(name)))
-    assert any(kind == "image/png" for _, kind, _ in found)
-    for output, kind, value in found:
+    results = list(outputs(stored(name)))
+    assert any(kind == "image/png" for _, kind, _ in results)
+    for output, kind, value in results:
         assert output in ("display_data", "execute_result", "stream")
         if not kind.startswith("image/"):
             assert not re.search(r"/(home|root|tmp|work|Users|usr|opt|var|mnt)/|[A-Z]:\\", value)
-    assert not any("execution" in cell.metadata for cell in kept(name).cells)
+    assert not any("execution" in cell.metadata for cell in stored(name).cells)
 
 
-# A push, a tuner and a fit for minutes: what they call, other tests call.
+# These run for minutes; other tests call the same functions.
 LONG = ("02", "05", "06")
-ANEW = [pytest.param(n, marks=[pytest.mark.slow] if n[:2] in LONG else []) for n in TEXTS]
+EXECUTED = [pytest.param(n, marks=[pytest.mark.slow] if n[:2] in LONG else []) for n in TEXTS]
 
 
-@pytest.mark.parametrize("name", ANEW)
-def test_it_runs_and_where_it_only_reads_says_what_is_kept(name, pytestconfig, monkeypatch):
-    """Executed anew, with the compiled programs of other tests."""
+@pytest.mark.parametrize("name", EXECUTED)
+def test_it_runs_and_if_it_only_reads_prints_the_stored_output(name, pytestconfig, monkeypatch):
+    """The notebook is executed with the compiled programs of other tests."""
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(pytestconfig.rootpath / ".jax_cache"))
     monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
-    (again,) = RUNNER["execute"]([TEXTS[name]])
-    before = kept(name)
-    assert [kind for _, kind, _ in outputs(again)] == [kind for _, kind, _ in outputs(before)]
+    (notebook,) = RUNNER["execute"]([TEXTS[name]])
+    expected = stored(name)
+    assert [kind for _, kind, _ in outputs(notebook)] == [kind for _, kind, _ in outputs(expected)]
     if name[:2] in ("03", "04"):
-        assert told(again) == told(before)
+        assert printed(notebook) == printed(expected)

@@ -1,4 +1,4 @@
-"""The pages say what the data say, lead where they say, and stay short."""
+"""Tests of the pages: tables match their data, links work, and the front page is short."""
 
 import json
 import re
@@ -13,24 +13,24 @@ PAGES = TABLES["pages"]()
 TEXTS = sorted((ROOT / "notebooks").glob("[0-9]*.py"))
 
 
-def named(path):
+def relative(path):
     return str(path.relative_to(ROOT))
 
 
 def anchors(page):
-    """What a heading of a page can be linked by."""
+    """Return the link anchors of the headings of a page."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
     return {
         re.sub(r"[^\w\- ]", "", heading).strip().lower().replace(" ", "-") for heading in headings
     }
 
 
-@pytest.mark.parametrize("page", PAGES, ids=named)
-def test_tables_are_as_their_data(page):
+@pytest.mark.parametrize("page", PAGES, ids=relative)
+def test_tables_match_their_data(page):
     assert TABLES["render"](page) == page.read_text()
 
 
-def test_every_table_is_shown_on_some_page():
+def test_every_table_is_on_a_page():
     shown = set(re.findall(r"<!-- table: (\S+) -->", "".join(p.read_text() for p in PAGES)))
     assert shown == set(TABLES["data_files"]())
 
@@ -40,14 +40,14 @@ def test_a_table_follows_its_data_and_those_it_cites(tmp_path):
         {"name": "what", "merge": True},
         {"name": "rate", "format": "{:.1f} %", "rest": " [{}]"},
     ]
-    one = dict.fromkeys(TABLES["KEYS"], "") | {"device": "a core", "columns": columns}
-    cited = {"from": "one", "row": ["a", 1.0], "column": "rate"}
-    two = {"columns": columns, "rows": [["b", cited]]}  # it was made by no command
+    table = dict.fromkeys(TABLES["KEYS"], "") | {"device": "a core", "columns": columns}
+    citation = {"from": "one", "row": ["a", 1.0], "column": "rate"}
+    derived = {"columns": columns, "rows": [["b", citation]]}  # without a command
     page = tmp_path / "page.md"
     page.write_text("<!-- table: one -->\n<!-- end -->\n<!-- table: two -->\n<!-- end -->\n")
 
     def rendered(rows):
-        for name, data in (("one", one | {"rows": rows}), ("two", two)):
+        for name, data in (("one", table | {"rows": rows}), ("two", derived)):
             folder = tmp_path / name / "results"
             folder.mkdir(parents=True, exist_ok=True)
             (folder / f"{name}.json").write_text(json.dumps(data))
@@ -90,16 +90,16 @@ def test_a_number_in_a_sentence_follows_its_data(tmp_path):
     page.write_text(f"{twice.format('90 %', '')} and {twice.format('way / 90 %', '')}")
     rendered = TABLES["render"](page, tmp_path)
     assert rendered == f"{twice.format('90 %', '11 s')} and {twice.format('way / 90 %', '4 m')}"
-    every = "".join(one.read_text() for one in PAGES)
-    assert "<!-- cell: headline" in every
-    assert not re.search(r"^\s*<!-- cell", every, re.MULTILINE)  # it would begin a paragraph
+    text = "".join(page.read_text() for page in PAGES)
+    assert "<!-- cell: headline" in text
+    assert not re.search(r"^\s*<!-- cell", text, re.MULTILINE)  # it would start a paragraph
     page.write_text(cell.format("none", ""))
     with pytest.raises(ValueError, match="does not name one cell"):
         TABLES["render"](page, tmp_path)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=named)
-def test_links_lead_somewhere(page):
+@pytest.mark.parametrize("page", PAGES, ids=relative)
+def test_links_have_targets(page):
     links = re.findall(r"\]\(([^)\s]+)\)", page.read_text())
     for link in links:
         if link.startswith("https://"):
@@ -110,7 +110,7 @@ def test_links_lead_somewhere(page):
         assert not anchor or anchor in anchors(target), link
 
 
-@pytest.mark.parametrize("page", [*PAGES, *TEXTS], ids=named)
+@pytest.mark.parametrize("page", [*PAGES, *TEXTS], ids=relative)
 def test_no_sentence_names_a_commit(page):
     assert not re.search(r"\b(?=\d*[a-f])(?=[a-f]*\d)[0-9a-f]{7,40}\b", page.read_text())
 

@@ -89,7 +89,7 @@ def check_signs(
     Raises:
       InputError: a parameter is out of range; the error names the `law` and the parameter.
     """
-    for name, value in named_leaves(params).items():
+    for name, value in named_leaves(params, is_leaf=lambda x: x is not params).items():
         bounds = {} if name in free else {"at_least": 0}
         bounds = {"above": 0} if name in positive else bounds
         errors.check_finite(f"{law}.{name}", value, **bounds)
