@@ -88,11 +88,7 @@ def _leaf_fault(value: object) -> str:
 
 @functools.lru_cache(maxsize=256)
 def _check_traced(
-    init: Function,
-    step: Function,
-    senses: Senses,
-    tree: Any,
-    shapes: Sequence[tuple[int, ...]],
+    init: Function, step: Function, senses: Senses, tree: Any, shapes: Sequence[tuple[int, ...]]
 ) -> None:
     """Trace both functions of a law, and compare their results with what a trial needs."""
     dtype = jnp.result_type(float)

@@ -106,9 +106,7 @@ def yield_to_force(
 
 
 def step(
-    params: PublishedForcePushParams,
-    state: PublishedForcePushState,
-    obs: ForceObservation,
+    params: PublishedForcePushParams, state: PublishedForcePushState, obs: ForceObservation
 ) -> tuple[PublishedForcePushState, Twist, Details]:
     """Compute one control step; before the first contact the base moves straight ahead."""
     touch = obs.touch

@@ -258,25 +258,13 @@ def _push(
 
     arrived = soft.less(distance, params.d_success, temps.arrive)
     twist = jax.tree.map(lambda v: soft.where(arrived, 0.0, v), twist)
-    new_l_th = soft.where(realigning, params.l_mr, params.l_cr)
-    return (
-        soft.where(arrived, l_th, new_l_th),
-        twist,
-        Details(
-            l,
-            distance,
-            a_r,
-            gamma,
-            soft.and_(realigning, soft.not_(arrived)),
-        ),
-    )
+    l_th = soft.where(arrived, l_th, soft.where(realigning, params.l_mr, params.l_cr))
+    realigning = soft.and_(realigning, soft.not_(arrived))
+    return l_th, twist, Details(l, distance, a_r, gamma, realigning)
 
 
 def step_with_details(
-    params: RPSParams,
-    state: RPSState,
-    obs: Observation,
-    temperatures: Temperatures | None = None,
+    params: RPSParams, state: RPSState, obs: Observation, temperatures: Temperatures | None = None
 ) -> tuple[RPSState, Twist, Details]:
     """Compute `step` and its details (without contact, those of the last contact)."""
     in_contact = jnp.asarray(obs.in_contact)
@@ -298,19 +286,12 @@ def step_with_details(
         p_robot_contact=contact,
         touched=soft.or_(state.touched, in_contact),
     )
-    return (
-        state,
-        twist,
-        details._replace(realigning=soft.and_(details.realigning, pushing)),
-    )
+    return state, twist, details._replace(realigning=soft.and_(details.realigning, pushing))
 
 
 @jax.jit
 def step(
-    params: RPSParams,
-    state: RPSState,
-    obs: Observation,
-    temperatures: Temperatures | None = None,
+    params: RPSParams, state: RPSState, obs: Observation, temperatures: Temperatures | None = None
 ) -> tuple[RPSState, Twist]:
     """Compute one control step of Algorithm 1: RPS, or NPS with `params.reactive` 0.
 
@@ -353,8 +334,4 @@ LAW = Law(
     bounds=tuple(BOUNDS.items()),
     temperatures=Temperatures(),
 )
-PRESETS = {
-    "rps": RPSParams.paper(),
-    "rps_tuned": RPSParams.tuned(),
-    "nps": RPSParams.nps(),
-}
+PRESETS = {"rps": RPSParams.paper(), "rps_tuned": RPSParams.tuned(), "nps": RPSParams.nps()}
