@@ -145,7 +145,7 @@ def test_a_skin_of_another_size_is_silent(driven):
 
 def test_a_clock_that_stands_still_commands_zero(driven):
     twists, said = driven([*events(0.5), ("tick", 0.505)])
-    assert said[-1] == "the clock stands still"
+    assert said[-1] == "the clock does not advance"
     assert not twists[-1].any()
 
 

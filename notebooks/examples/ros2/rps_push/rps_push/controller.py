@@ -102,12 +102,12 @@ class Controller:
                 self._sent = Command(status=f"waiting for {words}")
                 return self._sent
         if not period > 0:
-            self._sent = Command(status="the clock stands still")
+            self._sent = Command(status="the clock does not advance")
             return self._sent
         law_state, twist = self._decide(period)
         v_x, v_y, omega = map(float, twist)
         if not np.isfinite([v_x, v_y, omega]).all():
-            self._sent = Command(status="the law has no answer")
+            self._sent = Command(status="the law returns no finite twist")
             return self._sent
         self._law_state = law_state
         share = min(1.0, limits.v_max / max(math.hypot(v_x, v_y), 1e-9))

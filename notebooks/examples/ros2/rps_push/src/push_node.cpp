@@ -1,4 +1,4 @@
-// Lifecycle node around the controller: odometry, taxels and target in, twist out.
+// Lifecycle node around the controller: from odometry, taxels and target to a twist.
 #include <chrono>
 #include <cmath>
 #include <memory>
@@ -17,13 +17,13 @@ using CallbackReturn = rclcpp_lifecycle::node_interfaces::LifecycleNodeInterface
 class PushNode : public rclcpp_lifecycle::LifecycleNode {
  public:
   PushNode() : LifecycleNode("push") {
-    number("v_max", "greatest speed in any direction [m/s]", 0.05, 0.0, 1.0);
-    number("omega_max", "greatest turning rate [rad/s]", 0.15, 0.0, 3.0);
-    number("a_max", "greatest change of the velocity in a second [m/s^2]", 0.5, 0.01, 10.0);
-    number("alpha_max", "greatest change of the turning rate [rad/s^2]", 1.0, 0.01, 30.0);
-    number("odometry_age", "silence of odometry that stops the base [s]", 0.08, 0.01, 0.08);
-    number("taxels_age", "silence of the skin that stops the base [s]", 0.08, 0.01, 0.08);
-    number("target_age", "silence of the target that stops the base [s]", 0.08, 0.01, 0.08);
+    number("v_max", "largest speed in any direction [m/s]", 0.05, 0.0, 1.0);
+    number("omega_max", "largest turning rate [rad/s]", 0.15, 0.0, 3.0);
+    number("a_max", "largest change of the velocity in a second [m/s^2]", 0.5, 0.01, 10.0);
+    number("alpha_max", "largest change of the turning rate [rad/s^2]", 1.0, 0.01, 30.0);
+    number("odometry_age", "time without odometry that stops the base [s]", 0.08, 0.01, 0.08);
+    number("taxels_age", "time without taxels that stops the base [s]", 0.08, 0.01, 0.08);
+    number("target_age", "time without target that stops the base [s]", 0.08, 0.01, 0.08);
     number("rate", "commands in a second [Hz]", 50.0, 50.0, 1000.0);
   }
 
@@ -40,22 +40,22 @@ class PushNode : public rclcpp_lifecycle::LifecycleNode {
     twists_ = create_publisher<geometry_msgs::msg::TwistStamped>("cmd_vel", 1);
     const auto latest = rclcpp::SensorDataQoS().keep_last(1);
     odometry_ = create_subscription<nav_msgs::msg::Odometry>(
-        "odom", latest, [this](nav_msgs::msg::Odometry::ConstSharedPtr heard) {
-          const auto &pose = heard->pose.pose;
+        "odom", latest, [this](nav_msgs::msg::Odometry::ConstSharedPtr message) {
+          const auto &pose = message->pose.pose;
           const auto &q = pose.orientation;
           const double yaw = std::atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z));
           controller_->odometry(seconds(), pose.position.x, pose.position.y, yaw);
         });
     taxels_ = create_subscription<std_msgs::msg::Float32MultiArray>(
-        "taxels", latest, [this](std_msgs::msg::Float32MultiArray::ConstSharedPtr heard) {
-          if (heard->data.size() != controller_->taxels())
+        "taxels", latest, [this](std_msgs::msg::Float32MultiArray::ConstSharedPtr message) {
+          if (message->data.size() != controller_->taxels())
             RCLCPP_ERROR_THROTTLE(get_logger(), *get_clock(), 1000, "%zu taxels instead of %zu",
-                                  heard->data.size(), controller_->taxels());
-          controller_->skin(seconds(), heard->data);
+                                  message->data.size(), controller_->taxels());
+          controller_->skin(seconds(), message->data);
         });
     target_ = create_subscription<geometry_msgs::msg::PointStamped>(
-        "target", latest, [this](geometry_msgs::msg::PointStamped::ConstSharedPtr heard) {
-          controller_->target(seconds(), heard->point.x, heard->point.y);
+        "target", latest, [this](geometry_msgs::msg::PointStamped::ConstSharedPtr message) {
+          controller_->target(seconds(), message->point.x, message->point.y);
         });
     return CallbackReturn::SUCCESS;
   }
