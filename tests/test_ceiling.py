@@ -143,7 +143,7 @@ def test_the_first_worlds_and_common_failures_are_tried(monkeypatch):
     monkeypatch.setattr(ceiling.files, "read_results", lambda path: results)
 
     def worlds(*lost_by, **options):
-        return Ceiling(run="run", lost_by=lost_by, **options).numbers.tolist()
+        return Ceiling(run="run", lost_by=lost_by, **options).world_indices.tolist()
 
     assert worlds("a", "b", sample=1) == [0, 1, 3]
     assert worlds("a", sample=0, most=2) == [0, 1]

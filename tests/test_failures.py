@@ -13,9 +13,11 @@ import rps_jax
 from rps_jax.control.laws.rps_plus import RPSPlusParams
 from rps_jax.errors import InputError
 from rps_jax.record import files
+from rps_jax.runs.question import Run
 from rps_jax.studies import attack, rare, regress, sensitivity
 from rps_jax.studies.probe import Probe
 from rps_jax.studies.rare import Rare
+from rps_jax.trials.progress import no_progress
 from rps_jax.trials.score import severity
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
@@ -45,7 +47,7 @@ def test_severity_by_hand():
 
 
 def probe_in(folder):
-    return Probe(CYLINDERS, PAPER, BRIEF, folder, slots=4, workers=1)
+    return Probe(CYLINDERS, PAPER, BRIEF, Run(folder, no_progress, slots=4, workers=1))
 
 
 def test_a_probe_agrees_with_a_sweep_and_resumes(tmp_path, monkeypatch):

@@ -105,8 +105,9 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
 
 def _cvar(distance: np.ndarray) -> str:
     low, high = statistics.cvar_interval(distance)
-    ends = f"[{low:.2f}, {high:.2f}]" if np.isfinite(high) else "(too few worlds for an interval)"
-    return f"{statistics.cvar(distance):.2f} m {ends}"
+    known = np.isfinite(high)
+    interval = f"[{low:.2f}, {high:.2f}]" if known else "(too few worlds for an interval)"
+    return f"{statistics.cvar(distance):.2f} m {interval}"
 
 
 def _at_most(bound: float) -> str:
@@ -152,8 +153,8 @@ def share(successes: int, trials: int) -> str:
     if not trials:
         return "-"
     digits = _digits(successes, trials)
-    ends = (f"{100 * end:.{digits}f}" for end in statistics.wilson(successes, trials))
-    return f"{percent(successes, trials)} % [{', '.join(ends)}]"
+    low, high = (f"{100 * p:.{digits}f}" for p in statistics.wilson(successes, trials))
+    return f"{percent(successes, trials)} % [{low}, {high}]"
 
 
 def rate_range(rates: ArrayLike) -> str:
@@ -191,9 +192,13 @@ def against_table(results: xr.Dataset, reference: str) -> list[list[str]]:
     base = results.success.sel(law=reference)
     names = [str(law) for law in results.law.values]
     names.sort(key=lambda law: -float(results.success.sel(law=law).mean()))
-    others = [law for law in names if law != reference]
-    by_law = {law: statistics.compare(base, results.success.sel(law=law)) for law in others}
-    adjusted = dict(zip(others, statistics.holm([by_law[a].p for a in others]), strict=True))
+    by_law = {
+        law: statistics.compare(base, results.success.sel(law=law))
+        for law in names
+        if law != reference
+    }
+    p = statistics.holm([comparison.p for comparison in by_law.values()])
+    adjusted = dict(zip(by_law, p, strict=True))
     failures = int((base.values == 0).sum())
     gained = f"successes in the {failures} failures of {reference}"
     rows = [["", "success", f"against {reference}", "p (Holm)", gained]]

@@ -1,1 +1,1 @@
-"""Questions that users ask of their own laws: each file is one, with its report and its figures."""
+"""Studies of laws: one question in each file, with its report and figures."""

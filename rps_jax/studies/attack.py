@@ -24,7 +24,7 @@ from scipy import stats
 
 from rps_jax import errors
 from rps_jax.analysis import statistics, tables
-from rps_jax.analysis.figures.style import Figure, quantity, words
+from rps_jax.analysis.figures.style import Figure, axis_label, panel, words
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.engines import device
 from rps_jax.errors import InputError
@@ -132,7 +132,7 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         def has_time(share: float) -> bool:
             return time.perf_counter() - start_time < share * 60 * self.minutes
 
-        probe = Probe(self.ranges, self.params, self.setting, run.folder, **run.batch_options)
+        probe = Probe(self.ranges, self.params, self.setting, run)
         search = _Search(probe, self, seed_of(self.setting.seed, "tune"))
         results = search.run(partial(has_time, _SEARCH_UNTIL))
         results = self._check_elites(results, run, partial(has_time, _CHECK_UNTIL))
@@ -149,8 +149,8 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         order = _coarse_to_fine(count, min(self.check_again, count))
         set_phase(run.callback, "check in C MuJoCo")
         setting = replace(self.setting, engine="mujoco", physics="default", fidelity="reference")
-        folder = None if run.folder is None else run.folder / "check"
-        probe = Probe(self.ranges, self.params, setting, folder, **run.batch_options)
+        folder = run.folder and run.folder / "check"
+        probe = Probe(self.ranges, self.params, setting, run._replace(folder=folder))
         batch = max(1, run.workers or device.count_processors())
         for first in range(0, len(order), batch):
             if not has_time():
@@ -222,12 +222,20 @@ attack = call_of(Attack)
 
 
 def _coarse_to_fine(total: int, count: int) -> np.ndarray:
-    """Return `count` even indices from 0 to total - 1, in an order whose beginnings are even."""
+    """Return `count` even indices from 0 to total - 1, ordered so that each prefix is even, too."""
     if not count:
         return np.zeros(0, int)
     even = np.unique(np.linspace(0, total - 1, count).round().astype(int))
     strides = [even[:: 2**k] for k in range(int(np.log2(len(even))), -1, -1)]
     return np.array(list(dict.fromkeys(int(i) for stride in strides for i in stride)))
+
+
+def _grid_archive(dimensions: int, cells: int, **options: Any) -> Any:
+    """Return a pyribs archive with three axes from 0 to 1; pyribs is optional, hence `Any`."""
+    archives = errors.require("ribs.archives", "failures")
+    return archives.GridArchive(
+        solution_dim=dimensions, dims=[cells] * 3, ranges=[(0, 1)] * 3, **options
+    )
 
 
 class _Archive:
@@ -239,14 +247,9 @@ class _Archive:
         names = points.names(domain)
         self.axes = [names.index(name) for name in options.axes]
         self.shape = (len(domain.objects), *(options.cells,) * 3)
+        fields = dict.fromkeys(self.FIELDS, ((), float))
         self.grids = [
-            errors.require("ribs.archives", "failures").GridArchive(
-                solution_dim=len(names),
-                dims=self.shape[1:],
-                ranges=[(0, 1)] * 3,
-                extra_fields=dict.fromkeys(self.FIELDS, ((), float)),
-            )
-            for _ in domain.objects
+            _grid_archive(len(names), options.cells, extra_fields=fields) for _ in domain.objects
         ]
 
     def add(self, objects: np.ndarray, trials: xr.Dataset, objective: np.ndarray) -> None:
@@ -289,7 +292,7 @@ class _Search:
     def run(self, has_time: Callable[[], bool]) -> xr.Dataset:
         """Try drawn worlds, then generations of emitters while there is time."""
         options, probe = self.options, self.probe
-        set_phase(probe.callback, "drawn worlds")
+        set_phase(probe.run.callback, "drawn worlds")
         drawn = _Archive(self.domain, options)
         for first in range(0, options.drawn, _DRAWN_AT_ONCE):
             count = -(-min(_DRAWN_AT_ONCE, options.drawn - first) // self.objects)
@@ -300,30 +303,26 @@ class _Search:
             "drawn_simulated": probe.simulated,
         }
         archive, history = _Archive(self.domain, options), []
-        schedulers: list[Any] = []
-        thresholds: list[float] = []  # severities from which on the emitters accept a world
-        set_phase(probe.callback, "search")
+        schedulers: dict[int, Any] = {}  # by object
+        thresholds: dict[int, float] = {}  # severities from which on the emitters accept a world
+        set_phase(probe.run.callback, "search")
         for generation in range(options.generations):
             if generation and not has_time():
                 break
             if generation == 0:
                 v = self.rng.random((self.objects, options.batch, len(self.varied)))
             else:
-                v = stats.norm.cdf(self._scale * np.stack([x.ask() for x in schedulers]))
+                v = stats.norm.cdf(self._scale * np.stack([x.ask() for x in schedulers.values()]))
             objective = self._try(v, archive).reshape(self.objects, options.batch)
             failing = archive.failing
             for k in range(self.objects):
                 if generation:
                     schedulers[k].tell(objective[k], v[k][:, self._axes])
                 enough = failing[k] >= _MIN_FAILURES
-                near = float(np.quantile(objective[k], 1 - _NEAR_MISSES))
-                threshold = 1.0 if enough else min(1.0, near)
-                if generation == 0:
-                    schedulers.append(self._scheduler(k, archive, threshold))
-                    thresholds.append(threshold)
-                elif enough and thresholds[k] < 1:
-                    schedulers[k] = self._scheduler(k, archive, threshold)
-                    thresholds[k] = threshold
+                if k not in schedulers or (enough and thresholds[k] < 1):
+                    near = float(np.quantile(objective[k], 1 - _NEAR_MISSES))
+                    thresholds[k] = 1.0 if enough else min(1.0, near)
+                    schedulers[k] = self._scheduler(k, archive, thresholds[k])
             trials = probe.trials - attributes["drawn_trials"]
             simulated = probe.simulated - attributes["drawn_simulated"]
             history.append((int(failing.sum()), trials, simulated))
@@ -383,36 +382,29 @@ class _Search:
 
         Their archive starts with the elites whose severity reaches the threshold.
         """
-        archives, emitters = (
-            errors.require(f"ribs.{name}", "failures") for name in ("archives", "emitters")
-        )
+        emitters = errors.require("ribs.emitters", "failures")
         options, elites = self.options, archive.elites(k)
         accepted = elites["objective"] >= threshold
         v, objective = elites["solution"][accepted][:, self.varied], elites["objective"][accepted]
         z = stats.norm.ppf(np.clip(v, _EDGE, 1 - _EDGE)) / self._scale
         if options.algorithm == "cma_me":
-            thresholds, rules = {}, ("2imp", "filter", "no_improvement")
+            thresholds = {}
+            cma = {"ranker": "2imp", "selection_rule": "filter", "restart_rule": "no_improvement"}
         else:
             thresholds = {"learning_rate": _LEARNING_RATE, "threshold_min": threshold}
-            rules = ("imp", "mu", "basic")
-        cma = dict(zip(("ranker", "selection_rule", "restart_rule"), rules, strict=True))
-        grid = archives.GridArchive(
-            solution_dim=len(self.varied), dims=[options.cells] * 3, ranges=[(0, 1)] * 3,
-            seed=self.seed + k, **thresholds,
-        )  # fmt: skip
+            cma = {"ranker": "imp", "selection_rule": "mu", "restart_rule": "basic"}
+        line = {"iso_sigma": _ISO_SIGMA, "line_sigma": _LINE_SIGMA}
+        kinds = {
+            "line": partial(emitters.IsoLineEmitter, **line),
+            "cma": partial(emitters.EvolutionStrategyEmitter, sigma0=_CMA_SIGMA, **cma),
+        }
+        grid = _grid_archive(len(z[0]), options.cells, seed=self.seed + k, **thresholds)
         grid.add(z, objective, v[:, self._axes])
         order = np.argsort(-objective, kind="stable")
         sources = []
         for i, (kind, size) in enumerate(_emitter_sizes(options.batch, options.algorithm)):
-            shared = {"x0": z[order[i % len(z)]], "seed": int(self.rng.integers(2**31))}
-            shared["batch_size"] = size
-            if kind == "line":
-                sigmas = {"iso_sigma": _ISO_SIGMA, "line_sigma": _LINE_SIGMA}
-                sources.append(emitters.IsoLineEmitter(grid, **sigmas, **shared))
-            else:
-                sources.append(
-                    emitters.EvolutionStrategyEmitter(grid, sigma0=_CMA_SIGMA, **cma, **shared)
-                )
+            start, seed = z[order[i % len(z)]], int(self.rng.integers(2**31))
+            sources.append(kinds[kind](grid, x0=start, seed=seed, batch_size=size))
         return errors.require("ribs.schedulers", "failures").Scheduler(grid, sources)
 
     def _labelled(
@@ -423,41 +415,35 @@ class _Search:
     ) -> xr.Dataset:
         """Return the archive and the history of the search with names and units."""
         axes, quantities = self.options.axes, {x.name: x for x in points.coordinates(self.domain)}
+        by_object = [archive.elites(k) for k in range(self.objects)]
+        elites = {name: np.concatenate([x[name] for x in by_object]) for name in by_object[0]}
+        objects = np.repeat(np.arange(self.objects), [len(x["index"]) for x in by_object])
         margin = np.full((self.objects, np.prod(archive.shape[1:])), np.nan)
-        all_elites = [archive.elites(k) for k in range(self.objects)]
-        for k, elites in enumerate(all_elites):
-            margin[k, elites["index"]] = elites["objective"] - 1
-        elites = {
-            name: np.concatenate([x[name] for x in all_elites])
-            for name in ("solution", "objective", *archive.FIELDS)
-        }
-        objects = np.repeat(np.arange(self.objects), [len(x["index"]) for x in all_elites])
+        margin[objects, elites["index"]] = elites["objective"] - 1
         failed = np.flatnonzero(elites["success"] == 0)
-        worst_first = failed[np.argsort(-elites["objective"][failed], kind="stable")]
-        failing, trials, simulated = (list(column) for column in zip(*history, strict=True))
+        failed = failed[np.argsort(-elites["objective"][failed], kind="stable")]
+        columns = {
+            "severity": elites["objective"],
+            "time": elites["time"],
+            "left": elites["left"],
+            "which_object": objects,
+        }
+        sums = zip(("failing", "trials", "simulated"), zip(*history, strict=True), strict=True)
         middles = (np.arange(self.options.cells) + 0.5) / self.options.cells
         return xr.Dataset(
             {
                 "margin": (("object", *axes), margin.reshape(archive.shape)),
-                "u": (("elite", "quantity"), elites["solution"][worst_first]),
-                "severity": ("elite", elites["objective"][worst_first]),
-                "time": ("elite", elites["time"][worst_first]),
-                "left": ("elite", elites["left"][worst_first]),
-                "which_object": ("elite", objects[worst_first]),
-                "failing": ("generation", failing),
-                "trials": ("generation", trials),
-                "simulated": ("generation", simulated),
+                "u": (("elite", "quantity"), elites["solution"][failed]),
+                **{name: ("elite", values[failed]) for name, values in columns.items()},
+                **{name: ("generation", list(values)) for name, values in sums},
             },
             {
                 "object": list(self.domain.objects),
                 "quantity": list(quantities),
                 **{
-                    name: (
-                        name,
-                        quantities[name].range.at(middles),
-                        {"units": quantities[name].unit},
-                    )
-                    for name in axes
+                    name: (name, x.range.at(middles), {"units": x.unit})
+                    for name, x in quantities.items()
+                    if name in axes
                 },
             },
             attributes,
@@ -517,8 +503,7 @@ def archive_figure(results: xr.Dataset, quantities: Sequence[str], title: str) -
                 values = results[label].values
                 ticks = np.linspace(0, values.size - 1, 4).round().astype(int)
                 axis.set_ticks(ticks, [f"{values[i]:.2g}" for i in ticks], fontsize=7)
-                unit = f" [{results[label].attrs['units']}]".removesuffix(" [1]")
-                axis.set_label_text(f"{quantity(label)}{unit}", fontsize=8)
+                axis.set_label_text(axis_label(label, results[label].attrs["units"]), fontsize=8)
             ax.set_facecolor("0.9")
             ax.set_title(words(name), fontsize=9)
     if image is not None:
@@ -529,13 +514,9 @@ def archive_figure(results: xr.Dataset, quantities: Sequence[str], title: str) -
 
 def search_figure(results: xr.Dataset, drawn: float) -> Figure:
     """Draw failing cells over simulated time: of a search, and of `drawn` cells per hour."""
-    figure = Figure(figsize=(5.5, 3.6), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = panel((5.5, 3.6), "simulated time [h]", "cells with a failure")
     hours = results.simulated.values / 3600
     ax.plot(hours, results.failing, "o-", ms=3, color="C3", label="search")
     ax.plot(hours, drawn * hours, "--", color="C0", label="drawn worlds, no cell twice")
-    ax.set_xlabel("simulated time [h]")
-    ax.set_ylabel("cells with a failure")
-    ax.grid(alpha=0.3)
     ax.legend(fontsize=8)
     return figure

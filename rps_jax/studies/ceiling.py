@@ -15,30 +15,29 @@ can be solved; a failure after all rounds proves nothing.
 """
 
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import xarray as xr
 
 from rps_jax import errors
 from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.report import Section
-from rps_jax.control import registry
 from rps_jax.control.laws.guided import KNOTS, GuidedParams
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.record import files
 from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan, draw, load_plan
+from rps_jax.runs.plan import Plan, load_plan
 from rps_jax.runs.question import DomainQuestion, Run, call_of, count_true, seed_of
-from rps_jax.trials import batch, score
-from rps_jax.trials.batch import Job, WorldBatch
+from rps_jax.trials import score
 from rps_jax.trials.progress import SequentialProgress
+from rps_jax.trials.rollout import Candidates, rollout
 from rps_jax.trials.trial import Outcome
-from rps_jax.trials.worlds import drawn_worlds
 
 
 @dataclass(frozen=True)
@@ -93,7 +92,7 @@ class Ceiling(DomainQuestion[xr.Dataset]):
         return None if self.run is None else files.read_results(Path(self.run))
 
     @functools.cached_property
-    def numbers(self) -> np.ndarray:
+    def world_indices(self) -> np.ndarray:
         """Indices (W,) of the worlds that are tried."""
         if self.results is None:
             return np.arange(self.sample)
@@ -105,7 +104,7 @@ class Ceiling(DomainQuestion[xr.Dataset]):
     def plan(self) -> Plan:
         """Plan of a sweep that has the worlds."""
         law = {"guided": GuidedParams()}
-        count = int(self.numbers.max(initial=0)) + 1
+        count = int(self.world_indices.max(initial=0)) + 1
         if self.run is None:
             setting = replace(self.setting, seed=seed_of(self.setting.seed, "test"))
             return Plan(self.ranges, count, law, setting)
@@ -113,7 +112,7 @@ class Ceiling(DomainQuestion[xr.Dataset]):
         return Plan(sweep.domain, count, law, sweep.setting, points=sweep.points)
 
     def check(self) -> None:
-        if not self.numbers.size:
+        if not self.world_indices.size:
             raise errors.InputError(
                 f"sample = {self.sample} is not allowed: no world would be tried."
             )
@@ -121,27 +120,33 @@ class Ceiling(DomainQuestion[xr.Dataset]):
 
     def num_trials(self) -> int | None:
         """Maximum number of trials."""
-        return self.numbers.size * self.samples * self.rounds
+        return self.world_indices.size * self.samples * self.rounds
 
     def configuration(self) -> dict[str, Any]:
         search = {name: getattr(self, name) for name in _SEARCH_OPTIONS}
-        return {"ceiling": self.plan.configuration(), "worlds": self.numbers.tolist()} | search
+        return {
+            "ceiling": self.plan.configuration(),
+            "worlds": self.world_indices.tolist(),
+        } | search
 
     def answer(self, run: Run) -> xr.Dataset:
         """Search plans round by round; a resumed run loads its finished rounds."""
-        state = start = _initial_state(self.numbers)
+        state = start = _initial_state(self.world_indices)
         progress = SequentialProgress(run.callback)
         run = run._replace(callback=progress)
-        for r in range(self.rounds):
-            unsolved = np.flatnonzero(state.solved.values == 0)
-            if not unsolved.size:
-                break
-            name = f"round-{r:04d}"
-            state = run.checkpoint(name, functools.partial(self._round, state, unsolved, r, run))
-            files.check_like(
-                state, start, name if run.checkpoints is None else run.checkpoints.folder / name
-            )
-            progress.finish(unsolved.size * self.samples)
+
+        def unsolved() -> np.ndarray:
+            return np.flatnonzero(state.solved.values == 0)
+
+        rounds = run.steps(
+            lambda r: self._round(state, unsolved(), r, run),
+            lambda r: r < self.rounds and unsolved().size > 0,
+            name="round-{:04d}",
+        )
+        for result in rounds:
+            files.check_like(result, start, run.folder or "round")
+            progress.finish(unsolved().size * self.samples)
+            state = result
         return state
 
     def _round(self, state: xr.Dataset, unsolved: np.ndarray, r: int, run: Run) -> xr.Dataset:
@@ -196,28 +201,18 @@ class Ceiling(DomainQuestion[xr.Dataset]):
 
         The number of slots is that of `max_worlds` worlds, so all rounds share one program.
         """
-        offsets = plans.reshape(-1, *plans.shape[2:]).astype(jnp.result_type(float))
-        law = registry.law_of(GuidedParams())
-        objects = self.plan.domain.object_of(worlds)
-        slots = max_worlds * self.samples
-        rows_by_object = [np.flatnonzero(objects == k) for k in np.unique(objects)]
-        jobs = [Job(law, slots, self._worlds(worlds, rows, offsets)) for rows in rows_by_object]
-        return batch.run_all(jobs, self.plan.setting, len(offsets), **run.batch_options)[0]
-
-    def _worlds(
-        self, numbers: np.ndarray, rows: np.ndarray, offsets: np.ndarray
-    ) -> Iterator[WorldBatch]:
-        """Yield the trials of the worlds `rows`, which share an object; built on demand."""
-        plan = self.plan
-        part = drawn_worlds(plan.domain, draw(plan, numbers[rows]), plan.setting)
-        part = part.with_params(RPSParams.tuned())
-        trials = (rows[:, None] * self.samples + np.arange(self.samples)).ravel()
-        repeated = np.repeat(np.arange(rows.size), self.samples)
-        worlds, params = batch.rows((part.worlds, part.params), repeated)
+        plan, slots = self.plan, max_worlds * self.samples
+        offsets = np.swapaxes(plans, 0, 1)  # (K, W, J, 3)
         steps = max(1, round(self.hold / plan.setting.physics.control_period))
-        hold = np.full(trials.size, steps, offsets.dtype)
-        params = GuidedParams(params, offsets[trials], hold)
-        yield WorldBatch(trials, worlds, part.stage, params)
+        law, hold = jax.tree.map(
+            partial(np.full, offsets.shape[:2]), (RPSParams.tuned(), float(steps))
+        )
+        params = GuidedParams(law, offsets, hold)
+        request = Candidates(params, plan.setting.seed, worlds, plan.points, per_world=True)
+        ((outcome, _),), _ = rollout(
+            [request], [plan.domain], plan.setting, capacity=lambda _: slots, **run.batch_options
+        )
+        return jax.tree.map(lambda x: np.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]), outcome)
 
     def intro(self, results: xr.Dataset) -> str:
         source = "test worlds of the domain" if self.run is None else str(self.run)

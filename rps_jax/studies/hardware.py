@@ -7,13 +7,20 @@ plausible range is run.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import xarray as xr
 
 from rps_jax.analysis import statistics
-from rps_jax.analysis.figures.style import OBJECT_COLOURS, Figure, base_patch, success_rates, words
+from rps_jax.analysis.figures.style import (
+    OBJECT_COLOURS,
+    Figure,
+    base_patch,
+    panel,
+    success_rates,
+    words,
+)
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.registry import LawLike
 from rps_jax.record.options import option
@@ -35,6 +42,7 @@ from rps_jax.world.paper import (
 from rps_jax.world.scene import Friction
 
 MIDDLE = Friction(0.35, 0.5)  # friction of the paths and of the shove
+_TRACED = ("qpos", "p_world_contact", "outcome_success")  # variables of a trial over time
 
 
 def frictions() -> dict[str, Friction]:
@@ -108,14 +116,18 @@ class Hardware(LawQuestion[xr.Dataset]):
         assert isinstance(merged, xr.Dataset)
         return merged
 
-    def _push(self, run: Run) -> xr.Dataset:
-        """Return outcomes over objects, friction and targets."""
-        cases = [
-            replace(self.base, object=name, friction=friction, target=target)
+    def _cases(self, variations: Sequence[Mapping[str, Any]]) -> list[Case]:
+        """Return the cases of all objects, variations and targets, targets fastest."""
+        return [
+            replace(self.base, object=name, target=target, **changes)
             for name in HARDWARE_OBJECTS
-            for friction in frictions().values()
+            for changes in variations
             for target in self.targets
         ]
+
+    def _push(self, run: Run) -> xr.Dataset:
+        """Return outcomes over objects, friction and targets."""
+        cases = self._cases([{"friction": friction} for friction in frictions().values()])
         outcome, _ = pushes.run(cases, self.setting, **run.batch_options)
         labels = [self.label], HARDWARE_OBJECTS, tuple(frictions()), self.targets
         return outcome_dataset(outcome, *labels).assign_attrs(trials=len(cases))
@@ -124,12 +136,7 @@ class Hardware(LawQuestion[xr.Dataset]):
         """Return the success after the object is shoved along the front of the robot."""
         sides = (1.0, -1.0)
         shoves = [(0.0, side * size) for size in self.shifts for side in sides]
-        cases = [
-            replace(self.base, object=name, target=target, shift=Shift(self.shift_time, shove))
-            for name in HARDWARE_OBJECTS
-            for shove in shoves
-            for target in self.targets
-        ]
+        cases = self._cases([{"shift": Shift(self.shift_time, shove)} for shove in shoves])
         outcome, _ = pushes.run(cases, self.setting, **run.batch_options)
         sizes = (len(HARDWARE_OBJECTS), len(self.shifts), len(sides), len(self.targets))
         dims = ("object", "shift", "side", "target")
@@ -149,43 +156,27 @@ class Hardware(LawQuestion[xr.Dataset]):
 
     def _trace_paths(self, run: Run) -> xr.Dataset:
         """Return the paths of Fig. 7: all objects and targets, at the middle friction."""
-        cases = [
-            replace(self.base, object=name, target=target)
-            for name in HARDWARE_OBJECTS
-            for target in self.targets
-        ]
-        traces, success = [], []
-        for first in range(0, len(cases), len(self.targets)):  # one object at a time
-            followed = pushes.record_cases(
-                cases[first : first + len(self.targets)],
-                self.setting,
-                interval=0.5,
-                callback=run.callback,
+        by_object = []
+        for name in HARDWARE_OBJECTS:
+            cases = [replace(self.base, object=name, target=target) for target in self.targets]
+            trajectories = pushes.record_cases(
+                cases, self.setting, interval=0.5, callback=run.callback
             )
-            traces += [trace_dataset(trial) for trial in followed]
-            success += [int(trial.outcome.success) for trial in followed]
-        grid = len(HARDWARE_OBJECTS), len(self.targets)
-        steps = max(trace.sizes["time"] for trace in traces)
+            traces = [trace_dataset(x)[list(_TRACED)] for x in trajectories]
+            by_object.append(xr.concat(traces, "target", join="outer"))
+        traces = xr.concat(by_object, "object", join="outer")  # NaN after the end of a trial
+        base, contact, success = (traces[name].values for name in _TRACED)
         dims = ("object", "target", "path_time", "axis")
-
-        def padded(meaning: str, paths: list[np.ndarray]) -> xr.Variable:
-            path = np.full((len(cases), steps, 2), np.nan)
-            for row, values in zip(path, paths, strict=True):
-                row[: len(values)] = values
-            return xr.Variable(dims, path.reshape(*grid, steps, 2), _attrs("m", meaning))
-
         half = np.asarray(self.base.base.shell.half, float)
-        time = 0.5 * np.arange(1, steps + 1)
+        time = 0.5 * np.arange(1, traces.sizes["time"] + 1)
         return xr.Dataset(
             {
-                "base_path": padded("path of the base", [x.qpos.values[:, :2] for x in traces]),
-                "contact_path": padded(
-                    "path of the contact point", [x.p_world_contact.values for x in traces]
+                "base_path": (dims, base[..., :2].astype(float), _attrs("m", "path of the base")),
+                "contact_path": (
+                    dims, contact.astype(float), _attrs("m", "path of the contact point")
                 ),
                 "path_success": (
-                    dims[:2],
-                    np.reshape(success, grid),
-                    _attrs("1", "the target of Fig. 7 is reached"),
+                    dims[:2], success.astype(int), _attrs("1", "the target of Fig. 7 is reached")
                 ),
                 "half": ("axis", half, _attrs("m", "half length and half width of the base")),
             },
@@ -194,8 +185,8 @@ class Hardware(LawQuestion[xr.Dataset]):
                 "path_time": ("path_time", time, _attrs("s", "time after the start")),
                 "axis": ["x", "y"],
             },
-            {"trials": len(cases)},
-        )
+            {"trials": success.size},
+        )  # fmt: skip
 
     def intro(self, results: xr.Dataset) -> str:
         ground, robot = HARDWARE_GROUND, HARDWARE_ROBOT
@@ -308,14 +299,12 @@ def paths_figure(results: xr.Dataset) -> Figure:
 
 def shift_figure(results: xr.Dataset) -> Figure:
     """Draw success over the length of the shove, with Wilson 95 % intervals."""
-    figure = Figure(figsize=(5.5, 3.4), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = panel((5.5, 3.4), "length of the shove [cm]", "success [%]")
     successes, trials = counts(results)
     size = 100 * results["shift"].values
     for i, name in enumerate(map(str, results.object.values)):
         style = {"color": OBJECT_COLOURS[name], "label": words(name)}
         success_rates(ax, size, successes[i], trials[i], **style)
-    ax.set(xlabel="length of the shove [cm]", ylabel="success [%]", ylim=(-3, 103))
-    ax.grid(alpha=0.3)
+    ax.set_ylim(-3, 103)
     ax.legend(fontsize=8)
     return figure

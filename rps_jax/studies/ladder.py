@@ -18,7 +18,7 @@ import xarray as xr
 
 from rps_jax import errors
 from rps_jax.analysis import statistics, tables
-from rps_jax.analysis.figures.style import Figure
+from rps_jax.analysis.figures.style import Figure, panel
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams, Senses
@@ -33,7 +33,6 @@ from rps_jax.trials.progress import ProgressCallback, SequentialProgress
 from rps_jax.world.domain import Domain, DomainLike
 
 REFERENCE = "rps_tuned"  # the law that all others are compared with
-_OF_ONE_DOMAIN = ("points", "table", "ray")  # options that need a single domain
 
 
 def all_laws() -> tuple[str, ...]:
@@ -112,7 +111,7 @@ class Ladder(SweepOptions, MultiLawQuestion[xr.Dataset | xr.DataTree]):
 
     @cached_property
     def sweeps(self) -> dict[str, _TestSweep]:
-        """The sweep of each domain, by the domain's name."""
+        """Sweep of each domain, by the name of the domain."""
         domains = [self.domain] if isinstance(self.domain, str | Domain) else list(self.domain)
         labels = [
             domain if isinstance(domain, str) else f"domain_{i}" for i, domain in enumerate(domains)
@@ -131,16 +130,14 @@ class Ladder(SweepOptions, MultiLawQuestion[xr.Dataset | xr.DataTree]):
 
     @property
     def single(self) -> _TestSweep | None:
-        """The sweep, if there is only one domain."""
+        """Sweep of the domain, if there is only one."""
         first, *rest = self.sweeps.values()
         return None if rest else first
 
     def check(self) -> None:
-        for name in () if self.single else _OF_ONE_DOMAIN:
-            if getattr(self, name) is not None:
+        for name in () if self.single else ("points", "table", "ray", "shard"):
+            if getattr(self, name) not in (None, "1/1"):
                 raise InputError(f"{name} is not allowed with several domains: name one domain.")
-        if self.single is None and self.shard != "1/1":
-            raise InputError("shard is not allowed with several domains: name one domain.")
         for sweep in self.sweeps.values():
             sweep.check()
 
@@ -236,10 +233,9 @@ class Score(Ladder, _ScoredLaw):
     @cached_property
     def chosen(self) -> dict[str, LawParams]:
         label, params = registry.resolve_law(self.law)
-        others = registry.resolve_laws(self.laws)
-        return {label: registry.check_params(params)} | {
-            k: v for k, v in others.items() if k != label
-        }
+        reference = registry.resolve_laws(self.laws)
+        reference.pop(label, None)
+        return {label: registry.check_params(params)} | reference
 
     def sections(self, sweep: Sweep, results: xr.Dataset, run: Run) -> Sequence[Section]:
         sections = super().sections(sweep, results, run)
@@ -311,8 +307,8 @@ def draw_ladder(results: xr.Dataset) -> Figure:
     colours = {kind: f"C{i}" for i, kind in enumerate(get_args(Senses))}
     rates = {law: float(results.success.sel(law=law).mean()) for law in senses}
     order = sorted(rates, key=lambda law: (-kinds.index(senses[law]), rates[law]))
-    figure = Figure(figsize=(7, 1.2 + 0.34 * len(order)), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = panel((7, 1.2 + 0.34 * len(order)), "success [%]", "")
+    ax.grid(visible=False, axis="y")
     for y, law in enumerate(order):
         successes = results.success.sel(law=law).values > 0
         low, high = statistics.wilson(int(successes.sum()), successes.size)
@@ -326,8 +322,6 @@ def draw_ladder(results: xr.Dataset) -> Figure:
     ax.set_yticks(range(len(order)), order)
     ax.set_ylim(-0.6, len(order) - 0.3)
     ax.set_xlim(-3, 103)
-    ax.set_xlabel("success [%]")
     ax.set_title(f"{results.sizes['world']:,} worlds, the same for all laws", fontsize=10)
-    ax.grid(axis="x", alpha=0.3)
     ax.legend(fontsize=8, loc="best")
     return figure

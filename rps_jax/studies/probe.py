@@ -1,24 +1,21 @@
 """Probe: outcomes of one law at points of a domain's unit cube, call after call."""
 
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
 from rps_jax.analysis import statistics
-from rps_jax.control import registry
 from rps_jax.control.base import LawParams
 from rps_jax.errors import InputError
 from rps_jax.record import files
-from rps_jax.record.checkpoint import Checkpoints
-from rps_jax.trials import batch, score
-from rps_jax.trials.batch import Job, WorldBatch
-from rps_jax.trials.progress import ProgressCallback, SequentialProgress, no_progress
+from rps_jax.runs.evaluate import stack
+from rps_jax.runs.question import Run
+from rps_jax.trials import score
+from rps_jax.trials.progress import SequentialProgress, no_progress
+from rps_jax.trials.rollout import Candidates, rollout
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import points
 from rps_jax.world.domain import Domain
 from rps_jax.world.points import Points
@@ -40,79 +37,52 @@ class Probe:
     domain: Domain
     params: LawParams
     setting: Setting = Setting(engine="fused")
-    folder: Path | None = None
-    slots: int | None = None
-    workers: int | None = None
-    callback: ProgressCallback = no_progress
+    run: Run = Run(None, no_progress)
     calls: int = 0
     trials: int = 0  # of all calls, loaded ones included
     simulated: float = 0.0  # [s] of all these trials
     _progress: SequentialProgress = field(init=False)
 
     def __post_init__(self) -> None:
-        self._progress = SequentialProgress(self.callback)
+        self._progress = SequentialProgress(self.run.callback)
+        self.run = self.run._replace(callback=self._progress)
 
     def __call__(self, u: np.ndarray) -> xr.Dataset:
         """Return outcomes and `severity` (world) at points `u` (n, q)."""
         at = points.check_points(self.domain, u)
-        results = self._simulate(at) if self.folder is None else self._load_or_simulate(at)
+        results = self.run.checkpoint(f"{self.calls:06d}", lambda: self._simulate(at))
+        if self.run.folder is not None:
+            columns = {"u": ("world", "quantity")} | dict.fromkeys(_RESULTS, ("world",))
+            files.check_columns(results, self.run.folder, columns, {"world": len(at.u)})
+        if not np.array_equal(results.u.values, at.u):
+            raise InputError(
+                f"run = {self.run.folder} differs from this search from step {self.calls} on: use "
+                "the version and the device that created it, or choose another folder."
+            )
         self.calls += 1
         self.trials += len(at.u)
         self.simulated += float(results.time.sum())
         self._progress.finish(len(at.u))
         return results
 
-    def _load_or_simulate(self, at: Points) -> xr.Dataset:
-        """Return the trials of the checkpoint of this call, or simulate and store them."""
-        assert self.folder is not None
-        checkpoints, name = Checkpoints(self.folder), f"{self.calls:06d}"
-        results = checkpoints.load_or_compute(name, lambda: self._simulate(at))
-        columns = {"u": ("world", "quantity")} | dict.fromkeys(_RESULTS, ("world",))
-        files.check_columns(results, self.folder, columns, {"world": len(at.u)})
-        if not np.array_equal(results.u.values, at.u):
-            raise InputError(
-                f"run = {self.folder} differs from this search from step {self.calls} on: use "
-                "the version and the device that created it, or choose another folder."
-            )
-        return results
-
     def _simulate(self, at: Points) -> xr.Dataset:
-        start_time, count = time.perf_counter(), len(at.u)
-        objects = self.domain.object_of(at.cases(self.domain, np.arange(count)))
-        distance = np.empty(count)  # [m] of the target from the start
-        jobs = [self._job(at, np.flatnonzero(objects == k), distance) for k in np.unique(objects)]
-        outcome, _ = batch.run_all(
-            jobs,
-            self.setting,
-            count,
-            slots=self.slots,
-            workers=self.workers,
-            callback=self._progress,
+        start_time, rules = time.perf_counter(), self.setting.rules
+        request = Candidates(stack([self.params]), 0, np.arange(len(at.u)), at)
+        ((outcome, distance),), _ = rollout(
+            [request], [self.domain], self.setting, capacity=_capacity, **self.run.batch_options
         )
-        columns = {name: np.asarray(getattr(outcome, name), float) for name in _STORED}
-        columns["left"] = statistics.miss_distance(outcome.min_distance, distance)
-        columns["severity"] = score.severity(
-            columns["success"],
-            columns["time"],
-            columns["left"],
-            columns["contact_lost_time"],
-            columns["tilt"],
-            self.setting.rules,
-        )
-        variables = {name: ("world", values) for name, values in columns.items()}
+        trials = {name: np.asarray(getattr(outcome, name)[0], float) for name in _STORED}
+        trials["left"] = statistics.miss_distance(outcome.min_distance[0], distance)
+        graded = (trials[x] for x in ("success", "time", "left", "contact_lost_time", "tilt"))
+        trials["severity"] = score.severity(*graded, rules=rules)
+        variables = {name: ("world", values) for name, values in trials.items()}
         wall = time.perf_counter() - start_time
         return xr.Dataset({"u": (("world", "quantity"), at.u), **variables}, attrs={"wall": wall})
 
-    def _job(self, at: Points, rows: np.ndarray, distance: np.ndarray) -> Job:
-        """Return the job of points of one object, and fill in the distances of their targets."""
-        drawn = at.draw(self.domain, rows)
-        distance[rows] = np.linalg.norm(drawn.p_world_target, axis=1)
 
-        def worlds() -> Iterator[WorldBatch]:
-            yield drawn_worlds(self.domain, drawn, self.setting).with_params(self.params)
-
-        # Each size is a program of its own, so there are few: powers of four.
-        size = _SLOTS
-        while size < rows.size:
-            size *= 4
-        return Job(registry.law_of(self.params), size, worlds())
+def _capacity(trials: int) -> int:
+    """Return the size of the program for some trials: a power of four, so that few compile."""
+    size = _SLOTS
+    while size < trials:
+        size *= 4
+    return size

@@ -25,7 +25,7 @@ import xarray as xr
 from scipy import stats
 
 from rps_jax import errors
-from rps_jax.analysis.figures.style import Figure
+from rps_jax.analysis.figures.style import Figure, panel
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.record.options import option
 from rps_jax.runs.question import DomainQuestion, LawQuestion, Run, call_of, name_or_custom, seed_of
@@ -83,8 +83,8 @@ def run_together(severity: Severity, simulations: Sequence[Simulation]) -> list[
     requests = dict(enumerate(map(next, simulations)))
     while requests:
         answers = severity(np.concatenate(list(requests.values())))
-        ends = np.cumsum([len(u) for u in requests.values()])[:-1]
-        for i, s in zip(list(requests), np.split(answers, ends), strict=True):
+        splits = np.cumsum([len(u) for u in requests.values()])[:-1]
+        for i, s in zip(list(requests), np.split(answers, splits), strict=True):
             try:
                 requests[i] = simulations[i].send(s)
             except StopIteration as stop:
@@ -220,7 +220,7 @@ class Rare(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         domain, seed = self.ranges, self.setting.seed
-        probe = Probe(domain, self.params, self.setting, run.folder, **run.batch_options)
+        probe = Probe(domain, self.params, self.setting, run)
         kinds = [quantity.kind for quantity in points.coordinates(domain)]
         seeds = seed_of(seed, "tune") * 10_000 + np.arange(self.repetitions)
         simulations = [subset_simulation(kinds, self, int(i)) for i in seeds]
@@ -290,16 +290,12 @@ def estimate_row(name: str, estimate: Estimate) -> list[str]:
 
 def draw_estimates(results: xr.Dataset) -> Figure:
     """Draw the estimates of all repetitions with their intervals."""
-    figure = Figure(figsize=(6.5, 3.4), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = panel((6.5, 3.4), "repetition", "probability of failure [1]")
     p = results.p.values
     reach = np.abs(np.stack([p - results.low.values, results.high.values - p]))
     repetition = 1 + np.arange(p.size)
     ax.errorbar(repetition, p, reach, fmt="o", ms=4, capsize=2, color="C3", label="splitting")
     if (p > 0).all():
         ax.set_yscale("log")
-    ax.set_xlabel("repetition")
-    ax.set_ylabel("probability of failure [1]")
-    ax.grid(alpha=0.3, axis="y")
     ax.legend(fontsize=8)
     return figure

@@ -252,7 +252,7 @@ _BINS = 4  # of each range of a map of interactions
 
 def indices_figure(results: xr.Dataset, labels: Mapping[str, str]) -> Figure:
     """Draw the indices of first and total order with their intervals, the first label on top."""
-    labels = dict(reversed(labels.items()))
+    labels = dict(list(labels.items())[::-1])
     figure = Figure(figsize=(11, 1.4 + 0.24 * len(labels)), layout="constrained")
     axes = figure.subplots(1, len(OUTPUTS), sharey=True)
     y = np.arange(len(labels))
@@ -298,22 +298,16 @@ def interactions(
         rates[i, j] = (100 * failures / trials).reshape(bins[j], bins[i])
     highest = max(float(rate.max()) for rate in rates.values()) or 1.0
     image = None
-    for row in range(count - 1):
-        for column in range(count - 1):
-            ax = axes[row, column]
-            if column > row:
-                ax.axis("off")
-                continue
-            rate = rates[column, row + 1]
-            image = ax.imshow(
-                rate, origin="lower", vmin=0, vmax=highest, cmap="magma_r", aspect="auto"
-            )
-            for (y, x), value in np.ndenumerate(rate):
-                ink = "white" if value > 0.55 * highest else "black"
-                ax.text(x, y, f"{value:.0f}", ha="center", va="center", fontsize=7, color=ink)
-            bottom, leftmost = row == count - 2, column == 0
-            _label(ax.xaxis, names[column], choices, shown=bottom)
-            _label(ax.yaxis, names[row + 1], choices, shown=leftmost)
+    for ax in axes[np.triu_indices(count - 1, 1)]:
+        ax.axis("off")
+    for (i, j), rate in rates.items():
+        ax = axes[j - 1, i]
+        image = ax.imshow(rate, origin="lower", vmin=0, vmax=highest, cmap="magma_r", aspect="auto")
+        for (y, x), value in np.ndenumerate(rate):
+            ink = "white" if value > 0.55 * highest else "black"
+            ax.text(x, y, f"{value:.0f}", ha="center", va="center", fontsize=7, color=ink)
+        _label(ax.xaxis, names[i], choices, shown=j == count - 1)
+        _label(ax.yaxis, names[j], choices, shown=i == 0)
     if image is not None:
         figure.colorbar(image, ax=axes, label="failures [%]", shrink=0.6)
     figure.suptitle(

@@ -165,9 +165,11 @@ def _map(ax: Axes, part: xr.Dataset) -> PathCollection:
     image = ax.scatter(
         x, y, c=distance, s=420, marker="s", cmap="viridis_r", vmin=0.0, vmax=2.0, linewidths=0
     )
-    for *xy, far, n in zip(x, y, distance, count, strict=True):
-        colour = "white" if far > 1.0 else "black"
-        ax.annotate(str(int(n)), xy, ha="center", va="center", fontsize=8, color=colour)
+    for i, successes in enumerate(count):
+        colour = "white" if distance[i] > 1.0 else "black"
+        ax.annotate(
+            str(int(successes)), (x[i], y[i]), ha="center", va="center", fontsize=8, color=colour
+        )
     ax.add_patch(base_patch(np.zeros(3), fill=True))
     margin = 0.6
     ax.set(

@@ -35,6 +35,11 @@ def quantity(name: str) -> str:
     return LABELS.get(name) or words(name)
 
 
+def axis_label(name: str, units: str) -> str:
+    """Return the words for a drawn quantity with its unit."""
+    return f"{quantity(name)} [{units}]".removesuffix(" [1]")
+
+
 def tiles(
     count: int, columns: int, size: tuple[float, float], margin: tuple[float, float], **shared: Any
 ) -> tuple[Figure, np.ndarray]:
@@ -46,6 +51,15 @@ def tiles(
     for ax in axes.ravel()[count:]:
         ax.axis("off")
     return sheet, axes
+
+
+def panel(size: tuple[float, float], xlabel: str, ylabel: str) -> tuple[Figure, Axes]:
+    """Return a figure with one panel and a grid."""
+    sheet = Figure(figsize=size, layout="constrained")
+    ax = sheet.subplots()
+    ax.set(xlabel=xlabel, ylabel=ylabel)
+    ax.grid(alpha=0.3)
+    return sheet, ax
 
 
 def base_patch(
@@ -83,8 +97,8 @@ def success_rates(
     """
     rate = 100 * successes / np.maximum(trials, 1)
     pairs = zip(successes, trials, strict=True)
-    ends = 100 * np.array([statistics.wilson(int(n), int(m)) for n, m in pairs])
-    errors = np.abs(np.stack([rate - ends[:, 0], ends[:, 1] - rate]))
+    low, high = 100 * np.array([statistics.wilson(int(n), int(m)) for n, m in pairs]).T
+    errors = np.abs(np.stack([rate - low, high - rate]))
     sheet = ax.get_figure(root=True)
     assert sheet is not None
     shift = transforms.ScaledTranslation(2.5 * curve / 72, 0, sheet.dpi_scale_trans)

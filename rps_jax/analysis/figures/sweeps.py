@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import xarray as xr
 
 from rps_jax.analysis import statistics
-from rps_jax.analysis.figures.style import Figure, success_rates, tiles
+from rps_jax.analysis.figures.style import Figure, axis_label, success_rates, tiles
 from rps_jax.analysis.statistics import Influence
 from rps_jax.world.domain import LABELS
 
@@ -31,8 +31,7 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
         for i, law in enumerate(map(str, results.law.values)):
             bins = statistics.bins(values.values, results.success.sel(law=law).values > 0)
             success_rates(ax, *bins, color=f"C{i}", label=law, curve=i)
-        unit = f" [{values.attrs['units']}]".removesuffix(" [1]")
-        ax.set_xlabel(f"{LABELS[influence.name]}{unit}", fontsize=9)
+        ax.set_xlabel(axis_label(influence.name, values.attrs["units"]), fontsize=9)
         chance = " (may be chance)" * _is_flat(influence)
         ax.set_title(f"spread {_spread(influence)}, q = {influence.q:.1g}{chance}", fontsize=8)
         ax.grid(alpha=0.3)
