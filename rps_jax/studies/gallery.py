@@ -20,8 +20,9 @@ from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, build_batch
 from rps_jax.runs.push import another_engine, select_law
 from rps_jax.runs.question import Question, Run, call_of
-from rps_jax.trials import pushes, results
+from rps_jax.trials import pushes
 from rps_jax.trials.progress import SequentialProgress
+from rps_jax.trials.results import trace_dataset
 from rps_jax.world.domain import LABELS
 
 _COLUMNS = 6  # of maps
@@ -185,7 +186,7 @@ def _simulate(
             part, law_functions, plan.setting, interval=0.5, callback=progress
         )
         progress.finish(rows.size)
-        traces |= dict(zip(rows.tolist(), map(results.trace_dataset, followed), strict=True))
+        traces |= dict(zip(rows.tolist(), map(trace_dataset, followed), strict=True))
     return traces
 
 

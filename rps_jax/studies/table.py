@@ -19,8 +19,9 @@ from rps_jax.record import folder as run_folder
 from rps_jax.runs.plan import setting_of
 from rps_jax.runs.push import case_options
 from rps_jax.runs.question import MultiLawQuestion, Run, call_of
-from rps_jax.trials import pushes, results
+from rps_jax.trials import pushes
 from rps_jax.trials.case import Case, FrictionLike, TrialOptions, label_of
+from rps_jax.trials.results import outcome_dataset
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
 
@@ -81,7 +82,7 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
         outcome, _ = pushes.run(self.cases, self.setting, **run.batch_options)
         objects = [Path(name).stem if name.endswith(".xml") else name for name in self.objects]
         frictions = [label_of(friction) for friction in self.friction]
-        return results.outcome_dataset(outcome, list(self.chosen), objects, frictions, self.targets)
+        return outcome_dataset(outcome, list(self.chosen), objects, frictions, self.targets)
 
     def intro(self, results: xr.Dataset) -> str:
         return (
@@ -115,7 +116,7 @@ def table_of(folder: Path) -> Table:
     try:
         manifest = run_folder.read_manifest(folder)
         setting = setting_of(manifest["setting"])
-        laws = {name: registry.restored(law) for name, law in manifest["laws"].items()}
+        laws = {name: registry.params_from_json(law) for name, law in manifest["laws"].items()}
         pairs = {name: _tuples(manifest[name]) for name in ("objects", "friction", "targets")}
         sensing = {field.name: manifest[field.name] for field in dataclasses.fields(TrialOptions)}
         if manifest["question"] != "table":
