@@ -264,7 +264,7 @@ def test_a_missing_package_is_named(command, module, package, tmp_path, capsys, 
 
 
 def test_the_command_searches_checks_lists_and_draws(tmp_path, capsys):
-    """All tried cells fail within a short horizon, in C MuJoCo too."""
+    """Cells that are tried fail within a short horizon, also in C MuJoCo."""
     command = ["attack", "--engine", "quasistatic", "--cells", 2, "--batch", 8, "--generations", 2]
     command += ["--drawn", 3, "--horizon", 1, "--check-again", 2, "--worst", 2, "--slots", 8]
     command += ["--workers", 1, "--out", tmp_path / "run"]
