@@ -1,4 +1,4 @@
-"""Trials with an exported law in the loop, and what whole trials and their bags give back."""
+"""Trials with an exported law in the loop, and the observations and bags of whole trials."""
 
 from __future__ import annotations
 
@@ -26,150 +26,152 @@ from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.scene import FRICTION
 from sweeps.export.native import TOLERANCE, Native, scale_of
 
-OFF = (1, -1, 2, -2, 4, -4, 8, -8)  # roundings of a twist, of 2^-23 each
+ROUNDINGS = (1, -1, 2, -2, 4, -4, 8, -8)  # rounding errors of a twist, in units of 2^-23
 
 
 def recorded(cases: Sequence[Case], setting: Setting) -> list[Any]:
-    """What the law of each case observed in each control step: leaves (T, ...), by trial."""
+    """Return the observations of each case in each control step: leaves (T, ...), by trial."""
     law = registry.law_of(cases[0].params)
-    part = pushes.build(cases, setting)
-    period, found = setting.physics.control_period, []
-    for followed in pushes.record_batch(part, recorded_law(law), setting, interval=period):
-        seen = followed.snapshots
-        observed = tuple(seen.details)[1]  # of `recorded_law`, with taxels
-        leaves = jax.tree.leaves(observed.touch if law.senses == "touch" else observed)
-        found.append([np.broadcast_to(x, (len(seen.time), *x.shape[1:])) for x in leaves])
-    return found
+    worlds = pushes.build(cases, setting)
+    period, trials = setting.physics.control_period, []
+    for trace in pushes.record_batch(worlds, recorded_law(law), setting, interval=period):
+        snapshots = trace.snapshots
+        observation = tuple(snapshots.details)[1]  # of `recorded_law`, with taxels
+        leaves = jax.tree.leaves(observation.touch if law.senses == "touch" else observation)
+        trials.append([np.broadcast_to(x, (len(snapshots.time), *x.shape[1:])) for x in leaves])
+    return trials
 
 
-def in_the_loop(name: str, where: Path) -> Any:
-    """Parameters of a law of this process whose step is that in C, in float."""
+def in_the_loop(name: str, folder: Path) -> Any:
+    """Register a law whose step runs in C with floats; return its parameters."""
     label, params = registry.resolve_law(name)
-    law, native = registry.law_of(params), Native(program.program(name), where, "float")
+    law, native = registry.law_of(params), Native(program.program(name), folder, "float")
 
-    def called(memory: Any, seen: Any) -> Any:
-        shape = np.shape(jax.tree.leaves(seen)[0])[:-1]
-        count, given = int(np.prod(shape)), native.filled
+    def call_native(state: Any, obs: Any) -> Any:
+        shape = np.shape(jax.tree.leaves(obs)[0])[:-1]
+        count, filled = int(np.prod(shape)), native.filled
         flat = [
             [np.asarray(x).reshape(count, *np.shape(x)[len(shape) :]) for x in group]
-            for group in (memory, seen)
+            for group in (state, obs)
         ]
-        mine = given("memory", flat[0], count)
-        twist, _ = native.step(mine, given("observation", flat[1], count))
-        after = [
-            np.asarray(mine[f.name]).reshape(np.shape(x)).astype(x.dtype) if f.size else x
-            for f, x in zip(native.program.groups["memory"], memory, strict=True)
+        native_state = filled("memory", flat[0], count)
+        twist, _ = native.step(native_state, filled("observation", flat[1], count))
+        next_state = [
+            np.asarray(native_state[f.name]).reshape(np.shape(x)).astype(x.dtype) if f.size else x
+            for f, x in zip(native.program.groups["memory"], state, strict=True)
         ]
-        return after, twist.reshape(*shape, 3)
+        return next_state, twist.reshape(*shape, 3)
 
-    def step(_: Any, memory: Any, seen: Any) -> Any:
-        tree = jax.tree.structure(memory)
-        shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in jax.tree.leaves(memory)]
+    def step(_: Any, state: Any, obs: Any) -> Any:
+        tree = jax.tree.structure(state)
+        shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in jax.tree.leaves(state)]
         out = (shapes, jax.ShapeDtypeStruct((3,), np.float32))
-        after, twist = jax.pure_callback(
-            called, out, jax.tree.leaves(memory), jax.tree.leaves(seen),
+        next_state, twist = jax.pure_callback(
+            call_native, out, jax.tree.leaves(state), jax.tree.leaves(obs),
             vmap_method="broadcast_all",
         )  # fmt: skip
         return (
-            jax.tree.unflatten(tree, after),
+            jax.tree.unflatten(tree, next_state),
             Twist(*twist),
-            Details.from_obs(getattr(seen, "touch", seen)),
+            Details.from_obs(getattr(obs, "touch", obs)),
         )
 
     return _registered(f"{identifier(label)}_in_c", law, step, params)
 
 
 def nudged(name: str, roundings: int) -> Any:
-    """Parameters of a law of this process whose every twist is greater by some roundings."""
+    """Register a law with rounding errors added to its twists; return its parameters."""
     label, params = registry.resolve_law(name)
     law = registry.law_of(params)
 
-    def step(own: Any, memory: Any, seen: Any) -> Any:
-        memory, twist, details = law.step(own.law, memory, seen)
-        more: list[Any] = [x * np.float32(1 + roundings * 2**-23) for x in twist]
-        return memory, Twist(*more), details
+    def step(params: Any, state: Any, obs: Any) -> Any:
+        state, twist, details = law.step(params.law, state, obs)
+        changed: list[Any] = [x * np.float32(1 + roundings * 2**-23) for x in twist]
+        return state, Twist(*changed), details
 
-    off = f"{abs(roundings)}_{'down' if roundings < 0 else 'up'}"
-    return _registered(f"{identifier(label)}_{off}", law, step, params)
+    suffix = f"{abs(roundings)}_{'down' if roundings < 0 else 'up'}"
+    return _registered(f"{identifier(label)}_{suffix}", law, step, params)
 
 
 def _registered(name: str, law: Law, step: Any, params: Any) -> Any:
-    """Parameters, of a class of their own, of a law with another step."""
-    kind = namedtuple(name, "law d_success")
-    mine = kind(params, params.d_success)
-    registry.register_law(name, Law(lambda p: law.init(p.law), step, senses=law.senses), mine)
-    return mine
+    """Register a law with another step; return parameters of a new class."""
+    params_class = namedtuple(name, "law d_success")
+    wrapped = params_class(params, params.d_success)
+    registry.register_law(name, Law(lambda p: law.init(p.law), step, senses=law.senses), wrapped)
+    return wrapped
 
 
-class Ends(NamedTuple):
-    """How trials end with a law of JAX, with that of C in the loop, and with JAX roundings off."""
+class Outcomes(NamedTuple):
+    """Outcomes with the law in JAX, with the law in C, and in JAX with rounding errors."""
 
     trials: int
-    in_jax: int  # succeed
-    in_c: int
-    nudged: int  # the least of JAX with every twist off by some roundings
-    alike: int  # succeed with JAX and C, or with neither
-    nudged_alike: int  # the least of JAX, and of JAX roundings off
-    apart: float  # [s] 99th percentile of the difference of the times of those that both succeed in
+    in_jax: int  # successes in JAX
+    in_c: int  # successes in C
+    nudged: int  # smallest number of successes with rounding errors
+    alike: int  # equal outcomes of JAX and C
+    nudged_alike: int  # smallest number of equal outcomes with rounding errors
+    apart: float  # [s] 99th percentile of the difference in time, if both succeed
 
 
-def _ends(name: str, where: Path, run: Any, roundings: Sequence[int]) -> Ends:
-    """Ends of the trials that `run` makes with a law's parameters."""
-    laws = [registry.resolve_law(name)[1], in_the_loop(name, where)]
+def _compare(name: str, folder: Path, run: Any, roundings: Sequence[int]) -> Outcomes:
+    """Return the outcomes of `run`, a function of the parameters of a law."""
+    laws = [registry.resolve_law(name)[1], in_the_loop(name, folder)]
     outcomes = [run(p) for p in [*laws, *(nudged(name, n) for n in roundings)]]
-    won = [np.asarray(one.success).astype(bool).ravel() for one in outcomes]
-    times = [np.asarray(one.time).ravel() for one in outcomes[:2]]
-    both = won[0] & won[1]
-    apart = np.abs(times[0] - times[1])[both]
-    counts = [int(one.sum()) for one in won]
-    alike = [int((won[0] == one).sum()) for one in won]
-    most = float(np.quantile(apart, 0.99)) if both.any() else 0.0
-    return Ends(won[0].size, counts[0], counts[1], min(counts[2:]), alike[1], min(alike[2:]), most)
+    succeeded = [np.asarray(outcome.success).astype(bool).ravel() for outcome in outcomes]
+    times = [np.asarray(outcome.time).ravel() for outcome in outcomes[:2]]
+    both_succeeded = succeeded[0] & succeeded[1]
+    difference = np.abs(times[0] - times[1])[both_succeeded]
+    counts = [int(outcome.sum()) for outcome in succeeded]
+    alike = [int((succeeded[0] == outcome).sum()) for outcome in succeeded]
+    quantile = float(np.quantile(difference, 0.99)) if both_succeeded.any() else 0.0
+    return Outcomes(
+        succeeded[0].size, counts[0], counts[1], min(counts[2:]), alike[1], min(alike[2:]), quantile
+    )
 
 
-def papers_trials(name: str, setting: Setting, where: Path) -> Ends:
-    """How the paper's 144 trials end."""
+def papers_trials(name: str, setting: Setting, folder: Path) -> Outcomes:
+    """Return the outcomes of the paper's 144 trials."""
     cases = [(o, f, t) for o in PAPER_OBJECTS for f in FRICTION for t in paper.TARGETS]
 
     def run(params: Any) -> Any:
-        return pushes.run([Case(*one, law=params) for one in cases], setting)[0]
+        return pushes.run([Case(*options, law=params) for options in cases], setting)[0]
 
-    return _ends(name, where, run, OFF)
+    return _compare(name, folder, run, ROUNDINGS)
 
 
-def random_worlds(name: str, domain: str, worlds: int, setting: Setting, where: Path) -> Ends:
-    """How random worlds end."""
+def random_worlds(name: str, domain: str, worlds: int, setting: Setting, folder: Path) -> Outcomes:
+    """Return the outcomes in random worlds."""
 
     def run(params: Any) -> Any:
         return rps_jax.sweep({"law": params}, domain, worlds, setting=setting, progress=False)
 
-    return _ends(name, where, run, OFF[:1])
+    return _compare(name, folder, run, ROUNDINGS[:1])
 
 
 class Bags(NamedTuple):
-    """What bags of random worlds give back."""
+    """Differences between bags of random worlds and their trials."""
 
     bags: int
     commands: int
-    greatest: float  # difference of the law that is fed the bag from what it commanded, as a share
-    beyond: int  # commands whose share is more than 1e-6
-    plain: float  # [m/s, rad/s] greatest difference
-    strange: int  # messages that a reader which we did not write finds otherwise than they were
+    greatest: float  # largest difference between replayed and recorded commands, as a share
+    beyond: int  # commands with a share above 1e-6
+    plain: float  # [m/s, rad/s] largest difference
+    strange: int  # messages that differ when read by an independent library
 
 
-def bags(name: str, domain: str, worlds: int, setting: Setting, where: Path) -> Bags:
+def bags(name: str, domain: str, worlds: int, setting: Setting, folder: Path) -> Bags:
     """Write bags of random worlds, read them with `rosbags`, and feed them to their law."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
     law = registry.resolve_law(name)[1]
-    rps_jax.sweep({"law": law}, domain, worlds, setting=setting, out=where / "run", progress=False)
+    rps_jax.sweep({"law": law}, domain, worlds, setting=setting, out=folder / "run", progress=False)
     errors, strange = [], 0
     for world in range(worlds):
-        path = where / f"{world}.mcap"
-        rps_jax.replay(run=where / "run", world=world, bag=path)
-        found = shadow(path, law)
-        twists = np.stack([found[one].values for one in ("v_x", "v_y", "omega")], -1)
+        path = folder / f"{world}.mcap"
+        rps_jax.replay(run=folder / "run", world=world, bag=path)
+        twists_of = shadow(path, law)
+        twists = np.stack([twists_of[name].values for name in ("v_x", "v_y", "omega")], -1)
         errors.append(np.abs(twists[1] - twists[0]))
         sent: list[tuple[float, ...]] = []
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
@@ -178,8 +180,8 @@ def bags(name: str, domain: str, worlds: int, setting: Setting, where: Path) -> 
                 if connection.topic == "/cmd_vel":
                     twist = message.twist
                     sent.append((twist.linear.x, twist.linear.y, twist.angular.z))
-        lost = abs(len(sent) - len(twists[0]))
-        strange += lost or int((np.array(sent) != twists[0]).any(-1).sum())
+        missing = abs(len(sent) - len(twists[0]))
+        strange += missing or int((np.array(sent) != twists[0]).any(-1).sum())
     plain = np.concatenate(errors)
     error = (plain / scale_of(law)).max(-1)
     beyond = int((error > TOLERANCE["float"]).sum())

@@ -1,10 +1,10 @@
-"""Do the laws in C and ONNX do what they do in JAX, and how fast?
+"""Agreement of laws in C and ONNX with those in JAX, and their speed.
 
     rps sweeps/export
 
-compares each law in C (float and double) and as ONNX with that in JAX: at chance inputs, over whole
-trials, and with the C in the loop of the paper's trials and of random worlds. It feeds odd inputs
-to the C under sanitizers, and times it on one core.
+compares each law in C (float and double) and in ONNX with JAX: for random inputs, in whole trials,
+and with C in the loop of the paper's trials and of random worlds. It runs the C with odd inputs
+under sanitizers, and times it on one core.
 """
 
 from __future__ import annotations
@@ -55,120 +55,120 @@ class Export(Study[xr.Dataset]):
     }
 
     laws: tuple[str, ...] = ("rps", "rps_tuned", "rps_plus", "learned_mlp", "learned_gru")
-    """Laws that are compared."""
+    """Laws to compare."""
     tables: tuple[TableName, ...] = _TABLES
-    """What is asked: chance inputs, whole trials, the paper's trials and random worlds with C in
-    the loop, bags of random worlds, odd inputs, and speed."""
+    """Tables to compute: random inputs, whole trials, the paper's trials and random worlds with C
+    in the loop, bags of random worlds, odd inputs, and speed."""
     in_worlds: tuple[str, ...] = ("rps_plus",)
-    """Those of the laws that are in the loop of random worlds, too."""
+    """Laws that also run in the loop of random worlds."""
     inputs: int = option(10_000_000, 100, 10**9)
-    """Number of chance inputs of each law that is an equation, for C in either precision."""
+    """Number of random inputs of each law of equations, for C in either precision."""
     states: int = option(1_000_000, 100, 10**9)
-    """Number of chance inputs of each learned law, and of each law as ONNX."""
+    """Number of random inputs of each learned law, and of each law in ONNX."""
     worlds: int = option(1000, 1, 1_000_000)
     """Number of random worlds with C in the loop."""
     bags: int = option(4, 1, 1000)
-    """Number of random worlds that become bags, for each law."""
+    """Number of random worlds that are recorded as bags, for each law."""
     domain: str = "real"
     """Domain of these worlds."""
     quick: bool = False
-    """Whether to make a small run of minutes on two cores: what is not asked for becomes small."""
+    """Whether to make a small run of minutes on two cores; explicit options keep their values."""
 
     def check(self) -> None:
-        """Check that the laws can be exported, and that a compiler is there."""
+        """Check that the laws can be exported, and that a compiler is installed."""
         for law in self.laws:
             program.program(law)
         if shutil.which("gcc") is None:
-            raise InputError("gcc is not installed: install it to compile what was exported.")
+            raise InputError("gcc is not installed: install it to compile the exported laws.")
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Answer table by table and law by law."""
-        found: list[xr.Dataset] = []
+        """Compute the tables that are missing, law by law."""
+        by_table: list[xr.Dataset] = []
         for table in self.tables:
-            make = getattr(self, f"_{table}")
+            compute = getattr(self, f"_{table}")
             rows = []
             laws = [x for x in self.laws if table != "worlds" or x in self.in_worlds]
             for law in laws:
-                rows.append(run.checkpoint(f"{table}-{law}", partial(self._kept, make, law)))
+                rows.append(run.checkpoint(f"{table}-{law}", partial(self._compute, compute, law)))
                 run.callback(Progress(len(rows), 0.0))
             if rows:
                 joined = xr.concat(rows, "law")
                 assert isinstance(joined, xr.Dataset)
-                found.append(joined.assign_coords(law=laws))
-        whole = xr.merge(found, join="outer").reindex(law=list(self.laws))
-        assert isinstance(whole, xr.Dataset)
-        return whole
+                by_table.append(joined.assign_coords(law=laws))
+        results = xr.merge(by_table, join="outer").reindex(law=list(self.laws))
+        assert isinstance(results, xr.Dataset)
+        return results
 
-    def _kept(self, make: Callable[[str, Path], xr.Dataset], law: str) -> xr.Dataset:
-        with tempfile.TemporaryDirectory() as where:
-            found = make(law, Path(where))
-        jax.clear_caches()  # the programs of all tables take more mappings than a process may have
-        return found
+    def _compute(self, compute: Callable[[str, Path], xr.Dataset], law: str) -> xr.Dataset:
+        with tempfile.TemporaryDirectory() as folder:
+            results = compute(law, Path(folder))
+        jax.clear_caches()  # all programs together exceed the memory mappings of a process
+        return results
 
-    # --- what is asked of each law ---
+    # --- the tables of one law ---
 
-    def _inputs(self, law: str, where: Path) -> xr.Dataset:
+    def _inputs(self, law: str, folder: Path) -> xr.Dataset:
         rows = []
         for form in _FORMS:
-            few = form == "onnx" or law in policy.SHIPPED
-            rows.append(native.agreement(law, form, self.states if few else self.inputs, where))
+            is_slow = form == "onnx" or law in policy.SHIPPED
+            rows.append(
+                native.agreement(law, form, self.states if is_slow else self.inputs, folder)
+            )
         return _columns("inputs", rows, "form", _FORMS, but=("law", "form"))
 
-    def _trials(self, law: str, where: Path) -> xr.Dataset:
+    def _trials(self, law: str, folder: Path) -> xr.Dataset:
         cases = [
-            [Case(thing, "S1", target, law=law) for target in paper.FEW_TARGETS]
-            for thing in PAPER_OBJECTS
+            [Case(name, "S1", target, law=law) for target in paper.FEW_TARGETS]
+            for name in PAPER_OBJECTS
         ]
-        seen = [one for some in cases for one in loop.recorded(some, Setting("fused"))]
-        found = []
+        trials = [trial for group in cases for trial in loop.recorded(group, Setting("fused"))]
+        rows = []
         for form in _FORMS:
-            errors = native.trial_errors(law, form, seen, where)
-            own, told, in_jax = map(np.concatenate, errors)
-            found.append(
-                (len(seen), own.size, own.max(), told.max(),
-                 (own > native.TOLERANCE[form]).sum(), (own > native.JUMP).sum(),
+            errors = native.trial_errors(law, form, trials, folder)
+            free, synchronised, in_jax = map(np.concatenate, errors)
+            rows.append(
+                (len(trials), free.size, free.max(), synchronised.max(),
+                 (free > native.TOLERANCE[form]).sum(), (free > native.JUMP).sum(),
                  (in_jax > native.JUMP).sum())
             )  # fmt: skip
         names = ("trials", "steps", "greatest", "told", "beyond", "parted", "in_jax")
-        columns = zip(names, np.transpose(found), strict=True)
+        columns = zip(names, np.transpose(rows), strict=True)
         return xr.Dataset(
             {f"trials_{name}": ("form", values) for name, values in columns},
             {"form": list(_FORMS)},
         )
 
-    def _paper(self, law: str, where: Path) -> xr.Dataset:
-        return _columns("paper", [loop.papers_trials(law, Setting("fused"), where)])
+    def _paper(self, law: str, folder: Path) -> xr.Dataset:
+        return _columns("paper", [loop.papers_trials(law, Setting("fused"), folder)])
 
-    def _worlds(self, law: str, where: Path) -> xr.Dataset:
+    def _worlds(self, law: str, folder: Path) -> xr.Dataset:
         setting = Setting("fused")
-        ends = loop.random_worlds(law, self.domain, self.worlds, setting, where)
-        return _columns("worlds", [ends])
+        outcomes = loop.random_worlds(law, self.domain, self.worlds, setting, folder)
+        return _columns("worlds", [outcomes])
 
-    def _bags(self, law: str, where: Path) -> xr.Dataset:
-        found = loop.bags(law, self.domain, self.bags, Setting("fused"), where)
-        return _columns("bags", [found])
+    def _bags(self, law: str, folder: Path) -> xr.Dataset:
+        bags = loop.bags(law, self.domain, self.bags, Setting("fused"), folder)
+        return _columns("bags", [bags])
 
-    def _odd(self, law: str, where: Path) -> xr.Dataset:
-        made, compilers = program.program(law), native.COMPILERS
+    def _odd(self, law: str, folder: Path) -> xr.Dataset:
+        exported, compilers = program.program(law), native.COMPILERS
         rows = []
         for compiler in compilers:
-            both = [native.fuzzed(made, compiler, p, 200_000, where) for p in _PRECISIONS]
-            if wrong := [one for one in both if one.fault]:
-                raise AssertionError(f"{law}, {compiler}: {wrong}")
-            rows.append(native.Fuzzed(*(a + b for a, b in zip(*both, strict=True))))
+            results = [native.fuzzed(exported, compiler, p, 200_000, folder) for p in _PRECISIONS]
+            if faults := [result for result in results if result.fault]:
+                raise AssertionError(f"{law}, {compiler}: {faults}")
+            rows.append(native.Fuzzed(*(a + b for a, b in zip(*results, strict=True))))
         return _columns("odd", rows, "compiler", compilers, but=("said", "fault"))
 
-    def _speed(self, law: str, where: Path) -> xr.Dataset:
-        found = [native.latency(law, precision, where) for precision in _PRECISIONS]
+    def _speed(self, law: str, folder: Path) -> xr.Dataset:
+        times = [native.latency(law, precision, folder) for precision in _PRECISIONS]
         return xr.Dataset(
             {
-                "speed_latency": (("precision", "of", "share"), found, {"units": "us"}),
+                "speed_latency": (("precision", "of", "share"), times, {"units": "us"}),
                 "speed_load": os.getloadavg()[0],
             },
             {"precision": list(_PRECISIONS), "share": [0.5, 0.999]},
         )
-
-    # --- how it is told ---
 
     def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
         """Return all tables."""
@@ -178,7 +178,7 @@ class Export(Study[xr.Dataset]):
         }
 
     def report(self, results: Any, run: Run) -> Sequence[Section]:
-        """One section for each table."""
+        """Return one section per table."""
         return [Section(title, note, rows) for title, note, rows in tables(results, self).values()]
 
 
@@ -189,55 +189,56 @@ def _columns(
     table: TableName, rows: Sequence[Any], dim: str = "", names: Sequence[str] = (),
     but: Sequence[str] = (),
 ) -> xr.Dataset:  # fmt: skip
-    """Rows of named tuples as variables of their fields, along a dimension if it has a name."""
-    kept = [name for name in rows[0]._fields if name not in but]
+    """Return the fields of named tuples as variables, along dimension `dim` if it has a name."""
+    fields = [name for name in rows[0]._fields if name not in but]
     if not dim:
-        return xr.Dataset({f"{table}_{name}": float(getattr(rows[0], name)) for name in kept})
+        return xr.Dataset({f"{table}_{name}": float(getattr(rows[0], name)) for name in fields})
     return xr.Dataset(
-        {f"{table}_{n}": (dim, [float(getattr(one, n)) for one in rows]) for n in kept},
+        {f"{table}_{n}": (dim, [float(getattr(row, n)) for row in rows]) for n in fields},
         {dim: list(names)},
     )
 
 
 def _share(part: Any, whole: Any) -> str:
-    """A count as a share, with enough digits to tell it from nothing."""
+    """Format a count as a share, with two significant digits."""
     part, whole = int(part), int(whole)
     return "0" if part == 0 else f"{100 * part / whole:.2g} %"
 
 
-def tables(found: xr.Dataset, asked: Export) -> dict[str, tuple[str, str, list[list[str]]]]:
-    """Title, note, header and rows of each table, by name."""
-    made = {
+def tables(results: xr.Dataset, study: Export) -> dict[str, tuple[str, str, list[list[str]]]]:
+    """Return title, note, header and rows of each table, by name."""
+    functions = {
         "speed": _speed_rows, "inputs": _input_rows, "trials": _trial_rows, "paper": _paper_rows,
-        "worlds": partial(_world_rows, asked.domain), "bags": partial(_bag_rows, asked.domain),
+        "worlds": partial(_world_rows, study.domain), "bags": partial(_bag_rows, study.domain),
         "odd": _odd_rows,
     }  # fmt: skip
-    return {name: made[name](found) for name in asked.tables}
+    return {name: functions[name](results) for name in study.tables}
 
 
-def _each(found: xr.Dataset, table: TableName, dim: str) -> list[tuple[str, str, Any]]:
-    """Law, name along a dimension, and the numbers of a table there."""
+def _rows_of(results: xr.Dataset, table: TableName, dim: str) -> list[tuple[str, str, Any]]:
+    """Return law, coordinate along `dim` and values of each row of a table."""
     prefix = f"{table}_"
-    own = found[[name for name in map(str, found) if name.startswith(prefix)]]
-    own = own.rename({name: str(name).removeprefix(prefix) for name in own})
+    selected = results[[name for name in map(str, results) if name.startswith(prefix)]]
+    selected = selected.rename({name: str(name).removeprefix(prefix) for name in selected})
     return [
-        (str(law), str(one), own.sel({"law": law, dim: one}))
-        for law in found.law.values
-        for one in found[dim].values
+        (str(law), str(name), selected.sel({"law": law, dim: name}))
+        for law in results.law.values
+        for name in results[dim].values
     ]
 
 
-def _input_rows(found: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+def _input_rows(results: xr.Dataset) -> tuple[str, str, list[list[str]]]:
     rows = [
         ["law", "form", "inputs", "greatest difference", "beyond the goal", "flips", "unexplained",
          "beyond 1e-6 of float64", "JAX's float32 is"],
     ]  # fmt: skip
-    for law, form, one in _each(found, "inputs", "form"):
-        wide = ["", ""] if form == "double" else [_share(one.off, one.inputs),
-                                                  _share(one.off_in_jax, one.inputs)]  # fmt: skip
+    for law, form, row in _rows_of(results, "inputs", "form"):
+        shares = ["", ""] if form == "double" else [_share(row.off, row.inputs),
+                                                  _share(row.off_in_jax, row.inputs)]  # fmt: skip
         rows.append(
-            [law, _WORDS[form], f"{int(one.inputs):,}", f"{float(one.greatest):.1e}",
-             _share(one.beyond, one.inputs), f"{int(one.flips)}", f"{int(one.unexplained)}", *wide]
+            [law, _WORDS[form], f"{int(row.inputs):,}", f"{float(row.greatest):.1e}",
+             _share(row.beyond, row.inputs), f"{int(row.flips)}", f"{int(row.unexplained)}",
+             *shares]
         )  # fmt: skip
     note = (
         "The goal is 1e-12 in double and 1e-6 in float. Differences are shares of the greatest "
@@ -246,58 +247,60 @@ def _input_rows(found: xr.Dataset) -> tuple[str, str, list[list[str]]]:
     return "Chance inputs", note, rows
 
 
-def _trial_rows(found: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+def _trial_rows(results: xr.Dataset) -> tuple[str, str, list[list[str]]]:
     rows = [["law", "form", "steps", "greatest difference", "from JAX's memory",
              "steps beyond the goal", "beyond 1e-3", "JAX's float32 is"]]  # fmt: skip
-    for law, form, one in _each(found, "trials", "form"):
-        in_jax = "" if form == "double" else _share(one.in_jax, one.steps)
+    for law, form, row in _rows_of(results, "trials", "form"):
+        in_jax = "" if form == "double" else _share(row.in_jax, row.steps)
         rows.append(
-            [law, _WORDS[form], f"{int(one.steps):,}", f"{float(one.greatest):.1e}",
-             f"{float(one.told):.1e}", _share(one.beyond, one.steps),
-             _share(one.parted, one.steps), in_jax]
+            [law, _WORDS[form], f"{int(row.steps):,}", f"{float(row.greatest):.1e}",
+             f"{float(row.told):.1e}", _share(row.beyond, row.steps),
+             _share(row.parted, row.steps), in_jax]
         )  # fmt: skip
     note = (
-        f"{int(found.trials_trials.max())} trials of each law. Each law remembers by itself from "
+        f"{int(results.trials_trials.max())} trials of each law. Each law remembers by itself from "
         "the first step to the last; from JAX's memory, it is given that before each step. JAX's "
         "float32 is compared with JAX's float64."
     )
     return "Whole trials", note, rows
 
 
-def _end_rows(found: xr.Dataset, table: TableName) -> list[list[str]]:
+def _end_rows(results: xr.Dataset, table: TableName) -> list[list[str]]:
     rows = [["law", "succeed with JAX", "with C in the loop", "with JAX, roundings off",
              "C ends alike", "roundings off end alike", "99 % of times are within"]]  # fmt: skip
     counts = ("in_jax", "in_c", "nudged", "alike", "nudged_alike")
-    for law in map(str, found.law.values):
-        one = {name: float(found[f"{table}_{name}"].sel(law=law)) for name in loop.Ends._fields}
-        if np.isfinite(one["trials"]):
-            told = [f"{one[name]:.0f} of {one['trials']:.0f}" for name in counts]
-            rows.append([law, *told, f"{one['apart']:.2g} s"])
+    for law in map(str, results.law.values):
+        row = {
+            name: float(results[f"{table}_{name}"].sel(law=law)) for name in loop.Outcomes._fields
+        }
+        if np.isfinite(row["trials"]):
+            cells = [f"{row[name]:.0f} of {row['trials']:.0f}" for name in counts]
+            rows.append([law, *cells, f"{row['apart']:.2g} s"])
     return rows
 
 
-def _paper_rows(found: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+def _paper_rows(results: xr.Dataset) -> tuple[str, str, list[list[str]]]:
     note = (
         "Fused engine, float. Roundings off: every twist is greater or less by 1, 2, 4 or 8 parts "
         "in 2^23, and the least of these eight is told. Times are those of trials in which JAX and "
         "C both succeed."
     )
-    return "The paper's trials", note, _end_rows(found, "paper")
+    return "The paper's trials", note, _end_rows(results, "paper")
 
 
-def _world_rows(domain: str, found: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+def _world_rows(domain: str, results: xr.Dataset) -> tuple[str, str, list[list[str]]]:
     note = f"The same worlds of `{domain}` for both; one rounding off; fused engine, float."
-    return "Random worlds", note, _end_rows(found, "worlds")
+    return "Random worlds", note, _end_rows(results, "worlds")
 
 
-def _bag_rows(domain: str, found: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+def _bag_rows(domain: str, results: xr.Dataset) -> tuple[str, str, list[list[str]]]:
     rows = [["law", "bags", "commands", "greatest difference", "beyond 1e-6",
              "greatest in m/s and rad/s", "read otherwise by rosbags"]]  # fmt: skip
-    for law in map(str, found.law.values):
-        one = {name: float(found[f"bags_{name}"].sel(law=law)) for name in loop.Bags._fields}
-        counts = [f"{one[name]:,.0f}" for name in ("bags", "commands")]
-        beyond, strange = (f"{one[name]:.0f}" for name in ("beyond", "strange"))
-        shares = f"{one['greatest']:.1e}", beyond, f"{one['plain']:.1e}"
+    for law in map(str, results.law.values):
+        row = {name: float(results[f"bags_{name}"].sel(law=law)) for name in loop.Bags._fields}
+        counts = [f"{row[name]:,.0f}" for name in ("bags", "commands")]
+        beyond, strange = (f"{row[name]:.0f}" for name in ("beyond", "strange"))
+        shares = f"{row['greatest']:.1e}", beyond, f"{row['plain']:.1e}"
         rows.append([law, *counts, *shares, strange])
     note = (
         f"Worlds of `{domain}`, fused engine. Each law is fed its own bag. The goal is 1e-6, of "
@@ -306,23 +309,23 @@ def _bag_rows(domain: str, found: xr.Dataset) -> tuple[str, str, list[list[str]]
     return "Bags", note, rows
 
 
-def _odd_rows(found: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+def _odd_rows(results: xr.Dataset) -> tuple[str, str, list[list[str]]]:
     rows = [["law", "compiler", "inputs", "refused (not finite)", "no finite twist", "faults"]]
-    for law, compiler, one in _each(found, "odd", "compiler"):
-        counts = [int(one[name]) for name in ("taken", "refused", "no_result")]
+    for law, compiler, row in _rows_of(results, "odd", "compiler"):
+        counts = [int(row[name]) for name in ("taken", "refused", "no_result")]
         rows.append([law, compiler, *(f"{n:,}" for n in (sum(counts), *counts[1:])), "0"])
     note = "A fault would have ended the run without a table. Both precisions are counted together."
     return "Odd inputs", note, rows
 
 
-def _speed_rows(found: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+def _speed_rows(results: xr.Dataset) -> tuple[str, str, list[list[str]]]:
     rows = [["law", "form", "median", "99.9th percentile", "of five runs, from", "to"]]
-    for law, precision, one in _each(found, "speed", "precision"):
-        median, slow = (np.sort(one.latency.sel(share=share).values) for share in (0.5, 0.999))
+    for law, precision, row in _rows_of(results, "speed", "precision"):
+        median, slow = (np.sort(row.latency.sel(share=share).values) for share in (0.5, 0.999))
         middle = len(slow) // 2
         texts = [f"{x:.2f} us" for x in (median[middle], slow[middle], slow[0], slow[-1])]
         rows.append([law, _WORDS[precision], *texts])
-    load = float(found.speed_load.max())
+    load = float(results.speed_load.max())
     note = (
         "gcc -O2, 200,000 steps of skin and law in a run, on one core; the median of five runs. "
         f"The load of the machine was {load:.1f} at most."
