@@ -145,7 +145,8 @@ def test_the_data_are_what_the_page_says():
 
 
 def test_fingers_begin_outside_and_end_where_the_object_was_pushed(few):
-    way, pre, post = pushes.ways(few, STEPS), pushes.before(few), pushes.measured(few)
+    way = pushes.finger_paths(few, STEPS)
+    pre, post = pushes.initial_poses(few), pushes.measured(few)
     for pose, finger, low, high in ((pre, way[0], 2e-4, 5e-3), (post, way[-1], -2e-3, 6e-3)):
         seen = turned(-pose[:, None, 2], finger - pose[:, None, :2])
         gap = sliding.nearest(OUTLINE, seen)[0].min(axis=1)

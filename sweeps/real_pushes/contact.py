@@ -23,12 +23,12 @@ _FINE = 400  # parts of a way, between which fingers go straight
 _SETTLE = 0.5  # [s] that the object stands before the push
 _RISE = 0.1  # [s] in which fingers reach their speed
 _BALL = 2.5e-4  # [m] radius of a finger at the true size
-_SOFT = (0.9, 0.95)  # MuJoCo's own impedance
+_SOFT = (0.9, 0.95)  # MuJoCo's default impedance
 
 
 @dataclass(frozen=True)
-class Kind:
-    """How pushes are stepped."""
+class Condition:
+    """Physics, scale and speed of pushes."""
 
     physics: Physics
     scale: float = 4.0  # of all lengths
@@ -36,42 +36,44 @@ class Kind:
 
 
 _OURS = preset("default", "reference")  # converged, in steps of 1 ms
-_MUJOCOS = replace(_OURS, **MUJOCO_GROUND)
+_MUJOCO_GROUND = replace(_OURS, **MUJOCO_GROUND)
 _LIGHT = replace(_OURS, ground_solref=(0.1, 0.2), ground_impedance=0.3)
-_DEFAULT = replace(_MUJOCOS, cone="pyramidal", impratio=1.0, base_solref=(0.02, 1.0))
+_DEFAULT = replace(_MUJOCO_GROUND, cone="pyramidal", impratio=1.0, base_solref=(0.02, 1.0))
 KINDS = {
-    "mujoco_ours": Kind(_OURS),
-    "mujoco_ours_stiff": Kind(replace(_OURS, base_solref=(0.005, 1.0))),
-    "mujoco_ground": Kind(_MUJOCOS),
-    "mujoco_default": Kind(_DEFAULT),
-    "mujoco_light": Kind(_LIGHT),
-    "mujoco_light_stiff": Kind(replace(_LIGHT, base_solref=(0.005, 1.0))),
-    "mujoco_ours_true_size": Kind(_OURS, 1.0, 0.0025),
-    "mujoco_light_true_size": Kind(_LIGHT, 1.0, 0.0025),
-    "mujoco_ground_true_size": Kind(_MUJOCOS, 1.0, 0.0025),
+    "mujoco_ours": Condition(_OURS),
+    "mujoco_ours_stiff": Condition(replace(_OURS, base_solref=(0.005, 1.0))),
+    "mujoco_ground": Condition(_MUJOCO_GROUND),
+    "mujoco_default": Condition(_DEFAULT),
+    "mujoco_light": Condition(_LIGHT),
+    "mujoco_light_stiff": Condition(replace(_LIGHT, base_solref=(0.005, 1.0))),
+    "mujoco_ours_true_size": Condition(_OURS, 1.0, 0.0025),
+    "mujoco_light_true_size": Condition(_LIGHT, 1.0, 0.0025),
+    "mujoco_ground_true_size": Condition(_MUJOCO_GROUND, 1.0, 0.0025),
 }
 
 
-def push(table: pd.DataFrame, friction: np.ndarray, kind: Kind) -> np.ndarray:
-    """Poses (n, 3) [m, m, rad] at the end, of the true size; friction (n,) is the fingers'."""
-    way, start = pushes.ways(table, _FINE), pushes.before(table)
+def push(table: pd.DataFrame, friction: np.ndarray, condition: Condition) -> np.ndarray:
+    """Return final poses (n, 3) [m, m, rad] at the true size; friction (n,) of the fingers."""
+    paths, start = pushes.finger_paths(table, _FINE), pushes.initial_poses(table)
     surface = table.surface if "surface" in table else [""] * len(table)
-    found = []
+    poses = []
     for i, (support, name) in enumerate(zip(table.support, surface, strict=True)):
         ground = pushes.GROUND.get(name, pushes.GROUND["hardboard"])
-        model = _model(support, ground, float(friction[i]), kind)
-        found.append(_one(model, start[i], way[:, i], kind))
-    return np.array(found)
+        model = _model(support, ground, float(friction[i]), condition)
+        poses.append(_push_once(model, start[i], paths[:, i], condition))
+    return np.array(poses)
 
 
-def _one(model: mujoco.MjModel, start: np.ndarray, way: np.ndarray, kind: Kind) -> np.ndarray:
-    """Where one push ends (3,), of fingers that go a way (T + 1, 2, 2)."""
-    data, k, dt = mujoco.MjData(model), kind.scale, kind.physics.timestep
-    moves = np.linalg.norm(np.diff(way, axis=0), axis=-1).max(axis=1)
+def _push_once(
+    model: mujoco.MjModel, start: np.ndarray, path: np.ndarray, condition: Condition
+) -> np.ndarray:
+    """Return the final pose (3,) of a push along finger paths (T + 1, 2, 2)."""
+    data, k, dt = mujoco.MjData(model), condition.scale, condition.physics.timestep
+    moves = np.linalg.norm(np.diff(path, axis=0), axis=-1).max(axis=1)
     along = k * np.concatenate([[0.0], np.cumsum(moves)])
-    ball = _outside(start, way) * k
-    # The lone finger's fellow stands far off, where it does not round the numbers of the others.
-    at = np.where(np.abs(way) > 100, 50.0, k * way + ball)
+    ball = _ball_offsets(start, path) * k
+    # A missing finger is far away, but near enough for accurate floats.
+    at = np.where(np.abs(path) > 100, 50.0, k * path + ball)
     data.qpos[:4] = at[0].ravel()
     data.qpos[4:] = [
         *(k * start[:2]),
@@ -84,11 +86,15 @@ def _one(model: mujoco.MjModel, start: np.ndarray, way: np.ndarray, kind: Kind) 
     for _ in range(round(_SETTLE / dt)):
         data.qvel[:4] = 0.0
         mujoco.mj_step(model, data)
-    steps = int(np.ceil((along[-1] / kind.speed + _RISE / 2) / dt))
+    steps = int(np.ceil((along[-1] / condition.speed + _RISE / 2) / dt))
     time = dt * np.arange(1, steps + 1)
-    gone = kind.speed * np.where(time < _RISE, time * time / (2 * _RISE), time - _RISE / 2)
-    ways = np.stack([np.interp(gone, along, one) for one in at.reshape(len(at), 4).T], axis=1)
-    for goal in ways:
+    travelled = condition.speed * np.where(
+        time < _RISE, time * time / (2 * _RISE), time - _RISE / 2
+    )
+    positions = np.stack(
+        [np.interp(travelled, along, coordinate) for coordinate in at.reshape(len(at), 4).T], axis=1
+    )
+    for goal in positions:
         data.qvel[:4] = (goal - data.qpos[:4]) / dt
         mujoco.mj_step(model, data)
     x, y = data.qpos[4:6] / k
@@ -97,30 +103,30 @@ def _one(model: mujoco.MjModel, start: np.ndarray, way: np.ndarray, kind: Kind) 
     return np.array([x, y, yaw])
 
 
-def _outside(start: np.ndarray, way: np.ndarray) -> np.ndarray:
-    """By how much (2, 2) [m] balls are moved, so that they touch where the points of a way do."""
+def _ball_offsets(start: np.ndarray, path: np.ndarray) -> np.ndarray:
+    """Return offsets (2, 2) [m] of the balls so that they touch where the points of a path do."""
     yaw = start[2]
-    seen = turned(np.full(way.shape[:2], -yaw), way - start[:2])
-    gap, normal = pushes.sliding.nearest(pushes.OUTLINE, seen)
+    path_in_body = turned(np.full(path.shape[:2], -yaw), path - start[:2])
+    gap, normal = pushes.sliding.nearest(pushes.OUTLINE, path_in_body)
     first = np.argmax(gap <= 0, axis=0)
     first = np.where((gap <= 0).any(axis=0), first, gap.argmin(axis=0))
     return _BALL * turned(np.full(2, yaw), normal[first, [0, 1]])
 
 
 @functools.lru_cache(maxsize=64)
-def _model(support: str, ground: float, friction: float, kind: Kind) -> mujoco.MjModel:
-    """The triangle on its feet, and two fingers that move as they are told."""
-    k, physics = kind.scale, kind.physics
+def _model(support: str, ground: float, friction: float, condition: Condition) -> mujoco.MjModel:
+    """Return the model of the triangle on its feet and two fingers with given velocities."""
+    k, physics = condition.scale, condition.physics
     corners = [(*c, z) for z in (0.0, pushes.HEIGHT) for c in pushes.OUTLINE]
     mesh = " ".join(f"{k * x:.9g}" for corner in corners for x in corner)
     feet = [k * np.array([*foot, 0.0]) for foot in pushes.feet_of(support)]
-    own = physics == _DEFAULT
-    soft = f"{_SOFT[0]} {_SOFT[1]}" if own else ""
+    is_default = physics == _DEFAULT
+    soft = f"{_SOFT[0]} {_SOFT[1]}" if is_default else ""
     touch = f'solref="{physics.base_solref[0]} {physics.base_solref[1]}"' + (
-        f' solimp="{soft}"' if own else ""
+        f' solimp="{soft}"' if is_default else ""
     )
-    bears = soft if own else f"{physics.ground_impedance} {physics.ground_impedance}"
-    stands = f'solref="{physics.ground_solref[0]} {physics.ground_solref[1]}" solimp="{bears}"'
+    impedance = soft if is_default else f"{physics.ground_impedance} {physics.ground_impedance}"
+    floor = f'solref="{physics.ground_solref[0]} {physics.ground_solref[1]}" solimp="{impedance}"'
     spheres = "".join(
         f'<geom name="foot{i}" type="sphere" size="1e-6" mass="0" pos="{x:.9g} {y:.9g} {z:.9g}"/>'
         for i, (x, y, z) in enumerate(feet)
@@ -132,7 +138,7 @@ def _model(support: str, ground: float, friction: float, kind: Kind) -> mujoco.M
         for i in range(2)
     )
     pairs = "".join(
-        f'<pair geom1="ground" geom2="foot{i}" condim="3" friction="{ground} {ground}" {stands}/>'
+        f'<pair geom1="ground" geom2="foot{i}" condim="3" friction="{ground} {ground}" {floor}/>'
         for i in range(len(feet))
     ) + "".join(
         f'<pair geom1="finger{i}" geom2="object" condim="3" friction="{friction} {friction}" '

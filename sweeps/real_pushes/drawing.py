@@ -27,31 +27,33 @@ _FINGERS = ("point", "two-point")
 _STEPS = 60
 
 
-def figure(found: xr.Dataset, table: pd.DataFrame, words: Mapping[str, str]) -> Figure:
-    """Draw a dozen pushes with measured and predicted ends, and below how errors are distributed.
+def figure(results: xr.Dataset, table: pd.DataFrame, words: Mapping[str, str]) -> Figure:
+    """Plot twelve pushes with measured and predicted poses, and the distribution of errors.
 
     Args:
-      found: the answer of the study, with the model `rigid_feet`.
+      results: results of the study, with the model `rigid_feet`.
       table: the pushes.
-      words: for models.
+      words: labels of the models.
     """
-    drawn = Figure(figsize=(12.5, 9.2), layout="constrained", dpi=100)
-    halves: Any = drawn.subfigures(2, 1, height_ratios=(1.45, 1))
+    picture = Figure(figsize=(12.5, 9.2), layout="constrained", dpi=100)
+    halves: Any = picture.subfigures(2, 1, height_ratios=(1.45, 1))
     above, below = halves
     panels = above.subplots(2, len(_SHARES))
-    test = ~found.fits.values
-    three = np.array([", three feet" in str(one) for one in found.group.values])
-    way = pushes.ways(table, _STEPS)
-    best = found.sel(model="rigid_feet")
+    is_test = ~results.fits.values
+    on_three_feet = np.array([", three feet" in str(group) for group in results.group.values])
+    paths = pushes.finger_paths(table, _STEPS)
+    best = results.sel(model="rigid_feet")
     for row, finger in zip(panels, _FINGERS, strict=True):
-        told = np.isfinite(best.both.values)
-        rows = np.flatnonzero(test & three & told & (found.finger.values == finger))
+        is_finite = np.isfinite(best.both.values)
+        rows = np.flatnonzero(
+            is_test & on_three_feet & is_finite & (results.finger.values == finger)
+        )
         order = rows[np.argsort(best.both.values[rows])]
         for ax, share in zip(row, _SHARES, strict=True):
             ax.set_axis_off()
             if order.size:
                 i = order[int(share * (order.size - 1))]
-                _push(ax, best.isel(push=i), table.iloc[i], way[:, i])
+                _push(ax, best.isel(push=i), table.iloc[i], paths[:, i])
                 ax.set_title(
                     f"{finger} push, {1e3 * float(best.both[i]):.1f} mm off\n"
                     f"(better than {100 * (1 - share):.0f} % of all)",
@@ -61,15 +63,15 @@ def figure(found: xr.Dataset, table: pd.DataFrame, words: Mapping[str, str]) -> 
         Line2D([], [], color="0.65", lw=1, label="before the push"),
         Line2D([], [], color="k", lw=2.2, label="measured after it"),
         Line2D([], [], color="C3", lw=1.3, ls="--", label="predicted: rigid body on its feet"),
-        Line2D([], [], color="C0", lw=1.5, marker=">", ms=4, label="way of the finger(s)"),
+        Line2D([], [], color="C0", lw=1.5, marker=">", ms=4, label="path of the finger(s)"),
         Line2D([], [], color="0.4", marker="o", ls="none", ms=4, label="feet, before"),
     ]
     above.legend(handles=lines, loc="outside lower center", ncols=5, fontsize=9)
-    names = [name for name in _DRAWN if name in found.model]
+    names = [name for name in _DRAWN if name in results.model]
     for ax, finger in zip(below.subplots(1, 2), _FINGERS, strict=True):
-        rows = test & three & (found.finger.values == finger)
+        rows = is_test & on_three_feet & (results.finger.values == finger)
         for name in names:
-            off = np.sort(1e3 * found.both.sel(model=name).values[rows])
+            off = np.sort(1e3 * results.both.sel(model=name).values[rows])
             off = off[np.isfinite(off)]
             if off.size:
                 share = 100 * (np.arange(off.size) + 1) / off.size
@@ -88,35 +90,35 @@ def figure(found: xr.Dataset, table: pd.DataFrame, words: Mapping[str, str]) -> 
         ax.text(0.33, 93, "a push repeats\nno better", fontsize=8, va="top", color="0.4")
     handles, labels = below.axes[-1].get_legend_handles_labels()
     below.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
-    return drawn
+    return picture
 
 
-def _push(ax: Axes, one: xr.Dataset, row: pd.Series, way: np.ndarray) -> None:
-    """One push, turned so that its way goes up."""
+def _push(ax: Axes, push: xr.Dataset, row: pd.Series, path: np.ndarray) -> None:
+    """Plot one push, rotated so that its path points up."""
     pre = np.array([row.pre_x, row.pre_y, row.pre_yaw], float)
-    fingers = way[:, np.abs(way[0]).max(axis=1) < 100]
+    fingers = path[:, np.abs(path[0]).max(axis=1) < 100]
     middle = fingers.mean(axis=1)
     at = middle[-1] - middle[0]
     turn = np.pi / 2 - np.arctan2(at[1], at[0])
     origin = pre[:2] + turned(pre[2], pushes.COM)
 
-    def seen(place: np.ndarray) -> np.ndarray:
-        return 1e3 * turned(np.full(place.shape[:-1], turn), place - origin)
+    def to_figure(points: np.ndarray) -> np.ndarray:
+        return 1e3 * turned(np.full(points.shape[:-1], turn), points - origin)
 
     def outline(pose: np.ndarray, corners: np.ndarray = pushes.OUTLINE) -> np.ndarray:
-        return seen(pose[:2] + turned(np.full(len(corners), pose[2]), corners))
+        return to_figure(pose[:2] + turned(np.full(len(corners), pose[2]), corners))
 
     for pose, style in (
         (pre, {"color": "0.65", "lw": 1}),
-        (one.measured.values, {"color": "k", "lw": 2.2}),
-        (one.predicted.values, {"color": "C3", "lw": 1.3, "ls": "--"}),
+        (push.measured.values, {"color": "k", "lw": 2.2}),
+        (push.predicted.values, {"color": "C3", "lw": 1.3, "ls": "--"}),
     ):
         shape = outline(pose)
         ax.plot(*np.concatenate([shape, shape[:1]]).T, **style)
     if row.support != pushes.FLAT:
         ax.plot(*outline(pre, pushes.feet_of(row.support)).T, "o", color="0.4", ms=3.5)
     for finger in np.moveaxis(fingers, 1, 0):
-        line = seen(finger)
+        line = to_figure(finger)
         ax.plot(*line.T, color="C0", lw=1.5)
         ax.annotate(
             "", line[-1], line[-6], arrowprops={"arrowstyle": "-|>", "color": "C0", "lw": 1.5}

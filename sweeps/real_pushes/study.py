@@ -66,7 +66,7 @@ WORDS: Mapping[str, str] = {
     "mujoco_light_true_size": "that ground, true size, 2.5 mm/s",
     "mujoco_ground_true_size": "MuJoCo's ground, true size, 2.5 mm/s",
 }
-FITTED = ("ellipsoid", "rigid_feet", "rigid_corners")  # have a friction of their own
+FITTED = ("ellipsoid", "rigid_feet", "rigid_corners")  # each has a separately fitted friction
 SLIDING = {"ellipsoid": "ellipsoid", "rigid_feet": "feet", "rigid_corners": "corners"}
 MUJOCOS = tuple(name for name in get_args(Model) if name.startswith("mujoco"))
 FINGERS = ("point", "two-point")
@@ -87,7 +87,7 @@ _SHOWN = {  # models in the table; all of the others
     GROUPS[4]: ("ellipsoid", "rigid_feet", "rigid_corners"),
     GROUPS[5]: ("rigid_feet",),
 }
-_TRIED = tuple(round(0.05 * i, 2) for i in range(2, 18))  # frictions at the fingers
+_FRICTIONS = tuple(round(0.05 * i, 2) for i in range(2, 18))  # frictions at the fingers
 _FIT = 100  # pushes with one finger, and with two each, that friction is fitted on
 _TOGETHER = 320  # pushes that are predicted as one part of the run
 _DRAWS = 2000  # of the bootstrap
@@ -101,21 +101,21 @@ def predict(
     friction: Mapping[str, float] = FRICTION,
     steps: int = STEPS,
 ) -> xr.Dataset:
-    """Predict where pushes end.
+    """Predict the final poses of pushes.
 
     Args:
       table: a data frame, a dataset of one dimension, or the path of a CSV file, with the columns
-        of `data/pushes.csv` (what was measured after a push is not needed); by default the
-        project's own pushes.
-      model: which model predicts.
+        of `data/pushes.csv` (measurements after a push are optional); by default the
+        pushes of this project.
+      model: name of the model.
       friction: between finger(s) and object [1], by `point` and `two-point`.
-      steps: of the way of the fingers, for all but MuJoCo.
+      steps: of the path of the fingers, except for MuJoCo.
 
     Returns:
       `post_x`, `post_y` [m] and `post_yaw` [rad] by `push`, with the coordinate `id`.
 
     Raises:
-      InputError: the table cannot be read, or lacks something, or the model is unknown.
+      InputError: the table cannot be read or is incomplete, or the model is unknown.
     """
     errors.check_name("model", model, get_args(Model))
     read = pushes.read(table)
@@ -126,17 +126,17 @@ def predict(
 
 def _predicted(
     table: pd.DataFrame, model: str, friction: Mapping[str, float], steps: int = STEPS
-) -> pushes.Found:
-    """Poses at the end and, of those that slide, mean forces."""
+) -> pushes.Motion:
+    """Return final poses and, for sliding models, mean forces."""
     mu = np.array([friction[name] for name in pushes.kind_of_finger(table)], float)
     if model in SLIDING:
         return pushes.slide(table, mu, on=SLIDING[model], steps=steps)
     nothing = np.full((len(table), 2), np.nan)
     if model == "no_motion":
-        return pushes.Found(pushes.no_motion(table), nothing)
+        return pushes.Motion(pushes.no_motion(table), nothing)
     if model == "with_pusher":
-        return pushes.Found(pushes.with_pusher(table, steps), nothing)
-    return pushes.Found(contact.push(table, mu, contact.KINDS[model]), nothing)
+        return pushes.Motion(pushes.with_pusher(table, steps), nothing)
+    return pushes.Motion(contact.push(table, mu, contact.KINDS[model]), nothing)
 
 
 def _ids(table: pd.DataFrame) -> np.ndarray:
@@ -144,25 +144,25 @@ def _ids(table: pd.DataFrame) -> np.ndarray:
 
 
 def groups_of(table: pd.DataFrame) -> np.ndarray:
-    """Which of `GROUPS` (n,) pushes are of."""
+    """Return the group of each push (n,)."""
     finger, flat = pushes.kind_of_finger(table), np.asarray(table.support == pushes.FLAT)
     early = np.asarray(table.paper_set == 0 if "paper_set" in table else np.zeros(len(table), bool))
-    found = np.where(
+    groups = np.where(
         finger == "point",
         np.where(flat, GROUPS[1], np.where(early, GROUPS[2], GROUPS[0])),
         np.where(pushes.doubted(table), GROUPS[5], np.where(flat, GROUPS[4], GROUPS[3])),
     )
-    return found.astype(str)
+    return groups.astype(str)
 
 
 def halves_of(ids: np.ndarray) -> np.ndarray:
-    """Whether each push (n,) is of the half that friction is fitted on, by its id alone."""
+    """Return whether each push (n,) is in the half for the fit of friction, by its id."""
     return np.array([np.random.default_rng((_SPLIT, int(i))).random() < 0.5 for i in ids])
 
 
 @dataclass(frozen=True)
 class RealPushes(Study[xr.Dataset]):
-    """Predict where real pushes end, with several models, and tell how far off that is.
+    """Predict the final poses of real pushes with several models, and compute their errors.
 
     The answer holds predicted poses `predicted` (model, push, pose) [m, m, rad], NaN where a model
     did not run, those `measured`, and the errors `place` [m], `turn` [rad] and `both` [m].
@@ -172,16 +172,15 @@ class RealPushes(Study[xr.Dataset]):
     QUICK: ClassVar[Mapping[str, Any]] = {"few": 60, "mujoco": 6}
 
     pushes: Path | None = None
-    """A CSV file of pushes to predict, in the columns of data/pushes.csv; by default the project's
-    own."""
+    """CSV file of pushes to predict, with the columns of data/pushes.csv; by default that file."""
     models: tuple[Model, ...] = get_args(Model)
-    """Which models predict; by default all."""
+    """Models to run; by default all."""
     mujoco: int = option(100, 0, 100_000)
     """Number of pushes on three feet that C MuJoCo predicts, with one finger and with two each."""
     few: int | None = option(None, 10, 100_000)
-    """Number of pushes, every so many of the table; by default all."""
+    """Number of pushes, evenly spaced in the table; by default all."""
     quick: bool = False
-    """Whether to try only a few pushes, in less than a minute."""
+    """Whether to run only a few pushes, in less than a minute."""
 
     def check(self) -> None:
         """Check the models and the table."""
@@ -198,20 +197,20 @@ class RealPushes(Study[xr.Dataset]):
         return whole.iloc[rows].reset_index(drop=True)
 
     def num_trials(self) -> int | None:
-        """How many predictions there are, but for those of the fit."""
+        """Return the number of predictions, without those of the fit."""
         return sum(int(self._rows(name).sum()) for name in self.models)
 
     @property
     def fits(self) -> np.ndarray:
-        """Whether friction is fitted on a push (n,)."""
-        own = self.pushes is None
-        return halves_of(_ids(self.table)) if own else np.zeros(len(self.table), bool)
+        """Whether a push (n,) is in the half for the fit of friction."""
+        is_default_table = self.pushes is None
+        return halves_of(_ids(self.table)) if is_default_table else np.zeros(len(self.table), bool)
 
     def _rows(self, model: str) -> np.ndarray:
-        """Whether a model predicts a push (n,)."""
-        every = np.ones(len(self.table), bool)
+        """Return whether a model predicts a push (n,)."""
+        all_rows = np.ones(len(self.table), bool)
         if model not in MUJOCOS:
-            return every
+            return all_rows
         chosen = np.zeros(len(self.table), bool)
         group = groups_of(self.table)
         for name in (GROUPS[0], GROUPS[3]):
@@ -221,22 +220,22 @@ class RealPushes(Study[xr.Dataset]):
         return chosen
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Fit friction, and predict."""
+        """Fit friction, and predict the poses."""
         table = self.table
         fit = self.fits.any() and set(self.models) & {*FITTED, *MUJOCOS}
         friction = self._fitted(run) if fit else None
-        done, found = 0, []
+        done, by_model = 0, []
         for model in self.models:
             parts = []
             for first in range(0, len(table), _TOGETHER):
                 rows = slice(first, first + _TOGETHER)
-                make = partial(self._one, model, friction, rows)
+                make = partial(self._predict_rows, model, friction, rows)
                 parts.append(run.checkpoint(f"{model}-{first}", make))
                 done += int(self._rows(model)[rows].sum())
                 run.callback(Progress(done, 0.0))
-            found.append(xr.concat(parts, "push"))
-        whole = xr.concat(found, "model", join="override", coords="minimal", compat="override")
-        whole = whole.assign_coords(
+            by_model.append(xr.concat(parts, "push"))
+        results = xr.concat(by_model, "model", join="override", coords="minimal", compat="override")
+        results = results.assign_coords(
             model=list(self.models),
             pose=list(pushes.POSE),
             id=("push", _ids(table)),
@@ -245,28 +244,30 @@ class RealPushes(Study[xr.Dataset]):
             fits=("push", self.fits),
         )
         actual = pushes.measured(table)
-        whole["measured"] = (("push", "pose"), actual)
+        results["measured"] = (("push", "pose"), actual)
         if {"force_wx", "force_wy", "surface"} <= set(table):
-            whole["surface"] = ("push", table.surface.fillna("").to_numpy(str))
-            whole["force_measured"] = (("push", "axis"), table[["force_wx", "force_wy"]].to_numpy())
-        off = pushes.errors_of(whole.predicted.values, actual)
-        whole.update({name: (("model", "push"), one) for name, one in off._asdict().items()})
+            results["surface"] = ("push", table.surface.fillna("").to_numpy(str))
+            results["force_measured"] = (
+                ("push", "axis"),
+                table[["force_wx", "force_wy"]].to_numpy(),
+            )
+        off = pushes.errors_of(results.predicted.values, actual)
+        results.update({name: (("model", "push"), one) for name, one in off._asdict().items()})
         if friction is not None:
-            whole = whole.merge(friction)
+            results = results.merge(friction)
         if run.folder is not None:
-            files.write_text(run.folder / "predictions.csv", _csv(whole))
-        return whole
+            files.write_text(run.folder / "predictions.csv", _csv(results))
+        return results
 
     def _fitted(self, run: Run) -> xr.Dataset:
         """Median error `fit_error` [m] (fitted, finger_kind, tried), and the best friction.
 
-        And errors (fitted, tried, few) of pushes with each friction, for `layout_rows`: of those
-        that it is fitted on, and of as many of each layout of feet.
+        And errors (fitted, tried, few) of pushes with each friction, for `layout_rows`.
         """
-        whole, every = self.table, np.arange(len(self.table))
+        whole, indices = self.table, np.arange(len(self.table))
         finger, clear = pushes.kind_of_finger(whole), ~pushes.doubted(whole)
         fitted_on, layouts = self.fits & clear, np.isin(groups_of(whole), (GROUPS[0], GROUPS[3]))
-        kinds = [[every[fitted_on][finger[fitted_on] == name]] for name in FINGERS]
+        kinds = [[indices[fitted_on][finger[fitted_on] == name]] for name in FINGERS]
         support = np.asarray(whole.support)
         kinds += [
             [np.flatnonzero(layouts & (finger == name) & (support == one))]
@@ -274,59 +275,59 @@ class RealPushes(Study[xr.Dataset]):
             for one in dict.fromkeys(support)
         ]
         few = [np.random.default_rng(_SPLIT).permutation(rows)[:_FIT] for (rows,) in kinds]
-        fits = np.isin(every, np.concatenate(few[: len(FINGERS)]))
-        laid = np.isin(every, np.concatenate(few[len(FINGERS) :]))
+        fits = np.isin(indices, np.concatenate(few[: len(FINGERS)]))
+        laid = np.isin(indices, np.concatenate(few[len(FINGERS) :]))
         table = pushes.chosen(whole, fits | laid)
         needed = {"rigid_feet", *self.models} if set(MUJOCOS) & set(self.models) else self.models
         fitted = [name for name in FITTED if name in needed]
-        found = [
+        by_model = [
             xr.concat(
                 [run.checkpoint(f"fit-{model}-{mu[0]:g}", partial(self._tried, table, model, mu))
-                 for mu in (_TRIED[i : i + 4] for i in range(0, len(_TRIED), 4))],
+                 for mu in (_FRICTIONS[i : i + 4] for i in range(0, len(_FRICTIONS), 4))],
                 "tried",
             )
             for model in fitted
         ]  # fmt: skip
-        off = xr.concat(found, "fitted").assign_coords(
+        off = xr.concat(by_model, "fitted").assign_coords(
             fitted=fitted,
             few_finger=("few", pushes.kind_of_finger(table).astype(str)),
             few_support=("few", np.where(laid, support, "")[fits | laid].astype(str)),
         )
         rows = xr.DataArray(fits[fits | laid], dims="few")
-        each = [off.few_both.where(rows & (off.few_finger == name)) for name in FINGERS]
-        median = xr.concat([one.median("few") for one in each], "finger_kind")
+        by_finger = [off.few_both.where(rows & (off.few_finger == name)) for name in FINGERS]
+        median = xr.concat([one.median("few") for one in by_finger], "finger_kind")
         off["fit_error"] = median.assign_coords(finger_kind=list(FINGERS))
         return off.assign(friction=off.fit_error.fillna(9.0).idxmin("tried"))
 
     def _tried(self, table: pd.DataFrame, model: str, tried: Sequence[float]) -> xr.Dataset:
-        """Errors (tried, few) of one model with some frictions."""
-        many = pd.concat([table] * len(tried), ignore_index=True)
+        """Return errors (tried, few) of one model with some frictions."""
+        repeated = pd.concat([table] * len(tried), ignore_index=True)
         mu = np.repeat(tried, len(table))
-        pose = pushes.slide(many, mu, on=SLIDING[model], steps=STEPS // 2).pose
+        pose = pushes.slide(repeated, mu, on=SLIDING[model], steps=STEPS // 2).pose
         pose = pose.reshape(len(tried), len(table), 3)
         off = pushes.errors_of(pose, pushes.measured(table))._asdict()
         errors_ = {f"few_{name}": (("tried", "few"), one) for name, one in off.items()}
         return xr.Dataset(errors_, {"tried": list(tried)})
 
-    def _one(self, model: str, friction: xr.Dataset | None, some: slice) -> xr.Dataset:
-        """What one model predicts of its pushes among some."""
+    def _predict_rows(self, model: str, friction: xr.Dataset | None, chunk: slice) -> xr.Dataset:
+        """Return the predictions of one model for its pushes in a chunk."""
         chosen: Mapping[str, float] = FRICTION
         if friction is not None:
             fitted = model if model in FITTED else "rigid_feet"
-            own = friction.friction.sel(fitted=fitted) if fitted in friction.fitted else None
-            if own is not None:
-                chosen = {name: float(own.sel(finger_kind=name)) for name in FINGERS}
-        rows = self._rows(model)[some]
+            of_model = friction.friction.sel(fitted=fitted) if fitted in friction.fitted else None
+            if of_model is not None:
+                chosen = {name: float(of_model.sel(finger_kind=name)) for name in FINGERS}
+        rows = self._rows(model)[chunk]
         pose, force = np.full((len(rows), 3), np.nan), np.full((len(rows), 2), np.nan)
         if rows.any():
-            part = pushes.chosen(self.table.iloc[some], rows)
+            part = pushes.chosen(self.table.iloc[chunk], rows)
             pose[rows], force[rows] = _predicted(part, model, chosen)
         return xr.Dataset(
             {"predicted": (("push", "pose"), pose), "force": (("push", "axis"), force)}
         )
 
     def intro(self, results: xr.Dataset) -> str:
-        """What was asked."""
+        """Return a description of the data and the errors."""
         return (
             f"{results.sizes['push']} pushes of a real robot (an aluminium triangle of 150 mm on "
             "three feet or flat), predicted. Errors are medians, with the 95 % interval of a "
@@ -334,10 +335,10 @@ class RealPushes(Study[xr.Dataset]):
         )
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Errors by model, and the friction that was fitted."""
+        """Return sections with errors by model and the fitted friction."""
         sections = [
-            Section(name.replace("_", " ").capitalize(), "", _texts(*made))
-            for name, made in tables(results).items()
+            Section(name.replace("_", " ").capitalize(), "", _texts(*columns_and_rows))
+            for name, columns_and_rows in tables(results).items()
         ]
         if sections and np.isfinite(results.both).any() and "rigid_feet" in self.models:
             draw = partial(figure, results, self.table, WORDS)
@@ -360,19 +361,21 @@ class RealPushes(Study[xr.Dataset]):
 real_pushes = call_of(RealPushes)
 
 
-# --- how it is told ---
+# --- the tables ---
 
 
-def _csv(found: xr.Dataset) -> str:
-    """One row for each push and model: the pose predicted."""
-    rows = found.predicted.to_dataset("pose").rename({name: f"post_{name}" for name in pushes.POSE})
+def _csv(results: xr.Dataset) -> str:
+    """Return one row per push and model with the predicted pose."""
+    rows = results.predicted.to_dataset("pose").rename(
+        {name: f"post_{name}" for name in pushes.POSE}
+    )
     frame = rows[[f"post_{name}" for name in pushes.POSE]].to_dataframe().reset_index()
     names = ["id", "model", *(f"post_{name}" for name in pushes.POSE)]
     return frame[names].dropna().to_csv(index=False, lineterminator="\n")
 
 
 def median_interval(values: np.ndarray) -> tuple[float, float, float]:
-    """Median of values (n,), and the ends of its 95 % interval by a bootstrap."""
+    """Return the median of values (n,) and its 95 % interval by a bootstrap."""
     drawn = np.random.default_rng(0).choice(values, (_DRAWS, values.size))
     low, high = np.quantile(np.median(drawn, axis=1), [0.025, 0.975])
     return float(np.median(values)), float(low), float(high)
@@ -397,7 +400,7 @@ _UNITS = (1e3, 180 / np.pi, 1e3)  # of errors in tables: mm, degrees, mm
 def _row(label: str, model: str, off: Errors) -> list[Any]:
     cells: list[Any] = []
     for values, unit in zip(off, _UNITS, strict=True):
-        cells += [[unit * one for one in median_interval(values)], unit * np.quantile(values, 0.9)]
+        cells += [[unit * x for x in median_interval(values)], unit * np.quantile(values, 0.9)]
     return [label, WORDS[model], off.both.size, *_rounded(cells)]
 
 
@@ -405,41 +408,41 @@ def _rounded(cells: list[Any]) -> list[Any]:
     return [[round(x, 3) for x in c] if isinstance(c, list) else round(float(c), 3) for c in cells]
 
 
-def _off(found: xr.Dataset, model: str, rows: np.ndarray) -> Errors:
-    """Errors of a model on pushes that were measured."""
-    one = found.sel(model=model)
-    values = [one[name].values[rows] for name in Errors._fields]
-    told = np.isfinite(values[2])
-    return Errors(*(value[told] for value in values))
+def _errors(results: xr.Dataset, model: str, rows: np.ndarray) -> Errors:
+    """Return the errors of a model for measured pushes."""
+    predictions = results.sel(model=model)
+    values = [predictions[name].values[rows] for name in Errors._fields]
+    is_measured = np.isfinite(values[2])
+    return Errors(*(value[is_measured] for value in values))
 
 
-def tables(found: xr.Dataset) -> dict[str, tuple[list[dict[str, Any]], list[list[Any]]]]:
-    """Columns and rows of each table of the page: of the pushes that nothing was fitted on."""
-    group, test = found.group.values, ~found.fits.values
-    models = list(map(str, found.model.values))
+def tables(results: xr.Dataset) -> dict[str, tuple[list[dict[str, Any]], list[list[Any]]]]:
+    """Return columns and rows of each table of the page, for pushes outside the fit."""
+    group, test = results.group.values, ~results.fits.values
+    models = list(map(str, results.model.values))
     slow = [name for name in models if name in MUJOCOS]
     quick = [name for name in models if name not in MUJOCOS]
     rows = []
     for name in GROUPS:
         for model in quick:
             if model in _SHOWN.get(name, quick):
-                off = _off(found, model, test & (group == name))
+                off = _errors(results, model, test & (group == name))
                 rows += [_row(name, model, off)] if off.both.size else []
-    made = {"models": (_COLUMNS, rows)}
+    published = {"models": (_COLUMNS, rows)}
     if slow:
-        ran = np.isfinite(found.predicted.sel(model=slow[0]).values).all(axis=1)
+        ran = np.isfinite(results.predicted.sel(model=slow[0]).values).all(axis=1)
         rows = []
         for name in (GROUPS[0], GROUPS[3]):
             for model in [one for one in quick if one == "rigid_feet"] + slow:
-                off = _off(found, model, ran & (group == name))
+                off = _errors(results, model, ran & (group == name))
                 rows += [_row(name, model, off)] if off.both.size else []
-        made["mujoco"] = (_COLUMNS, rows)
-    if "friction" in found:
-        made["friction"] = _FRICTION_COLUMNS, list(_friction_rows(found))
-        made["layouts"] = _LAYOUT_COLUMNS, list(_layout_rows(found))
-    if "force_measured" in found and "rigid_feet" in models:
-        made["forces"] = _FORCE_COLUMNS, list(_force_rows(found))
-    return {name: (columns, rows) for name, (columns, rows) in made.items() if rows}
+        published["mujoco"] = (_COLUMNS, rows)
+    if "friction" in results:
+        published["friction"] = _FRICTION_COLUMNS, list(_friction_rows(results))
+        published["layouts"] = _LAYOUT_COLUMNS, list(_layout_rows(results))
+    if "force_measured" in results and "rigid_feet" in models:
+        published["forces"] = _FORCE_COLUMNS, list(_force_rows(results))
+    return {name: (columns, rows) for name, (columns, rows) in published.items() if rows}
 
 
 _FRICTION_COLUMNS = [
@@ -452,18 +455,18 @@ _FRICTION_COLUMNS = [
 ]
 
 
-def _friction_rows(found: xr.Dataset) -> Iterator[list[Any]]:
-    finger, test = found.finger.values, ~found.fits.values
-    clear = test & (found.group.values != GROUPS[5])
-    tried = found.tried.values
+def _friction_rows(results: xr.Dataset) -> Iterator[list[Any]]:
+    finger, test = results.finger.values, ~results.fits.values
+    clear = test & (results.group.values != GROUPS[5])
+    tried = results.tried.values
     for name in FINGERS:
         for model in FITTED:
-            if model not in found.model or not (finger == name).any():
+            if model not in results.model or not (finger == name).any():
                 continue
-            off = 1e3 * found.fit_error.sel(fitted=model, finger_kind=name).values
+            off = 1e3 * results.fit_error.sel(fitted=model, finger_kind=name).values
             near = tried[off <= np.nanmin(off) + 0.1]
-            mu = float(found.friction.sel(fitted=model, finger_kind=name))
-            told = _off(found, model, clear & (finger == name)).both
+            mu = float(results.friction.sel(fitted=model, finger_kind=name))
+            told = _errors(results, model, clear & (finger == name)).both
             cells = [mu, float(np.nanmin(off)), [float(near.min()), float(near.max())],
                      [1e3 * one for one in median_interval(told)]]  # fmt: skip
             yield [name, WORDS[model], *_rounded(cells)]
@@ -479,23 +482,29 @@ _LAYOUT_COLUMNS = [
 ]
 
 
-def _layout_rows(found: xr.Dataset) -> Iterator[list[Any]]:
-    """Errors on each layout of feet, with the friction that suits the other layouts best."""
-    support, finger = found.few_support.values, found.few_finger.values
+def _layout_rows(results: xr.Dataset) -> Iterator[list[Any]]:
+    """Yield errors on each layout of feet, with the best friction for the other layouts."""
+    support, finger = results.few_support.values, results.few_finger.values
     for name in FINGERS:
-        own = (finger == name) & (support != "")
-        for layout in dict.fromkeys(support[own]):
-            held, rest = own & (support == layout), own & (support != layout)
+        has_layout = (finger == name) & (support != "")
+        for layout in dict.fromkeys(support[has_layout]):
+            held_out, rest = has_layout & (support == layout), has_layout & (support != layout)
             if not rest.any():
                 continue
-            for model in map(str, found.fitted.values):
-                off = [found[f"few_{one}"].sel(fitted=model).values for one in Errors._fields]
-                best, usual = (int(np.median(off[2][:, rows], axis=1).argmin())
-                               for rows in (rest, held))  # fmt: skip
-                cells = [[unit * one for one in median_interval(values[best, held])]
+            for model in map(str, results.fitted.values):
+                off = [results[f"few_{one}"].sel(fitted=model).values for one in Errors._fields]
+                best, own_best = (int(np.median(off[2][:, rows], axis=1).argmin())
+                               for rows in (rest, held_out))  # fmt: skip
+                cells = [[unit * one for one in median_interval(values[best, held_out])]
                          for unit, values in zip(_UNITS, off, strict=True)]  # fmt: skip
-                mu, alone = float(found.tried[best]), 1e3 * np.median(off[2][usual, held])
-                yield [name, layout, WORDS[model], int(held.sum()), *_rounded([mu, *cells, alone])]
+                mu, alone = float(results.tried[best]), 1e3 * np.median(off[2][own_best, held_out])
+                yield [
+                    name,
+                    layout,
+                    WORDS[model],
+                    int(held_out.sum()),
+                    *_rounded([mu, *cells, alone]),
+                ]
 
 
 _FORCE_COLUMNS = [
@@ -508,26 +517,30 @@ _FORCE_COLUMNS = [
 ]  # fmt: skip
 
 
-def _force_rows(found: xr.Dataset) -> Iterator[list[Any]]:
-    said = found.force.sel(model="rigid_feet").values
-    real = found.force_measured.values
-    size = np.linalg.norm(said, axis=1)
-    off = np.arctan2(real[:, 1], real[:, 0]) - np.arctan2(said[:, 1], said[:, 0])
+def _force_rows(results: xr.Dataset) -> Iterator[list[Any]]:
+    predicted = results.force.sel(model="rigid_feet").values
+    real = results.force_measured.values
+    size = np.linalg.norm(predicted, axis=1)
+    off = np.arctan2(real[:, 1], real[:, 0]) - np.arctan2(predicted[:, 1], predicted[:, 0])
     ratio = np.linalg.norm(real, axis=1) / (np.maximum(size, 1e-9) * pushes.MASS * 9.81)
-    told = np.isfinite(real).all(axis=1) & np.isfinite(said).all(axis=1) & (size > 0.05)
-    told &= ~found.fits.values
+    is_valid = np.isfinite(real).all(axis=1) & np.isfinite(predicted).all(axis=1) & (size > 0.05)
+    is_valid &= ~results.fits.values
     kinds = [(one, on) for one in GROUPS[:2] for on in pushes.GROUND]
     for group, surface in kinds:
-        rows = told & (found.group.values == group) & (found.surface.values == surface)
+        rows = is_valid & (results.group.values == group) & (results.surface.values == surface)
         name = f"{group}, {surface}"
         if rows.any():
-            wrong = np.degrees(np.abs(pushes.angle(off[rows])))
-            cells = [np.median(wrong), np.quantile(wrong, 0.9), list(median_interval(ratio[rows]))]
+            degrees = np.degrees(np.abs(pushes.angle(off[rows])))
+            cells = [
+                np.median(degrees),
+                np.quantile(degrees, 0.9),
+                list(median_interval(ratio[rows])),
+            ]
             yield [name, int(rows.sum()), *_rounded(cells)]
 
 
 def _texts(columns: list[dict[str, Any]], rows: list[list[Any]]) -> list[list[str]]:
-    """A table as texts, as the pages have it."""
+    """Return a table as texts, like on the pages."""
 
     def text(cell: Any, column: dict[str, Any]) -> str:
         if isinstance(cell, str):
