@@ -160,7 +160,7 @@ def _load(parts: Checkpoints, name: str, condition: Condition, grid: Grid) -> xr
     """Return the results of a condition if it is finished."""
     if (content := parts.get(name)) is None:
         return None
-    results = files.decode_results(content, parts.folder / name, own=True)
+    results = files.decode_results(content, parts.folder / name, signed=True)
     if results.attrs.get("run_as") != _fingerprint(condition, grid):
         raise InputError(
             f"{parts.folder / name}-*.nc was run with other options: choose another folder, or "

@@ -1,1 +1,1 @@
-"""What runs leave behind: files written whole or not at all, and who made them."""
+"""Files of runs: atomic writing, checksums, run folders, checkpoints, provenance and options."""

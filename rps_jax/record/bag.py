@@ -1,19 +1,18 @@
-"""Bags of ROS 2 (MCAP): what a law observed and what was commanded, in standard messages.
+"""Bags of ROS 2 (MCAP): observations and commands of a law, in standard messages.
 
-Topics, each with one message a control step but `/tf` and the marker, which are for looking:
+Each topic has one message per control step, except `/tf` and the markers, which are for viewers:
 
     /odom           nav_msgs/Odometry              pose of the base and its velocity in its frame
     /target         geometry_msgs/PointStamped     the target, in the frame odom
-    /contact        geometry_msgs/PolygonStamped   in base_link: no point without contact, one for
-                                                   a contact that is a point, twice the same for a
-                                                   line
+    /contact        geometry_msgs/PolygonStamped   in base_link: no point without contact, one for a
+                                                   point contact, twice the same for a line contact
     /taxels         std_msgs/Float32MultiArray     relative change of capacitance of each taxel,
                                                    along the strip; filtered if there are contacts,
-                                                   and else as the skin answered
-    /force          geometry_msgs/WrenchStamped    of the object on the base, where a law senses it
-    /object         visualization_msgs/Marker      a cylinder as wide as the object, where a law
-                                                   senses its pose
-    /cmd_vel        geometry_msgs/TwistStamped     what was commanded then, last of its step
+                                                   else the raw signal
+    /force          geometry_msgs/WrenchStamped    of the object on the base, if a law senses it
+    /object         visualization_msgs/Marker      a cylinder as wide as the object, if a law senses
+                                                   its pose
+    /cmd_vel        geometry_msgs/TwistStamped     the command, last of its step
     /target_marker  visualization_msgs/Marker      the target, once a second
     /tf             tf2_msgs/TFMessage             odom to base_link and to object
 """
@@ -23,7 +22,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,9 +33,11 @@ from rps_jax import errors
 from rps_jax.errors import InputError
 from rps_jax.record import files
 
-_MOST = 64 * 2**20  # bytes of a record, and of a chunk when it is unpacked
-_MOST_NUMBERS = 2**28  # of all steps, where a field counts 8 more, which Python adds to it
-_SHOWN = 1.0  # [s] between two markers
+Message = dict[str, Any]  # fields of any type
+Floats = Sequence[float] | np.ndarray
+_MAX_BYTES = 64 * 2**20  # of a record, and of an unpacked chunk
+_MAX_NUMBERS = 2**28  # of all steps; each field counts 8 more for its Python object
+_MARKER_PERIOD = 1.0  # [s] between two target markers
 _FIELDS = {
     "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
     "std_msgs/ColorRGBA": "float32 r\nfloat32 g\nfloat32 b\nfloat32 a",
@@ -87,137 +88,136 @@ TOPICS = {
     "/target_marker": "visualization_msgs/Marker",
     "/tf": "tf2_msgs/TFMessage",
 }
-_NEEDED = ("/odom", "/target", "/cmd_vel")
-_TOUCH = ("/contact", "/taxels")  # of which one is needed, too
+_REQUIRED = ("/odom", "/target", "/cmd_vel")
+_TOUCH_TOPICS = ("/contact", "/taxels")  # of which one is required, too
 
 
 class Step(NamedTuple):
-    """One control step of a bag."""
+    """Observation and command of a control step."""
 
     time: float  # [s]
-    pose: Any  # (3,) [m, m, rad] of the base in the world, as odometry has it
-    target: Any  # (2,) [m] in the world
+    pose: Floats  # (3,) [m, m, rad] of the base in the world, by odometry
+    target: Floats  # (2,) [m] in the world
     contact_type: int  # 0 none, 1 a point, 2 a line
-    p_robot_contact: Any  # (2,) [m] in the robot frame
-    twist: Any  # (3,) [m/s, m/s, rad/s] commanded, in the robot frame
-    signal: Any = None  # (T,) [1] of the taxels
-    f_robot: Any = None  # (2,) [N] of the object on the base
-    p_world_object: Any = None  # (2,) [m]
-    r_object: Any = None  # () [m]
-    object_pose: Any = None  # (3,) [m, m, rad] for looking alone
+    p_robot_contact: Floats  # (2,) [m] in the robot frame
+    twist: Floats  # (3,) [m/s, m/s, rad/s] commanded, in the robot frame
+    signal: Floats | None = None  # (T,) [1] of the taxels
+    f_robot: Floats | None = None  # (2,) [N] of the object on the base
+    p_world_object: Floats | None = None  # (2,) [m]
+    r_object: float = 0.0  # [m]
+    object_pose: Floats | None = None  # (3,) [m, m, rad] for viewers alone
 
 
 _require = partial(errors.require, extra="bags")
 
 
 def check() -> None:
-    """Raises InputError unless what bags need is installed."""
+    """Raise InputError unless the packages of the extra `bags` are installed."""
     _require("mcap_ros2.writer")
 
 
 def _definition(kind: str) -> str:
-    """A message definition with those of its parts, as bags have them."""
-    parts, waiting = [], [kind]
-    for one in waiting:
-        for line in _FIELDS[one].splitlines():
+    """Return a message definition with those of its parts, in the format of bags."""
+    definitions, kinds = [], [kind]
+    for name in kinds:
+        for line in _FIELDS[name].splitlines():
             inner = line.split()[0].split("[")[0]
-            if inner in _FIELDS and inner not in waiting:
-                waiting.append(inner)
-        parts.append((f"MSG: {one}\n" if one != kind else "") + _FIELDS[one] + "\n")
-    return ("=" * 80 + "\n").join(parts)
+            if inner in _FIELDS and inner not in kinds:
+                kinds.append(inner)
+        definitions.append((f"MSG: {name}\n" if name != kind else "") + _FIELDS[name] + "\n")
+    return ("=" * 80 + "\n").join(definitions)
 
 
 # --- writing -------------------------------------------------------------------------------
 
 
-def write(path: Path, steps: Iterable[Step], about: Mapping[str, str]) -> Path:
-    """Write a bag, whole or not at all; `about` is kept as its metadata."""
+def write(path: Path, steps: Iterable[Step], metadata: Mapping[str, str]) -> Path:
+    """Write a bag atomically."""
     module = _require("mcap_ros2.writer")
 
     def fill(partial: Path) -> None:
         with open(partial, "wb") as file, module.Writer(file) as writer:
             names = {kind: kind.replace("/", "/msg/") for kind in TOPICS.values()}
             kinds = {k: writer.register_msgdef(names[k], _definition(k)) for k in names}
-            writer.add_metadata("rps_jax", dict(about))
+            writer.add_metadata("rps_jax", dict(metadata))
             for topic, time, message in _messages(steps):
                 writer.write_message(topic, kinds[TOPICS[topic]], message, time, time)
 
     return files.write_atomically(path, fill)
 
 
-def _messages(steps: Iterable[Step]) -> Iterator[tuple[str, int, dict[str, Any]]]:
-    """Topics, times [ns] and messages of steps, in their order; what a message lacks is zero."""
-    before, shown = None, -math.inf
+def _messages(steps: Iterable[Step]) -> Iterator[tuple[str, int, Message]]:
+    """Yield topics, times [ns] and messages of steps in order; absent fields are zero."""
+    previous, marker_time = None, -math.inf
     for step in steps:
-        now = round(1e9 * step.time)
-        odom, base = _header(now, "odom"), _header(now, "base_link")
+        stamp = round(1e9 * step.time)
+        odom, base = _header(stamp, "odom"), _header(stamp, "base_link")
         x, y, yaw = map(float, step.pose)
-        placed = {"position": _xyz(x, y), "orientation": _turned(yaw)}
-        yield "/odom", now, {
+        pose = {"position": _xyz(x, y), "orientation": _yaw(yaw)}
+        yield "/odom", stamp, {
             "header": odom,
             "child_frame_id": "base_link",
-            "pose": {"pose": placed},
-            "twist": {"twist": _velocity(before, step)},
+            "pose": {"pose": pose},
+            "twist": {"twist": _velocity(previous, step)},
         }  # fmt: skip
-        yield "/target", now, {"header": odom, "point": _xyz(*step.target)}
-        touched = [_xyz(*step.p_robot_contact)] * int(step.contact_type)
-        yield "/contact", now, {"header": base, "polygon": {"points": touched}}
+        yield "/target", stamp, {"header": odom, "point": _xyz(*step.target)}
+        points = [_xyz(*step.p_robot_contact)] * int(step.contact_type)
+        yield "/contact", stamp, {"header": base, "polygon": {"points": points}}
         if step.signal is not None:
             count = len(step.signal)
             dim = [{"label": "taxels", "size": count, "stride": count}]
-            yield "/taxels", now, {"layout": {"dim": dim}, "data": list(step.signal)}
+            yield "/taxels", stamp, {"layout": {"dim": dim}, "data": list(step.signal)}
         if step.f_robot is not None:
-            yield "/force", now, {"header": base, "wrench": {"force": _xyz(*step.f_robot)}}
+            yield "/force", stamp, {"header": base, "wrench": {"force": _xyz(*step.f_robot)}}
         if step.p_world_object is not None:
             width = 2 * float(step.r_object)
-            yield "/object", now, _cylinder(odom, "object", step.p_world_object, width)
-        moved = [_frame(odom, "base_link", x, y, yaw)]
+            yield "/object", stamp, _cylinder(odom, "object", step.p_world_object, width)
+        frames = [_frame(odom, "base_link", x, y, yaw)]
         if step.object_pose is not None:
-            moved.append(_frame(odom, "object", *map(float, step.object_pose)))
-        yield "/tf", now, {"transforms": moved}
-        if step.time >= shown + _SHOWN:
-            shown = step.time
-            yield "/target_marker", now, _cylinder(odom, "target", step.target, 0.1)
-        yield "/cmd_vel", now, {"header": base, "twist": _twist(*step.twist)}
-        before = step
+            frames.append(_frame(odom, "object", *map(float, step.object_pose)))
+        yield "/tf", stamp, {"transforms": frames}
+        if step.time >= marker_time + _MARKER_PERIOD:
+            marker_time = step.time
+            yield "/target_marker", stamp, _cylinder(odom, "target", step.target, 0.1)
+        yield "/cmd_vel", stamp, {"header": base, "twist": _twist(*step.twist)}
+        previous = step
 
 
-def _header(now: int, frame: str) -> dict[str, Any]:
-    return {"stamp": {"sec": now // 10**9, "nanosec": now % 10**9}, "frame_id": frame}
+def _header(stamp: int, frame: str) -> Message:
+    return {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": frame}
 
 
-def _xyz(x: Any, y: Any) -> dict[str, float]:
+def _xyz(x: float, y: float) -> dict[str, float]:
     return {"x": float(x), "y": float(y)}
 
 
-def _turned(yaw: float) -> dict[str, float]:
+def _yaw(yaw: float) -> dict[str, float]:
     return {"z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
 
 
-def _twist(v_x: Any, v_y: Any, omega: Any) -> dict[str, Any]:
+def _twist(v_x: float, v_y: float, omega: float) -> Message:
     return {"linear": _xyz(v_x, v_y), "angular": {"z": float(omega)}}
 
 
-def _velocity(before: Step | None, step: Step) -> dict[str, Any]:
-    """The velocity of the base since the step before, in its own frame."""
-    if before is None or step.time <= before.time:
+def _velocity(previous: Step | None, step: Step) -> Message:
+    """Return the velocity of the base since the previous step, in its own frame."""
+    if previous is None or step.time <= previous.time:
         return _twist(0, 0, 0)
-    way = (np.asarray(step.pose, float) - np.asarray(before.pose, float)) / (
-        step.time - before.time
-    )
-    c, s = math.cos(step.pose[2]), math.sin(step.pose[2])
-    return _twist(c * way[0] + s * way[1], c * way[1] - s * way[0], way[2])
+    pose = np.asarray(step.pose, float)
+    v_x, v_y, omega = (pose - np.asarray(previous.pose, float)) / (step.time - previous.time)
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return _twist(c * v_x + s * v_y, c * v_y - s * v_x, omega)
 
 
-def _frame(header: Any, child: str, x: float, y: float, yaw: float) -> dict[str, Any]:
-    transform = {"translation": _xyz(x, y), "rotation": _turned(yaw)}
+def _frame(header: Message, child: str, x: float, y: float, yaw: float) -> Message:
+    transform = {"translation": _xyz(x, y), "rotation": _yaw(yaw)}
     return {"header": header, "child_frame_id": child, "transform": transform}
 
 
-def _cylinder(header: Any, name: str, place: Any, width: float) -> dict[str, Any]:
-    """A marker of type 3."""
+def _cylinder(header: Message, name: str, center: Floats, width: float) -> Message:
+    """Return a marker of type 3."""
     return {
-        **{"header": header, "ns": name, "type": 3, "pose": {"position": _xyz(*place)}},
+        **{"header": header, "ns": name, "type": 3, "pose": {"position": _xyz(*center)}},
         "scale": {"x": width, "y": width, "z": 0.01},
         "color": {"r": 0.1, "g": 0.6, "b": 0.2, "a": 0.8},
     }
@@ -227,38 +227,39 @@ def _cylinder(header: Any, name: str, place: Any, width: float) -> dict[str, Any
 
 
 def read(path: Path) -> dict[str, np.ndarray]:
-    """The steps of a bag, as arrays by the fields of `Step`; those that it lacks are missing.
+    """Return the steps of a bag as arrays, by the fields of `Step` that it has, and `period`.
 
-    A step is a command, with what was heard last before it. The period of each is beside. A bag
-    with `/taxels` alone, as a robot's is, has no `contact_type` and no `p_robot_contact`.
+    A step is a command with the latest messages before it. A bag with `/taxels` alone, as of a
+    robot, has no `contact_type` and no `p_robot_contact`.
 
     Raises:
       InputError: the file is no bag, is damaged or too large, or lacks a topic.
     """
     columns: dict[str, list[Any]] = {}
     latest: dict[str, Any] = {}
-    held = 0
+    size = 0
     try:
         with open(path, "rb") as file:
             for topic, time, message in _decoded(file):
                 if topic == "/contact" and topic not in latest:
-                    columns.clear()  # what came before has none
+                    columns.clear()  # earlier steps have none
                 latest[topic] = message
                 if topic == "/cmd_vel" and not _missing(latest):
                     for name, value in _observed(1e-9 * time, latest).items():
                         columns.setdefault(name, []).append(value)
-                        held += 8 + np.size(value)
-                    if held > _MOST_NUMBERS:
-                        raise ValueError(f"it has more than {_MOST_NUMBERS} numbers")
+                        size += 8 + np.size(value)
+                    if size > _MAX_NUMBERS:
+                        raise ValueError(f"it has more than {_MAX_NUMBERS} numbers")
         if missing := _missing(latest):
             raise ValueError(f"it has no messages on {', '.join(missing)}")
         if not columns:
             raise ValueError("it has no command after its observations")
         count = len(columns["time"])
-        found = {k: np.array(v) for k, v in columns.items() if len(v) == count}
-        if odd := [name for name, values in found.items() if not np.isfinite(values).all()]:
-            raise ValueError(f"its {odd[0]} is not finite")
-        periods = np.diff(found["time"])
+        steps = {k: np.array(v) for k, v in columns.items() if len(v) == count}
+        for name, values in steps.items():
+            if not np.isfinite(values).all():
+                raise ValueError(f"its {name} is not finite")
+        periods = np.diff(steps["time"])
         if count < 2 or (periods <= 0).any():
             raise ValueError("its commands are not at least two, one after the other")
     except InputError:
@@ -266,30 +267,31 @@ def read(path: Path) -> dict[str, np.ndarray]:
     except (OSError, MemoryError, RecursionError) as error:
         reason = getattr(error, "strerror", None) or type(error).__name__
         raise InputError(f"bag = {path} cannot be read ({reason}): give an MCAP file.") from error
-    except Exception as error:  # whatever the readers of a damaged file raise
-        said = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
+    except Exception as error:  # of any kind, by the readers of a damaged file
+        reason = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
         raise InputError(
-            f"bag = {path} is not allowed ({said}): give an MCAP file with the topics "
-            f"{', '.join(_NEEDED)}, and {' or '.join(_TOUCH)}."
+            f"bag = {path} is not allowed ({reason}): give an MCAP file with the topics "
+            f"{', '.join(_REQUIRED)}, and {' or '.join(_TOUCH_TOPICS)}."
         ) from error
-    found["pose"][:, 2] = np.unwrap(found["pose"][:, 2])
-    found["period"] = np.concatenate([[np.median(periods)], periods])
-    return found
+    steps["pose"][:, 2] = np.unwrap(steps["pose"][:, 2])
+    steps["period"] = np.concatenate([[np.median(periods)], periods])
+    return steps
 
 
 def _missing(latest: Mapping[str, Any]) -> list[str]:
-    """Topics that a bag must have, and has not."""
-    touch = [] if any(one in latest for one in _TOUCH) else [" or ".join(_TOUCH)]
-    return [one for one in _NEEDED if one not in latest] + touch
+    """Return the required topics that a bag lacks."""
+    has_touch = any(topic in latest for topic in _TOUCH_TOPICS)
+    touch = [] if has_touch else [" or ".join(_TOUCH_TOPICS)]
+    return [topic for topic in _REQUIRED if topic not in latest] + touch
 
 
 def _decoded(file: Any) -> Iterator[tuple[str, int, Any]]:
-    """Topics, times [ns] and messages of a file, chunk by chunk."""
+    """Yield topics, times [ns] and messages of a file, chunk by chunk."""
     stream, records = _require("mcap.stream_reader"), _require("mcap.records")
     decoders = _require("mcap_ros2.decoder").DecoderFactory()
     schemas: dict[int, Any] = {}
     channels: dict[int, Any] = {}
-    reader = stream.StreamReader(file, emit_chunks=True, record_size_limit=_MOST)
+    reader = stream.StreamReader(file, emit_chunks=True, record_size_limit=_MAX_BYTES)
     for outer in reader.records:
         inside = isinstance(outer, records.Chunk)
         for record in stream.breakup_chunk(_unpacked(outer)) if inside else [outer]:
@@ -299,12 +301,12 @@ def _decoded(file: Any) -> Iterator[tuple[str, int, Any]]:
                 channels[record.id] = record
             elif isinstance(record, records.Message):
                 channel = channels[record.channel_id]
-                wanted, schema = TOPICS.get(channel.topic), schemas.get(channel.schema_id)
+                expected, schema = TOPICS.get(channel.topic), schemas.get(channel.schema_id)
                 kind = schema.name if schema else "no type"
-                if wanted is None:
+                if expected is None:
                     continue
-                if kind.replace("/msg/", "/") != wanted:
-                    raise ValueError(f"{channel.topic} has {kind[:60]} for {wanted}")
+                if kind.replace("/msg/", "/") != expected:
+                    raise ValueError(f"{channel.topic} has {kind[:60]} for {expected}")
                 decode = decoders.decoder_for(channel.message_encoding, schema)
                 if decode is None:
                     raise ValueError(f"{channel.topic} is not encoded as ROS 2 does")
@@ -312,41 +314,41 @@ def _decoded(file: Any) -> Iterator[tuple[str, int, Any]]:
 
 
 def _unpacked(chunk: Any) -> Any:
-    """A chunk without compression, of a bounded size whatever it says."""
+    """Return a chunk without compression, of bounded size."""
     if chunk.compression == "zstd":
         reader = _require("zstandard").ZstdDecompressor().stream_reader(io.BytesIO(chunk.data))
-        data = reader.read(_MOST + 1)
+        data = reader.read(_MAX_BYTES + 1)
     elif chunk.compression == "lz4":
-        data = _require("lz4.frame").LZ4FrameDecompressor().decompress(chunk.data, _MOST + 1)
+        data = _require("lz4.frame").LZ4FrameDecompressor().decompress(chunk.data, _MAX_BYTES + 1)
     else:
         return chunk
-    if len(data) > _MOST or len(data) != chunk.uncompressed_size:
-        raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes is not what it says")
+    if len(data) > _MAX_BYTES or len(data) != chunk.uncompressed_size:
+        raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes has another size")
     return dataclasses.replace(chunk, data=data, compression="")
 
 
 def _observed(time: float, latest: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of `Step` in the latest messages."""
-    pose = latest["/odom"].pose.pose
-    turn, place, target = pose.orientation, pose.position, latest["/target"].point
-    sent = latest["/cmd_vel"].twist
-    found: dict[str, Any] = {
+    """Return the fields of `Step` in the latest messages."""
+    pose, target = latest["/odom"].pose.pose, latest["/target"].point
+    position, rotation = pose.position, pose.orientation
+    twist = latest["/cmd_vel"].twist
+    fields: dict[str, Any] = {
         "time": time,
-        "pose": (place.x, place.y, 2 * math.atan2(turn.z, turn.w)),
+        "pose": (position.x, position.y, 2 * math.atan2(rotation.z, rotation.w)),
         "target": (target.x, target.y),
-        "twist": (sent.linear.x, sent.linear.y, sent.angular.z),
+        "twist": (twist.linear.x, twist.linear.y, twist.angular.z),
     }
     if "/contact" in latest:
         points = latest["/contact"].polygon.points
-        found["contact_type"] = min(len(points), 2)
-        found["p_robot_contact"] = (points[0].x, points[0].y) if points else (0.0, 0.0)
+        fields["contact_type"] = min(len(points), 2)
+        fields["p_robot_contact"] = (points[0].x, points[0].y) if points else (0.0, 0.0)
     if "/taxels" in latest:
-        found["signal"] = np.array(latest["/taxels"].data, np.float32)
+        fields["signal"] = np.array(latest["/taxels"].data, np.float32)
     if "/force" in latest:
         force = latest["/force"].wrench.force
-        found["f_robot"] = (force.x, force.y)
+        fields["f_robot"] = (force.x, force.y)
     if "/object" in latest:
-        thing = latest["/object"]
-        found["p_world_object"] = (thing.pose.position.x, thing.pose.position.y)
-        found["r_object"] = 0.5 * thing.scale.x
-    return found
+        marker = latest["/object"]
+        fields["p_world_object"] = (marker.pose.position.x, marker.pose.position.y)
+        fields["r_object"] = 0.5 * marker.scale.x
+    return fields

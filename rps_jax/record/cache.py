@@ -49,7 +49,7 @@ def use_cache(folder: str | Path | None = None) -> Path | None:
     except OSError:
         return None
     jax.config.update("jax_compilation_cache_dir", str(path))
-    # JAX by default skips programs that are small or compile fast, as many of ours do.
+    # By default JAX does not cache programs that are small or compile fast.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     return path

@@ -1,4 +1,4 @@
-"""Checkpoints: the finished parts of a run, which are not run again when it is continued."""
+"""Checkpoints: the finished parts of a run, which are loaded when the run is continued."""
 
 import contextlib
 from collections.abc import Callable, Container, Iterator
@@ -17,83 +17,85 @@ _DIGITS = 16  # of the digest in a file's name
 class Checkpoints:
     """The finished parts of a run, each in a file `parts/NAME-DIGEST.SUFFIX` of its folder.
 
-    The digest is of the file's content and is compared before anything else looks at the file. A
-    file that is not what was written is set aside, as `*.corrupt`, and its part is as if it had
-    never been finished.
+    The digest is of the file's content and is compared before anything else reads the file. A
+    damaged file is renamed to `*.corrupt`, and its part counts as unfinished.
     """
 
     run: Path
 
     @property
     def folder(self) -> Path:
-        """Where the files are."""
+        """Folder of the files."""
         return self.run / "parts"
 
     def paths(self) -> dict[str, Path]:
-        """The files of all parts, in the order of their names."""
-        return {name: path for name, path, _ in self._sound()}
+        """Return the files of all parts, in the order of their names."""
+        return {name: path for name, path, _ in self._valid_files()}
 
     def items(self, names: Container[str] | None = None) -> Iterator[tuple[str, bytes]]:
-        """Names and contents of all parts, or of these, in the order of their names."""
-        for name, _, content in self._sound(names):
+        """Yield names and contents of all parts, or of some, in the order of their names."""
+        for name, _, content in self._valid_files(names):
             yield name, content
 
     def get(self, name: str) -> bytes | None:
-        """The content of one part, if it is finished."""
+        """Return the content of one part; None if it is unfinished."""
         return next((content for _, content in self.items((name,))), None)
 
     def put(self, name: str, content: bytes, suffix: str = ".nc", *, new: bool = False) -> Path:
-        """Write the file of a part, whole or not at all, and then remove what it had before.
+        """Write the file of a part atomically, and then remove its earlier files.
 
-        A process that is killed in between leaves both, of which the newer counts. Nothing is
-        removed for a part that the caller knows to be `new`, which spares a look at the folder.
+        A process that is killed in between leaves both, of which the newer counts. For a `new` part
+        the folder is not searched for earlier files.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        older = [] if new else self._files((name,))
+        earlier = [] if new else self._files((name,))
         path = self.folder / f"{name}-{files.sha256(content)[:_DIGITS]}{suffix}"
         files.write_bytes(path, content)
-        for one in older:
-            if one != path:
-                one.unlink(missing_ok=True)
+        for old in earlier:
+            if old != path:
+                old.unlink(missing_ok=True)
         return path
 
-    def load_or_compute(self, name: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
-        """The labelled results of a part, which are made and put if it is not finished."""
+    def load_or_compute(self, name: str, compute: Callable[[], xr.Dataset]) -> xr.Dataset:
+        """Load the results of a part; compute and store them if it is unfinished."""
         if (content := self.get(name)) is None:
-            content = files.encode_results(make().assign_attrs(part=name))
+            content = files.encode_results(compute().assign_attrs(part=name))
             self.put(name, content)
-        found = files.decode_results(content, self.folder / name, own=True)
-        if found.attrs.pop("part", None) != name:
+        results = files.decode_results(content, self.folder / name, signed=True)
+        if results.attrs.pop("part", None) != name:
             raise files.CorruptFileError(self.folder / name, "it holds another part")
-        return found
+        return results
 
     def _files(self, names: Container[str] | None = None) -> list[Path]:
-        """Files of some parts, or of all, by name, and of one name the newest first."""
-        found = []
+        """Return the files of all parts, or of some, by name, and the newest of a name first."""
+        entries = []
         for path in self.folder.glob("*-*"):
-            whole = path.name[0] != "." and path.suffix != ".corrupt"
-            if whole and (names is None or _name(path) in names):
-                with contextlib.suppress(FileNotFoundError):  # another process has set it aside
-                    found.append((_name(path), -path.stat().st_mtime_ns, path))
-        return [path for *_, path in sorted(found)]
+            complete = path.name[0] != "." and path.suffix != ".corrupt"
+            if complete and (names is None or _part_name(path) in names):
+                with contextlib.suppress(FileNotFoundError):  # another process has renamed it
+                    entries.append((_part_name(path), -path.stat().st_mtime_ns, path))
+        return [path for *_, path in sorted(entries)]
 
-    def _sound(self, names: Container[str] | None = None) -> Iterator[tuple[str, Path, bytes]]:
-        """The newest sound file of every part, or of some: name, path and content."""
+    def _valid_files(
+        self, names: Container[str] | None = None
+    ) -> Iterator[tuple[str, Path, bytes]]:
+        """Yield name, path and content of the newest valid file of all parts, or of some."""
         last = None
         for path in self._files(names):
-            if _name(path) != last and (content := _content(path)) is not None:
-                last = _name(path)
-                yield last, path, content
+            name = _part_name(path)
+            if name != last and (content := _valid_content(path)) is not None:
+                last = name
+                yield name, path, content
 
 
-def _name(path: Path) -> str:
+def _part_name(path: Path) -> str:
     return path.stem.rpartition("-")[0]
 
 
-def _content(path: Path) -> bytes | None:
-    """What was written into a file; None of one that is damaged, which is set aside, or gone."""
-    with contextlib.suppress(FileNotFoundError):  # another process has set it aside
-        with contextlib.suppress(InputError):  # no regular file, which is as good as damaged
+def _valid_content(path: Path) -> bytes | None:
+    """Return the content of a file; rename a damaged one and return None."""
+    with contextlib.suppress(FileNotFoundError):  # another process has renamed it
+        with contextlib.suppress(InputError):  # a pipe or the like counts as damaged
             content = files.read_regular(path, "part")
             if files.sha256(content)[:_DIGITS] == path.stem.rpartition("-")[2]:
                 return content

@@ -1,4 +1,4 @@
-"""Run folders: what was asked, and who may write there now."""
+"""Run folders: their configuration, and locks against other processes."""
 
 import contextlib
 import json
@@ -7,18 +7,20 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from filelock import FileLock, Timeout
 
 from rps_jax.errors import InputError
 from rps_jax.record import files
+from rps_jax.record.files import JsonObject
 
 MANIFEST = "manifest.json"  # of a run that can be continued
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel = 1
 
 
 def remove_run(folder: Path) -> None:
-    """Remove the run that a folder holds, and nothing else; InputError if it is in use."""
+    """Remove the run of a folder, and nothing else; InputError if it is in use."""
     for inner in sorted(folder.rglob(MANIFEST)):  # runs in its folders, as of models
         if inner.parent != folder:
             remove_run(inner.parent)
@@ -38,7 +40,7 @@ def remove_run(folder: Path) -> None:
 
 
 def ensure_writable(folder: Path) -> Path:
-    """The folder, made if need be; InputError if it cannot be written."""
+    """Return the folder, created if it is missing; InputError if it cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -50,73 +52,69 @@ def ensure_writable(folder: Path) -> Path:
     return folder
 
 
-def claim(folder: Path, wanted: dict[str, Any]) -> Path:
-    """The folder of a run that can be continued, with its configuration as `manifest.json`."""
+def claim(folder: Path, configuration: JsonObject) -> Path:
+    """Write the configuration of a run to its folder; InputError if it holds another run."""
     ensure_writable(folder)
-    wanted = json.loads(json.dumps(wanted))
+    new = json.loads(json.dumps(configuration))
     with lock_briefly(folder):
         if not (folder / MANIFEST).exists():
-            files.write_json(folder / MANIFEST, wanted, checked=True)
-        elif (found := files.read_checked_json(folder / MANIFEST)) != wanted:
+            files.write_json(folder / MANIFEST, new, checked=True)
+        elif (stored := files.read_checked_json(folder / MANIFEST)) != new:
             raise InputError(
-                f"out = {folder} holds another run ({describe_difference(found, wanted)}): choose "
+                f"out = {folder} holds another run ({describe_difference(stored, new)}): choose "
                 "another folder, ask for the same, or pass --overwrite."
             )
     return folder
 
 
 def lock_briefly(folder: Path) -> FileLock:
-    """A lock for the moment of a look and a note, for which other processes wait.
+    """Return a lock for a read and a write, for which other processes wait.
 
-    Like every lock here it is let go by the operating system when its process is killed.
+    The operating system releases all locks of a process that is killed.
     """
     return FileLock(folder / ".lock", poll_interval=0.01)
 
 
 @contextlib.contextmanager
-def lock(folder: Path, number: int = 1, of: int = 1) -> Iterator[None]:
-    """Hold a run folder, or one of several equal shares of it; InputError if others do."""
-    with contextlib.ExitStack() as held:
+def lock(folder: Path, shard: int = 1, shards: int = 1) -> Iterator[None]:
+    """Lock a run folder, or one of its shards; InputError if another process has it locked."""
+    with contextlib.ExitStack() as stack:
         with lock_briefly(folder):
             for path in folder.glob(".lock-*-*"):
-                if not path.name.endswith(f"-{of}"):
-                    _seize(path, folder).release()
-            held.callback(_seize(folder / f".lock-{number}-{of}", folder).release)
+                if not path.name.endswith(f"-{shards}"):
+                    _acquire(path, folder).release()
+            stack.callback(_acquire(folder / f".lock-{shard}-{shards}", folder).release)
         yield
 
 
-def _seize(path: Path, folder: Path) -> FileLock:
-    lock = FileLock(path, timeout=0)
+def _acquire(path: Path, folder: Path) -> FileLock:
+    file_lock = FileLock(path, timeout=0)
     try:
-        lock.acquire()
+        file_lock.acquire()
     except Timeout as error:
         raise InputError(
             f"out = {folder} is in use by another process: wait for its end, or choose another "
             "folder."
         ) from error
-    return lock
+    return file_lock
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """The configuration of the run in a folder; InputError if there is none, or it is corrupt."""
+def read_manifest(folder: Path) -> JsonObject:
+    """Return the configuration of the run in a folder; InputError if missing or corrupt."""
     return files.read_checked_json(folder / MANIFEST)
 
 
-_SHORT = reprlib.Repr()
-_SHORT.maxlevel = 1
-
-
-def describe_difference(found: Any, wanted: Any) -> str:
-    """The first few differences of two JSON values, in words."""
-    differences = list(_differences(found, wanted, ""))
+def describe_difference(stored: object, new: object) -> str:
+    """Return the first three differences of two JSON values, in words."""
+    differences = list(_differences(stored, new, ""))
     more = f" and {len(differences) - 3} more" if len(differences) > 3 else ""
     return "; ".join(differences[:3]) + more
 
 
-def _differences(found: Any, wanted: Any, path: str) -> Iterator[str]:
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        for key in [*found, *(k for k in wanted if k not in found)]:
-            there, asked = (side.get(key, "nothing") for side in (found, wanted))
-            yield from _differences(there, asked, f"{path}.{key}" if path else key)
-    elif found != wanted:
-        yield f"{path} = {_SHORT.repr(found)} there, {_SHORT.repr(wanted)} asked for"
+def _differences(stored: object, new: object, path: str) -> Iterator[str]:
+    if isinstance(stored, dict) and isinstance(new, dict):
+        for key in {**stored, **new}:
+            old_value, new_value = stored.get(key, "nothing"), new.get(key, "nothing")
+            yield from _differences(old_value, new_value, f"{path}.{key}" if path else key)
+    elif stored != new:
+        yield f"{path} = {_SHORT.repr(stored)} there, {_SHORT.repr(new)} asked for"

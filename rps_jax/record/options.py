@@ -1,7 +1,6 @@
-"""Options: fields of a dataclass that say once what they mean, what is allowed, and in what unit.
+"""Options: dataclass fields with a type, bounds, a unit, and a docstring as their help.
 
-A field's annotation is its type, the string below it is its help, and `option` holds its bounds.
-The command line, the checks and the manifests of runs are made from these declarations.
+The command line, the checks and the manifests of runs are derived from these declarations.
 """
 
 import dataclasses
@@ -17,7 +16,7 @@ import numpy as np
 
 from rps_jax import errors
 
-_KEY = "option"
+_BOUNDS = "bounds"
 
 
 def option(
@@ -30,111 +29,113 @@ def option(
     kw_only: Any = dataclasses.MISSING,
     hidden: bool = False,
     positional: bool = False,
-) -> Any:
-    """Declare a field with bounds: of a number, or of each number of a tuple.
+) -> Any:  # any type of field, as of `dataclasses.field`
+    """Declare a field with bounds for its number, or for each number of its tuple.
 
     The command line has a `positional` field without a flag, and does not offer a `hidden` one.
     """
     bounds = {"at_least": at_least, "at_most": at_most, "above": above, "unit": unit}
-    given = {name: bound for name, bound in bounds.items() if bound is not None}
-    metadata = {_KEY: given, "hidden": hidden, "positional": positional}
+    metadata = {
+        _BOUNDS: {name: bound for name, bound in bounds.items() if bound is not None},
+        "hidden": hidden,
+        "positional": positional,
+    }
     return dataclasses.field(default=default, metadata=metadata, kw_only=kw_only)
 
 
-def check_fields(asked: Any) -> None:
-    """Check the fields of a dataclass by their types and bounds.
-
-    Whole numbers are `int`, finite numbers `float`, closed choices `Literal`; each may be `None`
-    where the type says so. Fields of other types are left to their owner.
-    """
-    types_ = field_types(type(asked))
-    for one in dataclasses.fields(asked):
-        _check(one.name, getattr(asked, one.name), types_[one.name], one.metadata.get(_KEY))
-
-
-def is_hidden(field: Any) -> bool:
-    """Whether the command line does not offer a field."""
+def is_hidden(field: dataclasses.Field[object]) -> bool:
+    """Return whether the command line does not offer a field."""
     return field.metadata.get("hidden", False)
 
 
-def is_positional(field: Any) -> bool:
-    """Whether the command line has a field without a flag."""
+def is_positional(field: dataclasses.Field[object]) -> bool:
+    """Return whether the command line has a field without a flag."""
     return field.metadata.get("positional", False)
 
 
 @functools.cache
 def field_types(kind: type) -> dict[str, Any]:
-    """Types of a dataclass's fields, by name."""
+    """Return the types of a dataclass's fields, by name."""
     return typing.get_type_hints(kind)
 
 
-def _check(name: str, value: Any, kind: Any, bounds: dict[str, Any] | None) -> None:
+def check_fields(record: object) -> None:
+    """Check the fields of a dataclass by their types and bounds.
+
+    Integers are `int`, finite numbers `float`, and closed choices `Literal`, or one of these and
+    `None`. Fields of other types are not checked.
+    """
+    types_ = field_types(type(record))
+    for field in dataclasses.fields(typing.cast(Any, record)):
+        _check(field.name, getattr(record, field.name), types_[field.name], field.metadata)
+
+
+def _check(name: str, value: Any, kind: object, metadata: Mapping[str, Any]) -> None:
+    """Check a value by its type, and by the bounds in the metadata of its field."""
     if get_origin(kind) in (typing.Union, types.UnionType):
         if value is None and type(None) in get_args(kind):
             return
-        inner = [one for one in get_args(kind) if one is not type(None)]
-        if len(inner) != 1:
-            return
-        (kind,) = inner
+        kinds = [inner for inner in get_args(kind) if inner is not type(None)]
+        kind = kinds[0] if len(kinds) == 1 else None
+    bounds = metadata.get(_BOUNDS)
     if get_origin(kind) is Literal:
         errors.check_name(name, str(value), get_args(kind))
     elif kind is int:
-        given = {"at_least": -(2**63), "at_most": 2**63} | (bounds or {})
-        low, high = int(given["at_least"]), int(given["at_most"])
+        limits = {"at_least": -(2**63), "at_most": 2**63} | (bounds or {})
+        low, high = int(limits["at_least"]), int(limits["at_most"])
         errors.check_count(name, value, at_least=low, at_most=high)
     elif kind is float:
         errors.check_finite(name, value, **(bounds or {}))
     elif get_origin(kind) is tuple and bounds is not None:
-        for one in value if isinstance(value, tuple | list) else (value,):
-            _check(name, one, get_args(kind)[0], bounds)
+        for item in value if isinstance(value, tuple | list) else (value,):
+            _check(name, item, get_args(kind)[0], metadata)
 
 
 def to_json(value: Any) -> Any:
-    """JSON of a value: dataclasses and named tuples by their fields, arrays as lists."""
+    """Return a value as JSON: dataclasses and named tuples by their fields, arrays as lists."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if hasattr(value, "_asdict"):
-        return {name: to_json(one) for name, one in value._asdict().items()}
+        value = value._asdict()
     if isinstance(value, Mapping):
-        return {str(name): to_json(one) for name, one in value.items()}
+        return {str(name): to_json(item) for name, item in value.items()}
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, str | bool | None):
         return value
     if isinstance(value, numbers.Integral):
         return int(value)
-    number: Any = value
     if isinstance(value, numbers.Real) or getattr(value, "ndim", None) == 0:
-        return float(number)
+        return float(np.asarray(value))
     if isinstance(value, tuple | list):
-        return [to_json(one) for one in value]
+        return [to_json(item) for item in value]
     if hasattr(value, "tolist"):
         return to_json(np.asarray(value).tolist())
-    raise TypeError(f"{type(value).__name__} cannot be described as JSON")
+    raise TypeError(f"{type(value).__name__} cannot be written as JSON")
 
 
 # --- texts with changes --------------------------------------------------------------------
 
 
 def parse_changes(kind: str, text: str) -> tuple[str, dict[str, Any]]:
-    """Split a text `NAME,FIELD=VALUE,...` into its name and its changes.
+    """Return the name and the changes of a text `NAME,FIELD=VALUE,...`.
 
-    A value is a number, several of them with colons between, as 3:10, or a text. `kind` is what is
-    named, for the error.
+    A value is a number, a text, or several of these between colons, as 3:10. Errors name the `kind`
+    of the text.
     """
-    head, *changes = text.split(",")
-    found = {}
-    for change in changes:
-        name, equals, value = change.partition("=")
-        if not (name and equals):
+    name, *assignments = text.split(",")
+    changes: dict[str, float | str | list[float | str]] = {}
+    for assignment in assignments:
+        field, equals, value = assignment.partition("=")
+        if not (field and equals):
             raise errors.InputError(f"{kind} = {text} is not allowed: write changes as name=value.")
-        parts = [_read(part) for part in value.split(":")]
-        found[name] = parts if len(parts) > 1 else parts[0]
-    return head, found
+        values = [_number_or_text(word) for word in value.split(":")]
+        changes[field] = values if len(values) > 1 else values[0]
+    return name, changes
 
 
-def _read(text: str) -> float | str:
+def _number_or_text(word: str) -> float | str:
     try:
-        return float(text)
+        return float(word)
     except ValueError:
-        return text
+        return word

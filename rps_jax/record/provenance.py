@@ -1,4 +1,4 @@
-"""What a run was made by: command, versions, device and commit, noted in its folder."""
+"""Provenance of a run: command, versions, device and commit, in `environment.json`."""
 
 import importlib.metadata
 import platform
@@ -6,13 +6,12 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record import folder as run_folder
+from rps_jax.record.files import JsonObject
 
 ENVIRONMENT = "environment.json"
 _PACKAGES = (
@@ -21,7 +20,7 @@ _PACKAGES = (
 )
 
 
-def collect_environment(**device: object) -> dict[str, Any]:
+def collect_environment(**device: object) -> JsonObject:
     """Return command, commit, time and versions of this process, and what `device` holds."""
     return {
         "command": _command(),
@@ -35,70 +34,70 @@ def collect_environment(**device: object) -> dict[str, Any]:
 
 
 def _command() -> list[str]:
-    """Words of the command that runs, as it can be run again."""
+    """Return the words of the running command, as a shell can run it again."""
     program = Path(sys.argv[0])
     if program.name in ("rps", "rps.exe") or program.parts[-2:] == ("rps_jax", "__main__.py"):
         return ["rps", *sys.argv[1:]]
     return ["python", sys.argv[0], *sys.argv[1:]] if program.suffix == ".py" else list(sys.argv)
 
 
-def write_environment(folder: Path, environment: Mapping[str, Any]) -> None:
-    """Note the environment of a run, or of a piece of it, in `environment.json`.
+def write_environment(folder: Path, environment: JsonObject) -> None:
+    """Record the environment of a run, or of a part of it, in `environment.json`.
 
-    An earlier note stays there, under `before`, if anything but the time differs.
+    An earlier record is kept under `before`, if anything but the time differs.
     """
     new = dict(environment)
     with run_folder.lock_briefly(folder):
-        earlier = _history(folder) if (folder / ENVIRONMENT).exists() else []
-        earlier = [*new.pop("before", []), *earlier]
-        others = [one for one in earlier if not _same(one, new)]
-        note = new | ({"before": others} if others else {})
-        files.write_json(folder / ENVIRONMENT, note, checked=True)
+        earlier = [*new.pop("before", [])]
+        if (folder / ENVIRONMENT).exists():
+            earlier += _history(folder)
+        different = [record for record in earlier if not _is_same(record, new)]
+        record = new | ({"before": different} if different else {})
+        files.write_json(folder / ENVIRONMENT, record, checked=True)
 
 
-def read_environment(folder: Path) -> dict[str, Any]:
-    """What `write_environment` noted; InputError if there is nothing, or it is corrupt."""
+def read_environment(folder: Path) -> JsonObject:
+    """Return the environment of a run; InputError if it is missing or corrupt."""
     return files.read_checked_json(folder / ENVIRONMENT)
 
 
-def _history(folder: Path) -> list[dict[str, Any]]:
-    """What `write_environment` noted, the latest last."""
+def _history(folder: Path) -> list[JsonObject]:
+    """Return all environments of a run, the latest last."""
     last = read_environment(folder)
-    before = last.pop("before", [])
-    if not (isinstance(before, list) and all(isinstance(one, dict) for one in before)):
+    earlier = last.pop("before", [])
+    if not (isinstance(earlier, list) and all(isinstance(record, dict) for record in earlier)):
         raise files.CorruptFileError(folder / ENVIRONMENT, "before is no list of names with values")
-    return [*before, last]
+    return [*earlier, last]
 
 
-def _same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether it is one process, whose workers may have become more, or another all like it."""
-    process = all(one.get(name) == other.get(name) for name in ("time", "command"))
-    differ = {name for name in (*one, *other) if one.get(name) != other.get(name)}
-    return process or differ <= {"time", "workers", "before"}
+def _is_same(record: JsonObject, new: JsonObject) -> bool:
+    """Whether two records are of one process, or differ only in time and workers."""
+    differ = {name for name in (*record, *new) if record.get(name) != new.get(name)}
+    return not differ & {"time", "command"} or differ <= {"time", "workers", "before"}
 
 
 def describe(folder: Path) -> str:
-    """What `write_environment` noted, in words."""
+    """Return all environments of a run in words."""
     try:
-        last, *before = (
-            f"`{shlex.join(one['command'])}`, rps_jax {one['packages']['rps_jax']}"
-            f"{', commit ' + one['commit'] if one['commit'] else ''}, {one['time']}, on "
-            f"{one['device']['kind']} with {one['processors']} processors, jax "
-            f"{one['packages']['jax']}, mujoco {one['packages']['mujoco']}"
-            for one in reversed(_history(folder))
+        last, *earlier = (
+            f"`{shlex.join(record['command'])}`, rps_jax {record['packages']['rps_jax']}"
+            f"{', commit ' + record['commit'] if record['commit'] else ''}, {record['time']}, on "
+            f"{record['device']['kind']} with {record['processors']} processors, jax "
+            f"{record['packages']['jax']}, mujoco {record['packages']['mujoco']}"
+            for record in reversed(_history(folder))
         )
     except (KeyError, TypeError, AttributeError) as error:
         raise files.CorruptFileError(folder / ENVIRONMENT, error) from error
-    return f"Made by {'; before that by '.join([last, *before])}."
+    return f"Made by {'; before that by '.join([last, *earlier])}."
 
 
 def package_version(folder: Path) -> str:
-    """The version of this package that last made some of a run, in words."""
+    """Return the version of this package that last continued a run, in words."""
     try:
-        found = read_environment(folder)["packages"]["rps_jax"]
+        version = read_environment(folder)["packages"]["rps_jax"]
     except (InputError, KeyError, TypeError):
-        found = None
-    return f"rps_jax {found}" if isinstance(found, str) else "a version that it does not name"
+        version = None
+    return f"rps_jax {version}" if isinstance(version, str) else "a version that it does not name"
 
 
 def _version(package: str) -> str | None:
@@ -109,19 +108,15 @@ def _version(package: str) -> str | None:
 
 
 def git_commit() -> str | None:
-    """The git commit of the checkout this code runs from, marked if changed; None elsewhere."""
+    """Return the git commit of the checkout of this code, marked if changed; None elsewhere."""
     root = Path(__file__).resolve().parents[2]
     words = ("describe", "--always", "--exclude=*", "--abbrev=40", "--dirty=-changed")
     try:
         if not (root / ".git").exists():
             return None
-        done = subprocess.run(
-            ["git", "-C", str(root), *words],
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=10,
+        command = ["git", "-C", str(root), *words]
+        return (
+            subprocess.check_output(command, stderr=subprocess.DEVNULL, timeout=10).decode().strip()
         )
     except (OSError, subprocess.SubprocessError):
         return None
-    return done.stdout.strip()

@@ -72,7 +72,7 @@ def _encode_step(name: str, results: xr.Dataset) -> bytes:
 
 
 def _decode_step(path: Path, content: bytes) -> xr.Dataset:
-    results = files.decode_results(content, path, own=True)
+    results = files.decode_results(content, path, signed=True)
     if not path.name.startswith(f"{results.attrs.pop('part', None)}-"):
         raise files.CorruptFileError(path, "it holds another part")
     return results
