@@ -314,9 +314,9 @@ def test_a_decisive_quantity_has_all_the_variance():
     # Three fifths of the upper third fail, none of the lower.
     assert difference == pytest.approx(-0.6, abs=0.05)
     assert low < difference < high < 0
-    assert study.said(results).startswith("More mass costs success")
-    assert study.said(results, "gap").startswith("No cost of gap is seen")
-    assert "draws no robot_force" in study.said(results, "robot_force")
+    assert study.cost_sentence(results).startswith("More mass costs success")
+    assert study.cost_sentence(results, "gap").startswith("No cost of gap is seen")
+    assert "draws no robot_force" in study.cost_sentence(results, "robot_force")
     assert sensitivity.index_table(results)[1][0] == "mass of the object"
     assert sensitivity.reliability(results).startswith("Trials fail at ")
     assert "run more worlds" not in sensitivity.reliability(results)
@@ -406,7 +406,7 @@ def test_picked_worlds_are_far_from_each_other():
     domain = replace(DOMAINS["prisms"], mass=Range(3, 60))
     u = points.points_of(domain, np.arange(100))
     doubled = np.concatenate([u, u])
-    indices = picked.chosen(domain, doubled, np.ones((2, 200)), 100, np.array([7]))
+    indices = picked.select(domain, doubled, np.ones((2, 200)), 100, np.array([7]))
     assert indices[0] == 7
     assert len(set(indices % 100)) == 100  # none of them twice
 

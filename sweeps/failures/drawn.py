@@ -1,8 +1,8 @@
-"""Are rare failures as rare as drawn worlds say?
+"""Comparison of rare-failure estimates with the rate in drawn worlds.
 
     rps sweeps/failures/drawn.py --law rps --repetitions 20 --brute 100000
 
-asks what `rps rare` asks, and compares its estimates with the rate in drawn worlds.
+runs `rps rare`, and compares its estimates with the rate in drawn worlds.
 """
 
 from __future__ import annotations
@@ -31,40 +31,42 @@ from rps_jax.trials.score import severity_of
 class Drawn(Rare):
     """Compare subset simulation with the rate in drawn worlds.
 
-    The answer is that of `rps_jax.rare`, with the estimate from drawn worlds, as `drawn_p`.
+    The results are those of `rps_jax.rare`, with the estimate from drawn worlds as `drawn_p`.
     """
 
     TITLE: ClassVar[str] = "Rare failures, and drawn worlds"
 
     brute: int = option(1000, 1, 1_000_000_000)
-    """Number of drawn worlds that it is compared with."""
+    """Number of drawn worlds for the comparison."""
 
     def configuration(self) -> dict[str, Any]:
-        """All that the estimates depend on, but the drawn worlds beside them."""
-        found = super().configuration() | {"question": "rare"}
-        del found["brute"]
-        return found
+        """Return everything that the estimates depend on, without the drawn worlds."""
+        options = super().configuration() | {"question": "rare"}
+        del options["brute"]
+        return options
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Estimate, and run the drawn worlds, a sweep in the folder's `drawn`."""
-        found = super().answer(run)
+        """Estimate, and sweep the drawn worlds in the subfolder `drawn`."""
+        estimates = super().answer(run)
         seeded = replace(self.setting, seed=seed_of(self.setting.seed, "tune"))
         plan = Plan(self.ranges, self.brute, {"law": self.params}, seeded, 4096)
         set_phase(run.callback, "drawn worlds")
         folder = None if run.folder is None else run.folder / "drawn"
         results = execution.run_plan(plan, folder, **run.batch_options)
         failed = severity_of(results.sel(law="law"), self.setting.rules) >= self.level
-        told = of_drawn(count_true(failed), failed.size)._asdict()
-        return found.assign({f"drawn_{name}": ((), value) for name, value in told.items()})
+        drawn_estimate = of_drawn(count_true(failed), failed.size)._asdict()
+        return estimates.assign(
+            {f"drawn_{name}": ((), value) for name, value in drawn_estimate.items()}
+        )
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """The estimates, beside drawn worlds."""
-        (usual,) = super().report(results, run)
+        """Return a section that compares the estimates with drawn worlds."""
+        (section,) = super().report(results, run)
         p, low, high, variation, trials = (
             float(results[f"drawn_{name}"]) for name in Estimate._fields
         )
         against = Estimate(p, low, high, variation, int(trials))
-        text = f"{usual.text} Those of drawn worlds are by Clopper and Pearson."
+        text = f"{section.text} Those of drawn worlds are by Clopper and Pearson."
         if against.p:
             off = 100 * (float(results.p.mean()) / against.p - 1)
             held = count_true(((results.low <= against.p) & (against.p <= results.high)).values)
@@ -76,7 +78,7 @@ class Drawn(Rare):
             text += " None of the drawn worlds fails."
         rows = [*estimate_table(results), [*estimate_row("drawn worlds", against)[:-1], ""]]
         picture = Picture("rare", partial(figure, results, against))
-        return [usual._replace(text=text, table=rows, picture=picture)]
+        return [section._replace(text=text, table=rows, picture=picture)]
 
 
 drawn = call_of(Drawn)
@@ -90,11 +92,11 @@ def of_drawn(failures: int, trials: int) -> Estimate:
     return Estimate(p, low, high, float(variation), trials)
 
 
-def figure(found: xr.Dataset, against: Estimate) -> Figure:
-    """Estimates of every repetition with their intervals, and drawn worlds' behind them."""
-    made = draw_estimates(found)
-    (ax,) = made.axes
+def figure(results: xr.Dataset, against: Estimate) -> Figure:
+    """Plot the estimates of all repetitions with their intervals, and those of drawn worlds."""
+    picture = draw_estimates(results)
+    (ax,) = picture.axes
     ax.axhspan(against.low, against.high, color="C0", alpha=0.2, lw=0)
     ax.axhline(against.p, color="C0", label="drawn worlds")
     ax.legend(fontsize=8)
-    return made
+    return picture

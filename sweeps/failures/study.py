@@ -1,8 +1,8 @@
-"""Does mass cost anything?
+"""Effect of a drawn quantity on success.
 
     rps sweeps/failures --law rps_plus --worlds 65536
 
-asks what `rps sensitivity` asks, and compares success between the thirds of a quantity's range.
+runs `rps sensitivity`, and compares success between the thirds of the range of a quantity.
 """
 
 from __future__ import annotations
@@ -19,66 +19,71 @@ from rps_jax.runs.question import Run, call_of
 from rps_jax.studies.sensitivity import MIN_FAILING_POINTS, Sensitivity, count_failing_points
 
 _RESAMPLES = 1000
-_NOTHING = 0.05  # [1] a total index that is not worth a word
+_SMALL_INDEX = 0.05  # [1] smaller total indices are not mentioned
 
 
 @dataclass(frozen=True)
 class Cost(Sensitivity):
-    """Say whether a drawn quantity costs success, beside what `rps sensitivity` says."""
+    """Test whether a drawn quantity reduces success, in addition to `rps sensitivity`."""
 
     TITLE: ClassVar[str] = "What a quantity costs"
 
     quantity: str = "mass"
-    """Drawn quantity that is asked about."""
+    """Drawn quantity to test."""
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Whether the quantity costs anything, and the indices."""
-        section = Section(f"Does {self.quantity} cost anything", said(results, self.quantity))
+        """Return sections with the effect of the quantity and the indices."""
+        section = Section(
+            f"Does {self.quantity} cost anything", cost_sentence(results, self.quantity)
+        )
         return [section, *super().report(results, run)]
 
 
 cost = call_of(Cost)
 
 
-def difference(found: xr.Dataset, name: str) -> tuple[float, float, float]:
-    """Success in the upper third of a quantity's range less that in its lower third, with 95 %.
+def difference(results: xr.Dataset, name: str) -> tuple[float, float, float]:
+    """Return success in the upper minus the lower third of a quantity's range, with 95 % interval.
 
-    The interval resamples base points, since the worlds of one differ in one factor only.
+    The interval resamples base points, because worlds of one base point differ in one factor only.
     """
-    at = found.u.sel(quantity=name).values
-    won = found.success.values
+    at = results.u.sel(quantity=name).values
+    success = results.success.values
     high, low = at >= 2 / 3, at < 1 / 3
-    blocks = np.arange(won.size) // (won.size // found.attrs["base"])
+    blocks = np.arange(success.size) // (success.size // results.attrs["base"])
     sums = np.stack(
-        [np.bincount(blocks, w, found.attrs["base"]) for w in (high * won, high, low * won, low)]
+        [
+            np.bincount(blocks, w, results.attrs["base"])
+            for w in (high * success, high, low * success, low)
+        ]
     )
     rng = np.random.default_rng(0)
     drawn = rng.integers(0, sums.shape[1], (_RESAMPLES, sums.shape[1]))
     a, b, c, d = sums[:, drawn].sum(axis=2)
     spread = a / np.maximum(b, 1) - c / np.maximum(d, 1)
     a, b, c, d = sums.sum(axis=1)
-    ends = np.quantile(spread, [0.025, 0.975])
-    return float(a / max(b, 1) - c / max(d, 1)), float(ends[0]), float(ends[1])
+    interval = np.quantile(spread, [0.025, 0.975])
+    return float(a / max(b, 1) - c / max(d, 1)), float(interval[0]), float(interval[1])
 
 
-def said(found: xr.Dataset, name: str = "mass") -> str:
-    """Whether a quantity costs success, in a sentence."""
-    if name not in found.factor.values:
+def cost_sentence(results: xr.Dataset, name: str = "mass") -> str:
+    """Return a sentence on the effect of a quantity on success."""
+    if name not in results.factor.values:
         return f"The domain draws no {name}."
-    change, low, high = (100 * value for value in difference(found, name))
-    one = found.sel(output="success", factor=name)
-    numbers = (
+    change, low, high = (100 * value for value in difference(results, name))
+    index = results.sel(output="success", factor=name)
+    values = (
         f"between the lower and the upper third of its range success changes by {change:+.1f} "
-        f"points [{low:+.1f}, {high:+.1f}], and its total index is {one.total:.2f} ± "
-        f"{one.total_reach:.2f}"
+        f"points [{low:+.1f}, {high:+.1f}], and its total index is {index.total:.2f} ± "
+        f"{index.total_reach:.2f}"
     )
     if high < 0:
-        return f"More {name} costs success: {numbers}."
+        return f"More {name} costs success: {values}."
     if low > 0:
-        return f"More {name} helps: {numbers}."
+        return f"More {name} helps: {values}."
     if (
-        float(one.total - one.total_reach) > _NOTHING
-        and count_failing_points(found) >= MIN_FAILING_POINTS
+        float(index.total - index.total_reach) > _SMALL_INDEX
+        and count_failing_points(results) >= MIN_FAILING_POINTS
     ):
-        return f"On average {name} costs nothing, but together with others it matters: {numbers}."
-    return f"No cost of {name} is seen in {found.sizes['world']:,} worlds: {numbers}."
+        return f"On average {name} costs nothing, but together with others it matters: {values}."
+    return f"No cost of {name} is seen in {results.sizes['world']:,} worlds: {values}."

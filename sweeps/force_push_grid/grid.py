@@ -64,76 +64,76 @@ PHYSICS = Physics(timestep=0.005, control_period=0.01)
 
 _MASS, _HALF, _HEIGHT = 1.0, 0.5, 0.12  # [kg, m, m] of both sliders
 _BEHIND = 0.5  # [m] of the pusher behind the point of contact, at the start
-_APART, _SILENT = 2.0, 20.0  # [m, s] at which a push has failed
+_MAX_DISTANCE, _SILENT = 2.0, 20.0  # [m, s] at which a push has failed
 _LEAST_FRICTION = 1e-3  # [1]
 _POINT = 0.01  # [m] half length and width of the base
 _SEGMENT, _LOOK = 1000, 50  # control steps of a call of the program, and between two looks
 _ROBOT = Robot(_POINT, _POINT, (Boards("front", 1, 2 * _POINT / 3),))
 
 
-class Following(NamedTuple):
-    """What the controller remembers, and what its trial is judged by."""
+class FollowingState(NamedTuple):
+    """State of the controller and the criterion of its trial."""
 
-    theta_p: jax.Array  # () [rad] the last push's, from the path's
-    pushed: jax.Array  # () bool: a force has been felt
+    theta_p: jax.Array  # () [rad] of the last push, relative to the path
+    run_grid: jax.Array  # () bool: a force has been felt
     clock: jax.Array  # () [s] since then
-    silent: jax.Array  # () [s] without a force by now
+    silent: jax.Array  # () [s] current time without a force
     longest: jax.Array  # () [s] without a force, the longest time
 
 
-def follow(law: LawName = "force_push", duration: float = DURATION) -> Law:
-    """A law of a point that is the base's origin, along the world's x axis.
+def build_law(law: LawName = "force_push", duration: float = DURATION) -> Law:
+    """Return a law of a point at the base's origin, which follows the world's x axis.
 
-    The point stands still from `duration` [s] after the first contact on.
+    The point stops `duration` [s] after the first contact.
     """
 
-    def init(params: PublishedForcePushParams) -> Following:
+    def init(params: PublishedForcePushParams) -> FollowingState:
         zero = jnp.zeros_like(jnp.asarray(params.v_max, float))
-        return Following(zero, jnp.zeros((), bool), zero, zero, zero)
+        return FollowingState(zero, jnp.zeros((), bool), zero, zero, zero)
 
     def step(
-        params: PublishedForcePushParams, state: Following, observation: ForceObservation
-    ) -> tuple[Following, Twist, Details]:
-        seen = observation.touch
-        period = seen.period
-        f_world = -planar.rotate(seen.yaw, observation.f_robot)
+        params: PublishedForcePushParams, state: FollowingState, observation: ForceObservation
+    ) -> tuple[FollowingState, Twist, Details]:
+        touch = observation.touch
+        period = touch.period
+        f_world = -planar.rotate(touch.yaw, observation.f_robot)
         felt = planar.norm(f_world) >= params.f_min
-        pushed = state.pushed | felt
-        zero = jnp.zeros_like(seen.yaw)
-        offset = seen.p_world_robot[1]
+        run_grid = state.pushed | felt
+        zero = jnp.zeros_like(touch.yaw)
+        offset = touch.p_world_robot[1]
         if law == "force_push":
             theta_p = force_push.steer(params, state.theta_p, f_world, zero, offset, period)
         else:
             theta_p = -params.k_y * offset
-        theta_p = jnp.where(pushed, theta_p, 0.0)
+        theta_p = jnp.where(run_grid, theta_p, 0.0)
         v_world = params.v_max * jnp.stack([jnp.cos(theta_p), jnp.sin(theta_p)])
-        v_robot = planar.rotate(-seen.yaw, force_push.yield_to_force(params, v_world, f_world))
+        v_robot = planar.rotate(-touch.yaw, force_push.yield_to_force(params, v_world, f_world))
         going = state.clock < duration
         v_robot = jnp.where(going, v_robot, 0.0)
         silent = jnp.where(felt, 0.0, state.silent + period)
         longest = jnp.where(going, jnp.maximum(state.longest, silent), state.longest)
-        clock = state.clock + jnp.where(pushed, period, 0.0)
-        state = Following(theta_p, pushed, clock, silent, longest)
-        return state, Twist(v_robot[0], v_robot[1], zero), Details.from_obs(seen)
+        clock = state.clock + jnp.where(run_grid, period, 0.0)
+        state = FollowingState(theta_p, run_grid, clock, silent, longest)
+        return state, Twist(v_robot[0], v_robot[1], zero), Details.from_obs(touch)
 
     exact = LoadCell(noise=0.0, time_constant=0.05, threshold=0.0)
     return Law(init, step, "force", check=force_push.check, cell=exact)
 
 
 def moments(slider: SliderName) -> np.ndarray:
-    """Moments of inertia (3, 3) [kg m^2] about x, y, z, in the order of `INERTIAS`."""
+    """Return moments of inertia (3, 3) [kg m^2] about x, y, z, in the order of `INERTIAS`."""
     flat, up = _HALF**2, (_HEIGHT / 2) ** 2
     if slider == "box":  # the greatest: eight points at its corners
-        most = np.array([flat + up, flat + up, 2 * flat])
-        even = most / 3
+        greatest = np.array([flat + up, flat + up, 2 * flat])
+        even = greatest / 3
     else:  # the greatest: a thin wall
         even = np.array([flat / 4 + up / 3, flat / 4 + up / 3, flat / 2])
-        most = np.array([flat / 2 + up / 3, flat / 2 + up / 3, flat])
-    return _MASS * np.stack([even / 2, even, most])
+        greatest = np.array([flat / 2 + up / 3, flat / 2 + up / 3, flat])
+    return _MASS * np.stack([even / 2, even, greatest])
 
 
 class Cells(NamedTuple):
-    """The grid, flat: (243,) each, inertia slowest and contact fastest, as theirs."""
+    """The grid, flat: (243,) each, inertia slowest and contact fastest."""
 
     inertia: np.ndarray  # which of `INERTIAS`
     friction: np.ndarray  # [1]
@@ -143,14 +143,14 @@ class Cells(NamedTuple):
 
 
 def cells() -> Cells:
-    """Every combination."""
-    every = itertools.product(range(len(INERTIAS)), FRICTIONS, LATERALS, ANGLES, CONTACTS)
-    columns = (np.array(column) for column in zip(*every, strict=True))
+    """Return all combinations."""
+    combinations = itertools.product(range(len(INERTIAS)), FRICTIONS, LATERALS, ANGLES, CONTACTS)
+    columns = (np.array(column) for column in zip(*combinations, strict=True))
     return Cells(*columns)
 
 
 def starts(slider: SliderName, grid: Cells) -> np.ndarray:
-    """Positions (n, 10) at the start: the pusher behind the point of contact, along the path."""
+    """Return initial positions (n, 10), with the pusher behind the point of contact."""
     at = np.stack([np.zeros_like(grid.lateral), grid.lateral], axis=-1)
     if slider == "box":
         c, s = np.cos(grid.angle), np.sin(grid.angle)
@@ -162,8 +162,8 @@ def starts(slider: SliderName, grid: Cells) -> np.ndarray:
     qpos[:, :2] = at + point - (_BEHIND, 0.0)
     half = grid.angle / 2
     zero = np.zeros_like(half)
-    place = [*at.T, zero + _HEIGHT / 2, np.cos(half), zero, zero, np.sin(half)]
-    qpos[:, JOINTS.object] = np.stack(place, axis=-1)
+    pose = [*at.T, zero + _HEIGHT / 2, np.cos(half), zero, zero, np.sin(half)]
+    qpos[:, JOINTS.object] = np.stack(pose, axis=-1)
     return qpos
 
 
@@ -174,11 +174,11 @@ def worlds(
     params: PublishedForcePushParams = PARAMS,
     physics: Physics = PHYSICS,
 ) -> tuple[Any, World, PublishedForcePushParams]:
-    """Stage, worlds and law parameters of some cells of the grid, on the host."""
+    """Return stage, worlds and law parameters of cells of the grid, on the host."""
     count = grid.angle.size
     half = np.full(count, _HALF)
     box = slider == "box"
-    things = Solid(
+    solids = Solid(
         vertices=solid.rectangles(half, half) if box else np.zeros((count, 1, 2)),
         radius=np.zeros(count) if box else half,
         height=np.full(count, _HEIGHT),
@@ -188,14 +188,14 @@ def worlds(
         q_object_body=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
     )
     friction = Friction(np.full(count, GROUND), np.maximum(grid.friction, _LEAST_FRICTION))
-    stage, fields = engines.get(engine).stage(slider, things, friction, physics, _ROBOT)
+    stage, fields = engines.get(engine).stage(slider, solids, friction, physics, _ROBOT)
 
     def same(tree: Any) -> Any:
         return jax.tree.map(lambda x: np.repeat(np.asarray(x, float)[None], count, axis=0), tree)
 
     world: Any = {
         "fields": fields,
-        "footprint": Footprint(things.vertices, things.radius),  # type: ignore[arg-type]
+        "footprint": Footprint(solids.vertices, solids.radius),  # type: ignore[arg-type]
         "skin": same(IdealSkin().on(_ROBOT.shell)),
         "p_world_target": np.tile([90.0, 0.0], (count, 1)),  # never reached
         "shift": same(Shift(p_robot=jnp.zeros(2))),
@@ -204,11 +204,11 @@ def worlds(
     }
     dtype = jnp.zeros(()).dtype
     narrow = jax.tree.map(lambda x: np.asarray(x, dtype), world)
-    made = World(**narrow, key=np.zeros((count, 2), np.uint32))  # type: ignore[arg-type]
-    return stage, made, jax.tree.map(lambda x: np.asarray(x, dtype), same(params))
+    built = World(**narrow, key=np.zeros((count, 2), np.uint32))  # type: ignore[arg-type]
+    return stage, built, jax.tree.map(lambda x: np.asarray(x, dtype), same(params))
 
 
-def pushed(
+def run_grid(
     name: LawName,
     slider: SliderName,
     engine: EngineName = "fused",
@@ -218,7 +218,7 @@ def pushed(
     physics: Physics = PHYSICS,
     callback: ProgressCallback = no_progress,
 ) -> xr.Dataset:
-    """Push a slider through the whole grid by one law.
+    """Run one law with a slider on the whole grid.
 
     Args:
       name: force_push, open_loop.
@@ -235,41 +235,43 @@ def pushed(
       middle; `deviation` [m] of the slider from the path at the end; and `completion` [1], the way
       along the path that was made good, of an ideal pusher's.
     """
-    grid, law = cells(), follow(name, duration)
+    grid, law = cells(), build_law(name, duration)
     stage, *inputs = worlds(slider, grid, engine, params, physics)
     period, count = physics.control_period, grid.angle.size
     horizon = duration + 2 * _BEHIND / float(params.v_max)
     rules = Rules(horizon=2 * horizon, max_lost=1e6)
     trials = trial.start_all(*inputs, np.ones(count, bool), law=law)
-    apart, steps, began = np.zeros(count), 0, time.perf_counter()
+    apart, steps, start_time = np.zeros(count), 0, time.perf_counter()
     waited = 0.0
     while steps * period < horizon:
         options = {"physics": physics, "rules": rules, "law": law}
-        trials, seen = trial.record(stage, *inputs, trials, **options, steps=_SEGMENT, every=_LOOK)
-        away = np.asarray(seen.qpos[..., 3:5] - seen.qpos[..., :2])
+        trials, snapshots = trial.record(
+            stage, *inputs, trials, **options, steps=_SEGMENT, every=_LOOK
+        )
+        away = np.asarray(snapshots.qpos[..., 3:5] - snapshots.qpos[..., :2])
         apart = np.maximum(apart, np.hypot(*np.moveaxis(away, -1, 0)).max(axis=0))
         if steps == 0:
-            waited += time.perf_counter() - began
+            waited += time.perf_counter() - start_time
         steps += _SEGMENT
         callback(Progress(0, steps * period * count, waited))
-    memory: Following = jax.device_get(trials.memory)
+    state: FollowingState = jax.device_get(trials.law_state)
     end = np.asarray(trials.qpos)[:, JOINTS.object][:, :2].astype(float)
-    way = float(params.v_max) * duration
-    lost = (apart > _APART) | (memory.longest > _SILENT) | ~memory.pushed
-    lost |= np.asarray(trials.tipped | trials.diverged)
+    path_length = float(params.v_max) * duration
+    failed = (apart > _MAX_DISTANCE) | (state.longest > _SILENT) | ~state.pushed
+    failed |= np.asarray(trials.tipped | trials.diverged)
     columns = {
-        "success": (~lost).astype(np.int8),
-        "silent": memory.longest.astype(float),
+        "success": (~failed).astype(np.int8),
+        "silent": state.longest.astype(float),
         "apart": apart,
         "deviation": end[:, 1],
-        "completion": 1 - np.hypot(end[:, 0] - way, end[:, 1]) / way,
+        "completion": 1 - np.hypot(end[:, 0] - path_length, end[:, 1]) / path_length,
     }
     shape = (len(INERTIAS), len(FRICTIONS), len(LATERALS), len(ANGLES), len(CONTACTS))
     values: dict[str, Sequence[Any]] = dict(
         zip(DIMS, (INERTIAS, FRICTIONS, LATERALS, ANGLES, CONTACTS), strict=True)
     )
     units = {"silent": "s", "apart": "m", "deviation": "m"}
-    one = xr.Dataset(
+    results = xr.Dataset(
         {
             name: (DIMS, column.reshape(shape), {"units": units.get(name, "1")})
             for name, column in columns.items()
@@ -277,23 +279,23 @@ def pushed(
         {name: list(value) for name, value in values.items()},
         {"engine": engine, "duration": duration},
     )
-    return one
+    return results
 
 
-def table(found: xr.Dataset) -> list[list[str]]:
-    """Header and a row for each law and slider: successes, way made good, deviation."""
+def table(results: xr.Dataset) -> list[list[str]]:
+    """Return a header and one row per law and slider: successes, completion, deviation."""
     rows = [["law", "slider", "success", "by contact friction", "completion", "deviation"]]
-    for law, slider in itertools.product(found.law.values, found.slider.values):
-        one = found.sel(law=law, slider=slider)
-        off, way = np.abs(one.deviation.values), 100 * one.completion.values
+    for law, slider in itertools.product(results.law.values, results.slider.values):
+        outcomes = results.sel(law=law, slider=slider)
+        deviation, completion = np.abs(outcomes.deviation.values), 100 * outcomes.completion.values
         rows.append(
             [
                 str(law),
                 str(slider),
-                f"{int(one.success.sum())} of {one.success.size}",
-                ", ".join(str(int(one.success.sel(friction=mu).sum())) for mu in FRICTIONS),
-                f"{np.median(way):.1f} % (least {way.min():.1f})",
-                f"{np.median(off):.2f} m (most {off.max():.2f})",
+                f"{int(outcomes.success.sum())} of {outcomes.success.size}",
+                ", ".join(str(int(outcomes.success.sel(friction=mu).sum())) for mu in FRICTIONS),
+                f"{np.median(completion):.1f} % (least {completion.min():.1f})",
+                f"{np.median(deviation):.2f} m (most {deviation.max():.2f})",
             ]
         )
     return rows

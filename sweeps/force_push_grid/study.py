@@ -30,7 +30,7 @@ from sweeps.study_base import Study
 class ForcePushGrid(Study[xr.Dataset]):
     """Push the sliders of Heins and Schoellig from every start of their grid, by their law.
 
-    The answer holds, over (law, slider, inertia, friction, lateral, angle, contact), `success` by
+    The results hold, over (law, slider, inertia, friction, lateral, angle, contact), `success` by
     their criterion, `silent` [s], `apart` [m], `deviation` [m] and `completion` [1].
     """
 
@@ -39,18 +39,18 @@ class ForcePushGrid(Study[xr.Dataset]):
     GROWS: ClassVar[tuple[str, ...]] = ("laws", "sliders")
 
     laws: tuple[grid.LawName, ...] = grid.LAWS
-    """Laws: force_push, and open_loop, which only goes back to the path."""
+    """Laws: force_push, and open_loop, which only returns to the path."""
     sliders: tuple[grid.SliderName, ...] = grid.SLIDERS
     """Sliders: box, cylinder."""
     duration: float = option(grid.DURATION, above=0, at_most=800, unit="s")  # 80 m of world
-    """Length of a push from its first contact on [s]."""
+    """Length of a push after its first contact [s]."""
     engine: EngineName = "fused"
-    """What steps the pushes, of the engines that tell the contact's force to a compiled program."""
+    """Engine; it must give the contact force to a compiled program."""
     quick: bool = False
-    """Whether to make a small run of minutes on two cores: what is not asked for becomes small."""
+    """Whether to make a small run of minutes on two cores; explicit options keep their values."""
 
     def check(self) -> None:
-        """Check the names, and that the engine can step such pushes here."""
+        """Check the names, and that the engine supports these pushes."""
         errors.check_each_once("laws", self.laws)
         for law in self.laws:
             errors.check_name("law", law, grid.LAWS)
@@ -64,31 +64,33 @@ class ForcePushGrid(Study[xr.Dataset]):
         engine.check_physics(grid.PHYSICS)
 
     def num_trials(self) -> int | None:
-        """How many pushes there are."""
+        """Return the number of pushes."""
         return len(self.laws) * len(self.sliders) * grid.cells().angle.size
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Push by the laws, and with the sliders, that are missing."""
-        heard, found = SequentialProgress(run.callback), []
+        """Run the laws and sliders that are missing."""
+        progress, by_law = SequentialProgress(run.callback), []
         for law in self.laws:
             of_law = []
             for slider in self.sliders:
-                push = partial(grid.pushed, law, slider, self.engine, self.duration, callback=heard)
+                push = partial(
+                    grid.run_grid, law, slider, self.engine, self.duration, callback=progress
+                )
                 of_law.append(run.checkpoint(f"{law}_{slider}", push))
-                heard.finish(of_law[-1].success.size)
-            found.append(xr.concat(of_law, xr.IndexVariable("slider", list(self.sliders))))
-        every: Any = xr.concat(found, xr.IndexVariable("law", list(self.laws)))
-        return every
+                progress.finish(of_law[-1].success.size)
+            by_law.append(xr.concat(of_law, xr.IndexVariable("slider", list(self.sliders))))
+        results: Any = xr.concat(by_law, xr.IndexVariable("law", list(self.laws)))
+        return results
 
     def intro(self, results: xr.Dataset) -> str:
-        """What was asked."""
+        """Return a description of the grid."""
         return (
             f"The grid of Heins and Schoellig (2024), {self.duration:g} s from the first contact "
             f"on, engine {self.engine}."
         )
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """How many pushes succeed by their criterion."""
+        """Return a section with the successes by the authors' criterion."""
         return [Section("Pushes that succeed", "", grid.table(results))]
 
 

@@ -1,6 +1,6 @@
-"""The tuned law with one mend at a time, each of which a zero or its default leaves out.
+"""The tuned law with candidate additions, each of which a zero or its default disables.
 
-RPS+ has the mends that were kept; the others stand here so that nobody has to try them again.
+RPS+ has the accepted additions; the others are documented here.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ TUNED = RPSParams.tuned()
 
 
 class Mended(NamedTuple):
-    """The tuned law with mends, each of which a zero or its default leaves out."""
+    """Parameters of the tuned law with additions, each of which a zero or its default disables."""
 
     law: RPSParams = TUNED
     d_near: float = 0.15  # [m] P1
@@ -42,52 +42,54 @@ class Mended(NamedTuple):
         return self.law.d_success
 
 
-class Memory(NamedTuple):
-    """What such a law remembers."""
+class MendedState(NamedTuple):
+    """State of the law."""
 
     law: RPSState
-    yaw: Any  # () [rad] when it last began to realign
+    yaw: Any  # () [rad] at the start of the last realignment
     realigning: Any  # () bool
     lost: Any  # () control steps without contact
     p_world_felt: Any  # (2,) [m]
 
 
-def init(params: Mended) -> Memory:
-    """Before the first touch."""
+def init(params: Mended) -> MendedState:
+    """Return the state before the first touch."""
     zero = jnp.zeros(())
-    return Memory(RPSState.init(params.law), zero, zero > 0, zero, jnp.zeros(2))
+    return MendedState(RPSState.init(params.law), zero, zero > 0, zero, jnp.zeros(2))
 
 
-def step(params: Mended, state: Memory, seen: Observation) -> tuple[Memory, Twist, Details]:
-    """One control step."""
-    memory, twist, details = rps.step_with_details(params.law, state.law, seen)
-    contact, l = memory.p_robot_contact, details.l  # noqa: E741
-    touching, realigning = jnp.asarray(seen.in_contact), details.realigning
-    d = displacement(seen._replace(p_robot_contact=contact))
-    error = planar.wrap(planar.direction(d) - seen.yaw)
-    yaw = jnp.where(realigning & ~state.realigning, seen.yaw, state.yaw)
-    near = (touching | memory.touched) & (~realigning | (jnp.abs(l) < params.over))
+def step(
+    params: Mended, state: MendedState, obs: Observation
+) -> tuple[MendedState, Twist, Details]:
+    """Return state, twist and details of one control step."""
+    rps_state, twist, details = rps.step_with_details(params.law, state.law, obs)
+    contact, l = rps_state.p_robot_contact, details.l  # noqa: E741
+    touching, realigning = jnp.asarray(obs.in_contact), details.realigning
+    d = displacement(obs._replace(p_robot_contact=contact))
+    error = planar.wrap(planar.direction(d) - obs.yaw)
+    yaw = jnp.where(realigning & ~state.realigning, obs.yaw, state.yaw)
+    near = (touching | rps_state.touched) & (~realigning | (jnp.abs(l) < params.over))
     near &= (details.distance < params.d_near) & (details.distance >= params.law.d_success)
     flush = touching & realigning & (params.flush > 0) & (jnp.abs(l) >= params.edge) & ~near
-    flush &= jnp.abs(planar.wrap(seen.yaw - yaw)) < params.turn
+    flush &= jnp.abs(planar.wrap(obs.yaw - yaw)) < params.turn
     flush &= (params.agree == 0) | (jnp.sign(l) * error > 0.05)
     omega = jnp.sign(l) * params.flush * params.law.omega_max
     pressing = jnp.array([1.0, 0.0]) * params.forward * params.law.v_max
     turning = rps.saturate(params.law, Twist.from_point_velocity(contact, pressing, omega))
-    p_world = seen.p_world_robot + planar.rotate(seen.yaw, contact)
+    p_world = obs.p_world_robot + planar.rotate(obs.yaw, contact)
     felt = jnp.where(touching, p_world, state.p_world_felt)
-    lost = jnp.where(touching, 0.0, state.lost + memory.touched)
-    p_robot_felt = planar.rotate(-seen.yaw, felt - seen.p_world_robot)
+    lost = jnp.where(touching, 0.0, state.lost + rps_state.touched)
+    p_robot_felt = planar.rotate(-obs.yaw, felt - obs.p_world_robot)
     plus: Any = rps_plus.RPSPlusParams(
         params.law, params.d_near, params.press, params.n_lost, params.ahead, params.aside
     )
-    for condition, other in (
+    for condition, replacement in (
         (flush, turning),
-        (near, rps_plus.translation(plus, d, seen.yaw)),
+        (near, rps_plus.translation(plus, d, obs.yaw)),
         (lost > params.n_lost, rps_plus.search(plus, p_robot_felt, contact[1])),
     ):
-        twist = jax.tree.map(lambda a, b, c=condition: jnp.where(c, a, b), other, twist)
-    return Memory(memory, yaw, realigning, lost, felt), twist, details
+        twist = jax.tree.map(lambda a, b, c=condition: jnp.where(c, a, b), replacement, twist)
+    return MendedState(rps_state, yaw, realigning, lost, felt), twist, details
 
 
 FIRST = "P1, P2 outside the Realignment State"

@@ -1,10 +1,10 @@
-"""What was tried to mend the law's losses, one mend at a time, in worlds for tuning.
+"""Candidate additions to the tuned law, one at a time, in tuning worlds.
 
     rps sweeps/mends --domain hostile --worlds 4096
 
-pushes with the tuned law, with its first mend (translation near the target, but not while it
-realigns) and with that and one more mend, all in the same worlds, and compares them world by world.
-The mends stand in `mended`.
+runs the tuned law, the first addition (translation near the target, but not while the law
+realigns), and the first with one more addition, in the same worlds, and compares the outcomes.
+`mended` has the additions.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from sweeps.mends.mended import FIRST, MENDS
 
 @dataclass(frozen=True)
 class Mends(SweepQuestion):
-    """Push with one mend of the tuned law at a time, in worlds for tuning, and compare them.
+    """Compare candidate additions to the tuned law, one at a time, in tuning worlds.
 
-    The answer holds outcomes (law, world), as of `rps_jax.sweep`.
+    The results hold outcomes (law, world), like those of `rps_jax.sweep`.
     """
 
     TITLE: ClassVar[str] = "Mends of the tuned law"
     QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 32}
 
     laws: LawsLike = ()
-    """The mends, by their names in the table; by default all. The one that the others are compared
-    with is always among them."""
+    """Additions, by their names in the table; by default all. The addition of comparison is always
+    included."""
     domain: DomainLike = "hostile"
     """Ranges from which worlds are drawn: paper, hardware, wide, real, prisms or hostile, or a JSON
     file of ranges; changes follow, as hostile,mass=3:10."""
@@ -54,24 +54,24 @@ class Mends(SweepQuestion):
 
     @cached_property
     def chosen(self) -> dict[str, LawParams]:
-        """Parameters of the mends, by name."""
-        asked = [self.laws] if isinstance(self.laws, str) else list(self.laws)
-        for name in asked:
+        """Parameters of the laws, by the name of the addition."""
+        names = [self.laws] if isinstance(self.laws, str) else list(self.laws)
+        for name in names:
             errors.check_name("mend", name, MENDS)
-        return {n: p for n, p in MENDS.items() if n in (asked or MENDS) or n == FIRST}
+        return {n: p for n, p in MENDS.items() if n in (names or MENDS) or n == FIRST}
 
     @cached_property
     def plan(self) -> Plan:
-        """What is run: in worlds for tuning."""
+        """Plan of the sweep, in tuning worlds."""
         plan = super().plan
         seed = seed_of(self.setting.seed, "tune")
         return dataclasses.replace(plan, setting=dataclasses.replace(plan.setting, seed=seed))
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Each mend against the first, world by world."""
+        """Return sections that compare each addition with the first, world by world."""
         rows = tables.against_table(results, FIRST)
-        against = Section(f"Against: {FIRST}", "World by world; p by Holm.", rows)
-        return [against, sweeps.success_section(results, float(self.plan.setting.rules.max_lost))]
+        compared = Section(f"Against: {FIRST}", "World by world; p by Holm.", rows)
+        return [compared, sweeps.success_section(results, float(self.plan.setting.rules.max_lost))]
 
 
 mends = call_of(Mends)
