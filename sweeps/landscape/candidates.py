@@ -20,34 +20,37 @@ from rps_jax.trials.trial import Outcome
 from rps_jax.tuning.run import Problem
 from rps_jax.tuning.space import SUBSETS, Space
 
-_EDGE = 0.03  # how near to a parameter's bounds it is varied, as a share of the range
+_EDGE = 0.03  # distance of varied parameters from their bounds, as a share of the range
 
 
 class Aims(NamedTuple):
-    """What is wanted of parameters, (P,) each; worlds are those of all domains."""
+    """Objectives of parameters (P,) in the worlds of all domains."""
 
     success: np.ndarray  # [1] share
     time: np.ndarray  # [s] median over the successes; NaN without any
-    path: np.ndarray  # [m] of the base, likewise
+    path: np.ndarray  # [m] median path length of the base over the successes
 
 
 def aims(outcome: Outcome) -> Aims:
-    """The aims of candidates by their outcomes (P, W)."""
-    won = np.asarray(outcome.success) > 0
+    """Return the objectives of candidates from their outcomes (P, W)."""
+    success = np.asarray(outcome.success) > 0
     with np.errstate(all="ignore"):
         medians = [
             np.array(
-                [np.median(x[w]) if w.any() else np.nan for x, w in zip(rows, won, strict=True)]
+                [
+                    np.median(x[mask]) if mask.any() else np.nan
+                    for x, mask in zip(rows, success, strict=True)
+                ]
             )
             for rows in np.asarray((outcome.time, outcome.path_length), float)
         ]
-    return Aims(won.mean(axis=1), *medians)
+    return Aims(success.mean(axis=1), *medians)
 
 
-def _try(
+def _run_candidates(
     params: Any, problem: Problem, splits: Sequence[Split], seed: int, count: int, **run: Any
 ) -> list[Outcome]:
-    """The outcomes (P, D * W) of candidates in the worlds of each split."""
+    """Return the outcomes (P, D * W) of candidates in the worlds of each split."""
     asks = [Candidates(params, seed_of(seed, split), np.arange(count)) for split in splits]
     answers, _ = evaluate.score_candidates(
         asks, problem.domains, problem.setting, problem.objective, **run
@@ -59,10 +62,10 @@ def _try(
 
 
 def lines(base: RPSParams, names: Sequence[str], count: int) -> RPSParams:
-    """Each parameter varied between its bounds, the others as in `base`: leaves (names, count)."""
+    """Return parameters with one of them varied between its bounds: leaves (names, count)."""
     u = jax.scipy.special.logit(jnp.linspace(_EDGE, 1 - _EDGE, count))
-    every = [Space((name,), base).params(u[:, None]) for name in names]
-    return jax.tree.map(lambda *x: jnp.stack(x), *every)
+    varied = [Space((name,), base).params(u[:, None]) for name in names]
+    return jax.tree.map(lambda *x: jnp.stack(x), *varied)
 
 
 def alone(
@@ -76,26 +79,28 @@ def alone(
     callback: ProgressCallback = no_progress,
     **shape: Any,
 ) -> xr.Dataset:
-    """Success, time and way against each parameter alone, in worlds for validation.
+    """Compute success, time and path length over each parameter alone, in validation worlds.
 
-    Returns labelled results (set, parameter, step), with the parameter's `value` at each step.
+    Return labelled results (set, parameter, step), with the parameter's `value` at each step.
     """
     shape_of = (len(sets), len(names), count)
     grid = jax.tree.map(
-        lambda *x: jnp.stack(x), *(lines(one, names, count) for one in sets.values())
+        lambda *x: jnp.stack(x), *(lines(base, names, count) for base in sets.values())
     )
     params = jax.tree.map(lambda leaf: leaf.reshape(-1), grid)
-    (found,) = _try(params, problem, ("validate",), seed, worlds, callback=callback, **shape)
+    (outcome,) = _run_candidates(
+        params, problem, ("validate",), seed, worlds, callback=callback, **shape
+    )
     dims = ("set", "parameter", "step")
     columns: dict[str, Any] = {
-        name: (dims, values.reshape(shape_of)) for name, values in aims(found)._asdict().items()
+        name: (dims, values.reshape(shape_of)) for name, values in aims(outcome)._asdict().items()
     }
     varied = [np.asarray(getattr(grid, name))[:, i] for i, name in enumerate(names)]
     columns["value"] = (dims, np.stack(varied, axis=1))
     return xr.Dataset(
         columns,
         {"set": list(sets), "parameter": list(names)},
-        {"worlds": found.success.shape[1]},
+        {"worlds": outcome.success.shape[1]},
     )
 
 
@@ -105,30 +110,32 @@ def alone(
 def cloud(
     sets: Sequence[RPSParams], names: Sequence[str], count: int, spread: float, seed: int
 ) -> RPSParams:
-    """Candidates (len(sets) + count,): the sets, and others on the lines between them, and beside.
+    """Return candidates (len(sets) + count,): the sets, and points near the lines between them.
 
-    Each of these lies evenly somewhere between two of the sets, plus a normal step of standard
-    deviation `spread` in the coordinates of the bounded map. What is not among `names`, such as
-    switches, it has from the nearer of the two.
+    Each point is uniformly distributed between two sets, plus a normal step of standard deviation
+    `spread` in the coordinates of the bounded map. Fields outside `names`, such as switches, are
+    those of the nearer set.
     """
     space = Space(tuple(names))
     corners = jnp.stack([space.vector(params) for params in sets])
     keys = jax.random.split(jax.random.key(seed), 4)
-    one, other = (jax.random.randint(key, (count,), 0, len(sets)) for key in keys[:2])
+    first, second = (jax.random.randint(key, (count,), 0, len(sets)) for key in keys[:2])
     share = jax.random.uniform(keys[2], (count, 1))
-    middle = corners[one] + share * (corners[other] - corners[one])
+    middle = corners[first] + share * (corners[second] - corners[first])
     steps = spread * jax.random.normal(keys[3], middle.shape, middle.dtype)
     varied = space.params(jnp.concatenate([corners, middle + steps]))
-    nearer = jnp.where(share[:, 0] < 0.5, one, other)
-    whose = jnp.concatenate([jnp.arange(len(sets)), nearer])
-    taken = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x, float) for x in leaves]), *sets)
-    own = {name: getattr(taken, name)[whose] for name in taken._fields if name not in names}
-    return varied._replace(**own)
+    nearer = jnp.where(share[:, 0] < 0.5, first, second)
+    origin = jnp.concatenate([jnp.arange(len(sets)), nearer])
+    stacked = jax.tree.map(
+        lambda *leaves: jnp.stack([jnp.asarray(x, float) for x in leaves]), *sets
+    )
+    fixed = {name: getattr(stacked, name)[origin] for name in stacked._fields if name not in names}
+    return varied._replace(**fixed)
 
 
-def undominated(found: Aims) -> np.ndarray:
-    """Which candidates, a mask (P,), no other one beats in one aim without losing in another."""
-    costs = np.stack([-found.success, found.time, found.path], axis=1)
+def undominated(values: Aims) -> np.ndarray:
+    """Return the mask (P,) of Pareto-optimal candidates."""
+    costs = np.stack([-values.success, values.time, values.path], axis=1)
     known = np.isfinite(costs).all(axis=1)
     costs = np.where(np.isfinite(costs), costs, np.inf)
     no_worse = (costs[:, None] <= costs[None]).all(axis=2)
@@ -148,38 +155,38 @@ def front(
     callback: ProgressCallback = no_progress,
     **shape: Any,
 ) -> xr.Dataset:
-    """Candidates between and around sets of parameters, and which of them are undominated.
+    """Run candidates between and around sets of parameters, and select the Pareto-optimal ones.
 
-    Who is on the front is decided in worlds for validation; its aims, (candidate,), are then
-    measured in worlds for testing, so that luck in the choice does not count.
+    The selection uses validation worlds. The objectives (candidate,) are then measured in test
+    worlds, so that the selection does not bias them.
     """
     params = cloud(list(sets.values()), names, candidates, spread, seed)
-    found, again = _try(
+    validated, tested = _run_candidates(
         params, problem, ("validate", "test"), seed, worlds, callback=callback, **shape
     )
-    chosen = undominated(aims(found))
+    chosen = undominated(aims(validated))
     labels = [*sets, *(f"{i}" for i in range(candidates))]
-    columns: dict[str, Any] = {k: ("candidate", v) for k, v in aims(again)._asdict().items()}
+    columns: dict[str, Any] = {k: ("candidate", v) for k, v in aims(tested)._asdict().items()}
     columns["front"] = ("candidate", chosen)
     columns |= {name: ("candidate", np.asarray(getattr(params, name))) for name in names}
-    return xr.Dataset(columns, {"candidate": labels}, {"worlds": again.success.shape[1]})
+    return xr.Dataset(columns, {"candidate": labels}, {"worlds": tested.success.shape[1]})
 
 
 def front_table(results: xr.Dataset) -> list[list[str]]:
-    """Header and a row for each candidate of the front and each set of parameters, by success."""
+    """Return a header and one row per Pareto-optimal candidate and set, by success."""
     rows = [["", "success", "median time", "median way", "on the front"]]
     labels = [str(label) for label in results.candidate.values]
     named = np.array([not label.isdigit() for label in labels])
-    keep = np.flatnonzero(results.front.values | named)
-    for i in keep[np.argsort(-results.success.values[keep], kind="stable")]:
-        one = results.isel(candidate=int(i))
+    shown = np.flatnonzero(results.front.values | named)
+    for i in shown[np.argsort(-results.success.values[shown], kind="stable")]:
+        row = results.isel(candidate=int(i))
         rows.append(
             [
                 labels[i],
-                f"{tables.percent(float(one.success))} %",
-                f"{float(one.time):.1f} s",
-                f"{float(one.path):.2f} m",
-                "yes" if bool(one.front) else "no",
+                f"{tables.percent(float(row.success))} %",
+                f"{float(row.time):.1f} s",
+                f"{float(row.path):.2f} m",
+                "yes" if bool(row.front) else "no",
             ]
         )
     return rows

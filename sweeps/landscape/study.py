@@ -1,4 +1,4 @@
-"""What success depends on, and what it costs in time and in the way driven.
+"""Effect of each parameter on success, time and path length, and their trade-offs.
 
     rps sweeps/landscape --worlds 510 --candidates 120
 
@@ -38,27 +38,27 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
     with those of candidates between the laws' parameters and around them (candidate).
     """
 
-    TITLE: ClassVar[str] = "What each parameter does"
+    TITLE: ClassVar[str] = "Effect of each parameter"
     QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 32, "values": 3, "candidates": 16}
 
     domain: Sequence[DomainLike] = ("wide",)
     """Domains: paper, hardware, wide, real, prisms or hostile, or JSON files of ranges; changes
     follow each, as wide,mass=3:10."""
     worlds: int = option(999, 2, 1_000_000)
-    """Number of worlds that each candidate meets, in each domain."""
+    """Number of worlds of each candidate in each domain."""
     values: int = option(9, 2, 1000)
     """Number of values of each parameter."""
     candidates: int = option(256, 2, 1_000_000)
     """Number of candidates between and around the laws' parameters."""
     spread: float = option(0.5, 0, 10)
-    """Standard deviation around, in units of the bounded map [1]."""
+    """Standard deviation of the candidates, in units of the bounded map [1]."""
 
     @cached_property
     def problem(self) -> Problem:
-        """The worlds."""
-        one = isinstance(self.domain, str | Domain)
-        several: list[Any] = [self.domain] if one else list(self.domain)
-        return Problem(tuple(domains.parse_domain(x) for x in several), setting=self.setting)
+        """Worlds of all candidates."""
+        is_single = isinstance(self.domain, str | Domain)
+        domain_list: list[Any] = [self.domain] if is_single else list(self.domain)
+        return Problem(tuple(domains.parse_domain(x) for x in domain_list), setting=self.setting)
 
     def check(self) -> None:
         """Check that the laws are RPS with parameters."""
@@ -68,35 +68,39 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
 
     @property
     def _shares(self) -> tuple[int, int]:
-        """Trials of both halves."""
-        each = len(self.problem.domains) * self.worlds
+        """Numbers of trials of both parts."""
+        per_candidate = len(self.problem.domains) * self.worlds
         varied = len(self.chosen) * len(SUBSETS["full"]) * self.values
-        return varied * each, 2 * (self.candidates + len(self.chosen)) * each
+        return varied * per_candidate, 2 * (self.candidates + len(self.chosen)) * per_candidate
 
     def num_trials(self) -> int | None:
-        """How many trials there are."""
+        """Return the number of trials."""
         return sum(self._shares)
 
     def answer(self, run: Run) -> xr.DataTree:
-        """Vary each parameter, then try the candidates."""
-        heard, seed = SequentialProgress(run.callback), self.setting.seed
-        common = {"worlds": self.worlds, "seed": seed, **run._replace(callback=heard).batch_options}
+        """Vary each parameter, then run the candidates."""
+        progress, seed = SequentialProgress(run.callback), self.setting.seed
+        common = {
+            "worlds": self.worlds,
+            "seed": seed,
+            **run._replace(callback=progress).batch_options,
+        }
         sets, problem = self.chosen, self.problem
         first, _ = self._shares
         alone = partial(candidates.alone, sets, problem, count=self.values, **common)
-        found = {"alone": run.checkpoint("alone", alone)}
-        heard.finish(first)
-        several = {"candidates": self.candidates, "spread": self.spread}
-        front = partial(candidates.front, sets, problem, **several, **common)
-        found["front"] = run.checkpoint("front", front)
-        return xr.DataTree.from_dict(found)
+        results = {"alone": run.checkpoint("alone", alone)}
+        progress.finish(first)
+        options = {"candidates": self.candidates, "spread": self.spread}
+        front = partial(candidates.front, sets, problem, **options, **common)
+        results["front"] = run.checkpoint("front", front)
+        return xr.DataTree.from_dict(results)
 
     def intro(self, results: xr.DataTree) -> str:
-        """What was asked."""
-        return f"Every candidate meets the same {self.worlds:,} worlds of each domain."
+        """Return a description of the worlds."""
+        return f"All candidates run in the same {self.worlds:,} worlds of each domain."
 
     def report(self, results: xr.DataTree, run: Run) -> Sequence[Section]:
-        """Success against each parameter, and the front."""
+        """Return sections with success over each parameter, and the Pareto front."""
         alone, front = (results[name].to_dataset() for name in ("alone", "front"))
         log = [name for name, bound in BOUNDS.items() if bound.log]
         lines = Picture("landscape", partial(parameters_figure, alone, log))
@@ -111,18 +115,21 @@ landscape = call_of(Landscape)
 
 
 def front_figure(results: xr.Dataset) -> Figure:
-    """Draw success against time and against the way driven, and mark the undominated."""
+    """Plot success over time and over path length, and mark Pareto-optimal candidates."""
     figure = Figure(figsize=(10, 4), layout="constrained")
     labels = [str(label) for label in results.candidate.values]
     for ax, (field, label) in zip(
         figure.subplots(1, 2, sharey=True),
-        {"time": "median time of a success [s]", "path": "median way of the base [m]"}.items(),
+        {
+            "time": "median time of a success [s]",
+            "path": "median path length of the base [m]",
+        }.items(),
         strict=True,
     ):
         x, y = results[field].values, 100 * results.success.values
         ax.plot(x, y, ".", color="0.75", label="candidates")
         chosen = results.front.values
-        ax.plot(x[chosen], y[chosen], "o", ms=5, color="C0", label="undominated")
+        ax.plot(x[chosen], y[chosen], "o", ms=5, color="C0", label="Pareto-optimal")
         for i, name in enumerate(labels):
             if not name.isdigit():
                 ax.plot(x[i], y[i], "*", ms=12, color="C3")
@@ -135,7 +142,7 @@ def front_figure(results: xr.Dataset) -> Figure:
 
 
 def parameters_figure(results: xr.Dataset, log: Collection[str]) -> Figure:
-    """Success against each parameter alone, those of `log` on a logarithmic axis.
+    """Plot success over each parameter alone, with logarithmic axes for those in `log`.
 
     Intervals are Wilson's, of 95 %.
     """
@@ -145,19 +152,19 @@ def parameters_figure(results: xr.Dataset, log: Collection[str]) -> Figure:
     axes = figure.subplots(rows, 4, squeeze=False, sharey=True).ravel()
     for ax in axes[len(names) :]:
         ax.axis("off")
-    of = int(results.attrs["worlds"])
+    worlds = int(results.attrs["worlds"])
     for ax, name in zip(axes, names, strict=False):
-        for i, which in enumerate(map(str, results.set.values)):
-            one = results.sel(set=which, parameter=name)
-            won = np.round(one.success.values * of).astype(int)
+        for i, label in enumerate(map(str, results.set.values)):
+            line = results.sel(set=label, parameter=name)
+            successes = np.round(line.success.values * worlds).astype(int)
             success_rates(
                 ax,
-                one.value.values,
-                won,
-                np.full(won.size, of),
+                line.value.values,
+                successes,
+                np.full(successes.size, worlds),
                 curve=i,
                 color=f"C{i}",
-                label=which,
+                label=label,
             )
         ax.set_xlabel(name, fontsize=9)
         ax.grid(alpha=0.3)

@@ -1,11 +1,11 @@
-"""Does a library that knows nothing of this project learn in `rps_jax/Push-v0`?
+"""PPO of Stable-Baselines3 in the environment `rps_jax/Push-v0`.
 
-    pip install stable-baselines3  # in an environment of its own: it brings PyTorch
+    pip install stable-baselines3  # in a separate environment: it installs PyTorch
     rps sweeps/learned/sb3.py --machine "two cores"
 
-runs PPO of Stable-Baselines3 for a minute of wall clock on the environment as `gymnasium.make`
-gives it, and then for another on many worlds that are stepped together. The library's own vector
-environments step one world after another; `Batched` lends it the one of `gymnasium.make_vec`.
+runs PPO for a minute of wall clock in one environment of `gymnasium.make`, and for another minute
+in many worlds that step together. The vector environments of the library step one world at a time;
+`Batched` adapts the one of `gymnasium.make_vec`.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from rps_jax.trials.trial import Rules
 from rps_jax.world import domain as domains
 from sweeps.study_base import Study, Table
 
-_FOUND = {
+_VARIABLES = {
     "time": ("s", "wall clock since learning began"),
     "steps": ("1", "steps of all worlds"),
-    "episodes": ("1", "trials that ended since the row before"),
+    "episodes": ("1", "trials that ended since the previous row"),
     "reward": ("1", "mean sum of the rewards of these"),
-    "success": ("1", "share of these that arrived"),
+    "success": ("1", "share of these that succeeded"),
 }
 
 
@@ -79,9 +79,9 @@ class SB3(Study[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Learn with each number of worlds."""
-        each = [run.checkpoint(f"curve_{n}", partial(self._learned, n)) for n in self.num_envs]
-        found = xr.concat(each, xr.IndexVariable("envs", list(self.num_envs)))
-        return found
+        curves = [run.checkpoint(f"curve_{n}", partial(self._learned, n)) for n in self.num_envs]
+        results = xr.concat(curves, xr.IndexVariable("envs", list(self.num_envs)))
+        return results
 
     def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
         """Return the learning curves."""
@@ -92,35 +92,37 @@ class SB3(Study[xr.Dataset]):
 
     def _learned(self, count: int) -> xr.Dataset:
         names = ("", ".common.vec_env", ".common.callbacks")
-        modules: list[Any] = [importlib.import_module(f"stable_baselines3{one}") for one in names]
+        modules: list[Any] = [
+            importlib.import_module(f"stable_baselines3{suffix}") for suffix in names
+        ]
         sb3, vec, back = modules
         gymnasium: Any = importlib.import_module("gymnasium")
         name = "rps_jax.trials.gym:rps_jax/Push-v0"
-        how = {"object": self.object, "domain": self.domain, "setting": self.setting}
-        how |= {"hold": self.hold}
+        options_ = {"object": self.object, "domain": self.domain, "setting": self.setting}
+        options_ |= {"hold": self.hold}
         if count == 1:
-            worlds = gymnasium.make(name, **how)
+            worlds = gymnasium.make(name, **options_)
         else:
-            envs = gymnasium.make_vec(name, num_envs=count, autoreset_mode="SameStep", **how)
+            envs = gymnasium.make_vec(name, num_envs=count, autoreset_mode="SameStep", **options_)
             worlds = vec.VecMonitor(batched(vec.VecEnv, envs))
         options = {"n_steps": max(32, 512 // count), "batch_size": max(64, 8 * count)}
         options |= {"n_epochs": 10, "learning_rate": 1e-3, "policy_kwargs": {"log_std_init": -0.7}}
         model = sb3.PPO("MlpPolicy", worlds, seed=self.setting.seed, device="cpu", **options)
-        first = model.get_env()
-        first.reset()
-        first.step(np.zeros((count, 3), np.float32))  # it compiles
+        learner = model.get_env()
+        learner.reset()
+        learner.step(np.zeros((count, 3), np.float32))  # compiles
         curve: list[list[float]] = []
-        began, rows, ended = time.perf_counter(), self.rows, []
-        every = self.seconds / rows
+        start_time, rows, ended = time.perf_counter(), self.rows, []
+        interval = self.seconds / rows
 
         class Curve(back.BaseCallback):
             def _on_step(self) -> bool:
                 infos = self.locals["infos"]
                 ended.extend((i["episode"]["r"], i["is_success"]) for i in infos if "episode" in i)
-                spent = time.perf_counter() - began
-                if spent >= every * (len(curve) + 1):
+                elapsed = time.perf_counter() - start_time
+                if elapsed >= interval * (len(curve) + 1):
                     mean = np.mean(ended, axis=0) if ended else [np.nan] * 2
-                    curve.append([spent, self.num_timesteps, len(ended), *mean])
+                    curve.append([elapsed, self.num_timesteps, len(ended), *mean])
                     ended.clear()
                 return len(curve) < rows
 
@@ -129,12 +131,12 @@ class SB3(Study[xr.Dataset]):
         return xr.Dataset(
             {
                 name: ("row", values[:, i], {"units": unit, "long_name": words})
-                for i, (name, (unit, words)) in enumerate(_FOUND.items())
+                for i, (name, (unit, words)) in enumerate(_VARIABLES.items())
             }
         )
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """The curves."""
+        """Return a section with the curves."""
         return [Section("Curve", "", table(results), Picture("sb3", partial(figure_of, results)))]
 
 
@@ -142,7 +144,7 @@ sb3 = call_of(SB3)
 
 
 def batched(base: Any, envs: Any) -> Any:
-    """Lend a vector environment of Gymnasium, in the mode SameStep, to Stable-Baselines3."""
+    """Adapt a vector environment of Gymnasium, in the mode SameStep, to Stable-Baselines3."""
 
     class Batched(base):
         render_mode = None
@@ -157,15 +159,15 @@ def batched(base: Any, envs: Any) -> Any:
             self._actions = actions
 
         def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-            seen, rewards, terminated, truncated, told = envs.step(self._actions)
+            obs, rewards, terminated, truncated, info = envs.step(self._actions)
             infos: list[dict[str, Any]] = [{} for _ in range(envs.num_envs)]
             for i in np.flatnonzero(terminated | truncated):
                 infos[i] = {
-                    "terminal_observation": told["final_obs"][i],
+                    "terminal_observation": info["final_obs"][i],
                     "TimeLimit.truncated": bool(truncated[i]),
-                    "is_success": bool(told["final_info"]["is_success"][i]),
+                    "is_success": bool(info["final_info"]["is_success"][i]),
                 }
-            return seen, rewards.astype(np.float32), terminated | truncated, infos
+            return obs, rewards.astype(np.float32), terminated | truncated, infos
 
         def close(self) -> None:
             envs.close()
@@ -185,40 +187,48 @@ def batched(base: Any, envs: Any) -> Any:
     return Batched()
 
 
-def table(found: xr.Dataset) -> list[list[str]]:
-    """Header and rows of the curve."""
+def table(results: xr.Dataset) -> list[list[str]]:
+    """Return header and rows of the curve."""
     rows = [
         ["worlds", "wall clock", "steps of all worlds", "trials that ended", "reward of these",
          "success"]
     ]  # fmt: skip
-    for count, i in product(found.envs.values, range(found.sizes["row"])):
-        at = found.sel(envs=count).isel(row=i)
-        trials = int(at.episodes)
+    for count, i in product(results.envs.values, range(results.sizes["row"])):
+        row = results.sel(envs=count).isel(row=i)
+        trials = int(row.episodes)
         rows.append(
             [
                 f"{count:,}",
-                f"{float(at.time):.0f} s",
-                f"{int(at.steps):,}",
+                f"{float(row.time):.0f} s",
+                f"{int(row.steps):,}",
                 f"{trials:,}",
-                f"{float(at.reward):.2f}" if trials else "-",
-                tables.share(round(float(at.success) * trials) if trials else 0, trials),
+                f"{float(row.reward):.2f}" if trials else "-",
+                tables.share(round(float(row.success) * trials) if trials else 0, trials),
             ]
         )
     return rows
 
 
-def figure_of(found: xr.Dataset) -> Figure:
-    """Draw success over wall clock, with Wilson's 95 % intervals."""
+def figure_of(results: xr.Dataset) -> Figure:
+    """Plot success over wall clock, with Wilson 95 % limits."""
     figure = Figure(figsize=(6, 3.2), layout="constrained")
     ax = figure.subplots()
-    for i, count in enumerate(found.envs.values):
-        one = found.sel(envs=count)
-        at = np.flatnonzero(one.episodes.values > 0)
-        trials = one.episodes.values[at].astype(int)
-        won = np.rint(one.success.values[at] * trials).astype(int)
-        ends = [statistics.wilson(int(w), int(n)) for w, n in zip(won, trials, strict=True)]
-        ax.plot(one.time[at], 100 * won / trials, "o-", color=f"C{i}", label=f"{count} at once")
-        ax.fill_between(one.time[at], *100 * np.transpose(ends), color=f"C{i}", alpha=0.2, lw=0)
+    for i, count in enumerate(results.envs.values):
+        curve = results.sel(envs=count)
+        rows = np.flatnonzero(curve.episodes.values > 0)
+        trials = curve.episodes.values[rows].astype(int)
+        successes = np.rint(curve.success.values[rows] * trials).astype(int)
+        limits = [statistics.wilson(int(w), int(n)) for w, n in zip(successes, trials, strict=True)]
+        ax.plot(
+            curve.time[rows],
+            100 * successes / trials,
+            "o-",
+            color=f"C{i}",
+            label=f"{count} at once",
+        )
+        ax.fill_between(
+            curve.time[rows], *100 * np.transpose(limits), color=f"C{i}", alpha=0.2, lw=0
+        )
     ax.set(xlabel="wall clock [s]", ylabel="success [%]", ylim=(0, 100))
     ax.grid(alpha=0.3)
     ax.legend(title="worlds")

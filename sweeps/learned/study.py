@@ -1,4 +1,4 @@
-"""What the runs of `rps learn` found, as a published table and a figure of their curves.
+"""Published table and learning curves of runs of `rps learn`.
 
     rps sweeps/learned runs/mlp runs/gru --device "one H200"
 
@@ -45,9 +45,9 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Learned(Study[list[list[Any]]]):
-    """Publish what runs of `rps learn` found: a row of the table for each, and their curves.
+    """Publish runs of `rps learn`: a table with one row per run, and their learning curves.
 
-    The answer holds the rows.
+    The results are the rows.
     """
 
     TITLE: ClassVar[str] = "A law learned from touch"
@@ -56,15 +56,15 @@ class Learned(Study[list[list[Any]]]):
     runs: tuple[str, ...] = option((), positional=True)
     """Run folders of `rps learn`."""
     device: tuple[str, ...] = ("this machine",)
-    """What they ran on, in words: one for all, or one for each."""
+    """Devices of the runs, in words: one for all, or one for each."""
 
     @property
     def devices(self) -> tuple[str, ...]:
-        """What each of them ran on."""
+        """Device of each run."""
         return self.device * (len(self.runs) if len(self.device) == 1 else 1)
 
     def check(self) -> None:
-        """Check that there are runs, and a device for each."""
+        """Check that there are runs, and a device for each of them."""
         errors.check_each_once("runs", self.runs)
         if not self.runs:
             raise errors.InputError("runs = () is not allowed: name at least one run folder.")
@@ -74,9 +74,9 @@ class Learned(Study[list[list[Any]]]):
             )
 
     def answer(self, run: Run) -> list[list[Any]]:
-        """Gather the rows, and publish them."""
-        folders = [Path(one) for one in self.runs]
-        rows = [row(one, device) for one, device in zip(folders, self.devices, strict=True)]
+        """Collect the rows, and publish them."""
+        folders = [Path(folder) for folder in self.runs]
+        rows = [row(folder, device) for folder, device in zip(folders, self.devices, strict=True)]
         note = (
             "Validation: worlds of the domain that no update has met, by the rules of the paper, "
             "without noise in the actions; of each run the law that did best there, which "
@@ -84,26 +84,27 @@ class Learned(Study[list[list[Any]]]):
         )
         write_table(
             RESULTS / "learned.json",
-            [provenance.read_environment(one) for one in folders],
+            [provenance.read_environment(folder) for folder in folders],
             "; ".join(dict.fromkeys(self.devices)),
             Table(rows, note, COLUMNS),
         )
         return rows
 
     def intro(self, results: list[list[Any]]) -> str:
-        """Where the rows are."""
+        """Return the location of the rows."""
         return f"{len(results)} rows of `results/learned.json`; now render the tables."
 
     def report(self, results: list[list[Any]], run: Run) -> Sequence[Section]:
-        """The curve of each run."""
+        """Return a section with the curve of each run."""
         return [
             Section(
                 str(folder),
                 picture=Picture(
-                    f"learned_{one[0].strip('`')}", partial(learn.figure_of, curve_of(Path(folder)))
+                    f"learned_{cells[0].strip('`')}",
+                    partial(learn.figure_of, curve_of(Path(folder))),
                 ),
             )
-            for folder, one in zip(self.runs, results, strict=True)
+            for folder, cells in zip(self.runs, results, strict=True)
         ]
 
 
@@ -111,29 +112,31 @@ learned = call_of(Learned)
 
 
 def curve_of(folder: Path) -> xr.Dataset:
-    """What a run found out after each update."""
+    """Return the values of a run after each update."""
     return files.read_dataset(folder / "results.nc")
 
 
 def row(folder: Path, device: str) -> list[Any]:
-    """The row of a run: its law is the one that validated best."""
-    curve, asked = curve_of(folder), run_folder.read_manifest(folder)
+    """Return the row of a run, for the law with the best validation."""
+    curve, manifest = curve_of(folder), run_folder.read_manifest(folder)
     judged = curve.dropna("update", subset=["validation"])
     rates = judged.validation.values
     best = judged.isel(update=len(rates) - 1 - int(np.argmax(rates[::-1])))
-    objects = [name.removeprefix("random_") for one in asked["domain"] for name in one["objects"]]
-    tried, rate = asked["validation"] * len(objects), float(best.validation)
-    ends = statistics.wilson(round(rate * tried), tried)
+    objects = [
+        name.removeprefix("random_") for domain in manifest["domain"] for name in domain["objects"]
+    ]
+    tried, rate = manifest["validation"] * len(objects), float(best.validation)
+    interval = statistics.wilson(round(rate * tried), tried)
     return [
-        f"`{asked['network']}`",
+        f"`{manifest['network']}`",
         provenance.read_environment(folder)["packages"]["rps_jax"],
         device,
         ", ".join(dict.fromkeys(objects)),
-        asked["num_envs"] * len(objects),
+        manifest["num_envs"] * len(objects),
         curve.sizes["update"],
         float(curve.simulated[-1]) / 3600,
         float(curve.attrs["compile"]),
         float(curve.time[-1]) / 60,
-        [100 * rate, 100 * ends[0], 100 * ends[1], tried],
+        [100 * rate, 100 * interval[0], 100 * interval[1], tried],
         float(best.validation_time),
     ]
