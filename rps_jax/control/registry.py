@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeVar, get_args
+from typing import Any, get_args
 
 import jax
 import numpy as np
@@ -27,7 +27,6 @@ from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
 from rps_jax.record import files
 
-T = TypeVar("T")
 # Both are `Any` for the command line, which reads a text; a program may pass parameters.
 LawLike = str | Any  # text that names a law, or parameters of its class
 LawsLike = str | Any | Sequence[Any] | Mapping[str, Any]  # one law or several, or labelled laws
