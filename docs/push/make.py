@@ -49,7 +49,7 @@ ENDLESS = Rules(horizon=1e5, max_lost=1e5)
 SETTING = Setting("quasistatic", rules=ENDLESS)
 # Of the robot and the task, beside the law's own bounds: least, greatest.
 TASK = {"v_max": (0.01, 0.1), "omega_max": (0.03, 0.5), "d_success": (0.02, 0.2)}
-BY_HAND: dict[str, Any] = {"skin": None, "poses": None, "twists": None, "memory": None}
+BY_HAND: dict[str, Any] = {"skin": None, "poses": None, "twists": None, "law_state": None}
 
 
 class Arrival(NamedTuple):
