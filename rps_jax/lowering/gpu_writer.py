@@ -269,6 +269,9 @@ class GpuWriter(SimdWriter):
             if node.op.startswith("fold"):
                 op, start = node.op[5:], literal(INITIAL[node.op[5:-2], node.kind], node.kind)
                 head.append(f"{kind} {name} = {start};")
+                if inside and "(" in text:  # all threads take part in a shuffle
+                    lines.append(f"  const {kind} e{node.number} = {text};")
+                    text = f"e{node.number}"
                 text = f"{inside}{text} : {start}" if inside else text
                 lines.append(f"  {name} = {op}({name}, {text});")
                 if op != "add_f":  # which has a node of its own, `_SUM`

@@ -285,23 +285,12 @@ class SimdNodes(Target):
     def _slice(self, value: Value, starts: Sequence[Value], sizes: Sequence[int], kind: str) -> Any:
         """Slice an array at an index that is known at run time, clamped to the array."""
         shape = np.shape(value)
-        numbers = np.arange(size_of(shape)).reshape(shape)
-        windows = np.lib.stride_tricks.sliding_window_view(numbers, tuple(sizes))
-        zero = np.zeros((), np.int32)
-        index: Value = zero
-        for start, count in zip(starts, windows.shape, strict=False):
-            clamped: Value = zero
-            if count > 1:
-                clamped = self.emit("max", [start, zero], {}, zero)
-                clamped = self.emit("min", [clamped, np.asarray(count - 1, np.int32)], {}, zero)
-            index = self.emit("mul", [index, np.asarray(count, np.int32)], {}, zero)
-            index = self.emit("add", [index, clamped], {}, zero)
-        table = windows.reshape(-1, size_of(sizes))
+        index, table = self.windows(shape, starts, sizes)
         if is_constant(value):
             node = self.node("move", list(np.reshape(value, -1)), kind, value.size)
             value = Array(node, 0, 1, shape)
         if value.step != 1 or value.node.size == 1:
-            return self.moved([value], windows[(0,) * len(shape)], like=value)
+            return self.moved([value], table[0].reshape(sizes), like=value)
         extra = tuple(map(tuple, (table + value.first).tolist()))
         node = self.node("take", [flat(index, 1), value], kind, table.shape[1], extra)
         return Array(node, 0, 1, tuple(sizes))

@@ -129,6 +129,8 @@ class Graph(Target):
 
         if name in ("div", "rem") and kind == "i":
             return self._divided(name, x[0], x[1], out)
+        if name in ("and", "or", "xor", "not") and kind == "i":
+            return make(f"Bitwise{name.capitalize()}", *x)
         if name in _NAMES:
             return make(_NAMES[name], *x)
         if name == "ne":
@@ -154,7 +156,7 @@ class Graph(Target):
             special = make("Or", make("IsInf", x[0], to="b"), make("IsNaN", x[0], to="b"), to="b")
             return make("Not", special)
         if name == "atan2":
-            y, at = x
+            y, at = self._unit_if_infinite(x, out)
             zero, pi = number(0), number(np.pi)
             upright = make("Mul", make("Sign", y), number(np.pi / 2))
             behind = make("Where", make("Less", y, zero, to="b"), make("Neg", pi), pi)
@@ -163,9 +165,34 @@ class Graph(Target):
             return make("Where", make("Equal", at, zero, to="b"), upright, angle)
         if name in REDUCTIONS:
             return self._reduced(REDUCTIONS[name], x[0], params["axes"], shape, kind)
+        if name == "exp2":
+            return make("Pow", number(2), x[0])
+        if name == "dynamic_slice":
+            return self._slice(x[0], values[1:], params["slice_sizes"], out)
         if name == "dot_general":
             return make("Einsum", *x, equation=_equation(x, params["dimension_numbers"]))
         raise UnsupportedError(name)
+
+    def _unit_if_infinite(self, x: Sequence[Tensor], out: Typed) -> list[Tensor]:
+        """Replace two numbers by their signs where both are infinite: their angle is the same."""
+        infinite = [self.node("IsInf", [y], y.shape, "b") for y in x]
+        both = self.node("And", infinite, out.shape, "b")
+        signs = [self.node("Sign", [y], y.shape, "f") for y in x]
+        return [
+            self.node("Where", [both, sign, y], out.shape, "f")
+            for sign, y in zip(signs, x, strict=True)
+        ]
+
+    def _slice(
+        self, x: Tensor, starts: Sequence[Value], sizes: Sequence[int], out: Typed
+    ) -> Tensor:
+        """Slice a tensor at an index that is known at run time, clamped to the tensor."""
+        index, table = self.windows(x.shape, starts, sizes)
+        windows, size = self.constant(table.astype(np.int64)), size_of(sizes)
+        indices = self.node("Gather", [windows, self.tensor(index)], (size,), "i", axis=0)
+        flat = self.reshaped(x, (size_of(x.shape),))
+        window = self.node("Gather", [flat, indices], (size,), x.kind, axis=0)
+        return self.reshaped(window, out.shape)
 
     def _divided(self, name: str, x: Tensor, y: Tensor, out: Typed) -> Value:
         """Divide integers as JAX does: by 0 the quotient is -1 and the remainder the dividend."""
@@ -208,7 +235,14 @@ class Graph(Target):
             whole = self._cast(x, "i")
             op = "ReduceMin" if binary == "and" else "ReduceMax"
             return self._cast(self.node(op, [whole, over], shape, "i", keepdims=0), "b")
-        return self.node(_REDUCED[binary], [x, over], shape, kind, keepdims=0)
+        reduced = self.node(_REDUCED[binary], [x, over], shape, kind, keepdims=0)
+        if kind != "f" or binary not in ("max", "min"):
+            return reduced
+        # The runtime drops some NaN.
+        flags = self._cast(self.node("IsNaN", [x], x.shape, "b"), "i")
+        any_nan = self._cast(self.node("ReduceMax", [flags, over], shape, "i", keepdims=0), "b")
+        nan = self.constant(np.asarray(np.nan, np.float32), "f")
+        return self.node("Where", [any_nan, nan, reduced], shape, "f")
 
     def model(
         self, name: str, inputs: Sequence[Tensor], outputs: Sequence[tuple[Tensor, Value]],

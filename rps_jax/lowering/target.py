@@ -96,6 +96,8 @@ class Target:
             return self._gathered(values[0], values[1], params, out)
         if name == "select_n" and (len(values) > 3 or kind_of(values[0].dtype) != "b"):
             return self._selected(values[0], values[1:], out)
+        if name == "square" and kind_of(out.dtype) != "f":
+            return self.emit("mul", [values[0], values[0]], {}, out)
         return self.apply(name, values, params, out)
 
     def _power(self, x: Value, exponent: int, out: Typed) -> Value:
@@ -177,6 +179,23 @@ class Target:
         places = np.squeeze(places, tuple(1 + i for i in numbers.collapsed_slice_dims))
         places = places.reshape((*np.shape(indices)[:-1], *places.shape[1:]))
         return self.moved(blocks, np.moveaxis(places, range(len(rest)), rest), out)
+
+    def windows(
+        self, shape: Sequence[int], starts: Sequence[Value], sizes: Sequence[int]
+    ) -> tuple[Value, np.ndarray]:
+        """Return the index of the window at a start, clamped, and the indices in each window."""
+        numbers = np.arange(size_of(shape)).reshape(shape)
+        windows = np.lib.stride_tricks.sliding_window_view(numbers, tuple(sizes))
+        zero = np.zeros((), np.int32)
+        index: Value = zero
+        for start, count in zip(starts, windows.shape, strict=False):
+            clamped: Value = zero
+            if count > 1:
+                clamped = self.emit("max", [start, zero], {}, zero)
+                clamped = self.emit("min", [clamped, np.asarray(count - 1, np.int32)], {}, zero)
+            index = self.emit("mul", [index, np.asarray(count, np.int32)], {}, zero)
+            index = self.emit("add", [index, clamped], {}, zero)
+        return index, windows.reshape(-1, size_of(sizes))
 
 
 def size_of(shape: Sequence[int]) -> int:

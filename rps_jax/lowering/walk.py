@@ -31,7 +31,8 @@ _MAX_STEPS = 256  # of a scan that is unrolled
 # operands behind them are indices.
 _MOVES = {
     **dict.fromkeys(("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "slice", "rev"), 1),
-    **dict.fromkeys(("transpose", "split", "unstack", "dynamic_slice", "gather", "scatter"), 1),
+    **dict.fromkeys(("transpose", "split", "unstack", "tile", "dynamic_slice", "gather"), 1),
+    "scatter": 1,
     **dict.fromkeys(("pad", "dynamic_update_slice"), 2),
     **dict.fromkeys(("stack", "concatenate")),
 }
