@@ -75,7 +75,7 @@ class FollowingState(NamedTuple):
     """State of the controller and the criterion of its trial."""
 
     theta_p: jax.Array  # () [rad] of the last push, relative to the path
-    run_grid: jax.Array  # () bool: a force has been felt
+    pushed: jax.Array  # () bool: a force has been felt
     clock: jax.Array  # () [s] since then
     silent: jax.Array  # () [s] current time without a force
     longest: jax.Array  # () [s] without a force, the longest time
@@ -98,22 +98,22 @@ def build_law(law: LawName = "force_push", duration: float = DURATION) -> Law:
         period = touch.period
         f_world = -planar.rotate(touch.yaw, observation.f_robot)
         felt = planar.norm(f_world) >= params.f_min
-        run_grid = state.pushed | felt
+        pushed = state.pushed | felt
         zero = jnp.zeros_like(touch.yaw)
         offset = touch.p_world_robot[1]
         if law == "force_push":
             theta_p = force_push.steer(params, state.theta_p, f_world, zero, offset, period)
         else:
             theta_p = -params.k_y * offset
-        theta_p = jnp.where(run_grid, theta_p, 0.0)
+        theta_p = jnp.where(pushed, theta_p, 0.0)
         v_world = params.v_max * jnp.stack([jnp.cos(theta_p), jnp.sin(theta_p)])
         v_robot = planar.rotate(-touch.yaw, force_push.yield_to_force(params, v_world, f_world))
         going = state.clock < duration
         v_robot = jnp.where(going, v_robot, 0.0)
         silent = jnp.where(felt, 0.0, state.silent + period)
         longest = jnp.where(going, jnp.maximum(state.longest, silent), state.longest)
-        clock = state.clock + jnp.where(run_grid, period, 0.0)
-        state = FollowingState(theta_p, run_grid, clock, silent, longest)
+        clock = state.clock + jnp.where(pushed, period, 0.0)
+        state = FollowingState(theta_p, pushed, clock, silent, longest)
         return state, Twist(v_robot[0], v_robot[1], zero), Details.from_obs(touch)
 
     exact = LoadCell(noise=0.0, time_constant=0.05, threshold=0.0)
