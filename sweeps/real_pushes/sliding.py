@@ -1,7 +1,7 @@
-"""How a rigid object slides that fingers push slowly over dry ground, many pushes at once.
+"""Quasi-static pushes of a rigid object by fingers over dry ground, many pushes at once.
 
-The object is pushed so slowly that inertia does not count, and so everything depends on the ways of
-the fingers alone, which are points. In each step the twist V of the object minimises
+The push is slow enough to neglect inertia, so the motion depends only on the paths of the fingers,
+which are points. In each step the twist V of the object minimises
 
     sum over points of the ground of N_i |v_i| + sum over fingers of P(gap + v_n - mu_c |v_t|),
 
@@ -22,23 +22,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-_ARM = 0.05  # [m] by which turns are made lengths
-_SLIP = 1e-3  # share of a step's way from which on friction is dry
-_SINK = 1e-4  # share of a step's way that a finger sinks in under mu m g
-_BALANCED = 1e-5  # [mu m g] to which forces balance
-_ROUNDS = 60  # of Newton's method at most
-_PACES = 0.3 ** np.arange(6)  # of a line search
-_NEAR = 0.1  # steps of room below which a contact might close
-_WIDER = (100.0, 10.0, 1.0)  # by which friction begins rounded when forces jump
+_ARM = 0.05  # [m] length scale of rotations
+_SLIP = 1e-3  # slip, as a share of a step, above which friction is dry
+_SINK = 1e-4  # penetration of a finger under mu m g, as a share of a step
+_BALANCED = 1e-5  # [mu m g] tolerance of the force balance
+_MAX_ITERATIONS = 60  # of Newton's method
+_STEP_SIZES = 0.3 ** np.arange(6)  # of the line search
+_NEAR = 0.1  # gap, in steps, below which a contact may close
+_SLIP_FACTORS = (100.0, 10.0, 1.0)  # factors of the slip for a start with smoother friction
 
 
 class Ground(NamedTuple):
-    """What objects (B,) stand on: S points, or an ellipsoid at the centre of mass."""
+    """Support of objects (B,): S points, or an ellipsoid at the centre of mass."""
 
     at: np.ndarray  # (B, S, 2) [m] body frame, from the centre of mass
-    weight: np.ndarray  # (B, S) [1] of the points, which share the load as springs of this size do
+    weight: np.ndarray  # (B, S) [1] stiffness of the points, which share the load like springs
     arm: np.ndarray  # (B,) [m] c of an ellipsoid; 0 of points
-    shift: np.ndarray  # (B,) [m] by which a push of mu m g moves the load: mu times its height
+    shift: np.ndarray  # (B,) [m] shift of the load by a push of mu m g: mu times its height
 
 
 class Slid(NamedTuple):
@@ -49,19 +49,19 @@ class Slid(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """What decides the twists of some objects in one step, in lengths of the step."""
+    """Problem for the twists of objects in one step, in units of the step length."""
 
     slide: np.ndarray  # (B, S, 3, 3) twist to sliding
     load: np.ndarray  # (B, S)
     a_n: np.ndarray  # (B, F, 3) twist to speed along the normals
     a_t: np.ndarray  # (B, F, 3)
-    d_n: np.ndarray  # (B, F) way of the fingers along the normals
+    d_n: np.ndarray  # (B, F) displacement of the fingers along the normals
     d_t: np.ndarray  # (B, F)
     gap: np.ndarray  # (B, F)
     friction: np.ndarray  # (B, 1)
 
-    def of(self, rows: np.ndarray) -> _Step:
-        """Some of the objects."""
+    def select(self, rows: np.ndarray) -> _Step:
+        """Return the rows of some objects."""
         return _Step(*(leaf[rows] for leaf in self))
 
 
@@ -73,25 +73,27 @@ def push(
     pose: np.ndarray,
     friction: np.ndarray,
 ) -> Slid:
-    """Push objects of one outline along ways of fingers.
+    """Push objects of one outline along paths of fingers.
 
     Args:
       outline: corners (N, 2) [m] of a convex polygon, counter-clockwise, body frame.
       com: centre of mass (2,) [m], body frame.
-      ground: what they stand on.
-      ways: of F fingers (T + 1, B, F, 2) [m], world; a finger that is not there is far away.
+      ground: support of the objects.
+      ways: paths of F fingers (T + 1, B, F, 2) [m], world; a missing finger is far away.
       pose: of the body frame at the start (B, 3) [m, m, rad], world.
       friction: between object and fingers (B,) [1].
     """
     pose = np.array(pose, float)
     twist, force = np.zeros_like(pose), np.zeros((len(pose), 2))
     poses, forces = [pose], []
-    for before, after in itertools.pairwise(ways):
-        way = after - before
-        length = np.maximum(np.linalg.norm(way, axis=-1).max(axis=1), 1e-9)
-        step, normal, tangent = _step(outline, com, ground, before, way, length, pose, force)
+    for start, end in itertools.pairwise(ways):
+        displacement = end - start
+        length = np.maximum(np.linalg.norm(displacement, axis=-1).max(axis=1), 1e-9)
+        step, normal, tangent = _step(
+            outline, com, ground, start, displacement, length, pose, force
+        )
         step = step._replace(friction=friction[:, None])
-        twist = _solved(step, twist)
+        twist = _solve(step, twist)
         pushing, rubbing = _forces(step, twist)
         force = np.sum(pushing[..., None] * normal + rubbing[..., None] * tangent, axis=1)
         middle = pose[:, :2] + turned(pose[:, 2], com) + length[:, None] * twist[:, :2]
@@ -103,50 +105,50 @@ def push(
 
 
 def turned(yaw: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Vectors (..., 2) turned by yaw (...) [rad]."""
+    """Return vectors (..., 2) rotated by yaw (...) [rad]."""
     c, s = np.cos(yaw), np.sin(yaw)
     x, y = vector[..., 0], vector[..., 1]
     return np.stack([c * x - s * y, s * x + c * y], axis=-1)
 
 
 def nearest(outline: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (...) [m] of points (..., 2) from a convex polygon, negative inside, and its normal.
+    """Return signed distances (...) [m] of points (..., 2) from a convex polygon, and normals.
 
-    The normal (..., 2) is the outward one there.
+    Distances are negative inside; the normals (..., 2) point outward.
     """
     along = np.roll(outline, -1, axis=0) - outline
     length = np.linalg.norm(along, axis=1)
     unit = along / length[:, None]
     out = np.stack([unit[:, 1], -unit[:, 0]], axis=1)
-    apart = point[..., None, :] - outline  # (..., N, 2)
-    beyond = np.sum(apart * out, axis=-1)
+    from_corner = point[..., None, :] - outline  # (..., N, 2)
+    beyond = np.sum(from_corner * out, axis=-1)
     side = np.argmax(beyond, axis=-1)
     far = np.take_along_axis(beyond, side[..., None], -1)[..., 0]
-    place = np.clip(np.sum(apart * unit, axis=-1), 0, length)
-    off = apart - place[..., None] * unit
+    position = np.clip(np.sum(from_corner * unit, axis=-1), 0, length)
+    off = from_corner - position[..., None] * unit
     distance = np.linalg.norm(off, axis=-1)
-    which = np.argmin(distance, axis=-1)[..., None]
-    close = np.take_along_axis(distance, which, -1)[..., 0]
-    way = np.take_along_axis(off, which[..., None], -2)[..., 0, :]
+    index = np.argmin(distance, axis=-1)[..., None]
+    close = np.take_along_axis(distance, index, -1)[..., 0]
+    direction = np.take_along_axis(off, index[..., None], -2)[..., 0, :]
     corner = (far > 0) & (close > far * (1 + 1e-9)) & (close > 1e-9)
-    normal = np.where(corner[..., None], way / np.maximum(close, 1e-12)[..., None], out[side])
+    normal = np.where(corner[..., None], direction / np.maximum(close, 1e-12)[..., None], out[side])
     return np.where(corner, close, far), normal
 
 
 def borne(at: np.ndarray, weight: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """Loads (B, S) [1] of springs of some weights at (B, S, 2) that only push.
+    """Return loads (B, S) [1] of springs at (B, S, 2) that only push.
 
-    Their sum is 1 and their centre (B, 2) [m]. If no springs could bear that, as when the object
-    tips over, what they bear has the centre that is nearest to it in the least squares.
+    Their sum is 1 and their centre is at (B, 2) [m]. If this is impossible, as for an object that
+    tips over, their centre is the nearest possible one in the least-squares sense.
     """
     rows = np.concatenate([np.ones((*at.shape[:2], 1)), at / _ARM], axis=-1)
-    wanted = np.column_stack([np.ones(len(at)), centre / _ARM])
+    required = np.column_stack([np.ones(len(at)), centre / _ARM])
     bears = weight > 0
     load = weight / weight.sum(axis=1, keepdims=True)
     for _ in range(at.shape[1]):
-        some = rows * (weight * bears)[..., None]
-        plane = np.linalg.pinv(some.swapaxes(1, 2) @ rows, rcond=1e-9) @ wanted[..., None]
-        load = (some @ plane)[..., 0]
+        weighted = rows * (weight * bears)[..., None]
+        plane = np.linalg.pinv(weighted.swapaxes(1, 2) @ rows, rcond=1e-9) @ required[..., None]
+        load = (weighted @ plane)[..., 0]
         if not np.any(load < 0):
             break
         bears &= load >= 0
@@ -159,26 +161,26 @@ def _step(
     com: np.ndarray,
     ground: Ground,
     finger: np.ndarray,
-    way: np.ndarray,
+    displacement: np.ndarray,
     length: np.ndarray,
     pose: np.ndarray,
     force: np.ndarray,
 ) -> tuple[_Step, np.ndarray, np.ndarray]:
-    """One step, with the normals (B, F, 2) towards the objects, and the tangents."""
+    """Return the problem of one step, and normals (B, F, 2) towards the objects and tangents."""
     yaw, scale = pose[:, 2], length[:, None]
     at = turned(yaw[:, None], ground.at)
-    zero, one = np.zeros(at.shape[:2]), np.ones(at.shape[:2])
+    zero, ones = np.zeros(at.shape[:2]), np.ones(at.shape[:2])
     arm = np.broadcast_to(ground.arm[:, None], at.shape[:2])
     slide = np.stack(
         [
-            np.stack([one, zero, -at[..., 1] / _ARM], axis=-1),
-            np.stack([zero, one, at[..., 0] / _ARM], axis=-1),
+            np.stack([ones, zero, -at[..., 1] / _ARM], axis=-1),
+            np.stack([zero, ones, at[..., 0] / _ARM], axis=-1),
             np.stack([zero, zero, arm / _ARM], axis=-1),
         ],
         axis=-2,
     )
-    seen = turned(-yaw[:, None], finger - pose[:, None, :2])
-    gap, outward = nearest(outline, seen)
+    finger_in_body = turned(-yaw[:, None], finger - pose[:, None, :2])
+    gap, outward = nearest(outline, finger_in_body)
     normal = -turned(yaw[:, None], outward)
     tangent = np.stack([-normal[..., 1], normal[..., 0]], axis=-1)
     r = finger + gap[..., None] * normal - pose[:, None, :2] - turned(yaw, com)[:, None]
@@ -191,13 +193,13 @@ def _step(
     return (
         _Step(
             slide,
-            borne(at, ground.weight, centre) if at.shape[1] > 1 else one,
+            borne(at, ground.weight, centre) if at.shape[1] > 1 else ones,
             row(normal),
             row(tangent),
-            np.sum(way * normal, axis=-1) / scale,
-            np.sum(way * tangent, axis=-1) / scale,
+            np.sum(displacement * normal, axis=-1) / scale,
+            np.sum(displacement * tangent, axis=-1) / scale,
             gap / scale,
-            one[:, :1],
+            ones[:, :1],
         ),
         normal,
         tangent,
@@ -208,7 +210,7 @@ def _step(
 
 
 def _contact(step: _Step, twist: np.ndarray, slip: float) -> tuple[np.ndarray, ...]:
-    """Room, sliding and its rounded size (B, F), in lengths of the step."""
+    """Return gap, slip and smoothed slip (B, F), in units of the step length."""
     v_t = np.einsum("bfi,bi->bf", step.a_t, twist) - step.d_t
     size = np.sqrt(v_t * v_t + slip * slip)
     v_n = np.einsum("bfi,bi->bf", step.a_n, twist) - step.d_n
@@ -216,7 +218,7 @@ def _contact(step: _Step, twist: np.ndarray, slip: float) -> tuple[np.ndarray, .
 
 
 def _forces(step: _Step, twist: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pushes and friction (B, F) [mu m g] of the fingers on the objects."""
+    """Return normal and friction forces (B, F) [mu m g] of the fingers on the objects."""
     room, v_t, size = _contact(step, twist, _SLIP)
     pushing = np.maximum(-room, 0.0) / _SINK
     return pushing, -step.friction * pushing * v_t / size
@@ -232,7 +234,7 @@ def _value(step: _Step, twist: np.ndarray, slip: float) -> np.ndarray:
 def _derivatives(
     step: _Step, twist: np.ndarray, slip: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gradient (B, 3), Hessian (B, 3, 3), and what an upper bound of it adds."""
+    """Return gradient (B, 3), Hessian (B, 3, 3), and the addition for an upper bound of it."""
     slid = np.einsum("bsij,bj->bsi", step.slide, twist)
     size = np.sqrt(np.sum(slid * slid, axis=-1) + slip * slip)
     per = step.load / size
@@ -248,55 +250,55 @@ def _derivatives(
     gradient -= np.einsum("bf,bfj->bj", pushing, b)
     wall = b[..., :, None] * b[..., None, :] / _SINK
     hessian += np.sum((room < 0)[..., None, None] * wall, axis=1)
-    # Contacts that might close in the step.
-    more = less + np.sum(((room >= 0) & (room < _NEAR))[..., None, None] * wall, axis=1)
+    # contacts that may close in the step
+    addition = less + np.sum(((room >= 0) & (room < _NEAR))[..., None, None] * wall, axis=1)
     bend = pushing * step.friction * slip**2 / round_**3
     hessian += np.sum(
         bend[..., None, None] * step.a_t[..., :, None] * step.a_t[..., None, :], axis=1
     )
-    return gradient, hessian + 1e-7 * np.eye(3), more
+    return gradient, hessian + 1e-7 * np.eye(3), addition
 
 
-def _solved(step: _Step, twist: np.ndarray) -> np.ndarray:
-    """The twists (B, 3) of least power, from a first guess: Newton's method with a line search."""
+def _solve(step: _Step, twist: np.ndarray) -> np.ndarray:
+    """Return the twists (B, 3) of least power, by Newton's method with a line search."""
     rest = _value(step, 0 * twist, _SLIP) <= _value(step, twist, _SLIP)
-    found = np.where(rest[:, None], 0.0, twist)
+    twists = np.where(rest[:, None], 0.0, twist)
     rows = np.arange(len(twist))
-    for wide in (1.0, *_WIDER):  # with a good guess the first is enough
-        rows = _newton(step, found, rows, wide * _SLIP)
+    for wide in (1.0, *_SLIP_FACTORS):  # the first suffices with a good guess
+        rows = _newton(step, twists, rows, wide * _SLIP)
         if not rows.size:
             break
-    return found
+    return twists
 
 
-def _newton(step: _Step, found: np.ndarray, rows: np.ndarray, slip: float) -> np.ndarray:
-    """Improve the twists of some rows in place; those that are not solved."""
-    for _ in range(_ROUNDS if slip == _SLIP else 10):
-        part, twist = step.of(rows), found[rows]
-        gradient, hessian, more = _derivatives(part, twist, slip)
+def _newton(step: _Step, twists: np.ndarray, rows: np.ndarray, slip: float) -> np.ndarray:
+    """Improve the twists of some rows in place; return the unsolved rows."""
+    for _ in range(_MAX_ITERATIONS if slip == _SLIP else 10):
+        part, twist = step.select(rows), twists[rows]
+        gradient, hessian, addition = _derivatives(part, twist, slip)
         if slip == _SLIP:
-            open_ = np.abs(gradient).max(axis=1) > _BALANCED
-            rows = rows[open_]
+            unsolved = np.abs(gradient).max(axis=1) > _BALANCED
+            rows = rows[unsolved]
             if not rows.size:
                 return rows
-            part, twist = part.of(open_), twist[open_]
-            gradient, hessian, more = gradient[open_], hessian[open_], more[open_]
-        # Newton's step is fast at the end; where friction is nearly level along it, that of an
-        # upper bound of the Hessian is safe.
-        now, best = _value(part, twist, slip), twist
-        least = now.copy()
+            part, twist = part.select(unsolved), twist[unsolved]
+            gradient, hessian, addition = gradient[unsolved], hessian[unsolved], addition[unsolved]
+        # Newton's step is fast near the solution. Where friction is nearly constant along it, the
+        # step of an upper bound of the Hessian is safe.
+        current, best = _value(part, twist, slip), twist
+        least = current.copy()
         changes = [-np.linalg.solve(one, gradient[..., None])[..., 0]
-                   for one in (hessian, hessian + more)]  # fmt: skip
-        for pace in _PACES:
+                   for one in (hessian, hessian + addition)]  # fmt: skip
+        for size in _STEP_SIZES:
             for change in changes:
-                tried = twist + pace * change
+                tried = twist + size * change
                 value = _value(part, tried, slip)
                 better = value < least
                 best = np.where(better[:, None], tried, best)
                 least = np.where(better, value, least)
-            if (least < now).all():
+            if (least < current).all():
                 break
-        found[rows] = best
-        if (least >= now).all():
+        twists[rows] = best
+        if (least >= current).all():
             break
     return rows
