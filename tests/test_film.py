@@ -76,9 +76,11 @@ def test_a_film_shows_each_trial_in_its_tile_and_holds_the_end(make, tmp_path):
 def test_worlds_of_several_objects_keep_their_order(tmp_path):
     plan = plan_of("random_cylinder", "random_box")
     takes = film.of_sweep(tmp_path, plan, ["rps"], "first", (1, 3))
-    assert [list(take.places) for take in takes] == [[0, 2], [1]]
-    assert film._placed([take.labels for take in takes], takes) == [f"world {i}" for i in range(3)]
-    assert [scene.family for scene in film._placed([t.scenes for t in takes], takes)] == [
+    assert [list(take.tiles) for take in takes] == [[0, 2], [1]]
+    assert film._in_grid_order([take.labels for take in takes], takes) == [
+        f"world {i}" for i in range(3)
+    ]
+    assert [scene.family for scene in film._in_grid_order([t.scenes for t in takes], takes)] == [
         *("cylinder", "box", "cylinder")
     ]
 
@@ -87,7 +89,7 @@ def test_worlds_are_filmed_by_their_indices(tmp_path):
     plan = plan_of("random_cylinder", "random_box")
     chosen = film.worlds_of(plan, (2, 1))
     takes = film.of_sweep(tmp_path, plan, ["rps"], chosen, (1, 3))
-    assert film._placed([take.labels for take in takes], takes) == ["world 2", "world 1"]
+    assert film._in_grid_order([take.labels for take in takes], takes) == ["world 2", "world 1"]
     for wrong in ((1, 1), (-1,), (plan.worlds,)):
         with pytest.raises(InputError, match="worlds"):
             film.worlds_of(plan, wrong)
@@ -97,7 +99,7 @@ def test_several_laws_have_a_row_each_and_a_world_a_column(tmp_path):
     one = plan_of("random_box", "random_cylinder")
     plan = dataclasses.replace(one, laws={"one": RPSParams.paper(), "two": RPSParams.nps()})
     takes = film.of_sweep(tmp_path, plan, ["two", "one"], "first", (2, 3))
-    assert film._placed([take.labels for take in takes], takes) == [
+    assert film._in_grid_order([take.labels for take in takes], takes) == [
         *(f"two, world {i}" for i in range(3)),
         *(f"one, world {i}" for i in range(3)),
     ]

@@ -197,7 +197,7 @@ def test_input_that_cannot_be_drawn_is_refused(
 
 
 def test_this_machine_can_draw_and_encode() -> None:
-    assert [(c.what, c.ok) for c in video.check()] == [("rendering", True), ("ffmpeg", True)]
+    assert [(c.name, c.ok) for c in video.check()] == [("rendering", True), ("ffmpeg", True)]
 
 
 def test_a_machine_that_cannot_draw_is_told_how_to_mend_it() -> None:

@@ -90,10 +90,10 @@ def test_every_kind_of_law_is_shown_live(law, tmp_path, monkeypatch, registries)
     (tmp_path / "tuned.json").write_text(json.dumps({"L": 0.3}))
     (tmp_path / "mine.py").write_text(OWN)
     shutil.copy(Path(learned.__file__).parent / "learned_mlp.npz", tmp_path / "policy.npz")
-    asked = viewer.Asked("cylinder", "S1", law, (0.6, 0.0))
+    request = viewer.PushRequest("cylinder", "S1", law, (0.6, 0.0))
     shown = viewer.View(law=law, setting=replace(SETTING, engine="quasistatic"))
     shown.validate()
-    push = shown.push_of(asked)
+    push = shown.push_of(request)
     push.live.step(25)
     assert law in push.title
     assert push.live.past[-1].seen.qpos[0] > 0.002  # [m] it drives
@@ -199,7 +199,7 @@ FLAGS = (
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
     *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--window-size=800,640"),
 )
-ASKED = viewer.Asked("cylinder", "S1", "rps", (0.0, 2.0))
+REQUEST = viewer.PushRequest("cylinder", "S1", "rps", (0.0, 2.0))
 
 
 def make(asked):
@@ -213,7 +213,7 @@ def make(asked):
 
 @pytest.fixture
 def page():
-    page = viewer.open_page("127.0.0.1", 0, ASKED, make)
+    page = viewer.open_page("127.0.0.1", 0, REQUEST, make)
     yield page
     page.close()
 
@@ -254,7 +254,7 @@ def test_the_page_plays_a_push_and_says_what_is_wrong(page, browser):
             time.sleep(0.2)
 
     browser.get(page.url)
-    page.begin(lambda: make(ASKED))
+    page.start(lambda: make(REQUEST))
     until(lambda: "line contact" in text())
     browser.find_element(By.CSS_SELECTOR, "[class*=Notification-closeButton]").click()
     until(lambda: not browser.find_elements(By.CSS_SELECTOR, "[class*=Notification-closeButton]"))
@@ -271,7 +271,7 @@ def test_the_page_plays_a_push_and_says_what_is_wrong(page, browser):
     field = browser.find_element(By.CSS_SELECTOR, "input[value='S1']")
     field.clear()
     field.send_keys("S3")
-    until(lambda: page.asked.friction == "S3")
+    until(lambda: page.request.friction == "S3")
     button(browser, "Push").click()
     until(lambda: "unknown friction set 'S3': choose from S1, S2." in text())
 
@@ -292,13 +292,13 @@ def said(page, *messages):
         for message in (CAMERA, *messages):
             raw = message if isinstance(message, bytes | str) else msgspec.msgpack.encode(message)
             socket_.send(raw)
-        before = page._size.value
+        before = page._distance.value
         after = 0.3 if before != 0.3 else 0.2
-        socket_.send(msgspec.msgpack.encode(value(page._size, after)))
+        socket_.send(msgspec.msgpack.encode(value(page._distance, after)))
         deadline = time.monotonic() + 10
-        while page._size.value != after and time.monotonic() < deadline:
+        while page._distance.value != after and time.monotonic() < deadline:
             time.sleep(0.01)
-        assert page._size.value == after  # the connection is still good
+        assert page._distance.value == after  # the connection is still good
 
 
 def value(control, new):
@@ -332,7 +332,7 @@ def test_it_is_served_under_names_of_this_machine_alone(page, host, status):
 
 
 def test_only_what_the_controls_offer_comes_through(page, capfd):
-    before = page.asked
+    before = page.request
     infinite, huge = float("inf"), 1e300
     said(
         page,
@@ -355,20 +355,20 @@ def test_only_what_the_controls_offer_comes_through(page, capfd):
         {"type": "Nothing"},
         b"\xc1", b"", "a text", b"\x91" * 100_000,
     )  # fmt: skip
-    assert page.asked == before
+    assert page.request == before
     assert page._time.value == 0.0
     assert page._speed.value == 5.0
     assert page._server._share_tunnel is None
     error = capfd.readouterr().err
     assert error == "rps view: a message that the page does not send was dropped.\n"
     said(page, value(page._law, "nps"), value(page._target, [1.0, 2.0]))
-    assert page.asked == before._replace(law="nps", target=(1.0, 2.0))
+    assert page.request == before._replace(law="nps", target=(1.0, 2.0))
 
 
 def test_a_viser_that_is_not_guarded_is_not_served(monkeypatch):
     monkeypatch.setattr(gate.Gate, "guarding", lambda self: contextlib.nullcontext())
-    with pytest.raises(InputError, match="cannot be kept to its own page"):
-        viewer.open_page("127.0.0.1", 0, ASKED, make)
+    with pytest.raises(InputError, match="this version of viser answers other pages"):
+        viewer.open_page("127.0.0.1", 0, REQUEST, make)
 
 
 def test_a_port_that_is_taken_is_one_sentence(capsys):

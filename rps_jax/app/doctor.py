@@ -1,4 +1,4 @@
-"""What works on this machine, and how to mend what does not."""
+"""The doctor: a report of what works on this machine, with a fix for the rest."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,7 @@ from rps_jax.world import video
 
 @dataclass(frozen=True)
 class Doctor(Question[str]):
-    """Print versions, devices and folders, and what does not work with its mend."""
+    """Print versions, devices and folders, and a fix for each check that fails."""
 
     out: Path | str | None = option(None, kw_only=True, hidden=True)
 
@@ -28,21 +28,21 @@ doctor = call_of(Doctor)
 
 
 def report(cache: Path) -> str:
-    """Versions, devices, folders and the state of rendering, one line each."""
-    checks = [("cache", *_writable(cache)), *video.check()]
+    """Return versions, devices, folders and the checks of rendering, one line each."""
+    checks = [_check_cache(cache), *video.check()]
     environment = device.collect_environment()
-    found = environment["device"]
+    hardware = environment["device"]
     rows = {
         "python": f"{environment['python']} on {environment['platform']}",
         **{name: version or "not installed" for name, version in environment["packages"].items()},
-        "device": f"{found['count']} x {found['kind']} ({found['platform']}), "
+        "device": f"{hardware['count']} x {hardware['kind']} ({hardware['platform']}), "
         f"{environment['processors']} processors",
         "compiler": environment["compiler"]
         or "none: XLA steps the fused engine, more slowly than a C compiler's program would",
-        "kernels": _kernels(found["platform"]),
+        "kernels": _kernels(hardware["platform"]),
         "commit": environment["commit"] or "not in a checkout",
         "cached in": str(cache),
-        **{what: "ok" if works else f"FAILS: {mend}" for what, works, mend in checks},
+        **{check.name: "ok" if check.ok else f"FAILS: {check.fix}" for check in checks},
     }
     return "\n".join(f"{name:<12}{text}" for name, text in rows.items())
 
@@ -50,13 +50,15 @@ def report(cache: Path) -> str:
 def _kernels(platform: str) -> str:
     if platform != "gpu":
         return "none: JAX finds no GPU"
-    made = native.target() and nvrtc.target()
-    return f"by NVRTC {made}" if made else "none: XLA steps the fused engine, many times slower"
+    target = native.target() and nvrtc.target()
+    return f"by NVRTC {target}" if target else "none: XLA steps the fused engine, many times slower"
 
 
-def _writable(folder: Path) -> tuple[bool, str]:
+def _check_cache(folder: Path) -> video.Check:
+    """Return whether the folder of the cache can be written."""
     try:
         run_folder.ensure_writable(folder)
     except InputError:
-        return False, f"{folder} cannot be written: set RPS_CACHE to a writable folder"
-    return True, ""
+        fix = f"{folder} cannot be written: set RPS_CACHE to a writable folder"
+        return video.Check("cache", False, fix)
+    return video.Check("cache", True, "")

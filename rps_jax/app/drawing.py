@@ -1,4 +1,4 @@
-"""How a push looks in the browser: the ground, the bodies, the taxels, the way and the twist."""
+"""The 3-D scene of a push in the browser: ground, bodies, taxels, paths and twist."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 _PATH_STEP = 10  # moments between two points of a path
 _ROOT = "/push"
 TARGET = f"{_ROOT}/target"  # the control by which a hand moves the target
-_SIDES = 48  # facets of what is round
-_CAMERA = ((-2.7, -4.6, 3.7), (0.25, 0.1, 0.0))  # [m] where it stands, and what it looks at
+_SIDES = 48  # facets of a cylinder
+_CAMERA = ((-2.7, -4.6, 3.7), (0.25, 0.1, 0.0))  # [m] its position, and the point that it looks at
 _FIELD = 0.75  # [rad] of view, upright
 _GROUND, _CELL, _METRE = (226, 226, 223), (198, 198, 196), (158, 158, 156)  # RGB
 _SKIN, _PRESSED = np.array([13, 168, 161]), np.array([255, 176, 0])  # RGB, from none to all foam
@@ -35,7 +35,7 @@ _ARC = (10.0, 0.56, 0.40)  # [s] of turning that an arc shows, its radius and he
 
 
 def furnish(server: ViserServer) -> None:
-    """What is there without a push: camera, light, ground."""
+    """Add camera, theme and ground."""
     server.gui.configure_theme(
         show_logo=False,
         show_share_button=False,  # it would send the scene to a server on the internet
@@ -59,18 +59,18 @@ def furnish(server: ViserServer) -> None:
     )
 
 
-# --- what is drawn -------------------------------------------------------------------------
+# --- the push ------------------------------------------------------------------------------
 
 
 class Drawing:
-    """One push in the 3-D scene, in place of the one before."""
+    """Bodies, paths and arrows of the current push in the 3-D scene."""
 
     def __init__(self, server: ViserServer, scene: Scene) -> None:
-        """The bodies of a scene, on the page of a server."""
+        """Add the bodies of a scene, in place of the last push."""
         world = server.scene
         world.remove_by_name(_ROOT)
         world.add_frame(_ROOT, show_axes=False)
-        self.held = False  # whether a hand holds the target
+        self.held = False  # whether a user drags the target
         self.target = world.add_transform_controls(
             TARGET,
             scale=0.45,
@@ -103,7 +103,7 @@ class Drawing:
         }
 
     def place_target(self, p_world_target: ArrayLike) -> None:
-        """Put the target at (2,) [m], unless a hand holds it."""
+        """Put the target at (2,) [m], unless a user drags it."""
         if not self.held:
             x, y = np.asarray(p_world_target, float)
             self.target.position = (x, y, 0.0)
@@ -144,7 +144,7 @@ class Drawing:
 
 
 def _joined(points: np.ndarray) -> np.ndarray:
-    """Lines (m, 2, 3) between neighbours of points (n, 2) [m] on the ground; NaN is a gap."""
+    """Return lines (m, 2, 3) along points (n, 2) [m] on the ground, with gaps at NaN."""
     flat = np.column_stack([points, np.zeros(len(points))])
     lines = np.stack([flat[:-1], flat[1:]], axis=1)
     lines = lines[np.isfinite(lines).all(axis=(1, 2))]
@@ -152,24 +152,24 @@ def _joined(points: np.ndarray) -> np.ndarray:
 
 
 def _add_taxels(world: Any, name: str, shell: Shell) -> Any:
-    """A tile for each taxel, along the rim of the base."""
+    """Add a tile for each taxel, along the rim of the base."""
     middles = np.asarray(shell.taxels())[:, 0]
     depth, height, z = _TAXEL
-    rows, counts = shell.rows(), [one.taxels for one in shell.boards]
+    rows, counts = shell.rows(), [board.taxels for board in shell.boards]
     along = np.repeat([row.along for row in rows], counts, axis=0)
     length = np.repeat([float(row.length) for row in rows], counts) / np.repeat(counts, counts)
     inward = np.stack([along[:, 1], -along[:, 0]], axis=-1)  # the strip runs clockwise
-    places = np.column_stack([middles + (depth / 2 - 0.004) * inward, np.full(len(middles), z)])
+    centers = np.column_stack([middles + (depth / 2 - 0.004) * inward, np.full(len(middles), z)])
     sizes = np.abs(along) * 0.92 * length[:, None] + np.abs(inward) * depth
     box = _solid_of(mujoco.mjtGeom.mjGEOM_BOX, np.full(3, 0.5))
     return world.add_batched_meshes_simple(
         name,
         np.asarray(box.vertices),
         np.asarray(box.faces),
-        batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (len(places), 1)),
-        batched_positions=places,
-        batched_scales=np.column_stack([sizes, np.full(len(places), height)]),
-        batched_colors=np.tile(_SKIN, (len(places), 1)).astype(np.uint8),
+        batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (len(centers), 1)),
+        batched_positions=centers,
+        batched_scales=np.column_stack([sizes, np.full(len(centers), height)]),
+        batched_colors=np.tile(_SKIN, (len(centers), 1)).astype(np.uint8),
         flat_shading=True,
         lod="off",
     )
@@ -178,9 +178,9 @@ def _add_taxels(world: Any, name: str, shell: Shell) -> Any:
 def meshes(
     model: mujoco.MjModel,
 ) -> Iterator[tuple[str, tuple[int, int, int], np.ndarray, np.ndarray]]:
-    """What can be seen of a model's bodies: body, RGB, vertices (V, 3) [m] and faces (F, 3).
+    """Yield the visible meshes of a model: body, RGB, vertices (V, 3) [m] and faces (F, 3).
 
-    One mesh for each colour of each body, in the body's frame.
+    Each is of one colour, in the frame of its body.
     """
     from trimesh import transformations, util  # comes with viser
 
@@ -189,18 +189,18 @@ def meshes(
         geom = model.geom(i)
         body = model.body(int(geom.bodyid[0])).name
         if geom.group[0] > 2 or geom.type[0] == mujoco.mjtGeom.mjGEOM_PLANE:
-            continue  # MuJoCo hides these groups, and the page has a ground of its own
-        place = transformations.quaternion_matrix(geom.quat)
-        place[:3, 3] = geom.pos
-        placed = _mesh_of(model, geom).apply_transform(place)
+            continue  # MuJoCo hides these groups, and the page has another ground
+        transform = transformations.quaternion_matrix(geom.quat)
+        transform[:3, 3] = geom.pos
+        placed = _mesh_of(model, geom).apply_transform(transform)
         parts.setdefault((body, _colour_of(model, geom)), []).append(placed)
-    for (body, colour), some in parts.items():
-        whole: Any = util.concatenate(some)
+    for (body, colour), solids in parts.items():
+        whole: Any = util.concatenate(solids)
         yield body, colour, whole.vertices.astype(np.float32), whole.faces.astype(np.uint32)
 
 
 def _mesh_of(model: mujoco.MjModel, geom: Any) -> Any:
-    """A geom in its frame, as trimesh has it."""
+    """Return a geom in its frame, for trimesh."""
     from trimesh import Trimesh
 
     if geom.type[0] != mujoco.mjtGeom.mjGEOM_MESH:
@@ -213,7 +213,7 @@ def _mesh_of(model: mujoco.MjModel, geom: Any) -> Any:
 
 
 def _solid_of(kind: int, size: np.ndarray) -> Any:
-    """A primitive of MuJoCo's."""
+    """Return a primitive of MuJoCo, for trimesh."""
     from trimesh import creation
 
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
@@ -227,16 +227,16 @@ def _solid_of(kind: int, size: np.ndarray) -> Any:
 
 
 def _colour_of(model: mujoco.MjModel, geom: Any) -> tuple[int, int, int]:
-    """RGB of a geom: its own or its material's, times what is commonest in its texture."""
+    """Return the RGB of a geom or its material, times the median of its texture."""
     if geom.matid[0] < 0:
         return _rgb(geom.rgba)
     material = model.mat(int(geom.matid[0]))
     colour = np.array(material.rgba[:3])
     texture = int(material.texid[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)])
     if texture >= 0:
-        one = model.tex(texture)
-        first, size = int(one.adr[0]), int(one.width[0] * one.height[0] * one.nchannel[0])
-        pixels = model.tex_data[first : first + size].reshape(-1, int(one.nchannel[0]))
+        image = model.tex(texture)
+        first, size = int(image.adr[0]), int(image.width[0] * image.height[0] * image.nchannel[0])
+        pixels = model.tex_data[first : first + size].reshape(-1, int(image.nchannel[0]))
         colour = colour * np.median(pixels[:, :3], axis=0) / 255
     return _rgb(colour)
 

@@ -1,6 +1,6 @@
-"""Many trials of a run in one film: stepped together, and drawn side by side as they go.
+"""Films of many trials side by side, drawn while the trials are stepped together.
 
-Neither the trials' pasts nor the pictures are kept, so memory does not grow with the film.
+Neither trajectories nor images are stored, so memory does not grow with the film.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -36,10 +36,11 @@ from rps_jax.world import video
 from rps_jax.world.scene import Scene
 from rps_jax.world.video import Shot, Tile
 
-_MOST = 12  # rows, and columns
-_WHOLE = (1920, 1080)  # [px] that the grid is fitted into
+_MAX_SIDE = 12  # rows, and columns
+_FILM_SIZE = (1920, 1080)  # [px] that the grid is fitted into
 _LENGTH = 40  # [s] of a film at the default speed, at most
-_HELD = 1.0  # [s] that the end is held
+_FREEZE = 1.0  # [s] that the end is held
+T = TypeVar("T")
 _FPS = 12  # frames per second
 
 
@@ -93,16 +94,16 @@ class Film(Question[Path]):
         return folder.read_manifest(Path(self.run)).get("question") == "table"
 
     def check(self) -> None:
-        """Check the grid, the file, and what is filmed."""
+        """Check the grid, the file and the selected trials."""
         out = Path(self.out or self.default_folder)
         if out.is_dir():
             raise InputError(f"out = {out} is a folder: name a file, as {out / 'film.mp4'}.")
         _ = self.shape
         folder.read_manifest(Path(self.run))
         folder.ensure_writable(out.parent)
-        for what in video.check():
-            if not what.ok:
-                raise InputError(what.mend)
+        for check in video.check():
+            if not check.ok:
+                raise InputError(check.fix)
         self.takes()
 
     def progress_bar(self) -> Bar:
@@ -128,30 +129,30 @@ class Film(Question[Path]):
         size = _tile_size(self.shape)
         grid = {"shape": self.shape, "size": size, "fps": _FPS, "camera": self.camera}
         try:
-            video.render_grid(_placed(of_takes, takes), frames, out, **grid)
+            video.render_grid(_in_grid_order(of_takes, takes), frames, out, **grid)
         except video.VideoError as error:
             raise InputError(str(error)) from error
         return out
 
     def takes(self) -> tuple[list[Take], Setting]:
-        """The trials to film, at most as many as the grid has places, and what they share."""
+        """Return the trials to film, limited by the grid, and their setting."""
         run, shape = Path(self.run), self.shape
         if not self._of_table:
             plan, law = select_law(run, 0, self.law)
             if self.laws:
                 rows_of(plan, self.laws, shape)
-            which = worlds_of(plan, self.worlds) if self.worlds else self.which
-            return of_sweep(run, plan, self.laws or (law,), which, shape), plan.setting
+            selection = worlds_of(plan, self.worlds) if self.worlds else self.which
+            return of_sweep(run, plan, self.laws or (law,), selection, shape), plan.setting
         table = table_of(run)
         law = self.law or next(iter(table.chosen))
         errors.check_name("object of the run", self.object, table.objects)
         errors.check_name("friction of the run", self.friction, map(str, table.friction))
         errors.check_name("law of the run", law, table.chosen)
         cases = [
-            one
-            for one in table.cases
-            if (one.object, one.friction) == (self.object, self.friction)
-            and one.law is table.chosen[law]
+            case
+            for case in table.cases
+            if (case.object, case.friction) == (self.object, self.friction)
+            and case.law is table.chosen[law]
         ]
         return of_cases(cases[: shape[0] * shape[1]], table.setting), table.setting
 
@@ -160,9 +161,9 @@ film = call_of(Film)
 
 
 class Take(NamedTuple):
-    """Trials of one kind, of those that are filmed."""
+    """Filmed trials that one program steps."""
 
-    places: Sequence[int]  # in the grid, counted row by row
+    tiles: Sequence[int]  # indices in the grid, row by row
     part: WorldBatch
     law: Law
     scenes: Sequence[Scene]
@@ -170,23 +171,23 @@ class Take(NamedTuple):
 
 
 def shape_of(grid: str) -> tuple[int, int]:
-    """Rows and columns of a grid, written as 4x6."""
-    found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", grid)
-    if not found or not all(1 <= int(n) <= _MOST for n in found.groups()):
+    """Return rows and columns of a grid, written as 4x6."""
+    match = re.fullmatch(r"(\d{1,9})x(\d{1,9})", grid)
+    if not match or not all(1 <= int(n) <= _MAX_SIDE for n in match.groups()):
         raise InputError(
-            f"grid = {grid} is not allowed: write ROWSxCOLUMNS, as 4x6, each from 1 to {_MOST}."
+            f"grid = {grid} is not allowed: write ROWSxCOLUMNS, as 4x6, each from 1 to {_MAX_SIDE}."
         )
-    rows_, columns = map(int, found.groups())
+    rows_, columns = map(int, match.groups())
     return rows_, columns
 
 
 def of_cases(cases: Sequence[Case], setting: Setting) -> list[Take]:
-    """The takes of cases of one kind, labelled by their targets."""
+    """Return the take of cases of one object, labelled by their targets."""
     part = pushes.build(cases, setting)
-    one = pushes.scene_of(cases[0], setting.physics)
+    scene = pushes.scene_of(cases[0], setting.physics)
     labels = [f"({x:g}, {y:g}) m" for x, y in (case.target for case in cases)]
     law = registry.law_of(cases[0].params)
-    return [Take(range(len(cases)), part, law, [one] * len(cases), labels)]
+    return [Take(range(len(cases)), part, law, [scene] * len(cases), labels)]
 
 
 def worlds_of(plan: Plan, worlds: Sequence[int]) -> Sequence[int]:
@@ -201,17 +202,17 @@ def of_sweep(
     run: Path,
     plan: Plan,
     laws: Sequence[str],
-    which: str | Sequence[int],
+    selection: str | Sequence[int],
     shape: tuple[int, int],
 ) -> list[Take]:
-    """The takes of worlds of a sweep: of one law, or a row of the grid for each of several.
+    """Return the takes of worlds of a sweep, with a row of the grid for each of several laws.
 
-    Which worlds: the `first`; the `hardest`, as the report of the sweep has them; or indices.
+    The `selection` is `first`, `hardest` (as in the report of the sweep), or indices.
     """
     count = shape[0] * shape[1] if len(laws) == 1 else shape[1]
-    if not isinstance(which, str):
-        index = np.asarray(which[:count], int)
-    elif which == "first":
+    if not isinstance(selection, str):
+        index = np.asarray(selection[:count], int)
+    elif selection == "first":
         index = np.arange(min(count, plan.worlds))
     else:
         index = statistics.hardest(files.read_results(run), count)
@@ -220,20 +221,20 @@ def of_sweep(
     of_object = plan.object_of(index)
     takes = []
     for row, law in enumerate(laws):
-        said = f"{law}, " if len(laws) > 1 else ""
-        for one in np.unique(of_object):
-            columns = np.flatnonzero(of_object == one)
+        prefix = f"{law}, " if len(laws) > 1 else ""
+        for object_index in np.unique(of_object):
+            columns = np.flatnonzero(of_object == object_index)
             worlds = index[columns].tolist()
-            places = (row * shape[1] + columns).tolist()
+            tiles = (row * shape[1] + columns).tolist()
             part = build_batch(plan, list(plan.laws).index(law), index[columns])
             scenes = [scene_of(plan, i) for i in worlds]
-            labels = [f"{said}world {i}" for i in worlds]
-            takes.append(Take(places, part, registry.law_of(plan.laws[law]), scenes, labels))
+            labels = [f"{prefix}world {i}" for i in worlds]
+            takes.append(Take(tiles, part, registry.law_of(plan.laws[law]), scenes, labels))
     return takes
 
 
 def rows_of(plan: Plan, laws: Sequence[str], shape: tuple[int, int]) -> None:
-    """Raises InputError unless the laws are the plan's, each once, and there is a row for each."""
+    """Raise InputError unless the plan has these laws, and the grid has a row for each."""
     errors.check_each_once("laws", laws)
     for law in laws:
         errors.check_name("law", law, plan.laws)
@@ -244,17 +245,17 @@ def rows_of(plan: Plan, laws: Sequence[str], shape: tuple[int, int]) -> None:
 
 
 def _tile_size(shape: tuple[int, int]) -> tuple[int, int]:
-    """Width and height [px], even, of the greatest tiles of 16 to 9 that fit."""
+    """Return even width and height [px] of the largest tiles of 16 to 9 that fit."""
     rows_, columns = shape
-    unit = min(_WHOLE[0] / columns / 16, _WHOLE[1] / rows_ / 9)
+    unit = min(_FILM_SIZE[0] / columns / 16, _FILM_SIZE[1] / rows_ / 9)
     return 2 * int(8 * unit), 2 * int(4.5 * unit)
 
 
-def _placed(of_takes: Sequence[Sequence[Any]], takes: Sequence[Take]) -> list[Any]:
-    """What each take has of its trials, in the order of the grid."""
-    places = [place for take in takes for place in take.places]
-    things = [thing for some in of_takes for thing in some]
-    return [things[i] for i in np.argsort(places)]
+def _in_grid_order(items: Sequence[Sequence[T]], takes: Sequence[Take]) -> list[T]:
+    """Return the items of all takes, one per trial, in the order of the grid."""
+    tiles = [tile for take in takes for tile in take.tiles]
+    flat = [item for items_of_take in items for item in items_of_take]
+    return [flat[i] for i in np.argsort(tiles)]
 
 
 def _frames(
@@ -264,51 +265,53 @@ def _frames(
     seconds: float,
     callback: ProgressCallback,
 ) -> Iterator[list[Shot]]:
-    """What all tiles show in each frame."""
+    """Yield the contents of all tiles, frame by frame."""
     period = setting.physics.control_period
-    every = max(1, round(speed / (_FPS * period)))
-    running = [_shots(take, setting, every) for take in takes]
+    interval = max(1, round(speed / (_FPS * period)))  # control steps
+    running = [_shots(take, setting, interval) for take in takes]
     shots: list[Shot] = []
-    # One more where they run to their ends, which are seen a step later.
+    # One frame more for whole trials, whose ends are drawn a step later.
     whole = seconds >= float(setting.rules.horizon)
-    for count in range(math.floor(seconds / (every * period)) + 1 + whole):
+    for count in range(math.floor(seconds / (interval * period)) + 1 + whole):
         ended, of_takes = zip(*map(next, running), strict=True)
-        shots = _placed(of_takes, takes)
+        shots = _in_grid_order(of_takes, takes)
         yield shots
-        callback(Progress(0, count * every * period))
+        callback(Progress(0, count * interval * period))
         if all(ended):
             break
-    for _ in range(round(_HELD * _FPS)):
+    for _ in range(round(_FREEZE * _FPS)):
         yield shots
 
 
-def _shots(take: Take, setting: Setting, every: int) -> Iterator[tuple[bool, list[Shot]]]:
-    """Whether all of a take's trials have ended, and what they show, each `every` steps."""
+def _shots(take: Take, setting: Setting, interval: int) -> Iterator[tuple[bool, list[Shot]]]:
+    """Yield whether all trials of a take have ended, and their tiles, at each interval."""
     part = jax.device_put(take.part)
     trials = trial.start_all(
         part.worlds, part.params, np.ones(len(take.labels), bool), law=take.law
     )
-    advance = pushes.recorder(part, trials, setting, take.law, steps=every, every=every)
+    advance = pushes.recorder(part, trials, setting, take.law, steps=interval, every=interval)
     shots: list[Shot] = []
     ended = np.zeros(len(take.labels), bool)
     while True:
         done, success, steps = jax.device_get((trials.done, trials.success, trials.steps))
         trials, snapshots, _ = advance(trials)
-        seen = rows(jax.device_get(snapshots), 0)
-        contacts = np.asarray(trial.p_world_contact(seen))
+        moment = rows(jax.device_get(snapshots), 0)
+        contacts = np.asarray(trial.p_world_contact(moment))
         time = steps * setting.physics.control_period
         shots = [
-            shots[i]  # the same again, which need not be drawn again
+            shots[i]  # unchanged, and so not drawn again
             if ended[i]
-            else Shot(seen.qpos[i], contacts[i], f"{label}, {_how(done[i], success[i], time[i])}")
+            else Shot(
+                moment.qpos[i], contacts[i], f"{label}, {_status(done[i], success[i], time[i])}"
+            )
             for i, label in enumerate(take.labels)
         ]
         ended = done
         yield bool(done.all()), shots
 
 
-def _how(done: bool, success: bool, time: float) -> str:
-    """How a trial stands after this time [s]."""
+def _status(done: bool, success: bool, time: float) -> str:
+    """Return the state of a trial after this time [s]."""
     if not done:
         return f"{time:.0f} s"
     return f"reached at {time:.0f} s" if success else "not reached"

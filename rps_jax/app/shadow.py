@@ -1,4 +1,4 @@
-"""What another law would have commanded, beside what was commanded: a recorded bag, replayed."""
+"""Shadow mode: the commands of a law for a recorded bag, beside the recorded commands."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _UNITS = {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s"}
 
 @dataclass(frozen=True)
 class Shadow(Question[xr.Dataset]):
-    """Feed a recorded bag to a law, and compare its twists with those that were commanded."""
+    """Feed a recorded bag to a law, and compare its twists with the recorded ones."""
 
     file: str | Path = option("", positional=True)
     """MCAP file with what a robot observed, as `rps push --bag` writes it."""
@@ -70,78 +70,79 @@ class Shadow(Question[xr.Dataset]):
         )
 
     def report(self, results: Any, run: Run) -> Sequence[Section]:
-        """How far the law is from what was commanded."""
+        """Return the differences between the twists of the law and the recorded ones."""
         rows = [["", "root mean square", "greatest", "at time [s]"]]
         for name, unit in _UNITS.items():
-            apart = np.abs(results[name].sel(source="law") - results[name].sel(source="commanded"))
-            worst, when = float(apart.max()), float(results.time[int(np.argmax(apart.values))])
-            mean = f"{float(np.sqrt(np.mean(apart**2))):.2g}"
+            error = np.abs(results[name].sel(source="law") - results[name].sel(source="commanded"))
+            worst, when = float(error.max()), float(results.time[int(np.argmax(error.values))])
+            mean = f"{float(np.sqrt(np.mean(error**2))):.2g}"
             rows.append([f"{name} [{unit}]", mean, f"{worst:.2g}", f"{when:.2f}"])
         start, end = float(results.time[0]), float(results.time[-1])
         text = (
-            f"{results.sizes['time']} commands in {end - start:.1f} s. The table has differences "
-            f"between what {results.attrs['law']} would have commanded and what was commanded, at "
+            f"{results.sizes['time']} commands in {end - start:.1f} s. The table has the "
+            f"differences between the twists of {results.attrs['law']} and the recorded ones, at "
             "the same observations."
         )
         picture = Picture("shadow", lambda: figure(results))
-        return [Section("Beside what was commanded", text, rows, picture)]
+        return [Section("Differences from the recorded commands", text, rows, picture)]
 
 
 shadow = call_of(Shadow)
 
 
 def shadowed(law: Law, params: LawParams, recorded: dict[str, np.ndarray]) -> np.ndarray:
-    """Twists (N, 3) [m/s, m/s, rad/s] that a law would have commanded.
+    """Return the twists (N, 3) [m/s, m/s, rad/s] of a law for the observations of a bag.
 
-    A law that observes its last twist hears what was commanded: that moved the base, and so no
-    rounding grows from one decision to the next.
+    A law that observes its last twist gets the recorded one, which moved the base. Rounding errors
+    therefore do not grow from step to step.
 
     Raises:
-      InputError: the bag lacks what the law senses.
+      InputError: the bag lacks a field of the law's observation.
     """
-    pose, kind = recorded["pose"], recorded["contact_type"]
-    given = recorded | {"p_world_robot": pose[:, :2], "yaw": pose[:, 2], "in_contact": kind > 0}
-    given |= {"line": kind == 2, "p_world_target": recorded["target"]}
+    pose, contact_type = recorded["pose"], recorded["contact_type"]
+    values = recorded | {"p_world_robot": pose[:, :2], "yaw": pose[:, 2]}
+    values |= {"in_contact": contact_type > 0, "line": contact_type == 2}
+    values |= {"p_world_target": recorded["target"]}
 
-    def filled(seen: Any) -> Any:
-        """What is observed, (N, ...)."""
+    def fill(shapes: Any) -> Any:  # a NamedTuple of any type, of arrays and of others
+        """Return observations (N, ...) of the bag."""
         fields = {}
-        for name, value in seen._asdict().items():
-            if hasattr(value, "_fields"):
-                fields[name] = filled(value)
-            elif name in given:
-                fields[name] = jnp.asarray(given[name], value.dtype)
+        for name, shape in shapes._asdict().items():
+            if hasattr(shape, "_fields"):
+                fields[name] = fill(shape)
+            elif name in values:
+                fields[name] = jnp.asarray(values[name], shape.dtype)
             else:
                 raise InputError(
                     f"the bag has no {name}, which the law senses ({law.senses}): record it, or "
                     "choose another law."
                 )
-        return type(seen)(**fields)
+        return type(shapes)(**fields)
 
     @jax.jit
-    def whole(params: Any, seen: Any) -> jax.Array:
-        def one(memory: Any, row: Any) -> Any:
-            now, before = row
+    def run(params: LawParams, observations: Any) -> jax.Array:
+        def step(state: Any, row: Any) -> Any:
+            obs, last = row
             if law.observe_sent is not None:
-                memory = law.observe_sent(params, memory, now, Twist(*before))
-            memory, twist, _ = law.step(params, memory, now)
-            return memory, jnp.stack([jnp.asarray(x, float) for x in Twist(*twist)])
+                state = law.observe_sent(params, state, obs, Twist(*last))
+            state, twist, _ = law.step(params, state, obs)
+            return state, jnp.stack([jnp.asarray(x, float) for x in Twist(*twist)])
 
-        return jax.lax.scan(one, law.init(params), (seen, sent))[1]
+        return jax.lax.scan(step, law.init(params), (observations, sent))[1]
 
     sent = jnp.asarray(np.pad(recorded["twist"][:-1], ((1, 0), (0, 0))), float)
     params = jax.tree.map(lambda x: jnp.asarray(x, float), params)
-    return np.asarray(whole(params, filled(validation.observation_shapes(law.senses))))
+    return np.asarray(run(params, fill(validation.observation_shapes(law.senses))))
 
 
-def figure(found: xr.Dataset) -> Figure:
-    """The twists over time, one panel for each component."""
-    drawn = Figure(figsize=(9, 6), layout="constrained")
-    axes = drawn.subplots(3, 1, sharex=True)
+def figure(results: xr.Dataset) -> Figure:
+    """Draw the twists over time, one panel per component."""
+    chart = Figure(figsize=(9, 6), layout="constrained")
+    axes = chart.subplots(3, 1, sharex=True)
     for ax, (name, unit) in zip(axes, _UNITS.items(), strict=True):
-        ax.plot(found.time, found[name].sel(source="commanded"), lw=2.5, color="0.7")
-        ax.plot(found.time, found[name].sel(source="law"), lw=1, color="C0")
+        ax.plot(results.time, results[name].sel(source="commanded"), lw=2.5, color="0.7")
+        ax.plot(results.time, results[name].sel(source="law"), lw=1, color="C0")
         ax.set_ylabel(f"{name} [{unit}]")
-    axes[0].legend(["commanded", found.attrs["law"]], loc="upper right")
+    axes[0].legend(["commanded", results.attrs["law"]], loc="upper right")
     axes[-1].set_xlabel("time [s]")
-    return drawn
+    return chart

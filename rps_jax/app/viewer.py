@@ -1,7 +1,7 @@
-"""A push in the browser: watched, gone back to, disturbed, and begun again with another object.
+"""The viewer: a push in the browser, which users can rewind, disturb and start again.
 
-The page is viser's, served by this process alone. The simulation and all that is drawn belong to
-the thread of `Page.run`; what a browser asks for waits in a queue until that thread comes by.
+viser serves the page. The thread of `Page.run` owns the simulation and the drawing; requests of
+browsers wait for it in a queue.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rps_jax import engines, errors
 from rps_jax.app.drawing import TARGET, Drawing, furnish
-from rps_jax.app.gate import Gate, check_guarded, updates_of
+from rps_jax.app.gate import Gate, accepts_update, check_guarded
 from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
@@ -41,9 +41,9 @@ from rps_jax.world.scene import Scene
 if TYPE_CHECKING:
     from viser import ViserServer
 
-_TICK = 0.04  # [s] between two pictures
-_WORDS = 0.25  # [s] between two looks at the panel, which browsers are slow to lay out
-_BUDGET = 0.15  # [s] of simulation before the page is looked after again
+_TICK = 0.04  # [s] between two frames
+_PANEL_TICK = 0.25  # [s] between two updates of the panel, which browsers are slow to lay out
+_BUDGET = 0.15  # [s] of simulation between two updates of the page
 _DRAGGING = (
     "TransformControlsUpdateMessage",
     "TransformControlsDragStartMessage",
@@ -53,7 +53,7 @@ _CONTACTS = ("no contact", "point contact", "line contact")
 
 
 class Push(NamedTuple):
-    """A push that can be shown."""
+    """A live push with its scene and title."""
 
     live: Live
     scene: Scene
@@ -82,17 +82,19 @@ class View(PushQuestion):
     workers: int | None = option(None, kw_only=True, hidden=True)
 
     @property
-    def _own(self) -> LawLike:
+    def _law_of_options(self) -> LawLike:
         """The law of the options' push."""
         return self.law if self.law is not None and self.run is None else "rps"
 
     @property
     def case(self) -> Case:
         """The options' push."""
-        own = {one.name: getattr(self, one.name) for one in dataclasses.fields(Case)}
-        own |= case_options(self, self.setting)
-        own["law"] = self._own
-        return Case(**own)
+        fields: dict[str, Any] = {
+            field.name: getattr(self, field.name) for field in dataclasses.fields(Case)
+        }
+        fields |= case_options(self, self.setting)
+        fields["law"] = self._law_of_options
+        return Case(**fields)
 
     def note(self) -> str:
         """Whether another engine than the run's is shown."""
@@ -113,28 +115,28 @@ class View(PushQuestion):
 
     def in_shell(self) -> None:
         """Serve the page until it is ended."""
-        law = self._own if isinstance(self._own, str) else "rps"
+        law = self._law_of_options if isinstance(self._law_of_options, str) else "rps"
         friction = self.friction if isinstance(self.friction, str) else label_of(self.friction)
-        asked = Asked(self.object, friction, law, self.target)
-        first = partial(self.push_of, asked)
+        request = PushRequest(self.object, friction, law, self.target)
+        first = partial(self.push_of, request)
         if self.run is not None:
             first = partial(_in_world, *self._chosen(), self.world)
-        page = open_page(self.host, self.port, asked, self.push_of)
+        page = open_page(self.host, self.port, request, self.push_of)
         print(f"page: {page.url} (Ctrl-C ends it)", flush=True)
         try:
-            page.begin(first)
+            page.start(first)
             page.run()
         except KeyboardInterrupt:
             print("page closed.")
         finally:
             page.close()
 
-    def push_of(self, asked: Asked) -> Push:
+    def push_of(self, request: PushRequest) -> Push:
         """The push that the page asks for."""
-        case = dataclasses.replace(self.case, **asked._asdict())
+        case = dataclasses.replace(self.case, **request._asdict())
         title = (
             f"{case.object_name.replace('_', ' ')}, friction ground {case.contact.ground:g}, robot "
-            f"{case.contact.robot:g}, {asked.law}"
+            f"{case.contact.robot:g}, {request.law}"
         )
         scene = pushes.scene_of(case, self.setting.physics)
         return Push(Live.of_case(case, self.setting), scene, title)
@@ -143,8 +145,8 @@ class View(PushQuestion):
 view = call_of(View)
 
 
-class Asked(NamedTuple):
-    """A push as the page asks for it."""
+class PushRequest(NamedTuple):
+    """Object, friction, law and target of a push, as in the panel."""
 
     object: str
     friction: str  # as on the command line
@@ -167,30 +169,36 @@ class Page:
     """The panel, the clock and what the browser asks for."""
 
     def __init__(
-        self, server: ViserServer, gate: Gate, asked: Asked, make: Callable[[Asked], Push]
+        self,
+        server: ViserServer,
+        gate: Gate,
+        request: PushRequest,
+        build: Callable[[PushRequest], Push],
     ) -> None:
-        """A page without a push, whose panel proposes what is `asked`.
+        """Create a page without a push, whose panel shows a `request`.
 
-        `make` is called in a thread of its own, and may raise InputError.
+        Another thread calls `build`, which may raise InputError.
         """
-        self._server, self._make = server, make
-        self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._server, self._build_push = server, build
+        self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._closed = threading.Event()
-        self._maker = ThreadPoolExecutor(1)
-        self._making: Future[Push] | None = None
+        self._builder = ThreadPoolExecutor(1)
+        self._pending: Future[Push] | None = None
         self._push: Push | None = None
         self._drawing: Drawing | None = None
-        self._drawn: tuple[int, int] | None = None  # the moment that is on the page, of how many
-        self._cursor = 0.0  # the moment that is to be seen; a fraction of the next has passed
+        self._drawn: tuple[int, int] | None = (
+            None  # index of the moment on the page, and number of moments
+        )
+        self._cursor = 0.0  # index of the moment to show, with the fraction of the next
         self._playing, self._error = True, ""
-        self._words_due = 0.0  # [s] when the panel is next brought up to date
+        self._panel_due = 0.0  # [s] of the next update of the panel
         furnish(server)
-        inputs = {control._impl.uuid: control for control in self._build(asked)}
-        gate.admit(
+        inputs = {control._impl.uuid: control for control in self._add_controls(request)}
+        gate.allow(
             {
                 "ViewerCameraMessage": lambda message: True,
                 "GuiUpdateMessage": lambda message: (
-                    message.uuid in inputs and updates_of(inputs[message.uuid], message.updates)
+                    message.uuid in inputs and accepts_update(inputs[message.uuid], message.updates)
                 ),
                 **dict.fromkeys(_DRAGGING, lambda message: message.name == TARGET),
             }
@@ -198,71 +206,71 @@ class Page:
 
     @property
     def url(self) -> str:
-        """Where a browser finds it."""
+        """URL of the page."""
         return f"http://{self._server.get_host()}:{self._server.get_port()}"
 
     @property
-    def asked(self) -> Asked:
-        """What the panel proposes now."""
+    def request(self) -> PushRequest:
+        """The push that the panel shows."""
         x, y = map(float, self._target.value)
-        return Asked(self._object.value, self._friction.value, self._law.value, (x, y))
+        return PushRequest(self._object.value, self._friction.value, self._law.value, (x, y))
 
-    def begin(self, make: Callable[[], Push]) -> None:
-        """Have another push made, and show it as soon as it is there."""
-        if self._making is None:
+    def start(self, build: Callable[[], Push]) -> None:
+        """Build another push, and show it when it is ready."""
+        if self._pending is None:
             self._error = ""
-            self._making = self._maker.submit(_started, make)
+            self._pending = self._builder.submit(_build_and_step, build)
 
     def run(self) -> None:
         """Serve the page until `close` is called."""
-        before = time.perf_counter()
+        last = time.perf_counter()
         while not self._closed.is_set():
-            now = time.perf_counter()
-            self.tick(now - before)
-            before = now
-            self._closed.wait(_TICK - (time.perf_counter() - now))
+            start = time.perf_counter()
+            self.tick(start - last)
+            last = start
+            self._closed.wait(_TICK - (time.perf_counter() - start))
 
     def tick(self, elapsed: float) -> None:
-        """What is due after another `elapsed` [s]."""
+        """Handle requests, simulate and draw, after `elapsed` [s] since the last tick."""
         with contextlib.suppress(queue.Empty):
             while True:
                 try:
-                    self._todo.get_nowait()()
+                    self._requests.get_nowait()()
                 except InputError as error:
                     self._error = str(error)
-        self._adopt()
+        self._show_built()
         if self._push is not None:
             self._advance(self._push.live, elapsed)
             self._show(self._push)
-        if (now := time.perf_counter()) >= self._words_due:
-            self._words_due = now + _WORDS
-            self._tell()
+        if (time_now := time.perf_counter()) >= self._panel_due:
+            self._panel_due = time_now + _PANEL_TICK
+            self._update_panel()
 
     def close(self) -> None:
         """End `run`, and the server."""
         self._closed.set()
-        self._maker.shutdown(wait=False, cancel_futures=True)
+        self._builder.shutdown(wait=False, cancel_futures=True)
         self._server.stop()
 
-    # --- what happens on its own ---
+    # --- simulation and drawing ---
 
-    def _adopt(self) -> None:
-        """Take the push that was made, if it is there."""
-        if self._making is None or not self._making.done():
+    def _show_built(self) -> None:
+        """Show the push that was built, if it is ready."""
+        if self._pending is None or not self._pending.done():
             return
-        made, self._making = self._making, None
+        finished, self._pending = self._pending, None
         try:
-            self._push = made.result()
+            self._push = finished.result()
         except InputError as error:
             self._error = str(error)
             return
         self._cursor, self._drawn, self._playing = 0.0, None, True
         with self._server.atomic():
             self._drawing = Drawing(self._server, self._push.scene)
-            self._when(self._drawing.target.on_update, self._drag)
+            self._connect(self._drawing.target.on_update, self._drag)
 
     def _advance(self, live: Live, elapsed: float) -> None:
-        """Move the clock on, and the simulation with it, while somebody looks."""
+        """Advance the clock and the simulation while a browser is connected."""
         if not self._playing or not self._server.get_clients():
             return
         self._cursor += elapsed * self._speed.value / live.period
@@ -279,7 +287,7 @@ class Page:
             self._playing = not live.done
 
     def _show(self, push: Push) -> None:
-        """Draw the moment that is to be seen, unless it is on the page."""
+        """Draw the moment at the cursor, unless the page shows it."""
         past = push.live.past
         index = min(int(self._cursor), len(past) - 1)
         if self._drawing is None:
@@ -293,47 +301,47 @@ class Page:
                 push.live.p_world_target if newest else past[index].worlds.p_world_target[0]
             )
 
-    def _tell(self) -> None:
-        """Words and buttons."""
+    def _update_panel(self) -> None:
+        """Update the texts and buttons of the panel."""
         lines = []
         if self._push is not None and self._push.live.past:
             live = self._push.live
-            lines += [f"**{self._push.title}**", self._state(live)]
+            lines += [f"**{self._push.title}**", self._state_text(live)]
             self._time.max = max(live.period, (len(live.past) - 1) * live.period)
             self._time.value = int(self._cursor) * live.period
-        if self._making is not None:
+        if self._pending is not None:
             lines.append("The push is being prepared; the first of a shape takes some seconds.")
         if self._error:
             lines.append(f"**Not possible:** {self._error}")
         self._status.content = "\n\n".join(lines)
-        self._again.disabled = self._making is not None
+        self._again.disabled = self._pending is not None
         self._play.label = "Pause" if self._playing else "Play"
 
-    def _state(self, live: Live) -> str:
+    def _state_text(self, live: Live) -> str:
         index = min(int(self._cursor), len(live.past) - 1)
-        seen = live.past[index].seen
+        moment = live.past[index].seen
         words = [f"{index * live.period:.1f} s"]
-        words.append(f"{float(seen.details.distance):.2f} m to the target")
-        words.append(_CONTACTS[int(seen.reading.contact_type)])
-        if seen.details.realigning:
+        words.append(f"{float(moment.details.distance):.2f} m to the target")
+        words.append(_CONTACTS[int(moment.reading.contact_type)])
+        if moment.details.realigning:
             words.append("realigning")
         if live.done and index == len(live.past) - 1:
-            words.append(f"**{_ending(live)}**")
+            words.append(f"**{_outcome_text(live)}**")
         return ", ".join(words)
 
-    # --- what the browser asks for ---
+    # --- requests of the browser ---
 
-    def _when(self, register: Callable[..., Any], act: Callable[[Any], None]) -> None:
-        """Have `run` act on every event of a browser; events that it causes itself are none."""
+    def _connect(self, register: Callable[..., Any], act: Callable[[Any], None]) -> None:
+        """Have `run` call `act` on each event of a browser, but not on its own events."""
 
         def note(event: Any) -> None:
             if event.client_id is not None:
-                self._todo.put(partial(act, event))
+                self._requests.put(partial(act, event))
 
         register(note)
 
-    def _build(self, asked: Asked) -> tuple[Any, ...]:
-        """The panel; returns its controls."""
+    def _add_controls(self, request: PushRequest) -> tuple[Any, ...]:
+        """Build the panel, and return its controls."""
         gui = self._server.gui
         self._status = gui.add_markdown("")
         with gui.add_folder("Time"):
@@ -341,31 +349,39 @@ class Page:
             self._time = gui.add_slider("time [s]", 0.0, 1.0, 0.01, 0.0)
             self._speed = gui.add_slider("speed", 1.0, 20.0, 1.0, 5.0, hint="times real time")
         with gui.add_folder("Shove the object"):
-            self._size = gui.add_slider("by [m]", 0.01, 0.5, 0.01, 0.15)
-            self._way = gui.add_slider(
+            self._distance = gui.add_slider("by [m]", 0.01, 0.5, 0.01, 0.15)
+            self._direction = gui.add_slider(
                 "towards [deg]", -180.0, 180.0, 5.0, 90.0, hint="0: ahead, 90: left of the robot"
             )
             shove = gui.add_button("Shove")
         with gui.add_folder("Another push"):
             self._object = gui.add_dropdown(
-                "object", tuple(objects.OBJECTS), initial_value=asked.object
+                "object", tuple(objects.OBJECTS), initial_value=request.object
             )
             self._friction = gui.add_text(
-                "friction", asked.friction, hint="S1, S2 or ground,robot (as 0.25,0.4)"
+                "friction", request.friction, hint="S1, S2 or ground,robot (as 0.25,0.4)"
             )
-            laws = tuple(dict.fromkeys((*registry.LAWS, asked.law)))
-            self._law = gui.add_dropdown("law", laws, initial_value=asked.law)
-            self._target = gui.add_vector2("target [m]", asked.target, step=0.1)
+            laws = tuple(dict.fromkeys((*registry.LAWS, request.law)))
+            self._law = gui.add_dropdown("law", laws, initial_value=request.law)
+            self._target = gui.add_vector2("target [m]", request.target, step=0.1)
             self._again = gui.add_button("Push", color=(13, 148, 141))
-        self._when(self._play.on_click, self._toggle)
-        self._when(self._time.on_update, self._seek)
-        self._when(shove.on_click, self._shove)
-        self._when(self._again.on_click, self._ask)
-        shown = self._play, self._time, self._speed, self._size, self._way, shove, self._again
+        self._connect(self._play.on_click, self._toggle)
+        self._connect(self._time.on_update, self._seek)
+        self._connect(shove.on_click, self._shove)
+        self._connect(self._again.on_click, self._push_again)
+        shown = (
+            self._play,
+            self._time,
+            self._speed,
+            self._distance,
+            self._direction,
+            shove,
+            self._again,
+        )
         return *shown, self._object, self._friction, self._law, self._target
 
     def _toggle(self, event: Any) -> None:
-        """Play or pause; at its end a push is played again."""
+        """Play or pause; restart a finished push."""
         del event
         self._playing = not self._playing
         if self._playing and self._push is not None:
@@ -374,19 +390,21 @@ class Page:
                 self._cursor = 0.0
 
     def _seek(self, event: Any) -> None:
-        """Stop, and look at another moment."""
+        """Pause at another moment."""
         if self._push is not None:
             self._playing = False
             self._cursor = round(event.target.value / self._push.live.period)
 
-    def _ask(self, event: Any) -> None:
+    def _push_again(self, event: Any) -> None:
         del event
-        self.begin(partial(self._make, self.asked))
+        self.start(partial(self._build_push, self.request))
 
     def _shove(self, event: Any) -> None:
         del event
-        by, way = self._size.value, math.radians(self._way.value)
-        self._disturb(lambda live: live.shove((by * math.cos(way), by * math.sin(way))))
+        distance, angle = self._distance.value, math.radians(self._direction.value)
+        self._disturb(
+            lambda live: live.shove((distance * math.cos(angle), distance * math.sin(angle)))
+        )
 
     def _drag(self, event: Any) -> None:
         x, y, _ = event.target.position
@@ -395,7 +413,7 @@ class Page:
             self._disturb(lambda live: live.set_target((float(x), float(y))))
 
     def _disturb(self, act: Callable[[Live], None]) -> None:
-        """Disturb the push at the moment that is seen; what came after it is forgotten."""
+        """Disturb the push at the moment at the cursor; later moments are discarded."""
         if self._push is not None:
             self._error = ""
             self._push.live.rewind(int(self._cursor))
@@ -403,14 +421,14 @@ class Page:
             self._playing = True
 
 
-def _started(make: Callable[[], Push]) -> Push:
-    """A push with its first step done, and so its program compiled."""
-    push = make()
+def _build_and_step(build: Callable[[], Push]) -> Push:
+    """Build a push and step it once, which compiles its program."""
+    push = build()
     push.live.step()
     return push
 
 
-def _ending(live: Live) -> str:
+def _outcome_text(live: Live) -> str:
     outcome = live.outcome
     if outcome.success:
         return "reached"
@@ -419,8 +437,10 @@ def _ending(live: Live) -> str:
     return "the physics ran away" if outcome.diverged else "not reached in time"
 
 
-def open_page(host: str, port: int, asked: Asked, make: Callable[[Asked], Push]) -> Page:
-    """A page, served from now on; InputError if viser is missing, or it can't be served there."""
+def open_page(
+    host: str, port: int, request: PushRequest, build: Callable[[PushRequest], Push]
+) -> Page:
+    """Serve a page; InputError if viser is missing, or cannot serve at this address."""
     viser = errors.require("viser", "viz")
     try:
         with socket.create_server((host, port)):  # viser would quietly take another port
@@ -438,4 +458,4 @@ def open_page(host: str, port: int, asked: Asked, make: Callable[[Asked], Push])
     except BaseException:
         server.stop()
         raise
-    return Page(server, gate, asked, make)
+    return Page(server, gate, request, build)

@@ -1,7 +1,7 @@
-"""A MuJoCo scene before a camera: images, each with the paths of base and contact so far.
+"""Images of a MuJoCo scene, with the paths of base and contact up to then.
 
-MuJoCo reads the environment variable MUJOCO_GL when it is imported. `choose_gl` makes that choice
-when something is first drawn, for every caller, also where MuJoCo was imported before.
+MuJoCo reads the environment variable MUJOCO_GL when it is imported. `choose_gl` sets it at the
+first image, also if MuJoCo was imported earlier.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ _OPENING = threading.Lock()
 _FINER = 2
 _SHADOWS_FROM = 240  # [px] height of an image: they take most of the time without a GPU
 
-_MEND_GL = (
+_FIX_GL = (
     "MuJoCo cannot draw on this machine: install Mesa's EGL library (`apt install libegl1 "
     "libgl1-mesa-dri`) and set MUJOCO_GL=egl, or set MUJOCO_GL=osmesa (`apt install libosmesa6`)."
 )
 
 
 class VideoError(RuntimeError):
-    """No picture or video could be made: one sentence that says how to mend it."""
+    """Failure to draw or encode: one sentence with its fix."""
 
 
 class Tile(NamedTuple):
@@ -63,7 +63,7 @@ class Tile(NamedTuple):
 
 
 class _Trail:
-    """A path on the ground, thinned to `_TRAIL_STEP`. NaN interrupts it."""
+    """A path on the ground in steps of `_TRAIL_STEP`, with gaps at NaN."""
 
     def __init__(self, rgba: tuple[float, ...], height: float) -> None:
         self.rgba = rgba
@@ -71,24 +71,24 @@ class _Trail:
         self.points: deque[np.ndarray] = deque(maxlen=_TRAIL_POINTS)
 
     def add(self, point: np.ndarray) -> None:
-        """Note a point (2,) [m] unless it lies close to the last one."""
+        """Append a point (2,) [m] unless it is close to the last one."""
         last = self.points[-1] if self.points else NO_CONTACT
         both = np.isnan([point[0], last[0]])
         if not both.all() and (both.any() or math.dist(point, last) >= _TRAIL_STEP):
             self.points.append(point)
 
     def segments(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Pairs of neighbouring points without a gap between them."""
+        """Yield pairs of neighbouring points without a gap between them."""
         for a, b in itertools.pairwise(self.points):
             if not (math.isnan(a[0]) or math.isnan(b[0])):
                 yield a, b
 
 
 class SceneRenderer:
-    """A scene before a camera, with what has been drawn so far left as trails."""
+    """A scene and its camera; each image adds to the trails."""
 
     def __init__(self, renderer: Any, scene: Scene, camera: str, target: np.ndarray) -> None:
-        """`camera` is one of the scene's; `target` (2,) [m] is where the flag stands."""
+        """Create it for a camera of the scene, with the flag at `target` (2,) [m]."""
         self.mujoco = _import_mujoco()
         self.renderer = renderer
         self.model = scene.model
@@ -105,14 +105,14 @@ class SceneRenderer:
         self._corners = middle + _CORNERS[:, None] * half  # (8, geoms, 3) [m]
 
     def draw(self, qpos: ArrayLike, p_world_contact: ArrayLike) -> np.ndarray:
-        """One image (height, width, 3) uint8, and a step further along the trails.
+        """Draw an image (height, width, 3) uint8, and extend the trails.
 
-        As long as the camera stands, only the part in which something moves is drawn anew.
+        While the camera stands still, only the rectangle with moving bodies is drawn again.
         """
         qpos = _checked("qpos", qpos, self.model.nq)
         contact = np.array(p_world_contact, float)  # a copy: the trail keeps it
         self.data.qpos[:] = qpos
-        self.mujoco.mj_kinematics(self.model, self.data)  # where things are; no dynamics
+        self.mujoco.mj_kinematics(self.model, self.data)  # poses of the bodies, without dynamics
         self.mujoco.mj_camlight(self.model, self.data)
         self.renderer.update_scene(self.data, camera=self.camera)
         view = self.renderer.scene
@@ -124,15 +124,15 @@ class SceneRenderer:
                 self._add_line(a, b, trail)
         if not np.isnan(contact).any():
             self._add_marker(contact)
-        self._draw_what_changed(np.where(np.isnan(contact), qpos[:2], contact))
+        self._draw_changes(np.where(np.isnan(contact), qpos[:2], contact))
         return self._image.copy()
 
-    def _draw_what_changed(self, p_world_marker: np.ndarray) -> None:
-        """Draw the box of what moves, now and in the last image; all if the camera moved."""
+    def _draw_changes(self, p_world_marker: np.ndarray) -> None:
+        """Draw the rectangle of moving bodies in this and the last image, or all of the image."""
         eye = self.mujoco.mjv_averageCamera(*self.renderer.scene.camera)
         pixel = 2 * eye.frustum_top / self._size[1]  # [m] where the field of view begins
-        before, self._eye = self._eye, np.concatenate([eye.pos, eye.forward, eye.up])
-        still = np.array_equal(before, self._eye)
+        last_eye, self._eye = self._eye, np.concatenate([eye.pos, eye.forward, eye.up])
+        still = np.array_equal(last_eye, self._eye)
         boxes = [self._box if still else np.array([[0, 0], self._size])]
         away = self._points(p_world_marker) - eye.pos
         depth = 1 if eye.orthographic else away @ eye.forward / eye.frustum_near
@@ -144,12 +144,12 @@ class SceneRenderer:
         (x, y), (end_x, end_y) = np.clip([low, high], 0, self._size).astype(int)
         if x == end_x or y == end_y:
             return
-        # Around it, where lines are cut off, some more.
+        # A margin, since lines are cut off at the edge.
         first, last = np.clip([[x - 8, y - 8], [end_x + 8, end_y + 8]], 0, self._size)
-        left, bottom, right, top = pixel * np.ravel([first, last] - self._size / 2)
-        for one in self.renderer.scene.camera:
-            one.frustum_bottom, one.frustum_top = bottom, top
-            one.frustum_center, one.frustum_width = (left + right) / 2, (right - left) / 2
+        x_min, y_min, x_max, y_max = pixel * np.ravel([first, last] - self._size / 2)
+        for camera in self.renderer.scene.camera:
+            camera.frustum_bottom, camera.frustum_top = y_min, y_max
+            camera.frustum_center, camera.frustum_width = (x_min + x_max) / 2, (x_max - x_min) / 2
         part = self.mujoco.MjrRect(0, 0, *(_FINER * (last - first)))
         drawn = np.empty((part.height, part.width, 3), np.uint8)
         self.renderer._gl_context.make_current()
@@ -159,10 +159,10 @@ class SceneRenderer:
         self._image[::-1][y:end_y, x:end_x] = drawn  # OpenGL's rows go up
 
     def _points(self, p_world_marker: np.ndarray) -> np.ndarray:
-        """Points (n, 3) [m] around the bodies, the marker and all shadows on the ground."""
-        data, which = self.data, self._moving
-        rotation = data.geom_xmat[which].reshape(-1, 3, 3)
-        bodies = np.einsum("gij,cgj->cgi", rotation, self._corners) + data.geom_xpos[which]
+        """Return points (n, 3) [m] around the moving bodies, the marker and their shadows."""
+        data, moving = self.data, self._moving
+        rotation = data.geom_xmat[moving].reshape(-1, 3, 3)
+        bodies = np.einsum("gij,cgj->cgi", rotation, self._corners) + data.geom_xpos[moving]
         marker = [*p_world_marker, CONTACT_HEIGHT / 2] + _CORNERS * (
             CONTACT_HEIGHT / 2 + CONTACT_RADIUS
         )
@@ -174,10 +174,10 @@ class SceneRenderer:
         return points
 
     def _add_line(self, a: np.ndarray, b: np.ndarray, trail: _Trail) -> None:
-        """A line on the ground from `a` to `b`: quicker to draw than any solid."""
+        """Add a line on the ground, which is faster to draw than a solid."""
         geom = self._new_geom("mjGEOM_LINE", np.zeros(3), np.zeros(3), trail.rgba)
-        ends = ([*point, trail.height] for point in (a, b))
-        self.mujoco.mjv_connector(geom, geom.type, _TRAIL_WIDTH * self.renderer.height, *ends)
+        points = ([*point, trail.height] for point in (a, b))
+        self.mujoco.mjv_connector(geom, geom.type, _TRAIL_WIDTH * self.renderer.height, *points)
 
     def _add_marker(self, point: np.ndarray) -> None:
         position, size = np.array([*point, CONTACT_HEIGHT]), np.full(3, CONTACT_RADIUS)
@@ -185,7 +185,7 @@ class SceneRenderer:
         geom.emission = 1.0  # seen in the shadow of the object too
 
     def _new_geom(self, kind: str, size: np.ndarray, position: np.ndarray, rgba: Any) -> Any:
-        """Another geom of this frame, which has room for 10,000."""
+        """Add a geom to this image, which has at most 10,000."""
         view = self.renderer.scene
         geom = view.geoms[view.ngeom]
         kind = getattr(self.mujoco.mjtGeom, kind)
@@ -196,7 +196,7 @@ class SceneRenderer:
 
 
 def _averaged(fine: np.ndarray) -> np.ndarray:
-    """An image (height, width, 3) from one that is `_FINER` times as fine."""
+    """Return the image (height, width, 3) of one that is `_FINER` times as fine."""
     parts = (fine[i::_FINER, j::_FINER] for i in range(_FINER) for j in range(_FINER))
     whole = functools.reduce(np.add, (part.astype(np.uint16) for part in parts))
     return ((whole + _FINER**2 // 2) // _FINER**2).astype(np.uint8)
@@ -206,9 +206,9 @@ def _averaged(fine: np.ndarray) -> np.ndarray:
 def open_renderers(
     tiles: Sequence[Tile], size: tuple[int, int], camera: str
 ) -> Iterator[list[SceneRenderer]]:
-    """A `SceneRenderer` for each tile, those of one scene with one renderer.
+    """Yield a renderer for each tile; tiles of one scene share a `mujoco.Renderer`.
 
-    Renderers are closed at the end; an open one complains when Python exits.
+    The MuJoCo renderers are closed at the end, since open ones warn when Python exits.
     """
     targets = []
     for scene, p_world_target in tiles:
@@ -230,7 +230,7 @@ def open_renderers(
 
 
 def _checked(name: str, values: ArrayLike, length: int) -> np.ndarray:
-    """A copy (length,) of finite `values`, or an InputError."""
+    """Return a copy (length,) of finite values; InputError for others."""
     array = np.array(values, float)
     if array.shape != (length,) or not np.isfinite(array).all():
         raise errors.InputError(
@@ -241,9 +241,9 @@ def _checked(name: str, values: ArrayLike, length: int) -> np.ndarray:
 
 @functools.cache
 def choose_gl() -> None:
-    """Draw through EGL on a Linux machine without a display, unless MUJOCO_GL says otherwise.
+    """Select EGL on Linux without a display, unless MUJOCO_GL is set or EGL is missing.
 
-    A machine that lacks the EGL library is left alone.
+    A MuJoCo that is imported already is reloaded.
     """
     if sys.platform != "linux" or os.environ.get("MUJOCO_GL") or os.environ.get("DISPLAY"):
         return
@@ -258,8 +258,8 @@ def _import_mujoco() -> Any:
     choose_gl()
     try:
         import mujoco
-    except Exception as error:  # what a missing GL library raises depends on the library
-        raise VideoError(_MEND_GL) from error
+    except Exception as error:  # of any kind, by a missing GL library
+        raise VideoError(_FIX_GL) from error
     return mujoco
 
 
@@ -269,23 +269,23 @@ def _renderer(model: Any, size: tuple[int, int]) -> Iterator[Any]:
     width, height = (_FINER * n for n in size)
     buffer, quality = model.vis.global_, model.vis.quality
     with _OPENING:  # a film and stills of one model may be drawn on two threads
-        before = buffer.offwidth, buffer.offheight, quality.offsamples
+        limits = buffer.offwidth, buffer.offheight, quality.offsamples
         # Else each renderer holds images of the limits, and several samples of a pixel.
         buffer.offwidth, buffer.offheight, quality.offsamples = width, height, 0
         try:
             with warnings.catch_warnings():  # GLFW warns before it fails
                 warnings.simplefilter("ignore")
                 renderer = mujoco.Renderer(model, height=height, width=width)
-        except Exception as error:  # likewise
-            raise VideoError(_MEND_GL) from error
+        except Exception as error:  # of any kind, by OpenGL
+            raise VideoError(_FIX_GL) from error
         finally:
-            buffer.offwidth, buffer.offheight, quality.offsamples = before
+            buffer.offwidth, buffer.offheight, quality.offsamples = limits
     with contextlib.closing(renderer):
         yield renderer
 
 
 def check_rendering() -> None:
-    """Draw a sphere; raises VideoError where nothing can be drawn, or nothing is seen."""
+    """Draw a sphere; raise VideoError if this fails, or the image is black."""
     mujoco = _import_mujoco()
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>'
@@ -295,4 +295,4 @@ def check_rendering() -> None:
         mujoco.mj_forward(model, data)
         renderer.update_scene(data)
         if not renderer.render().any():
-            raise VideoError(_MEND_GL)
+            raise VideoError(_FIX_GL)

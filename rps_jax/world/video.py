@@ -1,4 +1,4 @@
-"""Pictures of a trial: one image of a qpos, or a video of many."""
+"""Images and videos of trials, from their qpos."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ _EMPTY = 58  # grey of a place in a grid without a trial
 _INK = (24, 26, 30)  # RGB around labels and tiles
 _LABEL = 13  # [1] heights of a label in a tile
 
-_MEND_FFMPEG = "ffmpeg was not found or does not run: run `pip install imageio-ffmpeg`."
+_FIX_FFMPEG = "ffmpeg was not found or does not run: run `pip install imageio-ffmpeg`."
 
 
 class Shot(NamedTuple):
-    """What a tile shows in one frame."""
+    """Content of a tile in one frame."""
 
     qpos: ArrayLike  # (10,) as for `snapshot`
     p_world_contact: ArrayLike  # (2,) [m], NaN without contact
@@ -47,15 +47,15 @@ class Shot(NamedTuple):
 
 
 class Check(NamedTuple):
-    """One thing that a video needs."""
+    """Result of a check of this machine."""
 
-    what: str
+    name: str
     ok: bool
-    mend: str  # how to mend it, one sentence; empty if `ok`
+    fix: str  # one sentence; empty if `ok`
 
 
 def check() -> list[Check]:
-    """Whether this machine can draw and can encode, tried out; never raises VideoError."""
+    """Check that this machine can draw and encode; never raises VideoError."""
     return [_attempt("rendering", check_rendering), _attempt("ffmpeg", _try_encoding)]
 
 
@@ -67,12 +67,12 @@ def snapshot(
     size: tuple[int, int] = SIZE,
     camera: str = "oblique",
 ) -> np.ndarray:
-    """One RGB image (height, width, 3) uint8.
+    """Return an RGB image (height, width, 3) uint8.
 
     Args:
-      scene: as `scene.load` gives it.
+      scene: of `scene.load`.
       qpos: (10,) base x, y [m], yaw [rad]; object position [m] and quaternion, in the world.
-      p_world_target: (2,) [m] where the flag stands.
+      p_world_target: (2,) [m] of the flag.
       size: width and height [px].
       camera: name of a camera of the scene: oblique or above.
 
@@ -92,7 +92,7 @@ def images(
     size: tuple[int, int] = SIZE,
     camera: str = "oblique",
 ) -> list[np.ndarray]:
-    """Pictures as of `snapshot`, each with the path of the base up to there."""
+    """Return images as of `snapshot`, each with the path of the base until then."""
     with open_renderers([Tile(scene, p_world_target)], size, camera) as (renderer,):
         return [renderer.draw(qpos, NO_CONTACT) for qpos in frames]
 
@@ -140,12 +140,12 @@ def render_grid(
     fps: int = 25,
     camera: str = "oblique",
 ) -> None:
-    """Write an MP4 as of `render` of many trials side by side.
+    """Write an MP4, as of `render`, of many trials side by side.
 
     Args:
       tiles: of the grid, row by row; it may have room for more.
-      frames: what each tile shows in each frame; one that shows the very same as in the frame
-        before is not drawn again.
+      frames: the content of each tile, frame by frame; a tile with the same object as in the
+        last frame is not drawn again.
       path: the file to write.
       shape: rows and columns of the grid.
       size: width and height of a tile [px], even numbers.
@@ -177,7 +177,7 @@ def render_grid(
 
 
 def _labelled(renderer: SceneRenderer, shot: Shot) -> np.ndarray:
-    """A tile, with its label and a line around it if it has one."""
+    """Draw a tile; a label adds a text and a frame."""
     drawn = renderer.draw(shot.qpos, shot.p_world_contact)
     if not shot.label:
         return drawn
@@ -191,11 +191,11 @@ def _labelled(renderer: SceneRenderer, shot: Shot) -> np.ndarray:
 
 @contextlib.contextmanager
 def _encoder(path: Path, size: tuple[int, int], fps: int) -> Iterator[Callable[[Any], None]]:
-    """Takes raw RGB images; `path` appears if all goes well, and nothing is left behind if not."""
+    """Yield a function that encodes RGB images; write `path` only if all succeed."""
     try:
         import imageio_ffmpeg
     except ImportError as error:
-        raise VideoError(_MEND_FFMPEG) from error
+        raise VideoError(_FIX_FFMPEG) from error
     part = path.parent / f".{path.stem}.{os.getpid()}.part.mp4"
     try:
         part.touch()
@@ -214,7 +214,7 @@ def _encoder(path: Path, size: tuple[int, int], fps: int) -> Iterator[Callable[[
                 sink.send(None)
             yield sink.send
         if part.stat().st_size == 0:  # a silent death of ffmpeg goes unnoticed by its wrapper
-            raise VideoError(_MEND_FFMPEG)
+            raise VideoError(_FIX_FFMPEG)
         os.replace(part, path)
     except OSError as error:
         # ffmpeg's own failure comes as an OSError too, with the end of its log as the message.
@@ -224,18 +224,18 @@ def _encoder(path: Path, size: tuple[int, int], fps: int) -> Iterator[Callable[[
             "written to and has space left; if it does, run `pip install imageio-ffmpeg`."
         ) from error
     except RuntimeError as error:
-        raise error if isinstance(error, VideoError) else VideoError(_MEND_FFMPEG) from error
+        raise error if isinstance(error, VideoError) else VideoError(_FIX_FFMPEG) from error
     finally:
         with contextlib.suppress(OSError):
             part.unlink()
 
 
-def _attempt(what: str, action: Callable[[], None]) -> Check:
+def _attempt(name: str, action: Callable[[], None]) -> Check:
     try:
         action()
     except VideoError as error:
-        return Check(what, False, str(error))
-    return Check(what, True, "")
+        return Check(name, False, str(error))
+    return Check(name, True, "")
 
 
 def _try_encoding() -> None:

@@ -39,7 +39,7 @@ from rps_jax.trials.trial import Rules
 Q = TypeVar("Q", bound=Question[object])
 _REGISTRY = ConstructorRegistry()
 _NO_PREFIX = tyro.conf.arg(name="")
-_NUMBERS = {int: "a whole number", float: "a number"}
+_NUMBER_NOUNS = {int: "a whole number", float: "a number"}
 _LAST = [field.name for field in dataclasses.fields(SimulationQuestion)]  # in the help
 
 
@@ -99,7 +99,7 @@ def parse(question_type: type[Q], command: str, words: Sequence[str]) -> tuple[Q
 
     Raises:
       InputError: an option is unknown, lacks its value, or has one that is not allowed.
-      SystemExit: help was asked for.
+      SystemExit: the help was printed.
     """
     question, session = _parse(question_type(), command, words)
     if getattr(question, "quick", False):
@@ -161,17 +161,17 @@ def _number_or_text(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[object]
         if any(get_origin(kind) is Sequence for kind in kinds):
             return PrimitiveConstructorSpec("*", "[TEXT [TEXT ...]]", tuple, _is_any, _texts)
         return PrimitiveConstructorSpec(1, "TEXT", lambda words: words[0], _is_any, _texts)
-    for kind in kinds & {*_NUMBERS}:
-        read = partial(_number, kind)
+    for kind in kinds & {*_NUMBER_NOUNS}:
+        read = partial(_parse_number, kind)
         return PrimitiveConstructorSpec(1, kind.__name__.upper(), read, _is_any, _texts)
     return None
 
 
-def _number(kind: type[int] | type[float], words: list[str]) -> float:
+def _parse_number(kind: type[int] | type[float], words: list[str]) -> float:
     try:
         return kind(words[0])
     except ValueError as error:
-        raise ValueError(f"{words[0]} is not allowed: give {_NUMBERS[kind]}") from error
+        raise ValueError(f"{words[0]} is not allowed: give {_NUMBER_NOUNS[kind]}") from error
 
 
 def _is_any(value: object) -> bool:
@@ -206,7 +206,7 @@ def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
 
 def _offered(kind: type) -> list[dataclasses.Field[object]]:
     """Return the fields that are flags: those of the command first, then the shared ones."""
-    shown = [one for one in dataclasses.fields(kind) if one.init and not options.is_hidden(one)]
+    shown = [f for f in dataclasses.fields(kind) if f.init and not options.is_hidden(f)]
     return sorted(shown, key=lambda field: field.name in _LAST)
 
 

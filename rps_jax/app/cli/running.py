@@ -1,4 +1,4 @@
-"""How a command runs: exit codes, errors and interrupts, and what it prints and writes."""
+"""Running a command: exit codes, errors, interrupts, output and report."""
 
 from __future__ import annotations
 
@@ -130,8 +130,8 @@ def execute(question: Question[object], session: Session) -> None:
     in_shell = hasattr(question, "in_shell")
     if question.out is None and not in_shell:
         question = dataclasses.replace(question, out=question.default_folder)
-    few = session.device == "auto" and question.suits_processors()
-    device.choose("cpu" if few or getattr(question, "ray", None) else session.device)
+    is_small = session.device == "auto" and question.suits_processors()
+    device.choose("cpu" if is_small or getattr(question, "ray", None) else session.device)
     question.validate()
     _raise_interrupts()
     if note := question.note():
