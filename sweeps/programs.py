@@ -154,5 +154,5 @@ def side_by_side(
 
 
 def machine() -> str:
-    """Where speeds were measured, in a sentence."""
+    """Return a sentence with the device of the measurement."""
     return f"On {jax.devices()[0].device_kind}, {device.count_processors()} processors."

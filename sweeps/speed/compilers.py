@@ -1,7 +1,8 @@
-"""Do outcomes hang on who compiles the loop, and how much faster is it compiled here than by XLA?
+"""Outcomes and speed of the loop with the native compiler and with XLA.
 
-The same worlds are swept twice, each time in a process of its own: the loop compiled here (`cc`, on
-a GPU NVRTC), and by XLA, as where there is no compiler; or on a GPU, and on processors.
+Two processes sweep the same worlds: one with the loop compiled natively (`cc`, or NVRTC on a GPU),
+the other with the loop compiled by XLA, as on machines without a compiler; or on a GPU and on
+processors.
 
     rps sweeps/speed/compilers.py --machine "2 cores of an AMD EPYC"
     rps sweeps/speed/compilers.py --against cpu --worlds 4000 --machine "one NVIDIA H100"
@@ -29,7 +30,7 @@ from sweeps.speed.commands import TIMING, printed
 from sweeps.study_base import Study, Table
 
 _LIMIT = 3600.0  # [s] of a sweep
-# Which are compared: their names, and the environment and options of the second.
+# Comparisons: names of both, and environment and options of the second.
 _PAIRS: dict[str, tuple[tuple[str, str], dict[str, str], str]] = {
     "xla": (("compiled here", "by XLA"), {"RPS_COMPILER": "none"}, ""),
     "cpu": (("on the GPU", "on processors"), {}, " --device cpu"),
@@ -38,49 +39,49 @@ _PAIRS: dict[str, tuple[tuple[str, str], dict[str, str], str]] = {
 
 @dataclass(frozen=True)
 class Compilers(Study[xr.Dataset]):
-    """Compare sweeps whose loop was compiled here with sweeps by XLA, or on processors.
+    """Compare sweeps with the native loop with sweeps by XLA, or on processors.
 
-    The answer holds the share of equal outcomes, the rates of success, and simulated seconds in a
-    second of both, for each skin.
+    The results hold, by skin, the share of equal outcomes, and the success rates and simulated
+    seconds per second of both.
     """
 
     TITLE: ClassVar[str] = "The loop compiled here, and by XLA"
     GROWS: ClassVar[tuple[str, ...]] = ("skins", "file")
 
     law: str = "rps_tuned"
-    """What decides."""
+    """Law to run."""
     skins: tuple[str, ...] = ("capacitive", "ideal")
-    """Skins, as a domain has them."""
+    """Skins of the domain."""
     worlds: int = option(1000, 1, 1_000_000)
     """Number of worlds of `wide`."""
     against: Literal["xla", "cpu"] = "xla"
-    """With what the sweep as this machine runs it is compared: one by XLA, or on processors."""
+    """Sweep of comparison: by XLA, or on processors."""
     file: str = "compilers"
     """Name of the data file."""
 
     def num_trials(self) -> int | None:
-        """How many skins there are."""
+        """Return the number of skins."""
         return len(self.skins)
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Sweep what was not swept before."""
-        found = []
-        for number, skin in enumerate(self.skins):
-            found.append(run.checkpoint(skin, partial(self._compared, skin)))
-            run.callback(Progress(number + 1, 0.0))
-        whole: Any = xr.concat(found, "skin").assign_coords(skin=list(self.skins))
-        return whole
+        """Run the sweeps that are missing."""
+        parts = []
+        for i, skin in enumerate(self.skins):
+            parts.append(run.checkpoint(skin, partial(self._compared, skin)))
+            run.callback(Progress(i + 1, 0.0))
+        results: Any = xr.concat(parts, "skin").assign_coords(skin=list(self.skins))
+        return results
 
     def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
         """Return the comparison."""
         return {self.file: Table([self._columns, *self.table(results)])}
 
     def intro(self, results: xr.Dataset) -> str:
-        """Where it was compared."""
+        """Return the device of the comparison."""
         return programs.machine()
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Outcomes and speeds of both."""
+        """Return a section with outcomes and speeds of both."""
         return [Section("Outcomes and speeds", "", [self._columns, *self.table(results)])]
 
     @property
@@ -88,51 +89,51 @@ class Compilers(Study[xr.Dataset]):
         names, *_ = _PAIRS[self.against]
         return ["law", "skin", "worlds", "equal outcomes", *names, "simulated s/s"]
 
-    def table(self, found: xr.Dataset) -> list[list[str]]:
-        """A row for each skin."""
+    def table(self, results: xr.Dataset) -> list[list[str]]:
+        """Return one row per skin."""
         rows = []
-        for skin in map(str, found.skin.values):
-            one = {name: leaf.item() for name, leaf in found.sel(skin=skin).items()}
-            rates = f"{one['rate_here']:,.0f} and {one['rate_other']:,.0f}"
+        for skin in map(str, results.skin.values):
+            comparison = {name: leaf.item() for name, leaf in results.sel(skin=skin).items()}
+            rates = f"{comparison['rate_here']:,.0f} and {comparison['rate_other']:,.0f}"
             rows.append([
-                self.law, skin, f"{self.worlds:,}", f"{100 * one['equal']:.1f} %",
-                f"{100 * one['here']:.1f} %", f"{100 * one['other']:.1f} %", rates,
+                self.law, skin, f"{self.worlds:,}", f"{100 * comparison['equal']:.1f} %",
+                f"{100 * comparison['here']:.1f} %", f"{100 * comparison['other']:.1f} %", rates,
             ])  # fmt: skip
         return rows
 
     def _compared(self, skin: str) -> xr.Dataset:
-        """The same sweep by both."""
-        _, environment, more = _PAIRS[self.against]
-        asked = f"sweep --laws {self.law} --domain wide,skin={skin} --worlds {self.worlds}"
+        """Return the comparison of both sweeps."""
+        _, environment, options = _PAIRS[self.against]
+        command = f"sweep --laws {self.law} --domain wide,skin={skin} --worlds {self.worlds}"
         with tempfile.TemporaryDirectory() as folder:
-            here, rate_here = _swept(asked, Path(folder), "here", {})
-            other, rate_other = _swept(asked + more, Path(folder), "other", environment)
-        told = {
-            "equal": float((here == other).mean()),
-            "here": float(here.mean()),
-            "other": float(other.mean()),
+            first, rate_here = _swept(command, Path(folder), "here", {})
+            second, rate_other = _swept(command + options, Path(folder), "other", environment)
+        values = {
+            "equal": float((first == second).mean()),
+            "here": float(first.mean()),
+            "other": float(second.mean()),
             "rate_here": rate_here,
             "rate_other": rate_other,
         }
-        return xr.Dataset({name: ((), value) for name, value in told.items()})
+        return xr.Dataset({name: ((), value) for name, value in values.items()})
 
 
 compilers = call_of(Compilers)
 
 
 def _swept(
-    asked: str, folder: Path, name: str, environment: Mapping[str, str]
+    command: str, folder: Path, name: str, environment: Mapping[str, str]
 ) -> tuple[Any, float]:
-    """Which worlds are won, and simulated seconds in a second once all is compiled.
+    """Return success (world) and simulated seconds per second of a sweep without compilation.
 
     Raises:
       InputError: the sweep failed.
     """
-    said, out = "", folder
-    for number in range(2):  # the first compiles
-        out = folder / f"run_{name}_{number}"
-        words = ["-m", "rps_jax", *asked.split(), "--out", str(out)]
-        said, _ = printed(words, asked, str(folder), _LIMIT, environment=environment)
-    if (told := TIMING.search(said)) is None:
-        raise InputError(f"{asked} does not tell how long it ran.")
-    return rps_jax.load(out).success.values, float(told.group(3))
+    output, out = "", folder
+    for i in range(2):  # the first run compiles
+        out = folder / f"run_{name}_{i}"
+        words = ["-m", "rps_jax", *command.split(), "--out", str(out)]
+        output, _ = printed(words, command, str(folder), _LIMIT, environment=environment)
+    if (match := TIMING.search(output)) is None:
+        raise InputError(f"{command} printed no time of its run.")
+    return rps_jax.load(out).success.values, float(match.group(3))

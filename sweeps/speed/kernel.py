@@ -101,11 +101,11 @@ class Kernel(Study[xr.Dataset]):
         """Return a section with the stall reasons of each family."""
         return [Section("Waits", "", [list(_COLUMNS), *self.table(results)])]
 
-    def table(self, found: xr.Dataset) -> list[list[str]]:
+    def table(self, results: xr.Dataset) -> list[list[str]]:
         """Return one row per family."""
         steps, rows = SEGMENT / Setting().physics.control_period, []
-        for family in map(str, found.family.values):
-            counts = {name: leaf.item() for name, leaf in found.sel(family=family).items()}
+        for family in map(str, results.family.values):
+            counts = {name: leaf.item() for name, leaf in results.sel(family=family).items()}
             waits = [counts[name] for name in _WAITS]
             rows.append([
                 family, f"{self.worlds:,}", f"{counts['time'] / steps / 1e3:.0f} µs",
