@@ -103,7 +103,7 @@ def _check_traced(
     if not (is_twist and isinstance(parts[2], Details)):
         actual = ", ".join(map(_describe, parts)) or _describe(results)
         raise traced_step.error(actual, "state, Twist, Details, such as Details.from_obs(obs)")
-    scalars = [("Twist", "iuf", item) for item in Twist(*parts[1])._asdict().items()]
+    scalars = [("a Twist", "iuf", item) for item in Twist(*parts[1])._asdict().items()]
     scalars += [("Details", "biuf", item) for item in parts[2]._asdict().items()]
     for group, kinds, (name, leaf) in scalars:
         if fault := _scalar_fault(leaf, kinds):
@@ -173,9 +173,10 @@ def _describe(value: Any) -> str:
 
 def _scalar_fault(leaf: Any, kinds: str) -> str:
     """Describe why a leaf is no scalar of these kinds of type; empty if it is one."""
-    if not hasattr(leaf, "shape") or not hasattr(leaf, "dtype") or leaf.shape != ():
+    if not _is_array(leaf) or np.shape(leaf) != ():
         return _describe(leaf)
-    return "" if np.dtype(leaf.dtype).kind in kinds else f"{leaf.dtype}"
+    dtype = jnp.result_type(leaf)
+    return "" if getattr(dtype, "kind", "") in tuple(kinds) else f"of type {dtype}"
 
 
 def _difference(state: object, next_state: object) -> str:
@@ -187,10 +188,11 @@ def _difference(state: object, next_state: object) -> str:
         subject = f"whose {name}" if name else "that"
         if not _is_array(new):
             return f"{subject} is {_describe(new)}"
-        if old.shape != new.shape:
-            return f"{subject} has shape {tuple(new.shape)}, and {old.shape} in init"
-        if old.dtype != new.dtype:
-            return f"{subject} is {new.dtype}, and {old.dtype} in init"
+        shape, dtype = np.shape(new), jnp.result_type(new)
+        if old.shape != shape:
+            return f"{subject} has shape {shape}, and {old.shape} in init"
+        if old.dtype != dtype:
+            return f"{subject} is {dtype}, and {old.dtype} in init"
     return ""
 
 
