@@ -20,7 +20,7 @@ from rps_jax.runs.question import Question, Run, call_of
 
 @dataclass(frozen=True)
 class Export(Question[Path]):
-    """A law with its parameters, and the skin of a robot, in another language."""
+    """Export of a law with its parameters, and of the skin of a robot, to another language."""
 
     law: LawLike = "rps_plus"
     """The law: its name, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
@@ -31,18 +31,18 @@ class Export(Question[Path]):
     skin: SkinLike = "capacitive"
     """The skin with taxels: capacitive, with changes, as capacitive,threshold=0.3."""
     prefix: str = ""
-    """What all names begin with, a name of C; by default the law's."""
+    """Prefix of all names, a name of C; by default the law's."""
     out: Path | str | None = option(None, kw_only=True)
     """Folder that is written; by default runs/ and the command's name."""
 
     @functools.cached_property
     def program(self) -> Program:
-        """The law, traced."""
+        """Traced law and skin."""
         return programs.program(self.law, self.robot, self.skin)
 
     @property
     def named(self) -> str:
-        """What all names begin with."""
+        """Prefix of all names."""
         return self.prefix or identifier(self.program.label)
 
     def check(self) -> None:
@@ -58,7 +58,7 @@ class Export(Question[Path]):
         yield None
 
     def texts(self) -> Mapping[str, str | bytes]:
-        """Contents of the files, by name."""
+        """Return the contents of the files, by name."""
         raise NotImplementedError
 
     def answer(self, run: Run) -> Path:
@@ -73,7 +73,7 @@ class ExportC(Export):
     """Write a law and a skin as one C99 header, with an example that measures itself."""
 
     def texts(self) -> Mapping[str, str | bytes]:
-        """Header, example and CMake file."""
+        """Return the header, the example and the CMake file."""
         from rps_jax.app.export import folder
 
         return folder.files(self.program, self.named)
@@ -94,10 +94,11 @@ class ExportOnnx(Export):
     """Write a law as ONNX, with named inputs and outputs and an explicit memory."""
 
     batch: int | None = option(None, 1, 100_000, kw_only=True)
-    """How many worlds a model steps at once, along a first axis; by default one, without it."""
+    """Number of worlds that a model steps at once, along a first axis; by default one, without
+    it."""
 
     def texts(self) -> Mapping[str, str | bytes]:
-        """The models of the step and of the memory before it."""
+        """Return the model of the step."""
         from rps_jax.app.export import onnx_model
 
         return onnx_model.models(self.program, self.named, self.batch)

@@ -56,7 +56,7 @@ class CWriter(ScalarWriter):
         kind = _TYPES[kind].format(p=self.prefix)
         return f"{'const ' * constant}{kind} {name}{'' if size == 1 else f'[{size}]'}"
 
-    def literal(self, value: object, kind: str) -> str:
+    def literal(self, value: float, kind: str) -> str:
         return literal(self.prefix, value, kind)
 
     def listed(self, texts: Iterable[str]) -> str:
@@ -77,7 +77,7 @@ class CWriter(ScalarWriter):
         return f"static {self.declaration(kind, sized)} = {text(array)};"
 
 
-def literal(prefix: str, value: object, kind: str) -> str:
+def literal(prefix: str, value: float, kind: str) -> str:
     """Return a constant of C."""
     if kind == "b":
         return str(int(bool(value)))

@@ -53,8 +53,8 @@ struct Arguments {{
 extern "C" __global__ void __launch_bounds__(32) step(const __grid_constant__ Arguments a) {{
   __shared__ unsigned shared[{SHARED} * WORLDS];
   const int thread = threadIdx.x % THREADS, world = threadIdx.x / THREADS;
-  const long long own = (long long)blockIdx.x * WORLDS + world;
-  const bool exists = own < a.worlds;
+  const long long index = (long long)blockIdx.x * WORLDS + world;
+  const bool exists = index < a.worlds;
   const long long at = {WORLD};
 {LINES}
 }}
@@ -68,43 +68,43 @@ class GpuNodes(SimdNodes):
         super().__init__()
         self._gathers: dict[Hashable, Array] = {}
 
-    def moved(self, values: Sequence[Value], indices: np.ndarray, like: Typed) -> Value:
-        """Gather numbers; numbers that the same operation computes become one array operation."""
-        gathered = super().moved(values, indices, like)
+    def moved(self, values: Sequence[Value], indices: np.ndarray, template: Typed) -> Value:
+        """Gather scalars; scalars that the same operation computes become one array operation."""
+        gathered = super().moved(values, indices, template)
         if not isinstance(gathered, Array) or gathered.node.op != "move":
             return gathered
-        node, numbers = gathered.node, tuple(map(_source, gathered.node.args))
+        node, scalars = gathered.node, tuple(map(_source, gathered.node.args))
         if node.size > WARP:
-            return self._gathered_numbers(numbers, node.kind)._replace(shape=gathered.shape)
-        return gathered._replace(node=self.node("move", numbers, node.kind, node.size))
+            return self._gathered_numbers(scalars, node.kind)._replace(shape=gathered.shape)
+        return gathered._replace(node=self.node("move", scalars, node.kind, node.size))
 
-    def _gathered_numbers(self, numbers: tuple[Value, ...], kind: str) -> Value:
-        """Return single numbers as one operand."""
-        first, size = numbers[0], len(numbers)
-        if not any(isinstance(a, Array) for a in numbers):
-            return flat(np.asarray(numbers), size)
-        if not all(isinstance(a, Array) for a in numbers):
-            return Array(self.node("move", numbers, kind, size), 0, 1, (size,))
-        if all(a.node is first.node for a in numbers):
+    def _gathered_numbers(self, scalars: tuple[Value, ...], kind: str) -> Value:
+        """Return scalars as one operand."""
+        first, size = scalars[0], len(scalars)
+        if not any(isinstance(a, Array) for a in scalars):
+            return flat(np.asarray(scalars), size)
+        if not all(isinstance(a, Array) for a in scalars):
+            return Array(self.node("move", scalars, kind, size), 0, 1, (size,))
+        if all(a.node is first.node for a in scalars):
             for step in (0, 1):
-                if all(a.first == first.first + step * i for i, a in enumerate(numbers)):
+                if all(a.first == first.first + step * i for i, a in enumerate(scalars)):
                     return Array(first.node, first.first, step, (size,))
-        key = tuple((a.node.number, a.first) for a in numbers)
+        key = tuple((a.node.id, a.first) for a in scalars)
         if key not in self._gathers:
-            self._gathers[key] = self._vectorised(numbers, kind)
+            self._gathers[key] = self._vectorised(scalars, kind)
         return self._gathers[key]
 
-    def _vectorised(self, numbers: tuple[Array, ...], kind: str) -> Array:
+    def _vectorised(self, scalars: tuple[Array, ...], kind: str) -> Array:
         """Vectorise a gather of scalars: apply their common operation to gathered operands."""
-        first, size, nodes = numbers[0].node, len(numbers), {a.node for a in numbers}
+        first, size, nodes = scalars[0].node, len(scalars), {a.node for a in scalars}
         operations = {(x.op, len(x.args), x.extra) for x in nodes}
         if len(operations) > 1 or any(x.is_single or x.op.startswith("fold") for x in nodes):
-            return Array(self.node("move", numbers, kind, size), 0, 1, (size,))
+            return Array(self.node("move", scalars, kind, size), 0, 1, (size,))
         args = [
             self._gathered_numbers(
-                tuple(_operand(a, j) for a in numbers), self.kind(like.dtype, "a move")
+                tuple(_operand(a, j) for a in scalars), self.kind(template.dtype, "a move")
             )
-            for j, like in enumerate(first.args)
+            for j, template in enumerate(first.args)
         ]
         return Array(self.node(first.op, args, kind, size, first.extra), 0, 1, (size,))
 
@@ -112,21 +112,21 @@ class GpuNodes(SimdNodes):
         """Apply a primitive; sums over threads are added before they are exchanged."""
         sums = (_SUM, f"{name}_f")
         if name in ("add", "sub") and size_of(out.shape) == 1 and out.dtype == np.float32:
-            left, right = (_node_of(x) for x in values)
-            if left and right and right.op == _SUM and left.op in sums:
-                if left.op == _SUM:
-                    return self._sum(name, left, right, out)
-                if (last := _node_of(left.args[1])) and last.op == _SUM:
-                    both = self._sum("add", last, right, out)
-                    return super().apply(name, [left.args[0], both], params, out)
+            lhs, rhs = (_node_of(x) for x in values)
+            if lhs and rhs and rhs.op == _SUM and lhs.op in sums:
+                if lhs.op == _SUM:
+                    return self._sum(name, lhs, rhs, out)
+                if (last := _node_of(lhs.args[1])) and last.op == _SUM:
+                    both = self._sum("add", last, rhs, out)
+                    return super().apply(name, [lhs.args[0], both], params, out)
         result = super().apply(name, values, params, out)
         node = _node_of(result)
         if node is None or node.op != "fold add_f":
             return result
         return Array(self.node(_SUM, [result], "f", 1), 0, 1, result.shape)
 
-    def _sum(self, name: str, left: Node, right: Node, out: Typed) -> Array:
-        partial = [x.args[0]._replace(shape=out.shape) for x in (left, right)]
+    def _sum(self, name: str, lhs: Node, rhs: Node, out: Typed) -> Array:
+        partial = [x.args[0]._replace(shape=out.shape) for x in (lhs, rhs)]
         total = super().apply(name, partial, {}, out)
         return Array(self.node(_SUM, [flat(total, 1)], "f", 1), 0, 1, out.shape)
 
@@ -183,10 +183,10 @@ class GpuWriter(SimdWriter):
         if node not in self._shared:
             return f"{kind} {node.name}[{self._turns(node.size)}];"
         first = 0
-        for other, offset in sorted(self._offsets.items(), key=lambda item: item[1]):
+        for neighbour, offset in sorted(self._offsets.items(), key=lambda item: item[1]):
             if offset - first >= node.size:
                 break
-            first = offset + other.size
+            first = offset + neighbour.size
         self._offsets[node] = first
         self.shared_size = max(self.shared_size, first + node.size)
         return f"{kind} *const {node.name} = ({kind} *)shared + {first * self._worlds} + world;"
@@ -215,17 +215,17 @@ class GpuWriter(SimdWriter):
         """Return an element at a constant index, in all threads."""
         if node.width == 1 or node in self._shared:
             return self.item(node, index)
-        key = node.number, index
+        key = node.id, index
         if key not in self._broadcasts:
             name = self._broadcasts[key] = f"p{next(self._names)}"
             self._pending.append(f"const {TYPES[node.kind]} {name} = {self.item(node, index)};")
         return self._broadcasts[key]
 
-    def read(self, a: Value, node: Node, own: set[Node]) -> str:
+    def read(self, a: Value, node: Node, fused: set[Node]) -> str:
         if not isinstance(a, Array):
             return self.constant(a)
-        if a.node in own and node.is_in_step(a):
-            return f"e{a.node.number}"
+        if a.node in fused and node.is_in_step(a):
+            return f"e{a.node.id}"
         if a.node.width == 1:
             return a.node.name
         if not a.step or node.size == 1:
@@ -242,7 +242,7 @@ class GpuWriter(SimdWriter):
     def is_single(self, node: Node) -> bool:
         return node.is_single and not (node.size > 1 and node.op in _INLINE)
 
-    def _each(self, size: int, lines: Sequence[str]) -> list[str]:
+    def _element_loop(self, size: int, lines: Sequence[str]) -> list[str]:
         """Return a loop over the elements `i` of a thread; `s` counts its iterations."""
         turns, index = self._turns(size), "s * THREADS + thread"
         divisible = size % self._threads == 0
@@ -260,30 +260,30 @@ class GpuWriter(SimdWriter):
         return [*pending, *lines]
 
     def together(self, group: Sequence[Node], stored: set[Node]) -> list[str]:
-        head, lines, tail, own = [], [], [], set(group)
+        head, lines, tail, fused = [], [], [], set(group)
         size = group[0].size
         inside = "" if size % self._threads == 0 else f"s * THREADS + thread < {size} ? "
         for node in group:
             kind, name = TYPES[node.kind], node.name
-            needed, text = self._number(node, own)
+            needed, text = self._element_text(node, fused)
             if node.op.startswith("fold"):
                 op, start = node.op[5:], literal(INITIAL[node.op[5:-2], node.kind], node.kind)
                 head.append(f"{kind} {name} = {start};")
                 if inside and "(" in text:  # all threads take part in a shuffle
-                    lines.append(f"  const {kind} e{node.number} = {text};")
-                    text = f"e{node.number}"
+                    lines.append(f"  const {kind} e{node.id} = {text};")
+                    text = f"e{node.id}"
                 text = f"{inside}{text} : {start}" if inside else text
                 lines.append(f"  {name} = {op}({name}, {text});")
-                if op != "add_f":  # which has a node of its own, `_SUM`
+                if op != "add_f":  # which has a separate node, `_SUM`
                     tail.append(f"{name} = {op[:-2]}_over_threads_{node.kind}({name});")
                 continue
-            lines += [*needed, f"  const {kind} e{node.number} = {text};"]
+            lines += [*needed, f"  const {kind} e{node.id} = {text};"]
             if node in stored:
                 head.append(self._declared(node))
-                lines.append(f"  {self._element(node)} = e{node.number};")
-        return self.statement([*head, *self._each(size, lines), *tail], stored)
+                lines.append(f"  {self._element(node)} = e{node.id};")
+        return self.statement([*head, *self._element_loop(size, lines), *tail], stored)
 
-    def _number(self, node: Node, own: set[Node]) -> tuple[list[str], str]:
+    def _element_text(self, node: Node, fused: set[Node]) -> tuple[list[str], str]:
         """Return statements, and the expression of element `i` of a node."""
         size, at = node.size, "i" if node.size > 1 else "0"
         if node.op == "input":
@@ -298,7 +298,7 @@ class GpuWriter(SimdWriter):
             return self._gather(node)
         if node.op == "move":
             return [], self.read(node.args[0], node, set())
-        return [], self._expression(node, own)
+        return [], self._expression(node, fused)
 
     def _gather(self, node: Node) -> tuple[list[str], str]:
         """Return statements, and the expression of element `i` of a gather."""
@@ -306,9 +306,9 @@ class GpuWriter(SimdWriter):
         for i, a in enumerate(node.args):
             sources.setdefault(a.node if isinstance(a, Array) else None, []).append(i)
         texts, source_of = [], [0] * node.size
-        for number, (source, indices) in enumerate(sources.items()):
+        for k, (source, indices) in enumerate(sources.items()):
             for i in indices:
-                source_of[i] = number
+                source_of[i] = k
             inside = set(indices)  # elsewhere any valid index will do
             args = [node.args[i if i in inside else indices[0]] for i in range(node.size)]
             if source is None:
@@ -319,29 +319,29 @@ class GpuWriter(SimdWriter):
             return [], texts[0]
         names, choice = [f"p{next(self._names)}" for _ in texts], f"w{next(self._names)}"
         chosen = names[0]
-        for number, name in enumerate(names[1:], 1):
-            chosen = f"{choice} == {number} ? {name} : {chosen}"
+        for k, name in enumerate(names[1:], 1):
+            chosen = f"{choice} == {k} ? {name} : {chosen}"
         kind = TYPES[node.kind]
         # All threads take part in each shuffle.
         lines = [f"  const {kind} {n} = {t};" for n, t in zip(names, texts, strict=True)]
         return [*lines, f"  const int {choice} = {self._integers(source_of)};"], chosen
 
-    def _integers(self, numbers: Sequence[int]) -> str:
+    def _integers(self, scalars: Sequence[int]) -> str:
         """Return an expression in `i` of these integers."""
-        step = numbers[1] - numbers[0]
-        if list(numbers) == [numbers[0] + step * i for i in range(len(numbers))]:
-            return f"{step} * i + {numbers[0]}"
-        if len(numbers) <= 8 and max(numbers) < 16:
-            packed = sum(x << (4 * i) for i, x in enumerate(numbers))
+        step = scalars[1] - scalars[0]
+        if list(scalars) == [scalars[0] + step * i for i in range(len(scalars))]:
+            return f"{step} * i + {scalars[0]}"
+        if len(scalars) <= 8 and max(scalars) < 16:
+            packed = sum(x << (4 * i) for i, x in enumerate(scalars))
             return f"(int)({packed:#x}u >> (4 * i) & 15)"
-        return f"{self.table(np.array(numbers, np.int32))}[i]"
+        return f"{self.table(np.array(scalars, np.int32))}[i]"
 
     def single(self, node: Node) -> list[str]:
         kind, name = TYPES[node.kind], node.name
         if node.op == "part":
             star = "" if self._is_scalar(node) else "*const "
             return [f"{kind} {star}{name} = {node.extra.name};"]
-        return self.statement([f"const {kind} {name} = {self._number(node, set())[1]};"])
+        return self.statement([f"const {kind} {name} = {self._element_text(node, set())[1]};"])
 
     def loop(self, loop: LoopNode) -> list[str]:
         broadcasts, self._broadcasts = self._broadcasts, dict(self._broadcasts)
@@ -357,7 +357,7 @@ class GpuWriter(SimdWriter):
         text = self.read(value, Node(0, "set", (value,), node.kind, node.size), set())
         text = f"choose_{node.kind}(goes, {text}, {self._element(node)})" if masked else text
         line = f"{self._element(node)} = {text};"
-        lines = [line] if node.size == 1 else self._each(node.size, [f"  {line}"])
+        lines = [line] if node.size == 1 else self._element_loop(node.size, [f"  {line}"])
         return self.statement([*([self._declared(node)] if declare else []), *lines], [node])
 
     def end(self, result: Result) -> list[str]:
@@ -369,10 +369,10 @@ class GpuWriter(SimdWriter):
             f"  const {TYPES[kind]} e = {text};",
             f"  if (exists && s * THREADS + thread < {size}) {stored} = e;",
         ]
-        return self.statement(self._each(size, lines))
+        return self.statement(self._element_loop(size, lines))
 
 
-def _shared_arrays(nodes: Iterable[Node], ends: Iterable[Result]) -> set[Node]:
+def _shared_arrays(nodes: Iterable[Node], roots: Iterable[Result]) -> set[Node]:
     """Return the arrays that a thread reads where another has written."""
     shared: set[Node] = set()
     parts: list[tuple[Node, Node]] = []
@@ -383,14 +383,14 @@ def _shared_arrays(nodes: Iterable[Node], ends: Iterable[Result]) -> set[Node]:
         if not (in_step and a.step == 1 and a.first == 0 and a.node.width == size):
             shared.add(a.node)
 
-    def visit(some: Iterable[Node]) -> None:
-        for node in some:
+    def visit(group: Iterable[Node]) -> None:
+        for node in group:
             if node.op == "part":
                 parts.append((node, node.extra))
             if isinstance(node, LoopNode):
-                for own, *values in zip(node.carried, node.args, node.results, strict=True):
+                for carried, *values in zip(node.carried, node.args, node.results, strict=True):
                     for a in values:
-                        read(a, own.size)
+                        read(a, carried.size)
                 read(node.condition, 1)
                 visit(node.inner)
                 continue
@@ -398,7 +398,7 @@ def _shared_arrays(nodes: Iterable[Node], ends: Iterable[Result]) -> set[Node]:
                 read(a, node.size, node.op not in ("move", "take"))
 
     visit(nodes)
-    for result in ends:
+    for result in roots:
         read(result.value, result.size)
     for part, carried in parts:
         if part in shared or carried in shared:
@@ -426,15 +426,15 @@ def source(
       UnsupportedError: it has an operation that is not in the headers.
       TooLargeError: it needs too much shared memory.
     """
-    found, ends = results(closed, shapes, outs, GpuNodes())
-    nodes = reached(ends)
-    writer = GpuWriter(threads, _shared_arrays(nodes, found))
-    lines = writer.lines(nodes, ends, set())
-    for result in found:
+    returned, roots = results(closed, shapes, outs, GpuNodes())
+    nodes = reached(roots)
+    writer = GpuWriter(threads, _shared_arrays(nodes, returned))
+    lines = writer.lines(nodes, roots, set())
+    for result in returned:
         lines += writer.end(result)
     if 4 * writer.shared_size * (WARP // threads) > _MAX_SHARED:
         raise TooLargeError("the arrays of a world exceed the shared memory of a block.")
-    last = "exists ? own : a.worlds - 1"
+    last = "exists ? index : a.worlds - 1"
     fill = {
         "TABLES": "\n".join(writer.tables.values()),
         "LINES": "\n".join(f"  {line}" for line in lines),

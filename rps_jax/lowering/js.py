@@ -42,7 +42,7 @@ class JsWriter(ScalarWriter):
     def empty(self, kind: str, name: str, size: int) -> str:
         return f"const {name} = Array({size});"
 
-    def literal(self, value: object, kind: str) -> str:
+    def literal(self, value: float, kind: str) -> str:
         return text_of(np.asarray(value).item())
 
     def listed(self, texts: Iterable[str]) -> str:

@@ -39,7 +39,7 @@ _OPERATIONS = (_FOLDER / "operations.h").read_text()
 XLA_CALL = (_FOLDER / "xla_call.h").read_text()
 SIMD_HEADER = XLA_CALL + (_FOLDER / "simd.h").read_text() + _OPERATIONS
 GPU_HEADER = (_FOLDER / "gpu.h").read_text() + _OPERATIONS
-# Kinds of numbers for which each macro of the headers defines an operation.
+# Kinds of numbers for owners each macro of the headers defines an operation.
 _MACROS = {"INFIX": "fiu", "COMPARE": "fiub", "BITS": "iub", "EACH": "f", "EACH_OF_TWO": "f"}
 OPERATIONS = frozenset(re.findall(r"^FUNCTION \w+ (\w+)\(", SIMD_HEADER, re.M)) | {
     f"{name}_{kind}"
@@ -61,7 +61,7 @@ _SINGLE = ("move", "take", "while", "for", "if", "input", "part", "product")
 class Node:
     """An array of numbers and the operation that computes it."""
 
-    number: int
+    id: int
     op: str
     args: tuple[Value, ...]  # `Array` and constants
     kind: str
@@ -72,7 +72,7 @@ class Node:
     @property
     def name(self) -> str:
         """Variable in the printed code."""
-        return f"v{self.number}"
+        return f"v{self.id}"
 
     @property
     def needed(self) -> Iterable[Node]:
@@ -91,7 +91,7 @@ class Node:
 
     @functools.cached_property
     def whole(self) -> set[Node]:
-        """Nodes of which all elements must be computed before its first element."""
+        """Nodes of owners all elements must be computed before its first element."""
         arrays = [a for a in self.args if isinstance(a, Array)]
         in_step = set() if self.is_single else {a.node for a in arrays if self.is_in_step(a)}
         return {a.node for a in arrays} - in_step | set(self.free)
@@ -168,19 +168,19 @@ class SimdNodes(Target):
         """Return one number of a value."""
         return element(value, index)
 
-    def moved(self, values: Sequence[Value], indices: np.ndarray, like: Typed) -> Value:
+    def moved(self, values: Sequence[Value], indices: np.ndarray, template: Typed) -> Value:
         """Gather numbers at constant indices: a view of a node where that suffices."""
         starts = np.cumsum([0, *(size_of(np.shape(v)) for v in values)])
         flat_indices = indices.reshape(-1)
         if not flat_indices.size:
-            return np.zeros(indices.shape, like.dtype)
-        which = np.searchsorted(starts, flat_indices, "right") - 1
+            return np.zeros(indices.shape, template.dtype)
+        owners = np.searchsorted(starts, flat_indices, "right") - 1
         sources = [
             self.source(values[i], int(at - starts[i]))
-            for i, at in zip(which, flat_indices, strict=True)
+            for i, at in zip(owners, flat_indices, strict=True)
         ]
         if all(not isinstance(x, Array) for x in sources):
-            dtype = None if isinstance(like, Array) else like.dtype
+            dtype = None if isinstance(template, Array) else template.dtype
             return np.asarray(sources, dtype).reshape(indices.shape)
         first, second = sources[0], sources[min(1, len(sources) - 1)]
         if all(isinstance(s, Array) and s.node is first.node for s in sources):
@@ -189,7 +189,7 @@ class SimdNodes(Target):
             if step in (0, 1) and (firsts == first.first + step * np.arange(len(firsts))).all():
                 step = step if len(firsts) > 1 else 1
                 return Array(first.node, first.first, step, indices.shape)
-        node = self.node("move", sources, self.kind(like.dtype, "move"), flat_indices.size)
+        node = self.node("move", sources, self.kind(template.dtype, "move"), flat_indices.size)
         return Array(node, 0, 1, indices.shape)
 
     def apply(self, name: str, values: Sequence[Value], params: Params, out: Typed) -> Value:
@@ -245,12 +245,12 @@ class SimdNodes(Target):
             result = self.emit(binary, [result, self.moved([value], row, out)], {}, out)
         return result
 
-    def _product(self, left: Value, right: Value, dimensions: Any, out: Typed) -> Value:
+    def _product(self, lhs: Value, rhs: Value, dimensions: Any, out: Typed) -> Value:
         """Multiply matrices: sums over the rows of one, elementwise over those of the other."""
-        (left_sum, right_sum), (left_batch, right_batch) = dimensions
+        (lhs_sum, rhs_sum), (lhs_batch, rhs_batch) = dimensions
         sides = [
-            (left, matrix_indices(left, left_batch, left_sum)),
-            (right, matrix_indices(right, right_batch, right_sum)),
+            (lhs, matrix_indices(lhs, lhs_batch, lhs_sum)),
+            (rhs, matrix_indices(rhs, rhs_batch, rhs_sum)),
         ]
         sizes = [indices.shape[1] for _, indices in sides]
         if size_of(out.shape) * sides[0][1].shape[2] > self.max_products:
@@ -258,29 +258,30 @@ class SimdNodes(Target):
         # Elementwise over the constant matrix, else over the longer one.
         constant = [is_constant(value) for value, _ in sides]
         long = constant.index(True) if any(constant) else int(sizes[1] > sizes[0])
-        (many, many_indices), (few, few_indices) = sides[long], sides[1 - long]
-        like = np.empty(sizes[long], out.dtype)
+        (rows_of, row_indices), (scalar_of, scalar_indices) = sides[long], sides[1 - long]
+        template = np.empty(sizes[long], out.dtype)
         parts = []
-        for batch, row in np.ndindex(*few_indices.shape[:2]):
+        for batch, row in np.ndindex(*scalar_indices.shape[:2]):
             total = None
-            for k in range(few_indices.shape[2]):
+            for k in range(scalar_indices.shape[2]):
+                repeated = np.full(template.shape, scalar_indices[batch, row, k])
                 pair = [
-                    self._at(many, many_indices[batch, :, k], like),
-                    self._at(few, np.full(like.shape, few_indices[batch, row, k]), like),
+                    self._at(rows_of, row_indices[batch, :, k], template),
+                    self._at(scalar_of, repeated, template),
                 ]
-                term = self.emit("mul", pair, {}, like)
-                total = term if total is None else self.emit("add", [total, term], {}, like)
-            parts.append(np.zeros_like(like) if total is None else total)
-        indices = np.arange(size_of(out.shape)).reshape(*few_indices.shape[:2], sizes[long])
-        if long == 0:  # the rows of left come before those of right
+                term = self.emit("mul", pair, {}, template)
+                total = term if total is None else self.emit("add", [total, term], {}, template)
+            parts.append(np.zeros_like(template) if total is None else total)
+        indices = np.arange(size_of(out.shape)).reshape(*scalar_indices.shape[:2], sizes[long])
+        if long == 0:  # the rows of the left factor come first
             indices = indices.swapaxes(1, 2)
         return self.moved(parts, indices.reshape(out.shape), out)
 
-    def _at(self, value: Value, indices: np.ndarray, like: Typed) -> Value:
+    def _at(self, value: Value, indices: np.ndarray, template: Typed) -> Value:
         """Return numbers of a value at constant indices."""
         if is_constant(value):
             return np.reshape(value, -1)[indices]
-        return self.moved([value], indices, like)
+        return self.moved([value], indices, template)
 
     def _slice(self, value: Value, starts: Sequence[Value], sizes: Sequence[int], kind: str) -> Any:
         """Slice an array at an index that is known at run time, clamped to the array."""
@@ -290,7 +291,7 @@ class SimdNodes(Target):
             node = self.node("move", list(np.reshape(value, -1)), kind, value.size)
             value = Array(node, 0, 1, shape)
         if value.step != 1 or value.node.size == 1:
-            return self.moved([value], table[0].reshape(sizes), like=value)
+            return self.moved([value], table[0].reshape(sizes), template=value)
         extra = tuple(map(tuple, (table + value.first).tolist()))
         node = self.node("take", [flat(index, 1), value], kind, table.shape[1], extra)
         return Array(node, 0, 1, tuple(sizes))
@@ -329,13 +330,13 @@ class SimdNodes(Target):
             results.append(value)
         self._known.pop()
         holds = None if holds is None else flat(holds, 1)
-        ends = [a.node for a in (*results, holds) if isinstance(a, Array)]
+        roots = [a.node for a in (*results, holds) if isinstance(a, Array)]
         inside, inner = set(carried), []
-        for node in reached(ends):  # in the order of their creation
+        for node in reached(roots):  # in the order of their creation
             if node in inside or any(x in inside for x in node.needed):
                 inside.add(node)
                 inner += [node] if node.op != "carried" else []
-        free = {x for node in inner for x in node.needed} | set(ends)
+        free = {x for node in inner for x in node.needed} | set(roots)
         loop = LoopNode(
             next(self._numbers), "for" if length else "while",
             tuple(flat(x, size_of(np.shape(x))) for x in carry), "f", 0, None,
@@ -365,11 +366,12 @@ def results(
         target.input(i, x.shape, x.dtype) if size_of(x.shape) else np.zeros(x.shape, x.dtype)
         for i, x in enumerate(shapes)
     ]
-    found = []
-    for i, (value, like) in enumerate(zip(walk(closed, inputs, target), outs, strict=True)):
-        if size := size_of(like.shape):
-            found.append(Result(i, flat(value, size), size, target.kind(like.dtype, "a result")))
-    return found, [result.value.node for result in found if isinstance(result.value, Array)]
+    returned = []
+    for i, (value, template) in enumerate(zip(walk(closed, inputs, target), outs, strict=True)):
+        if size := size_of(template.shape):
+            kind = target.kind(template.dtype, "a result")
+            returned.append(Result(i, flat(value, size), size, kind))
+    return returned, [result.value.node for result in returned if isinstance(result.value, Array)]
 
 
 def matrix_indices(value: Value, batch: Sequence[int], summed: Sequence[int]) -> np.ndarray:
@@ -383,7 +385,7 @@ def matrix_indices(value: Value, batch: Sequence[int], summed: Sequence[int]) ->
 def key_of(value: Value) -> Hashable:
     """Return what equal operands have in common."""
     if isinstance(value, Array):
-        return (value.node.number, value.first, value.step)
+        return (value.node.id, value.first, value.step)
     return np.asarray(value).tobytes(), np.asarray(value).dtype.str
 
 
@@ -405,11 +407,11 @@ def flat(value: Value, size: int) -> Value:
 
 def reached(nodes: Iterable[Node]) -> list[Node]:
     """Return nodes and all nodes that they need, in the order of their creation."""
-    found: dict[int, Node] = {}
+    visited: dict[int, Node] = {}
     waiting = list(nodes)
     while waiting:
         node = waiting.pop()
-        if node.number not in found:
-            found[node.number] = node
+        if node.id not in visited:
+            visited[node.id] = node
             waiting += node.needed
-    return [found[number] for number in sorted(found)]
+    return [visited[key] for key in sorted(visited)]

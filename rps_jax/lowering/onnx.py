@@ -102,12 +102,12 @@ class Graph(Target):
         to = self.constant(np.array(shape, np.int64))
         return self.node("Reshape", [tensor, to], shape, tensor.kind)
 
-    def moved(self, values: Sequence[Value], indices: np.ndarray, like: Typed) -> Value:
+    def moved(self, values: Sequence[Value], indices: np.ndarray, template: Typed) -> Value:
         """Gather numbers at constant indices: a reshape or an expansion where that suffices."""
         if not indices.size:
-            return np.zeros(indices.shape, like.dtype)
+            return np.zeros(indices.shape, template.dtype)
         flat = [self.reshaped(value, (size_of(value.shape),)) for value in values]
-        kind, size = kind_of(like.dtype), sum(tensor.shape[0] for tensor in flat)
+        kind, size = kind_of(template.dtype), sum(tensor.shape[0] for tensor in flat)
         whole = flat[0] if len(flat) == 1 else self.node("Concat", flat, (size,), kind, axis=0)
         if size == 1 and indices.size > 1:
             to = self.constant(np.array(indices.shape, np.int64))
@@ -124,7 +124,7 @@ class Graph(Target):
         def make(op: str, *inputs: Tensor, to: str = kind, **attributes: object) -> Tensor:
             return self.node(op, inputs, shape, to, **attributes)
 
-        def number(value: float) -> Tensor:
+        def scalar(value: float) -> Tensor:
             return self.constant(np.asarray(value, _DTYPES[x[0].kind]), x[0].kind)
 
         if name in ("div", "rem") and kind == "i":
@@ -157,8 +157,8 @@ class Graph(Target):
             return make("Not", special)
         if name == "atan2":
             y, at = self._unit_if_infinite(x, out)
-            zero, pi = number(0), number(np.pi)
-            upright = make("Mul", make("Sign", y), number(np.pi / 2))
+            zero, pi = scalar(0), scalar(np.pi)
+            upright = make("Mul", make("Sign", y), scalar(np.pi / 2))
             behind = make("Where", make("Less", y, zero, to="b"), make("Neg", pi), pi)
             turn = make("Where", make("Less", at, zero, to="b"), behind, zero)
             angle = make("Add", make("Atan", make("Div", y, at)), turn)
@@ -166,7 +166,7 @@ class Graph(Target):
         if name in REDUCTIONS:
             return self._reduced(REDUCTIONS[name], x[0], params["axes"], shape, kind)
         if name == "exp2":
-            return make("Pow", number(2), x[0])
+            return make("Pow", scalar(2), x[0])
         if name == "dynamic_slice":
             return self._slice(x[0], values[1:], params["slice_sizes"], out)
         if name == "dot_general":
@@ -196,17 +196,17 @@ class Graph(Target):
 
     def _divided(self, name: str, x: Tensor, y: Tensor, out: Typed) -> Value:
         """Divide integers as JAX does: by 0 the quotient is -1 and the remainder the dividend."""
-        zero, one = np.zeros((), np.int32), np.ones((), np.int32)
+        zero, unit = np.zeros((), np.int32), np.ones((), np.int32)
         flag = np.empty(out.shape, bool)
         by_zero = self.apply("eq", [y, zero], {}, flag)
-        by_minus_one = self.apply("eq", [y, -one], {}, flag)
-        divisor = self.apply("select_n", [by_zero, y, one], {}, out)
-        divisor = self.apply("select_n", [by_minus_one, divisor, one], {}, out)
+        by_minus_one = self.apply("eq", [y, -unit], {}, flag)
+        divisor = self.apply("select_n", [by_zero, y, unit], {}, out)
+        divisor = self.apply("select_n", [by_minus_one, divisor, unit], {}, out)
         quotient = self.node("Div", [x, divisor], out.shape, "i")
         if name == "div":
             negative = self.apply("neg", [x], {}, out)
             quotient = self.apply("select_n", [by_minus_one, quotient, negative], {}, out)
-            return self.apply("select_n", [by_zero, quotient, -one], {}, out)
+            return self.apply("select_n", [by_zero, quotient, -unit], {}, out)
         whole = self.apply("mul", [quotient, divisor], {}, out)
         return self.apply("select_n", [by_zero, self.apply("sub", [x, whole], {}, out), x], {}, out)
 
@@ -214,8 +214,8 @@ class Graph(Target):
         """Convert reals to integers as JAX does: NaN to 0, and saturating."""
         flag, integer = np.empty(x.shape, bool), np.empty(x.shape, np.int32)
         low, high = np.float32(-(2**31)), np.float32(2**31 - 128)
-        number = self.apply("eq", [x, x], {}, flag)
-        y = self.apply("select_n", [number, np.float32(0), x], {}, x)
+        is_number = self.apply("eq", [x, x], {}, flag)
+        y = self.apply("select_n", [is_number, np.float32(0), x], {}, x)
         y = self.apply("max", [y, low], {}, x)
         y = self._cast(self.apply("min", [y, high], {}, x), "i")
         above = self.apply("gt", [x, high], {}, flag)
@@ -267,15 +267,15 @@ class Graph(Target):
         return make.make_model(graph, opset_imports=[opset], ir_version=_FORMAT, **names)
 
 
-def _equation(x: Sequence[Tensor], numbers: Any) -> str:
+def _equation(x: Sequence[Tensor], dimensions: Any) -> str:
     """Return a product as an equation of `Einsum`."""
-    (left, right), (left_batch, right_batch) = numbers
+    (lhs, rhs), (lhs_batch, rhs_batch) = dimensions
     letters = iter(string.ascii_lowercase)
     a = [next(letters) for _ in x[0].shape]
     b = [next(letters) for _ in x[1].shape]
-    for i, j in zip((*left, *left_batch), (*right, *right_batch), strict=True):
+    for i, j in zip((*lhs, *lhs_batch), (*rhs, *rhs_batch), strict=True):
         b[j] = a[i]
-    out = [a[i] for i in left_batch]
-    out += [c for i, c in enumerate(a) if i not in (*left, *left_batch)]
-    out += [c for j, c in enumerate(b) if j not in (*right, *right_batch)]
+    out = [a[i] for i in lhs_batch]
+    out += [c for i, c in enumerate(a) if i not in (*lhs, *lhs_batch)]
+    out += [c for j, c in enumerate(b) if j not in (*rhs, *rhs_batch)]
     return f"{''.join(a)},{''.join(b)}->{''.join(out)}"

@@ -54,32 +54,32 @@ class ScalarNodes(SimdNodes):
 
     def source(self, value: Value, index: int) -> Value:
         """Return one number of a value, from where it was gathered."""
-        number = element(value, index)
-        while isinstance(number, Array) and number.node.op == "move":
-            number = number.node.args[number.first]
-        return number
+        scalar = element(value, index)
+        while isinstance(scalar, Array) and scalar.node.op == "move":
+            scalar = scalar.node.args[scalar.first]
+        return scalar
 
     def while_loop(self, condition: Body, body: Body, carry: Sequence[Value]) -> list[Value]:
         """Refuse a loop whose length is unknown: a control step has a deadline."""
         raise UnsupportedError("while")
 
-    def _product(self, left: Value, right: Value, dimensions: Any, out: Typed) -> Value:
-        (left_sum, right_sum), (left_batch, right_batch) = dimensions
-        rows = matrix_indices(left, left_batch, left_sum)
-        columns = matrix_indices(right, right_batch, right_sum)
+    def _product(self, lhs: Value, rhs: Value, dimensions: Any, out: Typed) -> Value:
+        (lhs_sum, rhs_sum), (lhs_batch, rhs_batch) = dimensions
+        rows = matrix_indices(lhs, lhs_batch, lhs_sum)
+        columns = matrix_indices(rhs, rhs_batch, rhs_sum)
         shape = (rows.shape[1], columns.shape[1])
-        if left_batch or kind_of(out.dtype) != "f":
-            return super()._product(left, right, dimensions, out)
-        if is_constant(right) and columns.size >= _LARGE:
-            matrix = np.reshape(right, -1)[columns[0]].T
-            product = self._times_matrix(self._rows(left, rows[0]), matrix)
+        if lhs_batch or kind_of(out.dtype) != "f":
+            return super()._product(lhs, rhs, dimensions, out)
+        if is_constant(rhs) and columns.size >= _LARGE:
+            matrix = np.reshape(rhs, -1)[columns[0]].T
+            product = self._times_matrix(self._rows(lhs, rows[0]), matrix)
             indices = np.arange(size_of(shape))
-        elif is_constant(left) and rows.size >= _LARGE:
-            matrix = np.reshape(left, -1)[rows[0]].T
-            product = self._times_matrix(self._rows(right, columns[0]), matrix)
+        elif is_constant(lhs) and rows.size >= _LARGE:
+            matrix = np.reshape(lhs, -1)[rows[0]].T
+            product = self._times_matrix(self._rows(rhs, columns[0]), matrix)
             indices = np.arange(size_of(shape)).reshape(shape[::-1]).T
         else:
-            return super()._product(left, right, dimensions, out)
+            return super()._product(lhs, rhs, dimensions, out)
         return self.moved([product], indices.reshape(out.shape), out)
 
     def _rows(self, value: Value, indices: np.ndarray) -> list[list[Value]]:
@@ -95,11 +95,11 @@ class ScalarNodes(SimdNodes):
         columns, (half, odd) = matrix.shape[1], divmod(matrix.shape[0], 2)
         keys = [list(map(key_of, row)) for row in rows]
         if len(rows) == 2 and not odd and keys[0] == keys[1][half:] + keys[1][:half]:
-            like, outs = np.empty(half), np.empty(columns)
+            template, outs = np.empty(half), np.empty(columns)
             a, b = (self._stacked(part) for part in (rows[0][:half], rows[0][half:]))
             p, q = matrix.reshape(2, half, columns) / 2
             even, odd = (
-                self._times_matrix(self._rows(self.emit(name, [a, b], {}, like), _row(half)), m)
+                self._times_matrix(self._rows(self.emit(name, [a, b], {}, template), _row(half)), m)
                 for name, m in (("add", p + q), ("sub", p - q))
             )
             halves = [self.emit(name, [even, odd], {}, outs) for name in ("add", "sub")]
@@ -110,20 +110,20 @@ class ScalarNodes(SimdNodes):
         node = self.node("product", list(itertools.chain(*rows)), "f", size, key)
         return Array(node, 0, 1, (size,))
 
-    def _stacked(self, numbers: Sequence[Value]) -> Value:
-        return self.moved(numbers, np.arange(len(numbers)), np.empty(0))
+    def _stacked(self, scalars: Sequence[Value]) -> Value:
+        return self.moved(scalars, np.arange(len(scalars)), np.empty(0))
 
 
 def _row(size: int) -> np.ndarray:
     return np.arange(size)[None]
 
 
-def conditional(ends: Sequence[Node]) -> list[Node]:
+def conditional(roots: Sequence[Node]) -> list[Node]:
     """Return all nodes that some nodes need, with a block for products that are not always used.
 
     A learned law decides five times a second. Its network is evaluated only in these steps.
     """
-    nodes = reached(ends)
+    nodes = reached(roots)
     if not any(node.op == "product" for node in nodes):
         return nodes
     conditions = {
@@ -133,13 +133,13 @@ def conditional(ends: Sequence[Node]) -> list[Node]:
         if a.step == 0 or node.size == 1
     }
     for (condition, first), side in itertools.product(conditions, (1, 2)):
-        if _move_into_block(nodes, ends, conditions[condition, first], side):
-            return reached(ends)
+        if _move_into_block(nodes, roots, conditions[condition, first], side):
+            return reached(roots)
     return nodes
 
 
 def _move_into_block(
-    nodes: Sequence[Node], ends: Sequence[Node], condition: Array, side: int
+    nodes: Sequence[Node], roots: Sequence[Node], condition: Array, side: int
 ) -> bool:
     """Move nodes that matter on one side of a condition into a block, if a product is there."""
 
@@ -152,7 +152,7 @@ def _move_into_block(
         )
 
     always: set[Node] = set()
-    waiting = list(ends)
+    waiting = list(roots)
     while waiting:
         node = waiting.pop()
         if node not in always:
@@ -173,12 +173,12 @@ def _move_into_block(
     needed |= {a.node for a in (*starts, condition) if isinstance(a, Array)}
     if set(reached(needed)) & set(choices):
         return False
-    number = itertools.count(max(node.number for node in nodes) + 1)
-    carried = tuple(Node(next(number), "carried", (), n.kind, n.size) for n in choices)
+    ids = itertools.count(max(node.id for node in nodes) + 1)
+    carried = tuple(Node(next(ids), "carried", (), n.kind, n.size) for n in choices)
     results = tuple(flat(node.args[side], node.size) for node in choices)
     holds = condition._replace(shape=(1,))
     loop = LoopNode(
-        next(number), "if", starts, "f", 0, side == 1, tuple(needed), carried, results, holds,
+        next(ids), "if", starts, "f", 0, side == 1, tuple(needed), carried, results, holds,
         inner=tuple(block),
     )  # fmt: skip
     for node, carry in zip(choices, carried, strict=True):

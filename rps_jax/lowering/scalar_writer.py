@@ -55,17 +55,17 @@ class ScalarWriter(Writer):
         self._inputs = [(f"{text}{field.name}", field) for text, field in fields]
         outputs = [(group, x) for group, fields in routine.outputs.items() for x in fields]
         target = ScalarNodes(self.compiler, self.spelling)
-        values, ends = results(
+        values, roots = results(
             routine.jaxpr, [x.type for _, x in fields], [x.type for _, x in outputs], target
         )
         self._matrices = target.matrices
-        self.body = self.lines(conditional(ends), ends, set())
+        self.body = self.lines(conditional(roots), roots, set())
         known = {result.index: result.value for result in values}
         self.outputs = [Output(*x, known.get(i, ())) for i, x in enumerate(outputs)]
 
     # --- what a language defines ---
 
-    def literal(self, value: object, kind: str) -> str:
+    def literal(self, value: float, kind: str) -> str:
         """Return a constant."""
         raise NotImplementedError
 
@@ -135,8 +135,8 @@ class ScalarWriter(Writer):
                 lines.append(self._array(node, [self.call(node.op, row) for row in rows]))
         return lines
 
-    def _pair(self, op: str, left: str, right: str) -> str:
-        return f"({self.call(op, [left, right])})"
+    def _pair(self, op: str, lhs: str, rhs: str) -> str:
+        return f"({self.call(op, [lhs, rhs])})"
 
     def _array(self, node: Node, elements: Sequence[str]) -> str:
         """Return the declaration of a node with its elements."""
@@ -180,7 +180,7 @@ class ScalarWriter(Writer):
 
     def _product(self, node: Node) -> list[str]:
         """Return a product of rows with a matrix, which is padded with zeros."""
-        n, matrix = node.number, self._matrices[node.extra]
+        n, matrix = node.id, self._matrices[node.extra]
         inputs, columns = matrix.shape
         padded = inputs + -inputs % _ROWS
         table = self.table(np.pad(matrix, ((0, padded - inputs), (0, 0))))

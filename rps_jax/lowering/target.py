@@ -61,7 +61,7 @@ class Target:
 
     # --- what each back end implements ---
 
-    def moved(self, values: Sequence[Value], indices: np.ndarray, like: Typed) -> Value:
+    def moved(self, values: Sequence[Value], indices: np.ndarray, template: Typed) -> Value:
         """Gather numbers of the concatenated, flattened values at constant indices."""
         raise NotImplementedError
 
@@ -102,29 +102,29 @@ class Target:
 
     def _power(self, x: Value, exponent: int, out: Typed) -> Value:
         """Compute an integer power by repeated squaring, as XLA does."""
-        result, square, left = None, x, abs(exponent)
-        while left:
-            if left & 1:
+        result, square, remaining = None, x, abs(exponent)
+        while remaining:
+            if remaining & 1:
                 result = square if result is None else self.emit("mul", [result, square], {}, out)
-            left >>= 1
-            square = self.emit("mul", [square, square], {}, out) if left else square
-        one = np.ones(out.shape, out.dtype)
-        result = one if result is None else result
-        return self.emit("div", [one, result], {}, out) if exponent < 0 else result
+            remaining >>= 1
+            square = self.emit("mul", [square, square], {}, out) if remaining else square
+        unit = np.ones(out.shape, out.dtype)
+        result = unit if result is None else result
+        return self.emit("div", [unit, result], {}, out) if exponent < 0 else result
 
     def _argument(self, name: str, value: Value, axis: int, out: Typed) -> Value:
         """Compute the first index of the maximum or minimum along an axis, or of a NaN."""
         rows = np.moveaxis(_indices(value), axis, 0)
-        like, flag = np.empty(out.shape, value.dtype), np.empty(out.shape, bool)
+        template, flag = np.empty(out.shape, value.dtype), np.empty(out.shape, bool)
         best, index = self.moved([value], rows[0], value), np.zeros(out.shape, out.dtype)
         for k, row in enumerate(rows[1:], 1):
             x = self.moved([value], row, value)
             better = self.emit("gt" if name == "argmax" else "lt", [x, best], {}, flag)
             if kind_of(value.dtype) == "f":
-                number = self.emit("eq", [best, best], {}, flag)
-                nan = self.emit("and", [self.emit("ne", [x, x], {}, flag), number], {}, flag)
+                is_number = self.emit("eq", [best, best], {}, flag)
+                nan = self.emit("and", [self.emit("ne", [x, x], {}, flag), is_number], {}, flag)
                 better = self.emit("or", [better, nan], {}, flag)
-            best = self.emit("select_n", [better, best, x], {}, like)
+            best = self.emit("select_n", [better, best, x], {}, template)
             at = np.full(out.shape, k, out.dtype)
             index = self.emit("select_n", [better, index, at], {}, out)
         return index
@@ -132,13 +132,13 @@ class Target:
     def _cumulative(self, binary: str, value: Value, params: Params, out: Typed) -> Value:
         """Apply a binary operation cumulatively along an axis."""
         rows = np.moveaxis(_indices(value), params["axis"], 0)
-        like = np.empty(rows.shape[1:], out.dtype)
+        template = np.empty(rows.shape[1:], out.dtype)
         order = range(len(rows))
         totals: list[Value] = [None] * len(rows)
         total = None
         for k in reversed(order) if params["reverse"] else order:
-            row = self.moved([value], rows[k], like)
-            total = row if total is None else self.emit(binary, [total, row], {}, like)
+            row = self.moved([value], rows[k], template)
+            total = row if total is None else self.emit(binary, [total, row], {}, template)
             totals[k] = total
         return self.moved(totals, np.moveaxis(np.arange(rows.size).reshape(rows.shape), 0,
                                               params["axis"]), out)  # fmt: skip
@@ -153,15 +153,15 @@ class Target:
 
     def _gathered(self, value: Value, indices: Value, params: Params, out: Typed) -> Value:
         """Gather slices at indices that are known at run time."""
-        numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
-        if numbers.operand_batching_dims:
+        axes, sizes = params["dimension_numbers"], params["slice_sizes"]
+        if axes.operand_batching_dims:
             raise UnsupportedError("gather in a batch")
         shape, index = np.shape(value), jax.ShapeDtypeStruct((), indices.dtype)
         block, flag = np.empty(sizes, out.dtype), np.empty((), bool)
         zero, blocks = np.zeros((), indices.dtype), []
         for row in _indices(indices).reshape(-1, np.shape(indices)[-1]):
             starts, inside = [zero] * len(shape), []
-            for at, axis in zip(row, numbers.start_index_map, strict=True):
+            for at, axis in zip(row, axes.start_index_map, strict=True):
                 starts[axis] = start = self.moved([indices], np.asarray(at), index)
                 last = np.asarray(shape[axis] - sizes[axis], indices.dtype)
                 inside += [self.emit("ge", [start, zero], {}, flag),
@@ -174,18 +174,18 @@ class Target:
                 fill = np.full(sizes, _FILL[kind_of(out.dtype)], out.dtype)
                 part = self.emit("select_n", [all_inside, fill, part], {}, block)
             blocks.append(part)
-        rest = [i for i in range(len(out.shape)) if i not in numbers.offset_dims]
-        places = np.arange(len(blocks) * size_of(sizes)).reshape(len(blocks), *sizes)
-        places = np.squeeze(places, tuple(1 + i for i in numbers.collapsed_slice_dims))
-        places = places.reshape((*np.shape(indices)[:-1], *places.shape[1:]))
-        return self.moved(blocks, np.moveaxis(places, range(len(rest)), rest), out)
+        rest = [i for i in range(len(out.shape)) if i not in axes.offset_dims]
+        positions = np.arange(len(blocks) * size_of(sizes)).reshape(len(blocks), *sizes)
+        positions = np.squeeze(positions, tuple(1 + i for i in axes.collapsed_slice_dims))
+        positions = positions.reshape((*np.shape(indices)[:-1], *positions.shape[1:]))
+        return self.moved(blocks, np.moveaxis(positions, range(len(rest)), rest), out)
 
     def windows(
         self, shape: Sequence[int], starts: Sequence[Value], sizes: Sequence[int]
     ) -> tuple[Value, np.ndarray]:
         """Return the index of the window at a start, clamped, and the indices in each window."""
-        numbers = np.arange(size_of(shape)).reshape(shape)
-        windows = np.lib.stride_tricks.sliding_window_view(numbers, tuple(sizes))
+        positions = np.arange(size_of(shape)).reshape(shape)
+        windows = np.lib.stride_tricks.sliding_window_view(positions, tuple(sizes))
         zero = np.zeros((), np.int32)
         index: Value = zero
         for start, count in zip(starts, windows.shape, strict=False):

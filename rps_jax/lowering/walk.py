@@ -196,9 +196,9 @@ def _scatter_add(eqn: JaxprEqn, values: list[Value], target: Target) -> Value:
     array, at, updates = values
     out: Any = eqn.outvars[0].aval
     shape = np.shape(updates)
-    numbers = jnp.asarray(1 + np.arange(size_of(shape)).reshape(shape), out.dtype)
+    tags = jnp.asarray(1 + np.arange(size_of(shape)).reshape(shape), out.dtype)
     zeros = jnp.zeros(np.shape(array), out.dtype)
-    (indices,) = _bind(eqn, [zeros, at, numbers])
+    (indices,) = _bind(eqn, [zeros, at, tags])
     more = target.moved([np.zeros(1, out.dtype), updates], np.asarray(indices, int), out)
     return target.emit("add", [array, more], {}, out)
 

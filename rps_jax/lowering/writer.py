@@ -34,7 +34,7 @@ _FUNCTION = """\
 static void run_lanes(void **inputs, void **outputs, int64_t first, int64_t worlds) {{
   int64_t at[LANES];
   for (int l = 0; l < LANES; l++) {{
-    const int64_t own = first + l < worlds ? first + l : worlds - 1;
+    const int64_t index = first + l < worlds ? first + l : worlds - 1;
     at[l] = {WORLD};
   }}
 {LINES}
@@ -141,13 +141,13 @@ class Writer:
 
     def _next(self, waiting: Sequence[Node], computed: set[Node]) -> list[Node]:
         """Return the next nodes: all single ones, else one loop over elements, else a loop node."""
-        for wanted in ("single", "together", "loop"):
+        for kind in ("single", "together", "loop"):
             groups: dict[int, list[Node]] = {}
             ready = set(computed)
             for node in waiting:
                 group = "single" if self.is_single(node) else "together"
                 group = "loop" if isinstance(node, LoopNode) else group
-                if group != wanted:
+                if group != kind:
                     continue
                 whole = computed if group == "together" else ready
                 if node.whole <= whole and set(node.needed) <= ready:
@@ -163,18 +163,18 @@ class Writer:
 
     def together(self, group: Sequence[Node], stored: set[Node]) -> list[str]:
         """Return one loop over the elements of nodes."""
-        head, lines, own = [], [], set(group)
+        head, lines, fused = [], [], set(group)
         for node in group:
-            text = self._expression(node, own)
+            text = self._expression(node, fused)
             if node.op.startswith("fold"):
                 declared = self.declaration(node.kind, node.name, constant=False)
                 head.append(f"{declared} = {self.initial(node)};")
                 lines.append(f"  {node.name} = {self.call(node.op[5:], [node.name, text])};")
                 continue
-            lines.append(f"  {self.declaration(node.kind, f'e{node.number}')} = {text};")
+            lines.append(f"  {self.declaration(node.kind, f'e{node.id}')} = {text};")
             if node in stored:
                 head.append(self.empty(node.kind, node.name, node.size))
-                lines.append(f"  {node.name}[i] = e{node.number};")
+                lines.append(f"  {node.name}[i] = e{node.id};")
         return [*head, self.loop_head(group[0].size), *lines, "}"]
 
     def loop_head(self, size: int) -> str:
@@ -232,20 +232,20 @@ class Writer:
         """Return an element of a node."""
         return node.name if node.width == 1 else f"{node.name}[{index}]"
 
-    def read(self, a: Value, node: Node, own: set[Node]) -> str:
-        """Return an operand of a node; nodes in `own` are computed in the same loop."""
+    def read(self, a: Value, node: Node, fused: set[Node]) -> str:
+        """Return an operand of a node; nodes in `fused` are computed in the same loop."""
         if not isinstance(a, Array):
             return self.constant(a)
         if a.node.width == 1:
             return self.item(a.node, 0)
-        if a.node in own and node.is_in_step(a):
-            return f"e{a.node.number}"
+        if a.node in fused and node.is_in_step(a):
+            return f"e{a.node.id}"
         if not a.step or node.size == 1 or node.op in ("move", "take"):
             return self.item(a.node, a.first)
         return self.item(a.node, f"i + {a.first}" if a.first else "i")
 
-    def _expression(self, node: Node, own: set[Node]) -> str:
-        operands = [self.read(a, node, own) for a in node.args]
+    def _expression(self, node: Node, fused: set[Node]) -> str:
+        operands = [self.read(a, node, fused) for a in node.args]
         return operands[0] if node.op.startswith("fold") else self.call(node.op, operands)
 
 
@@ -312,18 +312,20 @@ class SimdWriter(Writer):
         return [f"const {declared} = {self._expression(node, set())};"]
 
 
-def literal(value: object, kind: str, suffix: str = "f") -> str:
+def literal(value: float, kind: str, suffix: str = "f") -> str:
     """Return a number in C."""
     if kind == "f":
-        number = float(value)  # pyright: ignore[reportArgumentType]
-        if math.isnan(number):
+        real = float(value)
+        if math.isnan(real):
             return "NAN"
-        finite = math.isfinite(number)
-        return f"{number!r}{suffix}" if finite else repr(number).replace("inf", "INFINITY")
-    number = int(value)  # pyright: ignore[reportArgumentType]
+        finite = math.isfinite(real)
+        return f"{real!r}{suffix}" if finite else repr(real).replace("inf", "INFINITY")
+    integer = int(value)
     if kind == "b":
-        return str(-number)
-    return f"{number}u" if kind == "u" else str(number) if number > -(2**31) else "-2147483647 - 1"
+        return str(-integer)
+    if kind == "u":
+        return f"{integer}u"
+    return str(integer) if integer > -(2**31) else "-2147483647 - 1"
 
 
 def source(
@@ -340,9 +342,9 @@ def source(
     Raises:
       UnsupportedError: it has an operation that is not in the headers.
     """
-    (found, ends), writer = results(closed, shapes, outs, SimdNodes()), SimdWriter()
-    lines = writer.lines(reached(ends), ends, set())
-    for index, a, size, kind in found:
+    (returned, roots), writer = results(closed, shapes, outs, SimdNodes()), SimdWriter()
+    lines = writer.lines(reached(roots), roots, set())
+    for index, a, size, kind in returned:
         text = writer.read(a, Node(0, "end", (a,), kind, size), set())
         stored, truth = STORED[kind], " != 0" * (kind == "b")
         lines += [
@@ -359,7 +361,7 @@ def source(
         "NAME": HANDLER,
         "INPUTS": len(shapes) + sorted_worlds,
         "OUTPUTS": len(outs),
-        "WORLD": f"((const int *)inputs[{len(shapes)}])[own]" if sorted_worlds else "own",
+        "WORLD": f"((const int *)inputs[{len(shapes)}])[index]" if sorted_worlds else "index",
         "SIZED": sized,
         "SIZE": size_of(shapes[sized].shape),
     }

@@ -118,7 +118,7 @@ def _initialiser(prefix: str, name: str, group: Group) -> str:
     return "\n".join([head, *(lines or ["  0 \\"]), "}", ""])
 
 
-def _each(fields: Sequence[Field], prefix: str, statement: str, kinds: str = "f") -> str:
+def _checks(fields: Sequence[Field], prefix: str, statement: str, kinds: str = "f") -> str:
     """Return a statement about each number of the fields of some kinds."""
     lines = []
     for field in fields:
@@ -145,16 +145,16 @@ def header(program: Program, prefix: str) -> str:
         "SKIN": statements(
             program.skin_step, skin, {"filtered": "next.", "contact": "result."}, tables, p
         ),
-        "STEP_CHECKED": _each(groups["observation"], "observation->", odd + bad_input),
+        "STEP_CHECKED": _checks(groups["observation"], "observation->", odd + bad_input),
         "STEP_RESULT": "\n".join(
             [
-                _each(groups["twist"], "result.", odd + bad_result),
-                _each(groups["memory"], "next.", "if ({0} != {0}) " + bad_result),
+                _checks(groups["twist"], "result.", odd + bad_result),
+                _checks(groups["memory"], "next.", "if ({0} != {0}) " + bad_result),
             ]
         ),
-        "NO_CONTACT": _each(groups["contact"], "contact->", "{} = 0;", "fib"),
-        "SKIN_CHECKED": _each(groups["scan"], "", odd + bad_input),
-        "SKIN_RESULT": _each(groups["skin"], "next.", odd + bad_result),
+        "NO_CONTACT": _checks(groups["contact"], "contact->", "{} = 0;", "fib"),
+        "SKIN_CHECKED": _checks(groups["scan"], "", odd + bad_input),
+        "SKIN_RESULT": _checks(groups["skin"], "next.", odd + bad_result),
         "STRUCTS": "\n".join(struct(p, name, groups[name]) for name in structs),
         "INITIALISERS": "\n".join(
             _initialiser(p, name.upper(), groups[name]) for name in ("params", "skin_params")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from rps_jax.app.export import c
 from rps_jax.app.export.program import Program
 
-# How the example fills what laws of each kind observe beside touch.
-_BESIDE = {
+# How the example fills what laws of each kind observe extra touch.
+_EXTRA = {
     "touch": "",
     "taxels": "      seen.line = contact.line;\n"
     "      for (int k = 0; k < {P}_TAXELS; k++) seen.signal[k] = contact.signal[k];\n",
@@ -61,7 +61,7 @@ int main(void) {{
       seen.in_contact = contact.in_contact;
       seen.p_robot_contact[0] = contact.p_robot_contact[0];
       seen.p_robot_contact[1] = contact.p_robot_contact[1];
-{beside}      code = {p}_step(&params, &memory, &seen, &twist);
+{extra}      code = {p}_step(&params, &memory, &seen, &twist);
     }}
     clock_gettime(CLOCK_MONOTONIC, &ended);
     took[i] = 1e6 * (double)(ended.tv_sec - began.tv_sec)
@@ -104,11 +104,11 @@ target_link_libraries({p}_example PRIVATE {p})
 
 
 def files(program: Program, prefix: str) -> dict[str, str]:
-    """Texts of the files, by name."""
+    """Return the texts of the files, by name."""
     names = {"p": prefix, "P": prefix.upper()}
-    beside = _BESIDE[program.senses].format(**names)
+    extra = _EXTRA[program.senses].format(**names)
     return {
         f"{prefix}.h": c.header(program, prefix),
-        "main.c": _EXAMPLE.format(**names, beside=beside),
+        "main.c": _EXAMPLE.format(**names, extra=extra),
         "CMakeLists.txt": _CMAKE.format(**names),
     }

@@ -16,7 +16,7 @@ from rps_jax.robot import robot as robots
 from rps_jax.robot import skin as skins
 from rps_jax.robot.skin import LINE, CapacitiveSkin
 
-Number: TypeAlias = Any  # an array of JAX or NumPy, or its type
+Leaf: TypeAlias = Any  # an array of JAX or NumPy, or its type
 _REAL = jax.ShapeDtypeStruct((), np.float64)
 
 
@@ -33,45 +33,45 @@ class Program(NamedTuple):
 
     @property
     def taxels(self) -> int:
-        """Number of taxels of the skin."""
+        """Leaf of taxels of the skin."""
         return self.groups["skin"][0].size
 
 
 class SkinParams(NamedTuple):
     """Parameters of a skin."""
 
-    time_constant: Number  # [s] of the low-pass filter
-    threshold: Number  # [1] relative change of capacitance that counts as touch
+    time_constant: Leaf  # [s] of the low-pass filter
+    threshold: Leaf  # [1] relative change of capacitance that counts as touch
 
 
 class Skin(NamedTuple):
     """State of a skin."""
 
-    signal: Number  # (T,) [1] filtered, of each taxel
-    alive: Number  # (T,) 0 of a taxel that is to be ignored
+    signal: Leaf  # (T,) [1] filtered, of each taxel
+    alive: Leaf  # (T,) 0 of a taxel that is to be ignored
 
 
 class Scan(NamedTuple):
-    """One reading of all taxels."""
+    """Reading of all taxels."""
 
-    taxels: Number  # (T,) [1] relative change of capacitance of each taxel, along the strip
-    period: Number  # [s] since the last step
+    taxels: Leaf  # (T,) [1] relative change of capacitance of each taxel, along the strip
+    period: Leaf  # [s] since the last step
 
 
 class Filtered(NamedTuple):
     """Part of the state of a skin that a scan changes."""
 
-    signal: Number  # (T,) [1] filtered, of each taxel
+    signal: Leaf  # (T,) [1] filtered, of each taxel
 
 
 class Contact(NamedTuple):
     """Contact that a skin detects."""
 
-    contact_type: Number  # 0 none, 1 a point, 2 a line
-    p_robot_contact: Number  # [m] in the robot frame; 0 without contact
-    in_contact: Number  # whether there is a contact
-    line: Number  # whether the contact is a line
-    signal: Number  # (T,) [1] filtered, 0 of a dead taxel
+    contact_type: Leaf  # 0 none, 1 a point, 2 a line
+    p_robot_contact: Leaf  # [m] in the robot frame; 0 without contact
+    in_contact: Leaf  # whether there is a contact
+    line: Leaf  # whether the contact is a line
+    signal: Leaf  # (T,) [1] filtered, 0 of a dead taxel
 
 
 def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive") -> Program:
@@ -103,8 +103,8 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
         memory, twist, _ = functions.step(params, memory, observation)
         return memory, Twist(*twist)
 
-    def skin_step(numbers: SkinParams, skin: Skin, scan: Scan) -> tuple[Filtered, Contact]:
-        scaled = sensor._replace(**numbers._asdict())
+    def skin_step(skin_params: SkinParams, skin: Skin, scan: Scan) -> tuple[Filtered, Contact]:
+        scaled = sensor._replace(**skin_params._asdict())
         key: Any = jax.ShapeDtypeStruct((2,), np.uint32)  # of simulated noise
         state = skins.SkinState(key, skin.signal, skin.signal, skin.alive)
         state, reading = scaled.read(state, scan.taxels, scan.period)
@@ -112,7 +112,7 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
         touch = (reading.contact_type, reading.p_robot_contact, reading.in_contact)
         return Filtered(state.signal), Contact(*touch, reading.contact_type == LINE, signal)
 
-    numbers = SkinParams(*(np.asarray(float(getattr(sensor, x))) for x in SkinParams._fields))
+    values = SkinParams(*(np.asarray(float(getattr(sensor, x))) for x in SkinParams._fields))
     skin_inputs = {
         "skin_params": SkinParams(_REAL, _REAL),
         "skin": Skin(taxels, jax.ShapeDtypeStruct(taxels.shape, bool)),
@@ -124,10 +124,10 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
     law_step = routine("step", step, inputs, ("memory", "twist"))
     touch = routine("skin_step", skin_step, skin_inputs, ("filtered", "contact"))
     groups = {**law_step.inputs, **law_step.outputs, **touch.inputs, **touch.outputs}
-    for name, tree, values in (
+    for name, tree, start_values in (
         *(("params", shapes, params), ("memory", memory, start)),
-        ("skin_params", skin_inputs["skin_params"], numbers),
+        ("skin_params", skin_inputs["skin_params"], values),
     ):
-        groups[name] = fields_of(tree, values)
+        groups[name] = fields_of(tree, start_values)
     name = robot if isinstance(robot, str) else "custom"
     return Program(label, name, functions.senses, groups, init, law_step, touch)
