@@ -1,7 +1,7 @@
-"""What mkdocs builds the site of: pages, notebooks and docstrings where they stand.
+"""Hooks of mkdocs, which build the site from pages, notebooks and docstrings.
 
-Nothing is copied by hand. A page keeps its place in the repository, so that its links hold; one to
-a module leads to the reference, and one to another file of the repository to that file.
+Nothing is copied by hand. A page keeps its path in the repository, so that its links remain valid.
+A link to a module leads to the reference, and a link to another file leads to that file.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parents[1]
 ROOMS = (
-    *("record", "geometry", "robot", "control", "world", "engines"),
+    *("record", "geometry", "robot", "control", "world", "lowering", "engines"),
     *("analysis", "trials", "runs", "tuning", "studies", "app"),
 )
-# Parts of a page as pages of their own: title of the part, by place.
-PARTS = {"rps_jax/law.md": "The law", "rps_jax/adding.md": "How to add ..."}
-# Pages by the tab they stand in; studies that no tab names stand in `Studies`.
+# Sections of a page that are separate pages: title of the section, by path.
+SECTIONS = {"rps_jax/law.md": "The law", "rps_jax/adding.md": "How to add ..."}
+# Pages by tab; studies that no tab names are in `Studies`.
 TABS: dict[str, list[Any]] = {
     "Start": ["README.md", {"Push it yourself": "push.html"}, "docs/gallery.md", "CHANGELOG.md"],
     "The law": ["rps_jax/law.md", "notebooks/01_the_law.md", "notebooks/02_one_push.md"],
@@ -51,10 +51,10 @@ TABS: dict[str, list[Any]] = {
     "Studies": ["sweeps/README.md"],
     "Make it yours": ["rps_jax/README.md", "rps_jax/adding.md", "CONTRIBUTING.md"],
 }
-# Where types of other packages are explained.
+# Documentation of types of other packages.
 _XARRAY = "https://docs.xarray.dev/en/stable/generated/{}.html"
 _MUJOCO = "https://mujoco.readthedocs.io/en/stable/APIreference/APItypes.html#"
-ELSEWHERE = {
+TYPE_URLS = {
     "jax.Array": "https://docs.jax.dev/en/latest/_autosummary/jax.Array.html",
     "numpy.ndarray": "https://numpy.org/doc/stable/reference/generated/numpy.ndarray.html",
     "pathlib.Path": "https://docs.python.org/3/library/pathlib.html#pathlib.Path",
@@ -65,12 +65,12 @@ LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
 FENCE = re.compile(r"^( *)(```|~~~).*?^\1\2`*~* *$", re.MULTILINE | re.DOTALL)
 
 
-# --- where everything is -------------------------------------------------------------------
+# --- paths ---------------------------------------------------------------------------------
 
 
 @cache
 def texts() -> dict[str, str]:
-    """Pages of the repository by the place that they have in the site."""
+    """Return the pages of the repository by their path in the site."""
     paths = [
         *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")),
         *(ROOT / name for name in ("rps_jax/README.md", "mjcf/README.md")),
@@ -78,18 +78,18 @@ def texts() -> dict[str, str]:
         *ROOT.glob("notebooks/**/README.md"),
         *ROOT.glob("docs/*.md"),
     ]
-    found = {str(path.relative_to(ROOT)): path.read_text("utf-8") for path in paths}
-    for place, title in PARTS.items():
-        whole = found[f"{posixpath.dirname(place)}/README.md"]
+    pages = {str(path.relative_to(ROOT)): path.read_text("utf-8") for path in paths}
+    for path, title in SECTIONS.items():
+        whole = pages[f"{posixpath.dirname(path)}/README.md"]
         part = re.search(rf"^## {re.escape(title)}\n(.*?)(?=^## |\Z)", whole, re.M | re.S)
-        assert part, f"{place}: no part {title}"
+        assert part, f"{path}: no section {title}"
         raised = re.sub(r"^#(#+ )", r"\1", part[1], flags=re.M)
-        found[place] = f"# {title.removesuffix(' ...')} {'anything' * ('...' in title)}\n{raised}"
-    return found
+        pages[path] = f"# {title.removesuffix(' ...')} {'anything' * ('...' in title)}\n{raised}"
+    return pages
 
 
 def nav() -> list[Any]:
-    """The tabs, each with its pages; a study that is new is found by its page."""
+    """Return the tabs with their pages; a new study is found by its page."""
     studies = {path.parent.name for path in ROOT.glob("sweeps/*/README.md")}
     named = {name for tab in TABS.values() for name in tab if isinstance(name, str)}
     tabs = {
@@ -105,80 +105,85 @@ def nav() -> list[Any]:
     return [{title: pages} for title, pages in tabs.items()]
 
 
-def led(link: str, page: str, files: Any) -> str:
-    """Where a link of a page leads in the site, as seen from there."""
+def site_link(link: str, page: str, files: Any) -> str:
+    """Return a link of a page, relative to that page of the site."""
     path = posixpath.normpath(posixpath.join(posixpath.dirname(page), link))
-    place = ROOT / path
+    source = ROOT / path
     if path == "docs/push/page.html":
         path = "push.html"
-    elif path.startswith("rps_jax/") and (place.is_dir() or place.suffix == ".py"):
+    elif path.startswith("rps_jax/") and (source.is_dir() or source.suffix == ".py"):
         parts = path.removesuffix(".py").removesuffix("/__init__").split("/")
         if len(parts) > 1 and parts[1] in ROOMS:
             path = f"reference/{parts[1]}.md"
             path += f"#{'.'.join(parts)}" if len(parts) > 2 else ""
         else:
             path = "reference/README.md"
-    elif place.is_dir():
+    elif source.is_dir():
         path += "/README.md"
-    elif place.suffix in (".ipynb", ".py") and f"notebooks/{place.stem}.md" in files.src_uris:
-        path = f"notebooks/{place.stem}.md"
-    elif place.suffix == ".py":
+    elif source.suffix in (".ipynb", ".py") and f"notebooks/{source.stem}.md" in files.src_uris:
+        path = f"notebooks/{source.stem}.md"
+    elif source.suffix == ".py":
         path += ".md"
     return posixpath.relpath(path, posixpath.dirname(page) or ".")
 
 
-def linked(text: str) -> list[str]:
-    """Links of a page to files of the repository."""
-    found = LINK.findall(FENCE.sub("", text))
-    return [link for _, link, _, _ in found if not re.match(r"[a-z]+:", link)]
+def file_links(text: str) -> list[str]:
+    """Return the links of a page to files of the repository."""
+    links = LINK.findall(FENCE.sub("", text))
+    return [link for _, link, _, _ in links if not re.match(r"[a-z]+:", link)]
 
 
-# --- what is made --------------------------------------------------------------------------
+# --- generated pages -----------------------------------------------------------------------
 
 
 def notebook(path: Path) -> tuple[str, dict[str, bytes]]:
-    """A notebook as Markdown, and its pictures by name."""
-    found, pictures = [], {}
+    """Return a notebook as Markdown, and its images by name."""
+    blocks, images = [], {}
     for cell in nbformat.read(path, as_version=4).cells:
         if cell.cell_type == "markdown":
-            found.append(cell.source)
+            blocks.append(cell.source)
             continue
-        found.append(f"```python\n{cell.source}\n```")
+        blocks.append(f"```python\n{cell.source}\n```")
         for output in cell.get("outputs", []):
             data = output.get("data", {"text/plain": output.get("text", "")})
             if "text/markdown" in data:
-                found.append(data["text/markdown"])
+                blocks.append(data["text/markdown"])
             elif "image/png" in data:
-                name = f"{path.stem}_{len(pictures)}.png"
-                pictures[name] = base64.b64decode(data["image/png"])
-                found.append(f"![A figure of this notebook]({name})")
+                name = f"{path.stem}_{len(images)}.png"
+                images[name] = base64.b64decode(data["image/png"])
+                blocks.append(f"![A figure of this notebook]({name})")
             else:
-                found.append(f"```text\n{data['text/plain'].rstrip()}\n```")
-    return "\n\n".join(found), pictures
+                blocks.append(f"```text\n{data['text/plain'].rstrip()}\n```")
+    return "\n\n".join(blocks), images
 
 
 def code(path: Path) -> str:
-    """A file of Python as a page."""
+    """Return a Python file as a page."""
     head = "---\nsearch:\n  exclude: true\n---\n"
     return f"{head}# {path.name}\n\n```python\n{path.read_text('utf-8')}\n```\n"
 
 
 def listing(path: Path) -> str:
-    """What is in a folder that has no page."""
+    """Return a page that lists the files of a folder without one."""
     folders = [
-        f"[{one.name}]({one.name})" for one in path.iterdir() if (one / "README.md").exists()
+        f"[{inner.name}]({inner.name})"
+        for inner in path.iterdir()
+        if (inner / "README.md").exists()
     ]
-    names = sorted({one.name for one in path.iterdir() if one.suffix in (".py", ".json", ".ipynb")})
+    suffixes = (".py", ".json", ".ipynb")
+    names = sorted({inner.name for inner in path.iterdir() if inner.suffix in suffixes})
     links = [*(f"[{name}]({name})" for name in names), *folders]
     return f"# {path.relative_to(ROOT)}\n\n" + "".join(f"- {link}\n" for link in links)
 
 
 def reference() -> dict[str, str]:
-    """Pages made from docstrings and signatures, one a room."""
+    """Return pages of docstrings and signatures, one per subpackage."""
     rows = [f"- [`rps_jax.{room}`]({room}.md)" for room in ROOMS]
     names = "[table of all public names](../rps_jax/README.md#public-names)"
-    head = "Made from docstrings and signatures. A user needs what stands in the"
-    first = f"# Reference\n\n{head} {names}; all else, by room:\n\n" + "\n".join(rows)
+    head = "Generated from docstrings and signatures. Users need the"
+    first = f"# Reference\n\n{head} {names}; all other modules, by subpackage:\n\n" + "\n".join(
+        rows
+    )
     pages = {f"{room}.md": f"# rps_jax.{room}\n\n::: rps_jax.{room}\n" for room in ROOMS}
     return {"README.md": first} | pages
 
@@ -187,84 +192,83 @@ def reference() -> dict[str, str]:
 
 
 def on_config(config: Any) -> Any:
-    """Hand in the tabs."""
+    """Set the tabs."""
     config.nav = nav()
     return config
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add what does not stand in docs."""
+    """Add the pages outside `docs`."""
 
-    def add(place: str, content: str | bytes) -> None:
-        if place not in files.src_uris:
-            files.append(File.generated(config, place, content=content))
+    def add(uri: str, content: str | bytes) -> None:
+        if uri not in files.src_uris:
+            files.append(File.generated(config, uri, content=content))
 
-    for place, text in texts().items():
-        add(place, text)
-    for place, text in reference().items():
-        add(f"reference/{place}", text)
+    for uri, text in texts().items():
+        add(uri, text)
+    for name, text in reference().items():
+        add(f"reference/{name}", text)
     for path in sorted((ROOT / "notebooks").glob("[0-9]*.ipynb")):
-        text, pictures = notebook(path)
+        text, images = notebook(path)
         add(f"notebooks/{path.stem}.md", text)
-        for name, content in pictures.items():
+        for name, content in images.items():
             add(f"notebooks/{name}", content)
     add("push.html", runpy.run_path(str(ROOT / "docs" / "push" / "make.py"))["page"]())
-    pages = [one for one in files.documentation_pages() if not one.src_uri.startswith("reference/")]
-    for page in pages:  # to which listings are added
-        for link in linked(page.content_string):
-            path = ROOT / posixpath.normpath(posixpath.join(posixpath.dirname(page.src_uri), link))
-            place = posixpath.join(
-                posixpath.dirname(page.src_uri), led(link, page.src_uri, files).partition("#")[0]
-            )
-            place = posixpath.normpath(place)
+    pages = [
+        page for page in files.documentation_pages() if not page.src_uri.startswith("reference/")
+    ]
+    for page in pages:  # the loop appends listings
+        for link in file_links(page.content_string):
+            folder = posixpath.dirname(page.src_uri)
+            path = ROOT / posixpath.normpath(posixpath.join(folder, link))
+            target = site_link(link, page.src_uri, files).partition("#")[0]
+            uri = posixpath.normpath(posixpath.join(folder, target))
             if path.is_file():
-                add(place, code(path) if place.endswith(".py.md") else path.read_bytes())
-            elif (
-                path.is_dir() and not place.startswith("reference/") and place not in files.src_uris
-            ):
-                add(place, listing(path))
-                pages.append(files.get_file_from_path(place))
+                add(uri, code(path) if uri.endswith(".py.md") else path.read_bytes())
+            elif path.is_dir() and not uri.startswith("reference/") and uri not in files.src_uris:
+                add(uri, listing(path))
+                pages.append(files.get_file_from_path(uri))
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """Lead the links to where things are in the site."""
+    """Point the links to pages of the site."""
     fences: list[str] = []
 
-    def kept(found: re.Match[str]) -> str:
-        fences.append(found[0])
+    def store(match: re.Match[str]) -> str:
+        fences.append(match[0])
         return f"\0{len(fences) - 1}\0"
 
-    def turned(found: re.Match[str]) -> str:
-        start, link, anchor, end = found.groups()
+    def relink(match: re.Match[str]) -> str:
+        start, link, anchor, end = match.groups()
         if re.match(r"[a-z]+:", link):
-            return found[0]
-        return start + led(link, page.file.src_uri, files) + (anchor or "") + end
+            return match[0]
+        return start + site_link(link, page.file.src_uri, files) + (anchor or "") + end
 
-    text = LINK.sub(turned, FENCE.sub(kept, markdown))
-    return re.sub("\0(\\d+)\0", lambda found: fences[int(found[1])], text)
+    text = LINK.sub(relink, FENCE.sub(store, markdown))
+    return re.sub("\0(\\d+)\0", lambda match: fences[int(match[1])], text)
 
 
 def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
-    r"""Write equations as MathML, which needs no script: \(...\) in lines and \[...\] between."""
+    r"""Write equations, \(...\) and \[...\], as MathML."""
 
-    def math(found: re.Match[str]) -> str:
-        text = found[2].replace("\\*", "*")  # as GitHub wants a star in an equation
-        return convert(unescape(text), display="block" if found[1] == "div" else "inline")
+    def math(match: re.Match[str]) -> str:
+        text = match[2].replace("\\*", "*")  # GitHub needs the backslash
+        return convert(unescape(text), display="block" if match[1] == "div" else "inline")
 
-    def type_of(found: re.Match[str]) -> str:
-        there = ELSEWHERE.get(found[1])
-        return f'<a href="{there}" title="{found[1]}">{found[2]}</a>' if there else found[0]
+    def type_link(match: re.Match[str]) -> str:
+        url = TYPE_URLS.get(match[1])
+        return f'<a href="{url}" title="{match[1]}">{match[2]}</a>' if url else match[0]
 
-    html = re.sub(r'<span title="([\w.]+)">(\w+)</span>', type_of, html)
+    html = re.sub(r'<span title="([\w.]+)">(\w+)</span>', type_link, html)
     marked = r'<(div|span) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>'
     return re.sub(marked, math, html, flags=re.DOTALL)
 
 
 def on_post_build(config: Any) -> None:
-    """Refuse a site with a dead link, or one that asks another host for anything."""
-    if wrong := faults(Path(config.site_dir)):
-        raise PluginError("\n".join(wrong))
+    """Raise an error for dead links and for loads from other hosts."""
+    if sentences := faults(Path(config.site_dir)):
+        raise PluginError("\n".join(sentences))
 
 
 LOADS = re.compile(r"<(?:script|img|iframe|source|video|link)\b[^>]*?\b(?:src|href)=\"?([^\s\">]+)")
@@ -272,20 +276,19 @@ LEADS = re.compile(r"\b(?:src|href)=\"?([^\s\">]+)")
 
 
 def faults(site: Path) -> list[str]:
-    """Sentences about loads from other hosts and dead links in the pages of a site."""
-    found = []
+    """Return sentences about loads from other hosts and dead links in the pages of a site."""
+    sentences = []
     for path in sorted(site.rglob("*.html")):
         text, page = path.read_text("utf-8"), path.relative_to(site)
         text = re.sub(r"<(script|pre)\b([^>]*)>.*?</\1>", r"<\1\2>", text, flags=re.DOTALL)
-        loads = [one for one in LOADS.findall(text) if re.match(r"(https?:)?//", one)]
-        found += [f"{page} loads {one} from another host" for one in loads]
-        for one in LEADS.findall(text):
-            there = unquote(re.split(r"[?#]", one)[0])
-            if there and not re.match(r"[a-z]+:|/", one) and not (path.parent / there).exists():
-                found.append(f"{page} leads to {one}, which is not there")
+        loads = [url for url in LOADS.findall(text) if re.match(r"(https?:)?//", url)]
+        sentences += [f"{page} loads {url} from another host" for url in loads]
+        for link in LEADS.findall(text):
+            file = unquote(re.split(r"[?#]", link)[0])
+            if file and not re.match(r"[a-z]+:|/", link) and not (path.parent / file).exists():
+                sentences.append(f"{page} has a dead link to {link}")
+    remote = re.compile(r"(?:url\(|@import )[\"']?((?:https?:)?//[^)\"']*)")
     for path in sorted(site.rglob("*.css")):
-        if there := re.findall(
-            r"(?:url\(|@import )[\"']?((?:https?:)?//[^)\"']*)", path.read_text("utf-8")
-        ):
-            found.append(f"{path.relative_to(site)} loads {there[0]} from another host")
-    return found
+        if loads := remote.findall(path.read_text("utf-8")):
+            sentences.append(f"{path.relative_to(site)} loads {loads[0]} from another host")
+    return sentences

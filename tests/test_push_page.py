@@ -94,8 +94,8 @@ def test_from_every_state_of_a_push_comes_the_twist_of_python(law, browser):
         wanted, every = twists(live), max(1, len(live.past) // 6000)
         shown = range(0, len(live.past) - 1, every)
         before = [live.past[i].before for i in shown]
-        own = named([one._replace(**MAKE["BY_HAND"]) for one in before])
-        states = list(zip(own, named([one.memory for one in before]), strict=True))
+        own = named([one._replace(**MAKE["UNTRACED"]) for one in before])
+        states = list(zip(own, named([one.law_state for one in before]), strict=True))
         after = np.array([live.past[i + 1].seen.qpos for i in shown])
     found = np.concatenate(
         [browser.execute_script(EACH, law, states[i : i + 500]) for i in range(0, len(states), 500)]
@@ -128,7 +128,7 @@ def test_an_object_is_borne_as_in_the_package(corners):
     wanted = sliders(solids, one, np.array([0.3625, 0.29]))
     with jax.enable_x64(True):
         outlines = MAKE["Outline"](vertices, radius, offset, bearing)
-        com, arm = jax.vmap(MAKE["borne"])(outlines)
+        com, arm = jax.vmap(MAKE["support"])(outlines)
     np.testing.assert_allclose(com, wanted.p_object_com, atol=1e-12)
     np.testing.assert_allclose(arm, wanted.arm, atol=1e-9)
 

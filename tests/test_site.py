@@ -40,7 +40,7 @@ def test_every_study_and_notebook_stands_in_one_tab():
     ],
 )  # fmt: skip
 def test_a_link_of_the_repository_leads_on_in_the_site(link, page, there):
-    assert HOOKS["led"](link, page, Files) == there
+    assert HOOKS["site_link"](link, page, Files) == there
 
 
 def test_a_notebook_keeps_its_words_code_tables_and_pictures():
@@ -75,6 +75,6 @@ def test_dead_links_and_loads_from_other_hosts_are_told(tmp_path):
     (tmp_path / "x.css").write_text("a { background: url(//example.org/y.png) }")
     assert HOOKS["faults"](tmp_path) == [
         "b.html loads https://example.org/x.js from another host",
-        "b.html leads to gone.html, which is not there",
+        "b.html has a dead link to gone.html",
         "x.css loads //example.org/y.png from another host",
     ]

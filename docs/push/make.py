@@ -1,9 +1,9 @@
-"""Write the page on which one pushes oneself: python docs/push/make.py [FILE.html] [--record].
+"""Write the page with an interactive push: python docs/push/make.py [FILE.html] [--record].
 
-Law, skin, rules of a trial and the quasi-static engine are traced here from the package's own
-functions, and printed as JavaScript by the emitter of `rps export js`. Written by hand are the
-order of the three calls of a control step, the outlines that one may choose, and what is seen.
-Beside it stands a push in C MuJoCo, to be looked at from all sides; `--record` records it anew.
+The laws, the skin, the rules of a trial and the quasi-static engine are traced from the functions
+of the package, and emitted as JavaScript as by `rps export js`. The order of the three calls of a
+control step, the outlines and the drawing are written by hand. The page also shows a push in C
+MuJoCo in 3-D; `--record` records it again.
 """
 
 from __future__ import annotations
@@ -44,62 +44,62 @@ LAWS = {
     "rps_plus": "RPS+",
     "learned_gru": "a network that learned from touch",
 }
-FAMILIES = {"cylinder": 1, "prism": 6}  # with how many corners; a box repeats two
+NUM_CORNERS = {"cylinder": 1, "prism": 6}  # by family; a box repeats two corners
 ENDLESS = Rules(horizon=1e5, max_lost=1e5)
 SETTING = Setting("quasistatic", rules=ENDLESS)
-# Of the robot and the task, beside the law's own bounds: least, greatest.
+# Bounds of parameters of the robot and the task, for which a law has none.
 TASK = {"v_max": (0.01, 0.1), "omega_max": (0.03, 0.5), "d_success": (0.02, 0.2)}
-BY_HAND: dict[str, Any] = {"skin": None, "poses": None, "twists": None, "law_state": None}
+UNTRACED: dict[str, Any] = {"skin": None, "poses": None, "twists": None, "law_state": None}
 
 
 class Arrival(NamedTuple):
-    """What judging a trial needs of the law's parameters."""
+    """The law parameter that the rules of a trial need."""
 
     d_success: Any = 0.05  # [m]
 
 
 class Outline(NamedTuple):
-    """What is chosen of an object."""
+    """Outline and load of an object, as users choose them."""
 
     vertices: Any  # (N, 2) [m]
     radius: Any  # () [m]
-    com_offset: Any  # () [1] of the way to the outline
+    com_offset: Any  # () [1] relative to the distance of the outline
     com_bearing: Any  # () [rad]
 
 
-class Borne(NamedTuple):
-    """What follows from it."""
+class Support(NamedTuple):
+    """Centre of mass and ground friction of an object."""
 
     p_object_com: Any  # (2,) [m]
     arm: Any  # () [m] c = m_max / f_max
 
 
-def borne(outline: Outline) -> Borne:
-    """Centre of mass and arm of the ground's friction, as `geometry.solid` computes them."""
-    at, radius = jnp.asarray(outline.vertices), outline.radius
+def support(outline: Outline) -> Support:
+    """Return centre of mass and arm of the ground friction, as `geometry.solid` does."""
+    corners, radius = jnp.asarray(outline.vertices), outline.radius
     c, s = jnp.cos(outline.com_bearing), jnp.sin(outline.com_bearing)
-    if at.shape[0] == 1:
+    if corners.shape[0] == 1:
         reach, share = radius, jnp.ones(3)
         lean = jnp.where(outline.com_offset > 0, jnp.arctan2(s, c), 0.0)
         feet = lean + jnp.array([0, 2, 4]) * jnp.pi / 3
-        at = radius * jnp.stack([jnp.cos(feet), jnp.sin(feet)], axis=-1)
+        corners = radius * jnp.stack([jnp.cos(feet), jnp.sin(feet)], axis=-1)
     else:
-        edge = jnp.roll(at, -1, axis=0) - at
+        edge = jnp.roll(corners, -1, axis=0) - corners
         outward = jnp.stack([edge[:, 1], -edge[:, 0]], axis=-1)
         pace = outward[:, 0] * c + outward[:, 1] * s
-        away = jnp.sum(outward * at, axis=-1)
+        away = jnp.sum(outward * corners, axis=-1)
         reach = jnp.min(jnp.where(pace > 1e-12, away / jnp.where(pace > 0, pace, 1), jnp.inf))
-        share = jnp.any(at != jnp.roll(at, 1, axis=0), axis=1) * 1.0
+        share = jnp.any(corners != jnp.roll(corners, 1, axis=0), axis=1) * 1.0
     com = outline.com_offset * reach * jnp.stack([c, s])
-    x, y = (at - com).T
+    x, y = (corners - com).T
     load, bears = share, jnp.ones(share.shape)
     for _ in range(len(share)):
         w = bears * share
-        h = [jnp.sum(w * one) for one in (jnp.ones_like(x), x, y, x * x, x * y, y * y)]
+        h = [jnp.sum(w * term) for term in (jnp.ones_like(x), x, y, x * x, x * y, y * y)]
         p = quasistatic.solved((1.0, 0.0, 0.0), h)
         load = w * (p[0] + p[1] * x + p[2] * y)
         bears = bears * (load >= 0)
-    return Borne(com, jnp.sum(load * jnp.sqrt(x * x + y * y)))
+    return Support(com, jnp.sum(load * jnp.sqrt(x * x + y * y)))
 
 
 def _shapes(tree: Any) -> Any:
@@ -107,11 +107,11 @@ def _shapes(tree: Any) -> Any:
 
 
 def world_of(family: str) -> tuple[Any, Any, Any]:
-    """Stage, world and trial of a family, all of the paper's but the number of corners."""
+    """Return stage, world and trial of a family: the paper's, but for the number of corners."""
     case = Case("cylinder" if family == "cylinder" else "box", "S1", (-2.0, 0.0))
     part = pushes.build([case], SETTING)
     world = jax.tree.map(lambda x: jnp.asarray(x[0]), part.worlds)
-    corners = jnp.zeros((FAMILIES[family], 2))
+    corners = jnp.zeros((NUM_CORNERS[family], 2))
     world = world._replace(
         footprint=world.footprint._replace(vertices=corners),
         fields=world.fields._replace(vertices=corners),
@@ -120,115 +120,122 @@ def world_of(family: str) -> tuple[Any, Any, Any]:
     return part.stage, world, trial.start(world, Arrival(), law)
 
 
-def of_family(family: str) -> list[Routine]:
-    """How an object of a family is borne, is sensed, and moves."""
+def family_routines(family: str) -> list[Routine]:
+    """Return the routines for support, sensing and motion of an object of a family."""
     stage, world, start = world_of(family)
-    physics, n = SETTING.physics, FAMILIES[family]
-    own = {name: getattr(world, name) for name in ("skin", "odometry", "key", "qpos")}
-    live = {**dict.fromkeys(own), "fields": None}
-    blank = {name: getattr(start, name) for name in BY_HAND}
+    physics, n = SETTING.physics, NUM_CORNERS[family]
+    constants = {name: getattr(world, name) for name in ("skin", "odometry", "key", "qpos")}
+    live = {**dict.fromkeys(constants), "fields": None}
+    blank = {name: getattr(start, name) for name in UNTRACED}
 
     def sense(world: Any, params: Any, told: Any) -> Any:
-        full = world._replace(**own)
+        full = world._replace(**constants)
         told, seen = trial.observe(
             full, params, told._replace(**blank), physics=physics, rules=SETTING.rules
         )
         placed = trial.outline(full, told.qpos)
         touch = seen.observation._replace(in_contact=seen.reading.contact_type != NONE)
         taxels = features.taxel_observation(touch, seen.reading, full.skin, told.skin, placed)
-        return told._replace(**BY_HAND), taxels, {"contact_type": seen.reading.contact_type}
+        return told._replace(**UNTRACED), taxels, {"contact_type": seen.reading.contact_type}
 
     def drive(fields: Any, before: Any, told: Any, twist: Any) -> Any:
-        # Noise is drawn by no one here, and its key is no number of JavaScript.
-        unseen = blank | {"skin": start.skin._replace(key=jnp.zeros(2))}
-        before, told = before._replace(**unseen), told._replace(**unseen)
-        given = fields, trial.motion(told), ControlPeriod(twist, physics)
-        batch = jax.tree.map(lambda x: jnp.asarray(x)[None], given)
+        # Without noise the key is unused; JavaScript has no number for it.
+        untraced = blank | {"skin": start.skin._replace(key=jnp.zeros(2))}
+        before, told = before._replace(**untraced), told._replace(**untraced)
+        arguments = fields, trial.motion(told), ControlPeriod(twist, physics)
+        batch = jax.tree.map(lambda x: jnp.asarray(x)[None], arguments)
         driven = jax.tree.map(lambda x: x[0], stage.drive(*batch))
-        return (trial.settle(before, told, driven)._replace(**BY_HAND),)
+        return (trial.settle(before, told, driven)._replace(**UNTRACED),)
 
-    shape = _shapes(start._replace(**BY_HAND))
+    shape = _shapes(start._replace(**UNTRACED))
     twist = Twist(*(jnp.zeros(()),) * 3)
     outline = Outline(jnp.zeros((n, 2)), *(jnp.zeros(()),) * 3)
-    seen = {"world": _shapes(world._replace(**live)), "params": _shapes(Arrival()), "trial": shape}
-    driven = {"fields": _shapes(world.fields), "before": shape, "told": shape}
+    sense_shapes = {
+        "world": _shapes(world._replace(**live)),
+        "params": _shapes(Arrival()),
+        "trial": shape,
+    }
+    drive_shapes = {"fields": _shapes(world.fields), "before": shape, "told": shape}
     return [
-        routine(f"borne_{family}", lambda o: (borne(o),), {"outline": _shapes(outline)}, ["made"]),
-        routine(f"sense_{family}", sense, seen, ["told", "observation", "reading"]),
-        routine(f"drive_{family}", drive, {**driven, "twist": _shapes(twist)}, ["trial"]),
+        routine(
+            f"borne_{family}", lambda o: (support(o),), {"outline": _shapes(outline)}, ["made"]
+        ),
+        routine(f"sense_{family}", sense, sense_shapes, ["told", "observation", "reading"]),
+        routine(f"drive_{family}", drive, {**drive_shapes, "twist": _shapes(twist)}, ["trial"]),
     ]
 
 
-def of_law(name: str) -> tuple[list[Routine], dict[str, Any]]:
-    """How a law begins and decides; and its parameters, with the bounds of those that can slide."""
+def law_routines(name: str) -> tuple[list[Routine], dict[str, Any]]:
+    """Return the routines `init` and `step` of a law, and its parameters with their bounds."""
     label, params = registry.resolve_law(name)
     law, kind = registry.law_of(params), type(params).__name__
-    seen = validation.observation_shapes(law.senses)
-    if isinstance(seen, TaxelObservation):
+    observation = validation.observation_shapes(law.senses)
+    if isinstance(observation, TaxelObservation):
         count = Robot().shell.count
-        seen = seen._replace(signal=jax.ShapeDtypeStruct((count,), np.float64))
+        observation = observation._replace(signal=jax.ShapeDtypeStruct((count,), np.float64))
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x), np.float64), params)
     memory = jax.eval_shape(law.init, shapes)
-    given = {"params": shapes, "memory": memory, "observation": seen}
+    arguments = {"params": shapes, "memory": memory, "observation": observation}
 
-    def step(*arguments: Any) -> Any:
-        memory, twist, details = law.step(*arguments)
+    def step(*inputs: Any) -> Any:
+        memory, twist, details = law.step(*inputs)
         return memory, Twist(*twist), details
 
     routines = [
         routine(f"init_{kind}", lambda p: (law.init(p),), {"params": shapes}, ["memory"]),
-        routine(f"step_{kind}", step, given, ["memory", "twist", "details"]),
+        routine(f"step_{kind}", step, arguments, ["memory", "twist", "details"]),
     ]
     fields: Group = fields_of(params, values=params)
-    values = {one.name: np.asarray(one.value, float).tolist() for one in fields}
+    values = {field.name: np.asarray(field.value, float).tolist() for field in fields}
     bounds = dict(law.bounds)
     sliders = {}
-    for one in fields:
-        last = one.name.removeprefix("law_")
+    for field in fields:
+        last = field.name.removeprefix("law_")
         if last in TASK:
-            sliders[one.name] = [*TASK[last], False, one.about]
-    for field, bound in bounds.items():
-        scale = bounds[bound.of].high if bound.of else 1.0
-        about = next(one.about for one in fields if one.name == identifier(field))
-        sliders[identifier(field)] = [bound.low * scale, bound.high * scale, bound.log, about]
-    told = {"title": LAWS[name], "kind": kind, "params": values, "sliders": sliders}
-    return routines, {label: told}
+            sliders[field.name] = [*TASK[last], False, field.about]
+    for parameter, bound in bounds.items():
+        name_in_js = identifier(parameter)
+        scale = bounds[bound.relative_to].high if bound.relative_to else 1.0
+        about = next(field.about for field in fields if field.name == name_in_js)
+        sliders[name_in_js] = [bound.low * scale, bound.high * scale, bound.log, about]
+    description = {"title": LAWS[name], "kind": kind, "params": values, "sliders": sliders}
+    return routines, {label: description}
 
 
 def scripts() -> str:
-    """All that is generated: functions, laws and the numbers of the paper's first trial."""
+    """Return the generated JavaScript: functions, laws and constants of the first trial."""
     with jax.enable_x64(True):
         tables: dict[str, str] = {}
         routines, laws = {}, {}
-        for family in FAMILIES:
-            routines |= {one.name: one for one in of_family(family)}
+        for family in NUM_CORNERS:
+            routines |= {item.name: item for item in family_routines(family)}
         for name in LAWS:
-            own, told = of_law(name)
-            routines |= {one.name: one for one in own}
-            laws |= told
-        functions = [js.function(name, one, tables) for name, one in routines.items()]
-        start = world_of("prism")[2]._replace(**BY_HAND)
+            of_law, description = law_routines(name)
+            routines |= {item.name: item for item in of_law}
+            laws |= description
+        functions = [js.function(name, item, tables) for name, item in routines.items()]
+        start = world_of("prism")[2]._replace(**UNTRACED)
     group = fields_of(start, values=start)
-    blank = {one.name: np.asarray(one.value).tolist() for one in group}
+    blank = {field.name: np.asarray(field.value).tolist() for field in group}
     base = Robot().shell
     taxels = np.asarray(base.taxels(2)).tolist()  # two points of each, a quarter from its ends
-    numbers = {
+    constants = {
         "VERSION": __version__,
         "LAWS": laws,
         "START": blank,
         "PERIOD": SETTING.physics.control_period,
         "BASE": [float(x) for x in base.half],
         "TAXELS": taxels,
-        "FRICTION": {name: list(one) for name, one in FRICTION.items()},
+        "FRICTION": {name: list(friction) for name, friction in FRICTION.items()},
         "GAP": Case().gap,
         "RECORDED": json.loads(RECORDED.read_text("utf-8")),
     }
-    told = [f"const {name} = {js.text_of(value)};" for name, value in numbers.items()]
-    return "\n".join([*told, js.HELPERS, *tables.values(), *functions])
+    lines = [f"const {name} = {js.text_of(value)};" for name, value in constants.items()]
+    return "\n".join([*lines, js.HELPERS, *tables.values(), *functions])
 
 
-def recorded(every: int = 3) -> dict[str, Any]:
-    """The paper's push to (-2, 0) in C MuJoCo: places of base and object, and their sizes [m]."""
+def record(stride: int = 3) -> dict[str, Any]:
+    """Return the qpos of the paper's push to (-2, 0) in C MuJoCo, and the sizes of its boxes."""
     trace = push("box", target=(-2.0, 0.0)).data
     model = scene.load("box").model
     boxes = {
@@ -236,21 +243,21 @@ def recorded(every: int = 3) -> dict[str, Any]:
         for name in ("base", "object")
         for i in [model.geom(name).id]
     }
-    qpos = np.round(trace.qpos.values[::every].astype(float), 3)
-    period = float(trace.time[every] - trace.time[0])
+    qpos = np.round(trace.qpos.values[::stride].astype(float), 3)
+    period = float(trace.time[stride] - trace.time[0])
     target = trace.p_world_target.values.tolist()
     return {"period": round(period, 4), "target": target, "boxes": boxes, "qpos": qpos.tolist()}
 
 
 def page() -> str:
-    """The whole page."""
+    """Return the page."""
     return (HERE / "page.html").read_text("utf-8").replace("/* GENERATED */", scripts())
 
 
 if __name__ == "__main__":
     words = [word for word in sys.argv[1:] if word != "--record"]
     if "--record" in sys.argv:
-        RECORDED.write_text(json.dumps(recorded(), separators=(",", ":")) + "\n", "utf-8")
+        RECORDED.write_text(json.dumps(record(), separators=(",", ":")) + "\n", "utf-8")
     path = Path(words[0] if words else "push.html")
     path.write_text(page(), "utf-8")
     sys.stdout.write(f"{path}: {path.stat().st_size / 1e6:.2f} MB\n")
