@@ -58,7 +58,7 @@ def test_their_law_brings_every_box_back_to_the_path_and_the_open_loop_loses_mos
     assert float(alone.completion.median()) < 0.3
     _, row, _ = grid.table(found)
     assert row[:4] == ["force_push", "box", "243 of 243", "81, 81, 81"]
-    monkeypatch.setattr(grid, "pushed", lambda *_, **__: pytest.fail("run again"))
+    monkeypatch.setattr(grid, "run_grid", lambda *_, **__: pytest.fail("run again"))
     again = asked()  # read, not run
     np.testing.assert_array_equal(again.completion, found.completion)
     with pytest.raises(InputError, match=r"duration = 60\.0 there, 50\.0 asked for"):

@@ -55,7 +55,8 @@ def test_a_line_varies_one_parameter_within_its_bounds_and_no_other():
             if other == name:
                 assert (np.diff(values) > 0).all()
                 bound = BOUNDS[name]
-                scale = np.asarray(getattr(grid, bound.of))[i] if bound.of else 1.0
+                owner = bound.relative_to
+                scale = np.asarray(getattr(grid, owner))[i] if owner else 1.0
                 assert (bound.low * scale < values).all()
                 assert (values < bound.high * scale).all()
             elif (name, other) != ("l_cr", "l_mr"):  # l_mr must not pass a small l_cr
