@@ -76,7 +76,7 @@ class TestDescent:
     def test_the_first_start_is_the_base(self):
         one = TuneGrad("rps", starts=3)
         tuner = one.tuner
-        tuner.begin()
+        tuner.start()
         thetas = tuner.propose()
         np.testing.assert_array_equal(thetas[0], one.space.vector(one.space.base))
         assert (np.abs(thetas[1:] - thetas[0]).max(axis=1) > 0.1).all()
@@ -87,7 +87,7 @@ class TestDescent:
         TuneGrad("pursuit", tuned=("K_v",), estimator="evolution").validate()
 
     def test_steps_go_downhill_and_stay_within_the_clip(self):
-        rule = TuneGrad("rps", optimiser="sgd", learning_rate=0.5, clip=1.0, steps=10).rule()
+        rule = TuneGrad("rps", optimiser="sgd", learning_rate=0.5, clip=1.0, steps=10).rule
         change, _ = rule.update(jnp.array([30.0, 40.0]), rule.init(jnp.zeros(2)), jnp.zeros(2))
         np.testing.assert_allclose(change, [-0.3, -0.4], rtol=1e-6)
 
@@ -100,7 +100,7 @@ def test_antithetic_steps_find_the_slope_of_the_objective():
         z = one.space.vector(asks[0].params)
         return [CandidateScores(None, np.asarray(2 * z[:, 0] - z[:, 1])[:, None] + np.zeros(3))]
 
-    found = descent.smoothed(jnp.zeros((2, 2)), one, 0, pretend)
+    found = descent.evolution_gradients(jnp.zeros((2, 2)), one, 0, pretend)
     np.testing.assert_allclose(found.gradient, [[2, -1], [2, -1]], atol=0.2)
     errors = np.abs(found.gradient - jnp.array([2.0, -1.0])) / jnp.sqrt(found.variance)
     assert (errors < 4).all()
@@ -114,8 +114,8 @@ def test_windows_begin_where_their_trials_are_by_then(monkeypatch):
     monkeypatch.setattr(gradients, "window", lambda *_, **__: lambda thetas, starts: starts[1])
     late = jnp.array([0.0, 0.5, 1.0])
     for within, steps in ((10.0, [0, 250, 500]), (0.0, [0, 0, 0])):
-        how = TuneGrad("rps", tuned=("L", "K_h"), within=within, setting=SETTING).how
-        scores = descent.scores_of(how, None)
+        windows = TuneGrad("rps", tuned=("L", "K_h"), within=within, setting=SETTING).windows
+        scores = descent.window_scores(windows, None)
         np.testing.assert_array_equal(scores(jnp.zeros((3, 2)), (None, late)), steps)
 
 

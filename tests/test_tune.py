@@ -50,13 +50,13 @@ class TestSpace:
         paper, tuned = RPSParams.paper(), RPSParams.tuned()
         narrow = Space(("l_cr",))
         low = narrow.params(narrow.vector(paper._replace(l_cr=0.12)))
-        written = narrow.named(narrow.vector(low))
+        written = narrow.changed_values(narrow.vector(low))
         assert written == pytest.approx({"l_cr": 0.12, "l_mr": 0.12})
         rps.check(paper._replace(**written))
         other = Space(("eta",), tuned)
-        again = paper._replace(**other.named(other.vector(tuned)))
+        again = paper._replace(**other.changed_values(other.vector(tuned)))
         np.testing.assert_allclose(again, tuned, rtol=1e-5)
-        assert set(narrow.named(narrow.vector(paper))) == {"l_cr"}
+        assert set(narrow.changed_values(narrow.vector(paper))) == {"l_cr"}
 
     def test_the_papers_parameters_come_back(self):
         paper = RPSParams.paper()
@@ -120,7 +120,7 @@ class TestObjective:
     def test_a_trial_without_contact_missed_by_the_whole_way(self):
         never, near = np.array([np.inf]), np.array([0.2])
         zero = np.zeros(1)
-        outcome = Outcome(zero, zero, never, *[zero] * 10)
+        outcome = Outcome(zero, zero, never, *[zero] * 9)
         for least, missed in ((never, 0.5), (near, 0.2)):
             found = Objective().scores(outcome._replace(min_distance=least), np.full(1, 0.5), RULES)
             assert found == pytest.approx(1 + 0.5 * missed)
@@ -147,7 +147,7 @@ def rosenbrock(x):
 def search(size=4, **options):
     """An evolution about the paper's parameters."""
     one = TuneES("rps", tuned=SUBSETS["full"][:size], **options).tuner
-    one.begin()
+    one.start()
     return one
 
 
@@ -227,7 +227,7 @@ def pretend(asks, domains, setting, objective, **_):
     for ask in asks:
         value = (np.asarray(ask.params.L) - 0.4) ** 2 + (np.asarray(ask.params.K_h) - 0.6) ** 2
         scores = value[:, None] + 1e-3 * np.sin(ask.worlds + ask.seed)
-        answers.append(CandidateScores(Outcome(scores < 0.05, *[scores] * 12), scores))
+        answers.append(CandidateScores(Outcome(scores < 0.05, *[scores] * 11), scores))
     return answers, Timing(0.0, 1.0, 1.0)
 
 
@@ -247,7 +247,7 @@ def descents(generations=6):
 
 
 def tuned(folder, tuner):
-    run.tune(folder, tuner)
+    run.tune(Run(folder, no_progress), tuner)
     return tuner.best.tolist()
 
 
@@ -309,7 +309,7 @@ class TestRuns:
             path.unlink()
         (foreign,) = (tmp_path / "other" / "parts").glob("000001*")
         foreign.rename(tmp_path / "one" / "parts" / foreign.name)
-        with pytest.raises(InputError, match="generation 1 is not what this search proposes"):
+        with pytest.raises(InputError, match="its generation 1 differs from the one"):
             tuned(tmp_path / "one", evolution(3))
 
     def test_what_is_done_stays_when_less_is_asked_for(self, tmp_path, pretended):

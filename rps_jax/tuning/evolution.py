@@ -1,6 +1,6 @@
-"""Tuning a law by evolution: a distribution over candidates that moves to where they do well.
+"""Tune a law by an evolution strategy: a distribution of candidates moves towards better values.
 
-Every candidate of a generation meets the same worlds; the next generation meets others.
+All candidates of a generation meet the same worlds; every generation has other worlds.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.record.options import option
 from rps_jax.runs.question import call_of
-from rps_jax.tuning.run import Metrics, ScoreCandidates, Tuning, finite
+from rps_jax.tuning.run import LogLine, Metrics, ScoreCandidates, Tuner, Tuning, finite
 
 Algorithm = Literal["cma", "lra_cma", "sep_cma", "xnes"]
-_KINDS: dict[str, Callable[..., Any]] = {
+Strategy = cmaes.CMA | cmaes.SepCMA | cmaes.XNES
+_STRATEGIES: dict[Algorithm, Callable[..., Strategy]] = {
     "cma": cmaes.CMA,
     "lra_cma": partial(cmaes.CMA, lr_adapt=True),
     "sep_cma": cmaes.SepCMA,
@@ -32,17 +33,17 @@ _KINDS: dict[str, Callable[..., Any]] = {
 class TuneES(Tuning):
     """Tune a law's parameters by evolution, in many worlds.
 
-    The answer holds, by generation, the objective of candidates and of the middle of their
-    distribution in the worlds for validation, and `params` (generation, parameter) of the latter;
-    and `tuned` (parameter), which validated best.
+    The answer has, by generation, the objective of the candidates, the objective of the mean of
+    their distribution in the worlds for validation, and the `params` (generation, parameter) of
+    that mean. Its `tuned` (parameter) are the parameters with the best validation.
 
     Example:
       >>> import rps_jax
       >>> drums = {"objects": ("random_cylinder",), "tuned": ("K_h", "K_v")}
       >>> brief = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
       >>> small = {"worlds": 2, "validation": 2, "population": 4, "generations": 1}
-      >>> found = rps_jax.tune_es("rps", **drums, **small, setting=brief)
-      >>> dict(found.params.sizes)
+      >>> results = rps_jax.tune_es("rps", **drums, **small, setting=brief)
+      >>> dict(results.params.sizes)
       {'generation': 1, 'parameter': 2}
     """
 
@@ -51,8 +52,8 @@ class TuneES(Tuning):
     }  # fmt: skip
 
     algorithm: Algorithm = "cma"
-    """cma adapts a full covariance; lra_cma adapts its learning rates to noisy scores as well;
-    sep_cma keeps to the axes; xnes follows the natural gradient."""
+    """cma adapts a full covariance; lra_cma also adapts its learning rates to noisy scores;
+    sep_cma adapts a diagonal covariance; xnes follows the natural gradient."""
     population: int = option(64, 4, 100_000)
     """Number of candidates in a generation."""
     generations: int = option(50, 1, 1_000_000)
@@ -61,81 +62,72 @@ class TuneES(Tuning):
     """Standard deviation of the first generation about the start, in units of the bounded map
     [1]."""
     prior: float = option(0.002, 0)
-    """Price of a mean square of 1 between a candidate's coordinates and those of the start [1]; it
-    keeps the search where the bounded map is not flat."""
+    """Cost of a mean squared distance of 1 between the vectors of a candidate and of the start
+    [1]; it keeps the search where the bounded map is steep."""
     patience: int = option(0, 0, 1_000_000)
-    """Number of generations without a better validation after which the search begins again
-    elsewhere; 0 stands for never."""
+    """Number of generations without a better validation after which the search restarts at random
+    parameters; 0 means never."""
 
     @functools.cached_property
-    def tuner(self) -> EvolutionState:
-        return EvolutionState(self)
+    def tuner(self) -> EvolutionTuner:
+        return EvolutionTuner(self)
 
 
 tune_es = call_of(TuneES)
 
 
-class EvolutionState:
-    """An evolution under way."""
+class EvolutionTuner(Tuner):
+    """Search by an evolution strategy of the package cmaes, with restarts."""
 
     def __init__(self, evolution: TuneES):
-        """Raises InputError for an algorithm that cannot search so few parameters."""
-        if len(evolution.space.names) < 2 and evolution.algorithm in ("sep_cma", "xnes"):
+        super().__init__(evolution, evolution.generations)
+        if len(self.space.names) < 2 and evolution.algorithm in ("sep_cma", "xnes"):
             raise errors.InputError(
                 f"algorithm = {evolution.algorithm} is not allowed for one parameter: choose cma."
             )
-        self.evolution, self.seed = evolution, evolution.setting.seed
-        self.space, self.problem = evolution.space, evolution.problem
-        self.generations, self.budget = evolution.generations, evolution.budget
+        self.evolution = evolution
 
-    def begin(self) -> None:
-        """Begin about the base parameters of the space."""
-        self.base = self.best = np.asarray(self.space.vector(self.space.base), float)
-        self.best_value = np.inf  # of `best` in the worlds for validation
-        self.since = 0  # generations without a better one
-        self.restarts = 0
-        self._search = self._around(self.base)
+    def start(self) -> None:
+        super().start()
+        self.generations_since_best = self.restarts = 0
+        self._strategy = self._strategy_at(self.base)
 
-    def _around(self, mean: np.ndarray) -> Any:
+    def _strategy_at(self, mean: np.ndarray) -> Strategy:
+        """Return a new strategy about a mean (p,)."""
         seed = np.random.SeedSequence((self.seed, self.restarts)).generate_state(1)[0]
-        return _KINDS[self.evolution.algorithm](
-            mean.copy(),
-            self.evolution.spread,
-            population_size=self.evolution.population,
-            seed=int(seed),
+        options = self.evolution
+        return _STRATEGIES[options.algorithm](
+            mean.copy(), options.spread, population_size=options.population, seed=int(seed)
         )
 
     @property
     def mean(self) -> np.ndarray:
-        """The middle (p,) of the distribution from which candidates are drawn."""
-        return self._search._mean.copy()  # XNES has no public name for it
+        """Mean (p,) of the distribution of candidates."""
+        return self._strategy._mean.copy()  # XNES has no public name for it
 
     def propose(self) -> np.ndarray:
-        """Candidates (P, p) drawn from the distribution."""
-        return np.stack([self._search.ask() for _ in range(self.evolution.population)])
+        return np.stack([self._strategy.ask() for _ in range(self.evolution.population)])
 
     def shapes(self, vectors: np.ndarray, generation: int) -> dict[str, tuple[int, ...]]:
-        """Shapes of the values of candidates, the mean that was validated, and how it did."""
         return {"values": vectors.shape[:1], "mean": vectors.shape[1:], "validation": ()}
 
     def judge(
         self, vectors: np.ndarray, generation: int, score_candidates: ScoreCandidates
-    ) -> tuple[Metrics, dict[str, Any]]:
-        """The values of candidates, and that of the mean in the worlds for validation."""
+    ) -> tuple[Metrics, LogLine]:
         space, problem, seed = self.space, self.problem, self.seed
         mean = self.mean
-        tried, base, check = score_candidates(
+        candidates, base, check = score_candidates(
             [
                 problem.ask(space.params(vectors), seed, generation),
                 problem.ask(space.params(self.base[None]), seed, generation),
                 problem.validate(space.params(mean[None]), seed),
             ]
         )
-        values = np.asarray(problem.objective.value(tried.score))
+        values = np.asarray(problem.objective.value(candidates.score))
         validation = float(problem.objective.value(check.score)[0])
-        away = np.mean((vectors - self.base) ** 2, axis=-1)
+        distances = np.mean((vectors - self.base) ** 2, axis=-1)
         metrics = {
-            "values": values + self.evolution.prior * away,
+            "values": values + self.evolution.prior * distances,
             "mean": mean,
             "validation": np.array(validation),
         }
@@ -148,23 +140,18 @@ class EvolutionState:
             "validation": finite(validation),
             "validation_success": float(check.outcome.success.mean()),
             "restarts": self.restarts,
-            "params": space.named(mean),
+            "params": space.changed_values(mean),
         }
 
     def update(self, vectors: np.ndarray, metrics: Metrics) -> None:
-        """Move towards the better candidates, those without a value ranking worst."""
         values = metrics["values"]
         worst = np.max(values[~np.isnan(values)], initial=-np.inf)
         ranked = np.where(np.isnan(values), worst + 1.0, values)
-        self._search.tell([(x, float(value)) for x, value in zip(vectors, ranked, strict=True)])
-        self.since += 1
-        if metrics["validation"] < self.best_value:
-            self.best, self.best_value, self.since = (
-                metrics["mean"],
-                float(metrics["validation"]),
-                0,
-            )
-        if self.evolution.patience and self.since >= self.evolution.patience:
-            self.restarts, self.since = self.restarts + 1, 0
-            elsewhere = np.random.default_rng((self.seed + 1, self.restarts))
-            self._search = self._around(elsewhere.standard_normal(self.base.size))
+        self._strategy.tell([(x, float(value)) for x, value in zip(vectors, ranked, strict=True)])
+        is_best = self.record_best(metrics["mean"], float(metrics["validation"]))
+        self.generations_since_best = 0 if is_best else self.generations_since_best + 1
+        patience = self.evolution.patience
+        if patience and self.generations_since_best >= patience:
+            self.generations_since_best, self.restarts = 0, self.restarts + 1
+            random = np.random.default_rng((self.seed + 1, self.restarts))
+            self._strategy = self._strategy_at(random.standard_normal(self.base.size))

@@ -1,12 +1,12 @@
-"""The parameters that are tuned, as a vector without bounds."""
+"""Map between the tuned parameters of a law, which have bounds, and vectors without bounds."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.control import registry
@@ -16,29 +16,32 @@ from rps_jax.control.laws.rps import BOUNDS, RPSParams
 SUBSETS = {"logistic": ("eta", "zeta", "beta", "k"), "full": tuple(BOUNDS)}  # of RPS
 
 
-def expanded(names: Sequence[str], base: LawParams = RPSParams()) -> tuple[str, ...]:
-    """Put the members of a subset in its place among names: of `full`, all of the law's."""
-    own = isinstance(base, RPSParams)
-    subsets = SUBSETS if own else {"full": tuple(dict(registry.law_of(base).bounds))}
+def expand_subsets(names: Sequence[str], base: LawParams = RPSParams()) -> tuple[str, ...]:
+    """Replace the names of subsets by their members; `full` means all parameters with bounds."""
+    if isinstance(base, RPSParams):
+        subsets = SUBSETS
+    else:
+        subsets = {"full": tuple(dict(registry.law_of(base).bounds))}
     return tuple(name for text in names for name in subsets.get(text, (text,)))
 
 
 @dataclass(frozen=True)
 class Space:
-    """The parameters that are tuned, as vectors (p,) without bounds; the others stay.
+    """Tuned parameters as vectors (p,) without bounds; all other parameters are fixed.
 
-    A coordinate is the logit of where the parameter, or its logarithm, lies between its bounds.
+    A coordinate is the logit of the relative position of a parameter, or of its logarithm, between
+    its bounds.
     """
 
     names: tuple[str, ...] = SUBSETS["logistic"]
-    base: Any = RPSParams()  # parameters of any law that has bounds
+    base: LawParams = RPSParams()  # parameters of any law that has bounds
 
     def __post_init__(self) -> None:
         errors.check_each_once("tuned", self.names)
-        base = registry.named_leaves(self.base)
+        values = registry.named_leaves(self.base)
         for name in self.names:
             bound = self._bounds[errors.check_name("tuned parameter", name, self._bounds)]
-            share = _share(bound, base, name)
+            share = _share(bound, values, name)
             errors.check_finite(f"{name}, to be tuned", share, above=bound.low)
             if share >= bound.high:
                 raise errors.InputError(
@@ -51,44 +54,49 @@ class Space:
         return dict(registry.law_of(self.base).bounds)
 
     def vector(self, params: LawParams) -> jax.Array:
-        """The vector (..., p) of parameters with leaves (...)."""
-        numbers = registry.named_leaves(params)
-        return jnp.stack([self._coordinate(numbers, name) for name in self.names], axis=-1)
+        """Return the vector (..., p) of parameters with leaves (...)."""
+        values = registry.named_leaves(params)
+        return jnp.stack([self._coordinate(values, name) for name in self.names], axis=-1)
 
-    def _coordinate(self, numbers: Mapping[str, Any], name: str) -> jax.Array:
+    def _coordinate(self, values: Mapping[str, jax.Array], name: str) -> jax.Array:
         low, high, log, _ = bound = self._bounds[name]
-        value = jnp.asarray(_share(bound, numbers, name), float)
+        value = jnp.asarray(_share(bound, values, name), float)
         if log:
             low, high, value = math.log(low), math.log(high), jnp.log(value)
         return jax.scipy.special.logit((value - low) / (high - low))
 
-    def params(self, vector: Any) -> Any:
-        """The parameters of vectors (..., p): leaves (...)."""
+    def params(self, vector: ArrayLike) -> LawParams:
+        """Return the parameters, leaves (...), of vectors (..., p)."""
         vector, bounds = jnp.asarray(vector, float), self._bounds
-        filled = {
+        values = {
             name: jnp.broadcast_to(jnp.asarray(value, vector.dtype), vector.shape[:-1])
             for name, value in registry.named_leaves(self.base).items()
         }
         for name in sorted(self.names, key=lambda name: bool(bounds[name].relative_to)):
-            low, high, log, of = bounds[name]
+            low, high, log, whole = bounds[name]
             u = jax.nn.sigmoid(vector[..., self.names.index(name)])
             value = low * (high / low) ** u if log else low + (high - low) * u
-            filled[name] = value * filled[of] if of else value
+            values[name] = value * values[whole] if whole else value
         for name, bound in bounds.items():
-            if bound.relative_to:  # must not exceed the other parameter, which may be fixed
-                filled[name] = jnp.minimum(filled[name], filled[bound.relative_to])
-        return registry.replace_leaves(self.base, filled)
+            if bound.relative_to:  # a fixed parameter must not exceed the tuned one that bounds it
+                values[name] = jnp.minimum(values[name], values[bound.relative_to])
+        return registry.replace_leaves(self.base, values)
 
-    def named(self, vector: Any) -> dict[str, float]:
-        """A vector's tuned parameters by name, and the others that differ from the usual ones."""
-        kind = type(self.base)  # the law is known by the first parameters; RPS by the paper's
-        known = next(known for known in registry.LAWS.values() if type(known) is kind)
-        found, usual = (
-            {name: float(f"{float(value):.7g}") for name, value in numbers.items()}
-            for numbers in map(registry.named_leaves, (self.params(vector), known))
+    def changed_values(self, vector: ArrayLike) -> dict[str, float]:
+        """Return the tuned parameters of a vector (p,), and all others that differ from the preset.
+
+        The preset is the first of the law; that of RPS has the paper's parameters.
+        """
+        params_class = type(self.base)
+        preset = next(p for p in registry.LAWS.values() if type(p) is params_class)
+        values, defaults = (
+            {name: float(f"{float(value):.7g}") for name, value in leaves.items()}
+            for leaves in map(registry.named_leaves, (self.params(vector), preset))
         )
-        return {n: x for n, x in found.items() if n in self.names or x != usual[n]}
+        return {n: x for n, x in values.items() if n in self.names or x != defaults[n]}
 
 
-def _share(bound: Bound, numbers: Mapping[str, Any], name: str) -> Any:
-    return numbers[name] / numbers[bound.relative_to] if bound.relative_to else numbers[name]
+def _share(bound: Bound, values: Mapping[str, jax.Array], name: str) -> jax.Array:
+    """Return a parameter, or its ratio to the parameter that bounds it."""
+    value = values[name]
+    return value / values[bound.relative_to] if bound.relative_to else value

@@ -34,9 +34,9 @@ from rps_jax.trials.progress import Progress, set_phase
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Snapshot, World
 from rps_jax.trials.worlds import drawn_worlds
-from rps_jax.tuning.descent import soften
+from rps_jax.tuning.descent import soften_skins
 from rps_jax.tuning.gradients import Estimate, Scores, reverse, window
-from rps_jax.tuning.space import Space, expanded
+from rps_jax.tuning.space import Space, expand_subsets
 from rps_jax.world import domain as domains
 from rps_jax.world import draws
 from rps_jax.world.domain import RANDOM, DomainLike
@@ -99,7 +99,7 @@ class Gradients(Study[xr.Dataset]):
     @functools.cached_property
     def space(self) -> Space:
         """The parameters that are differentiated by."""
-        return Space(expanded(self.tuned))
+        return Space(expand_subsets(self.tuned))
 
     @property
     def theta(self) -> jax.Array:
@@ -205,7 +205,7 @@ def repeats(study: Gradients, name: str) -> Iterator[Estimate]:
     }
     one = jax.jit(act[name])
     if smooth:
-        worlds = soften(worlds)
+        worlds = soften_skins(worlds)
     for r in range(study.repeats):
         rows = slice(r * study.worlds, (r + 1) * study.worlds)
         key = jax.random.fold_in(jax.random.key(study.seed), r)
