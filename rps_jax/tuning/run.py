@@ -195,10 +195,7 @@ class Tuning(LawQuestion[xr.Dataset]):
         return Bar(name, count, "generations", shown=self.shows_progress)
 
     def answer(self, run: Run) -> xr.Dataset:
-        log = tune(
-            run.folder, self.tuner, callback=run.callback, slots=run.slots, workers=run.workers
-        )
-        return label_log(log, self.tuner)
+        return label_log(tune(run, self.tuner), self.tuner)
 
     def intro(self, results: xr.Dataset) -> str:
         names = ", ".join(self.space.names)
