@@ -168,7 +168,7 @@ def test_contacts_are_made_of_taxels():
     signal = np.zeros((3, SHELL.count))
     front = np.flatnonzero(np.isclose(np.asarray(SHELL.taxels()[:, 0, 0]), 0.3625))
     signal[0, front[5:7]], signal[1, front[2]] = 1.0, 1.0
-    found = logs._touch_of(signal, SHELL)
+    found = logs._contacts(signal, SHELL)
     assert found["contact_type"].tolist() == [2, 1, 0]
     pitch = 0.58 / 12  # twelve taxels along the front
     np.testing.assert_allclose(found["p_robot_contact"][0], [0.3625, 0.0], atol=1e-6)
@@ -199,10 +199,10 @@ def test_delay_and_slip_are_read_off_the_base():
 
 def test_a_log_in_the_mirror_has_its_target_on_the_other_side():
     log = a_log()
-    here, there = (logs.statistics(x, 0.02) for x in (log, logs.mirrored(log)))
+    here, there = (logs.statistics(x, 0.02) for x in (log, logs.mirror(log)))
     assert here["base/target_2"] == -there["base/target_2"] == pytest.approx(5**-0.5, rel=1e-3)
     assert here["base/target_0"] == there["base/target_0"] == pytest.approx(5**0.5, rel=1e-3)
-    for mine, again in zip(log, logs.mirrored(logs.mirrored(log)), strict=True):
+    for mine, again in zip(log, logs.mirror(logs.mirror(log)), strict=True):
         np.testing.assert_array_equal(mine, again)
 
 

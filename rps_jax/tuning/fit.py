@@ -1,12 +1,12 @@
-"""Which worlds are these? A robot's own logs, and the part of a domain in which they may be made.
+"""Fit a domain's ranges to logs of a robot: in which of its worlds can the logs be recorded?
 
     rps fit push.csv --domain wide
 
-Many worlds of the domain are pushed with the law that drove the robot, in closed loop, and a neural
-posterior (`posterior`) learns to tell a world's quantities from the statistics of its log (`logs`).
-Logged commands alone are not replayed: pushing is unstable without feedback, so that in a slightly
-wrong world the object would be lost within seconds, whereas in closed loop every world gives a log
-of the kind that was seen. All logs are of one robot that pushes one object on one floor.
+The law that drove the robot pushes in many worlds of the domain, in closed loop. A neural posterior
+(`posterior`) learns to predict a world's quantities from the statistics of its log (`logs`). Logged
+commands are not replayed: pushing is unstable without feedback, so in a slightly different world
+the robot loses the object within seconds. All logs are of one robot that pushes one object on one
+floor.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
+from pathlib import Path
 from typing import Any, ClassVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
@@ -28,16 +30,20 @@ from rps_jax.analysis.figures.style import Figure, quantity, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.control.base import Law, LawParams
+from rps_jax.control.observation import ForceObservation, Twist
 from rps_jax.control.registry import LawLike
+from rps_jax.engines.base import Stage
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.record import files
 from rps_jax.record.options import option
+from rps_jax.runs.push import Trace
 from rps_jax.runs.question import (
     DomainQuestion,
     LawQuestion,
     Run,
     SimulationQuestion,
+    Split,
     call_of,
     seed_of,
 )
@@ -45,21 +51,22 @@ from rps_jax.trials import trial
 from rps_jax.trials.batch import rows
 from rps_jax.trials.progress import Progress, set_phase
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, object_pose
+from rps_jax.trials.trial import ControlLoop, Trial, World, object_pose
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.tuning import logs as logs_
 from rps_jax.tuning import posterior
-from rps_jax.tuning.logs import Given, Log
+from rps_jax.tuning.logs import Log, RawLog
 from rps_jax.world import domain as domains
 from rps_jax.world import draws, points
 from rps_jax.world.domain import QUANTITIES, VELOCITY_ERRORS, Domain, Range
 from rps_jax.world.draws import Draw
 
-_TOGETHER = 64  # worlds of one object that are stepped at once
+_BATCH = 64  # worlds of one object that are stepped at once
 SAMPLES = 2000
-UNDETERMINED = 0.8  # share of the prior's 90 % interval from which on nothing was learned
+UNDETERMINED = 0.8  # share of the prior's 90 % interval above which nothing was learned
 _DELAYS = ("pose_latency", "command_delay")
-# What is told of a world beside its quantities, of what may be told where they may not.
+# Functions of quantities, for logs that determine these but not the quantities: unit, quantities
+# and function.
 DERIVED: dict[str, tuple[str, tuple[str, ...], Callable[..., np.ndarray]]] = {
     "ground_force": ("N", ("friction_ground", "mass"), lambda a, b: GRAVITY * a * b),
     "loop_delay": ("s", _DELAYS, lambda a, b: a + b),
@@ -71,10 +78,10 @@ _WORDS = {"ground_force": "friction force of the ground",
 
 @dataclass(frozen=True)
 class Fitted:
-    """What logs tell of a domain."""
+    """Posterior of the quantities of a domain, and the fitted domain."""
 
     data: xr.Dataset  # see `Fit`
-    domain: Domain  # with the 90 % intervals of what is determined as its ranges
+    domain: Domain  # with the 90 % intervals of all determined quantities as ranges
 
     def plot(self) -> Figure:
         """Draw each quantity's posterior over its prior."""
@@ -82,23 +89,23 @@ class Fitted:
 
 
 @dataclass(frozen=True)
-class OfLogs(SimulationQuestion[Fitted]):
-    """A question about logs."""
+class LogsQuestion(SimulationQuestion[Fitted]):
+    """Question about logs, its first arguments."""
 
-    logs: tuple[str | Any, ...] = option((), positional=True)
+    logs: tuple[str | Path | Trace, ...] = option((), positional=True)
     """Logs of one object on one floor: tables FILE.csv (time, x, y, yaw, contact_type, contact_x,
     contact_y, v_x, v_y, omega, target_x, target_y and, if known, object_x, object_y, object_yaw,
     force_x, force_y, taxel_0, ...), bags FILE.mcap, run folders of rps push, or traces."""
 
 
 @dataclass(frozen=True)
-class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], OfLogs):
-    """Fit a domain's ranges to logs of a robot: what of mass, friction, skin and drive they tell.
+class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
+    """Fit a domain's ranges (mass, friction, skin, drive) to logs of a robot.
 
-    The answer's `data` holds samples (sample, quantity) of the posterior, its 5, 50 and 95 %
-    quantiles `low`, `median` and `high` and those of the prior, whether a quantity is
+    The answer's `data` has samples (sample, quantity) of the posterior, the 5, 50 and 95 %
+    quantiles `low`, `median` and `high` of posterior and prior, whether a quantity is
     `undetermined`, correlations, and the probability of each of the domain's objects. Its `domain`
-    is the fitted one, which the shell writes as fitted.json.
+    is the fitted domain, which `rps fit` writes as fitted.json.
 
     Example:
       >>> import rps_jax
@@ -115,71 +122,77 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], OfLogs):
     worlds: int = option(6144, 96, 1_000_000)
     """Number of worlds of the domain that are simulated."""
     window: float = option(30.0, 5, 300, unit="s")
-    """Length of the beginning of each log that is looked at [s]; the shortest log's, if less."""
+    """Length of the first part of each log that is used [s]; at most that of the shortest log."""
 
     @cached_property
-    def given(self) -> list[Given]:
-        """The logs, read and checked."""
+    def raw_logs(self) -> list[RawLog]:
+        """Logs, loaded and validated."""
         several = self.logs if isinstance(self.logs, tuple | list) else (self.logs,)
         if not several:
             raise InputError("logs = () is not allowed: give at least one.")
-        return [logs_.read(one, self.ranges.robot.shell) for one in several]
+        return [logs_.read(log, self.ranges.robot.shell) for log in several]
 
     @cached_property
     def bank(self) -> Bank:
-        """The simulated worlds that the logs are compared with."""
+        """Simulated worlds with which the logs are compared."""
         period = self.setting.physics.control_period
-        interval = max(logs_.pace(one, period) for one in self.given)
-        shortest = min(map(logs_.length, self.given))
+        interval = max(logs_.row_interval(log, period) for log in self.raw_logs)
+        shortest = min(map(logs_.duration, self.raw_logs))
         window = interval * math.floor(min(self.window, shortest) / interval + 1e-6)
         return Bank(self.ranges, registry.law_of(self.params), self.params, self.setting, window,
-                    interval, self.given[0].exact)  # fmt: skip
+                    interval, self.raw_logs[0].exact)  # fmt: skip
 
     @cached_property
     def observed(self) -> tuple[list[Log], list[str]]:
-        """The logs on the bank's clock, and what all of them have besides."""
-        found = [logs_.on_clock(one, self.bank.interval, self.bank.window) for one in self.given]
-        has = [k for k in logs_.OPTIONAL if all(getattr(one, k) is not None for one in found)]
-        return found, has
+        """Logs on the bank's clock, and the optional fields that all of them have."""
+        bank = self.bank
+        logs = [logs_.resample(raw, bank.interval, bank.window) for raw in self.raw_logs]
+        fields = [k for k in logs_.OPTIONAL if all(getattr(log, k) is not None for log in logs)]
+        return logs, fields
 
     def check(self) -> None:
         self.check_engine([self.params])
         check_law(self.label, self.bank.law, self.setting)
-        if len({one.exact for one in self.given}) > 1:
-            raise InputError("logs of traces and of a robot's odometry are not allowed together.")
-        for given in self.given:
-            start, target = given.columns["pose"][0], given.columns["target"]
-            away, far = float(np.linalg.norm(target - start[:2])), self.ranges.distance
-            if not self.ranges.targets and not far.low - 0.1 <= away <= far.high + 0.1:
+        if len({raw.exact for raw in self.raw_logs}) > 1:
+            raise InputError(
+                "logs of traces and of a robot's odometry are not allowed together: fit them "
+                "separately."
+            )
+        for raw in self.raw_logs:
+            start, target = raw.columns["pose"][0], raw.columns["target"]
+            distance, far = float(np.linalg.norm(target - start[:2])), self.ranges.distance
+            if not self.ranges.targets and not far.low - 0.1 <= distance <= far.high + 0.1:
                 raise InputError(
-                    f"a log's target is {away:.2f} m from its start, and the domain's distance is "
-                    f"{far.low:g} to {far.high:g} m: name a domain that has it, as wide,"
-                    f"distance={min(away, far.low):.1f}:{max(away, far.high):.1f}."
+                    f"a log's target is {distance:.2f} m from its start, and the domain's distance "
+                    f"is {far.low:g} to {far.high:g} m: name a domain that contains it, as wide,"
+                    f"distance={min(distance, far.low):.1f}:{max(distance, far.high):.1f}."
                 )
 
     def num_trials(self) -> int | None:
         return self.worlds
 
     def fields_as_json(self) -> dict[str, Any]:
-        """Own fields as JSON; logs by the digests of their numbers."""
-        usual = dataclasses.replace(self, logs=())
-        content = [b"".join(np.ascontiguousarray(v).tobytes() for v in g.columns.values())
-                   for g in self.given]  # fmt: skip
-        return super(Fit, usual).fields_as_json() | {"logs": [files.sha256(one) for one in content]}
+        """Fields as JSON; logs by the digests of their values."""
+        digests = []
+        for raw in self.raw_logs:
+            content = b"".join(np.ascontiguousarray(v).tobytes() for v in raw.columns.values())
+            digests.append(files.sha256(content))
+        without_logs = dataclasses.replace(self, logs=())
+        return super(Fit, without_logs).fields_as_json() | {"logs": digests}
 
     def answer(self, run: Run) -> Fitted:
-        """Simulate what is missing of the worlds, learn from them, and judge the logs."""
+        """Simulate the missing worlds, train the posterior, and sample it for the logs."""
         simulated = self.bank.worlds(self.worlds, run)
-        observed, has = self.observed
-        names = chosen(simulated, has)
+        logs, fields = self.observed
+        names = statistic_names(simulated, fields)
         x = np.concatenate(
-            [matrix(logs_.statistics(one, self.bank.interval), names) for one in observed]
+            [matrix(logs_.statistics(log, self.bank.interval), names) for log in logs]
         )
         set_phase(run.callback, "learn")
         bank = simulated.sel(statistic=names).statistics.values
-        learned = posterior.train(simulated.u.values, bank, self.setting.seed)
-        found = posterior.sample(learned, x, SAMPLES, self.setting.seed)
-        data = summary(self.ranges, found)
+        networks = posterior.train(simulated.u.values, bank, self.setting.seed)
+        samples = posterior.sample(networks, x, SAMPLES, self.setting.seed)
+        data = summary(self.ranges, samples)
         low, high = np.nanquantile(bank.reshape(-1, len(names)), [0.001, 0.999], axis=0)
         data["outside"] = np.mean((x < low) | (x > high))
         data["outside"].attrs["long_name"] = "share of statistics beyond 99.8 % of the worlds'"
@@ -189,10 +202,10 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], OfLogs):
         return Fitted(data, fitted)
 
     def intro(self, results: Fitted) -> str:
-        has = self.observed[1]
+        fields = self.observed[1]
         return (
-            f"Logs: {len(self.given)}, the first {self.bank.window:g} s of each at "
-            f"{1 / self.bank.interval:.3g} Hz, with {', '.join(has) or 'touch and odometry'}; "
+            f"Logs: {len(self.raw_logs)}, the first {self.bank.window:g} s of each at "
+            f"{1 / self.bank.interval:.3g} Hz, with {', '.join(fields) or 'touch and odometry'}; "
             f"{self.worlds} worlds of the domain {self.domain}, law {self.label}, in closed loop."
         )
 
@@ -200,13 +213,14 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], OfLogs):
         data = results.data
         text = (
             "Median and 90 % interval. A quantity is undetermined if its interval is at least "
-            f"{UNDETERMINED:.0%} of the prior's: the logs do not tell it, and its range stays as "
-            f"it was. `rps sweep --domain {self.out}/fitted.json` pushes in the fitted domain."
+            f"{UNDETERMINED:.0%} of the prior's: the logs do not determine it, and its range is "
+            f"unchanged. `rps sweep --domain {self.out}/fitted.json` simulates the fitted domain."
         )
-        if (beyond := float(data.outside)) > 0.05:
+        if (outside := float(data.outside)) > 0.05:
             text += (
-                f" {beyond:.0%} of the logs' statistics lie beyond those of 99.8 % of the domain's "
-                "worlds: the logs are not of this domain, law or robot, and nothing here holds."
+                f" {outside:.0%} of the logs' statistics lie outside those of 99.8 % of the "
+                "domain's worlds: the logs are not of this domain, law or robot, and this fit is "
+                "invalid."
             )
         pairs = [["object", "probability"]]
         share = data.probability.to_series()
@@ -214,7 +228,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], OfLogs):
         return [
             Section("Quantities", text, table(data), Picture("marginals", results.plot)),
             Section("Objects", "", pairs),
-            Section("Told only together", "Correlations above 0.5.", together(data)),
+            Section("Correlated quantities", "Correlations above 0.5.", correlations(data)),
         ]
 
 
@@ -226,258 +240,270 @@ fit = call_of(Fit)
 
 @dataclass(frozen=True)
 class Bank:
-    """Worlds of a domain and the statistics of their logs, which any log can be judged by."""
+    """Simulated worlds of a domain and the statistics of their logs."""
 
     domain: Domain
     law: Law
-    params: Any
+    params: LawParams
     setting: Setting
     window: float  # [s]
     interval: float  # [s]
-    exact: bool = False  # logs have the pose where the base is, not where it believes to be
+    exact: bool = False  # logs have the true pose, not the pose by odometry
 
-    def worlds(self, count: int, run: Run, split: Any = "tune") -> xr.Dataset:
-        """Coordinates `u` (world, quantity) and `statistics` (world, way, statistic) of worlds.
+    def worlds(self, count: int, run: Run, split: Split = "tune") -> xr.Dataset:
+        """Return coordinates `u` (world, quantity) and `statistics` (world, way, statistic).
 
-        A way is the world as it is, or in a mirror.
+        The ways are the world itself and its mirror image.
         """
-        each, found = _TOGETHER * len(self.domain.objects), []
-        for first in range(0, count, each):
-            index = np.arange(first, min(first + each, count))
-            part = run.checkpoint(f"{split}-{first:07d}", partial(self._part, index, split, run))
-            found.append(part)
+        size, chunks = _BATCH * len(self.domain.objects), []
+        for first in range(0, count, size):
+            index = np.arange(first, min(first + size, count))
+            compute = partial(self._simulate, index, split, run)
+            chunks.append(run.checkpoint(f"{split}-{first:07d}", compute))
             run.callback(Progress(int(index[-1]) + 1, (index[-1] + 1) * self.window))
-        whole = xr.concat(found, "world")
-        assert isinstance(whole, xr.Dataset)
-        return whole
+        worlds = xr.concat(chunks, "world")
+        assert isinstance(worlds, xr.Dataset)
+        return worlds
 
-    def _part(self, index: np.ndarray, split: Any, run: Run) -> xr.Dataset:
-        which = self.domain.object_of(index)
+    def _simulate(self, index: np.ndarray, split: Split, run: Run) -> xr.Dataset:
+        """Return coordinates and statistics of the worlds with these indices."""
+        objects = self.domain.object_of(index)
         seed = seed_of(self.setting.seed, split)
-        groups = [index[which == thing] for thing in np.unique(which)]
+        groups = [index[objects == i] for i in np.unique(objects)]
         drawn = [draws.draw(self.domain, seed, group) for group in groups]
         with ThreadPoolExecutor(
             run.workers or engines.get(self.setting.engine).workers("cpu")
-        ) as p:
-            made = list(p.map(self.statistics, drawn))
+        ) as pool:
+            statistics = list(pool.map(self.statistics, drawn))
         order = np.argsort(np.concatenate(groups))
-        names = list(made[0][0])
-        ways = [np.concatenate([matrix(one[i], names) for one in made])[order] for i in (0, 1)]
-        every = points.points_of(self.domain, index, seed)
-        own = [points.names(self.domain).index(name) for name in coordinates(self.domain)]
+        names = list(statistics[0][0])
+        ways = [
+            np.concatenate([matrix(pair[i], names) for pair in statistics])[order] for i in (0, 1)
+        ]
+        cube = points.points_of(self.domain, index, seed)
+        columns = [points.names(self.domain).index(name) for name in coordinates(self.domain)]
         return xr.Dataset(
             {
-                "u": (("world", "quantity"), every[:, own]),
+                "u": (("world", "quantity"), cube[:, columns]),
                 "statistics": (("world", "way", "statistic"), np.float32(np.stack(ways, 1))),
             },
             {"quantity": list(coordinates(self.domain)), "statistic": names},
         )
 
     def statistics(self, drawn: Draw) -> tuple[dict[str, np.ndarray], ...]:
-        """Statistics of worlds (n,) of one object, and in the mirror."""
-        seen = self.logs(drawn)
-        return tuple(logs_.statistics(x, self.interval) for x in (seen, logs_.mirrored(seen)))
+        """Return statistics of worlds (n,) of one object, and of their mirror images."""
+        log = self.logs(drawn)
+        return tuple(logs_.statistics(x, self.interval) for x in (log, logs_.mirror(log)))
 
     def logs(self, drawn: Draw) -> Log:
-        """The logs of worlds (n,) of one object; the program always steps as many."""
+        """Return the logs of worlds (n,) of one object, padded to one batch size."""
         count = drawn.indices.size
         part = drawn_worlds(self.domain, drawn, self.setting).with_params(self.params)
-        repeated = np.resize(np.arange(count), max(count, _TOGETHER))
+        repeated = np.resize(np.arange(count), max(count, _BATCH))
         worlds, params = rows((part.worlds, part.params), repeated)
         period = self.setting.physics.control_period
-        every = max(1, round(self.interval / period))
-        loop = ControlLoop(self.setting.physics, self.setting.rules, _telling(self.law))
-        seen = _tracks(
+        row_steps = max(1, round(self.interval / period))
+        loop = ControlLoop(self.setting.physics, self.setting.rules, _observing(self.law))
+        rows_ = _simulate_logs(
             part.stage, worlds, params, loop,
-            steps=round(self.window / self.interval), every=every,
+            rows=round(self.window / self.interval), row_steps=row_steps,
         )  # fmt: skip
-        seen = jax.tree.map(lambda x: np.swapaxes(np.asarray(x, float), 0, 1), seen)
-        kept: dict[str, Any] = rows(seen, slice(count))
-        exact = kept.pop("true_pose")
-        pose = {"pose": exact} if self.exact else {}
-        valid = kept.pop("done") < 0.5
-        return Log(valid=valid, target=np.asarray(part.worlds.p_world_target), **(kept | pose))
+        columns = {k: np.swapaxes(np.asarray(x, float), 0, 1)[:count] for k, x in rows_.items()}
+        true_pose, valid = columns.pop("true_pose"), columns.pop("done") < 0.5
+        if self.exact:
+            columns["pose"] = true_pose
+        return Log(valid=valid, target=np.asarray(part.worlds.p_world_target), **columns)
 
 
 def check_law(label: str, law: Law, setting: Setting) -> None:
-    """Raises InputError unless logs of this law can be simulated in this setting."""
+    """Raise InputError unless logs of this law can be simulated in this setting."""
     engines.get(setting.engine).check_traced()
     engines.get(setting.engine).check_senses("force")
     if law.senses != "touch":
         raise InputError(
-            f"law = {label} senses {law.senses}: fit knows laws that sense touch, as rps and "
-            "rps_plus."
+            f"law = {label} is not allowed: it senses {law.senses}; fit needs a law that senses "
+            "touch, as rps or rps_plus."
         )
 
 
 @cache
-def _telling(law: Law) -> Law:
-    """The law, with what it observed and the contact's force as its details."""
-    return dataclasses.replace(law, step=partial(_tell, law), senses="force")
+def _observing(law: Law[Any, Any, Any]) -> Law[Any, Any, Any]:
+    """Return the law with its observation and the contact's force as details."""
+
+    def step(
+        params: LawParams, state: object, obs: ForceObservation
+    ) -> tuple[object, Twist, ForceObservation]:
+        state, twist, _ = law.step(params, state, obs.touch)
+        return state, twist, obs
+
+    return dataclasses.replace(law, step=step, senses="force")
 
 
-def _tell(law: Law, params: Any, memory: Any, seen: Any) -> Any:
-    memory, twist, _ = law.step(params, memory, seen.touch)
-    return memory, twist, seen
-
-
-@partial(jax.jit, static_argnames=("steps", "every"))
-def _tracks(
-    stage: Any, worlds: Any, params: LawParams, loop: ControlLoop, *, steps: int, every: int
+@partial(jax.jit, static_argnames=("rows", "row_steps"))
+def _simulate_logs(
+    stage: Stage,
+    worlds: World,
+    params: LawParams,
+    loop: ControlLoop,
+    *,
+    rows: int,
+    row_steps: int,
 ) -> dict[str, jax.Array]:
-    """Logs of a batch, (steps, B, ...), one row every so many control steps."""
-    jnp = jax.numpy
-    one = partial(trial.control_step, stage, worlds, params, loop=loop)
+    """Return the logs of a batch, (rows, B, ...), with one row every `row_steps` control steps."""
+    control_step = partial(trial.control_step, stage, worlds, params, loop=loop)
 
-    def row(trials: Any, _: Any) -> Any:
-        after, seen = one(trials)
-        after = jax.lax.fori_loop(1, every, lambda _, t: one(t)[0], after)
-        touch = seen.details.touch
-        place, yaw = jax.vmap(object_pose)(seen.qpos)
-        found = {
-            "pose": jnp.concatenate([touch.p_world_robot, touch.yaw[:, None]], -1),
-            "true_pose": seen.qpos[:, :3],
-            "contact_type": seen.reading.contact_type,
-            "p_robot_contact": seen.reading.p_robot_contact,
-            "twist": jnp.stack([jnp.broadcast_to(x, yaw.shape) for x in seen.twist], -1),
-            "object_pose": jnp.concatenate([place, yaw[:, None]], -1),
-            "f_robot": seen.details.f_robot,
-            "done": seen.done,
+    def row(trials: Trial, _: None) -> tuple[Trial, dict[str, jax.Array]]:
+        trials, snapshot = control_step(trials)
+        trials = jax.lax.fori_loop(1, row_steps, lambda _, t: control_step(t)[0], trials)
+        obs = snapshot.details.touch
+        p_world_object, yaw = jax.vmap(object_pose)(snapshot.qpos)
+        columns = {
+            "pose": jnp.concatenate([obs.p_world_robot, obs.yaw[:, None]], -1),
+            "true_pose": snapshot.qpos[:, :3],
+            "contact_type": snapshot.reading.contact_type,
+            "p_robot_contact": snapshot.reading.p_robot_contact,
+            "twist": jnp.stack([jnp.broadcast_to(x, yaw.shape) for x in snapshot.twist], -1),
+            "object_pose": jnp.concatenate([p_world_object, yaw[:, None]], -1),
+            "f_robot": snapshot.details.f_robot,
+            "done": snapshot.done,
         }
-        if after.skin.signal.shape[-1]:
-            found["signal"] = jnp.where(after.skin.alive, after.skin.signal, 0.0)
-        return after, found
+        if trials.skin.signal.shape[-1]:
+            columns["signal"] = jnp.where(trials.skin.alive, trials.skin.signal, 0.0)
+        return trials, columns
 
     trials = trial.start_all(worlds, params, jnp.ones(len(worlds.qpos), bool), law=loop.law)
-    return jax.lax.scan(row, trials, length=steps)[1]
+    return jax.lax.scan(row, trials, length=rows)[1]
 
 
 # --- from samples to a domain --------------------------------------------------------------
 
 
 def coordinates(domain: Domain) -> tuple[str, ...]:
-    """The coordinates of a domain's cube that are fitted: all but the task's and shapes."""
+    """Return the coordinates of a domain's cube that are fitted: all but the task's and shapes."""
     task = {*domains.quantities_of("task"), "com_bearing", "friction", "target"}
     return tuple(
-        one.name for one in points.coordinates(domain)
-        if one.kind in ("range", "choice") and one.name not in task
+        coordinate.name for coordinate in points.coordinates(domain)
+        if coordinate.kind in ("range", "choice") and coordinate.name not in task
     )  # fmt: skip
 
 
-def chosen(bank: xr.Dataset, has: Sequence[str]) -> list[str]:
-    """Names of the statistics that logs with these columns have."""
-    return [n for n in map(str, bank.statistic.values) if n.split("/")[0] in ("base", *has)]
+def statistic_names(bank: xr.Dataset, fields: Sequence[str]) -> list[str]:
+    """Return the names of the statistics of logs with these optional fields."""
+    return [n for n in map(str, bank.statistic.values) if n.split("/")[0] in ("base", *fields)]
 
 
-def matrix(found: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
-    """Statistics (B, F) in an order."""
-    return np.stack([found[name] for name in names], -1)
+def matrix(statistics: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
+    """Return statistics (B, F) in the order of their names."""
+    return np.stack([statistics[name] for name in names], -1)
 
 
 def values_of(domain: Domain, u: np.ndarray) -> dict[str, np.ndarray]:
-    """Quantities (n,) in their units, and what is derived of them, of points (n, D)."""
-    found = {}
+    """Return quantities (n,) of points (n, D) in their units, and the derived quantities."""
+    values = {}
     for name, column in zip(coordinates(domain), u.T, strict=True):
         if name != "object":
-            found[name] = getattr(domain, "velocity_error" if name in VELOCITY_ERRORS else name).at(
-                column
-            )
-    for name, (_, of, make) in DERIVED.items():
-        if all(one in found for one in of):
-            found[name] = make(*(found[one] for one in of))
-    return found
+            field = "velocity_error" if name in VELOCITY_ERRORS else name
+            values[name] = getattr(domain, field).at(column)
+    for name, (_, inputs, function) in DERIVED.items():
+        if all(key in values for key in inputs):
+            values[name] = function(*(values[key] for key in inputs))
+    return values
 
 
 def summary(domain: Domain, u: np.ndarray) -> xr.Dataset:
-    """The posterior, from its points (n, D): see `Fit`."""
+    """Return the posterior of its points (n, D), as `Fit` describes it."""
     prior = values_of(domain, np.random.default_rng(0).random((20_000, u.shape[1])))
-    found = values_of(domain, u)
-    at = np.stack([np.searchsorted(np.sort(prior[k]), v) / 20_000 for k, v in found.items()], -1)
-    ends = np.quantile(at, [0.05, 0.95], axis=0)
-    unit = {k: QUANTITIES[k].unit if k in QUANTITIES else "1" for k in found}
-    unit |= {k: told for k, (told, *_) in DERIVED.items() if k in found}
+    values = values_of(domain, u)
+    ranks = [np.searchsorted(np.sort(prior[k]), v) / 20_000 for k, v in values.items()]
+    rank = np.stack(ranks, -1)  # (n, quantities) quantile of the prior
+    low, high = np.quantile(rank, [0.05, 0.95], axis=0)
+    units = {k: QUANTITIES[k].unit if k in QUANTITIES else "1" for k in values}
+    units |= {k: unit for k, (unit, *_) in DERIVED.items() if k in values}
     columns: dict[str, Any] = {
-        "sample": (("draw", "quantity"), np.stack(list(found.values()), -1)),
-        "undetermined": ("quantity", ((ends[1] - ends[0]) >= 0.9 * UNDETERMINED).astype(np.int8)),
-        "shrinkage": ("quantity", 1 - (ends[1] - ends[0]) / 0.9),
-        "correlation": (("quantity", "other"), np.nan_to_num(np.corrcoef(at.T))),
+        "sample": (("draw", "quantity"), np.stack(list(values.values()), -1)),
+        "undetermined": ("quantity", ((high - low) >= 0.9 * UNDETERMINED).astype(np.int8)),
+        "shrinkage": ("quantity", 1 - (high - low) / 0.9),
+        "correlation": (("quantity", "other"), np.nan_to_num(np.corrcoef(rank.T))),
     }
-    for prefix, source in (("", found), ("prior_", prior)):
-        cuts = np.quantile(np.stack(list(source.values()), -1), [0.05, 0.5, 0.95], axis=0)
-        for name, values in zip(("low", "median", "high"), cuts, strict=True):
-            columns[prefix + name] = ("quantity", values)
-    which = np.zeros(len(u), int)
+    for prefix, source in (("", values), ("prior_", prior)):
+        quantiles = np.quantile(np.stack(list(source.values()), -1), [0.05, 0.5, 0.95], axis=0)
+        for name, row in zip(("low", "median", "high"), quantiles, strict=True):
+            columns[prefix + name] = ("quantity", row)
+    objects = np.zeros(len(u), int)
     if "object" in coordinates(domain):
-        which = np.floor(u[:, 0] * len(domain.objects)).astype(int)
-    share = np.bincount(which, minlength=len(domain.objects)) / len(u)
+        objects = np.floor(u[:, 0] * len(domain.objects)).astype(int)
+    share = np.bincount(objects, minlength=len(domain.objects)) / len(u)
     columns["probability"] = ("object", share)
-    names = list(found)
+    names = list(values)
     coords = {"quantity": names, "other": names, "object": list(domain.objects)}
-    return xr.Dataset(columns, coords | {"unit": ("quantity", [unit[k] for k in names])})
+    return xr.Dataset(columns, coords | {"unit": ("quantity", [units[k] for k in names])})
 
 
 def fitted_domain(domain: Domain, data: xr.Dataset) -> Domain:
-    """The domain with the 90 % interval of each determined quantity as its range.
+    """Return the domain with the 90 % interval of each determined quantity as its range.
 
-    One range holds all three errors of the velocity. Objects of less than 5 % are left out.
+    All three errors of the velocity share one range. Objects with a probability below 5 % are
+    removed.
     """
-    told = data.isel(quantity=np.flatnonzero(data.undetermined.values == 0))
-    ends = {
-        str(name): (float(told.low[i]), float(told.high[i]))
-        for i, name in enumerate(told.quantity.values)
+    determined = data.isel(quantity=np.flatnonzero(data.undetermined.values == 0))
+    intervals = {
+        str(name): (float(determined.low[i]), float(determined.high[i]))
+        for i, name in enumerate(determined.quantity.values)
     }
     changes: dict[str, Any] = {
-        name: Range(*ends[name], getattr(domain, name).log) for name in ends if name in QUANTITIES
+        name: Range(*interval, getattr(domain, name).log)
+        for name, interval in intervals.items()
+        if name in QUANTITIES
     }
-    if all(name in ends for name in VELOCITY_ERRORS):
-        low, high = zip(*(ends[name] for name in VELOCITY_ERRORS), strict=True)
+    if all(name in intervals for name in VELOCITY_ERRORS):
+        low, high = zip(*(intervals[name] for name in VELOCITY_ERRORS), strict=True)
         changes["velocity_error"] = Range(min(low), max(high))
     likely = data.probability.values >= 0.05
-    objects = tuple(o for o, is_ in zip(domain.objects, likely, strict=True) if is_)
+    objects = tuple(o for o, is_likely in zip(domain.objects, likely, strict=True) if is_likely)
     return dataclasses.replace(domain, objects=objects, **changes)
 
 
-# --- how it is told ------------------------------------------------------------------------
+# --- report --------------------------------------------------------------------------------
 
 
 def words(name: str) -> str:
-    """A quantity, or what is derived of some, in words."""
+    """Return the description of a quantity or a derived quantity."""
     return _WORDS.get(name) or quantity(name)
 
 
 def table(data: xr.Dataset) -> list[list[str]]:
-    """Header and one row for each quantity."""
-    found = [["quantity", "unit", "median", "90 %", "prior 90 %", "told"]]
+    """Return a header and one row for each quantity."""
+    rows = [["quantity", "unit", "median", "90 %", "prior 90 %", "information"]]
     for name in data.quantity.values:
-        one = data.sel(quantity=name)
-        ends = [f"{float(one[k]):.3g} to {float(one[m]):.3g}"
-                for k, m in (("low", "high"), ("prior_low", "prior_high"))]  # fmt: skip
-        told = "undetermined" if one.undetermined else f"{float(one.shrinkage):.0%} narrower"
-        middle = f"{float(one['median']):.3g}"
-        found.append([words(str(name)), str(one.unit.values), middle, *ends, told])
-    return found
+        row = data.sel(quantity=name)
+        ranges = [f"{float(row[low]):.3g} to {float(row[high]):.3g}"
+                  for low, high in (("low", "high"), ("prior_low", "prior_high"))]  # fmt: skip
+        gain = "undetermined" if row.undetermined else f"{float(row.shrinkage):.0%} narrower"
+        median = f"{float(row['median']):.3g}"
+        rows.append([words(str(name)), str(row.unit.values), median, *ranges, gain])
+    return rows
 
 
-def together(data: xr.Dataset) -> list[list[str]]:
-    """Header and the pairs of quantities that are told only together."""
-    at = data.correlation.values
+def correlations(data: xr.Dataset) -> list[list[str]]:
+    """Return a header and the pairs of quantities that the logs determine only in combination."""
+    correlation = data.correlation.values
     names = [str(q) for q in data.quantity.values]
-    pairs = [(i, j) for i, j in np.argwhere(np.tril(abs(at), -1) > 0.5)
+    pairs = [(i, j) for i, j in np.argwhere(np.tril(abs(correlation), -1) > 0.5)
              if not DERIVED.keys() & {names[i], names[j]}]  # fmt: skip
-    told = [[words(names[i]), words(names[j]), f"{at[i, j]:.2f}"] for i, j in pairs]
-    return [["", "", "correlation"], *told]
+    rows = [[words(names[i]), words(names[j]), f"{correlation[i, j]:.2f}"] for i, j in pairs]
+    return [["", "", "correlation"], *rows]
 
 
 def marginals(data: xr.Dataset) -> Figure:
-    """Draw each quantity's posterior (blue) over its prior's 90 % (grey)."""
+    """Draw each quantity's posterior (blue) over the 90 % interval of its prior (grey)."""
     names = [str(q) for q in data.quantity.values]
-    drawn, axes = tiles(len(names), 4, (3, 1.9), (0, 0))
+    figure, axes = tiles(len(names), 4, (3, 1.9), (0, 0))
     for ax, name in zip(axes.ravel(), names, strict=False):
-        one = data.sel(quantity=name)
-        ax.axvspan(float(one.prior_low), float(one.prior_high), color="0.88")
-        flat = bool(one.undetermined)
-        ax.hist(one["sample"], 40, density=True, color="0.6" if flat else "C0")
+        column = data.sel(quantity=name)
+        ax.axvspan(float(column.prior_low), float(column.prior_high), color="0.88")
+        flat = bool(column.undetermined)
+        ax.hist(column["sample"], 40, density=True, color="0.6" if flat else "C0")
         ax.set_title(words(name) + (" (undetermined)" if flat else ""), fontsize=8)
-        ax.set(yticks=[], xlabel=f"[{one.unit.values}]")
+        ax.set(yticks=[], xlabel=f"[{column.unit.values}]")
         ax.tick_params(labelsize=7)
-    return drawn
+    return figure

@@ -1,15 +1,15 @@
-"""Logs of pushes as `rps fit` takes them: read, checked, and brought to one clock.
+"""Logs of pushes for `rps fit`: loaded, validated, resampled to one clock, and summarised.
 
-A log is a trace, as `push` and `replay` return it or keep it in their run folder; a bag, as
-`rps push --bag` writes it or a robot records it (`record.bag` lists the topics); or a table
+A log is one of these: a trace, which `push` and `replay` return or store in their run folder; a
+bag, which `rps push --bag` writes or a robot records (`record.bag` lists the topics); or a table
 `FILE.csv` with a header and the columns
 
     time                             [s]
     x, y, yaw                        [m, m, rad] of the base, by its odometry
     contact_type                     0 none, 1 a point, 2 a line
     contact_x, contact_y             [m] of the contact in the robot frame; 0 without contact
-    taxel_0, taxel_1, ...            [1] relative change of capacitance, along the strip; without
-                                     the contact's columns these are made of them
+    taxel_0, taxel_1, ...            [1] relative change of capacitance, along the strip; they give
+                                     the contact if its columns are missing
     v_x, v_y, omega                  [m/s, m/s, rad/s] commanded, in the robot frame
     target_x, target_y               [m] in the frame of the base's pose
     object_x, object_y, object_yaw   [m, m, rad] of the object, if known, in that frame
@@ -19,7 +19,7 @@ A log is a trace, as `push` and `replay` return it or keep it in their run folde
 import re
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -43,22 +43,22 @@ COLUMNS = {
     "object_pose": ("object_x", "object_y", "object_yaw"),
     "f_robot": ("force_x", "force_y"),
 }
-OPTIONAL = ("object_pose", "f_robot", "signal")  # what a log may have besides
+OPTIONAL = ("object_pose", "f_robot", "signal")  # fields that a log may lack
 _TOUCH = ("contact_type", "p_robot_contact")
 _SHORTEST = 5.0  # [s]
-_SLOWEST = 0.2  # [s] between two rows
+_SLOWEST = 0.2  # [s] between two rows, at most
 _STILL = 0.001  # [m] that a target may move
-# Greatest numbers of a log, and what they would otherwise be.
-_MOST = {
+# Largest magnitudes of a log, and the units that the error names.
+_LIMITS = {
     "twist": (np.array([3.0, 3.0, 10.0]), "v_x and v_y [m/s] and omega [rad/s]"),
     "f_robot": (np.full(2, 1e5), "forces [N]"),
 }
 
 
 class Log(NamedTuple):
-    """Pushes (B) on one clock (T); what is not known is None."""
+    """Pushes (B) on one clock (T); fields that a log lacks are None."""
 
-    valid: np.ndarray  # (B, T) bool: before its end
+    valid: np.ndarray  # (B, T) bool: before the end of the log
     pose: np.ndarray  # (B, T, 3) [m, m, rad] of the base
     contact_type: np.ndarray  # (B, T)
     p_robot_contact: np.ndarray  # (B, T, 2) [m]
@@ -69,47 +69,48 @@ class Log(NamedTuple):
     signal: np.ndarray | None = None  # (B, T, taxels) [1]
 
 
-class Given(NamedTuple):
-    """A log as it was given, (N, ...) by the fields of `Log`, with `time` (N,) [s]."""
+class RawLog(NamedTuple):
+    """Log with its own rows: columns (N, ...) by the fields of `Log`, and `time` (N,) [s]."""
 
     columns: dict[str, np.ndarray]
-    exact: bool  # the pose is where the base was, not where it believed to be
+    exact: bool  # the pose is the true one, not the one by odometry
 
 
-def read(source: Any, shell: Shell) -> Given:
-    """Read and check one log, a trace or the path of one; `shell` is that of the robot.
+def read(source: Trace | str | Path, shell: Shell) -> RawLog:
+    """Load and validate one log, a trace or a path; `shell` is that of the robot.
 
     Raises:
-      InputError: it cannot be read, lacks a column, or holds what cannot be of this robot.
+      InputError: the log cannot be read, lacks a column, or is not of this robot.
     """
     name = f"log = {'a trace' if isinstance(source, Trace) else source}"
     if isinstance(source, Trace):
-        found = _of_trace(source.data, name)
+        log = _from_trace(source.data, name)
     elif Path(source).is_dir():
-        found = _of_trace(files.read_results(Path(source)), name)
+        log = _from_trace(files.read_results(Path(source)), name)
     elif Path(source).suffix == ".mcap" and Path(source).is_file():
         bag.check()
         steps = with_contacts(bag.read(Path(source)), shell, f"bag = {source}")
         known = (*COLUMNS, "signal")
-        found = Given({k: np.asarray(v, float) for k, v in steps.items() if k in known}, False)
+        log = RawLog({k: np.asarray(v, float) for k, v in steps.items() if k in known}, False)
     elif Path(source).suffix == ".csv" and Path(source).is_file():
-        found = _of_table(Path(source), name)
+        log = _from_table(Path(source), name)
     else:
         raise InputError(
             f"{name} is not allowed: give a trace, a run folder of rps push, FILE.csv or FILE.mcap."
         )
-    columns = found.columns
+    columns = log.columns
     if "signal" in columns:
         check_taxels(columns["signal"], shell, name)
     if "contact_type" not in columns:
-        columns |= _touch_of(columns["signal"], shell)
+        columns |= _contacts(columns["signal"], shell)
     _check(columns, name, shell)
-    return found
+    return log
 
 
-def _of_trace(data: xr.Dataset, name: str) -> Given:
+def _from_trace(data: xr.Dataset, name: str) -> RawLog:
+    """Return the log of a trace."""
     if "qpos" not in data or "time" not in data.dims:
-        raise InputError(f"{name} is not allowed: the run holds no trace of rps push or replay.")
+        raise InputError(f"{name} is not allowed: the run has no trace of rps push or replay.")
     qpos, x = np.asarray(data.qpos.values, float), JOINTS.object.start
     yaw = np.unwrap(np.asarray(planar.yaw_of_quaternion(jnp.asarray(qpos[:, x + 3 : x + 7]))))
     columns = {
@@ -121,138 +122,144 @@ def _of_trace(data: xr.Dataset, name: str) -> Given:
         "target": data.p_world_target.values,
         "object_pose": np.column_stack([qpos[:, x : x + 2], yaw]),
     }
-    return Given({k: np.asarray(v, float) for k, v in columns.items()}, True)
+    return RawLog({k: np.asarray(v, float) for k, v in columns.items()}, True)
 
 
-def _of_table(path: Path, name: str) -> Given:
+def _from_table(path: Path, name: str) -> RawLog:
+    """Return the log of a table."""
     text = path.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     if len(text) < 2:
         raise InputError(f"{name} is empty: give a header and at least two rows.")
-    header = [one.strip() for one in text[0].split(",")]
-    at = {one: i for i, one in enumerate(header)}
+    header = [title.strip() for title in text[0].split(",")]
+    index = {title: i for i, title in enumerate(header)}
     taxels = sorted(
-        (one for one in at if re.fullmatch(r"taxel_\d+", one)), key=lambda n: int(n[6:])
+        (title for title in index if re.fullmatch(r"taxel_\d+", title)), key=lambda n: int(n[6:])
     )
     needed = [k for k in COLUMNS if k not in OPTIONAL and not (taxels and k in _TOUCH)]
-    if lacking := [one for k in needed for one in COLUMNS[k] if one not in at]:
-        raise InputError(f"{name} lacks the column {lacking[0]}: `rps fit --help` lists them.")
+    if missing := [title for k in needed for title in COLUMNS[k] if title not in index]:
+        raise InputError(f"{name} lacks the column {missing[0]}: `rps fit --help` lists them.")
     try:
-        rows = np.array([[float(one or "nan") for one in row.split(",")] for row in text[1:]])
+        rows = np.array([[float(cell or "nan") for cell in row.split(",")] for row in text[1:]])
     except ValueError as error:
         raise InputError(
             f"{name} is not allowed ({error}): write numbers in every cell."
         ) from error
-    wanted = {k: c for k, c in COLUMNS.items() if all(one in at for one in c)}
-    found = {k: rows[:, [at[one] for one in c]] for k, c in wanted.items()}
-    found |= {k: found[k][:, 0] for k in ("time", "contact_type") if k in found}
+    columns = {
+        key: rows[:, [index[title] for title in titles]]
+        for key, titles in COLUMNS.items()
+        if all(title in index for title in titles)
+    }
+    columns |= {k: columns[k][:, 0] for k in ("time", "contact_type") if k in columns}
     if taxels:
-        found["signal"] = rows[:, [at[one] for one in taxels]]
-    return Given(found, False)
+        columns["signal"] = rows[:, [index[title] for title in taxels]]
+    return RawLog(columns, False)
 
 
-def _touch_of(signal: np.ndarray, shell: Shell) -> dict[str, np.ndarray]:
-    """Contacts of taxels (N, T), as the simulated skin has them."""
+def _contacts(signal: np.ndarray, shell: Shell) -> dict[str, np.ndarray]:
+    """Return the contacts of filtered taxels (N, T), by the rule of the simulated skin."""
     active, middles = signal > CapacitiveSkin().threshold, np.asarray(shell.taxels()[:, 0])
     first, last = active.argmax(1), active.shape[1] - 1 - active[:, ::-1].argmax(1)
     kind = np.minimum(active.sum(1), 2)
-    place = np.where(kind[:, None] > 0, (middles[first] + middles[last]) / 2, 0.0)
-    return {"contact_type": kind.astype(float), "p_robot_contact": place}
+    p_robot = np.where(kind[:, None] > 0, (middles[first] + middles[last]) / 2, 0.0)
+    return {"contact_type": kind.astype(float), "p_robot_contact": p_robot}
 
 
-def _check(found: dict[str, np.ndarray], name: str, shell: Shell) -> None:
-    """Raises InputError for a log that cannot be of this robot, in these units."""
-    for key, values in found.items():
+def _check(columns: dict[str, np.ndarray], name: str, shell: Shell) -> None:
+    """Raise InputError for a log that is not of this robot or not in these units."""
+    for key, values in columns.items():
         if len(bad := np.argwhere(~np.isfinite(values))):
-            raise InputError(f"{name} has no number for {key} in row {bad[0][0]}: fill or cut it.")
-    targets = np.atleast_2d(found["target"])
+            raise InputError(
+                f"{name} has no number for {key} in row {bad[0][0]}: fill or remove the row."
+            )
+    targets = np.atleast_2d(columns["target"])
     if np.ptp(targets, axis=0).max() > _STILL:
         raise InputError(f"{name} has a target that moves: cut the log where it does.")
-    found["target"] = targets[0]
-    time, steps = found["time"], np.diff(found["time"])
+    columns["target"] = targets[0]
+    time, steps = columns["time"], np.diff(columns["time"])
     if len(time) < 2 or (steps <= 0).any():
         raise InputError(f"{name} is not allowed: its time must rise, over at least two rows.")
-    usual = float(np.median(steps))
-    if usual > _SLOWEST:
+    interval = float(np.median(steps))
+    if interval > _SLOWEST:
         raise InputError(
-            f"{name} has a row every {usual:g} s: give seconds, and a row every {_SLOWEST} s at "
-            "least."
+            f"{name} has a row every {interval:g} s: give the time in seconds, and a row at "
+            f"least every {_SLOWEST} s."
         )
-    if (worst := float(steps.max())) > max(5 * usual, _SLOWEST):
-        when = float(time[steps.argmax()])
-        raise InputError(f"{name} has a gap of {worst:.2g} s at {when:.2f} s: cut the log there.")
+    if (worst := float(steps.max())) > max(5 * interval, _SLOWEST):
+        start = float(time[steps.argmax()])
+        raise InputError(f"{name} has a gap of {worst:.2g} s at {start:.2f} s: cut the log there.")
     if time[-1] - time[0] < _SHORTEST:
         raise InputError(f"{name} lasts {time[-1] - time[0]:.1f} s: it must last {_SHORTEST:g} s.")
-    for key, (most, told) in _MOST.items():
-        if key in found and (abs(found[key]) > most).any():
-            raise InputError(f"{name} has {key} up to {abs(found[key]).max():g}: write {told}.")
-    moved = np.abs(np.diff(found["pose"], axis=0)).max(0)
+    for key, (limit, units) in _LIMITS.items():
+        if key in columns and (abs(columns[key]) > limit).any():
+            raise InputError(f"{name} has {key} up to {abs(columns[key]).max():g}: write {units}.")
+    moved = np.abs(np.diff(columns["pose"], axis=0)).max(0)
     if (moved > np.array([0.5, 0.5, 1.0])).any():
         raise InputError(
             f"{name} has a pose that jumps by {moved.max():.3g} between two rows: write x and y "
             "[m] and an unbroken yaw [rad]."
         )
-    touching = found["contact_type"] > 0
-    if not touching.any():
-        raise InputError(f"{name} has no contact, so that it tells nothing: log a push.")
-    place, half = np.abs(found["p_robot_contact"][touching]), np.array(shell.half, float)
-    inside = np.median(np.max(place - half, axis=-1))
-    if (place > half + 0.03).any() or inside < -0.05:
-        x, y = place.max(0)
+    in_contact = columns["contact_type"] > 0
+    if not in_contact.any():
+        raise InputError(f"{name} has no contact, so it has no information: log a push.")
+    reach, half = np.abs(columns["p_robot_contact"][in_contact]), np.array(shell.half, float)
+    inside = np.median(np.max(reach - half, axis=-1))
+    if (reach > half + 0.03).any() or inside < -0.05:
+        x, y = reach.max(0)
         raise InputError(
             f"{name} has contacts up to ({x:.3f}, {y:.3f}) m, and the robot ends at ({half[0]:.3f},"
             f" {half[1]:.3f}) m: it is of another robot, or not in metres; see --robot."
         )
 
 
-def on_clock(given: Given, interval: float, window: float) -> Log:
-    """One log (1, T, ...), its rows held until the next, every `interval` [s] of `window` [s]."""
-    found = given.columns
-    grid = found["time"][0] + interval * np.arange(round(window / interval))
-    at = np.searchsorted(found["time"], grid + 1e-6, side="right") - 1
-    rows = {k: v[at][None] for k, v in found.items() if k not in ("time", "target")}
-    return Log(valid=(grid <= found["time"][-1] + 1e-6)[None], target=found["target"][None], **rows)
+def resample(raw: RawLog, interval: float, window: float) -> Log:
+    """Return a log (1, T, ...) with a row every `interval` [s] of `window` [s]; rows are held."""
+    columns, time = raw.columns, raw.columns["time"]
+    grid = time[0] + interval * np.arange(round(window / interval))
+    index = np.searchsorted(time, grid + 1e-6, side="right") - 1
+    rows = {k: v[index][None] for k, v in columns.items() if k not in ("time", "target")}
+    return Log(valid=(grid <= time[-1] + 1e-6)[None], target=columns["target"][None], **rows)
 
 
-def pace(given: Given, period: float) -> float:
-    """The interval [s] of a log's rows, as a multiple of the control period [s]."""
-    usual = float(np.median(np.diff(given.columns["time"])))
-    return period * max(1, int(np.ceil(usual / period - 0.05)))
+def row_interval(raw: RawLog, period: float) -> float:
+    """Return the interval [s] of a log's rows, as a multiple of the control period [s]."""
+    interval = float(np.median(np.diff(raw.columns["time"])))
+    return period * max(1, int(np.ceil(interval / period - 0.05)))
 
 
-def length(given: Given) -> float:
-    """How long [s] a log is."""
-    time = given.columns["time"]
+def duration(raw: RawLog) -> float:
+    """Return the duration [s] of a log."""
+    time = raw.columns["time"]
     return float(time[-1] - time[0])
 
 
-# --- what a log tells ----------------------------------------------------------------------
+# --- summary statistics --------------------------------------------------------------------
 
 _BLOCKS = 10
 
 
-def mirrored(log: Log) -> Log:
-    """The same pushes seen in a mirror at the robot's axis, y to -y."""
-    planar_ = np.array([1.0, -1.0, -1.0])
-    flip = {"pose": planar_, "twist": planar_, "object_pose": planar_}
-    flip |= dict.fromkeys(("p_robot_contact", "target", "f_robot"), planar_[:2])
-    turned = {k: getattr(log, k) * sign for k, sign in flip.items() if getattr(log, k) is not None}
+def mirror(log: Log) -> Log:
+    """Return the pushes mirrored at the robot's x axis, y to -y."""
+    signs = np.array([1.0, -1.0, -1.0])
+    flip = {"pose": signs, "twist": signs, "object_pose": signs}
+    flip |= dict.fromkeys(("p_robot_contact", "target", "f_robot"), signs[:2])
+    fields = {k: getattr(log, k) * sign for k, sign in flip.items() if getattr(log, k) is not None}
     signal = None if log.signal is None else log.signal[..., ::-1]
-    return log._replace(**turned, signal=signal)
+    return log._replace(**fields, signal=signal)
 
 
 def statistics(log: Log, interval: float) -> dict[str, np.ndarray]:
-    """Summary statistics (B,) of pushes, by name; NaN where there is nothing to tell.
+    """Return summary statistics (B,) of pushes, by name; NaN where one is undefined.
 
-    A name begins with what it needs besides the pose, contacts and commands: `object_pose/`,
-    `f_robot/` or `signal/`; the others with `base/`.
+    A name starts with the optional field that the statistic needs, `object_pose/`, `f_robot/` or
+    `signal/`; the names of all others start with `base/`.
     """
-    found: dict[str, np.ndarray] = {}
+    columns: dict[str, np.ndarray] = {}
 
     def put(name: str, values: np.ndarray, group: str = "base") -> None:
-        """One column (B,), or several (B, k)."""
+        """Add one column (B,), or several (B, k)."""
         values = np.asarray(values, float)
         for i, column in enumerate(values.reshape(len(values), -1).T):
-            found[f"{group}/{name}_{i}"] = column
+            columns[f"{group}/{name}_{i}"] = column
 
     valid, touch = log.valid, log.valid & (log.contact_type > 0)
     start = log.pose[:, :1]
@@ -269,44 +276,44 @@ def statistics(log: Log, interval: float) -> dict[str, np.ndarray]:
     ):
         put(name, _blocks(values, where))
     put("noise", _log(_jitter(np.concatenate([pose, log.twist], -1), valid)))
-    # What the base did of what it was told, and how much later.
-    told, half = _rotate(pose[..., 2], log.twist), max(1, round(0.5 / interval))
-    way = interval * np.cumsum(told, axis=1)
+    # How well, and with which delay, the base follows the commands.
+    command, half = _rotate(pose[..., 2], log.twist), max(1, round(0.5 / interval))
+    path = interval * np.cumsum(command, axis=1)
     for span in (half, 4 * half):
-        at, both = -pose[:, :-span, 2], valid[:, span:] & valid[:, :-span]
-        did, want, change = (_rotate(at, _over(x, span)) for x in (pose, way, told))
+        angle, both = -pose[:, :-span, 2], valid[:, span:] & valid[:, :-span]
+        motion, expected, change = (_rotate(angle, _over(x, span)) for x in (pose, path, command))
         for axis in range(3):
-            of = slice(axis, axis + 1)
-            heard = np.concatenate([want[..., of], change[..., of]], -1)
-            put(f"follow_{span}_{axis}", _regression(heard, did[..., of], both))
+            row = slice(axis, axis + 1)
+            inputs = np.concatenate([expected[..., row], change[..., row]], -1)
+            put(f"follow_{span}_{axis}", _regression(inputs, motion[..., row], both))
     # How the contact moves on the base.
-    place = log.p_robot_contact
+    contact = log.p_robot_contact
     both = touch[:, half:] & touch[:, :-half] & (_over(np.cumsum(touch, 1), half) == half)
     mean_twist = _over(np.cumsum(log.twist, 1), half) / half
-    put("l_noise", _log(_jitter(place, touch)))
-    put("l_size", _mean(np.abs(place), touch))
+    put("l_noise", _log(_jitter(contact, touch)))
+    put("l_size", _mean(np.abs(contact), touch))
     put("switches", _mean((np.diff(log.contact_type, axis=1) != 0)[..., None], valid[:, 1:]))
     put("first", np.where(touch.any(1), touch.argmax(1), -1) * interval)
     drive = np.concatenate(
-        [mean_twist, place[:, :-half, 1:], np.ones_like(mean_twist[..., :1])], -1
+        [mean_twist, contact[:, :-half, 1:], np.ones_like(mean_twist[..., :1])], -1
     )
-    put("slide", _regression(drive, _over(place, half)[..., 1:] / 0.5, both))
+    put("slide", _regression(drive, _over(contact, half)[..., 1:] / 0.5, both))
     if log.object_pose is not None:
-        thing = log.object_pose
-        seen = _relative(thing, log.pose)
-        turn = seen[..., 2:]
-        whole = np.concatenate([seen, np.cos(turn), np.sin(turn)], -1)
-        put("seen", _blocks(whole, valid), "object_pose")
-        away = np.linalg.norm(seen[..., :2] - place, axis=-1, keepdims=True)
-        put("away", np.column_stack([_mean(away, touch), _rms(away, touch)]), "object_pose")
-        on_it = _rotate(
-            -thing[..., 2], _rotate(log.pose[..., 2], place) + (log.pose - thing)[..., :2]
-        )
-        put("on_it", _blocks(on_it, touch), "object_pose")
-        moved = _rotate(-log.pose[:, :-half, 2], _over(thing, half)) / 0.5
-        arm = place[:, :-half, 1:] - seen[:, :-half, 1:2]
-        pushed = np.concatenate([mean_twist, arm, mean_twist[..., :1] * arm], -1)
-        put("moved", _regression(pushed, moved, both), "object_pose")
+        pose_world = log.object_pose
+        pose_robot = _relative(pose_world, log.pose)
+        yaw = pose_robot[..., 2:]
+        with_yaw = np.concatenate([pose_robot, np.cos(yaw), np.sin(yaw)], -1)
+        put("seen", _blocks(with_yaw, valid), "object_pose")
+        distance = np.linalg.norm(pose_robot[..., :2] - contact, axis=-1, keepdims=True)
+        spread = np.column_stack([_mean(distance, touch), _rms(distance, touch)])
+        put("away", spread, "object_pose")
+        offset = _rotate(log.pose[..., 2], contact) + (log.pose - pose_world)[..., :2]
+        p_object_contact = _rotate(-pose_world[..., 2], offset)
+        put("on_it", _blocks(p_object_contact, touch), "object_pose")
+        velocity = _rotate(-log.pose[:, :-half, 2], _over(pose_world, half)) / 0.5
+        arm = contact[:, :-half, 1:] - pose_robot[:, :-half, 1:2]
+        inputs = np.concatenate([mean_twist, arm, mean_twist[..., :1] * arm], -1)
+        put("moved", _regression(inputs, velocity, both), "object_pose")
     if log.f_robot is not None:
         force = log.f_robot
         felt = touch & (np.linalg.norm(force, axis=-1) > 0)
@@ -328,28 +335,28 @@ def statistics(log: Log, interval: float) -> dict[str, np.ndarray]:
         highest = np.sort(np.where(valid[..., None], log.signal, 0.0), -1)[..., -4:]
         put("highest", _blocks(np.arcsinh(highest[..., -1:]), touch), "signal")
         put("reach", _quantiles(highest[..., -1], touch), "signal")
-    return found
+    return columns
 
 
 def _rotate(angle: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Vectors (..., 2) turned by angles (...), whatever follows their first two numbers."""
+    """Rotate the first two entries of vectors (..., k) by angles (...)."""
     c, s = np.cos(angle), np.sin(angle)
     x, y = c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]
     return np.concatenate([np.stack([x, y], -1), v[..., 2:]], -1)
 
 
 def _relative(pose: np.ndarray, frame: np.ndarray) -> np.ndarray:
-    """Poses (..., 3) as seen from others."""
+    """Return poses (..., 3) relative to frames (..., 3)."""
     return _rotate(-frame[..., 2], pose - frame)
 
 
 def _over(values: np.ndarray, span: int) -> np.ndarray:
-    """Change over `span` samples."""
+    """Return the change over `span` samples."""
     return values[:, span:] - values[:, :-span]
 
 
 def _mean(values: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Mean over time (B, k) of (B, T, k), where it holds; NaN where it never does."""
+    """Return the mean over time (B, k) of (B, T, k) where the mask is true; NaN if it never is."""
     count = where.sum(1)[:, None]
     total = np.where(where[..., None], values, 0.0).sum(1)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
@@ -364,32 +371,32 @@ def _log(values: np.ndarray) -> np.ndarray:
 
 
 def _jitter(values: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Standard deviation (B, k) of white noise on smooth values, by second differences."""
+    """Return the standard deviation (B, k) of white noise, from second differences."""
     second = values[:, 2:] - 2 * values[:, 1:-1] + values[:, :-2]
     return _rms(second / np.sqrt(6), where[:, 2:] & where[:, 1:-1] & where[:, :-2])
 
 
 def _blocks(values: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Means (B, blocks * k) over equal shares of the time."""
+    """Return means (B, blocks * k) over equal shares of the time."""
     cuts = np.linspace(0, values.shape[1], _BLOCKS + 1).astype(int)
     parts = [_mean(values[:, a:b], where[:, a:b]) for a, b in pairwise(cuts)]
     return np.concatenate(parts, -1)
 
 
 def _quantiles(values: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Quantiles (B, 5) over time, where it holds."""
-    kept = np.where(where, values, np.nan)
-    kept[~where.any(1)] = 0.0
-    return np.nanquantile(kept, [0.05, 0.25, 0.5, 0.75, 0.95], axis=1).T
+    """Return quantiles (B, 5) over time, where the mask is true."""
+    masked = np.where(where, values, np.nan)
+    masked[~where.any(1)] = 0.0
+    return np.nanquantile(masked, [0.05, 0.25, 0.5, 0.75, 0.95], axis=1).T
 
 
 def _regression(x: np.ndarray, y: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Ridge coefficients (B, k * m) of y (B, T, m) on x (B, T, k), and residuals (B, m)."""
+    """Return ridge coefficients (B, k * m) of y (B, T, m) on x (B, T, k), and residuals (B, m)."""
     x, y = np.where(where[..., None], x, 0.0), np.where(where[..., None], y, 0.0)
     count = np.maximum(where.sum(1), 1)[:, None, None]
     scale = np.sqrt((x**2).sum(1) / count[:, 0]) + 1e-4
     x = x / scale[:, None]
     gram = np.einsum("btk,btl->bkl", x, x) / count + 1e-3 * np.eye(x.shape[-1])
     slope = np.linalg.solve(gram, np.einsum("btk,btm->bkm", x, y) / count)
-    left = _log(_rms(y - np.einsum("btk,bkm->btm", x, slope), where))
-    return np.concatenate([(slope / scale[..., None]).reshape(len(x), -1), left], -1)
+    residual = _log(_rms(y - np.einsum("btk,bkm->btm", x, slope), where))
+    return np.concatenate([(slope / scale[..., None]).reshape(len(x), -1), residual], -1)

@@ -1,9 +1,10 @@
-"""A lean neural posterior over a unit cube: what simulated worlds say of those that were observed.
+"""Neural posterior of the coordinates of a world in the unit cube, given statistics of its log.
 
-The density of each coordinate, given statistics and the coordinates before it, is a histogram whose
-heights a small network gives, so that a flat one is the prior. Networks are trained on pairs of
-coordinates and statistics by the logarithm of that density, until it no longer rises on pairs that
-are kept apart, and several are averaged. (Papamakarios and Murray 2016; autoregressive in bins.)
+The density of each coordinate, given the statistics and the previous coordinates, is a histogram.
+A small network returns the heights of its bins; a flat histogram is the prior. The networks are
+trained on pairs of coordinates and statistics to maximise the log density, until it stops rising
+on validation pairs. The densities of several networks are averaged. (Papamakarios and Murray 2016;
+autoregressive in bins.)
 """
 
 from functools import partial
@@ -20,25 +21,29 @@ _MEMBERS = 3
 _BATCH = 256
 _EPOCHS = 40
 _NOISE = 0.03  # of the statistics' spread, added in training
-# What each observation after the first counts, since the networks' own errors multiply, too: found
-# in worlds for validation, see `sweeps/fit`.
-_FURTHER = 0.6
-_PATIENCE = 8  # epochs without a better density before training ends
+# Weight of each observation after the first, below 1 because errors of the networks multiply;
+# tuned in worlds for validation, see `sweeps/fit`.
+_NEXT_WEIGHT = 0.6
+_PATIENCE = 8  # epochs without a better density before training stops
+
+Params = dict[str, Any]  # weights of a network: arrays, and tuples of arrays, by name
 
 
 class Posterior(NamedTuple):
-    """Trained networks, (members, ...) each, with the scale of what they see."""
+    """Trained networks with leaves (members, ...), and the scale of their inputs."""
 
     mean: np.ndarray  # (F,)
     scale: np.ndarray  # (F,)
-    params: Any
+    params: Params
 
-    def seen(self, statistics: np.ndarray) -> np.ndarray:
-        """Statistics (n, F) as the networks see them; what is not known is 0."""
+    def inputs(self, statistics: np.ndarray) -> np.ndarray:
+        """Return the inputs (n, F) of the networks: scaled statistics, 0 where one is NaN."""
         return np.clip(np.nan_to_num((statistics - self.mean) / self.scale), -6, 6)
 
 
-def _init(key: jax.Array, features: int, size: int) -> Any:
+def _init(key: jax.Array, features: int, size: int) -> Params:
+    """Return random weights of a network for `size` coordinates."""
+
     def layer(key: jax.Array, fan: int, *shape: int) -> jax.Array:
         return jax.random.normal(key, shape) / np.sqrt(fan)
 
@@ -47,31 +52,32 @@ def _init(key: jax.Array, features: int, size: int) -> Any:
         "trunk": [
             (layer(k, n, n, w), jnp.zeros(w)) for k, n in ((keys[0], features), (keys[1], w))
         ],
-        "seen": layer(keys[2], w, w, size, h),
-        "before": layer(keys[3], size, size, size, h),  # of coordinates, on later ones
+        "inputs": layer(keys[2], w, w, size, h),
+        "previous": layer(keys[3], size, size, size, h),  # from coordinates to later ones
         "bias": jnp.zeros((size, h)),
         "out": (0.01 * layer(keys[4], h, size, h, BINS), jnp.zeros((size, BINS))),
     }
 
 
-def _trunk(params: Any, x: jax.Array) -> jax.Array:
+def _trunk(params: Params, x: jax.Array) -> jax.Array:
+    """Return the hidden units (n, W) of inputs (n, F)."""
     for w, b in params["trunk"]:
         x = jax.nn.silu(x @ w + b)
     return x
 
 
 def _mask(size: int) -> np.ndarray:
-    """Which coordinates (size, size, 1) come before which."""
+    """Return the mask (size, size, 1) of pairs whose first coordinate precedes the second."""
     return np.triu(np.ones((size, size), np.float32), 1)[..., None]
 
 
-def _loss(params: Any, x: jax.Array, u: jax.Array, key: jax.Array | None = None) -> jax.Array:
-    """Mean over (n) of minus the log density of u (n, D) against the prior's."""
-    if key is not None:  # noise keeps the networks from learning worlds by heart
+def _loss(params: Params, x: jax.Array, u: jax.Array, key: jax.Array | None = None) -> jax.Array:
+    """Return the mean negative log density of u (n, D), relative to the prior."""
+    if key is not None:  # noise against overfitting
         x = x + _NOISE * jax.random.normal(key, x.shape)
     size = u.shape[-1]
-    before = (params["before"] * _mask(size)).reshape(size, -1)
-    hidden = _trunk(params, x) @ params["seen"].reshape(_WIDTH, -1) + (2 * u - 1) @ before
+    previous = (params["previous"] * _mask(size)).reshape(size, -1)
+    hidden = _trunk(params, x) @ params["inputs"].reshape(_WIDTH, -1) + (2 * u - 1) @ previous
     hidden = jax.nn.silu(hidden.reshape(-1, *params["bias"].shape) + params["bias"])
     out, bias = params["out"]
     shares = jax.nn.log_softmax(jnp.einsum("ndh,dhk->ndk", hidden, out) + bias)
@@ -80,88 +86,96 @@ def _loss(params: Any, x: jax.Array, u: jax.Array, key: jax.Array | None = None)
 
 
 def train(u: np.ndarray, statistics: np.ndarray, seed: int = 0) -> Posterior:
-    """Train on worlds at `u` (n, D) of the cube with statistics (n, m, F), each seen in m ways."""
+    """Train on worlds at `u` (n, D) in the cube, with m versions of their statistics (n, m, F)."""
     rng = np.random.default_rng(seed)
     count, ways, features = statistics.shape
     flat = statistics.reshape(-1, features)
     mean, scale = np.nanmean(flat, 0), np.nanstd(flat, 0) + 1e-6
-    empty = Posterior(np.nan_to_num(mean), np.nan_to_num(scale, nan=1.0), None)
-    x = empty.seen(flat).reshape(count, ways, features).astype(np.float32)
-    order, kept = rng.permutation(count), max(2, count // 10)
-    apart = (
-        jnp.asarray(x[order[:kept]].reshape(-1, features)),
-        jnp.asarray(np.repeat(u[order[:kept]], ways, 0)),
+    untrained = Posterior(np.nan_to_num(mean), np.nan_to_num(scale, nan=1.0), {})
+    x = untrained.inputs(flat).reshape(count, ways, features).astype(np.float32)
+    order, held_out = rng.permutation(count), max(2, count // 10)
+    validation = (
+        jnp.asarray(x[order[:held_out]].reshape(-1, features)),
+        jnp.asarray(np.repeat(u[order[:held_out]], ways, 0)),
     )
-    own, uo = x[order[kept:]].reshape(-1, features), np.repeat(u[order[kept:]], ways, 0)
-    size, steps = len(own), max(1, len(own) // _BATCH)
+    inputs = x[order[held_out:]].reshape(-1, features)
+    targets = np.repeat(u[order[held_out:]], ways, 0)
+    size, steps = len(inputs), max(1, len(inputs) // _BATCH)
     schedule = optax.cosine_decay_schedule(2e-3, _EPOCHS * steps, 0.02)
     optimiser = optax.adamw(schedule, weight_decay=1e-2)
     init = partial(_init, features=features, size=u.shape[-1])
-    own, uo = jnp.asarray(own), jnp.asarray(uo, jnp.float32)
+    inputs, targets = jnp.asarray(inputs), jnp.asarray(targets, jnp.float32)
 
     @jax.jit
-    def epoch(params: Any, state: Any, key: jax.Array) -> Any:
-        def one(carry: Any, step: Any) -> Any:
+    def epoch(
+        params: Params, state: optax.OptState, key: jax.Array
+    ) -> tuple[Params, optax.OptState, jax.Array]:
+        def update(
+            carry: tuple[Params, optax.OptState], step: tuple[jax.Array, jax.Array]
+        ) -> tuple[tuple[Params, optax.OptState], None]:
             params, state = carry
             rows, key = step
-            grad = jax.grad(_loss)(params, own[rows], uo[rows], key)
+            grad = jax.grad(_loss)(params, inputs[rows], targets[rows], key)
             change, state = optimiser.update(grad, state, params)
             return (optax.apply_updates(params, change), state), None
 
         shuffled = jax.random.permutation(key, size)[: steps * _BATCH].reshape(steps, -1)
         keys = jax.random.split(key, steps)
-        (params, state), _ = jax.lax.scan(one, (params, state), (shuffled, keys))
-        return params, state, _loss(params, *apart)
+        (params, state), _ = jax.lax.scan(update, (params, state), (shuffled, keys))
+        return params, state, _loss(params, *validation)
 
     members = []
     for member in range(_MEMBERS):
         key = jax.random.PRNGKey(seed * _MEMBERS + member)
         params = best = init(key)
-        state, least, since = optimiser.init(params), np.inf, 0
-        for number in range(_EPOCHS):
-            params, state, loss = epoch(params, state, jax.random.fold_in(key, number))
-            since += 1
+        state, least, stalled = optimiser.init(params), np.inf, 0
+        for index in range(_EPOCHS):
+            params, state, loss = epoch(params, state, jax.random.fold_in(key, index))
+            stalled += 1
             if float(loss) < least:
-                best, least, since = params, float(loss), 0
-            if since >= _PATIENCE:
+                best, least, stalled = params, float(loss), 0
+            if stalled >= _PATIENCE:
                 break
         members.append(best)
-    return empty._replace(params=jax.tree.map(lambda *leaves: jnp.stack(leaves), *members))
+    return untrained._replace(params=jax.tree.map(lambda *leaves: jnp.stack(leaves), *members))
 
 
 def sample(posterior: Posterior, statistics: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
-    """Points (count, D) of the posterior, given all of several observations (m, F) of one world.
+    """Sample points (count, D) of the posterior, given several observations (m, F) of one world.
 
-    The prior is flat, so that the densities of observations multiply. Each coordinate is drawn from
-    the product over observations given those before it, and weighed by its sum.
+    The prior is flat, so the densities of the observations multiply. Each coordinate is drawn from
+    this product, given the previous coordinates; the points are then resampled by its sum.
     """
-    x = jnp.asarray(posterior.seen(statistics), jnp.float32)
-    return np.asarray(_drawn(posterior.params, x, jax.random.PRNGKey(seed), count))
+    x = jnp.asarray(posterior.inputs(statistics), jnp.float32)
+    return np.asarray(_draw(posterior.params, x, jax.random.PRNGKey(seed), count))
 
 
 @partial(jax.jit, static_argnames="count")
-def _drawn(params: Any, x: jax.Array, key: jax.Array, count: int) -> jax.Array:
-    seen = jax.vmap(_trunk, (0, None))(params, x)  # (members, m, W)
-    power = (1 + _FURTHER * (len(x) - 1)) / len(x)  # of each density in the product
+def _draw(params: Params, x: jax.Array, key: jax.Array, count: int) -> jax.Array:
+    """Draw points (count, D) of the posterior of the inputs (m, F)."""
+    units = jax.vmap(_trunk, (0, None))(params, x)  # (members, m, W)
+    power = (1 + _NEXT_WEIGHT * (len(x) - 1)) / len(x)  # of each density in the product
     size = params["bias"].shape[1]
-    before = params["before"] * _mask(size)
+    previous = params["previous"] * _mask(size)
 
-    def one(d: Any, carry: Any) -> Any:
+    def draw_coordinate(
+        d: jax.Array, carry: tuple[jax.Array, jax.Array]
+    ) -> tuple[jax.Array, jax.Array]:
         u, key = carry
-        key, pick, within, again = jax.random.split(key, 4)
-        known = jnp.einsum("cj,ejh->ech", 2 * u - 1, before[:, :, d]) + params["bias"][:, None, d]
-        hidden = jnp.einsum("emw,ewh->emh", seen, params["seen"][:, :, d])
+        key, key_bin, key_value, key_rows = jax.random.split(key, 4)
+        known = jnp.einsum("cj,ejh->ech", 2 * u - 1, previous[:, :, d]) + params["bias"][:, None, d]
+        hidden = jnp.einsum("emw,ewh->emh", units, params["inputs"][:, :, d])
         hidden = jax.nn.silu(hidden[:, :, None] + known[:, None])  # (members, m, count, H)
         out, bias = (x[:, d] for x in params["out"])
-        each = jnp.einsum("emch,ehk->emck", hidden, out) + bias[:, None, None]
-        each = jax.nn.log_softmax(each)
-        log = jax.nn.logsumexp(each, 0) - jnp.log(len(each)) + jnp.log(BINS)
+        logits = jnp.einsum("emch,ehk->emck", hidden, out) + bias[:, None, None]
+        shares = jax.nn.log_softmax(logits)
+        log = jax.nn.logsumexp(shares, 0) - jnp.log(len(shares)) + jnp.log(BINS)
         product = power * jnp.sum(log, 0) - jnp.log(BINS)
-        bins = jax.random.categorical(pick, product)
-        value = (bins + jax.random.uniform(within, (count,))) / BINS
+        bins = jax.random.categorical(key_bin, product)
+        value = (bins + jax.random.uniform(key_value, (count,))) / BINS
         weight = jax.nn.logsumexp(product, -1)
         u = u.at[:, d].set(jnp.clip(value, 0, 1 - 1e-6))
-        chosen = jax.random.categorical(again, weight, shape=(count,))
-        return jnp.where(x.shape[0] > 1, u[chosen], u), key
+        rows = jax.random.categorical(key_rows, weight, shape=(count,))
+        return jnp.where(x.shape[0] > 1, u[rows], u), key
 
-    return jax.lax.fori_loop(0, size, one, (jnp.zeros((count, size)), key))[0]
+    return jax.lax.fori_loop(0, size, draw_coordinate, (jnp.zeros((count, size)), key))[0]

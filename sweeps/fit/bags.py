@@ -65,7 +65,7 @@ class Bagged(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
         law, period = registry.law_of(self.params), self.setting.physics.control_period
         bank = fit.Bank(self.ranges, law, self.params, self.setting, self.window, period)
         learned = bank.worlds(self.worlds, run)
-        names = fit.chosen(learned, _HAS)
+        names = fit.statistic_names(learned, _HAS)
         held = bank.worlds(self.logs, run, "test")
         bags = run.checkpoint("bags", partial(self._bags, bank, names))
         seen = learned.sel(statistic=names)
@@ -100,7 +100,7 @@ class Bagged(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
                 path = Path(folder) / f"{world}.mcap"
                 rps_jax.replay(run=swept, world=world, bag=path)
                 given = logs.read(path, self.ranges.robot.shell)
-                log = logs.on_clock(given, bank.interval, bank.window)
+                log = logs.resample(given, bank.interval, bank.window)
                 found.append(fit.matrix(logs.statistics(log, bank.interval), names)[0])
         return xr.Dataset({"statistics": (("log", "statistic"), np.stack(found))})
 

@@ -104,7 +104,7 @@ class Coverage(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dat
         return whole
 
     def _learned(self, kind: str, learned: xr.Dataset, run: Run) -> tuple[Any, list[str]]:
-        names = fit.chosen(learned, KINDS.get(kind, ()))
+        names = fit.statistic_names(learned, KINDS.get(kind, ()))
         if tuple(names) not in self._networks:
             set_phase(run.callback, f"learn from {kind}")
             one = learned.sel(statistic=names)
