@@ -66,7 +66,7 @@ WRONG = {
     "has no number for pose in row 7": put("yaw", np.nan, 7),
     "has a gap of 2 s at": lambda r, h: (np.delete(r, np.s_[100:199], 0), h),
     "its time must rise": put("time", 0.0, 9),
-    r"has a row every 20 s: give seconds": scaled("time", 1e3),
+    r"has a row every 20 s: give the time in seconds": scaled("time", 1e3),
     "lasts 1.9 s: it must last 5 s": lambda rows, head: (rows[:95], head),
     r"twist up to 50: write v_x and v_y \[m/s\]": scaled("v_x", 1e3),
     "a pose that jumps": scaled("x", 1e3),
@@ -92,7 +92,7 @@ def test_what_is_no_log_of_this_robot_is_refused_before_anything_compiles(
     ("arguments", "message"),
     [
         (("nowhere.csv",), "give a trace, a run folder of rps push, FILE.csv or FILE.mcap"),
-        (("log.csv", "--law", "aps"), "fit knows laws that sense touch"),
+        (("log.csv", "--law", "aps"), "fit needs a law that senses touch"),
         (("log.csv", "--engine", "quasistatic"), "choose fused"),
         (("log.csv", "--robot", "mpo_500"), "it is of another robot"),
     ],
@@ -251,7 +251,7 @@ def test_a_log_is_fitted_from_the_shell(tmp_path, capsys, optimised):
     assert rps(*ask, "--physics", "default,timestep=0.01", "--out", tmp_path / "run") == 0
     told = capsys.readouterr().out
     assert "undetermined" in told
-    assert "nothing here holds" in told  # no world gives such a log: its object never slides
+    assert "this fit is invalid" in told  # no world gives such a log: its object never slides
     found = domains.parse_domain(str(tmp_path / "run" / "fitted.json"))
     assert found.objects == ("random_box",)
     assert (tmp_path / "run" / "marginals.png").stat().st_size > 10_000
