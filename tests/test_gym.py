@@ -106,7 +106,7 @@ def test_who_arrives_is_terminated_and_begins_anew_in_the_next_step(several):
 def test_or_at_once_where_that_is_asked_for(several):
     _, rewards, ended, *_ = to_the_end(several)
     envs = many(autoreset_mode="SameStep")
-    for name in ("_begin", "_act", "_pick"):  # whose programs are compiled
+    for name in ("_start", "_act", "_select"):  # whose programs are compiled
         setattr(envs.unwrapped, name, getattr(several.unwrapped, name))
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     seen, same, terminated, _, told = to_the_end(envs)

@@ -497,9 +497,9 @@ def test_an_easier_world_has_its_target_nearer_and_more_ahead():
     world = jax.tree.map(lambda leaf: leaf[0], env.table)._replace(
         p_world_target=jnp.array([0.0, 2.0])
     )
-    half = rollout.eased(world, jnp.array(0.5)).p_world_target
+    half = rollout.ease(world, jnp.array(0.5)).p_world_target
     np.testing.assert_allclose(half, 1.4 * np.array([1, 1]) / np.sqrt(2), rtol=1e-6)
-    np.testing.assert_array_equal(rollout.eased(world, jnp.array(1.0)).p_world_target, [0.0, 2.0])
+    np.testing.assert_array_equal(rollout.ease(world, jnp.array(1.0)).p_world_target, [0.0, 2.0])
 
 
 def test_rewards_of_what_the_law_is_not_told():

@@ -1,4 +1,4 @@
-"""Pushing as an environment of Gymnasium, alone or many worlds at once in the batched engine.
+"""Gymnasium environments of pushing: one world, or many worlds in one program.
 
     import gymnasium
     import rps_jax.trials.gym  # registers rps_jax/Push-v0
@@ -6,7 +6,7 @@
     env = gymnasium.make("rps_jax/Push-v0", object="random_cylinder")
     envs = gymnasium.make_vec("rps_jax/Push-v0", num_envs=64, domain="wide,mass=3:10")
 
-Both step a `PushEnv`, whose options they take by name: object, setting, robot, params, weights and
+Both step a `PushEnv` and accept its options by name: object, setting, robot, params, weights and
 worlds. `gymnasium.make("rps_jax.trials.gym:rps_jax/Push-v0")` needs no second import.
 """
 
@@ -35,16 +35,16 @@ except ImportError as error:
 _SEEDS = 2**31
 
 
-def _carry_out(
+def _hold_action(
     env: PushEnv, steps: int, state: State, action: jax.Array
 ) -> tuple[State, jax.Array]:
-    """Carry out an action (3,) for so many control steps; returns the sum of the rewards, too."""
+    """Hold an action (3,) for `steps` control steps; return the state and the sum of rewards."""
 
-    def one(carry: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], None]:
-        after = env.step(carry[0], action)
-        return (after, carry[1] + after.reward), None
+    def step(carry: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], None]:
+        state = env.step(carry[0], action)
+        return (state, carry[1] + state.reward), None
 
-    return jax.lax.scan(one, (state, jnp.zeros_like(state.reward)), length=steps)[0]
+    return jax.lax.scan(step, (state, jnp.zeros_like(state.reward)), length=steps)[0]
 
 
 class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -52,17 +52,17 @@ class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Observation, Box (T + 2,) float32: the T taxels of the robot, the paper's 42, in the order of
     `Shell.taxels`, each the filtered relative change of its capacitance [1]; then the target (x, y)
-    [m] in the robot's frame (x ahead, y to the left), by odometry.
+    [m] in the robot frame (x ahead, y to the left), by odometry.
 
     Action, Box (3,) float32 within -1 and 1: the twist (v_x, v_y, omega) in the robot's frame, in
-    units of v_max [m/s], v_max and omega_max [rad/s] of `params`. It is carried out for `hold` [s].
+    units of v_max [m/s], v_max and omega_max [rad/s] of `params`. It is held for `hold` [s].
 
     Reward [1]: `weights`, a `Reward` of `rps_jax.trials.env`; by default that of `rps learn`.
 
-    Terminated: the object arrived, or fell over, or the physics diverged. Truncated: the time of
-    the rules was over, or the object was out of touch for longer than they allow.
+    Terminated: the object arrived or fell over, or the physics diverged. Truncated: a time limit of
+    the rules was reached, for the trial or for the time without contact.
 
-    Info: `is_success`, `time` [s] since the start, `in_contact`, and `world`, its number.
+    Info: `is_success`, `time` [s] since the start, `in_contact`, and `world`, its index.
 
     Raises:
       InputError: an option that `PushEnv` does not allow, a `hold` shorter than a control period,
@@ -89,21 +89,21 @@ class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin in a world by chance, which the seed decides on; `options` are not used."""
+        """Start in a random world, which depends on the seed; `options` are ignored."""
         super().reset(seed=seed)
-        self._vector.begin(self.np_random)
-        seen, _, _, told = self._vector.seen()
-        return seen[0], {name: values[0].item() for name, values in told.items()}
+        self._vector.start(self.np_random)
+        obs, _, _, info = self._vector.observe()
+        return obs[0], {name: values[0].item() for name, values in info.items()}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Carry out an action (3,)."""
+        """Execute an action (3,)."""
         rewards = self._vector.act(np.asarray(action)[None])
-        seen, terminated, truncated, told = self._vector.seen()
-        info = {name: values[0].item() for name, values in told.items()}
-        return seen[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
+        obs, terminated, truncated, infos = self._vector.observe()
+        info = {name: values[0].item() for name, values in infos.items()}
+        return obs[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def render(self) -> Any:
-        """Image (240, 320, 3) uint8 of now, in the mode rgb_array."""
+        """Return an image (240, 320, 3) uint8 in the mode rgb_array, else None."""
         return self._vector.images()[0] if self.render_mode == "rgb_array" else None
 
 
@@ -135,10 +135,10 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.num_envs = errors.check_count("num_envs", num_envs, at_most=1_000_000)
         modes = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
         mode = str(getattr(autoreset_mode, "value", autoreset_mode))
-        errors.check_name("autoreset_mode", mode, [one.value for one in modes])
-        given: dict[str, Any] = {"weights": SHAPED_REWARD} | options
+        errors.check_name("autoreset_mode", mode, [allowed.value for allowed in modes])
+        options = {"weights": SHAPED_REWARD} | options
         self.render_mode = render_mode
-        self.push_env = PushEnv(domain=domains.parse_domain(domain), **given)
+        self.push_env = PushEnv(domain=domains.parse_domain(domain), **options)
         dt = self.push_env.dt
         hold = errors.check_finite("hold", hold, at_least=0.999 * dt, at_most=1000, unit="s")
         steps = max(1, round(hold / dt))
@@ -151,84 +151,86 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._ended = np.zeros(num_envs, bool)
         self._state: State | None = None
-        self._begin = jax.jit(jax.vmap(self.push_env.reset))
-        self._act = jax.jit(jax.vmap(partial(_carry_out, self.push_env, steps)))
-        self._pick = jax.jit(jax.vmap(soft.tree_where))
+        self._start = jax.jit(jax.vmap(self.push_env.reset))
+        self._act = jax.jit(jax.vmap(partial(_hold_action, self.push_env, steps)))
+        self._select = jax.jit(jax.vmap(soft.tree_where))
 
-    def begin(self, random: np.random.Generator, where: np.ndarray | None = None) -> None:
-        """Begin in other worlds by chance: in all, or where a mask (num_envs,) says so."""
+    def start(self, random: np.random.Generator, where: np.ndarray | None = None) -> None:
+        """Start random worlds, all of them or those of a mask (num_envs,)."""
         keys = jax.random.split(jax.random.key(int(random.integers(_SEEDS))), self.num_envs)
-        fresh = self._begin(keys)
-        self._state = fresh if where is None else self._pick(where, fresh, self._state)
+        started = self._start(keys)
+        self._state = started if where is None else self._select(where, started, self._state)
 
     def act(self, actions: Any) -> np.ndarray:
-        """Carry out actions (num_envs, 3); returns the rewards (num_envs,). What is done stays."""
+        """Execute actions (num_envs, 3) in running trials; return the rewards (num_envs,)."""
         actions = np.asarray(actions, np.float32)
         shape = (self.num_envs, self.push_env.action_size)
         if actions.shape != shape or not np.isfinite(actions).all():
-            told = actions.tolist() if actions.shape == shape else f"of shape {actions.shape}"
+            value = actions.tolist() if actions.shape == shape else f"of shape {actions.shape}"
             raise errors.InputError(
-                f"action = {told} is not allowed: it must be finite, of shape {shape}."
+                f"action = {value} is not allowed: it must be finite, of shape {shape}."
             )
         self._state, rewards = self._act(self._state, actions)
         return np.asarray(rewards, float)
 
-    def seen(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-        """Observations (num_envs, T + 2), what is terminated and truncated, and more, by name."""
-        assert self._state is not None, "reset comes first"
+    def observe(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """Return observations (num_envs, T + 2), terminated and truncated flags, and infos."""
+        assert self._state is not None, "call reset first"
         data, metrics = self._state.data, self._state.metrics
         ended = np.array(data.success | data.tipped | data.diverged)
-        more = {
+        infos = {
             "is_success": data.success, "time": data.steps * self.push_env.dt,
             "in_contact": metrics["in_contact"] > 0, "world": self._state.info["index"],
         }  # fmt: skip
-        told = {name: np.array(values) for name, values in more.items()}
+        infos = {name: np.array(values) for name, values in infos.items()}
         done = np.array(data.done)
-        return np.array(self._state.obs, np.float32), done & ended, done & ~ended, told
+        return np.array(self._state.obs, np.float32), done & ended, done & ~ended, infos
 
     def images(self) -> list[np.ndarray]:
-        """Images (240, 320, 3) uint8."""
-        each = [jax.tree.map(lambda leaf, i=i: leaf[i], self._state) for i in range(self.num_envs)]
-        return self.push_env.render(each)
+        """Return an image (240, 320, 3) uint8 of each world."""
+        states = [
+            jax.tree.map(lambda leaf, i=i: leaf[i], self._state) for i in range(self.num_envs)
+        ]
+        return self.push_env.render(states)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin in worlds by chance, which the seed decides on; `options` are not used."""
+        """Start in random worlds, which depend on the seed; `options` are ignored."""
         super().reset(seed=seed)
-        self.begin(self.np_random)
+        self.start(self.np_random)
         self._ended[:] = False
-        seen, _, _, told = self.seen()
-        return seen, self._masked(told, ~self._ended)
+        obs, _, _, infos = self.observe()
+        return obs, self._with_masks(infos, ~self._ended)
 
     def step(
         self, actions: Any
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Carry out actions (num_envs, 3)."""
+        """Execute actions (num_envs, 3)."""
         same = self.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-        rewards = self.act(actions)  # 0 where a trial had ended, which stays as it was
+        rewards = self.act(actions)  # 0 for trials that had ended
         if not same and self._ended.any():
-            self.begin(self.np_random, self._ended)
-        seen, terminated, truncated, told = self.seen()
-        self._ended, more = terminated | truncated, {}
+            self.start(self.np_random, self._ended)
+        obs, terminated, truncated, infos = self.observe()
+        self._ended, final = terminated | truncated, {}
         if same and self._ended.any():
             last = np.full(self.num_envs, None, object)
             for i in np.flatnonzero(self._ended):
-                last[i] = seen[i]
-            more = {"final_obs": last, "final_info": self._masked(told, self._ended)}
-            self.begin(self.np_random, self._ended)
-            seen, _, _, told = self.seen()
-        whole = self._masked(told, np.ones(self.num_envs, bool)) | self._masked(more, self._ended)
-        return seen, rewards, terminated, truncated, whole
+                last[i] = obs[i]
+            final = {"final_obs": last, "final_info": self._with_masks(infos, self._ended)}
+            self.start(self.np_random, self._ended)
+            obs, _, _, infos = self.observe()
+        infos = self._with_masks(infos, np.ones(self.num_envs, bool))
+        return obs, rewards, terminated, truncated, infos | self._with_masks(final, self._ended)
 
     def render(self) -> Any:
-        """Images (240, 320, 3) uint8 of now, one of each world, in the mode rgb_array."""
+        """Return an image (240, 320, 3) uint8 of each world in the mode rgb_array, else None."""
         return tuple(self.images()) if self.render_mode == "rgb_array" else None
 
     @staticmethod
-    def _masked(told: Mapping[str, Any], where: np.ndarray) -> dict[str, Any]:
-        """Infos, each with the mask of the worlds that have it."""
-        return dict(told) | {f"_{name}": where.copy() for name in told}
+    def _with_masks(infos: Mapping[str, Any], where: np.ndarray) -> dict[str, Any]:
+        """Return infos, each with the mask of the worlds that have it."""
+        return dict(infos) | {f"_{name}": where.copy() for name in infos}
 
 
 if "rps_jax/Push-v0" not in gymnasium.registry:

@@ -29,11 +29,11 @@ Scores = Callable[[jax.Array, Any], jax.Array]
 
 
 class Estimate(NamedTuple):
-    """A gradient as the mean of independent samples."""
+    """Gradient as the mean of independent samples, with its variance."""
 
     gradient: jax.Array  # (p, ...) 0 where no sample is finite
-    variance: jax.Array  # (p, ...) of the gradient, not of a sample; inf of fewer than two samples
-    finite: jax.Array  # (p, ...) [1] share of the samples that are finite; the others were dropped
+    variance: jax.Array  # (p, ...) of the mean; inf for fewer than two samples
+    finite: jax.Array  # (p, ...) [1] share of the samples that are finite and used
 
 
 def estimate(samples: jax.Array, clip: float = jnp.inf) -> Estimate:
@@ -42,19 +42,19 @@ def estimate(samples: jax.Array, clip: float = jnp.inf) -> Estimate:
     A sample whose norm over p exceeds `clip` times the median norm is scaled down to that bound.
     This biases the mean but keeps a few samples from dominating it.
     """
-    there = jnp.isfinite(samples)
-    samples = jnp.where(there, samples, 0.0)
+    is_finite = jnp.isfinite(samples)
+    samples = jnp.where(is_finite, samples, 0.0)
     if clip < jnp.inf:
         size = planar.norm(jnp.moveaxis(samples, 1, -1))[:, None]
-        # Of the worlds that have a gradient at all: some trials have ended.
-        most = clip * jnp.nan_to_num(jnp.nanmedian(jnp.where(size > 0, size, jnp.nan), axis=0))
-        samples = samples * jnp.minimum(1.0, most / jnp.where(size > 0, size, 1.0))
-    count = jnp.sum(there, axis=0)
+        # The median of the worlds with a gradient; trials that have ended have none.
+        bound = clip * jnp.nan_to_num(jnp.nanmedian(jnp.where(size > 0, size, jnp.nan), axis=0))
+        samples = samples * jnp.minimum(1.0, bound / jnp.where(size > 0, size, 1.0))
+    count = jnp.sum(is_finite, axis=0)
     mean = jnp.sum(samples, axis=0) / jnp.maximum(count, 1)
-    squares = jnp.sum(jnp.where(there, (samples - mean) ** 2, 0.0), axis=0)
+    squares = jnp.sum(jnp.where(is_finite, (samples - mean) ** 2, 0.0), axis=0)
     variance = squares / jnp.maximum(count - 1, 1) / jnp.maximum(count, 1)
     return Estimate(
-        mean, jnp.where(count > 1, variance, jnp.inf), jnp.mean(there, axis=0, dtype=mean.dtype)
+        mean, jnp.where(count > 1, variance, jnp.inf), jnp.mean(is_finite, axis=0, dtype=mean.dtype)
     )
 
 
@@ -92,10 +92,10 @@ def window(
         params = jax.vmap(params_of)(thetas)
 
         @partial(jax.checkpoint, prevent_cse=False)  # in reverse, memory of one state a step
-        def one(trials: Trial, _: None) -> tuple[Trial, Snapshot]:
+        def step(trials: Trial, _: None) -> tuple[Trial, Snapshot]:
             return trial.control_step(stage, worlds, params, trials, loop)
 
-        _, seen = jax.lax.scan(one, trials, length=steps)
-        return jax.vmap(cost, in_axes=1)(seen)
+        _, snapshots = jax.lax.scan(step, trials, length=steps)
+        return jax.vmap(cost, in_axes=1)(snapshots)
 
     return scores

@@ -1,15 +1,15 @@
-"""Rollouts for PPO: many worlds in which the policy pushes, beginning anew as their trials end.
+"""Rollouts for PPO: the policy pushes in many worlds, and worlds restart when their trials end.
 
-One update is one program: every world of every environment takes some actions, each of which is
-carried out for several control steps; then `ppo` updates the network.
+One update is one program. Every world of every environment takes several actions, each of them
+held for several control steps; then `ppo` updates the network.
 
-Curriculum: targets come from nearer and from more ahead, until the share of successes at a level
-is reached; then the level rises, up to the domain's own targets.
+Curriculum: at a low level targets are near and ahead. The level rises when enough trials succeed,
+up to the targets of the domain.
 """
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from rps_jax import errors
 from rps_jax.control import soft
 from rps_jax.control.learned import features
 from rps_jax.control.learned import network as networks
+from rps_jax.control.learned.features import TouchState
 from rps_jax.control.learned.network import Network, PolicyState, Weights
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
@@ -28,60 +29,62 @@ from rps_jax.trials.trial import World
 from rps_jax.tuning import ppo as ppo_
 from rps_jax.tuning.ppo import PPO, TrainState, Transition
 
+ActCarry = tuple[State, TouchState, jax.Array]  # states, touch states, rewards (N,)
+
 
 class EnvBatch(NamedTuple):
-    """Worlds of one environment under way; leaves (N, ...)."""
+    """Running worlds of one environment; leaves (N, ...)."""
 
     states: State
     memory: PolicyState
-    first: jax.Array  # (N,) bool: the trial has just begun
+    first: jax.Array  # (N,) bool: the trial has just started
     earned: jax.Array  # (N,) [1] rewards of the trial so far
 
 
 class EpisodeStats(NamedTuple):
-    """How trials ended, and the time in contact: of worlds (N,), or sums over them."""
+    """Counts of ended trials and of actions in contact: of worlds (N,), or sums over them."""
 
-    ended: jax.Array  # () trials
-    won: jax.Array  # () of these
-    tipped: jax.Array  # () of these: the object fell over
-    lost: jax.Array  # () of these: without contact for too long
-    earned: jax.Array  # () [1] rewards of these
+    ended: jax.Array  # () trials that ended
+    succeeded: jax.Array  # () trials that ended with success
+    tipped: jax.Array  # () trials that ended because the object fell over
+    lost: jax.Array  # () trials that ended without contact for too long
+    earned: jax.Array  # () [1] rewards of the trials that ended
     touching: jax.Array  # () actions that ended in contact
 
 
 class RunnerState(NamedTuple):
-    """All of a learning run that changes from update to update."""
+    """State of a learning run between two updates."""
 
     train: TrainState
     level: jax.Array  # () [1] of the curriculum
-    ended: jax.Array  # () recent trials, of late ones more
-    won: jax.Array  # () recent successes
+    ended: jax.Array  # () trials that ended, with exponentially decaying weights
+    succeeded: jax.Array  # () successes, with the same weights
     key: jax.Array
     batches: tuple[EnvBatch, ...]
 
 
 def network_of(ppo: PPO, envs: Sequence[PushEnv]) -> Network:
-    """The network for these environments, whose skins must have as many taxels."""
+    """Return the network for these environments; their skins must have equally many taxels."""
     counts = {env.observation_size - 2 for env in envs}
     if len(counts) > 1:
         raise errors.InputError(
-            f"domains with skins of {sorted(counts)} taxels are not allowed: learn in one of them."
+            f"domains with skins of {sorted(counts)} taxels are not allowed: learn in one domain."
         )
     return Network(ppo.network, ppo.width, counts.pop(), ppo.hold).check()
 
 
-def begin(
+def start(
     ppo: PPO, network: Network, envs: Sequence[PushEnv], tables: Sequence[World], *, seed: int = 0
 ) -> RunnerState:
-    """State before the first update, with every trial at a moment of its own."""
-    key, first, *own = jax.random.split(jax.random.PRNGKey(seed), 2 + len(envs))
+    """Return the state before the first update, with every trial at a random time."""
+    key, first, *keys = jax.random.split(jax.random.PRNGKey(seed), 2 + len(envs))
     level = jnp.asarray(ppo.level, float)
     batches = []
-    for env, table, one in zip(envs, tables, own, strict=True):
-        one, late = jax.random.split(one)
-        batch = _anew(network, env, table, level, one, ppo.num_envs)
-        most = int(float(env.setting.rules.horizon) / env.dt)
-        steps = jax.random.randint(late, (ppo.num_envs,), 0, most)
+    for env, table, env_key in zip(envs, tables, keys, strict=True):
+        env_key, time_key = jax.random.split(env_key)
+        batch = _restart(network, env, table, level, env_key, ppo.num_envs)
+        horizon_steps = int(float(env.setting.rules.horizon) / env.dt)
+        steps = jax.random.randint(time_key, (ppo.num_envs,), 0, horizon_steps)
         states = batch.states.replace(data=batch.states.data._replace(steps=steps))
         batches.append(batch._replace(states=states))
     zero = jnp.zeros(())
@@ -89,8 +92,8 @@ def begin(
     return RunnerState(train, level, zero, zero, key, tuple(batches))
 
 
-def eased(world: World, level: jax.Array) -> World:
-    """The world with its target nearer and more ahead: at a level of 1 it is its own."""
+def ease(world: World, level: jax.Array) -> World:
+    """Return a world with a nearer target, more ahead; unchanged at a level of 1."""
     x, y = world.p_world_target
     distance, bearing = jnp.hypot(x, y), level * jnp.arctan2(y, x)
     near = jnp.minimum(distance, 0.8)  # [m] outside robot and object
@@ -99,80 +102,81 @@ def eased(world: World, level: jax.Array) -> World:
     return world._replace(p_world_target=jnp.where(level < 1, target, world.p_world_target))
 
 
-def _anew(
+def _restart(
     network: Network, env: PushEnv, table: World, level: jax.Array, key: jax.Array, count: int
 ) -> EnvBatch:
-    """Random worlds at their start: one in five of a lower level, while there is a lower one."""
+    """Return random worlds at their start; one in five has a random lower level, below level 1."""
 
-    def one(key: jax.Array) -> tuple[State, PolicyState]:
-        which, noise, lower = jax.random.split(key, 3)
-        index = jax.random.randint(which, (), 0, env.worlds)
-        u = jax.random.uniform(lower)
-        own = jnp.where((u < 0.2) & (level < 1), 5 * u, 1.0) * level
-        world = eased(rows(table, index), own)
-        state = env.begin(world._replace(key=jax.random.key_data(noise)), index)
-        return state, _first_felt(network, state)
+    def start_world(key: jax.Array) -> tuple[State, PolicyState]:
+        index_key, noise_key, level_key = jax.random.split(key, 3)
+        index = jax.random.randint(index_key, (), 0, env.worlds)
+        u = jax.random.uniform(level_key)
+        world_level = jnp.where((u < 0.2) & (level < 1), 5 * u, 1.0) * level
+        world = ease(rows(table, index), world_level)
+        state = env.begin(world._replace(key=jax.random.key_data(noise_key)), index)
+        return state, _first_state(network, state)
 
-    states, memory = jax.vmap(one)(jax.random.split(key, count))
+    states, memory = jax.vmap(start_world)(jax.random.split(key, count))
     return EnvBatch(states, memory, jnp.ones(count, bool), jnp.zeros(count))
 
 
-def _first_felt(network: Network, state: State) -> PolicyState:
-    """State of the law after its first observation."""
+def _first_state(network: Network, state: State) -> PolicyState:
+    """Return the state of the law after its first observation."""
     memory = PolicyState.init(network, state.obs.dtype)
     return memory._replace(touch_state=memory.touch_state.update(state.info["observation"]))
 
 
 def _private(env: PushEnv, state: State) -> jax.Array:
-    """Inputs (P,) of the value function alone: the object's place and size, the time left."""
+    """Return the privileged inputs (P,): position and size of the object, remaining time."""
     data, world, rules = state.data, state.info["world"], env.setting.rules
-    place, _ = trial.object_pose(data.qpos)
-    p_robot_object = planar.rotate(-data.qpos[2], place - data.qpos[:2])
-    left = 1 - data.steps * env.dt / rules.horizon
+    p_world_object, _ = trial.object_pose(data.qpos)
+    p_robot_object = planar.rotate(-data.qpos[2], p_world_object - data.qpos[:2])
+    remaining = 1 - data.steps * env.dt / rules.horizon
     lost = data.lost_steps * env.dt / jnp.maximum(rules.max_lost, 1.0)
-    numbers = [*jnp.clip(p_robot_object, -3, 3), fp.circumradius(world.footprint) / 0.3, left, lost]
-    return jnp.stack(numbers)
+    radius = fp.circumradius(world.footprint) / 0.3
+    return jnp.stack([*jnp.clip(p_robot_object, -3, 3), radius, remaining, lost])
 
 
-def _seen(env: PushEnv, batch: EnvBatch) -> tuple[jax.Array, jax.Array]:
-    """Inputs of the network (N, F), and those of the value function alone (N, P)."""
-    memory, seen = batch.memory, batch.states.info["observation"]
-    obs = jax.vmap(features.compute_features)(memory.touch_state, memory.action, seen)
-    return obs, jax.vmap(partial(_private, env))(batch.states)
+def _inputs(env: PushEnv, batch: EnvBatch) -> tuple[jax.Array, jax.Array]:
+    """Return the inputs of the network (N, F) and the privileged inputs (N, P)."""
+    memory, obs = batch.memory, batch.states.info["observation"]
+    inputs = jax.vmap(features.compute_features)(memory.touch_state, memory.action, obs)
+    return inputs, jax.vmap(partial(_private, env))(batch.states)
 
 
-def carry_out(
+def act(
     env: PushEnv, network: Network, batch: EnvBatch, hidden: jax.Array, action: jax.Array
 ) -> tuple[EnvBatch, jax.Array]:
-    """Carry out an action (N, 3) of each world; returns the batch and the rewards (N,)."""
+    """Execute an action (N, 3) in each world; return the batch and the rewards (N,)."""
     bounded = features.clip_action(action)
-    felt = jax.vmap(type(batch.memory.touch_state).mark_decision)(
+    touch_state = jax.vmap(type(batch.memory.touch_state).mark_decision)(
         batch.memory.touch_state, batch.states.info["observation"]
     )
-    update = jax.vmap(type(felt).update)
+    update = jax.vmap(type(touch_state).update)
 
-    def one(carry: Any, _: None) -> tuple[Any, None]:
-        states, felt, reward = carry
+    def step(carry: ActCarry, _: None) -> tuple[ActCarry, None]:
+        states, touch_state, reward = carry
         states = jax.vmap(env.step)(states, bounded)
-        return (states, update(felt, states.info["observation"]), reward + states.reward), None
+        touch_state = update(touch_state, states.info["observation"])
+        return (states, touch_state, reward + states.reward), None
 
-    begun = batch.states, felt, jnp.zeros_like(batch.earned)
+    carry = batch.states, touch_state, jnp.zeros_like(batch.earned)
     steps = round(network.hold / env.dt)
-    (states, felt, reward), _ = jax.lax.scan(one, begun, length=steps)
-    memory = batch.memory._replace(touch_state=felt, hidden=hidden, action=bounded)
+    (states, touch_state, reward), _ = jax.lax.scan(step, carry, length=steps)
+    memory = batch.memory._replace(touch_state=touch_state, hidden=hidden, action=bounded)
     earned = batch.earned + reward
     return EnvBatch(states, memory, jnp.zeros_like(batch.first), earned), reward
 
 
-def _verdict(env: PushEnv, batch: EnvBatch) -> tuple[EpisodeStats, jax.Array]:
-    """Statistics of the trials that have ended, and which of them are terminated (N,) bool.
+def _episode_stats(env: PushEnv, batch: EnvBatch) -> tuple[EpisodeStats, jax.Array]:
+    """Return statistics of the trials that have ended, and whether each is terminated (N,).
 
-    A trial that ran out of time, or of time without contact, is truncated: it could have gone on.
+    A trial that reached a time limit, with or without contact, is truncated and not terminated.
     """
     data = batch.states.data
     stats = EpisodeStats(
         ended=data.done,
-        won=data.success,
+        succeeded=data.success,
         tipped=data.tipped,
         lost=data.done & (data.lost_steps * env.dt > env.setting.rules.max_lost),
         earned=jnp.where(data.done, batch.earned, 0.0),
@@ -181,7 +185,7 @@ def _verdict(env: PushEnv, batch: EnvBatch) -> tuple[EpisodeStats, jax.Array]:
     return stats, data.done & (data.success | data.tipped | data.diverged)
 
 
-def _act(
+def _take_action(
     ppo: PPO,
     network: Network,
     envs: Sequence[PushEnv],
@@ -190,35 +194,39 @@ def _act(
     carry: tuple[tuple[EnvBatch, ...], jax.Array],
     _: None,
 ) -> tuple[tuple[tuple[EnvBatch, ...], jax.Array], tuple[Transition, EpisodeStats]]:
-    """Take one action in all worlds; returns its transition, and statistics of ended trials."""
+    """Take one action in all worlds; return its transition and statistics of ended trials."""
     batches, key = carry
-    key, noise, *starts = jax.random.split(key, 2 + len(envs))
+    key, noise_key, *start_keys = jax.random.split(key, 2 + len(envs))
     weights, count = runner.train.weights, ppo.num_envs
 
-    def together(parts: Sequence[jax.Array]) -> jax.Array:
+    def join(parts: Sequence[jax.Array]) -> jax.Array:
         return jnp.concatenate(list(parts))
 
-    seen = [_seen(env, batch) for env, batch in zip(envs, batches, strict=True)]
-    obs, private = (together(parts) for parts in zip(*seen, strict=True))
-    before = together([batch.memory.hidden for batch in batches])
-    first = together([batch.first for batch in batches])
-    hidden, mean = network.apply(weights["actor"], before, obs)
-    noise = jax.random.normal(noise, mean.shape, mean.dtype)
+    inputs = [_inputs(env, batch) for env, batch in zip(envs, batches, strict=True)]
+    obs, private = (join(parts) for parts in zip(*inputs, strict=True))
+    previous_hidden = join([batch.memory.hidden for batch in batches])
+    first = join([batch.first for batch in batches])
+    hidden, mean = network.apply(weights["actor"], previous_hidden, obs)
+    noise = jax.random.normal(noise_key, mean.shape, mean.dtype)
     action = mean + jnp.exp(weights["log_std"]) * noise
-    went, after, rewards = [], [], []
+    next_batches, next_inputs, rewards = [], [], []
     for i, (env, batch) in enumerate(zip(envs, batches, strict=True)):
-        own = slice(i * count, (i + 1) * count)
-        batch, reward = carry_out(env, network, batch, hidden[own], action[own])
-        went.append(batch)
-        after.append(_seen(env, batch))
+        worlds = slice(i * count, (i + 1) * count)
+        batch, reward = act(env, network, batch, hidden[worlds], action[worlds])
+        next_batches.append(batch)
+        next_inputs.append(_inputs(env, batch))
         rewards.append(reward)
-    pairs = ppo_.critic_inputs(*(together(parts) for parts in zip(*after, strict=True)))
-    verdicts = [_verdict(env, batch) for env, batch in zip(envs, went, strict=True)]
-    stats, terminated = jax.tree.map(lambda *parts: together(parts), *verdicts)
-    pick = jax.vmap(soft.tree_where)
-    begun = tuple(
-        pick(batch.states.data.done, _anew(network, env, table, runner.level, at, count), batch)
-        for env, table, at, batch in zip(envs, tables, starts, went, strict=True)
+    pairs = ppo_.critic_inputs(*(join(parts) for parts in zip(*next_inputs, strict=True)))
+    verdicts = [_episode_stats(env, batch) for env, batch in zip(envs, next_batches, strict=True)]
+    stats, terminated = jax.tree.map(lambda *parts: join(parts), *verdicts)
+    select = jax.vmap(soft.tree_where)
+    restarted = tuple(
+        select(
+            batch.states.data.done,
+            _restart(network, env, table, runner.level, start_key, count),
+            batch,
+        )
+        for env, table, start_key, batch in zip(envs, tables, start_keys, next_batches, strict=True)
     )
     steps = Transition(
         obs,
@@ -228,11 +236,11 @@ def _act(
         ppo_.log_prob(action, mean, weights["log_std"]),
         networks.critic(weights["critic"], ppo_.critic_inputs(obs, private)),
         networks.critic(weights["critic"], pairs),
-        together(rewards),
+        join(rewards),
         stats.ended,
         terminated,
     )
-    return (begun, key), (steps, jax.tree.map(jnp.sum, stats))
+    return (restarted, key), (steps, jax.tree.map(jnp.sum, stats))
 
 
 def update(
@@ -242,19 +250,19 @@ def update(
     tables: Sequence[World],
     runner: RunnerState,
 ) -> tuple[RunnerState, dict[str, jax.Array]]:
-    """Make one update; returns the state after it, and the update's metrics () for the curve.
+    """Make one update; return the next state and the update's metrics () for the curve.
 
-    Each of `envs` is of one shape of object and domain. Their worlds, `tables`, are data and no
-    constants of the program.
+    Each of `envs` has one shape of object and one domain. Their worlds, `tables`, are inputs and
+    not constants of the program.
     """
     hidden = jnp.concatenate([batch.memory.hidden for batch in runner.batches])
-    key, own, passes = jax.random.split(runner.key, 3)
-    act = partial(_act, ppo, network, envs, tables, runner)
-    carry = runner.batches, own
-    (batches, _), (steps, every) = jax.lax.scan(act, carry, length=ppo.num_steps)
-    stats = jax.tree.map(jnp.sum, every)
-    train, kl = ppo_.update_policy(ppo, network, runner.train, passes, hidden, steps)
-    learned = runner._replace(train=train, key=key, batches=batches)
+    key, action_key, update_key = jax.random.split(runner.key, 3)
+    take_action = partial(_take_action, ppo, network, envs, tables, runner)
+    carry = runner.batches, action_key
+    (batches, _), (steps, step_stats) = jax.lax.scan(take_action, carry, length=ppo.num_steps)
+    stats = jax.tree.map(jnp.sum, step_stats)
+    train, kl = ppo_.update_policy(ppo, network, runner.train, update_key, hidden, steps)
+    updated = runner._replace(train=train, key=key, batches=batches)
     metrics = stats._asdict() | {
         "touching": stats.touching / steps.reward.size,
         "level": runner.level,
@@ -264,46 +272,47 @@ def update(
         "learning_rate": runner.train.learning_rate,
         "spread": jnp.exp(jnp.mean(runner.train.weights["log_std"])),
     }
-    return _graded(ppo, learned, stats.ended, stats.won), metrics
+    return _raise_level(ppo, updated, stats), metrics
 
 
-def _graded(ppo: PPO, runner: RunnerState, ended: jax.Array, won: jax.Array) -> RunnerState:
-    """Raise the level of the curriculum, if enough trials succeed; they are then counted anew."""
-    ended, won = 0.9 * runner.ended + ended, 0.9 * runner.won + won
+def _raise_level(ppo: PPO, runner: RunnerState, stats: EpisodeStats) -> RunnerState:
+    """Raise the level of the curriculum if enough trials succeed, and then halve their counts."""
+    ended = 0.9 * runner.ended + stats.ended
+    succeeded = 0.9 * runner.succeeded + stats.succeeded
     worlds = ppo.num_envs * len(runner.batches)
-    up = (ended > 0.2 * worlds) & (won > ppo.enough * ended) & (runner.level < 1)
+    up = (ended > 0.2 * worlds) & (succeeded > ppo.enough * ended) & (runner.level < 1)
     level = jnp.where(up, jnp.minimum(runner.level + 0.05, 1.0), runner.level)
-    ended, won = (jnp.where(up, 0.5 * x, x) for x in (ended, won))
-    return runner._replace(level=level, ended=ended, won=won)
+    ended, succeeded = (jnp.where(up, 0.5 * x, x) for x in (ended, succeeded))
+    return runner._replace(level=level, ended=ended, succeeded=succeeded)
 
 
 def rollout(network: Network, env: PushEnv, table: World, actor: Weights) -> State:
-    """Push in the worlds of an environment by the policy, noiseless; return their last states."""
+    """Push by the policy without noise in all worlds of an environment; return the last states."""
 
-    def one(index: jax.Array) -> tuple[State, PolicyState]:
+    def start_world(index: jax.Array) -> tuple[State, PolicyState]:
         state = env.begin(rows(table, index), index)
-        return state, _first_felt(network, state)
+        return state, _first_state(network, state)
 
-    states, memory = jax.vmap(one)(jnp.arange(env.worlds))
+    states, memory = jax.vmap(start_world)(jnp.arange(env.worlds))
     batch = EnvBatch(states, memory, jnp.ones(env.worlds, bool), jnp.zeros(env.worlds))
 
-    def on(batch: EnvBatch) -> EnvBatch:
-        obs, _ = _seen(env, batch)
+    def step(batch: EnvBatch) -> EnvBatch:
+        obs, _ = _inputs(env, batch)
         hidden, mean = network.apply(actor, batch.memory.hidden, obs)
-        return carry_out(env, network, batch, hidden, mean)[0]
+        return act(env, network, batch, hidden, mean)[0]
 
-    def some_run(batch: EnvBatch) -> jax.Array:
+    def any_running(batch: EnvBatch) -> jax.Array:
         return ~jnp.all(batch.states.data.done)
 
-    return jax.lax.while_loop(some_run, on, batch).states
+    return jax.lax.while_loop(any_running, step, batch).states
 
 
 def evaluate_policy(
     network: Network, envs: Sequence[PushEnv], tables: Sequence[World], actor: Weights
 ) -> tuple[jax.Array, jax.Array]:
-    """Success (N,) bool and time (N,) [s] of the law in all worlds, one environment by one."""
-    each = [
+    """Return success (N,) bool and time (N,) [s] of the law in all worlds of all environments."""
+    trials = [
         rollout(network, env, table, actor).data for env, table in zip(envs, tables, strict=True)
     ]
-    steps = [data.steps * env.dt for data, env in zip(each, envs, strict=True)]
-    return jnp.concatenate([data.success for data in each]), jnp.concatenate(steps)
+    steps = [data.steps * env.dt for data, env in zip(trials, envs, strict=True)]
+    return jnp.concatenate([data.success for data in trials]), jnp.concatenate(steps)
