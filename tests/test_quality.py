@@ -32,7 +32,7 @@ def test_the_measures_by_hand():
         "reverse": estimates([[4.0, 0.0], [0.0, 2.0]], variance=0.5, finite=0.75),
         "forward": estimates([[-1.0, 0.0], [-3.0, 0.0]]),
     }
-    judged = gradients.judged(results, ("reverse", "forward")).isel(horizon=0)
+    judged = gradients.compare(results, ("reverse", "forward")).isel(horizon=0)
     reverse, forward = (judged.sel(estimator=name) for name in ("reverse", "forward"))
     cosines = [float(reverse[f"{kind}cosine"]) for kind in ("", "least_", "greatest_")]
     assert cosines == [0.5, 0, 1]
@@ -42,7 +42,7 @@ def test_the_measures_by_hand():
     assert float(forward.cosine) == -1
     assert float(forward.bias) == pytest.approx(2.0)
     assert float(judged.doubt) == pytest.approx(0.1)  # sqrt(0.02 + 0.02) / 2
-    rows = gradients.table(gradients.judged(results, ("reverse", "forward")))
+    rows = gradients.table(gradients.compare(results, ("reverse", "forward")))
     assert rows[1][:3] == ["reverse", "cosine", "0.50"]
     assert len(rows) == 1 + 2 * 4 + 1
 
@@ -74,13 +74,13 @@ SMALL = Gradients(
 def test_a_study_resumes_and_refuses_other_options(tmp_path, monkeypatch):
     """The quasi-static model compiles fastest."""
     names = []
-    measured = gradients._measured
+    measured = gradients._measure
 
     def recorded(study, name, results):
         names.append(name)
         return measured(study, name, results)
 
-    monkeypatch.setattr(gradients, "_measured", recorded)
+    monkeypatch.setattr(gradients, "_measure", recorded)
     results = replace(SMALL, out=tmp_path)()
     xr.testing.assert_identical(results, replace(SMALL, out=tmp_path)())
     assert names == ["truth", "evolution"]  # each ran once

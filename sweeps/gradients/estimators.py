@@ -1,6 +1,6 @@
-"""Estimators of a gradient that only this study and notebook 05 compare.
+"""Gradient estimators of this study and of notebook 05, for comparison with reverse mode.
 
-`rps_jax.tuning.gradients` defines scores, `Estimate` and the reverse-mode estimator.
+`rps_jax.tuning.gradients` defines scores, `Estimate` and the estimator `reverse`.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,16 +20,16 @@ from rps_jax.tuning.gradients import Estimate, Scores, estimate, per_world, wind
 
 
 def forward(scores: Scores, theta: jax.Array, worlds: Any, *, clip: float = jnp.inf) -> Estimate:
-    """By forward-mode differentiation in each world: p times the work of the scores.
+    """Estimate the gradient by forward-mode differentiation in each world.
 
-    `clip` is that of `estimate`. It passes through the solvers of MJX (with a pyramidal cone) and
-    of the fused engine.
+    The cost is p evaluations of the scores. `clip` is that of `estimate`. Forward mode passes
+    through the solver loops of the fused engine and of MJX (with a pyramidal cone).
     """
     thetas = per_world(theta, worlds)
 
     def along(direction: jax.Array) -> jax.Array:
-        each = jnp.broadcast_to(direction, thetas.shape)
-        return jax.jvp(lambda t: scores(t, worlds), (thetas,), (each,))[1]
+        tangents = jnp.broadcast_to(direction, thetas.shape)
+        return jax.jvp(lambda t: scores(t, worlds), (thetas,), (tangents,))[1]
 
     return estimate(jax.vmap(along, out_axes=1)(jnp.eye(theta.size, dtype=theta.dtype)), clip)
 
@@ -37,16 +37,16 @@ def forward(scores: Scores, theta: jax.Array, worlds: Any, *, clip: float = jnp.
 def differences(
     scores: Scores, theta: jax.Array, worlds: Any, *, step: float | jax.Array
 ) -> Estimate:
-    """By central differences in each world: 2 p n scores.
+    """Estimate the gradient by central differences in each world, from 2 p n scores.
 
-    A `step` is () or (p,), in the units of theta.
+    The `step` is () or (p,), in the units of theta.
     """
     n, p = per_world(theta, worlds).shape
     steps = jnp.repeat(jnp.diag(jnp.broadcast_to(jnp.asarray(step, theta.dtype), p)), n, axis=0)
     thetas = theta + jnp.concatenate([steps, -steps])
-    found = scores(thetas, _repeated(worlds, 2 * p))
-    rises = -jnp.diff(found.reshape(2, p, n, *found.shape[1:]), axis=0)[0]
-    width = jnp.reshape(2 * jnp.asarray(step), (-1,) + (1,) * found.ndim)
+    values = scores(thetas, _repeat(worlds, 2 * p))
+    rises = -jnp.diff(values.reshape(2, p, n, *values.shape[1:]), axis=0)[0]
+    width = jnp.reshape(2 * jnp.asarray(step), (-1,) + (1,) * values.ndim)
     return estimate(jnp.swapaxes(rises / width, 0, 1))
 
 
@@ -59,11 +59,11 @@ def evolution(
     sigma: float | jax.Array,
     pairs: int = 1,
 ) -> Estimate:
-    """By differences between opposite random steps: of the mean score smoothed by `sigma`.
+    """Estimate the gradient of the mean score, smoothed by `sigma`, by antithetic random steps.
 
-    Each world tries `pairs` normal directions of its own, each both ways, and both in the same
-    world: 2 pairs n scores. Without bias it is the gradient of E[score(theta + sigma e)], which
-    exists even where scores jump. `sigma`, () or (p,), is in the units of theta.
+    Each world tries `pairs` random normal directions and their opposites: 2 pairs n scores. The
+    estimate of the gradient of E[score(theta + sigma e)] is unbiased, and this gradient exists even
+    where scores jump. `sigma`, () or (p,), is in the units of theta.
 
     Reference: Nesterov and Spokoiny, "Random gradient-free minimization of convex functions",
     Foundations of Computational Mathematics 17, 2017.
@@ -71,28 +71,28 @@ def evolution(
     n, p = per_world(theta, worlds).shape
     directions = jax.random.normal(key, (pairs, n, p), theta.dtype)
     steps = jnp.concatenate([directions, -directions]) * sigma
-    found = scores(theta + steps.reshape(-1, p), _repeated(worlds, 2 * pairs))
-    rises = -jnp.diff(found.reshape(2, pairs, n, 1, *found.shape[1:]), axis=0)[0]
+    values = scores(theta + steps.reshape(-1, p), _repeat(worlds, 2 * pairs))
+    rises = -jnp.diff(values.reshape(2, pairs, n, 1, *values.shape[1:]), axis=0)[0]
     along = directions / (2 * sigma)
-    slopes = rises * along.reshape(*along.shape, *(1,) * (found.ndim - 1))
+    slopes = rises * along.reshape(*along.shape, *(1,) * (values.ndim - 1))
     return estimate(jnp.mean(slopes, axis=0))
 
 
-def combine(one: Estimate, other: Estimate) -> Estimate:
-    """Two independent estimates of one gradient, weighted by their inverse variances.
+def combine(a: Estimate, b: Estimate) -> Estimate:
+    """Return the mean of two independent estimates, weighted by their inverse variances.
 
-    Entry by entry. Of all weighted means this has the least variance, if the variances are right;
-    an estimate that knows nothing (of infinite variance) has no weight.
+    Each entry is weighted separately. This mean has the least variance of all weighted means, if
+    the variances are correct. An estimate with infinite variance has no weight.
     """
-    total = one.variance + other.variance
-    weight = jnp.where(total > 0, other.variance / jnp.where(total > 0, total, 1.0), 0.5)
-    weight = jnp.where(jnp.isinf(other.variance), 1.0, weight)
-    weight = jnp.where(jnp.isinf(one.variance), 0.0, weight)  # of `one`
-    certain = jnp.minimum(one.variance, other.variance)
+    total = a.variance + b.variance
+    weight = jnp.where(total > 0, b.variance / jnp.where(total > 0, total, 1.0), 0.5)  # of a
+    weight = jnp.where(jnp.isinf(b.variance), 1.0, weight)
+    weight = jnp.where(jnp.isinf(a.variance), 0.0, weight)
+    least = jnp.minimum(a.variance, b.variance)
     return Estimate(
-        weight * one.gradient + (1 - weight) * other.gradient,
-        jnp.where(jnp.isinf(total), certain, weight * one.variance),
-        weight * one.finite + (1 - weight) * other.finite,
+        weight * a.gradient + (1 - weight) * b.gradient,
+        jnp.where(jnp.isinf(total), least, weight * a.variance),
+        weight * a.finite + (1 - weight) * b.finite,
     )
 
 
@@ -102,16 +102,16 @@ def distances(
     horizons: Sequence[float],
     setting: Setting = Setting(engine="quasistatic"),
 ) -> tuple[Scores, Any]:
-    """How far from their targets pushes are after some times, under the smooth law.
+    """Return the distances of pushes from their targets after several times, under the smooth law.
 
     Args:
-      cases: pushes of one kind and one law, RPS or RPS+, with smooth skins.
+      cases: pushes of one shape family and one law, RPS or RPS+, with smooth skins.
       params_of: parameters from theta (p,), differentiable.
       horizons: the times (H,) [s], in order.
-      setting: what the pushes share; its engine has derivatives.
+      setting: setting of the pushes; its engine has derivatives.
 
     Returns:
-      Scores (n, H) [m], compiled when first called, and the worlds that they take.
+      Scores (n, H) [m], compiled at the first call, and their worlds.
 
     Example:
       >>> from rps_jax import RPSParams
@@ -122,23 +122,23 @@ def distances(
       >>> space = Space(("K_h", "L"))
       >>> ahead = Case("box", "S1", (1.0, 1.0), skin=SmoothSkin(), gap=0.0)
       >>> scores, worlds = estimators.distances([ahead], space.params, [0.2, 0.4])
-      >>> found = estimators.forward(scores, space.vector(RPSParams.paper()), worlds)
-      >>> found.gradient.shape
+      >>> estimate = estimators.forward(scores, space.vector(RPSParams.paper()), worlds)
+      >>> estimate.gradient.shape
       (2, 2)
     """
     part = pushes.build(cases, setting)
     law = registry.smooth_law(registry.law_of(cases[0].params))
     at = np.round(np.asarray(horizons) / setting.physics.control_period).astype(int)
 
-    def left(seen: Snapshot) -> jax.Array:
-        return seen.details.distance[at]
+    def remaining(snapshots: Snapshot) -> jax.Array:
+        return snapshots.details.distance[at]
 
     loop = ControlLoop(setting.physics, law=law)
-    scores = jax.jit(window(part.stage, params_of, left, loop, int(at[-1]) + 1))
+    scores = jax.jit(window(part.stage, params_of, remaining, loop, int(at[-1]) + 1))
     start = trial.start_all(part.worlds, part.params, np.ones(len(cases), bool), law=law)
     return scores, (part.worlds, start)
 
 
-def _repeated(worlds: Any, times: int) -> Any:
+def _repeat(worlds: Any, times: int) -> Any:
     """Repeat worlds (n, ...) several times, (times n, ...)."""
     return jax.tree.map(lambda x: jnp.concatenate([x] * times), worlds)

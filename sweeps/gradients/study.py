@@ -1,8 +1,8 @@
-"""How good is a gradient? Each estimator against finite differences, by the time simulated.
+"""Compare gradient estimators with finite differences, as a function of the simulated time.
 
-What is differentiated is the mean, over random worlds of one kind, of the distance from contact to
-target that is left after a time. The truth is of the hard law and skin: central differences in
-thousands of worlds, all of them met by both sides. What an estimator softens is its bias.
+The score is the distance from contact to target after a time, averaged over random worlds of one
+object. The reference (`truth`) is the gradient of the original law and skin by central differences
+in thousands of worlds. The smoothing of an estimator shows as bias.
 
     rps sweeps/gradients --quick
 """
@@ -50,9 +50,9 @@ ESTIMATORS = ("reverse", "clipped", "forward", "evolution", "combined")
 
 @dataclass(frozen=True)
 class Gradients(Study[xr.Dataset]):
-    """Tell how good the gradient of each estimator is, after how many seconds of simulation.
+    """Compare gradient estimators with finite differences after several simulated times.
 
-    The answer holds, by (estimator, horizon), the cosine to finite differences, bias, standard
+    The answer has, by (estimator, horizon), the cosine to finite differences, bias, standard
     error, and the share of finite derivatives.
     """
 
@@ -75,78 +75,78 @@ class Gradients(Study[xr.Dataset]):
     tuned: tuple[str, ...] = ("beta", "K_h", "K_v", "L")
     """Parameters to differentiate by: names, or logistic, or full."""
     horizons: tuple[float, ...] = option((0.5, 2.0, 8.0, 30.0, 100.0, 300.0), 0.1, 300, unit="s")
-    """Times after which the distance is looked at [s]."""
+    """Times at which the distance is measured [s]."""
     worlds: int = option(64, 2, 1_000_000)
     """Number of worlds of one estimate."""
     repeats: int = option(4, 2, 1_000_000)
-    """Number of estimates, each in worlds of its own."""
+    """Number of estimates, each in other worlds."""
     truth: int = option(4096, 2, 1_000_000)
     """Number of worlds of the finite differences."""
     delta: float = option(0.05, above=0, at_most=5)
-    """Half a finite difference, in units of the bounded map [1]."""
+    """Step of the central differences, in units of the bounded map [1]."""
     sigma: float = option(0.15, above=0, at_most=5)
-    """Standard deviation of the steps of evolution, likewise [1]."""
+    """Standard deviation of the steps of evolution, in units of the bounded map [1]."""
     clip: float = option(2.0, above=0, at_most=5)
-    """Bound on the norm of a world's gradient, of the estimator clipped, in their medians [1]."""
+    """Bound on the norm of a world's gradient for the estimator clipped, as a multiple of the
+    median norm [1]."""
     engine: EngineName = "fused"
-    """Engine of the truth, of forward mode and of evolution; reverse mode takes the quasi-static
-    one."""
+    """Engine of the truth, of forward and of evolution; reverse uses the quasi-static engine."""
     seed: int = option(0, 0, 2**30)
     """Seed of the worlds."""
     quick: bool = False
-    """Whether to make a small run of minutes: what is not asked for becomes small."""
+    """Whether to make a small run of minutes; explicit options keep their values."""
 
     @functools.cached_property
     def space(self) -> Space:
-        """The parameters that are differentiated by."""
+        """Parameters of the gradient."""
         return Space(expand_subsets(self.tuned))
 
     @property
     def theta(self) -> jax.Array:
-        """Where the gradient is looked for, (p,)."""
+        """Vector (p,) at which the gradient is estimated."""
         return self.space.vector(self.space.base)
 
     def check(self) -> None:
-        """Check the names, and that horizons follow one another."""
+        """Check the names and that the horizons increase."""
         for name in self.estimators:
             errors.check_name("estimator", name, ESTIMATORS)
         errors.check_name("object", self.object, RANDOM)
         if not self.horizons or list(self.horizons) != sorted(set(self.horizons)):
             raise errors.InputError(
-                f"horizons = {self.horizons} is not allowed: give one or more, each longer than "
-                "the one before."
+                f"horizons = {self.horizons} is not allowed: give one or more, in increasing order."
             )
         _ = self.space
 
     @property
-    def wanted(self) -> tuple[str, ...]:
-        """What has to be measured, in turn: the truth first, and what others are made of."""
-        of_both = ("reverse", "evolution") if "combined" in self.estimators else ()
-        return tuple(dict.fromkeys((TRUTH, *of_both, *self.estimators)))
+    def measurements(self) -> tuple[str, ...]:
+        """Names of all measurements in order: truth, the inputs of `combined`, and the rest."""
+        inputs = ("reverse", "evolution") if "combined" in self.estimators else ()
+        return tuple(dict.fromkeys((TRUTH, *inputs, *self.estimators)))
 
     def num_trials(self) -> int | None:
-        """How many measurements there are."""
-        return len(self.wanted)
+        """Number of measurements."""
+        return len(self.measurements)
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Measure the truth and every estimator that the run folder lacks."""
-        found: dict[str, xr.Dataset] = {}
-        for name in self.wanted:
+        """Measure the truth and all estimators that the run folder lacks."""
+        estimates: dict[str, xr.Dataset] = {}
+        for name in self.measurements:
             set_phase(run.callback, name)
-            found[name] = run.checkpoint(name, partial(_measured, self, name, found))
-            run.callback(Progress(len(found), 0.0))
-        return judged(found, self.estimators)
+            compute = partial(_measure, self, name, estimates)
+            estimates[name] = run.checkpoint(name, compute)
+            run.callback(Progress(len(estimates), 0.0))
+        return compare(estimates, self.estimators)
 
     def intro(self, results: xr.Dataset) -> str:
-        """What was asked."""
+        """Return the options in a sentence."""
         return (
-            f"Of the distance that is left after a time, by {', '.join(self.space.names)}, in "
-            f"worlds of {self.object.replace('_', ' ')}; the truth: central differences in "
+            f"Gradients of the remaining distance by {', '.join(self.space.names)}, in worlds of "
+            f"{self.object.replace('_', ' ')}; the truth are central differences in "
             f"{self.truth:,} worlds."
         )
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Cosine, bias and error of each estimator."""
+        """Return cosine, bias and error of each estimator."""
         picture = Picture("gradients", partial(figure_of, results))
         return [Section("Estimators against the truth", "", table(results), picture)]
 
@@ -155,7 +155,7 @@ gradients = call_of(Gradients)
 
 
 def _stage_and_worlds(study: Gradients, engine: EngineName, split: Split, count: int) -> Any:
-    """What worlds share in their engine, the first worlds (count, ...) of a split, and physics."""
+    """Return the stage, the first worlds (count, ...) of a split, and the physics."""
     alone = replace(domains.parse_domain(study.domain), objects=(study.object,))
     setting = Setting(engine=engine)
     drawn = draws.draw(alone, seed_of(study.seed, split), np.arange(count))
@@ -164,16 +164,16 @@ def _stage_and_worlds(study: Gradients, engine: EngineName, split: Split, count:
 
 
 def _distances(study: Gradients, stage: Any, physics: Any, smooth: bool) -> Scores:
-    """Scores (n, H) [m]: the distances after the horizons."""
+    """Return scores (n, H) [m]: the distances at the horizons."""
     period = physics.control_period
     at = np.array([round(time / period) - 1 for time in study.horizons])
     law = registry.smooth_law(rps.LAW) if smooth else rps.LAW
 
-    def left(seen: Snapshot) -> jax.Array:
-        return seen.details.distance[at]
+    def remaining(snapshots: Snapshot) -> jax.Array:
+        return snapshots.details.distance[at]
 
     loop = trial.ControlLoop(physics, law=law)
-    score = window(stage, study.space.params, left, loop, int(at[-1]) + 1)
+    score = window(stage, study.space.params, remaining, loop, int(at[-1]) + 1)
 
     def scores(thetas: jax.Array, worlds: World) -> jax.Array:
         live, params = jnp.ones(thetas.shape[0], bool), jax.vmap(lambda _: RPSParams())(thetas)
@@ -184,44 +184,45 @@ def _distances(study: Gradients, stage: Any, physics: Any, smooth: bool) -> Scor
 
 
 def truth(study: Gradients) -> Estimate:
-    """Finite differences: gradient (p, H) [m], and its variance, by the number of worlds."""
+    """Return the central differences: gradient (p, H) [m] with its variance."""
     stage, worlds, physics = _stage_and_worlds(study, study.engine, "test", study.truth)
     scores = jax.jit(_distances(study, stage, physics, smooth=False))
     return estimators.differences(scores, study.theta, worlds, step=study.delta)
 
 
 def repeats(study: Gradients, name: str) -> Iterator[Estimate]:
-    """Estimates (p, H) by one estimator, in other worlds each."""
+    """Yield estimates (p, H) by one estimator, each in other worlds."""
     engine: EngineName = "quasistatic" if name in ("reverse", "clipped") else study.engine
     smooth = name != "evolution"
     count = study.repeats * study.worlds
     stage, worlds, physics = _stage_and_worlds(study, engine, "tune", count)
     scores = _distances(study, stage, physics, smooth)
-    act: dict[str, Callable[..., Estimate]] = {
+    functions: dict[str, Callable[..., Estimate]] = {
         "reverse": lambda worlds, key: reverse(scores, study.theta, worlds),
         "clipped": lambda worlds, key: reverse(scores, study.theta, worlds, clip=study.clip),
         "forward": lambda worlds, key: estimators.forward(scores, study.theta, worlds),
         "evolution": partial(estimators.evolution, scores, study.theta, sigma=study.sigma),
     }
-    one = jax.jit(act[name])
+    estimator = jax.jit(functions[name])
     if smooth:
         worlds = soften_skins(worlds)
     for r in range(study.repeats):
         rows = slice(r * study.worlds, (r + 1) * study.worlds)
         key = jax.random.fold_in(jax.random.key(study.seed), r)
-        yield one(jax.tree.map(lambda leaf, rows=rows: leaf[rows], worlds), key)
+        yield estimator(jax.tree.map(lambda leaf, rows=rows: leaf[rows], worlds), key)
 
 
-def _measured(study: Gradients, name: str, found: dict[str, xr.Dataset]) -> xr.Dataset:
+def _measure(study: Gradients, name: str, estimates: dict[str, xr.Dataset]) -> xr.Dataset:
+    """Return the repeated estimates of one estimator, or the truth."""
     if name == TRUTH:
         all_of = [truth(study)]
     elif name == "combined":
         pair: Any = [
-            Estimate(*(jnp.asarray(found[n][f].values) for f in Estimate._fields))
+            Estimate(*(jnp.asarray(estimates[n][f].values) for f in Estimate._fields))
             for n in ("reverse", "evolution")
         ]
-        every = jax.vmap(estimators.combine)(*pair)
-        all_of = [jax.tree.map(lambda leaf, r=r: leaf[r], every) for r in range(study.repeats)]
+        combined = jax.vmap(estimators.combine)(*pair)
+        all_of = [jax.tree.map(lambda leaf, r=r: leaf[r], combined) for r in range(study.repeats)]
     else:
         all_of = list(repeats(study, name))
     dims = ("repeat", "parameter", "horizon")
@@ -232,36 +233,36 @@ def _measured(study: Gradients, name: str, found: dict[str, xr.Dataset]) -> xr.D
     )
 
 
-def judged(found: Mapping[str, xr.Dataset], names: Sequence[str]) -> xr.Dataset:
-    """Each estimator beside the truth, (estimator, horizon).
+def compare(estimates: Mapping[str, xr.Dataset], names: Sequence[str]) -> xr.Dataset:
+    """Return the comparison of estimators with the truth, (estimator, horizon).
 
-    cosine: between one estimate and the truth, mean of the repeats, and its range; bias: of their
-    mean, and error: standard deviation of one estimate, both as shares of the truth's norm;
-    finite: share of the worlds' derivatives that are; doubt: standard error of the truth itself,
-    as a share of it.
+    cosine: between one estimate and the truth, mean and range over the repeats; bias: of the mean
+    of the repeats; error: standard deviation of one estimate; finite: share of finite derivatives;
+    doubt: standard error of the truth. Bias, error and doubt are relative to the truth's norm.
     """
-    true = found[TRUTH].isel(repeat=0)
+    true = estimates[TRUTH].isel(repeat=0)
     norm = _norm(true.gradient)
     doubt = np.sqrt(true.variance.sum("parameter")) / norm
     rows = []
     for name in names:
-        one = found[name]
-        along = (one.gradient * true.gradient).sum("parameter")
-        cosine = along / (_norm(one.gradient) * norm)
+        estimate = estimates[name]
+        product = (estimate.gradient * true.gradient).sum("parameter")
+        cosine = product / (_norm(estimate.gradient) * norm)
         rows.append(
             xr.Dataset(
                 {
                     "cosine": cosine.mean("repeat"),
                     "least_cosine": cosine.min("repeat"),
                     "greatest_cosine": cosine.max("repeat"),
-                    "bias": _norm(one.gradient.mean("repeat") - true.gradient) / norm,
-                    "error": np.sqrt(one.variance.sum("parameter").mean("repeat")) / norm,
-                    "finite": one.finite.mean(("repeat", "parameter")),
+                    "bias": _norm(estimate.gradient.mean("repeat") - true.gradient) / norm,
+                    "error": np.sqrt(estimate.variance.sum("parameter").mean("repeat")) / norm,
+                    "finite": estimate.finite.mean(("repeat", "parameter")),
                 }
             ).expand_dims(estimator=[name])
         )
-    every: Any = xr.concat(rows, "estimator")
-    return every.assign(doubt=doubt)
+    comparison = xr.concat(rows, "estimator")
+    assert isinstance(comparison, xr.Dataset)
+    return comparison.assign(doubt=doubt)
 
 
 def _norm(gradient: xr.DataArray) -> xr.DataArray:
@@ -269,15 +270,15 @@ def _norm(gradient: xr.DataArray) -> xr.DataArray:
 
 
 def table(results: xr.Dataset) -> list[list[str]]:
-    """Header, a row for each estimator: cosine, bias, error and finite share at every horizon."""
+    """Return rows of cosine, bias, error and finite share of each estimator at all horizons."""
     rows = [["estimator", "", *(f"{time:g} s" for time in results.horizon.values)]]
     for name in map(str, results.estimator.values):
-        one = results.sel(estimator=name)
+        row = results.sel(estimator=name)
         rows += [
-            [name, "cosine", *(f"{x:.2f}" for x in one.cosine.values)],
-            ["", "bias", *(f"{x:.2g}" for x in one.bias.values)],
-            ["", "standard error", *(f"{x:.2g}" for x in one.error.values)],
-            ["", "finite", *(f"{100 * x:.3g} %" for x in one.finite.values)],
+            [name, "cosine", *(f"{x:.2f}" for x in row.cosine.values)],
+            ["", "bias", *(f"{x:.2g}" for x in row.bias.values)],
+            ["", "standard error", *(f"{x:.2g}" for x in row.error.values)],
+            ["", "finite", *(f"{100 * x:.3g} %" for x in row.finite.values)],
         ]
     rows.append(["truth", "standard error", *(f"{x:.2g}" for x in results.doubt.values)])
     return rows
@@ -297,11 +298,11 @@ def figure_of(results: xr.Dataset) -> Figure:
         figure.subplots(2, 2, sharex=True).ravel(), panels.items(), strict=True
     ):
         for i, name in enumerate(map(str, results.estimator.values)):
-            one = results.sel(estimator=name)
-            ax.plot(x, one[field], "o-", ms=4, color=f"C{i}", label=name)
+            curve = results.sel(estimator=name)
+            ax.plot(x, curve[field], "o-", ms=4, color=f"C{i}", label=name)
             if field == "cosine":
                 ax.fill_between(
-                    x, one.least_cosine, one.greatest_cosine, color=f"C{i}", alpha=0.12, lw=0
+                    x, curve.least_cosine, curve.greatest_cosine, color=f"C{i}", alpha=0.12, lw=0
                 )
         if field in ("bias", "error"):
             ax.plot(x, results.doubt, "k--", lw=1, label="standard error of the truth")
