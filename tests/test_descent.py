@@ -1,4 +1,4 @@
-"""Tuning by gradients: the softened score, its limit, and runs that can be continued."""
+"""Tuning by gradients: the softened score, its limit, and resumed runs."""
 
 import json
 from types import SimpleNamespace
@@ -22,8 +22,8 @@ SETTING = Setting("quasistatic", rules=Rules(horizon=20.0, max_lost=10.0))
 OBJECTIVE = Objective(time=0.3, lost=0.1, miss=0.5)
 
 
-def seen(distance, contact):
-    """Snapshots of which the score reads no more than this."""
+def snapshots(distance, contact):
+    """Return snapshots with the fields that the score reads."""
     return SimpleNamespace(
         details=SimpleNamespace(distance=jnp.asarray(distance)),
         reading=SimpleNamespace(in_contact=jnp.asarray(contact)),
@@ -32,7 +32,7 @@ def seen(distance, contact):
 
 def score(distance, contact, arrive=1e-5):
     return float(
-        descent.soft_score(seen(distance, contact), RPSParams(), SETTING, OBJECTIVE, arrive)
+        descent.soft_score(snapshots(distance, contact), RPSParams(), SETTING, OBJECTIVE, arrive)
     )
 
 
@@ -56,8 +56,8 @@ class TestSoftScore:
 
     def test_it_has_a_slope_where_the_hard_one_jumps(self):
         def at(d):
-            one = seen(d * jnp.ones(5), jnp.ones(5))
-            return descent.soft_score(one, RPSParams(), SETTING, OBJECTIVE, 0.005)
+            question = snapshots(d * jnp.ones(5), jnp.ones(5))
+            return descent.soft_score(question, RPSParams(), SETTING, OBJECTIVE, 0.005)
 
         slope = float(jax.grad(at)(0.05))
         assert slope > 10 * OBJECTIVE.time / SETTING.rules.horizon  # [1/m] more than a way's own
@@ -74,11 +74,11 @@ class TestDescent:
                 TuneGrad("rps", **bad).validate()
 
     def test_the_first_start_is_the_base(self):
-        one = TuneGrad("rps", starts=3)
-        tuner = one.tuner
+        question = TuneGrad("rps", starts=3)
+        tuner = question.tuner
         tuner.start()
         thetas = tuner.propose()
-        np.testing.assert_array_equal(thetas[0], one.space.vector(one.space.base))
+        np.testing.assert_array_equal(thetas[0], question.space.vector(question.space.base))
         assert (np.abs(thetas[1:] - thetas[0]).max(axis=1) > 0.1).all()
 
     def test_a_law_without_a_smooth_form_is_refused(self):
@@ -94,23 +94,23 @@ class TestDescent:
 
 def test_antithetic_steps_find_the_slope_of_the_objective():
     # value = 2 z_0 - z_1 in the coordinates of the map, the same in all worlds.
-    one = TuneGrad("rps", tuned=("L", "K_h"), worlds=3, pairs=4000, setting=SETTING)
+    question = TuneGrad("rps", tuned=("L", "K_h"), worlds=3, pairs=4000, setting=SETTING)
 
     def pretend(asks):
-        z = one.space.vector(asks[0].params)
+        z = question.space.vector(asks[0].params)
         return [CandidateScores(None, np.asarray(2 * z[:, 0] - z[:, 1])[:, None] + np.zeros(3))]
 
-    found = descent.evolution_gradients(jnp.zeros((2, 2)), one, 0, pretend)
-    np.testing.assert_allclose(found.gradient, [[2, -1], [2, -1]], atol=0.2)
-    errors = np.abs(found.gradient - jnp.array([2.0, -1.0])) / jnp.sqrt(found.variance)
+    estimate = descent.evolution_gradients(jnp.zeros((2, 2)), question, 0, pretend)
+    np.testing.assert_allclose(estimate.gradient, [[2, -1], [2, -1]], atol=0.2)
+    errors = np.abs(estimate.gradient - jnp.array([2.0, -1.0])) / jnp.sqrt(estimate.variance)
     assert (errors < 4).all()
 
 
 def test_windows_begin_where_their_trials_are_by_then(monkeypatch):
-    """With trials that only count their steps of 20 ms."""
+    """Trials are replaced by counts of their steps of 20 ms."""
 
-    monkeypatch.setattr(descent, "start_all", lambda *given, law: jnp.zeros(given[-1].size))
-    monkeypatch.setattr(descent, "control_step", lambda *given: (given[3] + 1, None))
+    monkeypatch.setattr(descent, "start_all", lambda *arguments, law: jnp.zeros(arguments[-1].size))
+    monkeypatch.setattr(descent, "control_step", lambda *arguments: (arguments[3] + 1, None))
     monkeypatch.setattr(gradients, "window", lambda *_, **__: lambda thetas, starts: starts[1])
     late = jnp.array([0.0, 0.5, 1.0])
     for within, steps in ((10.0, [0, 250, 500]), (0.0, [0, 0, 0])):

@@ -1,4 +1,4 @@
-"""Worlds fitted to logs: what a log must be, what it tells, and an honest posterior."""
+"""Fits to logs: validation of logs, their statistics, and the coverage of the posterior."""
 
 import re
 from typing import Any
@@ -119,21 +119,21 @@ def test_a_bag_is_the_log_that_a_table_is(tmp_path):
     rows = rows_of()
     rows[:, 3] = np.linspace(3.0, 3.5, len(rows))  # a heading that a quaternion breaks
     table = logs.read(written(tmp_path / "log.csv", rows), SHELL)
-    found = logs.read(bagged(tmp_path / "log.mcap", rows), SHELL)
-    assert found.exact is table.exact is False
-    assert set(found.columns) == set(table.columns)
+    result = logs.read(bagged(tmp_path / "log.mcap", rows), SHELL)
+    assert result.exact is table.exact is False
+    assert set(result.columns) == set(table.columns)
     for name, values in table.columns.items():
-        np.testing.assert_allclose(found.columns[name], values, atol=1e-6)
+        np.testing.assert_allclose(result.columns[name], values, atol=1e-6)
     signal = np.zeros((len(rows), SHELL.count))
-    found = logs.read(bagged(tmp_path / "felt.mcap", rows, signal=signal), SHELL)
-    np.testing.assert_array_equal(found.columns["signal"], signal)
+    result = logs.read(bagged(tmp_path / "felt.mcap", rows, signal=signal), SHELL)
+    np.testing.assert_array_equal(result.columns["signal"], signal)
 
 
 def test_bags_that_are_no_log_are_refused_before_anything_compiles(tmp_path, compiled, capsys):
     rows, path = rows_of(), tmp_path / "log.mcap"
     moving = rows.copy()
     moving[200:, 10] = 1.0
-    for said, make in {
+    for message, make in {
         "a target that moves": lambda: bagged(path, moving),
         "has 41 taxels, and the robot 42": lambda: bagged(path, rows, signal=np.zeros((400, 41))),
         "lasts 1.9 s: it must last 5 s": lambda: bagged(path, rows[:95]),
@@ -142,7 +142,7 @@ def test_bags_that_are_no_log_are_refused_before_anything_compiles(tmp_path, com
         "is not allowed": lambda: path.write_bytes(bagged(path, rows).read_bytes()[:20_000]),
     }.items():
         make()
-        assert said in refusal(capsys, "fit", path, "--out", tmp_path / "run")
+        assert message in refusal(capsys, "fit", path, "--out", tmp_path / "run")
     assert not compiled
     assert not (tmp_path / "run").exists()
 
@@ -155,11 +155,11 @@ def test_traces_and_odometry_are_not_mixed_and_something_must_be_given(tmp_path)
     log = written(tmp_path / "log.csv", rows_of())
     with pytest.raises(InputError, match="not allowed together"):
         rps_jax.fit((trace, str(log)))
-    given = logs.read(trace, SHELL)
-    assert given.exact
-    assert given.columns["object_pose"].shape == (len(trace.data.time), 3)
+    log = logs.read(trace, SHELL)
+    assert log.exact
+    assert log.columns["object_pose"].shape == (len(trace.data.time), 3)
     # Of the start, 2 cm before the base: its half length, the gap and the radius of the cylinder.
-    x, y, yaw = given.columns["object_pose"][0]
+    x, y, yaw = log.columns["object_pose"][0]
     assert (x, y, yaw) == pytest.approx((0.3625 + 0.02 + 0.25, 0.0, 0.0), abs=0.02)
 
 
@@ -168,11 +168,11 @@ def test_contacts_are_made_of_taxels():
     signal = np.zeros((3, SHELL.count))
     front = np.flatnonzero(np.isclose(np.asarray(SHELL.taxels()[:, 0, 0]), 0.3625))
     signal[0, front[5:7]], signal[1, front[2]] = 1.0, 1.0
-    found = logs._contacts(signal, SHELL)
-    assert found["contact_type"].tolist() == [2, 1, 0]
+    result = logs._contacts(signal, SHELL)
+    assert result["contact_type"].tolist() == [2, 1, 0]
     pitch = 0.58 / 12  # twelve taxels along the front
-    np.testing.assert_allclose(found["p_robot_contact"][0], [0.3625, 0.0], atol=1e-6)
-    np.testing.assert_allclose(found["p_robot_contact"][1], [0.3625, 3.5 * pitch], atol=1e-6)
+    np.testing.assert_allclose(result["p_robot_contact"][0], [0.3625, 0.0], atol=1e-6)
+    np.testing.assert_allclose(result["p_robot_contact"][1], [0.3625, 3.5 * pitch], atol=1e-6)
 
 
 def a_log(delay=0, share=1.0, count=500):
@@ -183,25 +183,27 @@ def a_log(delay=0, share=1.0, count=500):
     done = share * np.concatenate([np.zeros(delay), twist[0, : count - delay, 0]])
     pose = np.zeros((1, count, 3))
     pose[0, :, 0] = 0.02 * np.cumsum(done)
-    place = np.tile([0.3625, 0.04], (1, count, 1))
+    contact = np.tile([0.3625, 0.04], (1, count, 1))
     return logs.Log(
-        np.ones((1, count), bool), pose, np.ones((1, count)), place, twist, np.array([[2.0, 1.0]])
+        np.ones((1, count), bool), pose, np.ones((1, count)), contact, twist, np.array([[2.0, 1.0]])
     )
 
 
 def test_delay_and_slip_are_read_off_the_base():
-    """What it did is (1 - slip) (what it was told - delay times the command's change)."""
-    found = logs.statistics(a_log(delay=10, share=0.9), 0.02)
-    share, later = (float(found[f"base/follow_100_0_{i}"][0]) for i in range(2))
+    """The motion is (1 - slip) (command - delay times the change of the command)."""
+    result = logs.statistics(a_log(delay=10, share=0.9), 0.02)
+    share, later = (float(result[f"base/follow_100_0_{i}"][0]) for i in range(2))
     assert share == pytest.approx(0.9, abs=0.01)
     assert -later / share == pytest.approx(0.2, abs=0.02)
 
 
 def test_a_log_in_the_mirror_has_its_target_on_the_other_side():
     log = a_log()
-    here, there = (logs.statistics(x, 0.02) for x in (log, logs.mirror(log)))
-    assert here["base/target_2"] == -there["base/target_2"] == pytest.approx(5**-0.5, rel=1e-3)
-    assert here["base/target_0"] == there["base/target_0"] == pytest.approx(5**0.5, rel=1e-3)
+    original, mirrored = (logs.statistics(x, 0.02) for x in (log, logs.mirror(log)))
+    assert (
+        original["base/target_2"] == -mirrored["base/target_2"] == pytest.approx(5**-0.5, rel=1e-3)
+    )
+    assert original["base/target_0"] == mirrored["base/target_0"] == pytest.approx(5**0.5, rel=1e-3)
     for mine, again in zip(log, logs.mirror(logs.mirror(log)), strict=True):
         np.testing.assert_array_equal(mine, again)
 
@@ -216,15 +218,15 @@ def toy():
 
 
 def test_a_posterior_is_as_wide_as_the_noise_and_else_the_prior(toy):
-    found = posterior.sample(toy, np.array([[0.5]]), 4000)
-    assert found[:, 0].mean() == pytest.approx(0.5, abs=0.03)
-    assert found[:, 0].std() == pytest.approx(0.1, rel=0.25)
-    assert found[:, 1].std() == pytest.approx(np.sqrt(1 / 12), rel=0.05)
+    result = posterior.sample(toy, np.array([[0.5]]), 4000)
+    assert result[:, 0].mean() == pytest.approx(0.5, abs=0.03)
+    assert result[:, 0].std() == pytest.approx(0.1, rel=0.25)
+    assert result[:, 1].std() == pytest.approx(np.sqrt(1 / 12), rel=0.05)
 
 
 def test_four_observations_halve_the_width(toy):
-    found = posterior.sample(toy, np.full((4, 1), 0.5), 4000)
-    assert found[:, 0].std() == pytest.approx(0.05, rel=0.3)
+    result = posterior.sample(toy, np.full((4, 1), 0.5), 4000)
+    assert result[:, 0].std() == pytest.approx(0.05, rel=0.3)
 
 
 def test_a_fitted_domain_keeps_what_is_undetermined_and_is_read_by_every_command(tmp_path):
@@ -249,11 +251,11 @@ def test_a_log_is_fitted_from_the_shell(tmp_path, capsys, optimised):
     log = written(tmp_path / "log.csv", rows_of())
     ask = ["fit", log, "--domain", "wide,objects=random_box", "--worlds", 96, "--window", 5]
     assert rps(*ask, "--physics", "default,timestep=0.01", "--out", tmp_path / "run") == 0
-    told = capsys.readouterr().out
-    assert "undetermined" in told
-    assert "this fit is invalid" in told  # no world gives such a log: its object never slides
-    found = domains.parse_domain(str(tmp_path / "run" / "fitted.json"))
-    assert found.objects == ("random_box",)
+    text = capsys.readouterr().out
+    assert "undetermined" in text
+    assert "this fit is invalid" in text  # no world gives such a log: its object never slides
+    result = domains.parse_domain(str(tmp_path / "run" / "fitted.json"))
+    assert result.objects == ("random_box",)
     assert (tmp_path / "run" / "marginals.png").stat().st_size > 10_000
     assert rps(*ask, "--physics", "default,timestep=0.01", "--out", tmp_path / "run") == 0
     ask[1] = bagged(tmp_path / "log.mcap", rows_of())
@@ -266,7 +268,7 @@ def test_the_table_of_bags_counts_intervals_that_hold_the_truth_and_ends_that_mo
     rank = [[[0.5, 0.01], [0.5, 0.5]], [[0.5, 0.5], [0.5, 0.5]]]  # (source, log, quantity)
     low = np.zeros((2, 2, 2))
     low[0, 1, 1] = -0.03
-    found = xr.Dataset(
+    result = xr.Dataset(
         {
             "rank": (("source", "log", "quantity"), rank),
             "undetermined": (("source", "log", "quantity"), np.zeros((2, 2, 2))),
@@ -275,7 +277,7 @@ def test_the_table_of_bags_counts_intervals_that_hold_the_truth_and_ends_that_mo
         },
         {"source": ["bag", "the log itself"]},
     )
-    found["undetermined"][:, 1] = 1
-    _, ours, theirs = bags.table(found)
+    result["undetermined"][:, 1] = 1
+    _, ours, theirs = bags.table(result)
     assert ours[1:] == ["2", "3 of 4, 75.0 %", "1 of 2, 50.0 %", "3 of 4, 75.0 %", "3 of 4, 75.0 %"]
     assert theirs[1:] == ["2", "4 of 4, 100.0 %", "2 of 2, 100.0 %", "", ""]

@@ -1,4 +1,4 @@
-"""Estimates of gradients: right on average, as sure as they say, and deaf to what is not finite."""
+"""Gradient estimates: unbiased, with correct variances, and without values that are not finite."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ REPEATS = 400
 
 
 def bowls(thetas, worlds):
-    """Of mean gradient STIFF THETA: a quadratic with its bottom somewhere else in each world."""
+    """Return quadratic scores with a random minimum; their mean gradient is STIFF THETA."""
     return 0.5 * jnp.sum(STIFF * (thetas - worlds) ** 2, axis=-1)
 
 
@@ -62,41 +62,41 @@ def found_by(name, scores, key, worlds) -> Estimate:
 def repeat(name, n, seed=1) -> Estimate:
     """Independent estimates, (REPEATS, ...), each in n fresh worlds."""
 
-    def one(key):
+    def a(key):
         key_worlds, key = jax.random.split(key)
         return ESTIMATORS[name](bowls, key, some_worlds(key_worlds, n))
 
     keys = jax.random.split(jax.random.key(seed), REPEATS)
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(keys))
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(a))(keys))
 
 
 @every_estimator
 def test_the_gradient_of_a_quadratic_is_found_without_bias_and_within_its_interval(name):
     for n in (32, 512):
-        found = repeat(name, n)
-        error = found.gradient - STIFF * THETA
+        estimate = repeat(name, n)
+        error = estimate.gradient - STIFF * THETA
         of_the_mean = error.std(axis=0) / math.sqrt(REPEATS)
         assert (np.abs(error.mean(axis=0)) < 3.5 * of_the_mean).all()
-        assert (found.finite == 1).all()
-    within = np.abs(error) < 1.96 * np.sqrt(found.variance)
+        assert (estimate.finite == 1).all()
+    within = np.abs(error) < 1.96 * np.sqrt(estimate.variance)
     assert (np.abs(within.mean(axis=0) - 0.95) < 0.04).all()
 
 
 @every_estimator
 def test_the_variance_is_that_of_repeated_estimates_and_falls_as_one_over_n(name):
-    few, many = repeat(name, 32), repeat(name, 512)
-    for found in (few, many):
-        np.testing.assert_allclose(found.variance.mean(0), found.gradient.var(0), rtol=0.3)
-    np.testing.assert_allclose(few.variance.mean(0) / many.variance.mean(0), 16, rtol=0.15)
+    small, large = repeat(name, 32), repeat(name, 512)
+    for estimate in (small, large):
+        np.testing.assert_allclose(estimate.variance.mean(0), estimate.gradient.var(0), rtol=0.3)
+    np.testing.assert_allclose(small.variance.mean(0) / large.variance.mean(0), 16, rtol=0.15)
 
 
 def test_all_but_evolution_are_the_derivatives_in_each_world():
     worlds = some_worlds(jax.random.key(2))
     slopes = STIFF * (THETA - worlds)  # (32, 3)
     for name in ("forward", "reverse", "differences"):
-        found = found_by(name, bowls, None, worlds)
-        np.testing.assert_allclose(found.gradient, slopes.mean(axis=0), rtol=1e-5)
-        np.testing.assert_allclose(found.variance, slopes.var(axis=0, ddof=1) / 32, rtol=1e-4)
+        estimate = found_by(name, bowls, None, worlds)
+        np.testing.assert_allclose(estimate.gradient, slopes.mean(axis=0), rtol=1e-5)
+        np.testing.assert_allclose(estimate.variance, slopes.var(axis=0, ddof=1) / 32, rtol=1e-4)
 
 
 def test_evolution_has_the_gradient_of_the_smoothed_score():
@@ -105,12 +105,12 @@ def test_evolution_has_the_gradient_of_the_smoothed_score():
         return jnp.sum(thetas**3, axis=-1) + worlds
 
     sigma = jnp.array([0.5, 0.1, 0.3])
-    found = estimators.evolution(
+    estimate = estimators.evolution(
         cubes, THETA, jnp.zeros(200_000), jax.random.key(3), sigma=sigma, pairs=1
     )
     expected = 3 * THETA**2 + 3 * sigma**2
-    assert (np.abs(found.gradient - expected) < 4 * np.sqrt(found.variance)).all()
-    assert (found.variance < 0.05**2 * 9).all()
+    assert (np.abs(estimate.gradient - expected) < 4 * np.sqrt(estimate.variance)).all()
+    assert (estimate.variance < 0.05**2 * 9).all()
 
 
 def test_only_evolution_sees_what_jumps():
@@ -122,9 +122,11 @@ def test_only_evolution_sees_what_jumps():
     hurdles = jax.random.uniform(jax.random.key(4), (20_000,), minval=-1, maxval=2)
     for name in ("forward", "reverse"):
         np.testing.assert_array_equal(found_by(name, wins, None, hurdles).gradient, np.zeros(3))
-    found = found_by("evolution", wins, jax.random.key(5), hurdles)
-    assert found.gradient[0] > 0.2
-    assert (np.abs(found.gradient - np.array([1 / 3, 0, 0])) < 4 * np.sqrt(found.variance)).all()
+    estimate = found_by("evolution", wins, jax.random.key(5), hurdles)
+    assert estimate.gradient[0] > 0.2
+    assert (
+        np.abs(estimate.gradient - np.array([1 / 3, 0, 0])) < 4 * np.sqrt(estimate.variance)
+    ).all()
 
 
 def test_common_worlds_cancel_what_does_not_depend_on_the_parameters():
@@ -141,43 +143,45 @@ def test_worlds_that_are_not_finite_are_dropped_and_counted(name):
     worlds = some_worlds(jax.random.key(8))
     broken = worlds.at[::8].set(jnp.nan).at[4::8].set(jnp.inf)
     rest = jnp.delete(worlds, np.arange(0, 32, 4), axis=0)
-    found = found_by(name, bowls, jax.random.key(9), broken)
-    np.testing.assert_allclose(found.finite, 0.75)
-    assert np.isfinite(found.gradient).all()
+    estimate = found_by(name, bowls, jax.random.key(9), broken)
+    np.testing.assert_allclose(estimate.finite, 0.75)
+    assert np.isfinite(estimate.gradient).all()
     if name != "evolution":  # which tries other directions in another number of worlds
         expected = found_by(name, bowls, None, rest)
-        np.testing.assert_allclose(found.gradient, expected.gradient, rtol=1e-5)
-        np.testing.assert_allclose(found.variance, expected.variance, rtol=1e-5)
+        np.testing.assert_allclose(estimate.gradient, expected.gradient, rtol=1e-5)
+        np.testing.assert_allclose(estimate.variance, expected.variance, rtol=1e-5)
 
 
 def test_entries_are_dropped_one_by_one():
-    found = gradients.estimate(jnp.array([[1.0, jnp.nan], [3.0, 2.0], [jnp.inf, 4.0], [5.0, 6.0]]))
-    np.testing.assert_allclose(found.gradient, [3.0, 4.0])
-    np.testing.assert_allclose(found.variance, [4 / 3, 4 / 3])  # of 1 3 5 and 2 4 6: 4 in 3
-    np.testing.assert_allclose(found.finite, [0.75, 0.75])
+    estimate = gradients.estimate(
+        jnp.array([[1.0, jnp.nan], [3.0, 2.0], [jnp.inf, 4.0], [5.0, 6.0]])
+    )
+    np.testing.assert_allclose(estimate.gradient, [3.0, 4.0])
+    np.testing.assert_allclose(estimate.variance, [4 / 3, 4 / 3])  # of 1 3 5 and 2 4 6: 4 in 3
+    np.testing.assert_allclose(estimate.finite, [0.75, 0.75])
 
 
 def test_a_sample_beyond_the_bound_is_scaled_down_to_it_by_hand():
     # Norms 5, 0.5, 1e30 and none: of those that are, the median is 5, and twice that 10.
     samples = jnp.array([[3.0, 4.0], [0.3, 0.4], [0.0, -1e30], [0.0, 0.0]])
-    found = gradients.estimate(samples, clip=2.0)
-    np.testing.assert_allclose(found.gradient, [3.3 / 4, (4.4 - 10) / 4], rtol=1e-5)
-    assert np.isfinite(found.variance).all()
+    estimate = gradients.estimate(samples, clip=2.0)
+    np.testing.assert_allclose(estimate.gradient, [3.3 / 4, (4.4 - 10) / 4], rtol=1e-5)
+    assert np.isfinite(estimate.variance).all()
     free = gradients.estimate(samples[:2])
     np.testing.assert_allclose(free.gradient, [1.65, 2.2], rtol=1e-6)
-    # Each score of a world has a bound of its own.
+    # Each score of a world has a separate bound.
     two = jnp.stack([samples, samples[::-1] / 10], axis=-1)
     both = gradients.estimate(two, clip=2.0).gradient
-    np.testing.assert_allclose(both, jnp.outer(found.gradient, jnp.array([1.0, 0.1])), rtol=1e-5)
+    np.testing.assert_allclose(both, jnp.outer(estimate.gradient, jnp.array([1.0, 0.1])), rtol=1e-5)
     nothing = gradients.estimate(jnp.zeros((3, 2)), clip=2.0)
     np.testing.assert_array_equal(nothing.gradient, [0.0, 0.0])
 
 
 def test_an_estimate_of_nothing_is_zero_with_infinite_variance():
-    found = gradients.estimate(jnp.array([[jnp.nan, 1.0], [jnp.nan, jnp.nan]]))
-    np.testing.assert_array_equal(found.gradient, [0.0, 1.0])
-    np.testing.assert_array_equal(found.variance, [np.inf, np.inf])
-    np.testing.assert_array_equal(found.finite, [0.0, 0.5])
+    estimate = gradients.estimate(jnp.array([[jnp.nan, 1.0], [jnp.nan, jnp.nan]]))
+    np.testing.assert_array_equal(estimate.gradient, [0.0, 1.0])
+    np.testing.assert_array_equal(estimate.variance, [np.inf, np.inf])
+    np.testing.assert_array_equal(estimate.finite, [0.0, 0.5])
 
 
 def known(gradient, variance) -> Estimate:
@@ -193,8 +197,8 @@ def test_a_combination_weighs_by_inverse_variance_by_hand():
 
 @pytest.mark.parametrize(("sure", "lost"), [(1.0, np.inf), (0.0, np.inf), (0.0, 0.0)])
 def test_what_knows_nothing_has_no_weight(sure, lost):
-    one, other = known([2.0], [sure]), known([2.0 if lost == 0 else 7.0], [lost])
-    for both in (estimators.combine(one, other), estimators.combine(other, one)):
+    a, b = known([2.0], [sure]), known([2.0 if lost == 0 else 7.0], [lost])
+    for both in (estimators.combine(a, b), estimators.combine(b, a)):
         assert both.gradient == 2.0
         assert both.variance == sure
     nothing = estimators.combine(known([0.0], [np.inf]), known([0.0], [np.inf]))
@@ -205,19 +209,19 @@ def test_what_knows_nothing_has_no_weight(sure, lost):
 @hypothesis.settings(max_examples=30, deadline=None)
 @hypothesis.given(st.lists(st.floats(0, 1e6), min_size=4, max_size=4))
 def test_a_combination_claims_to_be_no_worse_than_either_and_is_symmetric(variances):
-    one, other = known([1.0, -1.0], variances[:2]), known([3.0, 5.0], variances[2:])
-    both, again = estimators.combine(one, other), estimators.combine(other, one)
-    least = np.minimum(one.variance, other.variance)
+    a, b = known([1.0, -1.0], variances[:2]), known([3.0, 5.0], variances[2:])
+    both, again = estimators.combine(a, b), estimators.combine(b, a)
+    least = np.minimum(a.variance, b.variance)
     assert (both.variance <= least * (1 + 1e-6)).all()
     np.testing.assert_allclose(both.gradient, again.gradient, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(both.variance, again.variance, rtol=1e-5, atol=1e-30)
 
 
 def test_a_combination_is_nearer_to_the_truth_than_either():
-    """The derivative and the smoothed differences of the same score, in worlds of their own."""
-    one, other = repeat("forward", 32), repeat("evolution", 512, seed=2)
-    both = jax.vmap(estimators.combine)(one, other)
-    error = [np.mean((found.gradient - STIFF * THETA) ** 2) for found in (both, one, other)]
+    """Combine the derivative and the smoothed differences of one score, in different worlds."""
+    a, b = repeat("forward", 32), repeat("evolution", 512, seed=2)
+    both = jax.vmap(estimators.combine)(a, b)
+    error = [np.mean((estimate.gradient - STIFF * THETA) ** 2) for estimate in (both, a, b)]
     assert error[0] < 0.95 * min(error[1:])
     np.testing.assert_allclose(both.variance.mean(), error[0], rtol=0.3)
 
@@ -229,8 +233,8 @@ def params_of(theta) -> RPSParams:
     return RPSParams.paper()._replace(L=theta[0], K_h=theta[1], beta=theta[2], K_v=theta[3])
 
 
-def final_distance(seen):
-    return seen.details.distance[-1]
+def final_distance(snapshots):
+    return snapshots.details.distance[-1]
 
 
 def test_mjx_must_have_a_pyramidal_cone():

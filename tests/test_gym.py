@@ -22,48 +22,48 @@ COUNT = 4
 AHEAD = np.tile(np.float32([1.0, 0.0, 0.0]), (COUNT, 1))
 
 
-def many(**options):
+def make_vector(**options):
     return gymnasium.make_vec("rps_jax/Push-v0", num_envs=COUNT, **HOW | options)
 
 
 @pytest.fixture(scope="module")
-def one():
+def single():
     return gymnasium.make("rps_jax/Push-v0", **HOW)
 
 
 @pytest.fixture(scope="module")
-def several():
-    return many()
+def vector():
+    return make_vector()
 
 
 @pytest.mark.filterwarnings("ignore:.*A Box observation space (min|max)imum value is")
 @pytest.mark.filterwarnings("error:.*WARN")
-def test_gymnasium_finds_nothing_wrong(one):
-    check_env(one.unwrapped, skip_render_check=True)
-    assert one.observation_space.shape == (44,)
-    assert one.action_space == gymnasium.spaces.Box(-1, 1, (3,), np.float32)
-    assert one.metadata["render_fps"] == 1  # an action lasts for a second
+def test_gymnasium_finds_nothing_wrong(single):
+    check_env(single.unwrapped, skip_render_check=True)
+    assert single.observation_space.shape == (44,)
+    assert single.action_space == gymnasium.spaces.Box(-1, 1, (3,), np.float32)
+    assert single.metadata["render_fps"] == 1  # an action lasts for a second
 
 
-def test_a_step_is_an_action_of_push_env_held(one):
-    seen, info = one.reset(seed=3)
-    push, worlds = one.unwrapped.push_env, one.unwrapped._vector
+def test_a_step_is_an_action_of_push_env_held(single):
+    obs, info = single.reset(seed=3)
+    push, worlds = single.unwrapped.push_env, single.unwrapped._vector
     state = jax.tree.map(lambda leaf: leaf[0], worlds._state)
     assert int(state.info["index"]) == info["world"]
-    np.testing.assert_array_equal(seen, state.obs)
+    np.testing.assert_array_equal(obs, state.obs)
     step, total = jax.jit(push.step), 0.0
     for _ in range(round(1.0 / push.dt)):
         state = step(state, AHEAD[0])
         total += float(state.reward)
-    seen, reward, terminated, truncated, info = one.step(AHEAD[0])
-    np.testing.assert_allclose(seen, state.obs, atol=1e-4)
+    obs, reward, terminated, truncated, info = single.step(AHEAD[0])
+    np.testing.assert_allclose(obs, state.obs, atol=1e-4)
     assert reward == pytest.approx(total, abs=1e-4)
     assert not any((terminated, truncated, info["is_success"]))
     assert info["time"] == pytest.approx(1.0)
 
 
-def test_a_seed_decides_on_worlds_and_noise(one, several):
-    for env, action in ((one, AHEAD[0]), (several, AHEAD)):
+def test_a_seed_decides_on_worlds_and_noise(single, vector):
+    for env, action in ((single, AHEAD[0]), (vector, AHEAD)):
         runs = []
         for seed in (5, 5, 6):
             start, _ = env.reset(seed=seed)
@@ -71,7 +71,7 @@ def test_a_seed_decides_on_worlds_and_noise(one, several):
         for a, b in zip(runs[0], runs[1], strict=True):
             np.testing.assert_array_equal(a, b)
         assert not np.array_equal(runs[0][0], runs[2][0])
-    start, _ = several.reset(seed=5)
+    start, _ = vector.reset(seed=5)
     assert len(np.unique(start, axis=0)) == COUNT  # each world its own
 
 
@@ -79,59 +79,59 @@ def to_the_end(envs):
     """Steps until a trial arrives."""
     envs.reset(seed=0)
     for _ in range(20):
-        seen, rewards, terminated, truncated, told = envs.step(AHEAD)
+        obs, rewards, terminated, truncated, infos = envs.step(AHEAD)
         if terminated.any():
-            return seen, rewards, terminated, truncated, told
+            return obs, rewards, terminated, truncated, infos
     raise AssertionError("targets are ahead")
 
 
-def test_who_arrives_is_terminated_and_begins_anew_in_the_next_step(several):
-    assert several.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
-    _, rewards, ended, truncated, told = to_the_end(several)
-    assert told["is_success"][ended].all()
+def test_who_arrives_is_terminated_and_begins_anew_in_the_next_step(vector):
+    assert vector.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    _, rewards, ended, truncated, infos = to_the_end(vector)
+    assert infos["is_success"][ended].all()
     assert not truncated[ended].any()
     assert (rewards[ended] > 0.5).all()  # the success, which is worth 1, less what contact costs
-    before = told["time"]
-    seen, rewards, terminated, truncated, told = several.step(AHEAD)
+    previous = infos["time"]
+    obs, rewards, terminated, truncated, infos = vector.step(AHEAD)
     assert (rewards[ended] == 0).all()
     assert not (terminated | truncated)[ended].any()
-    assert (told["time"][ended] == 0).all()
-    assert (told["time"][~ended] >= before[~ended]).all()
-    assert told["_time"].all()
-    start = np.linalg.norm(seen[ended, 42:], axis=1)
+    assert (infos["time"][ended] == 0).all()
+    assert (infos["time"][~ended] >= previous[~ended]).all()
+    assert infos["_time"].all()
+    start = np.linalg.norm(obs[ended, 42:], axis=1)
     np.testing.assert_allclose(start, 0.71, atol=0.02)  # far again
-    assert (several.step(AHEAD)[4]["time"][ended] == 1).all()
+    assert (vector.step(AHEAD)[4]["time"][ended] == 1).all()
 
 
-def test_or_at_once_where_that_is_asked_for(several):
-    _, rewards, ended, *_ = to_the_end(several)
-    envs = many(autoreset_mode="SameStep")
+def test_or_at_once_where_that_is_asked_for(vector):
+    _, rewards, ended, *_ = to_the_end(vector)
+    envs = make_vector(autoreset_mode="SameStep")
     for name in ("_start", "_act", "_select"):  # whose programs are compiled
-        setattr(envs.unwrapped, name, getattr(several.unwrapped, name))
+        setattr(envs.unwrapped, name, getattr(vector.unwrapped, name))
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-    seen, same, terminated, _, told = to_the_end(envs)
+    obs, same, terminated, _, infos = to_the_end(envs)
     np.testing.assert_array_equal(terminated, ended)
     np.testing.assert_array_equal(same, rewards)
-    np.testing.assert_array_equal(told["_final_obs"], ended)
-    assert (told["time"][ended] == 0).all()
-    assert told["final_info"]["is_success"][ended].all()
+    np.testing.assert_array_equal(infos["_final_obs"], ended)
+    assert (infos["time"][ended] == 0).all()
+    assert infos["final_info"]["is_success"][ended].all()
     i = int(np.argmax(ended))
-    assert np.linalg.norm(told["final_obs"][i][42:]) < 0.45 < np.linalg.norm(seen[i, 42:])
-    assert all(last is None for last in told["final_obs"][~ended])
+    assert np.linalg.norm(infos["final_obs"][i][42:]) < 0.45 < np.linalg.norm(obs[i, 42:])
+    assert all(last is None for last in infos["final_obs"][~ended])
 
 
-def test_who_runs_out_of_time_is_truncated(several):
-    several.reset(seed=1)
+def test_who_runs_out_of_time_is_truncated(vector):
+    vector.reset(seed=1)
     for second in range(1, 21):
-        _, _, terminated, truncated, told = several.step(0 * AHEAD)
+        _, _, terminated, truncated, infos = vector.step(0 * AHEAD)
         assert not terminated.any()
         assert truncated.all() == (second == 20)
-    assert not told["is_success"].any()
+    assert not infos["is_success"].any()
 
 
-def test_images_are_drawn_where_they_are_asked_for(one):
-    one.reset(seed=0)
-    assert one.unwrapped.render() is None
+def test_images_are_drawn_where_they_are_asked_for(single):
+    single.reset(seed=0)
+    assert single.unwrapped.render() is None
     drawn = gymnasium.make("rps_jax/Push-v0", render_mode="rgb_array", **HOW)
     drawn.reset(seed=0)
     image = drawn.render()
@@ -139,7 +139,7 @@ def test_images_are_drawn_where_they_are_asked_for(one):
     assert image.std() > 10
 
 
-def test_what_means_nothing_is_refused(one, several):
+def test_what_means_nothing_is_refused(single, vector):
     with pytest.raises(InputError, match=r"hold = 0.001 is not allowed"):
         gym.GymPush(hold=0.001)
     with pytest.raises(InputError, match="num_envs = 0 is not allowed"):
@@ -148,12 +148,12 @@ def test_what_means_nothing_is_refused(one, several):
         gym.GymPushVector(2, autoreset_mode=AutoresetMode.DISABLED)
     with pytest.raises(InputError, match="unknown domain 'wild'"):
         gym.GymPush(domain="wild")
-    several.reset(seed=0)
+    vector.reset(seed=0)
     with pytest.raises(InputError, match=r"action = of shape \(3,\) is not allowed"):
-        several.step(AHEAD[0])
-    one.reset(seed=0)
+        vector.step(AHEAD[0])
+    single.reset(seed=0)
     with pytest.raises(InputError, match=r"action = \[\[nan, 0.0, 0.0\]\] is not allowed"):
-        one.unwrapped.step([np.nan, 0, 0])
+        single.unwrapped.step([np.nan, 0, 0])
 
 
 def test_without_gymnasium_it_says_what_to_install(monkeypatch):

@@ -1,4 +1,4 @@
-"""What parameters trade: candidates along lines and between sets, and who is undominated."""
+"""Trade-offs of parameters: candidates along lines and between sets, and the Pareto front."""
 
 import jax
 import numpy as np
@@ -19,7 +19,7 @@ SETS = {"paper": RPSParams.paper(), "tuned": RPSParams.tuned()}
 
 
 def outcomes(**known):
-    """Outcomes of which nothing else is looked at."""
+    """Return outcomes with the fields that the study reads."""
     return Outcome(**dict.fromkeys(Outcome._fields) | known)
 
 
@@ -29,45 +29,45 @@ def test_aims_by_hand():
         time=np.array([[10.0, 30, 20, 300], [300, 300, 300, 300]], np.float32),
         path_length=np.array([[1.0, 2, 6, 9], [9, 9, 9, 9]], np.float32),
     )
-    found = candidates.aims(outcome)
-    assert found.success.tolist() == [0.75, 0.0]
-    np.testing.assert_array_equal(found.time, [20, np.nan])
-    np.testing.assert_array_equal(found.path, [2, np.nan])
+    result = candidates.aims(outcome)
+    assert result.success.tolist() == [0.75, 0.0]
+    np.testing.assert_array_equal(result.time, [20, np.nan])
+    np.testing.assert_array_equal(result.path, [2, np.nan])
 
 
 def test_the_undominated_by_hand():
-    found = Aims(
+    result = Aims(
         success=np.array([0.9, 0.8, 0.9, 0.7, 0.95, 0.9]),
         time=np.array([60.0, 50.0, 61.0, 55.0, np.nan, 60.0]),
         path=np.array([3.0, 3.5, 3.0, 3.6, 1.0, 3.0]),
     )
     # The third is slower than the first, the fourth worse than the second in all, the fifth never
     # measured; the last equals the first, and neither beats the other.
-    assert candidates.undominated(found).tolist() == [True, True, False, False, False, True]
+    assert candidates.undominated(result).tolist() == [True, True, False, False, False, True]
 
 
 def test_a_line_varies_one_parameter_within_its_bounds_and_no_other():
     base = RPSParams.tuned()
     grid = candidates.lines(base, FULL, 5)
     for i, name in enumerate(FULL):
-        for other in RPSParams._fields:
-            values = np.asarray(getattr(grid, other))[i]
-            if other == name:
+        for second in RPSParams._fields:
+            values = np.asarray(getattr(grid, second))[i]
+            if second == name:
                 assert (np.diff(values) > 0).all()
                 bound = BOUNDS[name]
                 owner = bound.relative_to
                 scale = np.asarray(getattr(grid, owner))[i] if owner else 1.0
                 assert (bound.low * scale < values).all()
                 assert (values < bound.high * scale).all()
-            elif (name, other) != ("l_cr", "l_mr"):  # l_mr must not pass a small l_cr
-                np.testing.assert_allclose(values, getattr(base, other), rtol=1e-5)
+            elif (name, second) != ("l_cr", "l_mr"):  # l_mr must not pass a small l_cr
+                np.testing.assert_allclose(values, getattr(base, second), rtol=1e-5)
     assert (np.asarray(grid.l_mr) <= np.asarray(grid.l_cr)).all()
 
 
 def test_candidates_begin_with_the_sets_and_without_spread_lie_between_two_of_them():
-    found = candidates.cloud(list(SETS.values()), FULL, 30, 0.0, seed=3)
+    result = candidates.cloud(list(SETS.values()), FULL, 30, 0.0, seed=3)
     space = Space(FULL)
-    z = space.vector(found)
+    z = space.vector(result)
     for i, params in enumerate(SETS.values()):
         np.testing.assert_allclose(z[i], space.vector(params), rtol=1e-4, atol=1e-4)
     way = z[1] - z[0]
@@ -76,47 +76,49 @@ def test_candidates_begin_with_the_sets_and_without_spread_lie_between_two_of_th
     assert (share < 1 + 1e-3).all()
     np.testing.assert_allclose(z[2:], z[0] + share[:, None] * way, rtol=1e-3, atol=1e-3)
     # The switch that differs between the sets, from the nearer one.
-    np.testing.assert_array_equal(found.keep_contact[2:], share > 0.5)
+    np.testing.assert_array_equal(result.keep_contact[2:], share > 0.5)
 
 
 @pytest.fixture
 def pretended(monkeypatch):
     """Trials that succeed by the seed of their worlds, and take 100 s times L."""
-    asked = []
+    calls = []
 
     def score_candidates(asks, *_, **__):
         answers = []
         for ask in asks:
-            asked.append(ask)
+            calls.append(ask)
             L = np.asarray(ask.params.L)[:, None]
-            won = np.broadcast_to((ask.seed + ask.worlds) % 4 > 0, (L.size, ask.worlds.size))
-            outcome = outcomes(success=won, time=100 * L + 0 * won, path_length=5 + 0 * won)
-            answers.append(CandidateScores(outcome, 0 * won))
+            success = np.broadcast_to((ask.seed + ask.worlds) % 4 > 0, (L.size, ask.worlds.size))
+            outcome = outcomes(
+                success=success, time=100 * L + 0 * success, path_length=5 + 0 * success
+            )
+            answers.append(CandidateScores(outcome, 0 * success))
         return answers, None
 
     monkeypatch.setattr(evaluate, "score_candidates", score_candidates)
-    return asked
+    return calls
 
 
 def test_each_parameter_alone_is_labelled_and_from_worlds_for_validation(pretended):
-    found = candidates.alone(SETS, Problem(), names=("L", "K_h"), count=3, worlds=8)
-    assert dict(found.sizes) == {"set": 2, "parameter": 2, "step": 3}
+    result = candidates.alone(SETS, Problem(), names=("L", "K_h"), count=3, worlds=8)
+    assert dict(result.sizes) == {"set": 2, "parameter": 2, "step": 3}
     assert [ask.seed for ask in pretended] == [seed_of(0, "validate")]
-    one = found.sel(set="paper", parameter="L")
-    np.testing.assert_allclose(one.time, 100 * one.value, rtol=1e-5)
-    other = found.sel(set="tuned", parameter="K_h")
-    np.testing.assert_allclose(other.time, 100 * RPSParams.tuned().L, rtol=1e-4)
-    assert found.attrs["worlds"] == 8
+    first = result.sel(set="paper", parameter="L")
+    np.testing.assert_allclose(first.time, 100 * first.value, rtol=1e-5)
+    second = result.sel(set="tuned", parameter="K_h")
+    np.testing.assert_allclose(second.time, 100 * RPSParams.tuned().L, rtol=1e-4)
+    assert result.attrs["worlds"] == 8
 
 
 def test_the_front_is_chosen_in_worlds_for_validation_and_measured_in_those_for_testing(pretended):
-    found = candidates.front(SETS, Problem(), candidates=6, worlds=8)
+    result = candidates.front(SETS, Problem(), candidates=6, worlds=8)
     assert [ask.seed for ask in pretended] == [seed_of(0, s) for s in ("validate", "test")]
     params = [jax.tree.map(np.asarray, ask.params) for ask in pretended]
     jax.tree.map(np.testing.assert_array_equal, *params)
     # All succeed alike and drive as far: the quickest alone is undominated.
-    assert found.front.values.sum() == 1
-    assert np.argmax(found.front.values) == np.argmin(found.L.values)
-    table = candidates.front_table(found)
+    assert result.front.values.sum() == 1
+    assert np.argmax(result.front.values) == np.argmin(result.L.values)
+    table = candidates.front_table(result)
     assert {row[0] for row in table[1:]} >= {"paper", "tuned"}
     assert sum(row[-1] == "yes" for row in table) == 1

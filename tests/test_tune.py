@@ -1,4 +1,4 @@
-"""Tuning: the bounded map, the objective, evolution, and runs that are continued."""
+"""Tuning: the bounded map, the objective, evolution, and resumed runs."""
 
 import json
 from typing import get_args
@@ -46,15 +46,15 @@ class TestSpace:
         np.testing.assert_allclose(FULL.vector(FULL.params(vectors)), vectors, atol=2e-3)
 
     def test_what_is_written_is_the_whole_law(self):
-        """Also what is not tuned: of another start, or moved by a bound that is."""
+        """Fixed parameters are written if they differ from the preset."""
         paper, tuned = RPSParams.paper(), RPSParams.tuned()
         narrow = Space(("l_cr",))
         low = narrow.params(narrow.vector(paper._replace(l_cr=0.12)))
         written = narrow.changed_values(narrow.vector(low))
         assert written == pytest.approx({"l_cr": 0.12, "l_mr": 0.12})
         rps.check(paper._replace(**written))
-        other = Space(("eta",), tuned)
-        again = paper._replace(**other.changed_values(other.vector(tuned)))
+        second = Space(("eta",), tuned)
+        again = paper._replace(**second.changed_values(second.vector(tuned)))
         np.testing.assert_allclose(again, tuned, rtol=1e-5)
         assert set(narrow.changed_values(narrow.vector(paper))) == {"l_cr"}
 
@@ -122,8 +122,10 @@ class TestObjective:
         zero = np.zeros(1)
         outcome = Outcome(zero, zero, never, *[zero] * 9)
         for least, missed in ((never, 0.5), (near, 0.2)):
-            found = Objective().scores(outcome._replace(min_distance=least), np.full(1, 0.5), RULES)
-            assert found == pytest.approx(1 + 0.5 * missed)
+            result = Objective().scores(
+                outcome._replace(min_distance=least), np.full(1, 0.5), RULES
+            )
+            assert result == pytest.approx(1 + 0.5 * missed)
 
     def test_bad_weights_are_refused(self):
         for bad in ({"risk": "worst"}, {"time": -1.0}, {"tail": 0.0}, {"miss": np.nan}):
@@ -145,23 +147,23 @@ def rosenbrock(x):
 
 
 def search(size=4, **options):
-    """An evolution about the paper's parameters."""
-    one = TuneES("rps", tuned=SUBSETS["full"][:size], **options).tuner
-    one.start()
-    return one
+    """Return an evolution about the paper's parameters."""
+    first = TuneES("rps", tuned=SUBSETS["full"][:size], **options).tuner
+    first.start()
+    return first
 
 
 class TestEvolution:
     def minimise(self, function, generations, bad=0, **options):
-        """The least value of every generation; the first `bad` candidates of each have none."""
-        one, found = search(**options), []
+        """Return the least value of every generation; the first `bad` candidates have none."""
+        first, result = search(**options), []
         for _ in range(generations):
-            candidates = one.propose()
+            candidates = first.propose()
             values = function(candidates)
             values[:bad] = np.nan
-            one.update(candidates, {"values": values, "mean": one.mean, "validation": np.inf})
-            found.append(np.nanmin(values))
-        return np.array(found)
+            first.update(candidates, {"values": values, "mean": first.mean, "validation": np.inf})
+            result.append(np.nanmin(values))
+        return np.array(result)
 
     @pytest.mark.parametrize("algorithm", get_args(Algorithm))
     @pytest.mark.parametrize(
@@ -177,32 +179,32 @@ class TestEvolution:
 
     def test_without_any_value_it_goes_on(self):
         assert np.isfinite(self.minimise(sphere, 3, bad=7, population=8)).all()
-        one = search(population=8)
-        metrics = {"values": np.full(8, np.nan), "mean": one.mean, "validation": np.nan}
-        one.update(one.propose(), metrics)
-        assert np.isfinite(one.propose()).all()
+        first = search(population=8)
+        metrics = {"values": np.full(8, np.nan), "mean": first.mean, "validation": np.nan}
+        first.update(first.propose(), metrics)
+        assert np.isfinite(first.propose()).all()
 
     def test_the_seed_makes_the_proposals(self):
-        one, same, other = (
+        first, same, second = (
             search(population=8, setting=Setting(seed=seed)).propose() for seed in (0, 0, 1)
         )
-        np.testing.assert_array_equal(one, same)
-        assert (one != other).all()
+        np.testing.assert_array_equal(first, same)
+        assert (first != second).all()
 
     def test_the_first_generation_spreads_about_the_start(self):
-        one = search(population=4000, spread=0.3)
-        away = one.propose() - one.base
+        first = search(population=4000, spread=0.3)
+        away = first.propose() - first.base
         np.testing.assert_allclose(away.std(axis=0), 0.3, rtol=0.05)
         np.testing.assert_allclose(away.mean(axis=0), 0.0, atol=0.02)
 
     def test_a_stalled_search_begins_again_elsewhere_and_keeps_the_best(self):
-        one = search(population=8, patience=2)
+        first = search(population=8, patience=2)
         for value in (1.0, 2.0, 3.0):
             metrics = {"values": np.zeros(8), "mean": np.full(4, value), "validation": value}
-            one.update(one.propose(), metrics)
-        assert one.restarts == 1
-        assert one.best.tolist() == [1.0] * 4
-        assert np.abs(one.mean - one.base).max() > 0.3
+            first.update(first.propose(), metrics)
+        assert first.restarts == 1
+        assert first.best.tolist() == [1.0] * 4
+        assert np.abs(first.mean - first.base).max() > 0.3
 
     def test_bad_options_are_refused(self):
         with pytest.raises(InputError, match="choose from cma, lra_cma"):
@@ -222,7 +224,7 @@ class TestEvolution:
 
 
 def pretend(asks, domains, setting, objective, **_):
-    """Instead of worlds: the distance of L and K_h from a place, and a little of the worlds."""
+    """Score candidates by the distance of L and K_h from a point, instead of worlds."""
     answers = []
     for ask in asks:
         value = (np.asarray(ask.params.L) - 0.4) ** 2 + (np.asarray(ask.params.K_h) - 0.6) ** 2
@@ -239,9 +241,9 @@ def evolution(generations=6, **options):
 
 
 def descents(generations=6):
-    """Antithetic steps, which need no more than what is pretended."""
-    asked = TuneGrad("rps", estimator="evolution", steps=5, starts=2, pairs=3, **SMALL)
-    tuner = asked.tuner
+    """Return descents by antithetic steps, which need no derivatives of worlds."""
+    calls = TuneGrad("rps", estimator="evolution", steps=5, starts=2, pairs=3, **SMALL)
+    tuner = calls.tuner
     tuner.generations = generations
     return tuner
 
@@ -253,15 +255,15 @@ def tuned(folder, tuner):
 
 @pytest.fixture
 def pretended(monkeypatch):
-    """How often worlds were asked for."""
-    asked = []
+    """Arguments of the calls that run worlds, which return a formula instead."""
+    calls = []
 
     def score_candidates(*args, **kwargs):
-        asked.append(args)
+        calls.append(args)
         return pretend(*args, **kwargs)
 
     monkeypatch.setattr(evaluate, "score_candidates", score_candidates)
-    return asked
+    return calls
 
 
 class TestRuns:
@@ -273,13 +275,15 @@ class TestRuns:
         for done in killed:
             folder = tmp_path / f"{done}"
             tuned(folder, tuner(done))
-            asked = len(pretended)
+            calls = len(pretended)
             assert tuned(folder, tuner()) == whole
-            each = 1 if tuner is evolution else 2  # and the last step of a descent only validates
-            assert len(pretended) - asked == each * (6 - done) - (each - 1)
+            rounds = 1 if tuner is evolution else 2  # the last step of a descent only validates
+            assert len(pretended) - calls == rounds * (6 - done) - (rounds - 1)
             for name in ("log.jsonl", "tuned.json", "curve.csv"):
-                one, other = ((tmp_path / run / name).read_text() for run in ("whole", f"{done}"))
-                assert one == other
+                first, second = (
+                    (tmp_path / run / name).read_text() for run in ("whole", f"{done}")
+                )
+                assert first == second
         assert len(read_log(tmp_path / "whole")) == 6
 
     @pytest.mark.parametrize("algorithm", get_args(Algorithm))
@@ -297,9 +301,9 @@ class TestRuns:
         log = (tmp_path / "log.jsonl").read_text()
         (third,) = (tmp_path / "parts").glob("000002*")
         third.write_bytes(third.read_bytes()[:-100])
-        asked = len(pretended)
+        calls = len(pretended)
         assert tuned(tmp_path, tuner()) == whole
-        assert len(pretended) == asked + (1 if tuner is evolution else 2)
+        assert len(pretended) == calls + (1 if tuner is evolution else 2)
         assert (tmp_path / "log.jsonl").read_text() == log
 
     def test_generations_that_the_seed_does_not_propose_are_refused(self, tmp_path, pretended):
@@ -334,33 +338,33 @@ class TestRuns:
 
     def test_it_finds_the_place_and_writes_it_down(self, tmp_path, pretended):
         tuned(tmp_path, evolution(20))
-        found = json.loads((tmp_path / "tuned.json").read_text())
-        assert found == {"L": pytest.approx(0.4, abs=0.03), "K_h": pytest.approx(0.6, abs=0.03)}
+        result = json.loads((tmp_path / "tuned.json").read_text())
+        assert result == {"L": pytest.approx(0.4, abs=0.03), "K_h": pytest.approx(0.6, abs=0.03)}
 
     def test_another_configuration_is_refused_with_the_difference(self, tmp_path, pretended):
-        asked = SMALL | {"population": 8, "out": tmp_path}
-        first = TuneES("rps", **asked, generations=1)()
-        longer = TuneES("rps", **asked, generations=3)()  # of which the first is there
+        calls = SMALL | {"population": 8, "out": tmp_path}
+        first = TuneES("rps", **calls, generations=1)()
+        longer = TuneES("rps", **calls, generations=3)()  # of which the first is there
         assert first.params.equals(longer.params[:1])
         with pytest.raises(InputError, match=r"spread = 0.5 there, 0.4 asked for"):
-            TuneES("rps", **asked, spread=0.4)()
+            TuneES("rps", **calls, spread=0.4)()
         with pytest.raises(InputError, match="holds another run"):
             TuneGrad("rps", **SMALL, estimator="evolution", out=tmp_path)()
 
     def test_the_report_of_a_descent_tells_its_times_and_parameters(self, pretended):
-        asked = TuneGrad("rps", **SMALL, estimator="evolution", steps=2, starts=1, pairs=1)
-        (section,) = asked.report(asked(), Run(None, no_progress))
+        calls = TuneGrad("rps", **SMALL, estimator="evolution", steps=2, starts=1, pairs=1)
+        (section,) = calls.report(calls(), Run(None, no_progress))
         assert "after" in section.text
         assert "gradients 0.0 s with their compilation" in section.text
         assert [name for name, *_ in section.table[1:]] == ["L", "K_h"]
 
 
 def test_the_command_line(tmp_path, capsys):
-    asked = ["tune", "es", "--engine", "quasistatic", "--objects", "random_cylinder"]
-    asked += ["--worlds", 2, "--validation", 2, "--population", 4, "--generations", 2]
-    asked += ["--horizon", 8, "--tuned", "L", "K_h", "--slots", 6, "--out", tmp_path / "run"]
-    assert command(*asked) == 0
+    calls = ["tune", "es", "--engine", "quasistatic", "--objects", "random_cylinder"]
+    calls += ["--worlds", 2, "--validation", 2, "--population", 4, "--generations", 2]
+    calls += ["--horizon", 8, "--tuned", "L", "K_h", "--slots", 6, "--out", tmp_path / "run"]
+    assert command(*calls) == 0
     assert set(json.loads((tmp_path / "run" / "tuned.json").read_text())) == {"L", "K_h"}
     assert (tmp_path / "run" / "tuning.png").stat().st_size > 10_000
     assert "Validation: objective" in capsys.readouterr().out
-    assert "seed = 0 there, 1 asked for" in refusal(capsys, *asked, "--seed", 1)
+    assert "seed = 0 there, 1 asked for" in refusal(capsys, *calls, "--seed", 1)
