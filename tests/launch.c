@@ -1,5 +1,5 @@
-/* A driver of a GPU that writes down what it is asked, and XLA's side of a call. A kernel makes its
-   one result of its first argument, times the digit that its image is. */
+/* Fake driver of a GPU that logs its calls, and XLA's side of a call. A kernel multiplies its first
+   argument by a digit, which is its image. */
 
 #include <stdarg.h>
 #include <stdio.h>

@@ -1,4 +1,4 @@
-"""Laws outside of JAX: what is written compiles without a warning, and does what JAX does."""
+"""Exported laws compile without a warning, and have the results of JAX."""
 
 import json
 import re
@@ -65,7 +65,7 @@ def init(params):
 def step(params, memory, seen):
     l = seen.p_robot_contact[1]
     place = memory.count % 3
-    gain = params.gains[jnp.int32(seen.in_contact), place]  # a row and a column, found as it runs
+    gain = params.gains[jnp.int32(seen.in_contact), place]  # a row and a column, selected at run time
     other = jnp.take(jnp.array([1.0, 2.0, 3.0]), place + 1, mode="clip")
     trace = jnp.concatenate([memory.trace[1:], l[None]]).at[0].set(memory.trace[3])
     smooth = jax.lax.scan(lambda s, x: (0.5 * s + x, s), 0.0, trace)[0]
@@ -108,16 +108,16 @@ def compiled(compiler, source, *options):
 
 @pytest.mark.parametrize("name", [name for name in LAWS if name not in ("nps", "learned_gru")])
 def test_a_law_in_c_does_what_it_does_in_jax(name, tmp_path):
-    found = agreement(name, "double", 10_000, tmp_path)
-    assert (found.inputs, found.unexplained) == (10_000, 0)
-    assert found.beyond == found.flips <= 10
+    result = agreement(name, "double", 10_000, tmp_path)
+    assert (result.inputs, result.unexplained) == (10_000, 0)
+    assert result.beyond == result.flips <= 10
 
 
 def test_a_law_in_c_does_what_it_does_in_jax_in_float(tmp_path):
     """Differences beyond the tolerance are only where JAX's own twist is as uncertain."""
-    found = agreement("rps_plus", "float", 20_000, tmp_path)
-    assert (found.inputs, found.unexplained) == (20_000, 0)
-    assert found.beyond < 200
+    result = agreement("rps_plus", "float", 20_000, tmp_path)
+    assert (result.inputs, result.unexplained) == (20_000, 0)
+    assert result.beyond < 200
 
 
 @pytest.mark.slow
@@ -139,15 +139,15 @@ def test_a_fault_in_c_is_found(tmp_path, monkeypatch):
 @pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize("name", ["rps_plus", "learned_mlp", f"{EXAMPLE}:PParams"])
 def test_the_folder_compiles_without_a_warning_and_runs(name, compiler, tmp_path, registries):
-    made = program.program(name, "kairos")
-    texts = folder.files(made, "law")
+    exported = program.program(name, "kairos")
+    texts = folder.files(exported, "law")
     for file, text in texts.items():
         (tmp_path / file).write_text(text)
     (tmp_path / "main.c").write_text(texts["main.c"].replace("STEPS 200000", "STEPS 3000"))
     for options in (["-O2"], ["-O2", "-DLAW_DOUBLE"], SANE):
         run = [str(compiled(compiler, tmp_path / "main.c", *options))]
-        said = subprocess.run(run, check=True, capture_output=True, text=True).stdout
-        assert re.match(r"3000 steps: median [\d.]+ us, 99.9th percentile [\d.]+ us\n", said)
+        output = subprocess.run(run, check=True, capture_output=True, text=True).stdout
+        assert re.match(r"3000 steps: median [\d.]+ us, 99.9th percentile [\d.]+ us\n", output)
     assert "#include <math.h>" in texts["law.h"]
     assert texts["law.h"].count("#include") == 1
     assert not re.search(r"\b(malloc|calloc|realloc|alloca)\b", texts["law.h"])
@@ -155,17 +155,17 @@ def test_the_folder_compiles_without_a_warning_and_runs(name, compiler, tmp_path
 
 @pytest.mark.parametrize("name", ["rps_plus", "learned_mlp", "force_push_published", "own"])
 def test_what_is_not_finite_gives_a_zero_twist_and_nothing_undefined(name, tmp_path, own):
-    made = program.program(own if name == "own" else name)
+    exported = program.program(own if name == "own" else name)
     for compiler in COMPILERS:
-        found = fuzzed(made, compiler, "float", 20_000, tmp_path)
-        assert found.fault == 0, found
-        assert found.taken > 0 < found.refused
+        result = fuzzed(exported, compiler, "float", 20_000, tmp_path)
+        assert result.fault == 0, result
+        assert result.taken > 0 < result.refused
 
 
 def test_a_law_of_a_users_file_is_exported(own, tmp_path):
     for precision in ("float", "double"):
-        found = agreement(own, precision, 5_000, tmp_path)
-        assert (found.inputs, found.unexplained, found.flips) == (5_000, 0, 0)
+        result = agreement(own, precision, 5_000, tmp_path)
+        assert (result.inputs, result.unexplained, result.flips) == (5_000, 0, 0)
 
 
 @pytest.mark.parametrize("robot", ["ridgeback"])
@@ -210,9 +210,9 @@ def test_a_whole_trial_step_by_step(name, tmp_path):
     assert len(trials[0][0]) > 900
     (errors,) = trial_errors(name, "double", trials, tmp_path).own
     assert errors.max() < 1e-12
-    found = trial_errors(name, "float", trials, tmp_path)
-    (errors,), (told,) = found.own, found.told
-    assert np.quantile(told, 0.999) < 1e-5  # from JAX's memory no step is another one
+    result = trial_errors(name, "float", trials, tmp_path)
+    (errors,), (from_memory,) = result.own, result.told
+    assert np.quantile(from_memory, 0.999) < 1e-5  # given JAX's memory, all steps agree
     # A step differs where a switch flips in one of the two; it must not last.
     assert np.mean(errors > 2e-5) < 0.01
     assert np.median(errors) < 1e-6
@@ -237,13 +237,15 @@ def test_an_operation_that_cannot_be_written_is_named(tmp_path, capsys, registri
         )
         path.write_text(head + rest)
         for kind in ("c", "js", "onnx"):
-            said = refusal(capsys, "export", kind, "--law", f"{path}:OwnParams", "--out", tmp_path)
+            output = refusal(
+                capsys, "export", kind, "--law", f"{path}:OwnParams", "--out", tmp_path
+            )
             name = {"c": "C", "js": "JavaScript", "onnx": "ONNX"}[kind]
-            assert f"operation `{operation}` is not supported by the {name} exporter" in said
-    said = refusal(capsys, "export", "c", "--law", "rps", "--skin", "ideal", "--out", tmp_path)
-    assert "name one with taxels" in said
-    said = refusal(capsys, "export", "c", "--law", "rps", "--prefix", "2 laws", "--out", tmp_path)
-    assert "prefix = 2 laws is not allowed" in said
+            assert f"operation `{operation}` is not supported by the {name} exporter" in output
+    output = refusal(capsys, "export", "c", "--law", "rps", "--skin", "ideal", "--out", tmp_path)
+    assert "name one with taxels" in output
+    output = refusal(capsys, "export", "c", "--law", "rps", "--prefix", "2 laws", "--out", tmp_path)
+    assert "prefix = 2 laws is not allowed" in output
 
 
 def test_the_command_writes_a_folder_with_the_chosen_parameters(tmp_path, capsys):
@@ -270,9 +272,9 @@ import { params, init, step, skinInit, skinParams, skinStep } from "./law.mjs";
 const given = JSON.parse(readFileSync(process.argv[2]));
 let memory = init(params);
 const twists = given.map((seen) => {
-  const found = step(params, memory, seen);
-  memory = found.memory;
-  return [found.twist.v_x, found.twist.v_y, found.twist.omega, found.code];
+  const result = step(params, memory, seen);
+  memory = result.memory;
+  return [result.twist.v_x, result.twist.v_y, result.twist.omega, result.code];
 });
 const odd = step(params, memory, { ...given[0], yaw: NaN });
 const felt = skinStep(skinParams, skinInit(), Array(42).fill(0).fill(0.6, 15, 27), 1);
@@ -283,39 +285,39 @@ console.log(JSON.stringify({ twists, odd, felt: felt.contact }));
 @pytest.mark.skipif(shutil.which("node") is None, reason="Node.js is not there")
 @pytest.mark.parametrize("name", ["rps_plus", "learned_mlp", "own"])
 def test_javascript_does_what_c_does(name, tmp_path, own):
-    made = program.program(own if name == "own" else name)
-    native = Native(made, tmp_path, "double")
-    leaves = observations(made, np.random.default_rng(0), 300, np.float64)
+    exported = program.program(own if name == "own" else name)
+    native = Native(exported, tmp_path, "double")
+    leaves = observations(exported, np.random.default_rng(0), 300, np.float64)
     seen = native.filled("observation", leaves, 300)
     memory = native.begin(1)
-    wanted = np.concatenate([native.step(memory, seen[i : i + 1])[0] for i in range(300)])
-    names = [one.name for one in made.groups["observation"]]
+    expected = np.concatenate([native.step(memory, seen[i : i + 1])[0] for i in range(300)])
+    names = [one.name for one in exported.groups["observation"]]
     rows = [dict(zip(names, (x[i].tolist() for x in leaves), strict=True)) for i in range(300)]
     (tmp_path / "seen.json").write_text(json.dumps(rows))
-    (tmp_path / "law.mjs").write_text(js.module(made, "law"))
+    (tmp_path / "law.mjs").write_text(js.module(exported, "law"))
     (tmp_path / "run.mjs").write_text(NODE)
     ran = subprocess.run(
         ["node", "run.mjs", "seen.json"], cwd=tmp_path, check=True, capture_output=True, text=True
     )
-    found = json.loads(ran.stdout)
-    twists = np.array(found["twists"])
+    result = json.loads(ran.stdout)
+    twists = np.array(result["twists"])
     assert not twists[:, 3].any()
-    np.testing.assert_allclose(twists[:, :3], wanted, rtol=1e-9, atol=1e-12)
-    assert found["odd"]["code"] == 1
-    assert found["odd"]["twist"] == {"v_x": 0, "v_y": 0, "omega": 0}
-    assert found["felt"]["in_contact"] is True
-    np.testing.assert_allclose(found["felt"]["p_robot_contact"], [0.3625, 0], atol=1e-9)
+    np.testing.assert_allclose(twists[:, :3], expected, rtol=1e-9, atol=1e-12)
+    assert result["odd"]["code"] == 1
+    assert result["odd"]["twist"] == {"v_x": 0, "v_y": 0, "omega": 0}
+    assert result["felt"]["in_contact"] is True
+    np.testing.assert_allclose(result["felt"]["p_robot_contact"], [0.3625, 0], atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["rps_plus", "learned_mlp", "aps", "force_push_published"])
 def test_onnx_does_what_c_does(name, tmp_path):
     onnx, runtime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
-    count, made = 200, program.program(name)
-    model = onnx_model.models(made, "law", count)["law.onnx"]
+    count, exported = 200, program.program(name)
+    model = onnx_model.models(exported, "law", count)["law.onnx"]
     session = runtime.InferenceSession(model, providers=["CPUExecutionProvider"])
     about = {one.key: one.value for one in onnx.load_from_string(model).metadata_props}
     assert json.loads(about["units"])["yaw"] == "[rad] heading of the robot in the world"
-    native, rng = Native(made, tmp_path, "float"), np.random.default_rng(0)
+    native, rng = Native(exported, tmp_path, "float"), np.random.default_rng(0)
     mine, start = native.begin(count), json.loads(about["memory_at_the_start"])
     types = {one.name: one.type for one in session.get_inputs()}
     of = {"tensor(float)": np.float32, "tensor(bool)": bool, "tensor(int32)": np.int32}
@@ -323,26 +325,26 @@ def test_onnx_does_what_c_does(name, tmp_path):
         key: np.broadcast_to(np.array(value, of[types[key]]), (count, *np.shape(value)))
         for key, value in start.items()
     }
-    names, fields = [one.name for one in session.get_outputs()], made.groups["observation"]
-    apart = []
+    names, fields = [one.name for one in session.get_outputs()], exported.groups["observation"]
+    differences = []
     for _ in range(20):
-        leaves = observations(made, rng, count, np.float32)
+        leaves = observations(exported, rng, count, np.float32)
         given = dict(zip((one.name for one in fields), leaves, strict=True))
         known = {key: value for key, value in (given | memory).items() if key in types}
-        found = dict(zip(names, session.run(None, known), strict=True))
+        result = dict(zip(names, session.run(None, known), strict=True))
         twist, _ = native.step(mine, native.filled("observation", leaves, count))
-        theirs = np.stack([found[key] for key in ("v_x", "v_y", "omega")], -1)
-        apart.append(np.abs(theirs - twist).max(-1))
-        memory = {key: found[f"next_{key}"] for key in memory}
-    apart = np.concatenate(apart)
-    assert np.mean(apart > 1e-5) < 0.02  # where a switch flips, and what follows from it
-    assert np.median(apart) < 1e-7
+        theirs = np.stack([result[key] for key in ("v_x", "v_y", "omega")], -1)
+        differences.append(np.abs(theirs - twist).max(-1))
+        memory = {key: result[f"next_{key}"] for key in memory}
+    differences = np.concatenate(differences)
+    assert np.mean(differences > 1e-5) < 0.02  # where a switch flips, and what follows from it
+    assert np.median(differences) < 1e-7
 
 
 def test_the_command_says_what_onnx_lacks(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
-    said = refusal(capsys, "export", "onnx", "--law", "rps", "--out", tmp_path)
-    assert "pip install 'rps_jax[export]'" in said
+    output = refusal(capsys, "export", "onnx", "--law", "rps", "--out", tmp_path)
+    assert "pip install 'rps_jax[export]'" in output
 
 
 def test_a_law_that_is_exported_is_not_rounded_on_the_way():

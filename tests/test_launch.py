@@ -1,4 +1,4 @@
-"""Kernels are launched side by side, on streams of their own: with a driver that writes it down."""
+"""Kernels are launched concurrently on separate streams, with a fake driver that logs its calls."""
 
 import ctypes
 import json
@@ -17,7 +17,7 @@ from rps_jax.lowering import nvrtc
 COMPILER = device.find_compiler()
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler: apt install gcc")
 NAME = "rps_native_launched"
-# In a process of its own, which has no other driver: two worlds of one kind, twenty of another.
+# A separate process has no other driver. One kernel has two worlds, the other has twenty.
 RUN = """
 import ctypes, json, sys
 import numpy as np
@@ -30,11 +30,11 @@ arrays = [x for n in worlds for x in (np.arange(n, dtype=np.float32), np.arange(
 pointers = (ctypes.c_void_p * 6)(*(x.ctypes.data for x in arrays))
 driver.call.restype = driver.said.restype = ctypes.c_char_p
 handler = getattr(launcher, "rps_native_launched")
-told = []
+calls = []
 for _ in range(2):
     error = driver.call(handler, pointers, ctypes.c_void_p(worlds.ctypes.data), fails.encode())
-    told.append([error.decode(), driver.said().decode().splitlines()])
-print(json.dumps([told, arrays[2].tolist(), arrays[5].tolist()]))
+    calls.append([error.decode(), driver.said().decode().splitlines()])
+print(json.dumps([calls, arrays[2].tolist(), arrays[5].tolist()]))
 """
 
 
@@ -55,10 +55,10 @@ def folder(tmp_path_factory):
 
 
 def launched(folder, fails="nothing"):
-    """What two calls in turn say, the driver's notes of each, and the results of both kernels."""
+    """Return the errors and the driver's logs of two calls, and the results of both kernels."""
     words = [sys.executable, "-c", RUN, str(folder), fails]
-    given = os.environ | {"LD_LIBRARY_PATH": str(folder)}
-    done = subprocess.run(words, capture_output=True, text=True, env=given, check=True)
+    environment = os.environ | {"LD_LIBRARY_PATH": str(folder)}
+    done = subprocess.run(words, capture_output=True, text=True, env=environment, check=True)
     return json.loads(done.stdout)
 
 
@@ -77,7 +77,7 @@ def test_kernels_run_beside_each_other_and_what_follows_waits_for_all(folder):
         "launch 3 on 7: 1 of 32",  # 8 worlds in a block of 32 threads
         "stream 101",
         "event 202",
-        "await 201 on 101",  # what was asked of XLA's stream before comes first
+        "await 201 on 101",  # earlier work of XLA's stream comes first
         "launch 5 on 101: 3 of 32",
         "record 202 on 101",
         "await 202 on 7",
@@ -97,12 +97,12 @@ def test_kernels_run_beside_each_other_and_what_follows_waits_for_all(folder):
     ("launch", "a kernel could not be launched"),
 ])  # fmt: skip
 def test_a_failure_is_told_and_leaves_nothing_open(fails, error, folder):
-    for told, notes in launched(folder, fails)[0]:
-        assert told == error
+    for message, notes in launched(folder, fails)[0]:
+        assert message == error
         for kind in ("stream", "event"):
-            made = sum(line.startswith(f"{kind} ") for line in notes)
+            created = sum(line.startswith(f"{kind} ") for line in notes)
             ended = sum(line.startswith(f"end {kind} ") for line in notes)
-            assert made - ended == (fails == kind)  # what failed to be made is not ended
+            assert created - ended == (fails == kind)  # what failed to be created is not ended
         assert ("pop" in notes) == any(line.startswith("push") for line in notes)
 
 

@@ -1,4 +1,4 @@
-"""What the C compiler makes of a function of one world is what XLA makes of it."""
+"""Functions of one world that a C compiler compiles have the results of XLA."""
 
 from dataclasses import replace
 
@@ -24,13 +24,13 @@ SETTING = Setting()
 
 @pytest.fixture
 def cache(tmp_path):
-    """A cache of its own, and nothing that was compiled before."""
-    before, loaded = jax.config.jax_compilation_cache_dir, dict(native._libraries)
+    """Return an empty cache folder; no compiled function is loaded."""
+    previous, loaded = jax.config.jax_compilation_cache_dir, dict(native._libraries)
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     native._libraries.clear()
     yield tmp_path / "native"
     native._libraries.update(loaded)
-    jax.config.update("jax_compilation_cache_dir", before)
+    jax.config.update("jax_compilation_cache_dir", previous)
 
 
 def batch(shape, skin="capacitive", count=21, law="rps_tuned", domain="wide", **drawn):
@@ -52,33 +52,33 @@ def advance(stage, loop, steps):
 
 
 def advanced(stage, inputs, trials, loop, steps):
-    """Trials after some control steps."""
+    """Trials after subset control steps."""
     return jax.device_get(jax.jit(advance(stage, loop, steps))(*inputs, trials))
 
 
-def begun(inputs, loop):
+def start_trials(inputs, loop):
     return trial.start_all(*inputs, jnp.ones(len(inputs[0].qpos), bool), loop.law)
 
 
-def in_a_push(*asked, **drawn):
+def in_a_push(*arguments, **drawn):
     """Those of `batch`, and trials in the middle of a push, after 8 s."""
-    stage, inputs, loop = batch(*asked, **drawn)
-    step, pushing = jax.jit(advance(stage, loop, 1)), begun(inputs, loop)
+    stage, inputs, loop = batch(*arguments, **drawn)
+    step, pushing = jax.jit(advance(stage, loop, 1)), start_trials(inputs, loop)
     for _ in range(400):  # a program of one step, which the tests compile anyway
         pushing = step(*inputs, pushing)
     assert np.mean(pushing.contact_steps > 0) > 0.5
     return stage, inputs, loop, pushing
 
 
-def same(one, other):
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+def same(actual, desired):
+    for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(desired), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
-def close(one, other, warm, rest):
+def close(actual, desired, warm, rest):
     """Trials, whose accelerations [m/s^2] the solver leaves to 1e-4, and all else."""
-    np.testing.assert_allclose(one.warmstart, other.warmstart, atol=warm)
-    for a, b in zip(*(jax.tree.leaves(x._replace(warmstart=0)) for x in (one, other)),
+    np.testing.assert_allclose(actual.warmstart, desired.warmstart, atol=warm)
+    for a, b in zip(*(jax.tree.leaves(x._replace(warmstart=0)) for x in (actual, desired)),
                     strict=True):  # fmt: skip
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=rest)
 
@@ -87,25 +87,25 @@ def close(one, other, warm, rest):
 @pytest.mark.parametrize("shape", ["box", "cylinder", "prism"])
 def test_a_control_step_ends_where_xla_ends_it(shape, skin, monkeypatch):
     stage, inputs, loop, pushing = in_a_push(shape, skin)
-    found = advanced(stage, inputs, pushing, loop, 1)
+    computed = advanced(stage, inputs, pushing, loop, 1)
     monkeypatch.setenv("RPS_COMPILER", "none")
     expected = advanced(stage, inputs, pushing, loop, 1)
-    close(found, expected, warm=2e-3, rest=2e-5)
+    close(computed, expected, warm=2e-3, rest=2e-5)
 
 
 @pytest.mark.parametrize("shape", ["box", "cylinder", "prism"])
 def test_the_bits_of_a_world_depend_on_no_other_world(shape):
     stage, inputs, loop = batch(shape)
-    together = advanced(stage, inputs, begun(inputs, loop), loop, 300)
+    together = advanced(stage, inputs, start_trials(inputs, loop), loop, 300)
     for order in (np.arange(20, -1, -1), np.array([17]), np.array([5, 17, 5])):
-        some = jax.tree.map(lambda x, order=order: x[order], inputs)
-        found = advanced(stage, some, begun(some, loop), loop, 300)
-        same(found, jax.tree.map(lambda x, order=order: x[order], together))
+        subset = jax.tree.map(lambda x, order=order: x[order], inputs)
+        computed = advanced(stage, subset, start_trials(subset, loop), loop, 300)
+        same(computed, jax.tree.map(lambda x, order=order: x[order], together))
 
 
 def test_a_drive_is_compiled_and_its_derivative_is_xlas(monkeypatch):
     stage, inputs, loop = batch("box", count=3)
-    start = trial.motion(begun(inputs, loop))
+    start = trial.motion(start_trials(inputs, loop))
     still = jnp.zeros(3)
 
     def moved(speed):
@@ -120,16 +120,16 @@ def test_a_drive_is_compiled_and_its_derivative_is_xlas(monkeypatch):
         return jax.jit(lambda x: moved(x)).lower(still).as_text()
 
     assert "rps_native" in lowered()
-    found = slope()
+    computed = slope()
     monkeypatch.setenv("RPS_COMPILER", "none")
     assert "rps_native" not in lowered()
-    same(found, slope())
+    same(computed, slope())
 
 
 def test_without_a_compiler_batches_run_side_by_side_in_one_loop(monkeypatch):
     made = (batch(shape, count=2) for shape in ("box", "prism"))
     stages, inputs, loops = zip(*made, strict=True)
-    trials = tuple(begun(some, loops[0]) for some in inputs)
+    trials = tuple(start_trials(subset, loops[0]) for subset in inputs)
     monkeypatch.setenv("RPS_COMPILER", "none")
     run = jax.make_jaxpr(lambda w, p, t: trial.advance(stages, w, p, t, loops[0], 3))
     primitives = [eqn.primitive.name for eqn in run(*zip(*inputs, strict=True), trials).eqns]
@@ -138,14 +138,14 @@ def test_without_a_compiler_batches_run_side_by_side_in_one_loop(monkeypatch):
 
 def test_a_compiler_that_fails_is_told_once_and_xla_compiles(monkeypatch, tmp_path, cache):
     broken = tmp_path / "broken"
-    said = 'case "$*" in *-dM*) exit 0;; esac\necho it is broken >&2\nexit 1\n'
-    broken.write_text(f"#!/bin/sh\n{said}")
+    script = 'case "$*" in *-dM*) exit 0;; esac\necho it is broken >&2\nexit 1\n'
+    broken.write_text(f"#!/bin/sh\n{script}")
     broken.chmod(0o755)
     monkeypatch.setenv("RPS_COMPILER", str(broken))
     run = native.batched(lambda x: 2 * x, lambda x: 3 * x)
-    with pytest.warns(UserWarning, match="fails, so XLA compiles: it is broken") as told:
+    with pytest.warns(UserWarning, match="fails, so XLA compiles: it is broken") as caught:
         results = [jax.jit(lambda x: run(x))(jnp.ones(n)).tolist() for n in (2, 3)]
-    assert len({str(one.message) for one in told}) == 1
+    assert len({str(warning.message) for warning in caught}) == 1
     assert results == [[3.0] * 2, [3.0] * 3]
 
 
@@ -158,39 +158,39 @@ def test_operations_that_cannot_be_read_are_told_and_xla_steps(monkeypatch, cach
 
 def test_a_gpu_without_a_compiler_is_told(monkeypatch):
     monkeypatch.setattr(native, "target", lambda: None)
-    assert not native.is_available()  # a processor without one is a usual thing
+    assert not native.is_available()  # a processor without a compiler is common
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     with pytest.warns(UserWarning, match="a C compiler .* is not installed, so XLA compiles"):
         assert not native.is_available()
     monkeypatch.setenv("RPS_COMPILER", "none")
-    assert not native.is_available()  # nor is one who asks for it told
+    assert not native.is_available()  # the user chose XLA
 
 
 @pytest.mark.parametrize("damage", ["cut", "turned", "empty"])
 def test_a_damaged_function_is_dropped_with_one_line(damage, cache, monkeypatch):
-    x, more = jnp.arange(5.0), float(len(damage))  # so that each has a function of its own
+    x, more = jnp.arange(5.0), float(len(damage))  # a different function for each case
     expected = (2 * x + more).tolist()
 
-    def made():
+    def run():
         return np.asarray(jax.jit(native.batched(lambda x: 2 * x + more, None))(x)).tolist()
 
-    assert made() == expected
+    assert run() == expected
     monkeypatch.setattr(jax.ffi, "register_ffi_target", lambda *_, **__: None)  # once a process
-    (kept,) = cache.iterdir()
-    content = kept.read_bytes()
+    (cached,) = cache.iterdir()
+    content = cached.read_bytes()
     changed = {"cut": content[:100], "empty": b"", "turned": content[:-1] + b"?"}
-    kept.write_bytes(changed[damage])
+    cached.write_bytes(changed[damage])
     native._libraries.clear()
-    with pytest.warns(UserWarning, match="is dropped, and compiled again: its checksum") as told:
-        assert made() == expected
-    assert len(told) == 1
+    with pytest.warns(UserWarning, match="is dropped, and compiled again: its checksum") as caught:
+        assert run() == expected
+    assert len(caught) == 1
     native._libraries.clear()
-    assert made() == expected
-    assert kept.read_bytes() == content
+    assert run() == expected
+    assert cached.read_bytes() == content
 
 
 def halvings(x):
-    """How often x can be halved until it is below one: each world goes on for another time."""
+    """Return the number of halvings until x is below 1, which differs between worlds."""
     return jax.lax.while_loop(lambda c: c[1] >= 1, lambda c: (c[0] + 1, c[1] / 2), (0, x))
 
 
@@ -249,13 +249,13 @@ def test_the_loop_of_an_equation_is_compiled_as_a_whole(law, skin, request, monk
         monkeypatch.setattr(native, "_binary", lambda text, name: b"")
         monkeypatch.setattr(native, "_register", lambda name, body: True)
     stage, inputs, loop = batch("box", skin, 2, law)
-    primitives = str(jax.make_jaxpr(advance(stage, loop, 3))(*inputs, begun(inputs, loop)))
+    primitives = str(jax.make_jaxpr(advance(stage, loop, 3))(*inputs, start_trials(inputs, loop)))
     assert "rps_native" in primitives
     assert "while" not in primitives
 
 
 def test_xla_compiles_large_products_without_a_warning(recwarn):
-    """As those of a learned law."""
+    """Large products are those of a learned law."""
     run = native.batched(lambda x: jnp.ones((99, 3)) * x @ jnp.ones(3), lambda x: 3 * x)
     assert np.asarray(run(jnp.arange(2.0))).tolist() == [0.0, 3.0]
     assert not len(recwarn)
@@ -282,4 +282,4 @@ def test_only_the_fused_engine_calls_compiled_functions(engine):
     loop = ControlLoop(setting.physics, setting.rules, registry.law_of(params))
     inputs = jax.tree.map(jnp.asarray, (part.worlds, part.params))
     run = jax.make_jaxpr(advance(part.stage, loop, 1))
-    assert ("rps_native" in str(run(*inputs, begun(inputs, loop)))) == (engine == "fused")
+    assert ("rps_native" in str(run(*inputs, start_trials(inputs, loop)))) == (engine == "fused")

@@ -1,6 +1,6 @@
-/* A warp of a GPU, whose threads are fibers of one thread of a processor: what `gpu.h` asks of
-   CUDA. At every shuffle, vote and barrier each thread waits for the 31 others; threads that meet at
-   different ones are told, and end the process. */
+/* Emulated warp of a GPU: its threads are fibers of one thread of a processor. At each shuffle, vote
+   and barrier a thread waits for the 31 others. If threads wait at different places, the process
+   ends with the message "threads diverge". */
 
 #include <math.h>
 #include <stdint.h>
