@@ -65,7 +65,7 @@ def init(params):
 def step(params, memory, seen):
     l = seen.p_robot_contact[1]
     place = memory.count % 3
-    gain = params.gains[jnp.int32(seen.in_contact), place]  # a row and a column, selected at run time
+    gain = params.gains[jnp.int32(seen.in_contact), place]  # row and column known at run time
     other = jnp.take(jnp.array([1.0, 2.0, 3.0]), place + 1, mode="clip")
     trace = jnp.concatenate([memory.trace[1:], l[None]]).at[0].set(memory.trace[3])
     smooth = jax.lax.scan(lambda s, x: (0.5 * s + x, s), 0.0, trace)[0]
@@ -237,15 +237,13 @@ def test_an_operation_that_cannot_be_written_is_named(tmp_path, capsys, registri
         )
         path.write_text(head + rest)
         for kind in ("c", "js", "onnx"):
-            output = refusal(
-                capsys, "export", kind, "--law", f"{path}:OwnParams", "--out", tmp_path
-            )
+            error = refusal(capsys, "export", kind, "--law", f"{path}:OwnParams", "--out", tmp_path)
             name = {"c": "C", "js": "JavaScript", "onnx": "ONNX"}[kind]
-            assert f"operation `{operation}` is not supported by the {name} exporter" in output
-    output = refusal(capsys, "export", "c", "--law", "rps", "--skin", "ideal", "--out", tmp_path)
-    assert "name one with taxels" in output
-    output = refusal(capsys, "export", "c", "--law", "rps", "--prefix", "2 laws", "--out", tmp_path)
-    assert "prefix = 2 laws is not allowed" in output
+            assert f"operation `{operation}` is not supported by the {name} exporter" in error
+    error = refusal(capsys, "export", "c", "--law", "rps", "--skin", "ideal", "--out", tmp_path)
+    assert "name one with taxels" in error
+    error = refusal(capsys, "export", "c", "--law", "rps", "--prefix", "2 laws", "--out", tmp_path)
+    assert "prefix = 2 laws is not allowed" in error
 
 
 def test_the_command_writes_a_folder_with_the_chosen_parameters(tmp_path, capsys):
@@ -343,8 +341,8 @@ def test_onnx_does_what_c_does(name, tmp_path):
 
 def test_the_command_says_what_onnx_lacks(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
-    output = refusal(capsys, "export", "onnx", "--law", "rps", "--out", tmp_path)
-    assert "pip install 'rps_jax[export]'" in output
+    error = refusal(capsys, "export", "onnx", "--law", "rps", "--out", tmp_path)
+    assert "pip install 'rps_jax[export]'" in error
 
 
 def test_a_law_that_is_exported_is_not_rounded_on_the_way():
