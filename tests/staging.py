@@ -1,19 +1,24 @@
-"""Worlds of test scenes: staged by an engine, and as MuJoCo compiles each of them."""
+"""Worlds of test scenes: staged and stepped by an engine, and compiled by MuJoCo."""
 
 from collections.abc import Sequence
-from typing import Any
+from functools import cache, partial
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import engines
+from rps_jax.control.observation import Twist
 from rps_jax.engines import mjx as mjx_engine
+from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.engines.fused.step import body
 from rps_jax.engines.quasistatic import sliders
 from rps_jax.geometry import solid
 from rps_jax.robot.robot import Robot
-from rps_jax.world.physics import Physics
-from rps_jax.world.scene import Friction, Scene
+from rps_jax.world import scene
+from rps_jax.world.physics import Physics, preset
+from rps_jax.world.scene import FRICTION, Friction, Scene
 
 
 def staged(
@@ -38,3 +43,89 @@ def recompiled(engine: str, scenes: Sequence[Scene]) -> Any:
         return sliders(solid.stack([one.solid for one in scenes]), friction, half)
     bodies = [body(one.physics, one.solid.vertices) for one in scenes]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *bodies)
+
+
+class Recording(NamedTuple):
+    """States of n worlds at the start and after each of T control periods."""
+
+    qpos: Any  # (T + 1, n, 10)
+    qvel: Any  # (T + 1, n, 9)
+    force: Any = None  # [N, N, N m] (T, n, 3) on the base, where the engine computes it
+
+
+@partial(jax.jit, static_argnames=("stage", "physics", "force"))
+def drive(
+    stage: Any,
+    fields: Any,
+    motion: Motion,
+    twists: Any,
+    physics: Physics,
+    robots: Robot | None = None,
+    force: bool = False,
+) -> Recording:
+    """Step worlds in a compiled program with twists (T, n, 3) of their bases."""
+
+    def step(motion: Motion, twist: Any) -> tuple[Motion, Any]:
+        period = ControlPeriod(Twist(*twist.T), physics, robots, force)
+        driven = stage.drive(fields, motion, period)
+        return driven.motion, (driven.motion.qpos, driven.motion.qvel, driven.force)
+
+    qpos, qvel, wrench = jax.lax.scan(step, motion, twists)[1]
+    join = lambda first, rest: jnp.concatenate([first[None], rest])  # noqa: E731
+    return Recording(join(motion.qpos, qpos), join(motion.qvel, qvel), wrench)
+
+
+def simulate(
+    engine: str,
+    stage: Any,
+    fields: Any,
+    qpos: np.ndarray,
+    twist: Any,
+    physics: Physics,
+    periods: int,
+    robots: Robot | None = None,
+    qvel: np.ndarray | None = None,
+) -> Recording:
+    """Step worlds from positions (n, 10) and velocities (n, 9) with a constant twist (n, 3)."""
+    found, count = engines.get(engine), len(qpos)
+    qvel = np.zeros((count, 9)) if qvel is None else qvel
+    twist = np.broadcast_to(np.asarray(twist, float), (count, 3))
+    if not found.traced:
+        batch = found.stepper(stage, qpos, 2, robots)
+        batch.qvel[:] = qvel
+        states = [(batch.qpos.copy(), batch.qvel.copy(), batch.force.copy())]
+        for _ in range(periods):
+            batch.drive(np.arange(count), twist, physics.substeps)
+            states.append((batch.qpos.copy(), batch.qvel.copy(), batch.force.copy()))
+        batch.close()
+        positions, velocities, force = map(np.stack, zip(*states, strict=True))
+        return Recording(positions, velocities, force[1:])
+    fields, robots, qpos, qvel = jax.tree.map(
+        lambda x: jnp.asarray(x, float), (fields, robots, qpos, qvel)
+    )
+    motion = Motion(qpos, qvel, 0 * qvel, None if robots is None else jnp.zeros((count, 3)))
+    twists = jnp.broadcast_to(jnp.asarray(twist), (periods, count, 3))
+    args = (stage, fields, motion, twists, physics, robots, found.computes_force)
+    return jax.tree.map(lambda x: np.asarray(x, float), drive(*args))
+
+
+@cache
+def push_object(
+    engine: str,
+    robot: Robot = Robot(),
+    seconds: float = 2.0,
+    twist: tuple[float, float, float] = (0.05, 0.0, 0.0),
+    friction: Friction = FRICTION["S1"],
+    yaw: float = 0.0,
+    lateral: float = 0.0,
+) -> Recording:
+    """Push the box at a constant twist from contact, in one world of standard physics."""
+    physics = preset()
+    loaded = scene.load("box", physics, friction, robot=robot)
+    start = scene.initial_qpos(loaded, gap=0.0, yaw=yaw)[None]
+    start[0, 4] += lateral
+    stage, fields = staged(engine, [loaded], physics, robot)
+    robots = jax.tree.map(lambda x: np.asarray(x, float)[None], robot) if robot.driven else None
+    periods = round(seconds / physics.control_period)
+    found = simulate(engine, stage, fields, start, twist, physics, periods, robots)
+    return Recording(*(x if x is None else x[:, 0] for x in found))

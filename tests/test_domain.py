@@ -36,13 +36,13 @@ def drawn(name, count=COUNT, seed=3, **changes):
 
 
 def test_a_world_is_the_same_alone_as_among_others():
-    """And whatever the order in which worlds are asked for."""
-    many = draws.draw(WIDE, 7, np.arange(1, 3000, 3))
+    """The order of the requested worlds does not matter either."""
+    worlds_again = draws.draw(WIDE, 7, np.arange(1, 3000, 3))
     for i in (0, 17, 999):
         alone = draws.draw(WIDE, 7, [1 + 3 * i])
-        same(alone, jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], many))
+        same(alone, jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], worlds_again))
     backwards = draws.draw(WIDE, 7, np.arange(1, 3000, 3)[::-1])
-    same(jax.tree.map(lambda leaf: leaf[::-1], backwards), many)
+    same(jax.tree.map(lambda leaf: leaf[::-1], backwards), worlds_again)
 
 
 def test_other_indices_and_other_seeds_give_other_worlds():
@@ -85,8 +85,8 @@ def test_objects_take_turns():
 def test_the_paper_domain_is_the_papers_grid(engine):
     chosen, setting = DOMAINS["paper"], Setting(engine=engine)
     assert chosen.combinations == 144
-    for which, name in enumerate(PAPER_OBJECTS):
-        index = np.flatnonzero(chosen.object_of(np.arange(144)) == which)
+    for number, name in enumerate(PAPER_OBJECTS):
+        index = np.flatnonzero(chosen.object_of(np.arange(144)) == number)
         part = drawn_worlds(chosen, draws.draw(chosen, 0, index), setting)
         cases = [Case(name, f, t) for f in FRICTION.values() for t in paper.TARGETS]
         worlds = pushes.build(cases, setting).worlds
@@ -103,10 +103,10 @@ def test_fused_bodies_equal_those_of_recompiled_models(name):
     worlds, family = drawn(name), RANDOM[name]
     _, bodies = engines.get("fused").stage(family, worlds.solid, worlds.friction, preset())
     for i in range(COUNT):
-        one = scene.compile_row(family, worlds.solid, worlds.friction, preset(), i)
-        compiled = fused.body(one.physics, np.asarray(one.footprint.vertices, float))
+        row = scene.compile_row(family, worlds.solid, worlds.friction, preset(), i)
+        compiled = fused.body(row.physics, np.asarray(row.footprint.vertices, float))
         for field, a, b in zip(compiled._fields, bodies, compiled, strict=True):
-            if b is None:  # these solids have no feet of their own
+            if b is None:  # these solids have no custom feet
                 assert a is None
                 continue
             np.testing.assert_allclose(a[i], b, rtol=1e-6, atol=1e-7, err_msg=field)
@@ -118,10 +118,10 @@ def test_applied_domain_equals_the_recompiled_model_in_every_field(name):
     _, fields = engines.get("mjx").stage(family, worlds.solid, worlds.friction, preset())
     assert set(fields) <= set(mjx_engine.FIELDS)
     for i in range(COUNT):
-        one = scene.compile_row(family, worlds.solid, worlds.friction, preset(), i)
-        compiled = mjx.put_model(one.physics)
-        # The mesh of a prism stands for it in C MuJoCo alone: MJX reads its corners off its feet.
-        real = one.physics.geom_type != mujoco.mjtGeom.mjGEOM_MESH
+        row = scene.compile_row(family, worlds.solid, worlds.friction, preset(), i)
+        compiled = mjx.put_model(row.physics)
+        # Only C MuJoCo has the mesh of a prism: MJX reads the corners from its feet.
+        real = row.physics.geom_type != mujoco.mjtGeom.mjGEOM_MESH
         leaves = jax.tree_util.tree_flatten_with_path(compiled)[0]
         values = {jax.tree_util.keystr(path): np.asarray(leaf, float) for path, leaf in leaves}
         for field in mjx_engine.FIELDS:
@@ -148,38 +148,38 @@ def test_mass_properties_are_those_that_mujoco_finds(name):
     """For a solid of even density with a small load in it."""
     worlds = drawn(name, 6, seed=1)
     for i in range(6):
-        one = jax.tree.map(lambda leaf, i=i: leaf[i], worlds.solid)
-        share = np.linalg.norm(one.p_object_com) / (
-            0.8 * _reach(one, np.arctan2(*one.p_object_com[1::-1]))
+        row = jax.tree.map(lambda leaf, i=i: leaf[i], worlds.solid)
+        share = np.linalg.norm(row.p_object_com) / (
+            0.8 * _reach(row, np.arctan2(*row.p_object_com[1::-1]))
         )
-        load = one.p_object_com / share
+        load = row.p_object_com / share
         spec = mujoco.MjSpec()
         body = spec.worldbody.add_body()
-        body.add_geom(**_even(spec, one), mass=(1 - share) * one.mass)
+        body.add_geom(**_even(spec, row), mass=(1 - share) * row.mass)
         body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-4] * 3, pos=load, mass=share * one.mass
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-4] * 3, pos=load, mass=share * row.mass
         )
         model = spec.compile()
         turn = np.zeros(9)
         mujoco.mju_quat2Mat(turn, model.body_iquat[1])
         theirs = turn.reshape(3, 3) @ np.diag(model.body_inertia[1]) @ turn.reshape(3, 3).T
-        axes = solid.axes(jax.tree.map(lambda leaf: leaf[None], one))[0]
-        np.testing.assert_allclose(one.p_object_com, model.body_ipos[1], atol=1e-6)
-        np.testing.assert_allclose(axes @ np.diag(one.inertia) @ axes.T, theirs, rtol=1e-4,
-                                   atol=1e-4 * one.inertia.max())  # fmt: skip
+        axes = solid.axes(jax.tree.map(lambda leaf: leaf[None], row))[0]
+        np.testing.assert_allclose(row.p_object_com, model.body_ipos[1], atol=1e-6)
+        np.testing.assert_allclose(axes @ np.diag(row.inertia) @ axes.T, theirs, rtol=1e-4,
+                                   atol=1e-4 * row.inertia.max())  # fmt: skip
 
 
-def _reach(one, bearing):
+def _reach(row, bearing):
     direction = np.array([[np.cos(bearing), np.sin(bearing)]])
-    return solid.reach(one.vertices[None], one.radius[None], direction)[0]
+    return solid.reach(row.vertices[None], row.radius[None], direction)[0]
 
 
-def _even(spec, one):
+def _even(spec, row):
     """The geom of a solid of even density."""
-    half = one.height / 2
-    if len(one.vertices) == 1:
-        return {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": [one.radius, half, 0]}
-    corners = np.unique(one.vertices, axis=0)
+    half = row.height / 2
+    if len(row.vertices) == 1:
+        return {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": [row.radius, half, 0]}
+    corners = np.unique(row.vertices, axis=0)
     points = [[*corner, z] for z in (-half, half) for corner in corners]
     spec.add_mesh(name="solid", uservert=np.ravel(points))
     return {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": "solid"}
@@ -202,14 +202,14 @@ def test_prisms_are_convex_of_three_to_eight_sides_and_centred():
 def test_a_square_prism_has_a_boxs_mass_properties():
     square = solid.rectangles(np.array([0.2]), np.array([0.3]))
     (height, mass, offset) = (np.array([x]) for x in (0.6, 12.0, 0.0))
-    one = solid.build(square, np.zeros(1), height, mass, offset, offset)
+    row = solid.build(square, np.zeros(1), height, mass, offset, offset)
     ixx, iyy, izz = 12 / 3 * (0.3**2 + 0.3**2), 12 / 3 * (0.2**2 + 0.3**2), 12 / 3 * 0.13
-    axes = solid.axes(one)[0]
-    found = np.diag(axes @ np.diag(one.inertia[0]) @ axes.T)
-    np.testing.assert_allclose(found, [ixx, iyy, izz])
+    axes = solid.axes(row)[0]
+    moments = np.diag(axes @ np.diag(row.inertia[0]) @ axes.T)
+    np.testing.assert_allclose(moments, [ixx, iyy, izz])
     padded = np.concatenate([square, np.repeat(square[:, -1:], 4, axis=1)], axis=1)
     assert solid.build(padded, np.zeros(1), height, mass, offset, offset).inertia == pytest.approx(
-        one.inertia
+        row.inertia
     )
 
 
@@ -247,7 +247,7 @@ def test_a_domain_survives_json():
     with pytest.raises(InputError, match="write low and high"):
         domain.from_json({"mass": "heavy"})
     assert domain.from_json({"mass": 3}).mass == Range(3, 3, log=True)
-    assert domain.from_json({"mass": [3, 10]}).mass == Range(3, 10, log=True)  # as it is in `wide`
+    assert domain.from_json({"mass": [3, 10]}).mass == Range(3, 10, log=True)  # as in `wide`
     assert domain.from_json({"mass": [3, 10, False]}).mass == Range(3, 10)
 
 

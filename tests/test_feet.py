@@ -1,15 +1,12 @@
-"""Objects that stand on feet of their own, in the engines that know them."""
+"""Objects on custom feet in the engines."""
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from staging import staged
+from staging import simulate, staged
 
 from rps_jax import engines
-from rps_jax.control.observation import Twist
-from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.errors import InputError
 from rps_jax.geometry import solid
 from rps_jax.geometry.solid import SIDES
@@ -75,20 +72,7 @@ def driven(engine, names, steps):
     """Positions (n, 10) after steps at TWIST in an engine."""
     scenes, qpos = zip(*map(start, names), strict=True)
     stage, fields = staged(engine, scenes, FINE)
-    twist = Twist(*(jnp.full(len(names), x) for x in TWIST))
-    still = jnp.zeros((len(names), 9))
-
-    @jax.jit
-    def run(motion):
-        return jax.lax.fori_loop(
-            0,
-            steps,
-            lambda _, now: stage.drive(fields, now, ControlPeriod(twist, FINE)).motion,
-            motion,
-        )
-
-    fields = jax.tree.map(lambda x: jnp.asarray(x, float), fields)
-    return np.asarray(run(Motion(jnp.asarray(np.array(qpos), float), still, still)).qpos, float)
+    return simulate(engine, stage, fields, np.array(qpos), TWIST, FINE, steps).qpos[-1]
 
 
 Y = 4  # of the object, along the base's front, on which it comes to lie
@@ -98,31 +82,31 @@ Y = 4  # of the object, along the base's front, on which it comes to lie
 def test_feet_decide_where_an_object_ends_and_engines_end_where_c_mujoco_does(engine):
     feet, corners = in_c("on_feet", 300), in_c("on_corners", 300)
     assert feet[Y] - corners[Y] > 0.01
-    found = driven(engine, ["on_feet", "on_both"], 300)
-    np.testing.assert_allclose(found[0], feet, atol=2e-3)
-    np.testing.assert_allclose(found[1, :6], corners[:6], atol=3e-3)
+    qpos = driven(engine, ["on_feet", "on_both"], 300)
+    np.testing.assert_allclose(qpos[0], feet, atol=2e-3)
+    np.testing.assert_allclose(qpos[1, :6], corners[:6], atol=3e-3)
 
 
 def test_quasistatic_ends_nearer_to_c_mujoco_with_the_same_feet():
     feet, corners = in_c("on_feet", 300), in_c("on_corners", 300)
-    found = driven("quasistatic", ["on_feet", "on_both"], 300)
-    assert found[0, Y] - found[1, Y] > 0.005
-    for one, same, other in ((found[0], feet, corners), (found[1], corners, feet)):
-        assert abs(one[Y] - same[Y]) < abs(one[Y] - other[Y])
+    qpos = driven("quasistatic", ["on_feet", "on_both"], 300)
+    assert qpos[0, Y] - qpos[1, Y] > 0.005
+    for final, expected, wrong in ((qpos[0], feet, corners), (qpos[1], corners, feet)):
+        assert abs(final[Y] - expected[Y]) < abs(final[Y] - wrong[Y])
 
 
 def test_a_scene_gives_its_feet_back():
-    one = scene.solid_of(scene.load("on_feet", FINE, FRICTION))
-    np.testing.assert_array_equal(one.feet[0, :3], np.column_stack([FEET, np.ones(3)]))
-    np.testing.assert_array_equal(one.feet[0, 3:, 2], 0)
-    assert one.feet.shape == (1, SIDES, 3)
+    row = scene.solid_of(scene.load("on_feet", FINE, FRICTION))
+    np.testing.assert_array_equal(row.feet[0, :3], np.column_stack([FEET, np.ones(3)]))
+    np.testing.assert_array_equal(row.feet[0, 3:, 2], 0)
+    assert row.feet.shape == (1, SIDES, 3)
     assert scene.solid_of(scene.load("on_corners", FINE, FRICTION)).feet is None
 
 
 def test_the_arm_of_friction_is_that_of_the_feet():
-    one = scene.solid_of(scene.load("on_feet", FINE, FRICTION))
+    row = scene.solid_of(scene.load("on_feet", FINE, FRICTION))
     loads = np.linalg.solve(np.vstack([FEET.T, np.ones(3)]), [0, 0, 1])
-    arm = solid.friction_arm(one)[0]
+    arm = solid.friction_arm(row)[0]
     assert arm == pytest.approx(loads @ np.linalg.norm(FEET, axis=1), rel=1e-4)
     names = ("on_both", "on_corners")
     both, corners = (scene.solid_of(scene.load(name, FINE, FRICTION)) for name in names)
@@ -132,15 +116,15 @@ def test_the_arm_of_friction_is_that_of_the_feet():
     for weight, expected in ((1.0, 0.8), (4.0, 0.5), (1e9, 0.0)):
         feet = np.zeros((1, SIDES, 3))
         feet[0, :5] = np.column_stack([square, [1, 1, 1, 1, weight]])
-        share = solid.friction_arm(one._replace(feet=feet))[0] / np.hypot(0.1, 0.1)
+        share = solid.friction_arm(row._replace(feet=feet))[0] / np.hypot(0.1, 0.1)
         assert share == pytest.approx(expected, abs=1e-6)
 
 
 def test_the_rigid_solver_stands_on_feet():
-    one = scene.solid_of(scene.load("on_feet", FINE, FRICTION))
-    feet = rigid.supports(one, np.zeros(1), np.zeros((1, 2)))
+    row = scene.solid_of(scene.load("on_feet", FINE, FRICTION))
+    feet = rigid.supports(row, np.zeros(1), np.zeros((1, 2)))
     np.testing.assert_allclose(feet[0, :3], FEET, atol=1e-9)
-    load = rigid.borne(feet, np.zeros((1, 2)), np.zeros((1, 1)), one.feet[..., 2])
+    load = rigid.borne(feet, np.zeros((1, 2)), np.zeros((1, 1)), row.feet[..., 2])
     expected = np.linalg.solve(np.vstack([FEET.T, np.ones(3)]), [0, 0, 1])
     np.testing.assert_allclose(load[0], [*expected, *np.zeros(SIDES - 3)], atol=1e-9)
 
@@ -167,36 +151,16 @@ def drawn_on_feet(name, count=4):
     """Worlds with drawn feet, and with those of the same worlds without."""
     changes = f"wide,objects={name},gap=0,lateral=-0.05:0.05,height=0.3:0.4,friction_ground=0.1:0.4"
     ranges = [domains.parse_domain(changes), domains.parse_domain(f"{changes},feet=0.5:0.9")]
-    plain, on_feet = (draws.draw(one, 3, np.arange(count)) for one in ranges)
+    plain, on_feet = (draws.draw(domain, 3, np.arange(count)) for domain in ranges)
     return plain, on_feet, ranges[1].families[0]
 
 
 def stepped(engine, family, drawn, steps):
     """Positions (n, 10) of drawn worlds after steps at TWIST in a traced engine, or in C."""
-    found = engines.get(engine)
-    stage, fields = found.stage(family, drawn.solid, drawn.friction, FINE, Robot())
+    stage, fields = engines.get(engine).stage(family, drawn.solid, drawn.friction, FINE, Robot())
     qpos = starts(drawn)
     qpos[:, [3, 5]] -= 0.0005
-    if engine == "mujoco":
-        batch = found.stepper(stage, qpos, 1)
-        for _ in range(steps):
-            batch.drive(np.arange(len(qpos)), np.tile(TWIST, (len(qpos), 1)), 1)
-        batch.close()
-        return batch.qpos
-    twist = Twist(*(jnp.full(len(qpos), x) for x in TWIST))
-    fields = jax.tree.map(lambda x: jnp.asarray(x, float), fields)
-    still = jnp.zeros((len(qpos), 9))
-
-    @jax.jit
-    def run(motion):
-        return jax.lax.fori_loop(
-            0,
-            steps,
-            lambda _, now: stage.drive(fields, now, ControlPeriod(twist, FINE)).motion,
-            motion,
-        )
-
-    return np.asarray(run(Motion(jnp.asarray(qpos, float), still, still)).qpos, float)
+    return simulate(engine, stage, fields, qpos, TWIST, FINE, steps).qpos[-1]
 
 
 @pytest.mark.parametrize("name", domains.RANDOM)
@@ -210,10 +174,10 @@ def test_drawn_feet_change_nothing_else_and_bear_the_object(name):
     assert set(drawn.values) - set(plain.values) == {"feet"}
     feet, com = drawn.solid.feet, drawn.solid.p_object_com[:, :2]
     assert set(feet[..., 2].sum(axis=1)) == {3.0, 4.0}
-    for share, one, middle, outline, radius in zip(
+    for share, row, middle, outline, radius in zip(
         drawn.values["feet"], feet, com, drawn.solid.vertices, drawn.solid.radius, strict=True
     ):
-        for foot in one[one[:, 2] > 0, :2]:
+        for foot in row[row[:, 2] > 0, :2]:
             # Stretched by the share, a foot lies on the outline.
             edge = middle + (foot - middle) / share
             if radius:
@@ -226,7 +190,7 @@ def test_drawn_feet_change_nothing_else_and_bear_the_object(name):
             assert np.abs(away).min() < 1e-9
             assert away.min() > -1e-9
         bearing = np.linspace(0, 2 * np.pi, 90)
-        reach = (one[:, :2] - middle) @ np.stack([np.cos(bearing), np.sin(bearing)])
+        reach = (row[:, :2] - middle) @ np.stack([np.cos(bearing), np.sin(bearing)])
         assert reach.max(axis=0).min() > 0
 
 
@@ -258,7 +222,7 @@ def test_quasistatic_slides_on_drawn_feet():
 
 
 def test_feet_are_drawn_for_random_objects_alone():
-    with pytest.raises(InputError, match="random ones alone stand on drawn feet"):
+    with pytest.raises(InputError, match="only random objects stand on drawn feet"):
         domains.parse_domain("wide,objects=box,feet=0.5:0.9")
     ranges = domains.parse_domain("wide,feet=0.5:0.9")
     assert {"feet", "feet_number", "feet_turn"} == set(points.names(ranges)) - set(

@@ -60,8 +60,8 @@ every_kind = pytest.mark.parametrize("kind", KINDS)
 def boundary(vertices: np.ndarray, per_edge: int = 4000) -> np.ndarray:
     """Dense samples (N * per_edge, 2) of the outline of a polygon."""
     t = np.linspace(0, 1, per_edge)[:, None]
-    ends = zip(vertices, np.roll(vertices, -1, axis=0), strict=True)
-    return np.concatenate([a + t * (b - a) for a, b in ends])
+    edges = zip(vertices, np.roll(vertices, -1, axis=0), strict=True)
+    return np.concatenate([a + t * (b - a) for a, b in edges])
 
 
 def brute_force_distance(vertices: np.ndarray, radius: float, points: np.ndarray) -> np.ndarray:
@@ -117,14 +117,16 @@ def test_two_vertices_and_a_radius_are_a_stadium():
 
 
 def test_a_repeated_corner_changes_no_distance():
-    """As those by which prisms are filled up to one number of corners."""
+    """Prisms are filled up to one number of corners by such points."""
     square = jnp.array([[0.2, -0.2], [0.2, 0.2], [-0.2, 0.2], [-0.2, -0.2]])
     filled = jnp.concatenate([square, jnp.tile(square[-1], (4, 1))])
     points = jnp.array([[0.0, 0.0], [0.19, 0.0], [0.3, 0.1], [-0.25, -0.25]])
-    found = [fp.signed_distance(Footprint(v, jnp.array(0.0)), points) for v in (square, filled)]
-    np.testing.assert_allclose(found[0], [-0.2, -0.01, 0.1, 0.05 * 2**0.5], atol=1e-6)
-    np.testing.assert_array_equal(*found)
-    point = Footprint(jnp.zeros((4, 2)), jnp.array(0.1))  # a circle, filled up likewise
+    distances_of = [
+        fp.signed_distance(Footprint(v, jnp.array(0.0)), points) for v in (square, filled)
+    ]
+    np.testing.assert_allclose(distances_of[0], [-0.2, -0.01, 0.1, 0.05 * 2**0.5], atol=1e-6)
+    np.testing.assert_array_equal(*distances_of)
+    point = Footprint(jnp.zeros((4, 2)), jnp.array(0.1))  # a circle, filled up in the same way
     np.testing.assert_allclose(
         fp.signed_distance(point, points), [-0.1, 0.09, 0.2162278, 0.2535534], rtol=1e-5
     )
@@ -179,13 +181,13 @@ def test_the_derivative_of_the_distance_is_the_unit_normal(kind):
         footprints = jax.tree.map(lambda v: jnp.asarray(v, jnp.float64), KINDS[kind](rng))
         points = rng.uniform(-1, 1, (BATCH, POINTS, 2))
         gradient = np.asarray(slopes(footprints, points))
-        here = np.asarray(distances(footprints, points))[..., None]
+        distance = np.asarray(distances(footprints, points))[..., None]
         steps = h * np.eye(2)
         up, down = (
             np.stack([np.asarray(distances(footprints, points + a * e)) for e in steps], -1)
             for a in (1, -1)
         )
-    smooth = (np.abs(up - 2 * here + down) < 1e-3 * h).all(axis=-1)
+    smooth = (np.abs(up - 2 * distance + down) < 1e-3 * h).all(axis=-1)
     assert smooth.mean() > 0.98
     np.testing.assert_allclose(gradient[smooth], ((up - down) / (2 * h))[smooth], atol=1e-4)
     np.testing.assert_allclose(np.linalg.norm(gradient, axis=-1), 1, rtol=1e-6)
@@ -276,11 +278,11 @@ def random_lines(rng, footprints: Footprint) -> tuple[np.ndarray, np.ndarray]:
     vertices = np.float64(footprints.vertices)
     if vertices.shape[1] > 1:
         edge = vertices[:, 1] - vertices[:, 0]
-        beside = rng.random(BATCH) < 0.3
-        angle = np.where(beside, np.arctan2(edge[:, 1], edge[:, 0]), angle)
+        is_beside = rng.random(BATCH) < 0.3
+        angle = np.where(is_beside, np.arctan2(edge[:, 1], edge[:, 0]), angle)
         outward = np.stack([np.sin(angle), -np.cos(angle)], -1)
         shifted = vertices[:, 0] + outward * rng.uniform(-0.05, 0.15, (BATCH, 1))
-        origin = np.where(beside[:, None], shifted, origin)
+        origin = np.where(is_beside[:, None], shifted, origin)
     along = np.stack([np.cos(angle), np.sin(angle)], -1)
     return origin.astype(np.float32), along.astype(np.float32)
 
@@ -297,9 +299,9 @@ def test_a_crossing_holds_exactly_the_points_within_the_tolerance(kind, seed):
     hit = low <= high
     # Samples along the line, and its points just within and just beyond the ends.
     s = np.linspace(-2.5, 2.5, POINTS - 4) * np.ones((BATCH, 1))
-    ends = np.where(hit, np.concatenate([low, high], axis=1), 0)
+    edges = np.where(hit, np.concatenate([low, high], axis=1), 0)
     inward = np.array([2e-3, -2e-3])
-    s = np.concatenate([s, ends + inward, ends - inward], axis=1)
+    s = np.concatenate([s, edges + inward, edges - inward], axis=1)
     points = np.float32(origin[:, None] + s[..., None] * along[:, None])
     margin = np.asarray(distances(footprints, points)) - tolerance[:, None]
     within = (low <= s) & (s <= high)
@@ -391,9 +393,9 @@ def test_outlines_are_counter_clockwise_and_of_the_given_size():
 
 def test_polygon_keeps_its_vertices():
     triangle = [[0.0, 0.0], [1.0, 0.0], [0.25, 0.5]]
-    made = fp.polygon(triangle)
-    np.testing.assert_array_equal(made.vertices, triangle)
-    assert made.radius == 0
+    built = fp.polygon(triangle)
+    np.testing.assert_array_equal(built.vertices, triangle)
+    assert built.radius == 0
 
 
 SQUARE = [[0, 0], [1, 0], [1, 1], [0, 1]]

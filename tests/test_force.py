@@ -1,15 +1,12 @@
-"""The contact's force: what engines tell of it, and what a load cell makes of that."""
-
-import functools
+"""The contact's force in the engines, and the readings of a load cell."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import refusal
-from staging import staged
+from staging import push_object, staged
 
-from rps_jax import engines
 from rps_jax.control import registry
 from rps_jax.control.laws.force_push_published import PublishedForcePushParams
 from rps_jax.control.observation import Twist
@@ -27,57 +24,22 @@ from rps_jax.world.physics import Physics
 from rps_jax.world.scene import FRICTION, JOINTS, Friction
 
 STANDARD = Physics()
-AHEAD, TURNING = (0.05, 0.0, 0.0), (0.05, 0.01, 0.05)  # [m/s, m/s, rad/s]
+TURNING = (0.05, 0.01, 0.05)  # [m/s, m/s, rad/s]
 WEIGHT = 20 * GRAVITY  # [N] of the box
 S1, SLIPPERY = FRICTION["S1"], Friction(1e-4, 0.35)
-
-
-@functools.cache
-def pushed(engine, twist=AHEAD, seconds=2.0, friction=S1, robot=Robot(), yaw=0.0, lateral=0.0):
-    """Forces (T, 3) on the base, in its frame, positions (T, 10) and velocities (T, 9) after."""
-    at = scene.load("box", STANDARD, friction, robot=robot)
-    start = scene.initial_qpos(at, gap=0.0, yaw=yaw)[None]
-    start[0, 4] += lateral
-    stage, fields = staged(engine, [at], STANDARD, robot)
-    robots = jax.tree.map(lambda x: np.asarray(x, float)[None], robot) if robot.driven else None
-    count = round(seconds / STANDARD.control_period)
-    if engine == "mujoco":
-        batch = engines.get(engine).stepper(stage, start, 1, robots)
-        seen = []
-        for _ in range(count):
-            batch.drive(np.zeros(1, int), np.array([twist]), STANDARD.substeps)
-            seen.append([x[0].copy() for x in (batch.force, batch.qpos, batch.qvel)])
-        batch.close()
-        return tuple(map(np.array, zip(*seen, strict=True)))
-    still = jnp.zeros((1, 9))
-    twists = Twist(*jnp.asarray(twist, float)[:, None])
-    fields, robots = jax.tree.map(lambda x: jnp.asarray(x, float), (fields, robots))
-
-    @jax.jit
-    def run(now):
-        def body(now, _):
-            driven = stage.drive(fields, now, ControlPeriod(twists, STANDARD, robots, True))
-            now = driven.motion
-            return now, (driven.force[0], now.qpos[0], now.qvel[0])
-
-        return jax.lax.scan(body, now, length=count)[1]
-
-    integral = None if robots is None else jnp.zeros((1, 3))
-    return tuple(map(np.asarray, run(Motion(jnp.asarray(start, float), still, still, integral))))
 
 
 @pytest.mark.parametrize("engine", ["fused", "mjx", "mujoco"])
 def test_a_box_pushed_straight_ahead_pushes_back_with_the_friction_of_its_weight(engine):
     """Within some per cent: sliding friction of MuJoCo's soft ground lifts what slides."""
-    force, _, _ = pushed(engine)
-    steady = force[50:].mean(axis=0)
+    steady = push_object(engine).force[50:].mean(axis=0)
     np.testing.assert_allclose(steady, (-0.3 * WEIGHT, 0.0, 0.0), atol=0.05 * 0.3 * WEIGHT)
 
 
 def test_a_base_of_limited_force_feels_the_object_and_not_its_own_drive():
     strong = Robot(force_max=400.0)
     for engine in ("fused", "mujoco"):
-        force, _, _ = pushed(engine, robot=strong)
+        force = push_object(engine, strong).force
         np.testing.assert_allclose(force[50:].mean(axis=0)[0], -0.3 * WEIGHT, rtol=0.05)
 
 
@@ -87,24 +49,25 @@ def test_on_ground_without_friction_a_push_is_the_momentum_that_the_box_gains(en
 
     What friction there is, of 1e-4, takes 2 % of it.
     """
-    force, _, qvel = pushed(engine, friction=SLIPPERY)
+    _, qvel, force = push_object(engine, friction=SLIPPERY)
     impulse = force.sum(axis=0) * STANDARD.control_period
     gained = 20.0 * qvel[-1][JOINTS.object.start]
     assert gained > 0.9 * 20 * 0.05
-    given = gained + 1e-4 * WEIGHT * 2.0
-    np.testing.assert_allclose(impulse[:2], (-given, 0.0), atol=0.003 * gained)
+    expected = gained + 1e-4 * WEIGHT * 2.0
+    np.testing.assert_allclose(impulse[:2], (-expected, 0.0), atol=0.003 * gained)
     np.testing.assert_allclose(force[-20:], 0.0, atol=1e-3)
 
 
 def test_the_fused_engine_tells_the_force_of_c_mujoco():
     """Over a push of a corner that turns, step by step and in the mean."""
-    (ours, here, _), (theirs, there, _) = (
-        pushed(engine, TURNING, yaw=0.3, lateral=0.05) for engine in ("fused", "mujoco")
+    fused, mujoco = (
+        push_object(engine, twist=TURNING, yaw=0.3, lateral=0.05) for engine in ("fused", "mujoco")
     )
-    np.testing.assert_allclose(here[-1], there[-1], atol=2e-3)
-    size = np.hypot(*theirs[25:, :2].mean(axis=0))
+    np.testing.assert_allclose(fused.qpos[-1], mujoco.qpos[-1], atol=2e-3)
+    force, expected = (recording.force[25:].mean(axis=0) for recording in (fused, mujoco))
+    size = np.hypot(*expected[:2])
     assert size > 20
-    np.testing.assert_allclose(ours[25:].mean(axis=0), theirs[25:].mean(axis=0), atol=0.03 * size)
+    np.testing.assert_allclose(force, expected, atol=0.03 * size)
 
 
 def test_who_does_not_ask_is_told_no_force():
@@ -123,37 +86,37 @@ def test_who_does_not_ask_is_told_no_force():
     assert len(program(True).out_avals) == 4
 
 
-def told(cell, forces, period=0.02):
+def read_cell(cell, forces, period=0.02):
     key, load = jnp.array([1, 2], jnp.uint32), init_load(jnp.zeros(1))
-    seen = []
+    readings = []
     for i, force in enumerate(forces):
         load = load._replace(wrench=jnp.array([*force, 0.0]))
         load, reading = cell.read(load, key, jnp.asarray(i), period)
-        seen.append(reading)
-    return np.array(seen)
+        readings.append(reading)
+    return np.array(readings)
 
 
 def test_a_load_cell_follows_a_step_with_its_time_constant():
-    seen = told(LoadCell(noise=0.0, threshold=0.0), [(-30.0, 10.0)] * 5)
+    readings = read_cell(LoadCell(noise=0.0, threshold=0.0), [(-30.0, 10.0)] * 5)
     share = 1 - np.exp(-0.02 * np.arange(1, 6) / 0.05)
-    np.testing.assert_allclose(seen, share[:, None] * (-30.0, 10.0), rtol=1e-5)
+    np.testing.assert_allclose(readings, share[:, None] * (-30.0, 10.0), rtol=1e-5)
 
 
 def test_a_load_cell_tells_nothing_below_its_threshold():
-    seen = told(LoadCell(noise=0.0, threshold=5.0), [(-3.0, 4.2)] * 20)
+    readings = read_cell(LoadCell(noise=0.0, threshold=5.0), [(-3.0, 4.2)] * 20)
     size = np.hypot(*((1 - np.exp(-0.4 * np.arange(1, 21)))[:, None] * (-3.0, 4.2)).T)
-    np.testing.assert_array_equal(np.hypot(*seen.T) > 0, size >= 5)
-    assert 0 < np.count_nonzero(seen[:, 0]) < 20
+    np.testing.assert_array_equal(np.hypot(*readings.T) > 0, size >= 5)
+    assert 0 < np.count_nonzero(readings[:, 0]) < 20
 
 
 def test_the_noise_of_a_load_cell_is_filtered_too():
-    """Of white noise of 1 N a low-pass of share a leaves sqrt(a / (2 - a)) N."""
+    """A low-pass filter of share a reduces white noise of 1 N to sqrt(a / (2 - a)) N."""
     cell = LoadCell(noise=1.0, threshold=0.0)
     period, count = 0.02, 400
-    seen = told(cell, [(0.0, 0.0)] * count, period)[20:]
+    readings = read_cell(cell, [(0.0, 0.0)] * count, period)[20:]
     share = 1 - np.exp(-period / cell.time_constant)
-    np.testing.assert_allclose(seen.std(axis=0), np.sqrt(share / (2 - share)), rtol=0.15)
-    assert abs(np.corrcoef(seen.T)[0, 1]) < 0.2
+    np.testing.assert_allclose(readings.std(axis=0), np.sqrt(share / (2 - share)), rtol=0.15)
+    assert abs(np.corrcoef(readings.T)[0, 1]) < 0.2
 
 
 @pytest.mark.parametrize("name", ["noise", "time_constant", "threshold"])
@@ -164,30 +127,30 @@ def test_a_load_cell_refuses_what_no_sensor_has(name):
 
 @pytest.mark.parametrize("engine", ["fused", "mujoco"])
 def test_a_law_is_told_the_force_of_the_push_it_makes(engine):
-    """Straight on: what the law is told is what the box of 10 kg takes to slide."""
-    params = PublishedForcePushParams(k_theta=-1.0, k_y=0.0)
-    case = Case("box", FRICTION["S1"], (1.6, 0.0), params, gap=0.0, mass=10.0)
+    """Straight ahead, the law reads the force that slides the box of 10 kg."""
+    gains = PublishedForcePushParams(k_theta=-1.0, k_y=0.0)
+    case = Case("box", FRICTION["S1"], (1.6, 0.0), gains, gap=0.0, mass=10.0)
     setting = Setting(engine=engine, rules=Rules(horizon=4.0))
     if engine == "mujoco":
         outcome, _ = pushes.run([case], setting, workers=1)
         assert outcome.base_pose[0][0] == pytest.approx(0.2, rel=0.1)  # 0.05 m/s: it was felt
         return
-    _, worlds, stage, own = pushes.build([case], setting)
-    law = registry.law_of(params)
-    trials = trial.start_all(worlds, own, np.ones(1, bool), law=law)
+    _, worlds, stage, params = pushes.build([case], setting)
+    law = registry.law_of(gains)
+    trials = trial.start_all(worlds, params, np.ones(1, bool), law=law)
     how = {"physics": setting.physics, "law": law, "steps": 200}
-    trials, _ = trial.record(stage, worlds, own, trials, **how)
+    trials, _ = trial.record(stage, worlds, params, trials, **how)
     np.testing.assert_allclose(trials.load.wrench[0, 0], -0.3 * 10 * GRAVITY, rtol=0.1)
     np.testing.assert_allclose(trials.load.signal[0, 0], -0.3 * 10 * GRAVITY, rtol=0.1)
 
 
 def test_engines_that_tell_no_force_refuse_laws_that_ask_for_it(capsys):
-    words = "engine = quasistatic is not allowed for a law that senses the contact's force"
-    with pytest.raises(InputError, match=words):
+    message = "engine = quasistatic is not allowed for a law that senses the contact's force"
+    with pytest.raises(InputError, match=message):
         pushes.build([Case("box", S1, (2.0, 0.0), PublishedForcePushParams())], Setting(
             engine="quasistatic"
         ))  # fmt: skip
-    asked = ("ladder", "--laws", "force_push_published", "--engine", "quasistatic")
-    assert words in refusal(capsys, *asked)
+    ladder = ("ladder", "--laws", "force_push_published", "--engine", "quasistatic")
+    assert message in refusal(capsys, *ladder)
     tune = ("tune", "es", "--law", "force_push_published", "--engine", "quasistatic")
-    assert words in refusal(capsys, *tune)
+    assert message in refusal(capsys, *tune)

@@ -28,7 +28,7 @@ sqrt_and_gradient = jax.jit(jax.vmap(jax.value_and_grad(planar.safe_sqrt)))
 
 
 def ordinary(v: np.ndarray) -> np.ndarray:
-    """Without what XLA on the CPU flushes to zero: subnormal numbers, and subnormal reciprocals."""
+    """Exclude subnormal numbers and reciprocals, which XLA on the CPU flushes to zero."""
     return np.clip(np.where(np.abs(v) < 1e-37, 0, v), -8e37, 8e37)
 
 
@@ -266,8 +266,8 @@ def test_tilt_is_the_angle_of_the_vertical_and_differentiable_where_it_is_none()
     half = np.float32(0.3)
     lean = np.array([np.cos(half), np.sin(half) * 0.6, np.sin(half) * 0.8, 0.0], np.float32)
     turned = np.array([np.cos(half), 0.0, 0.0, np.sin(half)], np.float32)
-    found = planar.tilt(jnp.stack([lean, turned, np.array([0.0, 1.0, 0.0, 0.0])]))
-    np.testing.assert_allclose(found, [0.6, 0.0, math.pi], atol=1e-3)
+    tilts = planar.tilt(jnp.stack([lean, turned, np.array([0.0, 1.0, 0.0, 0.0])]))
+    np.testing.assert_allclose(tilts, [0.6, 0.0, math.pi], atol=1e-3)
     tiny = jnp.array([1.0, 5e-6, 0.0, 0.0])
     assert float(planar.tilt(tiny)) == pytest.approx(1e-5, rel=1e-4)
     assert np.isfinite(jax.grad(lambda q: planar.tilt(q))(jnp.array([1.0, 0.0, 0.0, 0.0]))).all()

@@ -64,7 +64,7 @@ def program(family, physics):
     def run(body, state, steps):
         twist = Twist(*(jnp.full(state[0].shape[0], x) for x in TWIST))
         period = ControlPeriod(twist, physics)
-        push = lambda _, now: fused.drive(body, now, period).motion  # noqa: E731
+        push = lambda _, motion: fused.drive(body, motion, period).motion  # noqa: E731
         return jax.lax.fori_loop(0, steps, push, Motion(*state))
 
     return run
@@ -72,8 +72,8 @@ def program(family, physics):
 
 def drive(name, body, physics, qpos, steps):
     state = jnp.asarray(qpos, float)[None], jnp.zeros((1, 9)), jnp.zeros((1, 9))
-    after = program(FAMILIES[name], physics)(body, state, steps)
-    return [np.asarray(x[0], float) for x in after[:3]]
+    motion = program(FAMILIES[name], physics)(body, state, steps)
+    return [np.asarray(x[0], float) for x in motion[:3]]
 
 
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
@@ -145,15 +145,15 @@ def test_an_object_that_leans_away_is_touched_where_it_is(name, degrees):
     data = mujoco.MjData(loaded.physics)
     data.qpos[:] = qpos
     mujoco.mj_forward(loaded.physics, data)
-    base, thing = (loaded.physics.geom(g).id for g in ("base", "object"))
-    true = mujoco.mj_geomDistance(loaded.physics, data, base, thing, 1.0, None)
+    base, object_ = (loaded.physics.geom(g).id for g in ("base", "object"))
+    true = mujoco.mj_geomDistance(loaded.physics, data, base, object_, 1.0, None)
     body = fused.body(loaded.physics, np.asarray(loaded.footprint.vertices))
     body = jax.tree.map(lambda leaf: jnp.asarray(leaf, float)[None], body)
     still = jnp.zeros((1, 9))
     state = fused.enter(body, Motion(jnp.asarray(qpos, float)[None], still, still))
     ahead = jnp.ones(1), jnp.zeros(1)
-    found = contacts.meetings(fused.spread(body), state, vectors.matrix(state.q), ahead)
-    heights, _, _, distances = (np.asarray(x) for x in found)
+    contact = contacts.meetings(fused.spread(body), state, vectors.matrix(state.q), ahead)
+    heights, _, _, distances = (np.asarray(x) for x in contact)
     corner = z - tall * c + half * s
     assert heights.min() >= max(0.06, corner) - 1e-5
     assert distances.min() == pytest.approx(true, abs=5e-4)

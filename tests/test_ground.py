@@ -1,6 +1,7 @@
-"""The rigid limit against answers known by hand, and what the study of grounds makes of pushes."""
+"""The rigid limit agrees with solutions by hand; the study of grounds measures pushes."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,58 +14,60 @@ from sweeps.ground import grounds, pushes, rigid
 from sweeps.ground.rigid import Pushed, Rounding
 
 MU, MU_ROBOT = 0.3, 0.35
-STEP = 1e-3  # [m] of way: what is looked at is its beginning
+STEP = 1e-3  # [m] of the first step, which most tests check
 DRY = Rounding(slip=1e-5, depth=1e-7)
 
 
 def blocks(half_x, half_y, offset=0.0, bearing=0.0):
     """Boxes, one for each half length and width [m]; the load moves the centre of mass."""
     half_x, half_y = np.broadcast_arrays(np.atleast_1d(half_x), half_y)
-    one = np.ones(len(half_x))
+    ones = np.ones(len(half_x))
     outline = solid.rectangles(half_x, half_y)
-    return solid.build(outline, 0 * one, 0.8 * one, 20 * one, offset * one, bearing * one)
+    return solid.build(outline, 0 * ones, 0.8 * ones, 20 * ones, offset * ones, bearing * ones)
 
 
 def drums(count=1, radius=0.25):
-    one = np.ones(count)
-    return solid.build(np.zeros((count, 1, 2)), radius * one, 0.7 * one, 25 * one, 0 * one, 0 * one)
+    ones = np.ones(count)
+    return solid.build(
+        np.zeros((count, 1, 2)), radius * ones, 0.7 * ones, 25 * ones, 0 * ones, 0 * ones
+    )
 
 
 def pushed(solids, robot=MU_ROBOT, height=0.0):
-    one = np.ones(solids.mass.size)
-    return Pushed(solids, MU * one, robot * one, height * one)
+    ones = np.ones(solids.mass.size)
+    return Pushed(solids, MU * ones, robot * ones, height * ones)
 
 
-def before(solids, y=0.0, yaw=0.0):
+def poses_at_front(solids, y=0.0, yaw=0.0):
     """Poses of solids that touch the base's front."""
-    one = np.ones(solids.mass.size)
-    return np.column_stack([solid.extent(solids, yaw * one), y * one, yaw * one])
+    ones = np.ones(solids.mass.size)
+    return np.column_stack([solid.extent(solids, yaw * ones), y * ones, yaw * ones])
 
 
-def begun(what, pose, direction=(1.0, 0.0), rounding=DRY):
+def first_step(target, pose, direction=(1.0, 0.0), rounding=DRY):
     """The first step of a push."""
-    here = rigid.contacts(what.solids, pose)
-    pose = pose - np.array([1.0, 0, 0]) * here.gap.min(axis=1)[:, None]  # so that it touches
+    touching = rigid.contacts(target.solids, pose)
+    pose = pose - np.array([1.0, 0, 0]) * touching.gap.min(axis=1)[:, None]  # so that it touches
     start = np.zeros((len(pose), 3)), np.zeros((len(pose), 2))
-    return rigid.solve(what, pose, np.array(direction), STEP, *start, rounding)
+    return rigid.solve(target, pose, np.array(direction), STEP, *start, rounding)
 
 
 @pytest.mark.parametrize("height", [0.0, 0.2])
 def test_a_push_through_the_middle_moves_straight_on_with_mu_m_g(height):
     for solids in (blocks(0.2, [0.2, 0.3]), drums()):
-        found = begun(pushed(solids, height=height), before(solids))
-        np.testing.assert_allclose(found.twist - [1, 0, 0], 0, atol=1e-4)
-        np.testing.assert_allclose(found.force[:, 0], MU, rtol=1e-6)
-        np.testing.assert_allclose(found.force[:, 1], 0, atol=1e-6)
+        step = first_step(pushed(solids, height=height), poses_at_front(solids))
+        np.testing.assert_allclose(step.twist - [1, 0, 0], 0, atol=1e-4)
+        np.testing.assert_allclose(step.force[:, 0], MU, rtol=1e-6)
+        np.testing.assert_allclose(step.force[:, 1], 0, atol=1e-6)
 
 
 def test_the_push_shifts_the_load_ahead_by_its_moment():
     """Four springs at x = +-a bear 1/4 +- mu z / (4 a); three bear what the moments leave them."""
     a, z = 0.2, 0.25
-    box = begun(pushed(blocks(a, a), height=z), before(blocks(a, a)))
+    box = first_step(pushed(blocks(a, a), height=z), poses_at_front(blocks(a, a)))
     ahead = 0.25 + MU * z / (4 * a)
     np.testing.assert_allclose(box.loads, [[ahead, 0.5 - ahead, 0.5 - ahead, ahead]], rtol=1e-5)
-    drum = begun(pushed(drums(radius=a), height=z), before(drums(radius=a)))
+    drum = first_step(pushed(drums(radius=a), height=z), poses_at_front(drums(radius=a)))
     first = 1 / 3 + 2 / 3 * MU * z / a  # the point where it leans to
     np.testing.assert_allclose(drum.loads, [[first, *[(1 - first) / 2] * 2]], rtol=1e-5)
 
@@ -77,19 +80,19 @@ def test_points_that_would_have_to_pull_lift_off():
     np.testing.assert_allclose(load[0] @ feet[0], [0.12, 0.12])
 
 
-@pytest.mark.parametrize("place", [0.25, 0.5, 0.9])
-def test_a_rod_turns_about_its_far_end(place):
+@pytest.mark.parametrize("offset_share", [0.25, 0.5, 0.9])
+def test_a_rod_turns_about_its_far_end(offset_share):
     """Two feet at -a and a, pushed at d: the far one stays, and F = mu m g a / (a + d).
 
     The friction's power, mu m g / 2 (|1 + w (d - a)| + |1 + w (d + a)|) at the turn w, is least
     where the far foot rests, at w = -1 / (a + d), for it falls until there and rises from there.
     """
-    a, d = 0.25, place * 0.25
+    a, d = 0.25, offset_share * 0.25
     rod = blocks(1e-9, a)  # four feet, in pairs
     pose = np.array([[1e-3, 0.0, 0.0]])
     feet = rigid.supports(rod, pose[:, 2], np.zeros((1, 2)))
-    here = rigid.Contacts(np.array([[[1.0, 0.0]]]), np.array([[[0.0, d]]]), np.zeros((1, 1)))
-    problem = rigid._problem(feet, here, np.array([1.0, 0.0]), STEP)
+    touching = rigid.Contacts(np.array([[[1.0, 0.0]]]), np.array([[[0.0, d]]]), np.zeros((1, 1)))
+    problem = rigid._problem(feet, touching, np.array([1.0, 0.0]), STEP)
     weights = np.array([[*[MU / 4] * 4, 0.0]])
     twist = rigid.minimise(problem, weights, np.zeros((1, 3)), DRY, first=True)
     np.testing.assert_allclose(twist, [[a / (a + d), 0, -1 / (a + d)]], atol=3e-4)
@@ -105,11 +108,11 @@ def test_an_object_slides_along_the_base_beyond_the_cone_of_friction():
     box = blocks(0.2, 0.2)
     for slope in (0.2, 0.34, 0.36, 0.8):
         u = np.array([1.0, slope]) / math.hypot(1.0, slope)
-        found = begun(pushed(box), before(box), direction=tuple(u))
-        kept = min(slope, MU_ROBOT)
-        np.testing.assert_allclose(found.twist, [[u[0], u[0] * kept, 0]], atol=2e-4)
-        np.testing.assert_allclose(np.hypot(*found.force.T), MU, rtol=1e-4)
-        np.testing.assert_allclose(found.force[0, 1] / found.force[0, 0], kept, rtol=1e-3)
+        step = first_step(pushed(box), poses_at_front(box), direction=tuple(u))
+        share = min(slope, MU_ROBOT)
+        np.testing.assert_allclose(step.twist, [[u[0], u[0] * share, 0]], atol=2e-4)
+        np.testing.assert_allclose(np.hypot(*step.force.T), MU, rtol=1e-4)
+        np.testing.assert_allclose(step.force[0, 1] / step.force[0, 0], share, rtol=1e-3)
 
 
 def test_the_edges_of_the_cone_and_the_push_vote_on_the_sense_of_turning():
@@ -121,84 +124,82 @@ def test_the_edges_of_the_cone_and_the_push_vote_on_the_sense_of_turning():
     count = 40
     half = rng.uniform(0.1, 0.25, (2, count))
     solids = blocks(*half)
-    pose = before(solids, rng.uniform(-0.15, 0.15, count), rng.uniform(-0.7, 0.7, count))
+    pose = poses_at_front(solids, rng.uniform(-0.15, 0.15, count), rng.uniform(-0.7, 0.7, count))
     slope = rng.uniform(-0.6, 0.6, count)
     touching = rigid.contacts(solids, pose)
     first = touching.gap.argmin(axis=1)
     at, normal = (x[np.arange(count), first] for x in (touching.at, touching.normal))
     for i in range(count):
         u = np.array([1.0, slope[i]]) / math.hypot(1.0, slope[i])
-        one = pushed(blocks(*half[:, i : i + 1]))
-        found = begun(one, pose[i : i + 1], direction=tuple(u))
+        block = pushed(blocks(*half[:, i : i + 1]))
+        step = first_step(block, pose[i : i + 1], direction=tuple(u))
         tangent = np.array([-normal[i, 1], normal[i, 0]])
         lines = [normal[i] + s * MU_ROBOT * tangent for s in (-1, 1)] + [u]
         votes = np.sign([at[i, 0] * v[1] - at[i, 1] * v[0] for v in lines])
-        turn = found.twist[0, 2]
+        turn = step.twist[0, 2]
         assert np.sign(turn) == np.sign(votes.sum()) or abs(turn) < 1e-3
 
 
 def test_pushes_mirror_balance_and_converge():
-    """Mirrored pushes end mirrored; the base's work is what friction takes; steps hardly matter."""
+    """Mirrored pushes end mirrored; the base does the work of friction; steps hardly matter."""
     solids = blocks([0.2, 0.2, 0.3, 0.3], [0.2, 0.2, 0.3, 0.3])
     sign = np.array([1, -1, 1, -1])
-    what = pushed(solids, height=0.2)
-    pose = before(solids, 0.1 * sign, 0.3 * sign)
-    coarse, fine = (rigid.push(what, pose, 0.2, steps) for steps in (50, 100))
+    target = pushed(solids, height=0.2)
+    pose = poses_at_front(solids, 0.1 * sign, 0.3 * sign)
+    coarse, fine = (rigid.push(target, pose, 0.2, steps) for steps in (50, 100))
     np.testing.assert_allclose(fine.pose[:, 0] * [1, -1, -1], fine.pose[:, 1], atol=1e-6)
     np.testing.assert_allclose(fine.pose[:, 2] * [1, -1, -1], fine.pose[:, 3], atol=1e-6)
     assert max(coarse.rounds, fine.rounds) < rigid.ROUNDS
     assert np.abs(coarse.pose[-1] - fine.pose[-1])[:, :2].max() < 5e-4
     np.testing.assert_allclose(fine.force[5:, :, 0], fine.power[5:], atol=2e-3)
-    softer = rigid.push(what, pose, 0.2, 50, rounding=Rounding(slip=1e-3, depth=1e-5))
+    softer = rigid.push(target, pose, 0.2, 50, rounding=Rounding(slip=1e-3, depth=1e-5))
     assert np.abs(coarse.pose[-1] - softer.pose[-1])[:, :2].max() < 5e-4
 
 
 def test_a_steady_lift_of_what_slides_hardly_moves_the_end():
-    """Of four points it moves load between two diagonals alone, and of three none at all."""
-    for name, apart in (("box", 1e-3), ("cylinder", 1e-9)):
-        thing = pushes.targets()[name]
-        ends = [
-            pushes.in_the_limit(thing, [0.08], 0.06, steps=60, rounding=Rounding(lift=lift)).lateral
-            for lift in (0.0, 1.2)
-        ]
-        assert abs(ends[0] - ends[1])[0] < apart
+    """It moves load between the diagonals of four points, and none between three points."""
+    for name, bound in (("box", 1e-3), ("cylinder", 1e-9)):
+        target = pushes.targets()[name]
+        limit = partial(pushes.in_the_limit, target, [0.08], 0.06, steps=60)
+        lateral = [limit(rounding=Rounding(lift=lift)).lateral for lift in (0.0, 1.2)]
+        assert abs(lateral[0] - lateral[1])[0] < bound
 
 
 def test_a_box_touches_with_its_corners_and_at_the_ends_of_the_front():
     box = blocks(0.2, 0.2)
     flush = rigid.contacts(box, np.array([[0.21, 0.0, 0.0]]))
     assert (flush.gap[0] < 0.011).sum() == 2  # its two rear corners
-    aside = rigid.contacts(box, np.array([[0.21, 0.2, 0.0]]))  # one corner beyond the front
-    near = aside.gap[0] < 0.5
-    np.testing.assert_allclose(aside.gap[0][near].min(), 0.01)
-    end = aside.at[0, -1]
+    shifted = rigid.contacts(box, np.array([[0.21, 0.2, 0.0]]))  # one corner beyond the front
+    near = shifted.gap[0] < 0.5
+    np.testing.assert_allclose(shifted.gap[0][near].min(), 0.01)
+    end = shifted.at[0, -1]
     np.testing.assert_allclose(end, [-0.21, HALF_WIDTH - 0.2])
-    np.testing.assert_allclose(aside.gap[0, -1], 0.01)
-    assert aside.gap[0, -2] == 1.0  # the other end meets nothing
+    np.testing.assert_allclose(shifted.gap[0, -1], 0.01)
+    assert shifted.gap[0, -2] == 1.0  # the other end meets nothing
 
 
 def test_a_push_in_mujoco_ends_where_a_rigid_object_does():
     """On this project's ground, at 5 cm/s, pushed at the lower edge of the base."""
     box = pushes.targets()["box"]
-    found = pushes.in_mujoco(box, 0.08, 0.05, grounds.GROUNDS["standard"].physics)
-    rigid_one = pushes.in_the_limit(box, [0.08], float(found.height), steps=100)
-    assert 0.059 < found.height < 0.075
-    assert abs(found.lateral - rigid_one.lateral[0]) < 2e-3
-    np.testing.assert_allclose([found.force, found.work], [1, 0.95], atol=0.02)
-    assert found.spread < 0.02
-    assert found.aloft == 0
-    assert 0 < found.hop < 1e-3
-    assert found.tilt < 5e-3
+    measured = pushes.in_mujoco(box, 0.08, 0.05, grounds.GROUNDS["standard"].physics)
+    rigid_one = pushes.in_the_limit(box, [0.08], float(measured.height), steps=100)
+    assert 0.059 < measured.height < 0.075
+    assert abs(measured.lateral - rigid_one.lateral[0]) < 2e-3
+    np.testing.assert_allclose([measured.force, measured.work], [1, 0.95], atol=0.02)
+    assert measured.spread < 0.02
+    assert measured.aloft == 0
+    assert 0 < measured.hop < 1e-3
+    assert measured.tilt < 5e-3
 
 
 def test_a_study_is_labelled_kept_and_refuses_what_was_run_otherwise(tmp_path, monkeypatch):
     tiny = grounds.GROUNDS["fast"]
-    few = {"a": tiny, "b": grounds.GROUNDS["standard"]}
-    monkeypatch.setattr(grounds, "GROUNDS", {k: _at(v, 0.2) for k, v in few.items()})
+    kinds = {"a": tiny, "b": grounds.GROUNDS["standard"]}
+    monkeypatch.setattr(grounds, "GROUNDS", {k: _at(v, 0.2) for k, v in kinds.items()})
     monkeypatch.setattr(grounds, "HEIGHTS", (0.06, 0.34))
-    some = {"objects": ("box",), "offsets": (0.05, 0.12), "steps": 50}
-    told = []
-    results = grounds.run(("a", "b"), tmp_path, **some, callback=told.append)
+    options = {"objects": ("box",), "offsets": (0.05, 0.12), "steps": 50}
+    progress = []
+    results = grounds.run(("a", "b"), tmp_path, **options, callback=progress.append)
     friction = len(grounds.FRICTIONS)
     sizes = {
         "ground": 2,
@@ -209,17 +210,17 @@ def test_a_study_is_labelled_kept_and_refuses_what_was_run_otherwise(tmp_path, m
         "friction": friction,
     }
     assert dict(results.sizes) == sizes
-    assert told[-1].finished == 4
+    assert progress[-1].finished == 4
     assert np.isfinite(results.error).all()
     monkeypatch.setattr(pushes, "in_mujoco", None)  # nothing is run again
-    xr.testing.assert_equal(results, grounds.run(("a", "b"), tmp_path, **some))
+    xr.testing.assert_equal(results, grounds.run(("a", "b"), tmp_path, **options))
     header, first, *rows = grounds.table(results, (0.2,))
     assert header[0] == "ground"
     assert first[0] == "rigid object"
-    assert [row[0] for row in rows] == [one.what for one in few.values()]
+    assert [row[0] for row in rows] == [kind.label for kind in kinds.values()]
     with pytest.raises(InputError, match="run with other options"):
         grounds.run(("a",), tmp_path, objects=("cylinder",), offsets=(0.05,))
 
 
-def _at(one, speed):
-    return grounds.Kind(one.what, one.physics, (speed,))
+def _at(kind, speed):
+    return grounds.Kind(kind.label, kind.physics, (speed,))

@@ -1,4 +1,4 @@
-"""What limits of a robot cost: paired losses, and where a law has lost so much."""
+"""The cost of limits of a robot: paired losses, and the limit at a given loss."""
 
 import math
 
@@ -41,46 +41,46 @@ def test_a_bootstrap_interval_holds_the_crossing():
     rng = np.random.default_rng(1)
     value = rng.uniform(0, 1, 400)
     success = (value < 0.5).astype(np.int8)[None]
-    found = xr.Dataset(
+    results = xr.Dataset(
         {"success": (("law", "case"), success), "usual": (("law", "case"), np.ones_like(success))},
         {"law": ["rps"], "value": ("case", value)},
         {"harms": 1},
     )
-    at, low, high = limits.crossings(found, 0.1)["rps"]
+    at, low, high = limits.crossings(results, 0.1)["rps"]
     assert low <= at <= high
     assert 0.49 < low < high < 0.52
 
 
 def test_every_robot_meets_the_worlds_of_the_ideal_one(monkeypatch):
-    usual = Robot().half_width
-    few = {
+    half_width = Robot().half_width
+    kinds = {
         "lag": Limit("lag [s]", {"robot_lag": Range(0, 2)}, value=lambda f: f.robot_lag.values),
-        "half_width": Limit("half width [m]", robots={usual: Robot()}),
+        "half_width": Limit("half width [m]", robots={half_width: Robot()}),
     }
-    monkeypatch.setattr(limits, "LIMITS", few)
-    heard: list[Progress] = []
-    asked = Limits(
+    monkeypatch.setattr(limits, "LIMITS", kinds)
+    progress: list[Progress] = []
+    study = Limits(
         {"rps": PAPER},
         Domain(("random_cylinder",)),
-        tuple(few),
+        tuple(kinds),
         3,
         setting=Setting(seed=0, rules=Rules(horizon=6.0)),
-        report_to=heard.append,
+        report_to=progress.append,
     )
-    found = asked()
-    assert heard[-1].finished == asked.num_trials() == 9
-    one = found["half_width"]
-    np.testing.assert_array_equal(one.success, one.usual)  # it is the ideal base itself
-    np.testing.assert_array_equal(one.value, [usual] * 3)
-    assert ((found["lag"].value >= 0) & (found["lag"].value <= 2)).all()
-    np.testing.assert_array_equal(found["lag"].world, np.arange(3))
+    results = study()
+    assert progress[-1].finished == study.num_trials() == 9
+    rows = results["half_width"]
+    np.testing.assert_array_equal(rows.success, rows.usual)  # it is the ideal base itself
+    np.testing.assert_array_equal(rows.value, [half_width] * 3)
+    assert ((results["lag"].value >= 0) & (results["lag"].value <= 2)).all()
+    np.testing.assert_array_equal(results["lag"].world, np.arange(3))
 
 
 def test_a_bounded_acceleration_makes_ramps_of_the_laws_turns():
     robot = Robot(acceleration_max=(1.0, 0.2))
-    seen = limits.turning({"slow": robot}, PAPER, 4.0).sel(robot="slow")
-    assert float(np.abs(np.diff(seen.asked)).max()) > 0.1  # it asks for jumps
-    assert float(np.abs(np.diff(seen.done)).max()) <= 0.2 * 0.02 + 1e-4  # [rad/s] in a step
+    turns = limits.turning({"slow": robot}, PAPER, 4.0).sel(robot="slow")
+    assert float(np.abs(np.diff(turns.asked)).max()) > 0.1  # it asks for jumps
+    assert float(np.abs(np.diff(turns.done)).max()) <= 0.2 * 0.02 + 1e-4  # [rad/s] in a step
 
 
 def test_an_unknown_limit_is_named():

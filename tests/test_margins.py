@@ -1,4 +1,4 @@
-"""What is proved of the law is searched for counterexamples, in a million states."""
+"""A search of a million states finds no counterexamples to the proofs about the law."""
 
 import jax
 import jax.numpy as jnp
@@ -27,14 +27,14 @@ def states(seed, params):
 
 
 def twists(params, touch, target):
-    def one(contact, target):
+    def step(contact, target):
         state = RPSState.init(params)
-        seen = Observation(jnp.zeros(2), jnp.zeros(()), contact, jnp.ones((), bool), target)
-        _, twist, details = rps.step_with_details(params, state, seen)
+        observation = Observation(jnp.zeros(2), jnp.zeros(()), contact, jnp.ones((), bool), target)
+        _, twist, details = rps.step_with_details(params, state, observation)
         return jnp.stack(twist), details.realigning, details.distance
 
-    found = jax.jit(jax.vmap(one))(touch.p_robot_contact, target)
-    return [np.asarray(leaf, float) for leaf in found]
+    twists = jax.jit(jax.vmap(step))(touch.p_robot_contact, target)
+    return [np.asarray(leaf, float) for leaf in twists]
 
 
 @pytest.mark.parametrize("params", [RPSParams.paper(), RPSParams.tuned()], ids=["paper", "tuned"])
@@ -52,7 +52,7 @@ def test_a_contact_in_the_critical_region_moves_back_wherever_t4_holds(params):
 
 
 def test_without_t4_a_contact_may_move_outwards():
-    """With a slope of 1 instead of 10 the condition fails, and counterexamples are found."""
+    """The condition fails with a slope of 1 instead of 10, and a search finds counterexamples."""
     params = RPSParams.paper()._replace(a_r_max=1.0)
     touch, target = states(1, params)
     twist, _, distance = twists(params, touch, target)
@@ -71,18 +71,18 @@ def test_without_t4_a_contact_may_move_outwards():
 def test_the_drift_by_hand():
     """A point ahead of the centre of friction: A = 1 along x and 1 + r^2 / c^2 across."""
 
-    def of(v_y, mu):
+    def margin(v_y, mu):
         touch = margins.Touch(
             np.array([0.36, 0.1]), np.array([-0.3, 0.0]), np.array(0.3), np.array(mu)
         )
         return float(margins.drift(np.array([0.02, v_y, 0.0]), touch))
 
     # Sticking needs a force of slope (v_y / 2) / v_x: at mu = 0.5 up to v_y = v_x.
-    assert of(0.019, 0.5) == 0.0
+    assert margin(0.019, 0.5) == 0.0
     # Beyond, it slips: w_y = 2 mu w_x = 0.02, and the base goes on at 0.05.
-    np.testing.assert_allclose(of(0.05, 0.5), 0.02 - 0.05)
+    np.testing.assert_allclose(margin(0.05, 0.5), 0.02 - 0.05)
     # Without friction the point is only pushed ahead.
-    np.testing.assert_allclose(of(0.05, 0.0), -0.05)
+    np.testing.assert_allclose(margin(0.05, 0.0), -0.05)
     assert np.isnan(margins.drift(np.array([-0.02, 0.0, 0.0]), margins.Touch(
         np.array([0.36, 0.1]), np.array([-0.3, 0.0]), np.array(0.3), np.array(0.5)
     )))  # fmt: skip

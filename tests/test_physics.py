@@ -16,11 +16,9 @@ import mujoco
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
-from staging import staged
+from staging import simulate, staged
 
 from rps_jax.control.laws.rps import RPSParams
-from rps_jax.control.observation import Twist
-from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.engines.mjx_colliders import collision, mjx
 from rps_jax.engines.mujoco import Batch
 from rps_jax.geometry import planar
@@ -56,7 +54,7 @@ class World(NamedTuple):
 
 
 class Film(NamedTuple):
-    """One world, seen every control period."""
+    """States of one world, one row for each control period and the start."""
 
     qpos: np.ndarray  # (T, 10)
     qvel: np.ndarray  # (T, 9)
@@ -92,38 +90,17 @@ def starts(worlds, physics):
     return scenes, qpos, qvel, np.array([(*w.push, 0.0) for w in worlds])
 
 
-def in_c(worlds, physics=REFERENCE, seconds=SECONDS):
+def in_engine(engine, worlds, physics=STANDARD, seconds=SECONDS):
     """Films of worlds of one shape family."""
     scenes, qpos, qvel, twist = starts(worlds, physics)
-    batch = Batch([s.physics for s in scenes], qpos, threads=2)
-    batch.qvel[:] = qvel
-    states = [(qpos, qvel)]
-    for _ in range(round(seconds / physics.control_period)):
-        batch.drive(np.arange(len(worlds)), twist, physics.substeps)
-        states.append((batch.qpos.copy(), batch.qvel.copy()))
-    batch.close()
-    qpos, qvel = (np.stack(x, axis=1) for x in zip(*states, strict=True))
-    return [Film(*both, physics) for both in zip(qpos, qvel, strict=True)]
-
-
-def in_jax(worlds, physics=STANDARD, engine="mjx", seconds=SECONDS):
-    scenes, *start, twist = starts(worlds, physics)
     stage, fields = staged(engine, scenes, physics)
-    qpos, qvel, twist = (jnp.asarray(x, float) for x in (*start, twist))
-    fields = jax.tree.map(jnp.asarray, fields)
+    periods = round(seconds / physics.control_period)
+    recording = simulate(engine, stage, fields, qpos, twist, physics, periods, qvel=qvel)
+    return [Film(recording.qpos[:, i], recording.qvel[:, i], physics) for i in range(len(worlds))]
 
-    @jax.jit
-    def run(*state):
-        state = Motion(*state)
 
-        def body(state, _):
-            period = ControlPeriod(Twist(*twist.T), physics)
-            return stage.drive(fields, state, period).motion, state[:2]
-
-        return jax.lax.scan(body, state, length=round(seconds / physics.control_period) + 1)[1]
-
-    seen = (np.asarray(x, float).swapaxes(0, 1) for x in run(qpos, qvel, 0 * qvel))
-    return [Film(*both, physics) for both in zip(*seen, strict=True)]
+def in_c(worlds, physics=REFERENCE, seconds=SECONDS):
+    return in_engine("mujoco", worlds, physics, seconds)
 
 
 def polar(length, degrees):
@@ -153,8 +130,9 @@ for yaw, direction in NEAR + FAR:
 def films(engine):
     names = [[n for n in ALL if ALL[n].name == name] for name in MASS]
     with ThreadPoolExecutor(2) as pool:  # MJX compiles both families at once
-        run = in_c if engine == "mujoco" else functools.partial(in_jax, engine=engine)
-        boxes, cylinders = pool.map(run, [[ALL[n] for n in some] for some in names])
+        physics = REFERENCE if engine == "mujoco" else STANDARD
+        run = functools.partial(in_engine, engine, physics=physics)
+        boxes, cylinders = pool.map(run, [[ALL[n] for n in group] for group in names])
     return dict(zip(names[0] + names[1], boxes + cylinders, strict=True))
 
 
@@ -164,12 +142,12 @@ def seen(request, optimised):
     return films(request.param)
 
 
-IN_ALL = pytest.mark.parametrize("seen", ["mjx", "fused", "mujoco"], indirect=True)
+IN_ALL = pytest.mark.parametrize("all_films", ["mjx", "fused", "mujoco"], indirect=True)
 
 
 @IN_ALL
-def test_a_box_pushed_through_its_centre_keeps_its_heading_and_goes_as_far_as_the_base(seen):
-    film = seen["centre"]
+def test_a_box_pushed_through_its_centre_keeps_its_heading_and_goes_as_far_as_the_base(all_films):
+    film = all_films["centre"]
     assert film.qpos[-1, 0] == pytest.approx(0.05 * SECONDS, abs=1e-4)
     assert film.moved[:2] == pytest.approx([0.05 * SECONDS, 0.0], abs=1e-3)
     assert abs(film.moved[2]) < math.radians(0.2)
@@ -215,16 +193,16 @@ def test_an_object_left_alone_creeps_less_than_a_millimetre_in_a_minute(name):
 @pytest.mark.parametrize("name", MASS)
 def test_the_fused_engine_lets_nothing_creep_in_float32(name):
     calm = replace(STANDARD, control_period=1.0)
-    (film,) = in_jax([World(gap=1.0, name=name)], calm, "fused", seconds=60.0)
+    (film,) = in_engine("fused", [World(gap=1.0, name=name)], calm, seconds=60.0)
     assert film.way < 1e-5
     assert abs(film.moved[2]) < 1e-6
 
 
 @IN_ALL
 @pytest.mark.parametrize("name", MASS)
-def test_an_object_left_alone_creeps_less_than_half_a_millimetre_a_second(seen, name):
-    """In MJX noise of float32 moves it by up to 0.2 mm/s; the others are held to more above."""
-    assert seen[f"resting {name}"].way < 0.5e-3 * SECONDS
+def test_an_object_left_alone_creeps_less_than_half_a_millimetre_a_second(all_films, name):
+    """Float32 noise in MJX moves it by up to 0.2 mm/s; tests above hold the others to more."""
+    assert all_films[f"resting {name}"].way < 0.5e-3 * SECONDS
 
 
 def loses_energy(film, name):
@@ -240,17 +218,17 @@ def loses_energy(film, name):
 
 
 @IN_ALL
-@pytest.mark.parametrize("what", ["sliding box", "diagonal box", "sliding cylinder"])
-def test_an_object_thrown_at_v_slides_v2_over_2_mu_g_and_never_gains_energy(seen, what):
+@pytest.mark.parametrize("motion", ["sliding box", "diagonal box", "sliding cylinder"])
+def test_an_object_thrown_at_v_slides_v2_over_2_mu_g_and_never_gains_energy(all_films, motion):
     """0.5^2 / (2 x 0.3 x 9.81) = 42.5 mm.
 
     Euler's rule, which moves it by the speed at the end of each step, takes off v dt / 2: 2.5 mm
     in steps of 10 ms.
     """
-    film = seen[what]
+    film = all_films[motion]
     assert film.way == pytest.approx(0.5**2 / (2 * 0.3 * G), rel=0.05)
     assert abs(film.moved[2]) < math.radians(0.2)
-    assert loses_energy(film, what.split()[1])
+    assert loses_energy(film, motion.split()[1])
 
 
 def stops_by_the_torque_mu_m_g_c(film, name):
@@ -262,13 +240,13 @@ def stops_by_the_torque_mu_m_g_c(film, name):
 
 
 @IN_ALL
-def test_a_spun_box_is_stopped_by_mu_m_g_times_half_its_diagonal(seen):
-    stops_by_the_torque_mu_m_g_c(seen["spinning box"], "box")
+def test_a_spun_box_is_stopped_by_mu_m_g_times_half_its_diagonal(all_films):
+    stops_by_the_torque_mu_m_g_c(all_films["spinning box"], "box")
 
 
 @IN_ALL
-def test_a_spun_cylinder_is_stopped_by_mu_m_g_times_its_radius(seen):
-    stops_by_the_torque_mu_m_g_c(seen["spinning cylinder"], "cylinder")
+def test_a_spun_cylinder_is_stopped_by_mu_m_g_times_its_radius(all_films):
+    stops_by_the_torque_mu_m_g_c(all_films["spinning cylinder"], "cylinder")
 
 
 @pytest.mark.parametrize(("name", "points"), [("box", 4), ("cylinder", 3)])
@@ -318,7 +296,7 @@ def slip(film, push):
 
 
 @IN_ALL
-def test_a_cylinder_rolls_along_the_face_without_slipping(seen):
+def test_a_cylinder_rolls_along_the_face_without_slipping(all_films):
     """The base moves at (v_n, v_t) = (5, 2) cm/s, with mu_robot 0.5.
 
     The contact force f = (f_n, f_t) acts on the rim with the torque -R f_t, so by the limit
@@ -328,15 +306,15 @@ def test_a_cylinder_rolls_along_the_face_without_slipping(seen):
     torque of an added w is mu m g w <(r.e)^2> / v, so that c^2 = R^2 / 2. It sticks up to 1 to
     1.5, and rolling takes up R^2 / (R^2 + c^2) of v_t: between a half and two thirds.
     """
-    slipping, rolling = slip(seen["rolling"], ALL["rolling"].push)
+    slipping, rolling = slip(all_films["rolling"], ALL["rolling"].push)
     assert abs(slipping) < 0.02
     assert 1 / 2 < rolling < 2 / 3
 
 
 @IN_ALL
-def test_a_cylinder_slips_along_a_slippery_face(seen):
-    """With mu_robot 0.02 and c^2 = R^2 / 2 the rim moves sideways at 3 mu v_n: 85 % is slip."""
-    slipping, _ = slip(seen["slipping"], ALL["slipping"].push)
+def test_a_cylinder_slips_along_a_slippery_face(all_films):
+    """The rim moves sideways at 3 mu v_n, with mu_robot 0.02 and c^2 = R^2 / 2: 85 % is slip."""
+    slipping, _ = slip(all_films["slipping"], ALL["slipping"].push)
     assert slipping == pytest.approx(1 - 3 * 0.02 / 0.4, abs=0.02)
 
 
@@ -366,13 +344,15 @@ def on_points(feet, point, v):
 
 
 def centre(twist):
-    """Where an object turns about, from its middle (2,) [m]."""
+    """Return the centre of rotation of an object, from its middle (2,) [m]."""
     return np.array([-twist[1], twist[0]]) / twist[2]
 
 
 @IN_ALL
 @pytest.mark.parametrize(("yaw", "direction"), NEAR + FAR)
-def test_a_box_pushed_at_a_corner_turns_about_the_centre_that_friction_says(seen, yaw, direction):
+def test_a_box_pushed_at_a_corner_turns_about_the_centre_that_friction_says(
+    all_films, yaw, direction
+):
     """A corner of the box sticks to the face, at 1 cm/s.
 
     The ellipsoid through the measured f_max and m_max is right where the box turns about a point
@@ -380,7 +360,7 @@ def test_a_box_pushed_at_a_corner_turns_about_the_centre_that_friction_says(seen
     farther away, the box is as on c^2 / 2, as derived for the cylinder. There the ellipsoid puts
     the centre a third too far, and only the exact solution holds.
     """
-    twist, middle = seen[f"corner {yaw} {direction}"].twist()
+    twist, middle = all_films[f"corner {yaw} {direction}"].twist()
     feet = np.array([polar(ARM["box"], 45 + 90 * i + math.degrees(middle)) for i in range(4)])
     corner, push = feet[1], np.array(polar(0.01, direction))
     is_near = (yaw, direction) in NEAR
@@ -405,8 +385,8 @@ def test_ten_centimetres_of_an_off_centre_push_end_alike_at_1_and_at_5_cm_a_seco
     assert abs(a.moved[2] - b.moved[2]) < math.radians(0.5)
 
 
-def ends(physics, *bearings):
-    """Where 6 s of the law leave the cylinder, for each bearing [degrees], turned back (3,)."""
+def final_poses(physics, *bearings):
+    """Poses (n, 3) of the cylinder after 6 s of the law at bearings [degrees], turned back."""
     bearings = np.radians(bearings)
     cases = [Case("cylinder", Friction(0.05, 0.5), (0.4, 2.0), bearing=b) for b in bearings]
     setting = Setting(physics=physics, rules=Rules(horizon=6.0), engine="mujoco")
@@ -416,15 +396,15 @@ def ends(physics, *bearings):
 
 
 def test_with_the_cone_a_trial_turned_by_45_degrees_ends_the_same_turned():
-    ahead, diagonal = ends(STANDARD, 0, 45)
+    ahead, diagonal = final_poses(STANDARD, 0, 45)
     assert np.hypot(*(diagonal - ahead)[:2]) < 5e-4
     assert abs(diagonal - ahead)[2] < math.radians(0.1)
 
 
 def test_with_the_pyramid_a_trial_turned_by_45_degrees_ends_elsewhere_but_not_by_90():
-    ahead, diagonal, left = ends(preset("paper_gazebo"), 0, 45, 90)
+    ahead, diagonal, sideways = final_poses(preset("paper_gazebo"), 0, 45, 90)
     assert np.hypot(*(diagonal - ahead)[:2]) > 0.05
-    assert np.hypot(*(left - ahead)[:2]) < 0.01
+    assert np.hypot(*(sideways - ahead)[:2]) < 0.01
 
 
 @pytest.mark.parametrize("name", MASS)

@@ -1,4 +1,4 @@
-"""Worlds as points of the unit cube: the same bits, the same runs, and what is refused."""
+"""Worlds at points of the unit cube: they and their runs are bit-identical to drawn ones."""
 
 import shutil
 from dataclasses import replace
@@ -22,7 +22,7 @@ SHOWN = (*quantities_of("object", "robot"), "distance", "bearing")
 
 
 def used(drawn):
-    """What a world has of a draw."""
+    """Return a draw without the values that are in its solid, friction, target and robot."""
     return drawn._replace(values={k: v for k, v in drawn.values.items() if k not in SHOWN})
 
 
@@ -30,12 +30,14 @@ def used(drawn):
 def test_a_drawn_world_is_the_same_world_at_its_point_bit_for_bit(name):
     domain, index = DOMAINS[name], np.arange(7, 300)
     at = points.check_points(domain, points.points_of(name, index, seed=5))
-    which = domain.object_of(index)
-    np.testing.assert_array_equal(domain.object_of(at.cases(domain, np.arange(293))), which)
-    for thing in np.unique(which):
-        rows = np.flatnonzero(which == thing)
+    object_indices = domain.object_of(index)
+    np.testing.assert_array_equal(
+        domain.object_of(at.cases(domain, np.arange(293))), object_indices
+    )
+    for number in np.unique(object_indices):
+        rows = np.flatnonzero(object_indices == number)
         drawn, again = used(draws.draw(domain, 5, index[rows])), used(at.draw(domain, rows))
-        for a, b in zip(drawn, again._replace(number=index[rows], case=drawn.cases), strict=True):
+        for a, b in zip(drawn, again._replace(indices=index[rows], cases=drawn.cases), strict=True):
             assert jax.tree.all(jax.tree.map(np.array_equal, a, b))
 
 
@@ -44,16 +46,17 @@ def test_every_coordinate_of_a_domain_changes_some_world(name):
     domain = DOMAINS[name]
     u = points.points_of(domain, np.arange(144))
     for column, quantity in enumerate(points.coordinates(domain)):
-        other = u.copy()
-        other[:, column] = (other[:, column] + 0.5) % 1
-        a, b = (_leaves(domain, some) for some in (u, other))
+        shifted = u.copy()
+        shifted[:, column] = (shifted[:, column] + 0.5) % 1
+        a, b = (_leaves(domain, rows) for rows in (u, shifted))
         assert not np.array_equal(a, b), quantity.name
 
 
 def _leaves(domain, u):
     at = points.check_points(domain, u)
-    which = domain.object_of(at.cases(domain, np.arange(len(u))))
-    drawn = [used(at.draw(domain, np.flatnonzero(which == thing))) for thing in np.unique(which)]
+    object_indices = domain.object_of(at.cases(domain, np.arange(len(u))))
+    groups = [np.flatnonzero(object_indices == number) for number in np.unique(object_indices)]
+    drawn = [used(at.draw(domain, index)) for index in groups]
     return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(drawn)])
 
 
@@ -77,37 +80,39 @@ def test_a_quantity_is_where_its_range_says():
 def test_sweeps_and_evaluations_take_points_as_they_take_drawn_worlds(tmp_path):
     u = points.points_of(CYLINDERS, np.arange(6), seed=3)
     drawn = rps_jax.sweep("rps", CYLINDERS, 6, setting=replace(SHORT, seed=3), slots=SLOTS)
-    kept = tmp_path / "run"
-    found = rps_jax.sweep("rps", CYLINDERS, points=u, out=kept, **SWEPT)
-    xr.testing.assert_identical(found, drawn)
-    assert load_plan(kept).points == points.Points(u)
-    again = rps_jax.replay(kept, 4)
+    folder = tmp_path / "run"
+    swept = rps_jax.sweep("rps", CYLINDERS, points=u, out=folder, **SWEPT)
+    xr.testing.assert_identical(swept, drawn)
+    assert load_plan(folder).points == points.Points(u)
+    again = rps_jax.replay(folder, 4)
     assert int(again.outcome.success) == int(drawn.success[0, 4])
     reversed_ = points.worlds_at(CYLINDERS, u[::-1])
-    some = jax.tree.map(lambda value: np.full(1, value), PAPER)
-    tried = rps_jax.evaluate(some, CYLINDERS, points=reversed_, **SWEPT)
+    params = jax.tree.map(lambda value: np.full(1, value), PAPER)
+    tried = rps_jax.evaluate(params, CYLINDERS, points=reversed_, **SWEPT)
     np.testing.assert_allclose(tried.mass, drawn.mass.values[::-1], rtol=1e-6)
     np.testing.assert_allclose(tried.time[0], drawn.time[0, ::-1], atol=0.5)
     # A folder of other points, and one whose points were damaged.
     with pytest.raises(InputError, match="holds another run"):
-        rps_jax.sweep("rps", CYLINDERS, points=u[::-1], out=kept, **SWEPT)
-    shutil.copy(kept / "points.nc", tmp_path / "good.nc")
-    (kept / "points.nc").write_bytes(b"noise")
+        rps_jax.sweep("rps", CYLINDERS, points=u[::-1], out=folder, **SWEPT)
+    shutil.copy(folder / "points.nc", tmp_path / "good.nc")
+    (folder / "points.nc").write_bytes(b"noise")
     with pytest.raises(InputError, match=r"points\.nc is corrupt"):
-        rps_jax.replay(kept, 4)
-    xr.testing.assert_identical(rps_jax.sweep("rps", CYLINDERS, points=u, out=kept, **SWEPT), found)
-    assert (kept / "points.nc").read_bytes() == (tmp_path / "good.nc").read_bytes()
+        rps_jax.replay(folder, 4)
+    xr.testing.assert_identical(
+        rps_jax.sweep("rps", CYLINDERS, points=u, out=folder, **SWEPT), swept
+    )
+    assert (folder / "points.nc").read_bytes() == (tmp_path / "good.nc").read_bytes()
 
 
 def test_objects_need_not_come_in_turn(tmp_path):
     both = replace(CYLINDERS, objects=("random_box", "random_cylinder"))
     u = points.points_of(both, np.arange(5))
     u[:, 0] = [0.9, 0.9, 0.9, 0.9, 0.1]  # one box among cylinders
-    asked = {"setting": replace(SHORT, engine="quasistatic"), "part": 2, "slots": SLOTS}
-    found = rps_jax.sweep("rps", both, points=u, out=tmp_path, **asked)
-    assert found.which_object.values.tolist() == [1, 1, 1, 1, 0]
-    assert (found.corners.values == [0, 0, 0, 0, 4]).all()
-    assert (found.time.values > 0).all()
+    options = {"setting": replace(SHORT, engine="quasistatic"), "part": 2, "slots": SLOTS}
+    swept = rps_jax.sweep("rps", both, points=u, out=tmp_path, **options)
+    assert swept.which_object.values.tolist() == [1, 1, 1, 1, 0]
+    assert (swept.corners.values == [0, 0, 0, 0, 4]).all()
+    assert (swept.time.values > 0).all()
 
 
 def test_points_that_are_none_are_refused(tmp_path, capsys):
@@ -126,17 +131,17 @@ def test_points_that_are_none_are_refused(tmp_path, capsys):
         with pytest.raises(InputError, match=words):
             rps_jax.sweep("rps", "wide", points=wrong)
     files.write_results(tmp_path / "some.nc", points.worlds_at("wide", u))
-    said = refusal(capsys, "sweep", "--domain", "hostile", "--points", tmp_path / "some.nc")
-    assert "of another domain" in said
-    said = refusal(capsys, "sweep", "--points", tmp_path / "some.nc", "--worlds", 3)
-    assert "worlds is not allowed with points" in said
+    message = refusal(capsys, "sweep", "--domain", "hostile", "--points", tmp_path / "some.nc")
+    assert "of another domain" in message
+    message = refusal(capsys, "sweep", "--points", tmp_path / "some.nc", "--worlds", 3)
+    assert "worlds is not allowed with points" in message
     assert "cannot be read" in refusal(capsys, "sweep", "--points", tmp_path / "none.nc")
 
 
 def test_the_command_sweeps_points_and_can_be_continued(tmp_path, capsys):
     u = points.points_of("paper", np.arange(0, 144, 48))
     files.write_results(tmp_path / "some.nc", points.worlds_at("paper", u))
-    asked = [
+    command = [
         "sweep",
         "--domain",
         "paper",
@@ -145,10 +150,10 @@ def test_the_command_sweeps_points_and_can_be_continued(tmp_path, capsys):
         "--out",
         tmp_path / "r",
     ]
-    asked += ["--laws", "rps", "--engine", "quasistatic", "--horizon", 5, "--slots", 2]
-    assert rps(*asked) == 0
+    command += ["--laws", "rps", "--engine", "quasistatic", "--horizon", 5, "--slots", 2]
+    assert rps(*command) == 0
     assert "3 worlds, points of the unit cube" in capsys.readouterr().out
-    assert rps(*asked) == 0
+    assert rps(*command) == 0
     objects = rps_jax.load(tmp_path / "r").which_object.values.tolist()
     assert objects == [0, 1, 2]
 

@@ -15,12 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import nnls
-from staging import staged
+from staging import drive, staged
 
 from rps_jax.control import registry
 from rps_jax.control.laws.rps import RPSParams
-from rps_jax.control.observation import Twist
-from rps_jax.engines.base import ControlPeriod, Motion
+from rps_jax.engines.base import Motion
 from rps_jax.engines.quasistatic import Contact, Problem, Quasistatic, Slider, solved
 from rps_jax.errors import InputError
 from rps_jax.geometry import footprint as fp
@@ -53,7 +52,7 @@ class Push(NamedTuple):
 
     twist: tuple[float, float, float] = (0.05, 0.0, 0.0)  # [m/s, m/s, rad/s]
     pose: tuple[float, float, float] = (FRONT + HALF, 0.0, 0.0)  # [m, m, rad] of the object
-    base: tuple[float, float, float] = (0.0, 0.0, 0.0)  # likewise
+    base: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [m, m, rad]
     arm: float = ARM["box"]  # [m]
     friction: float = 0.5  # [1] with the base
     com: tuple[float, float] = (0.0, 0.0)  # [m] in the object's frame
@@ -65,28 +64,21 @@ class Film(NamedTuple):
     """Poses (T, 3) [m, m, rad] of the base and of the object."""
 
     base: np.ndarray
-    thing: np.ndarray
+    object_pose: np.ndarray
 
     @property
     def moved(self):
-        return self.thing[-1] - self.thing[0]
+        return self.object_pose[-1] - self.object_pose[0]
 
     def velocity(self):
-        """Of the object in the last step (3,)."""
-        return (self.thing[-1] - self.thing[-2]) / PERIOD
+        """Velocity (3,) of the object in the last step."""
+        return (self.object_pose[-1] - self.object_pose[-2]) / PERIOD
 
 
-@partial(jax.jit, static_argnames=("stage", "physics"))
-def drive(stage, fields, start, twists, physics):
+def positions(fields, qpos, twists, physics):
     """Positions (T + 1, B, 10) of worlds that start at (B, 10), driven by twists (T, B, 3)."""
-
-    def step(qpos, twist):
-        still = jnp.zeros_like(qpos[:, :9])
-        period = ControlPeriod(Twist(*twist.T), physics)
-        driven = stage.drive(fields, Motion(qpos, still, still), period)
-        return driven.motion.qpos, driven.motion.qpos
-
-    return jnp.concatenate([start[None], jax.lax.scan(step, start, twists)[1]])
+    still = jnp.zeros_like(qpos[:, :9])
+    return drive(Quasistatic(), fields, Motion(qpos, still, still), twists, physics).qpos
 
 
 def film(pushes):
@@ -105,16 +97,16 @@ def film(pushes):
         twists = (going * scale)[..., None] * rows("twist")
         physics = Physics(timestep=PERIOD, control_period=PERIOD)
         fields, start = jax.tree.map(lambda x: jnp.asarray(x, float), (fields, start))
-        qpos = np.asarray(drive(Quasistatic(), fields, start, jnp.asarray(twists), physics))
+        qpos = np.asarray(positions(fields, start, jnp.asarray(twists), physics))
     yaw = np.unwrap(2 * np.arctan2(qpos[..., 9], qpos[..., 6]), axis=0)
-    thing = np.concatenate([qpos[..., 3:5], yaw[..., None]], axis=-1)
-    return [Film(qpos[:, i, :3], thing[:, i]) for i in range(len(pushes))]
+    object_pose = np.concatenate([qpos[..., 3:5], yaw[..., None]], axis=-1)
+    return [Film(qpos[:, i, :3], object_pose[:, i]) for i in range(len(pushes))]
 
 
-def at_corner(yaw, **given):
-    """The box turned by `yaw` > 0, its nearest corner, (-HALF, HALF) of its own, at the face."""
+def at_corner(yaw, **changes):
+    """The box turned by `yaw` > 0, its nearest corner, (-HALF, HALF) in its frame, at the face."""
     x, y = turn(yaw, (-HALF, HALF))
-    return Push(pose=(FRONT - x, 0.02 - y, yaw), **given)
+    return Push(pose=(FRONT - x, 0.02 - y, yaw), **changes)
 
 
 def turn(angle, point):
@@ -122,9 +114,9 @@ def turn(angle, point):
     return np.array([c * point[0] - s * point[1], s * point[0] + c * point[1]])
 
 
-def on_disc(push, **given):
+def on_disc(push, **changes):
     return push._replace(
-        outline=fp.circle(RADIUS), arm=ARM["cylinder"], pose=(FRONT + RADIUS, 0.0, 0.0), **given
+        outline=fp.circle(RADIUS), arm=ARM["cylinder"], pose=(FRONT + RADIUS, 0.0, 0.0), **changes
     )
 
 
@@ -202,9 +194,9 @@ CASES = {
     **{f"sliding {i}": push for i, push in enumerate(SLIDING)},
 }
 MOVE = (2.0, -1.0, 2.5)  # [m, m, rad]
-_here = CASES["here"]
-CASES["there"] = _here._replace(
-    base=MOVE, pose=(*(turn(MOVE[2], _here.pose[:2]) + MOVE[:2]), _here.pose[2] + MOVE[2])
+HERE = CASES["here"]
+CASES["there"] = HERE._replace(
+    base=MOVE, pose=(*(turn(MOVE[2], HERE.pose[:2]) + MOVE[:2]), HERE.pose[2] + MOVE[2])
 )
 _rng = np.random.default_rng(1)
 for _i in range(24):  # flat on the face
@@ -239,18 +231,18 @@ def test_an_object_that_nothing_touches_does_not_move_at_all():
 def test_a_corner_that_sticks_is_carried_along_as_lynch_has_it(i):
     pose, slid = expected(STICKING[i])
     assert slid == {False}
-    seen = boxes()[f"sticking {i}"]
-    assert abs(pose - seen.thing[0])[2] > 0.03
-    np.testing.assert_allclose(seen.moved, pose - seen.thing[0], rtol=0.02, atol=1e-3)
+    recorded = boxes()[f"sticking {i}"]
+    assert abs(pose - recorded.object_pose[0])[2] > 0.03
+    np.testing.assert_allclose(recorded.moved, pose - recorded.object_pose[0], rtol=0.02, atol=1e-3)
 
 
 @pytest.mark.parametrize("i", range(len(SLIDING)))
 def test_a_corner_that_slides_is_pushed_along_the_edge_of_the_cone(i):
     pose, slid = expected(SLIDING[i])
     assert slid == {True}
-    seen = boxes()[f"sliding {i}"]
-    assert abs(pose - seen.thing[0])[2] > 0.03
-    np.testing.assert_allclose(seen.moved, pose - seen.thing[0], rtol=0.02, atol=1e-3)
+    recorded = boxes()[f"sliding {i}"]
+    assert abs(pose - recorded.object_pose[0])[2] > 0.03
+    np.testing.assert_allclose(recorded.moved, pose - recorded.object_pose[0], rtol=0.02, atol=1e-3)
 
 
 def can_be_carried(push):
@@ -262,15 +254,15 @@ def can_be_carried(push):
     """
     p = np.array(push.pose[:2])
     v_x, v_y, omega = push.twist
-    wanted = np.array([v_x - omega * p[1], v_y + omega * p[0], push.arm**2 * omega])
-    ends = np.clip(p[1] + np.array([-HALF, HALF]), -SIDE, SIDE)
+    expected = np.array([v_x - omega * p[1], v_y + omega * p[0], push.arm**2 * omega])
+    face = np.clip(p[1] + np.array([-HALF, HALF]), -SIDE, SIDE)
     edges = []
-    for y in ends:
+    for y in face:
         r = np.array([FRONT, y]) - p
         for side in (-1, 1):
             force = np.array([1.0, side * push.friction])
             edges.append([*force, r[0] * force[1] - r[1] * force[0]])
-    return nnls(np.array(edges).T, wanted)[1] / np.linalg.norm(wanted)
+    return nnls(np.array(edges).T, expected)[1] / np.linalg.norm(expected)
 
 
 def test_a_flat_contact_holds_if_and_only_if_forces_within_its_cones_can():
@@ -279,10 +271,13 @@ def test_a_flat_contact_holds_if_and_only_if_forces_within_its_cones_can():
     for i in range(24):
         name = f"flat {i}"
         short = can_be_carried(CASES[name])
-        seen = boxes()[name]
-        relative = [turn(-b[2], t[:2] - b[:2]) for b, t in zip(seen.base, seen.thing, strict=True)]
+        recorded = boxes()[name]
+        relative = [
+            turn(-b[2], t[:2] - b[:2])
+            for b, t in zip(recorded.base, recorded.object_pose, strict=True)
+        ]
         crept = np.hypot(*(relative[25] - relative[0])) / (25 * PERIOD)
-        turned = abs((seen.thing - seen.base)[25, 2]) / (25 * PERIOD)
+        turned = abs((recorded.object_pose - recorded.base)[25, 2]) / (25 * PERIOD)
         slipped = (crept + HALF * turned) / math.hypot(*CASES[name].twist[:2])
         if short < 1e-9:
             held.append(True)
@@ -303,7 +298,7 @@ def test_twice_the_speed_is_the_same_path_in_half_the_time():
     """But for the length of a step, which is twice as long."""
     a, b = boxes()["once"], boxes()["twice"]
     assert np.hypot(*a.moved[:2]) > 0.03
-    np.testing.assert_allclose(a.thing[::2], b.thing[: STEPS // 2 + 1], atol=5e-4)
+    np.testing.assert_allclose(a.object_pose[::2], b.object_pose[: STEPS // 2 + 1], atol=5e-4)
 
 
 def test_where_it_happens_does_not_matter():
@@ -320,9 +315,9 @@ def discs():
     return film([ROLLING, SLIPPING])
 
 
-def rim(seen, push):
+def rim(recorded, push):
     """Sideways velocity of the rim at the face, relative to the base's [1], and of rolling [1]."""
-    _, v_y, omega = seen.velocity() / push.twist[1]
+    _, v_y, omega = recorded.velocity() / push.twist[1]
     return v_y - RADIUS * omega - 1, -RADIUS * omega
 
 
@@ -348,7 +343,7 @@ def test_a_tiny_box_with_a_round_edge_is_a_cylinder():
 
 
 def some_problems(count=500):
-    """One or two contacts at the front face, near, deep or far, and any twist of the base."""
+    """Problems of one or two contacts at the front face, near, deep or far, and any base twist."""
     rng = np.random.default_rng(0)
     speed, angle = np.exp(rng.uniform(-7, -3, count)), rng.uniform(-1.5, 1.5, count)
     v_x, v_y, omega = speed * np.cos(angle), speed * np.sin(angle), rng.uniform(-0.15, 0.15, count)
@@ -373,7 +368,7 @@ def some_problems(count=500):
 
 
 def cost(stage, problem, v, dt):
-    """What the twist of one object minimises, written out."""
+    """Written-out cost that the twist of one object minimises."""
     c, speed, depth = problem.arm, problem.speed, stage.depth
     total = (v[0] ** 2 + v[1] ** 2 + c**2 * v[2] ** 2) / (2 * speed)
     for contact in problem.contacts:
@@ -398,7 +393,7 @@ def test_newtons_method_finds_the_minimum_by_its_derivatives():
         hessian = jax.vmap(jax.hessian(of, argnums=1), (0, 0, None))
 
         @jax.jit
-        def both(v):  # as it is written, and by differentiation
+        def both(v):  # as written, and by differentiation
             return stage.derivatives(problem, v, stage.slip, dt), (
                 gradient(problem, v, dt),
                 hessian(problem, v, dt),
@@ -412,8 +407,8 @@ def test_newtons_method_finds_the_minimum_by_its_derivatives():
             np.einsum("ij...,j...->i...", np.array(h_true), np.stack(solved(g, h))), g_true,
             atol=1e-6,
         )  # fmt: skip
-        found = jax.jit(partial(stage.solve, dt=dt))(problem, v)
-        (step, matrix), _ = both(found)
+        solution = jax.jit(partial(stage.solve, dt=dt))(problem, v)
+        (step, matrix), _ = both(solution)
         short = np.abs(np.stack(solved(step, matrix)))[:2].max(axis=0) / problem.speed
     assert np.mean(short > 1e-3) < 0.03
     assert np.median(short) < 1e-9
@@ -422,13 +417,13 @@ def test_newtons_method_finds_the_minimum_by_its_derivatives():
 # --- derivatives ----------------------------------------------------------------------------
 
 
-def moved_both_ways(given, seed):
-    """Trees (7, ...) of `given` moved along a random direction in each of its three parts."""
+def moved_both_ways(inputs, seed):
+    """Trees (7, ...) of `inputs` moved along a random direction in each of its three parts."""
     rng = np.random.default_rng(seed)
-    ways = [jax.tree.map(lambda x: rng.normal(size=x.shape), part) for part in given]
+    ways = [jax.tree.map(lambda x: rng.normal(size=x.shape), part) for part in inputs]
     rows = [(0.0, 0)] + [(e, part) for part in range(3) for e in (1e-6, -1e-6)]
     stacked = []
-    for part, (nominal, way) in enumerate(zip(given, ways, strict=True)):
+    for part, (nominal, way) in enumerate(zip(inputs, ways, strict=True)):
         steps = np.array([e if part == of else 0.0 for e, of in rows])
         move = lambda x, d, s=steps: x + s.reshape(-1, *(1,) * x.ndim) * d  # noqa: E731
         stacked.append(jax.tree.map(move, nominal, way))
@@ -436,22 +431,22 @@ def moved_both_ways(given, seed):
 
 
 def test_derivatives_of_a_push_are_those_of_finite_differences():
-    """Of where a cylinder, pushed in curves, ends: by what it is, where it starts and the push."""
+    """Derivatives of the final pose of a cylinder by its properties, start and push, in curves."""
     time = np.arange(50)[:, None] * PERIOD
     waves = 0.05 + 0.01 * np.sin(2 * time), 0.02 * np.cos(3 * time), 0.1 * np.sin(4 * time)
     parts = (0.01, 0.02), 0.2, 0.3, (FRONT, SIDE), np.zeros((1, 2)), RADIUS
-    object_ = Slider(*map(np.array, parts))
+    cylinder = Slider(*map(np.array, parts))
     pose = np.array([0, 0, 0, FRONT + RADIUS, 0, 0.2, 1, 0, 0, 0])
-    given = object_, pose, np.concatenate(waves, axis=1)
+    inputs = cylinder, pose, np.concatenate(waves, axis=1)
     with jax.enable_x64(True):
-        moved, ways = moved_both_ways(given, 0)
+        moved, ways = moved_both_ways(inputs, 0)
         physics = Physics(timestep=PERIOD, control_period=PERIOD)
 
         @jax.jit
         @partial(jax.value_and_grad, has_aux=True)
-        def end(given):
-            slider, start, twists = given
-            qpos = drive(Quasistatic(), slider, start, twists.swapaxes(0, 1), physics)[-1]
+        def end(inputs):
+            slider, start, twists = inputs
+            qpos = positions(slider, start, twists.swapaxes(0, 1), physics)[-1]
             where = qpos[:, 3] + 2 * qpos[:, 4] + 3 * qpos[:, 9]
             return where[0], where
 
@@ -484,11 +479,11 @@ def closed_loop():
         @partial(jax.value_and_grad, has_aux=True)
         def run(params):
             start = trial.start_all(worlds, params, jnp.ones(len(nudges), bool))
-            one = partial(
+            step = partial(
                 trial.control_step, stage, worlds, params, loop=trial.ControlLoop(preset())
             )
-            _, seen = jax.lax.scan(lambda trials, _: one(trials), start, length=150)
-            distance = jnp.mean(seen.details.distance, axis=0)
+            _, recorded = jax.lax.scan(lambda trials, _: step(trials), start, length=150)
+            distance = jnp.mean(recorded.details.distance, axis=0)
             return jnp.sum(distance), distance
 
         (_, distance), gradient = run(nudged)
@@ -518,9 +513,9 @@ def test_feet_bear_what_holds_the_centre_of_mass_and_none_pulls():
 
     def arm(x):
         com = np.array([[x, 0.0, 0.0]])
-        one = Solid(solid.rectangles(np.array([0.2]), np.array([0.1])), np.zeros(1), np.ones(1),
+        rows = Solid(solid.rectangles(np.array([0.2]), np.array([0.1])), np.zeros(1), np.ones(1),
                     np.ones(1), com, np.ones((1, 3)), np.array([[1.0, 0, 0, 0]]))  # fmt: skip
-        return solid.friction_arm(one)[0]
+        return solid.friction_arm(rows)[0]
 
     assert arm(0.1) == pytest.approx(0.75 * math.hypot(0.1, 0.1) + 0.25 * math.hypot(0.3, 0.1))
     assert arm(0.2) == pytest.approx(0.1)

@@ -2,18 +2,17 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import PAPER, SHORT, refusal
-from staging import recompiled, staged
+from staging import push_object, recompiled
 
 import rps_jax
 from rps_jax import engines
-from rps_jax.control.observation import Twist
-from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.robot import drive
@@ -32,35 +31,38 @@ STANDARD = preset()
 AHEAD = (0.05, 0.0, 0.0)
 
 
-def aims(one, twist, steps):
-    """What a base at rest aims at after each of some control steps at one commanded twist."""
-    now, seen = jnp.zeros(3), []
+def reference_velocities(robot, twist, steps):
+    """Velocities (steps, 3) at which the drive of a base at rest aims, at one commanded twist."""
+    aim, velocities = jnp.zeros(3), []
     for _ in range(steps):
-        now = drive.aim(one, now, jnp.asarray(twist, float), PERIOD)
-        seen.append(np.asarray(now))
-    return np.array(seen)
+        aim = drive.aim(robot, aim, jnp.asarray(twist, float), PERIOD)
+        velocities.append(np.asarray(aim))
+    return np.array(velocities)
 
 
 # --- the aim -------------------------------------------------------------------------------
 
 
 def test_a_lag_is_a_first_order_step_response():
-    seen = aims(Robot(lag=0.3), (0.05, -0.02, 0.1), 60)
+    velocities = reference_velocities(Robot(lag=0.3), (0.05, -0.02, 0.1), 60)
     time = PERIOD * np.arange(1, 61)[:, None]
-    np.testing.assert_allclose(seen, (1 - np.exp(-time / 0.3)) * [0.05, -0.02, 0.1], atol=1e-7)
-    np.testing.assert_allclose(aims(Robot(lag=0.0), AHEAD, 1)[0], AHEAD)
+    np.testing.assert_allclose(
+        velocities, (1 - np.exp(-time / 0.3)) * [0.05, -0.02, 0.1], atol=1e-7
+    )
+    np.testing.assert_allclose(reference_velocities(Robot(lag=0.0), AHEAD, 1)[0], AHEAD)
 
 
 def test_acceleration_is_bounded_along_the_change_and_about_the_vertical():
-    one = Robot(acceleration_max=(0.5, 1.0))
-    seen = aims(one, (0.03, 0.04, -0.1), 8)  # a speed of 0.05 m/s takes 0.1 s, the turn as long
+    robot = Robot(acceleration_max=(0.5, 1.0))
+    # A speed of 0.05 m/s takes 0.1 s, the turn as long.
+    velocities = reference_velocities(robot, (0.03, 0.04, -0.1), 8)
     share = np.minimum(np.arange(1, 9) / 5, 1.0)[:, None]
-    np.testing.assert_allclose(seen, share * [0.03, 0.04, -0.1], atol=1e-7)
+    np.testing.assert_allclose(velocities, share * [0.03, 0.04, -0.1], atol=1e-7)
 
 
 def test_speed_is_scaled_as_a_vector_and_the_turn_is_clipped():
-    seen = aims(Robot(v_max=0.5, omega_max=0.2), (3.0, 4.0, -1.0), 1)[0]
-    np.testing.assert_allclose(seen, (0.3, 0.4, -0.2), rtol=1e-6)
+    velocities = reference_velocities(Robot(v_max=0.5, omega_max=0.2), (3.0, 4.0, -1.0), 1)[0]
+    np.testing.assert_allclose(velocities, (0.3, 0.4, -0.2), rtol=1e-6)
 
 
 def test_wheels_that_slip_lose_their_share():
@@ -71,65 +73,36 @@ def test_wheels_that_slip_lose_their_share():
 
 
 def test_the_force_is_bounded_in_its_direction_by_drive_traction_and_rolling():
-    one = Robot(mass=100.0, force_max=300.0, traction=0.25, resistance=0.05)
-    assert one.push_max == pytest.approx(0.20 * 100 * GRAVITY)  # traction less rolling
-    assert replace(one, traction=0.9).push_max == pytest.approx(300 - 0.05 * 100 * GRAVITY)
-    assert one.turn_max == pytest.approx(one.push_max * math.hypot(0.3625, 0.29))
-    assert replace(one, torque_max=7.0).turn_max == 7.0
+    robot = Robot(mass=100.0, force_max=300.0, traction=0.25, resistance=0.05)
+    assert robot.push_max == pytest.approx(0.20 * 100 * GRAVITY)  # traction less rolling
+    assert replace(robot, traction=0.9).push_max == pytest.approx(300 - 0.05 * 100 * GRAVITY)
+    assert robot.turn_max == pytest.approx(robot.push_max * math.hypot(0.3625, 0.29))
+    assert replace(robot, torque_max=7.0).turn_max == 7.0
     still = (0.0, 0.0, 0.0)
     for turn in ((1.0, 0.0), (0.6, 0.8)):
-        force, _ = drive.push(one, still, (3.0, 4.0, 5.0), still, turn, 0.01, np)
-        assert np.hypot(*force[:2]) == pytest.approx(one.push_max)
+        force, _ = drive.push(robot, still, (3.0, 4.0, 5.0), still, turn, 0.01, np)
+        assert np.hypot(*force[:2]) == pytest.approx(robot.push_max)
         c, s = turn
         along = (c * force[0] + s * force[1], c * force[1] - s * force[0])
-        np.testing.assert_allclose(along, np.array([0.6, 0.8]) * one.push_max)
-        assert force[2] == pytest.approx(one.turn_max)
+        np.testing.assert_allclose(along, np.array([0.6, 0.8]) * robot.push_max)
+        assert force[2] == pytest.approx(robot.turn_max)
 
 
 def test_the_servo_meets_its_twist_with_one_overshoot_and_forgets_a_stall():
     """Alone, it is a double pole at 2 pi 5 Hz; after a stall its integral is the limit's."""
-    one, dt = Robot(mass=100.0, force_max=200.0), 0.01
+    robot, dt = Robot(mass=100.0, force_max=200.0), 0.01
     v, integral = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    seen = []
+    velocities = []
     for _ in range(100):
-        force, integral = drive.push(one, integral, AHEAD, v, (1.0, 0.0), dt, np)
+        force, integral = drive.push(robot, integral, AHEAD, v, (1.0, 0.0), dt, np)
         v = (v[0] + dt * force[0] / 100, 0.0, 0.0)
-        seen.append(v[0])
-    assert seen[-1] == pytest.approx(0.05, rel=1e-4)
-    assert max(seen) < 1.2 * 0.05
+        velocities.append(v[0])
+    assert velocities[-1] == pytest.approx(0.05, rel=1e-4)
+    assert max(velocities) < 1.2 * 0.05
     for _ in range(500):  # held by a wall
-        force, integral = drive.push(one, integral, AHEAD, (0.0,) * 3, (1.0, 0.0), dt, np)
+        force, integral = drive.push(robot, integral, AHEAD, (0.0,) * 3, (1.0, 0.0), dt, np)
     assert force[0] == pytest.approx(200.0)
     assert abs(integral[0]) < 2 * 200.0
-
-
-def pushed(engine, one, seconds=4.0, twist=AHEAD, name="box"):
-    """Base velocity [m/s] and positions (10,) after a push, from contact, at a constant twist."""
-    at = scene.load(name, STANDARD, FRICTION["S1"], robot=one)
-    start = scene.initial_qpos(at, gap=0.0)[None]
-    stage, fields = staged(engine, [at], STANDARD, one)
-    robots = jax.tree.map(lambda x: np.asarray(x, float)[None], one) if one.driven else None
-    steps = round(seconds / STANDARD.control_period)
-    if not engines.get(engine).traced:
-        batch = engines.get(engine).stepper(stage, start, 1, robots)
-        for _ in range(steps):
-            batch.drive(np.zeros(1, int), np.array([twist]), STANDARD.substeps)
-        batch.close()
-        return batch.qvel[0, 0], batch.qpos[0].copy()
-    still = jnp.zeros((1, 9))
-    twists = Twist(*jnp.asarray(twist, float)[:, None])
-    fields, robots = jax.tree.map(lambda x: jnp.asarray(x, float), (fields, robots))
-
-    @jax.jit
-    def run(now):
-        def body(now, _):
-            return stage.drive(fields, now, ControlPeriod(twists, STANDARD, robots)).motion, None
-
-        return jax.lax.scan(body, now, length=steps)[0]
-
-    integral = None if robots is None else jnp.zeros((1, 3))
-    after = run(Motion(jnp.asarray(start, float), still, still, integral))
-    return float(after.qvel[0, 0]), np.asarray(after.qpos[0])
 
 
 WEIGHT = 0.3 * 20 * GRAVITY  # [N] that it takes to slide the box under S1: 58.9
@@ -137,31 +110,31 @@ WEIGHT = 0.3 * 20 * GRAVITY  # [N] that it takes to slide the box under S1: 58.9
 
 @pytest.mark.parametrize("engine", ["fused", "mujoco"])
 def test_a_base_pushes_what_its_force_can_slide_and_stalls_before_what_it_cannot(engine):
-    can, moved = pushed(engine, Robot(force_max=1.1 * WEIGHT))
-    assert can == pytest.approx(0.05, rel=0.01)
-    cannot, stood = pushed(engine, Robot(force_max=0.9 * WEIGHT))
-    assert abs(cannot) < 2e-3  # MuJoCo's friction creeps
-    assert moved[JOINTS.object][0] - stood[JOINTS.object][0] > 0.1
+    strong, weak = (push_object(engine, Robot(force_max=f * WEIGHT), 4.0) for f in (1.1, 0.9))
+    assert strong.qvel[-1, 0] == pytest.approx(0.05, rel=0.01)
+    assert abs(weak.qvel[-1, 0]) < 2e-3  # MuJoCo's friction creeps
+    assert strong.qpos[-1, JOINTS.object][0] - weak.qpos[-1, JOINTS.object][0] > 0.1
 
 
 def test_integral_action_leaves_no_droop_under_load():
-    assert pushed("fused", Robot(force_max=400.0))[0] == pytest.approx(0.05, rel=1e-3)
+    velocity = push_object("fused", Robot(force_max=400.0), 4.0).qvel[-1, 0]
+    assert velocity == pytest.approx(0.05, rel=1e-3)
 
 
 def test_engines_agree_on_a_base_that_contact_slows():
-    one = Robot(mass=60.0, force_max=90.0, torque_max=25.0)
-    twist = (0.05, 0.01, 0.15)
-    places = {name: pushed(name, one, 3.0, twist)[1] for name in ("fused", "mujoco", "mjx")}
+    push = partial(push_object, seconds=3.0, twist=(0.05, 0.01, 0.15))
+    weak = Robot(mass=60.0, force_max=90.0, torque_max=25.0)
+    qpos = {name: push(name, weak).qpos[-1] for name in ("fused", "mujoco", "mjx")}
     for name in ("fused", "mjx"):
-        np.testing.assert_allclose(places[name], places["mujoco"], atol=4e-3, err_msg=name)
-    ideal = pushed("fused", Robot(), 3.0, twist)[1]
-    assert np.abs(ideal - places["fused"])[:6].max() > 0.01  # it did slow
+        np.testing.assert_allclose(qpos[name], qpos["mujoco"], atol=4e-3, err_msg=name)
+    ideal = push("fused").qpos[-1]
+    assert np.abs(ideal - qpos["fused"])[:6].max() > 0.01  # it did slow
 
 
 def test_a_strong_base_is_as_good_as_a_velocity_source():
-    strong = pushed("fused", Robot(mass=2000.0, force_max=1e5), 3.0, (0.05, 0.02, 0.0))[1]
-    source = pushed("fused", Robot(), 3.0, (0.05, 0.02, 0.0))[1]
-    np.testing.assert_allclose(strong, source, atol=4e-3)
+    push = partial(push_object, "fused", seconds=3.0, twist=(0.05, 0.02, 0.0))
+    strong, source = push(Robot(mass=2000.0, force_max=1e5)), push(Robot())
+    np.testing.assert_allclose(strong.qpos[-1], source.qpos[-1], atol=4e-3)
 
 
 @pytest.mark.parametrize("engine", ["fused", "mjx"])
@@ -181,13 +154,15 @@ def test_worlds_by_template_equal_recompiled_ones(engine):
 def test_a_trial_whose_base_stalls_says_so():
     weak, strong = Robot(force_max=0.8 * WEIGHT), Robot(force_max=3 * WEIGHT, lag=0.1)
     setting = replace(SHORT, rules=Rules(horizon=20.0))
-    cases = [Case("box", FRICTION["S1"], (0.6, 0.0), PAPER, robot=one) for one in (weak, strong)]
-    found = [pushes.run([case], setting)[0] for case in cases]
-    assert found[0].stalled[0]
-    assert not found[0].success[0]
-    assert found[0].time[0] == pytest.approx(20.0)
-    assert found[1].success[0]
-    assert not found[1].stalled[0]
+    cases = [
+        Case("box", FRICTION["S1"], (0.6, 0.0), PAPER, robot=robot) for robot in (weak, strong)
+    ]
+    outcomes = [pushes.run([case], setting)[0] for case in cases]
+    assert outcomes[0].stalled[0]
+    assert not outcomes[0].success[0]
+    assert outcomes[0].time[0] == pytest.approx(20.0)
+    assert outcomes[1].success[0]
+    assert not outcomes[1].stalled[0]
 
 
 def test_random_robots_are_drawn_last_and_change_no_other_number():
@@ -198,7 +173,9 @@ def test_random_robots_are_drawn_last_and_change_no_other_number():
     }
     assert len(limits) == 4
     assert set(real.values) - set(wide.values) == limits
-    same = real._replace(at={k: v for k, v in real.values.items() if k not in limits}, robot=None)
+    same = real._replace(
+        values={k: v for k, v in real.values.items() if k not in limits}, robot=None
+    )
     jax.tree.map(np.testing.assert_array_equal, wide._replace(robot=None), same)
     assert wide.robot.ideal
     assert real.robot.driven
@@ -216,8 +193,8 @@ def test_a_domain_with_robots_goes_through_json():
     import dataclasses
     import json
 
-    for one in (DOMAINS["real"], replace(DOMAINS["wide"], robot=ROBOTS["mpo_500"])):
-        assert domain.from_json(json.loads(json.dumps(dataclasses.asdict(one)))) == one
+    for expected in (DOMAINS["real"], replace(DOMAINS["wide"], robot=ROBOTS["mpo_500"])):
+        assert domain.from_json(json.loads(json.dumps(dataclasses.asdict(expected)))) == expected
 
 
 def test_robots_are_named_in_the_library_and_in_files(tmp_path):
@@ -226,19 +203,19 @@ def test_robots_are_named_in_the_library_and_in_files(tmp_path):
     path.write_text('{"mass": 50, "force_max": 120, "acceleration_max": [0.5, 1]}')
     mine = parse_robot(str(path))
     assert mine == Robot(mass=50, force_max=120, acceleration_max=(0.5, 1))
-    found = rps_jax.sweep(
+    rows = rps_jax.sweep(
         "rps",
         replace(DOMAINS["real"], objects=("random_cylinder",), robot_force=None),
         worlds=3,
         robot=mine,
         setting=Setting(rules=Rules(horizon=1.0)),
     )
-    assert np.unique(found.robot_force) == 120
-    assert "stalled" in found
+    assert np.unique(rows.robot_force) == 120
+    assert "stalled" in rows
 
 
 @pytest.mark.parametrize(
-    ("numbers", "said"),
+    ("changes", "message"),
     [
         ({"force_max": -1}, "robot force_max = -1"),
         ({"lag": float("nan")}, "robot lag = nan"),
@@ -249,22 +226,22 @@ def test_robots_are_named_in_the_library_and_in_files(tmp_path):
         ({"speed": 1}, "unknown robot quantity 'speed'"),
     ],
 )
-def test_numbers_that_no_robot_has_are_one_sentence(numbers, said):
-    with pytest.raises(InputError, match=said.replace("(", r"\(")):
-        parse_robot(numbers)
+def test_numbers_that_no_robot_has_are_one_sentence(changes, message):
+    with pytest.raises(InputError, match=message.replace("(", r"\(")):
+        parse_robot(changes)
 
 
 def test_commands_refuse_robots_that_they_cannot_step(capsys, tmp_path):
     assert "did you mean 'kairos'" in refusal(capsys, "push", "--robot", "kairo")
-    said = refusal(
+    message = refusal(
         capsys, "table", "--robot", "kairos", "--engine", "quasistatic", "--out", tmp_path / "t"
     )
-    assert "engine = quasistatic is not allowed for a robot with a limited force" in said
-    said = refusal(
+    assert "engine = quasistatic is not allowed for a robot with a limited force" in message
+    message = refusal(
         capsys,
         *("sweep", "--domain", "real", "--engine", "quasistatic", "--out", tmp_path / "s"),
     )
-    assert "engine = quasistatic is not allowed" in said
+    assert "engine = quasistatic is not allowed" in message
 
 
 def test_an_ideal_robot_is_the_base_as_it_was():

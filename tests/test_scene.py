@@ -69,15 +69,15 @@ def test_mjx_agrees_with_c_mujoco_at_one_step_and_over_0_4_seconds(names):
     data = mjx.make_data(scenes[0].physics)
     # Where capsule and face are exactly parallel, MJX reports both ends of the line of contact
     # and C MuJoCo one: the first step of a cylinder is compared before it touches.
-    apart = 0.005 if names[0] == "cylinder" else -0.0005
-    starts = np.array([scene.initial_qpos(s, gap=apart) for s in scenes])
+    gap = 0.005 if names[0] == "cylinder" else -0.0005
+    starts = np.array([scene.initial_qpos(s, gap=gap) for s in scenes])
     qpos, qvel = step_mjx(model, data, fields, starts.astype(np.float32), 1)
     for i, loaded in enumerate(scenes):
         want = step_c(loaded, starts[i], 1)
         np.testing.assert_allclose(qpos[i], want.qpos, atol=2e-6, err_msg=loaded.name)
         np.testing.assert_allclose(qvel[i], want.qvel, atol=1e-3, err_msg=loaded.name)
 
-    # Over a push of 20 mm the way along is sharp; sideways it hangs on stick and slip at a corner.
+    # After a push of 20 mm the x position is sharp; y depends on stick and slip at a corner.
     starts = np.array([touching(s) for s in scenes])
     qpos, _ = step_mjx(model, data, fields, starts.astype(np.float32), 40)
     want = np.array([step_c(s, start, 40).qpos for s, start in zip(scenes, starts, strict=True)])
@@ -142,8 +142,8 @@ def test_friction_reaches_both_contact_pairs(label):
 
 
 def test_a_given_mass_scales_the_inertia_and_keeps_the_centre():
-    own, heavy = load("nonuniform_box"), load("nonuniform_box", mass=30.0)
-    a, b = own.physics.body("object"), heavy.physics.body("object")
+    plain, heavy = load("nonuniform_box"), load("nonuniform_box", mass=30.0)
+    a, b = plain.physics.body("object"), heavy.physics.body("object")
     assert b.mass[0] == pytest.approx(30.0)
     np.testing.assert_allclose(b.inertia, 2 * a.inertia, rtol=1e-6)
     np.testing.assert_allclose(b.ipos, a.ipos, atol=1e-9)

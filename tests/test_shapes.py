@@ -1,4 +1,4 @@
-"""The checker of shapes that the tests put between calls: it refuses what is wrong, where it is."""
+"""The checker of shapes, which tests add to calls, reports wrong shapes at their call."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from rps_jax.robot.skin import IdealSkin, SkinState
 from rps_jax.trials import trial
 
 PAPER = RPSParams.paper()
-SEEN = Observation(
+OBSERVATION = Observation(
     jnp.zeros(2), jnp.zeros(()), jnp.array([0.36, 0.0]), jnp.array(True), jnp.array([2.0, 0.0])
 )
 TWO_OF_THREE = SkinState(
@@ -24,7 +24,7 @@ TWO_OF_THREE = SkinState(
 
 
 def chain(error):
-    """What an error says, and those that led to it."""
+    """Return the texts of an error and of its causes."""
     return [str(error), *(chain(error.__context__) if error.__context__ else [])]
 
 
@@ -41,15 +41,15 @@ def chain(error):
 )
 def test_a_law_is_given_no_observation_of_another_shape_or_kind(change, field):
     state = RPSState.init(PAPER)
-    rps.step(PAPER, state, SEEN)
+    rps.step(PAPER, state, OBSERVATION)
     with pytest.raises(TypeCheckError, match="typechecking parameter 'observation'") as caught:
-        rps.step(PAPER, state, SEEN._replace(**change))
+        rps.step(PAPER, state, OBSERVATION._replace(**change))
     assert f"Observation.{field} is " in " ".join(chain(caught.value))
 
 
 def test_batched_worlds_are_single_ones_to_a_law():
     """`jax.vmap` hides the axis; without it the law refuses the batch."""
-    batch = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 3), SEEN)
+    batch = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 3), OBSERVATION)
     assert jax.vmap(rps.displacement)(batch).shape == (3, 2)
     with pytest.raises(TypeCheckError, match="typechecking parameter 'observation'"):
         rps.displacement(batch)

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import PAPER, refusal
-from staging import recompiled
-from test_robot import AHEAD, aims, pushed
+from staging import push_object, recompiled
+from test_robot import reference_velocities
 
 import rps_jax
 from rps_jax import engines
@@ -33,7 +33,7 @@ SETTLED = 1e3  # [s] after which the skin's low-pass filter has forgotten its pa
 
 
 def read(sensor, footprint):
-    """What a sensor tells of an object that has been there for long."""
+    """Return the reading of a sensor of an object that has been there for a long time."""
     return sensor.sense(sensor.init(jax.random.key(0)), footprint, SETTLED)[1]
 
 
@@ -59,8 +59,8 @@ def test_rows_lie_on_the_strip(boards):
     shell = Robot(0.48, 0.3965, boards).shell
     for row in shell.rows():
         for s in (0.0, 0.3, 1.0):
-            place = shell.on_strip(jnp.asarray(row.offset + s * row.length))
-            np.testing.assert_allclose(place, row.start + s * row.length * row.along, atol=1e-6)
+            point = shell.on_strip(jnp.asarray(row.offset + s * row.length))
+            np.testing.assert_allclose(point, row.start + s * row.length * row.along, atol=1e-6)
 
 
 def test_taxels_are_sampled_a_centimetre_apart():
@@ -74,9 +74,9 @@ def test_boards_at_the_papers_pitch_feel_as_the_papers():
     sides = Boards("left", 5, pitch), Boards("front", 4, pitch), Boards("right", 5, pitch)
     for sensor in (IdealSkin(), CapacitiveSkin(), SmoothSkin()):
         for y in (0.0, 0.13, -0.33, 0.391):
-            usual = read(sensor, box(0.46, y))
-            same = read(sensor.on(Robot(boards=sides).shell), box(0.46, y))
-            for a, b in zip(usual, same, strict=True):
+            expected = read(sensor, box(0.46, y))
+            found = read(sensor.on(Robot(boards=sides).shell), box(0.46, y))
+            for a, b in zip(expected, found, strict=True):
                 np.testing.assert_allclose(a, b, atol=1e-5)
 
 
@@ -95,7 +95,7 @@ def test_nothing_is_felt_where_no_board_is(sensor):
 
 
 def test_a_corner_must_press_harder_on_coarser_taxels():
-    """Of a corner a tenth as long as the taxel, the mean capacitance tells little."""
+    """The mean capacitance hardly changes for a corner a tenth as long as the taxel."""
     corner = fp.place(
         fp.rectangle(0.1, 0.1), jnp.array([0.3625 + 0.1 * np.sqrt(2), 0.0]), jnp.asarray(np.pi / 4)
     )
@@ -109,8 +109,8 @@ def test_a_corner_must_press_harder_on_coarser_taxels():
 
 
 def test_paper_case_starts_before_the_front_of_its_own_base():
-    one = Case("box", FRICTION["S1"], (2.0, 0.0), PAPER, robot=Robot(half_length=0.5))
-    worlds = pushes.build([one], Setting(engine="fused")).worlds
+    case = Case("box", FRICTION["S1"], (2.0, 0.0), PAPER, robot=Robot(half_length=0.5))
+    worlds = pushes.build([case], Setting(engine="fused")).worlds
     assert worlds.qpos[0][JOINTS.object][0] == pytest.approx(0.5 + 0.02 + 0.2, abs=1e-6)
     assert worlds.robot is None  # it has no limits
     assert worlds.skin.shell.half_length == pytest.approx(0.5)
@@ -119,15 +119,13 @@ def test_paper_case_starts_before_the_front_of_its_own_base():
 def test_engines_agree_on_a_base_of_another_size():
     """A box off the axis is turned by the corner of a narrow base, else by the middle."""
     slim, twist = Robot(half_length=0.5, half_width=0.12), (0.05, 0.0, 0.1)
-    places = {
-        name: pushed(name, slim, 2.0, twist)[1]
-        for name in ("fused", "mujoco", "mjx", "quasistatic")
-    }
-    for name, at in places.items():
+    names = ("fused", "mujoco", "mjx", "quasistatic")
+    qpos = {name: push_object(name, slim, twist=twist).qpos[-1] for name in names}
+    for name, final in qpos.items():
         bound = 0.02 if name == "quasistatic" else 2e-3
-        np.testing.assert_allclose(at, places["mujoco"], atol=bound, err_msg=name)
-    usual = pushed("fused", replace(slim, half_width=0.29), 2.0, twist)[1]
-    assert np.abs(usual - places["fused"])[:9].max() > 0.005
+        np.testing.assert_allclose(final, qpos["mujoco"], atol=bound, err_msg=name)
+    wide = push_object("fused", replace(slim, half_width=0.29), twist=twist).qpos[-1]
+    assert np.abs(wide - qpos["fused"])[:9].max() > 0.005
 
 
 @pytest.mark.parametrize("engine", ["fused", "mjx", "quasistatic"])
@@ -149,12 +147,12 @@ def test_a_sweep_pushes_with_the_base_that_it_is_given():
     """A base is as wide as its boards: a narrow one loses objects that the usual one holds."""
     domain = replace(DOMAINS["wide"], objects=("random_cylinder",))
     setting = Setting(rules=Rules(horizon=20.0))
-    wide, own, same = (
-        rps_jax.sweep("rps", domain, worlds=8, robot=one, setting=setting)
-        for one in (None, Robot(half_length=0.5, half_width=0.2), Robot())
+    wide, narrow, same = (
+        rps_jax.sweep("rps", domain, worlds=8, robot=base, setting=setting)
+        for base in (None, Robot(half_length=0.5, half_width=0.2), Robot())
     )
-    assert (own.base_pose.values != wide.base_pose.values).any()
-    assert np.isfinite(own.path_length).all()
+    assert (narrow.base_pose.values != wide.base_pose.values).any()
+    assert np.isfinite(narrow.path_length).all()
     np.testing.assert_array_equal(same.base_pose, wide.base_pose)
 
 
@@ -164,22 +162,22 @@ def test_presets_wear_as_many_boards_as_they_have_room_for():
         ROBOTS[name].check()
 
 
-@pytest.mark.parametrize("given", ["array", "file"])
-def test_boards_go_through_json(given, tmp_path):
+@pytest.mark.parametrize("source", ["array", "file"])
+def test_boards_go_through_json(source, tmp_path):
     rows = [{"side": "front", "count": 2, "pitch": 0.05}, {"side": "right", "count": 1}]
     values = {"half_width": 0.3, "boards": rows}
-    one = robot.parse_robot(values)
-    assert one.boards == (Boards("front", 2, 0.05), Boards("right", 1))
-    if given == "file":
+    parsed = robot.parse_robot(values)
+    assert parsed.boards == (Boards("front", 2, 0.05), Boards("right", 1))
+    if source == "file":
         (tmp_path / "mine.json").write_text(json.dumps(values))
-        assert robot.parse_robot(str(tmp_path / "mine.json")) == one
+        assert robot.parse_robot(str(tmp_path / "mine.json")) == parsed
 
 
 FRONT = Boards("front", 2, 0.05)
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"half_length": -0.3}, "robot half_length = -0.3 is not allowed"),
         ({"half_width": 5.0}, "robot half_width = 5.0 is not allowed: .* at most 2"),
@@ -203,21 +201,21 @@ FRONT = Boards("front", 2, 0.05)
         ({"bandwidth": 0.0}, "robot bandwidth = 0.0 is not allowed"),
     ],
 )
-def test_bases_that_cannot_be_are_refused(changes, said):
-    with pytest.raises(InputError, match=said):
+def test_bases_that_cannot_be_are_refused(changes, message):
+    with pytest.raises(InputError, match=message):
         Robot(**changes).check()
 
 
 def test_commands_refuse_them_in_one_sentence(capsys, tmp_path):
     mine = tmp_path / "mine.json"
-    for text, said in (
+    for text, message in (
         ('{"boards": [{"side": "front", "count": 9, "pitch": 0.05}]}', "they leave the base"),
         ('{"boards": [{"count": 9}]}', "write each row as"),
         ('{"boards": [{"side": "front", "count": 1, "width": 1}]}', "quantity 'width'"),
         ('{"v_max": [1.0, 0.0]}', "cannot move sideways"),
     ):
         mine.write_text(text)
-        assert said in refusal(capsys, "sweep", "--robot", str(mine))
+        assert message in refusal(capsys, "sweep", "--robot", str(mine))
     mine.write_text('{"half_length": 1.5}')
     assert "which reaches 1.53 m" in refusal(capsys, "sweep", "--robot", str(mine))
     assert "outside the robot" in refusal(
@@ -226,13 +224,13 @@ def test_commands_refuse_them_in_one_sentence(capsys, tmp_path):
 
 
 def test_a_force_limit_pushes_as_far_from_a_larger_base():
-    one = Robot(half_length=0.48, half_width=0.3965, mass=100.0, force_max=400.0)
-    assert one.inertia == pytest.approx(100 * (0.48**2 + 0.3965**2) / 3)
-    assert pushed("fused", one, 2.0, AHEAD)[0] == pytest.approx(0.05, rel=1e-2)
+    larger = Robot(half_length=0.48, half_width=0.3965, mass=100.0, force_max=400.0)
+    assert larger.inertia == pytest.approx(100 * (0.48**2 + 0.3965**2) / 3)
+    assert push_object("fused", larger).qvel[-1, 0] == pytest.approx(0.05, rel=1e-2)
 
 
 def test_speeds_ahead_and_sideways_are_bounded_with_the_direction_kept():
-    ahead = aims(Robot(v_max=(0.5, 0.1)), (0.4, 0.2, 0.0), 1)[0]
+    ahead = reference_velocities(Robot(v_max=(0.5, 0.1)), (0.4, 0.2, 0.0), 1)[0]
     np.testing.assert_allclose(ahead, (0.2, 0.1, 0.0), rtol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""The skin: where its taxels are, what it calls a contact, and where it places one.
+"""Positions of the taxels of the skin, and type and position of its contacts.
 
 The base is 0.725 m by 0.58 m: its front face is the line x = 0.3625, its sides are y = +-0.29.
 """
@@ -246,8 +246,8 @@ def test_an_object_beside_the_end_of_a_face_is_felt_only_if_near_the_face():
 
 def test_the_ideal_sensor_has_no_memory():
     state = IDEAL.init(jax.random.key(0))
-    after, _ = sense_one(IDEAL, state, box(FRONT + 0.2, 0.0), 0.02)
-    chex.assert_trees_all_equal(after, state)
+    next_state, _ = sense_one(IDEAL, state, box(FRONT + 0.2, 0.0), 0.02)
+    chex.assert_trees_all_equal(next_state, state)
 
 
 @property_test
@@ -290,7 +290,7 @@ def test_derivatives_of_a_reading_are_finite_even_if_nothing_is_felt():
 
 
 def clear_cut(less_sensitive, more_sensitive, shapes: Footprint) -> np.ndarray:
-    """Where (n,) a slightly different sensor reads the same, so that rounding decides nothing."""
+    """Return whether (n,) a slightly different sensor gives the same: rounding decides nothing."""
     less, more = sense_all(less_sensitive, shapes), sense_all(more_sensitive, shapes)
     moved = np.abs(less.p_robot_contact - more.p_robot_contact).max(axis=1)
     return (moved < 2e-5) & np.asarray(less.contact_type == more.contact_type)
@@ -310,12 +310,16 @@ def test_a_mirrored_object_gives_the_mirrored_reading(sensor, less, more, seed):
     for shapes in random_placements(seed).values():
         # Mirrored vertices are counter-clockwise again in reverse.
         mirrored = shapes._replace(vertices=(shapes.vertices * jnp.array([1.0, -1.0]))[:, ::-1])
-        here, there = sense_all(sensor, shapes), sense_all(sensor, mirrored)
+        readings, mirrored_readings = sense_all(sensor, shapes), sense_all(sensor, mirrored)
         sure = clear_cut(less, more, shapes)
         assert sure.mean() > 0.5
-        np.testing.assert_array_equal(there.contact_type[sure], here.contact_type[sure])
+        np.testing.assert_array_equal(
+            mirrored_readings.contact_type[sure], readings.contact_type[sure]
+        )
         np.testing.assert_allclose(
-            there.p_robot_contact[sure], (here.p_robot_contact * np.array([1, -1]))[sure], atol=1e-5
+            mirrored_readings.p_robot_contact[sure],
+            (readings.p_robot_contact * np.array([1, -1]))[sure],
+            atol=1e-5,
         )
 
 
@@ -326,12 +330,12 @@ def test_in_firm_contact_both_sensors_agree_within_one_taxel(seed):
     ideal = IDEAL._replace(tolerance=0.008)  # 10 mm / 1.25
     for shapes in random_placements(seed, gap=(-0.004, 0.0005)).values():
         exact, felt = sense_all(ideal, shapes), sense_all(CAPACITIVE, shapes)
-        before = np.abs(exact.p_robot_contact[:, 1]) < SIDE - PITCH  # not on a corner of the base
-        before &= np.asarray(exact.in_contact)
-        assert before.sum() > 16
-        assert felt.in_contact[before].all()
-        apart = np.linalg.norm(exact.p_robot_contact - felt.p_robot_contact, axis=1)
-        assert apart[before].max() <= PITCH
+        is_front = np.abs(exact.p_robot_contact[:, 1]) < SIDE - PITCH  # not on a corner of the base
+        is_front &= np.asarray(exact.in_contact)
+        assert is_front.sum() > 16
+        assert felt.in_contact[is_front].all()
+        distance = np.linalg.norm(exact.p_robot_contact - felt.p_robot_contact, axis=1)
+        assert distance[is_front].max() <= PITCH
 
 
 @pytest.mark.parametrize(("gap", "kind"), [(1.4e-3, LINE), (1.5e-3, NONE)])
@@ -446,8 +450,8 @@ def test_the_signal_fades_with_the_time_constant():
     state, _ = sense_one(
         CAPACITIVE, CAPACITIVE.init(jax.random.key(0)), box(FRONT + 0.205, 0.0), SETTLED
     )
-    after, _ = sense_one(CAPACITIVE, state, ball(9.0, 0.0), 0.05)
-    np.testing.assert_allclose(after.signal, state.signal / math.e, rtol=1e-5, atol=1e-7)
+    next_state, _ = sense_one(CAPACITIVE, state, ball(9.0, 0.0), 0.05)
+    np.testing.assert_allclose(next_state.signal, state.signal / math.e, rtol=1e-5, atol=1e-7)
 
 
 def test_touch_begins_when_the_signal_passes_the_threshold():
@@ -505,9 +509,9 @@ def test_noise_is_drawn_afresh_for_every_reading_and_taxel_then_filtered():
 
 def test_noise_depends_on_the_key_alone():
     noisy = CAPACITIVE._replace(noise=0.1)
-    first, again, other = (long_record(noisy, jax.random.key(k)) for k in (1, 1, 2))
+    first, again, different = (long_record(noisy, jax.random.key(k)) for k in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
-    assert (np.asarray(first) != np.asarray(other)).mean() > 0.99
+    assert (np.asarray(first) != np.asarray(different)).mean() > 0.99
 
 
 def test_without_noise_a_sensor_that_feels_nothing_is_silent():
@@ -516,18 +520,18 @@ def test_without_noise_a_sensor_that_feels_nothing_is_silent():
 
 
 @jax.jit
-def many(sensor):
+def batch_of(sensor):
     """500 sensors of one make."""
     return jax.vmap(sensor.init)(jax.random.split(jax.random.key(3), 500))
 
 
 def test_gains_spread_about_one_from_taxel_to_taxel_and_sensor_to_sensor():
-    gain = np.asarray(many(CAPACITIVE._replace(gain_spread=0.2)).gain)
+    gain = np.asarray(batch_of(CAPACITIVE._replace(gain_spread=0.2)).gain)
     assert gain.mean() == pytest.approx(1, abs=0.01)
     assert gain.std() == pytest.approx(0.2, rel=0.03)
     assert gain.std(axis=0).min() > 0.15
     assert gain.std(axis=1).min() > 0.1
-    np.testing.assert_array_equal(many(CAPACITIVE).gain, np.ones((500, 42)))
+    np.testing.assert_array_equal(batch_of(CAPACITIVE).gain, np.ones((500, 42)))
 
 
 def test_a_signal_is_proportional_to_the_gain():
@@ -541,7 +545,7 @@ def test_a_signal_is_proportional_to_the_gain():
 
 def test_the_share_of_dead_taxels_is_as_asked():
     for share in (0.0, 0.3, 1.0):
-        alive = np.asarray(many(CAPACITIVE._replace(dead_share=share)).alive)
+        alive = np.asarray(batch_of(CAPACITIVE._replace(dead_share=share)).alive)
         assert alive.mean() == pytest.approx(1 - share, abs=0.01)
     assert not alive.any()
 

@@ -1,4 +1,4 @@
-"""The smooth law and the smooth skin: what they keep of the hard ones, and what they tend to."""
+"""The smooth law and skin share properties with the hard ones, to which they converge."""
 
 from __future__ import annotations
 
@@ -103,18 +103,18 @@ def hard(params, state, observation):
 
 @jax.jit
 def smooth(params, state, observation, temperatures):
-    one = jax.vmap(rps.step_with_details, in_axes=(0, 0, 0, None))
-    return one(params, state, observation, temperatures)
+    step = jax.vmap(rps.step_with_details, in_axes=(0, 0, 0, None))
+    return step(params, state, observation, temperatures)
 
 
 def clear(params, state, observation, details, margin: float) -> np.ndarray:
-    """Where (n,) no switch is nearer to its surface than `margin` [m]."""
+    """Return (n,) whether every switch is farther from its surface than `margin` [m]."""
     l, distance = np.abs(details.l), details.distance  # noqa: E741
     near = [l - state.l_th, l, distance - params.d_th, distance - params.d_success]
     return np.min(np.abs(near), axis=0) > margin
 
 
-def numbers(results) -> np.ndarray:
+def flat_numbers(results) -> np.ndarray:
     """(n, ...) of all that a step returns, bools as 0 and 1."""
     leaves = [np.asarray(x, float).reshape(WORLDS, -1) for x in jax.tree.leaves(results)]
     return np.concatenate(leaves, axis=1)
@@ -127,7 +127,9 @@ def test_without_heat_the_smooth_law_is_the_law_away_from_its_switches(seed):
     exact, cold = hard(*worlds), smooth(*worlds, COLD)
     sure = clear(*worlds, exact[2], 1e-4)
     assert sure.mean() > 0.9
-    np.testing.assert_allclose(numbers(cold)[sure], numbers(exact)[sure], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(
+        flat_numbers(cold)[sure], flat_numbers(exact)[sure], rtol=1e-4, atol=1e-5
+    )
 
 
 @property_test
@@ -155,9 +157,9 @@ def test_each_switch_comes_the_nearer_to_the_laws_the_colder_it_is(seed):
 @hypothesis.given(seeds)
 def test_the_whole_law_comes_nearer_as_all_temperatures_fall(seed):
     worlds = random_worlds(seed)
-    exact = numbers(hard(*worlds)[:2])
+    exact = flat_numbers(hard(*worlds)[:2])
     gaps = [
-        np.abs(numbers(smooth(*worlds, times(factor))[:2]) - exact).mean()
+        np.abs(flat_numbers(smooth(*worlds, times(factor))[:2]) - exact).mean()
         for factor in (4.0, 1.0, 0.25, 0.06, 0.015)
     ]
     assert (np.diff(gaps) < 0).all()
@@ -188,13 +190,13 @@ def test_the_realignment_state_keeps_its_memory(side):
     """Between l_mr and l_cr the law realigns only on the way in, as the hard law does."""
     out, into = np.linspace(0.0, 0.29, 300), np.linspace(0.29, 0.0, 300)
 
-    def one(state, l):  # noqa: E741
+    def step(state, l):  # noqa: E741
         contact = jnp.stack([jnp.float32(FRONT), side * l])
-        seen = observe((1.0, 0.3))._replace(p_robot_contact=contact)
-        state, _, details = rps.step_with_details(PAPER, state, seen, WARM)
+        observation = observe((1.0, 0.3))._replace(p_robot_contact=contact)
+        state, _, details = rps.step_with_details(PAPER, state, observation, WARM)
         return state, details.realigning
 
-    _, weight = jax.jit(lambda ls: jax.lax.scan(one, state_with(), ls))(
+    _, weight = jax.jit(lambda ls: jax.lax.scan(step, state_with(), ls))(
         jnp.asarray(np.concatenate([out, into]), jnp.float32)
     )
     going, coming = np.asarray(weight[:300]), np.asarray(weight[300:])[::-1]
@@ -234,15 +236,15 @@ def test_the_smooth_speed_is_still_v_star_split_by_the_slope(seed):
 
 def test_the_weight_of_a_contact_mixes_pushing_with_going_ahead():
     """And where the contact is with where it was last."""
-    before = state_with()._replace(p_robot_contact=jnp.array([FRONT, -0.10]))
-    seen = observe((2.0, 0.0), l=0.10, in_contact=0.25)
-    state, twist, details = one_step(before, seen)
+    start = state_with()._replace(p_robot_contact=jnp.array([FRONT, -0.10]))
+    observation = observe((2.0, 0.0), l=0.10, in_contact=0.25)
+    state, twist, details = one_step(start, observation)
     assert details.l == pytest.approx(0.25 * 0.10 - 0.75 * 0.10)
-    felt = seen._replace(p_robot_contact=jnp.array([FRONT, -0.05]), in_contact=jnp.ones(()))
-    pushed, push, _ = one_step(before, felt)
+    felt = observation._replace(p_robot_contact=jnp.array([FRONT, -0.05]), in_contact=jnp.ones(()))
+    pushed, push, _ = one_step(start, felt)
     expected = 0.25 * np.stack(push) + 0.75 * np.array([0.01, 0.0, 0.0])
     np.testing.assert_allclose(np.stack(twist), expected, rtol=1e-5)
-    np.testing.assert_allclose(state.l_th, 0.25 * pushed.l_th + 0.75 * before.l_th, rtol=1e-5)
+    np.testing.assert_allclose(state.l_th, 0.25 * pushed.l_th + 0.75 * start.l_th, rtol=1e-5)
     assert state.touched == 1.0
 
 
@@ -264,11 +266,11 @@ def test_a_mirrored_world_gives_the_mirrored_smooth_twist(seed):
         p_robot_contact=observation.p_robot_contact * flip,
         p_world_target=observation.p_world_target * flip,
     )
-    there = state._replace(p_robot_contact=state.p_robot_contact * flip)
-    after, twist, details = smooth(params, state, observation, WARM)
-    after_m, twist_m, details_m = smooth(params, there, mirrored, WARM)
+    mirrored_state = state._replace(p_robot_contact=state.p_robot_contact * flip)
+    next_state, twist, details = smooth(params, state, observation, WARM)
+    next_state_m, twist_m, details_m = smooth(params, mirrored_state, mirrored, WARM)
     behind = np.abs(np.abs(details.gamma) - params.gamma_max) < 1e-6  # at +-pi it chooses a side
-    np.testing.assert_allclose(after_m.l_th, after.l_th, rtol=1e-5)
+    np.testing.assert_allclose(next_state_m.l_th, next_state.l_th, rtol=1e-5)
     np.testing.assert_allclose(details_m.a_r, -details.a_r, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(twist_m.v_x, twist.v_x, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(twist_m.v_y, -twist.v_y, rtol=1e-4, atol=1e-6)
@@ -305,9 +307,9 @@ def test_derivatives_are_finite_on_surfaces_and_at_singular_points():
     rows = []
     for weight in (0.0, 0.5, 1.0):
         for d, l in points:  # noqa: E741
-            seen = observe(d, l, weight)
-            rows += [ravel_pytree((PAPER, state_with(0.15), seen, WARM))[0]]
-            rows += [ravel_pytree((PAPER, RPSState.init(PAPER, COLD), seen, COLD))[0]]
+            observation = observe(d, l, weight)
+            rows += [ravel_pytree((PAPER, state_with(0.15), observation, WARM))[0]]
+            rows += [ravel_pytree((PAPER, RPSState.init(PAPER, COLD), observation, COLD))[0]]
     assert len(rows) <= WORLDS
     x = np.resize(np.stack(rows), (WORLDS, rows[0].size)).astype(np.float32)
     chex.assert_tree_all_finite(reverse(x))
@@ -331,9 +333,9 @@ def test_derivatives_agree_with_finite_differences():
         derivatives = np.asarray(forward(x))
         differences, bend = [], []
         for e in h * np.eye(x.shape[1]):
-            up, here, down = (np.asarray(batch_step(x + a * e)) for a in (1, 0, -1))
+            up, middle, down = (np.asarray(batch_step(x + a * e)) for a in (1, 0, -1))
             differences.append((up - down) / (2 * h))
-            bend.append(np.abs(up - 2 * here + down) / h)
+            bend.append(np.abs(up - 2 * middle + down) / h)
     differences = np.stack(differences, -1)
     scale = 1 + np.abs(differences)
     kink = np.stack(bend, -1) > 1e-4 * scale
@@ -344,9 +346,9 @@ def test_derivatives_agree_with_finite_differences():
 @pytest.mark.parametrize("x64", [False, True])
 def test_a_smooth_step_preserves_the_dtypes_of_the_state(x64):
     with jax.enable_x64(x64):
-        before = RPSState.init(PAPER, WARM)
-        after, twist = rps.step(PAPER, before, observe((1.0, 0.2), 0.1), WARM)
-        assert jax.tree.map(lambda x: x.dtype, after) == jax.tree.map(lambda x: x.dtype, before)
+        state = RPSState.init(PAPER, WARM)
+        next_state, twist = rps.step(PAPER, state, observe((1.0, 0.2), 0.1), WARM)
+        assert jax.tree.map(lambda x: x.dtype, next_state) == jax.tree.map(lambda x: x.dtype, state)
         assert {x.dtype for x in twist} == {jnp.zeros(()).dtype}
 
 
@@ -368,7 +370,7 @@ both_sensors = pytest.mark.parametrize("skin", SENSORS.values(), ids=SENSORS)
 
 @jax.jit
 def sense_all(sensor, shapes: Footprint, key):
-    """Settled readings of a batch of footprints, each by a sensor of its own."""
+    """Return settled readings of a batch of footprints, each from a separate sensor."""
     keys = jax.random.split(key, SHAPES)
     return jax.vmap(lambda k, shape: sensor.sense(sensor.init(k), shape, SETTLED)[1])(keys, shapes)
 
@@ -472,19 +474,19 @@ def test_a_contact_grows_as_the_object_nears_and_is_half_at_the_threshold(skin):
 def differences(skin, poses, step, h: float) -> np.ndarray:
     """Derivatives (n, 2) of contact locations as poses (n, 3) move along `step` (3,)."""
     up, down = (np.asarray(poses) + side * h * np.asarray(step) for side in (1, -1))
-    places = read(skin, np.concatenate([up, down])).p_robot_contact
-    return (places[: len(up)] - places[len(up) :]) / (2 * h)
+    contacts = read(skin, np.concatenate([up, down])).p_robot_contact
+    return (contacts[: len(up)] - contacts[len(up) :]) / (2 * h)
 
 
 def test_an_ideal_contact_moves_with_the_object():
-    """By as much as a flush box moves aside."""
+    """The contact of a flush box moves sideways with the box."""
     poses = [flush(0.001, y) for y in np.linspace(-0.07, 0.07, 40)]
     slopes = differences(SENSORS["ideal"], poses, (0, 1, 0), 1e-3)
     np.testing.assert_allclose(slopes, np.tile([0.0, 1.0], (40, 1)), atol=5e-3)
 
 
 def test_a_flush_box_that_turns_moves_its_contact_at_once():
-    """Of a flush box the plain skin feels both corners, until one is beyond its tolerance."""
+    """The plain skin feels both corners of a flush box, until one is beyond its tolerance."""
     pose, step = [flush(0.004)], (0, 0, 1)
     assert differences(IdealSkin(), pose, step, 1e-3)[0, 1] == pytest.approx(0.0, abs=0.05)
     # Turned to the left its left end is the nearer one.
@@ -497,10 +499,12 @@ def test_a_flush_box_that_turns_moves_its_contact_at_once():
 def test_a_mirrored_object_gives_the_mirrored_smooth_reading(skin, seed):
     shapes, key = random_shapes(seed), jax.random.key(0)
     mirrored = shapes._replace(vertices=(shapes.vertices * jnp.array([1.0, -1.0]))[:, ::-1])
-    here, there = sense_all(skin, shapes, key), sense_all(skin, mirrored, key)
-    np.testing.assert_allclose(there.in_contact, here.in_contact, atol=1e-3)
+    reading, mirrored_reading = sense_all(skin, shapes, key), sense_all(skin, mirrored, key)
+    np.testing.assert_allclose(mirrored_reading.in_contact, reading.in_contact, atol=1e-3)
     flip = np.array([1, -1])
-    np.testing.assert_allclose(there.p_robot_contact, here.p_robot_contact * flip, atol=2e-3)
+    np.testing.assert_allclose(
+        mirrored_reading.p_robot_contact, reading.p_robot_contact * flip, atol=2e-3
+    )
 
 
 POSES = [
@@ -544,8 +548,8 @@ def test_the_derivatives_of_a_smooth_reading_agree_with_finite_differences(skin)
     slopes = np.asarray(slope(poses, skin)[1])[:2]
     assert np.abs(slopes).max() > 0.1
     for axis, step in enumerate(np.eye(3)):
-        found = differences(skin, poses[:2], step, 1e-4)
-        np.testing.assert_allclose(slopes[:, :2, axis], found, rtol=0.02, atol=0.02)
+        expected = differences(skin, poses[:2], step, 1e-4)
+        np.testing.assert_allclose(slopes[:, :2, axis], expected, rtol=0.02, atol=0.02)
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
@@ -556,27 +560,27 @@ def test_a_skin_that_is_not_warm_is_refused(value):
         SmoothSkin(IdealSkin(tolerance=-1.0)).check()
 
 
-# Whole trials, stepped by C MuJoCo, which needs no compiling
+# Whole trials in C MuJoCo, which needs no compilation
 
 
 def push(case: Case, law, horizon: float):
     """The trial of a case after `horizon` [s], or at its end."""
     setting = Setting(engine="mujoco", rules=Rules(horizon=horizon))
     _, worlds, models, params = pushes.build([case], setting)
-    seen = []
+    states = []
 
     def report(ended, trials, simulated):
-        seen.append(trials)
+        states.append(trials)
         return True
 
     loop = ControlLoop(setting.physics, setting.rules, law)
     host.run(engines.get("mujoco"), models, worlds, params, loop, threads=1, callback=report)
-    return jax.tree.map(lambda x: np.asarray(x)[0], seen[-1])
+    return jax.tree.map(lambda x: np.asarray(x)[0], states[-1])
 
 
 @pytest.mark.parametrize("name", ["box", "cylinder"])
 def test_without_heat_a_smooth_trial_is_the_hard_one(name):
-    """From before the first touch, through a turn towards a target at the side."""
+    """The push starts before the first touch and turns towards a target at the side."""
     case = Case(name, FRICTION["S1"], (1.0, -1.5), gap=0.005)
     cold = replace(case, skin=SmoothSkin(IdealSkin(), 1e-6))
     exact = push(case, rps.LAW, 10.0)
@@ -590,7 +594,7 @@ def test_without_heat_a_smooth_trial_is_the_hard_one(name):
 
 @pytest.mark.parametrize("law", [rps.LAW, registry.smooth_law(rps.LAW)], ids=["hard", "smooth"])
 def test_with_a_warm_skin_a_push_arrives(law):
-    """By either law: a hard one is told whether there is contact."""
+    """With both laws; a hard law reads whether there is contact."""
     case = Case("box", FRICTION["S1"], (0.7, 0.05), skin=SmoothSkin())
     ended = push(case, law, 30.0)
     assert ended.success
@@ -599,17 +603,17 @@ def test_with_a_warm_skin_a_push_arrives(law):
 
 
 def test_equal_temperatures_are_one_law():
-    own = registry.smooth_law(rps.LAW, Temperatures())
-    assert registry.smooth_law(rps.LAW, Temperatures(realign=0.01)) is own
-    assert registry.smooth_law(rps.LAW) is own
-    assert registry.smooth_law(rps.LAW, COLD) is not own
+    law = registry.smooth_law(rps.LAW, Temperatures())
+    assert registry.smooth_law(rps.LAW, Temperatures(realign=0.01)) is law
+    assert registry.smooth_law(rps.LAW) is law
+    assert registry.smooth_law(rps.LAW, COLD) is not law
 
 
 # --- RPS+ ----------------------------------------------------------------------------------
 
 
 def plus_moments(count=40):
-    """What RPS+ is told at moments by chance, in contact or not; every tenth begins anew."""
+    """Random observations for RPS+, with and without contact; every tenth starts a push."""
     rng = np.random.default_rng(8)
     for i in range(count):
         x, y, far, side = rng.uniform(-1, 1, 4)
@@ -627,11 +631,11 @@ def test_without_heat_smooth_rps_plus_is_the_hard_one(monkeypatch):
         monkeypatch.setattr(rps_plus, name, 1e-6)
     params = RPSPlusParams(n_lost=2.5)  # a count meets no threshold that is a count
     hard, cold = registry.law_of(params), registry.smooth_law(rps_plus.LAW, COLD)
-    for anew, told in plus_moments():
-        if anew:
+    for is_start, observation in plus_moments():
+        if is_start:
             states = [hard.init(params), cold.init(params)]
-        weight = told._replace(in_contact=told.in_contact.astype(float))
-        (states[0], twist, _) = hard.step(params, states[0], told)
+        weight = observation._replace(in_contact=observation.in_contact.astype(float))
+        (states[0], twist, _) = hard.step(params, states[0], observation)
         (states[1], mixed, _) = cold.step(params, states[1], weight)
         np.testing.assert_allclose(jnp.stack(mixed), jnp.stack(twist), atol=1e-5)
         assert float(states[1].steps_lost) == pytest.approx(float(states[0].steps_lost))
@@ -646,9 +650,9 @@ def test_a_smooth_rps_plus_can_be_differentiated_by_its_own_parameters():
         def driven(values):
             params = start._replace(**dict(zip(names, values, strict=True)))
             state, total = law.init(params), 0.0
-            for anew, told in plus_moments(10):
-                state = law.init(params) if anew else state
-                weight = told._replace(in_contact=told.in_contact.astype(float))
+            for is_start, observation in plus_moments(10):
+                state = law.init(params) if is_start else state
+                weight = observation._replace(in_contact=observation.in_contact.astype(float))
                 state, twist, _ = law.step(params, state, weight)
                 total = total + twist.v_x + 0.7 * twist.v_y + 0.1 * twist.omega
             return total
