@@ -217,10 +217,10 @@ def test_a_study_is_labelled_kept_and_refuses_what_was_run_otherwise(tmp_path, m
     header, first, *rows = grounds.table(results, (0.2,))
     assert header[0] == "ground"
     assert first[0] == "rigid object"
-    assert [row[0] for row in rows] == [kind.label for kind in kinds.values()]
+    assert [row[0] for row in rows] == [kind.what for kind in kinds.values()]
     with pytest.raises(InputError, match="run with other options"):
         grounds.run(("a",), tmp_path, objects=("cylinder",), offsets=(0.05,))
 
 
 def _at(kind, speed):
-    return grounds.Kind(kind.label, kind.physics, (speed,))
+    return grounds.Kind(kind.what, kind.physics, (speed,))

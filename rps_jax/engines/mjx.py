@@ -97,6 +97,7 @@ class MJXStage(NamedTuple):
         if robot is None:
             qvel = qvel.at[JOINTS.base].set(twist.in_world(qpos[2]))
         else:
+            assert integral is not None  # of a base with a limited force
             turn, base = (jnp.cos(qpos[2]), jnp.sin(qpos[2])), qvel[JOINTS.base]
             servo: Any = tuple(integral)
             force, servo = drives.push(robot, servo, twist, tuple(base), turn, timestep)

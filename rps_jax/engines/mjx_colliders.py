@@ -62,14 +62,16 @@ def plane_cylinder(plane: GeomInfo, cylinder: GeomInfo) -> tuple[jax.Array, jax.
     return distance, points - 0.5 * distance[:, None] * n, frames
 
 
-def _box_box(model: Model, data: Data, *_: Any) -> Collision:
+def _box_box(model: Model, data: Data, *_: object) -> Collision:
     """Return distances (4,), points (4, 3) and frames (4, 3, 3) [m] of base and upright box."""
     base, box = map(int, np.flatnonzero(model.geom_type == GeomType.BOX))
     signs = np.array([[1, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1]])
     return upright(model, data, base, box, model.geom_size[box] * signs)
 
 
-def _box_prism(model: Model, data: Data, key: Any, geom: Any, outline: Any = None) -> Collision:
+def _box_prism(
+    model: Model, data: Data, key: object, geom: object, outline: jax.Array | None = None
+) -> Collision:
     """Return distances (4,), points (4, 3) and frames (4, 3, 3) [m] of base and upright prism."""
     base, prism, feet = (
         np.flatnonzero(model.geom_type == kind)
@@ -99,7 +101,8 @@ def upright(model: Model, data: Data, base: int, prism: int, corners: jax.Array)
     )
     state: Any = SimpleNamespace(base=middle, p=data.xpos[body])
     m: Any = [tuple(row) for row in data.xmat[body]]
-    z, normal, point, distance = meetings(solid, state, m, (turn[0], turn[1]))
+    found: Any = meetings(solid, state, m, (turn[0], turn[1]))
+    z, normal, point, distance = found
     back = jnp.array([[turn[0], turn[1]], [-turn[1], turn[0]]])
     n = jnp.stack(normal) @ back
     position = middle[:2] + jnp.stack(point, axis=-1) @ back

@@ -33,6 +33,7 @@ from rps_jax.engines.base import ControlPeriod, Driven, Engine, Motion
 from rps_jax.engines.fused.contacts import Point, circle_and_rectangle, polygon_and_rectangle
 from rps_jax.geometry import planar, solid
 from rps_jax.geometry import vectors as sp
+from rps_jax.geometry.arrays import Entries, Number
 from rps_jax.geometry.solid import Solid
 from rps_jax.geometry.vectors import Vec
 from rps_jax.robot.robot import Robot
@@ -48,12 +49,12 @@ _ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric ma
 class Slider(NamedTuple):
     """Constants of one world."""
 
-    p_object_com: Any  # (2,) [m] centre of mass and of friction, in the object's frame
-    arm: Any  # () [m] c = m_max / f_max of the friction with the ground
-    friction_robot: Any  # () [1]
-    base_half: Any  # (2,) [m] half length and width of the base
-    vertices: Any  # (N, 2) [m] of the outline, counter-clockwise, in the object's frame
-    radius: Any  # () [m] of the outline
+    p_object_com: Entries  # (2,) [m] centre of mass and of friction, in the object's frame
+    arm: Number  # () [m] c = m_max / f_max of the friction with the ground
+    friction_robot: Number  # () [1]
+    base_half: Entries  # (2,) [m] half length and width of the base
+    vertices: Entries  # (N, 2) [m] of the outline, counter-clockwise, in the object's frame
+    radius: Number  # () [m] of the outline
 
 
 def sliders(solids: Solid, friction_robot: np.ndarray, base_half: np.ndarray) -> Slider:
@@ -78,16 +79,16 @@ class Contact(NamedTuple):
     normal: Point  # unit, towards the object
     r: Point  # [m] from the object's centre of mass
     v: Point  # [m/s] of the base there
-    gap: Any  # [m] negative for penetration
+    gap: Number  # [m] negative for penetration
 
 
 class Problem(NamedTuple):
     """Optimisation problem for the object's twist in one step."""
 
     contacts: Sequence[Contact]
-    speed: Any  # [m/s] of the base
-    arm: Any  # [m]
-    friction: Any  # [1]
+    speed: Number  # [m/s] of the base
+    arm: Number  # [m]
+    friction: Number  # [1]
 
 
 @jax.tree_util.register_static
@@ -118,7 +119,7 @@ class Quasistatic:
         corners = jnp.moveaxis(fields.vertices - com[:, None], (0, 1), (2, 1))
         sliders = fields._replace(base_half=tuple(fields.base_half.T), vertices=tuple(corners))
         poses = (tuple(qpos[:, JOINTS.base].T), (*p.T, yaw))
-        twist = tuple(period.twists)
+        twist = (period.twists.v_x, period.twists.v_y, period.twists.omega)
         step = partial(self._step, sliders, twist, physics.timestep)
         base, (x, y, angle) = jax.lax.fori_loop(0, physics.substeps, lambda _, s: step(s), poses)
         half = 0.5 * (angle - yaw)
@@ -178,13 +179,15 @@ class Quasistatic:
         gradient, hessian = self.derivatives(problem, v, self.slip, dt)
         return sp.sub(v, solved(gradient, jax.lax.stop_gradient(hessian)))
 
-    def derivatives(self, problem: Problem, v: Vec, slip: Any, dt: float) -> tuple[Vec, list[Any]]:
+    def derivatives(
+        self, problem: Problem, v: Vec, slip: Number, dt: float
+    ) -> tuple[Vec, list[Number]]:
         """Return the gradient and the upper entries of the Hessian of the cost."""
         tiny, friction = slip * problem.speed, problem.friction
         stiff = 1 / problem.speed
         inertia = (stiff, stiff, stiff * problem.arm * problem.arm)
         gradient: Vec = (inertia[0] * v[0], inertia[1] * v[1], inertia[2] * v[2])
-        hessian: list[Any] = [inertia[i] if i == j else 0.0 for i, j in _ENTRIES]
+        hessian: list[Number] = [inertia[i] if i == j else 0.0 for i, j in _ENTRIES]
         for contact in problem.contacts:
             n, r = contact.normal, contact.r
             t = (-n[1], n[0])
@@ -236,7 +239,7 @@ def _with_moment(direction: Point, r: Point) -> Vec:
     return (*direction, r[0] * direction[1] - r[1] * direction[0])
 
 
-def _spring(inside: Any, depth: float) -> tuple[Any, Any]:
+def _spring(inside: Number, depth: float) -> tuple[Number, Number]:
     """Return force [1] and stiffness [1/m] of a contact `inside` [m] the base.
 
     The force is zero up to -depth, a parabola up to depth, and has the slope 1 / depth beyond.
@@ -246,7 +249,7 @@ def _spring(inside: Any, depth: float) -> tuple[Any, Any]:
     return force / depth, bent / (2 * depth * depth)
 
 
-def solved(g: Vec, h: Sequence[Any]) -> Vec:
+def solved(g: Vec, h: Sequence[Number]) -> Vec:
     """Solve h x = g for a symmetric 3 x 3 matrix with the upper entries h."""
     a, b, c, d, e, f = h
     l_1, l_2 = b / a, c / a

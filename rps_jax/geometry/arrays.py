@@ -7,6 +7,7 @@ the calls of some modules, see `tests/shapes.py`.
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from jaxtyping import Bool as Bool
 from jaxtyping import Float as Float
 from jaxtyping import Int as Int
@@ -17,3 +18,5 @@ else:
     Array = Any  # NumPy's, too, which JAX takes for its own
 
 Scalar = float | Float[Array, ""]
+Number = float | Array | np.ndarray  # of one world, or of a batch, of any shape
+Entries = Any  # an array, or a tuple of numbers: one for each index of its last axis

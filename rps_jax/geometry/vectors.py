@@ -8,15 +8,16 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import reduce
-from typing import Any
 
 import jax.numpy as jnp
 
-Vec = tuple[Any, Any, Any]
+from rps_jax.geometry.arrays import Number
+
+Vec = tuple[Number, Number, Number]
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 
-def mul(a: Any, b: Any) -> Any:
+def mul(a: Number, b: Number) -> Number:
     """Return a b."""
     for x, y in ((a, b), (b, a)):
         if isinstance(x, float) and x in (0.0, 1.0):
@@ -24,7 +25,7 @@ def mul(a: Any, b: Any) -> Any:
     return a * b
 
 
-def plus(a: Any, b: Any) -> Any:
+def plus(a: Number, b: Number) -> Number:
     """Return a + b."""
     for x, y in ((a, b), (b, a)):
         if isinstance(x, float) and x == 0.0:
@@ -32,7 +33,7 @@ def plus(a: Any, b: Any) -> Any:
     return a + b
 
 
-def minus(a: Any, b: Any) -> Any:
+def minus(a: Number, b: Number) -> Number:
     """Return a - b."""
     return a if isinstance(b, float) and b == 0.0 else a - b
 
@@ -47,12 +48,12 @@ def sub(a: Vec, b: Vec) -> Vec:
     return minus(a[0], b[0]), minus(a[1], b[1]), minus(a[2], b[2])
 
 
-def scale(s: Any, a: Vec) -> Vec:
+def scale(s: Number, a: Vec) -> Vec:
     """Return a multiple of a vector."""
     return mul(s, a[0]), mul(s, a[1]), mul(s, a[2])
 
 
-def dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
+def dot(a: Sequence[Number], b: Sequence[Number]) -> Number:
     """Return the inner product of sequences of entries."""
     return reduce(plus, map(mul, a, b))
 
@@ -66,12 +67,12 @@ def cross(a: Vec, b: Vec) -> Vec:
     )
 
 
-def combine(weights: Sequence[Any], vectors: Sequence[Vec]) -> Vec:
+def combine(weights: Sequence[Number], vectors: Sequence[Vec]) -> Vec:
     """Return the weighted sum of vectors."""
     return reduce(add, map(scale, weights, vectors))
 
 
-def norm(a: Sequence[Any], least: float = 1e-12) -> Any:
+def norm(a: Sequence[Number], least: float = 1e-12) -> Number:
     """Return the length, at least `least`."""
     return jnp.sqrt(jnp.maximum(dot(a, a), least * least))
 
@@ -87,7 +88,7 @@ def to_body(m: Sequence[Vec], a: Vec) -> Vec:
     return x, y, z
 
 
-def matrix(q: Sequence[Any]) -> tuple[Vec, Vec, Vec]:
+def matrix(q: Sequence[Number]) -> tuple[Vec, Vec, Vec]:
     """Return the rows of the rotation matrix of a unit quaternion."""
     w, x, y, z = q
     return (
@@ -97,7 +98,7 @@ def matrix(q: Sequence[Any]) -> tuple[Vec, Vec, Vec]:
     )
 
 
-def times(p: Sequence[Any], q: Sequence[Any]) -> tuple[Any, Any, Any, Any]:
+def times(p: Sequence[Number], q: Sequence[Number]) -> tuple[Number, Number, Number, Number]:
     """Return the product of quaternions, scalar first."""
     a, u = p[0], (p[1], p[2], p[3])
     b, v = q[0], (q[1], q[2], q[3])
@@ -112,7 +113,7 @@ _IN_ONE = ContextVar("rps_jax_reductions_in_one", default=False)
 
 @contextmanager
 def reductions_in_one() -> Iterator[None]:
-    """Trace reductions as one operation, of which `engines.native` makes one loop.
+    """Trace reductions as one operation, from which `rps_jax.lowering` makes one loop.
 
     On a processor XLA turns such an operation into a loop over the leading axis for one world at a
     time, and sums of slices into vectors of worlds.
@@ -124,8 +125,10 @@ def reductions_in_one() -> Iterator[None]:
         _IN_ONE.reset(token)
 
 
-def _over(x: Any, in_one: Callable[..., Any], two: Callable[[Any, Any], Any]) -> Any:
-    if isinstance(x, float):
+def _over(
+    x: Number, in_one: Callable[..., Number], two: Callable[[Number, Number], Number]
+) -> Number:
+    if isinstance(x, float | int):
         return x
     if _IN_ONE.get():
         return in_one(x, axis=0)
@@ -136,16 +139,16 @@ def _over(x: Any, in_one: Callable[..., Any], two: Callable[[Any, Any], Any]) ->
     return rows[0]
 
 
-def total(x: Any) -> Any:
+def total(x: Number) -> Number:
     """Return the sum over the leading axis; a literal number is returned unchanged."""
     return _over(x, jnp.sum, jnp.add)
 
 
-def greatest(x: Any) -> Any:
+def greatest(x: Number) -> Number:
     """Return the maximum along the leading axis."""
     return _over(x, jnp.max, jnp.maximum)
 
 
-def least(x: Any) -> Any:
+def least(x: Number) -> Number:
     """Return the minimum along the leading axis."""
     return _over(x, jnp.min, jnp.minimum)

@@ -32,7 +32,7 @@ _LIMIT_FIELDS = ("lateral", "force", "spread")  # results of the rigid limit bes
 class Kind:
     """A kind of ground: how the pushes are stepped, and at which speeds [m/s] of the base."""
 
-    label: str
+    what: str  # label
     physics: Physics
     speeds: tuple[float, ...] = SPEEDS
 

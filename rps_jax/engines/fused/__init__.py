@@ -97,8 +97,12 @@ def bodies_of(solids: Solid, friction: Friction, template: Body) -> Body:
         ],
         axis=-1,
     )
-    count, axes = solids.mass.size, solid.axes(solids)
-    derived = Body(
+    axes = solid.axes(solids)
+    invweight, half, z = (
+        np.broadcast_to(x, (solids.mass.size, *np.shape(x)))
+        for x in (template.base_invweight, template.base_half, template.base_z)
+    )
+    bodies = Body(
         mass=solids.mass,
         inertia=solids.inertia,
         p_object_com=com,
@@ -110,14 +114,11 @@ def bodies_of(solids: Solid, friction: Friction, template: Body) -> Body:
         friction_ground=friction.ground,
         friction_robot=friction.robot,
         invweight=1 / solids.mass,
-        base_invweight=None,
-        base_half=None,
-        base_z=None,
+        base_invweight=invweight,
+        base_half=half,
+        base_z=z,
     )
-    shared = [None if x is None else np.broadcast_to(np.asarray(x), (count, *np.shape(x)))
-              for x in template]  # fmt: skip
-    pairs = zip(derived, shared, strict=True)
-    return _on_feet(Body(*(base if value is None else value for value, base in pairs)), solids)
+    return _on_feet(bodies, solids)
 
 
 ENGINE = Fused()

@@ -9,12 +9,13 @@ Reference: MuJoCo documentation, "Computation: Constraint model".
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from rps_jax.geometry import vectors as sp
+from rps_jax.geometry.arrays import Array, Entries, Number
 from rps_jax.geometry.vectors import Vec
 from rps_jax.world.physics import Physics
 
@@ -28,22 +29,24 @@ _D_MIN, _D_MAX, _WIDTH = 0.9, 0.95, 0.001
 class Body(NamedTuple):
     """Constants of one world, from MuJoCo. Frame: principal axes at the centre of mass."""
 
-    mass: Any  # () [kg]
-    inertia: Any  # (3,) [kg m^2] principal moments
-    p_object_com: Any  # (3,) [m] centre of mass in the object's frame
-    q_object_body: Any  # (4,) principal axes in the object's frame
-    vertices: Any  # (N, 3) [m] of the lower face; a cylinder's centre; after `spread`: `Corners`
-    radius: Any  # () [m] of a cylinder; 0 of a prism
-    height: Any  # () [m]
-    up: Any  # (3,) unit vector along the height
-    friction_ground: Any  # () [1]
-    friction_robot: Any  # () [1]
-    invweight: Any  # () [1/kg] MuJoCo's inverse weight of the object in a contact
-    base_invweight: Any  # () [1/kg] inverse weight of the base
-    base_half: Any  # (2,) [m] half length and width of the base
-    base_z: Any  # (2,) [m] heights of the base's lower and upper edge
-    feet: Any = None  # (N, 3) [m] of a prism that does not stand on its vertices; later a `Vec`
-    bears: Any = None  # (N, 1) [1] 1 for a foot, 0 for an unused entry
+    mass: Number  # () [kg]
+    inertia: Entries  # (3,) [kg m^2] principal moments
+    p_object_com: Entries  # (3,) [m] centre of mass in the object's frame
+    q_object_body: Entries  # (4,) principal axes in the object's frame
+    vertices: (
+        Entries  # (N, 3) [m] of the lower face; a cylinder's centre; after `spread`: `Corners`
+    )
+    radius: Number  # () [m] of a cylinder; 0 of a prism
+    height: Number  # () [m]
+    up: Entries  # (3,) unit vector along the height
+    friction_ground: Number  # () [1]
+    friction_robot: Number  # () [1]
+    invweight: Number  # () [1/kg] MuJoCo's inverse weight of the object in a contact
+    base_invweight: Number  # () [1/kg] inverse weight of the base
+    base_half: Entries  # (2,) [m] half length and width of the base
+    base_z: Entries  # (2,) [m] heights of the base's lower and upper edge
+    feet: Entries = None  # (N, 3) [m] of a prism that does not stand on its vertices; later a `Vec`
+    bears: Entries = None  # (N, 1) [1] 1 for a foot, 0 for an unused entry
 
 
 class Corners(NamedTuple):
@@ -51,7 +54,7 @@ class Corners(NamedTuple):
 
     at: Vec  # (N, ...) [m]
     ahead: Vec  # (N, ...) [m] the next corner
-    real: Any  # (N, ...) bool, False for a corner that repeats the previous one
+    real: Array  # (N, ...) bool, False for a corner that repeats the previous one
 
     @classmethod
     def of(cls, at: Vec) -> Corners:
@@ -66,7 +69,7 @@ class State(NamedTuple):
 
     base: Vec  # x, y [m], yaw [rad]
     p: Vec  # [m] centre of mass
-    q: tuple[Any, Any, Any, Any]  # principal axes in the world, scalar first
+    q: tuple[Number, Number, Number, Number]  # principal axes in the world, scalar first
     v: Vec  # [m/s] of the centre of mass
     w: Vec  # [rad/s] in principal axes
     a: Vec  # [m/s^2] last acceleration, the solver's first guess
@@ -92,17 +95,17 @@ class Contact(NamedTuple):
     t: Vec  # unit tangents
     s: Vec
     bias: Vec  # [m/s^2] -a_ref
-    d: Any  # [kg] stiffness of the normal row; 0 without contact
-    friction: Any  # [1]
-    arm: tuple[Any, Any] | None = None  # [m] from the origin of a base that can be slowed
+    d: Number  # [kg] stiffness of the normal row; 0 without contact
+    friction: Number  # [1]
+    arm: tuple[Number, Number] | None = None  # [m] from the origin of a base that can be slowed
 
 
-def _stiff(distance: Any, exists: Any, impedance: Any, invweight: Any) -> Any:
+def _stiff(distance: Number, exists: Array | bool, impedance: Number, invweight: Number) -> Number:
     """Return the stiffness [kg] of a contact's normal row; 0 without contact."""
     return jnp.where(exists & (distance < 0), impedance / (invweight * (1 - impedance)), 0.0)
 
 
-def _bias(k: Any, b: Any, impedance: Any, distance: Any, u: Vec) -> Vec:
+def _bias(k: Number, b: Number, impedance: Number, distance: Number, u: Vec) -> Vec:
     """Return minus the reference acceleration of a point of velocity u, along (n, t, s)."""
     return b * u[0] + k * impedance * distance, b * u[1], b * u[2]
 
@@ -113,9 +116,9 @@ def _stiffness(solref: tuple[float, float], d_max: float, timestep: float) -> tu
     return 1 / (d_max * time * ratio) ** 2, 2 / (d_max * time)
 
 
-def _index(count: int, template: jax.Array) -> jax.Array:
+def _index(count: int, template: Number) -> jax.Array:
     """Return 0, 1, ... along a new leading axis of the batch of `template`."""
-    return jax.lax.broadcasted_iota(jnp.int32, (count, *template.shape), 0)
+    return jax.lax.broadcasted_iota(jnp.int32, (count, *jnp.shape(template)), 0)
 
 
 def on_ground(body: Body, state: State, m: Sequence[Vec], physics: Physics) -> Contact:
@@ -130,7 +133,7 @@ def on_ground(body: Body, state: State, m: Sequence[Vec], physics: Physics) -> C
     return Contact(at, sp.Z, sp.X, sp.Y, bias, d, body.friction_ground)
 
 
-def _lower_face(body: Body, m: Sequence[Vec]) -> tuple[Vec, Any]:
+def _lower_face(body: Body, m: Sequence[Vec]) -> tuple[Vec, Array]:
     """Return points that may touch the ground, from the centre of mass, and whether they exist."""
     if body.feet is not None:
         return sp.to_world(m, body.feet), body.bears[0] > 0
@@ -180,12 +183,12 @@ def on_base(body: Body, state: State, m: Sequence[Vec], twist: Vec, physics: Phy
     return Contact(r, n, t, sp.Z, bias, d, body.friction_robot, None if held else arm)
 
 
-Point = tuple[Any, Any]
+Point = tuple[Number, Number]
 
 
 def meetings(
     body: Body, state: State, m: Sequence[Vec], turn: Point
-) -> tuple[Any, Point, Point, Any]:
+) -> tuple[Number, Point, Point, Number]:
     """Return heights, normals, points and distances [m] of contacts (C, ...), in the base's frame.
 
     They are at the lower and upper edge of the base; if the object leans away, at its lower edge.
@@ -202,13 +205,15 @@ def meetings(
         x, y, h = sp.sub(sp.add(sp.to_world(m, point), state.p), (*state.base[:2], 0.0))
         return c * x + s * y, -s * x + c * y, h
 
-    def outline(foot: Vec, z: Any) -> Point:
+    def outline(foot: Vec, z: Number) -> Point:
         """Return points of the lower face, moved along the upright edges to the height z."""
         x, y, h = in_base(foot)
         rise = z - h
         return x + slope[0] * rise, y + slope[1] * rise
 
-    def on_object(z: Any, normal: Point, surface: Point, distance: Any) -> tuple[Any, Any]:
+    def on_object(
+        z: Number, normal: Point, surface: Point, distance: Number
+    ) -> tuple[Number, Number]:
         """Return heights and distances, with points below the lower face moved up to it."""
         middle, face = in_base((0.0, 0.0, 0.0)), sp.dot(body.up, feet)
         face = sp.greatest(face) if isinstance(body.vertices, Corners) else face
@@ -245,8 +250,8 @@ def meetings(
 
 
 def circle_and_rectangle(
-    centre: Point, radius: Any, half: Sequence[Any]
-) -> tuple[Point, Point, Any]:
+    centre: Point, radius: Number, half: Sequence[Number]
+) -> tuple[Point, Point, Number]:
     """Return normal, point and distance [m] of a circle outside a centred rectangle."""
     nearest = tuple(jnp.clip(x, -h, h) for x, h in zip(centre, half, strict=True))
     offset = (centre[0] - nearest[0], centre[1] - nearest[1])
@@ -259,8 +264,8 @@ def circle_and_rectangle(
 
 
 def polygon_and_rectangle(
-    corners: Point, ahead: Point, half: Sequence[Any]
-) -> tuple[Point, list[Point], list[Any]]:
+    corners: Point, ahead: Point, half: Sequence[Number]
+) -> tuple[Point, list[Point], list[Number]]:
     """Return the normal from a centred rectangle to a convex polygon, two points and distances [m].
 
     The polygon has corners (N, ...), each with its next corner `ahead`. The face of maximum
@@ -287,7 +292,7 @@ def polygon_and_rectangle(
         (-sp.greatest(y) - b, (nil, -unit), (-a, -b), (unit, nil), 2 * a),
     ]
 
-    def side(score: list[Any]) -> Any:
+    def side(score: list[Number]) -> Entries:
         top, picked = score[0], sides[0]
         for row, value in zip(sides[1:], score[1:], strict=True):
             better = value > top
@@ -322,7 +327,7 @@ def polygon_and_rectangle(
     return normal, points, distances
 
 
-def _best(score: Any, values: Any) -> tuple[Any, Any]:
+def _best(score: Array, values: Entries) -> tuple[Number, Entries]:
     """Return the maximum score along the leading axis and its values; the first of equal ones."""
     top = sp.greatest(score)
     i = jax.lax.broadcasted_iota(jnp.int32, score.shape, 0)

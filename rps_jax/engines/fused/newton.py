@@ -14,13 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from rps_jax.engines.fused.contacts import Body, Contact, State
 from rps_jax.geometry import vectors as sp
+from rps_jax.geometry.arrays import Entries, Number
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.geometry.vectors import Vec
 from rps_jax.world.physics import Physics
@@ -30,7 +31,7 @@ _FLAT = 1e-3  # [1] share of the initial slope at which a line search ends
 _FAR = 1e9  # upper bound of a line search without a bracket
 
 
-def contact_force(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tuple[Any, ...]]:
+def contact_force(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tuple[Number, ...]]:
     """Return the force [N] along (n, t, s) at J a - aref = x, and the stiffness.
 
     The stiffness (nn, nt, ns, tt, ts, ss) is minus the derivative of the force.
@@ -67,7 +68,7 @@ def contact_force(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tupl
     return force, stiffness
 
 
-def _pyramid(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tuple[Any, ...]]:
+def _pyramid(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tuple[Number, ...]]:
     """Return force and stiffness of four frictionless edges n +- friction t, n +- friction s."""
     f = contact.friction
     d = contact.d * physics.impratio / (2 * f * f * (1 + f * f))
@@ -107,19 +108,19 @@ def _rows(contact: Contact, a: Vec, alpha: Vec, b: Vec | None) -> Vec:
     return sp.dot(contact.n, u), sp.dot(contact.t, u), sp.dot(contact.s, u)
 
 
-def _solve(h: list[list[Any]], g: Sequence[Any]) -> list[Any]:
+def _solve(h: list[list[Number]], g: Sequence[Number]) -> list[Number]:
     """Solve h x = g for a symmetric positive definite h, given by its lower triangle."""
     size = len(g)
-    low: list[list[Any]] = [[None] * size for _ in range(size)]
+    low: list[list[Number]] = [[0.0] * size for _ in range(size)]
     for i in range(size):
         for j in range(i + 1):
             rest = h[i][j] - sp.dot(low[i][:j], low[j][:j]) if j else h[i][j]
             low[i][j] = jax.lax.rsqrt(rest) if i == j else rest * low[j][j]
         # the diagonal holds the reciprocals
-    y: list[Any] = []
+    y: list[Number] = []
     for i in range(size):
         y.append((g[i] - sp.dot(low[i][:i], y) if i else g[i]) * low[i][i])
-    x: list[Any] = [None] * size
+    x: list[Number] = [0.0] * size
     for i in reversed(range(size)):
         below = [low[k][i] for k in range(i + 1, size)]
         x[i] = (y[i] - sp.dot(below, x[i + 1 :]) if below else y[i]) * low[i][i]
@@ -157,8 +158,8 @@ def accelerations(
     def gradient(a: Vec, alpha: Vec, b: Vec | None):
         linear, angular = gauss(a, alpha)
         size = 6 if base is None else 9
-        h: list[list[Any]] = [[0.0] * size for _ in range(size)]
-        on_base: Any = ()
+        h: list[list[Number]] = [[0.0] * size for _ in range(size)]
+        on_base: Entries = ()
         if base is not None:
             on_base = _imbalance(base, b)
             for row in range(3):
@@ -183,7 +184,7 @@ def accelerations(
         g, h = gradient(a, alpha, b)
         step = _solve(h, [-x for x in g])
         d, delta = (step[0], step[1], step[2]), (step[3], step[4], step[5])
-        e: Any = None if base is None else (step[6], step[7], step[8])
+        e: Entries = None if base is None else (step[6], step[7], step[8])
         linear, angular = gauss(a, alpha)
         slope = sp.dot(linear, d) + sp.dot(angular, delta)
         bend = body.mass * sp.dot(d, d) + sp.dot(delta, sp.to_world(i_w, delta))
@@ -212,23 +213,23 @@ def accelerations(
     return a, alpha, b
 
 
-def _imbalance(base: Base, b: Any) -> Vec:
+def _imbalance(base: Base, b: Entries) -> Vec:
     """Return M (b - free accelerations) of a base."""
     return sp.sub(tuple(m * x for m, x in zip(base.inertia, b, strict=True)), base.force)
 
 
-def _on_base(arm: tuple[Any, Any], f: Vec) -> Vec:
+def _on_base(arm: tuple[Number, Number], f: Vec) -> Vec:
     """Return a force at an arm from the base's origin as x, y and torque about the origin."""
     return f[0], f[1], sp.minus(sp.mul(arm[0], f[1]), sp.mul(arm[1], f[0]))
 
 
 def wrench_on_base(
     contact: Contact,
-    arm: tuple[Any, Any],
+    arm: tuple[Number, Number],
     a: Vec,
     alpha: Vec,
     b: Vec | None,
-    turn: tuple[Any, Any],
+    turn: tuple[Number, Number],
     physics: Physics,
 ) -> Vec:
     """Return the wrench of the object on the base [N, N, N m], about its origin, in its frame.
@@ -269,7 +270,7 @@ def _spin(body: Body, m: Sequence[Vec]) -> list[Vec]:
     ]  # type: ignore[return-value]
 
 
-def _stiffen(h: list[list[Any]], c: Contact, k: tuple[Any, ...]) -> None:
+def _stiffen(h: list[list[Number]], c: Contact, k: tuple[Number, ...]) -> None:
     """Add the contacts' J^T K J to the lower triangle of h."""
     nn, nt, ns, tt, ts, ss = k
     # K in the world's axes: columns of Q K Q^T with Q = (n, t, s).
@@ -306,13 +307,13 @@ class _Line(NamedTuple):
     For each, n(x) = n + x pace and slip(x)^2 = square + 2 x half + x^2 bend.
     """
 
-    n: Any
-    pace: Any
-    square: Any
-    half: Any
-    bend: Any
-    weight: Any  # [kg] stiffness of a sticking contact
-    mu: Any
+    n: Number
+    pace: Number
+    square: Number
+    half: Number
+    bend: Number
+    weight: Number  # [kg] stiffness of a sticking contact
+    mu: Number
 
 
 def _line(c: Contact, start: Vec, pace: Vec, physics: Physics) -> _Line:
@@ -325,7 +326,7 @@ def _line(c: Contact, start: Vec, pace: Vec, physics: Physics) -> _Line:
     return _Line(mu * n, mu * p, square, half, bend, c.d * physics.impratio / ff, mu)
 
 
-def _slope_of_ellipse(line: _Line, x: Any) -> tuple[Any, Any]:
+def _slope_of_ellipse(line: _Line, x: Number) -> tuple[Number, Number]:
     """Return first and second derivative of the contacts' cost along the line."""
     n, mu = line.n + x * line.pace, line.mu
     turn = line.half + x * line.bend
@@ -343,7 +344,9 @@ def _slope_of_ellipse(line: _Line, x: Any) -> tuple[Any, Any]:
     )
 
 
-def _slope_of_pyramid(lines: tuple[Contact, Vec, Vec], x: Any, physics: Physics) -> tuple[Any, Any]:
+def _slope_of_pyramid(
+    lines: tuple[Contact, Vec, Vec], x: Number, physics: Physics
+) -> tuple[Number, Number]:
     """Return first and second derivative of the contacts' cost for the friction pyramid."""
     c, start, pace = lines
     force, k = _pyramid(c, sp.add(start, sp.scale(x, pace)), physics)
@@ -354,8 +357,12 @@ def _slope_of_pyramid(lines: tuple[Contact, Vec, Vec], x: Any, physics: Physics)
 
 
 def _line_search(
-    lines: list[tuple[Contact, Vec, Vec]], slope: Any, bend: Any, steepness: Any, physics: Physics
-) -> Any:
+    lines: list[tuple[Contact, Vec, Vec]],
+    slope: Number,
+    bend: Number,
+    steepness: Number,
+    physics: Physics,
+) -> Number:
     """Return the step length of minimum cost, by Newton's method with a bracket.
 
     The search ends at a slope of `_FLAT` times the initial one.
@@ -364,7 +371,7 @@ def _line_search(
     the contacts with their rows at the start and the change of these; `steepness` is minus the
     initial slope, or 0 for worlds that need no search.
     """
-    slopes: list[Callable[[Any], tuple[Any, Any]]]
+    slopes: list[Callable[[Number], tuple[Number, Number]]]
     if physics.cone == "pyramidal":
         slopes = [partial(lambda line, x: _slope_of_pyramid(line, x, physics), c) for c in lines]
     else:

@@ -22,6 +22,7 @@ from rps_jax.engines.base import ControlPeriod, Driven, Motion
 from rps_jax.engines.fused.contacts import Body, Corners, DrivenBase, State, on_base, on_ground
 from rps_jax.engines.fused.newton import Base, accelerations, wrench_on_base
 from rps_jax.geometry import vectors as sp
+from rps_jax.geometry.arrays import Entries
 from rps_jax.geometry.vectors import Vec
 from rps_jax.robot import drive as drives
 from rps_jax.robot.robot import Robot
@@ -57,7 +58,7 @@ def body(model: mujoco.MjModel, vertices: np.ndarray) -> Body:
     )
 
 
-def _split(array: jax.Array, at: slice = slice(None)) -> Any:
+def _split(array: Entries, at: slice = slice(None)) -> Entries:
     return tuple(array[..., i] for i in range(array.shape[-1]))[at]
 
 
