@@ -8,12 +8,13 @@ above the limit the base stalls.
 
 import math
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Number
 from rps_jax.geometry.vectors import Vec
 from rps_jax.robot.robot import Robot
 
@@ -71,7 +72,7 @@ def push(
     integral: Vec,  # [N, N, N m] of the servo, in the base's frame
     twist: Vec,  # [m/s, m/s, rad/s] aimed, in the base's frame
     velocity: Vec,  # [m/s, m/s, rad/s] of the base, in the world's frame
-    turn: tuple[Any, Any],  # cosine and sine of the base's heading
+    turn: tuple[Number, Number],  # cosine and sine of the base's heading
     timestep: float,  # [s] of the physics
     xp: ModuleType = jnp,  # or numpy, for numbers on the host
 ) -> tuple[Vec, Vec]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.errors import InputError
+from rps_jax.geometry.arrays import Number
 
 HALF_LENGTH = 0.3625  # [m] of the paper's base: 15 taxels of 48.3 mm make 0.725 m
 HALF_WIDTH = 0.29  # [m] of the paper's base: l_cr + 5 cm, Sec. III-A
@@ -36,8 +37,8 @@ class Boards:
 
     side: Side = field(metadata=_STATIC)
     count: int = field(metadata=_STATIC)  # boards
-    pitch: Any = None  # () [m] of the taxels; None: the row covers the whole side
-    middle: Any = None  # () [m] of the row along the strip, from the middle of the side; None: 0
+    pitch: Number | None = None  # () [m] of the taxels; None: the row covers the whole side
+    middle: Number | None = None  # () [m] along the strip, from the middle of the side; None: 0
     electrodes: int = field(default=3, metadata=_STATIC)  # on each board
 
     @property
@@ -54,8 +55,8 @@ class Row(NamedTuple):
 
     start: jax.Array  # (2,) [m] in the robot frame
     along: np.ndarray  # (2,) unit vector
-    length: Any  # () [m]
-    offset: Any  # () [m] of its start along the strip
+    length: Number  # () [m]
+    offset: Number  # () [m] of its start along the strip
 
 
 @jax.tree_util.register_dataclass
@@ -63,14 +64,14 @@ class Row(NamedTuple):
 class Shell:
     """Outline of a base, a rectangle about its origin, and its boards in the strip's order."""
 
-    half_length: Any = HALF_LENGTH  # () [m]
-    half_width: Any = None  # () [m]; None: the paper's, a constant of the compiled program
+    half_length: Number = HALF_LENGTH  # () [m]
+    half_width: Number | None = None  # () [m]; None: the paper's, constant in compiled programs
     boards: tuple[Boards, ...] = BOARDS
     # Sample points of each taxel for the compression of foam; 1 cm apart they resolve a corner.
     samples: int = field(default=5, metadata=_STATIC)
 
     @classmethod
-    def of(cls, half_length: Any, half_width: Any, boards: tuple[Boards, ...]) -> Shell:
+    def of(cls, half_length: Number, half_width: Number, boards: tuple[Boards, ...]) -> Shell:
         """Return the shell of a base, or of many bases if the sizes are (n,)."""
         x, y = (float(np.max(half)) for half in (half_length, half_width))
         sides = _lengths(x, y)
@@ -83,7 +84,7 @@ class Shell:
         return cls(half_length, None if is_default else half_width, boards, samples)
 
     @property
-    def half(self) -> tuple[Any, Any]:
+    def half(self) -> tuple[Number, Number]:
         """Half length and half width [m]."""
         return self.half_length, HALF_WIDTH if self.half_width is None else self.half_width
 
@@ -161,12 +162,12 @@ class Shell:
                     )
 
 
-def _lengths(x: Any, y: Any) -> dict[Side, Any]:
+def _lengths(x: Number, y: Number) -> dict[Side, Number]:
     """Return the lengths [m] of the sides of a base of half length x and half width y [m]."""
     return {"left": 2 * x, "front": 2 * y, "right": 2 * x}
 
 
-def _interval(row: Boards, side: float) -> tuple[float, float]:
+def _interval(row: Boards, side: Number) -> tuple[Number, Number]:
     """Return the start and end [m] of a row on its side of length `side` [m]."""
     if row.pitch is None:
         return 0.0, side

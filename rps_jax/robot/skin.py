@@ -111,7 +111,7 @@ class IdealSkin(NamedTuple):
         return state, _reading(jnp.where(jnp.any(hits), kind, NONE), first[:2], last[:2])
 
     def sense_smoothly(
-        self, state: SkinState, footprint: Footprint, period: Scalar, temperature: Any
+        self, state: SkinState, footprint: Footprint, period: Scalar, temperature: Scalar
     ) -> tuple[SkinState, SmoothReading]:
         """Return the reading of points whose activity is a sigmoid.
 
@@ -132,7 +132,7 @@ class IdealSkin(NamedTuple):
         kind = jnp.where(length > self.point_length, LINE, POINT)
         return state, _smooth_reading(planar.greatest(excess), kind, first, last)
 
-    def _nodes(self, footprint: Footprint, tolerance: Any) -> tuple[jax.Array, jax.Array]:
+    def _nodes(self, footprint: Footprint, tolerance: Scalar) -> tuple[jax.Array, jax.Array]:
         """Return points (N,) [m] of the strip within `tolerance` of a footprint, and their lengths.
 
         A row of boards outside of the tolerance has points along its whole length.
@@ -233,7 +233,7 @@ class CapacitiveSkin(NamedTuple):
         return self.read(*self._scan(state, footprint), period)
 
     def sense_smoothly(
-        self, state: SkinState, footprint: Footprint, period: Scalar, temperature: Any
+        self, state: SkinState, footprint: Footprint, period: Scalar, temperature: Scalar
     ) -> tuple[SkinState, SmoothReading]:
         """Return the reading of taxels whose activity is a sigmoid.
 
