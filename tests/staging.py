@@ -53,7 +53,6 @@ class Recording(NamedTuple):
     force: Any = None  # [N, N, N m] (T, n, 3) on the base, where the engine computes it
 
 
-@partial(jax.jit, static_argnames=("stage", "physics", "force"))
 def drive(
     stage: Any,
     fields: Any,
@@ -63,7 +62,7 @@ def drive(
     robots: Robot | None = None,
     force: bool = False,
 ) -> Recording:
-    """Step worlds in a compiled program with twists (T, n, 3) of their bases."""
+    """Step worlds with twists (T, n, 3) of their bases; JAX can trace this."""
 
     def step(motion: Motion, twist: Any) -> tuple[Motion, Any]:
         period = ControlPeriod(Twist(*twist.T), physics, robots, force)
@@ -105,8 +104,10 @@ def simulate(
     )
     motion = Motion(qpos, qvel, 0 * qvel, None if robots is None else jnp.zeros((count, 3)))
     twists = jnp.broadcast_to(jnp.asarray(twist), (periods, count, 3))
-    args = (stage, fields, motion, twists, physics, robots, found.computes_force)
-    return jax.tree.map(lambda x: np.asarray(x, float), drive(*args))
+    run = partial(drive, stage, physics=physics, force=found.computes_force)
+    return jax.tree.map(
+        lambda x: np.asarray(x, float), jax.jit(run)(fields, motion, twists, robots=robots)
+    )
 
 
 @cache

@@ -75,6 +75,7 @@ class Film(NamedTuple):
         return (self.object_pose[-1] - self.object_pose[-2]) / PERIOD
 
 
+@partial(jax.jit, static_argnames="physics")
 def positions(fields, qpos, twists, physics):
     """Positions (T + 1, B, 10) of worlds that start at (B, 10), driven by twists (T, B, 3)."""
     still = jnp.zeros_like(qpos[:, :9])
