@@ -92,7 +92,7 @@ def register_object(
 ) -> None:
     """Register a custom object, to be used like the paper's objects.
 
-    The file includes `base.xml`, which need not be in the same folder. It has a body `object` with
+    The file includes `base.xml`, perhaps of another folder. It has a body `object` with
     a free joint `object` and upright geoms, one of them named `object`. The body's origin is at
     half the height of that geom.
 
