@@ -214,6 +214,11 @@ class TestEvolution:
             with pytest.raises(InputError, match=name):
                 TuneES("rps", **bad).validate()
 
+    def test_quick_tunes_few_parameters_of_rps_and_all_of_other_laws(self):
+        few = TuneES("rps", quick=True).with_quick_values()
+        assert few.tuned == ("K_h", "K_v", "l_cr", "d_th")
+        assert TuneES("pursuit", quick=True).with_quick_values().tuned == ("full",)
+
     def test_algorithms_of_several_parameters_are_refused_for_one(self):
         with pytest.raises(InputError, match="for one parameter"):
             search(1, algorithm="xnes")

@@ -21,9 +21,10 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax.control.base import LawParams
+from rps_jax.engines.base import Stage
 from rps_jax.geometry import planar
 from rps_jax.trials import trial
-from rps_jax.trials.trial import ControlLoop, Snapshot, Trial
+from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
 
 Scores = Callable[[jax.Array, Any], jax.Array]
 
@@ -76,7 +77,7 @@ def per_world(theta: jax.Array, worlds: Any) -> jax.Array:
 
 
 def window(
-    stage: Any,  # of an engine with derivatives: see `Engine.check_derivatives`
+    stage: Stage,  # of an engine with derivatives: see `Engine.check_derivatives`
     params_of: Callable[[jax.Array], LawParams],  # from theta (p,), differentiable
     cost: Callable[[Snapshot], jax.Array],  # () or (...) of snapshots (steps, ...) of one trial
     loop: ControlLoop,  # with the smooth law that the parameters belong to
@@ -87,7 +88,7 @@ def window(
     The worlds of these scores are batched pairs (World, Trial); a window starts at its trial.
     """
 
-    def scores(thetas: jax.Array, starts: Any) -> jax.Array:
+    def scores(thetas: jax.Array, starts: tuple[World, Trial]) -> jax.Array:
         worlds, trials = starts
         params = jax.vmap(params_of)(thetas)
 

@@ -168,7 +168,7 @@ class Tuning(LawQuestion[xr.Dataset]):
         """Search of this command."""
         raise NotImplementedError
 
-    def small(self) -> Mapping[str, Any]:
+    def quick_values(self) -> Mapping[str, Any]:
         """Values of `quick`; its choice of parameters is for RPS alone."""
         is_rps = isinstance(self.params, type(registry.LAWS["rps"]))
         return {k: v for k, v in self.QUICK.items() if k != "tuned" or is_rps}
