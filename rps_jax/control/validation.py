@@ -173,7 +173,7 @@ def _describe(value: Any) -> str:
 
 def _scalar_fault(leaf: Any, kinds: str) -> str:
     """Describe why a leaf is no scalar of these kinds of type; empty if it is one."""
-    if not _is_array(leaf) or np.shape(leaf) != ():
+    if leaf is None or not _is_array(leaf) or np.shape(leaf) != ():
         return _describe(leaf)
     dtype = jnp.result_type(leaf)
     return "" if getattr(dtype, "kind", "") in tuple(kinds) else f"of type {dtype}"
