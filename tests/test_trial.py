@@ -89,10 +89,12 @@ def test_the_last_trials_of_jobs_end_alike_side_by_side(monkeypatch, most):
     some = [case((0.6 + 0.05 * k, 0.05 * k)) for k in range(6)] + [case(AHEAD)]
     some += [case((0.6, 0.1 * k), name="cylinder") for k in range(3)]
     alone, _ = pushes.run(some, replace(FUSED, rules=rules), slots=SLOTS, workers=1)
-    ran, plain = [], batch._Worker._program
-    monkeypatch.setattr(batch, "_most_aside", lambda: most)
+    ran, plain = [], batch._Worker._compiled
+    monkeypatch.setattr(batch, "_max_suspended", lambda: most)
     monkeypatch.setattr(
-        batch._Worker, "_program", lambda self, one: ran.append(one.slots) or plain(self, one)
+        batch._Worker,
+        "_compiled",
+        lambda self, program: ran.append(program.slots) or plain(self, program),
     )
     found, _ = pushes.run(some, replace(FUSED, rules=rules), slots=SLOTS, workers=2)
     assert len(ran[-1]) == 2

@@ -1,7 +1,19 @@
-"""Trials on a device: slots of a batch, each refilled as soon as its trial ends.
+"""Batches of trials: a compiled program steps slots, and each slot is refilled when its trial ends.
 
-A job is all that one compiled program runs; its trials come in parts, which are made only when a
-slot waits for one of their trials, so that memory does not grow with the number of trials.
+A job holds the trials that one program can step: one law, one shape family. Its worlds are built
+batch by batch when slots become free, so that memory does not grow with the number of trials.
+
+- `WorldBatch`: worlds and law parameters of some trials of a job.
+- `_TrialQueue`: the trials of a job that wait for a slot, and its suspended trials.
+- `_Program`: a compiled program for the slots of one queue, or of several queues side by side.
+- `_Slots`: the trials in the slots of one queue, on one worker.
+- `_Worker`: a host thread that runs programs, one after another, until no trial is left.
+- `_Schedule`: the order of the programs.
+- `_Monitor`: what all workers report to: finished trials, progress and the signal to stop.
+
+A GPU steps a few thousand worlds in hardly less time than a few. When no trial of a job waits and
+few of its trials still run, a worker there suspends these trials and takes the next job. At the end
+the suspended trials of several jobs are resumed side by side in one program.
 """
 
 from __future__ import annotations
@@ -10,9 +22,9 @@ import functools
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from functools import partial
-from typing import Any, NamedTuple, TypedDict, Unpack
+from typing import Any, NamedTuple, TypedDict, TypeVar, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -29,20 +41,19 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Rules, Trial, World
 from rps_jax.world.physics import Physics
 
-SEGMENT = 10.0  # [s] simulated between two looks at which trials have ended
-# A GPU steps a few thousand worlds in hardly less time than a few. So a worker there sets aside
-# what runs of a job when none of its trials waits and no more than this many run, and takes the
-# next job; in the end what was set aside of all jobs is run side by side.
-_ASIDE = 8192
-_SIDE_BY_SIDE = 4  # jobs, at most: a program of more would be long in compiling
+SEGMENT = 10.0  # [s] of simulated time in one call of a program; then slots are refilled
+_MAX_SUSPENDED = 8192  # trials of a job per GPU
+_MAX_SIDE_BY_SIDE = 4  # jobs in one program; more would take long to compile
+
+Tree = TypeVar("Tree")  # a pytree
 
 
 class WorldBatch(NamedTuple):
-    """Some trials of a job."""
+    """Worlds and law parameters of some trials of a job."""
 
     indices: np.ndarray  # (n,) indices of the trials in the run
     worlds: World  # leaves (n, ...), on the host
-    stage: Any
+    stage: Any  # a `Stage`, or what the `stepper` of an engine outside of JAX takes
     params: Any = ()  # `LawParams` with leaves (n, ...), on the host; () if not yet known
 
     def with_params(self, params: LawParams) -> WorldBatch:
@@ -51,16 +62,34 @@ class WorldBatch(NamedTuple):
         same = jax.tree.map(lambda x: np.full((count, *np.shape(x)), x, dtype), params)
         return self._replace(params=same)
 
+    @property
+    def inputs(self) -> Inputs:
+        """Inputs of the program, which differ from trial to trial."""
+        return self.worlds, self.params
+
+    def split(self, count: int) -> tuple[WorldBatch, WorldBatch | None]:
+        """Return the first `count` trials, and the rest if there is one."""
+
+        def select(part: slice) -> WorldBatch:
+            worlds, params = rows(self.inputs, part)
+            return WorldBatch(self.indices[part], worlds, self.stage, params)
+
+        has_rest = self.indices.size > count
+        return select(slice(count)), select(slice(count, None)) if has_rest else None
+
+
+Inputs = tuple[World, LawParams]
+
 
 class Job(NamedTuple):
-    """Trials of one kind: one compiled program runs them all."""
+    """Trials that one compiled program can step."""
 
     law: Law
-    trials: int  # at most; there are no more slots than that
-    parts: Iterable[WorldBatch]  # of one stage, if JAX traces the engine
+    num_trials: int  # at most; there are no more slots than that
+    batches: Iterable[WorldBatch]  # of one stage, if JAX traces the engine
 
 
-Collect = Callable[[np.ndarray, Outcome], Any]  # numbers (m,) of trials and their outcomes
+Collect = Callable[[np.ndarray, Outcome], object]  # indices (m,) of trials and their outcomes
 
 
 class BatchOptions(TypedDict, total=False):
@@ -75,263 +104,307 @@ def run(
     jobs: Sequence[Job],
     setting: Setting,
     *,
-    slots: int | None = None,  # worlds stepped at once by a worker on each device of the host
+    slots: int | None = None,
     workers: int | None = None,
-    collect: Collect,  # called with trials that ended, in any order, one call at a time
-    callback: ProgressCallback = no_progress,  # called after every segment, likewise
+    collect: Collect,
+    callback: ProgressCallback = no_progress,
 ) -> Timing:
     """Run every trial of every job to its end.
 
-    Workers are host threads that each drive a batch of their own, or that step worlds, if JAX does
-    not trace the engine.
+    Args:
+      jobs: trials by the program that steps them.
+      setting: engine, physics and rules.
+      slots: worlds that one worker steps at once on each device; by default as suits the engine.
+      workers: host threads that each step slots of their own, or the threads of an engine that JAX
+        does not trace; by default as suits the engine.
+      collect: called with trials that ended, in any order, by one thread at a time.
+      callback: called with the progress after every segment, likewise.
+
+    Returns:
+      The times of compilation and run, and the simulated time.
     """
     engine, backend = engines.get(setting.engine), jax.default_backend()
     slots = engine.slots(backend) if slots is None else slots
     workers = engine.workers(backend) if workers is None else workers
     errors.check_count("slots", slots, at_most=10_000_000)
     errors.check_count("workers", workers, at_most=1024)
-    shared = _Shared(collect, callback, workers)
-    began = time.perf_counter()
+    monitor = _Monitor(collect, callback, workers)
+    start_time = time.perf_counter()
+    tasks: list[Callable[[], object]]
     if not engine.traced:
         count = max(1, min(workers, len(jobs)))
-        tasks = [partial(_run_on_host, job, setting, workers // count, shared) for job in jobs]
+        tasks = [partial(_run_on_host, job, setting, workers // count, monitor) for job in jobs]
     else:
-        plan = _Schedule([_Queue(job) for job in jobs], setting, slots, workers)
-        tasks = [partial(_Worker(plan, shared).work, number) for number in range(workers)]
-        if backend != "cpu":  # the processor is idle: compile all at once, what is needed first
-            tasks += [each.program for each in (*plan.own, *plan.last)]
+        schedule = _Schedule([_TrialQueue(job) for job in jobs], setting, slots, workers)
+        tasks = [partial(_Worker(schedule, monitor).work, index) for index in range(workers)]
+        if (
+            backend != "cpu"
+        ):  # the processor is idle: compile all programs at once, first used first
+            tasks += [program.compiled for program in (*schedule.single, *schedule.joint)]
         count = len(tasks)
-    _side_by_side(tasks, count, shared)
-    total = time.perf_counter() - began
-    return Timing(shared.compile, total - shared.compile, shared.simulated)
+    _run_in_threads(tasks, count, monitor)
+    total = time.perf_counter() - start_time
+    return Timing(monitor.compile, total - monitor.compile, monitor.simulated)
 
 
 def run_all(
     jobs: Sequence[Job], setting: Setting, count: int, **options: Unpack[BatchOptions]
 ) -> tuple[Outcome, Timing]:
-    """Run every trial of every job, whose numbers are 0 to `count` - 1, by the `shape` of `run`.
+    """Run every trial of every job, of indices 0 to `count` - 1, and return all outcomes.
 
-    Returns their outcomes as numpy arrays (count, ...), and the timing.
+    Returns:
+      Outcomes as numpy arrays (count, ...), and the timing.
     """
-    found: dict[str, np.ndarray] = {}
+    columns: dict[str, np.ndarray] = {}
 
-    def collect(numbers: np.ndarray, outcome: Outcome) -> None:
+    def collect(indices: np.ndarray, outcome: Outcome) -> None:
         for name, leaf in outcome._asdict().items():
-            if name not in found:
-                found[name] = np.empty((count, *leaf.shape[1:]), leaf.dtype)
-            found[name][numbers] = leaf
+            if name not in columns:
+                columns[name] = np.empty((count, *leaf.shape[1:]), leaf.dtype)
+            columns[name][indices] = leaf
 
     timing = run(jobs, setting, collect=collect, **options)
-    return Outcome(**found), timing  # pyright: ignore[reportArgumentType]
+    return Outcome(**columns), timing  # pyright: ignore[reportArgumentType]
 
 
-def _side_by_side(tasks: Sequence[Callable[[], None]], count: int, shared: _Shared) -> None:
+def rows(tree: Tree, index: Any) -> Tree:
+    """Return the rows `index` of every leaf; an index is whatever arrays take."""
+    return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
+def _run_in_threads(tasks: Sequence[Callable[[], object]], count: int, monitor: _Monitor) -> None:
     """Run tasks on `count` threads; the first that fails stops the others."""
     with ThreadPoolExecutor(count) as pool:
-        jobs = [pool.submit(task) for task in tasks]
+        futures = [pool.submit(task) for task in tasks]
         try:
-            for job in as_completed(jobs):
-                job.result()
+            for future in as_completed(futures):
+                future.result()
         except BaseException:
-            shared.stop = True
-            shared.drained.abort()
+            monitor.stop = True
+            monitor.queues_empty.abort()
             pool.shutdown(wait=False, cancel_futures=True)
             raise
 
 
-class _Shared:
-    """What the workers report into."""
+class _Monitor:
+    """Finished trials, progress and stop signal of all workers of a run."""
 
-    def __init__(self, collect: Collect, callback: Callable[[Progress], Any], workers: int):
-        self.drained = threading.Barrier(workers)  # no trial of any queue waits
-        self.simulated = 0.0
-        self.compile = 0.0
+    def __init__(self, collect: Collect, callback: ProgressCallback, workers: int):
+        self.queues_empty = threading.Barrier(workers)  # workers wait until no trial waits
+        self.simulated = 0.0  # [s] summed over trials
+        self.compile = 0.0  # [s] that the worker who waited longest had no program
         self.stop = False  # set when one worker fails or the user interrupts
-        self._finished = 0
-        self._collect, self._report = collect, callback
+        self._finished = 0  # trials
+        self._collect, self._callback = collect, callback
         self._lock = threading.Lock()
 
-    def add(self, numbers: np.ndarray, trials: Outcome, simulated: float) -> None:
-        """Trials that ended in a segment, and the time [s] all of the worker's trials advanced."""
+    def add(self, indices: np.ndarray, outcomes: Outcome, simulated: float) -> None:
+        """Add the trials that ended in a segment, and the time [s] that all trials advanced."""
         with self._lock:
-            if numbers.size:
-                self._collect(numbers, trials)
-            self._finished += numbers.size
+            if indices.size:
+                self._collect(indices, outcomes)
+            self._finished += indices.size
             self.simulated += simulated
-            self._report(Progress(self._finished, self.simulated, self.compile))
+            self._callback(Progress(self._finished, self.simulated, self.compile))
 
-    def compiled(self, seconds: float) -> None:
-        """One worker had no program for this long."""
+    def add_compile_time(self, seconds: float) -> None:
+        """Record how long [s] one worker had no program."""
         with self._lock:
             self.compile = max(self.compile, seconds)
-            self._report(Progress(self._finished, self.simulated, self.compile))
+            self._callback(Progress(self._finished, self.simulated, self.compile))
 
 
-# --- on the host ---------------------------------------------------------------------------
+# --- engines outside of JAX ----------------------------------------------------------------
 
 
-def _run_on_host(job: Job, setting: Setting, threads: int, shared: _Shared) -> None:
-    for part in job.parts:
+def _run_on_host(job: Job, setting: Setting, threads: int, monitor: _Monitor) -> None:
+    """Run the trials of a job with an engine that JAX does not trace, batch by batch."""
+    period = setting.physics.control_period
+    for batch in job.batches:
 
-        def tell(
-            ended: np.ndarray, trials: Trial, simulated: float, part: WorldBatch = part
+        def add(
+            ended: np.ndarray, trials: Trial, simulated: float, batch: WorldBatch = batch
         ) -> bool:
-            outcomes = jax.device_get(trial.outcome(trials, setting.physics.control_period))
-            shared.add(part.indices[ended], rows(outcomes, ended), simulated)
-            return not shared.stop
+            outcomes = jax.device_get(trial.outcome(trials, period))
+            monitor.add(batch.indices[ended], rows(outcomes, ended), simulated)
+            return not monitor.stop
 
-        if shared.stop:
+        if monitor.stop:
             return
         loop = ControlLoop(setting.physics, setting.rules, job.law)
-        engine, threads = engines.get(setting.engine), max(1, threads)
-        host.run(engine, part.stage, part.worlds, part.params, loop, threads=threads, callback=tell)
+        engine, inputs = engines.get(setting.engine), (batch.stage, *batch.inputs)
+        host.run(engine, *inputs, loop, threads=max(1, threads), callback=add)
 
 
-# --- on a device -----------------------------------------------------------------------------
+# --- engines in JAX ------------------------------------------------------------------------
 
 
-class _Queue:
-    """The waiting trials of one job, and those that run and were set aside."""
+class _Suspended(NamedTuple):
+    """Running trials of a job that left their slots."""
+
+    batch: WorldBatch
+    trials: Trial  # leaves (n, ...), on the host
+    fresh: np.ndarray  # (n,) whether a trial has yet to start
+
+
+class _TrialQueue:
+    """Trials of a job that wait for a slot, and its suspended trials; workers share it."""
 
     def __init__(self, job: Job):
-        self.law, self.trials = job.law, job.trials
-        self._parts = iter(job.parts)
-        self.like: WorldBatch = next(self._parts)
-        self._waiting: WorldBatch | None = self.like  # what is left of it
+        self.law, self.num_trials = job.law, job.num_trials
+        self._batches = iter(job.batches)
+        self.example: WorldBatch = next(self._batches)  # for its stage and its shapes
+        self._waiting: WorldBatch | None = self.example  # rest of the current batch
         self._lock = threading.Lock()
-        self.aside: list[tuple[WorldBatch, Trial, np.ndarray]] = []  # with which are to be begun
+        self.suspended: list[_Suspended] = []
 
     @property
-    def waits(self) -> bool:
-        """Whether any trial waits."""
+    def is_empty(self) -> bool:
+        """Whether no trial waits."""
         with self._lock:
-            self._waiting = self._waiting or next(self._parts, None)
-            return self._waiting is not None
+            self._waiting = self._waiting or next(self._batches, None)
+            return self._waiting is None
 
     def take(self, count: int) -> list[WorldBatch]:
-        """Up to `count` waiting trials, as pieces of parts."""
+        """Remove and return up to `count` waiting trials."""
         taken = []
         with self._lock:
-            while count and (part := self._waiting or next(self._parts, None)):
-                piece, self._waiting = _cut(part, count)
-                taken.append(piece)
-                count -= piece.indices.size
+            while count and (batch := self._waiting or next(self._batches, None)):
+                first, self._waiting = batch.split(count)
+                taken.append(first)
+                count -= first.indices.size
         return taken
 
 
 class _Schedule:
-    """Which batches run which queues: first those of one queue, then those of several."""
+    """Order of the programs: first one for each queue, then those for suspended trials."""
 
-    def __init__(self, queues: Sequence[_Queue], setting: Setting, slots: int, workers: int):
-        devices, self.most_aside = jax.device_count(), _most_aside()
-        self.own, groups = [], {}
-        together = engines.get(setting.engine).side_by_side
-        for number, queue in enumerate(queues):
-            width = devices * min(slots, -(-queue.trials // devices))
-            if width > self.most_aside:
-                self.own.append(_Batch([queue], [width], setting))
-                width = min(devices * -(-queue.trials // devices), workers * self.most_aside)
+    single: list[_Program]  # each for one queue, until few of its trials run
+    joint: list[_Program]  # for suspended trials and short queues, several queues side by side
+
+    def __init__(self, queues: Sequence[_TrialQueue], setting: Setting, slots: int, workers: int):
+        devices, self.max_suspended = jax.device_count(), _max_suspended()
+        self.single, groups = [], {}
+        side_by_side = engines.get(setting.engine).side_by_side
+        for index, queue in enumerate(queues):
+            per_device = -(-queue.num_trials // devices)
+            width = devices * min(slots, per_device)
+            if width > self.max_suspended:
+                self.single.append(_Program([queue], [width], setting))
+                width = min(devices * per_device, workers * self.max_suspended)
             if width:
-                groups.setdefault(queue.law if together else number, []).append((queue, width))
-        self.last = [
-            _Batch([queue for queue, _ in some], [width for _, width in some], setting)
+                groups.setdefault(queue.law if side_by_side else index, []).append((queue, width))
+        self.joint = [
+            _Program(*zip(*group[i : i + _MAX_SIDE_BY_SIDE], strict=True), setting)
             for group in groups.values()
-            for some in (group[i : i + _SIDE_BY_SIDE] for i in range(0, len(group), _SIDE_BY_SIDE))
+            for i in range(0, len(group), _MAX_SIDE_BY_SIDE)
         ]
 
 
-def _most_aside() -> int:
-    """How many running trials of a job a worker sets aside, at most."""
-    return 0 if jax.default_backend() == "cpu" else jax.device_count() * _ASIDE
+def _max_suspended() -> int:
+    """Return how many running trials of a job a worker suspends, at most."""
+    return 0 if jax.default_backend() == "cpu" else jax.device_count() * _MAX_SUSPENDED
 
 
-class _Batch:
-    """So many slots for each of some queues on all devices of the host, and their program.
+class _Program:
+    """Compiled program that steps the slots of one queue, or of several of one law side by side."""
 
-    All queues are of one law. What is done of a batch is done to its queues side by side.
-    """
-
-    def __init__(self, queues: Sequence[_Queue], slots: Sequence[int], setting: Setting):
+    def __init__(self, queues: Sequence[_TrialQueue], slots: Sequence[int], setting: Setting):
         self.queues, self.slots, self.setting = queues, slots, setting
         self.law = queues[0].law
-        self.stages = tuple(queue.like.stage for queue in queues)
+        self.stages = tuple(queue.example.stage for queue in queues)
         self.sharding = None
         if jax.device_count() > 1:
             mesh = jax.make_mesh((jax.device_count(),), ("worlds",), (AxisType.Auto,))
             self.sharding = NamedSharding(mesh, P("worlds"))
-        self._compiling = threading.Lock()
-        self._program = None
-        self.ready = 0.0  # [s] of `time.perf_counter`, when the program was there
+        self._lock = threading.Lock()
+        self._compiled: _Advance | None = None
+        self.compiled_at = 0.0  # [s] of `time.perf_counter`
 
-    def program(self) -> Any:
-        """The compiled program; the first to come compiles, others wait."""
-        with self._compiling:
-            if self._program is None:
-                self._program = self._compile()
-                self.ready = time.perf_counter()
-            return self._program
+    def compiled(self) -> _Advance:
+        """Return the compiled function; the first caller compiles it and others wait."""
+        with self._lock:
+            if self._compiled is None:
+                self._compiled = self._compile()
+                self.compiled_at = time.perf_counter()
+            return self._compiled
 
-    def put(self, tree: Any) -> Any:
-        """Leaves (slots, ...) on the device, or split over all devices of the host."""
+    def put(self, tree: Tree) -> Tree:
+        """Put leaves (slots, ...) on the device, or split them over all devices of the host."""
         return jax.device_put(tree, self.sharding)
 
-    def _compile(self) -> Any:
-        inputs = [
-            jax.tree.map(partial(self._batched, slots), _inputs(queue.like))
+    def _compile(self) -> _Advance:
+        inputs = tuple(
+            self._shapes(slots, queue.example.inputs)
             for queue, slots in zip(self.queues, self.slots, strict=True)
-        ]
+        )
         masks = tuple(jax.ShapeDtypeStruct((n,), bool, sharding=self.sharding) for n in self.slots)
         stages, rules = jax.eval_shape(lambda: (self.stages, self.setting.rules))
-        shapes = (stages, tuple(inputs), self.blank, masks, masks, rules)
-        leaves, tree = jax.tree.flatten(shapes)
-        return _compiled(self.setting.physics, self.law, self.sharding, tree, tuple(leaves))
+        arguments = (stages, inputs, self.trial_shapes, masks, masks, rules)
+        leaves, structure = jax.tree.flatten(arguments)
+        physics = self.setting.physics
+        return _compile_advance(physics, self.law, self.sharding, structure, tuple(leaves))
 
     @functools.cached_property
-    def blank(self) -> tuple[Trial, ...]:
-        """Shapes of the trials of each queue."""
-        start, found = partial(trial.start_all, law=self.law), []
+    def trial_shapes(self) -> tuple[Trial, ...]:
+        """Shapes of the trials (slots, ...) of each queue."""
+        start, shapes = partial(trial.start_all, law=self.law), []
         for queue, slots in zip(self.queues, self.slots, strict=True):
-            one = jax.tree.map(partial(self._batched, 1), _inputs(queue.like))
-            like = jax.eval_shape(start, *one, jax.ShapeDtypeStruct((1,), bool))
-            found.append(jax.tree.map(partial(self._batched, slots), like))
-        return tuple(found)
+            inputs = self._shapes(1, queue.example.inputs)
+            trials = jax.eval_shape(start, *inputs, jax.ShapeDtypeStruct((1,), bool))
+            shapes.append(self._shapes(slots, trials))
+        return tuple(shapes)
 
-    def _batched(self, slots: int, leaf: Any) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct((slots, *leaf.shape[1:]), leaf.dtype, sharding=self.sharding)
+    def _shapes(self, slots: int, tree: Tree) -> Tree:
+        """Return the shapes of a pytree with leaves (n, ...) for another number of slots."""
+
+        def shape(leaf: jax.Array) -> jax.ShapeDtypeStruct:
+            size = slots, *leaf.shape[1:]
+            return jax.ShapeDtypeStruct(size, leaf.dtype, sharding=self.sharding)
+
+        return jax.tree.map(shape, tree)
+
+
+class _Segment(NamedTuple):
+    """State of the slots of one queue after a segment."""
+
+    steps: Any  # (slots,) int: control steps of each trial since its start
+    done: Any  # (slots,) bool
+    outcome: Outcome  # (slots, ...)
+
+
+_Advance = Callable[..., tuple[tuple[Trial, ...], tuple[_Segment, ...]]]
 
 
 @functools.lru_cache(maxsize=32)
-def _compiled(
+def _compile_advance(
     physics: Physics,
     law: Law,
     sharding: NamedSharding | None,
-    tree: Any,
+    structure: jax.tree_util.PyTreeDef,
     leaves: tuple[jax.ShapeDtypeStruct, ...],
-) -> Any:
-    """`trial.advance` compiled for arguments of these shapes; later runs of the kind reuse it.
-
-    With the trials of each batch come their steps, who has ended, and how.
-    """
+) -> _Advance:
+    """Compile `trial.advance` by one segment for arguments of these shapes; cached."""
 
     def advance(
         stages: tuple[Any, ...],
-        inputs: tuple[tuple[World, LawParams], ...],
+        inputs: tuple[Inputs, ...],
         trials: tuple[Trial, ...],
         fresh: tuple[jax.Array, ...],
         live: tuple[jax.Array, ...],
         rules: Rules,
-    ) -> tuple[tuple[Trial, ...], tuple[tuple[jax.Array, jax.Array, Outcome], ...]]:
+    ) -> tuple[tuple[Trial, ...], tuple[_Segment, ...]]:
         worlds, params = zip(*inputs, strict=True)
-        every = zip(worlds, params, live, strict=True)
-        started = [trial.start_all(*each, law=law) for each in every]
-        begun = tuple(map(_pick, fresh, started, trials))
+        started = [
+            trial.start_all(*args, law=law) for args in zip(worlds, params, live, strict=True)
+        ]
+        current = tuple(map(_select, fresh, started, trials))
         steps = max(1, round(SEGMENT / physics.control_period))
-        after = trial.advance(
-            stages, worlds, params, begun, ControlLoop(physics, rules, law), steps
-        )
-        # Of the same program: one of its own would wait for the other workers' segments.
+        loop = ControlLoop(physics, rules, law)
+        after = trial.advance(stages, worlds, params, current, loop, steps)
+        # Outcomes are in the same program: another one would wait for other workers' segments.
         return after, tuple(
-            (one.steps, one.done, trial.outcome(one, physics.control_period)) for one in after
+            _Segment(t.steps, t.done, trial.outcome(t, physics.control_period)) for t in after
         )
 
     if sharding is not None:  # each device runs its own worlds and waits for no other
@@ -342,163 +415,152 @@ def _compiled(
             out_specs=P("worlds"),
             check_vma=False,
         )
-    arguments = jax.tree.unflatten(tree, leaves)
+    arguments = jax.tree.unflatten(structure, leaves)
     if sharding is None:
         static = (physics, SEGMENT)
         return programs.compile_function(advance, arguments, law=law, donate=2, static=static)
     return programs.compile_lowered(jax.jit(advance, donate_argnums=2).lower(*arguments))
 
 
-def rows(tree: Any, which: Any) -> Any:
-    """Take these rows of every leaf."""
-    return jax.tree.map(lambda leaf: leaf[which], tree)
-
-
-def _inputs(part: WorldBatch) -> tuple[World, LawParams]:
-    """Return what differs between the trials of a part."""
-    return part.worlds, part.params
-
-
-def _cut(part: WorldBatch, count: int) -> tuple[WorldBatch, WorldBatch | None]:
-    """The first `count` trials of a part, and the others if there are any."""
-
-    def piece(which: slice) -> WorldBatch:
-        worlds, params = rows(_inputs(part), which)
-        return WorldBatch(part.indices[which], worlds, part.stage, params)
-
-    over = part.indices.size > count
-    return piece(slice(count)), piece(slice(count, None)) if over else None
-
-
-def _pick(which: jax.Array, yes: Trial, no: Trial) -> Trial:
-    """Rows of one batch of trials where `which` (B,) holds, and of another elsewhere."""
-    one = partial(jax.vmap(lambda w, a, b: jnp.where(w, a, b)), which)
-    return jax.tree.map(one, yes, no)
+def _select(mask: jax.Array, yes: Trial, no: Trial) -> Trial:
+    """Return the rows of `yes` where a mask (B,) holds, and those of `no` elsewhere."""
+    where = partial(jax.vmap(lambda m, a, b: jnp.where(m, a, b)), mask)
+    return jax.tree.map(where, yes, no)
 
 
 class _Slots:
-    """The slots of one queue in a batch of one worker, and what is in them."""
+    """Slots of one queue in a program of one worker, and the trials in them."""
 
-    def __init__(self, batch: _Batch, number: int, resumed: bool):
-        queue, slots = batch.queues[number], batch.slots[number]
-        self._queue, self._batch = queue, batch
-        self._numbers = np.zeros(slots, np.int64)
-        self.live = np.zeros(slots, bool)
-        self._before = np.zeros(slots, int)  # steps at the last look
-        like = _inputs(queue.like)
-        self._host = jax.tree.map(lambda leaf: np.repeat(leaf[:1], slots, axis=0), like)
-        self._fresh = np.ones(slots, bool)  # begin with the next segment
-        blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), batch.blank[number])
-        self.trials = batch.put(blank)
-        if not (aside := queue.aside if resumed else ()):
-            self.inputs = self._put(np.arange(slots), queue.take(slots))
+    def __init__(self, program: _Program, index: int, resume: bool):
+        """Fill the slots of the queue `index` with suspended trials, or else waiting ones."""
+        queue, slots = program.queues[index], program.slots[index]
+        self._queue, self._program = queue, program
+        self._indices = np.zeros(slots, np.int64)  # of the trials in the run
+        self.live = np.zeros(slots, bool)  # whether a slot holds a trial that has not ended
+        self._steps = np.zeros(slots, int)  # of each trial at the end of the last segment
+        self._fresh = np.ones(slots, bool)  # whether a trial starts with the next segment
+        example = queue.example.inputs
+        self._host = jax.tree.map(lambda leaf: np.repeat(leaf[:1], slots, axis=0), example)
+        shapes = program.trial_shapes[index]
+        self.trials = program.put(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes))
+        if not (suspended := queue.suspended if resume else ()):
+            self.inputs = self._fill(np.arange(slots), queue.take(slots))
             return
-        parts, states, fresh = zip(*aside, strict=True)
-        self.inputs = self._put(np.arange(slots), parts)
-        running = jax.tree.map(lambda *leaves: np.concatenate(leaves), *states)
-        # What fills the other slots has ended.
-        which = np.resize(np.arange(len(running.steps)), slots)
-        running, self._fresh = rows(running, which), self.live & np.concatenate(fresh)[which]
-        self._before = running.steps.copy()
-        self.trials = batch.put(running._replace(done=~self.live))
+        batches, states, fresh = zip(*suspended, strict=True)
+        self.inputs = self._fill(np.arange(slots), batches)
+        trials = jax.tree.map(lambda *leaves: np.concatenate(leaves), *states)
+        # Slots without a trial hold a copy of one, marked as done.
+        source = np.resize(np.arange(len(trials.steps)), slots)
+        trials, self._fresh = rows(trials, source), self.live & np.concatenate(fresh)[source]
+        self._steps = trials.steps.copy()
+        self.trials = program.put(trials._replace(done=~self.live))
 
-    def _put(self, at: np.ndarray, taken: Sequence[WorldBatch]) -> tuple[World, LawParams]:
-        """Put trials into the first of the slots `at`; return the inputs of all slots."""
-        ends = np.cumsum([0, *(part.indices.size for part in taken)])
+    def _fill(self, at: np.ndarray, batches: Sequence[WorldBatch]) -> Inputs:
+        """Fill the first of the slots `at` with trials; return the inputs of all slots."""
+        ends = np.cumsum([0, *(batch.indices.size for batch in batches)])
         at = at[: ends[-1]]
-        for part, slots in zip(taken, np.split(at, ends[1:-1]) if taken else (), strict=True):
-            self._numbers[slots] = part.indices
-            for mine, theirs in zip(
-                jax.tree.leaves(self._host), jax.tree.leaves(_inputs(part)), strict=True
+        for batch, slots in zip(batches, np.split(at, ends[1:-1]) if batches else (), strict=True):
+            self._indices[slots] = batch.indices
+            for target, source in zip(
+                jax.tree.leaves(self._host), jax.tree.leaves(batch.inputs), strict=True
             ):
-                mine[slots] = theirs
-        self.live[at], self._before[at] = True, 0
+                target[slots] = source
+        self.live[at], self._steps[at] = True, 0
         # A copy: the device may otherwise share the host's memory, which the next call changes.
-        return self._batch.put(jax.tree.map(np.copy, self._host))
+        return self._program.put(jax.tree.map(np.copy, self._host))
 
-    def give(self) -> tuple[tuple[World, LawParams], Trial, Any, Any]:
-        """What the program takes; what is fresh then begins."""
-        masks = self._batch.put((self._fresh.copy(), self.live.copy()))
+    def arguments(self) -> tuple[Inputs, Trial, jax.Array, jax.Array]:
+        """Return the arguments of the program for the next segment, in which fresh trials start."""
+        fresh, live = self._program.put((self._fresh.copy(), self.live.copy()))
         self._fresh[:] = False
-        return self.inputs, self.trials, *masks
+        return self.inputs, self.trials, fresh, live
 
-    def look(self, steps: np.ndarray, done: np.ndarray, outcomes: Outcome) -> tuple[Any, ...]:
-        """What `_Shared.add` takes of a segment; what ended in it makes room."""
+    def refill(self, segment: _Segment) -> tuple[np.ndarray, Outcome, float]:
+        """Replace the trials that ended in a segment; return the arguments of `_Monitor.add`."""
+        steps, done, outcomes = segment
         at = np.flatnonzero(done & self.live)
-        period = self._batch.setting.physics.control_period
-        simulated = float((steps - self._before)[self.live].sum()) * period
-        ended = self._numbers[at], rows(outcomes, at), simulated
-        self._before = steps.copy()
+        period = self._program.setting.physics.control_period
+        simulated = float((steps - self._steps)[self.live].sum()) * period
+        ended = self._indices[at], rows(outcomes, at), simulated
+        self._steps = steps.copy()
         self.live[at] = False
         if taken := self._queue.take(at.size):
-            self.inputs = self._put(at, taken)
+            self.inputs = self._fill(at, taken)
             self._fresh[at] = self.live[at]
         return ended
 
-    def set_aside(self) -> None:
-        """Hand what runs over to the queue."""
+    def suspend(self) -> None:
+        """Move the trials that run to the queue."""
         if (at := np.flatnonzero(self.live)).size:
             worlds, params = rows(self._host, at)
-            part = WorldBatch(self._numbers[at], worlds, self._queue.like.stage, params)
+            batch = WorldBatch(self._indices[at], worlds, self._queue.example.stage, params)
             trials = rows(jax.device_get(self.trials), at)
-            self._queue.aside.append((part, trials, self._fresh[at]))
+            self._queue.suspended.append(_Suspended(batch, trials, self._fresh[at]))
 
 
 class _Worker:
-    """A host thread that drives batches of its own."""
+    """Host thread that runs programs, one after another."""
 
-    def __init__(self, schedule: _Schedule, shared: _Shared):
-        self._schedule, self._shared = schedule, shared
-        self._waited = 0.0  # [s] for programs
+    def __init__(self, schedule: _Schedule, monitor: _Monitor):
+        self._schedule, self._monitor = schedule, monitor
+        self._waited = 0.0  # [s] for compilation
 
-    def work(self, number: int) -> None:
-        """Until no trial waits or runs; `number` is the worker's."""
-        own, last = self._schedule.own, self._schedule.last
-        first = number % max(1, len(own))
-        for batch in own[first:] + own[:first]:
-            self._run(batch, self._schedule.most_aside)
-        self._shared.drained.wait()
-        for batch in last[number :: self._shared.drained.parties]:
-            self._run(batch, 0)
+    def work(self, index: int) -> None:
+        """Run until no trial waits or runs; `index` is the worker's."""
+        single, joint = self._schedule.single, self._schedule.joint
+        first = index % max(1, len(single))
+        for program in single[first:] + single[:first]:
+            self._run(program, self._schedule.max_suspended)
+        self._monitor.queues_empty.wait()
+        for program in joint[index :: self._monitor.queues_empty.parties]:
+            self._run(program, 0)
 
-    def _program(self, batch: _Batch) -> Any:
-        began = time.perf_counter()
-        program = batch.program()
-        self._waited += max(0.0, batch.ready - began)
-        self._shared.compiled(self._waited)
-        return program
+    def _compiled(self, program: _Program) -> _Advance:
+        start_time = time.perf_counter()
+        advance = program.compiled()
+        self._waited += max(0.0, program.compiled_at - start_time)
+        self._monitor.add_compile_time(self._waited)
+        return advance
 
-    def _run(self, batch: _Batch, most_aside: int) -> None:
-        """Run the trials of a batch until none waits, and no more than so many run."""
-        if self._shared.stop:
+    def _run(self, program: _Program, max_suspended: int) -> None:
+        """Run segments until no trial waits and at most `max_suspended` run; suspend these."""
+        if self._monitor.stop:
             return
-        every = [_Slots(batch, number, not most_aside) for number in range(len(batch.queues))]
-        if not any(each.live.any() for each in every):
+        resume = not max_suspended
+        queues = [_Slots(program, index, resume) for index in range(len(program.queues))]
+        if not any(slots.live.any() for slots in queues):
             return
-        program, stages, rules = self._program(batch), batch.stages, batch.setting.rules
-        with ThreadPoolExecutor(1) as teller:  # what ended is kept while the next segment runs
-            telling, unseen = [], None
+        advance, stages, rules = self._compiled(program), program.stages, program.setting.rules
+        with ThreadPoolExecutor(1) as reporter:  # reports a segment while the next one runs
+            reports: list[Future[None]] = []
+            unread: tuple[_Segment, ...] | None = None  # segment whose results are still on the GPU
 
-            def look(seen: Any) -> list[Any]:
-                seen = jax.device_get(seen)
-                ended = [each.look(*one) for each, one in zip(every, seen, strict=True)]
-                for one in telling:
-                    one.result()
-                return [teller.submit(self._shared.add, *one) for one in ended]
+            def read(segments: tuple[_Segment, ...]) -> list[Future[None]]:
+                segments = jax.device_get(segments)
+                ended = [slots.refill(s) for slots, s in zip(queues, segments, strict=True)]
+                _wait(reports)
+                return [reporter.submit(self._monitor.add, *args) for args in ended]
 
-            while sum(each.live.sum() for each in every) > most_aside and not self._shared.stop:
-                given = zip(*(each.give() for each in every), strict=True)
-                after, seen = program(stages, *given, rules)
-                for each, trials in zip(every, after, strict=True):
-                    each.trials = trials
-                # Where no trial waits for room, a GPU goes on while the host looks.
-                ahead = _most_aside() and not any(queue.waits for queue in batch.queues)
-                seen, unseen = (unseen, seen) if ahead else (seen, None)
-                if seen is not None:
-                    telling = look(seen)
-            if unseen is not None:
-                telling = look(unseen)
-            for one in telling:
-                one.result()
-        for each in every:
-            each.set_aside()
+            while sum(slots.live.sum() for slots in queues) > max_suspended:
+                if self._monitor.stop:
+                    break
+                arguments = zip(*(slots.arguments() for slots in queues), strict=True)
+                after, segments = advance(stages, *arguments, rules)
+                for slots, trials in zip(queues, after, strict=True):
+                    slots.trials = trials
+                # Where no trial waits for a slot, a GPU runs the next segment while the host reads.
+                overlap = _max_suspended() and all(queue.is_empty for queue in program.queues)
+                segments, unread = (unread, segments) if overlap else (segments, None)
+                if segments is not None:
+                    reports = read(segments)
+            if unread is not None:
+                reports = read(unread)
+            _wait(reports)
+        for slots in queues:
+            slots.suspend()
+
+
+def _wait(futures: Iterable[Future[None]]) -> None:
+    """Wait for all futures, and raise the error of the first that failed."""
+    for future in futures:
+        future.result()
